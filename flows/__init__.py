@@ -1,0 +1,1 @@
+"""What runs, in which order, on how many workers; and the command line."""

@@ -1,0 +1,1 @@
+"""Everything that touches bytes: logs, datasets, catalogues, Earth orientation."""

@@ -1,0 +1,1 @@
+"""What the data looks like: tables, log messages, settings and named errors."""

@@ -1,0 +1,133 @@
+"""The settings: one frozen group a stage, validated, each field with its unit in its name.
+
+They come from a TOML file and from flow parameters, and are passed in, never read from
+a global.
+"""
+
+import hashlib
+import tomllib
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from epipole.schemas.errors import SettingsError
+
+
+class Group(BaseModel):
+    """A group of settings: frozen, and an unknown name is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class SensorSettings(Group):
+    """What to assume of a sensor where its log does not say."""
+
+    attitude_sigma_arcsec: float = Field(60.0, gt=0, description="Prior attitude without sigma.")
+    position_sigma_km: float = Field(0.05, gt=0, description="Position without sigma.")
+    centroid_sigma_px: float | None = Field(
+        None, gt=0, description="Centroids without sigma; none: estimated from the stars."
+    )
+    state_gap_s: float = Field(
+        30.0, gt=0, description="A frame further than this from any state has no position."
+    )
+
+
+class IdentificationSettings(Group):
+    """Star identification and attitude."""
+
+    method: Literal["likelihood"] = Field("likelihood", description="How stars are identified.")
+    magnitude_limit: float | None = Field(
+        None, description="Faintest star looked for; none: from the number of centroids."
+    )
+    merge_px: float = Field(
+        2.0, ge=0, description="Stars closer than this are one spot, with the brighter one's id."
+    )
+    gate_sigma: float = Field(3.7, gt=0, description="A star lies within this of its place.")
+    false_alarm: float = Field(
+        1e-6, gt=0, lt=1, description="Accepted probability that a reported attitude is by chance."
+    )
+    time_limit_s: float = Field(0.5, gt=0, description="Longest search for one frame.")
+
+
+class TrackletSettings(Group):
+    """Detections of one sensor, frame after frame."""
+
+    gate_sigma: float = Field(4.0, gt=0, description="A detection continues a track within this.")
+    max_rate_deg_s: float = Field(2.0, gt=0, description="Fastest apparent motion looked for.")
+    max_missed: int = Field(3, ge=0, description="Frames an object may be missed in a row.")
+    min_detections: int = Field(4, ge=2, description="Shortest run that is an object.")
+
+
+class AlignmentSettings(Group):
+    """Common instants of sensors that expose at different times."""
+
+    interval_s: float | None = Field(
+        None, gt=0, description="Between epochs; none: the slowest sensor's frame interval."
+    )
+    window_s: float = Field(
+        6.0, gt=0, description="Half-width of the local motion fitted around an epoch."
+    )
+    max_gap_s: float | None = Field(
+        None, gt=0, description="Farthest frame that serves an epoch; none: its frame interval."
+    )
+
+
+class AssociationSettings(Group):
+    """Which views of different sensors are one object."""
+
+    method: Literal["likelihood"] = Field("likelihood", description="How views are associated.")
+    gate_sigma: float = Field(4.5, gt=0, description="Views of one object agree within this.")
+    min_altitude_km: float = Field(100.0, ge=0, description="Lowest object looked for.")
+    max_range_km: float = Field(1.0e5, gt=0, description="Farthest object looked for.")
+    span_s: float = Field(30.0, gt=0, description="Evidence is summed over spans of this length.")
+
+
+class PositionSettings(Group):
+    """Least-squares positions."""
+
+    reject_sigma: float = Field(4.0, gt=0, description="A view further off than this is rejected.")
+
+
+class Settings(Group):
+    """All settings of a run."""
+
+    sensors: SensorSettings = SensorSettings()
+    identification: IdentificationSettings = IdentificationSettings()
+    tracklets: TrackletSettings = TrackletSettings()
+    alignment: AlignmentSettings = AlignmentSettings()
+    association: AssociationSettings = AssociationSettings()
+    positions: PositionSettings = PositionSettings()
+
+    def key(self) -> str:
+        """Return a digest that is the same for the same settings."""
+        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+
+
+def parse_settings(text: str, where: str) -> Settings:
+    """Return the settings of a TOML text; `where` names it in messages.
+
+    Raises
+    ------
+    SettingsError
+        Names the setting, what came and what was expected.
+    """
+    try:
+        return validate_settings(tomllib.loads(text), where)
+    except tomllib.TOMLDecodeError as error:
+        raise SettingsError(f"{where}: not TOML: {error}") from error
+
+
+def validate_settings(values: dict[str, Any], where: str) -> Settings:
+    """Return the settings of nested mappings, such as flow parameters; see `parse_settings`."""
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        raise SettingsError(f"{where}: {_first_fault(error)}") from error
+
+
+def _first_fault(error: ValidationError) -> str:
+    fault = error.errors()[0]
+    name = ".".join(str(part) for part in fault["loc"])
+    if fault["type"] == "extra_forbidden":
+        return f"unknown setting {name}; `epipole settings` lists them all"
+    return f"{name} = {fault['input']!r}: {fault['msg'][0].lower()}{fault['msg'][1:]}"

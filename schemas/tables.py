@@ -1,0 +1,329 @@
+"""The tables of a dataset, declared once: type, unit, frame and meaning of every column.
+
+A dataset is ``DATASET/night=YYYY-MM-DD/<table>/<part>.parquet``. What is declared here
+travels in the Parquet files as field metadata.
+"""
+
+import pyarrow as pa
+
+from epipole.schemas.columns import (
+    axes,
+    column,
+    covariance,
+    id_column,
+    schema,
+    time_column,
+    upper_triangle,
+)
+
+F64 = pa.float64()
+I32 = pa.int32()
+I64 = pa.int64()
+
+SENSOR_ID = id_column("sensor_id", doc="Star sensor.")
+FRAME_NUMBER = column(
+    "frame_number", I64, doc="Exposure of the sensor; with sensor_id, the key of a frame."
+)
+FRAME_TIME = time_column()
+FRAME_KEY = [SENSOR_ID, FRAME_NUMBER, FRAME_TIME]
+CENTROID = column("centroid", I32, doc="Index in the arrays of the frame's message.")
+PIXEL = axes(
+    "{}_px",
+    unit="px",
+    frame="image",
+    doc="Place in the image; (0, 0) is the middle of the top-left pixel",
+    names="xy",
+)
+EPOCH = time_column("epoch", doc="Common instant at which the sensors are compared, UTC.")
+OBJECT_ID = id_column("object_id", doc="Space object, the same as long as it is followed.")
+
+FRAMES = schema(
+    "frames",
+    "One row a frame: its attitude and where the sensor was.",
+    [
+        *FRAME_KEY,
+        column("n_centroids", I32, doc="Centroids in the message."),
+        column("n_stars", I32, doc="Centroids identified as stars and used for the attitude."),
+        column("attitude_source", pa.string(), doc="stars, prior or none."),
+        column(
+            "status",
+            pa.string(),
+            null=True,
+            doc="Why there is no attitude from stars: no_centroids, too_few_stars, no_match, "
+            "no_calibration, time_limit; null where there is one.",
+        ),
+        *[
+            column(
+                f"q{a}",
+                F64,
+                null=True,
+                frame="sensor from ICRS",
+                doc="Attitude: unit quaternion, scalar last, qw >= 0; turns ICRS into sensor "
+                "components. Null without attitude.",
+            )
+            for a in "xyzw"
+        ],
+        column("ra_deg", F64, unit="deg", frame="ICRS", null=True, doc="Boresight."),
+        column("dec_deg", F64, unit="deg", frame="ICRS", null=True, doc="Boresight."),
+        column(
+            "roll_deg",
+            F64,
+            unit="deg",
+            frame="ICRS",
+            null=True,
+            doc="Position angle of the sensor's -y axis at the boresight, from celestial north "
+            "through east, 0 to 360.",
+        ),
+        *axes(
+            "sigma_{}_arcsec",
+            unit="arcsec",
+            frame="sensor",
+            null=True,
+            doc="1-sigma attitude error about the sensor axis",
+        ),
+        column(
+            "residual_px", F64, unit="px", null=True, doc="Rms of the stars' image residuals."
+        ),
+        *axes("{}_km", unit="km", frame="GCRF", null=True, doc="Sensor position"),
+        *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Sensor velocity"),
+    ],
+)
+
+STARS = schema(
+    "stars",
+    "One row an identified star.",
+    [
+        *FRAME_KEY,
+        CENTROID,
+        column("star_id", I64, doc="Number in the star catalogue (Hipparcos unless said)."),
+        column("magnitude", F64, unit="mag", doc="V magnitude in the catalogue."),
+        *PIXEL,
+        *axes(
+            "d{}_px", unit="px", frame="image", doc="Measured minus predicted place", names="xy"
+        ),
+    ],
+)
+
+DETECTIONS = schema(
+    "detections",
+    "One row a centroid that is no star, in a frame with an attitude.",
+    [
+        *FRAME_KEY,
+        CENTROID,
+        *PIXEL,
+        column("flux", F64, null=True, doc="Linear, any unit; null where unknown."),
+        column("ra_deg", F64, unit="deg", frame="ICRS", doc="Apparent direction."),
+        column("dec_deg", F64, unit="deg", frame="ICRS", doc="Apparent direction."),
+        column(
+            "sigma_arcsec",
+            F64,
+            unit="arcsec",
+            doc="1-sigma an axis, of the centroid alone; the attitude's is in frames.",
+        ),
+        column(
+            "kind", pa.string(), doc="Taken for: object, star_unlisted, planet, hot_pixel, unknown."
+        ),
+        id_column("tracklet_id", null=True, doc="Null: belongs to none."),
+        id_column("track_id", null=True, doc="Null: belongs to none; only an object has one."),
+    ],
+)
+
+TRACKLETS = schema(
+    "tracklets",
+    "One row an unbroken run of detections of one object in one sensor.",
+    [
+        id_column("tracklet_id", doc="Unbroken run of detections."),
+        id_column("track_id", doc="Fragments of one object share it."),
+        SENSOR_ID,
+        time_column("start_time", doc="First detection, UTC."),
+        time_column("end_time", doc="Last detection, UTC."),
+        column("n_detections", I32, doc="Detections in the run."),
+        column("rate_arcsec_s", F64, unit="arcsec/s", doc="Mean apparent rate on the sky."),
+        column(
+            "residual_px", F64, unit="px", doc="Rms of the detections about the run's local motion."
+        ),
+        column(
+            "link_chi2",
+            F64,
+            null=True,
+            doc="Chi-square of the link to the fragment before; null where it is the first.",
+        ),
+    ],
+)
+
+EPOCHS = schema(
+    "epochs",
+    "One row a sensor and epoch: the frame that serves.",
+    [
+        EPOCH,
+        SENSOR_ID,
+        FRAME_NUMBER,
+        column("dt_s", F64, unit="s", doc="Frame time minus epoch."),
+    ],
+)
+
+ASSOCIATIONS = schema(
+    "associations",
+    "One row a sensor's view of an object at an epoch.",
+    [
+        EPOCH,
+        OBJECT_ID,
+        SENSOR_ID,
+        FRAME_NUMBER,
+        column(
+            "centroid",
+            I32,
+            null=True,
+            doc="Centroid in the nearest frame; null where the object was missed in it and its "
+            "place comes from the tracklet.",
+        ),
+        id_column("tracklet_id", null=True, doc="Null: a detection that belongs to no tracklet."),
+        *axes("{}_px", unit="px", frame="image", doc="Place at the epoch", names="xy"),
+        column(
+            "epipolar_px",
+            F64,
+            unit="px",
+            doc="Distance to the epipolar line, rms over the other views.",
+        ),
+        column(
+            "used",
+            pa.bool_(),
+            doc="False: rejected by the position solution, no longer claimed as this object.",
+        ),
+    ],
+)
+
+POSITIONS = schema(
+    "positions",
+    "One row an object at an epoch.",
+    [
+        EPOCH,
+        time_column(
+            doc="When the object was there, UTC: epoch minus mean light time of the used views."
+        ),
+        OBJECT_ID,
+        *axes("{}_km", unit="km", frame="GCRF", doc="Object position"),
+        *covariance("cov_{}", unit="km^2", frame="GCRF", doc="Covariance of the position."),
+        column("n_sensors", I32, doc="Sensors whose view was used."),
+        column("n_rejected", I32, doc="Sensors whose view was rejected."),
+        column("residual_px", F64, unit="px", doc="Rms of the used views' image residuals."),
+        column("chi2", F64, doc="Weighted sum of squares; 2 n_sensors - 3 degrees of freedom."),
+    ],
+)
+
+_STATE = ("x", "y", "z", "vx", "vy", "vz")
+
+
+def _state_unit(a: str, b: str) -> str:
+    return ("km^2", "km^2/s", "km^2/s^2")[a.startswith("v") + b.startswith("v")]
+
+
+STATES = schema(
+    "states",
+    "One row an object's position and velocity over an arc.",
+    [
+        EPOCH,
+        OBJECT_ID,
+        *axes("{}_km", unit="km", frame="GCRF", doc="Object position"),
+        *axes("v{}_km_s", unit="km/s", frame="GCRF", doc="Object velocity"),
+        *[
+            column(
+                f"cov_{a}{b}", F64, unit=_state_unit(a, b), frame="GCRF", doc="State covariance."
+            )
+            for a, b in upper_triangle(_STATE)
+        ],
+        column("n_epochs", I32, doc="Epochs of the arc."),
+        column("chi2", F64, doc="Weighted sum of squares of the fit."),
+    ],
+)
+
+_OPTICS = [
+    ("fx_px", "px", "Focal length along columns."),
+    ("fy_px", "px", "Focal length along rows."),
+    ("cx_px", "px", "Principal point, column."),
+    ("cy_px", "px", "Principal point, row."),
+    ("k1", "", "Brown-Conrady radial."),
+    ("k2", "", "Brown-Conrady radial."),
+    ("p1", "", "Brown-Conrady tangential."),
+    ("p2", "", "Brown-Conrady tangential."),
+    ("k3", "", "Brown-Conrady radial."),
+]
+
+CALIBRATIONS = schema(
+    "calibrations",
+    "One row a sensor: its optics as its stars of the night show them.",
+    [
+        SENSOR_ID,
+        *[column(name, F64, unit=unit, doc=doc) for name, unit, doc in _OPTICS],
+        *[
+            column(f"sigma_{name}", F64, unit=unit, doc=f"1-sigma of {name}.")
+            for name, unit, _ in _OPTICS
+        ],
+        column("n_stars", I32, doc="Star images that took part."),
+        column("residual_px", F64, unit="px", doc="Rms of their image residuals."),
+    ],
+)
+
+PAIRS = schema(
+    "pairs",
+    "One row two detections judged a pair.",
+    [
+        EPOCH,
+        id_column("sensor_id_1", doc="First sensor."),
+        column("frame_number_1", I64, doc="Frame of the first sensor."),
+        column("centroid_1", I32, doc="Centroid in that frame."),
+        id_column("sensor_id_2", doc="Second sensor."),
+        column("frame_number_2", I64, doc="Frame of the second sensor."),
+        column("centroid_2", I32, doc="Centroid in that frame."),
+        column(
+            "epipolar_px",
+            F64,
+            unit="px",
+            doc="Distance of the second from the epipolar line of the first, both at the epoch.",
+        ),
+        column("mahalanobis", F64, doc="That distance in units of its standard deviation."),
+    ],
+)
+
+SOURCES = schema(
+    "sources",
+    "One row a log that the night is made of.",
+    [
+        column("name", pa.string(), doc="File name of the log."),
+        column("size", I64, unit="byte", doc="Size of the log."),
+        column("sha256", pa.string(), doc="Digest of its bytes."),
+        time_column("first_time", doc="First frame in the log, UTC."),
+        time_column("last_time", doc="Last frame in the log, UTC."),
+        column("code_version", pa.string(), doc="Version of epipole that made the night."),
+        column("settings_key", pa.string(), doc="Digest of the settings that made the night."),
+    ],
+)
+
+REJECTS = schema(
+    "rejects",
+    "One row something that was left out.",
+    [
+        column("source", pa.string(), null=True, doc="Log file; null where it is no single one."),
+        column("offset", I64, unit="byte", null=True, doc="Place in the log."),
+        id_column("sensor_id", null=True, doc="Null where unknown, or more than one."),
+        time_column("time", doc="Time of what was left out, UTC; the night's start where it has none."),
+        column("stage", pa.string(), doc="Stage that left it out."),
+        column("reason", pa.string(), doc="Why, in a word: nan, duplicate_number, ambiguous, ..."),
+        column("count", I64, doc="How many."),
+    ],
+)
+
+TABLES: dict[str, pa.Schema] = {
+    "frames": FRAMES,
+    "stars": STARS,
+    "detections": DETECTIONS,
+    "tracklets": TRACKLETS,
+    "epochs": EPOCHS,
+    "associations": ASSOCIATIONS,
+    "positions": POSITIONS,
+    "states": STATES,
+    "calibrations": CALIBRATIONS,
+    "pairs": PAIRS,
+    "sources": SOURCES,
+    "rejects": REJECTS,
+}

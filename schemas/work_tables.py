@@ -1,0 +1,131 @@
+"""Tables that pass from stage to stage but are not published."""
+
+import pyarrow as pa
+
+from epipole.schemas.columns import axes, column, covariance, id_column, schema, time_column
+from epipole.schemas.tables import F64, FRAME_KEY, FRAMES, I64, SENSOR_ID
+
+
+def _floats() -> pa.DataType:
+    return pa.list_(pa.field("element", pa.float64(), nullable=False))
+
+
+EXPOSURES = schema(
+    "exposures",
+    "One row a frame as the log has it; arrays of one row have equal length.",
+    [
+        *FRAME_KEY,
+        column("exposure_s", F64, unit="s", doc="Exposure time."),
+        column("x_px", _floats(), unit="px", frame="image", doc="Column of each centroid."),
+        column("y_px", _floats(), unit="px", frame="image", doc="Row of each centroid."),
+        column("flux", _floats(), null=True, doc="Linear, any unit; null where unknown."),
+        column("sigma_px", _floats(), unit="px", null=True, doc="1-sigma; null where unknown."),
+        column("source", pa.string(), doc="Log file."),
+        column("offset", I64, null=True, unit="byte", doc="Place in the log."),
+    ],
+)
+
+SENSOR_STATES = schema(
+    "sensor_states",
+    "One row a state as the log has it, turned to GCRF.",
+    [
+        SENSOR_ID,
+        time_column(doc="Time of the state, UTC."),
+        *axes("{}_km", unit="km", frame="GCRF", doc="Sensor position"),
+        *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity; null: not sent"),
+        column("position_sigma_km", F64, unit="km", doc="1-sigma an axis; 0 where unknown."),
+        *[
+            column(f"q{a}", F64, null=True, frame="sensor from ICRS", doc="Prior attitude.")
+            for a in "xyzw"
+        ],
+        column("attitude_sigma_arcsec", F64, unit="arcsec", doc="1-sigma; 0 where unknown."),
+    ],
+)
+
+CAMERAS = schema(
+    "cameras",
+    "One row a calibration as the log has it.",
+    [
+        SENSOR_ID,
+        time_column(doc="From when it holds, UTC; before the first, the first holds."),
+        column("width", I64, unit="px", doc="Image width."),
+        column("height", I64, unit="px", doc="Image height."),
+        *[
+            column(name, F64, doc="Pinhole and Brown-Conrady coefficients.")
+            for name in ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
+        ],
+    ],
+)
+
+PLACES = schema(
+    "places",
+    "One row a frame: the sensor's state interpolated to the frame's time, row by row with exposures.",
+    [
+        *FRAME_KEY,
+        *axes("{}_km", unit="km", frame="GCRF", null=True, doc="Position; null: no state near"),
+        *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity"),
+        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma an axis."),
+        *[
+            column(f"q{a}", F64, null=True, frame="sensor from ICRS", doc="Prior; null: none")
+            for a in "xyzw"
+        ],
+        column("attitude_sigma_arcsec", F64, unit="arcsec", null=True, doc="1-sigma of the prior."),
+    ],
+)
+
+SOLUTIONS = schema(
+    "solutions",
+    "A row of `frames` with what later stages need beside it.",
+    [
+        *FRAMES,
+        *covariance(
+            "cov_att_{}_arcsec2",
+            unit="arcsec^2",
+            frame="sensor",
+            null=True,
+            doc="Covariance of the small rotation from the true to the reported sensor axes.",
+        ),
+        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma an axis."),
+        column("camera", I64, doc="Row of `cameras` that holds for the frame."),
+    ],
+)
+
+STAR_CATALOGUE = schema(
+    "star_catalogue",
+    "One row a star at the catalogue's epoch.",
+    [
+        column("star_id", I64, doc="Number in the catalogue (Hipparcos unless said)."),
+        column("ra_rad", F64, unit="rad", frame="ICRS", doc="Right ascension at the epoch."),
+        column("dec_rad", F64, unit="rad", frame="ICRS", doc="Declination at the epoch."),
+        column("parallax_mas", F64, unit="mas", doc="Parallax."),
+        column("pm_ra_mas_yr", F64, unit="mas/yr", doc="Proper motion times cos(dec)."),
+        column("pm_dec_mas_yr", F64, unit="mas/yr", doc="Proper motion."),
+        column("magnitude", F64, unit="mag", doc="V magnitude."),
+        column("variable", pa.bool_(), doc="Flagged as variable by the catalogue."),
+    ],
+)
+
+TRUE_FRAMES = schema(
+    "true_frames",
+    "Simulation truth, one row a frame.",
+    [
+        id_column("sensor_id", doc="Star sensor."),
+        column("frame_number", I64, doc="Exposure of the sensor."),
+        column("t_ns", I64, unit="ns", doc="Mid-exposure time, UTC since 1970."),
+        *[column(f"q{a}", F64, frame="sensor from ICRS", doc="True attitude.") for a in "xyzw"],
+        *[column(a, F64, unit="km", frame="GCRF", doc="Sensor position.") for a in "xyz"],
+        *[column(f"v{a}", F64, unit="km/s", frame="GCRF", doc="Sensor velocity.") for a in "xyz"],
+    ],
+)
+
+TRUE_POINTS = schema(
+    "true_points",
+    "Simulation truth, one row a centroid.",
+    [
+        id_column("sensor_id", doc="Star sensor."),
+        column("frame_number", I64, doc="Exposure of the sensor."),
+        column("centroid", pa.int32(), doc="Index in the arrays of the frame's message."),
+        column("kind", pa.int8(), doc="0 star, 1 object, 2 false."),
+        column("source", I64, doc="Hipparcos number, object index, or -1."),
+    ],
+)
