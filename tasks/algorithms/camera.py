@@ -1,0 +1,98 @@
+"""The camera: pinhole and Brown-Conrady distortion (OpenCV's and ROS's plumb_bob).
+
+Pixel (0, 0) is the middle of the top-left pixel; x right, y down, z out along the boresight.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+class Camera(NamedTuple):
+    """Intrinsics of a sensor [px; the distortion coefficients have no unit]."""
+
+    width: int
+    height: int
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    @property
+    def pixel_rad(self) -> float:
+        """Angle a pixel spans at the principal point [rad]."""
+        return 1.0 / np.sqrt(self.fx_px * self.fy_px)
+
+    @property
+    def half_diagonal_rad(self) -> float:
+        """Angle from the boresight to the farthest corner, distortion left aside [rad]."""
+        x = max(self.cx_px + 0.5, self.width - 0.5 - self.cx_px) / self.fx_px
+        y = max(self.cy_px + 0.5, self.height - 0.5 - self.cy_px) / self.fy_px
+        return float(np.arctan(np.hypot(x, y)))
+
+
+def distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return distorted normalised coordinates (OpenCV, camera calibration, eq. plumb_bob)."""
+    r2 = x * x + y * y
+    radial = 1 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
+    xd = x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x)
+    yd = y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y
+    return xd, yd
+
+
+def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
+    """Return the normalised coordinates that `distort` maps to (xd, yd), by Newton's method.
+
+    Far outside the calibrated field, where the distortion folds back, the nearest iterate
+    is returned; a star sensor's field does not reach there.
+    """
+    x, y = np.array(xd, float), np.array(yd, float)
+    k1, k2, p1, p2, k3 = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
+    if not any((k1, k2, p1, p2, k3)):
+        return x, y
+    for _ in range(8):
+        ex, ey = distort(camera, x, y)
+        ex, ey = ex - xd, ey - yd
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # d radial / d r2, times 2
+        jxx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+        jyy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        jxy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+        determinant = jxx * jyy - jxy * jxy
+        x, y = (
+            x - (jyy * ex - jxy * ey) / determinant,
+            y - (jxx * ey - jxy * ex) / determinant,
+        )
+    return x, y
+
+
+def unproject(camera: Camera, x_px: Array, y_px: Array) -> Array:
+    """Return (n, 3) unit vectors in the sensor frame of places in the image."""
+    x, y = undistort(
+        camera, (x_px - camera.cx_px) / camera.fx_px, (y_px - camera.cy_px) / camera.fy_px
+    )
+    u = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return u / np.linalg.norm(u, axis=-1, keepdims=True)
+
+
+def project(camera: Camera, u: Array) -> tuple[Array, Array]:
+    """Return the places [px] of (n, 3) sensor-frame directions; NaN behind the camera."""
+    z = np.where(u[..., 2] > 0, u[..., 2], np.nan)
+    x, y = distort(camera, u[..., 0] / z, u[..., 1] / z)
+    return camera.cx_px + camera.fx_px * x, camera.cy_px + camera.fy_px * y
+
+
+def inside(camera: Camera, x_px: Array, y_px: Array) -> npt.NDArray[np.bool_]:
+    """Return which places lie on the image (false for NaN)."""
+    return (
+        (x_px >= -0.5) & (x_px < camera.width - 0.5) & (y_px >= -0.5) & (y_px < camera.height - 0.5)
+    )

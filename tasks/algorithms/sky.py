@@ -1,0 +1,67 @@
+"""Directions on the sky: spherical coordinates, tangent planes, aberration, attitude angles."""
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+SPEED_OF_LIGHT_KM_S = 299792.458
+ARCSEC = np.pi / 648000.0  # rad
+
+
+def unit_from_radec(ra: Array, dec: Array) -> Array:
+    """Return (..., 3) unit vectors of right ascensions and declinations [rad]."""
+    return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=-1)
+
+
+def radec_from_unit(u: Array) -> tuple[Array, Array]:
+    """Return right ascension in [0, 2 pi) and declination [rad] of (..., 3) vectors."""
+    ra = np.arctan2(u[..., 1], u[..., 0]) % (2 * np.pi)
+    return ra, np.arctan2(u[..., 2], np.hypot(u[..., 0], u[..., 1]))
+
+
+def aberrate(u: Array, v_km_s: Array) -> Array:
+    """Return the directions an observer moving at v sees (exact, special relativity).
+
+    Parameters
+    ----------
+    u : (..., 3) float
+        Unit vectors towards the sources, for an observer at rest in the frame of v.
+    v_km_s : (..., 3) float
+        The observer's velocity [km/s]. With -v the function is its own inverse.
+
+    References
+    ----------
+    Explanatory Supplement to the Astronomical Almanac (2013), eq. 7.40.
+    """
+    beta = np.asarray(v_km_s) / SPEED_OF_LIGHT_KM_S
+    projection = np.sum(u * beta, axis=-1, keepdims=True)
+    inverse_gamma = np.sqrt(1 - np.sum(beta * beta, axis=-1, keepdims=True))
+    seen = inverse_gamma * u + beta * (1 + projection / (1 + inverse_gamma))
+    return seen / np.linalg.norm(seen, axis=-1, keepdims=True)
+
+
+def tangent_basis(u: Array) -> Array:
+    """Return (..., 2, 3): two unit vectors that complete u to a right-handed triad.
+
+    Deterministic and smooth except where it switches the helper axis; no special direction
+    of the sky is degenerate.
+    """
+    helper = np.where(np.abs(u[..., 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
+    first = np.cross(helper, u)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(u, first)], axis=-2)
+
+
+def boresight_angles(R_sensor_from_icrs: Array) -> tuple[Array, Array, Array]:
+    """Return right ascension, declination and roll [rad] of (..., 3, 3) attitudes.
+
+    Roll is the position angle of the sensor's -y axis at the boresight, from celestial
+    north through east, in [0, 2 pi).
+    """
+    up, boresight = -R_sensor_from_icrs[..., 1, :], R_sensor_from_icrs[..., 2, :]
+    ra, dec = radec_from_unit(boresight)
+    east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=-1)
+    north = np.cross(boresight, east)
+    roll = np.arctan2(np.sum(up * east, axis=-1), np.sum(up * north, axis=-1))
+    return ra, dec, roll % (2 * np.pi)
