@@ -1,0 +1,262 @@
+"""Datasets: a folder a night, a folder a table, published night by night.
+
+``DATASET/night=YYYY-MM-DD/<table>/part-0.parquet``. A night is made in ``DATASET/.staging``
+and put in place by one rename, so a reader never sees half a night, and a run that fails
+or is killed leaves the dataset as it was.
+"""
+
+import contextlib
+import datetime
+import fcntl
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from epipole.io.folder_swap import put_in_place, sync, take_back
+from epipole.schemas.bridge import array, conform, empty
+from epipole.schemas.columns import TIME
+from epipole.schemas.errors import DatasetError
+from epipole.schemas.tables import TABLES
+
+DAY_NS = 86_400_000_000_000
+STAGING = ".staging"
+
+# The column that says to which night a row belongs; the rest have `time`. Calibrations and
+# sources are of a whole night, not of an instant.
+_NIGHT_COLUMN = {"tracklets": "start_time"}
+_WHOLE_NIGHT = {"calibrations", "sources"}
+
+
+def check_folder(dataset: Path | str) -> None:
+    """Raise unless a dataset is here, or can be made here.
+
+    Raises
+    ------
+    DatasetError
+        Where it is a file, or a folder that holds other things than a dataset.
+    """
+    if "://" in str(dataset):
+        raise DatasetError(f"{dataset}: a night is published by a rename; give a local folder")
+    dataset = Path(dataset)
+    try:
+        if dataset.exists() and not dataset.is_dir():
+            raise DatasetError(f"{dataset}: is a file, not a folder; give another --out")
+        if dataset.is_dir() and not _is_dataset(dataset):
+            raise DatasetError(
+                f"{dataset}: holds other files and no dataset (no night=... folder); "
+                "give an empty folder or a dataset"
+            )
+    except OSError as error:
+        raise DatasetError(f"{dataset}: {error.strerror}; give another --out") from error
+
+
+def _is_dataset(folder: Path) -> bool:
+    names = [entry.name for entry in folder.iterdir()]
+    return not names or any(name == STAGING or name.startswith("night=") for name in names)
+
+
+def check_sources(dataset: Path, nights: Sequence[str], sources: pa.Table, replace: bool) -> None:
+    """Raise where a night was made of a log that is not among these sources.
+
+    Raises
+    ------
+    DatasetError
+        Names the logs; not raised with `replace`.
+    """
+    if replace:
+        return
+    given = set(sources["sha256"].to_pylist())
+    for night in nights:
+        recorded = read_table(dataset, "sources", night)
+        missing = [row["name"] for row in recorded.to_pylist() if row["sha256"] not in given]
+        if missing:
+            raise DatasetError(
+                f"{dataset}/night={night}: was also made of {', '.join(missing)}; "
+                "give all logs of the night, or --replace to publish it without"
+            )
+
+
+def read_table(dataset: Path, table: str, night: str) -> pa.Table:
+    """Return a table of a night; with no rows where the night is not there.
+
+    Raises
+    ------
+    DatasetError
+        Where its files cannot be read as this table.
+    """
+    schema = TABLES[table]
+    parts = sorted((dataset / f"night={night}" / table).glob("*.parquet"))
+    try:
+        rows = [conform(schema, pq.read_table(part, partitioning=None)) for part in parts]
+    except (OSError, ValueError) as error:
+        raise DatasetError(
+            f"{dataset}/night={night}/{table}: cannot be read ({error}); "
+            "remove the night's folder and run it again"
+        ) from error
+    return pa.concat_tables([empty(schema), *rows])
+
+
+def publish(
+    dataset: Path,
+    tables: Mapping[str, pa.Table],
+    nights: Sequence[str],
+    replace: bool = False,
+) -> None:
+    """Write these nights of the tables and put them in place, each by one rename.
+
+    Parameters
+    ----------
+    dataset
+        The folder; it is made where it is missing.
+    tables
+        Tables of `epipole.schemas.tables` by name, `sources` among them. One that is
+        missing is published with no rows. Rows of other nights are not written.
+    nights
+        UTC dates, ``YYYY-MM-DD``. Other nights of the dataset stay as they are.
+    replace
+        Publish a night even though it was made of a log that is not among `sources`.
+
+    Raises
+    ------
+    DatasetError
+        Where the folder is no dataset, a recorded log is missing or the disk refuses. The
+        dataset is then as it was. While another run publishes here, this one waits.
+    """
+    check_folder(dataset)
+    made = not dataset.exists()
+    try:
+        dataset.mkdir(parents=True, exist_ok=True)
+        with _staging(dataset) as staging:
+            check_sources(dataset, nights, tables["sources"], replace)
+            for night in nights:
+                _write_night(staging / f"night={night}", tables, night)
+            _put_all_in_place(dataset, staging, nights)
+    except OSError as error:
+        raise DatasetError(
+            f"{dataset}: cannot be written ({error.strerror or error}); nothing was changed"
+        ) from error
+    finally:
+        if made:
+            with contextlib.suppress(OSError):  # where nights were published it is not empty
+                dataset.rmdir()
+
+
+@contextlib.contextmanager
+def _staging(dataset: Path) -> Iterator[Path]:
+    """Lend a staging folder to one run at a time; none is left afterwards.
+
+    Whoever holds the lock is alone, so whatever lies in staging was left by a run that was
+    killed.
+    """
+    staging = dataset / STAGING
+    with _locked(staging):
+        for left_over in staging.glob("run-*"):
+            _recover(dataset, left_over)
+        run = staging / f"run-{os.getpid()}"
+        run.mkdir()
+        try:
+            yield run
+        finally:
+            shutil.rmtree(run, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _locked(staging: Path) -> Iterator[None]:
+    path = staging / "lock"
+    while True:
+        with contextlib.suppress(FileNotFoundError):  # the last holder has just tidied up
+            staging.mkdir(exist_ok=True)
+            lock = path.open("w")
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if path.exists() and os.path.samestat(os.fstat(lock.fileno()), path.stat()):
+                break
+            lock.close()
+    try:
+        yield
+    finally:
+        # The lock's file goes while it is held; who waits for it sees that, above.
+        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            staging.rmdir()
+        lock.close()
+
+
+def _recover(dataset: Path, left_over: Path) -> None:
+    """Remove what a killed run left; a night it had taken away first goes back."""
+    for old in left_over.glob("old-night=*"):
+        target = dataset / old.name.removeprefix("old-")
+        if not target.exists():
+            old.rename(target)
+    shutil.rmtree(left_over)
+
+
+def _put_all_in_place(dataset: Path, staging: Path, nights: Sequence[str]) -> None:
+    done: list[str] = []
+    try:
+        for night in nights:
+            name = f"night={night}"
+            put_in_place(staging / name, dataset / name, staging / f"old-{name}")
+            done.append(name)
+        sync(dataset)
+    except BaseException:
+        for name in reversed(done):
+            take_back(dataset / name, staging / f"old-{name}", staging / f"undone-{name}")
+        raise
+
+
+def _write_night(folder: Path, tables: Mapping[str, pa.Table], night: str) -> None:
+    folder.mkdir()
+    for name, schema in TABLES.items():
+        rows = rows_of_night(name, conform(schema, tables.get(name, empty(schema))), night)
+        (folder / name).mkdir()
+        part = folder / name / "part-0.parquet"
+        pq.write_table(in_order(rows), part, compression="zstd")
+        sync(part)
+        sync(folder / name)
+    sync(folder)
+
+
+def nights_of(time_ns: np.ndarray) -> list[str]:
+    """Return the UTC dates, ``YYYY-MM-DD``, in which these instants lie, in order."""
+    return [_date(day) for day in np.unique(time_ns // DAY_NS)]
+
+
+def rows_of_night(name: str, rows: pa.Table, night: str) -> pa.Table:
+    """Return the rows of a table that belong to a night.
+
+    A row belongs to the UTC date of its epoch where it has one, of its time otherwise; a
+    log to every night between its first and last frame; a calibration to all.
+    """
+    day = _day(night)
+    if name == "sources":
+        first, last = array(rows, "first_time") // DAY_NS, array(rows, "last_time") // DAY_NS
+        return rows.filter(pa.array((first <= day) & (day <= last)))
+    if name in _WHOLE_NIGHT:
+        return rows
+    column = "epoch" if "epoch" in rows.column_names else _NIGHT_COLUMN.get(name, "time")
+    return rows.filter(pa.array(array(rows, column) // DAY_NS == day))
+
+
+def in_order(rows: pa.Table) -> pa.Table:
+    """Return the rows sorted by time, then by the columns that identify them.
+
+    Rows that agree in all of these keep their order.
+    """
+    times = [field.name for field in rows.schema if field.type == TIME]
+    keys = [f.name for f in rows.schema if pa.types.is_integer(f.type) or f.type == pa.string()]
+    by = [(name, "ascending") for name in (*times, *keys)]
+    return rows.take(pc.sort_indices(rows, sort_keys=by)) if rows.num_rows else rows
+
+
+def _day(night: str) -> int:
+    return (datetime.date.fromisoformat(night) - datetime.date(1970, 1, 1)).days
+
+
+def _date(day: int) -> str:
+    return (datetime.date(1970, 1, 1) + datetime.timedelta(days=int(day))).isoformat()
