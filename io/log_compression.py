@@ -1,0 +1,52 @@
+"""Chunks of a log to plain bytes, never more of them than the chunk declares."""
+
+import lz4.frame
+import zstandard
+
+
+class ChunkError(Exception):
+    """A chunk that does not hold what it says; the message is the reason, in a word."""
+
+
+def decompress(data: memoryview, compression: str, size: int) -> bytes:
+    """Return the `size` bytes that a chunk's records take when they are not compressed.
+
+    Raises
+    ------
+    ChunkError
+        Unknown compression (which names it), corrupt bytes, another size than declared.
+    """
+    try:
+        if compression == "zstd":
+            # The frame's own size comes first: the decoder would allocate that, whatever the cap.
+            if zstandard.frame_content_size(data) not in (-1, size):
+                raise ChunkError("wrong_chunk_size")
+            records = zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))
+        elif compression == "lz4":
+            records = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        elif compression == "":
+            records = bytes(data)
+        else:
+            raise ChunkError(f"unknown_compression_{compression}")
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
+        raise ChunkError("bad_compression") from error
+    if len(records) != size:
+        raise ChunkError("wrong_chunk_size")
+    return records
+
+
+def decompress_part(data: memoryview, compression: str, size: int) -> bytes:
+    """Return the first bytes of a chunk whose end is missing, at most `size` of them."""
+    try:
+        if compression == "zstd":
+            reader = zstandard.ZstdDecompressor().stream_reader(data)
+            parts = []
+            while size > 0 and (part := reader.read(min(size, 1 << 20))):
+                parts.append(part)
+                size -= len(part)
+            return b"".join(parts)
+        if compression == "lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
+    except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):
+        return b""
+    return bytes(data[:size]) if compression == "" else b""

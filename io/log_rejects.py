@@ -1,0 +1,62 @@
+"""What a log's reader leaves out, collected until it becomes rows of `rejects`."""
+
+from dataclasses import dataclass, field
+
+import pyarrow as pa
+
+from epipole.schemas.bridge import table
+from epipole.schemas.tables import REJECTS
+
+STAGE = "read_logs"
+DAY_NS = 86_400_000_000_000
+
+
+@dataclass
+class RejectList:
+    """Rows of `rejects` in the making, all of one log."""
+
+    source: str
+    _rows: list[tuple[int | None, str | None, int, str, int]] = field(default_factory=list)
+
+    def add(
+        self,
+        reason: str,
+        *,
+        time_ns: int,
+        offset: int | None = None,
+        sensor_id: str | None = None,
+        count: int = 1,
+    ) -> None:
+        """Add a row; a time of 0 is an unknown one."""
+        self._rows.append((offset, sensor_id, time_ns, reason, count))
+
+    def summary(self) -> str:
+        """Return what was left out and why, most first: ``nan 3, no_timestamp 1``."""
+        counts: dict[str, int] = {}
+        for *_, reason, count in self._rows:
+            counts[reason] = counts.get(reason, 0) + count
+        ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+        return ", ".join(f"{reason} {count}" for reason, count in ordered)
+
+    def table(self, first_ns: int, last_ns: int) -> pa.Table:
+        """Return the rows; `first_ns` to `last_ns` is the time that the log's frames span.
+
+        A row whose time is unknown, or a day or more outside that span (damage has made it
+        up), gets the span's start: it must fall into a night that is being made.
+        """
+        offsets, sensor_ids, times, reasons, counts = (
+            [row[i] for row in self._rows] for i in range(5)
+        )
+        near = [first_ns - DAY_NS < t < last_ns + DAY_NS for t in times]
+        return table(
+            REJECTS,
+            {
+                "source": [self.source] * len(times),
+                "offset": offsets,
+                "sensor_id": sensor_ids,
+                "time": [t if ok else first_ns for t, ok in zip(times, near, strict=True)],
+                "stage": [STAGE] * len(times),
+                "reason": reasons,
+                "count": counts,
+            },
+        )
