@@ -1,0 +1,265 @@
+"""A scene goes in, a log and its truth come out."""
+
+import os
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from epipole.io.log_writer import LogWriter
+from epipole.io.scene_files import read_scene
+from epipole.io.truth import SUFFIX, TruthWriter
+from epipole.schemas.errors import SceneError
+from epipole.schemas.scene import Scene, validate_scene
+from epipole.tasks.algorithms.simulation.exposures import Exposures
+from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.sensor import (
+    ARCSEC,
+    SECOND_NS,
+    Attitudes,
+    Beliefs,
+    Sensor,
+    seconds_since,
+    state_times,
+)
+from epipole.tasks.simulate_scene import (
+    Simulation,
+    expose_blocks,
+    sent_optics,
+    simulate_scene,
+    true_tables,
+)
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """What was written."""
+
+    logs: list[Path]
+    truth: Path
+    sensors: int
+    objects: int
+    frames: int
+    centroids: int
+
+
+def simulate(
+    scene: str | os.PathLike[str] | Scene,
+    out: str | os.PathLike[str],
+    *,
+    seed: int | None = None,
+    sensors: int | None = None,
+    objects: int | None = None,
+    hours: float | None = None,
+    rate_hz: float | None = None,
+    start: datetime | None = None,
+    logs: int = 1,
+    encoding: str = "protobuf",
+    compression: str = "zstd",
+) -> Simulated:
+    """Simulate a scene: write its log, and its truth to the folder ``<out>.truth``.
+
+    Parameters
+    ----------
+    scene
+        A built-in scene's name, a TOML file, or a scene.
+    out
+        The log, an MCAP file.
+    seed, hours, start
+        Instead of the scene's own seed, duration and start (an aware datetime).
+    sensors, objects
+        How many, in the scene's first group of sensors and of targets.
+    rate_hz
+        Frames a second, of every sensor.
+    logs
+        Into how many logs the scene is cut, one after the other in time; with more than one they
+        are called ``<stem>-1.mcap`` and so on, and the truth is still ``<out>.truth``.
+    encoding, compression
+        Of the log, see `LogWriter`.
+
+    Raises
+    ------
+    SceneError
+        Where the scene or an option does not fit, or the log cannot be written.
+    """
+    settled = scene if isinstance(scene, Scene) else read_scene(scene)
+    settled = _with_options(settled, seed, sensors, objects, hours, rate_hz, start)
+    if logs < 1:
+        raise SceneError(f"logs = {logs}: at least one is needed")
+    out = Path(out)
+    names = [out] if logs == 1 else [out.with_stem(f"{out.stem}-{k + 1}") for k in range(logs)]
+    truth = Path(str(out) + SUFFIX)
+    simulation = simulate_scene(settled)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with ExitStack() as stack:
+            writers = [
+                stack.enter_context(LogWriter(name, encoding=encoding, compression=compression))
+                for name in names
+            ]
+            true = stack.enter_context(TruthWriter(truth, scenario(simulation)))
+            frames, centroids = _write(simulation, writers, true)
+    except OSError as error:
+        raise SceneError(f"{out}: cannot be written: {error}") from error
+    return Simulated(
+        names, truth, len(simulation.sensors), len(simulation.targets), frames, centroids
+    )
+
+
+def scenario(simulation: Simulation) -> dict[str, Any]:
+    """Return how a log was made: the scene, and what chance settled of it."""
+    return {
+        "t0_ns": simulation.t0_ns,
+        "duration_s": simulation.scene.duration_s,
+        "seed": simulation.scene.seed,
+        "sensors": [
+            {
+                "id": s.sensor_id,
+                "elements": s.elements.tolist(),
+                "rate_hz": s.rate_hz,
+                "phase": s.phase,
+                "mag_limit": s.magnitude_limit,
+                "sigma_px": s.sigma_px,
+                "camera": dict(s.optics._asdict()),
+            }
+            for s in simulation.sensors
+        ],
+        "targets": [
+            {"elements": elements.tolist(), "mag": float(magnitude)}
+            for elements, magnitude in zip(
+                simulation.targets, simulation.target_magnitude, strict=True
+            )
+        ],
+        "scene": simulation.scene.model_dump(mode="json"),
+    }
+
+
+def _with_options(
+    scene: Scene,
+    seed: int | None,
+    sensors: int | None,
+    objects: int | None,
+    hours: float | None,
+    rate_hz: float | None,
+    start: datetime | None,
+) -> Scene:
+    values = scene.model_dump(exclude_unset=True)
+    top = {
+        "seed": seed,
+        "start": start,
+        "duration_s": None if hours is None else hours * 3600.0,
+    }
+    values |= {key: value for key, value in top.items() if value is not None}
+    if sensors is not None:
+        values["sensors"][0]["count"] = sensors
+    if objects is not None:
+        if not values.get("targets"):
+            raise SceneError(f"{scene.name}: has no targets to take {objects} of")
+        values["targets"][0]["count"] = objects
+    if rate_hz is not None:
+        for sensor in values["sensors"]:
+            sensor["rate_hz"] = rate_hz
+    return validate_scene(values, scene.name)
+
+
+def _write(simulation: Simulation, writers: list[LogWriter], true: TruthWriter) -> tuple[int, int]:
+    """Write all messages in order of time, calibrations first; return frames and centroids."""
+    for sensor, told in zip(simulation.sensors, simulation.told, strict=True):
+        for writer in writers:
+            writer.camera(sensor.sensor_id, simulation.t0_ns, sent_optics(told.camera))
+    bounds = _log_bounds(simulation, len(writers))
+    states = [_States(simulation, k) for k in range(len(simulation.sensors))]
+    n_frames = n_centroids = 0
+    for block in expose_blocks(simulation):
+        _write_truth(simulation, block, true)
+        ends = [int(seen.time_ns[-1]) for seen in block if len(seen.time_ns)]
+        until = max(ends, default=0) + 1
+        messages = [m for s in states for m in s.until(until)]
+        for k, seen in enumerate(block):
+            messages += _frames(simulation, k, seen)
+            n_frames += len(seen.time_ns)
+            n_centroids += int(seen.offsets[-1])
+        _send(messages, writers, bounds)
+    _send([m for s in states for m in s.until(None)], writers, bounds)
+    return n_frames, n_centroids
+
+
+def _write_truth(simulation: Simulation, block: list[Exposures], true: TruthWriter) -> None:
+    tables = [
+        true_tables(sensor.sensor_id, seen)
+        for sensor, seen in zip(simulation.sensors, block, strict=True)
+    ]
+    frames, points = zip(*tables, strict=True)
+    true.write(pa.concat_tables(frames), pa.concat_tables(points))
+
+
+def _log_bounds(simulation: Simulation, n: int) -> np.ndarray:
+    length_ns = round(simulation.scene.duration_s * SECOND_NS)
+    return simulation.t0_ns + np.arange(1, n) * (length_ns // n)
+
+
+# A message's time, the sensor, the writer's method and its arguments.
+_Message = tuple[int, str, str, dict[str, Any]]
+
+
+def _send(messages: list[_Message], writers: list[LogWriter], bounds: np.ndarray) -> None:
+    messages.sort(key=lambda message: message[:3])
+    for time_ns, sensor_id, method, values in messages:
+        k = int(np.searchsorted(bounds, time_ns, side="right")) if len(bounds) else 0
+        getattr(writers[k], method)(sensor_id, time_ns, **values)
+
+
+def _frames(simulation: Simulation, k: int, seen: Exposures) -> Iterator[_Message]:
+    sensor, detection = simulation.sensors[k], simulation.told[k].detection
+    x, y = seen.x_px.astype(np.float32), seen.y_px.astype(np.float32)
+    flux, sigma = seen.flux.astype(np.float32), seen.sigma_px.astype(np.float32)
+    offsets = seen.offsets.tolist()
+    numbers, times = seen.frame_number.tolist(), seen.time_ns.tolist()
+    for i, time_ns in enumerate(times):
+        part = slice(offsets[i], offsets[i + 1])
+        values = {
+            "frame_number": numbers[i],
+            "exposure_s": sensor.exposure_s,
+            "x_px": x[part],
+            "y_px": y[part],
+            "flux": flux[part] if detection.send_flux else None,
+            "sigma_px": sigma[part] if detection.send_sigma else None,
+        }
+        yield time_ns, sensor.sensor_id, "frame", values
+
+
+class _States:
+    """The states of one sensor, sent in order of time up to a moment."""
+
+    def __init__(self, simulation: Simulation, k: int) -> None:
+        self.sensor: Sensor = simulation.sensors[k]
+        self._told = simulation.told[k].states
+        self._attitudes, self._beliefs = Attitudes(self.sensor), Beliefs(self.sensor)
+        self._times, self._sent = state_times(self.sensor), 0
+
+    def until(self, time_ns: int | None) -> Iterator[_Message]:
+        s = self.sensor
+        end = len(self._times) if time_ns is None else int(np.searchsorted(self._times, time_ns))
+        times, self._sent = self._times[self._sent : end], max(end, self._sent)
+        if not len(times):
+            return
+        r_km, v_km_s = state_at(s.elements, seconds_since(s.t0_ns, times))
+        believed = self._beliefs.attitude(self._attitudes.at(times, r_km))
+        q = None if believed is None else believed.as_quat()
+        place = self._beliefs.position(r_km)
+        sigma_km = float(np.hypot(s.position_noise_km, s.position_bias_km))
+        sigma_q = 0.0 if q is None else float(np.hypot(s.prior_noise or 0.0, s.prior_bias) / ARCSEC)
+        for i, at in enumerate(times.tolist()):
+            values: dict[str, Any] = {
+                "position_km": place[i],
+                "velocity_km_s": v_km_s[i] if self._told.send_velocity else None,
+                "position_sigma_km": sigma_km,
+                "attitude_xyzw": None if q is None else q[i],
+                "attitude_sigma_arcsec": sigma_q,
+            }
+            yield at, s.sensor_id, "state", values

@@ -1,0 +1,259 @@
+"""A simulation scene: sensors, objects and noise, from a TOML file.
+
+A scene may leave things to chance (``count``, ``random`` orbits, an object's spread); its
+seed then settles them.
+"""
+
+import tomllib
+from datetime import UTC, datetime
+from typing import Any, Literal, Self
+
+from pydantic import AwareDatetime, Field, ValidationError, model_validator
+
+from epipole.schemas.errors import SceneError
+from epipole.schemas.settings import Group
+
+Vector = tuple[float, float, float]
+_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,62}$"
+
+
+class Orbit(Group):
+    """An orbit about the Earth at the scene's start: elements, a place, or one by chance."""
+
+    a_km: float | None = Field(None, gt=6378.0, description="Semi-major axis.")
+    e: float = Field(0.0, ge=0, lt=1, description="Eccentricity.")
+    i_deg: float = Field(0.0, ge=0, le=180, description="Inclination.")
+    raan_deg: float = Field(0.0, description="Right ascension of the ascending node.")
+    argp_deg: float = Field(0.0, description="Argument of perigee.")
+    mean_anomaly_deg: float | None = Field(None, description="Mean anomaly at the start.")
+    true_anomaly_deg: float | None = Field(None, description="The same as a true anomaly.")
+    position_km: Vector | None = Field(None, description="GCRF place at the start.")
+    velocity_km_s: Vector | None = Field(
+        None, description="GCRF velocity there; none: a circular orbit eastward."
+    )
+    random: Literal["leo", "meo", "geo"] | None = Field(None, description="By chance.")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        ways = [self.a_km is not None, self.position_km is not None, self.random is not None]
+        if sum(ways) != 1:
+            raise ValueError("an orbit takes one of a_km, position_km and random")
+        if self.mean_anomaly_deg is not None and self.true_anomaly_deg is not None:
+            raise ValueError("an orbit takes mean_anomaly_deg or true_anomaly_deg, not both")
+        if self.position_km is not None and not any(self.position_km[:2]):
+            raise ValueError("position_km lies on the Earth's axis or in its middle")
+        if self.velocity_km_s is not None and self.position_km is None:
+            raise ValueError("velocity_km_s goes with position_km")
+        if self.a_km is not None and self.a_km * (1 - self.e) < 6378.0:
+            raise ValueError("the orbit's perigee lies below the ground")
+        return self
+
+
+class LensDeparture(Group):
+    """How the true optics depart from the calibration that is sent: true minus sent."""
+
+    focal: float = Field(0.0, gt=-0.5, lt=0.5, description="Relative error of the focal length.")
+    cx_px: float = 0.0
+    cy_px: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+
+class SceneCamera(Group):
+    """A sensor's optics, as the log tells them."""
+
+    width: int = Field(1024, ge=16, le=65536)
+    height: int = Field(1024, ge=16, le=65536)
+    fov_deg: float | None = Field(None, gt=0, lt=150, description="Full field along the columns.")
+    focal_px: float | None = Field(None, gt=0, description="The same as a focal length.")
+    cx_px: float | None = Field(None, description="Principal point; none: the middle.")
+    cy_px: float | None = None
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+    departure: LensDeparture = LensDeparture()
+
+    @model_validator(mode="after")
+    def _one_scale(self) -> Self:
+        if (self.fov_deg is None) == (self.focal_px is None):
+            raise ValueError("a camera takes one of fov_deg and focal_px")
+        return self
+
+
+class Pointing(Group):
+    """How a sensor is turned."""
+
+    mode: Literal["track", "fixed", "spin", "random"] = "track"
+    orbit: Orbit | None = Field(None, description="track: what is followed.")
+    target: int | None = Field(None, ge=0, description="track: an object of the scene instead.")
+    up: Vector = Field(
+        (0.0, 0.0, 1.0), description="track, fixed, spin: inertial, up in the image."
+    )
+    roll_deg: float = Field(0.0, description="track, fixed, spin: then turned about the boresight.")
+    ra_deg: float | None = Field(None, description="fixed, spin: the boresight (at the start).")
+    dec_deg: float | None = Field(None, ge=-90, le=90)
+    axis: Vector = Field((0.0, 0.0, 1.0), description="spin: inertial axis.")
+    rate_deg_s: float = Field(0.0, description="spin: about the axis.")
+    hold_s: float | None = Field(
+        None, gt=0, description="random: time until the next jump; none: one frame."
+    )
+    clear_of_earth_deg: float | None = Field(
+        None, ge=0, le=60, description="random: least angle of the boresight above the limb."
+    )
+    skip_hidden: bool = Field(
+        False, description="No exposure while the Earth stands in the boresight's way."
+    )
+    jitter_arcsec: float = Field(0.0, ge=0, description="1-sigma an axis, anew each frame.")
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.mode == "track" and (self.orbit is None) == (self.target is None):
+            raise ValueError('pointing "track" takes one of orbit and target')
+        if self.mode in ("fixed", "spin") and (self.ra_deg is None or self.dec_deg is None):
+            raise ValueError(f'pointing "{self.mode}" takes ra_deg and dec_deg')
+        if not any(self.up) or not any(self.axis):
+            raise ValueError("up and axis must not be zero")
+        return self
+
+
+class Detection(Group):
+    """What the image processing makes of the light: noise, losses and false points."""
+
+    sigma_px: float = Field(0.15, gt=0, description="1-sigma an axis of a bright centroid.")
+    faint_sigma_px: float = Field(
+        0.0, ge=0, description="Added in squares at the magnitude limit, less for brighter ones."
+    )
+    send_sigma: bool = True
+    send_flux: bool = True
+    flux_error: float = Field(0.05, ge=0, lt=1, description="Relative, 1-sigma.")
+    false_points: float = Field(0.0, ge=0, description="Mean a frame (Poisson).")
+    hot_pixels: int = Field(0, ge=0, description="Places that show a point in every frame.")
+    star_drop: float = Field(0.0, ge=0, le=1, description="Share of stars missed.")
+    target_drop: float = Field(0.0, ge=0, le=1, description="Share of objects missed.")
+
+
+class States(Group):
+    """The sensor's states in the log, and how wrong they are."""
+
+    rate_hz: float = Field(1.0, gt=0)
+    margin_s: float = Field(2.0, ge=0, description="Before the first and after the last frame.")
+    send_velocity: bool = True
+    position_noise_km: float = Field(0.01, ge=0, description="1-sigma an axis, each state.")
+    position_bias_km: float = Field(0.02, ge=0, description="1-sigma an axis, once a sensor.")
+    prior_noise_arcsec: float | None = Field(
+        None, ge=0, description="1-sigma an axis of the attitude sent; none: no attitude is sent."
+    )
+    prior_bias_arcsec: float = Field(0.0, ge=0, description="1-sigma an axis, once a sensor.")
+
+
+class SceneSensor(Group):
+    """A sensor, or several that differ in what chance decides."""
+
+    id: str = Field(pattern=_NAME, description="With a count above 1, a number is added.")
+    count: int = Field(1, ge=1, le=10000)
+    orbit: Orbit
+    in_view: bool = Field(
+        False, description="A random orbit is drawn until what is tracked is seen all the time."
+    )
+    camera: SceneCamera
+    pointing: Pointing
+    detection: Detection = Detection()
+    states: States = States()
+    magnitude_limit: float = Field(7.5, description="Faintest star seen, V.")
+    rate_hz: float = Field(1.0, gt=0, le=1000)
+    phase: float | None = Field(
+        None, ge=0, lt=1, description="First frame, in frame intervals; none: by chance."
+    )
+    exposure_s: float = Field(0.1, gt=0)
+    time_jitter_s: float = Field(0.0, ge=0, description="1-sigma of a frame's time.")
+    frame_drop: float = Field(0.0, ge=0, lt=1, description="Share of frames missing.")
+    outages_s: list[tuple[float, float]] = Field(
+        [], description="From and to, since the start: no frames."
+    )
+
+
+class SceneTargets(Group):
+    """An object, or several about the same orbit."""
+
+    count: int = Field(1, ge=0, le=1000000)
+    orbit: Orbit
+    spread_km: float = Field(
+        0.0, ge=0, description="1-sigma an axis about the orbit's place at the start."
+    )
+    magnitude: float | tuple[float, float] = Field(8.0, description="Or from and to, by chance.")
+
+
+class Scene(Group):
+    """What is simulated."""
+
+    name: str = Field(pattern=_NAME)
+    start: AwareDatetime = datetime(2019, 4, 1, 4, tzinfo=UTC)
+    duration_s: float = Field(60.0, gt=0, le=31 * 86400)
+    seed: int = Field(1, ge=0)
+    sensors: list[SceneSensor] = Field(min_length=1)
+    targets: list[SceneTargets] = []
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        names = [s.id for s in self.sensors]
+        if len(set(names)) < len(names):
+            raise ValueError("two sensors have the same id")
+        n = sum(t.count for t in self.targets)
+        for sensor in self.sensors:
+            if sensor.pointing.target is not None and sensor.pointing.target >= n:
+                raise ValueError(
+                    f"sensor {sensor.id} tracks target {sensor.pointing.target} of {n}"
+                )
+        return self
+
+
+def parse_scene(text: str, where: str) -> Scene:
+    """Return the scene of a TOML text; `where` names it in messages.
+
+    A table ``[sensor_defaults]`` is merged under every sensor.
+
+    Raises
+    ------
+    SceneError
+        Names the field, what came and what was expected.
+    """
+    try:
+        return validate_scene(tomllib.loads(text), where)
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"{where}: not TOML: {error}") from error
+
+
+def validate_scene(values: dict[str, Any], where: str) -> Scene:
+    """Return the scene of nested mappings; see `parse_scene`."""
+    defaults = values.pop("sensor_defaults", None) if isinstance(values, dict) else None
+    if isinstance(defaults, dict) and isinstance(values.get("sensors"), list):
+        values = {**values, "sensors": [_merge(defaults, s) for s in values["sensors"]]}
+    try:
+        return Scene.model_validate(values)
+    except ValidationError as error:
+        raise SceneError(f"{where}: {_first_fault(error)}") from error
+
+
+def _merge(under: Any, over: Any) -> Any:
+    if isinstance(under, dict) and isinstance(over, dict):
+        shared = {k: _merge(under[k], over[k]) if k in under else over[k] for k in over}
+        return {**under, **shared}
+    return over
+
+
+def _first_fault(error: ValidationError) -> str:
+    fault = error.errors()[0]
+    name = ".".join(str(part) for part in fault["loc"]) or "scene"
+    message = fault["msg"].removeprefix("Value error, ")
+    if fault["type"] == "extra_forbidden":
+        return f"unknown field {name}"
+    if fault["type"] == "missing":
+        return f"{name} is missing"
+    if fault["type"] == "value_error":
+        return f"{name}: {message}"
+    return f"{name} = {fault['input']!r}: {message[0].lower()}{message[1:]}"

@@ -1,0 +1,294 @@
+"""Exposures: every spot that a sensor sees in a block of frames, and what each one is."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from epipole.tasks.algorithms.simulation.ephemeris import earth_at, julian_years_since_hipparcos
+from epipole.tasks.algorithms.simulation.optics import field_radius, image_place, on_image
+from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.sensor import (
+    Attitudes,
+    Sensor,
+    boresight_hidden,
+    random_stream,
+    seconds_since,
+)
+from epipole.tasks.algorithms.simulation.sightlines import boost, hidden_by_earth, received_from
+from epipole.tasks.algorithms.simulation.star_field import (
+    StarField,
+    star_directions,
+    stars_in_cones,
+)
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+STAR, TARGET, FALSE = 0, 1, 2
+MERGE_PX = 2.0  # stars closer than this are one spot
+FLUX_AT_ZERO = 1e6  # of magnitude 0, in units of nothing in particular
+ABERRATION_ROOM = 1.5e-3  # rad; aberration is 1.3e-4, proper motion in 30 years 1.5e-3 at most
+TARGETS_AT_ONCE = 500_000  # pairs of a frame and a target
+
+
+@dataclass
+class Spots:
+    """Spots of a block of frames, one entry a spot; `frame` is the frame's place in the block."""
+
+    frame: Indices
+    x_px: Array
+    y_px: Array
+    magnitude: Array
+    kind: npt.NDArray[np.int8]
+    source: Indices
+
+
+@dataclass
+class Exposures:
+    """A block of frames: their truth, and their centroids one after the other.
+
+    Frame i has centroids ``offsets[i]:offsets[i + 1]``; attitudes turn ICRS into sensor axes.
+    """
+
+    frame_number: Indices
+    time_ns: Indices
+    r_km: Array
+    v_km_s: Array
+    attitude: Rotation
+    offsets: Indices
+    x_px: Array
+    y_px: Array
+    flux: Array
+    sigma_px: Array
+    kind: npt.NDArray[np.int8]
+    source: Indices
+
+
+class Exposing:
+    """A sensor at work. Give it its frames in order of time, in blocks of any length."""
+
+    def __init__(
+        self, sensor: Sensor, stars: StarField, targets: Array, target_magnitude: Array
+    ) -> None:
+        self.sensor, self.stars = sensor, stars
+        self.targets, self.target_magnitude = targets, target_magnitude
+        self.attitudes = Attitudes(sensor)
+        self._radius = field_radius(sensor.optics)
+        purposes = (
+            "jitter", "star drop", "target drop", "false count", "false place",
+            "false light", "centroid noise", "flux noise", "shuffle",
+        )  # fmt: skip
+        self._streams = {p: random_stream(sensor.seed, sensor.index, p) for p in purposes}
+        self._hot = self._hot_pixels()
+        self._neighbours = self._close_stars()
+
+    def expose(self, frame_number: Indices, time_ns: Indices) -> Exposures:
+        """Return what the frames show; frames that the sensor skips are left out."""
+        s = self.sensor
+        r_km, v_km_s = state_at(s.elements, seconds_since(s.t0_ns, time_ns))
+        attitude = self.attitudes.at(time_ns, r_km)
+        jitter = self._streams["jitter"].standard_normal((len(time_ns), 3)) * s.jitter
+        attitude = Rotation.from_rotvec(jitter) * attitude if len(time_ns) else attitude
+        if s.skip_hidden and len(time_ns):
+            seen = ~boresight_hidden(r_km, attitude)
+            frame_number, time_ns = frame_number[seen], time_ns[seen]
+            r_km, v_km_s, attitude = r_km[seen], v_km_s[seen], attitude[seen]
+        if not len(time_ns):
+            return _nothing(frame_number, time_ns, r_km, v_km_s, attitude)
+        R_sensor_from_icrs = attitude.as_matrix()
+        earth_km, earth_km_s = earth_at(time_ns)
+        spots = [
+            self._star_spots(time_ns, r_km, earth_km, earth_km_s + v_km_s, R_sensor_from_icrs),
+            self._target_spots(time_ns, r_km, v_km_s, earth_km_s, R_sensor_from_icrs),
+            self._false_spots(len(time_ns)),
+        ]
+        return self._measure(_joined(spots), frame_number, time_ns, r_km, v_km_s, attitude)
+
+    def _star_spots(
+        self, time_ns: Indices, r_km: Array, earth_km: Array, v_km_s: Array, R: Array
+    ) -> Spots:
+        s, field = self.sensor, self.stars
+        frame, star = stars_in_cones(field, R[:, 2], self._radius + ABERRATION_ROOM)
+        years = julian_years_since_hipparcos(time_ns)
+        u = star_directions(field, star, years[frame], (earth_km + r_km)[frame])
+        clear = ~hidden_by_earth(r_km[frame], u, np.inf)
+        frame, star, u = frame[clear], star[clear], u[clear]
+        x, y, ok = self._image(boost(u, v_km_s[frame]), R[frame])
+        frame, star, x, y = frame[ok], star[ok], x[ok], y[ok]
+        spots = self._merged(frame, star, x, y)
+        inside = on_image(s.optics, spots.x_px, spots.y_px)
+        kept = self._streams["star drop"].random(int(inside.sum())) >= s.star_drop
+        return _selected(spots, np.flatnonzero(inside)[kept])
+
+    def _target_spots(
+        self, time_ns: Indices, r_km: Array, v_km_s: Array, earth_km_s: Array, R: Array
+    ) -> Spots:
+        s, n_targets = self.sensor, len(self.targets)
+        t_s = seconds_since(s.t0_ns, time_ns)
+        parts = []
+        step = max(TARGETS_AT_ONCE // max(n_targets, 1), 1)
+        seen = np.flatnonzero(self.target_magnitude <= s.magnitude_limit)
+        for low in range(0, len(time_ns) if len(seen) else 0, step):
+            of_frame = np.arange(low, min(low + step, len(time_ns)))
+            frame, target = (v.ravel() for v in np.meshgrid(of_frame, seen, indexing="ij"))
+            d, _ = received_from(self.targets[target], t_s[frame], r_km[frame], earth_km_s[frame])
+            distance = np.linalg.norm(d, axis=1)
+            u = d / distance[:, None]
+            clear = ~hidden_by_earth(r_km[frame], u, distance)
+            frame, target, u = frame[clear], target[clear], u[clear]
+            x, y, ok = self._image(boost(u, (earth_km_s + v_km_s)[frame]), R[frame])
+            ok &= on_image(s.optics, x, y)
+            parts.append((frame[ok], target[ok], x[ok], y[ok]))
+        frame, target, x, y = (
+            np.concatenate([np.empty(0, k), *[p[i] for p in parts]])
+            for i, k in enumerate((np.int64, np.int64, float, float))
+        )
+        kept = self._streams["target drop"].random(len(frame)) >= s.target_drop
+        kind = np.full(len(frame), TARGET, np.int8)
+        spots = Spots(frame, x, y, self.target_magnitude[target], kind, target)
+        return _selected(spots, np.flatnonzero(kept))
+
+    def _false_spots(self, n_frames: int) -> Spots:
+        s, streams = self.sensor, self._streams
+        n = streams["false count"].poisson(s.false_points, n_frames)
+        place = streams["false place"].random((int(n.sum()), 2))
+        magnitude = _random_magnitudes(streams["false light"], len(place), s.magnitude_limit)
+        hot, hot_magnitude = self._hot
+        frame = np.arange(n_frames)
+        frame = np.concatenate([np.repeat(frame, n), np.repeat(frame, len(hot))])
+        size = np.array([s.optics.width, s.optics.height])
+        place = np.concatenate([place * size - 0.5, np.tile(hot, (n_frames, 1))])
+        magnitude = np.concatenate([magnitude, np.tile(hot_magnitude, n_frames)])
+        kind = np.full(len(frame), FALSE, np.int8)
+        return Spots(frame, place[:, 0], place[:, 1], magnitude, kind, np.full(len(frame), -1))
+
+    def _image(self, u: Array, R: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
+        """Return columns, rows, and which directions lie within the camera's cone."""
+        in_sensor = np.einsum("nij,nj->ni", R, u)
+        ok = in_sensor[:, 2] > np.cos(self._radius)
+        x, y = np.full(len(u), np.nan), np.full(len(u), np.nan)
+        x[ok], y[ok] = image_place(self.sensor.optics, in_sensor[ok])
+        return x, y, ok
+
+    def _close_stars(self) -> tuple[Indices, Indices]:
+        """Return the pairs of stars that may fall within MERGE_PX of each other."""
+        # A lens stretches by a few per cent at most, proper motion by some arcseconds.
+        optics = self.sensor.optics
+        radius = 1.2 * MERGE_PX / min(optics.fx_px, optics.fy_px) + 3e-4
+        pairs = cKDTree(self.stars.place).query_pairs(radius, output_type="ndarray")
+        pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+        return pairs[:, 0], pairs[:, 1]
+
+    def _merged(self, frame: Indices, star: Indices, x: Array, y: Array) -> Spots:
+        """Return star spots, stars within MERGE_PX as one with the brightest one's number."""
+        n_stars = len(self.stars.star_id)
+        key = frame * n_stars + star
+        order = np.argsort(key, kind="stable")
+        frame, star, x, y, key = frame[order], star[order], x[order], y[order], key[order]
+        first, second = self._neighbours
+        low, high = np.searchsorted(first, star), np.searchsorted(first, star, side="right")
+        n = high - low
+        a = np.repeat(np.arange(len(star)), n)
+        other = second[np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n) + np.repeat(low, n)]
+        b = np.searchsorted(key, frame[a] * n_stars + other)
+        there = (b < len(key)) & (key[np.minimum(b, len(key) - 1)] == frame[a] * n_stars + other)
+        a, b = a[there], b[there]
+        close = np.hypot(x[a] - x[b], y[a] - y[b]) < MERGE_PX
+        links = coo_matrix((np.ones(close.sum()), (a[close], b[close])), shape=(len(key),) * 2)
+        n_spots, spot = connected_components(links, directed=False)
+        light = 10 ** (-0.4 * self.stars.magnitude[star])
+        total = np.bincount(spot, light, n_spots)
+        # The brightest of each spot comes first in this order.
+        order = np.lexsort((-light, spot))
+        brightest = order[np.searchsorted(spot[order], np.arange(n_spots))]
+        return Spots(
+            frame[brightest],
+            np.bincount(spot, light * x, n_spots) / total,
+            np.bincount(spot, light * y, n_spots) / total,
+            -2.5 * np.log10(total),
+            np.full(n_spots, STAR, np.int8),
+            self.stars.star_id[star[brightest]],
+        )
+
+    def _hot_pixels(self) -> tuple[Array, Array]:
+        s = self.sensor
+        rng = random_stream(s.seed, s.index, "hot pixels")
+        place = rng.integers(0, [s.optics.width, s.optics.height], (s.hot_pixels, 2))
+        return place.astype(float), _random_magnitudes(rng, s.hot_pixels, s.magnitude_limit)
+
+    def _measure(
+        self,
+        spots: Spots,
+        frame_number: Indices,
+        time_ns: Indices,
+        r_km: Array,
+        v_km_s: Array,
+        attitude: Rotation,
+    ) -> Exposures:
+        """Return the exposures with noise on their centroids, in random order in each frame."""
+        s = self.sensor
+        brightness = 10 ** (0.4 * (spots.magnitude - s.magnitude_limit))  # 1 at the limit
+        sigma = np.hypot(s.sigma_px, s.faint_sigma_px * brightness)
+        # By frame first, so that the noise does not depend on the length of the blocks.
+        order = np.lexsort((np.arange(len(spots.frame)), spots.frame))
+        noise = self._streams["centroid noise"].standard_normal((len(order), 2))
+        light = self._streams["flux noise"].standard_normal(len(order))
+        shuffle = self._streams["shuffle"].random(len(order))
+        x = spots.x_px[order] + noise[:, 0] * sigma[order]
+        y = spots.y_px[order] + noise[:, 1] * sigma[order]
+        flux = FLUX_AT_ZERO * 10 ** (-0.4 * spots.magnitude[order])
+        flux = flux * np.maximum(1 + s.flux_error * light, 0.01)
+        # Noise may carry a spot over the edge: there is no pixel to see it.
+        inside = np.flatnonzero(on_image(s.optics, x, y))
+        mixed = inside[np.lexsort((shuffle[inside], spots.frame[order][inside]))]
+        n = np.bincount(spots.frame[order][mixed], minlength=len(time_ns))
+        return Exposures(
+            frame_number,
+            time_ns,
+            r_km,
+            v_km_s,
+            attitude,
+            np.concatenate([[0], np.cumsum(n)]),
+            x[mixed],
+            y[mixed],
+            flux[mixed],
+            sigma[order][mixed],
+            spots.kind[order][mixed],
+            spots.source[order][mixed],
+        )
+
+
+def _random_magnitudes(rng: np.random.Generator, n: int, limit: float) -> Array:
+    """Return magnitudes spread as the sky's: star counts rise by 10^0.5 a magnitude."""
+    return limit + 2 * np.log10(1 - rng.random(n))
+
+
+def _selected(spots: Spots, at: Indices) -> Spots:
+    return Spots(
+        spots.frame[at],
+        spots.x_px[at],
+        spots.y_px[at],
+        spots.magnitude[at],
+        spots.kind[at],
+        spots.source[at],
+    )
+
+
+def _joined(parts: list[Spots]) -> Spots:
+    names = ("frame", "x_px", "y_px", "magnitude", "kind", "source")
+    return Spots(*[np.concatenate([getattr(p, name) for p in parts]) for name in names])
+
+
+def _nothing(
+    frame_number: Indices, time_ns: Indices, r_km: Array, v_km_s: Array, attitude: Rotation
+) -> Exposures:
+    none, whole = np.empty(0), np.empty(0, np.int64)
+    return Exposures(
+        frame_number, time_ns, r_km, v_km_s, attitude, np.zeros(1, np.int64),
+        none, none, none, none, np.empty(0, np.int8), whole,
+    )  # fmt: skip

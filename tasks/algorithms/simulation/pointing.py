@@ -1,0 +1,47 @@
+"""How a sensor is turned: attitudes that track, stand, spin or jump."""
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from epipole.tasks.algorithms.simulation.orbits import EARTH_RADIUS_KM
+
+Array = npt.NDArray[np.float64]
+
+
+def look_along(z: Array, up: Array, roll_rad: float = 0.0) -> Rotation:
+    """Return the rotations, sensor from ICRS, with the boresight along (n, 3) directions.
+
+    The image's upper edge (-y) is turned towards `up` (3,), then rolled about the boresight.
+    """
+    z = z / np.linalg.norm(z, axis=1, keepdims=True)
+    y = -(up - np.einsum("ij,j->i", z, up)[:, None] * z)
+    y /= np.linalg.norm(y, axis=1, keepdims=True)
+    R_sensor_from_icrs = np.stack([np.cross(y, z), y, z], axis=1)
+    return Rotation.from_rotvec([0.0, 0.0, roll_rad]) * Rotation.from_matrix(R_sensor_from_icrs)
+
+
+def spinning(start: Rotation, axis: Array, rate_rad_s: float, t_s: Array) -> Rotation:
+    """Return attitudes, sensor from ICRS, of a body that turns evenly about an inertial axis."""
+    turned = np.asarray(t_s)[:, None] * (rate_rad_s * axis / np.linalg.norm(axis))
+    return start * Rotation.from_rotvec(turned).inv()
+
+
+def random_attitudes(
+    rng: np.random.Generator, r_sensor_km: Array, clearance_rad: float | None
+) -> Rotation:
+    """Return one evenly random attitude a sensor position (n, 3), sensor from ICRS.
+
+    With a clearance, the boresight stays that far above the Earth's limb.
+    """
+    distance = np.linalg.norm(r_sensor_km, axis=1)
+    limb = np.arcsin(np.minimum(EARTH_RADIUS_KM / distance, 1.0))
+    # Four normal numbers, scaled to one, are evenly spread over all rotations.
+    q = rng.standard_normal((len(r_sensor_km), 4))
+    low = np.arange(len(q)) if clearance_rad is not None else np.arange(0)
+    while len(low):
+        boresight = Rotation.from_quat(q[low]).as_matrix()[:, 2]
+        to_earth = -np.einsum("ij,ij->i", boresight, r_sensor_km[low]) / distance[low]
+        low = low[np.arccos(np.clip(to_earth, -1, 1)) < limb[low] + clearance_rad]
+        q[low] = rng.standard_normal((len(low), 4))
+    return Rotation.from_quat(q)

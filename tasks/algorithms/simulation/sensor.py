@@ -1,0 +1,171 @@
+"""A simulated sensor: when it exposes, where it is, how it is turned and what it believes."""
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from epipole.tasks.algorithms.simulation.optics import Optics
+from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.pointing import look_along, random_attitudes, spinning
+from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
+
+Array = npt.NDArray[np.float64]
+Nanoseconds = npt.NDArray[np.int64]
+
+ARCSEC = np.pi / 648000.0
+SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """Everything of a sensor that the simulation needs, in radians, pixels, km and seconds."""
+
+    sensor_id: str
+    index: int
+    seed: int
+    t0_ns: int
+    duration_s: float
+    elements: Array  # (6,) at t0, see `state_at`
+    optics: Optics  # the true ones
+    # pointing
+    mode: str  # track, fixed, spin, random
+    followed: Array  # (6,) track
+    up: Array  # (3,)
+    roll: float
+    boresight: Array  # (3,) fixed, spin
+    axis: Array  # (3,) spin
+    spin_rate: float
+    hold_s: float
+    clearance: float | None
+    skip_hidden: bool
+    jitter: float
+    # frames
+    rate_hz: float
+    phase: float
+    exposure_s: float
+    time_jitter_s: float
+    frame_drop: float
+    outages_s: tuple[tuple[float, float], ...]
+    # detection
+    magnitude_limit: float
+    sigma_px: float
+    faint_sigma_px: float
+    flux_error: float
+    false_points: float
+    hot_pixels: int
+    star_drop: float
+    target_drop: float
+    # states
+    state_rate_hz: float
+    state_margin_s: float
+    position_noise_km: float
+    position_bias_km: float
+    prior_noise: float | None
+    prior_bias: float
+
+
+def random_stream(seed: int, index: int, purpose: str) -> np.random.Generator:
+    """Return the stream of random numbers of a sensor (or group) for one purpose.
+
+    Each purpose has its own, so that switching one effect on does not move the others.
+    """
+    return np.random.default_rng([seed, index, zlib.crc32(purpose.encode())])
+
+
+def seconds_since(t0_ns: int, time_ns: Nanoseconds) -> Array:
+    """Return seconds since the scene's start."""
+    return (np.asarray(time_ns, np.int64) - t0_ns) / SECOND_NS
+
+
+def frame_times(sensor: Sensor) -> tuple[npt.NDArray[np.int64], Nanoseconds]:
+    """Return frame numbers and mid-exposure times of all frames that the sensor takes."""
+    n = max(int(np.ceil(sensor.duration_s * sensor.rate_hz - sensor.phase - 1e-9)), 0)
+    number = np.arange(n, dtype=np.int64)
+    t = (number + sensor.phase) / sensor.rate_hz
+    if sensor.time_jitter_s:
+        rng = random_stream(sensor.seed, sensor.index, "frame times")
+        most = 0.4 / sensor.rate_hz  # keeps the frames in order
+        t = t + np.clip(rng.standard_normal(n) * sensor.time_jitter_s, -most, most)
+    keep = (t >= 0) & (t < sensor.duration_s)
+    for start, end in sensor.outages_s:
+        keep &= (t < start) | (t >= end)
+    if sensor.frame_drop:
+        rng = random_stream(sensor.seed, sensor.index, "frame drops")
+        keep &= rng.random(n) >= sensor.frame_drop
+    time_ns = sensor.t0_ns + np.rint(t * SECOND_NS).astype(np.int64)
+    return number[keep], time_ns[keep]
+
+
+class Attitudes:
+    """The sensor's turning over the whole scene, without the jitter of single frames."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self._held = Rotation.identity(1)
+        if sensor.mode == "random":
+            n = int(np.ceil(sensor.duration_s / sensor.hold_s)) + 2
+            # One more hold on either side, for the states beyond the ends.
+            middle = (np.arange(n) - 0.5) * sensor.hold_s
+            r_km, _ = state_at(sensor.elements, middle)
+            rng = random_stream(sensor.seed, sensor.index, "attitudes")
+            self._held = random_attitudes(rng, r_km, sensor.clearance)
+
+    def at(self, time_ns: Nanoseconds, r_km: Array) -> Rotation:
+        """Return attitudes, sensor from ICRS, at times with sensor positions (n, 3) GCRF."""
+        s = self.sensor
+        t_s = seconds_since(s.t0_ns, time_ns)
+        if s.mode == "random":
+            hold = np.floor((t_s * s.rate_hz - s.phase + 0.5) / (s.hold_s * s.rate_hz)).astype(int)
+            return self._held[np.clip(hold + 1, 0, len(self._held) - 1)]
+        if s.mode == "track":
+            followed_km, _ = state_at(s.followed, t_s)
+            return look_along(followed_km - r_km, s.up, s.roll)
+        start = look_along(s.boresight[None, :], s.up, s.roll)
+        if s.mode == "fixed":
+            return start[np.zeros(len(t_s), int)]
+        return spinning(start[np.zeros(len(t_s), int)], s.axis, s.spin_rate, t_s)
+
+
+def boresight_hidden(r_km: Array, attitude: Rotation) -> npt.NDArray[np.bool_]:
+    """Return where the Earth stands in the boresight's way."""
+    return hidden_by_earth(r_km, attitude.as_matrix()[:, 2], np.inf)
+
+
+def state_times(sensor: Sensor) -> Nanoseconds:
+    """Return the times of the sensor's states, a margin beyond the scene's ends included."""
+    first = -np.floor(sensor.state_margin_s * sensor.state_rate_hz)
+    n = (
+        int(np.floor((sensor.duration_s + sensor.state_margin_s) * sensor.state_rate_hz - first))
+        + 1
+    )
+    t = (first + np.arange(n)) / sensor.state_rate_hz
+    return sensor.t0_ns + np.rint(t * SECOND_NS).astype(np.int64)
+
+
+class Beliefs:
+    """What the sensor believes of its place and attitude: the truth, a bias and noise."""
+
+    def __init__(self, sensor: Sensor) -> None:
+        self.sensor = sensor
+        self._bias_km = self._stream("position bias").standard_normal(3) * sensor.position_bias_km
+        self._bias = self._stream("attitude bias").standard_normal(3) * sensor.prior_bias
+        self._position_noise = self._stream("position noise")
+        self._attitude_noise = self._stream("attitude noise")
+
+    def _stream(self, purpose: str) -> np.random.Generator:
+        return random_stream(self.sensor.seed, self.sensor.index, purpose)
+
+    def position(self, r_km: Array) -> Array:
+        """Return the believed positions of true ones; call in order of time."""
+        noise = self._position_noise.standard_normal(r_km.shape)
+        return r_km + self._bias_km + noise * self.sensor.position_noise_km
+
+    def attitude(self, true: Rotation) -> Rotation | None:
+        """Return the believed attitudes of true ones, or None where none is sent."""
+        if self.sensor.prior_noise is None:
+            return None
+        noise = self._attitude_noise.standard_normal((len(true), 3)) * self.sensor.prior_noise
+        return Rotation.from_rotvec(self._bias + noise) * true

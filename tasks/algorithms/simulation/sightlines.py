@@ -1,0 +1,87 @@
+"""What light does on its way: light time, aberration, the Earth in between."""
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.simulation.orbits import EARTH_RADIUS_KM, state_at
+
+Array = npt.NDArray[np.float64]
+
+LIGHT_KM_S = 299792.458
+
+
+def boost(n: Array, v_km_s: Array) -> Array:
+    """Return the directions towards light sources as an observer moving at v sees them.
+
+    A photon's four-momentum (1, -n) is taken to the observer's frame by a Lorentz boost.
+
+    Parameters
+    ----------
+    n : (n, 3) float
+        Unit vectors towards the sources for an observer at rest in the frame of v.
+    v_km_s : (n, 3) float
+        Velocity of the observer.
+    """
+    beta = v_km_s / LIGHT_KM_S
+    beta2 = np.einsum("ij,ij->i", beta, beta)
+    gamma = 1 / np.sqrt(1 - beta2)
+    along = np.einsum("ij,ij->i", n, beta)
+    # (gamma - 1) / beta^2 written so that it does not cancel at small speeds.
+    seen = n + (gamma * gamma / (gamma + 1) * along + gamma)[:, None] * beta
+    return seen / np.linalg.norm(seen, axis=1, keepdims=True)
+
+
+def received_from(
+    elements: Array, t_s: Array, r_sensor_km: Array, v_earth_km_s: Array
+) -> tuple[Array, Array]:
+    """Return barycentric vectors from sensors to objects whose light they receive.
+
+    The object counts where it was when the light left, in the solar system's frame at rest:
+    the Earth has moved on since.
+
+    Parameters
+    ----------
+    elements : (n, 6) float
+        Orbits of the objects, see `state_at`.
+    t_s : (n,) float
+        Reception, seconds since the elements' epoch.
+    r_sensor_km : (n, 3) float
+        Geocentric position of the sensor at reception, GCRF.
+    v_earth_km_s : (n, 3) float
+        Barycentric velocity of the Earth at reception.
+
+    Returns
+    -------
+    d_km : (n, 3) float
+        Object at emission minus sensor at reception, both barycentric.
+    r_km : (n, 3) float
+        Geocentric position of the object at emission.
+    """
+    r, v = state_at(elements, t_s)
+    tau = np.linalg.norm(r - r_sensor_km, axis=1) / LIGHT_KM_S
+    sent = tau
+    r, v = state_at(elements, t_s - sent)
+    for _ in range(3):
+        # Over the 1e-5 s still missing, and over 0.3 s of the Earth's way, a straight line is
+        # exact to 1e-6 km.
+        r_sent = r - v * (tau - sent)[:, None]
+        d = r_sent - r_sensor_km - v_earth_km_s * tau[:, None]
+        tau = np.linalg.norm(d, axis=1) / LIGHT_KM_S
+    return d, r_sent
+
+
+def hidden_by_earth(
+    r_sensor_km: Array, u: Array, distance_km: Array | float
+) -> npt.NDArray[np.bool_]:
+    """Return which lines of sight meet the Earth before they end.
+
+    Parameters
+    ----------
+    r_sensor_km, u : (n, 3) float
+        Geocentric positions of the sensors, and unit vectors of the geometric directions.
+    distance_km : (n,) float or float
+        Where the lines end; infinity for stars.
+    """
+    along = -np.einsum("ij,ij->i", r_sensor_km, u)
+    miss2 = np.einsum("ij,ij->i", r_sensor_km, r_sensor_km) - along * along
+    return (along > 0) & (along < distance_km) & (miss2 < EARTH_RADIUS_KM**2)
