@@ -96,3 +96,20 @@ def inside(camera: Camera, x_px: Array, y_px: Array) -> npt.NDArray[np.bool_]:
     return (
         (x_px >= -0.5) & (x_px < camera.width - 0.5) & (y_px >= -0.5) & (y_px < camera.height - 0.5)
     )
+
+
+def pixel_angle(camera: Camera, u: Array) -> Array:
+    """Return the angle [rad] a pixel spans at (n, 3) sensor-frame directions.
+
+    The mean of both image axes (root of the solid angle): off the boresight a pixel spans
+    less, by the cosine of the field angle along and its square across.
+    """
+    x, y = u[..., 0] / u[..., 2], u[..., 1] / u[..., 2]
+    step = 1e-6
+    xa, ya = distort(camera, x + step, y)
+    xb, yb = distort(camera, x - step, y)
+    xc, yc = distort(camera, x, y + step)
+    xd, yd = distort(camera, x, y - step)
+    stretch = np.abs((xa - xb) * (yc - yd) - (ya - yb) * (xc - xd)) / (4 * step * step)
+    solid = u[..., 2] ** 3 / (camera.fx_px * camera.fy_px * np.maximum(stretch, 1e-6))
+    return np.sqrt(solid)

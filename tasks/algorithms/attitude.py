@@ -1,0 +1,172 @@
+"""Attitude from matched directions: optimal, with covariance.
+
+A reported attitude R errs by a small rotation phi about the sensor axes,
+``R_true = exp([phi x]) R``, and the covariance is that of phi [rad^2]. (Its sign does not
+matter to first order.)
+"""
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+def optimal_attitude(u_sensor: Array, u_icrs: Array, sigma_rad: Array) -> tuple[Array, Array]:
+    """Return the attitude that fits weighted directions best, and its covariance.
+
+    Parameters
+    ----------
+    u_sensor, u_icrs : (n, 3) float
+        Measured unit vectors and where they are on the sky (aberrated). n >= 2, not all one.
+    sigma_rad : (n,) float
+        1-sigma an axis of the measured ones.
+
+    Returns
+    -------
+    R_sensor_from_icrs : (3, 3) float
+    cov_rad2 : (3, 3) float
+        Of the small rotation about the sensor axes; NaN where the directions leave a turn free.
+
+    References
+    ----------
+    Davenport's q method, in Wertz (1978), section 12.2.3; covariance: Shuster and Oh (1981), eq. 103.
+    """
+    weight = 1.0 / np.square(sigma_rad)
+    weight = weight / weight.sum()
+    B = np.einsum("n,ni,nj->ij", weight, u_sensor, u_icrs)
+    z = np.array([B[2, 1] - B[1, 2], B[0, 2] - B[2, 0], B[1, 0] - B[0, 1]])
+    K = np.zeros((4, 4))
+    K[:3, :3] = B + B.T - np.trace(B) * np.eye(3)
+    K[:3, 3] = K[3, :3] = z
+    K[3, 3] = np.trace(B)
+    x, y, zz, w = np.linalg.eigh(K)[1][:, -1]
+    R = np.array(
+        [
+            [1 - 2 * (y * y + zz * zz), 2 * (x * y - zz * w), 2 * (x * zz + y * w)],
+            [2 * (x * y + zz * w), 1 - 2 * (x * x + zz * zz), 2 * (y * zz - x * w)],
+            [2 * (x * zz - y * w), 2 * (y * zz + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    return R, attitude_covariance(u_sensor, sigma_rad)
+
+
+def attitude_covariance(u_sensor: Array, sigma_rad: Array) -> Array:
+    """Return (sum of (I - u u') / sigma^2)^-1 [rad^2] about the sensor axes; NaN if singular."""
+    weight = 1.0 / np.square(sigma_rad)
+    information = weight.sum() * np.eye(3) - np.einsum("n,ni,nj->ij", weight, u_sensor, u_sensor)
+    # Directions closer together than a millionth of a radian fix no roll.
+    if len(u_sensor) < 2 or np.linalg.cond(information) > 1e12:
+        return np.full((3, 3), np.nan)
+    return np.linalg.inv(information)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def invert_symmetric(A, out):
+    """Write the inverse of a symmetric 3x3 matrix; return its determinant (compiled)."""
+    c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
+    c01 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
+    c02 = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
+    determinant = A[0, 0] * c00 + A[0, 1] * c01 + A[0, 2] * c02
+    if determinant <= 0.0:
+        return 0.0
+    out[0, 0] = c00 / determinant
+    out[0, 1] = out[1, 0] = c01 / determinant
+    out[0, 2] = out[2, 0] = c02 / determinant
+    out[1, 1] = (A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2]) / determinant
+    out[1, 2] = out[2, 1] = (A[0, 2] * A[0, 1] - A[0, 0] * A[1, 2]) / determinant
+    out[2, 2] = (A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]) / determinant
+    return determinant
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def turn(R, x, y, z):
+    """Turn R by the rotation vector (x, y, z) about its sensor axes, in place (compiled)."""
+    angle = np.sqrt(x * x + y * y + z * z)
+    if angle == 0.0:
+        return
+    half = 0.5 * angle
+    f = np.sin(half) / angle
+    qx, qy, qz, qw = f * x, f * y, f * z, np.cos(half)
+    for j in range(3):
+        a, b, c = R[0, j], R[1, j], R[2, j]
+        # v + 2 q x (q x v + w v)
+        tx, ty, tz = (
+            qy * c - qz * b + qw * a,
+            qz * a - qx * c + qw * b,
+            qx * b - qy * a + qw * c,
+        )
+        R[0, j] = a + 2.0 * (qy * tz - qz * ty)
+        R[1, j] = b + 2.0 * (qz * tx - qx * tz)
+        R[2, j] = c + 2.0 * (qx * ty - qy * tx)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def orthonormalise(R):
+    """Make the rows of R orthonormal again, in place, the boresight's direction kept (compiled)."""
+    n = np.sqrt(R[2, 0] ** 2 + R[2, 1] ** 2 + R[2, 2] ** 2)
+    for j in range(3):
+        R[2, j] /= n
+    d = R[0, 0] * R[2, 0] + R[0, 1] * R[2, 1] + R[0, 2] * R[2, 2]
+    for j in range(3):
+        R[0, j] -= d * R[2, j]
+    n = np.sqrt(R[0, 0] ** 2 + R[0, 1] ** 2 + R[0, 2] ** 2)
+    for j in range(3):
+        R[0, j] /= n
+    R[1, 0] = R[2, 1] * R[0, 2] - R[2, 2] * R[0, 1]
+    R[1, 1] = R[2, 2] * R[0, 0] - R[2, 0] * R[0, 2]
+    R[1, 2] = R[2, 0] * R[0, 1] - R[2, 1] * R[0, 0]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def refine_attitude(R, u, sigma, a, star_of, P):
+    """Move R to the weighted least-squares attitude of its matches, in place; write P (compiled).
+
+    Gauss-Newton on the rotation group: quadratic, its fixed point is Wahba's optimum.
+
+    Parameters
+    ----------
+    R : (3, 3) float, sensor from ICRS, near the optimum (a few degrees)
+    u, sigma : (n, 3), (n,) float, measured directions and their errors [rad]
+    a : (m, 3) float, apparent directions of stars, ICRS axes
+    star_of : (n,) int, the star of each direction, -1 none
+    P : (3, 3) float, out: covariance about the sensor axes [rad^2]
+
+    Returns
+    -------
+    bool
+        False where the matches leave a turn free; R and P are then of no use.
+    """
+    A = np.zeros((3, 3))
+    for _ in range(3):
+        A[:] = 0.0
+        b0, b1, b2, total = 0.0, 0.0, 0.0, 0.0
+        for k in range(len(u)):
+            s = star_of[k]
+            if s < 0:
+                continue
+            x = R[0, 0] * a[s, 0] + R[0, 1] * a[s, 1] + R[0, 2] * a[s, 2]
+            y = R[1, 0] * a[s, 0] + R[1, 1] * a[s, 1] + R[1, 2] * a[s, 2]
+            z = R[2, 0] * a[s, 0] + R[2, 1] * a[s, 1] + R[2, 2] * a[s, 2]
+            w = 1.0 / (sigma[k] * sigma[k])
+            total += w
+            A[0, 0] += w * (1.0 - x * x)
+            A[1, 1] += w * (1.0 - y * y)
+            A[2, 2] += w * (1.0 - z * z)
+            A[0, 1] -= w * x * y
+            A[0, 2] -= w * x * z
+            A[1, 2] -= w * y * z
+            b0 += w * (y * u[k, 2] - z * u[k, 1])
+            b1 += w * (z * u[k, 0] - x * u[k, 2])
+            b2 += w * (x * u[k, 1] - y * u[k, 0])
+        A[1, 0], A[2, 0], A[2, 1] = A[0, 1], A[0, 2], A[1, 2]
+        if invert_symmetric(A, P) <= 1e-12 * total * total * total:
+            return False
+        px = P[0, 0] * b0 + P[0, 1] * b1 + P[0, 2] * b2
+        py = P[1, 0] * b0 + P[1, 1] * b1 + P[1, 2] * b2
+        pz = P[2, 0] * b0 + P[2, 1] * b1 + P[2, 2] * b2
+        turn(R, px, py, pz)
+        if px * px + py * py + pz * pz < 1e-20:
+            break
+    orthonormalise(R)
+    return True

@@ -1,0 +1,1 @@
+"""Star identification: which centroid is which star, and the attitude that follows."""

@@ -1,0 +1,54 @@
+"""The sky as one camera needs it: stars to a limit, their grid, their pairs."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue
+from epipole.tasks.algorithms.star_identification.evidence import log_magnitude_density
+from epipole.tasks.algorithms.star_identification.pair_table import PairTable, build_pair_table
+from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid, build_sky_grid
+
+# Bright stars a field whose pairs are tabled: enough that nearly every field shows several,
+# few enough that a pair has few namesakes.
+PATTERN_STARS = 15.0
+MAX_PAIRS = 3_000_000
+
+
+class Sky(NamedTuple):
+    """Stars to a magnitude limit, brightest first, with what look-ups need.
+
+    catalogue : the stars
+    log_density : (72,) float, see `evidence.log_magnitude_density`
+    rho : stars a steradian, mean of the sky
+    """
+
+    catalogue: NavigationCatalogue
+    log_density: npt.NDArray[np.float64]
+    rho: float
+
+
+def sky_to_limit(stars: NavigationCatalogue, magnitude_limit: float) -> Sky:
+    """Return the sky of the stars no fainter than the limit."""
+    n = int(np.searchsorted(stars.magnitude, magnitude_limit, side="right"))
+    cut = NavigationCatalogue(*[np.ascontiguousarray(column[:n]) for column in stars])
+    return Sky(cut, log_magnitude_density(cut.magnitude), max(n, 1) / (4 * np.pi))
+
+
+def pattern_pairs(sky: Sky, solid_angle_sr: float, diagonal_rad: float) -> PairTable:
+    """Return the pairs of the sky's brightest stars that fit into a field.
+
+    Parameters
+    ----------
+    solid_angle_sr, diagonal_rad : of the field.
+    """
+    n = min(int(PATTERN_STARS * 4 * np.pi / solid_angle_sr), len(sky.catalogue.star_id))
+    # Neighbours a star has within r: (n / 4 pi) pi r^2, half of which are its own pairs.
+    reach = min(diagonal_rad, np.sqrt(8.0 * MAX_PAIRS) / max(n, 1), np.pi)
+    return build_pair_table(sky.catalogue.u_icrs[:n], float(reach))
+
+
+def sky_grid(sky: Sky, radius_rad: float) -> SkyGrid:
+    """Return the grid of the sky's stars for look-ups within the radius."""
+    return build_sky_grid(sky.catalogue.u_icrs, radius_rad)
