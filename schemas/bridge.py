@@ -59,7 +59,9 @@ def _as_arrow(table_name: str, field: pa.Field, values: Any) -> pa.Array | pa.Ch
 
 def conform(schema: pa.Schema, values: pa.Table) -> pa.Table:
     """Return the columns of `values` that `schema` names, checked against it."""
-    return table(schema, {name: values.column(name) for name in schema.names if name in values.column_names})
+    return table(
+        schema, {name: values.column(name) for name in schema.names if name in values.column_names}
+    )
 
 
 def empty(schema: pa.Schema) -> pa.Table:
@@ -94,7 +96,9 @@ def stack(values: pa.Table, pattern: str, names: str = "xyz") -> npt.NDArray[np.
     return out
 
 
-def unstack(pattern: str, vectors: npt.NDArray[Any], names: str = "xyz") -> dict[str, npt.NDArray[Any]]:
+def unstack(
+    pattern: str, vectors: npt.NDArray[Any], names: str = "xyz"
+) -> dict[str, npt.NDArray[Any]]:
     """Return one column an axis of an (n, len(names)) array, named by the pattern."""
     return {pattern.format(a): vectors[:, i] for i, a in enumerate(names)}
 
@@ -136,5 +140,9 @@ def flatten(values: pa.Table, name: str) -> tuple[npt.NDArray[Any], npt.NDArray[
     if isinstance(column, pa.ChunkedArray):  # an empty column stays chunked
         column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
     offsets = column.offsets.to_numpy().astype(np.int64)
-    flat = column.values.to_numpy()[offsets[0] : offsets[-1]] if len(offsets) else column.values.to_numpy()
+    flat = (
+        column.values.to_numpy()[offsets[0] : offsets[-1]]
+        if len(offsets)
+        else column.values.to_numpy()
+    )
     return flat, offsets - offsets[0]

@@ -48,7 +48,9 @@ def axes(
     Parquet statistics do not mix the axes.
     """
     return [
-        column(pattern.format(a), pa.float64(), unit=unit, frame=frame, doc=f"{doc} ({a})", null=null)
+        column(
+            pattern.format(a), pa.float64(), unit=unit, frame=frame, doc=f"{doc} ({a})", null=null
+        )
         for a in names
     ]
 

@@ -68,7 +68,10 @@ class AlignmentSettings(Group):
         6.0, gt=0, description="Half-width of the local motion fitted around an epoch."
     )
     max_gap_s: float | None = Field(
-        None, gt=0, description="Farthest frame that serves an epoch; none: its frame interval."
+        None,
+        gt=0,
+        description="Farthest frame that serves an epoch; none: half its frame interval, or half "
+        "the interval between epochs where that is longer.",
     )
 
 
@@ -80,6 +83,12 @@ class AssociationSettings(Group):
     min_altitude_km: float = Field(100.0, ge=0, description="Lowest object looked for.")
     max_range_km: float = Field(1.0e5, gt=0, description="Farthest object looked for.")
     span_s: float = Field(30.0, gt=0, description="Evidence is summed over spans of this length.")
+    min_log_odds: float = Field(
+        3.0, description="An object is reported if it is this much likelier than chance (ln)."
+    )
+    ambiguity_log_odds: float = Field(
+        3.0, ge=0, description="Where a rival comes closer than this (ln), neither is reported."
+    )
 
 
 class PositionSettings(Group):

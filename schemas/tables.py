@@ -81,9 +81,7 @@ FRAMES = schema(
             null=True,
             doc="1-sigma attitude error about the sensor axis",
         ),
-        column(
-            "residual_px", F64, unit="px", null=True, doc="Rms of the stars' image residuals."
-        ),
+        column("residual_px", F64, unit="px", null=True, doc="Rms of the stars' image residuals."),
         *axes("{}_km", unit="km", frame="GCRF", null=True, doc="Sensor position"),
         *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Sensor velocity"),
     ],
@@ -98,9 +96,7 @@ STARS = schema(
         column("star_id", I64, doc="Number in the star catalogue (Hipparcos unless said)."),
         column("magnitude", F64, unit="mag", doc="V magnitude in the catalogue."),
         *PIXEL,
-        *axes(
-            "d{}_px", unit="px", frame="image", doc="Measured minus predicted place", names="xy"
-        ),
+        *axes("d{}_px", unit="px", frame="image", doc="Measured minus predicted place", names="xy"),
     ],
 )
 
@@ -306,7 +302,9 @@ REJECTS = schema(
         column("source", pa.string(), null=True, doc="Log file; null where it is no single one."),
         column("offset", I64, unit="byte", null=True, doc="Place in the log."),
         id_column("sensor_id", null=True, doc="Null where unknown, or more than one."),
-        time_column("time", doc="Time of what was left out, UTC; the night's start where it has none."),
+        time_column(
+            "time", doc="Time of what was left out, UTC; the night's start where it has none."
+        ),
         column("stage", pa.string(), doc="Stage that left it out."),
         column("reason", pa.string(), doc="Why, in a word: nan, duplicate_number, ambiguous, ..."),
         column("count", I64, doc="How many."),

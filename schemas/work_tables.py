@@ -3,7 +3,7 @@
 import pyarrow as pa
 
 from epipole.schemas.columns import axes, column, covariance, id_column, schema, time_column
-from epipole.schemas.tables import F64, FRAME_KEY, FRAMES, I64, SENSOR_ID
+from epipole.schemas.tables import EPOCH, F64, FRAME_KEY, FRAMES, I64, SENSOR_ID
 
 
 def _floats() -> pa.DataType:
@@ -87,6 +87,39 @@ SOLUTIONS = schema(
         ),
         column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma an axis."),
         column("camera", I64, doc="Row of `cameras` that holds for the frame."),
+    ],
+)
+
+VIEWS = schema(
+    "views",
+    "One row a tracklet at an epoch, as its sensor saw it.",
+    [
+        EPOCH,
+        SENSOR_ID,
+        column("frame_number", I64, doc="The nearest frame."),
+        id_column("tracklet_id", doc="Whose local motion it is."),
+        column(
+            "centroid", pa.int32(), null=True, doc="Centroid in that frame; null: missed in it."
+        ),
+        *axes("{}_px", unit="px", frame="image", doc="Place at the epoch", names="xy"),
+        *axes("u{}", unit="", frame="ICRS", doc="Direction, aberration removed"),
+        *[
+            column(
+                f"cov_{which}_{ab}_rad2",
+                F64,
+                unit="rad^2",
+                frame="tangent plane of the direction",
+                doc=doc,
+            )
+            for which, doc in (
+                ("noise", "Error that is new in every frame."),
+                ("bias", "Error that all frames of the sensor share."),
+            )
+            for ab in ("11", "12", "22")
+        ],
+        *axes("{}_km", unit="km", frame="GCRF", doc="Sensor position at the epoch"),
+        column("position_sigma_km", F64, unit="km", doc="1-sigma an axis."),
+        column("pixel_rad", F64, unit="rad", doc="Angle a pixel spans."),
     ],
 )
 

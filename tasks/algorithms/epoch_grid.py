@@ -1,0 +1,55 @@
+"""Epochs: common instants of sensors that expose at different times."""
+
+import numpy as np
+import numpy.typing as npt
+
+Nanoseconds = npt.NDArray[np.int64]
+
+MILLISECOND_NS = 1_000_000
+DAY_NS = 86_400_000_000_000
+
+
+def frame_interval_ns(time_ns: Nanoseconds) -> int:
+    """Return the usual interval between a sensor's frames [ns]; 0 with fewer than two."""
+    steps = np.diff(np.unique(time_ns))
+    return int(np.median(steps)) if len(steps) else 0
+
+
+def epoch_interval_ns(time_ns_by_sensor: list[Nanoseconds]) -> int:
+    """Return the slowest sensor's frame interval, to the millisecond, at least one.
+
+    Rounded, so that jitter of the exposures does not move the grid from night to night.
+    """
+    slowest = max((frame_interval_ns(t) for t in time_ns_by_sensor), default=0)
+    return max(round(slowest / MILLISECOND_NS), 1) * MILLISECOND_NS if slowest else 1_000_000_000
+
+
+def epoch_grid(first_ns: int, last_ns: int, interval_ns: int) -> Nanoseconds:
+    """Return all multiples of the interval since midnight UTC that lie in [first, last].
+
+    Counted from midnight, the grid of a night does not depend on which logs it has.
+    """
+    out = []
+    for day in range(first_ns // DAY_NS, last_ns // DAY_NS + 1):
+        midnight = day * DAY_NS
+        lo = max(first_ns - midnight + interval_ns - 1, 0) // interval_ns
+        hi = min(last_ns - midnight, DAY_NS - 1) // interval_ns
+        out.append(midnight + np.arange(lo, hi + 1, dtype=np.int64) * interval_ns)
+    return np.concatenate(out) if out else np.zeros(0, np.int64)
+
+
+def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> npt.NDArray[np.int64]:
+    """Return the index of the frame nearest to each epoch; the earlier one of two as near.
+
+    Parameters
+    ----------
+    epoch_ns : (e,) int
+        Wanted instants [ns].
+    time_ns : (f,) int
+        Frame times [ns], increasing, f >= 1.
+    """
+    after = np.clip(np.searchsorted(time_ns, epoch_ns), 1, max(len(time_ns) - 1, 1))
+    after = np.minimum(after, len(time_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = (epoch_ns - time_ns[before]) <= (time_ns[after] - epoch_ns)
+    return np.where(closer, before, after)

@@ -1,0 +1,223 @@
+"""Associate objects: which sensors' tracklets are one object, span by span of the night."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+
+from epipole.schemas.bridge import array, concat, stack, table
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import REJECTS
+from epipole.tasks.algorithms.association import Groups, Samples, associate_tracklets
+from epipole.tasks.algorithms.object_identity import ObjectRegistry
+from epipole.tasks.algorithms.rotations import matrix_from_quaternion
+from epipole.tasks.sightings import camera_of, solved_frames
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+MOST_SAMPLES = 12  # instants in a span
+
+
+class Associated(NamedTuple):
+    """Views that belong to an object, each with its object's number; and what was left out."""
+
+    views: pa.Table
+    object_number: Indices
+    rejects: pa.Table
+
+
+@task(name="associate objects", cache_policy=NO_CACHE)
+def associate_objects(
+    views: pa.Table,
+    tracklets: pa.Table,
+    solutions: pa.Table,
+    cameras: pa.Table,
+    settings: Settings,
+) -> Associated:
+    """Return the views that are objects seen by two sensors or more, and which object each is.
+
+    Object numbers count from 0 in the order of first appearance and hold from span to span as
+    long as a tracklet of the object goes on.
+    """
+    views = views.sort_by([("epoch", "ascending"), ("sensor_id", "ascending"),
+                           ("tracklet_id", "ascending")])  # fmt: skip
+    night = _Night(views, tracklets, solutions, cameras)
+    registry = ObjectRegistry()
+    number = np.full(views.num_rows, -1)
+    rejects = []
+    for rows in night.spans(settings.association.span_s):
+        samples, tracklet = night.samples(rows, settings.alignment.window_s)
+        groups = _solve(samples, settings)
+        objects = registry.name_groups(
+            [tracklet[groups.group == g] for g in range(len(groups.score))]
+        )
+        of_tracklet = np.full(len(night.tracklet_id), -1)
+        grouped = groups.group >= 0
+        of_tracklet[tracklet[grouped]] = np.array(objects, np.int64)[groups.group[grouped]]
+        number[rows] = of_tracklet[night.tracklet[rows]]
+        if groups.ambiguous.any():
+            rejects.append(_ambiguous(night, rows, tracklet[groups.ambiguous]))
+    number = _seen_by_two(night, number)
+    chosen = np.flatnonzero(number >= 0)
+    return Associated(views.take(chosen), number[chosen], concat(REJECTS, rejects))
+
+
+def _solve(samples: Samples, settings: Settings) -> Groups:
+    chosen = settings.association
+    return associate_tracklets(
+        samples,
+        gate_sigma=chosen.gate_sigma,
+        min_altitude_km=chosen.min_altitude_km,
+        max_range_km=chosen.max_range_km,
+        min_log_odds=chosen.min_log_odds,
+        ambiguity_log_odds=chosen.ambiguity_log_odds,
+    )
+
+
+def _ambiguous(night: "_Night", rows: Indices, tracklet: Indices) -> pa.Table:
+    """Return a reject row a sensor: how many of its tracklets could not be decided."""
+    sensors, count = np.unique(night.sensor_of_tracklet[tracklet], return_counts=True)
+    n = len(sensors)
+    return table(
+        REJECTS,
+        {
+            "source": pa.nulls(n, pa.string()),
+            "offset": pa.nulls(n, pa.int64()),
+            "sensor_id": night.sensors[sensors],
+            "time": np.full(n, night.epoch_ns[rows[0]]),
+            "stage": ["associate"] * n,
+            "reason": ["ambiguous"] * n,
+            "count": count.astype(np.int64),
+        },
+    )
+
+
+def _seen_by_two(night: "_Night", number: Indices) -> Indices:
+    """Return the object numbers, -1 where at that epoch no second sensor sees the object.
+
+    Of two fragments of one object in one sensor the one with a centroid in the frame, or else
+    the first, speaks for the epoch: no sensor sees an object twice.
+    """
+    out = number.copy()
+    grouped = np.flatnonzero(number >= 0)
+    order = grouped[
+        np.lexsort(
+            (night.missed[grouped], night.sensor[grouped], number[grouped], night.epoch_ns[grouped])
+        )
+    ]
+    key = np.column_stack([night.epoch_ns[order], number[order], night.sensor[order]])
+    again = np.zeros(len(order), bool)
+    again[1:] = (key[1:] == key[:-1]).all(axis=1)
+    out[order[again]] = -1
+    order, key = order[~again], key[~again]
+    _, inverse, count = np.unique(key[:, :2], axis=0, return_inverse=True, return_counts=True)
+    out[order[count[inverse.ravel()] < 2]] = -1
+    return out
+
+
+class _Night:
+    """The views of all sensors as arrays, and the samples of a span of them."""
+
+    def __init__(
+        self, views: pa.Table, tracklets: pa.Table, solutions: pa.Table, cameras: pa.Table
+    ) -> None:
+        tracklets = tracklets.sort_by("tracklet_id")
+        self.tracklet_id = array(tracklets, "tracklet_id").astype(str)
+        self.sensors, self.sensor_of_tracklet = np.unique(
+            array(tracklets, "sensor_id").astype(str), return_inverse=True
+        )
+        self.start_ns, self.end_ns = array(tracklets, "start_time"), array(tracklets, "end_time")
+        self.epoch_ns = array(views, "epoch")
+        self.missed = ~views["centroid"].is_valid().to_numpy()
+        self.sensor = np.searchsorted(self.sensors, array(views, "sensor_id").astype(str))
+        self.tracklet = np.searchsorted(self.tracklet_id, array(views, "tracklet_id").astype(str))
+        self.u, self.r_km = stack(views, "u{}"), stack(views, "{}_km")
+        self.noise = _symmetric(views, "cov_noise_{}_rad2")
+        self.bias = _symmetric(views, "cov_bias_{}_rad2")
+        self.sigma_km = array(views, "position_sigma_km")
+        self._look(solutions, cameras)
+
+    def _look(self, solutions: pa.Table, cameras: pa.Table) -> None:
+        """Keep where each sensor stands and looks, frame by frame, and how wide its field is."""
+        self.field_sr, self.inner_rad, self.frames = [], [], []
+        for sensor in self.sensors:
+            frames = solved_frames(solutions.filter(pa.compute.field("sensor_id") == sensor))
+            camera = camera_of(cameras, int(frames.camera[0]))
+            self.frames.append((frames, matrix_from_quaternion(frames.q_sensor_from_icrs)[:, 2]))
+            self.field_sr.append(camera.width * camera.height * camera.pixel_rad**2)
+            self.inner_rad.append(min(camera.width, camera.height) / 2 * camera.pixel_rad)
+
+    def spans(self, span_s: float) -> list[Indices]:
+        """Return the rows of each span of time, counted from midnight, in order."""
+        if not len(self.epoch_ns):
+            return []
+        span = self.epoch_ns // max(round(span_s * 1e9), 1)
+        cuts = np.flatnonzero(np.diff(span)) + 1
+        return np.split(np.arange(len(span)), cuts)
+
+    def samples(self, rows: Indices, window_s: float) -> tuple[Samples, Indices]:
+        """Return the tracklets of a span at its sample instants, and which tracklets they are."""
+        instants = self._instants(rows, window_s)
+        rows = rows[np.isin(self.epoch_ns[rows], instants)]
+        tracklet, item = np.unique(self.tracklet[rows], return_inverse=True)
+        at = np.searchsorted(instants, self.epoch_ns[rows])
+        t, k = len(tracklet), len(instants)
+        seen = np.zeros((t, k), bool)
+        r_km, u = np.zeros((t, k, 3)), np.tile([0.0, 0.0, 1.0], (t, k, 1))
+        cov, sigma_km = np.tile(np.eye(2), (t, k, 1, 1)), np.ones((t, k))
+        seen[item, at] = True
+        r_km[item, at], u[item, at] = self.r_km[rows], self.u[rows]
+        # What all frames share is one draw, however often it is looked at: k looks at it with
+        # k times its variance count as one.
+        looks = seen.sum(axis=1)[item].astype(float)
+        cov[item, at] = self.noise[rows] + looks[:, None, None] * self.bias[rows]
+        sigma_km[item, at] = np.sqrt(looks) * self.sigma_km[rows]
+        boresight, sensor_km = self._looks(instants)
+        origin = self.epoch_ns[0]
+        return Samples(
+            self.sensor_of_tracklet[tracklet].astype(np.int64),
+            (self.start_ns[tracklet] - origin) / 1e9,
+            (self.end_ns[tracklet] - origin) / 1e9,
+            seen, r_km, u, cov, sigma_km, (instants - origin) / 1e9,
+            np.array(self.field_sr), boresight, sensor_km, np.array(self.inner_rad),
+        ), tracklet  # fmt: skip
+
+    def _instants(self, rows: Indices, window_s: float) -> Indices:
+        """Return a few epochs of a span: far enough apart to be independent, none left out.
+
+        Two epochs within twice the half-window share detections. A tracklet that none of the
+        evenly spaced epochs shows adds the middle one of its own.
+        """
+        epochs = np.unique(self.epoch_ns[rows])
+        step = 2 * window_s * 1e9
+        n = int(max((epochs[-1] - epochs[0]) // step, 1))
+        edges = np.linspace(epochs[0], epochs[-1], n + 1)
+        chosen = {int(epochs[np.argmin(np.abs(epochs - m))]) for m in (edges[1:] + edges[:-1]) / 2}
+        for tracklet in np.unique(self.tracklet[rows]):
+            own = self.epoch_ns[rows[self.tracklet[rows] == tracklet]]
+            if len(chosen) < MOST_SAMPLES and not chosen.intersection(own.tolist()):
+                chosen.add(int(own[len(own) // 2]))
+        return np.array(sorted(chosen), np.int64)
+
+    def _looks(self, instants: Indices) -> tuple[Array, Array]:
+        """Return where the sensors look and stand at the instants; NaN with no frame near."""
+        boresight = np.full((len(self.sensors), len(instants), 3), np.nan)
+        sensor_km = boresight.copy()
+        for s, (frames, look) in enumerate(self.frames):
+            near = np.clip(np.searchsorted(frames.time_ns, instants), 0, len(look) - 1)
+            there = np.abs(frames.time_ns[near] - instants) < 2e9
+            boresight[s, there] = look[near[there]]
+            sensor_km[s, there] = frames.r_gcrf_km[near[there]]
+        return boresight, sensor_km
+
+
+def _symmetric(views: pa.Table, pattern: str) -> Array:
+    out = np.empty((views.num_rows, 2, 2))
+    out[:, 0, 0] = array(views, pattern.format("11"))
+    out[:, 0, 1] = out[:, 1, 0] = array(views, pattern.format("12"))
+    out[:, 1, 1] = array(views, pattern.format("22"))
+    return out

@@ -1,0 +1,166 @@
+"""Build tracklets: detections of one sensor, frame after frame, become runs of one object."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+
+from epipole.schemas.bridge import empty, table
+from epipole.schemas.settings import Settings, TrackletSettings
+from epipole.schemas.tables import DETECTIONS, TRACKLETS
+from epipole.tasks.algorithms.epoch_grid import frame_interval_ns
+from epipole.tasks.algorithms.local_motion import directions_at
+from epipole.tasks.algorithms.sky import ARCSEC
+from epipole.tasks.algorithms.tracking import NONE, follow_detections
+from epipole.tasks.sightings import Frames, Sightings, camera_of, sightings_of, solved_frames
+
+Array = npt.NDArray[np.float64]
+
+STAR_RATE_SIGMA = 4.0  # a tracklet that moves by less than this many sigmas stands still
+STAR_RATE_KNOWN = 1.0 * ARCSEC  # rad/s: a rate not known this well does not make it a star
+
+
+class Tracked(NamedTuple):
+    """Detections with their tracklets, and the tracklets."""
+
+    detections: pa.Table
+    tracklets: pa.Table
+
+
+@task(name="build tracklets", cache_policy=NO_CACHE)
+def build_tracklets(
+    solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
+) -> Tracked:
+    """Return one sensor's detections with tracklet_id, track_id and kind, and its tracklets."""
+    frames = solved_frames(solutions)
+    if not detections.num_rows or not len(frames.number):
+        return Tracked(detections, empty(TRACKLETS))
+    seen = sightings_of(frames, detections)
+    track = _follow(frames, seen, settings.tracklets)
+    return _label(frames, seen, track, detections, cameras, settings)
+
+
+def _follow(frames: Frames, seen: Sightings, settings: TrackletSettings) -> npt.NDArray[np.int64]:
+    """Return the track number of every sighting."""
+    interval_s = frame_interval_ns(frames.time_ns) / 1e9
+    sigma = np.sqrt(np.trace(seen.cov_noise + seen.cov_bias, axis1=1, axis2=2) / 2)
+    return follow_detections(
+        (frames.time_ns - frames.time_ns[0]) / 1e9,
+        seen.offsets,
+        seen.u_icrs,
+        sigma,
+        max_rate_rad_s=np.radians(settings.max_rate_deg_s),
+        # Half a frame of slack, for jitter.
+        max_coast_s=(settings.max_missed + 1.5) * interval_s,
+        max_missed=settings.max_missed,
+        min_detections=settings.min_detections,
+        gate_sigma=settings.gate_sigma,
+    )
+
+
+class _Run(NamedTuple):
+    """One track's sightings and what they show."""
+
+    members: npt.NDArray[np.int64]
+    rate_rad_s: float
+    stands_still: bool
+    residual_px: float
+
+
+def _label(
+    frames: Frames,
+    seen: Sightings,
+    track: npt.NDArray[np.int64],
+    detections: pa.Table,
+    cameras: pa.Table,
+    settings: Settings,
+) -> Tracked:
+    runs = _runs(frames, seen, track, cameras, settings.alignment.window_s)
+    sensor_id = detections["sensor_id"][0].as_py()
+    kind = np.full(detections.num_rows, "unknown", dtype=object)
+    tracklet_id = np.full(detections.num_rows, None, dtype=object)
+    names = []
+    for run in runs:
+        rows = seen.row[run.members]
+        if run.stands_still:
+            kind[rows] = "star_unlisted"
+            names.append(None)
+            continue
+        # The frame in which it begins names it: the same, whatever else the night holds.
+        first = run.members[0]
+        start = frames.number[seen.frame[first]]
+        centroid = detections["centroid"][int(seen.row[first])].as_py()
+        names.append(f"{sensor_id}-{start}-{centroid}")
+        kind[rows] = "object"
+        tracklet_id[rows] = names[-1]
+    columns = {name: detections[name] for name in DETECTIONS.names}
+    columns |= {"kind": kind, "tracklet_id": tracklet_id, "track_id": tracklet_id}
+    objects = [(run, name) for run, name in zip(runs, names, strict=True) if name]
+    return Tracked(
+        table(DETECTIONS, columns), _tracklet_table(frames, seen, objects, str(sensor_id))
+    )
+
+
+def _runs(
+    frames: Frames,
+    seen: Sightings,
+    track: npt.NDArray[np.int64],
+    cameras: pa.Table,
+    window_s: float,
+) -> list[_Run]:
+    """Return what each track shows, in the order in which they were confirmed."""
+    order = np.lexsort((seen.frame, track))
+    order = order[track[order] != NONE]
+    bounds = np.flatnonzero(np.diff(track[order], prepend=NONE, append=NONE))
+    time_s = (frames.time_ns[seen.frame] - frames.time_ns[0]) / 1e9
+    first = np.repeat(bounds[:-1], np.diff(bounds))
+    last = np.repeat(bounds[1:], np.diff(bounds))
+    smooth, *_ = directions_at(
+        first, last, time_s[order], 0.0, time_s[order], seen.u_icrs[order],
+        seen.cov_noise[order], seen.cov_bias[order], window_s,
+    )  # fmt: skip
+    miss = np.linalg.norm(seen.u_icrs[order] - smooth, axis=1)
+    pixel = camera_of(cameras, int(frames.camera[0])).pixel_rad
+    out = []
+    for lo, hi in itertools.pairwise(bounds):
+        members = order[lo:hi]
+        rate, sigma = _mean_rate(time_s[members], seen.u_icrs[members], seen.cov_noise[members])
+        still = rate < STAR_RATE_SIGMA * sigma and sigma < STAR_RATE_KNOWN
+        residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / pixel
+        out.append(_Run(members, rate, still, residual))
+    return out
+
+
+def _mean_rate(time_s: Array, u: Array, cov_noise: Array) -> tuple[float, float]:
+    """Return the mean rate of a run and its 1-sigma error [rad/s]."""
+    t = time_s - time_s.mean()
+    lever = float(np.sum(t * t))
+    slope = t @ (u - u[0]) / lever
+    sigma = np.sqrt(np.mean(np.trace(cov_noise, axis1=1, axis2=2)) / lever)
+    return float(np.linalg.norm(slope)), float(sigma)
+
+
+def _tracklet_table(
+    frames: Frames, seen: Sightings, objects: list[tuple[_Run, str]], sensor_id: str
+) -> pa.Table:
+    time_ns = frames.time_ns[seen.frame]
+    names = [name for _, name in objects]
+    built = table(
+        TRACKLETS,
+        {
+            "tracklet_id": names,
+            "track_id": names,
+            "sensor_id": [sensor_id] * len(objects),
+            "start_time": np.array([time_ns[run.members[0]] for run, _ in objects], np.int64),
+            "end_time": np.array([time_ns[run.members[-1]] for run, _ in objects], np.int64),
+            "n_detections": [len(run.members) for run, _ in objects],
+            "rate_arcsec_s": [run.rate_rad_s / ARCSEC for run, _ in objects],
+            "residual_px": [run.residual_px for run, _ in objects],
+            "link_chi2": pa.nulls(len(objects), pa.float64()),
+        },
+    )
+    return built.sort_by([("start_time", "ascending"), ("tracklet_id", "ascending")])

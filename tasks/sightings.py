@@ -1,0 +1,98 @@
+"""Detections with the attitude and place of the frame they come from."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.tasks.algorithms.camera import Camera
+from epipole.tasks.algorithms.direction_errors import attitude_covariance, centroid_covariance
+from epipole.tasks.algorithms.rotations import matrix_from_quaternion
+from epipole.tasks.algorithms.sky import ARCSEC, unit_from_radec
+
+Array = npt.NDArray[np.float64]
+
+
+class Frames(NamedTuple):
+    """The frames of one sensor that have an attitude, in time order."""
+
+    table: pa.Table
+    number: npt.NDArray[np.int64]
+    time_ns: npt.NDArray[np.int64]
+    q_sensor_from_icrs: Array
+    cov_att_rad2: Array
+    from_stars: npt.NDArray[np.bool_]
+    r_gcrf_km: Array
+    v_gcrf_km_s: Array
+    position_sigma_km: Array
+    camera: npt.NDArray[np.int64]
+
+
+def solved_frames(solutions: pa.Table) -> Frames:
+    """Return the frames of a `solutions` table that have an attitude, in time order."""
+    solved = solutions.filter(pa.compute.field("attitude_source") != "none").sort_by("time")
+    return Frames(
+        solved,
+        array(solved, "frame_number"),
+        array(solved, "time"),
+        stack(solved, "q{}", "xyzw"),
+        stack_covariance(solved, "cov_att_{}_arcsec2") * ARCSEC**2,
+        array(solved, "attitude_source") == "stars",
+        stack(solved, "{}_km"),
+        stack(solved, "v{}_km_s"),
+        array(solved, "position_sigma_km").astype(float),
+        array(solved, "camera"),
+    )
+
+
+class Sightings(NamedTuple):
+    """Detections of one sensor in the order of its frames, and the frame each comes from.
+
+    `cov_noise` is what is new in every frame, `cov_bias` what all frames share [rad^2, ICRS]:
+    the error of an attitude from stars is new each time, that of a prior is one bias.
+    """
+
+    row: npt.NDArray[np.int64]
+    frame: npt.NDArray[np.int64]
+    offsets: npt.NDArray[np.int64]
+    u_icrs: Array
+    cov_noise: Array
+    cov_bias: Array
+
+
+def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
+    """Return the detections of one sensor that lie in its solved frames, by frame."""
+    by_number = np.argsort(frames.number, kind="stable")
+    number = array(detections, "frame_number")
+    at = np.searchsorted(frames.number[by_number], number)
+    at = np.minimum(at, max(len(by_number) - 1, 0))
+    known = frames.number[by_number][at] == number if len(by_number) else np.zeros(0, bool)
+    row = np.flatnonzero(known)
+    frame = by_number[at[row]] if len(row) else np.zeros(0, np.int64)
+    order = np.lexsort((array(detections, "centroid")[row], frame))
+    row, frame = row[order], frame[order]
+    u = unit_from_radec(
+        np.radians(array(detections, "ra_deg")[row]), np.radians(array(detections, "dec_deg")[row])
+    )
+    noise = centroid_covariance(u, array(detections, "sigma_arcsec")[row] * ARCSEC)
+    attitude = attitude_covariance(
+        u, matrix_from_quaternion(frames.q_sensor_from_icrs[frame]), frames.cov_att_rad2[frame]
+    )
+    stars = frames.from_stars[frame][:, None, None]
+    offsets = np.searchsorted(frame, np.arange(len(frames.number) + 1))
+    return Sightings(
+        row,
+        frame,
+        offsets,
+        u,
+        noise + np.where(stars, attitude, 0.0),
+        np.where(stars, 0.0, attitude),
+    )
+
+
+def camera_of(cameras: pa.Table, row: int) -> Camera:
+    """Return the camera in a row of `cameras`."""
+    values = cameras.slice(row, 1).to_pylist()[0]
+    return Camera(**{name: values[name] for name in Camera._fields})
