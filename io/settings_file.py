@@ -1,0 +1,49 @@
+"""Settings files: TOML in, commented TOML out."""
+
+import json
+import textwrap
+from pathlib import Path
+
+from epipole.schemas.errors import SettingsError
+from epipole.schemas.settings import Group, Settings, parse_settings
+
+WIDTH = 88
+
+
+def read_settings(path: Path) -> Settings:
+    """Return the settings of a TOML file; what it leaves out keeps its default.
+
+    Raises
+    ------
+    SettingsError
+        Where the file cannot be read, or names the setting that does not fit.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"{path}: not a text file; `epipole settings` prints one") from error
+    except OSError as error:
+        raise SettingsError(
+            f"{path}: {error.strerror}; `epipole settings` prints a file to start from"
+        ) from error
+    return parse_settings(text, str(path))
+
+
+def settings_text(settings: Settings) -> str:
+    """Return the settings as commented TOML that `read_settings` reads back as they are.
+
+    A setting without a value is a comment, as TOML has no null.
+    """
+    lines = ["# Settings of epipole. What is left out keeps its default."]
+    for name in type(settings).model_fields:
+        group: Group = getattr(settings, name)
+        lines += ["", *_comment((type(group).__doc__ or "").strip()), f"[{name}]"]
+        for key, field in type(group).model_fields.items():
+            value = getattr(group, key)
+            setting = f"# {key} =" if value is None else f"{key} = {json.dumps(value)}"
+            lines += [*_comment(field.description or ""), setting]
+    return "\n".join(lines) + "\n"
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, WIDTH, initial_indent="# ", subsequent_indent="# ")
