@@ -85,7 +85,9 @@ def navigation_catalogue(
         [np.bincount(owner, light * u_icrs[:, i], len(owner))[keep] for i in range(3)], axis=1
     )
     merged = np.bincount(owner, minlength=len(owner))[keep] > 1
-    place = np.where(merged[:, None], place / np.linalg.norm(place, axis=1, keepdims=True), u_icrs[keep])
+    place = np.where(
+        merged[:, None], place / np.linalg.norm(place, axis=1, keepdims=True), u_icrs[keep]
+    )
     total = np.where(merged, -2.5 * np.log10(together), magnitude[keep])
     again = np.lexsort((star_id[keep], total))
     return NavigationCatalogue(star_id[keep][again], place[again], total[again])

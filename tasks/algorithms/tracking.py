@@ -16,6 +16,8 @@ GRAVITY_PER_SPEED = 1e-3  # [1/s] g / v of a low orbit: how fast a path bends un
 FLOOR_RAD_S2 = 2.5e-7  # [rad/s^2] a low sensor's own acceleration, seen from a distant object
 
 NONE = -1
+SEEN = 0.9  # probability that a frame shows an object it looks at
+SLACK = 4  # frames beyond the fewest detections in which a track must begin
 
 
 @njit(cache=True, nogil=True)
@@ -134,94 +136,80 @@ def _rate_of(w):
 
 @njit(cache=True, nogil=True)
 def _chain_back(
-    f,
-    i_frame,
-    i,
-    j,
-    directions,
-    variances,
-    times,
-    offsets,
-    order,
-    key,
-    axis,
-    track,
-    depth,
-    gate2,
+    f, g, i, j, directions, variances, times, offsets, order, key, axis, track, density, gate2,
     members,
-):
-    """Follow the pair (i, j) back through earlier frames; return how many it holds, chi-square.
+):  # fmt: skip
+    """Follow the pair (j of frame f, i of frame g) back; return its detections and evidence.
 
-    The frames between i and j count as missed; `members` receives the detections, newest first.
+    `members` receives the detections, newest first. The evidence is the log of how much
+    likelier one moving object makes the further detections than strays of that density do.
     """
     u, w, P = np.empty(3), np.empty(3), np.empty(3)
-    _begin(
-        directions[j], times[f], variances[j], directions[i], times[i_frame], variances[i], u, w, P
-    )
+    _begin(directions[j], times[f], variances[j], directions[i], times[g], variances[i], u, w, P)
     members[0], members[1] = j, i
-    n, total, at = 2, 0.0, times[i_frame]
-    for g in range(i_frame - 1, max(f - depth, -1), -1):
-        dt = times[g] - at
+    n, evidence, at = 2, (f - g - 1) * np.log(1.0 - SEEN), times[g]
+    waiting = 0.0  # frames missed before the oldest detection so far: it may have entered there
+    for h in range(g - 1, f - len(density), -1):
+        dt = times[h] - at
         if dt == 0.0:
             continue
         _grow(P, _rate_of(w), dt)
         _advance(u, w, dt)
-        at = times[g]
+        at = times[h]
         k, chi2 = _nearest_free(
-            u,
-            P[0],
-            directions,
-            variances,
-            order,
-            key,
-            axis[g],
-            offsets[g],
-            offsets[g + 1],
-            track,
-            gate2,
-        )
-        if k != NONE:
-            _correct(u, w, P, directions[k], variances[k])
-            members[n] = k
-            n += 1
-            total += chi2
-    return n, total
+            u, P[0], directions, variances, order, key, axis[h], offsets[h], offsets[h + 1],
+            track, gate2,
+        )  # fmt: skip
+        if k == NONE:
+            waiting += np.log(1.0 - SEEN)
+            continue
+        spot = 2 * np.pi * (P[0] + variances[k])
+        gain = np.log(SEEN / (density[f - h] * spot)) - 0.5 * chi2 + waiting
+        if gain < 0.0:
+            waiting += np.log(1.0 - SEEN)
+            continue
+        evidence, waiting = evidence + gain, 0.0
+        _correct(u, w, P, directions[k], variances[k])
+        members[n] = k
+        n += 1
+    return n, evidence
+
+
+@njit(cache=True, nogil=True)
+def _free_density(f, depth, offsets, track, field_sr):
+    """Return free detections a steradian in frame f and the frames before it, at least one."""
+    out = np.empty(min(depth, f + 1))
+    for back in range(len(out)):
+        free = 0
+        for j in range(offsets[f - back], offsets[f - back + 1]):
+            free += track[j] == NONE
+        out[back] = max(free, 1) / field_sr
+    return out
 
 
 @njit(cache=True, nogil=True)
 def _new_tracks(
-    f,
-    times,
-    offsets,
-    directions,
-    variances,
-    order,
-    key,
-    axis,
-    track,
-    n_tracks,
-    max_rate,
-    max_coast,
-    need,
-    gate2,
-):
+    f, times, offsets, directions, variances, order, key, axis, track, n_tracks, max_rate,
+    max_coast, need, gate2, field_sr, enough,
+):  # fmt: skip
     """Begin tracks that end in frame f from detections no track has claimed.
 
-    A track is begun by `need` detections within need + 1 frames that one motion explains.
-    The fullest, then the smoothest, come first; a detection serves once. Returns the number
-    of tracks there are now; `track` is filled in.
+    Each pair of this frame and one of the two before it is followed back. It begins a track if
+    it gathers `need` detections and more evidence than the number of pairs tried lets chance
+    have. The strongest come first; a detection serves once. Returns the number of tracks there
+    are now; `track` is filled in.
     """
-    depth = need + 1
+    depth = need + SLACK
     lo, hi = offsets[f], offsets[f + 1]
     n = hi - lo
-    held = np.zeros(n, np.int64)
-    cost = np.full(n, np.inf)
-    chains = np.full((n, depth), NONE)
-    members = np.empty(depth, np.int64)
+    density = _free_density(f, depth, offsets, track, field_sr)
+    held, strength = np.zeros(n, np.int64), np.full(n, -np.inf)
+    chains, members = np.full((n, depth), NONE), np.empty(depth, np.int64)
     for g in range(f - 1, max(f - 3, -1), -1):
         dt = times[f] - times[g]
         if dt <= 0.0 or dt > max_coast:
             continue
+        tries = np.log(density[0] * density[f - g] * field_sr * field_sr)
         # No chord is longer than the arc, so the band holds all that is slow enough.
         reach = max_rate * dt
         for row in range(n):
@@ -236,29 +224,16 @@ def _new_tracks(
                 i = order[k]
                 if track[i] != NONE or _distance2(directions[i], directions[j]) > reach * reach:
                     continue
-                got, chi2 = _chain_back(
-                    f,
-                    g,
-                    i,
-                    j,
-                    directions,
-                    variances,
-                    times,
-                    offsets,
-                    order,
-                    key,
-                    axis,
-                    track,
-                    depth,
-                    gate2,
-                    members,
-                )
-                if got >= need and (got > held[row] or (got == held[row] and chi2 < cost[row])):
-                    held[row], cost[row] = got, chi2
+                got, evidence = _chain_back(
+                    f, g, i, j, directions, variances, times, offsets, order, key, axis, track,
+                    density, gate2, members,
+                )  # fmt: skip
+                evidence -= tries
+                if got >= need and evidence > max(enough, strength[row]):
+                    held[row], strength[row] = got, evidence
                     chains[row, :got] = members[:got]
-    # Fullest first, then smoothest: a stable sort keeps this the same on every run.
-    ranking = np.argsort(cost - 1e6 * held, kind="mergesort")
-    for row in ranking:
+    # A stable sort: the same order on every run.
+    for row in np.argsort(-strength, kind="mergesort"):
         if held[row] == 0:
             break
         free = True
@@ -331,19 +306,9 @@ def _claim(
 
 @njit(cache=True, nogil=True)
 def _follow(
-    times,
-    offsets,
-    directions,
-    variances,
-    order,
-    key,
-    axis,
-    max_rate,
-    max_coast,
-    max_missed,
-    need,
-    gate2,
-):
+    times, offsets, directions, variances, order, key, axis, max_rate, max_coast, max_missed, need,
+    gate2, field_sr, enough,
+):  # fmt: skip
     n = len(directions)
     frame_of = np.empty(n, np.int64)
     for f in range(len(times)):
@@ -353,7 +318,7 @@ def _follow(
     U, W, P = np.empty((room, 3)), np.empty((room, 3)), np.empty((room, 3))
     at, ids = np.empty(room), np.empty(room, np.int64)
     missed, live = np.zeros(room, np.int64), np.empty(room, np.int64)
-    members = np.empty(need + 1, np.int64)
+    members = np.empty(need + SLACK, np.int64)
     n_live, n_tracks = 0, 0
     for f in range(len(times)):
         kept = 0
@@ -364,42 +329,17 @@ def _follow(
                 kept += 1
         n_live = kept
         _claim(
-            live,
-            n_live,
-            U,
-            W,
-            P,
-            at,
-            ids,
-            missed,
-            f,
-            times,
-            offsets,
-            directions,
-            variances,
-            track,
-            gate2,
-        )
+            live, n_live, U, W, P, at, ids, missed, f, times, offsets, directions, variances,
+            track, gate2,
+        )  # fmt: skip
         before = n_tracks
         n_tracks = _new_tracks(
-            f,
-            times,
-            offsets,
-            directions,
-            variances,
-            order,
-            key,
-            axis,
-            track,
-            n_tracks,
-            max_rate,
-            max_coast,
-            need,
-            gate2,
-        )
+            f, times, offsets, directions, variances, order, key, axis, track, n_tracks, max_rate,
+            max_coast, need, gate2, field_sr, enough,
+        )  # fmt: skip
         for new in range(before, n_tracks):
             count = 0
-            for j in range(offsets[max(f - need, 0)], offsets[f + 1]):
+            for j in range(offsets[max(f - need - SLACK + 1, 0)], offsets[f + 1]):
                 if track[j] == new:
                     members[count] = j
                     count += 1
@@ -423,6 +363,8 @@ def follow_detections(
     max_missed: int,
     min_detections: int,
     gate_sigma: float,
+    field_sr: float,
+    false_alarm: float,
 ) -> npt.NDArray[np.int64]:
     """Return the track number of every detection, -1 where it belongs to none.
 
@@ -441,9 +383,14 @@ def follow_detections(
     max_missed
         Frames in a row in which a track may miss its object.
     min_detections
-        Detections, within one frame more, that begin a track (at least 2).
+        Fewest detections that begin a track (at least 2), within `SLACK` frames more.
     gate_sigma
         A detection continues a track within this many standard deviations.
+    field_sr
+        Solid angle of the field: with it, how dense the detections are.
+    false_alarm
+        Accepted number of tracks a frame that are made of strays. Where strays are dense, or
+        an object is fast, it takes more detections to begin a track.
 
     Returns
     -------
@@ -464,6 +411,8 @@ def follow_detections(
         int(max_missed),
         int(max(min_detections, 2)),
         float(gate_sigma) ** 2,
+        float(field_sr),
+        -float(np.log(false_alarm)),
     )
 
 

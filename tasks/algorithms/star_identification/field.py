@@ -133,7 +133,9 @@ def _drop_odd(star_of, instrumental, magnitude, zero_point):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def settle(R, P, s_xy, s_z, u, sigma, instrumental, a, magnitude, gate, zero_point, star_of, chi2_of):
+def settle(
+    R, P, s_xy, s_z, u, sigma, instrumental, a, magnitude, gate, zero_point, star_of, chi2_of
+):
     """Match, refine, match again until nothing changes; return the number of matches (compiled).
 
     Starts at R with an error of s_xy across and s_z about the boresight [rad]; R is moved in
@@ -222,8 +224,24 @@ def best_nudge(R0, s_xy, s_z, u, sigma, a, gate, n_tried, R):
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def solve_predicted(
-    R0, P0, lost, u, sigma, instrumental, a, magnitude, box, rho_mean, gate, log_density,
-    zero_point, enough, R, P, star_of, chi2_of,
+    R0,
+    P0,
+    lost,
+    u,
+    sigma,
+    instrumental,
+    a,
+    magnitude,
+    box,
+    rho_mean,
+    gate,
+    log_density,
+    zero_point,
+    enough,
+    R,
+    P,
+    star_of,
+    chi2_of,
 ):
     """Identify a frame whose attitude is nearly known; return its log evidence (compiled).
 
@@ -253,13 +271,43 @@ def solve_predicted(
     for way in range(2):
         if way == 0:
             Rt[:] = R0
-            matches = settle(Rt, Pt, s_xy, s_z, u, sigma, instrumental, a, magnitude, gate, zero_point, star_t, chi2_t)
+            matches = settle(
+                Rt,
+                Pt,
+                s_xy,
+                s_z,
+                u,
+                sigma,
+                instrumental,
+                a,
+                magnitude,
+                gate,
+                zero_point,
+                star_t,
+                chi2_t,
+            )
         else:
             best_nudge(R0, s_xy, s_z, u, sigma, a, gate, 12, Rt)
             near = 2.0 * np.min(sigma)
-            matches = settle(Rt, Pt, near, s_z, u, sigma, instrumental, a, magnitude, gate, zero_point, star_t, chi2_t)
+            matches = settle(
+                Rt,
+                Pt,
+                near,
+                s_z,
+                u,
+                sigma,
+                instrumental,
+                a,
+                magnitude,
+                gate,
+                zero_point,
+                star_t,
+                chi2_t,
+            )
         if matches >= 3:
-            evidence, _ = match_evidence(star_t, chi2_t, sigma, instrumental, magnitude, log_density, zero_point, rho)
+            evidence, _ = match_evidence(
+                star_t, chi2_t, sigma, instrumental, magnitude, log_density, zero_point, rho
+            )
             evidence += choice_lost(Pt) if lost else choice_predicted(Pt, P0, Rt, R0)
             if evidence > best:
                 best = evidence

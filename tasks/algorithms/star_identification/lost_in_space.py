@@ -68,14 +68,36 @@ def _look_up(R, u, k, beta, radius, star_u, first, star, n_face):
     p = x * beta[0] + y * beta[1] + z * beta[2]
     # To first order in v / c; the rest is 2 mas.
     return nearest_star(
-        x + p * x - beta[0], y + p * y - beta[1], z + p * z - beta[2], radius, star_u, first, star, n_face
+        x + p * x - beta[0],
+        y + p * y - beta[1],
+        z + p * z - beta[2],
+        radius,
+        star_u,
+        first,
+        star,
+        n_face,
     )
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def _judge(
-    R, P, u, sigma, instrumental, beta, star_u, star_mag, first, star, n_face, grid_radius, gate,
-    log_density, zero_point, rho, row_of,
+    R,
+    P,
+    u,
+    sigma,
+    instrumental,
+    beta,
+    star_u,
+    star_mag,
+    first,
+    star,
+    n_face,
+    grid_radius,
+    gate,
+    log_density,
+    zero_point,
+    rho,
+    row_of,
 ):
     """Refine an attitude whose first matches are in row_of; return its log evidence."""
     n = len(u)
@@ -112,15 +134,39 @@ def _judge(
             break
         if not refine_attitude(R, u, sigma, a, slot, P):
             return -1e9
-    evidence, _ = match_evidence(slot, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, rho)
+    evidence, _ = match_evidence(
+        slot, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, rho
+    )
     return evidence + choice_lost(P)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def search(
-    u, sigma, instrumental, beta, star_u, star_mag, first, star, n_face, grid_radius,
-    chord, below, slope, intercept, pair_a, pair_b, min_chord, n_pattern, gate, log_density,
-    zero_point, rho, enough, budget, R_best,
+    u,
+    sigma,
+    instrumental,
+    beta,
+    star_u,
+    star_mag,
+    first,
+    star,
+    n_face,
+    grid_radius,
+    chord,
+    below,
+    slope,
+    intercept,
+    pair_a,
+    pair_b,
+    min_chord,
+    n_pattern,
+    gate,
+    log_density,
+    zero_point,
+    rho,
+    enough,
+    budget,
+    R_best,
 ):
     """Return evidence, runner-up's evidence and look-ups made; write the best attitude (compiled).
 
@@ -192,8 +238,14 @@ def search(
                         z = t[k, 0] * F[0, 2] + t[k, 1] * F[1, 2] + t[k, 2] * F[2, 2]
                         q = x * beta[0] + y * beta[1] + z * beta[2]
                         s, _ = nearest_star(
-                            x + q * x - beta[0], y + q * y - beta[1], z + q * z - beta[2],
-                            radius[k], star_u, first, star, n_face,
+                            x + q * x - beta[0],
+                            y + q * y - beta[1],
+                            z + q * z - beta[2],
+                            radius[k],
+                            star_u,
+                            first,
+                            star,
+                            n_face,
                         )
                         if s >= 0:
                             row_of[k] = s
@@ -203,7 +255,11 @@ def search(
                     if hits < min_hits:
                         continue
                     rest = n_checked - 2.0
-                    score -= math.lgamma(rest + 1.0) - math.lgamma(hits + 1.0) - math.lgamma(rest - hits + 1.0)
+                    score -= (
+                        math.lgamma(rest + 1.0)
+                        - math.lgamma(hits + 1.0)
+                        - math.lgamma(rest - hits + 1.0)
+                    )
                     if score < math.log(rest + 1.0) - 1.0:  # as many hits as chance gives
                         continue
                     row_of[i], row_of[j] = ra, rb
@@ -213,8 +269,23 @@ def search(
                             R[r, m] = E[0, r] * F[0, m] + E[1, r] * F[1, m] + E[2, r] * F[2, m]
                     row_try[:] = row_of
                     evidence = _judge(
-                        R, P, u, sigma, instrumental, beta, star_u, star_mag, first, star, n_face,
-                        grid_radius, gate, log_density, zero_point, rho, row_try,
+                        R,
+                        P,
+                        u,
+                        sigma,
+                        instrumental,
+                        beta,
+                        star_u,
+                        star_mag,
+                        first,
+                        star,
+                        n_face,
+                        grid_radius,
+                        gate,
+                        log_density,
+                        zero_point,
+                        rho,
+                        row_try,
                     )
                     work += 10 * n
                     if evidence <= runner:

@@ -36,17 +36,16 @@ def sky_to_limit(stars: NavigationCatalogue, magnitude_limit: float) -> Sky:
     return Sky(cut, log_magnitude_density(cut.magnitude), max(n, 1) / (4 * np.pi))
 
 
-def pattern_pairs(sky: Sky, solid_angle_sr: float, diagonal_rad: float) -> PairTable:
-    """Return the pairs of the sky's brightest stars that fit into a field.
+def pattern_size(sky: Sky, solid_angle_sr: float) -> int:
+    """Return how many of the sky's brightest stars are paired for a field of this size."""
+    return min(int(PATTERN_STARS * 4 * np.pi / solid_angle_sr), len(sky.catalogue.star_id))
 
-    Parameters
-    ----------
-    solid_angle_sr, diagonal_rad : of the field.
-    """
-    n = min(int(PATTERN_STARS * 4 * np.pi / solid_angle_sr), len(sky.catalogue.star_id))
-    # Neighbours a star has within r: (n / 4 pi) pi r^2, half of which are its own pairs.
-    reach = min(diagonal_rad, np.sqrt(8.0 * MAX_PAIRS) / max(n, 1), np.pi)
-    return build_pair_table(sky.catalogue.u_icrs[:n], float(reach))
+
+def pattern_pairs(u_icrs: npt.NDArray[np.float64], diagonal_rad: float) -> PairTable:
+    """Return the pairs of these (n, 3) stars that fit into a field with this diagonal."""
+    # Neighbours a star has within r: (n / 4 pi) pi r^2; each pair counts twice.
+    reach = min(diagonal_rad, np.sqrt(8.0 * MAX_PAIRS) / max(len(u_icrs), 1), np.pi)
+    return build_pair_table(u_icrs, float(reach))
 
 
 def sky_grid(sky: Sky, radius_rad: float) -> SkyGrid:
