@@ -1,0 +1,62 @@
+"""The order of frames, and which of them are there twice."""
+
+import numpy as np
+import numpy.typing as npt
+
+Integers = npt.NDArray[np.int64]
+
+KEEP, DUPLICATE_FRAME, DUPLICATE_NUMBER, DUPLICATE_TIME = range(4)
+
+
+def order_frames(
+    sensor: Integers, time_ns: Integers, frame_number: Integers
+) -> tuple[Integers, npt.NDArray[np.int8]]:
+    """Return the order of frames by sensor, time and number, and a verdict on each.
+
+    Parameters
+    ----------
+    sensor, time_ns, frame_number : (n,) int
+        Sensor as an index. Of frames that are alike, the first given is kept.
+
+    Returns
+    -------
+    order : (n,) int
+        Indices that sort the frames.
+    verdict : (n,) int8
+        In that order. DUPLICATE_FRAME: the same sensor, number and time as a frame that is
+        kept. DUPLICATE_NUMBER: the number of an earlier frame at another time, from a counter
+        that restarted or from two sensors with one id; the first in time is kept.
+        DUPLICATE_TIME: another number at the time of a frame that is kept (the lowest number
+        is): a sensor exposes once at a time.
+    """
+    order = np.lexsort((np.arange(len(sensor)), frame_number, time_ns, sensor))
+    s, t, f = sensor[order], time_ns[order], frame_number[order]
+    verdict = np.zeros(len(order), np.int8)
+    if len(order) == 0:
+        return order, verdict
+    same_time = (s[1:] == s[:-1]) & (t[1:] == t[:-1])
+    same_frame = same_time & (f[1:] == f[:-1])
+    verdict[1:][same_time] = DUPLICATE_TIME
+    verdict[1:][same_frame] = DUPLICATE_FRAME
+    # By number, the candidates in order of time: all but the first repeat it.
+    rest = np.flatnonzero(verdict == KEEP)
+    by_number = rest[np.lexsort((rest, f[rest], s[rest]))]
+    a, b = by_number[:-1], by_number[1:]
+    verdict[b[(s[a] == s[b]) & (f[a] == f[b])]] = DUPLICATE_NUMBER
+    # A repeat of a frame shares its fate: two copies of one that repeats a number both do.
+    keeper = np.maximum.accumulate(np.where(verdict != DUPLICATE_FRAME, np.arange(len(s)), 0))
+    copies = verdict == DUPLICATE_FRAME
+    verdict[copies & (verdict[keeper] == DUPLICATE_NUMBER)] = DUPLICATE_NUMBER
+    return order, verdict
+
+
+def order_states(sensor: Integers, time_ns: Integers) -> tuple[Integers, npt.NDArray[np.bool_]]:
+    """Return the order of states by sensor and time, and, in it, which repeat the one before.
+
+    Of states of one sensor at one time the first given is kept.
+    """
+    order = np.lexsort((np.arange(len(sensor)), time_ns, sensor))
+    s, t = sensor[order], time_ns[order]
+    repeats = np.zeros(len(order), bool)
+    repeats[1:] = (s[1:] == s[:-1]) & (t[1:] == t[:-1])
+    return order, repeats

@@ -1,0 +1,167 @@
+"""Logs to frames, states and calibrations of all sensors, each once and in order."""
+
+import logging
+import os
+from collections.abc import Sequence
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+
+from epipole.io.earth_orientation import read_earth_orientation
+from epipole.io.log_reader import read_log
+from epipole.io.log_rejects import STAGE
+from epipole.schemas.bridge import array, concat, conform, nullable, stack, table, unstack
+from epipole.schemas.errors import LogError
+from epipole.schemas.log_tables import ITRF, LOG_STATES, Log, LogPart
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import REJECTS
+from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES
+from epipole.tasks.algorithms.frame_order import (
+    DUPLICATE_FRAME,
+    DUPLICATE_NUMBER,
+    DUPLICATE_TIME,
+    KEEP,
+    order_frames,
+    order_states,
+)
+from epipole.tasks.algorithms.reference_frames import orientation_at, to_gcrf
+
+logger = logging.getLogger(__name__)
+
+_DUPLICATES = {
+    DUPLICATE_FRAME: "duplicate_frame",
+    DUPLICATE_NUMBER: "duplicate_number",
+    DUPLICATE_TIME: "duplicate_time",
+}
+
+
+@task(name="read logs", cache_policy=NO_CACHE)
+def read_logs(paths: Sequence[str | os.PathLike[str]], settings: Settings) -> Log:
+    """What the logs hold together; the order of the paths does not matter.
+
+    A frame that comes twice counts once; see `order_frames` for what is a repeat. A log that
+    is given twice is read once.
+    """
+    parts = _distinct([read_log(path) for path in paths])
+    if not parts:
+        raise LogError("no logs given; name at least one MCAP file")
+    exposures, duplicate_frames = _sorted_frames(
+        concat(EXPOSURES, [part.exposures for part in parts])
+    )
+    states, duplicate_states = _sorted_states(parts, settings)
+    cameras = _sorted_cameras(concat(CAMERAS, [part.cameras for part in parts]))
+    rejects = concat(
+        REJECTS, [*(part.rejects for part in parts), duplicate_frames, duplicate_states]
+    )
+    logger.info(
+        "read %d logs: %d frames, %d states, %d calibrations, %d left out",
+        len(parts),
+        exposures.num_rows,
+        states.num_rows,
+        cameras.num_rows,
+        pc.sum(rejects["count"]).as_py() or 0,
+    )
+    return Log(exposures, states, cameras, [part.source for part in parts], rejects)
+
+
+def _distinct(parts: list[LogPart]) -> list[LogPart]:
+    """Return the parts by name and content, each content once."""
+    by_content: dict[str, LogPart] = {}
+    for part in sorted(parts, key=lambda part: (part.source.name, part.source.sha256)):
+        first = by_content.setdefault(part.source.sha256, part)
+        if first is not part:
+            logger.info("%s holds the same as %s: read once", part.source.name, first.source.name)
+    return list(by_content.values())
+
+
+def _sensor_index(values: pa.Table) -> np.ndarray:
+    """Return the sensors as integers that sort as their ids do."""
+    return np.unique(array(values, "sensor_id").astype(str), return_inverse=True)[1]
+
+
+def _sorted_frames(exposures: pa.Table) -> tuple[pa.Table, pa.Table]:
+    """Return the exposures sorted and each once, and the rejects for the rest."""
+    order, verdict = order_frames(
+        _sensor_index(exposures), array(exposures, "time"), array(exposures, "frame_number")
+    )
+    keep = exposures.take(pa.array(order[verdict == KEEP])).combine_chunks()
+    rejects = [
+        _repeats(exposures.take(pa.array(order[verdict == code])), reason)
+        for code, reason in _DUPLICATES.items()
+    ]
+    return keep, concat(REJECTS, rejects)
+
+
+def _repeats(frames: pa.Table, reason: str) -> pa.Table:
+    """Return a row of `rejects` a sensor and log: when the first repeat was, how many."""
+    grouped = frames.group_by(["sensor_id", "source"], use_threads=False).aggregate(
+        [("time", "min"), ("time", "count")]
+    )
+    n = grouped.num_rows
+    return table(
+        REJECTS,
+        {
+            "source": grouped["source"],
+            "offset": [None] * n,
+            "sensor_id": grouped["sensor_id"],
+            "time": grouped["time_min"],
+            "stage": [STAGE] * n,
+            "reason": [reason] * n,
+            "count": grouped["time_count"],
+        },
+    )
+
+
+def _sorted_states(parts: list[LogPart], settings: Settings) -> tuple[pa.Table, pa.Table]:
+    """Return the states in GCRF, sorted and each once, and the rejects for the rest."""
+    names = [name for part in parts for name in [part.source.name] * part.states.num_rows]
+    states = concat(LOG_STATES, [part.states for part in parts])
+    order, repeats = order_states(_sensor_index(states), array(states, "time"))
+    named = states.select(["sensor_id", "time"])
+    named = named.append_column("source", pa.array(names, pa.string()))
+    rejects = _repeats(named.take(pa.array(order[repeats])), "duplicate_state")
+    return _turned_to_gcrf(states.take(pa.array(order[~repeats])), settings), rejects
+
+
+def _turned_to_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
+    """Return SENSOR_STATES of LOG_STATES, row by row.
+
+    Where the Earth-orientation table does not reach, an Earth-fixed position is less well
+    known than its sigma says; the sigma returned says so.
+    """
+    time_ns, frame = array(states, "time"), array(states, "frame")
+    r_km, v_km_s = stack(states, "{}_km"), stack(states, "v{}_km_s")
+    sigma_km = array(states, "position_sigma_km").copy()
+    for name in sorted(set(frame)):
+        i = np.flatnonzero(frame == name)
+        orientation = orientation_at(time_ns[i], *read_earth_orientation())
+        r_km[i], v_km_s[i] = to_gcrf(name, time_ns[i], r_km[i], v_km_s[i], orientation)
+        if name == ITRF and orientation.sigma_rad.any():
+            turn_km = orientation.sigma_rad * np.linalg.norm(r_km[i], axis=1)
+            own_km = np.where(sigma_km[i] > 0, sigma_km[i], settings.sensors.position_sigma_km)
+            sigma_km[i] = np.where(turn_km > 0, np.hypot(own_km, turn_km), sigma_km[i])
+            _warn_of_orientation(turn_km)
+    values = {name: states[name] for name in SENSOR_STATES.names}
+    values.update(unstack("{}_km", r_km), position_sigma_km=sigma_km)
+    values.update({n: nullable(v) for n, v in unstack("v{}_km_s", v_km_s).items()})
+    return table(SENSOR_STATES, values)
+
+
+def _warn_of_orientation(turn_km: np.ndarray) -> None:
+    end = np.datetime64("1858-11-17") + int(read_earth_orientation().mjd[-1])
+    logger.warning(
+        "%d ITRF states lie outside the Earth-orientation table (it ends %s): their positions "
+        "are uncertain by up to %.3f km more; a newer astropy-iers-data helps",
+        np.count_nonzero(turn_km),
+        end,
+        turn_km.max(),
+    )
+
+
+def _sorted_cameras(cameras: pa.Table) -> pa.Table:
+    """Return the calibrations by sensor and time, those that say the same at one time once."""
+    unique = cameras.group_by(CAMERAS.names, use_threads=False).aggregate([])
+    return conform(CAMERAS, unique.sort_by([(name, "ascending") for name in CAMERAS.names]))
