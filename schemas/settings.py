@@ -55,7 +55,10 @@ class TrackletSettings(Group):
     gate_sigma: float = Field(4.0, gt=0, description="A detection continues a track within this.")
     max_rate_deg_s: float = Field(2.0, gt=0, description="Fastest apparent motion looked for.")
     max_missed: int = Field(3, ge=0, description="Frames an object may be missed in a row.")
-    min_detections: int = Field(4, ge=2, description="Shortest run that is an object.")
+    min_detections: int = Field(3, ge=2, description="Shortest run that is an object.")
+    false_alarm: float = Field(
+        1e-4, gt=0, lt=1, description="Accepted runs made of strays, a frame."
+    )
 
 
 class AlignmentSettings(Group):

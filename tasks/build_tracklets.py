@@ -12,6 +12,7 @@ from prefect.cache_policies import NO_CACHE
 from epipole.schemas.bridge import empty, table
 from epipole.schemas.settings import Settings, TrackletSettings
 from epipole.schemas.tables import DETECTIONS, TRACKLETS
+from epipole.tasks.algorithms.camera import Camera
 from epipole.tasks.algorithms.epoch_grid import frame_interval_ns
 from epipole.tasks.algorithms.local_motion import directions_at
 from epipole.tasks.algorithms.sky import ARCSEC
@@ -40,11 +41,14 @@ def build_tracklets(
     if not detections.num_rows or not len(frames.number):
         return Tracked(detections, empty(TRACKLETS))
     seen = sightings_of(frames, detections)
-    track = _follow(frames, seen, settings.tracklets)
+    camera = camera_of(cameras, int(frames.camera[0]))
+    track = _follow(frames, seen, camera, settings.tracklets)
     return _label(frames, seen, track, detections, cameras, settings)
 
 
-def _follow(frames: Frames, seen: Sightings, settings: TrackletSettings) -> npt.NDArray[np.int64]:
+def _follow(
+    frames: Frames, seen: Sightings, camera: Camera, settings: TrackletSettings
+) -> npt.NDArray[np.int64]:
     """Return the track number of every sighting."""
     interval_s = frame_interval_ns(frames.time_ns) / 1e9
     sigma = np.sqrt(np.trace(seen.cov_noise + seen.cov_bias, axis1=1, axis2=2) / 2)
@@ -59,6 +63,8 @@ def _follow(frames: Frames, seen: Sightings, settings: TrackletSettings) -> npt.
         max_missed=settings.max_missed,
         min_detections=settings.min_detections,
         gate_sigma=settings.gate_sigma,
+        field_sr=camera.width * camera.height * camera.pixel_rad**2,
+        false_alarm=settings.false_alarm,
     )
 
 
