@@ -1,0 +1,218 @@
+"""The command line: ``epipole run``, ``simulate``, ``info``, ``evaluate``, ``settings``.
+
+What a command needs is imported when it runs, so that ``epipole --help`` answers at once.
+"""
+
+import datetime
+import json
+import os
+import sys
+import warnings
+from enum import StrEnum
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from epipole.schemas.errors import EpipoleError
+
+app = typer.Typer(
+    name="epipole",
+    help="Turns logs of star sensors into positions of space objects.",
+    epilog="A first run: epipole simulate four_sensor_geo --out night.mcap; "
+    "epipole run night.mcap --out out/",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def main() -> None:
+    """Run the command line: one line and exit code 1 for an error that the user can mend."""
+    try:
+        app(standalone_mode=True)
+    except EpipoleError as error:
+        _fail(str(error), 1)
+    except KeyboardInterrupt:
+        _fail("interrupted; the dataset is as it was", 130)
+    except BrokenPipeError:  # `epipole settings | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+
+
+def _fail(message: str, code: int) -> None:
+    print(f"epipole: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"epipole {version('epipole')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print version."),
+    ] = False,
+) -> None:
+    """Options of every command."""
+
+
+Logs = Annotated[list[str], typer.Argument(metavar="LOG...", help="MCAP files, in any order.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
+
+
+class Encoding(StrEnum):
+    """How messages of a log are written."""
+
+    protobuf = "protobuf"
+    json = "json"
+    ros2 = "ros2"
+
+
+class Compression(StrEnum):
+    """How chunks of a log are written."""
+
+    zstd = "zstd"
+    lz4 = "lz4"
+    none = "none"
+
+
+class Runner(StrEnum):
+    """Where the tasks of a run are worked on."""
+
+    threads = "threads"
+
+
+@app.command()
+def run(
+    logs: Logs,
+    out: Annotated[
+        str, typer.Option(metavar="DATASET", help="Folder to publish to; made if missing.")
+    ],
+    settings: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="TOML; `epipole settings` prints one.")
+    ] = None,
+    night: Annotated[
+        str | None, typer.Option(metavar="DATE", help="Publish this UTC date only, YYYY-MM-DD.")
+    ] = None,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Publish a night even if a log it had is not given.")
+    ] = False,
+    runner: Annotated[Runner, typer.Option(help="Where tasks are worked on.")] = Runner.threads,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Tasks at once; default: a CPU each.")
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Print more, Prefect's lines too.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Turn logs into a dataset: the nightly flow, here and now."""
+    from epipole.flows.run import RunOptions, run_nightly
+
+    _check_night(night)
+    if not verbose:
+        warnings.simplefilter("ignore")
+    options = RunOptions(settings, night, replace, workers, quiet, verbose)
+    summary, seconds = run_nightly(logs, out, options)
+    if as_json:
+        _print_json(summary.as_dict() | {"seconds": round(seconds, 2)})
+    elif not quiet:
+        typer.echo("\n".join([*summary.lines(), f"took        {seconds:.1f} s"]))
+
+
+def _check_night(night: str | None) -> None:
+    try:
+        if night is not None and datetime.date.fromisoformat(night).isoformat() != night:
+            raise ValueError(night)
+    except ValueError:
+        raise typer.BadParameter(
+            f"{night!r} is no date such as 2019-04-01", param_hint="--night"
+        ) from None
+
+
+@app.command()
+def info(logs: Logs, as_json: AsJson = False) -> None:
+    """Say what is in logs: sensors, times, counts, and what cannot be used."""
+    from epipole.flows.log_info import describe, lines
+
+    described = [describe(log) for log in logs]
+    if as_json:
+        _print_json(described)
+    else:
+        typer.echo("\n".join(line for one in described for line in lines(one)))
+
+
+@app.command()
+def simulate(
+    scene: Annotated[str, typer.Argument(help="A built-in scene, or a TOML file.")],
+    out: Annotated[Path, typer.Option(metavar="LOG", help="Log to write, such as night.mcap.")],
+    seed: Annotated[int | None, typer.Option(help="Instead of the scene's.")] = None,
+    sensors: Annotated[int | None, typer.Option(help="How many sensors.")] = None,
+    objects: Annotated[int | None, typer.Option(help="How many objects.")] = None,
+    hours: Annotated[float | None, typer.Option(help="How long.")] = None,
+    rate_hz: Annotated[float | None, typer.Option(help="Frames a second of a sensor.")] = None,
+    start: Annotated[str | None, typer.Option(help="Such as 2019-04-01T04:00:00Z.")] = None,
+    logs: Annotated[int, typer.Option(help="Cut into so many logs, in order of time.")] = 1,
+    encoding: Annotated[Encoding, typer.Option(help="Of the messages.")] = Encoding.protobuf,
+    compression: Annotated[Compression, typer.Option(help="Of chunks.")] = Compression.zstd,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a scene: a log, and its truth beside it."""
+    from epipole.flows.simulate import simulate
+
+    made = simulate(
+        scene,
+        out,
+        seed=seed,
+        sensors=sensors,
+        objects=objects,
+        hours=hours,
+        rate_hz=rate_hz,
+        start=_instant(start),
+        logs=logs,
+        encoding=encoding.value,
+        compression=compression.value,
+    )
+    if as_json:
+        _print_json(vars(made) | {"logs": [str(p) for p in made.logs], "truth": str(made.truth)})
+        return
+    typer.echo(f"log    {', '.join(str(log) for log in made.logs)}")
+    typer.echo(f"truth  {made.truth}")
+    typer.echo(
+        f"{made.sensors:,} sensors, {made.objects:,} objects, {made.frames:,} frames, "
+        f"{made.centroids:,} centroids"
+    )
+
+
+def _instant(text: str | None) -> datetime.datetime | None:
+    """Return an aware time; one without a zone is UTC."""
+    if text is None:
+        return None
+    try:
+        instant = datetime.datetime.fromisoformat(text)
+    except ValueError:
+        raise typer.BadParameter(
+            f"{text!r} is no time such as 2019-04-01T04:00:00Z", param_hint="--start"
+        ) from None
+    return instant if instant.tzinfo else instant.replace(tzinfo=datetime.UTC)
+
+
+@app.command()
+def settings() -> None:
+    """Print all settings with their defaults, as TOML for `epipole run --settings`."""
+    from epipole.io.settings_file import settings_text
+    from epipole.schemas.settings import Settings
+
+    typer.echo(settings_text(Settings()), nl=False)
+
+
+def _print_json(value: Any) -> None:
+    typer.echo(json.dumps(value, indent=2))

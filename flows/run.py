@@ -1,0 +1,63 @@
+"""The nightly flow started from the command line, on an embedded Prefect."""
+
+import logging
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from epipole.flows.progress import shown, step
+from epipole.flows.summary import Summary
+from epipole.io.dataset import check_folder
+from epipole.io.settings_file import read_settings
+from epipole.schemas.errors import LogError
+from epipole.schemas.settings import Settings
+
+LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is asked for."""
+
+    settings: Path | None = None
+    night: str | None = None
+    replace: bool = False
+    workers: int | None = None
+    quiet: bool = False
+    verbose: bool = False
+
+
+def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary, float]:
+    """Return what a run found, and how many seconds it took.
+
+    Raises
+    ------
+    EpipoleError
+        Where the work cannot be done. What is plain at once is said before Prefect starts.
+    """
+    started = time.monotonic()
+    settings = read_settings(options.settings) if options.settings else Settings()
+    check_folder(out)
+    for log in logs:
+        if "://" not in log and not Path(log).exists():
+            raise LogError(f"{log}: no such file; check the path")
+    with shown(options.quiet, options.verbose):
+        step("start Prefect", 0, 1)
+        from epipole.flows.prefect_defaults import embedded_prefect, quiet_console
+
+        if not options.verbose:
+            quiet_console()
+        with embedded_prefect():
+            summary = _run(logs, out, settings, options)
+    return summary, time.monotonic() - started
+
+
+def _run(logs: list[str], out: str, settings: Settings, options: RunOptions) -> Summary:
+    from prefect.task_runners import ThreadPoolTaskRunner
+
+    from epipole.flows.nightly import nightly
+
+    workers = options.workers or os.cpu_count() or 1
+    flow = nightly.with_options(task_runner=ThreadPoolTaskRunner(max_workers=workers))
+    return flow(logs, out, settings.model_dump(), options.night, options.replace)

@@ -1,0 +1,77 @@
+"""What a run found and what it left out, in a few lines."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Counts of what was published."""
+
+    dataset: str
+    nights: list[str]
+    logs: int
+    sensors: int
+    frames: int
+    identified: int
+    stars: int
+    detections: int
+    tracklets: int
+    epochs: int
+    objects: int
+    positions: int
+    rejects: dict[str, int]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the counts by name, as JSON takes them."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Return the summary as people read it."""
+        left_out = [f"  {count:,} {reason}" for reason, count in self.rejects.items()]
+        return [
+            f"nights      {', '.join(self.nights)}",
+            f"frames      {self.frames:,} of {_many(self.sensors, 'sensor')} "
+            f"in {_many(self.logs, 'log')}",
+            f"identified  {self.identified:,} by {self.stars:,} stars",
+            f"objects     {self.objects:,} in {self.detections:,} detections, "
+            f"{_many(self.tracklets, 'tracklet')}",
+            f"positions   {self.positions:,} at {_many(self.epochs, 'epoch')}",
+            f"left out    {_many(sum(self.rejects.values()), 'thing')}" + (":" if left_out else ""),
+            *left_out,
+            f"dataset     {self.dataset}",
+        ]
+
+
+def summarise(dataset: str, nights: list[str], tables: Mapping[str, pa.Table]) -> Summary:
+    """Return the summary of published tables."""
+    frames = tables["frames"]
+    return Summary(
+        dataset=dataset,
+        nights=nights,
+        logs=pc.count_distinct(tables["sources"]["sha256"]).as_py(),
+        sensors=pc.count_distinct(frames["sensor_id"]).as_py(),
+        frames=frames.num_rows,
+        identified=pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
+        stars=tables["stars"].num_rows,
+        detections=tables["detections"].num_rows,
+        tracklets=tables["tracklets"].num_rows,
+        epochs=pc.count_distinct(tables["epochs"]["epoch"]).as_py(),
+        objects=pc.count_distinct(tables["positions"]["object_id"]).as_py(),
+        positions=tables["positions"].num_rows,
+        rejects=_by_reason(tables["rejects"]),
+    )
+
+
+def _by_reason(rejects: pa.Table) -> dict[str, int]:
+    counts = rejects.group_by("reason").aggregate([("count", "sum")])
+    ordered = counts.sort_by([("count_sum", "descending"), ("reason", "ascending")])
+    return {row["reason"]: row["count_sum"] for row in ordered.to_pylist()}
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count:,} {what}" + ("" if count == 1 else "s")
