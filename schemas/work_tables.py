@@ -59,7 +59,7 @@ CAMERAS = schema(
 
 PLACES = schema(
     "places",
-    "One row a frame: the sensor's state interpolated to the frame's time, row by row with exposures.",
+    "One row a frame, row by row with exposures: the state interpolated to the frame's time.",
     [
         *FRAME_KEY,
         *axes("{}_km", unit="km", frame="GCRF", null=True, doc="Position; null: no state near"),

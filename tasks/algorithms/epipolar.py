@@ -31,9 +31,11 @@ def epipolar_angle(r_1_km: Array, u_1: Array, r_2_km: Array, u_2: Array) -> Arra
     Huang, Zhang, Feng, doi 10.19650/j.cnki.cjsi.J1905157, as |p_2' F p_1| over the norm of the
     line, here on the unit sphere, where it holds for any camera.
     """
-    normal = np.cross(r_2_km - r_1_km, u_1)
+    baseline = r_2_km - r_1_km
+    normal = np.cross(baseline, u_1)
     length = np.linalg.norm(normal, axis=-1)
-    sine = np.sum(normal * u_2, axis=-1) / np.where(length > 0, length, 1.0)
+    defined = length > 1e-12 * np.linalg.norm(baseline, axis=-1)  # below, it is rounding
+    sine = np.sum(normal * u_2, axis=-1) / np.where(defined, length, np.inf)
     return np.arcsin(np.clip(sine, -1.0, 1.0))
 
 
