@@ -102,10 +102,11 @@ def faintest_star(
     for frame, solution in zip(frames, solutions, strict=True):
         if solution is None:
             continue
-        v = deep.catalogue.u_icrs @ solution.R_sensor_from_icrs.T
+        R = solution.R_sensor_from_icrs
         x0, x1, y0, y1 = frame.optics.box
-        ahead = v[:, 2] > 0.1
-        x, y = v[ahead, 0] / v[ahead, 2], v[ahead, 1] / v[ahead, 2]
+        ahead = deep.catalogue.u_icrs @ R[2] > np.cos(frame.optics.half_diagonal_rad)
+        v = deep.catalogue.u_icrs[ahead] @ R.T
+        x, y = v[:, 0] / v[:, 2], v[:, 1] / v[:, 2]
         seen = (x > x0) & (x < x1) & (y > y0) & (y < y1)
         n = np.histogram(deep.catalogue.magnitude[ahead][seen], edges)[0]
         star = solution.star[solution.star >= 0]

@@ -1,13 +1,14 @@
 """The verdict: how much better stars explain a frame than chance does.
 
 The log evidence of an attitude is the log of the ratio of two probabilities of the
-centroids' places: with the stars where the attitude puts them, and with every match by
-chance. Its parts:
+centroids' places: with the stars where the attitude puts them, and with every centroid
+anywhere in the image. Its parts:
 
-- a match adds ln(1 / (2 pi s^2 rho)) - d^2 / (2 s^2), s the centroid's sigma, d its
-  distance from the star, rho the stars a steradian; with brightness also
+- a match adds ln(A / (2 pi s^2)) - d^2 / (2 s^2), s the centroid's sigma, d its distance
+  from the star, A the solid angle of the image; with brightness also
   ln(g(difference) / h(magnitude)), h the magnitudes of the catalogue;
-- which k of n centroids are stars is not known: -ln((n + 1) C(n, k));
+- which k of n centroids are which of the m stars in view is not known, and how many of
+  these the sensor sees: -ln(k! C(n, k) C(m, k) (m + 1));
 - the attitude was chosen: the share of the prior that the data leave. Lost in space,
   that is sqrt(det 2 pi P) / (8 pi^2).
 
@@ -68,7 +69,9 @@ def median_zero_point(star_of, instrumental, magnitude):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, rho):
+def match_evidence(
+    star_of, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, in_view, area
+):
     """Return the matches' part of the log evidence, and their number (compiled).
 
     Parameters
@@ -79,8 +82,8 @@ def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, log_density
         Of the stars that `star_of` counts.
     log_density, zero_point : (N_BINS,), float
         Catalogue's magnitudes; star minus instrumental magnitude, NaN where not known.
-    rho : float
-        Stars a steradian.
+    in_view, area : float
+        Stars in the image (matched or not), and its solid angle [sr].
     """
     n = len(star_of)
     zero, total = zero_point, 0.0
@@ -94,12 +97,14 @@ def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, log_density
         if s < 0:
             continue
         matches += 1
-        total += -math.log(2.0 * math.pi * sigma[k] * sigma[k] * rho) - 0.5 * chi2_of[k]
+        total += math.log(area / (2.0 * math.pi * sigma[k] * sigma[k])) - 0.5 * chi2_of[k]
         if not (math.isnan(zero) or math.isnan(instrumental[k])):
             difference = magnitude[s] - instrumental[k] - zero
             total += log_brightness_ratio(difference, magnitude[s], log_density)
-    choose = math.lgamma(n + 1.0) - math.lgamma(matches + 1.0) - math.lgamma(n - matches + 1.0)
-    return total - choose - math.log(n + 1.0), matches
+    m = max(in_view, float(matches))
+    ways = math.lgamma(n + 1.0) - math.lgamma(n - matches + 1.0)
+    ways += math.lgamma(m + 1.0) - math.lgamma(matches + 1.0) - math.lgamma(m - matches + 1.0)
+    return total - ways - math.log(m + 1.0), matches
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

@@ -54,19 +54,18 @@ def turn_stars(R, a, v):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def density_in_view(v, box, rho_mean):
-    """Return the stars a steradian in view, at least the mean of the sky (compiled).
+def count_in_view(v, box):
+    """Return how many stars are in the image, sensor-frame directions given (compiled).
 
-    Where stars crowd, chance matches do as well. `box` is x0, x1, y0, y1 of the image in
-    normalised coordinates.
+    `box` is x0, x1, y0, y1 of the image in normalised coordinates.
     """
-    n = 1
+    n = 0
     for s in range(len(v)):
         if v[s, 2] > 0.0:
             x, y = v[s, 0] / v[s, 2], v[s, 1] / v[s, 2]
             if box[0] < x < box[1] and box[2] < y < box[3]:
                 n += 1
-    return max(n / ((box[1] - box[0]) * (box[3] - box[2])), rho_mean)
+    return n
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -233,7 +232,6 @@ def solve_predicted(
     a,
     magnitude,
     box,
-    rho_mean,
     gate,
     log_density,
     zero_point,
@@ -264,7 +262,8 @@ def solve_predicted(
     s_xy, s_z = math.sqrt(0.5 * (P0[0, 0] + P0[1, 1])), math.sqrt(P0[2, 2])
     v = np.empty((len(a), 3))
     turn_stars(R0, a, v)
-    rho = density_in_view(v, box, rho_mean)
+    in_view = count_in_view(v, box)
+    area = (box[1] - box[0]) * (box[3] - box[2])
     best = -1e9
     Rt, Pt = np.empty((3, 3)), np.empty((3, 3))
     star_t, chi2_t = np.empty(len(u), np.int64), np.zeros(len(u))
@@ -306,7 +305,15 @@ def solve_predicted(
             )
         if matches >= 3:
             evidence, _ = match_evidence(
-                star_t, chi2_t, sigma, instrumental, magnitude, log_density, zero_point, rho
+                star_t,
+                chi2_t,
+                sigma,
+                instrumental,
+                magnitude,
+                log_density,
+                zero_point,
+                in_view,
+                area,
             )
             evidence += choice_lost(Pt) if lost else choice_predicted(Pt, P0, Rt, R0)
             if evidence > best:

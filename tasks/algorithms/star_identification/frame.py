@@ -116,7 +116,7 @@ def identify_predicted(
     star, chi2 = np.full(n, -1, np.int64), np.zeros(n)
     evidence = solve_predicted(
         R0, P0, lost, frame.u, frame.sigma_rad, frame.instrumental_mag, a, stars.magnitude[row],
-        frame.optics.box, sky.rho, how.gate_sigma, sky.log_density, how.zero_point_mag,
+        frame.optics.box, how.gate_sigma, sky.log_density, how.zero_point_mag,
         how.threshold + CLEAR_LEAD, R, P, star, chi2,
     )  # fmt: skip
     if not evidence > how.threshold:
@@ -136,13 +136,14 @@ def aberrate_all(u_icrs: Array, beta: Array) -> Array:
 def search_lost(frame: Frame, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search) -> Verdict:
     """Search the whole sky for the frame's attitude; see `lost_in_space.search`."""
     R = np.zeros((3, 3))
+    area = frame.optics.solid_angle_sr
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))
     budget = int(how.time_limit_s * MAX_LOOKUPS_PER_S)
     best, runner_up, work = search(
         frame.u, frame.sigma_rad, frame.instrumental_mag, frame.beta,
         sky.catalogue.u_icrs, sky.catalogue.magnitude, grid.first, grid.star, grid.n_face,
         grid.radius_rad, *pairs.chord, pairs.first, pairs.second, min_chord,
-        N_PATTERN_CENTROIDS, how.gate_sigma, sky.log_density, how.zero_point_mag, sky.rho,
+        N_PATTERN_CENTROIDS, how.gate_sigma, sky.log_density, how.zero_point_mag, sky.rho * area, area,
         how.threshold + CLEAR_LEAD, budget, R,
     )  # fmt: skip
     found = best > how.threshold and best - runner_up > CLEAR_LEAD

@@ -25,6 +25,7 @@ from epipole.tasks.algorithms.star_identification.sky_grid import nearest_star
 SAME_ATTITUDE = 5e-3
 # The best attitude must be this much (in log) more probable than any other.
 CLEAR_LEAD = 7.0
+GIVE_UP_AFTER = 8  # look-ups without a hit, on the quick first pass
 N_VERIFIED = 64  # brightest centroids that are looked up for each hypothesis
 MAX_LOOKUPS_PER_S = 2.5e7
 
@@ -96,7 +97,8 @@ def _judge(
     gate,
     log_density,
     zero_point,
-    rho,
+    in_view,
+    area,
     row_of,
 ):
     """Refine an attitude whose first matches are in row_of; return its log evidence."""
@@ -135,7 +137,7 @@ def _judge(
         if not refine_attitude(R, u, sigma, a, slot, P):
             return -1e9
     evidence, _ = match_evidence(
-        slot, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, rho
+        slot, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, in_view, area
     )
     return evidence + choice_lost(P)
 
@@ -163,7 +165,8 @@ def search(
     gate,
     log_density,
     zero_point,
-    rho,
+    in_view,
+    area,
     enough,
     budget,
     R_best,
@@ -182,8 +185,8 @@ def search(
         The `PairTable`.
     min_chord, n_pattern
         Closest centroids paired [rad]; how many of the brightest are.
-    gate, log_density, zero_point, rho
-        As in `evidence`.
+    gate, log_density, zero_point, in_view, area
+        As in `evidence`; the mean number of stars in view.
     enough, budget
         Log evidence to stop at; most look-ups.
     """
@@ -195,116 +198,124 @@ def search(
     t, radius, gain = np.empty((n, 3)), np.empty(n), np.empty(n)
     row_of, row_try = np.empty(n, np.int64), np.empty(n, np.int64)
     best, runner, work = -1e9, -1e9, 0
-    for j in range(1, min(n, n_pattern)):
-        for i in range(j):
-            dx, dy, dz = u[j, 0] - u[i, 0], u[j, 1] - u[i, 1], u[j, 2] - u[i, 2]
-            c = math.sqrt(dx * dx + dy * dy + dz * dz)
-            if c < min_chord:
-                continue
-            noise2 = sigma[i] * sigma[i] + sigma[j] * sigma[j]
-            # Aberration stretches by v / c at most.
-            tolerance = 3.2 * math.sqrt(noise2) + 1.1e-4 * c
-            lo, hi = range_of(chord, below, slope, intercept, c - tolerance, c + tolerance)
-            work += 10
-            if lo == hi:
-                continue
-            _basis(u[i, 0], u[i, 1], u[i, 2], u[j, 0], u[j, 1], u[j, 2], E)
-            for k in range(n_checked):
-                for m in range(3):
-                    t[k, m] = E[m, 0] * u[k, 0] + E[m, 1] * u[k, 1] + E[m, 2] * u[k, 2]
-                # The pair's own errors, with the lever of the distance from its middle.
-                d2 = t[k, 1] * t[k, 1] + t[k, 2] * t[k, 2]
-                s2 = sigma[k] * sigma[k] + 0.5 * noise2 * (0.5 + 2.0 * d2 / (c * c))
-                radius[k] = min(gate * math.sqrt(s2), grid_radius)
-                gain[k] = -math.log(math.pi * radius[k] * radius[k] * rho)
-            m_ij = instrumental[i] - instrumental[j]
-            for p in range(lo, hi):
-                for way in range(2):
-                    ra, rb = (pair_a[p], pair_b[p]) if way == 0 else (pair_b[p], pair_a[p])
-                    if abs(star_mag[ra] - star_mag[rb] - m_ij) > 1.5:  # false where NaN
-                        continue
-                    if abs(star_mag[ra] - instrumental[i] - zero_point) > 1.5:
-                        continue
-                    aberrated(star_u[ra, 0], star_u[ra, 1], star_u[ra, 2], beta, sa)
-                    aberrated(star_u[rb, 0], star_u[rb, 1], star_u[rb, 2], beta, sb)
-                    _basis(sa[0], sa[1], sa[2], sb[0], sb[1], sb[2], F)
-                    hits, score = 0, 0.0
-                    for k in range(n_checked):
-                        row_of[k] = -1
-                        if k == i or k == j:
+    for thorough in range(2):
+        give_up_after = n if thorough else GIVE_UP_AFTER
+        mag_gate = 1.5 if thorough else 0.8
+        pair_gate = 3.2 if thorough else 2.3
+        for j in range(1, min(n, n_pattern)):
+            for i in range(j):
+                dx, dy, dz = u[j, 0] - u[i, 0], u[j, 1] - u[i, 1], u[j, 2] - u[i, 2]
+                c = math.sqrt(dx * dx + dy * dy + dz * dz)
+                if c < min_chord:
+                    continue
+                noise2 = sigma[i] * sigma[i] + sigma[j] * sigma[j]
+                # Aberration stretches by v / c at most.
+                tolerance = pair_gate * math.sqrt(noise2) + 1.1e-4 * c
+                lo, hi = range_of(chord, below, slope, intercept, c - tolerance, c + tolerance)
+                work += 10
+                if lo == hi:
+                    continue
+                _basis(u[i, 0], u[i, 1], u[i, 2], u[j, 0], u[j, 1], u[j, 2], E)
+                for k in range(n_checked):
+                    for m in range(3):
+                        t[k, m] = E[m, 0] * u[k, 0] + E[m, 1] * u[k, 1] + E[m, 2] * u[k, 2]
+                    # The pair's own errors, with the lever of the distance from its middle.
+                    d2 = t[k, 1] * t[k, 1] + t[k, 2] * t[k, 2]
+                    s2 = sigma[k] * sigma[k] + 0.5 * noise2 * (0.5 + 2.0 * d2 / (c * c))
+                    radius[k] = min(gate * math.sqrt(s2), grid_radius)
+                    gain[k] = math.log(area / (math.pi * radius[k] * radius[k] * in_view))
+                m_ij = instrumental[i] - instrumental[j]
+                for p in range(lo, hi):
+                    for way in range(2):
+                        ra, rb = (pair_a[p], pair_b[p]) if way == 0 else (pair_b[p], pair_a[p])
+                        if abs(star_mag[ra] - star_mag[rb] - m_ij) > mag_gate:  # false where NaN
                             continue
-                        x = t[k, 0] * F[0, 0] + t[k, 1] * F[1, 0] + t[k, 2] * F[2, 0]
-                        y = t[k, 0] * F[0, 1] + t[k, 1] * F[1, 1] + t[k, 2] * F[2, 1]
-                        z = t[k, 0] * F[0, 2] + t[k, 1] * F[1, 2] + t[k, 2] * F[2, 2]
-                        q = x * beta[0] + y * beta[1] + z * beta[2]
-                        s, _ = nearest_star(
-                            x + q * x - beta[0],
-                            y + q * y - beta[1],
-                            z + q * z - beta[2],
-                            radius[k],
+                        if abs(star_mag[ra] - instrumental[i] - zero_point) > mag_gate:
+                            continue
+                        aberrated(star_u[ra, 0], star_u[ra, 1], star_u[ra, 2], beta, sa)
+                        aberrated(star_u[rb, 0], star_u[rb, 1], star_u[rb, 2], beta, sb)
+                        _basis(sa[0], sa[1], sa[2], sb[0], sb[1], sb[2], F)
+                        work += 4
+                        hits, score = 0, 0.0
+                        for k in range(n_checked):
+                            if k >= give_up_after and hits == 0:
+                                break
+                            row_of[k] = -1
+                            if k == i or k == j:
+                                continue
+                            work += 1
+                            x = t[k, 0] * F[0, 0] + t[k, 1] * F[1, 0] + t[k, 2] * F[2, 0]
+                            y = t[k, 0] * F[0, 1] + t[k, 1] * F[1, 1] + t[k, 2] * F[2, 1]
+                            z = t[k, 0] * F[0, 2] + t[k, 1] * F[1, 2] + t[k, 2] * F[2, 2]
+                            q = x * beta[0] + y * beta[1] + z * beta[2]
+                            s, _ = nearest_star(
+                                x + q * x - beta[0],
+                                y + q * y - beta[1],
+                                z + q * z - beta[2],
+                                radius[k],
+                                star_u,
+                                first,
+                                star,
+                                n_face,
+                            )
+                            if s >= 0:
+                                row_of[k] = s
+                                hits += 1
+                                score += gain[k]
+                        if hits < min_hits:
+                            continue
+                        rest = n_checked - 2.0
+                        score -= (
+                            math.lgamma(rest + 1.0)
+                            - math.lgamma(hits + 1.0)
+                            - math.lgamma(rest - hits + 1.0)
+                        )
+                        if score < math.log(rest + 1.0) - 1.0:  # as many hits as chance gives
+                            continue
+                        row_of[i], row_of[j] = ra, rb
+                        row_of[n_checked:] = -1
+                        for r in range(3):
+                            for m in range(3):
+                                R[r, m] = E[0, r] * F[0, m] + E[1, r] * F[1, m] + E[2, r] * F[2, m]
+                        row_try[:] = row_of
+                        evidence = _judge(
+                            R,
+                            P,
+                            u,
+                            sigma,
+                            instrumental,
+                            beta,
                             star_u,
+                            star_mag,
                             first,
                             star,
                             n_face,
+                            grid_radius,
+                            gate,
+                            log_density,
+                            zero_point,
+                            in_view,
+                            area,
+                            row_try,
                         )
-                        if s >= 0:
-                            row_of[k] = s
-                            hits += 1
-                            score += gain[k]
-                    work += n_checked
-                    if hits < min_hits:
-                        continue
-                    rest = n_checked - 2.0
-                    score -= (
-                        math.lgamma(rest + 1.0)
-                        - math.lgamma(hits + 1.0)
-                        - math.lgamma(rest - hits + 1.0)
-                    )
-                    if score < math.log(rest + 1.0) - 1.0:  # as many hits as chance gives
-                        continue
-                    row_of[i], row_of[j] = ra, rb
-                    row_of[n_checked:] = -1
-                    for r in range(3):
-                        for m in range(3):
-                            R[r, m] = E[0, r] * F[0, m] + E[1, r] * F[1, m] + E[2, r] * F[2, m]
-                    row_try[:] = row_of
-                    evidence = _judge(
-                        R,
-                        P,
-                        u,
-                        sigma,
-                        instrumental,
-                        beta,
-                        star_u,
-                        star_mag,
-                        first,
-                        star,
-                        n_face,
-                        grid_radius,
-                        gate,
-                        log_density,
-                        zero_point,
-                        rho,
-                        row_try,
-                    )
-                    work += 10 * n
-                    if evidence <= runner:
-                        continue
-                    gap2 = 0.0
-                    for r in range(3):
-                        for m in range(3):
-                            gap2 += (R[r, m] - R_best[r, m]) ** 2
-                    if best > -1e9 and gap2 < 2.0 * SAME_ATTITUDE * SAME_ATTITUDE:
-                        if evidence > best:
-                            best = evidence
+                        work += 10 * n
+                        if evidence <= runner:
+                            continue
+                        gap2 = 0.0
+                        for r in range(3):
+                            for m in range(3):
+                                gap2 += (R[r, m] - R_best[r, m]) ** 2
+                        if best > -1e9 and gap2 < 2.0 * SAME_ATTITUDE * SAME_ATTITUDE:
+                            if evidence > best:
+                                best = evidence
+                                R_best[:] = R
+                        elif evidence > best:
+                            best, runner = evidence, best
                             R_best[:] = R
-                    elif evidence > best:
-                        best, runner = evidence, best
-                        R_best[:] = R
-                    else:
-                        runner = evidence
-                    if best > enough and best - runner > CLEAR_LEAD:
+                        else:
+                            runner = evidence
+                        if best > enough and best - runner > CLEAR_LEAD:
+                            return best, runner, work
+                    if work > budget:
                         return best, runner, work
-                if work > budget:
-                    return best, runner, work
     return best, runner, work

@@ -2,6 +2,7 @@
 identified with that."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -119,7 +120,8 @@ def identify_sensor(
         limit = learned.limit
     frames = [frame_of(s, learned.scale, use_flux) for s in spots]
     sky = skies.sky(limit)
-    grid, pairs = skies.grid(limit, _grid_radius(frames, how)), skies.pairs(limit, optics)
+    grid = skies.grid(limit, _grid_radius(frames, how))
+    pairs = partial(skies.pairs, limit, optics)
     solutions, status = identify_sequence(t_s, frames, priors, sky, grid, pairs, how)
     found = residual_scale(solutions)
     scale = learned.scale
@@ -217,11 +219,13 @@ def _alone(
         return []
     frames = [frame_of(s, scale) for s in spots]
     sky, grid = skies.sky(limit), skies.grid(limit, _grid_radius(frames, how))
-    pairs = skies.pairs(limit, spots[0].optics)
-    return [
-        Tracker(sky, grid, pairs, how).step(0.0, frame, prior)[0]
-        for frame, prior in zip(frames, priors, strict=True)
-    ]
+    pairs = partial(skies.pairs, limit, spots[0].optics)
+    tracker = Tracker(sky, grid, None, how)
+    found = [tracker.step_alone(f, p) for f, p in zip(frames, priors, strict=True)]
+    for i, frame in enumerate(frames):
+        if found[i] is None and not (priors[i] and tracker.prior_holds):
+            found[i] = Tracker(sky, grid, pairs, how).step_alone(frame, None)
+    return found
 
 
 def _grid_radius(frames: list[Frame], how: Search) -> float:

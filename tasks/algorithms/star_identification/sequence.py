@@ -1,6 +1,6 @@
 """A sensor's frames in order: tracked from frame to frame, lost in space where that fails."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -72,15 +72,21 @@ def predict(fixes: list[Fix], t_s: float) -> tuple[Array, Array] | None:
 class Tracker:
     """Follows one sensor through its frames, forward or backward in time."""
 
-    def __init__(self, sky: Sky, grid: SkyGrid, pairs: PairTable | None, how: Search) -> None:
+    def __init__(
+        self, sky: Sky, grid: SkyGrid, pairs: Callable[[], PairTable] | None, how: Search
+    ) -> None:
+        """`pairs` is called when first needed: a sensor with good priors needs none. None: no
+        searches of the whole sky."""
         self.sky, self.grid, self.pairs, self.how = sky, grid, pairs, how
         self.fixes: list[Fix] = []
         self.failures = self.skip = 0
+        self.prior_holds = False
 
     def step(self, t_s: float, frame: Frame, prior: Prior | None) -> tuple[Solution | None, str]:
         """Return the frame's solution, or None and why: no_match, time_limit."""
         solution, why = self._predicted(t_s, frame, prior), "no_match"
-        if solution is None and self.pairs is not None:
+        # Where priors were borne out, a frame that fails has too few stars, not a wrong prior.
+        if solution is None and self.pairs is not None and not (prior and self.prior_holds):
             solution, why = self._lost(frame)
         if solution is not None:
             self.fixes = [
@@ -90,16 +96,23 @@ class Tracker:
             self.failures = self.skip = 0
         return solution, why
 
+    def step_alone(self, frame: Frame, prior: Prior | None) -> Solution | None:
+        """Return the frame's solution without help from the frames around it."""
+        self.fixes = []
+        return self.step(0.0, frame, prior)[0]
+
     def _predicted(self, t_s: float, frame: Frame, prior: Prior | None) -> Solution | None:
-        predictions = [predict(self.fixes, t_s)]
-        if prior is not None:
-            predictions.append((prior.R_sensor_from_icrs, np.eye(3) * prior.sigma_rad**2))
-        for prediction in predictions:
-            if prediction is not None:
-                solution = identify_predicted(frame, self.sky, *prediction, self.how)
-                if solution is not None:
-                    return solution
-        return None
+        prediction = predict(self.fixes, t_s)
+        if prediction is not None:
+            solution = identify_predicted(frame, self.sky, *prediction, self.how)
+            if solution is not None:
+                return solution
+        if prior is None:
+            return None
+        P = np.eye(3) * prior.sigma_rad**2
+        solution = identify_predicted(frame, self.sky, prior.R_sensor_from_icrs, P, self.how)
+        self.prior_holds |= solution is not None
+        return solution
 
     def _lost(self, frame: Frame) -> tuple[Solution | None, str]:
         """Search the whole sky; ever more rarely while that keeps failing (clouds, a night
@@ -107,7 +120,7 @@ class Tracker:
         if self.skip > 0:
             self.skip -= 1
             return None, "no_match"
-        solution, cut_short = identify_lost(frame, self.sky, self.grid, self.pairs, self.how)
+        solution, cut_short = identify_lost(frame, self.sky, self.grid, self.pairs(), self.how)
         if solution is None:
             self.failures += 1
             self.skip = min(2 ** max(self.failures - 6, 0) - 1, MAX_SKIPPED)
@@ -122,7 +135,7 @@ def identify_sequence(
     priors: list[Prior | None],
     sky: Sky,
     grid: SkyGrid,
-    pairs: PairTable,
+    pairs: Callable[[], PairTable],
     how: Search,
 ) -> tuple[list[Solution | None], list[str | None]]:
     """Identify frames in order of time; what that misses, from the frame after it.

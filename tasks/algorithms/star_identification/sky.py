@@ -13,7 +13,7 @@ from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid, build
 # Bright stars a field whose pairs are tabled: enough that nearly every field shows several,
 # few enough that a pair has few namesakes.
 PATTERN_STARS = 15.0
-MAX_PAIRS = 3_000_000
+MAX_PAIRS = 1_000_000
 
 
 class Sky(NamedTuple):
