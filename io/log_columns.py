@@ -129,7 +129,8 @@ def _frame_fault(frame: Frame) -> str | None:
 
 
 def _joined(arrays: list[Array]) -> Array:
-    return np.concatenate([np.empty(0), *arrays])
+    with np.errstate(invalid="ignore"):  # a signalling NaN among float32 is still a NaN
+        return np.concatenate([np.empty(0), *arrays])
 
 
 def _joined_or_nan(
@@ -217,7 +218,7 @@ def _state_fault(state: State) -> str | None:
         return "bad_position"
     if len(velocity) not in (0, 3) or not np.isfinite(velocity).all():
         return "bad_velocity"
-    radius_km = math.sqrt(sum(float(x) ** 2 for x in position))
+    radius_km = math.hypot(*position)
     if radius_km < EARTH_RADIUS_KM:
         return "inside_earth"
     return "bad_position" if radius_km > FARTHEST_KM else None
@@ -227,7 +228,7 @@ def _unit_quaternion(q: Array) -> Array | None:
     """Return the quaternion at length 1, as it is where empty, None where it is none."""
     if len(q) == 0:
         return q
-    norm = math.sqrt(sum(float(x) ** 2 for x in q)) if len(q) == 4 else math.nan
+    norm = math.hypot(*q) if len(q) == 4 else math.nan
     return q / norm if abs(norm - 1.0) < QUATERNION_TOLERANCE else None
 
 

@@ -43,10 +43,10 @@ def order_frames(
     by_number = rest[np.lexsort((rest, f[rest], s[rest]))]
     a, b = by_number[:-1], by_number[1:]
     verdict[b[(s[a] == s[b]) & (f[a] == f[b])]] = DUPLICATE_NUMBER
-    # A repeat of a frame shares its fate: two copies of one that repeats a number both do.
-    keeper = np.maximum.accumulate(np.where(verdict != DUPLICATE_FRAME, np.arange(len(s)), 0))
+    # A copy shares the fate of the frame it is a copy of, if that is not kept.
+    copied = np.maximum.accumulate(np.where(verdict == DUPLICATE_FRAME, 0, np.arange(len(s))))
     copies = verdict == DUPLICATE_FRAME
-    verdict[copies & (verdict[keeper] == DUPLICATE_NUMBER)] = DUPLICATE_NUMBER
+    verdict[copies] = np.where(verdict[copied] == KEEP, DUPLICATE_FRAME, verdict[copied])[copies]
     return order, verdict
 
 
