@@ -91,7 +91,7 @@ def test_a_wrong_view_is_left_out_and_named():
     rng = np.random.default_rng(5)
     r = sensors(rng, 5)
     u = look(r, GEO, rng, ARCSEC)
-    u[2] = look(r[2:3], GEO + [0, 0, 100.0])[0]  # 9 arcmin away
+    u[2] = look(r[2:3], GEO + np.array([0, 0, 100.0]))[0]  # 9 arcmin away
     x, cov, _, used, _ = solve(r, u, ARCSEC)
     assert used.tolist() == [True, True, False, True, True]
     assert np.linalg.norm(x[0] - GEO) < 4 * np.sqrt(np.trace(cov[0]))

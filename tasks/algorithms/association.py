@@ -76,7 +76,8 @@ class Groups(NamedTuple):
     score : (g,) float
         Log of the odds of each group against its members being unrelated.
     ambiguous : (t,) bool
-        Tracklets left out because two groups claim them about equally well.
+        Tracklets left out because two groups claim them about equally well, or because one
+        does without being sure enough.
     """
 
     group: Indices
@@ -513,6 +514,8 @@ class _Search:
             open_list.sort(key=lambda h: (-h.score, h.members))
             best = open_list.pop(0)
             if best.score < min_log_odds:
+                for h in (best, *open_list):  # likelier than not, and not sure enough
+                    ambiguous[list(h.members)] |= h.score > 0
                 break
             rivals = [
                 h
