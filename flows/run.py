@@ -5,6 +5,7 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from epipole.flows.progress import shown, step
 from epipole.flows.summary import Summary
@@ -59,5 +60,5 @@ def _run(logs: list[str], out: str, settings: Settings, options: RunOptions) -> 
     from epipole.flows.nightly import nightly
 
     workers = options.workers or os.cpu_count() or 1
-    flow = nightly.with_options(task_runner=ThreadPoolTaskRunner(max_workers=workers))
+    flow = nightly.with_options(task_runner=ThreadPoolTaskRunner[Any](max_workers=workers))
     return flow(logs, out, settings.model_dump(), options.night, options.replace)

@@ -1,0 +1,142 @@
+"""The stages of a night, each shared out over tasks of a sensor and a span of time.
+
+Every stage puts its tasks' tables together in the order the tasks were made, so the result
+does not depend on the number of workers.
+"""
+
+import logging
+from collections.abc import Sequence
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.flows.progress import results, step
+from epipole.flows.sensors import of_sensor, sensor_ids, spans
+from epipole.io.star_catalogue import read_hipparcos
+from epipole.schemas.bridge import concat
+from epipole.schemas.log_tables import Log
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import DETECTIONS, REJECTS, STARS, TRACKLETS
+from epipole.schemas.work_tables import SOLUTIONS, VIEWS
+from epipole.tasks.associate_objects import Associated, associate_objects
+from epipole.tasks.build_tracklets import Tracked, build_tracklets
+from epipole.tasks.identify_stars import Identified, identify_stars
+from epipole.tasks.place_sensors import place_sensors
+from epipole.tasks.read_logs import read_logs
+from epipole.tasks.solve_positions import Solved, solve_positions
+from epipole.tasks.view_objects import view_objects
+
+LOGGER = logging.getLogger(__name__)
+
+SPAN_NS = 600_000_000_000  # long enough that tracking pays, short enough to share out
+
+
+def read(logs: Sequence[str], settings: Settings) -> Log:
+    """Read the logs, sorted and each frame once."""
+    step("read logs", 0, len(logs))
+    log = read_logs(list(logs), settings)
+    LOGGER.info("read %s frames of %d logs", f"{log.exposures.num_rows:,}", len(logs))
+    return log
+
+
+def place(exposures: pa.Table, states: pa.Table, settings: Settings) -> pa.Table:
+    """Interpolate each sensor's state to its frames."""
+    step("place sensors", 0, 1)
+    places: pa.Table = place_sensors(exposures, states, settings)
+    placed = places.num_rows - places["x_km"].null_count
+    LOGGER.info("placed %s of %s frames", f"{placed:,}", f"{places.num_rows:,}")
+    return places
+
+
+def identify(
+    exposures: pa.Table, places: pa.Table, cameras: pa.Table, settings: Settings
+) -> Identified:
+    """Tell stars from the rest and solve attitudes, a task a sensor and span of time."""
+    catalogue = read_hipparcos()
+    futures = [
+        identify_stars.submit(exposures.take(rows), places.take(rows), cameras, catalogue, settings)
+        for rows in spans(exposures, SPAN_NS)
+    ]
+    parts: list[Identified] = results("identify stars", futures)
+    solutions, stars, detections, rejects = zip(*parts, strict=True)
+    identified = Identified(
+        concat(SOLUTIONS, solutions),
+        concat(STARS, stars),
+        concat(DETECTIONS, detections),
+        concat(REJECTS, rejects),
+    )
+    by_stars = pc.sum(pc.equal(identified.solutions["attitude_source"], "stars")).as_py() or 0
+    LOGGER.info(
+        "identified %s of %s frames by %s stars",
+        f"{by_stars:,}", f"{identified.solutions.num_rows:,}", f"{identified.stars.num_rows:,}",
+    )  # fmt: skip
+    return identified
+
+
+def track(identified: Identified, cameras: pa.Table, settings: Settings) -> Tracked:
+    """Follow detections from frame to frame, a task a sensor."""
+    futures = [
+        build_tracklets.submit(
+            of_sensor(identified.solutions, name),
+            of_sensor(identified.detections, name),
+            cameras,
+            settings,
+        )
+        for name in sensor_ids(identified.solutions)
+    ]
+    detections, tracklets = zip(*results("build tracklets", futures), strict=True)
+    tracked = Tracked(concat(DETECTIONS, detections), concat(TRACKLETS, tracklets))
+    LOGGER.info(
+        "tracked %s of %s detections in %s tracklets",
+        f"{tracked.detections.num_rows - tracked.detections['tracklet_id'].null_count:,}",
+        f"{tracked.detections.num_rows:,}", f"{tracked.tracklets.num_rows:,}",
+    )  # fmt: skip
+    return tracked
+
+
+def view(
+    epochs: pa.Table,
+    identified: Identified,
+    tracked: Tracked,
+    cameras: pa.Table,
+    settings: Settings,
+) -> pa.Table:
+    """Say where each sensor sees its tracklets at the epochs, a task a sensor."""
+    futures = [
+        view_objects.submit(
+            of_sensor(epochs, name),
+            of_sensor(identified.solutions, name),
+            of_sensor(tracked.detections, name),
+            of_sensor(tracked.tracklets, name),
+            cameras,
+            settings,
+        )
+        for name in sensor_ids(epochs)
+    ]
+    views = concat(VIEWS, results("view objects", futures))
+    LOGGER.info("aligned %s epochs", f"{pc.count_distinct(epochs['epoch']).as_py():,}")
+    return views
+
+
+def associate(
+    views: pa.Table,
+    identified: Identified,
+    tracked: Tracked,
+    cameras: pa.Table,
+    settings: Settings,
+) -> Associated:
+    """Say which sensors' tracklets are one object."""
+    step("associate objects", 0, 1)
+    associated: Associated = associate_objects(
+        views, tracked.tracklets, identified.solutions, cameras, settings
+    )
+    LOGGER.info("associated %s of %s views", f"{associated.views.num_rows:,}", f"{len(views):,}")
+    return associated
+
+
+def triangulate(associated: Associated, settings: Settings) -> Solved:
+    """Solve each object's position at each epoch."""
+    step("solve positions", 0, 1)
+    solved: Solved = solve_positions(associated.views, associated.object_number, settings)
+    LOGGER.info("solved %s positions", f"{solved.positions.num_rows:,}")
+    return solved
