@@ -30,7 +30,8 @@ def optimal_attitude(u_sensor: Array, u_icrs: Array, sigma_rad: Array) -> tuple[
 
     References
     ----------
-    Davenport's q method, in Wertz (1978), section 12.2.3; covariance: Shuster and Oh (1981), eq. 103.
+    Davenport's q method, in Wertz (1978), section 12.2.3; covariance: Shuster and Oh (1981),
+    eq. 103.
     """
     weight = 1.0 / np.square(sigma_rad)
     weight = weight / weight.sum()

@@ -41,7 +41,7 @@ def places_at(
     ra, dec : (n,) float
         Barycentric places at the epoch, ICRS [rad].
     parallax_mas, pm_ra_mas_yr, pm_dec_mas_yr : (n,) float
-        Parallax; proper motions, in right ascension times cos(dec). A parallax below zero counts as zero.
+        Parallax (below zero counts as zero); proper motions, in right ascension times cos(dec).
     years : float
         Julian years since the epoch.
     r_observer_km : (3,) float

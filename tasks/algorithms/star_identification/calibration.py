@@ -46,7 +46,7 @@ def is_significant(found: Scale) -> bool:
 def zero_point(
     frames: list[Frame], solutions: list[Solution | None], sky: Sky
 ) -> tuple[float, float]:
-    """Return the median of star minus instrumental magnitude, and its scatter (NaN without flux)."""
+    """Return the median of star minus instrumental magnitude, and its scatter (NaN: no flux)."""
     differences = []
     for frame, solution in zip(frames, solutions, strict=True):
         if solution is not None:

@@ -241,7 +241,7 @@ def search(
                             if k >= give_up_after and hits == 0:
                                 break
                             row_of[k] = -1
-                            if k == i or k == j:
+                            if k in (i, j):
                                 continue
                             work += 1
                             x = t[k, 0] * F[0, 0] + t[k, 1] * F[1, 0] + t[k, 2] * F[2, 0]

@@ -18,7 +18,7 @@ from epipole.tasks.algorithms.star_identification.calibration import (
 )
 from epipole.tasks.algorithms.star_identification.frame import Frame, Optics, Search, Solution
 from epipole.tasks.algorithms.star_identification.pair_table import PairTable
-from epipole.tasks.algorithms.star_identification.sequence import Prior, Tracker, identify_sequence
+from epipole.tasks.algorithms.star_identification.sequence import Prior, identify_sequence
 from epipole.tasks.algorithms.star_identification.sky import Sky
 from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid
 
@@ -98,6 +98,7 @@ def identify_sensor(
     Errors that are not stated are estimated from the residuals; those that are get scaled
     where residuals contradict them beyond doubt, so that reported sigmas are honest.
     """
+    spots, stated = _fill_sigmas(spots)
     counts = np.array([len(s.u) for s in spots])
     usable = np.flatnonzero(counts >= 4)
     optics = spots[0].optics
@@ -105,15 +106,8 @@ def identify_sensor(
     if limit is None:
         density = 1.2 * float(np.median(counts[usable])) if len(usable) else 10.0
         limit = skies.limit_for(density / optics.solid_angle_sr)
-    stated = bool(np.isfinite(np.concatenate([s.sigma_px for s in spots])).all())
-    sample = (
-        usable[np.unique(np.linspace(0, len(usable) - 1, N_SAMPLED).astype(int))]
-        if len(usable)
-        else usable
-    )
-    learned = _learn(
-        [spots[i] for i in sample], [priors[i] for i in sample], skies, limit, how, stated
-    )
+    sample = usable[_evenly(len(usable), N_SAMPLED)]
+    learned = _learn(_Sample(t_s, spots, priors).take(sample), skies, limit, how, stated)
     use_flux = learned.how is not None
     how = learned.how or how
     if magnitude_limit is None:
@@ -125,7 +119,7 @@ def identify_sensor(
     solutions, status = identify_sequence(t_s, frames, priors, sky, grid, pairs, how)
     found = residual_scale(solutions)
     scale = learned.scale
-    if is_significant(found):
+    if is_significant(found) or (not stated and found.dof > 0):
         scale *= found.scale
         solutions = [
             s and s._replace(cov_rad2=s.cov_rad2 * found.scale**2, chi2=s.chi2 / found.scale**2)
@@ -140,17 +134,38 @@ class _Learned(NamedTuple):
     how: Search | None  # with the zero point; none: flux is of no use
 
 
-def _learn(
-    spots: list[Spots],
-    priors: list[Prior | None],
-    skies: Skies,
-    limit: float,
-    how: Search,
-    stated: bool,
-) -> _Learned:
+class _Sample(NamedTuple):
+    t_s: Array
+    spots: Sequence[Spots]
+    priors: Sequence[Prior | None]
+
+    def take(self, rows: npt.NDArray[np.int64]) -> "_Sample":
+        return _Sample(
+            self.t_s[rows], [self.spots[i] for i in rows], [self.priors[i] for i in rows]
+        )
+
+
+def _evenly(n: int, wanted: int) -> npt.NDArray[np.int64]:
+    """Return at most `wanted` of n rows, spread evenly."""
+    return np.unique(np.linspace(0, n - 1, wanted).astype(np.int64)) if n else np.empty(0, np.int64)
+
+
+def _fill_sigmas(spots: Sequence[Spots]) -> tuple[list[Spots], bool]:
+    """Return spots with no sigma missing where any is stated (the median stands in), and
+    whether any is."""
+    sigma_px = np.concatenate([s.sigma_px for s in spots])
+    if not np.isfinite(sigma_px).any():
+        return list(spots), False
+    middle = float(np.nanmedian(sigma_px))
+    return [
+        s._replace(sigma_px=np.where(np.isnan(s.sigma_px), middle, s.sigma_px)) for s in spots
+    ], True
+
+
+def _learn(sample: _Sample, skies: Skies, limit: float, how: Search, stated: bool) -> _Learned:
     """Return centroid errors, faintest star and zero point from a sample of frames."""
-    sky = skies.sky(limit)
-    scale, solutions = _first_scale(spots, priors, skies, limit, how, stated)
+    sky, spots = skies.sky(limit), sample.spots
+    scale, solutions = _first_scale(sample, skies, limit, how, stated)
     for _ in range(4):
         found = residual_scale(solutions)
         if found.dof < 10 or not (
@@ -181,51 +196,33 @@ def _learn(
 
 
 def _first_scale(
-    spots: list[Spots],
-    priors: list[Prior | None],
-    skies: Skies,
-    limit: float,
-    how: Search,
-    stated: bool,
+    sample: _Sample, skies: Skies, limit: float, how: Search, stated: bool
 ) -> tuple[float, list[Solution | None]]:
     """Return a scale of the errors with which frames can be identified, and the solutions."""
     scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
-    probed = sorted({int(i) for i in np.linspace(0, len(spots) - 1, N_PROBED)}) if spots else []
+    probe = sample.take(_evenly(len(sample.spots), N_PROBED))
     best, best_count = scales[0], 0
     for scale in scales:
-        found = _alone(
-            [spots[i] for i in probed], [priors[i] for i in probed], skies, limit, how, scale
-        )
-        count = sum(s is not None for s in found)
+        count = sum(s is not None for s in _with_scale(probe, skies, limit, how, scale))
         if count > best_count:
             best, best_count = scale, count
-        if 3 * count >= 2 * len(probed):
+        if 3 * count >= 2 * len(probe.spots):
             break
     if best_count == 0:
-        return best, [None] * len(spots)
-    return best, _alone(spots, priors, skies, limit, how, best)
+        return best, [None] * len(sample.spots)
+    return best, _with_scale(sample, skies, limit, how, best)
 
 
-def _alone(
-    spots: list[Spots],
-    priors: list[Prior | None],
-    skies: Skies,
-    limit: float,
-    how: Search,
-    scale: float,
+def _with_scale(
+    sample: _Sample, skies: Skies, limit: float, how: Search, scale: float
 ) -> list[Solution | None]:
-    """Return each frame's solution without help from the others."""
-    if not spots:
+    """Return the sample's solutions with the errors scaled so."""
+    if not sample.spots:
         return []
-    frames = [frame_of(s, scale) for s in spots]
+    frames = [frame_of(s, scale) for s in sample.spots]
     sky, grid = skies.sky(limit), skies.grid(limit, _grid_radius(frames, how))
-    pairs = partial(skies.pairs, limit, spots[0].optics)
-    tracker = Tracker(sky, grid, None, how)
-    found = [tracker.step_alone(f, p) for f, p in zip(frames, priors, strict=True)]
-    for i, frame in enumerate(frames):
-        if found[i] is None and not (priors[i] and tracker.prior_holds):
-            found[i] = Tracker(sky, grid, pairs, how).step_alone(frame, None)
-    return found
+    pairs = partial(skies.pairs, limit, sample.spots[0].optics)
+    return identify_sequence(sample.t_s, frames, list(sample.priors), sky, grid, pairs, how)[0]
 
 
 def _grid_radius(frames: list[Frame], how: Search) -> float:

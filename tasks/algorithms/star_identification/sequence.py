@@ -96,11 +96,6 @@ class Tracker:
             self.failures = self.skip = 0
         return solution, why
 
-    def step_alone(self, frame: Frame, prior: Prior | None) -> Solution | None:
-        """Return the frame's solution without help from the frames around it."""
-        self.fixes = []
-        return self.step(0.0, frame, prior)[0]
-
     def _predicted(self, t_s: float, frame: Frame, prior: Prior | None) -> Solution | None:
         prediction = predict(self.fixes, t_s)
         if prediction is not None:
