@@ -7,7 +7,8 @@ independent errors are averaged, never amplified: no position is differenced wit
 one nearby. Where velocities are not sent they come from a fit over 20 s of positions, with
 gravity's part of the motion taken off first.
 
-A vehicle below 80 km altitude is on no orbit; its acceleration is taken as zero.
+A vehicle below 80 km altitude is on no orbit; its acceleration is taken as zero, which at
+one state a second still follows a point at rest on Earth to a metre.
 """
 
 from typing import NamedTuple
@@ -85,7 +86,7 @@ def interpolate_states(states: States, at_ns: Nanoseconds, state_gap_s: float) -
     if n == 0 or m == 0:
         nan = np.full((m, 4), np.nan)
         return Places(nan[:, :3], nan[:, :3], nan[:, 0], nan, nan[:, 0])
-    v_km_s, memory_s = _with_velocities(states)
+    v_km_s, growth = _with_velocities(states)
     right = np.clip(np.searchsorted(states.time_ns, at_ns), 1, max(n - 1, 1)) % n
     left = np.maximum(right - 1, 0)
     # In integers first: floating seconds since 1970 are good to a quarter microsecond only.
@@ -100,7 +101,9 @@ def interpolate_states(states: States, at_ns: Nanoseconds, state_gap_s: float) -
     between &= since_left_s - since_right_s <= bridge_s
 
     r, v = _carry_on(states.r_gcrf_km[nearest], v_km_s[nearest], np.where(between, 0.0, since_s))
-    sigma = states.position_sigma_km[nearest] * np.sqrt(1 + (since_s / memory_s[nearest]) ** 2)
+    linear, square = growth[nearest].T
+    variance = 1 + linear * since_s + square * since_s**2
+    sigma = states.position_sigma_km[nearest] * np.sqrt(variance)
     i = np.flatnonzero(between)
     a, b, step_s = left[i], right[i], (since_left_s - since_right_s)[i]
     share = since_left_s[i] / step_s
@@ -168,21 +171,20 @@ def _carry_on(r_km: Array, v_km_s: Array, step_s: Array) -> tuple[Array, Array]:
 
 
 def _with_velocities(states: States) -> tuple[Array, Array]:
-    """Return every state's velocity, sent or fitted, and for how long it is good [s].
+    """Return every state's velocity, sent or fitted, and what it costs to carry it on.
 
-    The second is the time after which a velocity's error has moved the position by the
-    position's own sigma. A lone state without velocity rests, and is good for no time.
+    The second is (n, 2): after t seconds the variance of the position is that of the state
+    times 1 + a t + b t^2. A lone state without velocity has NaN in both.
     """
     v = states.v_gcrf_km_s.copy()
-    memory_s = np.full(len(v), VELOCITY_MEMORY_S)
+    growth = np.tile([0.0, VELOCITY_MEMORY_S**-2], (len(v), 1))
     missing = np.flatnonzero(np.isnan(v[:, 0]))
     if len(missing):
-        v[missing], memory_s[missing] = _fit_velocities(states, missing)
-    return v, memory_s
+        v[missing], growth[missing] = _fit_velocities(states, missing)
+    return v, growth
 
 
 def _fit_velocities(states: States, which: Nanoseconds) -> tuple[Array, Array]:
-    n = len(states.time_ns)
     points, used = _fit_points(states.time_ns, which)
     since_s = (states.time_ns[points] - states.time_ns[which][:, None]) / SECOND_NS
     r_km = states.r_gcrf_km[points]
@@ -191,16 +193,13 @@ def _fit_velocities(states: States, which: Nanoseconds) -> tuple[Array, Array]:
     tau = since_s / width_s[:, None]
     weight = used.astype(float)
     fall = _double_integral(tau, gravity(r_km), weight) * (width_s**2)[:, None, None]
-    # What is left is a straight line.
-    count = weight.sum(axis=1)
-    mean_s = (weight * since_s).sum(axis=1) / count
+    # What is left is a straight line; its slope errs together with the state's own position.
+    mean_s = (weight * since_s).sum(axis=1) / weight.sum(axis=1)
     lever_s = np.where(used, since_s - mean_s[:, None], 0.0)
     spread = (lever_s**2).sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        v = np.einsum("np,npi->ni", lever_s, r_km - fall) / spread[:, None]
-    alone = np.full(len(which), n == 1) | (spread == 0)
-    v[alone] = np.nan
-    return v, np.where(alone, np.nan, np.sqrt(spread))
+    spread[spread == 0] = np.nan
+    v = np.einsum("np,npi->ni", lever_s, r_km - fall) / spread[:, None]
+    return v, np.stack([-2 * mean_s / spread, 1 / spread], axis=-1)
 
 
 def _fit_points(time_ns: Nanoseconds, which: Nanoseconds) -> tuple[Nanoseconds, Mask]:
