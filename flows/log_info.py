@@ -41,7 +41,7 @@ def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table)
     frames, own_states = of_sensor(exposures, name), of_sensor(states, name)
     time_ns = np.sort(array(frames, "time"))
     interval_ns = float(np.median(np.diff(time_ns))) if len(time_ns) > 1 else None
-    camera = of_sensor(cameras, name).to_pylist()
+    camera = of_sensor(cameras, name).drop_columns("time").to_pylist()
     centroids, _ = flatten(frames, "x_px")
     return {
         "sensor_id": name,

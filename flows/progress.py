@@ -54,11 +54,18 @@ def shown(quiet: bool, verbose: bool) -> Iterator[None]:
         else:
             handler = logging.StreamHandler()
             handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
-            ROOT.setLevel(logging.DEBUG if verbose else logging.INFO)
+            ROOT.setLevel(logging.INFO)
+        if not verbose:
+            handler.addFilter(_is_of_the_flow)
         ROOT.addHandler(handler)
         stack.callback(ROOT.removeHandler, handler)
         stack.callback(ROOT.setLevel, level)
         yield
+
+
+def _is_of_the_flow(record: logging.LogRecord) -> bool:
+    """Tell a stage's line from those of its tasks, of which a night has thousands."""
+    return record.levelno >= logging.WARNING or record.name.startswith("epipole.flows.")
 
 
 class StageDisplay(logging.Handler):

@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 
 from epipole.flows.progress import results, step
 from epipole.flows.sensors import of_sensor, sensor_ids, spans
+from epipole.flows.summary import many
 from epipole.io.star_catalogue import read_hipparcos
 from epipole.schemas.bridge import concat
 from epipole.schemas.log_tables import Log
@@ -35,7 +36,7 @@ def read(logs: Sequence[str], settings: Settings) -> Log:
     """Read the logs, sorted and each frame once."""
     step("read logs", 0, len(logs))
     log = read_logs(list(logs), settings)
-    LOGGER.info("read %s frames of %d logs", f"{log.exposures.num_rows:,}", len(logs))
+    LOGGER.info("read %s of %s", many(len(log.exposures), "frame"), many(len(logs), "log"))
     return log
 
 
@@ -114,7 +115,7 @@ def view(
         for name in sensor_ids(epochs)
     ]
     views = concat(VIEWS, results("view objects", futures))
-    LOGGER.info("aligned %s epochs", f"{pc.count_distinct(epochs['epoch']).as_py():,}")
+    LOGGER.info("aligned %s", many(pc.count_distinct(epochs["epoch"]).as_py(), "epoch"))
     return views
 
 
@@ -138,5 +139,5 @@ def triangulate(associated: Associated, settings: Settings) -> Solved:
     """Solve each object's position at each epoch."""
     step("solve positions", 0, 1)
     solved: Solved = solve_positions(associated.views, associated.object_number, settings)
-    LOGGER.info("solved %s positions", f"{solved.positions.num_rows:,}")
+    LOGGER.info("solved %s", many(len(solved.positions), "position"))
     return solved

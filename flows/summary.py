@@ -35,13 +35,13 @@ class Summary:
         left_out = [f"  {count:,} {reason}" for reason, count in self.rejects.items()]
         return [
             f"nights      {', '.join(self.nights)}",
-            f"frames      {self.frames:,} of {_many(self.sensors, 'sensor')} "
-            f"in {_many(self.logs, 'log')}",
+            f"frames      {self.frames:,} of {many(self.sensors, 'sensor')} "
+            f"in {many(self.logs, 'log')}",
             f"identified  {self.identified:,} by {self.stars:,} stars",
             f"objects     {self.objects:,} in {self.detections:,} detections, "
-            f"{_many(self.tracklets, 'tracklet')}",
-            f"positions   {self.positions:,} at {_many(self.epochs, 'epoch')}",
-            f"left out    {_many(sum(self.rejects.values()), 'thing')}" + (":" if left_out else ""),
+            f"{many(self.tracklets, 'tracklet')}",
+            f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
+            f"left out    {many(sum(self.rejects.values()), 'thing')}" + (":" if left_out else ""),
             *left_out,
             f"dataset     {self.dataset}",
         ]
@@ -73,5 +73,6 @@ def _by_reason(rejects: pa.Table) -> dict[str, int]:
     return {row["reason"]: row["count_sum"] for row in ordered.to_pylist()}
 
 
-def _many(count: int, what: str) -> str:
+def many(count: int, what: str) -> str:
+    """Return a count with its noun, such as ``1 log`` or ``2,000 logs``."""
     return f"{count:,} {what}" + ("" if count == 1 else "s")

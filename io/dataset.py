@@ -73,7 +73,7 @@ def check_sources(dataset: Path, nights: Sequence[str], sources: pa.Table, repla
         return
     given = set(sources["sha256"].to_pylist())
     for night in nights:
-        recorded = read_table(dataset, "sources", night)
+        recorded = read_table(dataset, "sources", night).select(["name", "sha256"])
         missing = [row["name"] for row in recorded.to_pylist() if row["sha256"] not in given]
         if missing:
             raise DatasetError(
