@@ -116,7 +116,7 @@ def _read_messages(
             continue
         columns[carries].add(record, offset, time_ns)
     for damage in walk.damage:
-        rejects.add(damage.reason, time_ns=damage.time_ns, offset=damage.offset, count=damage.count)
+        rejects.add(damage.reason, time_ns=damage.time_ns, offset=damage.offset, count=damage.n)
 
 
 def _decoder(channel: Channel, where: str) -> tuple[str, Decoder]:

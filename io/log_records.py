@@ -53,7 +53,7 @@ class Damage(NamedTuple):
     offset: int
     time_ns: int
     reason: str
-    count: int
+    n: int
 
 
 @dataclass
@@ -286,7 +286,7 @@ class RecordWalk:
         self._counts[number] = self._counts.get(number, 0) + size // 16
         index = self._lost_chunk
         self._lost[index] = self._lost.get(index, 0) + size // 16
-        self.damage[index] = self.damage[index]._replace(count=max(1, self._lost[index]))
+        self.damage[index] = self.damage[index]._replace(n=max(1, self._lost[index]))
 
     def _report_missing(self) -> None:
         for number, count in sorted(self._unknown.items()):

@@ -44,19 +44,17 @@ class RejectList:
         A row whose time is unknown, or a day or more outside that span (damage has made it
         up), gets the span's start: it must fall into a night that is being made.
         """
-        offsets, sensor_ids, times, reasons, counts = (
-            [row[i] for row in self._rows] for i in range(5)
-        )
-        near = [first_ns - DAY_NS < t < last_ns + DAY_NS for t in times]
+        rows = self._rows
+        near_ns = range(first_ns - DAY_NS + 1, last_ns + DAY_NS)
         return table(
             REJECTS,
             {
-                "source": [self.source] * len(times),
-                "offset": offsets,
-                "sensor_id": sensor_ids,
-                "time": [t if ok else first_ns for t, ok in zip(times, near, strict=True)],
-                "stage": [STAGE] * len(times),
-                "reason": reasons,
-                "count": counts,
+                "source": [self.source] * len(rows),
+                "offset": [offset for offset, *_ in rows],
+                "sensor_id": [sensor_id for _, sensor_id, *_ in rows],
+                "time": [t if t in near_ns else first_ns for _, _, t, _, _ in rows],
+                "stage": [STAGE] * len(rows),
+                "reason": [reason for *_, reason, _ in rows],
+                "count": [count for *_, count in rows],
             },
         )

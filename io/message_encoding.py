@@ -161,8 +161,8 @@ def encode_calibration(encoding: str, sensor_id: str, time_ns: int, camera: Valu
         width, height, fx_px, fy_px, cx_px, cy_px, k1, k2, p1, p2, k3.
     """
     fx, fy, cx, cy = (float(camera[n]) for n in ("fx_px", "fy_px", "cx_px", "cy_px"))
-    size = {"width": int(camera["width"]), "height": int(camera["height"])}
-    matrices = {
+    size: dict[str, Any] = {"width": int(camera["width"]), "height": int(camera["height"])}
+    matrices: dict[str, Any] = {
         "D": [float(camera[n]) for n in ("k1", "k2", "p1", "p2", "k3")],
         "K": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],

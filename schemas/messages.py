@@ -174,7 +174,7 @@ _JSON_TIME = {
     "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
     "required": ["sec", "nsec"],
 }
-_JSON_TYPE = {
+_JSON_TYPE: dict[str, dict[str, Any]] = {
     "time": _JSON_TIME,
     "string": {"type": "string"},
     "uint64": {"type": "integer"},
@@ -199,7 +199,7 @@ def json_schema(name: str) -> bytes:
         message = next(m for m in (CENTROID_FRAME, SENSOR_STATE) if m.name == name)
         properties, doc = {}, message.doc
         for member in message.members:
-            kind = _JSON_TYPE[member.kind]
+            kind: dict[str, Any] = _JSON_TYPE[member.kind]
             kind = {"type": "array", "items": kind} if member.repeated else kind
             properties[member.name] = {**kind, "description": member.doc}
     schema = {"title": name, "description": doc, "type": "object", "properties": properties}

@@ -39,7 +39,7 @@ def walk(data):
     """Return the numbers of the messages found, and the damage as (reason, count)."""
     walked = RecordWalk(memoryview(bytes(data)), frozenset([SCHEMA]))
     found = [struct.unpack_from("<I", m.data)[0] for m in walked.messages()]
-    return found, [(d.reason, d.count) for d in walked.damage]
+    return found, [(d.reason, d.n) for d in walked.damage]
 
 
 def chunks(data):
