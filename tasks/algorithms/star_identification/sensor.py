@@ -119,7 +119,7 @@ def identify_sensor(
     solutions, status = identify_sequence(t_s, frames, priors, sky, grid, pairs, how)
     found = residual_scale(solutions)
     scale = learned.scale
-    if is_significant(found) or (not stated and found.dof > 0):
+    if is_significant(found) or (learned.adjusted and found.dof > 0):
         scale *= found.scale
         solutions = [
             s and s._replace(cov_rad2=s.cov_rad2 * found.scale**2, chi2=s.chi2 / found.scale**2)
@@ -132,6 +132,7 @@ class _Learned(NamedTuple):
     scale: float
     limit: float
     how: Search | None  # with the zero point; none: flux is of no use
+    adjusted: bool  # errors as stated do not hold, or none are
 
 
 class _Sample(NamedTuple):
@@ -166,11 +167,11 @@ def _learn(sample: _Sample, skies: Skies, limit: float, how: Search, stated: boo
     """Return centroid errors, faintest star and zero point from a sample of frames."""
     sky, spots = skies.sky(limit), sample.spots
     scale, solutions = _first_scale(sample, skies, limit, how, stated)
-    for _ in range(4):
+    adjusting = not stated
+    for _ in range(5):
         found = residual_scale(solutions)
-        if found.dof < 10 or not (
-            is_significant(found) or (not stated and abs(found.scale - 1) > 0.02)
-        ):
+        adjusting |= is_significant(found)
+        if found.dof < 10 or not adjusting or abs(found.scale - 1) < 0.01:
             break
         scale *= found.scale
         again = rematch([frame_of(s, scale) for s in spots], solutions, sky, how)
@@ -192,7 +193,7 @@ def _learn(sample: _Sample, skies: Skies, limit: float, how: Search, stated: boo
         limit = faintest_star(
             frames, rematch(frames, solutions, deep, how), deep, how.gate_sigma, least
         )
-    return _Learned(scale, limit, None if useless else how)
+    return _Learned(scale, limit, None if useless else how, adjusting)
 
 
 def _first_scale(

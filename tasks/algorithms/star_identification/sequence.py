@@ -120,7 +120,6 @@ class Tracker:
             self.failures += 1
             self.skip = min(2 ** max(self.failures - 6, 0) - 1, MAX_SKIPPED)
             return None, "time_limit" if cut_short else "no_match"
-        self.fixes = []
         return solution, ""
 
 
