@@ -22,7 +22,9 @@ MAGIC = b"\x89MCAP0\r\n"
 MAX_CHUNK_BYTES = 256 << 20
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-STATISTICS, DATA_END = 0x0B, 0x0F
+ATTACHMENT, STATISTICS, METADATA, DATA_END = 0x09, 0x0B, 0x0C, 0x0F
+PRIVATE = 0x80  # from here on records are someone's own, and skipped
+IGNORED = (ATTACHMENT, METADATA)
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -89,19 +91,22 @@ class RecordWalk:
             opcode, length = _RECORD.unpack_from(data, at)
             after = at + _RECORD.size + length
             skipped_to = self._next_chunk(at)
-            if opcode == 0 or after > end or (skipped_to and skipped_to < after):
+            limit = end if skipped_to is None else skipped_to
+            if opcode == CHUNK:
+                after = self._end_of_chunk(at, after, limit)
+            if opcode == 0 or after > limit:
                 if skipped_to is None:
                     if opcode == CHUNK:
                         yield from self._walk_cut_chunk(at)
                     break
                 self._leave_out(at, 0, "damaged_record")
                 at = skipped_to
-                continue
-            if opcode == DATA_END:
+            elif opcode == DATA_END and length == 4 and self._data_end in (None, at):
                 closed = True
                 break
-            yield from self._walk_record(opcode, at, after)
-            at = after
+            else:
+                yield from self._walk_record(opcode, at, after)
+                at = after
         if not closed:
             self._leave_out(at, 0, "truncated")
 
@@ -110,8 +115,8 @@ class RecordWalk:
         if opcode == CHUNK:
             self._lost_chunk = None
             yield from self._walk_chunk(at, after)
-        elif opcode == MESSAGE_INDEX:
-            self._count_lost(body, after)
+        elif opcode == MESSAGE_INDEX and self._is_message_index(body, after):
+            self._count_lost(body)
         elif opcode in (SCHEMA, CHANNEL, MESSAGE):
             messages = self._walk_records(bytes(self.data[at:after]), at)
             if self._sound_outside_chunks:
@@ -119,6 +124,8 @@ class RecordWalk:
             else:
                 for message in messages:
                     self._leave_out(at, message.time_ns, "bad_checksum")
+        elif opcode < PRIVATE and opcode not in IGNORED and at != len(MAGIC):
+            self._leave_out(at, 0, "damaged_record")  # no such record in a data section
 
     @cached_property
     def _sound_outside_chunks(self) -> bool:
@@ -141,6 +148,15 @@ class RecordWalk:
             self._lost_chunk = len(self.damage) - 1
             return
         yield from self._walk_records(records, at, start_ns)
+
+    def _end_of_chunk(self, at: int, after: int, limit: int) -> int:
+        """Return where a chunk ends: as its record says, unless only its own length can be."""
+        try:
+            body = self._open_chunk(at, None)[-1]
+        except ChunkError:
+            return after
+        own = body + struct.unpack_from("<Q", self.data, body - 8)[0]
+        return own if own <= limit else after
 
     def _walk_cut_chunk(self, at: int) -> Iterator[Message]:
         """Yield what the first part of a chunk holds where the file ends in it.
@@ -258,7 +274,7 @@ class RecordWalk:
                 self._declare(opcode, self.data, body, at)
             elif opcode == CHUNK_INDEX:
                 offset = struct.unpack_from("<Q", self.data, body + 16)[0]
-                if len(MAGIC) <= offset < end and self.data[offset] == CHUNK:
+                if len(MAGIC) <= offset < end:
                     self._chunk_offsets.append(offset)
             elif opcode == STATISTICS:
                 (size,) = struct.unpack_from("<I", self.data, body + 42)
@@ -276,12 +292,16 @@ class RecordWalk:
     def _leave_out(self, offset: int, time_ns: int, reason: str, count: int = 1) -> None:
         self.damage.append(Damage(offset, time_ns, reason, count))
 
-    def _count_lost(self, body: int, after: int) -> None:
-        """Count the messages of a chunk that is left out, by the index that follows it."""
-        if self._lost_chunk is None or after - body < 6:
-            return
+    def _is_message_index(self, body: int, after: int) -> bool:
+        if after - body < 6:
+            return False
+        size = struct.unpack_from("<HI", self.data, body)[1]
+        return size == after - body - 6 and size % 16 == 0
+
+    def _count_lost(self, body: int) -> None:
+        """Count the messages of a chunk that is left out, by an index that follows it."""
         number, size = struct.unpack_from("<HI", self.data, body)
-        if size != after - body - 6 or (self._channels and not self._find_channel(number)):
+        if self._lost_chunk is None or (self._channels and not self._find_channel(number)):
             return
         self._counts[number] = self._counts.get(number, 0) + size // 16
         index = self._lost_chunk
@@ -291,10 +311,9 @@ class RecordWalk:
     def _report_missing(self) -> None:
         for number, count in sorted(self._unknown.items()):
             self._leave_out(0, 0, f"unknown_channel_{number}", count)
-        reported = any(d.reason != "truncated" for d in self.damage)
         declared = {n: c for n, c in self._declared.items() if self._find_channel(n)}
         missing = sum(max(0, c - self._counts.get(n, 0)) for n, c in declared.items())
-        if missing and not reported:
+        if missing:
             self._leave_out(0, 0, "missing_messages", missing)
 
 

@@ -125,15 +125,43 @@ def test_without_a_summary_messages_of_an_unknown_channel_are_counted():
     assert ("unknown_channel_1", known - lost) in damage
 
 
-def test_a_damaged_length_is_stepped_over_by_the_summarys_chunk_places():
+@pytest.mark.parametrize("length", [0, 5, 1 << 20, 1 << 63])
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_chunk_whose_records_length_is_damaged_is_found_by_its_own(length, closed):
     data = bytearray(log())
-    at, _ = chunks(data)[2]
-    for length in (0, 5, 1 << 20, 1 << 63):
-        data[at + 1 : at + 9] = struct.pack("<Q", length)
-        found, damage = walk(data)
-        lost = chunk_messages(log(), 2)
-        assert [n for n in range(N) if n not in found] == lost
-        assert damage
+    last = chunks(data)[-1][0]
+    struct.pack_into("<Q", data, chunks(data)[2][0] + 1, length)
+    expected = list(range(N)) if closed else list(range(chunk_messages(log(), -1)[0]))
+    assert walk(data if closed else data[:last])[0] == expected
+
+
+@pytest.mark.parametrize("length", [0, 5, 1 << 20, 1 << 63])
+def test_behind_a_damaged_record_the_next_chunk_that_the_summary_knows_is_taken(length):
+    data = bytearray(log())
+    at, size = chunks(data)[2]
+    struct.pack_into("<Q", data, at + size + 1, length)  # of the message index that follows
+    found, damage = walk(data)
+    assert found == list(range(N))
+    assert {reason for reason, _ in damage} == {"damaged_record"}
+
+
+@pytest.mark.parametrize("opcode", [0x00, 0x02, 0x04, 0x07, 0x0E, 0x0F, 0x16, 0x46, 0x86])
+def test_a_chunk_that_is_no_longer_called_one_is_missed(opcode):
+    data = bytearray(log())
+    lost = chunk_messages(data, 2)
+    data[chunks(data)[2][0]] = opcode
+    found, damage = walk(data)
+    assert found == [n for n in range(N) if n not in lost]
+    assert ("missing_messages", len(lost)) in damage
+
+
+def test_a_file_that_ends_in_zeros_is_read_to_there():
+    data = log()
+    at = chunks(data)[3][0]
+    assert walk(data[:at] + bytes(5000)) == (
+        list(range(chunk_messages(data, 3)[0])),
+        [("truncated", 1)],
+    )
 
 
 def with_chunk(data, i, change):
