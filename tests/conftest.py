@@ -1,10 +1,13 @@
 """What tests share: an embedded Prefect of their own, and one simulated night."""
 
 import os
+import sys
 import tempfile
 from pathlib import Path
 
 import pytest
+
+sys.path.append(str(Path(__file__).parent))  # helpers beside the tests: random_stars
 
 # Before anything imports prefect: a developer's own Prefect neither sees these runs nor
 # changes them.
