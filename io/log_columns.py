@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from epipole.io.log_rejects import RejectList
 from epipole.io.message_decoding import Calibration, Frame, State
-from epipole.schemas.bridge import nullable, table, unstack
+from epipole.schemas.bridge import concat, nullable, table, unstack
 from epipole.schemas.log_tables import LOG_STATES, STATE_FRAMES
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES
 
@@ -26,6 +26,7 @@ MAX_FRAME_NUMBER = (1 << 63) - 1
 # Below the poles' radius of 6357 km: no sensor is there, whatever its frame and its errors.
 EARTH_RADIUS_KM = 6340.0
 FARTHEST_KM = 1.0e7  # well behind the Moon; a number in metres lands here
+BATCH = 65536  # frames: as Python objects they take several times the memory of a table
 QUATERNION_TOLERANCE = 1e-2  # |q| further from 1 is not a rounded unit quaternion
 
 
@@ -53,6 +54,7 @@ class FrameColumns:
     rejects: RejectList
     _frames: list[Frame] = field(default_factory=list)
     _offsets: list[int] = field(default_factory=list)
+    _tables: list[pa.Table] = field(default_factory=list)
 
     def add(self, frame: Frame, offset: int, log_time_ns: int) -> None:
         """Take a frame, or leave it out for its time, sensor, number or lengths."""
@@ -60,6 +62,8 @@ class FrameColumns:
         if reason is None:
             self._frames.append(frame)
             self._offsets.append(offset)
+            if len(self._frames) == BATCH:
+                self._close_batch()
             return
         self.rejects.add(
             reason,
@@ -74,6 +78,14 @@ class FrameColumns:
         Flux is never relied on: where it is not a positive finite number it is NaN, and the
         frame stays. An exposure that is not one is 0, unknown.
         """
+        self._close_batch()
+        return concat(EXPOSURES, self._tables)
+
+    def _close_batch(self) -> None:
+        self._tables.append(self._batch())
+        self._frames, self._offsets = [], []
+
+    def _batch(self) -> pa.Table:
         frames = self._frames
         lengths = np.array([len(f.x_px) for f in frames], np.int64)
         x = _joined([f.x_px for f in frames])

@@ -1,4 +1,18 @@
-"""What a log's reader leaves out, collected until it becomes rows of `rejects`."""
+"""What a log's reader leaves out, collected until it becomes rows of `rejects`.
+
+The reasons, all of stage `read_logs`:
+
+- of the file: truncated (also: never closed), damaged_record, missing_messages (the summary
+  counts more), unknown_channel_N;
+- of a chunk, with the number of its messages where an index tells it: bad_checksum,
+  bad_compression, wrong_chunk_size, chunk_too_large, damaged_chunk, unknown_compression_X;
+- of any message: undecodable_frame, _state or _calibration, bad_sensor_id, no_timestamp;
+- of a frame: nan (a place that is none), unequal_arrays, bad_sigma, bad_frame_number, and, among
+  all logs: duplicate_frame, duplicate_number, duplicate_time;
+- of a state: unknown_frame, bad_position, inside_earth, bad_velocity, bad_attitude (the position
+  is kept), duplicate_state;
+- of a calibration: bad_image_size, bad_camera_matrix, bad_distortion, unknown_distortion_model.
+"""
 
 from dataclasses import dataclass, field
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
+from epipole.io import log_columns
 from epipole.io.log_reader import read_log
 from epipole.io.log_writer import LogWriter
 from epipole.io.message_encoding import encode_calibration, encode_protobuf
@@ -142,6 +143,22 @@ def test_what_is_written_is_read(tmp_path, encoding, compression):
     assert part.rejects.num_rows == 0
     assert part.source.size == path.stat().st_size
     assert part.source.first_time_ns == START_NS + 7
+
+
+def test_frames_that_come_in_batches_are_one_table(tmp_path, monkeypatch):
+    whole = read_log(write(tmp_path / "a.mcap"))
+    monkeypatch.setattr(log_columns, "BATCH", 7)
+    assert read_log(tmp_path / "a.mcap").exposures.equals(whole.exposures)
+
+
+def test_a_url_is_read_like_a_file(tmp_path):
+    fsspec = pytest.importorskip("fsspec")
+    path = write(tmp_path / "a.mcap")
+    with fsspec.open("memory://logs/a.mcap", "wb") as file:
+        file.write(path.read_bytes())
+    assert read_log("memory://logs/a.mcap").exposures.equals(read_log(path).exposures)
+    with pytest.raises(LogError, match="cannot be read"):
+        read_log("memory://logs/none.mcap")
 
 
 def test_encodings_may_be_mixed_and_other_messages_are_ignored(tmp_path):
