@@ -192,11 +192,14 @@ class StateColumns:
         if reason is not None:
             self.rejects.add(reason, time_ns=time_ns, offset=offset, sensor_id=sensor_id)
             return
-        attitude = _unit_quaternion(state.attitude_xyzw)
-        if attitude is None:
-            self.rejects.add("bad_attitude", time_ns=time_ns, offset=offset, sensor_id=sensor_id)
-            attitude = np.empty(0)
-        self._rows.append(state._replace(attitude_xyzw=attitude))
+        if len(state.attitude_xyzw):
+            attitude = _unit_quaternion(state.attitude_xyzw)
+            if len(attitude) == 0:
+                self.rejects.add(
+                    "bad_attitude", time_ns=time_ns, offset=offset, sensor_id=sensor_id
+                )
+            state = state._replace(attitude_xyzw=attitude)
+        self._rows.append(state)
 
     def table(self) -> pa.Table:
         """Return LOG_STATES."""
@@ -225,23 +228,20 @@ class StateColumns:
 def _state_fault(state: State) -> str | None:
     if state.frame not in STATE_FRAMES:
         return "unknown_frame"
-    position, velocity = state.position_km, state.velocity_km_s
-    if len(position) != 3 or not np.isfinite(position).all():
+    # A length is finite only if every component is.
+    radius_km = math.hypot(*state.position_km)
+    if len(state.position_km) != 3 or not radius_km <= FARTHEST_KM:
         return "bad_position"
-    if len(velocity) not in (0, 3) or not np.isfinite(velocity).all():
+    velocity = state.velocity_km_s
+    if len(velocity) not in (0, 3) or not math.isfinite(math.hypot(*velocity)):
         return "bad_velocity"
-    radius_km = math.hypot(*position)
-    if radius_km < EARTH_RADIUS_KM:
-        return "inside_earth"
-    return "bad_position" if radius_km > FARTHEST_KM else None
+    return "inside_earth" if radius_km < EARTH_RADIUS_KM else None
 
 
-def _unit_quaternion(q: Array) -> Array | None:
-    """Return the quaternion at length 1, as it is where empty, None where it is none."""
-    if len(q) == 0:
-        return q
+def _unit_quaternion(q: Array) -> Array:
+    """Return the quaternion at length 1, or an empty array where it is no unit quaternion."""
     norm = math.hypot(*q) if len(q) == 4 else math.nan
-    return q / norm if abs(norm - 1.0) < QUATERNION_TOLERANCE else None
+    return q / norm if abs(norm - 1.0) < QUATERNION_TOLERANCE else q[:0]
 
 
 def _vectors(arrays: list[Array], n: int) -> Array:
