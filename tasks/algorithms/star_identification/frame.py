@@ -24,6 +24,7 @@ Array = npt.NDArray[np.float64]
 # Chance reaches a log evidence x, lost in space, with a probability below exp(-(x + 4)):
 # measured on 4,000 random frames of three cameras. Markov's inequality has exp(-x).
 LOST_MARGIN = 4.0
+N_SEARCHED = 200  # brightest centroids that take part in a search of the whole sky
 N_PATTERN_CENTROIDS = 40  # brightest centroids that are paired lost in space
 
 
@@ -138,6 +139,11 @@ def aberrate_all(u_icrs: Array, beta: Array) -> Array:
 
 def search_lost(frame: Frame, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search) -> Verdict:
     """Search the whole sky for the frame's attitude; see `lost_in_space.search`."""
+    frame = frame._replace(
+        u=frame.u[:N_SEARCHED],
+        sigma_rad=frame.sigma_rad[:N_SEARCHED],
+        instrumental_mag=frame.instrumental_mag[:N_SEARCHED],
+    )
     R = np.zeros((3, 3))
     area = frame.optics.solid_angle_sr
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))

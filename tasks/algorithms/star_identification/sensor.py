@@ -202,9 +202,10 @@ def _first_scale(
     """Return a scale of the errors with which frames can be identified, and the solutions."""
     scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
     probe = sample.take(_evenly(len(sample.spots), N_PROBED))
+    quick = how._replace(time_limit_s=how.time_limit_s / 4)
     best, best_count = scales[0], 0
     for scale in scales:
-        count = sum(s is not None for s in _with_scale(probe, skies, limit, how, scale))
+        count = sum(s is not None for s in _with_scale(probe, skies, limit, quick, scale))
         if count > best_count:
             best, best_count = scale, count
         if 3 * count >= 2 * len(probe.spots):

@@ -137,7 +137,8 @@ def identify_sequence(
     Returns
     -------
     solutions : one a frame, None where the stars give no attitude
-    status : None where they do, else too_few_stars, no_match or time_limit
+    status : None where they do, else no_centroids, too_few_stars, no_match or
+        time_limit
     """
     solutions: list[Solution | None] = [None] * len(frames)
     status: list[str | None] = [None] * len(frames)
@@ -149,7 +150,7 @@ def identify_sequence(
                 fix = Fix(t_s[k], found.R_sensor_from_icrs, found.cov_rad2)
                 tracker.fixes = [*tracker.fixes[-1:], fix]
             elif len(frames[k].u) < 3:
-                status[k] = "too_few_stars"
+                status[k] = "too_few_stars" if len(frames[k].u) else "no_centroids"
             else:
                 solutions[k], why = tracker.step(t_s[k], frames[k], priors[k])
                 status[k] = None if solutions[k] is not None else status[k] or why
