@@ -1,0 +1,119 @@
+"""A sensor's errors and depth, learned before its frames are identified."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
+
+from epipole.tasks.algorithms.star_catalogue import limit_for_density
+from epipole.tasks.algorithms.star_identification.sensor import Spots, frame_of, identify_sensor
+from epipole.tasks.algorithms.star_identification.sky import (
+    pattern_pairs,
+    pattern_size,
+    sky_grid,
+    sky_to_limit,
+)
+
+CATALOGUE = random_catalogue(15_000)
+SEEN = sky_to_limit(CATALOGUE, 5.75).catalogue
+
+
+class Skies:
+    """Skies of the random catalogue."""
+
+    def limit_for(self, stars_per_sr):
+        return limit_for_density(CATALOGUE.magnitude, stars_per_sr)
+
+    @cache  # noqa: B019 - as long as the tests
+    def sky(self, limit):
+        return sky_to_limit(CATALOGUE, limit)
+
+    @cache  # noqa: B019
+    def grid(self, limit, radius_rad):
+        return sky_grid(self.sky(limit), radius_rad)
+
+    def pairs(self, limit, optics):
+        n = pattern_size(self.sky(limit), optics.solid_angle_sr)
+        return _pairs(n, 2 * optics.half_diagonal_rad)
+
+
+@cache
+def _pairs(n, diagonal_rad):
+    return pattern_pairs(CATALOGUE.u_icrs[:n], diagonal_rad)
+
+
+SKIES = Skies()
+
+
+def _spots(k, sigma_px, stated_px=np.nan, **how):
+    """Return a frame's spots with an error that is stated as another, or not at all."""
+    seen, true = frame(SEEN, random_attitude(k), k, sigma_px, **how)
+    pixel_rad = seen.sigma_rad / sigma_px
+    sigma = np.full(len(seen.u), stated_px)
+    return Spots(seen.u, pixel_rad, sigma, seen.instrumental_mag, seen.beta, seen.optics), true
+
+
+def _identify(spots, limit=None):
+    return identify_sensor(
+        np.arange(len(spots)) * 1.0, spots, [None] * len(spots), SKIES, limit, HOW
+    )
+
+
+@pytest.mark.parametrize("sigma_px", [0.08, 0.4, 1.2])
+@pytest.mark.parametrize("stated", [False, True])
+def test_the_centroid_error_is_found_whether_stated_wrongly_or_not_at_all(sigma_px, stated):
+    stated_px = 0.3 if stated else np.nan
+    found = _identify([_spots(k, sigma_px, stated_px, n_false=5)[0] for k in range(25)])
+    assert sum(s is not None for s in found.solutions) >= 24
+    assert found.sigma_scale * (stated_px if stated else 1.0) == pytest.approx(sigma_px, rel=0.08)
+
+
+def test_stars_and_attitudes_are_the_true_ones_among_many_false_points():
+    spots, true = zip(*[_spots(k, 0.3, n_false=30, missing=0.1) for k in range(25)], strict=True)
+    found = _identify(list(spots))
+    for k, solution in enumerate(found.solutions):
+        assert angle_between(solution.R_sensor_from_icrs, random_attitude(k)) < 1e-3
+        ids = found.sky.catalogue.star_id[solution.star[solution.star >= 0]]
+        want = SEEN.star_id[true[k][solution.star >= 0]]
+        np.testing.assert_array_equal(ids, want)
+
+
+def test_a_flux_that_tells_nothing_is_left_aside():
+    rng = np.random.default_rng(0)
+    spots = [_spots(k, 0.3)[0] for k in range(15)]
+    spots = [s._replace(instrumental_mag=rng.uniform(-20, -10, len(s.u))) for s in spots]
+    assert sum(s is not None for s in _identify(spots).solutions) == 15
+
+
+def test_a_limit_that_is_set_is_kept():
+    found = _identify([_spots(k, 0.3)[0] for k in range(5)], limit=5.0)
+    assert found.sky.catalogue.magnitude[-1] <= 5.0
+    assert all(s is not None for s in found.solutions)
+
+
+def test_one_frame_and_frames_without_stars_are_borne():
+    assert _identify([_spots(0, 0.3)[0]]).status == [None]
+    dark = [_spots(k, 0.3, n_false=5, missing=1.0)[0] for k in range(4)]
+    assert set(_identify(dark).status) <= {"no_match", "time_limit"}
+    nothing = dark[0]._replace(
+        u=np.empty((0, 3)),
+        pixel_rad=np.empty(0),
+        sigma_px=np.empty(0),
+        instrumental_mag=np.empty(0),
+    )
+    assert _identify([nothing]).status == ["no_centroids"]
+
+
+def test_an_error_missing_in_one_frame_is_taken_from_the_others():
+    spots = [_spots(k, 0.3, 0.3)[0] for k in range(6)]
+    spots[2] = spots[2]._replace(sigma_px=np.full(len(spots[2].u), np.nan))
+    found = _identify(spots)
+    assert found.sigma_scale == pytest.approx(1.0, abs=0.06)
+
+
+def test_an_error_that_is_nowhere_stated_counts_as_one_pixel_times_the_scale():
+    spots, _ = _spots(0, 0.3)
+    scaled = frame_of(spots, 0.5, use_flux=False)
+    np.testing.assert_allclose(scaled.sigma_rad, 0.5 * spots.pixel_rad)
+    assert np.isnan(scaled.instrumental_mag).all()

@@ -1,0 +1,74 @@
+"""Lost in space on the shared sample frames of three cameras: right, refused, never wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_stars import angle_between
+
+from epipole.tasks.algorithms.camera import Camera, pixel_angle, unproject
+from epipole.tasks.algorithms.star_catalogue import navigation_catalogue
+from epipole.tasks.algorithms.star_identification.frame import (
+    Frame,
+    Optics,
+    Search,
+    identify_lost,
+)
+from epipole.tasks.algorithms.star_identification.sky import (
+    pattern_pairs,
+    pattern_size,
+    sky_grid,
+    sky_to_limit,
+)
+
+FRAMES = Path(__file__).parents[2] / "shared" / "data" / "starid"
+HOW = Search(3.7, np.log(1e6), 0.5, np.nan)
+
+
+class Sample:
+    """One camera's frames, catalogue and truth."""
+
+    def __init__(self, name):
+        self.data = data = dict(np.load(FRAMES / f"{name}.npz"))
+        width, f = int(data["width"]), float(data["focal_px"])
+        # There the middle of the top-left pixel is (0.5, 0.5).
+        self.camera = Camera(width, width, f, f, width / 2 - 0.5, width / 2 - 0.5)
+        half = width / 2 / f
+        self.optics = Optics(
+            self.camera.half_diagonal_rad, np.array([-half, half, -half, half]), 1 / f
+        )
+        stars = navigation_catalogue(
+            data["cat_hip"].astype(np.int64), data["cat_vec"], data["cat_mag"].astype(float), 2 / f
+        )
+        self.sky = sky_to_limit(stars, float(data["mag_limit"]) + 0.2)
+        n = pattern_size(self.sky, self.optics.solid_angle_sr)
+        self.pairs = pattern_pairs(stars.u_icrs[:n], 2 * self.optics.half_diagonal_rad)
+
+    def frame(self, k):
+        d, rows = self.data, slice(self.data["offset"][k], self.data["offset"][k + 1])
+        u = unproject(self.camera, d["x"][rows] - 0.5, d["y"][rows] - 0.5)
+        sigma = max(float(d["sigma_px"][k]), 0.05) * pixel_angle(self.camera, u)
+        return Frame(u, sigma, d["mag"][rows].astype(float), np.zeros(3), self.optics)
+
+
+@pytest.mark.skipif(not FRAMES.is_dir(), reason="the shared sample frames are not here")
+@pytest.mark.parametrize(
+    ("name", "least_right"), [("a_fov20", 0.99), ("b_fov12", 0.90), ("c_fov08", 0.99)]
+)
+def test_sample_frames_are_right_or_refused(name, least_right):
+    sample, right, answered, grids = Sample(name), 0, 0, {}
+    frames = range(180)
+    for k in frames:
+        seen = sample.frame(k)
+        radius = float(2.5 * 3.7 * np.median(seen.sigma_rad))
+        key = round(np.log2(radius), 1)
+        if key not in grids:
+            grids[key] = sky_grid(sample.sky, 1.05 * radius)
+        grid = grids[key]
+        found, _ = identify_lost(seen, sample.sky, grid, sample.pairs, HOW)
+        if found is not None:
+            answered += 1
+            off = angle_between(found.R_sensor_from_icrs, sample.data["rot"][k])
+            right += np.degrees(off) < 0.5
+    assert right == answered
+    assert right >= least_right * len(frames)
