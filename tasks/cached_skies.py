@@ -34,7 +34,7 @@ class Catalogue:
         self.stars = stars
         key = 0
         for name in ("star_id", "ra_rad", "dec_rad", "magnitude"):
-            key = zlib.crc32(np.ascontiguousarray(array(stars, name)), key)
+            key = zlib.crc32(array(stars, name).tobytes(), key)
         self.key = (stars.num_rows, key)
 
     def __hash__(self) -> int:

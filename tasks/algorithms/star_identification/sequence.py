@@ -87,7 +87,7 @@ class Tracker:
         solution, why = self._predicted(t_s, frame, prior), "no_match"
         # Where priors were borne out, a frame that fails has too few stars, not a wrong prior.
         if solution is None and self.pairs is not None and not (prior and self.prior_holds):
-            solution, why = self._lost(frame)
+            solution, why = self._lost(frame, self.pairs)
         if solution is not None:
             self.fixes = [
                 *self.fixes[-1:],
@@ -109,13 +109,13 @@ class Tracker:
         self.prior_holds |= solution is not None
         return solution
 
-    def _lost(self, frame: Frame) -> tuple[Solution | None, str]:
+    def _lost(self, frame: Frame, pairs: Callable[[], PairTable]) -> tuple[Solution | None, str]:
         """Search the whole sky; ever more rarely while that keeps failing (clouds, a night
         without stars), so that a dark log takes bounded time."""
         if self.skip > 0:
             self.skip -= 1
             return None, "no_match"
-        solution, cut_short = identify_lost(frame, self.sky, self.grid, self.pairs(), self.how)
+        solution, cut_short = identify_lost(frame, self.sky, self.grid, pairs(), self.how)
         if solution is None:
             self.failures += 1
             self.skip = min(2 ** max(self.failures - 6, 0) - 1, MAX_SKIPPED)
@@ -145,8 +145,8 @@ def identify_sequence(
 
     def run(tracker: Tracker, order: Iterable[int]) -> None:
         for k in order:
-            if solutions[k] is not None:
-                found = solutions[k]
+            found = solutions[k]
+            if found is not None:
                 fix = Fix(t_s[k], found.R_sensor_from_icrs, found.cov_rad2)
                 tracker.fixes = [*tracker.fixes[-1:], fix]
             elif len(frames[k].u) < 3:
