@@ -115,11 +115,12 @@ def faintest_star(
         disc = np.pi * gate_sigma**2 * np.median(frame.sigma_rad) ** 2
         by_chance += n * (len(frame.u) - len(star)) * disc / frame.optics.solid_angle_sr
     good = (matched > 0.1 * in_view) & (matched > 3 * by_chance)
-    # One empty step, of few stars, does not end it.
-    last = -1
-    for i in range(len(good)):
+    # A step in which a narrow field has no star says nothing, and one of few stars little.
+    last, poor = -1, 0
+    for i in np.flatnonzero(in_view):
+        poor = 0 if good[i] else poor + 1
         if good[i]:
-            last = i
-        elif i - last > 2:
+            last = int(i)
+        if poor == 3:
             break
     return float(edges[last + 1])

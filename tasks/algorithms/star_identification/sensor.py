@@ -101,37 +101,43 @@ def identify_sensor(
     spots, stated = _fill_sigmas(spots)
     counts = np.array([len(s.u) for s in spots])
     usable = np.flatnonzero(counts >= 4)
-    optics = spots[0].optics
     limit = magnitude_limit
     if limit is None:
         density = 1.2 * float(np.median(counts[usable])) if len(usable) else 10.0
-        limit = skies.limit_for(density / optics.solid_angle_sr)
-    sample = usable[_evenly(len(usable), N_SAMPLED)]
-    learned = _learn(_Sample(t_s, spots, priors).take(sample), skies, limit, how, stated)
-    use_flux = learned.how is not None
-    how = learned.how or how
-    if magnitude_limit is None:
-        limit = learned.limit
-    frames = [frame_of(s, learned.scale, use_flux) for s in spots]
-    sky = skies.sky(limit)
-    grid = skies.grid(limit, _grid_radius(frames, how))
-    pairs = partial(skies.pairs, limit, optics)
-    solutions, status = identify_sequence(t_s, frames, priors, sky, grid, pairs, how)
+        limit = skies.limit_for(density / spots[0].optics.solid_angle_sr)
+    known = _Known(1.0, limit, magnitude_limit is None, how, True, not stated)
+    whole = _Sample(t_s, spots, priors)
+    sample = whole.take(usable[_evenly(len(usable), N_SAMPLED)])
+    known, sampled = _first_scale(
+        sample, skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
+    )
+    known = _learn(sample.spots, sampled, skies, known)
+    solutions, status = _identify(whole, skies, known)
+    if not any(sampled) and any(solutions):  # the sample was poor: learn from what was found
+        solved = np.flatnonzero([s is not None for s in solutions])
+        rows = solved[_evenly(len(solved), N_SAMPLED)]
+        known = _learn(whole.take(rows).spots, [solutions[i] for i in rows], skies, known)
+        solutions, status = _identify(whole, skies, known)
     found = residual_scale(solutions)
-    scale = learned.scale
-    if is_significant(found) or (learned.adjusted and found.dof > 0):
-        scale *= found.scale
-        solutions = [
-            s and s._replace(cov_rad2=s.cov_rad2 * found.scale**2, chi2=s.chi2 / found.scale**2)
-            for s in solutions
-        ]
-    return Identified(solutions, status, sky, scale)
+    if found.dof > 0 and (known.adjusted or is_significant(found)):
+        known = known._replace(scale=known.scale * found.scale)
+        solutions = [s and _rescaled(s, found.scale) for s in solutions]
+    return Identified(solutions, status, skies.sky(known.limit), known.scale)
 
 
-class _Learned(NamedTuple):
-    scale: float
-    limit: float
-    how: Search | None  # with the zero point; none: flux is of no use
+def _rescaled(solution: Solution, scale: float) -> Solution:
+    """Return the solution as if the errors had been this many times as large."""
+    return solution._replace(cov_rad2=solution.cov_rad2 * scale**2, chi2=solution.chi2 / scale**2)
+
+
+class _Known(NamedTuple):
+    """What is known of a sensor so far."""
+
+    scale: float  # on the errors as stated, or on 1 px
+    limit: float  # faintest star looked for
+    limit_is_open: bool  # the settings leave it to be found
+    how: Search
+    use_flux: bool  # flux tells something of a star
     adjusted: bool  # errors as stated do not hold, or none are
 
 
@@ -163,68 +169,74 @@ def _fill_sigmas(spots: Sequence[Spots]) -> tuple[list[Spots], bool]:
     ], True
 
 
-def _learn(sample: _Sample, skies: Skies, limit: float, how: Search, stated: bool) -> _Learned:
-    """Return centroid errors, faintest star and zero point from a sample of frames."""
-    sky, spots = skies.sky(limit), sample.spots
-    scale, solutions = _first_scale(sample, skies, limit, how, stated)
-    adjusting = not stated
-    for _ in range(5):
+def _learn(
+    spots: Sequence[Spots], solutions: list[Solution | None], skies: Skies, known: _Known
+) -> _Known:
+    """Return centroid errors, zero point and faintest star as a sample of solved frames tells."""
+    if not any(solutions):
+        return known
+    sky, scale, adjusted = skies.sky(known.limit), known.scale, known.adjusted
+    for _ in range(12):  # a gate too narrow cuts residuals: few steps are not enough
         found = residual_scale(solutions)
-        adjusting |= is_significant(found)
-        if found.dof < 10 or not adjusting or abs(found.scale - 1) < 0.01:
+        adjusted |= is_significant(found)
+        if found.dof < 10 or not adjusted or abs(found.scale - 1) < 0.01:
             break
-        scale *= found.scale
-        again = rematch([frame_of(s, scale) for s in spots], solutions, sky, how)
+        again = rematch(
+            [frame_of(s, scale * found.scale) for s in spots], solutions, sky, known.how
+        )
         if not any(again):
             break
-        solutions = again
-    frames = [frame_of(s, scale) for s in spots]
-    zero, scatter = zero_point(frames, solutions, sky)
-    useless = scatter > USELESS_SCATTER_MAG
-    how = how._replace(zero_point_mag=np.nan if useless else zero)
-    if useless:
-        frames = [frame_of(s, scale, False) for s in spots]
-    if any(solutions):
-        magnitudes = [
-            sky.catalogue.magnitude[s.star[s.star >= 0]] for s in solutions if s is not None
-        ]
-        least = np.floor(4 * np.median(np.concatenate(magnitudes))) / 4
-        deep = skies.sky(limit + DEEPER_MAG)
-        limit = faintest_star(
-            frames, rematch(frames, solutions, deep, how), deep, how.gate_sigma, least
-        )
-    return _Learned(scale, limit, None if useless else how, adjusting)
+        scale, solutions = scale * found.scale, again
+    zero, scatter = zero_point([frame_of(s, scale) for s in spots], solutions, sky)
+    use_flux = not scatter > USELESS_SCATTER_MAG
+    how = known.how._replace(zero_point_mag=zero if use_flux else np.nan)
+    known = known._replace(scale=scale, how=how, use_flux=use_flux, adjusted=adjusted)
+    return known._replace(limit=_faintest(spots, solutions, skies, known))
+
+
+def _faintest(
+    spots: Sequence[Spots], solutions: list[Solution | None], skies: Skies, known: _Known
+) -> float:
+    """Return the faintest star that the sensor sees, where the settings leave it open."""
+    if not known.limit_is_open:
+        return known.limit
+    frames = [frame_of(s, known.scale, known.use_flux) for s in spots]
+    sky, deep = skies.sky(known.limit), skies.sky(known.limit + DEEPER_MAG)
+    seen = [sky.catalogue.magnitude[s.star[s.star >= 0]] for s in solutions if s is not None]
+    least = float(np.floor(4 * np.median(np.concatenate(seen))) / 4)
+    deeper = rematch(frames, solutions, deep, known.how)
+    return faintest_star(frames, deeper, deep, known.how.gate_sigma, least)
 
 
 def _first_scale(
-    sample: _Sample, skies: Skies, limit: float, how: Search, stated: bool
-) -> tuple[float, list[Solution | None]]:
+    sample: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...]
+) -> tuple[_Known, list[Solution | None]]:
     """Return a scale of the errors with which frames can be identified, and the solutions."""
-    scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
     probe = sample.take(_evenly(len(sample.spots), N_PROBED))
-    quick = how._replace(time_limit_s=how.time_limit_s / 4)
-    best, best_count = scales[0], 0
+    quick = known.how._replace(time_limit_s=known.how.time_limit_s / 4)
+    best, best_count = known._replace(scale=scales[0]), 0
     for scale in scales:
-        count = sum(s is not None for s in _with_scale(probe, skies, limit, quick, scale))
+        tried = known._replace(scale=scale, how=quick)
+        count = sum(s is not None for s in _identify(probe, skies, tried)[0])
         if count > best_count:
-            best, best_count = scale, count
+            best, best_count = known._replace(scale=scale), count
         if 3 * count >= 2 * len(probe.spots):
             break
     if best_count == 0:
         return best, [None] * len(sample.spots)
-    return best, _with_scale(sample, skies, limit, how, best)
+    return best, _identify(sample, skies, best)[0]
 
 
-def _with_scale(
-    sample: _Sample, skies: Skies, limit: float, how: Search, scale: float
-) -> list[Solution | None]:
-    """Return the sample's solutions with the errors scaled so."""
+def _identify(
+    sample: _Sample, skies: Skies, known: _Known
+) -> tuple[list[Solution | None], list[str | None]]:
+    """Return the frames' solutions and status with what is known of the sensor."""
     if not sample.spots:
-        return []
-    frames = [frame_of(s, scale) for s in sample.spots]
-    sky, grid = skies.sky(limit), skies.grid(limit, _grid_radius(frames, how))
-    pairs = partial(skies.pairs, limit, sample.spots[0].optics)
-    return identify_sequence(sample.t_s, frames, list(sample.priors), sky, grid, pairs, how)[0]
+        return [], []
+    frames = [frame_of(s, known.scale, known.use_flux) for s in sample.spots]
+    sky, grid = skies.sky(known.limit), skies.grid(known.limit, _grid_radius(frames, known.how))
+    pairs = partial(skies.pairs, known.limit, sample.spots[0].optics)
+    return identify_sequence(sample.t_s, frames, list(sample.priors), sky, grid, pairs, known.how)
 
 
 def _grid_radius(frames: list[Frame], how: Search) -> float:
