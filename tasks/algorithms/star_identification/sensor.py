@@ -24,8 +24,8 @@ from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-N_SAMPLED = 24  # frames from which a sensor's errors and depth are learned
-N_PROBED = 6  # of these, tried with each scale of the errors until one works
+SAMPLED = (4, 6)  # runs and their length, of which a sensor's errors and depth are learned
+PROBED = (3, 2)  # of these, tried with each scale of the errors until one works
 KNOWN_SCALES = (1.0, 3.0, 0.4)  # of errors that the log or the settings state
 UNKNOWN_SCALES_PX = (0.5, 1.5, 0.15)
 DEEPER_MAG = 2.0  # how far beyond the first guess of the faintest star is looked
@@ -107,7 +107,7 @@ def identify_sensor(
         limit = skies.limit_for(density / spots[0].optics.solid_angle_sr)
     known = _Known(1.0, limit, magnitude_limit is None, how, True, not stated)
     whole = _Sample(t_s, spots, priors)
-    sample = whole.take(usable[_evenly(len(usable), N_SAMPLED)])
+    sample = whole.take(usable[_runs(len(usable), SAMPLED)])
     known, sampled = _first_scale(
         sample, skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
     )
@@ -115,7 +115,7 @@ def identify_sensor(
     solutions, status = _identify(whole, skies, known)
     if not any(sampled) and any(solutions):  # the sample was poor: learn from what was found
         solved = np.flatnonzero([s is not None for s in solutions])
-        rows = solved[_evenly(len(solved), N_SAMPLED)]
+        rows = solved[_runs(len(solved), SAMPLED)]
         known = _learn(whole.take(rows).spots, [solutions[i] for i in rows], skies, known)
         solutions, status = _identify(whole, skies, known)
     found = residual_scale(solutions)
@@ -152,9 +152,13 @@ class _Sample(NamedTuple):
         )
 
 
-def _evenly(n: int, wanted: int) -> npt.NDArray[np.int64]:
-    """Return at most `wanted` of n rows, spread evenly."""
-    return np.unique(np.linspace(0, n - 1, wanted).astype(np.int64)) if n else np.empty(0, np.int64)
+def _runs(n: int, wanted: tuple[int, int]) -> npt.NDArray[np.int64]:
+    """Return rows of n in some runs of some length, spread evenly: a run's first frame has to
+    be searched, the others can be tracked."""
+    count, length = wanted
+    starts = np.linspace(0, max(n - length, 0), count).astype(np.int64)
+    rows = np.unique(starts[:, None] + np.arange(length))
+    return rows[rows < n]
 
 
 def _fill_sigmas(spots: Sequence[Spots]) -> tuple[list[Spots], bool]:
@@ -212,7 +216,7 @@ def _first_scale(
     sample: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...]
 ) -> tuple[_Known, list[Solution | None]]:
     """Return a scale of the errors with which frames can be identified, and the solutions."""
-    probe = sample.take(_evenly(len(sample.spots), N_PROBED))
+    probe = sample.take(_runs(len(sample.spots), PROBED))
     quick = known.how._replace(time_limit_s=known.how.time_limit_s / 4)
     best, best_count = known._replace(scale=scales[0]), 0
     for scale in scales:
