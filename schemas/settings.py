@@ -59,6 +59,18 @@ class TrackletSettings(Group):
     false_alarm: float = Field(
         1e-4, gt=0, lt=1, description="Accepted runs made of strays, a frame."
     )
+    link_method: Literal["likelihood_ratio", "prediction", "none"] = Field(
+        "likelihood_ratio", description="How broken tracks are joined."
+    )
+    link_gap_s: float = Field(90.0, gt=0, description="Longest break that is joined.")
+    link_kept: float = Field(
+        0.9999, gt=0, lt=1, description="Share of true joins that the chi-square test lets pass."
+    )
+    link_noise_px: float = Field(
+        1e-3,
+        gt=0,
+        description="Process noise of the method 'prediction': px^2/s^3 across the gap.",
+    )
 
 
 class AlignmentSettings(Group):

@@ -9,13 +9,16 @@ import pyarrow as pa
 from prefect import task
 from prefect.cache_policies import NO_CACHE
 
-from epipole.schemas.bridge import empty, table
+from epipole.schemas.bridge import empty, nullable, table
 from epipole.schemas.settings import Settings, TrackletSettings
 from epipole.schemas.tables import DETECTIONS, TRACKLETS
 from epipole.tasks.algorithms.camera import Camera
 from epipole.tasks.algorithms.epoch_grid import frame_interval_ns
 from epipole.tasks.algorithms.local_motion import directions_at
 from epipole.tasks.algorithms.sky import ARCSEC
+from epipole.tasks.algorithms.track_linking.chains import Links, chain_heads
+from epipole.tasks.algorithms.track_linking.likelihood_ratio import link_by_likelihood
+from epipole.tasks.algorithms.track_linking.prediction import link_by_prediction
 from epipole.tasks.algorithms.tracking import NONE, follow_detections
 from epipole.tasks.sightings import Frames, Sightings, camera_of, sightings_of, solved_frames
 
@@ -51,12 +54,11 @@ def _follow(
 ) -> npt.NDArray[np.int64]:
     """Return the track number of every sighting."""
     interval_s = frame_interval_ns(frames.time_ns) / 1e9
-    sigma = np.sqrt(np.trace(seen.cov_noise + seen.cov_bias, axis1=1, axis2=2) / 2)
     return follow_detections(
         (frames.time_ns - frames.time_ns[0]) / 1e9,
         seen.offsets,
         seen.u_icrs,
-        sigma,
+        _sigma(seen),
         max_rate_rad_s=np.radians(settings.max_rate_deg_s),
         # Half a frame of slack, for jitter.
         max_coast_s=(settings.max_missed + 1.5) * interval_s,
@@ -86,29 +88,73 @@ def _label(
     settings: Settings,
 ) -> Tracked:
     runs = _runs(frames, seen, track, cameras, settings.alignment.window_s)
-    sensor_id = detections["sensor_id"][0].as_py()
+    sensor_id = str(detections["sensor_id"][0])
     kind = np.full(detections.num_rows, "unknown", dtype=object)
-    tracklet_id = np.full(detections.num_rows, None, dtype=object)
-    names = []
     for run in runs:
-        rows = seen.row[run.members]
-        if run.stands_still:
-            kind[rows] = "star_unlisted"
-            names.append(None)
-            continue
-        # The frame in which it begins names it: the same, whatever else the night holds.
-        first = run.members[0]
-        start = frames.number[seen.frame[first]]
-        centroid = detections["centroid"][int(seen.row[first])].as_py()
-        names.append(f"{sensor_id}-{start}-{centroid}")
-        kind[rows] = "object"
-        tracklet_id[rows] = names[-1]
-    columns = {name: detections[name] for name in DETECTIONS.names}
-    columns |= {"kind": kind, "tracklet_id": tracklet_id, "track_id": tracklet_id}
-    objects = [(run, name) for run, name in zip(runs, names, strict=True) if name]
-    return Tracked(
-        table(DETECTIONS, columns), _tracklet_table(frames, seen, objects, str(sensor_id))
+        kind[seen.row[run.members]] = "star_unlisted" if run.stands_still else "object"
+    objects = sorted(
+        (run for run in runs if not run.stands_still), key=lambda run: int(run.members[0])
     )
+    names = [_name(sensor_id, frames, seen, detections, run) for run in objects]
+    links = _link(frames, seen, objects, camera_of(cameras, int(frames.camera[0])), settings)
+    heads = [names[head] for head in chain_heads(links.before)]
+    tracklet_id = np.full(detections.num_rows, None, dtype=object)
+    track_id = tracklet_id.copy()
+    for run, name, head in zip(objects, names, heads, strict=True):
+        tracklet_id[seen.row[run.members]] = name
+        track_id[seen.row[run.members]] = head
+    columns = {name: detections[name] for name in DETECTIONS.names}
+    columns |= {"kind": kind, "tracklet_id": tracklet_id, "track_id": track_id}
+    return Tracked(
+        table(DETECTIONS, columns),
+        _tracklet_table(frames, seen, objects, names, heads, links.chi2, sensor_id),
+    )
+
+
+def _name(sensor_id: str, frames: Frames, seen: Sightings, detections: pa.Table, run: _Run) -> str:
+    """Return a tracklet's id: the frame and centroid in which it begins name it.
+
+    So it is the same, whatever else the night holds.
+    """
+    first = run.members[0]
+    centroid = detections["centroid"][int(seen.row[first])].as_py()
+    return f"{sensor_id}-{frames.number[seen.frame[first]]}-{centroid}"
+
+
+def _link(
+    frames: Frames, seen: Sightings, runs: list[_Run], camera: Camera, settings: Settings
+) -> Links:
+    """Return which run continues which, by the method that the settings name."""
+    chosen = settings.tracklets
+    if chosen.link_method == "none" or not runs:
+        return Links(np.full(len(runs), NONE), np.full(len(runs), np.nan))
+    members = np.concatenate([run.members for run in runs])
+    offsets = np.cumsum([0, *(len(run.members) for run in runs)])
+    fragments = (
+        offsets.astype(np.int64),
+        (frames.time_ns[seen.frame[members]] - frames.time_ns[0]) / 1e9,
+        seen.u_icrs[members],
+        _sigma(seen)[members],
+    )
+    if chosen.link_method == "prediction":
+        return link_by_prediction(
+            *fragments,
+            gap_s=chosen.link_gap_s,
+            kept=chosen.link_kept,
+            interval_s=frame_interval_ns(frames.time_ns) / 1e9,
+            q_rad2_s3=chosen.link_noise_px * camera.pixel_rad**2,
+        )
+    return link_by_likelihood(
+        *fragments,
+        gap_s=chosen.link_gap_s,
+        kept=chosen.link_kept,
+        field_sr=camera.width * camera.height * camera.pixel_rad**2,
+    )
+
+
+def _sigma(seen: Sightings) -> Array:
+    """Return the 1-sigma error an axis [rad] of each sighting, attitude and all."""
+    return np.sqrt(np.trace(seen.cov_noise + seen.cov_bias, axis1=1, axis2=2) / 2)
 
 
 def _runs(
@@ -151,22 +197,27 @@ def _mean_rate(time_s: Array, u: Array, cov_noise: Array) -> tuple[float, float]
 
 
 def _tracklet_table(
-    frames: Frames, seen: Sightings, objects: list[tuple[_Run, str]], sensor_id: str
+    frames: Frames,
+    seen: Sightings,
+    runs: list[_Run],
+    names: list[str],
+    heads: list[str],
+    link_chi2: Array,
+    sensor_id: str,
 ) -> pa.Table:
     time_ns = frames.time_ns[seen.frame]
-    names = [name for _, name in objects]
     built = table(
         TRACKLETS,
         {
             "tracklet_id": names,
-            "track_id": names,
-            "sensor_id": [sensor_id] * len(objects),
-            "start_time": np.array([time_ns[run.members[0]] for run, _ in objects], np.int64),
-            "end_time": np.array([time_ns[run.members[-1]] for run, _ in objects], np.int64),
-            "n_detections": [len(run.members) for run, _ in objects],
-            "rate_arcsec_s": [run.rate_rad_s / ARCSEC for run, _ in objects],
-            "residual_px": [run.residual_px for run, _ in objects],
-            "link_chi2": pa.nulls(len(objects), pa.float64()),
+            "track_id": heads,
+            "sensor_id": [sensor_id] * len(runs),
+            "start_time": np.array([time_ns[run.members[0]] for run in runs], np.int64),
+            "end_time": np.array([time_ns[run.members[-1]] for run in runs], np.int64),
+            "n_detections": [len(run.members) for run in runs],
+            "rate_arcsec_s": [run.rate_rad_s / ARCSEC for run in runs],
+            "residual_px": [run.residual_px for run in runs],
+            "link_chi2": nullable(link_chi2),
         },
     )
     return built.sort_by([("start_time", "ascending"), ("tracklet_id", "ascending")])

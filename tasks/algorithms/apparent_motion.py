@@ -1,0 +1,35 @@
+"""How fast the apparent motion of an object can change: bounds from its apparent rate.
+
+Geometry changes a rate by its square (an object that passes at range d with speed v turns at
+v / d, and its rate changes by up to that squared), gravity by g / v of a low orbit times the
+rate, and a sensor in a low orbit by its own acceleration over the range of a far object. Each
+further derivative brings one more factor of the rate, or of the angular rate of a low orbit.
+"""
+
+import numpy as np
+from numba import njit
+
+LOW_ORBIT_S = 1e-3  # [1/s] angular rate of a low orbit; also g / v there
+FAR_RAD_S2 = 2.5e-7  # [rad/s^2] a low sensor's own acceleration, seen from a distant object
+
+
+@njit(cache=True, nogil=True)
+def acceleration(rate: float) -> float:
+    """Return how fast [rad/s^2] a rate [rad/s] may change."""
+    return rate * rate + LOW_ORBIT_S * rate + FAR_RAD_S2
+
+
+@njit(cache=True, nogil=True)
+def jerk(rate: float) -> float:
+    """Return how fast [rad/s^3] the acceleration at a rate [rad/s] may change."""
+    return 2 * rate**3 + LOW_ORBIT_S * acceleration(rate)
+
+
+@njit(cache=True, nogil=True)
+def cubic_span(rate: float, sigma: float) -> float:
+    """Return over how long [s] a cubic describes the motion to a standard deviation [rad].
+
+    The best cubic misses a quartic s t^4 / 24 by an eighth of its value at the ends.
+    """
+    snap = 2 * (rate + LOW_ORBIT_S) * jerk(rate)
+    return float(2 * np.sqrt(np.sqrt(8 * 24 * sigma / snap)))
