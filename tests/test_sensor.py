@@ -7,6 +7,7 @@ import pytest
 from random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
 
 from epipole.tasks.algorithms.star_catalogue import limit_for_density
+from epipole.tasks.algorithms.star_identification import sensor
 from epipole.tasks.algorithms.star_identification.sensor import Spots, frame_of, identify_sensor
 from epipole.tasks.algorithms.star_identification.sky import (
     pattern_pairs,
@@ -117,3 +118,12 @@ def test_an_error_that_is_nowhere_stated_counts_as_one_pixel_times_the_scale():
     scaled = frame_of(spots, 0.5, use_flux=False)
     np.testing.assert_allclose(scaled.sigma_rad, 0.5 * spots.pixel_rad)
     assert np.isnan(scaled.instrumental_mag).all()
+
+
+def test_what_a_poor_sample_hides_is_learned_from_the_frames_that_are_solved(monkeypatch):
+    # The sample is made to fail: then 0.4 px stated as 0.3 would go through as stated.
+    spots = [_spots(k, 0.4, 0.3, n_false=5)[0] for k in range(25)]
+    monkeypatch.setattr(sensor, "_first_scale", lambda sample, skies, known, scales: (known, []))
+    found = _identify(spots)
+    assert found.sigma_scale * 0.3 == pytest.approx(0.4, rel=0.06)
+    assert found.sky.catalogue.magnitude[-1] <= 6.25
