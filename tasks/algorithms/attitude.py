@@ -81,6 +81,14 @@ def invert_symmetric(A, out):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def copy_matrix(source, target):
+    """Copy a 3x3 matrix (compiled); a slice assignment compiles to far more."""
+    for i in range(3):
+        for j in range(3):
+            target[i, j] = source[i, j]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def turn(R, x, y, z):
     """Turn R by the rotation vector (x, y, z) about its sensor axes, in place (compiled)."""
     angle = np.sqrt(x * x + y * y + z * z)

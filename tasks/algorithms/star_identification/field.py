@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from epipole.tasks.algorithms.attitude import refine_attitude, turn
+from epipole.tasks.algorithms.attitude import copy_matrix, refine_attitude, turn
 from epipole.tasks.algorithms.star_identification.evidence import (
     choice_lost,
     choice_predicted,
@@ -15,6 +15,8 @@ from epipole.tasks.algorithms.star_identification.evidence import (
 # A centroid between two stars, or a star between two centroids, goes to the better one only
 # if that is this much better in chi-square (odds 20:1); otherwise to neither.
 CLEARLY_BETTER = 6.0
+# Brightest centroids on which a prediction is tried to be shifted.
+N_NUDGED = 12
 # A match whose brightness is this far off is a coincidence [mag].
 ODD_MAG = 2.5
 
@@ -195,7 +197,7 @@ def best_nudge(R0, s_xy, s_z, u, sigma, a, gate, n_tried, R):
     v, w, trial = np.empty((m, 3)), np.empty((m, 3)), np.empty((3, 3))
     turn_stars(R0, a, v)
     best = 0.0
-    R[:] = R0
+    copy_matrix(R0, R)
     for i in range(min(n, n_tried)):
         off2 = u[i, 0] * u[i, 0] + u[i, 1] * u[i, 1]
         reach2 = gate * gate * (s_xy * s_xy + s_z * s_z * off2 + sigma[i] * sigma[i])
@@ -203,7 +205,7 @@ def best_nudge(R0, s_xy, s_z, u, sigma, a, gate, n_tried, R):
             dx, dy = v[s, 0] - u[i, 0], v[s, 1] - u[i, 1]
             if dx * dx + dy * dy > reach2 or v[s, 2] <= 0.0:
                 continue
-            trial[:] = R0
+            copy_matrix(R0, trial)
             _nudge(trial, u, i, a, s)
             turn_stars(trial, a, w)
             hits = 0.0
@@ -218,7 +220,7 @@ def best_nudge(R0, s_xy, s_z, u, sigma, a, gate, n_tried, R):
                 hits += 1.0 - nearest / r2
             if hits > best:
                 best = hits
-                R[:] = trial
+                copy_matrix(trial, R)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -268,41 +270,24 @@ def solve_predicted(
     Rt, Pt = np.empty((3, 3)), np.empty((3, 3))
     star_t, chi2_t = np.empty(len(u), np.int64), np.zeros(len(u))
     for way in range(2):
-        if way == 0:
-            Rt[:] = R0
-            matches = settle(
-                Rt,
-                Pt,
-                s_xy,
-                s_z,
-                u,
-                sigma,
-                instrumental,
-                a,
-                magnitude,
-                gate,
-                zero_point,
-                star_t,
-                chi2_t,
-            )
-        else:
-            best_nudge(R0, s_xy, s_z, u, sigma, a, gate, 12, Rt)
-            near = 2.0 * np.min(sigma)
-            matches = settle(
-                Rt,
-                Pt,
-                near,
-                s_z,
-                u,
-                sigma,
-                instrumental,
-                a,
-                magnitude,
-                gate,
-                zero_point,
-                star_t,
-                chi2_t,
-            )
+        copy_matrix(R0, Rt)
+        if way == 1:
+            best_nudge(R0, s_xy, s_z, u, sigma, a, gate, N_NUDGED, Rt)
+        matches = settle(
+            Rt,
+            Pt,
+            s_xy if way == 0 else 2.0 * sigma[0],
+            s_z,
+            u,
+            sigma,
+            instrumental,
+            a,
+            magnitude,
+            gate,
+            zero_point,
+            star_t,
+            chi2_t,
+        )
         if matches >= 3:
             evidence, _ = match_evidence(
                 star_t,
@@ -318,7 +303,10 @@ def solve_predicted(
             evidence += choice_lost(Pt) if lost else choice_predicted(Pt, P0, Rt, R0)
             if evidence > best:
                 best = evidence
-                R[:], P[:], star_of[:], chi2_of[:] = Rt, Pt, star_t, chi2_t
+                copy_matrix(Rt, R)
+                copy_matrix(Pt, P)
+                for k in range(len(u)):
+                    star_of[k], chi2_of[k] = star_t[k], chi2_t[k]
         if best > enough or lost:
             break
     return best

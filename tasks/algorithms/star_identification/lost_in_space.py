@@ -15,7 +15,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.attitude import refine_attitude
+from epipole.tasks.algorithms.attitude import copy_matrix, refine_attitude
 from epipole.tasks.algorithms.kvector import range_of
 from epipole.tasks.algorithms.star_identification.evidence import choice_lost, match_evidence
 from epipole.tasks.algorithms.star_identification.field import aberrated
@@ -273,11 +273,11 @@ def search(
                         if score < math.log(rest + 1.0) - 1.0:  # as many hits as chance gives
                             continue
                         row_of[i], row_of[j] = ra, rb
-                        row_of[n_checked:] = -1
                         for r in range(3):
                             for m in range(3):
                                 R[r, m] = E[0, r] * F[0, m] + E[1, r] * F[1, m] + E[2, r] * F[2, m]
-                        row_try[:] = row_of
+                        for k in range(n):
+                            row_try[k] = row_of[k] if k < n_checked else -1
                         evidence = _judge(
                             R,
                             P,
@@ -308,10 +308,10 @@ def search(
                         if best > -1e9 and gap2 < 2.0 * SAME_ATTITUDE * SAME_ATTITUDE:
                             if evidence > best:
                                 best = evidence
-                                R_best[:] = R
+                                copy_matrix(R, R_best)
                         elif evidence > best:
                             best, runner = evidence, best
-                            R_best[:] = R
+                            copy_matrix(R, R_best)
                         else:
                             runner = evidence
                         if best > enough and best - runner > CLEAR_LEAD:
