@@ -28,38 +28,53 @@ class Fragments(NamedTuple):
 
 
 def broken_tracks(
-    seed: int, n_objects: int, gap_s: tuple[float, float], *, duration_s: float = 240.0
+    seed: int,
+    n_objects: int,
+    gap_s: tuple[float, float],
+    *,
+    belt: bool = True,
+    field_rad: float = FIELD_RAD,
+    duration_s: float = 240.0,
 ) -> Fragments:
-    """Return tracks at 1 Hz of objects in 8 degrees about a low sensor's target, each with gaps.
+    """Return tracks at 1 Hz of objects in a low sensor's field, each with gaps.
 
-    Objects are on every kind of orbit: at ranges of 1,500 to 45,000 km, with velocities in any
-    direction, so rates from some arcseconds to some hundred a second. Each is in the field for
-    part of the time, and is lost once or twice for a time drawn from `gap_s`.
+    In the belt, objects are near geostationary height on orbits inclined up to 15 degrees: they
+    all move nearly alike, which is what makes them hard to tell apart. Else they are on every
+    kind of orbit, at ranges of 1,500 to 45,000 km and with velocities in any direction. Each
+    is in the field for part of the time, and is lost once or twice for a time from `gap_s`.
     """
     rng = np.random.default_rng(seed)
     sensor = np.array([7000.0, 0.001, np.radians(60.0), rng.uniform(0, 6), 0.0, rng.uniform(0, 6)])
     t = np.arange(duration_s) + 0.0
     r_sensor, _ = state_at(sensor, t)
-    out = r_sensor[len(t) // 2] / np.linalg.norm(r_sensor[len(t) // 2])
+    out = _direction_up(rng, r_sensor[len(t) // 2])
     e_1 = np.cross(out, rng.normal(size=3))
     e_1 /= np.linalg.norm(e_1)
     e_2 = np.cross(out, e_1)
+    sigma = SIGMA_PX * field_rad / FIELD_PX
     offsets, times, u, truth = [0], [], [], []
     for k in range(n_objects):
         at = rng.uniform(0, duration_s)
-        place = rng.uniform(-FIELD_RAD / 2, FIELD_RAD / 2, 2)
+        place = rng.uniform(-field_rad / 2, field_rad / 2, 2)
         sight = out + place[0] * e_1 + place[1] * e_2
-        reach = np.exp(rng.uniform(np.log(1500.0), np.log(45000.0)))
+        sight /= np.linalg.norm(sight)
         here, _ = state_at(sensor, np.array([at]))
-        r = here[0] + reach * sight / np.linalg.norm(sight)
-        heading = np.cross(r, rng.normal(size=3))
+        if belt:  # where the line of sight passes the height of an orbit
+            height = 42164.0 + rng.normal() * 300.0
+            reach = _reach(here[0], sight, height)
+            heading = np.cross([0.0, 0.0, 1.0], sight)
+            heading += rng.normal() * np.radians(8.0) * np.cross(sight, heading)
+        else:
+            reach = np.exp(rng.uniform(np.log(1500.0), np.log(45000.0)))
+            heading = np.cross(sight, rng.normal(size=3))
+        r = here[0] + reach * sight
         v = heading / np.linalg.norm(heading) * np.sqrt(GM_KM3_S2 / np.linalg.norm(r))
         line = _two_body(r, v, t - at) - r_sensor
         line /= np.linalg.norm(line, axis=1, keepdims=True)
-        inside = (np.abs(line @ e_1) < FIELD_RAD / 2) & (np.abs(line @ e_2) < FIELD_RAD / 2)
+        inside = (np.abs(line @ e_1) < field_rad / 2) & (np.abs(line @ e_2) < field_rad / 2)
         seen = np.flatnonzero(inside & (line @ out > 0) & (rng.random(len(t)) > 0.05))
         for part in _break(rng, seen, t, gap_s):
-            noise = rng.normal(size=(len(part), 3)) * SIGMA_PX * PIXEL_RAD
+            noise = rng.normal(size=(len(part), 3)) * sigma
             spot = line[part] + noise
             u.append(spot / np.linalg.norm(spot, axis=1, keepdims=True))
             times.append(t[part])
@@ -68,8 +83,23 @@ def broken_tracks(
     n = offsets[-1]
     return Fragments(
         np.array(offsets), np.concatenate(times), np.concatenate(u),
-        np.full(n, SIGMA_PX * PIXEL_RAD), np.array(truth),
+        np.full(n, sigma), np.array(truth),
     )  # fmt: skip
+
+
+def _direction_up(rng: np.random.Generator, r: Array) -> Array:
+    """Return a direction near the equator that is well above a low sensor's horizon."""
+    while True:
+        a = rng.uniform(0, 2 * np.pi)
+        out = np.array([np.cos(a), np.sin(a), 0.0])
+        if out @ r > 0.3 * np.linalg.norm(r):
+            return out
+
+
+def _reach(r: Array, sight: Array, height_km: float) -> float:
+    """Return how far along a line of sight a sphere about the Earth's middle is crossed."""
+    along = r @ sight
+    return float(-along + np.sqrt(along * along - r @ r + height_km**2))
 
 
 def _break(

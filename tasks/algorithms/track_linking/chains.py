@@ -73,6 +73,34 @@ def _assign(members: Indices, i: Indices, j: Indices, gain: Array) -> Indices:
     return taken[taken != NONE]
 
 
+def fill_in(links: Links, earlier: Indices, later: Indices, gain: Array, chi2: Array) -> Links:
+    """Return the links with fragments put in that stand alone inside a link and fit both sides.
+
+    Two long fragments know of each other more than either does of a short one between them, so
+    that the link past it can outweigh the two links through it; but it contradicts neither.
+    Parameters as in `choose_links`.
+    """
+    n = len(links.before)
+    before, found = links.before.copy(), links.chi2.copy()
+    good = np.flatnonzero(gain > 0)
+    pair = {(int(earlier[p]), int(later[p])): p for p in good}
+    while True:
+        after = np.full(n, NONE)
+        after[before[before != NONE]] = np.flatnonzero(before != NONE)
+        alone = (before == NONE) & (after == NONE)
+        inner = [
+            (gain[p] + gain[pair[m, k]], p, pair[m, k])
+            for p in good[alone[later[good]] & (after[earlier[good]] != NONE)]
+            for m, k in [(int(later[p]), int(after[earlier[p]]))]
+            if (m, k) in pair
+        ]
+        if not inner:
+            return Links(before, found)
+        _, p, q = max(inner)
+        for link in (p, q):
+            before[later[link]], found[later[link]] = earlier[link], chi2[link]
+
+
 def chain_heads(before: Indices) -> Indices:
     """Return, for each fragment, the first of its chain (itself where it stands alone)."""
     head = np.arange(len(before))

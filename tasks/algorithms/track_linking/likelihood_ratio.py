@@ -13,7 +13,7 @@ from numba import njit
 from scipy.special import chdtri
 
 from epipole.tasks.algorithms.apparent_motion import acceleration, cubic_span, jerk
-from epipole.tasks.algorithms.track_linking.chains import Links, choose_links
+from epipole.tasks.algorithms.track_linking.chains import Links, choose_links, fill_in
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -27,7 +27,8 @@ class _Ends(NamedTuple):
 
     S[:, k] = sum w t^k, B[:, k] = sum w t^k (u - u0), C = sum w (u - u0)(u - u0)', with
     w = 1 / sigma^2 and t from the instant t0; and the end itself: time, place and rate with
-    their variances (infinite: a single detection has no rate).
+    their variances (infinite: a single detection has no rate), and the square of what its
+    acceleration shows beyond noise and beyond the bound that its rate sets.
     """
 
     t0: Array
@@ -40,6 +41,7 @@ class _Ends(NamedTuple):
     w: Array
     var_u: Array
     var_w: Array
+    extra: Array
 
 
 @njit(cache=True, nogil=True)
@@ -59,7 +61,32 @@ def _sums(time_s, u, sigma, lo, hi, t0, u0, S, B, C):
 
 
 @njit(cache=True, nogil=True)
-def _reduce(offsets, time_s, u, sigma, last, t0, u0, S, B, C, at, end_u, end_w, var_u, var_w):
+def _unforeseen(S, B, half, bend):
+    """Return the square [rad^2/s^4] of a fragment's acceleration beyond noise and bound.
+
+    A near object that comes straight on is slow and yet soon fast: its rate sets no bound.
+    """
+    # Time in units of the half-length, and a parabola free of value and slope.
+    s_0, s_1, s_2 = S[0], S[1] / half, S[2] / half**2
+    s_3, s_4 = S[3] / half**3, S[4] / half**4
+    det = s_0 * s_2 - s_1 * s_1
+    on_0 = (s_2 * s_2 - s_3 * s_1) / det
+    on_1 = (s_0 * s_3 - s_1 * s_2) / det
+    weight = s_4 - on_0 * s_2 - on_1 * s_3
+    if not weight > 1e-9 * s_4:
+        return 0.0
+    square = 0.0
+    for a in range(3):
+        value = B[2, a] / half**2 - on_0 * B[0, a] - on_1 * B[1, a] / half
+        square += (2 * value / (weight * half**2)) ** 2
+    noise = 4 / (weight * half**4)  # variance of the acceleration on each of two axes
+    return max(square - 16 * noise - bend * bend, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _reduce(
+    offsets, time_s, u, sigma, last, t0, u0, S, B, C, at, end_u, end_w, var_u, var_w, extra
+):
     """Fill the sums of every fragment's first (or last) part, as long as a cubic serves it."""
     for f in range(len(offsets) - 1):
         lo, hi = offsets[f], offsets[f + 1]
@@ -94,6 +121,7 @@ def _reduce(offsets, time_s, u, sigma, last, t0, u0, S, B, C, at, end_u, end_w, 
             var_u[f] = (S[f, 2] - 2 * S[f, 1] * dt + S[f, 0] * dt * dt) / det
             var_u[f] += (bend * half * half) ** 2
             var_w[f] = S[f, 0] / det + (bend * half) ** 2
+            extra[f] = _unforeseen(S[f], B[f], half, bend)
         else:
             end_u[f] = u0[f]
             var_u[f], var_w[f] = 1.0 / S[f, 0], np.inf
@@ -103,7 +131,7 @@ def _ends(offsets: Indices, time_s: Array, u: Array, sigma: Array, last: bool) -
     n = len(offsets) - 1
     ends = _Ends(
         np.zeros(n), np.zeros((n, 3)), np.zeros((n, 7)), np.zeros((n, 4, 3)), np.zeros((n, 3, 3)),
-        np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n),
+        np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros(n),
     )  # fmt: skip
     _reduce(offsets, time_s, u, sigma, last, *ends)
     return ends
@@ -193,7 +221,7 @@ def _free_parameters(work, prior_2, prior_3):
 
 @njit(cache=True, nogil=True)
 def _compare(
-    i, j, t0_1, u0_1, S_1, B_1, C_1, t0_2, u0_2, S_2, B_2, C_2, at_1, at_2, first, last,
+    i, j, t0_1, u0_1, S_1, B_1, C_1, t0_2, u0_2, S_2, B_2, C_2, at_1, at_2, first, last, extra_2,
     A_1, b_1, A_2, b_2, work,
 ):  # fmt: skip
     """Return (D, degrees of freedom, ln likelihood ratio without the prior volume)."""
@@ -225,8 +253,11 @@ def _compare(
     scale = max(last[j] - centre, centre - first[i])
     c_1 = _shift(S_1[i], B_1[i], C_1[i], e_1, e_2, drift, t0_1[i], centre, scale, A_1, b_1)
     c_2 = _shift(S_2[j], B_2[j], C_2[j], e_1, e_2, drift, t0_2[j], centre, scale, A_2, b_2)
-    prior_2 = 4.0 / (acceleration(rate) * scale**2) ** 2
-    prior_3 = 36.0 / (jerk(rate) * scale**3) ** 2
+    bend2 = acceleration(rate) ** 2 + extra_2
+    # What approaches at r' / r bends by twice that times its rate, and that by half as much again.
+    twist = jerk(rate) + 1.5 * extra_2 / max(rate, 1e-9)
+    prior_2 = 4.0 / (bend2 * scale**4)
+    prior_3 = 36.0 / (twist * scale**3) ** 2
     got_1, log_1 = _misfit(A_1, b_1, prior_2, prior_3, work)
     free = _free_parameters(work, prior_2, prior_3)
     got_2, log_2 = _misfit(A_2, b_2, prior_2, prior_3, work)
@@ -245,20 +276,20 @@ def _compare(
 
 
 @njit(cache=True, nogil=True)
-def _near(u_1, w_1, var_u_1, var_w_1, u_2, w_2, var_u_2, var_w_2, gap):
+def _near(u_1, w_1, var_u_1, var_w_1, u_2, w_2, var_u_2, var_w_2, extra, gap):
     """Return whether straight lines from both ends come near each other in mid-gap."""
     half, miss, arc, rate = 0.5 * gap, 0.0, 0.0, 0.0
     for a in range(3):
         miss += (u_1[a] + half * w_1[a] - u_2[a] + half * w_2[a]) ** 2
         arc += (u_2[a] - u_1[a]) ** 2
     rate = np.sqrt(arc) / gap
-    bend = 0.5 * acceleration(rate) * half * half
-    allowed = var_u_1 + var_u_2 + half * half * (var_w_1 + var_w_2) + 2 * bend * bend
+    bend2 = 0.25 * (acceleration(rate) ** 2 + extra) * half**4
+    allowed = var_u_1 + var_u_2 + half * half * (var_w_1 + var_w_2) + 2 * bend2
     return arc < FARTHEST_RAD**2 and miss < 2 * SEARCH_SIGMA**2 * allowed
 
 
 @njit(cache=True, nogil=True)
-def _search(by_start, start, end, gap_s, u_1, w_1, vu_1, vw_1, u_2, w_2, vu_2, vw_2):
+def _search(by_start, start, end, gap_s, u_1, w_1, vu_1, vw_1, x_1, u_2, w_2, vu_2, vw_2, x_2):
     """Return the pairs (earlier, later) that the gap and the quick test leave."""
     n, room, count = len(start), 1024, 0
     first, second = np.empty(room, np.int64), np.empty(room, np.int64)
@@ -269,7 +300,10 @@ def _search(by_start, start, end, gap_s, u_1, w_1, vu_1, vw_1, u_2, w_2, vu_2, v
             gap = start[j] - end[i]
             if gap > gap_s:
                 break
-            if not _near(u_1[i], w_1[i], vu_1[i], vw_1[i], u_2[j], w_2[j], vu_2[j], vw_2[j], gap):
+            if not _near(
+                u_1[i], w_1[i], vu_1[i], vw_1[i], u_2[j], w_2[j], vu_2[j], vw_2[j],
+                max(x_1[i], x_2[j]), gap,
+            ):  # fmt: skip
                 continue
             if count == room:
                 room *= 2
@@ -283,14 +317,15 @@ def _search(by_start, start, end, gap_s, u_1, w_1, vu_1, vw_1, u_2, w_2, vu_2, v
 @njit(cache=True, nogil=True)
 def _compare_all(
     earlier, later, t0_1, u0_1, S_1, B_1, C_1, at_1, t0_2, u0_2, S_2, B_2, C_2, at_2, first, last,
-    out_D, out_free, out_log,
+    extra_1, extra_2, out_D, out_free, out_log,
 ):  # fmt: skip
     A_1, b_1, A_2, b_2 = np.empty((4, 4)), np.empty((4, 2)), np.empty((4, 4)), np.empty((4, 2))
     work = np.zeros((4, 4))
     for p in range(len(earlier)):
         out_D[p], out_free[p], out_log[p] = _compare(
             earlier[p], later[p], t0_1, u0_1, S_1, B_1, C_1, t0_2, u0_2, S_2, B_2, C_2, at_1,
-            at_2, first, last, A_1, b_1, A_2, b_2, work,
+            at_2, first, last, max(extra_1[earlier[p]], extra_2[later[p]]), A_1, b_1, A_2, b_2,
+            work,
         )  # fmt: skip
 
 
@@ -332,17 +367,19 @@ def link_by_likelihood(
     by_start = np.argsort(head.at, kind="stable")
     earlier, later = _search(
         by_start, head.at, tail.at, float(gap_s), tail.u, tail.w, tail.var_u, tail.var_w,
-        head.u, head.w, head.var_u, head.var_w,
+        tail.extra, head.u, head.w, head.var_u, head.var_w, head.extra,
     )  # fmt: skip
     D, free, log_ratio = (np.empty(len(earlier)) for _ in range(3))
     _compare_all(
         earlier, later, *tail[:6], *head[:6], time_s[offsets[:-1]], time_s[offsets[1:] - 1],
-        D, free, log_ratio,
+        tail.extra, head.extra, D, free, log_ratio,
     )  # fmt: skip
     gain = log_ratio - np.log(_others(head, tail, gap_s)[earlier])
     gain += np.log(field_sr * _rate_area(head))
     gain[chdtri(free, 1.0 - kept) < D] = 0.0
-    return choose_links(earlier, later, gain, np.maximum(D, 0.0), len(offsets) - 1)
+    D = np.maximum(D, 0.0)
+    links = choose_links(earlier, later, gain, D, len(offsets) - 1)
+    return fill_in(links, earlier, later, gain, D)
 
 
 def _others(head: _Ends, tail: _Ends, gap_s: float) -> Array:
