@@ -8,20 +8,28 @@ in `rejects`. Only a log that gives no frame at all is an error.
 import hashlib
 import mmap
 import os
-from collections.abc import Callable
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from epipole.io.log_columns import CameraColumns, FrameColumns, StateColumns
-from epipole.io.log_records import MAGIC, Channel, RecordWalk
+import numpy as np
+import numpy.typing as npt
+
+from epipole.io.camera_columns import CameraColumns
+from epipole.io.frame_columns import FrameColumns
+from epipole.io.log_records import Block, RecordWalk
 from epipole.io.log_rejects import RejectList
-from epipole.io.message_decoding import ENCODINGS, Record, UndecodableError, decoder
+from epipole.io.log_summary import MAGIC
+from epipole.io.message_decoding import ENCODINGS
+from epipole.io.message_parts import Part
+from epipole.io.state_columns import StateColumns
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
 from epipole.schemas.log_tables import LogPart, LogSource
 from epipole.schemas.messages import CALIBRATION, CARRIES, FRAME, STATE
 
-Decoder = Callable[[bytes], Record]
+THREADS = 2  # that unpack and check chunks, beside the one that decodes
 
 
 def read_log(path: str | os.PathLike[str]) -> LogPart:
@@ -101,32 +109,30 @@ def _line(error: BaseException) -> str:
 def _read_messages(
     data: memoryview, where: str, rejects: RejectList, columns: dict[str, Any]
 ) -> None:
-    """Decode every wanted message into the collector of its kind."""
-    decoders: dict[Channel, tuple[str, Decoder]] = {}
-    walk = RecordWalk(data, frozenset(CARRIES))
-    for channel, time_ns, offset, message in walk.messages():
-        found = decoders.get(channel)
-        if found is None:
-            found = decoders[channel] = _decoder(channel, where)
-        carries, decode = found
-        try:
-            record = decode(message)
-        except UndecodableError:
-            rejects.add(f"undecodable_{carries}", time_ns=time_ns, offset=offset)
-            continue
-        columns[carries].add(record, offset, time_ns)
+    """Take every wanted message into the columns of its kind."""
+    with ThreadPoolExecutor(THREADS, "open chunks") as pool:
+        walk = RecordWalk(data, frozenset(CARRIES), pool)
+        for block in walk.blocks():
+            for carries, chosen in _kinds(block, where):
+                columns[carries].add(Part(block, carries, chosen, rejects))
     for damage in walk.damage:
         rejects.add(damage.reason, time_ns=damage.time_ns, offset=damage.offset, count=damage.n)
 
 
-def _decoder(channel: Channel, where: str) -> tuple[str, Decoder]:
-    if channel.encoding not in ENCODINGS:
-        raise LogError(
-            f"{where}: topic {channel.topic}: messages are encoded as {channel.encoding!r}; "
-            f"write {channel.schema} as one of {', '.join(ENCODINGS)}"
-        )
-    carries = CARRIES[channel.schema]
-    return carries, decoder(carries, channel.encoding)
+def _kinds(block: Block, where: str) -> Iterator[tuple[str, npt.NDArray[np.int64]]]:
+    """Yield what the messages of a block carry, and which of them carry it."""
+    code = np.zeros(max(block.channels) + 1, np.uint8)
+    kinds = (FRAME, STATE, CALIBRATION)
+    for number, channel in block.channels.items():
+        if channel.encoding not in ENCODINGS:
+            raise LogError(
+                f"{where}: topic {channel.topic}: messages are encoded as {channel.encoding!r}; "
+                f"write {channel.schema} as one of {', '.join(ENCODINGS)}"
+            )
+        code[number] = kinds.index(CARRIES[channel.schema])
+    of_message = code[block.channel]
+    for i in np.unique(code[list(block.channels)]).tolist():
+        yield kinds[i], np.flatnonzero(of_message == i)
 
 
 def _advice(rejects: RejectList) -> str:

@@ -10,43 +10,41 @@ behind a damaged record), and the number of messages (to know that one is missin
 import struct
 import zlib
 from bisect import bisect_right
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
-from epipole.io.log_compression import ChunkError, decompress, decompress_part
+import numpy as np
+import numpy.typing as npt
 
-MAGIC = b"\x89MCAP0\r\n"
-# A chunk holds a few MiB; one that claims more than this is damage or an attack.
-MAX_CHUNK_BYTES = 256 << 20
+from epipole.io.log_channels import Channel, ChannelTable
+from epipole.io.log_chunks import OpenedChunk, open_chunk, open_cut_chunk, read_head
+from epipole.io.log_compression import ChunkError
+from epipole.io.log_summary import DATA_END, MAGIC, RECORD, Summary, next_log, read_summary
+from epipole.io.record_scan import CHANNEL, MESSAGE, SCHEMA, Bytes, RecordIndex, index_records
 
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-ATTACHMENT, STATISTICS, METADATA, DATA_END = 0x09, 0x0B, 0x0C, 0x0F
+CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA = 0x06, 0x07, 0x09, 0x0C
 PRIVATE = 0x80  # from here on records are someone's own, and skipped
 IGNORED = (ATTACHMENT, METADATA)
+LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # may lie in a chunk or outside
+AHEAD_BYTES = 32 << 20  # of chunks that are opened while the ones before them are decoded
 
-_RECORD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<BQHIQQ")
-_CHUNK = struct.Struct("<QQQI")
-_FOOTER_BYTES = 9 + 20 + len(MAGIC)
-
-
-class Channel(NamedTuple):
-    """What a channel carries, by the name of its schema, and in which encoding."""
-
-    topic: str
-    encoding: str
-    schema: str
+Numbers = npt.NDArray[np.int64]
 
 
-class Message(NamedTuple):
-    """One message; `offset` is its chunk's place in the file, or its own outside chunks."""
+class Block(NamedTuple):
+    """Wanted messages that follow each other; message i is ``data[start[i]:end[i]]``."""
 
-    channel: Channel
-    time_ns: int
-    offset: int
-    data: bytes
+    data: Bytes
+    channels: dict[int, Channel]  # by number
+    channel: npt.NDArray[np.uint16]  # number
+    time_ns: npt.NDArray[np.uint64]  # when it was logged
+    start: Numbers
+    end: Numbers
+    offset: Numbers  # place in the file of its chunk, or its own outside chunks
 
 
 class Damage(NamedTuple):
@@ -58,38 +56,46 @@ class Damage(NamedTuple):
     n: int
 
 
+class Place(NamedTuple):
+    """Part of the data section: a record, a run of loose ones, or damage, which has a reason."""
+
+    opcode: int
+    at: int
+    after: int
+    reason: str = ""
+
+
 @dataclass
 class RecordWalk:
-    """A walk over the bytes of one log; `damage` is complete when `messages` has ended."""
+    """A walk over the bytes of one log; `damage` is complete when `blocks` has ended."""
 
     data: memoryview
     wanted: frozenset[str]  # names of the schemas whose messages are asked for
+    pool: Executor | None = None  # opens chunks while the ones before them are decoded
     damage: list[Damage] = field(default_factory=list)
-    _schemas: dict[int, str] = field(default_factory=dict)
-    _channels: dict[int, tuple[str, str, int]] = field(default_factory=dict)
-    _known: dict[int, Channel | None] = field(default_factory=dict)
+    _summary: Summary = field(default_factory=Summary)
     _unknown: dict[int, int] = field(default_factory=dict)
     _counts: dict[int, int] = field(default_factory=dict)
-    _declared: dict[int, int] = field(default_factory=dict)
-    _chunk_offsets: list[int] = field(default_factory=list)
     _lost: dict[int, int] = field(default_factory=dict)  # messages of a damage, by its index
     _lost_chunk: int | None = None  # the damage that message indexes now belong to
-    _data_end: int | None = None  # where the data section ends, if the file is whole
 
-    def messages(self) -> Iterator[Message]:
+    def __post_init__(self) -> None:
+        self._channels = ChannelTable(self.wanted)
+
+    def blocks(self) -> Iterator[Block]:
         """Yield the wanted messages in the order of the file."""
-        self._read_summary()
-        yield from self._walk_file()
+        self._summary = read_summary(self.data, self._channels)
+        for place, opening in self._opened_ahead():
+            yield from self._walk_place(place, opening)
         self._report_missing()
 
-    # The file
+    # Where things are, by the lengths of records alone
 
-    def _walk_file(self) -> Iterator[Message]:
+    def _places(self) -> Iterator[Place]:
         data, end, at = self.data, len(self.data), len(MAGIC)
-        closed = False
-        while at + _RECORD.size <= end:
-            opcode, length = _RECORD.unpack_from(data, at)
-            after = at + _RECORD.size + length
+        while at + RECORD.size <= end:
+            opcode, length = RECORD.unpack_from(data, at)
+            after = at + RECORD.size + length
             skipped_to = self._next_chunk(at)
             limit = end if skipped_to is None else skipped_to
             if opcode == CHUNK:
@@ -97,195 +103,161 @@ class RecordWalk:
             if opcode == 0 or after > limit:
                 if skipped_to is None:
                     if opcode == CHUNK:
-                        yield from self._walk_cut_chunk(at)
+                        yield Place(CHUNK, at, end, "cut")
                     break
-                self._leave_out(at, 0, "damaged_record")
+                yield Place(opcode, at, skipped_to, "damaged_record")
                 at = skipped_to
-            elif opcode == DATA_END and length == 4 and self._data_end in (None, at):
-                closed = True
-                break
+            elif opcode == DATA_END and length == 4 and self._summary.data_end in (None, at):
+                another = next_log(data, after)
+                if another is None:
+                    return
+                yield Place(0, another, another, "log_behind_log")
+                at = another + len(MAGIC)
             else:
-                yield from self._walk_record(opcode, at, after)
+                if opcode in LOOSE:
+                    run = index_records(_bytes(data[at:limit]), only_known=True)
+                    after = max(after, at + run.walked)
+                yield Place(opcode, at, after)
                 at = after
-        if not closed:
-            self._leave_out(at, 0, "truncated")
-
-    def _walk_record(self, opcode: int, at: int, after: int) -> Iterator[Message]:
-        body = at + _RECORD.size
-        if opcode == CHUNK:
-            self._lost_chunk = None
-            yield from self._walk_chunk(at, after)
-        elif opcode == MESSAGE_INDEX and self._is_message_index(body, after):
-            self._count_lost(body)
-        elif opcode in (SCHEMA, CHANNEL, MESSAGE):
-            messages = self._walk_records(bytes(self.data[at:after]), at)
-            if self._sound_outside_chunks:
-                yield from messages
-            else:
-                for message in messages:
-                    self._leave_out(at, message.time_ns, "bad_checksum")
-        elif opcode < PRIVATE and opcode not in IGNORED and at != len(MAGIC):
-            self._leave_out(at, 0, "damaged_record")  # no such record in a data section
-
-    @cached_property
-    def _sound_outside_chunks(self) -> bool:
-        """Whether the data section holds its checksum, the only one of messages outside chunks."""
-        at = self._data_end
-        if at is None or _RECORD.unpack_from(self.data, at) != (DATA_END, 4):
-            return True  # an unclosed log has none
-        (checksum,) = struct.unpack_from("<I", self.data, at + _RECORD.size)
-        return checksum in (0, zlib.crc32(self.data[:at]))
-
-    def _walk_chunk(self, at: int, after: int) -> Iterator[Message]:
-        start_ns = 0
-        try:
-            start_ns, size, checksum, compression, body = self._open_chunk(at, after)
-            records = decompress(self.data[body:after], compression, size)
-            if checksum and zlib.crc32(records) != checksum:
-                raise ChunkError("bad_checksum")
-        except ChunkError as error:
-            self._leave_out(at, start_ns, str(error))
-            self._lost_chunk = len(self.damage) - 1
-            return
-        yield from self._walk_records(records, at, start_ns)
+        yield Place(0, at, end, "truncated")
 
     def _end_of_chunk(self, at: int, after: int, limit: int) -> int:
         """Return where a chunk ends: as its record says, unless only its own length can be."""
         try:
-            body = self._open_chunk(at, None)[-1]
+            own = read_head(self.data, at).end
         except ChunkError:
             return after
-        own = body + struct.unpack_from("<Q", self.data, body - 8)[0]
         return own if own <= limit else after
-
-    def _walk_cut_chunk(self, at: int) -> Iterator[Message]:
-        """Yield what the first part of a chunk holds where the file ends in it.
-
-        Its checksum cannot be verified; that it was cut is known, that it is wrong is not.
-        """
-        try:
-            start_ns, size, _, compression, body = self._open_chunk(at, None)
-            records = decompress_part(self.data[body:], compression, size)
-        except ChunkError:
-            return
-        yield from self._walk_records(records, at, start_ns, cut=True)
-
-    def _open_chunk(self, at: int, after: int | None) -> tuple[int, int, int, str, int]:
-        """Return start time, size, checksum, compression and where the records begin."""
-        body, end = at + _RECORD.size, len(self.data) if after is None else after
-        try:
-            start_ns, _, size, checksum = _CHUNK.unpack_from(self.data, body)
-            compression, body = _string(self.data, body + _CHUNK.size, end)
-            (length,) = struct.unpack_from("<Q", self.data, body)
-        except (struct.error, UnicodeDecodeError) as error:
-            raise ChunkError("damaged_chunk") from error
-        if after is not None and body + 8 + length != after:
-            raise ChunkError("damaged_chunk")
-        if size > MAX_CHUNK_BYTES:
-            raise ChunkError("chunk_too_large")
-        return start_ns, size, checksum, compression, body + 8
-
-    def _walk_records(
-        self, records: bytes, offset: int, start_ns: int = 0, cut: bool = False
-    ) -> Iterator[Message]:
-        """Yield the messages of a chunk's records; `cut`: the last one may be incomplete."""
-        at, end = 0, len(records)
-        while at < end:
-            try:
-                opcode, length = _RECORD.unpack_from(records, at)
-                after = at + _RECORD.size + length
-                if after > end:
-                    raise ChunkError("damaged_chunk")
-                if opcode == MESSAGE:
-                    _, _, number, _, time_ns, _ = _MESSAGE.unpack_from(records, at)
-                    channel = self._channel(number)
-                    if channel is not None:
-                        data = records[at + _MESSAGE.size : after]
-                        yield Message(channel, time_ns, offset, data)
-                elif opcode in (SCHEMA, CHANNEL):
-                    self._declare(opcode, memoryview(records), at + _RECORD.size, after)
-            except (struct.error, ChunkError):
-                if not cut:
-                    self._leave_out(offset, start_ns, "damaged_chunk")
-                return
-            at = after
-
-    # Schemas and channels
-
-    def _declare(self, opcode: int, data: memoryview, at: int, end: int) -> None:
-        try:
-            number = struct.unpack_from("<H", data, at)[0]
-            if opcode == SCHEMA:
-                self._schemas[number] = _string(data, at + 2, end)[0]
-            else:
-                schema = struct.unpack_from("<H", data, at + 2)[0]
-                topic, at = _string(data, at + 4, end)
-                self._channels[number] = (topic, _string(data, at, end)[0], schema)
-        except UnicodeDecodeError as error:
-            raise ChunkError("damaged_chunk") from error
-        self._known.clear()
-
-    def _channel(self, number: int) -> Channel | None:
-        """Return a message's channel, or None where its messages are not asked for."""
-        self._counts[number] = self._counts.get(number, 0) + 1
-        if number not in self._known:
-            self._known[number] = self._find_channel(number)
-        if self._known[number] is None and number not in self._channels:
-            self._unknown[number] = self._unknown.get(number, 0) + 1
-        return self._known[number]
-
-    def _find_channel(self, number: int) -> Channel | None:
-        if number not in self._channels:
-            return None
-        topic, encoding, schema = self._channels[number]
-        name = self._schemas.get(schema, "")
-        return Channel(topic, encoding, name) if name in self.wanted else None
-
-    # The summary
-
-    def _read_summary(self) -> None:
-        """Take schemas, channels, chunk places and counts from the summary, if it is sound."""
-        data, end = self.data, len(self.data)
-        at = end - _FOOTER_BYTES
-        if at < len(MAGIC) or data[end - len(MAGIC) :] != MAGIC:
-            return
-        if _RECORD.unpack_from(data, at) != (FOOTER, 20):
-            return
-        start, _, checksum = struct.unpack_from("<QQI", data, at + _RECORD.size)
-        if not len(MAGIC) <= start < at:
-            self._data_end = at - _RECORD.size - 4 if start == 0 else None
-            return
-        if checksum and zlib.crc32(data[start : end - len(MAGIC) - 4]) != checksum:
-            return
-        self._data_end = start - _RECORD.size - 4
-        try:
-            self._read_summary_records(start, at)
-        except (struct.error, ChunkError):
-            self._declared.clear()  # the walk does without
-        self._chunk_offsets.sort()
-
-    def _read_summary_records(self, at: int, end: int) -> None:
-        while at < end:
-            opcode, length = _RECORD.unpack_from(self.data, at)
-            body, at = at + _RECORD.size, at + _RECORD.size + length
-            if at > end:
-                raise ChunkError("damaged_summary")
-            if opcode in (SCHEMA, CHANNEL):
-                self._declare(opcode, self.data, body, at)
-            elif opcode == CHUNK_INDEX:
-                offset = struct.unpack_from("<Q", self.data, body + 16)[0]
-                if len(MAGIC) <= offset < end:
-                    self._chunk_offsets.append(offset)
-            elif opcode == STATISTICS:
-                (size,) = struct.unpack_from("<I", self.data, body + 42)
-                for i in range(body + 46, min(body + 46 + size, at), 10):
-                    number, count = struct.unpack_from("<HQ", self.data, i)
-                    self._declared[number] = count
 
     def _next_chunk(self, at: int) -> int | None:
         """Return the first place behind `at` where the summary knows of a chunk."""
-        i = bisect_right(self._chunk_offsets, at)
-        return self._chunk_offsets[i] if i < len(self._chunk_offsets) else None
+        offsets = self._summary.chunk_offsets
+        i = bisect_right(offsets, at)
+        return offsets[i] if i < len(offsets) else None
+
+    def _opened_ahead(self) -> Iterator[tuple[Place, Future[OpenedChunk] | None]]:
+        """Yield the places, each chunk with its opening under way if there is a pool."""
+        waiting: deque[tuple[Place, Future[OpenedChunk] | None, int]] = deque()
+        ahead = 0
+        for place in self._places():
+            opening, size = None, 0
+            if self.pool is not None and place.opcode == CHUNK and not place.reason:
+                opening = self.pool.submit(open_chunk, self.data, place.at, place.after)
+                size = self._size(place)
+            waiting.append((place, opening, size))
+            ahead += size
+            while waiting and (ahead > AHEAD_BYTES or waiting[0][1] is None):
+                first, opening, size = waiting.popleft()
+                ahead -= size
+                yield first, opening
+        for place, opening, _ in waiting:
+            yield place, opening
+
+    def _size(self, place: Place) -> int:
+        try:
+            return read_head(self.data, place.at).size
+        except ChunkError:
+            return 0
+
+    # What is there
+
+    def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
+        opcode, at, after, reason = place
+        body = at + RECORD.size
+        if reason == "cut":
+            yield from self._walk_chunk(at, open_cut_chunk(self.data, at), cut=True)
+        elif reason:
+            self._leave_out(at, 0, reason)
+        elif opcode == CHUNK:
+            opened = open_chunk(self.data, at, after) if opening is None else opening.result()
+            yield from self._walk_chunk(at, opened)
+        elif opcode == MESSAGE_INDEX and self._is_message_index(body, after):
+            self._count_lost(body)
+        elif opcode in LOOSE:
+            yield from self._walk_loose(at, after)
+        elif opcode < PRIVATE and opcode not in IGNORED and at != len(MAGIC):
+            self._leave_out(at, 0, "damaged_record")  # no such record in a data section
+
+    def _walk_chunk(self, at: int, opened: OpenedChunk, cut: bool = False) -> Iterator[Block]:
+        """Yield the messages of a chunk; `cut`: its last record may be incomplete."""
+        self._lost_chunk = None
+        start_ns, records, index, reason = opened
+        if reason:
+            self._leave_out(at, start_ns, reason)
+            self._lost_chunk = len(self.damage) - 1
+            return
+        offset = np.full(len(index.start), at)
+        yield from self._walk_index(_bytes(records), index, offset, start_ns)
+        if index.n_short:
+            self._leave_out(at, start_ns, "damaged_record", index.n_short)
+        if index.walked < len(records) and not cut:
+            self._leave_out(at, start_ns, "damaged_chunk")
+
+    def _walk_loose(self, at: int, after: int) -> Iterator[Block]:
+        """Yield the messages of a run of records outside chunks."""
+        data = _bytes(self.data[at:after])
+        index = index_records(data)
+        offset = at + index.start - RECORD.size
+        offset[index.opcode == MESSAGE] -= 22
+        if index.n_short:
+            self._leave_out(at, 0, "damaged_record", index.n_short)
+        for block in self._walk_index(data, index, offset, 0):
+            if self._sound_outside_chunks:
+                yield block
+            else:
+                for place, time_ns in zip(block.offset, block.time_ns, strict=True):
+                    self._leave_out(int(place), int(time_ns), "bad_checksum")
+
+    @cached_property
+    def _sound_outside_chunks(self) -> bool:
+        """Whether the data section holds its checksum, the only one of messages outside chunks."""
+        at = self._summary.data_end
+        if at is None:
+            return True  # an unclosed log has none
+        (checksum,) = struct.unpack_from("<I", self.data, at + RECORD.size)
+        return checksum in (0, zlib.crc32(self.data[:at]))
+
+    def _walk_index(
+        self, data: Bytes, index: RecordIndex, offset: Numbers, start_ns: int
+    ) -> Iterator[Block]:
+        """Yield the runs of messages between declarations."""
+        declared = np.flatnonzero(index.opcode != MESSAGE)
+        at = 0
+        for i in [*declared.tolist(), len(index.opcode)]:
+            if i > at:
+                yield from self._wanted(data, index, offset, slice(at, i))
+            at = i + 1
+            if i == len(index.opcode):
+                break
+            start, end = int(index.start[i]), int(index.end[i])
+            try:
+                self._channels.declare(int(index.opcode[i]), data.data, start, end)
+            except ChunkError:
+                self._leave_out(int(offset[i]), start_ns, "damaged_record")
+
+    def _wanted(
+        self, data: Bytes, index: RecordIndex, offset: Numbers, part: slice
+    ) -> Iterator[Block]:
+        """Yield the messages of a run that are asked for; all of them are counted."""
+        channel = index.channel[part]
+        wanted: dict[int, Channel] = {}
+        counts = np.bincount(channel)
+        for number in np.flatnonzero(counts).tolist():
+            n = int(counts[number])
+            self._counts[number] = self._counts.get(number, 0) + n
+            found = self._channels.find(number)
+            if found is not None:
+                wanted[number] = found
+            elif number not in self._channels:
+                self._unknown[number] = self._unknown.get(number, 0) + n
+        columns = (channel, index.time_ns[part], index.start[part], index.end[part], offset[part])
+        if np.count_nonzero(counts) > len(wanted):
+            asked = np.zeros(len(counts), bool)
+            asked[list(wanted)] = True
+            keep = asked[channel]
+            columns = tuple(column[keep] for column in columns)
+        if wanted:
+            yield Block(data, wanted, *columns)
 
     # What is missing
 
@@ -301,7 +273,7 @@ class RecordWalk:
     def _count_lost(self, body: int) -> None:
         """Count the messages of a chunk that is left out, by an index that follows it."""
         number, size = struct.unpack_from("<HI", self.data, body)
-        if self._lost_chunk is None or (self._channels and not self._find_channel(number)):
+        if self._lost_chunk is None or (self._channels and not self._channels.find(number)):
             return
         self._counts[number] = self._counts.get(number, 0) + size // 16
         index = self._lost_chunk
@@ -311,14 +283,15 @@ class RecordWalk:
     def _report_missing(self) -> None:
         for number, count in sorted(self._unknown.items()):
             self._leave_out(0, 0, f"unknown_channel_{number}", count)
-        declared = {n: c for n, c in self._declared.items() if self._find_channel(n)}
-        missing = sum(max(0, c - self._counts.get(n, 0)) for n, c in declared.items())
+        declared = self._summary.declared
+        missing = sum(
+            max(0, count - self._counts.get(number, 0))
+            for number, count in declared.items()
+            if self._channels.find(number)
+        )
         if missing:
             self._leave_out(0, 0, "missing_messages", missing)
 
 
-def _string(data: memoryview, at: int, end: int) -> tuple[str, int]:
-    (length,) = struct.unpack_from("<I", data, at)
-    if at + 4 + length > end:
-        raise ChunkError("damaged_chunk")
-    return bytes(data[at + 4 : at + 4 + length]).decode(), at + 4 + length
+def _bytes(data: bytes | memoryview) -> Bytes:
+    return np.frombuffer(data, np.uint8)

@@ -8,7 +8,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from epipole.io import log_records
+from epipole.io.log_chunks import MAX_CHUNK_BYTES
 from epipole.io.log_records import RecordWalk
 
 N = 40
@@ -38,7 +38,11 @@ def log(compression=CompressionType.ZSTD, **options):
 def walk(data):
     """Return the numbers of the messages found, and the damage as (reason, count)."""
     walked = RecordWalk(memoryview(bytes(data)), frozenset([SCHEMA]))
-    found = [struct.unpack_from("<I", m.data)[0] for m in walked.messages()]
+    found = [
+        int(block.data[at : at + 4].view("<u4")[0])
+        for block in walked.blocks()
+        for at in block.start
+    ]
     return found, [(d.reason, d.n) for d in walked.damage]
 
 
@@ -176,7 +180,7 @@ def with_chunk(data, i, change):
 
 
 def test_an_absurd_size_is_refused_before_anything_is_unpacked():
-    data = with_chunk(log(), 1, {"size": log_records.MAX_CHUNK_BYTES + 1})
+    data = with_chunk(log(), 1, {"size": MAX_CHUNK_BYTES + 1})
     _, damage = walk(data)
     assert damage == [("chunk_too_large", len(chunk_messages(log(), 1)))]
 

@@ -1,0 +1,84 @@
+"""The summary at the end of a log: channels again, where chunks are, how many messages."""
+
+import struct
+import zlib
+from dataclasses import dataclass, field
+
+from epipole.io.log_channels import ChannelTable
+from epipole.io.log_compression import ChunkError
+from epipole.io.record_scan import CHANNEL, SCHEMA
+
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER, CHUNK_INDEX, STATISTICS, DATA_END = 0x02, 0x08, 0x0B, 0x0F
+RECORD = struct.Struct("<BQ")  # its type, its length
+DATA_END_BYTES = RECORD.size + 4
+_FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)
+
+
+@dataclass
+class Summary:
+    """What a summary says; it is never believed to be complete."""
+
+    data_end: int | None = None  # where the data section ends, if the file is whole
+    chunk_offsets: list[int] = field(default_factory=list)  # sorted
+    declared: dict[int, int] = field(default_factory=dict)  # messages of each channel
+
+    @property
+    def sound(self) -> bool:
+        """Whether there is a summary that is what its log was closed with."""
+        return self.data_end is not None and bool(self.declared)
+
+
+def read_summary(data: memoryview, channels: ChannelTable) -> Summary:
+    """Return what the summary says, and declare its channels; empty where it is not sound."""
+    end = len(data)
+    at = end - _FOOTER_BYTES
+    if at < len(MAGIC) or data[end - len(MAGIC) :] != MAGIC:
+        return Summary()
+    if RECORD.unpack_from(data, at) != (FOOTER, 20):
+        return Summary()
+    start, _, checksum = struct.unpack_from("<QQI", data, at + RECORD.size)
+    data_end = (start or at) - DATA_END_BYTES
+    if not len(MAGIC) <= data_end < at or RECORD.unpack_from(data, data_end) != (DATA_END, 4):
+        return Summary()
+    if checksum and zlib.crc32(data[start or at : end - len(MAGIC) - 4]) != checksum:
+        return Summary()
+    summary = Summary(data_end)
+    try:
+        _read_records(data, start or at, at, summary, channels)
+    except (struct.error, ChunkError):
+        summary.declared.clear()  # the walk does without
+    summary.chunk_offsets.sort()
+    return summary
+
+
+def _read_records(
+    data: memoryview, at: int, end: int, summary: Summary, channels: ChannelTable
+) -> None:
+    while at < end:
+        opcode, length = RECORD.unpack_from(data, at)
+        body, at = at + RECORD.size, at + RECORD.size + length
+        if at > end:
+            raise ChunkError("damaged_summary")
+        if opcode in (SCHEMA, CHANNEL):
+            channels.declare(opcode, data, body, at)
+        elif opcode == CHUNK_INDEX:
+            offset = struct.unpack_from("<Q", data, body + 16)[0]
+            if len(MAGIC) <= offset < end:
+                summary.chunk_offsets.append(offset)
+        elif opcode == STATISTICS:
+            (size,) = struct.unpack_from("<I", data, body + 42)
+            for i in range(body + 46, min(body + 46 + size, at), 10):
+                number, count = struct.unpack_from("<HQ", data, i)
+                summary.declared[number] = count
+
+
+def next_log(data: memoryview, at: int) -> int | None:
+    """Return where another log begins behind the one whose data section ends at `at`."""
+    while at + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, at)
+        at += RECORD.size + length
+        if opcode == FOOTER:
+            at += len(MAGIC)
+            return at if data[at : at + len(MAGIC)] == MAGIC else None
+    return None

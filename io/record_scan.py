@@ -1,0 +1,87 @@
+"""The places of all records in a chunk, found by one compiled walk over its bytes."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+Bytes = npt.NDArray[np.uint8]
+
+SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
+HEAD_BYTES = 9  # of a record: its type, its length
+MESSAGE_BYTES = 22  # of a message before its data: channel, sequence, two times
+
+
+class RecordIndex(NamedTuple):
+    """The messages, schemas and channels among records, in their order.
+
+    `time_ns` and `channel` are 0 but for messages. `start` to `end` is a message's data, and
+    the whole body of a schema or channel.
+    """
+
+    opcode: npt.NDArray[np.uint8]
+    channel: npt.NDArray[np.uint16]
+    time_ns: npt.NDArray[np.uint64]
+    start: npt.NDArray[np.int64]
+    end: npt.NDArray[np.int64]
+    n_short: int  # message records too short to be one, passed over
+    walked: int  # bytes up to where the walk ended: all of them, unless it met damage
+
+
+def index_records(data: Bytes, only_known: bool = False) -> RecordIndex:
+    """Return where the records lie.
+
+    Parameters
+    ----------
+    data
+        Records one behind the other.
+    only_known
+        End at the first record that is no message, schema or channel, rather than pass over it.
+    """
+    n, walked, n_short = _walk(data, only_known, *_columns(0))
+    columns = _columns(n)
+    _walk(data, only_known, *columns)
+    return RecordIndex(*columns, n_short, walked)
+
+
+def _columns(n: int) -> tuple[npt.NDArray[np.generic], ...]:
+    kinds = (np.uint8, np.uint16, np.uint64, np.int64, np.int64)
+    return tuple(np.zeros(n, kind) for kind in kinds)
+
+
+@njit(nogil=True, cache=True)
+def little_endian(data, at, n):
+    """Return the unsigned integer of `n` bytes."""
+    value = np.uint64(0)
+    for k in range(n):
+        value |= np.uint64(data[at + k]) << np.uint64(8 * k)
+    return value
+
+
+@njit(nogil=True, cache=True)
+def _walk(data, only_known, opcode, channel, time_ns, start, end):
+    """Return how many records there are, and write those that the columns have room for."""
+    n, n_short, at, size, room = 0, 0, 0, len(data), len(opcode)
+    while at + HEAD_BYTES <= size:
+        kind = data[at]
+        length = little_endian(data, at + 1, 8)
+        body = at + HEAD_BYTES
+        if length > np.uint64(size - body):
+            break
+        after = body + np.int64(length)
+        if kind == MESSAGE and after - body < MESSAGE_BYTES:
+            n_short += 1
+        elif kind in (MESSAGE, SCHEMA, CHANNEL):
+            if n < room:
+                opcode[n] = kind
+                start[n], end[n] = body, after
+                if kind == MESSAGE:
+                    channel[n] = little_endian(data, body, 2)
+                    time_ns[n] = little_endian(data, body + 6, 8)
+                    start[n] = body + MESSAGE_BYTES
+            n += 1
+        elif only_known:
+            break
+        at = after
+    return n, at, n_short
