@@ -20,7 +20,15 @@ from epipole.tasks.algorithms.track_linking.chains import Links, chain_heads
 from epipole.tasks.algorithms.track_linking.likelihood_ratio import link_by_likelihood
 from epipole.tasks.algorithms.track_linking.prediction import link_by_prediction
 from epipole.tasks.algorithms.tracking import NONE, follow_detections
-from epipole.tasks.sightings import Frames, Sightings, camera_of, sightings_of, solved_frames
+from epipole.tasks.detection_kinds import at_star, is_hot_pixel, is_planet, sighting_sigma
+from epipole.tasks.sightings import (
+    Frames,
+    Sightings,
+    camera_of,
+    part_of,
+    sightings_of,
+    solved_frames,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -43,10 +51,16 @@ def build_tracklets(
     frames = solved_frames(solutions)
     if not detections.num_rows or not len(frames.number):
         return Tracked(detections, empty(TRACKLETS))
-    seen = sightings_of(frames, detections)
     camera = camera_of(cameras, int(frames.camera[0]))
+    seen = sightings_of(frames, detections)
+    kind = np.full(detections.num_rows, "unknown", dtype=object)
+    hot = is_hot_pixel(frames, seen, detections, camera)
+    kind[seen.row[hot]] = "hot_pixel"
+    planet = is_planet(frames, seen, camera) & ~hot
+    kind[seen.row[planet]] = "planet"
+    seen = part_of(seen, ~hot & ~planet)
     track = _follow(frames, seen, camera, settings.tracklets)
-    return _label(frames, seen, track, detections, cameras, settings)
+    return _label(frames, seen, track, detections, kind, camera, settings)
 
 
 def _follow(
@@ -58,7 +72,7 @@ def _follow(
         (frames.time_ns - frames.time_ns[0]) / 1e9,
         seen.offsets,
         seen.u_icrs,
-        _sigma(seen),
+        sighting_sigma(seen),
         max_rate_rad_s=np.radians(settings.max_rate_deg_s),
         # Half a frame of slack, for jitter.
         max_coast_s=(settings.max_missed + 1.5) * interval_s,
@@ -84,19 +98,22 @@ def _label(
     seen: Sightings,
     track: npt.NDArray[np.int64],
     detections: pa.Table,
-    cameras: pa.Table,
+    kind: npt.NDArray[np.object_],
+    camera: Camera,
     settings: Settings,
 ) -> Tracked:
-    runs = _runs(frames, seen, track, cameras, settings.alignment.window_s)
+    runs = _runs(frames, seen, track, camera, settings.alignment.window_s)
     sensor_id = str(detections["sensor_id"][0])
-    kind = np.full(detections.num_rows, "unknown", dtype=object)
     for run in runs:
         kind[seen.row[run.members]] = "star_unlisted" if run.stands_still else "object"
+    stars = np.array([seen.u_icrs[run.members].mean(axis=0) for run in runs if run.stands_still])
+    single = np.flatnonzero(track == NONE)
+    kind[seen.row[single[at_star(seen, single, stars)]]] = "star_unlisted"
     objects = sorted(
         (run for run in runs if not run.stands_still), key=lambda run: int(run.members[0])
     )
     names = [_name(sensor_id, frames, seen, detections, run) for run in objects]
-    links = _link(frames, seen, objects, camera_of(cameras, int(frames.camera[0])), settings)
+    links = _link(frames, seen, objects, camera, settings)
     heads = [names[head] for head in chain_heads(links.before)]
     tracklet_id = np.full(detections.num_rows, None, dtype=object)
     track_id = tracklet_id.copy()
@@ -134,7 +151,7 @@ def _link(
         offsets.astype(np.int64),
         (frames.time_ns[seen.frame[members]] - frames.time_ns[0]) / 1e9,
         seen.u_icrs[members],
-        _sigma(seen)[members],
+        sighting_sigma(seen)[members],
     )
     if chosen.link_method == "prediction":
         return link_by_prediction(
@@ -152,16 +169,11 @@ def _link(
     )
 
 
-def _sigma(seen: Sightings) -> Array:
-    """Return the 1-sigma error an axis [rad] of each sighting, attitude and all."""
-    return np.sqrt(np.trace(seen.cov_noise + seen.cov_bias, axis1=1, axis2=2) / 2)
-
-
 def _runs(
     frames: Frames,
     seen: Sightings,
     track: npt.NDArray[np.int64],
-    cameras: pa.Table,
+    camera: Camera,
     window_s: float,
 ) -> list[_Run]:
     """Return what each track shows, in the order in which they were confirmed."""
@@ -176,13 +188,12 @@ def _runs(
         seen.cov_noise[order], seen.cov_bias[order], window_s,
     )  # fmt: skip
     miss = np.linalg.norm(seen.u_icrs[order] - smooth, axis=1)
-    pixel = camera_of(cameras, int(frames.camera[0])).pixel_rad
     out = []
     for lo, hi in itertools.pairwise(bounds):
         members = order[lo:hi]
         rate, sigma = _mean_rate(time_s[members], seen.u_icrs[members], seen.cov_noise[members])
         still = rate < STAR_RATE_SIGMA * sigma and sigma < STAR_RATE_KNOWN
-        residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / pixel
+        residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / camera.pixel_rad
         out.append(_Run(members, rate, still, residual))
     return out
 

@@ -92,6 +92,19 @@ def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
     )
 
 
+def part_of(seen: Sightings, kept: npt.NDArray[np.bool_]) -> Sightings:
+    """Return the sightings that are kept, still in the order of the frames."""
+    before = np.concatenate([[0], np.cumsum(kept)])
+    return Sightings(
+        seen.row[kept],
+        seen.frame[kept],
+        before[seen.offsets],
+        seen.u_icrs[kept],
+        seen.cov_noise[kept],
+        seen.cov_bias[kept],
+    )
+
+
 def camera_of(cameras: pa.Table, row: int) -> Camera:
     """Return the camera in a row of `cameras`."""
     values = cameras.slice(row, 1).to_pylist()[0]
