@@ -297,40 +297,34 @@ def _parse(messages, i, kinds, fields):
 
 
 @njit(nogil=True, cache=True)
-def _positive_or_nan(column, low, high):
-    """Make what is not positive and finite NaN; return how many there were."""
-    bits = column.view(np.int32)
+def _copy_places(data, at, column, low, n):
+    """Copy float32 as they stand; return how many are not finite."""
+    # Not aligned as the type promises, which no processor that numba compiles for minds.
+    sent, bits = data[at : at + 4 * n].view(np.int32), column[low : low + n].view(np.int32)
     bad = 0
-    for k in range(low, high):
-        wrong = not (0 < bits[k] < INFINITY_BITS)
+    for k in range(n):
+        bits[k] = sent[k]
+        bad += (sent[k] & INFINITY_BITS) == INFINITY_BITS
+    return bad
+
+
+@njit(nogil=True, cache=True)
+def _copy_positive(data, at, n_sent, column, low, n):
+    """Copy float32, NaN where one is not positive and finite or none was sent.
+
+    Return how many of those sent are not.
+    """
+    bits = column[low : low + n].view(np.int32)
+    if not n_sent:
+        bits[:] = NAN_BITS
+        return 0
+    sent = data[at : at + 4 * n].view(np.int32)
+    bad = 0
+    for k in range(n):
+        wrong = (sent[k] <= 0) | (sent[k] >= INFINITY_BITS)
+        bits[k] = NAN_BITS if wrong else sent[k]
         bad += wrong
-        bits[k] = NAN_BITS if wrong else bits[k]
     return bad
-
-
-@njit(nogil=True, cache=True)
-def _not_finite(column, low, high):
-    bits = column.view(np.int32)
-    bad = 0
-    for k in range(low, high):
-        bad += (bits[k] & INFINITY_BITS) == INFINITY_BITS
-    return bad
-
-
-@njit(nogil=True, cache=True)
-def _copy(data, at, column, low, n):
-    """Copy float32 from bytes, wherever they begin."""
-    out = column.view(np.uint8)
-    for k in range(4 * n):
-        out[4 * low + k] = data[at + k]
-
-
-@njit(nogil=True, cache=True)
-def _copy_or_nan(data, at, n_sent, column, low, n):
-    if n_sent:
-        _copy(data, at, column, low, n)
-    else:
-        column[low : low + n] = np.nan
 
 
 @njit(nogil=True, cache=True)
@@ -350,23 +344,21 @@ def scan_frames(messages, i, names, rows, n, kinds):
         if fields[6] < 0:  # a number of 2**63 or more
             break
         low = np.int64(rows.first[n])
-        high = low + size
-        _copy(messages.data, fields[10], rows.x_px, low, size)
-        _copy(messages.data, fields[12], rows.y_px, low, size)
-        _copy_or_nan(messages.data, fields[14], n_flux, rows.flux, low, size)
-        _copy_or_nan(messages.data, fields[16], n_sigma, rows.sigma_px, low, size)
-        bad = _not_finite(rows.x_px, low, high) + _not_finite(rows.y_px, low, high)
-        if bad or (n_sigma and _positive_or_nan(rows.sigma_px, low, high)):
+        data = messages.data
+        bad = _copy_places(data, fields[10], rows.x_px, low, size)
+        bad += _copy_places(data, fields[12], rows.y_px, low, size)
+        bad += _copy_positive(data, fields[16], n_sigma, rows.sigma_px, low, size)
+        if bad:
             break
-        _positive_or_nan(rows.flux, low, high)
-        code = _sensor(messages.data, fields[4], fields[5], names, messages.channel[i])
+        _copy_positive(data, fields[14], n_flux, rows.flux, low, size)
+        code = _sensor(data, fields[4], fields[5], names, messages.channel[i])
         if code < 0:
             break
         exposure_s = np.uint64(fields[8]).view(np.float64)
         rows.sensor[n], rows.number[n], rows.time_ns[n] = code, fields[6], fields[2]
         rows.exposure_s[n] = exposure_s if 0 < exposure_s < np.inf else 0.0
         rows.has_flux[n], rows.has_sigma[n] = n_flux > 0, n_sigma > 0
-        rows.first[n + 1] = high
+        rows.first[n + 1] = low + size
         i += 1
         n += 1
     return i, n

@@ -135,7 +135,10 @@ def lists(flat: npt.NDArray[Any], offsets: npt.NDArray[Any], kind: pa.DataType) 
 
 
 def flatten(values: pa.Table, name: str) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
-    """Return a list column as (flat values, (n + 1) offsets), the inverse of `lists`."""
+    """Return a list column as (flat values, (n + 1) offsets), the inverse of `lists`.
+
+    Floating-point values come as float64, whatever the column holds.
+    """
     column = values.column(name).combine_chunks()
     if isinstance(column, pa.ChunkedArray):  # an empty column stays chunked
         column = pa.concat_arrays(column.chunks) if column.num_chunks else pa.array([], column.type)
@@ -145,4 +148,6 @@ def flatten(values: pa.Table, name: str) -> tuple[npt.NDArray[Any], npt.NDArray[
         if len(offsets)
         else column.values.to_numpy()
     )
+    if flat.dtype == np.float32:
+        flat = flat.astype(np.float64)
     return flat, offsets - offsets[0]
