@@ -1,5 +1,7 @@
 """Time scales and Earth's motion, against astropy."""
 
+import warnings
+
 import astropy.units as units
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from epipole.tasks.algorithms.time_scales import (
     DAY_NS,
     earth_barycentric,
     julian_year,
+    tai_minus_utc_s,
     tt_julian_date,
     utc_julian_date,
 )
@@ -36,6 +39,30 @@ def test_terrestrial_time_is_astropys_to_a_nanosecond():
     want = _astropy().tt
     difference_ns = ((jd1 - want.jd1) + (jd2 - want.jd2)) * DAY_NS
     assert np.max(np.abs(difference_ns)) < 1
+
+
+@pytest.mark.parametrize(
+    "day", ["2016-12-31", "2015-06-30", "1972-06-30", "2017-01-01", "1999-01-01"]
+)
+def test_terrestrial_time_is_right_on_days_with_a_leap_second(day):
+    clock = ["00:00:00", "00:00:01.5", "11:59:59.25", "23:59:59", "23:59:59.999999999"]
+    texts = [f"{day}T{time}" for time in clock]
+    jd1, jd2 = tt_julian_date(np.array(texts, "datetime64[ns]").astype(np.int64))
+    want = Time(texts, scale="utc").tt
+    difference_ns = ((jd1 - want.jd1) + (jd2 - want.jd2)) * DAY_NS
+    assert np.max(np.abs(difference_ns)) < 1
+
+
+def test_a_date_far_ahead_brings_no_warning():
+    far_ns = np.datetime64("2095-01-01", "ns").astype(np.int64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert julian_year(far_ns) == pytest.approx(2095.0, abs=0.01)
+        earth_barycentric(far_ns)
+
+
+def test_before_the_first_leap_second_its_value_holds():
+    assert tai_minus_utc_s(np.array([2440587.5, 2441317.5, 2441499.5])).tolist() == [10, 10, 11]
 
 
 def test_the_julian_year_is_astropys():

@@ -15,7 +15,7 @@ import erfa
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.time_scales import tt_julian_date, utc_julian_date
+from epipole.tasks.algorithms.time_scales import tai_minus_utc_s, tt_julian_date, utc_julian_date
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
@@ -55,10 +55,10 @@ def orientation_at(
     day, share = utc_julian_date(time_ns)
     at = (day - MJD_JD) + share
     # UT1-TAI, unlike UT1-UTC, has no step where a leap second comes.
-    ut1_tai_s = ut1_utc_s - _tai_minus_utc_s(MJD_JD + mjd)
+    ut1_tai_s = ut1_utc_s - tai_minus_utc_s(MJD_JD + mjd)
     # By the day's start: within a day that ends in a leap second, erfa's fraction of a day
     # is one of 86,401 seconds, ours is not.
-    ut1_utc = (np.interp(at, mjd, ut1_tai_s) + _tai_minus_utc_s(day)) / 86400.0
+    ut1_utc = (np.interp(at, mjd, ut1_tai_s) + tai_minus_utc_s(day)) / 86400.0
     ut1 = (day, share + ut1_utc)
     days = np.maximum(at - mjd[-1], 0.0)
     ut1_sigma_s = np.where(at < mjd[0], 1.0, 0.00025 * days**0.75)
@@ -69,12 +69,6 @@ def orientation_at(
         np.interp(at, mjd, yp_rad),
         np.hypot(ut1_sigma_s * EARTH_RATE_RAD_S, pole_sigma_rad),
     )
-
-
-def _tai_minus_utc_s(day: Array) -> Array:
-    """Return TAI-UTC [s] at the start of UTC days (Julian dates that end in .5)."""
-    tai_day, tai_share = erfa.utctai(day, np.zeros_like(day))
-    return ((tai_day - day) + tai_share) * 86400.0
 
 
 def gcrf_from_eme2000(r_km: Array, v_km_s: Array) -> tuple[Array, Array]:

@@ -1,4 +1,6 @@
-"""Time scales: integer UTC nanoseconds to the Julian dates that pyerfa takes, and Earth's velocity."""
+"""Time scales: UTC nanoseconds to the Julian dates that pyerfa takes, and Earth's velocity."""
+
+from functools import cache
 
 import erfa
 import numpy as np
@@ -10,6 +12,8 @@ Nanoseconds = npt.NDArray[np.int64]
 DAY_NS = 86_400_000_000_000
 UNIX_EPOCH_JD = 2440587.5
 AU_KM = 149597870.7
+DAY_S = 86400.0
+TT_MINUS_TAI_S = 32.184
 
 
 def utc_julian_date(time_ns: Nanoseconds) -> tuple[Array, Array]:
@@ -18,9 +22,31 @@ def utc_julian_date(time_ns: Nanoseconds) -> tuple[Array, Array]:
     return UNIX_EPOCH_JD + day, rest / DAY_NS
 
 
+def tai_minus_utc_s(jd_utc: Array) -> Array:
+    """Return TAI-UTC [s] on UTC days, given by Julian dates.
+
+    The table is erfa's, looked up here: `erfa.utctai` warns of every date a few years ahead
+    of it, and takes a fraction of a day that ends in a leap second as one of 86,401 s, where
+    Unix time has 86,400. Before 1972 it is 10 s, the table's first value: UTC then drifted,
+    and no log is that old.
+    """
+    days, seconds = _leap_seconds()
+    return seconds[np.maximum(np.searchsorted(days, jd_utc, side="right") - 1, 0)]
+
+
+@cache
+def _leap_seconds() -> tuple[Array, Array]:
+    """Return the Julian dates from which TAI-UTC [s] holds, and its values."""
+    steps = erfa.leap_seconds.get()
+    steps = steps[steps["year"] >= 1972]
+    jd1, jd2 = erfa.cal2jd(steps["year"], steps["month"], 1)
+    return jd1 + jd2, np.asarray(steps["tai_utc"], float)
+
+
 def tt_julian_date(time_ns: Nanoseconds) -> tuple[Array, Array]:
     """Return the two-part Julian date in terrestrial time."""
-    return erfa.taitt(*erfa.utctai(*utc_julian_date(time_ns)))
+    day, fraction = utc_julian_date(time_ns)
+    return day, fraction + (tai_minus_utc_s(day) + TT_MINUS_TAI_S) / DAY_S
 
 
 def julian_year(time_ns: Nanoseconds) -> Array:
@@ -35,4 +61,4 @@ def earth_barycentric(time_ns: Nanoseconds) -> tuple[Array, Array]:
     TT stands for TDB: they differ by less than 2 ms, which moves Earth's velocity by 1e-8 km/s.
     """
     _, barycentric = erfa.epv00(*tt_julian_date(time_ns))
-    return barycentric["p"] * AU_KM, barycentric["v"] * (AU_KM / 86400.0)
+    return barycentric["p"] * AU_KM, barycentric["v"] * (AU_KM / DAY_S)
