@@ -90,6 +90,21 @@ class AlignmentSettings(Group):
     )
 
 
+class AltitudeShell(Group):
+    """Heights above the equator's radius at which a share of all objects is."""
+
+    lowest_km: float = Field(ge=0, description="Lower edge.")
+    highest_km: float = Field(gt=0, description="Upper edge.")
+    share: float = Field(gt=0, lt=1, description="Share of all objects that are in between.")
+
+
+LOW_ORBITS = AltitudeShell(lowest_km=200, highest_km=2000, share=0.35)
+NAVIGATION_ORBITS = AltitudeShell(lowest_km=19000, highest_km=24500, share=0.1)
+# The protected region of the geostationary ring (IADC: 200 km either side), and its core.
+GEOSTATIONARY_REGION = AltitudeShell(lowest_km=35586, highest_km=35986, share=0.2)
+GEOSTATIONARY_RING = AltitudeShell(lowest_km=35746, highest_km=35826, share=0.2)
+
+
 class AssociationSettings(Group):
     """Which views of different sensors are one object."""
 
@@ -98,8 +113,12 @@ class AssociationSettings(Group):
     min_altitude_km: float = Field(100.0, ge=0, description="Lowest object looked for.")
     max_range_km: float = Field(1.0e5, gt=0, description="Farthest object looked for.")
     span_s: float = Field(30.0, gt=0, description="Evidence is summed over spans of this length.")
+    shells: tuple[AltitudeShell, ...] = Field(
+        (LOW_ORBITS, NAVIGATION_ORBITS, GEOSTATIONARY_REGION, GEOSTATIONARY_RING),
+        description="A weak prior on altitude: where objects are more likely; empty: off.",
+    )
     min_log_odds: float = Field(
-        3.0, description="An object is reported if it is this much likelier than chance (ln)."
+        1.0, description="An object is reported if it is this much likelier than chance (ln)."
     )
     ambiguity_log_odds: float = Field(
         3.0, ge=0, description="Where a rival comes closer than this (ln), neither is reported."

@@ -11,7 +11,8 @@ from prefect.cache_policies import NO_CACHE
 from epipole.schemas.bridge import array, concat, stack, table
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
-from epipole.tasks.algorithms.association import Groups, Samples, associate_tracklets
+from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
+from epipole.tasks.algorithms.association.samples import Groups, Samples
 from epipole.tasks.algorithms.object_identity import ObjectRegistry
 from epipole.tasks.algorithms.rotations import matrix_from_quaternion
 from epipole.tasks.sightings import camera_of, solved_frames
@@ -75,6 +76,7 @@ def _solve(samples: Samples, settings: Settings) -> Groups:
         max_range_km=chosen.max_range_km,
         min_log_odds=chosen.min_log_odds,
         ambiguity_log_odds=chosen.ambiguity_log_odds,
+        shells=[Shell(s.lowest_km, s.highest_km, s.share) for s in chosen.shells],
     )
 
 
@@ -166,25 +168,32 @@ class _Night:
         tracklet, item = np.unique(self.tracklet[rows], return_inverse=True)
         at = np.searchsorted(instants, self.epoch_ns[rows])
         t, k = len(tracklet), len(instants)
-        seen = np.zeros((t, k), bool)
-        r_km, u = np.zeros((t, k, 3)), np.tile([0.0, 0.0, 1.0], (t, k, 1))
+        seen, u = np.zeros((t, k), bool), np.tile([0.0, 0.0, 1.0], (t, k, 1))
         cov, sigma_km = np.tile(np.eye(2), (t, k, 1, 1)), np.ones((t, k))
         seen[item, at] = True
-        r_km[item, at], u[item, at] = self.r_km[rows], self.u[rows]
+        u[item, at] = self.u[rows]
         # What all frames share is one draw, however often it is looked at: k looks at it with
         # k times its variance count as one.
         looks = seen.sum(axis=1)[item].astype(float)
         cov[item, at] = self.noise[rows] + looks[:, None, None] * self.bias[rows]
         sigma_km[item, at] = np.sqrt(looks) * self.sigma_km[rows]
         boresight, sensor_km = self._looks(instants)
+        sensor_km[self.sensor[rows], at] = self.r_km[rows]
         origin = self.epoch_ns[0]
         return Samples(
-            self.sensor_of_tracklet[tracklet].astype(np.int64),
-            (self.start_ns[tracklet] - origin) / 1e9,
-            (self.end_ns[tracklet] - origin) / 1e9,
-            seen, r_km, u, cov, sigma_km, (instants - origin) / 1e9,
-            np.array(self.field_sr), boresight, sensor_km, np.array(self.inner_rad),
-        ), tracklet  # fmt: skip
+            sensor=self.sensor_of_tracklet[tracklet].astype(np.int64),
+            start_s=(self.start_ns[tracklet] - origin) / 1e9,
+            end_s=(self.end_ns[tracklet] - origin) / 1e9,
+            seen=seen,
+            u=u,
+            cov=cov,
+            sigma_km=sigma_km,
+            time_s=(instants - origin) / 1e9,
+            sensor_km=sensor_km,
+            boresight=boresight,
+            field_sr=np.array(self.field_sr),
+            inner_rad=np.array(self.inner_rad),
+        ), tracklet
 
     def _instants(self, rows: Indices, window_s: float) -> Indices:
         """Return a few epochs of a span: far enough apart to be independent, none left out.

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from epipole.tasks.algorithms.association import Samples, associate_tracklets
+from epipole.tasks.algorithms.association.likelihood import associate_tracklets
+from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.sky import ARCSEC, tangent_basis
 
 GEO = np.array([-39359.89, 15125.76, 64.30])
@@ -70,12 +71,19 @@ class Scene:
         n_sensors = len(self.r)
         u = np.array(self.u).reshape(-1, len(self.times), 3)[order]
         return Samples(
-            sensor, first, last, seen, self.r[sensor], u,
-            np.tile(np.eye(2) * self.sigma**2, (*u.shape[:2], 1, 1)),
-            np.full(u.shape[:2], 0.02), self.times, np.full(n_sensors, FIELD**2),
-            look / np.linalg.norm(look, axis=2, keepdims=True), self.r,
-            np.full(n_sensors, FIELD / 2),
-        )  # fmt: skip
+            sensor=sensor,
+            start_s=first,
+            end_s=last,
+            seen=seen,
+            u=u,
+            cov=np.tile(np.eye(2) * self.sigma**2, (*u.shape[:2], 1, 1)),
+            sigma_km=np.full(u.shape[:2], 0.02),
+            time_s=self.times,
+            sensor_km=self.r,
+            boresight=look / np.linalg.norm(look, axis=2, keepdims=True),
+            field_sr=np.full(n_sensors, FIELD**2),
+            inner_rad=np.full(n_sensors, FIELD / 2),
+        )
 
 
 def solve(samples, **changes):
@@ -208,7 +216,7 @@ def test_one_sensor_alone_has_no_object():
 def test_no_tracklet_gives_no_group():
     scene = Scene(10, 2).objects(1)
     nothing = Samples(*(
-        value[:0] if i < 8 else value for i, value in enumerate(scene.samples())
+        value[:0] if i < 7 else value for i, value in enumerate(scene.samples())
     ))  # fmt: skip
     groups = solve(nothing)
     assert len(groups.group) == len(groups.score) == 0

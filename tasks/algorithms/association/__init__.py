@@ -1,0 +1,1 @@
+"""Association: which spots in different sensors are one object."""

@@ -1,0 +1,72 @@
+"""A pool of hypotheses, best first, that knows which others share a tracklet with one."""
+
+import heapq
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+
+class Hypothesis(NamedTuple):
+    """Tracklets that may be one object; `seed` are the two it grew from."""
+
+    score: float
+    seed: tuple[int, int]
+    members: tuple[int, ...]
+
+
+class Pool:
+    """Hypotheses, best first; of equal ones that with the lowest tracklets."""
+
+    def __init__(self, hypotheses: Iterable[Hypothesis]) -> None:
+        self._heap: list[tuple[float, tuple[int, ...], Hypothesis]] = []
+        self._holding: dict[int, set[Hypothesis]] = defaultdict(set)
+        for h in distinct(hypotheses):
+            self.push(h)
+
+    def push(self, h: Hypothesis) -> None:
+        """Add a hypothesis."""
+        heapq.heappush(self._heap, (-h.score, h.members, h))
+        for i in h.members:
+            self._holding[i].add(h)
+
+    def pop(self) -> Hypothesis | None:
+        """Take out the best hypothesis; none where the pool is empty."""
+        if not self._heap:
+            return None
+        h = heapq.heappop(self._heap)[2]
+        for i in h.members:
+            self._holding[i].discard(h)
+        return h
+
+    def rest(self) -> list[Hypothesis]:
+        """Return what is left, in no order."""
+        return [entry[2] for entry in self._heap]
+
+    def rivals(
+        self, best: Hypothesis, closer_than: float, taken: npt.NDArray[np.bool_]
+    ) -> list[Hypothesis]:
+        """Return hypotheses about as likely as `best` that contradict it.
+
+        They share a tracklet with it, neither contains the other, and all their tracklets are
+        still free.
+        """
+        near = {h for i in best.members for h in self._holding[i]}
+        return [
+            h
+            for h in near
+            if h.score > best.score - closer_than
+            and not (set(h.members) <= set(best.members) or set(best.members) <= set(h.members))
+            and not taken[list(h.members)].any()
+        ]
+
+
+def distinct(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
+    """Return one hypothesis, the likeliest, for each set of members."""
+    best: dict[tuple[int, ...], Hypothesis] = {}
+    for h in hypotheses:
+        if h.members not in best or h.score > best[h.members].score:
+            best[h.members] = h
+    return list(best.values())
