@@ -1,5 +1,6 @@
 """Associate objects: which sensors' tracklets are one object, span by span of the night."""
 
+import logging
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +14,12 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
 from epipole.tasks.algorithms.association.samples import Groups, Samples
+from epipole.tasks.algorithms.association.sensor_check import agreement
 from epipole.tasks.algorithms.object_identity import ObjectRegistry
 from epipole.tasks.algorithms.rotations import matrix_from_quaternion
 from epipole.tasks.sightings import camera_of, solved_frames
+
+LOGGER = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -42,19 +46,29 @@ def associate_objects(
     """Return the views that are objects seen by two sensors or more, and which object each is.
 
     Object numbers count from 0 in the order of first appearance and hold from span to span as
-    long as a tracklet of the object goes on.
+    long as a track of the object goes on. A sensor that disagrees with all others is left out.
     """
     views = views.sort_by([("epoch", "ascending"), ("sensor_id", "ascending"),
                            ("tracklet_id", "ascending")])  # fmt: skip
     night = _Night(views, tracklets, solutions, cameras)
     registry = ObjectRegistry()
     number = np.full(views.num_rows, -1)
-    rejects = []
+    rejects: list[pa.Table] = []
+    left_out: set[str] = set()
     for rows in night.spans(settings.association.span_s):
         samples, tracklet = night.samples(rows, settings.alignment.window_s)
         groups = _solve(samples, settings)
+        wrong = agreement(samples, groups).disagreeing()
+        if len(wrong):
+            rejects.append(_disagreeing(night, rows, wrong))
+            left_out.update(night.sensors[wrong].tolist())
+            rows = rows[~np.isin(night.sensor[rows], wrong)]
+            if not len(rows):
+                continue
+            samples, tracklet = night.samples(rows, settings.alignment.window_s)
+            groups = _solve(samples, settings)
         objects = registry.name_groups(
-            [tracklet[groups.group == g] for g in range(len(groups.score))]
+            [night.track[tracklet[groups.group == g]] for g in range(len(groups.score))]
         )
         of_tracklet = np.full(len(night.tracklet_id), -1)
         grouped = groups.group >= 0
@@ -62,6 +76,11 @@ def associate_objects(
         number[rows] = of_tracklet[night.tracklet[rows]]
         if groups.ambiguous.any():
             rejects.append(_ambiguous(night, rows, tracklet[groups.ambiguous]))
+    if left_out:
+        LOGGER.warning(
+            "%s: lines of sight agree with no other sensor's (clock, position or attitude "
+            "wrong?): left out where they do not", ", ".join(sorted(left_out)),
+        )  # fmt: skip
     number = _seen_by_two(night, number)
     chosen = np.flatnonzero(number >= 0)
     return Associated(views.take(chosen), number[chosen], concat(REJECTS, rejects))
@@ -83,6 +102,19 @@ def _solve(samples: Samples, settings: Settings) -> Groups:
 def _ambiguous(night: "_Night", rows: Indices, tracklet: Indices) -> pa.Table:
     """Return a reject row a sensor: how many of its tracklets could not be decided."""
     sensors, count = np.unique(night.sensor_of_tracklet[tracklet], return_counts=True)
+    return _reject_table(night, rows, "ambiguous", sensors, count)
+
+
+def _disagreeing(night: "_Night", rows: Indices, sensors: Indices) -> pa.Table:
+    """Return a reject row for each sensor left out of a span: how many tracklets it had."""
+    own = np.unique(np.column_stack([night.sensor[rows], night.tracklet[rows]]), axis=0)[:, 0]
+    count = np.array([np.sum(own == s) for s in sensors])
+    return _reject_table(night, rows, "sensor_disagrees", sensors, count)
+
+
+def _reject_table(
+    night: "_Night", rows: Indices, reason: str, sensors: Indices, count: Indices
+) -> pa.Table:
     n = len(sensors)
     return table(
         REJECTS,
@@ -92,7 +124,7 @@ def _ambiguous(night: "_Night", rows: Indices, tracklet: Indices) -> pa.Table:
             "sensor_id": night.sensors[sensors],
             "time": np.full(n, night.epoch_ns[rows[0]]),
             "stage": ["associate"] * n,
-            "reason": ["ambiguous"] * n,
+            "reason": [reason] * n,
             "count": count.astype(np.int64),
         },
     )
@@ -129,6 +161,8 @@ class _Night:
     ) -> None:
         tracklets = tracklets.sort_by("tracklet_id")
         self.tracklet_id = array(tracklets, "tracklet_id").astype(str)
+        # Fragments that the linking joined are one track: an object keeps its number by it.
+        _, self.track = np.unique(array(tracklets, "track_id").astype(str), return_inverse=True)
         self.sensors, self.sensor_of_tracklet = np.unique(
             array(tracklets, "sensor_id").astype(str), return_inverse=True
         )

@@ -107,5 +107,5 @@ def part_of(seen: Sightings, kept: npt.NDArray[np.bool_]) -> Sightings:
 
 def camera_of(cameras: pa.Table, row: int) -> Camera:
     """Return the camera in a row of `cameras`."""
-    values = cameras.slice(row, 1).to_pylist()[0]
-    return Camera(**{name: values[name] for name in Camera._fields})
+    # Without its time: a nanosecond is more than a Python datetime can hold.
+    return Camera(**cameras.select(list(Camera._fields)).slice(row, 1).to_pylist()[0])
