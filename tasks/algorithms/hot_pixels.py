@@ -104,7 +104,7 @@ def _is_one_pixel(time_s: Array, x_px: Array, y_px: Array, sigma_px: Array) -> b
     spread = max(float(lever @ lever), 1e-300)
     middle = n * (off_x.mean() ** 2 + off_y.mean() ** 2) / sigma**2
     drift = ((lever @ off_x) ** 2 + (lever @ off_y) ** 2) / (spread * sigma**2)
-    return bool(middle < NEAR_CHI2 and drift < NEAR_CHI2)
+    return bool(middle < NEAR_CHI2 and drift < 2 * NEAR_CHI2)
 
 
 def _rates(time_s: Array, path: Array) -> tuple[Array, Array]:

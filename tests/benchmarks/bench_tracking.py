@@ -1,0 +1,121 @@
+"""Frame to frame: IDF1 and CPU time a detection, against the number of false detections.
+
+python tests/benchmarks/bench_tracking.py
+"""
+
+import argparse
+import time
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from identity_score import identity_f1
+
+from epipole.tasks.algorithms.tracking import follow_detections
+
+Array = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.int64]
+
+FIELD_RAD = np.radians(8.0)
+SIGMA_RAD = 0.15 * FIELD_RAD / 1024
+FASTEST_RAD_S = np.radians(0.05)
+MISSED = 0.05
+
+
+class Night(NamedTuple):
+    """Detections of one sensor at 1 Hz, and the object each one is (-1: false)."""
+
+    time_s: Array
+    offsets: Labels
+    u_icrs: Array
+    truth: Labels
+
+
+def night(seed: int, n_objects: int, n_false: int, n_frames: int) -> Night:
+    """Return a field of 8 degrees that always holds so many objects.
+
+    They move on great circles at 0 to 180 arcsec/s, any direction; one that leaves is replaced
+    by one that comes in over an edge.
+    """
+    rng = np.random.default_rng(seed)
+    place = rng.uniform(-0.5, 0.5, (n_objects, 2)) * FIELD_RAD
+    rate = _rates(rng, n_objects)
+    number = np.arange(n_objects)
+    offsets, spots, truth = [0], [], []
+    for _ in range(n_frames):
+        seen = rng.random(n_objects) > MISSED
+        false = rng.uniform(-0.5, 0.5, (rng.poisson(n_false), 2)) * FIELD_RAD
+        found = np.vstack([place[seen] + rng.normal(size=(seen.sum(), 2)) * SIGMA_RAD, false])
+        who = np.concatenate([number[seen], np.full(len(false), -1)])
+        order = rng.permutation(len(found))
+        spots.append(found[order])
+        truth.append(who[order])
+        offsets.append(offsets[-1] + len(order))
+        place = place + rate
+        out = np.flatnonzero((np.abs(place) > FIELD_RAD / 2).any(axis=1))
+        if len(out):
+            number[out] = number.max() + 1 + np.arange(len(out))
+            rate[out] = _rates(rng, len(out))
+            place[out] = _edge(rng, rate[out])
+    spot = np.concatenate(spots)
+    # Great circles are straight on the plane that touches the sky in the middle of the field.
+    u = np.column_stack([spot, np.ones(len(spot))]) @ np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return Night(np.arange(n_frames) + 0.0, np.array(offsets), u, np.concatenate(truth))
+
+
+def _rates(rng: np.random.Generator, n: int) -> Array:
+    heading = rng.uniform(0, 2 * np.pi, n)
+    speed = rng.uniform(0, FASTEST_RAD_S, n)
+    return speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+
+
+def _edge(rng: np.random.Generator, rate: Array) -> Array:
+    """Return places on the edge where what moves at these rates comes in."""
+    place = rng.uniform(-0.5, 0.5, rate.shape) * FIELD_RAD
+    axis = np.argmax(np.abs(rate), axis=1)
+    rows = np.arange(len(rate))
+    place[rows, axis] = -np.sign(rate[rows, axis]) * FIELD_RAD / 2
+    return place
+
+
+def follow(scene: Night, **changes: float) -> Labels:
+    """Return the tracks, with the default settings of the pipeline."""
+    options = {
+        "max_rate_rad_s": np.radians(2.0),
+        "max_coast_s": 4.5,
+        "max_missed": 3,
+        "min_detections": 3,
+        "gate_sigma": 4.0,
+        "field_sr": FIELD_RAD**2,
+        "false_alarm": 1e-4,
+    }
+    sigma = np.full(len(scene.u_icrs), SIGMA_RAD)
+    return follow_detections(
+        scene.time_s, scene.offsets, scene.u_icrs, sigma, **(options | changes)
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--frames", type=int, default=600)
+    parser.add_argument("--objects", type=int, default=250)
+    parser.add_argument("--false", type=int, nargs="*", default=[2, 10, 30, 100, 300, 1000])
+    parser.add_argument("--repeats", type=int, default=3)
+    chosen = parser.parse_args()
+    follow(night(0, 5, 5, 20))
+    print(f"{'objects':>7} {'false':>6} {'IDF1 %':>7} {'us a detection':>15}")
+    for n_false in chosen.false:
+        scene = night(1, chosen.objects, n_false, chosen.frames)
+        seconds = []
+        for _ in range(chosen.repeats):
+            began = time.process_time()
+            track = follow(scene)
+            seconds.append(time.process_time() - began)
+        score = 100 * identity_f1(scene.truth, track)
+        cost = 1e6 * np.median(seconds) / len(track)
+        print(f"{chosen.objects:>7} {n_false:>6} {score:>7.2f} {cost:>15.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
