@@ -35,7 +35,10 @@ class SensorSettings(Group):
 class IdentificationSettings(Group):
     """Star identification and attitude."""
 
-    method: Literal["likelihood"] = Field("likelihood", description="How stars are identified.")
+    method: Literal["likelihood", "four_base_stars", "match_group", "radial_cyclic"] = Field(
+        "likelihood",
+        description="How stars are identified; the others are published methods, for comparison.",
+    )
     magnitude_limit: float | None = Field(
         None, description="Faintest star looked for; none: from the number of centroids."
     )

@@ -32,6 +32,7 @@ from epipole.tasks.algorithms.sky import (
     radec_from_unit,
 )
 from epipole.tasks.algorithms.star_identification.frame import Optics, Search
+from epipole.tasks.algorithms.star_identification.published import identify_published
 from epipole.tasks.algorithms.star_identification.sensor import Identified as Found
 from epipole.tasks.algorithms.star_identification.sensor import Spots, identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Prior
@@ -185,6 +186,8 @@ def _identify(
     pixel_rad = next(iter(c.cameras.values())).pixel_rad
     skies = CachedSkies(Catalogue(catalogue), day, round(rule.merge_px * pixel_rad, 9))
     how = Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
+    if rule.method != "likelihood":
+        return identify_published(spots, skies, rule.magnitude_limit, rule.method, how), rows
     t_s = (time_ns - time_ns[0]) / 1e9
     found = identify_sensor(t_s, spots, _priors(places, settings), skies, rule.magnitude_limit, how)
     return found, rows
