@@ -121,10 +121,10 @@ class AssociationSettings(Group):
         description="A weak prior on altitude: where objects are more likely; empty: off.",
     )
     min_log_odds: float = Field(
-        1.0, description="An object is reported if it is this much likelier than chance (ln)."
+        0.5, description="An object is reported if it is this much likelier than chance (ln)."
     )
     ambiguity_log_odds: float = Field(
-        3.0, ge=0, description="Where a rival comes closer than this (ln), neither is reported."
+        2.0, ge=0, description="Where a rival comes closer than this (ln), neither is reported."
     )
 
 

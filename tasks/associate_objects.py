@@ -25,6 +25,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MOST_SAMPLES = 12  # instants in a span
+NEAR_NS = 2_000_000_000  # a frame this near tells where a sensor looks
 
 
 class Associated(NamedTuple):
@@ -179,13 +180,13 @@ class _Night:
 
     def _look(self, solutions: pa.Table, cameras: pa.Table) -> None:
         """Keep where each sensor stands and looks, frame by frame, and how wide its field is."""
-        self.field_sr, self.inner_rad, self.frames = [], [], []
+        self.frames, half_field = [], []
         for sensor in self.sensors:
             frames = solved_frames(solutions.filter(pa.compute.field("sensor_id") == sensor))
             camera = camera_of(cameras, int(frames.camera[0]))
-            self.frames.append((frames, matrix_from_quaternion(frames.q_sensor_from_icrs)[:, 2]))
-            self.field_sr.append(camera.width * camera.height * camera.pixel_rad**2)
-            self.inner_rad.append(min(camera.width, camera.height) / 2 * camera.pixel_rad)
+            self.frames.append((frames, matrix_from_quaternion(frames.q_sensor_from_icrs)))
+            half_field.append((camera.width / camera.fx_px / 2, camera.height / camera.fy_px / 2))
+        self.half_field = np.array(half_field).reshape(-1, 2)
 
     def spans(self, span_s: float) -> list[Indices]:
         """Return the rows of each span of time, counted from midnight, in order."""
@@ -211,7 +212,7 @@ class _Night:
         looks = seen.sum(axis=1)[item].astype(float)
         cov[item, at] = self.noise[rows] + looks[:, None, None] * self.bias[rows]
         sigma_km[item, at] = np.sqrt(looks) * self.sigma_km[rows]
-        boresight, sensor_km = self._looks(instants)
+        attitude, sensor_km = self._looks(instants)
         sensor_km[self.sensor[rows], at] = self.r_km[rows]
         origin = self.epoch_ns[0]
         return Samples(
@@ -224,9 +225,8 @@ class _Night:
             sigma_km=sigma_km,
             time_s=(instants - origin) / 1e9,
             sensor_km=sensor_km,
-            boresight=boresight,
-            field_sr=np.array(self.field_sr),
-            inner_rad=np.array(self.inner_rad),
+            R_sensor_from_icrs=attitude,
+            half_field=self.half_field,
         ), tracklet
 
     def _instants(self, rows: Indices, window_s: float) -> Indices:
@@ -247,15 +247,15 @@ class _Night:
         return np.array(sorted(chosen), np.int64)
 
     def _looks(self, instants: Indices) -> tuple[Array, Array]:
-        """Return where the sensors look and stand at the instants; NaN with no frame near."""
-        boresight = np.full((len(self.sensors), len(instants), 3), np.nan)
-        sensor_km = boresight.copy()
-        for s, (frames, look) in enumerate(self.frames):
-            near = np.clip(np.searchsorted(frames.time_ns, instants), 0, len(look) - 1)
-            there = np.abs(frames.time_ns[near] - instants) < 2e9
-            boresight[s, there] = look[near[there]]
+        """Return how the sensors are turned and where they are; NaN with no frame near."""
+        attitude = np.full((len(self.sensors), len(instants), 3, 3), np.nan)
+        sensor_km = np.full((len(self.sensors), len(instants), 3), np.nan)
+        for s, (frames, turned) in enumerate(self.frames):
+            near = np.clip(np.searchsorted(frames.time_ns, instants), 0, len(turned) - 1)
+            there = np.abs(frames.time_ns[near] - instants) < NEAR_NS
+            attitude[s, there] = turned[near[there]]
             sensor_km[s, there] = frames.r_gcrf_km[near[there]]
-        return boresight, sensor_km
+        return attitude, sensor_km
 
 
 def _symmetric(views: pa.Table, pattern: str) -> Array:

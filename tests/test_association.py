@@ -68,6 +68,7 @@ class Scene:
         first = np.array([self.times[np.flatnonzero(s)[0]] for s in seen])
         last = np.array([self.times[np.flatnonzero(s)[-1]] for s in seen])
         look = GEO + self.times[:, None] * V_GEO - self.r
+        look /= np.linalg.norm(look, axis=2, keepdims=True)
         n_sensors = len(self.r)
         u = np.array(self.u).reshape(-1, len(self.times), 3)[order]
         return Samples(
@@ -80,9 +81,8 @@ class Scene:
             sigma_km=np.full(u.shape[:2], 0.02),
             time_s=self.times,
             sensor_km=self.r,
-            boresight=look / np.linalg.norm(look, axis=2, keepdims=True),
-            field_sr=np.full(n_sensors, FIELD**2),
-            inner_rad=np.full(n_sensors, FIELD / 2),
+            R_sensor_from_icrs=np.concatenate([tangent_basis(look), look[:, :, None]], axis=2),
+            half_field=np.full((n_sensors, 2), np.tan(FIELD / 2)),
         )
 
 

@@ -88,7 +88,7 @@ def scene(
         who.append(label[order])
         u.append(u_icrs)
         cov.append(on_tangent_plane(u_icrs, error))
-        look.append(R[2])
+        look.append(R)
     n = sum(map(len, who))
     samples = Samples(
         sensor=np.concatenate(sensor),
@@ -100,9 +100,8 @@ def scene(
         sigma_km=np.full((n, 1), 1e-3),
         time_s=np.zeros(1),
         sensor_km=r[:, None],
-        boresight=np.array(look)[:, None],
-        field_sr=np.full(n_sensors, FIELD_RAD**2),
-        inner_rad=np.full(n_sensors, FIELD_RAD / 2),
+        R_sensor_from_icrs=np.array(look)[:, None],
+        half_field=np.full((n_sensors, 2), FIELD_RAD / 2),
     )
     return Points(samples, np.concatenate(who))
 

@@ -10,8 +10,13 @@ from numba import njit
 from epipole.tasks.algorithms.triangulation import invert3
 
 EARTH_RADIUS_KM = 6378.137
+BEYOND = 0.2  # share of the farthest distance
 SLACK_SIGMA = 3.0  # a point may lie this far outside where objects can be
+INSIDE = 0.98  # of the half field: nearer to the edge a sensor may well miss an object
 FEW = 3  # sensors that must have looked before a hypothesis is given up
+SPEAKS = 2.0  # log-odds at which a view of a well-known point is clearly of the object
+CONTESTED = 3.0  # log-odds by which the best view of a sensor must lead the next one
+REVIEWS = 2  # the first may still rest on a stray
 ENOUGH = 4  # views that fix a point well enough to choose them all again
 GIVEN_UP = -4.0  # log-odds of the sensors beside the seed's at which it is
 ITERATIONS = 6
@@ -71,7 +76,7 @@ def pair_miss(views, i, j, m, lowest, farthest):
     spread = range_i * range_i * (ci[0, 0] + ci[1, 1]) + range_j * range_j * (cj[0, 0] + cj[1, 1])
     slack = SLACK_SIGMA * np.sqrt(spread + 2 * (si * si + sj * sj)) / sine
     radius = np.sqrt(radius2)
-    if radius + slack < lowest or radius - slack > farthest:
+    if radius + slack < lowest or radius - min(slack, BEYOND * farthest) > farthest:
         return np.nan
     variance = si * si + sj * sj
     bi, bj = views.basis[i, m], views.basis[j, m]
@@ -200,7 +205,8 @@ def possible(views, members, n, X, P, seen_by, lowest, farthest):
             continue
         radius = np.sqrt(X[m, 0] ** 2 + X[m, 1] ** 2 + X[m, 2] ** 2)
         slack = SLACK_SIGMA * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
-        if radius + slack < lowest or radius - slack > farthest:
+        # However badly a range is known: far outside, no object is looked for.
+        if radius + slack < lowest or radius - min(slack, BEYOND * farthest) > farthest:
             return False
         for q in range(n):
             i = members[q]
@@ -250,13 +256,15 @@ def fit(views, chance, c, X, P, seen_by):
 
 @njit(cache=True, nogil=True)
 def _best_of_sensor(views, chance, s, members, n, taken, X, P, seen_by, gate_sigma, least):
-    """Return the free tracklet of sensor s that adds most to the odds, and how much; -1: none.
+    """Return the free tracklet of sensor s that adds most to the odds, how much, and the next.
+
+    -1 where there is none; the last is what the second best adds, `least` without one.
 
     One that adds less than `least` is not taken. At each instant only the grid cells
     that the gate touches are looked at; a tracklet is weighed once, at the first instant that
     it shares with the points.
     """
-    best, best_gain = -1, least
+    best, best_gain, second = -1, least, least
     for m in range(len(views.time_s)):
         side = views.grid[s, m, 1]
         if seen_by[m] < 2 or side == 0:
@@ -288,10 +296,13 @@ def _best_of_sensor(views, chance, s, members, n, taken, X, P, seen_by, gate_sig
                 if taken[c] or _shared_before(views, c, m, seen_by):
                     continue
                 gain, chi2, shared = fit(views, chance, c, X, P, seen_by)
-                fits = gain > best_gain and chi2 <= quantile(2 * shared, gate_sigma)
+                fits = gain > second and chi2 <= quantile(2 * shared, gate_sigma)
                 if fits and not _clashes(views, c, members, n):
-                    best, best_gain = c, gain
-    return best, best_gain
+                    if gain > best_gain:
+                        best, best_gain, second = c, gain, best_gain
+                    else:
+                        second = gain
+    return best, best_gain, second
 
 
 @njit(cache=True, nogil=True)
@@ -339,22 +350,30 @@ def _holds(members, n, c):
 
 
 @njit(cache=True, nogil=True)
+def sees(r, R, half_field, x):
+    """Return whether a sensor at r has x in its field, not at the edge, the Earth not between.
+
+    False where the sensor's place or attitude is unknown (NaN).
+    """
+    d0, d1, d2 = x[0] - r[0], x[1] - r[1], x[2] - r[2]
+    depth = R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2
+    if not depth > 0.0:
+        return False
+    for a in range(2):
+        side = (R[a, 0] * d0 + R[a, 1] * d1 + R[a, 2] * d2) / depth
+        if abs(side) > INSIDE * half_field[a]:
+            return False
+    return not blocked(r, x, EARTH_RADIUS_KM)
+
+
+@njit(cache=True, nogil=True)
 def looks_at(views, s, X, seen_by):
-    """Return whether sensor s has the point well inside its field at every solved instant."""
+    """Return whether sensor s has the point in its field at every solved instant."""
     looked = False
     for m in range(len(views.time_s)):
         if seen_by[m] < 2:
             continue
-        if np.isnan(views.boresight[s, m, 0]) or np.isnan(views.r_km[s, m, 0]):
-            return False
-        dot, rho2 = 0.0, 0.0
-        for a in range(3):
-            d = X[m, a] - views.r_km[s, m, a]
-            dot += d * views.boresight[s, m, a]
-            rho2 += d * d
-        if dot < np.sqrt(rho2) * views.cos_inner[s]:
-            return False
-        if blocked(views.r_km[s, m], X[m], EARTH_RADIUS_KM):
+        if not sees(views.r_km[s, m], views.attitude[s, m], views.half_field[s], X[m]):
             return False
         looked = True
     return looked
@@ -416,7 +435,7 @@ def score(views, chance, members, n, X, P, seen_by, chi2, shells):
 def _absences(views, chance, members, n, X, seen_by):
     """Return the log-probability of the sensors that look at the point and see nothing."""
     total = 0.0
-    served = np.zeros(len(views.cos_inner), np.bool_)
+    served = np.zeros(len(views.half_field), np.bool_)
     for q in range(n):
         served[views.sensor[members[q]]] = True
     for s in range(len(served)):
@@ -459,7 +478,7 @@ def grow(
     doubles, and at the end, when a member that no longer fits goes.
     """
     X, P, seen_by = work
-    n_sensors = len(views.cos_inner)
+    n_sensors = len(views.half_field)
     seen_by[:] = 0
     members[0], members[1] = seed_i, seed_j
     n, again = 2, 3
@@ -479,7 +498,7 @@ def grow(
             continue
         found = False
         while True:
-            c, gain = _best_of_sensor(
+            c, gain, _ = _best_of_sensor(
                 views, chance, s, members, n, taken, X, P, seen_by, gate_sigma, absent
             )
             if c < 0:
@@ -505,9 +524,10 @@ def grow(
             if looked >= FEW and evidence < GIVEN_UP:
                 return 0, -np.inf
     n, chi2 = _settle(views, members, n, X, P, seen_by, gate_sigma)
-    if n >= ENOUGH:
-        n = _review(views, chance, members, n, taken, X, P, seen_by, gate_sigma)
-        n, chi2 = _settle(views, members, n, X, P, seen_by, gate_sigma)
+    for _ in range(REVIEWS):
+        if n >= ENOUGH:
+            n = _review(views, chance, members, n, taken, X, P, seen_by, gate_sigma)
+            n, chi2 = _settle(views, members, n, X, P, seen_by, gate_sigma)
     if n < 2 or not possible(views, members, n, X, P, seen_by, lowest, farthest):
         return 0, -np.inf
     return n, score(views, chance, members, n, X, P, seen_by, chi2, shells)
@@ -518,22 +538,23 @@ def _review(views, chance, members, n, taken, X, P, seen_by, gate_sigma):
     """Choose every sensor's tracklet again, now that the points are well known.
 
     The first members were chosen by points that two or three views gave. A stray does more harm
-    than an absence: what does not speak for the object by itself stays out. Returns the size.
+    than an absence: what does not speak for the object by itself stays out, and so does a
+    sensor in which two tracklets do about equally. Returns the size.
     """
     before = members[:n].copy()
     n = 0
-    for s in range(len(views.cos_inner)):
+    for s in range(len(views.half_field)):
         while n < len(members):
-            c, _ = _best_of_sensor(
-                views, chance, s, members, n, taken, X, P, seen_by, gate_sigma, 0.0
+            c, gain, second = _best_of_sensor(
+                views, chance, s, members, n, taken, X, P, seen_by, gate_sigma, SPEAKS
             )
-            if c < 0:
+            if c < 0 or (second > SPEAKS and gain - second < CONTESTED):
                 break
             members[n] = c
             n += 1
             if len(views.time_s) == 1:
                 break
-    if n < 2:
+    if n < ENOUGH - 1:
         n = len(before)
         members[:n] = before
     return n

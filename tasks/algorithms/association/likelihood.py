@@ -29,6 +29,7 @@ Indices = npt.NDArray[np.int64]
 
 DETECTED = 0.9  # before the data tell: a sensor that looks at an object has it
 FEW_SENSORS = 6  # up to this many, every pair of sensors seeds; objects of two views are found
+SEED_SIGMA = 2.5  # with more sensors: an object that one pair just misses, the next one has
 UNSEEDED = 0.05  # objects that may be left without a seed, with more sensors than that
 CLEAR_LOG_ODDS = 15.0  # with more sensors, such a group is taken before the next pair seeds
 CERTAIN_LOG_ODDS = 8.0  # groups that count from the start in how many objects there are
@@ -118,7 +119,7 @@ class _Search:
     def run(self, min_log_odds: float) -> Groups:
         """Return the groups: seed by seed, the clear ones at once, the others at the end."""
         pairs = SensorPairs(self.views, self.limits[1])
-        many = len(self.views.cos_inner) > FEW_SENSORS
+        many = len(self.views.half_field) > FEW_SENSORS
         waiting: list[Hypothesis] = []
         done: list[int] = []
         for k in pairs.in_turn():
@@ -166,7 +167,9 @@ class _Search:
 
     def hypotheses(self, a: int, b: int) -> list[Hypothesis]:
         """Return what the pairs of two sensors' tracklets grow into."""
-        seeds = seeds_between(self.views, a, b, self.taken, *self.limits, self.gate_sigma)
+        many = len(self.views.half_field) > FEW_SENSORS
+        gate_sigma = min(self.gate_sigma, SEED_SIGMA) if many else self.gate_sigma
+        seeds = seeds_between(self.views, a, b, self.taken, *self.limits, gate_sigma)
         return distinct(self.grow(seeds))
 
     def grow(self, seeds: Indices) -> list[Hypothesis]:
@@ -174,7 +177,7 @@ class _Search:
         n = len(seeds)
         sizes, scores = np.zeros(n, np.int64), np.empty(n)
         # More than two fragments a sensor are not kept; the next span has them again.
-        grown = np.empty((n, min(2 * len(self.views.cos_inner), len(self.taken))), np.int64)
+        grown = np.empty((n, min(2 * len(self.views.half_field), len(self.taken))), np.int64)
         grow_all(
             self.views, self.chance, seeds, self.taken, *self.limits, self.gate_sigma, self.shells,
             -self.margin, sizes, scores, grown,
@@ -200,7 +203,9 @@ class _Search:
                 continue
             rivals = pool.rivals(best, self.margin, self.taken)
             kept = set(best.members).intersection(*(h.members for h in rivals))
-            if len({int(self.views.sensor[i]) for i in kept}) >= 2:
+            sensors = {int(self.views.sensor[i]) for i in kept}
+            # What is left of a group that lost most of its views is no object by itself.
+            if len(sensors) >= 2 and 2 * len(kept) >= len(best.members):
                 self.group[sorted(kept)] = len(self.scores)
                 self.scores.append(best.score)
             else:

@@ -33,12 +33,10 @@ class Samples(NamedTuple):
         The instants.
     sensor_km : (s, k, 3) float
         Where the sensors are, GCRF; NaN where unknown, which no tracklet seen then may have.
-    boresight : (s, k, 3) float
-        Where the sensors look, ICRS; NaN where unknown.
-    field_sr : (s,) float
-        Solid angle of each sensor's field.
-    inner_rad : (s,) float
-        Radius of the largest circle that the field holds.
+    R_sensor_from_icrs : (s, k, 3, 3) float
+        How the sensors are turned; NaN where unknown.
+    half_field : (s, 2) float
+        Tangents of half the field's width and height.
     """
 
     sensor: Indices
@@ -50,9 +48,14 @@ class Samples(NamedTuple):
     sigma_km: Array
     time_s: Array
     sensor_km: Array
-    boresight: Array
-    field_sr: Array
-    inner_rad: Array
+    R_sensor_from_icrs: Array
+    half_field: Array
+
+    @property
+    def field_sr(self) -> Array:
+        """Solid angle of each sensor's field, (s,)."""
+        x, y = self.half_field.T
+        return 4 * np.arcsin(np.clip(x * y / np.sqrt((1 + x * x) * (1 + y * y)), 0, 1))
 
 
 class Groups(NamedTuple):
@@ -93,8 +96,8 @@ class Views(NamedTuple):
     sigma_km: Array
     time_s: Array
     r_km: Array
-    boresight: Array
-    cos_inner: Array
+    attitude: Array
+    half_field: Array
     plane: Array
     grid: Indices
     corner: Array
@@ -150,8 +153,8 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
         sigma_km=np.ascontiguousarray(samples.sigma_km[order], float),
         time_s=samples.time_s.astype(float),
         r_km=np.ascontiguousarray(samples.sensor_km, float),
-        boresight=np.ascontiguousarray(samples.boresight, float),
-        cos_inner=np.cos(samples.inner_rad),
+        attitude=np.ascontiguousarray(samples.R_sensor_from_icrs, float),
+        half_field=np.ascontiguousarray(samples.half_field, float),
         plane=plane,
         grid=grid,
         corner=corner,

@@ -183,7 +183,7 @@ class SensorPairs:
 
 def _middle(views: Views) -> tuple[Array, Array, Array]:
     """Return where each sensor's tracklets lie, where it stands, and their widest angle."""
-    n = len(views.cos_inner)
+    n = len(views.half_field)
     look, place, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
     for s in range(n):
         seen = views.seen[views.first[s] : views.first[s + 1]]

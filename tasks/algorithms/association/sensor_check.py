@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.hypotheses import EARTH_RADIUS_KM, blocked
+from epipole.tasks.algorithms.association.hypotheses import sees
 from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.triangulation import triangulate
 
@@ -48,7 +48,7 @@ class Agreement(NamedTuple):
 
 def agreement(samples: Samples, groups: Groups) -> Agreement:
     """Return how far each sensor agrees with the objects that the others found."""
-    n_sensors = len(samples.field_sr)
+    n_sensors = len(samples.half_field)
     looked, joined = np.zeros(n_sensors, np.int64), np.zeros(n_sensors, np.int64)
     for g in range(len(groups.score)):
         members = np.flatnonzero(groups.group == g)
@@ -56,7 +56,10 @@ def agreement(samples: Samples, groups: Groups) -> Agreement:
         members = members[samples.seen[members, m]]
         for s in range(n_sensors):
             others = members[samples.sensor[members] != s]
-            if len(others) < 2 or not _sees(samples, s, m, _point(samples, others, m)):
+            if len(others) < 2:
+                continue
+            place, attitude = samples.sensor_km[s, m], samples.R_sensor_from_icrs[s, m]
+            if not sees(place, attitude, samples.half_field[s], _point(samples, others, m)):
                 continue
             looked[s] += 1
             joined[s] += len(others) < len(members)
@@ -76,12 +79,3 @@ def _point(samples: Samples, members: Indices, m: int) -> Array:
         np.inf,
     )
     return x[0]
-
-
-def _sees(samples: Samples, s: int, m: int, x: Array) -> bool:
-    """Return whether the point is in the inner field of a sensor, the Earth not in the way."""
-    sight = x - samples.sensor_km[s, m]
-    cosine = sight @ samples.boresight[s, m] / np.linalg.norm(sight)
-    if not cosine > np.cos(samples.inner_rad[s]):  # false for NaN
-        return False
-    return not blocked(samples.sensor_km[s, m], x, EARTH_RADIUS_KM)
