@@ -22,6 +22,7 @@ from epipole.schemas.work_tables import SOLUTIONS, VIEWS
 from epipole.tasks.associate_objects import Associated, associate_objects
 from epipole.tasks.build_tracklets import Tracked, build_tracklets
 from epipole.tasks.identify_stars import Identified, identify_stars
+from epipole.tasks.lone_detections import with_lone_tracklets
 from epipole.tasks.place_sensors import place_sensors
 from epipole.tasks.read_logs import read_logs
 from epipole.tasks.solve_positions import Solved, solve_positions
@@ -108,7 +109,6 @@ def view(
             of_sensor(epochs, name),
             of_sensor(identified.solutions, name),
             of_sensor(tracked.detections, name),
-            of_sensor(tracked.tracklets, name),
             cameras,
             settings,
         )
@@ -129,7 +129,11 @@ def associate(
     """Say which sensors' tracklets are one object."""
     step("associate objects", 0, 1)
     associated: Associated = associate_objects(
-        views, tracked.tracklets, identified.solutions, cameras, settings
+        views,
+        with_lone_tracklets(tracked.tracklets, views),
+        identified.solutions,
+        cameras,
+        settings,
     )
     LOGGER.info("associated %s of %s views", f"{associated.views.num_rows:,}", f"{len(views):,}")
     return associated

@@ -13,6 +13,7 @@ from epipole.tasks.algorithms.epoch_grid import (
     epoch_grid,
     epoch_interval_ns,
     frame_interval_ns,
+    instants_of,
     nearest_frame,
 )
 
@@ -33,11 +34,14 @@ def align_epochs(solutions: pa.Table, settings: Settings) -> pa.Table:
     if not parts:
         return concat(EPOCHS, [])
     interval_ns = _interval_ns(times, settings.alignment)
-    epochs = epoch_grid(
-        min(int(t[0]) for t in times) - interval_ns // 2,
-        max(int(t[-1]) for t in times) + interval_ns // 2,
-        interval_ns,
-    )
+    if settings.alignment.interval_s is None and all(len(t) < 2 for t in times):
+        epochs = instants_of(np.concatenate(times), interval_ns)
+    else:
+        epochs = epoch_grid(
+            min(int(t[0]) for t in times) - interval_ns // 2,
+            max(int(t[-1]) for t in times) + interval_ns // 2,
+            interval_ns,
+        )
     rows = [
         _serving(epochs, sensor, array(part, "frame_number"), t, interval_ns, settings.alignment)
         for sensor, part, t in zip(sensors, parts, times, strict=True)

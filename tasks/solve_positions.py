@@ -15,6 +15,7 @@ from epipole.tasks.algorithms.epipolar import epipolar_angle, epipolar_sigma
 from epipole.tasks.algorithms.object_motion import velocities
 from epipole.tasks.algorithms.sky import SPEED_OF_LIGHT_KM_S, tangent_basis
 from epipole.tasks.algorithms.triangulation import triangulate
+from epipole.tasks.lone_detections import published_ids
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -162,11 +163,12 @@ def _association_table(groups: _Groups, pairs: _Pairs) -> pa.Table:
     square = np.bincount(pairs.second, pairs.epipolar_px**2, minlength=n)
     count = np.maximum(np.bincount(pairs.second, minlength=n), 1)
     views = groups.views
-    shared = ("epoch", "sensor_id", "frame_number", "centroid", "tracklet_id", "x_px", "y_px")
+    shared = ("epoch", "sensor_id", "frame_number", "centroid", "x_px", "y_px")
     return table(
         ASSOCIATIONS,
         {name: views[name] for name in shared}
         | {
+            "tracklet_id": published_ids(views["tracklet_id"]),
             "object_id": groups.object_id[groups.group],
             "epipolar_px": np.sqrt(square / count),
             "used": groups.used,

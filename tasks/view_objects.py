@@ -14,6 +14,7 @@ from epipole.tasks.algorithms.direction_errors import on_tangent_plane
 from epipole.tasks.algorithms.local_motion import directions_at
 from epipole.tasks.algorithms.rotations import interpolate_quaternions, matrix_from_quaternion
 from epipole.tasks.algorithms.sky import aberrate
+from epipole.tasks.lone_detections import in_lone_frames, with_lone_detections
 from epipole.tasks.sightings import Frames, Sightings, camera_of, sightings_of, solved_frames
 
 Array = npt.NDArray[np.float64]
@@ -27,19 +28,21 @@ def view_objects(
     epochs: pa.Table,
     solutions: pa.Table,
     detections: pa.Table,
-    tracklets: pa.Table,
     cameras: pa.Table,
     settings: Settings,
 ) -> pa.Table:
     """Return one sensor's views: each tracklet at each epoch that it covers.
+
+    A detection of a frame that stands alone is a tracklet of its own, at an unknown rate.
 
     A tracklet covers an epoch that lies between its ends or no farther beyond them than the
     frame that serves the epoch may be. Aberration by the sensor's geocentric velocity is taken
     off each detection before its motion is fitted.
     """
     frames = solved_frames(solutions)
+    detections = _with_lone(frames, detections, settings)
     tracked = detections.filter(pa.compute.field("tracklet_id").is_valid())
-    if not tracked.num_rows or not epochs.num_rows or not tracklets.num_rows:
+    if not tracked.num_rows or not epochs.num_rows:
         return empty(VIEWS)
     seen = sightings_of(frames, tracked)
     name = array(tracked, "tracklet_id")[seen.row]
@@ -52,6 +55,16 @@ def view_objects(
     return _view_table(
         frames, seen, order, bounds, query, frame, epochs, tracked, cameras, settings
     )
+
+
+def _with_lone(frames: Frames, detections: pa.Table, settings: Settings) -> pa.Table:
+    """Return the detections; the unknown ones of lone frames have an id as a tracklet has."""
+    lone_frames = frames.number[in_lone_frames(frames.time_ns, settings.tracklets)]
+    if not len(lone_frames):
+        return detections
+    unknown = array(detections, "kind") == "unknown"
+    lone = unknown & np.isin(array(detections, "frame_number"), lone_frames)
+    return with_lone_detections(detections, lone)
 
 
 def frames_of(epochs: pa.Table, frames: Frames) -> Indices:
@@ -104,7 +117,7 @@ def _view_table(
         bounds[tracklet],
         bounds[tracklet + 1],
         at_s,
-        np.radians(settings.tracklets.max_rate_deg_s),
+        np.radians(settings.tracklets.max_rate_deg_s) / 3,  # the fastest is a 3-sigma rate
         (frames.time_ns[own] - origin) / 1e9,
         u_still,
         seen.cov_noise[order],

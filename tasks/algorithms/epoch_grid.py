@@ -24,6 +24,20 @@ def epoch_interval_ns(time_ns_by_sensor: list[Nanoseconds]) -> int:
     return max(round(slowest / MILLISECOND_NS), 1) * MILLISECOND_NS if slowest else 1_000_000_000
 
 
+def instants_of(time_ns: Nanoseconds, apart_ns: int) -> Nanoseconds:
+    """Return the mean times of frames that lie together, no two of them `apart_ns` from the next.
+
+    The epochs of a night in which no sensor has a frame interval: there is no grid to keep.
+    """
+    time_ns = np.unique(time_ns)
+    group = np.concatenate([[0], np.cumsum(np.diff(time_ns) >= apart_ns)]).astype(np.int64)
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    if not len(time_ns):
+        return time_ns
+    since = time_ns - time_ns[first][group]
+    return time_ns[first] + np.bincount(group, since).astype(np.int64) // np.bincount(group)
+
+
 def epoch_grid(first_ns: int, last_ns: int, interval_ns: int) -> Nanoseconds:
     """Return all multiples of the interval since midnight UTC that lie in [first, last].
 
