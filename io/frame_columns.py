@@ -10,7 +10,8 @@ import pyarrow as pa
 from epipole.io.log_rejects import RejectList
 from epipole.io.message_decoding import Frame
 from epipole.io.message_parts import Part, Received, fault, known_id
-from epipole.io.message_scan import FRAME_KINDS, FrameRows, scan_frames
+from epipole.io.message_scan import FrameRows, scan_frames
+from epipole.io.message_wire import FRAME_KINDS
 from epipole.io.name_codes import NameCodes
 from epipole.schemas.bridge import table
 from epipole.schemas.work_tables import EXPOSURES

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from epipole.io.log_records import Block
 from epipole.io.log_rejects import RejectList
 from epipole.io.message_decoding import Record, UndecodableError, decoder
-from epipole.io.message_scan import CDR, OTHER, PROTOBUF, Messages
+from epipole.io.message_scan import Messages
+from epipole.io.message_wire import CDR, OTHER, PROTOBUF
 
 SENSOR_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}")
 MOST_AT_ONCE = 4096  # messages decoded one by one before the scan is tried again

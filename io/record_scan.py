@@ -6,6 +6,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from epipole.io.byte_loads import load_uint16, load_uint64
+
 Bytes = npt.NDArray[np.uint8]
 
 SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
@@ -51,21 +53,12 @@ def _columns(n: int) -> tuple[npt.NDArray[np.generic], ...]:
 
 
 @njit(nogil=True, cache=True)
-def little_endian(data, at, n):
-    """Return the unsigned integer of `n` bytes."""
-    value = np.uint64(0)
-    for k in range(n):
-        value |= np.uint64(data[at + k]) << np.uint64(8 * k)
-    return value
-
-
-@njit(nogil=True, cache=True)
 def _walk(data, only_known, opcode, channel, time_ns, start, end):
     """Return how many records there are, and write those that the columns have room for."""
     n, n_short, at, size, room = 0, 0, 0, len(data), len(opcode)
     while at + HEAD_BYTES <= size:
         kind = data[at]
-        length = little_endian(data, at + 1, 8)
+        length = load_uint64(data, at + 1)
         body = at + HEAD_BYTES
         if length > np.uint64(size - body):
             break
@@ -77,8 +70,8 @@ def _walk(data, only_known, opcode, channel, time_ns, start, end):
                 opcode[n] = kind
                 start[n], end[n] = body, after
                 if kind == MESSAGE:
-                    channel[n] = little_endian(data, body, 2)
-                    time_ns[n] = little_endian(data, body + 6, 8)
+                    channel[n] = load_uint16(data, body)
+                    time_ns[n] = load_uint64(data, body + 6)
                     start[n] = body + MESSAGE_BYTES
             n += 1
         elif only_known:

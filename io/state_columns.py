@@ -11,7 +11,8 @@ import pyarrow as pa
 from epipole.io.log_rejects import RejectList
 from epipole.io.message_decoding import State
 from epipole.io.message_parts import Part, Received, fault, known_id
-from epipole.io.message_scan import STATE_KINDS, StateRows, scan_states
+from epipole.io.message_scan import StateRows, scan_states
+from epipole.io.message_wire import STATE_KINDS
 from epipole.io.name_codes import NameCodes
 from epipole.schemas.bridge import nullable, table, unstack
 from epipole.schemas.log_tables import LOG_STATES, STATE_FRAMES
