@@ -45,8 +45,9 @@ def orbit_maps(n, seed=0):
 def contest_maps(seed=0, sigma_px=0.3, large_px=8.0):
     """Return the eight maps by number: (kind, u, stated sigma [rad], true numbers, attitude).
 
-    The stars are the source's; pose, places, small errors and the size of the large ones
-    are chosen here, as the source does not print them.
+    The stars are the source's; pose, places and the size of the errors are chosen here, as
+    the source does not print them: it only says that three stars of maps 3 and 6 have a
+    large one.
     """
     rng = np.random.default_rng(seed)
     with SEEDS.open() as file:
