@@ -196,7 +196,7 @@ class Scene(Group):
     duration_s: float = Field(60.0, gt=0, le=31 * 86400)
     seed: int = Field(1, ge=0)
     sensors: list[SceneSensor] = Field(min_length=1)
-    targets: list[SceneTargets] = []
+    targets: list[SceneTargets] = Field([], description="Objects, or groups of them.")
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:

@@ -57,7 +57,8 @@ def simulate_scene(scene: Scene) -> Simulation:
     """Return the sensors and objects of a scene; the same scene gives the same ones."""
     t0_ns = round(scene.start.timestamp() * 1e6) * 1000
     targets, magnitude = _targets(scene)
-    sensors, told = [], []
+    sensors: list[Sensor] = []
+    told: list[SceneSensor] = []
     for group in scene.sensors:
         for number in range(1, group.count + 1):
             name = group.id if group.count == 1 else f"{group.id}{number}"
