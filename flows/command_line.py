@@ -5,7 +5,6 @@ What a command needs is imported when it runs, so that ``epipole --help`` answer
 
 import datetime
 import json
-import os
 import sys
 import warnings
 from enum import StrEnum
@@ -14,11 +13,32 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+import typer.core
 
 from epipole.schemas.errors import EpipoleError
 
+
+class _Commands(typer.core.TyperGroup):
+    """Commands that end in one line where the user has to mend something."""
+
+    def invoke(self, ctx: typer.Context) -> Any:
+        """Run the command; what is raised besides is a fault of the program, and shown as one."""
+        try:
+            return super().invoke(ctx)
+        except EpipoleError as error:
+            _fail(str(error), 1)
+        except KeyboardInterrupt:
+            _fail("interrupted", 130)
+
+
+def _fail(message: str, code: int) -> None:
+    print(f"epipole: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)
+
+
 app = typer.Typer(
     name="epipole",
+    cls=_Commands,
     help="Turns logs of star sensors into positions of space objects.",
     epilog="A first run: epipole simulate four_sensor_geo --out night.mcap; "
     "epipole run night.mcap --out out/",
@@ -30,21 +50,8 @@ app = typer.Typer(
 
 
 def main() -> None:
-    """Run the command line: one line and exit code 1 for an error that the user can mend."""
-    try:
-        app(standalone_mode=True)
-    except EpipoleError as error:
-        _fail(str(error), 1)
-    except KeyboardInterrupt:
-        _fail("interrupted; the dataset is as it was", 130)
-    except BrokenPipeError:  # `epipole settings | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(141)
-
-
-def _fail(message: str, code: int) -> None:
-    print(f"epipole: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(code)
+    """Run the command line."""
+    app()
 
 
 def _print_version(wanted: bool) -> None:

@@ -3,6 +3,7 @@
 import json
 import textwrap
 from pathlib import Path
+from typing import Any
 
 from epipole.schemas.errors import SettingsError
 from epipole.schemas.settings import Group, Settings, parse_settings
@@ -40,9 +41,21 @@ def settings_text(settings: Settings) -> str:
         lines += ["", *_comment((type(group).__doc__ or "").strip()), f"[{name}]"]
         for key, field in type(group).model_fields.items():
             value = getattr(group, key)
-            setting = f"# {key} =" if value is None else f"{key} = {json.dumps(value)}"
+            setting = f"# {key} =" if value is None else f"{key} = {_toml(value)}"
             lines += [*_comment(field.description or ""), setting]
     return "\n".join(lines) + "\n"
+
+
+def _toml(value: Any) -> str:
+    """Return a value as TOML writes it: a group inside a list is an inline table."""
+    if isinstance(value, Group):
+        inside = (f"{key} = {_toml(getattr(value, key))}" for key in type(value).model_fields)
+        return f"{{ {', '.join(inside)} }}"
+    if isinstance(value, tuple | list):
+        if any(isinstance(item, Group) for item in value):
+            return "[\n" + "".join(f"    {_toml(item)},\n" for item in value) + "]"
+        return f"[{', '.join(map(_toml, value))}]"
+    return json.dumps(value)
 
 
 def _comment(text: str) -> list[str]:
