@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 from prefect import flow
 
+from epipole.flows.clocks import read_clocks, set_right
 from epipole.flows.progress import step
 from epipole.flows.sensors import calibrated, sensor_ids, unplaced
 from epipole.flows.stages import associate, identify, place, read, track, triangulate, view
@@ -72,11 +73,16 @@ def nightly(
 
     places = place(exposures, log.states, chosen_settings)
     identified = identify(exposures, places, log.cameras, chosen_settings)
-    tracked = track(identified, log.cameras, chosen_settings)
-    epochs = align_epochs(identified.solutions, chosen_settings)
-    views = view(epochs, identified, tracked, log.cameras, chosen_settings)
-    associated = associate(views, identified, tracked, log.cameras, chosen_settings)
-    solved = triangulate(associated, chosen_settings)
+    for correcting in (chosen_settings.alignment.correct_clocks, False):
+        tracked = track(identified, log.cameras, chosen_settings)
+        epochs = align_epochs(identified.solutions, chosen_settings)
+        views = view(epochs, identified, tracked, log.cameras, chosen_settings)
+        associated = associate(views, identified, tracked, log.cameras, chosen_settings)
+        solved = triangulate(associated, chosen_settings)
+        clocks = read_clocks(associated, solved, identified, chosen_settings)
+        if not correcting or not any(clock.is_off for clock in clocks):
+            break
+        identified = set_right(identified, exposures, log.states, clocks, chosen_settings)
 
     rejects = [
         log.rejects, uncalibrated, unplaced(places),
@@ -97,7 +103,7 @@ def nightly(
     step("publish", 0, 1)
     published = publish_night(out, tables, nights, chosen, replace)
     LOGGER.info("published %s", ", ".join(f"{out}/night={n}" for n in chosen))
-    return summarise(out, chosen, published)
+    return summarise(out, chosen, published, clocks)
 
 
 def choose_nights(nights: Sequence[str], night: str | None) -> list[str]:

@@ -1,11 +1,13 @@
 """What a run found and what it left out, in a few lines."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
+
+from epipole.tasks.estimate_clocks import Clock
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class Summary:
     objects: int
     positions: int
     rejects: dict[str, int]
+    clocks: list[str]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts by name, as JSON takes them."""
@@ -41,14 +44,17 @@ class Summary:
             f"objects     {self.objects:,} in {self.detections:,} detections, "
             f"{many(self.tracklets, 'tracklet')}",
             f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
+            *[f"clock       {clock}" for clock in self.clocks],
             f"left out    {many(sum(self.rejects.values()), 'thing')}" + (":" if left_out else ""),
             *left_out,
             f"dataset     {self.dataset}",
         ]
 
 
-def summarise(dataset: str, nights: list[str], tables: Mapping[str, pa.Table]) -> Summary:
-    """Return the summary of published tables."""
+def summarise(
+    dataset: str, nights: list[str], tables: Mapping[str, pa.Table], clocks: Sequence[Clock] = ()
+) -> Summary:
+    """Return the summary of published tables, and of clocks that are surely off."""
     frames = tables["frames"]
     return Summary(
         dataset=dataset,
@@ -64,6 +70,7 @@ def summarise(dataset: str, nights: list[str], tables: Mapping[str, pa.Table]) -
         objects=pc.count_distinct(tables["positions"]["object_id"]).as_py(),
         positions=tables["positions"].num_rows,
         rejects=_by_reason(tables["rejects"]),
+        clocks=[str(clock) for clock in clocks if clock.is_off],
     )
 
 

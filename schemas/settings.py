@@ -91,6 +91,9 @@ class AlignmentSettings(Group):
         description="Farthest frame that serves an epoch; none: half its frame interval, or half "
         "the interval between epochs where that is longer.",
     )
+    correct_clocks: bool = Field(
+        False, description="Put frames at their true times where a sensor's clock is surely off."
+    )
 
 
 class AltitudeShell(Group):

@@ -59,7 +59,7 @@ id = "b"
 orbit = { a_km = 7470.0, i_deg = 63.4, raan_deg = 328.6, argp_deg = 7.2, true_anomaly_deg = 144.7 }
 [[sensors]]
 id = "c"
-orbit = { a_km = 6995.0, i_deg = 98.1, raan_deg = 124.5, argp_deg = 189.7, true_anomaly_deg = 234.5 }
+orbit = { a_km = 6995.0, i_deg = 98.1, raan_deg = 124.5, argp_deg = 189.7, true_anomaly_deg = 234 }
 [[targets]]
 count = 4
 orbit = { position_km = [-39359.89, 15125.76, 64.30] }

@@ -1,0 +1,94 @@
+"""Clock offsets: found from lines of sight, with honest sigmas; nothing is taken for a clock."""
+
+import numpy as np
+import pytest
+
+from epipole.tasks.algorithms.clock_offset import PRIOR_S, Lines, clock_offsets
+from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.sky import ARCSEC, tangent_basis
+
+SIGMA = 1.0 * ARCSEC
+POSITION_KM = 0.02
+
+
+def orbit(a, i, raan, anomaly):
+    return np.array([a, 0.001, np.radians(i), np.radians(raan), 0.0, np.radians(anomaly)])
+
+
+SENSORS = [
+    orbit(6977.0, 35, 354, 112), orbit(7471.0, 63, 329, 152), orbit(6979.0, 35, 115, 60),
+    orbit(6996.0, 98, 125, 64),
+]  # fmt: skip
+
+
+def lines_of(seed, offsets, *, bias_km=POSITION_KM, turn_rad=0.0, n_epochs=60, used=(0, 1, 2, 3)):
+    """Lines of sight of sensors whose stamps are late by `offsets`, to nine far objects."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n_epochs) * 2.0
+    bias = rng.normal(size=(4, 3)) * bias_km
+    turn = rng.normal(size=(4, 3)) * turn_rad
+    parts = {name: [] for name in Lines._fields}
+    for k in range(9):
+        target = orbit(42164.0 + rng.normal() * 100, 0.5 * k, 0.0, 158.0 + 0.2 * k)
+        x, v = state_at(target, t)
+        for s in used:
+            true_t = t - offsets[s]
+            seen, _ = state_at(target, true_t)
+            here, _ = state_at(SENSORS[s], true_t)
+            r, v_sensor = state_at(SENSORS[s], t)
+            u = seen - here
+            u /= np.linalg.norm(u, axis=1)[:, None]
+            u += np.cross(turn[s], u)
+            noise = rng.normal(size=(n_epochs, 2)) * SIGMA
+            u = u + np.einsum("ni,nij->nj", noise, tangent_basis(u))
+            u /= np.linalg.norm(u, axis=1)[:, None]
+            parts["group"].append(k * n_epochs + np.arange(n_epochs))
+            parts["sensor"].append(np.full(n_epochs, s))
+            parts["u"].append(u)
+            parts["cov"].append(np.tile(np.eye(2) * SIGMA**2, (n_epochs, 1, 1)))
+            parts["x_km"].append(x + 0.5)  # a position that is solved is a little wrong
+            parts["v_km_s"].append(v)
+            parts["r_km"].append(r + bias[s])
+            parts["v_sensor_km_s"].append(v_sensor)
+    return Lines(**{name: np.concatenate(values) for name, values in parts.items()})
+
+
+def solve(lines, turn_rad=0.0):
+    return clock_offsets(lines, np.full(4, POSITION_KM), np.full(4, turn_rad))
+
+
+def test_the_offset_of_one_sensor_is_found():
+    offset, sigma = solve(lines_of(1, (0.0, 0.0, 0.2, 0.0)))
+    assert (sigma < 0.03).all()
+    assert abs(offset[2] - 0.2) < 4 * sigma[2]
+    assert (abs(offset[[0, 1, 3]]) < 4 * sigma[[0, 1, 3]]).all()
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 30 * ARCSEC])
+def test_errors_over_sigmas_are_standard_normal(turn_rad):
+    true = np.array([0.02, -0.05, 0.1, 0.0])
+    scores = []
+    for seed in range(40):
+        offset, sigma = solve(lines_of(seed, true, turn_rad=turn_rad, n_epochs=20), turn_rad)
+        scores.append((offset - true) / sigma)
+    scores = np.array(scores)
+    # Four offsets a seed share their position biases: some 80 independent draws.
+    assert 0.8 < np.sqrt(np.mean(scores**2)) < 1.2
+
+
+def test_one_sensor_alone_shows_nothing():
+    lines = lines_of(2, np.zeros(4), used=(1,))
+    offset, sigma = solve(lines)
+    assert np.isnan(offset[[0, 2, 3]]).all()
+    assert sigma[1] == pytest.approx(PRIOR_S)
+    assert offset[1] == pytest.approx(0.0)
+
+
+def test_no_lines_give_no_offsets():
+    empty = Lines(
+        *[np.zeros((0, *shape)) for shape in ((), (), (3,), (2, 2), (3,), (3,), (3,), (3,))]
+    )
+    empty = empty._replace(group=np.zeros(0, np.int64), sensor=np.zeros(0, np.int64))
+    offset, sigma = solve(empty)
+    assert np.isnan(offset).all()
+    assert np.isnan(sigma).all()
