@@ -60,7 +60,7 @@ class FrameColumns:
 
     rejects: RejectList
     span: tuple[int, int] | None = None
-    clock_off_ns: int = 0  # the largest difference of a frame's time and when it was logged
+    clock_off_ns: int | None = None  # at most how far a frame's time and its logging were apart
     _sensors: NameCodes = field(default_factory=NameCodes)
     _rows: _Rows = field(default_factory=lambda: _Rows(0, 0))
     _tables: list[pa.Table] = field(default_factory=list)
@@ -95,7 +95,7 @@ class FrameColumns:
             return
         logged = part.block.time_ns[part.chosen[first:last]].astype(np.int64)
         off = np.abs(self._rows.columns.time_ns[n : n + last - first] - logged)
-        self.clock_off_ns = max(self.clock_off_ns, int(off.max()))
+        self.clock_off_ns = max(self.clock_off_ns or 0, int(off.max()))
 
     def _make_room(self, n: int, n_centroids: int) -> None:
         if not self._rows.has_room(n, n_centroids):
@@ -193,7 +193,7 @@ class FrameColumns:
             rows.n += 1
             if self.span is not None:
                 off = abs(frame.time_ns - one.log_time_ns)
-                self.clock_off_ns = max(self.clock_off_ns, off)
+                self.clock_off_ns = max(self.clock_off_ns or 0, off)
 
 
 def _frame_fault(frame: Frame) -> str | None:

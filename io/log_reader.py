@@ -6,18 +6,18 @@ in `rejects`. Only a log that gives no frame at all is an error.
 """
 
 import hashlib
-import mmap
 import os
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
+from concurrent.futures import Executor, ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
 from epipole.io.camera_columns import CameraColumns
 from epipole.io.frame_columns import FrameColumns
+from epipole.io.log_bytes import open_log
 from epipole.io.log_records import Block, RecordWalk
 from epipole.io.log_rejects import RejectList
 from epipole.io.log_summary import MAGIC
@@ -30,15 +30,28 @@ from epipole.schemas.log_tables import LogPart, LogSource
 from epipole.schemas.messages import CALIBRATION, CARRIES, FRAME, STATE
 
 THREADS = 2  # that unpack and check chunks, beside the one that decodes
+KINDS = (FRAME, STATE, CALIBRATION)
+# A frame's time and the time it was logged at may be so far apart, no further, for chunks
+# to be judged by the latter. States that far beyond a range help its first and last frames.
+MARGIN_NS = 600_000_000_000
+FIRST_NS, LAST_NS = 0, (1 << 63) - 1 - MARGIN_NS
+# A calibration holds until the next one, so it may lie far before a range.
+ALWAYS_READ = frozenset(name for name, carries in CARRIES.items() if carries == CALIBRATION)
 
 
-def read_log(path: str | os.PathLike[str]) -> LogPart:
+def read_log(
+    path: str | os.PathLike[str], start_ns: int | None = None, end_ns: int | None = None
+) -> LogPart:
     """Return what a log holds, in the order of the file.
 
     Parameters
     ----------
     path
         A local file or an fsspec URL such as ``s3://bucket/night.mcap``.
+    start_ns, end_ns
+        Frames from the one to before the other only (UTC since 1970; none: no limit), states
+        within `MARGIN_NS` of them, all calibrations. Chunks of another time are passed over
+        unopened where the log's own times can be trusted.
 
     Returns
     -------
@@ -49,90 +62,99 @@ def read_log(path: str | os.PathLike[str]) -> LogPart:
     Raises
     ------
     LogError
-        No such file, a folder, no MCAP, messages in an unknown encoding, no frame.
+        No such file, a folder, no MCAP, messages in an unknown encoding, no frame. That none
+        lies in the range is no error.
     """
     where = os.fspath(path)
-    data = _open(where)
+    data = open_log(where)
     if data[: len(MAGIC)] != MAGIC:
         raise LogError(f"{where}: not an MCAP file; give a log as MCAP (https://mcap.dev)")
     name = where.rstrip("/").rpartition("/")[2]
-    rejects = RejectList(name)
-    frames, states, cameras = (
-        FrameColumns(rejects),
-        StateColumns(rejects),
-        CameraColumns(rejects),
-    )
-    _read_messages(data, where, rejects, {FRAME: frames, STATE: states, CALIBRATION: cameras})
-    exposures = frames.table()
-    if exposures.num_rows == 0:
-        raise LogError(f"{where}: no frames in it; {_advice(rejects)}")
-    times = array(exposures, "time")
-    first, last = int(times.min()), int(times.max())
-    source = LogSource(name, len(data), hashlib.sha256(data).hexdigest(), first, last)
-    return LogPart(exposures, states.table(), cameras.table(), rejects.table(first, last), source)
-
-
-def _open(where: str) -> memoryview:
-    """Return the bytes of a local file (mapped, not read) or of a URL."""
-    if "://" in where:
-        return _open_url(where)
-    path = Path(where)
-    if path.is_dir():
-        raise LogError(f"{where}: is a folder; give the logs in it, such as {where}/*.mcap")
-    try:
-        with path.open("rb") as file:
-            if os.fstat(file.fileno()).st_size == 0:
-                return memoryview(b"")
-            return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    except FileNotFoundError as error:
-        raise LogError(f"{where}: no such file; check the path") from error
-    except OSError as error:
-        raise LogError(f"{where}: cannot be read: {error.strerror}") from error
-
-
-def _open_url(where: str) -> memoryview:
-    try:
-        import fsspec
-    except ImportError as error:
-        raise LogError(f"{where}: URLs need the package fsspec; install it") from error
-    try:
-        with fsspec.open(where, "rb") as file:
-            return memoryview(file.read())
-    except (OSError, ValueError, ImportError) as error:
-        raise LogError(f"{where}: cannot be read: {_line(error)}") from error
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
-
-
-def _read_messages(
-    data: memoryview, where: str, rejects: RejectList, columns: dict[str, Any]
-) -> None:
-    """Take every wanted message into the columns of its kind."""
+    span = None
+    if start_ns is not None or end_ns is not None:
+        span = (FIRST_NS if start_ns is None else start_ns, LAST_NS if end_ns is None else end_ns)
     with ThreadPoolExecutor(THREADS, "open chunks") as pool:
-        walk = RecordWalk(data, frozenset(CARRIES), pool)
-        for block in walk.blocks():
-            for carries, chosen in _kinds(block, where):
-                columns[carries].add(Part(block, carries, chosen, rejects))
+        sha256 = pool.submit(_sha256, data)
+        columns = _read_columns(data, where, name, span, pool)
+        if columns is None:
+            columns = _read_columns(data, where, name, span, pool, pass_over=False)
+    frames, states, cameras, rejects = columns
+    exposures, log_states = frames.table(), states.table()
+    if exposures.num_rows == 0 and span is None:
+        raise LogError(f"{where}: no frames in it; {_advice(rejects)}")
+    first, last = _time_span(exposures, log_states, span)
+    source = LogSource(name, len(data), sha256.result(), first, last)
+    left_out = rejects.table(first, last, span)
+    return LogPart(exposures, log_states, cameras.table(), left_out, source)
+
+
+class Columns(NamedTuple):
+    """What a log's messages become."""
+
+    frames: FrameColumns
+    states: StateColumns
+    cameras: CameraColumns
+    rejects: RejectList
+
+
+def _read_columns(
+    data: memoryview,
+    where: str,
+    name: str,
+    span: tuple[int, int] | None,
+    pool: Executor,
+    pass_over: bool = True,
+) -> Columns | None:
+    """Take every wanted message of a span into the columns of its kind.
+
+    Return None where chunks were passed over and it shows that they should not have been:
+    the frames that were read are of another time than they were logged at.
+    """
+    wide = None if span is None else (span[0] - MARGIN_NS, span[1] + MARGIN_NS)
+    rejects = RejectList(name)
+    columns = Columns(
+        FrameColumns(rejects, span), StateColumns(rejects, wide), CameraColumns(rejects), rejects
+    )
+    walk = RecordWalk(data, frozenset(CARRIES), pool, wide if pass_over else None, ALWAYS_READ)
+    for block in walk.blocks():
+        for i, chosen in _kinds(block, where):
+            columns[i].add(Part(block, KINDS[i], chosen, rejects))
+    off_ns = columns.frames.clock_off_ns
+    if walk.n_passed and (off_ns is None or off_ns > MARGIN_NS):
+        return None
     for damage in walk.damage:
         rejects.add(damage.reason, time_ns=damage.time_ns, offset=damage.offset, count=damage.n)
+    return columns
 
 
-def _kinds(block: Block, where: str) -> Iterator[tuple[str, npt.NDArray[np.int64]]]:
-    """Yield what the messages of a block carry, and which of them carry it."""
+def _sha256(data: memoryview) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def _time_span(
+    exposures: pa.Table, states: pa.Table, span: tuple[int, int] | None
+) -> tuple[int, int]:
+    """Return the first and the last time of what was read: of frames, if there are any."""
+    for rows in (exposures, states):
+        if rows.num_rows:
+            time_ns = array(rows, "time")
+            return int(time_ns.min()), int(time_ns.max())
+    return (0, 0) if span is None else (span[0], span[0])
+
+
+def _kinds(block: Block, where: str) -> Iterator[tuple[int, npt.NDArray[np.int64]]]:
+    """Yield the place in `KINDS` of what messages of a block carry, and which do."""
     code = np.zeros(max(block.channels) + 1, np.uint8)
-    kinds = (FRAME, STATE, CALIBRATION)
     for number, channel in block.channels.items():
         if channel.encoding not in ENCODINGS:
             raise LogError(
                 f"{where}: topic {channel.topic}: messages are encoded as {channel.encoding!r}; "
                 f"write {channel.schema} as one of {', '.join(ENCODINGS)}"
             )
-        code[number] = kinds.index(CARRIES[channel.schema])
+        code[number] = KINDS.index(CARRIES[channel.schema])
     of_message = code[block.channel]
     for i in np.unique(code[list(block.channels)]).tolist():
-        yield kinds[i], np.flatnonzero(of_message == i)
+        yield i, np.flatnonzero(of_message == i)
 
 
 def _advice(rejects: RejectList) -> str:

@@ -72,12 +72,16 @@ class RecordWalk:
     data: memoryview
     wanted: frozenset[str]  # names of the schemas whose messages are asked for
     pool: Executor | None = None  # opens chunks while the ones before them are decoded
+    span: tuple[int, int] | None = None  # chunks logged wholly outside it need not be opened
+    always: frozenset[str] = frozenset()  # but for those with messages of these schemas
+    n_passed: int = 0  # chunks that were not opened
     damage: list[Damage] = field(default_factory=list)
     _summary: Summary = field(default_factory=Summary)
     _unknown: dict[int, int] = field(default_factory=dict)
     _counts: dict[int, int] = field(default_factory=dict)
     _lost: dict[int, int] = field(default_factory=dict)  # messages of a damage, by its index
     _lost_chunk: int | None = None  # the damage that message indexes now belong to
+    _passing: bool = False  # whether message indexes now belong to a chunk that is not opened
 
     def __post_init__(self) -> None:
         self._channels = ChannelTable(self.wanted)
@@ -117,7 +121,8 @@ class RecordWalk:
                 if opcode in LOOSE:
                     run = index_records(_bytes(data[at:limit]), only_known=True)
                     after = max(after, at + run.walked)
-                yield Place(opcode, at, after)
+                passed = opcode == CHUNK and self._may_pass(at, after)
+                yield Place(opcode, at, after, "passed" if passed else "")
                 at = after
         yield Place(0, at, end, "truncated")
 
@@ -159,6 +164,45 @@ class RecordWalk:
         except ChunkError:
             return 0
 
+    def _may_pass(self, at: int, after: int) -> bool:
+        """Return whether a chunk is of another time for certain, and nothing else needs it.
+
+        The log must have been closed: its summary has the channels that a chunk may declare.
+        The chunk's times must be those of the indexes behind it. The first and the last are
+        always opened: they show whether messages are logged at the time that they are of.
+        """
+        places = self._summary.chunk_offsets
+        if self.span is None or not self._summary.sound or at in (places[:1] + places[-1:]):
+            return False
+        try:
+            head = read_head(self.data, at)
+        except ChunkError:
+            return False
+        low, high = self.span
+        if not (head.start_ns <= head.end_ns < low or high <= head.start_ns <= head.end_ns):
+            return False
+        indexes = list(self._indexes_behind(after))
+        return bool(indexes) and all(
+            self._channels.knows(number)
+            and getattr(self._channels.find(number), "schema", "") not in self.always
+            and len(time_ns)
+            and head.start_ns <= time_ns.min()
+            and time_ns.max() <= head.end_ns
+            for number, time_ns in indexes
+        )
+
+    def _indexes_behind(self, at: int) -> Iterator[tuple[int, npt.NDArray[np.uint64]]]:
+        """Yield the channel and the times of each message index from `at` on."""
+        while at + RECORD.size <= len(self.data):
+            opcode, length = RECORD.unpack_from(self.data, at)
+            body, at = at + RECORD.size, at + RECORD.size + length
+            if opcode != MESSAGE_INDEX or at > len(self.data):
+                return
+            if not self._is_message_index(body, at):
+                return
+            number, size = struct.unpack_from("<HI", self.data, body)
+            yield number, np.frombuffer(self.data, "<u8", size // 8, body + 6)[::2]
+
     # What is there
 
     def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
@@ -166,6 +210,9 @@ class RecordWalk:
         body = at + RECORD.size
         if reason == "cut":
             yield from self._walk_chunk(at, open_cut_chunk(self.data, at), cut=True)
+        elif reason == "passed":
+            self.n_passed += 1
+            self._passing = True
         elif reason:
             self._leave_out(at, 0, reason)
         elif opcode == CHUNK:
@@ -180,7 +227,7 @@ class RecordWalk:
 
     def _walk_chunk(self, at: int, opened: OpenedChunk, cut: bool = False) -> Iterator[Block]:
         """Yield the messages of a chunk; `cut`: its last record may be incomplete."""
-        self._lost_chunk = None
+        self._lost_chunk, self._passing = None, False
         start_ns, records, index, reason = opened
         if reason:
             self._leave_out(at, start_ns, reason)
@@ -271,8 +318,11 @@ class RecordWalk:
         return size == after - body - 6 and size % 16 == 0
 
     def _count_lost(self, body: int) -> None:
-        """Count the messages of a chunk that is left out, by an index that follows it."""
+        """Count the messages of a chunk that is left out or passed, by an index behind it."""
         number, size = struct.unpack_from("<HI", self.data, body)
+        if self._passing:
+            self._counts[number] = self._counts.get(number, 0) + size // 16
+            return
         if self._lost_chunk is None or (self._channels and not self._channels.find(number)):
             return
         self._counts[number] = self._counts.get(number, 0) + size // 16

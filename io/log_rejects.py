@@ -52,14 +52,19 @@ class RejectList:
         ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
         return ", ".join(f"{reason} {count}" for reason, count in ordered)
 
-    def table(self, first_ns: int, last_ns: int) -> pa.Table:
+    def table(self, first_ns: int, last_ns: int, span: tuple[int, int] | None = None) -> pa.Table:
         """Return the rows; `first_ns` to `last_ns` is the time that the log's frames span.
 
         A row whose time is unknown, or a day or more outside that span (damage has made it
-        up), gets the span's start: it must fall into a night that is being made.
+        up), gets the span's start: it must fall into a night that is being made. Of rows
+        whose time is known, those before `span[0]` or from `span[1]` on are left out.
         """
-        rows = self._rows
         near_ns = range(first_ns - DAY_NS + 1, last_ns + DAY_NS)
+        rows = [
+            row
+            for row in self._rows
+            if span is None or row[2] not in near_ns or span[0] <= row[2] < span[1]
+        ]
         return table(
             REJECTS,
             {

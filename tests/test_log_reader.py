@@ -157,8 +157,12 @@ def test_a_url_is_read_like_a_file(tmp_path):
     with fsspec.open("memory://logs/a.mcap", "wb") as file:
         file.write(path.read_bytes())
     assert read_log("memory://logs/a.mcap").exposures.equals(read_log(path).exposures)
-    with pytest.raises(LogError, match="cannot be read"):
+    with pytest.raises(LogError, match=r"none\.mcap: no such file"):
         read_log("memory://logs/none.mcap")
+    with pytest.raises(LogError, match="is a folder"):
+        read_log("memory://logs")
+    with pytest.raises(LogError, match="cannot be read"):
+        read_log("carrier-pigeon://logs/a.mcap")
 
 
 def test_encodings_may_be_mixed_and_other_messages_are_ignored(tmp_path):
