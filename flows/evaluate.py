@@ -1,0 +1,68 @@
+"""A dataset and the truth of a simulation go in, a report comes out."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from rich.console import Console
+from rich.table import Table
+
+from epipole.io.dataset import nights_of, read_table
+from epipole.io.truth import Truth, read_truth
+from epipole.schemas.errors import DatasetError
+from epipole.schemas.report import Report
+from epipole.tasks.evaluate_dataset import evaluate_dataset
+
+TABLES = ("frames", "stars", "detections", "epochs", "associations", "positions")
+
+
+def evaluate(dataset: str | os.PathLike[str], truth: str | os.PathLike[str]) -> Report:
+    """Hold a dataset against the truth of the simulation it was made of.
+
+    Parameters
+    ----------
+    dataset
+        The folder that `epipole run` published to. Only the nights of the truth count.
+    truth
+        The truth's folder, ``LOG.truth``, or the log beside it.
+
+    Raises
+    ------
+    DatasetError
+        Where either is missing or cannot be read, or the dataset has no night of the truth.
+    """
+    true = read_truth(truth)
+    dataset = Path(dataset)
+    nights = _nights(dataset, true)
+    tables = {
+        name: pa.concat_tables([read_table(dataset, name, night) for night in nights])
+        for name in TABLES
+    }
+    return evaluate_dataset(tables, true)
+
+
+def _nights(dataset: Path, truth: Truth) -> list[str]:
+    if not dataset.is_dir():
+        raise DatasetError(f"{dataset}: no such folder; `epipole run LOG --out {dataset}` makes it")
+    wanted = nights_of(np.asarray(truth.frames["t_ns"], np.int64))
+    there = [night for night in wanted if (dataset / f"night={night}").is_dir()]
+    if not there:
+        raise DatasetError(
+            f"{dataset}: has no night={' or night='.join(wanted) or '...'} of this truth; "
+            "give the truth of a log that the dataset was made of"
+        )
+    return there
+
+
+def show(report: Report, console: Console | None = None) -> None:
+    """Print a report as a table."""
+    table = Table(box=None, pad_edge=False, show_header=False)
+    table.add_column(style="bold")
+    table.add_column()
+    table.add_column(justify="right")
+    last = ""
+    for group, label, value in report.rows():
+        table.add_row("" if group == last else group, label, value)
+        last = group
+    (console or Console()).print(table)
