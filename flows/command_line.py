@@ -159,21 +159,51 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
 
 @app.command()
 def simulate(
-    scene: Annotated[str, typer.Argument(help="A built-in scene, or a TOML file.")],
-    out: Annotated[Path, typer.Option(metavar="LOG", help="Log to write, such as night.mcap.")],
-    seed: Annotated[int | None, typer.Option(help="Instead of the scene's.")] = None,
-    sensors: Annotated[int | None, typer.Option(help="How many sensors.")] = None,
-    objects: Annotated[int | None, typer.Option(help="How many objects.")] = None,
-    hours: Annotated[float | None, typer.Option(help="How long.")] = None,
-    rate_hz: Annotated[float | None, typer.Option(help="Frames a second of a sensor.")] = None,
-    start: Annotated[str | None, typer.Option(help="Such as 2019-04-01T04:00:00Z.")] = None,
-    logs: Annotated[int, typer.Option(help="Cut into so many logs, in order of time.")] = 1,
-    encoding: Annotated[Encoding, typer.Option(help="Of the messages.")] = Encoding.protobuf,
+    scene: Annotated[
+        str, typer.Argument(metavar="SCENE", help="A built-in scene's name, or a TOML file.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="LOG", help="Log to write; its truth goes to LOG.truth.")
+    ],
+    seed: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Another seed: the same scene anew.")
+    ] = None,
+    sensors: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Sensors of the first group.")
+    ] = None,
+    objects: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Objects of the first group.")
+    ] = None,
+    hours: Annotated[
+        float | None, typer.Option(metavar="H", help="Duration, instead of the scene's.")
+    ] = None,
+    rate_hz: Annotated[
+        float | None, typer.Option("--rate", metavar="HZ", help="Frames a second of a sensor.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(metavar="TIME", help="UTC, such as 2019-04-01T04:00:00Z.")
+    ] = None,
+    logs: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Cut into N logs, one after the other in time.")
+    ] = 1,
+    encoding: Annotated[Encoding, typer.Option(help="Of messages.")] = Encoding.protobuf,
     compression: Annotated[Compression, typer.Option(help="Of chunks.")] = Compression.zstd,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate a scene: a log, and its truth beside it."""
+    """Simulate a scene: write a log, and its truth beside it.
+
+    Built-in scenes:
+
+    four_sensor_geo: four low sensors, nine geostationary objects, a minute
+
+    six_sensor_wide: wide fields, attitudes unknown, many false points
+
+    lost_in_space: a new attitude in every frame
+
+    night: any number of sensors, objects and hours
+    """
     from epipole.flows.simulate import simulate
+    from epipole.flows.summary import many
 
     made = simulate(
         scene,
@@ -194,9 +224,32 @@ def simulate(
     typer.echo(f"log    {', '.join(str(log) for log in made.logs)}")
     typer.echo(f"truth  {made.truth}")
     typer.echo(
-        f"{made.sensors:,} sensors, {made.objects:,} objects, {made.frames:,} frames, "
-        f"{made.centroids:,} centroids"
+        f"{many(made.sensors, 'sensor')}, {many(made.objects, 'object')}, "
+        f"{many(made.frames, 'frame')}, {many(made.centroids, 'centroid')}"
     )
+
+
+@app.command()
+def evaluate(
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="What `epipole run` published to.")
+    ],
+    truth: Annotated[
+        Path, typer.Option(metavar="DIR", help="LOG.truth, beside the simulated log.")
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Hold a dataset against the truth of the simulated log it was made of.
+
+    Shows precision and recall of stars, pairs and objects, errors and honesty of sigmas.
+    """
+    from epipole.flows.evaluate import evaluate, show
+
+    report = evaluate(dataset, truth)
+    if as_json:
+        _print_json(report.as_dict())
+    else:
+        show(report)
 
 
 def _instant(text: str | None) -> datetime.datetime | None:
