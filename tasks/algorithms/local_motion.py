@@ -9,18 +9,17 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from epipole.tasks.algorithms.apparent_motion import acceleration, jerk
+
 Array = npt.NDArray[np.float64]
 
 BIAS_SHARE = 0.25  # of one detection's sigma: what the neglected third derivative may amount to
-LOW_ORBIT_S = 1e-3  # [1/s] angular rate of a low orbit, of the sensor's own motion
-FAR_RAD_S2 = 2.5e-7  # [rad/s^2] a low sensor's own acceleration, seen from a distant object
 
 
 @njit(cache=True, nogil=True)
 def _half_width(rate, sigma, widest):
     """Return the window [s] in which the neglected cubic term stays below the noise."""
-    jerk = 2 * rate**3 + LOW_ORBIT_S * (rate * rate + LOW_ORBIT_S * rate + FAR_RAD_S2)
-    return min(widest, (6 * BIAS_SHARE * sigma / jerk) ** (1 / 3))
+    return min(widest, (6 * BIAS_SHARE * sigma / jerk(rate)) ** (1 / 3))
 
 
 @njit(cache=True, nogil=True)
@@ -67,12 +66,26 @@ def _coefficients(t, weight, scale, curvature_prior, value, slope):
 
 
 @njit(cache=True, nogil=True)
-def _window(t, u, lo, hi, at, nearest, sigma, widest):
-    """Return the part of lo:hi that serves an instant, and the object's rate [rad/s] there."""
-    while lo < nearest and at - t[lo] > widest:
-        lo += 1
-    while hi - 1 > nearest and t[hi - 1] - at > widest:
-        hi -= 1
+def _about(t, first, last, at, half):
+    """Return the detections within a half-width of an instant, three at least if there are."""
+    lo = first + np.searchsorted(t[first:last], at - half)
+    hi = first + np.searchsorted(t[first:last], at + half, side="right")
+    while hi - lo < min(3, last - first):
+        if hi == last or (lo > first and at - t[lo - 1] <= t[hi] - at):
+            lo -= 1
+        else:
+            hi += 1
+    return lo, hi
+
+
+@njit(cache=True, nogil=True)
+def _window(t, u, first, last, at, sigma, widest):
+    """Return the part of first:last that serves an instant, the rate [rad/s] and half-width.
+
+    Three detections stay, however slow the sensor or fast the object: the prior covers its
+    curvature, and what lies beyond the half-width is paid for.
+    """
+    lo, hi = _about(t, first, last, at, widest)
     rate = 0.0
     if hi - lo > 1:
         chord = 0.0
@@ -80,12 +93,8 @@ def _window(t, u, lo, hi, at, nearest, sigma, widest):
             chord += (u[hi - 1, a] - u[lo, a]) ** 2
         rate = np.sqrt(chord) / (t[hi - 1] - t[lo])
     half = _half_width(rate, sigma, widest)
-    # Three detections stay, however fast the object: the prior covers its curvature.
-    while hi - lo > 3 and lo < nearest and at - t[lo] > half:
-        lo += 1
-    while hi - lo > 3 and hi - 1 > nearest and t[hi - 1] - at > half:
-        hi -= 1
-    return lo, hi, rate
+    lo, hi = _about(t, lo, hi, at, half)
+    return lo, hi, rate, half
 
 
 @njit(cache=True, nogil=True)
@@ -106,12 +115,13 @@ def _evaluate(
     out_n,
 ):
     for q in range(len(at)):
-        nearest = first[q]
-        for k in range(first[q], last[q]):
-            if abs(t[k] - at[q]) < abs(t[nearest] - at[q]):
-                nearest = k
+        nearest = first[q] + np.searchsorted(t[first[q] : last[q]], at[q])
+        if nearest == last[q] or (
+            nearest > first[q] and at[q] - t[nearest - 1] <= t[nearest] - at[q]
+        ):
+            nearest -= 1
         sigma = np.sqrt(np.trace(noise[nearest]) / 2)
-        lo, hi, rate = _window(t, u, first[q], last[q], at[q], nearest, sigma, widest)
+        lo, hi, rate, half = _window(t, u, first[q], last[q], at[q], sigma, widest)
         n = hi - lo
         out_n[q] = n
         tau, weight = t[lo:hi] - at[q], np.empty(n)
@@ -123,9 +133,10 @@ def _evaluate(
             unmodelled = (unknown_rate * tau[0]) ** 2
         else:
             scale = max(np.max(np.abs(tau)), 1e-9)
-            acceleration = rate * rate + LOW_ORBIT_S * rate + FAR_RAD_S2
-            prior = 1.0 / (acceleration * scale * scale) ** 2
+            prior = 1.0 / (acceleration(rate) * scale * scale) ** 2
             unmodelled = _coefficients(tau, weight, scale, prior, value, slope)
+            if scale > half:
+                unmodelled += (jerk(rate) * scale**3 / 6) ** 2
             for k in range(n):
                 unmodelled -= value[k] * value[k] / weight[k]
         for a in range(3):

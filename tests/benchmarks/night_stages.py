@@ -1,0 +1,109 @@
+"""The stages of a night as plain functions, one after the other, without Prefect."""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.flows.sensors import calibrated, of_sensor, sensor_ids, spans
+from epipole.io.star_catalogue import read_hipparcos
+from epipole.schemas.bridge import concat
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import DETECTIONS, TRACKLETS
+from epipole.schemas.work_tables import SOLUTIONS, VIEWS
+from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.align_epochs import align_epochs
+from epipole.tasks.associate_objects import associate_objects
+from epipole.tasks.build_tracklets import Tracked, build_tracklets
+from epipole.tasks.identify_stars import identify_stars
+from epipole.tasks.lone_detections import with_lone_tracklets
+from epipole.tasks.place_sensors import place_sensors
+from epipole.tasks.read_logs import read_logs
+from epipole.tasks.solve_positions import Solved, solve_positions
+from epipole.tasks.view_objects import view_objects
+
+Array = npt.NDArray[np.float64]
+SPAN_NS = 600_000_000_000
+
+
+class Seen(NamedTuple):
+    """What a log shows before any object is looked for."""
+
+    solutions: pa.Table
+    detections: pa.Table
+    cameras: pa.Table
+
+
+def see(log: Path, settings: Settings) -> Seen:
+    """Read a log and identify its stars."""
+    read = read_logs.fn([str(log)], settings)
+    exposures, _ = calibrated(read.exposures, read.cameras)
+    places = place_sensors.fn(exposures, read.states, settings)
+    catalogue = read_hipparcos()
+    parts = [
+        identify_stars.fn(
+            exposures.take(rows), places.take(rows), read.cameras, catalogue, settings
+        )
+        for rows in spans(exposures, SPAN_NS)
+    ]
+    return Seen(
+        concat(SOLUTIONS, [part.solutions for part in parts]),
+        concat(DETECTIONS, [part.detections for part in parts]),
+        read.cameras,
+    )
+
+
+def track(seen: Seen, settings: Settings) -> Tracked:
+    """Build the tracklets of every sensor."""
+    parts = [
+        build_tracklets.fn(
+            of_sensor(seen.solutions, name),
+            of_sensor(seen.detections, name),
+            seen.cameras,
+            settings,
+        )
+        for name in sensor_ids(seen.solutions)
+    ]
+    return Tracked(
+        concat(DETECTIONS, [part.detections for part in parts]),
+        concat(TRACKLETS, [part.tracklets for part in parts]),
+    )
+
+
+def solve(seen: Seen, tracked: Tracked, settings: Settings) -> Solved:
+    """Align, associate and triangulate."""
+    epochs = align_epochs.fn(seen.solutions, settings)
+    views = concat(
+        VIEWS,
+        [
+            view_objects.fn(
+                of_sensor(epochs, name),
+                of_sensor(seen.solutions, name),
+                of_sensor(tracked.detections, name),
+                seen.cameras,
+                settings,
+            )
+            for name in sensor_ids(epochs)
+        ],
+    )
+    associated = associate_objects.fn(
+        views, with_lone_tracklets(tracked.tracklets, views), seen.solutions, seen.cameras, settings
+    )
+    return solve_positions.fn(associated.views, associated.object_number, settings)
+
+
+def position_errors(log: Path, positions: pa.Table) -> Array:
+    """Return how far each position lies from the nearest object of the simulation [km]."""
+    truth = json.loads((Path(f"{log}.truth") / "scenario.json").read_text())
+    at_s = (pc.cast(positions["time"], pa.int64()).to_numpy() - int(truth["t0_ns"])) / 1e9
+    here = pl.from_arrow(positions).select("x_km", "y_km", "z_km").to_numpy()
+    best = np.full(len(here), np.inf)
+    for target in truth["targets"]:
+        r, _ = state_at(np.array(target["elements"]), at_s)
+        best = np.minimum(best, np.linalg.norm(here - r, axis=1))
+    return best
