@@ -26,7 +26,7 @@ def _evidence(star_of, chi2=0.0, n_stars=5, instrumental=None, magnitude=None, z
     magnitude = np.full(n_stars, 5.0) if magnitude is None else magnitude
     return match_evidence(
         np.array(star_of), np.full(n, chi2), np.full(n, SIGMA), instrumental, magnitude, FLAT,
-        zero, float(n_stars), AREA,
+        zero, 0.4, float(n_stars), AREA,
     )  # fmt: skip
 
 
@@ -47,14 +47,14 @@ def test_averaged_over_chance_the_evidence_is_below_one():
     d2 = np.sum((u - side / 2) ** 2, axis=2).min(axis=1) / sigma**2
     lone = match_evidence(
         np.array([0, -1, -1]), np.zeros(3), np.full(3, sigma), NO_FLUX, np.array([5.0]), FLAT,
-        math.nan, 1.0, AREA,
+        math.nan, 0.4, 1.0, AREA,
     )[0]  # fmt: skip
     assert np.mean(np.exp(lone - 0.5 * d2)) < 1.0
 
 
 def test_right_brightness_adds_and_wrong_brightness_takes_away():
-    assert log_brightness_ratio(0.0, 5.0, FLAT) > 2.0
-    assert log_brightness_ratio(3.0, 5.0, FLAT) < -0.5
+    assert log_brightness_ratio(0.0, 5.0, FLAT, 0.4) > 2.0
+    assert log_brightness_ratio(3.0, 5.0, FLAT, 0.4) < -0.5
     magnitude = np.array([2.0, 3.0, 4.0, 5.0, 6.0])
     right, _ = _evidence([0, 1, 2, 3], instrumental=magnitude[:4] - 20.0, magnitude=magnitude)
     swapped, _ = _evidence([3, 2, 1, 0], instrumental=magnitude[:4] - 20.0, magnitude=magnitude)

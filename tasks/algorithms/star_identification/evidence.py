@@ -29,7 +29,7 @@ Array = npt.NDArray[np.float64]
 BIN_MAG = 0.25  # of the histogram of magnitudes
 FIRST_MAG = -2.0
 N_BINS = 72
-SPREAD_MAG = 0.4  # a sensor's magnitude about V, colours included
+TYPICAL_SPREAD_MAG = 0.4  # a sensor's magnitude about V, colours included, while not learned
 OUTLIER_SHARE = 0.15  # variables, blends, odd colours
 MAG_RANGE = 6.0
 
@@ -42,11 +42,11 @@ def log_magnitude_density(magnitude: Array) -> Array:
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
-def log_brightness_ratio(difference, magnitude, log_density):
-    """Return ln(g / h) of a match whose magnitudes differ so (compiled)."""
-    z = difference / SPREAD_MAG
+def log_brightness_ratio(difference, magnitude, log_density, spread):
+    """Return ln(g / h) of a match whose magnitudes differ so; `spread` 1-sigma (compiled)."""
+    z = difference / spread
     g = OUTLIER_SHARE / MAG_RANGE
-    g += (1.0 - OUTLIER_SHARE) * math.exp(-0.5 * z * z) / (SPREAD_MAG * 2.5066282746310002)
+    g += (1.0 - OUTLIER_SHARE) * math.exp(-0.5 * z * z) / (spread * 2.5066282746310002)
     i = min(max(int((magnitude - FIRST_MAG) / BIN_MAG), 0), N_BINS - 1)
     return math.log(g) - log_density[i]
 
@@ -69,8 +69,18 @@ def median_zero_point(star_of, instrumental, magnitude):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def log_ways(n, matches, in_view):
+    """Return ln of in how many ways `matches` of n centroids are as many of the stars in view,
+    and of how many numbers of matches there could be (compiled)."""
+    m = max(in_view, float(matches))
+    ways = math.lgamma(n + 1.0) - math.lgamma(n - matches + 1.0)
+    ways += math.lgamma(m + 1.0) - math.lgamma(matches + 1.0) - math.lgamma(m - matches + 1.0)
+    return ways + math.log(m + 1.0)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def match_evidence(
-    star_of, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, in_view, area
+    star_of, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, spread, in_view, area
 ):
     """Return the matches' part of the log evidence, and their number (compiled).
 
@@ -80,8 +90,9 @@ def match_evidence(
         Each centroid's star (-1 none), d^2 / s^2, s [rad], -2.5 log10 flux (NaN unknown).
     magnitude : (m,)
         Of the stars that `star_of` counts.
-    log_density, zero_point : (N_BINS,), float
-        Catalogue's magnitudes; star minus instrumental magnitude, NaN where not known.
+    log_density, zero_point, spread : (N_BINS,), float, float
+        Catalogue's magnitudes; star minus instrumental magnitude, NaN where not known; its
+        scatter [mag].
     in_view, area : float
         Stars in the image (matched or not), and its solid angle [sr].
     """
@@ -100,11 +111,8 @@ def match_evidence(
         total += math.log(area / (2.0 * math.pi * sigma[k] * sigma[k])) - 0.5 * chi2_of[k]
         if not (math.isnan(zero) or math.isnan(instrumental[k])):
             difference = magnitude[s] - instrumental[k] - zero
-            total += log_brightness_ratio(difference, magnitude[s], log_density)
-    m = max(in_view, float(matches))
-    ways = math.lgamma(n + 1.0) - math.lgamma(n - matches + 1.0)
-    ways += math.lgamma(m + 1.0) - math.lgamma(matches + 1.0) - math.lgamma(m - matches + 1.0)
-    return total - ways - math.log(m + 1.0), matches
+            total += log_brightness_ratio(difference, magnitude[s], log_density, spread)
+    return total - log_ways(n, matches, in_view), matches
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

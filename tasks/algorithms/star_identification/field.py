@@ -237,6 +237,7 @@ def solve_predicted(
     gate,
     log_density,
     zero_point,
+    spread,
     enough,
     R,
     P,
@@ -297,6 +298,7 @@ def solve_predicted(
                 magnitude,
                 log_density,
                 zero_point,
+                spread,
                 in_view,
                 area,
             )

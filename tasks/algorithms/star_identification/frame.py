@@ -5,13 +5,16 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.star_identification.evidence import TYPICAL_SPREAD_MAG
 from epipole.tasks.algorithms.star_identification.field import (
     solve_predicted,
     stars_in_cone,
 )
 from epipole.tasks.algorithms.star_identification.lost_in_space import (
     CLEAR_LEAD,
+    ENOUGH_LOOKUPS,
     MAX_LOOKUPS_PER_S,
+    PASSES,
     Verdict,
     search,
 )
@@ -86,12 +89,14 @@ class Search(NamedTuple):
     threshold : least log evidence, ln(1 / false alarm probability)
     time_limit_s : of one search lost in space
     zero_point_mag : star minus instrumental magnitude; NaN while unknown
+    spread_mag : its scatter, 1-sigma
     """
 
     gate_sigma: float
     threshold: float
     time_limit_s: float
     zero_point_mag: float
+    spread_mag: float = TYPICAL_SPREAD_MAG
 
 
 def identify_predicted(
@@ -121,7 +126,7 @@ def identify_predicted(
     evidence = solve_predicted(
         R0, P0, lost, frame.u, frame.sigma_rad, frame.instrumental_mag, a, stars.magnitude[row],
         frame.optics.box, how.gate_sigma, sky.log_density, how.zero_point_mag,
-        how.threshold + CLEAR_LEAD, R, P, star, chi2,
+        how.spread_mag, how.threshold + CLEAR_LEAD, R, P, star, chi2,
     )  # fmt: skip
     if not evidence > how.threshold - (LOST_MARGIN if lost else 0.0):
         return None
@@ -148,13 +153,17 @@ def search_lost(frame: Frame, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Se
     area = frame.optics.solid_angle_sr
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))
     budget = int(how.time_limit_s * MAX_LOOKUPS_PER_S)
+    flux = bool(np.isfinite(frame.instrumental_mag).any())
+    if flux and np.isfinite(how.zero_point_mag):
+        budget = min(budget, ENOUGH_LOOKUPS)
+    passes = PASSES if flux and np.isnan(how.zero_point_mag) else PASSES[:2]
     best, runner_up, work = search(
         frame.u, frame.sigma_rad, frame.instrumental_mag, frame.beta,
         sky.catalogue.u_icrs, sky.catalogue.magnitude, grid.first, grid.star, grid.n_face,
         grid.radius_rad, *pairs.chord, pairs.first, pairs.second, min_chord,
         N_PATTERN_CENTROIDS, how.gate_sigma, sky.log_density, how.zero_point_mag,
-        sky.rho * area, area,
-        how.threshold + CLEAR_LEAD, budget, R,
+        how.spread_mag, sky.rho * area, area, frame.optics.box,
+        passes, how.threshold + CLEAR_LEAD, budget, R,
     )  # fmt: skip
     found = best > how.threshold - LOST_MARGIN and best - runner_up > CLEAR_LEAD
     return Verdict(found, R, best, runner_up, work > budget)

@@ -17,7 +17,11 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.attitude import copy_matrix, refine_attitude
 from epipole.tasks.algorithms.kvector import range_of
-from epipole.tasks.algorithms.star_identification.evidence import choice_lost, match_evidence
+from epipole.tasks.algorithms.star_identification.evidence import (
+    choice_lost,
+    log_ways,
+    match_evidence,
+)
 from epipole.tasks.algorithms.star_identification.field import aberrated
 from epipole.tasks.algorithms.star_identification.sky_grid import nearest_star
 
@@ -25,8 +29,16 @@ from epipole.tasks.algorithms.star_identification.sky_grid import nearest_star
 SAME_ATTITUDE = 5e-3
 # The best attitude must be this much (in log) more probable than any other.
 CLEAR_LEAD = 7.0
-GIVE_UP_AFTER = 8  # look-ups without a hit, on the quick first pass
 N_VERIFIED = 64  # brightest centroids that are looked up for each hypothesis
+# Passes over the pairs of centroids, ever more thorough: log odds at which a hypothesis is
+# dropped, gates of the pair's brightness [spreads] and separation [sigma], log odds that are
+# worth a refinement. The last does without brightness, for flux of which nothing is known.
+PASSES = np.array([[-1.5, 2.0, 2.0, 2.0], [-3.0, 3.0, 2.5, 1.0], [-3.0, 1e9, 2.5, 1.0]])
+# Where brightness is known, a frame's stars turn up within this many look-ups or hardly ever.
+ENOUGH_LOOKUPS = 750_000
+STAR_SHARE = 0.5  # of the centroids, before anything is known
+LOG_MISS = math.log(1.0 - STAR_SHARE)
+MAX_BETA = 1.1e-4  # of an observer near the Earth
 MAX_LOOKUPS_PER_S = 2.5e7
 
 
@@ -61,6 +73,44 @@ def _basis(ax, ay, az, bx, by, bz, E):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def _star_basis(a, b, c, F):
+    """Write `_basis` of two unit vectors c apart; faster."""
+    f, g = 1.0 / math.sqrt(4.0 - c * c), 1.0 / c
+    for m in range(3):
+        F[0, m], F[1, m] = f * (a[m] + b[m]), g * (b[m] - a[m])
+    F[2, 0] = F[0, 1] * F[1, 2] - F[0, 2] * F[1, 1]
+    F[2, 1] = F[0, 2] * F[1, 0] - F[0, 0] * F[1, 2]
+    F[2, 2] = F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _try_pair(t, order, F, sign, gain, fall, radius, floor, star_u, first, star, n_face, row_of):
+    """Return how much more likely the other centroids are with the pair's attitude than by
+    chance (ln), below `floor` as soon as that is seen; write their stars. `order`: in which
+    they are looked up.
+
+    A sequential probability ratio test (Wald 1945).
+    """
+    odds = 0.0
+    for k in order:
+        p, q = sign * t[k, 1], sign * t[k, 2]
+        row_of[k], d2 = nearest_star(
+            t[k, 0] * F[0, 0] + p * F[1, 0] + q * F[2, 0],
+            t[k, 0] * F[0, 1] + p * F[1, 1] + q * F[2, 1],
+            t[k, 0] * F[0, 2] + p * F[1, 2] + q * F[2, 2],
+            radius[k],
+            star_u,
+            first,
+            star,
+            n_face,
+        )
+        odds += gain[k] - fall[k] * d2 if row_of[k] >= 0 else LOG_MISS
+        if odds < floor:
+            break
+    return odds
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def _look_up(R, u, k, beta, radius, star_u, first, star, n_face):
     """Return the star nearest to centroid k, and the squared chord: aberration taken off it."""
     x = R[0, 0] * u[k, 0] + R[1, 0] * u[k, 1] + R[2, 0] * u[k, 2]
@@ -81,6 +131,24 @@ def _look_up(R, u, k, beta, radius, star_u, first, star, n_face):
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def _stars_in_image(R, beta, star_u, box):
+    """Return how many catalogue stars are in the image."""
+    n = 0
+    rx, ry = max(-box[0], box[1]), max(-box[2], box[3])
+    c = 1.0 / math.sqrt(1.0 + rx * rx + ry * ry) - 1e-4
+    for s in range(len(star_u)):
+        x, y, z = star_u[s, 0], star_u[s, 1], star_u[s, 2]
+        z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+        if z > c:
+            x, y, w = x + beta[0], y + beta[1], star_u[s, 2] + beta[2]
+            z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * w
+            across = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * w) / z
+            down = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * w) / z
+            n += box[0] < across < box[1] and box[2] < down < box[3]
+    return n
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def _judge(
     R,
     P,
@@ -97,11 +165,14 @@ def _judge(
     gate,
     log_density,
     zero_point,
-    in_view,
+    spread,
+    box,
     area,
     row_of,
+    beaten,
 ):
-    """Refine an attitude whose first matches are in row_of; return its log evidence."""
+    """Refine an attitude whose first matches are in row_of; return its log evidence, or a
+    number below `beaten` where it is no more than that."""
     n = len(u)
     a, magnitude = np.empty((n, 3)), np.zeros(n)
     slot, chi2_of = np.empty(n, np.int64), np.zeros(n)
@@ -136,10 +207,14 @@ def _judge(
             break
         if not refine_attitude(R, u, sigma, a, slot, P):
             return -1e9
-    evidence, _ = match_evidence(
-        slot, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, in_view, area
+    evidence, matches = match_evidence(
+        slot, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, spread, 0.0, area
     )
-    return evidence + choice_lost(P)
+    evidence += choice_lost(P)
+    if evidence <= beaten:  # even if no star was missed
+        return evidence
+    in_view = float(_stars_in_image(R, beta, star_u, box))
+    return evidence + log_ways(n, matches, float(matches)) - log_ways(n, matches, in_view)
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
@@ -165,8 +240,11 @@ def search(
     gate,
     log_density,
     zero_point,
+    spread,
     in_view,
     area,
+    box,
+    passes,
     enough,
     budget,
     R_best,
@@ -185,23 +263,21 @@ def search(
         The `PairTable`.
     min_chord, n_pattern
         Closest centroids paired [rad]; how many of the brightest are.
-    gate, log_density, zero_point, in_view, area
-        As in `evidence`; the mean number of stars in view.
+    gate, log_density, zero_point, spread, in_view, area, box
+        As in `evidence`; the mean number of stars in view; the image as `Optics` has it.
     enough, budget
         Log evidence to stop at; most look-ups.
     """
     n = len(u)
     n_checked = min(n, N_VERIFIED)
-    min_hits = 2 if n > 3 else 1
     E, F, R, P = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    sa, sb = np.empty(3), np.empty(3)
-    t, radius, gain = np.empty((n, 3)), np.empty(n), np.empty(n)
-    row_of, row_try = np.empty(n, np.int64), np.empty(n, np.int64)
+    t, gain = np.empty((n_checked, 3)), np.empty(n_checked)
+    fall, radius = np.empty(n_checked), np.empty(n_checked)
+    row_of = np.full(n, -1, np.int64)
     best, runner, work = -1e9, -1e9, 0
-    for thorough in range(2):
-        give_up_after = n if thorough else GIVE_UP_AFTER
-        mag_gate = 1.5 if thorough else 0.8
-        pair_gate = 3.2 if thorough else 2.3
+    for step in range(len(passes)):
+        floor, mag_gate, pair_gate = passes[step, 0], passes[step, 1] * spread, passes[step, 2]
+        worth = passes[step, 3]
         for j in range(1, min(n, n_pattern)):
             for i in range(j):
                 dx, dy, dz = u[j, 0] - u[i, 0], u[j, 1] - u[i, 1], u[j, 2] - u[i, 2]
@@ -210,7 +286,7 @@ def search(
                     continue
                 noise2 = sigma[i] * sigma[i] + sigma[j] * sigma[j]
                 # Aberration stretches by v / c at most.
-                tolerance = pair_gate * math.sqrt(noise2) + 1.1e-4 * c
+                tolerance = pair_gate * math.sqrt(noise2) + MAX_BETA * c
                 lo, hi = range_of(chord, below, slope, intercept, c - tolerance, c + tolerance)
                 work += 10
                 if lo == hi:
@@ -219,65 +295,56 @@ def search(
                 for k in range(n_checked):
                     for m in range(3):
                         t[k, m] = E[m, 0] * u[k, 0] + E[m, 1] * u[k, 1] + E[m, 2] * u[k, 2]
-                    # The pair's own errors, with the lever of the distance from its middle.
+                    # The pair's own errors, with the lever of the distance from its middle;
+                    # aberration, left out here, is nearly the same for all.
                     d2 = t[k, 1] * t[k, 1] + t[k, 2] * t[k, 2]
                     s2 = sigma[k] * sigma[k] + 0.5 * noise2 * (0.5 + 2.0 * d2 / (c * c))
-                    radius[k] = min(gate * math.sqrt(s2), grid_radius)
-                    gain[k] = math.log(area / (math.pi * radius[k] * radius[k] * in_view))
+                    s2 += MAX_BETA * MAX_BETA * d2
+                    fall[k] = 0.5 / s2
+                    gain[k] = math.log(STAR_SHARE * area * fall[k] / (math.pi * in_view))
+                    # Beyond that a hit says less than a miss.
+                    near = min(gate * gate, 2.0 * max(gain[k] - LOG_MISS, 0.0))
+                    radius[k] = min(math.sqrt(near * s2), grid_radius)
+                # The pair itself first, then the nearest, which it places best: not by
+                # brightness, as false ones may be the brightest.
+                fall[i] = fall[j] = np.inf
+                order = np.argsort(-fall)
                 m_ij = instrumental[i] - instrumental[j]
                 for p in range(lo, hi):
+                    d_mag = star_mag[pair_a[p]] - star_mag[pair_b[p]]
                     for way in range(2):
-                        ra, rb = (pair_a[p], pair_b[p]) if way == 0 else (pair_b[p], pair_a[p])
-                        if abs(star_mag[ra] - star_mag[rb] - m_ij) > mag_gate:  # false where NaN
+                        sign, a = (1.0, pair_a[p]) if way == 0 else (-1.0, pair_b[p])
+                        if abs(sign * d_mag - m_ij) > 1.414 * mag_gate:  # false where NaN
                             continue
-                        if abs(star_mag[ra] - instrumental[i] - zero_point) > mag_gate:
+                        if abs(star_mag[a] - instrumental[i] - zero_point) > mag_gate:
                             continue
-                        aberrated(star_u[ra, 0], star_u[ra, 1], star_u[ra, 2], beta, sa)
-                        aberrated(star_u[rb, 0], star_u[rb, 1], star_u[rb, 2], beta, sb)
-                        _basis(sa[0], sa[1], sa[2], sb[0], sb[1], sb[2], F)
-                        work += 4
-                        hits, score = 0, 0.0
-                        for k in range(n_checked):
-                            if k >= give_up_after and hits == 0:
-                                break
-                            row_of[k] = -1
-                            if k in (i, j):
-                                continue
-                            work += 1
-                            x = t[k, 0] * F[0, 0] + t[k, 1] * F[1, 0] + t[k, 2] * F[2, 0]
-                            y = t[k, 0] * F[0, 1] + t[k, 1] * F[1, 1] + t[k, 2] * F[2, 1]
-                            z = t[k, 0] * F[0, 2] + t[k, 1] * F[1, 2] + t[k, 2] * F[2, 2]
-                            q = x * beta[0] + y * beta[1] + z * beta[2]
-                            s, _ = nearest_star(
-                                x + q * x - beta[0],
-                                y + q * y - beta[1],
-                                z + q * z - beta[2],
-                                radius[k],
-                                star_u,
-                                first,
-                                star,
-                                n_face,
-                            )
-                            if s >= 0:
-                                row_of[k] = s
-                                hits += 1
-                                score += gain[k]
-                        if hits < min_hits:
-                            continue
-                        rest = n_checked - 2.0
-                        score -= (
-                            math.lgamma(rest + 1.0)
-                            - math.lgamma(hits + 1.0)
-                            - math.lgamma(rest - hits + 1.0)
+                        _star_basis(star_u[pair_a[p]], star_u[pair_b[p]], chord[p], F)
+                        work += 10
+                        odds = _try_pair(
+                            t,
+                            order[2:],
+                            F,
+                            sign,
+                            gain,
+                            fall,
+                            radius,
+                            floor,
+                            star_u,
+                            first,
+                            star,
+                            n_face,
+                            row_of,
                         )
-                        if score < math.log(rest + 1.0) - 1.0:  # as many hits as chance gives
+                        if odds < worth:
                             continue
-                        row_of[i], row_of[j] = ra, rb
+                        row_of[i] = a
+                        row_of[j] = pair_b[p] if way == 0 else pair_a[p]
+                        for k in range(n_checked, n):
+                            row_of[k] = -1
                         for r in range(3):
                             for m in range(3):
-                                R[r, m] = E[0, r] * F[0, m] + E[1, r] * F[1, m] + E[2, r] * F[2, m]
-                        for k in range(n):
-                            row_try[k] = row_of[k] if k < n_checked else -1
+                                turned = E[1, r] * F[1, m] + E[2, r] * F[2, m]
+                                R[r, m] = E[0, r] * F[0, m] + sign * turned
                         evidence = _judge(
                             R,
                             P,
@@ -294,9 +361,11 @@ def search(
                             gate,
                             log_density,
                             zero_point,
-                            in_view,
+                            spread,
+                            box,
                             area,
-                            row_try,
+                            row_of,
+                            runner,
                         )
                         work += 10 * n
                         if evidence <= runner:

@@ -28,6 +28,7 @@ SAMPLED = (4, 6)  # runs and their length, of which a sensor's errors and depth 
 PROBED = (3, 2)  # of these, tried with each scale of the errors until one works
 KNOWN_SCALES = (1.0, 3.0, 0.4)  # of errors that the log or the settings state
 UNKNOWN_SCALES_PX = (0.5, 1.5, 0.15)
+LEAST_SPREAD_MAG = 0.15  # of brightness: a sample may scatter less than all
 DEEPER_MAG = 2.0  # how far beyond the first guess of the faintest star is looked
 
 
@@ -193,7 +194,10 @@ def _learn(
         scale, solutions = scale * found.scale, again
     zero, scatter = zero_point([frame_of(s, scale) for s in spots], solutions, sky)
     use_flux = not scatter > USELESS_SCATTER_MAG
-    how = known.how._replace(zero_point_mag=zero if use_flux else np.nan)
+    how = known.how
+    if use_flux and not np.isnan(zero):
+        spread = min(max(1.2 * scatter, LEAST_SPREAD_MAG), USELESS_SCATTER_MAG)
+        how = how._replace(zero_point_mag=zero, spread_mag=spread)
     known = known._replace(scale=scale, how=how, use_flux=use_flux, adjusted=adjusted)
     return known._replace(limit=_faintest(spots, solutions, skies, known))
 
