@@ -41,7 +41,7 @@ class _Rows:
             np.zeros(n + 1, np.int32),
             np.empty(n, np.bool_),
             np.empty(n, np.bool_),
-            *(np.empty(n_centroids, np.float32) for _ in range(4)),
+            *(_arrow_floats(n_centroids) for _ in range(4)),
         )
 
     @property
@@ -194,6 +194,11 @@ class FrameColumns:
             if self.span is not None:
                 off = abs(frame.time_ns - one.log_time_ns)
                 self.clock_off_ns = max(self.clock_off_ns or 0, off)
+
+
+def _arrow_floats(n: int) -> Floats:
+    """Return room for numbers, of Arrow's memory, which gives back what is no longer needed."""
+    return np.frombuffer(pa.allocate_buffer(4 * n), np.float32)
 
 
 def _frame_fault(frame: Frame) -> str | None:

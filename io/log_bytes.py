@@ -41,6 +41,15 @@ def _mapped(descriptor: int) -> memoryview:
     return memoryview(mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ))
 
 
+def forget(data: memoryview, start: int, end: int) -> None:
+    """Give back the memory of bytes that have been looked at; they can be looked at again."""
+    if isinstance(data.obj, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        start = -(-start // mmap.PAGESIZE) * mmap.PAGESIZE
+        length = end // mmap.PAGESIZE * mmap.PAGESIZE - start
+        if length > 0:
+            data.obj.madvise(mmap.MADV_DONTNEED, start, length)
+
+
 def _open_url(where: str) -> memoryview:
     try:
         import fsspec

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from epipole.io.log_bytes import forget
 from epipole.io.log_channels import string
 from epipole.io.log_compression import ChunkError, decompress, decompress_part
 from epipole.io.log_summary import RECORD
@@ -67,6 +68,7 @@ def open_chunk(data: memoryview, at: int, after: int) -> OpenedChunk:
         if head.size > MAX_CHUNK_BYTES:
             raise ChunkError("chunk_too_large")
         records = decompress(data[head.body : after], head.compression, head.size)
+        forget(data, at, after)
         if head.checksum and zlib.crc32(records) != head.checksum:
             raise ChunkError("bad_checksum")
     except ChunkError as error:

@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from epipole.io.camera_columns import CameraColumns
 from epipole.io.frame_columns import FrameColumns
-from epipole.io.log_bytes import open_log
+from epipole.io.log_bytes import forget, open_log
 from epipole.io.log_records import Block, RecordWalk
 from epipole.io.log_rejects import RejectList
 from epipole.io.log_summary import MAGIC
@@ -30,6 +30,7 @@ from epipole.schemas.log_tables import LogPart, LogSource
 from epipole.schemas.messages import CALIBRATION, CARRIES, FRAME, STATE
 
 THREADS = 2  # that unpack and check chunks, beside the one that decodes
+HASHED_BYTES = 4 << 20  # of a file at once
 KINDS = (FRAME, STATE, CALIBRATION)
 # A frame's time and the time it was logged at may be so far apart, no further, for chunks
 # to be judged by the latter. States that far beyond a range help its first and last frames.
@@ -128,7 +129,11 @@ def _read_columns(
 
 
 def _sha256(data: memoryview) -> str:
-    return hashlib.sha256(data).hexdigest()
+    digest = hashlib.sha256()
+    for at in range(0, len(data), HASHED_BYTES):
+        digest.update(data[at : at + HASHED_BYTES])
+        forget(data, at, at + HASHED_BYTES)
+    return digest.hexdigest()
 
 
 def _time_span(

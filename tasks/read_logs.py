@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -27,9 +27,12 @@ from epipole.tasks.algorithms.frame_order import (
     order_frames,
     order_states,
 )
+from epipole.tasks.algorithms.list_order import take_lists
 from epipole.tasks.algorithms.reference_frames import orientation_at, to_gcrf
 
 logger = logging.getLogger(__name__)
+
+MOST_CENTROIDS = (1 << 31) - 1  # that Arrow's lists can count
 
 _DUPLICATES = {
     DUPLICATE_FRAME: "duplicate_frame",
@@ -39,32 +42,54 @@ _DUPLICATES = {
 
 
 @task(name="read logs", cache_policy=NO_CACHE)
-def read_logs(paths: Sequence[str | os.PathLike[str]], settings: Settings) -> Log:
+def read_logs(
+    paths: Sequence[str | os.PathLike[str]],
+    settings: Settings,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> Log:
     """What the logs hold together; the order of the paths does not matter.
 
     A frame that comes twice counts once; see `order_frames` for what is a repeat. A log that
-    is given twice is read once.
+    is given twice is read once. With a range of time only its frames are read, and of states
+    as many more as `read_log` says; logs that have nothing in it are no sources.
     """
-    parts = _distinct([read_log(path) for path in paths])
+    parts = _distinct([read_log(path, start_ns, end_ns) for path in paths])
     if not parts:
         raise LogError("no logs given; name at least one MCAP file")
-    exposures, duplicate_frames = _sorted_frames(
-        concat(EXPOSURES, [part.exposures for part in parts])
-    )
+    sources = [part.source for part in parts if part.exposures.num_rows or part.states.num_rows]
     states, duplicate_states = _sorted_states(parts, settings)
     cameras = _sorted_cameras(concat(CAMERAS, [part.cameras for part in parts]))
-    rejects = concat(
-        REJECTS, [*(part.rejects for part in parts), duplicate_frames, duplicate_states]
-    )
+    rejects = [part.rejects for part in parts]
+    frames = {
+        name: pa.chunked_array([c for part in parts for c in part.exposures[name].chunks], kind)
+        for name, kind in zip(EXPOSURES.names, EXPOSURES.types, strict=True)
+    }
+    del parts  # so that `_sorted_frames` has the only hold on the frames
+    exposures, duplicate_frames = _sorted_frames(frames)
+    if not exposures.num_rows:
+        raise LogError(_nothing_in_range(paths, start_ns, end_ns))
+    left_out = concat(REJECTS, [*rejects, duplicate_frames, duplicate_states])
     logger.info(
         "read %d logs: %d frames, %d states, %d calibrations, %d left out",
-        len(parts),
+        len(paths),
         exposures.num_rows,
         states.num_rows,
         cameras.num_rows,
-        pc.sum(rejects["count"]).as_py() or 0,
+        pc.sum(left_out["count"]).as_py() or 0,
     )
-    return Log(exposures, states, cameras, [part.source for part in parts], rejects)
+    return Log(exposures, states, cameras, sources, left_out)
+
+
+def _nothing_in_range(
+    paths: Sequence[str | os.PathLike[str]], start_ns: int | None, end_ns: int | None
+) -> str:
+    limits = [
+        "..." if t is None else f"{np.datetime64(t, 'ns').astype('datetime64[s]')}Z"
+        for t in (start_ns, end_ns)
+    ]
+    names = ", ".join(os.fspath(path) for path in paths)
+    return f"{names}: no frames from {limits[0]} to {limits[1]}; give logs of that time"
 
 
 def _distinct(parts: list[LogPart]) -> list[LogPart]:
@@ -77,22 +102,59 @@ def _distinct(parts: list[LogPart]) -> list[LogPart]:
     return list(by_content.values())
 
 
-def _sensor_index(values: pa.Table) -> np.ndarray:
+def _sensor_index(sensor_id: pa.ChunkedArray) -> np.ndarray:
     """Return the sensors as integers that sort as their ids do."""
-    return np.unique(array(values, "sensor_id").astype(str), return_inverse=True)[1]
+    encoded = pa.chunked_array([*sensor_id.chunks, pa.array([], pa.string())])
+    encoded = encoded.combine_chunks().dictionary_encode()
+    names = encoded.dictionary.to_pylist()
+    rank = np.zeros(len(names), np.int64)
+    rank[sorted(range(len(names)), key=names.__getitem__)] = np.arange(len(names))
+    return rank[encoded.indices.to_numpy()]
 
 
-def _sorted_frames(exposures: pa.Table) -> tuple[pa.Table, pa.Table]:
-    """Return the exposures sorted and each once, and the rejects for the rest."""
+def _sorted_frames(frames: dict[str, pa.ChunkedArray]) -> tuple[pa.Table, pa.Table]:
+    """Return the exposures sorted and each once, and the rejects for the rest.
+
+    The columns are taken out of `frames` one by one: there is never a second copy of all.
+    """
+    key = pa.table({name: frames[name] for name in ("sensor_id", "time", "frame_number", "source")})
     order, verdict = order_frames(
-        _sensor_index(exposures), array(exposures, "time"), array(exposures, "frame_number")
+        _sensor_index(key["sensor_id"]), array(key, "time"), array(key, "frame_number")
     )
-    keep = exposures.take(pa.array(order[verdict == KEEP])).combine_chunks()
     rejects = [
-        _repeats(exposures.take(pa.array(order[verdict == code])), reason)
+        _repeats(key.take(pa.array(order[verdict == code])), reason)
         for code, reason in _DUPLICATES.items()
     ]
-    return keep, concat(REJECTS, rejects)
+    keep = order[verdict == KEEP]
+    columns = {
+        name: _taken_lists(name, frames.pop(name).chunks, keep)
+        if pa.types.is_list(EXPOSURES.field(name).type)
+        else frames.pop(name).take(pa.array(keep)).combine_chunks()
+        for name in EXPOSURES.names
+    }
+    return table(EXPOSURES, columns), concat(REJECTS, rejects)
+
+
+def _taken_lists(name: str, chunks: list[pa.ListArray], rows: np.ndarray) -> pa.ListArray:
+    """Return rows of a column of lists; `chunks` is emptied, each piece as soon as it is done."""
+    nothing = [np.empty(0, np.int64)]
+    lengths = np.concatenate([*nothing, *(np.diff(c.offsets.to_numpy()) for c in chunks)])
+    given = np.concatenate([*nothing, *(c.is_valid().to_numpy(False) for c in chunks)]) > 0
+    if lengths.sum() > MOST_CENTROIDS:
+        raise LogError(f"{lengths.sum():,} centroids are too many for one run; give fewer logs")
+    chunks.reverse()
+
+    def pieces() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        while chunks:
+            chunk = chunks.pop()
+            yield chunk.values.to_numpy(), chunk.offsets.to_numpy()
+
+    values, first = take_lists(pieces(), lengths, rows)
+    pa.default_memory_pool().release_unused()
+    missing = pa.array(~given[rows]) if not given.all() else None
+    return pa.ListArray.from_arrays(
+        pa.array(first, pa.int32()), pa.array(values), type=EXPOSURES.field(name).type, mask=missing
+    )
 
 
 def _repeats(frames: pa.Table, reason: str) -> pa.Table:
@@ -119,7 +181,7 @@ def _sorted_states(parts: list[LogPart], settings: Settings) -> tuple[pa.Table, 
     """Return the states in GCRF, sorted and each once, and the rejects for the rest."""
     names = [name for part in parts for name in [part.source.name] * part.states.num_rows]
     states = concat(LOG_STATES, [part.states for part in parts])
-    order, repeats = order_states(_sensor_index(states), array(states, "time"))
+    order, repeats = order_states(_sensor_index(states["sensor_id"]), array(states, "time"))
     named = states.select(["sensor_id", "time"])
     named = named.append_column("source", pa.array(names, pa.string()))
     rejects = _repeats(named.take(pa.array(order[repeats])), "duplicate_state")

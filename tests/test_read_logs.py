@@ -65,6 +65,50 @@ def test_frames_of_all_logs_are_sorted_by_sensor_and_time(tmp_path):
     assert log.sources[1].first_time_ns == START_NS + SECOND_NS
 
 
+def test_a_range_takes_its_frames_of_all_logs_and_only_their_sources(tmp_path):
+    a = write(tmp_path / "a.mcap", "s", [(i, i) for i in range(6)], states=range(6))
+    b = write(tmp_path / "b.mcap", "s", [(i, i) for i in range(4, 9)])
+    c = write(tmp_path / "c.mcap", "s", [(i, i) for i in range(10_000, 10_003)])
+    limits = START_NS + 3 * SECOND_NS, START_NS + 7 * SECOND_NS
+    log = read_logs.fn([c, b, a], Settings(), *limits)
+    assert array(log.exposures, "frame_number").tolist() == [3, 4, 5, 6]
+    assert [source.name for source in log.sources] == ["a.mcap", "b.mcap"]
+    assert [(reason, n) for reason, _, _, n in rows(log)] == [("duplicate_frame", 2)]
+    assert log.states.num_rows == 6
+
+
+def test_a_range_without_frames_is_an_error_that_names_it(tmp_path):
+    a = write(tmp_path / "a.mcap", "s", [(0, 0)])
+    with pytest.raises(LogError, match=r"a\.mcap: no frames from 2019-04-01T05:00:00Z to \.\.\."):
+        read_logs.fn([a], Settings(), START_NS + 3600 * SECOND_NS)
+
+
+def test_lists_of_frames_go_with_their_frames(tmp_path):
+    order = np.random.default_rng(0).permutation(300)
+    for name, part in (("a", order[:100]), ("b", order[100:])):
+        with LogWriter(tmp_path / f"{name}.mcap", chunk_size=2000) as log:
+            for number in part.tolist():
+                x = np.full(number % 4, number, np.float32)
+                flux = None if number % 3 else x + 1
+                time_ns = START_NS + number * SECOND_NS
+                log.frame(
+                    f"s{number % 2}",
+                    time_ns,
+                    frame_number=number,
+                    exposure_s=1.0,
+                    x_px=x,
+                    y_px=x,
+                    flux=flux,
+                )
+    log = read(tmp_path / "b.mcap", tmp_path / "a.mcap")
+    numbers = array(log.exposures, "frame_number").tolist()
+    assert numbers == [*range(0, 300, 2), *range(1, 300, 2)]
+    assert log.exposures["x_px"].to_pylist() == [[float(n)] * (n % 4) for n in numbers]
+    expected = [None if n % 3 or not n % 4 else [n + 1.0] * (n % 4) for n in numbers]
+    assert log.exposures["flux"].to_pylist() == expected
+    assert log.exposures["sigma_px"].null_count == 300
+
+
 def test_overlapping_logs_give_each_frame_and_state_once_in_any_order(tmp_path):
     a = write(tmp_path / "a.mcap", "s", [(i, i) for i in range(6)], states=range(6))
     b = write(tmp_path / "b.mcap", "s", [(i, i) for i in range(4, 9)], states=range(4, 9))
