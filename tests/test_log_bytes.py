@@ -1,0 +1,148 @@
+"""Logs in places other than a folder, an S3 server of its own among them."""
+
+import contextlib
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+
+import pytest
+
+from epipole.io.log_bytes import forget, open_log
+from epipole.io.log_reader import read_log
+from epipole.io.log_writer import LogWriter
+from epipole.schemas.errors import LogError
+
+START_NS = 1_554_091_200_000_000_000
+SECONDS = 60  # that the server may take to start
+
+
+@pytest.fixture
+def log(tmp_path):
+    path = tmp_path / "a.mcap"
+    with LogWriter(path, chunk_size=1000) as out:
+        for i in range(100):
+            out.frame("s", START_NS + i, frame_number=i, exposure_s=1.0, x_px=[i] * 9, y_px=[i] * 9)
+    return path
+
+
+@pytest.fixture(scope="module")
+def s3_server():
+    """Run an S3 server on a free port, and return its address; skip where none is installed."""
+    for package in ("moto", "flask", "s3fs"):
+        pytest.importorskip(package)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    address = f"http://127.0.0.1:{port}"
+    try:
+        for _ in range(10 * SECONDS):
+            with contextlib.suppress(OSError):
+                urllib.request.urlopen(address, timeout=1).close()
+                break
+            time.sleep(0.1)
+        else:
+            pytest.fail("the S3 server did not start")
+        yield address
+    finally:
+        server.terminate()
+        server.wait(10)
+
+
+@pytest.fixture
+def s3(s3_server, monkeypatch):
+    """Point s3:// at the server, as a user would: by the environment."""
+    import s3fs
+
+    for name, value in {
+        "AWS_ENDPOINT_URL": s3_server,
+        "AWS_ACCESS_KEY_ID": "any",
+        "AWS_SECRET_ACCESS_KEY": "any",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_CONFIG_FILE": os.devnull,
+        "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
+        "AWS_EC2_METADATA_DISABLED": "true",
+        "AWS_MAX_ATTEMPTS": "1",
+    }.items():
+        monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()
+    storage = s3fs.S3FileSystem()
+    if not storage.exists("logs"):
+        storage.mkdir("logs")
+    yield storage
+    s3fs.S3FileSystem.clear_instance_cache()
+
+
+def line_of(url):
+    with pytest.raises(LogError) as caught:
+        read_log(url)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert line.startswith(url)
+    return line
+
+
+def test_a_log_in_a_bucket_is_read_like_a_file(s3, log):
+    s3.put_file(str(log), "logs/2019/a.mcap")
+    there, here = read_log("s3://logs/2019/a.mcap"), read_log(log)
+    assert there.exposures.equals(here.exposures)
+    assert there.source == here.source
+
+
+def test_a_range_of_a_log_in_a_bucket_is_read(s3, log):
+    s3.put_file(str(log), "logs/a.mcap")
+    assert read_log("s3://logs/a.mcap", START_NS + 5, START_NS + 8).exposures.num_rows == 3
+
+
+def test_what_is_not_in_the_bucket_is_an_error_of_one_line(s3, log):
+    s3.put_file(str(log), "logs/folder/a.mcap")
+    assert "no such file" in line_of("s3://logs/none.mcap")
+    assert "no such file" in line_of("s3://no-such-bucket/a.mcap")
+    assert "is a folder" in line_of("s3://logs/folder")
+
+
+def test_a_server_that_is_not_there_is_an_error_of_one_line(s3, monkeypatch):
+    import s3fs
+
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    s3fs.S3FileSystem.clear_instance_cache()
+    assert "cannot be read" in line_of("s3://logs/a.mcap")
+
+
+def test_missing_credentials_are_an_error_of_one_line(s3, monkeypatch, tmp_path):
+    import s3fs
+
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    s3fs.S3FileSystem.clear_instance_cache()
+    line = line_of("s3://logs/a.mcap")
+    assert "credentials" in line.lower()
+
+
+def test_a_temporary_copy_is_not_left_behind(s3, log, monkeypatch, tmp_path):
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "scratch"))
+    (tmp_path / "scratch").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", None)
+    s3.put_file(str(log), "logs/a.mcap")
+    assert bytes(open_log("s3://logs/a.mcap")) == log.read_bytes()
+    assert list((tmp_path / "scratch").iterdir()) == []
+
+
+def test_bytes_that_were_forgotten_are_there_again(log):
+    data = open_log(str(log))
+    whole = bytes(data)
+    for start, end in ((0, len(data)), (1, 5000), (4095, 4097), (5, 5), (0, 10 * len(data))):
+        forget(data, start, end)
+        assert bytes(data) == whole
+
+
+def test_an_unreadable_file_is_an_error_of_one_line(log):
+    if os.geteuid() == 0:
+        pytest.skip("root reads everything")
+    log.chmod(0)
+    assert "Permission denied" in line_of(str(log))
