@@ -19,6 +19,7 @@ from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_POINTS
 from epipole.tasks.algorithms.simulation.exposures import Exposing, Exposures
 from epipole.tasks.algorithms.simulation.optics import Optics, field_radius
 from epipole.tasks.algorithms.simulation.orbits import (
+    GM_KM3_S2,
     circular_velocity,
     elements_from_state,
     mean_from_true_anomaly,
@@ -171,10 +172,9 @@ def _elements(orbit: Orbit, rng: np.random.Generator) -> Array:
         r_km = np.array(orbit.position_km)
         v = orbit.velocity_km_s
         v_km_s = circular_velocity(r_km) if v is None else np.array(v)
-        elements = elements_from_state(r_km, v_km_s)
-        if not (0 <= elements[1] < 1 and elements[0] > 0):
+        if v_km_s @ v_km_s >= 2 * GM_KM3_S2 / np.linalg.norm(r_km):
             raise SceneError(f"velocity_km_s {v}: faster than escape, no orbit about the Earth")
-        return elements
+        return elements_from_state(r_km, v_km_s)
     angles = np.radians([orbit.i_deg, orbit.raan_deg, orbit.argp_deg])
     if orbit.true_anomaly_deg is not None:
         mean = mean_from_true_anomaly(math.radians(orbit.true_anomaly_deg), orbit.e)

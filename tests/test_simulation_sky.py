@@ -128,7 +128,7 @@ def test_objects_are_seen_where_skyfield_sees_them():
         _, earth_km_s = earth_at(time_ns(t_s))
         d_km, _ = received_from(high[None, :], np.array([t_s]), r_km, earth_km_s)
         u = boost(d_km / np.linalg.norm(d_km), earth_km_s + v_km_s)
-        assert angle(u, expected)[0] < 0.5 * MAS
+        assert angle(u, expected)[0] < 0.1 * MAS
 
 
 def field_of(stars, **changes):
@@ -148,10 +148,7 @@ def test_stars_are_seen_where_skyfield_sees_them():
         years = np.repeat(julian_years_since_hipparcos(time_ns(t_s)), n)
         u = star_directions(field, np.arange(n), years, np.repeat(earth_km + r_km, n, axis=0))
         u = boost(u, np.repeat(earth_km_s + v_km_s, n, axis=0))
-        off = angle(u, expected)
-        # Skyfield moves stars on straight lines in space, which bends the fastest ones' paths.
-        assert np.median(off) < 0.02 * MAS
-        assert off.max() < 3 * MAS
+        assert angle(u, expected).max() < 0.05 * MAS
 
 
 def close_to_others(stars, radius_rad):
@@ -189,7 +186,7 @@ def test_a_whole_image_is_what_skyfield_and_a_pinhole_make_of_it():
             f, cx, cy = pinhole
             found = np.stack([seen.x_px[part], seen.y_px[part]])[:, at + targets]
             off = found - [f * x / z + cx, f * y / z + cy]
-            assert np.abs(off).max() < 3 * MAS * f
+            assert np.abs(off).max() < 0.1 * MAS * f
             seen_stars, seen_targets = seen_stars + len(at), seen_targets + len(targets)
     assert seen_targets > 9 * 4 * 2
     assert seen_stars > 40
