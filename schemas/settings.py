@@ -114,7 +114,15 @@ GEOSTATIONARY_RING = AltitudeShell(lowest_km=35746, highest_km=35826, share=0.2)
 class AssociationSettings(Group):
     """Which views of different sensors are one object."""
 
-    method: Literal["likelihood"] = Field("likelihood", description="How views are associated.")
+    method: Literal["likelihood", "epipolar"] = Field(
+        "likelihood",
+        description="How views are associated; the other is a published method, for comparison.",
+    )
+    threshold_px: float = Field(
+        8.0,
+        gt=0,
+        description="Method 'epipolar': farthest from a line; published best are 8 to 12 px.",
+    )
     gate_sigma: float = Field(4.5, gt=0, description="Views of one object agree within this.")
     min_altitude_km: float = Field(100.0, ge=0, description="Lowest object looked for.")
     max_range_km: float = Field(1.0e5, gt=0, description="Farthest object looked for.")
@@ -137,6 +145,15 @@ class PositionSettings(Group):
     reject_sigma: float = Field(4.0, gt=0, description="A view further off than this is rejected.")
 
 
+class StateSettings(Group):
+    """Positions and velocities over arcs."""
+
+    arc_s: float = Field(600.0, gt=0, description="Longest arc of one state.")
+    min_epochs: int = Field(
+        3, ge=2, description="Fewest epochs that share no detection: two alone cannot be checked."
+    )
+
+
 class Settings(Group):
     """All settings of a run."""
 
@@ -146,6 +163,7 @@ class Settings(Group):
     alignment: AlignmentSettings = AlignmentSettings()
     association: AssociationSettings = AssociationSettings()
     positions: PositionSettings = PositionSettings()
+    states: StateSettings = StateSettings()
 
     def key(self) -> str:
         """Return a digest that is the same for the same settings."""

@@ -12,6 +12,7 @@ from prefect.cache_policies import NO_CACHE
 from epipole.schemas.bridge import array, concat, stack, table
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
+from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
 from epipole.tasks.algorithms.association.samples import Groups, Samples
 from epipole.tasks.algorithms.association.sensor_check import agreement
@@ -58,7 +59,7 @@ def associate_objects(
     left_out: set[str] = set()
     for rows in night.spans(settings.association.span_s):
         samples, tracklet = night.samples(rows, settings.alignment.window_s)
-        groups = _solve(samples, settings)
+        groups = _solve(night, samples, settings)
         wrong = agreement(samples, groups).disagreeing()
         if len(wrong):
             rejects.append(_disagreeing(night, rows, wrong))
@@ -67,7 +68,7 @@ def associate_objects(
             if not len(rows):
                 continue
             samples, tracklet = night.samples(rows, settings.alignment.window_s)
-            groups = _solve(samples, settings)
+            groups = _solve(night, samples, settings)
         objects = registry.name_groups(
             [night.track[tracklet[groups.group == g]] for g in range(len(groups.score))]
         )
@@ -87,8 +88,10 @@ def associate_objects(
     return Associated(views.take(chosen), number[chosen], concat(REJECTS, rejects))
 
 
-def _solve(samples: Samples, settings: Settings) -> Groups:
+def _solve(night: "_Night", samples: Samples, settings: Settings) -> Groups:
     chosen = settings.association
+    if chosen.method == "epipolar":
+        return associate_by_lines(samples, night.focal_px, chosen.threshold_px)
     return associate_tracklets(
         samples,
         gate_sigma=chosen.gate_sigma,
@@ -180,13 +183,15 @@ class _Night:
 
     def _look(self, solutions: pa.Table, cameras: pa.Table) -> None:
         """Keep where each sensor stands and looks, frame by frame, and how wide its field is."""
-        self.frames, half_field = [], []
+        self.frames, half_field, focal_px = [], [], []
         for sensor in self.sensors:
             frames = solved_frames(solutions.filter(pa.compute.field("sensor_id") == sensor))
             camera = camera_of(cameras, int(frames.camera[0]))
             self.frames.append((frames, matrix_from_quaternion(frames.q_sensor_from_icrs)))
             half_field.append((camera.width / camera.fx_px / 2, camera.height / camera.fy_px / 2))
+            focal_px.append(camera.fx_px)
         self.half_field = np.array(half_field).reshape(-1, 2)
+        self.focal_px = np.array(focal_px)
 
     def spans(self, span_s: float) -> list[Indices]:
         """Return the rows of each span of time, counted from midnight, in order."""
