@@ -21,7 +21,7 @@ from epipole.schemas.errors import EpipoleError
 class _Commands(typer.core.TyperGroup):
     """Commands that end in one line where the user has to mend something."""
 
-    def invoke(self, ctx: typer.Context) -> Any:
+    def invoke(self, ctx: Any) -> Any:
         """Run the command; what is raised besides is a fault of the program, and shown as one."""
         try:
             return super().invoke(ctx)

@@ -151,7 +151,7 @@ def _associations(
     """Return which object each claim is (-1: a ghost), and the measures of claims and pairs."""
     claims = views.select(*CLAIM, "claim").unique("claim").sort("claim")
     mostly = majority(_ints(views, "claim"), _ints(views, "target"), claims.height)
-    of = np.where(mostly.count >= 2, mostly.value, -1)
+    of = np.where(mostly.votes >= 2, mostly.value, -1)
     claims = claims.with_columns(target=pl.Series(of, dtype=pl.Int64))
     seen = views.filter("seen")
     n_pairs, n_right = pairs_within(_ints(seen, "claim"), _ints(seen, "target"), claims.height)
@@ -200,8 +200,8 @@ def _positions(positions: pa.Table, claims: pl.DataFrame, truth: Truth) -> Measu
         "axis_rms_km": (x, y, z),
         "nees_median": middle if np.isfinite(middle) else None,
         "nees_in_99": float(np.mean(nees < INSIDE_99)),
-        "ids_per_target": float(ids["n"].mean()),
-        "longest_id_share": float(ids["main"].mean()),
+        "ids_per_target": float(np.mean(ids["n"].to_numpy())),
+        "longest_id_share": float(np.mean(ids["main"].to_numpy())),
     }
 
 
@@ -222,7 +222,7 @@ def _tracks(tracked: pl.DataFrame, points: pl.DataFrame) -> Measures:
     tracks = tracks.with_row_index("track")
     track = tracked.join(tracks, on=["sensor_id", "track_id"], how="left", maintain_order="left")
     mostly = majority(_ints(track, "track"), _target(track), tracks.height)
-    right = int(mostly.count.sum())
+    right = int(mostly.votes.sum())
     of = tracks.select("sensor_id", target=pl.Series(mostly.value)).filter(pl.col("target") >= 0)
     each = of.group_by("sensor_id", "target").len()["len"]
     there = points.filter(pl.col("kind") == TARGET).height
@@ -230,5 +230,5 @@ def _tracks(tracked: pl.DataFrame, points: pl.DataFrame) -> Measures:
         "tracks": tracks.height,
         "track_purity": _share(right, tracked.height),
         "track_completeness": _share(right, there),
-        "tracks_per_target": float(each.mean()) if len(each) else None,
+        "tracks_per_target": float(np.mean(each.to_numpy())) if len(each) else None,
     }

@@ -50,7 +50,7 @@ def test_majority_and_pairs_are_those_of_counting_one_by_one(rows):
         real = [v for v in own if v >= 0]
         # max() keeps the first of equals.
         most = max(real, key=real.count, default=-1)
-        assert (found.value[k], found.count[k]) == (most, real.count(most))
+        assert (found.value[k], found.votes[k]) == (most, real.count(most))
         couples = [(a, b) for i, a in enumerate(own) for b in own[:i]]
         pairs += len(couples)
         right += sum(a == b >= 0 for a, b in couples)

@@ -36,7 +36,7 @@ def squared_normalised_errors(error: Array, covariance: Array) -> Array:
 
     Infinite where the covariance is not positive definite: such a claim is as wrong as can be.
     """
-    finite = np.isfinite(covariance).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], covariance, np.eye(3))
     good = finite & (np.linalg.eigvalsh(safe)[:, 0] > 0)
     safe = np.where(good[:, None, None], safe, np.eye(3))
@@ -48,7 +48,7 @@ class Majority(NamedTuple):
     """Of each group, the value most of its members have, -1 where none has any, and how many."""
 
     value: Indices
-    count: Indices
+    votes: Indices
 
 
 def majority(group: Indices, value: Indices, n_groups: int) -> Majority:
@@ -73,7 +73,7 @@ def majority(group: Indices, value: Indices, n_groups: int) -> Majority:
     owner, first = np.unique(group[start][best], return_index=True)
     out = Majority(np.full(n_groups, -1, np.int64), np.zeros(n_groups, np.int64))
     out.value[owner] = value[start][best][first]
-    out.count[owner] = count[best][first]
+    out.votes[owner] = count[best][first]
     return out
 
 
