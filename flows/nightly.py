@@ -12,7 +12,16 @@ from prefect import flow
 from epipole.flows.clocks import read_clocks, set_right
 from epipole.flows.progress import step
 from epipole.flows.sensors import calibrated, sensor_ids, unplaced
-from epipole.flows.stages import associate, identify, place, read, track, triangulate, view
+from epipole.flows.stages import (
+    associate,
+    calibrate,
+    identify,
+    place,
+    read,
+    track,
+    triangulate,
+    view,
+)
 from epipole.flows.summary import Summary, summarise
 from epipole.io.dataset import check_folder, check_sources, nights_of
 from epipole.schemas.bridge import array, concat, conform
@@ -73,11 +82,14 @@ def nightly(
 
     places = place(exposures, log.states, chosen_settings)
     identified = identify(exposures, places, log.cameras, chosen_settings)
+    identified, cameras, calibrations = calibrate(
+        identified, exposures, places, log.cameras, chosen_settings
+    )
     for correcting in (chosen_settings.alignment.correct_clocks, False):
-        tracked = track(identified, log.cameras, chosen_settings)
+        tracked = track(identified, cameras, chosen_settings)
         epochs = align_epochs(identified.solutions, chosen_settings)
-        views = view(epochs, identified, tracked, log.cameras, chosen_settings)
-        associated = associate(views, identified, tracked, log.cameras, chosen_settings)
+        views = view(epochs, identified, tracked, cameras, chosen_settings)
+        associated = associate(views, identified, tracked, cameras, chosen_settings)
         solved = triangulate(associated, chosen_settings)
         clocks = read_clocks(associated, solved, identified, chosen_settings)
         if not correcting or not any(clock.is_off for clock in clocks):
@@ -96,6 +108,7 @@ def nightly(
         "epochs": epochs,
         "associations": solved.associations,
         "positions": solved.positions,
+        "calibrations": calibrations,
         "pairs": solved.pairs,
         "sources": sources,
         "rejects": concat(REJECTS, rejects),

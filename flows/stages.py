@@ -6,7 +6,9 @@ does not depend on the number of workers.
 
 import logging
 from collections.abc import Sequence
+from typing import NamedTuple
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -14,13 +16,14 @@ from epipole.flows.progress import results, step
 from epipole.flows.sensors import of_sensor, sensor_ids, spans
 from epipole.flows.summary import many
 from epipole.io.star_catalogue import read_hipparcos
-from epipole.schemas.bridge import concat
+from epipole.schemas.bridge import array, concat
 from epipole.schemas.log_tables import Log
 from epipole.schemas.settings import Settings
-from epipole.schemas.tables import DETECTIONS, REJECTS, STARS, TRACKLETS
-from epipole.schemas.work_tables import SOLUTIONS, VIEWS
+from epipole.schemas.tables import CALIBRATIONS, DETECTIONS, REJECTS, STARS, TRACKLETS
+from epipole.schemas.work_tables import CAMERAS, SOLUTIONS, VIEWS
 from epipole.tasks.associate_objects import Associated, associate_objects
 from epipole.tasks.build_tracklets import Tracked, build_tracklets
+from epipole.tasks.calibrate_sensors import Calibrated, calibrate_sensors
 from epipole.tasks.identify_stars import Identified, identify_stars
 from epipole.tasks.lone_detections import with_lone_tracklets
 from epipole.tasks.place_sensors import place_sensors
@@ -73,6 +76,54 @@ def identify(
         f"{by_stars:,}", f"{identified.solutions.num_rows:,}", f"{identified.stars.num_rows:,}",
     )  # fmt: skip
     return identified
+
+
+class Calibration(NamedTuple):
+    """The stars' verdict on the optics, and what was identified and is to be used with it."""
+
+    identified: Identified
+    cameras: pa.Table
+    calibrations: pa.Table
+
+
+def calibrate(
+    identified: Identified,
+    exposures: pa.Table,
+    places: pa.Table,
+    cameras: pa.Table,
+    settings: Settings,
+) -> Calibration:
+    """Fit each sensor's optics to its stars; identify again those whose calibration is off."""
+    mode = settings.identification.calibrate
+    calibrations = CALIBRATIONS.empty_table()
+    for _ in range(2 if mode == "use" else 1):  # with better optics more stars take part
+        if mode == "off":
+            break
+        names = sensor_ids(cameras)
+        futures = [
+            calibrate_sensors.submit(of_sensor(identified.stars, n), of_sensor(cameras, n))
+            for n in names
+        ]
+        parts: list[Calibrated] = results("calibrate sensors", futures)
+        calibrations = concat(CALIBRATIONS, [part.calibrations for part in parts])
+        departed = [name for part in parts for name in part.departed]
+        if mode == "report" or not departed:
+            break
+        LOGGER.info("optics of %s depart from the calibration", ", ".join(departed))
+        cameras = concat(CAMERAS, [part.cameras for part in parts])
+        again = pc.is_in(exposures["sensor_id"], pa.array(departed, pa.string()))
+        new = identify(exposures.filter(again), places.filter(again), cameras, settings)
+        identified = Identified(
+            *[_replaced(old, part, departed) for old, part in zip(identified, new, strict=True)]
+        )
+    return Calibration(identified, cameras, calibrations)
+
+
+def _replaced(old: pa.Table, new: pa.Table, sensors: list[str]) -> pa.Table:
+    """Return a table with these sensors' rows from the new one, by sensor as before."""
+    kept = old.filter(~pc.is_in(pc.field("sensor_id"), pa.array(sensors, pa.string())))
+    both = pa.concat_tables([kept, new])
+    return both.take(np.argsort(array(both, "sensor_id").astype(str), kind="stable"))
 
 
 def track(identified: Identified, cameras: pa.Table, settings: Settings) -> Tracked:

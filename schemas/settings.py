@@ -50,6 +50,11 @@ class IdentificationSettings(Group):
         1e-6, gt=0, lt=1, description="Accepted probability that a reported attitude is by chance."
     )
     time_limit_s: float = Field(0.5, gt=0, description="Longest search for one frame.")
+    calibrate: Literal["use", "report", "off"] = Field(
+        "use",
+        description="Optics from the night's stars: use them where they depart from the log's "
+        "calibration, only report them, or neither.",
+    )
 
 
 class TrackletSettings(Group):

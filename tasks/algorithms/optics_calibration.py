@@ -19,6 +19,7 @@ OPTICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 # the higher terms of the distortion are hardly there.
 FOCAL_SHARE = 0.02
 CORNER_PX = 20.0
+PRINCIPAL_POINT_PX = 5.0
 STEPS = 15
 HUBER = 2.0  # residuals beyond this many sigma count less
 LEAST_FRAMES, LEAST_STARS = 3, 60
@@ -127,7 +128,7 @@ def _prior_sigma(camera: Camera) -> Array:
     """Return how far each number may be from what the calibration says."""
     f, r = np.sqrt(camera.fx_px * camera.fy_px), np.tan(camera.half_diagonal_rad)
     at_corner = CORNER_PX / f / np.array([r**3, r**5, r**2, r**2, r**7])
-    return np.array([FOCAL_SHARE * f] * 2 + [CORNER_PX] * 2 + at_corner.tolist())
+    return np.array([FOCAL_SHARE * f] * 2 + [PRINCIPAL_POINT_PX] * 2 + at_corner.tolist())
 
 
 def _robust_sigma(residual: Array, degrees_of_freedom: int) -> float:
