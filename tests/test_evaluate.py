@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
+from epipole.flows.command_line import app
 from epipole.flows.evaluate import evaluate, show
 from epipole.flows.simulate import simulate
 from epipole.io.truth import Truth, read_truth
@@ -214,6 +217,22 @@ def test_the_truth_may_be_named_by_its_log_or_its_folder(night_log, night_datase
     assert by_log.star_precision > 0.99
     show(by_log)
     assert "precision" in capsys.readouterr().out
+
+
+def test_the_command_line_prints_a_table_or_json(night_log, night_dataset):
+    arguments = ["evaluate", str(night_dataset), "--truth", f"{night_log}.truth"]
+    printed = CliRunner().invoke(app, arguments)
+    assert printed.exit_code == 0
+    assert re.search(r"stars +claimed +[\d,]+\n +precision +[\d.]+%\n", printed.output)
+    as_json = CliRunner().invoke(app, [*arguments, "--json"])
+    assert json.loads(as_json.output) == evaluate(night_dataset, night_log).as_dict()
+
+
+def test_what_is_not_there_is_one_line_on_the_command_line(night_log, tmp_path):
+    gone = CliRunner().invoke(app, ["evaluate", str(tmp_path / "no"), "--truth", str(night_log)])
+    assert gone.exit_code == 1
+    assert gone.stderr.startswith(f"epipole: {tmp_path}/no: no such folder; ")
+    assert gone.stderr.count("\n") == 1
 
 
 def test_what_is_not_there_is_said(night_log, tmp_path):
