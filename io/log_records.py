@@ -24,10 +24,17 @@ from epipole.io.log_channels import Channel, ChannelTable
 from epipole.io.log_chunks import OpenedChunk, open_chunk, open_cut_chunk, read_head
 from epipole.io.log_compression import ChunkError
 from epipole.io.log_summary import DATA_END, MAGIC, RECORD, Summary, next_log, read_summary
-from epipole.io.record_scan import CHANNEL, MESSAGE, SCHEMA, Bytes, RecordIndex, index_records
+from epipole.io.record_scan import (
+    CHANNEL,
+    MESSAGE,
+    PRIVATE,
+    SCHEMA,
+    Bytes,
+    RecordIndex,
+    index_records,
+)
 
-CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA = 0x06, 0x07, 0x09, 0x0C
-PRIVATE = 0x80  # from here on records are someone's own, and skipped
+HEADER, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA = 0x01, 0x06, 0x07, 0x09, 0x0C
 IGNORED = (ATTACHMENT, METADATA)
 LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # may lie in a chunk or outside
 AHEAD_BYTES = 32 << 20  # of chunks that are opened while the ones before them are decoded
@@ -111,12 +118,11 @@ class RecordWalk:
                     break
                 yield Place(opcode, at, skipped_to, "damaged_record")
                 at = skipped_to
-            elif opcode == DATA_END and length == 4 and self._summary.data_end in (None, at):
-                another = next_log(data, after)
-                if another is None:
-                    return
+            elif opcode == DATA_END and (another := next_log(data, after)) is not None:
                 yield Place(0, another, another, "log_behind_log")
                 at = another + len(MAGIC)
+            elif opcode == DATA_END and length == 4 and self._summary.data_end in (None, at):
+                return
             else:
                 if opcode in LOOSE:
                     run = index_records(_bytes(data[at:limit]), only_known=True)
@@ -222,7 +228,9 @@ class RecordWalk:
             self._count_lost(body)
         elif opcode in LOOSE:
             yield from self._walk_loose(at, after)
-        elif opcode < PRIVATE and opcode not in IGNORED and at != len(MAGIC):
+        elif opcode == HEADER and self.data[at - len(MAGIC) : at] == MAGIC:
+            pass
+        elif opcode < PRIVATE and opcode not in IGNORED:
             self._leave_out(at, 0, "damaged_record")  # no such record in a data section
 
     def _walk_chunk(self, at: int, opened: OpenedChunk, cut: bool = False) -> Iterator[Block]:
@@ -235,8 +243,8 @@ class RecordWalk:
             return
         offset = np.full(len(index.start), at)
         yield from self._walk_index(_bytes(records), index, offset, start_ns)
-        if index.n_short:
-            self._leave_out(at, start_ns, "damaged_record", index.n_short)
+        if index.n_strange:
+            self._leave_out(at, start_ns, "damaged_record", index.n_strange)
         if index.walked < len(records) and not cut:
             self._leave_out(at, start_ns, "damaged_chunk")
 
@@ -246,8 +254,8 @@ class RecordWalk:
         index = index_records(data)
         offset = at + index.start - RECORD.size
         offset[index.opcode == MESSAGE] -= 22
-        if index.n_short:
-            self._leave_out(at, 0, "damaged_record", index.n_short)
+        if index.n_strange:
+            self._leave_out(at, 0, "damaged_record", index.n_strange)
         for block in self._walk_index(data, index, offset, 0):
             if self._sound_outside_chunks:
                 yield block

@@ -2,8 +2,8 @@
 
 The reasons, all of stage `read_logs`:
 
-- of the file: truncated (also: never closed), damaged_record, missing_messages (the summary
-  counts more), unknown_channel_N;
+- of the file: truncated (also: never closed), damaged_record, log_behind_log (which is read),
+  missing_messages (the summary counts more), unknown_channel_N;
 - of a chunk, with the number of its messages where an index tells it: bad_checksum,
   bad_compression, wrong_chunk_size, chunk_too_large, damaged_chunk, unknown_compression_X;
 - of any message: undecodable_frame, _state or _calibration, bad_sensor_id, no_timestamp;
@@ -22,7 +22,10 @@ from epipole.schemas.bridge import table
 from epipole.schemas.tables import REJECTS
 
 STAGE = "read_logs"
+ROWS_ALIKE = 100  # a log that is broken all through does not need a row a message
 DAY_NS = 86_400_000_000_000
+
+_Key = tuple[int | None, str | None, str]
 
 
 @dataclass
@@ -31,6 +34,8 @@ class RejectList:
 
     source: str
     _rows: list[tuple[int | None, str | None, int, str, int]] = field(default_factory=list)
+    _alike: dict[_Key, int] = field(default_factory=dict)  # how many of a kind there were
+    _last: dict[_Key, int] = field(default_factory=dict)  # the last row of a kind
 
     def add(
         self,
@@ -41,8 +46,19 @@ class RejectList:
         sensor_id: str | None = None,
         count: int = 1,
     ) -> None:
-        """Add a row; a time of 0 is an unknown one."""
-        self._rows.append((offset, sensor_id, time_ns, reason, count))
+        """Add a row; a time of 0 is an unknown one.
+
+        Of those alike in all but time (same chunk, sensor and reason) the first `ROWS_ALIKE`
+        have a row each; the last of these counts the rest.
+        """
+        key = (offset, sensor_id, reason)
+        n = self._alike[key] = self._alike.get(key, 0) + 1
+        if n <= ROWS_ALIKE:
+            self._rows.append((offset, sensor_id, time_ns, reason, count))
+            self._last[key] = len(self._rows) - 1
+            return
+        i = self._last[key]
+        self._rows[i] = (*self._rows[i][:-1], self._rows[i][-1] + count)
 
     def summary(self) -> str:
         """Return what was left out and why, most first: ``nan 3, no_timestamp 1``."""

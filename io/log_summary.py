@@ -6,10 +6,12 @@ from dataclasses import dataclass, field
 
 from epipole.io.log_channels import ChannelTable
 from epipole.io.log_compression import ChunkError
-from epipole.io.record_scan import CHANNEL, SCHEMA
+from epipole.io.record_scan import CHANNEL, PRIVATE, SCHEMA
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, CHUNK_INDEX, STATISTICS, DATA_END = 0x02, 0x08, 0x0B, 0x0F
+# Schemas, channels, indexes of chunks, attachments and metadata, statistics, offsets.
+SUMMARY = frozenset((SCHEMA, CHANNEL, CHUNK_INDEX, 0x0A, STATISTICS, 0x0D, 0x0E))
 RECORD = struct.Struct("<BQ")  # its type, its length
 DATA_END_BYTES = RECORD.size + 4
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)
@@ -47,7 +49,7 @@ def read_summary(data: memoryview, channels: ChannelTable) -> Summary:
     try:
         _read_records(data, start or at, at, summary, channels)
     except (struct.error, ChunkError):
-        summary.declared.clear()  # the walk does without
+        return Summary()  # the walk does without
     summary.chunk_offsets.sort()
     return summary
 
@@ -58,8 +60,8 @@ def _read_records(
     while at < end:
         opcode, length = RECORD.unpack_from(data, at)
         body, at = at + RECORD.size, at + RECORD.size + length
-        if at > end:
-            raise ChunkError("damaged_summary")
+        if at > end or _is_foreign(opcode):
+            raise ChunkError("damaged_summary")  # or the start is that of another log
         if opcode in (SCHEMA, CHANNEL):
             channels.declare(opcode, data, body, at)
         elif opcode == CHUNK_INDEX:
@@ -81,4 +83,11 @@ def next_log(data: memoryview, at: int) -> int | None:
         if opcode == FOOTER:
             at += len(MAGIC)
             return at if data[at : at + len(MAGIC)] == MAGIC else None
+        if _is_foreign(opcode):
+            return None
     return None
+
+
+def _is_foreign(opcode: int) -> bool:
+    """Return whether a record has no place in a summary."""
+    return opcode not in SUMMARY and opcode < PRIVATE

@@ -11,6 +11,7 @@ from epipole.io.byte_loads import load_uint16, load_uint64
 Bytes = npt.NDArray[np.uint8]
 
 SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
+PRIVATE = 0x80  # from here on records are someone's own, and skipped
 HEAD_BYTES = 9  # of a record: its type, its length
 MESSAGE_BYTES = 22  # of a message before its data: channel, sequence, two times
 
@@ -27,7 +28,7 @@ class RecordIndex(NamedTuple):
     time_ns: npt.NDArray[np.uint64]
     start: npt.NDArray[np.int64]
     end: npt.NDArray[np.int64]
-    n_short: int  # message records too short to be one, passed over
+    n_strange: int  # records that have no place here, and messages too short to be one
     walked: int  # bytes up to where the walk ended: all of them, unless it met damage
 
 
@@ -41,10 +42,10 @@ def index_records(data: Bytes, only_known: bool = False) -> RecordIndex:
     only_known
         End at the first record that is no message, schema or channel, rather than pass over it.
     """
-    n, walked, n_short = _walk(data, only_known, *_columns(0))
+    n, walked, n_strange = _walk(data, only_known, *_columns(0))
     columns = _columns(n)
     _walk(data, only_known, *columns)
-    return RecordIndex(*columns, n_short, walked)
+    return RecordIndex(*columns, n_strange, walked)
 
 
 def _columns(n: int) -> tuple[npt.NDArray[np.generic], ...]:
@@ -55,7 +56,7 @@ def _columns(n: int) -> tuple[npt.NDArray[np.generic], ...]:
 @njit(nogil=True, cache=True)
 def _walk(data, only_known, opcode, channel, time_ns, start, end):
     """Return how many records there are, and write those that the columns have room for."""
-    n, n_short, at, size, room = 0, 0, 0, len(data), len(opcode)
+    n, n_strange, at, size, room = 0, 0, 0, len(data), len(opcode)
     while at + HEAD_BYTES <= size:
         kind = data[at]
         length = load_uint64(data, at + 1)
@@ -64,7 +65,7 @@ def _walk(data, only_known, opcode, channel, time_ns, start, end):
             break
         after = body + np.int64(length)
         if kind == MESSAGE and after - body < MESSAGE_BYTES:
-            n_short += 1
+            n_strange += 1
         elif kind in (MESSAGE, SCHEMA, CHANNEL):
             if n < room:
                 opcode[n] = kind
@@ -76,5 +77,7 @@ def _walk(data, only_known, opcode, channel, time_ns, start, end):
             n += 1
         elif only_known:
             break
+        elif kind < PRIVATE:
+            n_strange += 1
         at = after
-    return n, at, n_short
+    return n, at, n_strange

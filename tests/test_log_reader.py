@@ -9,6 +9,7 @@ from mcap.writer import CompressionType, Writer
 
 from epipole.io import frame_columns
 from epipole.io.log_reader import read_log
+from epipole.io.log_rejects import ROWS_ALIKE
 from epipole.io.log_writer import LogWriter
 from epipole.io.message_encoding import encode_calibration, encode_protobuf
 from epipole.schemas import messages
@@ -341,6 +342,14 @@ def test_a_distortion_of_four_terms_has_no_k3(tmp_path):
 def test_an_undecodable_message_is_a_row(tmp_path, data):
     part = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, data))
     assert reasons(part) == [("undecodable_frame", None, 1)]
+
+
+def test_many_bad_messages_alike_are_few_rows_that_count_them_all(tmp_path):
+    good = (CENTROID_FRAME.name, frame(sensor_id="good"))
+    path = write_raw(tmp_path / "a.mcap", good, *[(CENTROID_FRAME.name, b"\1")] * 5000)
+    part = read_log(path)
+    assert part.rejects.num_rows == ROWS_ALIKE
+    assert sum(part.rejects["count"].to_pylist()) == 5000
 
 
 # What is an error

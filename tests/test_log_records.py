@@ -3,6 +3,7 @@
 import io
 import struct
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from mcap.reader import make_reader
@@ -10,6 +11,7 @@ from mcap.writer import CompressionType, Writer
 
 from epipole.io.log_chunks import MAX_CHUNK_BYTES
 from epipole.io.log_records import RecordWalk
+from epipole.io.log_summary import MAGIC
 
 N = 40
 SCHEMA = "epipole.CentroidFrame"
@@ -225,3 +227,90 @@ def test_a_summary_that_is_wrong_is_not_believed():
     place = data.rfind(b"/b")
     data[place + 1] = ord("c")
     assert walk(data) == (list(range(N)), [])
+
+
+# Logs that are made to be a burden
+
+SCHEMA_BODY = struct.pack("<HI", 1, len(SCHEMA)) + SCHEMA.encode() + bytes(8)
+CHANNEL_BODY = struct.pack("<HHI", 1, 1, 2) + b"/a" + struct.pack("<I", 8) + b"protobuf" + bytes(4)
+
+
+def record(opcode, body):
+    return HEAD.pack(opcode, len(body)) + body
+
+
+def message(i):
+    return record(5, struct.pack("<HIQQ", 1, 0, 1000 + i, 0) + struct.pack("<I", i))
+
+
+def chunk(records):
+    head = struct.pack("<QQQI", 1000, 2000, len(records), zlib.crc32(records))
+    return record(6, head + bytes(4) + struct.pack("<Q", len(records)) + records)
+
+
+def hand_made(*parts):
+    """Return a log of these parts of a data section, with no summary."""
+    footer = record(2, bytes(20))
+    head = record(1, bytes(8))
+    return MAGIC + head + b"".join(parts) + record(15, bytes(4)) + footer + MAGIC
+
+
+DECLARED = record(3, SCHEMA_BODY) + record(4, CHANNEL_BODY)
+
+
+def test_a_log_by_hand_is_sound():
+    assert walk(hand_made(chunk(DECLARED + message(3)), DECLARED + message(4))) == ([3, 4], [])
+
+
+def test_channels_may_be_declared_before_every_message():
+    records = b"".join(DECLARED + message(i) for i in range(50))
+    assert walk(hand_made(chunk(records))) == (list(range(50)), [])
+
+
+def test_a_chunk_in_a_chunk_is_said_to_be_left_out():
+    records = DECLARED + message(0) + chunk(message(1)) + message(2)
+    assert walk(hand_made(chunk(records))) == ([0, 2], [("damaged_record", 1)])
+
+
+def test_messages_too_short_to_be_one_are_counted():
+    records = DECLARED + record(5, b"abc") + message(1) + record(5, b"")
+    assert walk(hand_made(chunk(records))) == ([1], [("damaged_record", 2)])
+    assert walk(hand_made(records)) == ([1], [("damaged_record", 2)])
+
+
+def test_records_of_ones_own_are_passed_over():
+    own = record(0x80, b"") * 3 + record(0xFF, b"any")
+    assert walk(hand_made(own, chunk(DECLARED + own + message(1)), own)) == ([1], [])
+
+
+def test_a_declaration_that_is_none_leaves_the_rest():
+    records = DECLARED + record(4, b"") + record(3, b"\1") + message(1)
+    assert walk(hand_made(chunk(records))) == ([1], [("damaged_record", 1)] * 2)
+
+
+def test_the_same_chunk_twice_is_read_twice():
+    part = chunk(DECLARED + message(1))
+    assert walk(hand_made(part, part)) == ([1, 1], [])
+
+
+@pytest.mark.parametrize("crc", [True, False])
+def test_logs_behind_each_other_are_read_and_named(crc):
+    data = log(enable_crcs=crc)
+    found, damage = walk(data * 3)
+    assert found == list(range(N)) * 3
+    assert damage == [("log_behind_log", 1)] * 2
+
+
+def test_a_log_behind_a_log_without_a_summary_is_read():
+    data = hand_made(chunk(DECLARED + message(1)))
+    assert walk(data + data) == ([1, 1], [("log_behind_log", 1)])
+
+
+def test_opening_ahead_changes_nothing():
+    data = bytearray(log())
+    at, length = chunks(data)[3]
+    data[at + length - 20] ^= 1
+    with ThreadPoolExecutor(3) as pool:
+        walked = RecordWalk(memoryview(bytes(data)), frozenset([SCHEMA]), pool)
+        found = [int(b.data[at : at + 4].view("<u4")[0]) for b in walked.blocks() for at in b.start]
+    assert (found, [(d.reason, d.n) for d in walked.damage]) == walk(data)
