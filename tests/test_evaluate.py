@@ -4,6 +4,7 @@ import importlib.util
 import json
 import re
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -245,6 +246,19 @@ def test_what_is_not_there_is_said(night_log, tmp_path):
     (tmp_path / "x.truth").mkdir()
     with pytest.raises(DatasetError, match=r"frames.parquet: cannot be read as truth"):
         evaluate(tmp_path, tmp_path / "x")
+
+
+def test_a_truth_over_midnight_is_held_against_both_nights(prefect, tmp_path):
+    from epipole.flows.nightly import nightly
+
+    start = datetime(2019, 4, 1, 23, 59, 50, tzinfo=UTC)
+    made = simulate("four_sensor_geo", tmp_path / "n.mcap", start=start, hours=20 / 3600)
+    nightly([str(log) for log in made.logs], str(tmp_path / "out"))
+    assert len(list((tmp_path / "out").glob("night=*"))) == 2
+    found = evaluate(tmp_path / "out", made.truth)
+    assert found.frames == made.frames == 80
+    assert found.star_recall > 0.95
+    assert found.object_recall > 0.95
 
 
 def test_several_logs_of_a_night_have_one_truth(tmp_path):
