@@ -8,7 +8,7 @@ import pyarrow as pa
 from epipole.io.log_rejects import RejectList
 from epipole.io.message_decoding import Calibration
 from epipole.io.message_parts import Part, fault, known_id
-from epipole.schemas.bridge import table, unstack
+from epipole.schemas.bridge import table
 from epipole.schemas.work_tables import CAMERAS
 
 
@@ -55,7 +55,7 @@ class CameraColumns:
                 "fy_px": matrices[:, 4],
                 "cx_px": matrices[:, 2],
                 "cy_px": matrices[:, 5],
-                **unstack("{}", distortion, ("k1", "k2", "p1", "p2", "k3")),
+                **dict(zip(("k1", "k2", "p1", "p2", "k3"), distortion.T, strict=True)),
             },
         )
 

@@ -164,7 +164,7 @@ class FrameColumns:
             bad_sigma = _any(~((sigma > 0) & np.isfinite(sigma)), lengths) & has_sigma
             flux[~((flux > 0) & np.isfinite(flux))] = np.nan
         keep = ~(bad_place | bad_sigma)
-        for i in np.flatnonzero(~keep):
+        for i in np.flatnonzero(~keep).tolist():
             self._leave_out(received[i], "nan" if bad_place[i] else "bad_sigma")
         each = np.repeat(keep, lengths)
         values = (x[each], y[each], flux[each], sigma[each])

@@ -35,7 +35,7 @@ class OpenedChunk(NamedTuple):
 
     start_ns: int
     records: bytes
-    index: RecordIndex
+    places: RecordIndex
     reason: str = ""
 
 

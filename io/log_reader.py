@@ -76,9 +76,9 @@ def read_log(
         span = (FIRST_NS if start_ns is None else start_ns, LAST_NS if end_ns is None else end_ns)
     with ThreadPoolExecutor(THREADS, "open chunks") as pool:
         sha256 = pool.submit(_sha256, data)
-        columns = _read_columns(data, where, name, span, pool)
-        if columns is None:
-            columns = _read_columns(data, where, name, span, pool, pass_over=False)
+        columns, sure = _read_columns(data, where, name, span, pool)
+        if not sure:
+            columns, _ = _read_columns(data, where, name, span, pool, pass_over=False)
     frames, states, cameras, rejects = columns
     exposures, log_states = frames.table(), states.table()
     if exposures.num_rows == 0 and span is None:
@@ -105,27 +105,26 @@ def _read_columns(
     span: tuple[int, int] | None,
     pool: Executor,
     pass_over: bool = True,
-) -> Columns | None:
+) -> tuple[Columns, bool]:
     """Take every wanted message of a span into the columns of its kind.
 
-    Return None where chunks were passed over and it shows that they should not have been:
-    the frames that were read are of another time than they were logged at.
+    Return also whether all are there. They may not be where chunks were passed over and the
+    frames that were read are of another time than they were logged at.
     """
     wide = None if span is None else (span[0] - MARGIN_NS, span[1] + MARGIN_NS)
     rejects = RejectList(name)
     columns = Columns(
         FrameColumns(rejects, span), StateColumns(rejects, wide), CameraColumns(rejects), rejects
     )
+    takers = (columns.frames, columns.states, columns.cameras)  # as in `KINDS`
     walk = RecordWalk(data, frozenset(CARRIES), pool, wide if pass_over else None, ALWAYS_READ)
     for block in walk.blocks():
         for i, chosen in _kinds(block, where):
-            columns[i].add(Part(block, KINDS[i], chosen, rejects))
-    off_ns = columns.frames.clock_off_ns
-    if walk.n_passed and (off_ns is None or off_ns > MARGIN_NS):
-        return None
+            takers[i].add(Part(block, KINDS[i], chosen, rejects))
     for damage in walk.damage:
         rejects.add(damage.reason, time_ns=damage.time_ns, offset=damage.offset, count=damage.n)
-    return columns
+    off_ns = columns.frames.clock_off_ns
+    return columns, not walk.n_passed or (off_ns is not None and off_ns <= MARGIN_NS)
 
 
 def _sha256(data: memoryview) -> str:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -305,12 +305,18 @@ class RecordWalk:
                 wanted[number] = found
             elif number not in self._channels:
                 self._unknown[number] = self._unknown.get(number, 0) + n
-        columns = (channel, index.time_ns[part], index.start[part], index.end[part], offset[part])
+        columns: list[npt.NDArray[Any]] = [
+            channel,
+            index.time_ns[part],
+            index.start[part],
+            index.end[part],
+            offset[part],
+        ]
         if np.count_nonzero(counts) > len(wanted):
             asked = np.zeros(len(counts), bool)
             asked[list(wanted)] = True
             keep = asked[channel]
-            columns = tuple(column[keep] for column in columns)
+            columns = [column[keep] for column in columns]
         if wanted:
             yield Block(data, wanted, *columns)
 

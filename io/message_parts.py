@@ -68,8 +68,8 @@ class Part:
         """The messages as the scans take them."""
         b = self.block
         encodings = np.full(max(b.channels) + 1, OTHER, np.uint8)
-        for number, channel in b.channels.items():
-            encodings[number] = _SCANNED.get(channel.encoding, OTHER)
+        for n, channel in b.channels.items():
+            encodings[n] = _SCANNED.get(channel.encoding, OTHER)
         number = b.channel[self.chosen]
         return Messages(b.data, b.start[self.chosen], b.end[self.chosen], encodings[number], number)
 

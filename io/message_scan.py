@@ -42,7 +42,7 @@ class Names(NamedTuple):
 
     text: npt.NDArray[np.uint8]  # (MAX_NAMES, NAME_BYTES)
     length: npt.NDArray[np.int64]
-    count: npt.NDArray[np.int64]  # (1,)
+    n_met: npt.NDArray[np.int64]  # (1,)
     hint: npt.NDArray[np.int64]  # (65536,) the code last met on a channel
 
 
@@ -106,7 +106,7 @@ def _same(data, at, n, names, code):
 @njit(nogil=True, cache=True)
 def _find(data, at, n, names):
     """Return the code of a name, or -1."""
-    for code in range(names.count[0]):
+    for code in range(names.n_met[0]):
         if _same(data, at, n, names, code):
             return code
     return -1
@@ -116,18 +116,18 @@ def _find(data, at, n, names):
 def _sensor(data, at, n, names, channel):
     """Return the code of a sensor id, new or known; -1 where it is no id or there is no room."""
     code = names.hint[channel]
-    if code < names.count[0] and _same(data, at, n, names, code):
+    if code < names.n_met[0] and _same(data, at, n, names, code):
         return code
     if not _valid_id(data, at, n):
         return -1
     code = _find(data, at, n, names)
     if code < 0:
-        code = names.count[0]
+        code = names.n_met[0]
         if code == MAX_NAMES:
             return -1
         names.text[code, :n] = data[at : at + n]
         names.length[code] = n
-        names.count[0] = code + 1
+        names.n_met[0] = code + 1
     names.hint[channel] = code
     return code
 

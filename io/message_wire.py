@@ -83,7 +83,7 @@ def _parse_protobuf(data, at, end, kinds, fields):
         if at < 0 or tag > np.uint64(0xFFFFFFFF):
             return False
         number, wire = np.int64(tag >> np.uint64(3)), np.int64(tag & np.uint64(7))
-        kind = kinds[number] if number < len(kinds) else UNKNOWN
+        kind = kinds[number if number < len(kinds) else UNKNOWN]
         if kind != UNKNOWN:
             if seen >> number & 1:
                 return False

@@ -21,7 +21,7 @@ class NameCodes:
 
     def names(self) -> list[str]:
         """Return the names by code, those that a scan has met among them."""
-        met = int(self.table.count[0])
+        met = int(self.table.n_met[0])
         for code in range(len(self._names), met):  # none, once the table is full
             name = self.table.text[code, : self.table.length[code]].tobytes().decode()
             self._codes[name] = code
@@ -43,7 +43,7 @@ class NameCodes:
             return
         self.table.text[code, : len(text)] = np.frombuffer(text, np.uint8)
         self.table.length[code] = len(text)
-        self.table.count[0] = code + 1
+        self.table.n_met[0] = code + 1
 
     def strings(self, codes: npt.NDArray[np.int32]) -> pa.Array:
         """Return the names of codes as a column."""

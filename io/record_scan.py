@@ -1,6 +1,6 @@
 """The places of all records in a chunk, found by one compiled walk over its bytes."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -45,18 +45,20 @@ def index_records(data: Bytes, only_known: bool = False) -> RecordIndex:
     n, walked, n_strange = _walk(data, only_known, *_columns(0))
     columns = _columns(n)
     _walk(data, only_known, *columns)
-    return RecordIndex(*columns, n_strange, walked)
+    opcode, channel, time_ns, start, end = columns
+    return RecordIndex(opcode, channel, time_ns, start, end, n_strange, walked)
 
 
-def _columns(n: int) -> tuple[npt.NDArray[np.generic], ...]:
+def _columns(n: int) -> list[npt.NDArray[Any]]:
     kinds = (np.uint8, np.uint16, np.uint64, np.int64, np.int64)
-    return tuple(np.zeros(n, kind) for kind in kinds)
+    return [np.zeros(n, kind) for kind in kinds]
 
 
 @njit(nogil=True, cache=True)
 def _walk(data, only_known, opcode, channel, time_ns, start, end):
     """Return how many records there are, and write those that the columns have room for."""
-    n, n_strange, at, size, room = 0, 0, 0, len(data), len(opcode)
+    n, n_strange, size, room = 0, 0, len(data), len(opcode)
+    at = np.int64(0)
     while at + HEAD_BYTES <= size:
         kind = data[at]
         length = load_uint64(data, at + 1)

@@ -70,7 +70,7 @@ class StateColumns:
 
     def _close(self) -> None:
         """Add the rows so far to the table."""
-        rows = StateRows(*(column[: self._n] for column in self._rows))
+        rows = StateRows._make(column[: self._n] for column in self._rows)
         self._n = 0
         if len(rows.time_ns) == 0:
             return
@@ -106,7 +106,7 @@ class StateColumns:
             if len(state.attitude_xyzw) and not _is_attitude(state.attitude_xyzw):
                 self._leave_out(one, "bad_attitude")
                 state = state._replace(attitude_xyzw=state.attitude_xyzw[:0])
-            self._write(state)
+            self._write(state, one.record.time_ns)
 
     def _leave_out(self, one: Received, reason: str) -> None:
         self.rejects.add(
@@ -116,11 +116,11 @@ class StateColumns:
             sensor_id=known_id(one.record.sensor_id),
         )
 
-    def _write(self, state: State) -> None:
+    def _write(self, state: State, time_ns: int) -> None:
         rows, n = self._rows, self._n
         rows.sensor[n] = self._sensors.code(state.sensor_id)
         rows.frame[n] = _FRAMES.code(state.frame)
-        rows.time_ns[n] = state.time_ns
+        rows.time_ns[n] = time_ns
         rows.r_km[n] = state.position_km
         rows.v_km_s[n] = state.velocity_km_s if len(state.velocity_km_s) else np.nan
         rows.q[n] = state.attitude_xyzw if len(state.attitude_xyzw) else np.nan
