@@ -15,6 +15,7 @@ from epipole.flows.sensors import calibrated, sensor_ids, unplaced
 from epipole.flows.stages import (
     associate,
     calibrate,
+    fit,
     identify,
     place,
     read,
@@ -108,6 +109,7 @@ def nightly(
         "epochs": epochs,
         "associations": solved.associations,
         "positions": solved.positions,
+        "states": fit(associated, solved, chosen_settings),
         "calibrations": calibrations,
         "pairs": solved.pairs,
         "sources": sources,

@@ -24,6 +24,7 @@ from epipole.schemas.work_tables import CAMERAS, SOLUTIONS, VIEWS
 from epipole.tasks.associate_objects import Associated, associate_objects
 from epipole.tasks.build_tracklets import Tracked, build_tracklets
 from epipole.tasks.calibrate_sensors import Calibrated, calibrate_sensors
+from epipole.tasks.fit_states import fit_states
 from epipole.tasks.identify_stars import Identified, identify_stars
 from epipole.tasks.lone_detections import with_lone_tracklets
 from epipole.tasks.place_sensors import place_sensors
@@ -196,3 +197,11 @@ def triangulate(associated: Associated, settings: Settings) -> Solved:
     solved: Solved = solve_positions(associated.views, associated.object_number, settings)
     LOGGER.info("solved %s", many(len(solved.positions), "position"))
     return solved
+
+
+def fit(associated: Associated, solved: Solved, settings: Settings) -> pa.Table:
+    """Fit a state to each arc of each object."""
+    step("fit states", 0, 1)
+    states: pa.Table = fit_states(associated.views, solved.associations, solved.positions, settings)
+    LOGGER.info("fitted %s", many(len(states), "state"))
+    return states
