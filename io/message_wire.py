@@ -77,7 +77,7 @@ def _protobuf_time(data, at, end):
 def _parse_protobuf(data, at, end, kinds, fields):
     """Fill in the fields of a message; return whether it is one that a scan may take."""
     fields[:] = 0
-    seen = 0
+    seen = np.int64(0)
     while at < end:
         tag, at = _varint(data, at, end)
         if at < 0 or tag > np.uint64(0xFFFFFFFF):
