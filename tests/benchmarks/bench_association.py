@@ -1,0 +1,220 @@
+"""Association measured: points at one instant, many sensors, tracklets; the published beside it.
+
+``python tests/benchmarks/bench_association.py [points] [scale] [tracklets] [--seeds N]``
+
+Points: F1 over the objects that at least three sensors detect; a group is right if it holds at
+least three of its object's points and no other. OpenPTV stands beside it where `optv` is
+installed.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from points import PIXEL_RAD, Points, Score, judge, scene
+
+from epipole.schemas.settings import AssociationSettings
+from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
+from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
+from epipole.tasks.algorithms.association.samples import Groups, Samples
+from epipole.tasks.algorithms.sky import ARCSEC, tangent_basis
+
+FALSE = (10, 100, 300, 1000)
+LINES_PX = 1.0  # the published method's threshold: about 3 sigma of these points
+DEFAULT = AssociationSettings()
+
+
+def associate(samples: Samples) -> Groups:
+    """Associate with the default settings of a run."""
+    return associate_tracklets(
+        samples,
+        gate_sigma=DEFAULT.gate_sigma,
+        min_altitude_km=DEFAULT.min_altitude_km,
+        max_range_km=DEFAULT.max_range_km,
+        min_log_odds=DEFAULT.min_log_odds,
+        ambiguity_log_odds=DEFAULT.ambiguity_log_odds,
+        shells=[Shell(s.lowest_km, s.highest_km, s.share) for s in DEFAULT.shells],
+    )
+
+
+def by_lines(samples: Samples) -> Groups:
+    """Associate as it was published."""
+    focal_px = np.full(len(samples.half_field), 1 / PIXEL_RAD)
+    return associate_by_lines(samples, focal_px, LINES_PX)
+
+
+def judge_once(points: Points, group: np.ndarray) -> Score:
+    """Score as `judge` does, but an object found twice is right once only."""
+    score = judge(points, group)
+    found = [
+        int(own[0])
+        for g in range(group.max(initial=-1) + 1)
+        if len(own := points.who[group == g]) >= 3 and own[0] >= 0 and (own == own[0]).all()
+    ]
+    return score._replace(right=len(set(found)))
+
+
+def cell(method, n_sensors: int, n_false: int, seeds: int) -> tuple[float, Score, float]:
+    """Return F1 [%], the scores summed, and the median time [ms] of one density."""
+    scores, took = [], []
+    for seed in range(seeds):
+        points = scene(seed, n_sensors, 20, n_false)
+        begun = time.perf_counter()
+        groups = method(points.samples)
+        took.append(time.perf_counter() - begun)
+        scores.append(judge_once(points, groups.group))
+    total = Score(*(sum(column) for column in zip(*scores, strict=True)))
+    return 100 * total.f1, total, 1e3 * float(np.median(took))
+
+
+def points_table(seeds: int) -> None:
+    """Print the table of points at one instant."""
+    associate(scene(0, 4, 20, 10).samples)  # compiled before anything is timed
+    print(f"\nPoints at one instant, 20 objects, {seeds} seeds a cell: F1 % (median ms)")
+    print("sensors | false points | default | wanted, groups, right | published, L = 1 px")
+    for n_sensors in (4, 8, 20):
+        for n_false in FALSE:
+            f1, total, ms = cell(associate, n_sensors, n_false, seeds)
+            few = max(seeds // 10, 3) if n_sensors > 4 else seeds
+            lines, _, lines_ms = cell(by_lines, n_sensors, n_false, min(few, 10))
+            print(
+                f"{n_sensors} | {n_false} | {f1:.2f} ({ms:.1f}) | {total.wanted}, "
+                f"{total.groups}, {total.right} | {lines:.1f} ({lines_ms:.0f})",
+                flush=True,
+            )
+
+
+def scale_table(seeds: int) -> None:
+    """Print what 100 sensors with 1,000 objects and 1,000 false points each come to."""
+    print("\n100 sensors, 1,000 objects, 1,000 false points each, one core")
+    associate(scene(0, 8, 20, 10).samples)
+    for seed in range(seeds):
+        points = scene(seed, 100, 1000, 1000)
+        begun = time.perf_counter()
+        groups = associate(points.samples)
+        took = time.perf_counter() - begun
+        score = judge_once(points, groups.group)
+        ghosts = score.groups - score.right - score.strays
+        print(
+            f"seed {seed}: {1e3 * took:.0f} ms, {len(points.who)} points, {score.wanted} objects, "
+            f"{score.right} right, {score.strays} with a stray, {ghosts} ghosts",
+            flush=True,
+        )
+
+
+def tracklets(seed: int, n_sensors: int, n_lone: int, times_s: np.ndarray, n_objects: int = 20):
+    """Return tracklets at instants that share no detection, and whose they are.
+
+    Low orbits; GEO objects that all sensors see, and as many as said that one sensor alone sees,
+    whose motion differs by 2"/s.
+    """
+    rng = np.random.default_rng(seed)
+    geo, v = np.array([-39359.89, 15125.76, 64.30]), np.array([-1.103, -2.870, 0.0])
+    r = np.empty((n_sensors, len(times_s), 3))
+    for s in range(n_sensors):
+        while True:
+            out, along = rng.normal(size=(2, 3))
+            out /= np.linalg.norm(out)
+            if out @ geo > 0.3 * np.linalg.norm(geo):
+                break
+        along = np.cross(out, along)
+        along /= np.linalg.norm(along)
+        angle = (times_s - times_s.mean())[:, None] * 7.5 / 7000.0
+        r[s] = 7000.0 * (np.cos(angle) * out + np.sin(angle) * along)
+    centre = geo + times_s[:, None] * v
+    look = centre - r
+    look /= np.linalg.norm(look, axis=2, keepdims=True)
+    u, sensor, who = [], [], []
+    for k in range(n_objects):
+        start, drift = rng.normal(size=3) * 200.0, rng.normal(size=3) * 0.02
+        path = centre + start + times_s[:, None] * drift
+        for s in range(n_sensors):
+            u.append(path - r[s])
+            sensor.append(s)
+            who.append(k)
+    for s in range(n_sensors):
+        rate = rng.normal(size=(n_lone, 2)) * 2 * ARCSEC
+        off = rng.uniform(-1, 1, (n_lone, 2)) * np.radians(1.0)
+        steps = off[:, None] + (times_s - times_s.mean())[:, None] * rate[:, None]
+        u.extend(look[s] + np.einsum("nka,kai->nki", steps, tangent_basis(look[s])))
+        sensor += [s] * n_lone
+        who += [-1] * n_lone
+    sight = np.array(u)
+    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
+    shake = rng.normal(size=(*sight.shape[:2], 2)) * ARCSEC
+    sight += np.einsum("nka,nkai->nki", shake, tangent_basis(sight))
+    sight /= np.linalg.norm(sight, axis=2, keepdims=True)
+    # What leaves the field has no view there.
+    inside = np.einsum("nki,nki->nk", sight, look[np.array(sensor)]) > np.cos(np.radians(1.4))
+    first = np.array([times_s[np.flatnonzero(row)[0]] if row.any() else 0.0 for row in inside])
+    last = np.array([times_s[np.flatnonzero(row)[-1]] if row.any() else 0.0 for row in inside])
+    samples = Samples(
+        np.array(sensor), first, last, inside, sight,
+        np.tile(np.eye(2) * ARCSEC**2, (*sight.shape[:2], 1, 1)),
+        np.full(sight.shape[:2], 0.02), times_s, r,
+        np.concatenate([tangent_basis(look), look[:, :, None]], axis=2),
+        np.full((n_sensors, 2), np.tan(np.radians(1.0))),
+    )  # fmt: skip
+    return samples, np.array(who)
+
+
+def pair_score(who: np.ndarray, group: np.ndarray) -> tuple[int, int, int]:
+    """Return how many pairs of tracklets are one object, are grouped, and both."""
+
+    def pairs(label: np.ndarray) -> set[tuple[int, int]]:
+        out = set()
+        for k in range(label.max(initial=-1) + 1):
+            own = np.flatnonzero(label == k).tolist()
+            out |= {(i, j) for i in own for j in own if i < j}
+        return out
+
+    true, found = pairs(who), pairs(group)
+    return len(true), len(found), len(true & found)
+
+
+def tracklet_table(seeds: int) -> None:
+    """Print pair precision and recall of tracklets, by the length of the data."""
+    cases = (
+        (4, 1000, np.arange(6.0, 60, 12)),
+        (2, 100, np.arange(6.0, 60, 12)),
+        (2, 100, np.linspace(25, 575, 12)),
+    )
+    print("\nTracklets, 20 objects, lone ones a sensor as said")
+    for n_sensors, n_lone, times_s in cases:
+        total, took = np.zeros(3, int), []
+        for seed in range(seeds):
+            samples, who = tracklets(seed, n_sensors, n_lone, times_s)
+            begun = time.perf_counter()
+            groups = associate(samples)
+            took.append(time.perf_counter() - begun)
+            total += pair_score(who, groups.group)
+        true, found, right = total.tolist()
+        print(
+            f"{n_sensors} sensors, {n_lone} lone, {len(times_s)} instants in "
+            f"{np.ptp(times_s) + 12:.0f} s: precision {100 * right / max(found, 1):.2f} %, recall "
+            f"{100 * right / max(true, 1):.2f} % of {true} pairs, {1e3 * np.median(took):.0f} ms",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Run the tables asked for, or all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tables", nargs="*", default=["points", "scale", "tracklets"])
+    parser.add_argument("--seeds", type=int, default=30, help="scenes a cell")
+    args = parser.parse_args()
+    if "points" in args.tables:
+        points_table(args.seeds)
+    if "scale" in args.tables:
+        scale_table(min(args.seeds, 3))
+    if "tracklets" in args.tables:
+        tracklet_table(min(args.seeds, 10))
+
+
+if __name__ == "__main__":
+    main()
