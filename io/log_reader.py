@@ -18,9 +18,10 @@ import pyarrow as pa
 from epipole.io.camera_columns import CameraColumns
 from epipole.io.frame_columns import FrameColumns
 from epipole.io.log_bytes import forget, open_log
+from epipole.io.log_channels import ChannelTable
 from epipole.io.log_records import Block, RecordWalk
 from epipole.io.log_rejects import RejectList
-from epipole.io.log_summary import MAGIC
+from epipole.io.log_summary import MAGIC, read_summary
 from epipole.io.message_decoding import ENCODINGS
 from epipole.io.message_parts import Part
 from epipole.io.state_columns import StateColumns
@@ -67,9 +68,7 @@ def read_log(
         lies in the range is no error.
     """
     where = os.fspath(path)
-    data = open_log(where)
-    if data[: len(MAGIC)] != MAGIC:
-        raise LogError(f"{where}: not an MCAP file; give a log as MCAP (https://mcap.dev)")
+    data = _open_mcap(where)
     name = where.rstrip("/").rpartition("/")[2]
     span = None
     if start_ns is not None or end_ns is not None:
@@ -87,6 +86,28 @@ def read_log(
     source = LogSource(name, len(data), sha256.result(), first, last)
     left_out = rejects.table(first, last, span)
     return LogPart(exposures, log_states, cameras.table(), left_out, source)
+
+
+def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
+    """Return when a log's first and last message were logged, without reading them.
+
+    UTC nanoseconds since 1970, of the recorder's clock: not the times of frames. None where
+    the log has no sound summary (it was never closed): then only `read_log` can tell.
+
+    Raises
+    ------
+    LogError
+        No such file, a folder, no MCAP.
+    """
+    data = _open_mcap(os.fspath(path))
+    return read_summary(data, ChannelTable(frozenset())).logged_ns
+
+
+def _open_mcap(where: str) -> memoryview:
+    data = open_log(where)
+    if data[: len(MAGIC)] != MAGIC:
+        raise LogError(f"{where}: not an MCAP file; give a log as MCAP (https://mcap.dev)")
+    return data
 
 
 class Columns(NamedTuple):

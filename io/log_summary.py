@@ -24,6 +24,7 @@ class Summary:
     data_end: int | None = None  # where the data section ends, if the file is whole
     chunk_offsets: list[int] = field(default_factory=list)  # sorted
     declared: dict[int, int] = field(default_factory=dict)  # messages of each channel
+    logged_ns: tuple[int, int] | None = None  # when the first and the last message were logged
 
     @property
     def sound(self) -> bool:
@@ -69,7 +70,8 @@ def _read_records(
             if len(MAGIC) <= offset < end:
                 summary.chunk_offsets.append(offset)
         elif opcode == STATISTICS:
-            (size,) = struct.unpack_from("<I", data, body + 42)
+            *logged_ns, size = struct.unpack_from("<QQI", data, body + 26)
+            summary.logged_ns = (logged_ns[0], logged_ns[1])
             for i in range(body + 46, min(body + 46 + size, at), 10):
                 number, count = struct.unpack_from("<HQ", data, i)
                 summary.declared[number] = count

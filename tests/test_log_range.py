@@ -7,10 +7,11 @@ import pytest
 from mcap.writer import Writer
 
 from epipole.io import log_chunks, log_records
-from epipole.io.log_reader import MARGIN_NS, read_log
+from epipole.io.log_reader import MARGIN_NS, read_log, read_log_times
 from epipole.io.log_writer import LogWriter
 from epipole.io.message_encoding import encode_calibration, encode_protobuf
 from epipole.schemas.bridge import array
+from epipole.schemas.errors import LogError
 from epipole.schemas.messages import CALIBRATION_NAME, CENTROID_FRAME, SENSOR_STATE
 
 START_NS = 1_554_091_200_000_000_000
@@ -190,6 +191,17 @@ def test_a_range_without_frames_is_empty_and_no_error(tmp_path):
     part = read_log(write(tmp_path / "a.mcap"), far_ns, far_ns + MINUTE_NS)
     assert (part.exposures.num_rows, part.states.num_rows) == (0, 0)
     assert part.rejects.num_rows == 0
+
+
+def test_the_times_of_a_log_are_known_without_reading_it(tmp_path, opened):
+    path = write(tmp_path / "a.mcap")
+    assert read_log_times(path) == (START_NS, START_NS + (N - 1) * MINUTE_NS)
+    assert opened == []
+    path.write_bytes(path.read_bytes()[:-1])
+    assert read_log_times(path) is None
+    (tmp_path / "b.mcap").write_bytes(b"no log")
+    with pytest.raises(LogError, match="not an MCAP file"):
+        read_log_times(tmp_path / "b.mcap")
 
 
 def test_rows_of_a_range_do_not_depend_on_how_the_log_is_written(tmp_path):
