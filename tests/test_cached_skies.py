@@ -13,9 +13,9 @@ from epipole.tasks.cached_skies import CachedSkies, Catalogue
 
 
 def _table(seed=0):
-    stars = random_catalogue(3000, seed)
+    stars = random_catalogue(6000, seed)
     ra, dec = radec_from_unit(stars.u_icrs)
-    none = np.zeros(3000)
+    none = np.zeros(6000)
     return table(
         STAR_CATALOGUE,
         {

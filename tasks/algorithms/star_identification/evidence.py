@@ -7,8 +7,8 @@ anywhere in the image. Its parts:
 - a match adds ln(A / (2 pi s^2)) - d^2 / (2 s^2), s the centroid's sigma, d its distance
   from the star, A the solid angle of the image; with brightness also
   ln(g(difference) / h(magnitude)), h the magnitudes of the catalogue;
-- which k of n centroids are which of the m stars in view is not known, and how many of
-  these the sensor sees: -ln(k! C(n, k) C(m, k) (m + 1));
+- which k of n centroids are which of the m stars in view is not known, nor what share of
+  these the sensor sees (`log_ways`);
 - the attitude was chosen: the share of the prior that the data leave. Lost in space,
   that is sqrt(det 2 pi P) / (8 pi^2).
 
@@ -70,12 +70,16 @@ def median_zero_point(star_of, instrumental, magnitude):
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
 def log_ways(n, matches, in_view):
-    """Return ln of in how many ways `matches` of n centroids are as many of the stars in view,
-    and of how many numbers of matches there could be (compiled)."""
-    m = max(in_view, float(matches))
-    ways = math.lgamma(n + 1.0) - math.lgamma(n - matches + 1.0)
-    ways += math.lgamma(m + 1.0) - math.lgamma(matches + 1.0) - math.lgamma(m - matches + 1.0)
-    return ways + math.log(m + 1.0)
+    """Return -ln of the probability, before the places are seen, that just these centroids of n
+    are just these of the stars in view (compiled).
+
+    The share p of the stars in view that the sensor sees is not known: 4 p^3, as most
+    sensors see most stars to their limit.
+    """
+    k, m = float(matches), max(in_view, float(matches))
+    centroids = math.lgamma(n + 1.0) - math.lgamma(n - k + 1.0)
+    seen = math.log(4.0) + math.lgamma(k + 4.0) + math.lgamma(m - k + 1.0) - math.lgamma(m + 5.0)
+    return centroids - seen
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

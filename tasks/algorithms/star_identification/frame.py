@@ -24,9 +24,9 @@ from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-# Chance reaches a log evidence x, lost in space, with a probability below exp(-(x + 4)):
-# measured on 4,000 random frames of three cameras. Markov's inequality has exp(-x).
-LOST_MARGIN = 4.0
+# Chance reaches a log evidence x, lost in space, with a probability below exp(-(x + 6)):
+# measured on 12,000 random frames of three cameras. Markov's inequality has exp(-x).
+LOST_MARGIN = 6.0
 N_SEARCHED = 200  # brightest centroids that take part in a search of the whole sky
 N_PATTERN_CENTROIDS = 40  # brightest centroids that are paired lost in space
 

@@ -10,9 +10,9 @@ from epipole.tasks.algorithms.star_identification.evidence import log_magnitude_
 from epipole.tasks.algorithms.star_identification.pair_table import PairTable, build_pair_table
 from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid, build_sky_grid
 
-# Bright stars a field whose pairs are tabled: enough that nearly every field shows several,
+# Bright stars a field, on average, whose pairs are tabled: enough that sparse fields show several,
 # few enough that a pair has few namesakes.
-PATTERN_STARS = 15.0
+PATTERN_STARS = 24.0
 MAX_PAIRS = 1_000_000
 
 
