@@ -45,7 +45,7 @@ def quaternion_from_matrix(R: Array) -> Array:
     w = np.where(vector, (m[n, k, j] - m[n, j, k]) * half, squares[n, best] * half)
     q[n, i] = np.where(vector, squares[n, best] * half, q[n, i])
     q[:, 3] = w
-    return canonical(q).reshape(R.shape[:-2] + (4,))
+    return canonical(q).reshape((*R.shape[:-2], 4))
 
 
 def canonical(q: Array) -> Array:
