@@ -60,5 +60,6 @@ def _run(logs: list[str], out: str, settings: Settings, options: RunOptions) -> 
     from epipole.flows.nightly import nightly
 
     workers = options.workers or os.cpu_count() or 1
-    flow = nightly.with_options(task_runner=ThreadPoolTaskRunner[Any](max_workers=workers))
+    runner: Any = ThreadPoolTaskRunner(max_workers=workers)
+    flow = nightly.with_options(task_runner=runner)
     return flow(logs, out, settings.model_dump(), options.night, options.replace)

@@ -67,12 +67,13 @@ class CachedSkies:
 
 @lru_cache(maxsize=4)
 def _navigation(catalogue: Catalogue, day: int, merge_rad: float) -> NavigationCatalogue:
-    time_ns = np.int64(day) * DAY_NS + DAY_NS // 2
+    time_ns = np.array(day * DAY_NS + DAY_NS // 2, np.int64)
     r_earth_km, _ = earth_barycentric(time_ns)
     names = ("ra_rad", "dec_rad", "parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")
-    columns = [array(catalogue.stars, name) for name in names]
+    ra, dec, parallax, pm_ra, pm_dec = (array(catalogue.stars, name) for name in names)
     epoch = float((catalogue.stars.schema.metadata or {}).get(b"epoch", HIPPARCOS_EPOCH))
-    u = places_at(*columns, float(julian_year(time_ns)) - epoch, r_earth_km)
+    years = float(julian_year(time_ns)) - epoch
+    u = places_at(ra, dec, parallax, pm_ra, pm_dec, years, r_earth_km)
     star_id, magnitude = array(catalogue.stars, "star_id"), array(catalogue.stars, "magnitude")
     return navigation_catalogue(star_id, u, magnitude, merge_rad)
 

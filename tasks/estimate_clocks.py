@@ -1,6 +1,6 @@
 """Estimate clocks: each sensor's clock offset over the night, and frames put right by it."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -98,7 +98,7 @@ def _used_views(
     bias = rows.group_by("sensor_id").agg(
         pl.col("position_sigma_km").max(), attitude_sigma_rad=spread.max().sqrt()
     ).sort("sensor_id")  # fmt: skip
-    sensor = bias["sensor_id"].search_sorted(rows["sensor_id"]) if len(rows) else []
+    sensor: Any = bias["sensor_id"].search_sorted(rows["sensor_id"]) if len(rows) else []
     lines = Lines(
         group=rows.select(pl.struct("epoch", "object_id").rle_id()).to_series().to_numpy(),
         sensor=np.asarray(sensor, np.int64),

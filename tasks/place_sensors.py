@@ -1,8 +1,10 @@
 """Where each sensor was, and how it was said to be turned, at each of its frames."""
 
 import logging
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 from prefect import task
 from prefect.cache_policies import NO_CACHE
@@ -28,8 +30,9 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
     for name in sorted(set(sensor)):
         frames = np.flatnonzero(sensor == name)
         own = np.flatnonzero(state_sensor == name)
+        columns: list[npt.NDArray[Any]] = [values[own] for values in all_states]
         places = interpolate_states(
-            States(*(values[own] for values in all_states)),
+            States(*columns),
             time_ns[frames],
             settings.sensors.state_gap_s,
         )
@@ -37,7 +40,7 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
             column[frames] = values
     without = np.count_nonzero(np.isnan(placed.r_gcrf_km[:, 0]))
     logger.info("placed %d frames, %d have no state near", n - without, without)
-    values = {
+    by_name = {
         **unstack("{}_km", placed.r_gcrf_km),
         **unstack("v{}_km_s", placed.v_gcrf_km_s),
         "position_sigma_km": placed.position_sigma_km,
@@ -45,7 +48,7 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
         "attitude_sigma_arcsec": placed.attitude_sigma,
     }
     key = {name: exposures[name] for name in ("sensor_id", "frame_number", "time")}
-    return table(PLACES, {**key, **{name: nullable(value) for name, value in values.items()}})
+    return table(PLACES, {**key, **{name: nullable(value) for name, value in by_name.items()}})
 
 
 def _states(states: pa.Table, settings: SensorSettings) -> States:

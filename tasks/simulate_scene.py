@@ -209,7 +209,7 @@ def _spread(orbit: Orbit, spread_km: float, rng: np.random.Generator) -> Array:
     elements = _elements(orbit, rng)
     if not spread_km:
         return elements
-    r_km, v_km_s = state_at(elements, np.float64(0))
+    r_km, v_km_s = state_at(elements, np.zeros(()))
     moved = r_km + rng.standard_normal(3) * spread_km
     # The same direction and energy of motion, level and circular at the new place.
     level = v_km_s - moved * (v_km_s @ moved) / (moved @ moved)
@@ -228,7 +228,7 @@ def _sensor(
     else:
         followed = _elements(pointing.orbit, rng) if pointing.orbit else np.zeros(6)
     ra, dec = math.radians(pointing.ra_deg or 0.0), math.radians(pointing.dec_deg or 0.0)
-    no_prior = states.prior_noise_arcsec is None
+    noise_arcsec = states.prior_noise_arcsec
     return Sensor(
         sensor_id=name,
         index=index,
@@ -268,7 +268,7 @@ def _sensor(
         state_margin_s=states.margin_s,
         position_noise_km=states.position_noise_km,
         position_bias_km=states.position_bias_km,
-        prior_noise=None if no_prior else states.prior_noise_arcsec * ARCSEC,
+        prior_noise=None if noise_arcsec is None else noise_arcsec * ARCSEC,
         prior_bias=states.prior_bias_arcsec * ARCSEC,
     )
 

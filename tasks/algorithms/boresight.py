@@ -65,7 +65,7 @@ def boresight_and_focal_length(
             step = (d @ d - 1.0) / (2.0 * d @ slope)
         if not np.isfinite(step):
             break
-        f = max(f - step, 0.5 * f)  # a step across zero would not come back
+        f = max(float(f - step), 0.5 * f)  # a step across zero would not come back
         if abs(step) < CONVERGED * f:
             d = _free_boresight(u_icrs, _cosines(distance_px, f))
             return d / np.linalg.norm(d), f
@@ -160,7 +160,8 @@ def _free_boresight(u_icrs: Array, cosines: Array) -> Array:
         raise ValueError(f"expected three stars, got {u_icrs.shape} and {cosines.shape}")
     if np.linalg.cond(u_icrs) > 1e12:
         raise ValueError("the three stars lie on one great circle: their boresight is not fixed")
-    return np.linalg.solve(u_icrs, cosines)
+    boresight: Array = np.linalg.solve(u_icrs, cosines).astype(np.float64)
+    return boresight
 
 
 def _angle(a: Array, b: Array) -> Array:

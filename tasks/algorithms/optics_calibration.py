@@ -12,6 +12,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.camera import Camera, project
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 OPTICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 # How far a camera may be from its calibration, 1-sigma. It only matters for what the stars
@@ -81,7 +82,7 @@ def calibrate_optics(
     return OpticsFit(free.camera, free.cov, len(frame), free.sigma_px, cost[0] - cost[1])
 
 
-def _fit(camera: Camera, xy: Array, u: Array, starts: Array, optics: bool) -> _Fit:
+def _fit(camera: Camera, xy: Array, u: Array, starts: Indices, optics: bool) -> _Fit:
     """Return the best turns of the frames and, if asked for, the best optics."""
     scale = _prior_sigma(camera)
     came = _values(camera)

@@ -251,14 +251,15 @@ def triangulate(
     n, g = len(r_gcrf_km), len(offsets) - 1
     x, P = np.full((g, 3), np.nan), np.full((g, 3, 3), np.nan)
     chi2, used, mean_range = np.full(g, np.nan), np.zeros(n, np.bool_), np.full(g, np.nan)
+    # Copies: to numba a read-only array is another type, and all would compile twice.
     _solve_groups(
-        np.ascontiguousarray(offsets, np.int64),
-        np.ascontiguousarray(r_gcrf_km, float),
-        np.ascontiguousarray(u_icrs, float),
-        np.ascontiguousarray(tangent_basis(u_icrs)),
-        np.ascontiguousarray(cov_rad2, float),
-        np.ascontiguousarray(sigma_km, float),
-        np.ascontiguousarray(velocity_km_s, float),
+        np.array(offsets, np.int64),
+        np.array(r_gcrf_km, float, order="C"),
+        np.array(u_icrs, float, order="C"),
+        np.array(tangent_basis(u_icrs), order="C"),
+        np.array(cov_rad2, float, order="C"),
+        np.array(sigma_km, float, order="C"),
+        np.array(velocity_km_s, float, order="C"),
         float(reject_sigma) ** 2,
         x,
         P,

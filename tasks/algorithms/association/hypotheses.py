@@ -481,7 +481,7 @@ def grow(
     n_sensors = len(views.half_field)
     seen_by[:] = 0
     members[0], members[1] = seed_i, seed_j
-    n, again = 2, 3
+    n, again = np.int64(2), 3  # a plain 2 is a type of its own to numba: all would compile twice
     chi2, dof = solve(views, members, n, X, P, seen_by)
     if not chi2 <= quantile(max(dof, 1), gate_sigma):
         return 0, -np.inf

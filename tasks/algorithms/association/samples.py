@@ -122,7 +122,9 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
     grid = np.zeros((n_sensors, n_instants, 2), np.int64)
     corner, scale = np.zeros((n_sensors, n_instants, 2)), np.zeros((n_sensors, n_instants, 2))
     widest = np.zeros((n_sensors, n_instants))
-    starts, items, begin = [], [], 0
+    starts: list[Indices] = []
+    items: list[Indices] = []
+    begin = 0
     for s in range(n_sensors):
         for m in range(n_instants):
             own = first[s] + np.flatnonzero(seen[first[s] : first[s + 1], m])
@@ -136,7 +138,9 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
             side, corner[s, m], scale[s, m], cell = _cells(u[own, m] @ plane[s, m].T)
             by_cell = np.argsort(cell, kind="stable")
             count = np.bincount(cell, minlength=side * side)
-            starts.append(sum(map(len, items)) + np.concatenate([[0], np.cumsum(count)]))
+            starts.append(
+                sum(len(cells) for cells in items) + np.concatenate([[0], np.cumsum(count)])
+            )
             items.append(own[by_cell])
             grid[s, m, 1] = side
             begin += side * side + 1

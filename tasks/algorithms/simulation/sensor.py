@@ -108,7 +108,7 @@ class Attitudes:
         if sensor.mode == "random":
             n = int(np.ceil(sensor.duration_s / sensor.hold_s)) + 2
             # One more hold on either side, for the states beyond the ends.
-            middle = (np.arange(n) - 0.5) * sensor.hold_s
+            middle: Array = (np.arange(n, dtype=float) - 0.5) * sensor.hold_s
             r_km, _ = state_at(sensor.elements, middle)
             rng = random_stream(sensor.seed, sensor.index, "attitudes")
             self._held = random_attitudes(rng, r_km, sensor.clearance)

@@ -1,6 +1,6 @@
 """The sky as one camera needs it: stars to a limit, their grid, their pairs."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,8 @@ class Sky(NamedTuple):
 def sky_to_limit(stars: NavigationCatalogue, magnitude_limit: float) -> Sky:
     """Return the sky of the stars no fainter than the limit."""
     n = int(np.searchsorted(stars.magnitude, magnitude_limit, side="right"))
-    cut = NavigationCatalogue(*[np.ascontiguousarray(column[:n]) for column in stars])
+    columns: list[npt.NDArray[Any]] = [np.ascontiguousarray(column[:n]) for column in stars]
+    cut = NavigationCatalogue(*columns)
     return Sky(cut, log_magnitude_density(cut.magnitude), max(n, 1) / (4 * np.pi))
 
 
