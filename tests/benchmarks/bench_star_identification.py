@@ -1,0 +1,224 @@
+"""Star identification: right and wrong answers, and CPU time, beside public tools.
+
+    python tests/benchmarks/bench_star_identification.py [--made N] [--cameras abc] [--no-peers]
+
+Frames: the 36 cells (centroid error 0 to 2 px, 0 to 10 false stars, 0 to 40 % missing) of
+three cameras, from ../shared/data/starid where it is there, else made here; with --made, N
+frames a camera are made from Hipparcos. Every solver gets the same frames, one by one, and
+is told the camera and the centroid error. Right: boresight within 0.05 degrees and roll
+within 0.5; wrong: an answer more than 0.25 degrees off. Public tools: `pip install '.[bench]'`.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import gettempdir
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from star_frames import CELLS, MERGED_PX, SCATTER_MAG, Frames, make_frames, read_frames
+from star_peers import Solver, cedar_solve, tetra3rs
+
+from epipole.tasks.algorithms.camera import pixel_angle, unproject
+from epipole.tasks.algorithms.star_catalogue import navigation_catalogue
+from epipole.tasks.algorithms.star_identification.frame import (
+    Frame,
+    Optics,
+    Search,
+    identify_lost,
+    identify_predicted,
+)
+from epipole.tasks.algorithms.star_identification.published import Method, matcher, solve_matches
+from epipole.tasks.algorithms.star_identification.sky import (
+    Sky,
+    pattern_pairs,
+    pattern_size,
+    sky_grid,
+    sky_to_limit,
+)
+
+Array = npt.NDArray[np.float64]
+
+SHARED = Path(__file__).parents[3] / "shared" / "data" / "starid"
+RIGHT_DEG, RIGHT_ROLL_DEG, WRONG_DEG = 0.05, 0.5, 0.25
+FALSE_ALARM = 1e-6
+LEAST_SIGMA_PX = 0.05  # stated where there is none
+PUBLISHED: tuple[Method, ...] = ("four_base_stars", "match_group", "radial_cyclic")
+
+
+class Ours:
+    """One camera as epipole knows it: sky, optics, how to search."""
+
+    def __init__(self, frames: Frames) -> None:
+        self.kind = kind = frames.kind
+        self.camera = kind.camera
+        half = kind.width_px / 2 / self.camera.fx_px
+        box = np.array([-half, half, -half, half])
+        self.optics = Optics(self.camera.half_diagonal_rad, box, self.camera.pixel_rad)
+        merged = navigation_catalogue(*frames.stars, MERGED_PX * self.camera.pixel_rad)
+        self.sky: Sky = sky_to_limit(merged, kind.magnitude_limit + SCATTER_MAG)
+        self.how = Search(3.7, -np.log(FALSE_ALARM), 0.5, np.nan)
+        n = pattern_size(self.sky, self.optics.solid_angle_sr)
+        self.pairs = pattern_pairs(merged.u_icrs[:n], 2 * self.optics.half_diagonal_rad)
+        sigmas = [2.0 ** (k / 2) for k in range(-9, 4)]
+        self.grids = {
+            s: sky_grid(self.sky, 2.5 * self.how.gate_sigma * s * self.optics.pixel_rad)
+            for s in sigmas
+        }
+
+    def frame(self, x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> Frame:
+        u = unproject(self.camera, x_px, y_px)
+        sigma_rad = max(sigma_px, LEAST_SIGMA_PX) * pixel_angle(self.camera, u)
+        return Frame(u, sigma_rad, mag, np.zeros(3), self.optics)
+
+    def default(self, x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> Array | None:
+        seen = self.frame(x_px, y_px, mag, sigma_px)
+        grid = next(g for s, g in self.grids.items() if s >= max(sigma_px, LEAST_SIGMA_PX))
+        found, _ = identify_lost(seen, self.sky, grid, self.pairs, self.how)
+        return found and found.R_sensor_from_icrs
+
+    def without_brightness(
+        self, x_px: Array, y_px: Array, mag: Array, sigma_px: float
+    ) -> Array | None:
+        return self.default(x_px, y_px, np.full(len(mag), np.nan), sigma_px)
+
+    def published(self, method: Method) -> Solver:
+        match = matcher(method, sky_to_limit(self.sky.catalogue, self.kind.magnitude_limit),
+                        self.optics)  # fmt: skip
+
+        def solve(x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> Array | None:
+            seen = self.frame(x_px, y_px, mag, sigma_px)
+            star = match(seen.u, seen.sigma_rad)
+            found = solve_matches(seen, self.sky, star, self.how.gate_sigma)
+            return found and found.R_sensor_from_icrs
+
+        return solve
+
+
+class Row(NamedTuple):
+    """What a solver did with frames: right and wrong by frame, CPU milliseconds."""
+
+    right: npt.NDArray[np.bool_]
+    wrong: npt.NDArray[np.bool_]
+    ms: Array
+
+    def text(self, name: str) -> str:
+        median, last = np.percentile(self.ms, [50, 99])
+        right, wrong = 100 * self.right.mean(), 100 * self.wrong.mean()
+        return f"| {name} | {right:.2f} | {wrong:.2f} | {median:.3g} | {last:.3g} |"
+
+
+def judge(R: Array | None, true: Array) -> tuple[bool, bool]:
+    """Return whether an answer is right, and whether it is wrong."""
+    if R is None:
+        return False, False
+    off = np.degrees(np.arctan2(np.linalg.norm(np.cross(R[2], true[2])), R[2] @ true[2]))
+    turn = R @ true.T
+    roll = abs(np.degrees(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])))
+    whole = np.degrees(2 * np.arcsin(min(np.linalg.norm(R - true) / np.sqrt(8), 1.0)))
+    return bool(off < RIGHT_DEG and roll < RIGHT_ROLL_DEG), bool(max(off, 0.25 * whole) > WRONG_DEG)
+
+
+def run(solve: Solver, frames: Frames) -> Row:
+    right, wrong = np.zeros((2, len(frames.cell)), bool)
+    ms = np.empty(len(frames.cell))
+    for warm in range(3):  # compiled, caches filled
+        solve(*centroids(frames, warm))
+    for k in range(len(frames.cell)):
+        given = centroids(frames, k)
+        start = time.process_time()
+        R = solve(*given)
+        ms[k] = 1e3 * (time.process_time() - start)
+        right[k], wrong[k] = judge(R, frames.R_sensor_from_icrs[k])
+    return Row(right, wrong, ms)
+
+
+def centroids(frames: Frames, k: int) -> tuple[Array, Array, Array, float]:
+    rows = slice(frames.offset[k], frames.offset[k + 1])
+    return frames.x_px[rows], frames.y_px[rows], frames.mag[rows], CELLS[frames.cell[k]][0]
+
+
+def solvers(frames: Frames, cache: Path, peers: bool) -> dict[str, Callable[[], Solver | None]]:
+    """Return what makes each solver, by name."""
+    ours = Ours(frames)
+    made: dict[str, Callable[[], Solver | None]] = {
+        "epipole": lambda: ours.default,
+        "epipole, no brightness": lambda: ours.without_brightness,
+    }
+    for method in PUBLISHED:
+        made[f"published: {method}"] = lambda method=method: ours.published(method)  # type: ignore[misc]
+    if peers:
+        made["tetra3rs, error told"] = lambda: tetra3rs(frames, cache, error_told=True)
+        made["tetra3rs, defaults"] = lambda: tetra3rs(frames, cache, error_told=False)
+        made["cedar-solve, error told"] = lambda: cedar_solve(frames, cache)
+    return made
+
+
+def tracking_us(frames: Frames, n_centroids: int = 20) -> float:
+    """Return CPU microseconds a frame of so many centroids, the attitude predicted to 20"."""
+    ours, spent, n = Ours(frames), 0.0, 0
+    rng = np.random.default_rng(0)
+    P = np.eye(3) * np.radians(20 / 3600) ** 2
+    for k in range(len(frames.cell)):
+        x, y, mag, sigma_px = centroids(frames, k)
+        if sigma_px != 0.5 or len(x) < n_centroids:
+            continue
+        seen = ours.frame(x[:n_centroids], y[:n_centroids], mag[:n_centroids], sigma_px)
+        turn = np.cross(np.eye(3), rng.normal(0, np.radians(20 / 3600), 3))
+        R = (np.eye(3) + turn) @ frames.R_sensor_from_icrs[k]
+        identify_predicted(seen, ours.sky, R, P, ours.how)
+        start = time.process_time()
+        for _ in range(20):
+            identify_predicted(seen, ours.sky, R, P, ours.how)
+        spent, n = spent + time.process_time() - start, n + 20
+    return 1e6 * spent / max(n, 1)
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--made", type=int, metavar="N", help="make N frames a camera")
+    options.add_argument("--seed", type=int, default=1)
+    options.add_argument("--cameras", default="abc")
+    options.add_argument("--no-peers", action="store_true")
+    options.add_argument("--only", default="", help="solvers whose names contain this")
+    options.add_argument("--cells", action="store_true", help="right %% by cell as well")
+    given = options.parse_args()
+    cache = Path(gettempdir()) / "epipole-bench"
+    cache.mkdir(exist_ok=True)
+    for name in given.cameras:
+        if given.made or not SHARED.is_dir():
+            n = given.made or 5 * len(CELLS)
+            frames = make_frames(name, np.arange(n) % len(CELLS), given.seed)
+        else:
+            frames = read_frames(SHARED, name)
+        kind = frames.kind
+        print(f"\nCamera {name}: {kind.field_deg:g} degrees, {kind.width_px} px, stars to "
+              f"{kind.magnitude_limit:g}, {len(frames.cell):,} frames")  # fmt: skip
+        print("| | right % | wrong % | CPU ms, median | 99th percentile |")
+        print("|---|---|---|---|---|")
+        for label, make in solvers(frames, cache, not given.no_peers).items():
+            if given.only not in label:
+                continue
+            solve = make()
+            if solve is None:
+                print(f"| {label} | not installed | | | |")
+                continue
+            row = run(solve, frames)
+            print(row.text(label), flush=True)
+            if given.cells:
+                print_cells(row, frames)
+        if given.only in "tracking":
+            print(f"tracking, 20 centroids: {tracking_us(frames):.0f} CPU microseconds a frame")
+
+
+def print_cells(row: Row, frames: Frames) -> None:
+    for cell, (sigma_px, n_false, missing) in enumerate(CELLS):
+        at = frames.cell == cell
+        print(f"    {sigma_px:g} px, {n_false} false, {missing:.0%} missing: right "
+              f"{100 * row.right[at].mean():.1f} %, wrong {row.wrong[at].sum()}")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
