@@ -4,20 +4,18 @@ import erfa
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.time_scales import AU_KM, DAY_S, tt_julian_date
+
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 
-AU_KM = 149597870.7
-DAY_S = 86400.0
-UNIX_JD = 2440587.5
 HIPPARCOS_EPOCH_JD = 2448349.0625  # J1991.25
 NODE_S = 1200  # a cubic between such nodes is right to 1e-6 km
 
 
 def barycentric_julian_date(time_ns: Nanoseconds) -> tuple[Array, Array]:
     """Return the two-part TDB Julian date of UTC nanoseconds since 1970."""
-    days, rest = np.divmod(np.asarray(time_ns, np.int64), int(DAY_S) * 1_000_000_000)
-    jd1, jd2 = erfa.taitt(*erfa.utctai(UNIX_JD + days, rest / (DAY_S * 1e9)))
+    jd1, jd2 = tt_julian_date(time_ns)
     g = np.radians(357.53 + 0.98560028 * (jd1 - 2451545.0 + jd2))
     return jd1, jd2 + 0.001657 * np.sin(g) / DAY_S
 
