@@ -7,9 +7,6 @@ or is killed leaves the dataset as it was.
 
 import contextlib
 import datetime
-import fcntl
-import os
-import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -18,14 +15,15 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from epipole.io.folder_swap import put_in_place, sync, take_back
+from epipole.io import local_nights
+from epipole.io.folder_swap import sync
+from epipole.io.local_nights import STAGING
 from epipole.schemas.bridge import array, conform, empty
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
 DAY_NS = 86_400_000_000_000
-STAGING = ".staging"
 
 # The column that says to which night a row belongs; the rest have `time`. Calibrations and
 # sources are of a whole night, not of an instant.
@@ -103,7 +101,7 @@ def read_table(dataset: Path, table: str, night: str) -> pa.Table:
 
 
 def publish(
-    dataset: Path,
+    dataset: Path | str,
     tables: Mapping[str, pa.Table],
     nights: Sequence[str],
     replace: bool = False,
@@ -128,98 +126,93 @@ def publish(
         Where the folder is no dataset, a recorded log is missing or the disk refuses. The
         dataset is then as it was. While another run publishes here, this one waits.
     """
+    with claim_nights(dataset, []) as work:
+        staged = {night: work / f"night={night}" for night in nights}
+        with _written(dataset):
+            for night, folder in staged.items():
+                _write_night(folder, tables, night)
+        publish_folders(dataset, staged, tables["sources"], replace)
+
+
+@contextlib.contextmanager
+def claim_nights(dataset: Path | str, nights: Sequence[str]) -> Iterator[Path]:
+    """Keep other runs off these nights while this one works on them.
+
+    Yields
+    ------
+    Path
+        An empty folder of this run's own, on the dataset's file system: what is staged in it
+        can be put in place by a rename. It is removed at the end. What a run that was killed
+        has left there is removed by the next one.
+
+    Raises
+    ------
+    DatasetError
+        Where another run is at work on one of the nights (names the night, the process, its
+        host and since when), the folder is no dataset, or it cannot be written.
+    """
     check_folder(dataset)
-    made = not dataset.exists()
+    with contextlib.ExitStack() as held:
+        with _written(dataset):
+            work = held.enter_context(local_nights.claim(Path(dataset), nights))
+        yield work
+
+
+def publish_folders(
+    dataset: Path | str, staged: Mapping[str, Path], sources: pa.Table, replace: bool = False
+) -> None:
+    """Put whole nights in place: all of them, or none.
+
+    Parameters
+    ----------
+    staged
+        By night, ``YYYY-MM-DD``, a folder that holds every table: ``<table>/*.parquet``. It
+        lies on the dataset's file system (see `claim_nights`) and is gone afterwards.
+    sources
+        The logs that the nights were made of.
+    replace
+        Publish a night even though it was made of a log that is not among `sources`.
+
+    Raises
+    ------
+    DatasetError
+        Where a recorded log is missing or the disk refuses. The dataset is then as it was.
+        While another run publishes here, this one waits.
+    """
+    check_folder(dataset)
+    dataset = Path(dataset)
+    with _written(dataset):
+        for folder in staged.values():
+            _require_whole(folder)
+            for path in [*folder.rglob("*"), folder]:
+                sync(path)
+        with local_nights.alone(dataset):
+            check_sources(dataset, list(staged), sources, replace)
+            local_nights.put_all_in_place(dataset, staged)
+
+
+def _require_whole(folder: Path) -> None:
+    missing = [name for name in TABLES if not any((folder / name).glob("*.parquet"))]
+    if missing:
+        raise ValueError(f"{folder}: is no whole night, without {', '.join(missing)}")
+
+
+@contextlib.contextmanager
+def _written(dataset: Path | str) -> Iterator[None]:
+    """Have what the system says of a write told as an error of the dataset."""
     try:
-        dataset.mkdir(parents=True, exist_ok=True)
-        with _staging(dataset) as staging:
-            check_sources(dataset, nights, tables["sources"], replace)
-            for night in nights:
-                _write_night(staging / f"night={night}", tables, night)
-            _put_all_in_place(dataset, staging, nights)
+        yield
     except OSError as error:
         raise DatasetError(
             f"{dataset}: cannot be written ({error.strerror or error}); nothing was changed"
         ) from error
-    finally:
-        if made:
-            with contextlib.suppress(OSError):  # where nights were published it is not empty
-                dataset.rmdir()
-
-
-@contextlib.contextmanager
-def _staging(dataset: Path) -> Iterator[Path]:
-    """Lend a staging folder to one run at a time; none is left afterwards.
-
-    Whoever holds the lock is alone, so whatever lies in staging was left by a run that was
-    killed.
-    """
-    staging = dataset / STAGING
-    with _locked(staging):
-        for left_over in staging.glob("run-*"):
-            _recover(dataset, left_over)
-        run = staging / f"run-{os.getpid()}"
-        run.mkdir()
-        try:
-            yield run
-        finally:
-            shutil.rmtree(run, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _locked(staging: Path) -> Iterator[None]:
-    path = staging / "lock"
-    while True:
-        with contextlib.suppress(FileNotFoundError):  # the last holder has just tidied up
-            staging.mkdir(exist_ok=True)
-            lock = path.open("w")
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            if path.exists() and os.path.samestat(os.fstat(lock.fileno()), path.stat()):
-                break
-            lock.close()
-    try:
-        yield
-    finally:
-        # The lock's file goes while it is held; who waits for it sees that, above.
-        path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):
-            staging.rmdir()
-        lock.close()
-
-
-def _recover(dataset: Path, left_over: Path) -> None:
-    """Remove what a killed run left; a night it had taken away first goes back."""
-    for old in left_over.glob("old-night=*"):
-        target = dataset / old.name.removeprefix("old-")
-        if not target.exists():
-            old.rename(target)
-    shutil.rmtree(left_over)
-
-
-def _put_all_in_place(dataset: Path, staging: Path, nights: Sequence[str]) -> None:
-    done: list[str] = []
-    try:
-        for night in nights:
-            name = f"night={night}"
-            put_in_place(staging / name, dataset / name, staging / f"old-{name}")
-            done.append(name)
-        sync(dataset)
-    except BaseException:
-        for name in reversed(done):
-            take_back(dataset / name, staging / f"old-{name}", staging / f"undone-{name}")
-        raise
 
 
 def _write_night(folder: Path, tables: Mapping[str, pa.Table], night: str) -> None:
-    folder.mkdir()
     for name, schema in TABLES.items():
         rows = rows_of_night(name, conform(schema, tables.get(name, empty(schema))), night)
-        (folder / name).mkdir()
-        part = folder / name / "part-0.parquet"
-        pq.write_table(in_order(rows), part, compression="zstd")
-        sync(part)
-        sync(folder / name)
-    sync(folder)
+        (folder / name).mkdir(parents=True)
+        pq.write_table(in_order(rows), folder / name / "part-0.parquet", compression="zstd")
 
 
 def nights_of(time_ns: np.ndarray) -> list[str]:

@@ -9,61 +9,21 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from dataset_tables import (
+    NEXT_NIGHT,
+    NIGHT,
+    OVER_MIDNIGHT,
+    TIMES,
+    contents,
+    night_tables,
+)
 
 from epipole.io import dataset as under_test
-from epipole.io import folder_swap
+from epipole.io import folder_swap, local_nights
 from epipole.io.dataset import check_folder, publish, read_table
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
-
-DAY_NS = 86_400_000_000_000
-FIRST_DAY = 17987  # 2019-04-01
-NIGHT, NEXT_NIGHT = "2019-04-01", "2019-04-02"
-
-
-def rows(schema: pa.Schema, times: np.ndarray, seed: int = 0) -> pa.Table:
-    """Return a table with one made-up row a time."""
-    rng = np.random.default_rng(seed)
-
-    def values(field: pa.Field) -> pa.Array:
-        if field.type == TIME:
-            return pa.array(times, pa.int64()).cast(TIME)
-        if field.type == pa.string():
-            return pa.array([f"s{i % 3}" for i in range(len(times))])
-        return pa.array(rng.uniform(0, 100, len(times))).cast(field.type, safe=False)
-
-    return pa.Table.from_arrays([values(field) for field in schema], schema=schema)
-
-
-def night_tables(times: np.ndarray, logs: tuple[str, ...] = ("a",), seed: int = 0) -> dict:
-    tables = {name: rows(schema, times, seed) for name, schema in TABLES.items()}
-    first, last = int(times.min()), int(times.max())
-    tables["sources"] = pa.Table.from_pylist(
-        [
-            {
-                "name": f"{log}.mcap",
-                "size": 1,
-                "sha256": log * 64,
-                "first_time": first,
-                "last_time": last,
-                "code_version": "0",
-                "settings_key": "0",
-            }
-            for log in logs
-        ],
-        schema=TABLES["sources"],
-    )
-    return tables
-
-
-# Times that no microsecond holds: Arrow refuses to make them Python's.
-TIMES = FIRST_DAY * DAY_NS + np.arange(20) * 1_000_000_001 + 7
-OVER_MIDNIGHT = (FIRST_DAY + 1) * DAY_NS + np.arange(-10, 10) * 1_000_000_001 + 7
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def test_every_table_has_a_file_each_night_with_its_units(tmp_path):
@@ -192,14 +152,14 @@ def test_a_failure_at_the_second_night_takes_the_first_back(
     before = contents(tmp_path)
     if not exchange_supported:
         monkeypatch.setattr(folder_swap, "exchange", lambda *_: False)
-    put_in_place = under_test.put_in_place
+    put_in_place = local_nights.put_in_place
 
     def fails_at_second(new, target, old):
         if target.name == f"night={NEXT_NIGHT}":
             _disk_full()
         put_in_place(new, target, old)
 
-    monkeypatch.setattr(under_test, "put_in_place", fails_at_second)
+    monkeypatch.setattr(local_nights, "put_in_place", fails_at_second)
     with pytest.raises(DatasetError):
         publish(tmp_path, night_tables(OVER_MIDNIGHT, seed=9), [NIGHT, NEXT_NIGHT])
     assert contents(tmp_path) == before
@@ -215,9 +175,9 @@ def test_without_exchange_two_renames_do(tmp_path, monkeypatch):
 
 def test_what_a_killed_run_left_is_cleared_and_a_night_it_had_taken_goes_back(tmp_path):
     publish(tmp_path, night_tables(TIMES), [NIGHT])
-    left_over = tmp_path / ".staging" / "run-12345"
-    (left_over / f"night={NEXT_NIGHT}" / "frames").mkdir(parents=True)
-    (tmp_path / f"night={NIGHT}").rename(left_over / f"old-night={NIGHT}")
+    (tmp_path / ".staging/run-12345" / f"night={NEXT_NIGHT}" / "frames").mkdir(parents=True)
+    (tmp_path / ".staging/swap-12345").mkdir()
+    (tmp_path / f"night={NIGHT}").rename(tmp_path / f".staging/swap-12345/old-night={NIGHT}")
     publish(tmp_path, night_tables(OVER_MIDNIGHT), [NEXT_NIGHT])
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"night={NIGHT}", f"night={NEXT_NIGHT}"]
     assert read_table(tmp_path, "frames", NIGHT).num_rows == len(TIMES)

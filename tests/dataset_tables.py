@@ -1,0 +1,57 @@
+"""Made-up nights of a dataset, for tests of how they are kept."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from epipole.schemas.columns import TIME
+from epipole.schemas.tables import TABLES
+
+DAY_NS = 86_400_000_000_000
+FIRST_DAY = 17987  # 2019-04-01
+NIGHT, NEXT_NIGHT = "2019-04-01", "2019-04-02"
+
+
+def rows(schema: pa.Schema, times: np.ndarray, seed: int = 0) -> pa.Table:
+    """Return a table with one made-up row a time."""
+    rng = np.random.default_rng(seed)
+
+    def values(field: pa.Field) -> pa.Array:
+        if field.type == TIME:
+            return pa.array(times, pa.int64()).cast(TIME)
+        if field.type == pa.string():
+            return pa.array([f"s{i % 3}" for i in range(len(times))])
+        return pa.array(rng.uniform(0, 100, len(times))).cast(field.type, safe=False)
+
+    return pa.Table.from_arrays([values(field) for field in schema], schema=schema)
+
+
+def night_tables(times: np.ndarray, logs: tuple[str, ...] = ("a",), seed: int = 0) -> dict:
+    tables = {name: rows(schema, times, seed) for name, schema in TABLES.items()}
+    first, last = int(times.min()), int(times.max())
+    tables["sources"] = pa.Table.from_pylist(
+        [
+            {
+                "name": f"{log}.mcap",
+                "size": 1,
+                "sha256": log * 64,
+                "first_time": first,
+                "last_time": last,
+                "code_version": "0",
+                "settings_key": "0",
+            }
+            for log in logs
+        ],
+        schema=TABLES["sources"],
+    )
+    return tables
+
+
+# Times that no microsecond holds: Arrow refuses to make them Python's.
+TIMES = FIRST_DAY * DAY_NS + np.arange(20) * 1_000_000_001 + 7
+OVER_MIDNIGHT = (FIRST_DAY + 1) * DAY_NS + np.arange(-10, 10) * 1_000_000_001 + 7
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
