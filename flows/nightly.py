@@ -3,13 +3,14 @@
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from prefect import flow
 
 from epipole.flows.clocks import read_clocks, set_right
+from epipole.flows.log_choice import BEYOND_NS, find_logs
+from epipole.flows.parameters import Night, night_asked, run_name
 from epipole.flows.progress import step
 from epipole.flows.sensors import calibrated, sensor_ids, unplaced
 from epipole.flows.stages import (
@@ -27,78 +28,72 @@ from epipole.flows.summary import Summary, summarise
 from epipole.io.dataset import check_folder, check_sources, nights_of
 from epipole.schemas.bridge import array, concat, conform
 from epipole.schemas.errors import LogError
-from epipole.schemas.settings import validate_settings
+from epipole.schemas.settings import Settings
 from epipole.schemas.tables import FRAMES, REJECTS
 from epipole.tasks.align_epochs import align_epochs
 from epipole.tasks.publish_night import publish_night, source_table
 
 LOGGER = logging.getLogger(__name__)
 
-MARGIN_NS = 600_000_000_000  # read beyond both ends of a chosen night: no track is cut there
 
-
-@flow(name="nightly")  # on threads, unless told otherwise
+@flow(name="nightly", flow_run_name=run_name)  # on threads, unless told otherwise
 def nightly(
-    logs: list[str],
+    logs: str | list[str],
     out: str,
-    settings: dict[str, Any] | None = None,
-    night: str | None = None,
+    settings: Settings = Settings(),  # noqa: B008  frozen
+    night: Night = None,
     replace: bool = False,
 ) -> Summary:
     """Turn logs into a dataset.
 
-    Parameters
-    ----------
-    logs
-        MCAP files, in any order.
-    out
-        The dataset, a folder; it is made where it is missing.
-    settings
-        Groups of settings by name, as in a settings file; what is left out keeps its default.
-    night
-        Publish this UTC date only, ``YYYY-MM-DD``; none: every night the logs have frames of.
-    replace
-        Publish a night even though it was made of a log that is not among these.
+    Prefect's form for a run shows what stands under Args.
 
-    Raises
-    ------
-    EpipoleError
-        Where the work cannot be done; the dataset is then as it was.
+    Args:
+        logs: MCAP files, folders, globs or URLs of them; those of the night are chosen.
+        out: The dataset, a folder; it is made where it is missing.
+        settings: Groups of settings, as in a settings file; what is left out keeps its default.
+        night: Publish this UTC date only: YYYY-MM-DD, or yesterday, seen from when the run was
+            due. None: every night that the logs have frames of.
+        replace: Publish a night even though it was made of a log that is not among these.
+
+    Raises:
+        EpipoleError: Where the work cannot be done; the dataset is then as it was.
     """
-    chosen_settings = validate_settings(settings or {}, "settings")
+    night = night_asked(night)
     check_folder(out)
+    found = find_logs(logs, night)
 
-    log = read(logs, chosen_settings)
+    log = read(found.paths, settings)
     nights = nights_of(array(log.exposures, "time"))
     chosen = choose_nights(nights, night)
-    sources = source_table(log.sources, chosen_settings)
+    sources = source_table(log.sources, settings)
     check_sources(Path(out), chosen, sources, replace)
     exposures, uncalibrated = calibrated(near(log.exposures, night), log.cameras)
     if not exposures.num_rows:
         raise LogError(
-            f"{', '.join(logs)}: no sensor has a calibration "
+            f"{', '.join(found.paths)}: no sensor has a calibration "
             f"({', '.join(sensor_ids(uncalibrated))}); record foxglove.CameraCalibration "
             "with the sensor's id as frame_id"
         )
 
-    places = place(exposures, log.states, chosen_settings)
-    identified = identify(exposures, places, log.cameras, chosen_settings)
+    places = place(exposures, log.states, settings)
+    identified = identify(exposures, places, log.cameras, settings)
     identified, cameras, calibrations = calibrate(
-        identified, exposures, places, log.cameras, chosen_settings
+        identified, exposures, places, log.cameras, settings
     )
-    for correcting in (chosen_settings.alignment.correct_clocks, False):
-        tracked = track(identified, cameras, chosen_settings)
-        epochs = align_epochs(identified.solutions, chosen_settings)
-        views = view(epochs, identified, tracked, cameras, chosen_settings)
-        associated = associate(views, identified, tracked, cameras, chosen_settings)
-        solved = triangulate(associated, chosen_settings)
-        clocks = read_clocks(associated, solved, identified, chosen_settings)
+    for correcting in (settings.alignment.correct_clocks, False):
+        tracked = track(identified, cameras, settings)
+        epochs = align_epochs(identified.solutions, settings)
+        views = view(epochs, identified, tracked, cameras, settings)
+        associated = associate(views, identified, tracked, cameras, settings)
+        solved = triangulate(associated, settings)
+        clocks = read_clocks(associated, solved, identified, settings)
         if not correcting or not any(clock.is_off for clock in clocks):
             break
-        identified = set_right(identified, exposures, log.states, clocks, chosen_settings)
+        identified = set_right(identified, exposures, log.states, clocks, settings)
 
     rejects = [
-        log.rejects, uncalibrated, unplaced(places),
+        found.rejects, log.rejects, uncalibrated, unplaced(places),
         identified.rejects, associated.rejects, solved.rejects,
     ]  # fmt: skip
     tables = {
@@ -109,7 +104,7 @@ def nightly(
         "epochs": epochs,
         "associations": solved.associations,
         "positions": solved.positions,
-        "states": fit(associated, solved, chosen_settings),
+        "states": fit(associated, solved, settings),
         "calibrations": calibrations,
         "pairs": solved.pairs,
         "sources": sources,
@@ -137,4 +132,4 @@ def near(exposures: pa.Table, night: str | None) -> pa.Table:
     start = int(np.datetime64(night, "ns").astype(np.int64))
     end = int((np.datetime64(night) + 1).astype("datetime64[ns]").astype(np.int64))
     time_ns = array(exposures, "time")
-    return exposures.filter(pa.array((time_ns >= start - MARGIN_NS) & (time_ns < end + MARGIN_NS)))
+    return exposures.filter(pa.array((time_ns >= start - BEYOND_NS) & (time_ns < end + BEYOND_NS)))

@@ -10,8 +10,8 @@ from typing import Any
 from epipole.flows.progress import shown, step
 from epipole.flows.summary import Summary
 from epipole.io.dataset import check_folder
+from epipole.io.log_listing import list_logs
 from epipole.io.settings_file import read_settings
-from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 
 LOGGER = logging.getLogger(__name__)
@@ -40,9 +40,8 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
     started = time.monotonic()
     settings = read_settings(options.settings) if options.settings else Settings()
     check_folder(out)
-    for log in logs:
-        if "://" not in log and not Path(log).exists():
-            raise LogError(f"{log}: no such file; check the path")
+    for where in logs:
+        list_logs(where)
     with shown(options.quiet, options.verbose):
         step("start Prefect", 0, 1)
         from epipole.flows.prefect_defaults import embedded_prefect, quiet_console
@@ -62,4 +61,4 @@ def _run(logs: list[str], out: str, settings: Settings, options: RunOptions) -> 
     workers = options.workers or os.cpu_count() or 1
     runner: Any = ThreadPoolTaskRunner(max_workers=workers)
     flow = nightly.with_options(task_runner=runner)
-    return flow(logs, out, settings.model_dump(), options.night, options.replace)
+    return flow(logs, out, settings, options.night, options.replace)

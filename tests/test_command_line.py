@@ -70,7 +70,7 @@ def of_a_sensor_called(name: str):
 
 
 BAD_LOGS = {
-    "a folder": (Path.mkdir, "is a folder"),
+    "a folder": (Path.mkdir, "no logs in this folder"),
     "empty": (Path.touch, "not an MCAP file"),
     "text": (lambda path: path.write_text("PNG"), "not an MCAP file"),
     "without frames": (without_frames, "no frames in it"),

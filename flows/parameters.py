@@ -1,0 +1,44 @@
+"""The night that a run is asked for; Prefect checks it before a run is made."""
+
+import datetime
+from typing import Annotated, Any
+
+from prefect.runtime import flow_run
+from pydantic import Field
+
+from epipole.schemas.errors import EpipoleError
+
+YESTERDAY = "yesterday"
+
+Night = Annotated[str | None, Field(pattern=rf"^(\d{{4}}-\d\d-\d\d|{YESTERDAY})$")]
+
+
+def night_asked(night: str | None) -> str | None:
+    """Return the UTC date that is asked for; none: every night.
+
+    Yesterday is seen from when the run was due, so one that starts late does its own night.
+
+    Raises
+    ------
+    EpipoleError
+        Where there is no such date.
+    """
+    if night is None:
+        return None
+    if night == YESTERDAY:
+        due: datetime.datetime = flow_run.scheduled_start_time
+        return (due.astimezone(datetime.UTC).date() - datetime.timedelta(days=1)).isoformat()
+    try:
+        return datetime.date.fromisoformat(night).isoformat()
+    except ValueError as error:
+        raise EpipoleError(f"night {night}: no such date; give one such as 2019-04-01") from error
+
+
+def run_name() -> str:
+    """Return what a run is called on Prefect's page, such as ``night 2019-04-01``."""
+    asked: dict[str, Any] = flow_run.parameters
+    try:
+        night = night_asked(asked.get("night"))
+    except EpipoleError:  # the run itself says so
+        night = asked["night"]
+    return f"night {night}" if night else "every night"

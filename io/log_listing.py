@@ -1,0 +1,88 @@
+"""Where logs lie: a folder, a glob or a URL to the logs that it names."""
+
+import glob
+import sys
+from pathlib import Path
+from typing import Any
+
+from epipole.schemas.errors import LogError
+
+PATTERN = "*.mcap"  # what a log is called in a folder
+
+
+def list_logs(where: str) -> tuple[list[str], bool]:
+    """Return the logs that a path or URL names, sorted, and whether it is one log itself.
+
+    Parameters
+    ----------
+    where
+        A file, a folder (its ``*.mcap``, not those of folders in it) or a glob (``**`` goes
+        into folders): local, or an fsspec URL such as ``s3://bucket/logs``. A ``file://`` URL
+        becomes a local path.
+
+    Raises
+    ------
+    LogError
+        Where nothing is there, or the storage cannot be asked.
+    """
+    found, is_one = _list_url(where) if "://" in where else _list_local(where)
+    if not found:
+        raise LogError(f"{where}: {_nothing(where)}")
+    return sorted(found), is_one
+
+
+def _list_local(where: str) -> tuple[list[str], bool]:
+    path = Path(where)
+    try:
+        if path.is_dir():
+            return [str(file) for file in path.glob(PATTERN) if file.is_file()], False
+        if path.exists():
+            return [where], True
+        return [name for name in glob.iglob(where, recursive=True) if Path(name).is_file()], False
+    except OSError as error:
+        raise LogError(f"{where}: cannot be read: {error.strerror}") from error
+
+
+def _list_url(where: str) -> tuple[list[str], bool]:
+    import fsspec
+    from fsspec.implementations.local import LocalFileSystem
+
+    try:
+        storage, path = fsspec.core.url_to_fs(where)
+        if isinstance(storage, LocalFileSystem):
+            return _list_local(path)
+        storage.invalidate_cache()  # a worker lives for weeks; the logs are of last night
+        is_glob = glob.has_magic(path)
+        if not is_glob and storage.isfile(path):
+            return [where], True
+        pattern = path if is_glob else f"{path.rstrip('/')}/{PATTERN}"
+        entries = storage.glob(pattern, detail=True).values()
+        files = [entry["name"] for entry in entries if entry["type"] == "file"]
+        return [storage.unstrip_protocol(name) for name in files], False
+    except FileNotFoundError as error:
+        raise LogError(f"{where}: no such folder; check the URL") from error
+    except _storage_errors() as error:
+        raise LogError(f"{where}: cannot be read: {_line(error)}") from error
+
+
+def _nothing(where: str) -> str:
+    if glob.has_magic(where):
+        return "no file matches; check the pattern"
+    if "://" in where:
+        return f"no such log, nor a folder with logs ({PATTERN}); check the URL"
+    if Path(where).is_dir():
+        return f"no logs in this folder ({PATTERN}); check the path"
+    return "no such file; check the path"
+
+
+def _storage_errors() -> tuple[type[Exception], ...]:
+    """Return what a store may raise: S3's client has errors that are no OSError."""
+    errors: list[Any] = [OSError, ValueError, ImportError]
+    client = sys.modules.get("botocore.exceptions")
+    if client is not None:
+        errors += [client.BotoCoreError, client.ClientError]
+    return tuple(errors)
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
