@@ -18,6 +18,7 @@ from epipole.flows.stages import (
     calibrate,
     fit,
     identify,
+    link,
     place,
     read,
     track,
@@ -31,6 +32,7 @@ from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import FRAMES, REJECTS
 from epipole.tasks.align_epochs import align_epochs
+from epipole.tasks.link_objects import renamed
 from epipole.tasks.publish_night import publish_night, source_table
 
 LOGGER = logging.getLogger(__name__)
@@ -92,6 +94,9 @@ def nightly(
             break
         identified = set_right(identified, exposures, log.states, clocks, settings)
 
+    states = fit(associated, solved, settings)
+    new_id = link(solved, states, settings)
+
     rejects = [
         found.rejects, log.rejects, uncalibrated, unplaced(places),
         identified.rejects, associated.rejects, solved.rejects,
@@ -102,9 +107,9 @@ def nightly(
         "detections": tracked.detections,
         "tracklets": tracked.tracklets,
         "epochs": epochs,
-        "associations": solved.associations,
-        "positions": solved.positions,
-        "states": fit(associated, solved, settings),
+        "associations": renamed(solved.associations, new_id),
+        "positions": renamed(solved.positions, new_id),
+        "states": renamed(states, new_id),
         "calibrations": calibrations,
         "pairs": solved.pairs,
         "sources": sources,

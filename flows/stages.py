@@ -26,6 +26,7 @@ from epipole.tasks.build_tracklets import Tracked, build_tracklets
 from epipole.tasks.calibrate_sensors import Calibrated, calibrate_sensors
 from epipole.tasks.fit_states import fit_states
 from epipole.tasks.identify_stars import Identified, identify_stars
+from epipole.tasks.link_objects import link_objects
 from epipole.tasks.lone_detections import with_lone_tracklets
 from epipole.tasks.place_sensors import place_sensors
 from epipole.tasks.read_logs import read_logs
@@ -205,3 +206,11 @@ def fit(associated: Associated, solved: Solved, settings: Settings) -> pa.Table:
     states: pa.Table = fit_states(associated.views, solved.associations, solved.positions, settings)
     LOGGER.info("fitted %s", many(len(states), "state"))
     return states
+
+
+def link(solved: Solved, states: pa.Table, settings: Settings) -> dict[str, str]:
+    """Return the ids of objects that are one with an earlier one, each with its first id."""
+    step("link objects", 0, 1)
+    new_id: dict[str, str] = link_objects(solved.positions, states, settings)
+    LOGGER.info("knew %s again", many(len(new_id), "object"))
+    return new_id

@@ -157,6 +157,17 @@ class StateSettings(Group):
     min_epochs: int = Field(
         3, ge=2, description="Fewest epochs that share no detection: two alone cannot be checked."
     )
+    link_gap_s: float = Field(
+        7200.0,
+        ge=0,
+        description="Longest time unseen after which an object is known again by its motion: "
+        "more than half a low orbit, for which its sensors may look elsewhere; 0: never.",
+    )
+    link_log_odds: float = Field(
+        4.6,
+        gt=0,
+        description="It must be this much likelier (ln) the same than another one: 1 in 100 errs.",
+    )
 
 
 class Settings(Group):

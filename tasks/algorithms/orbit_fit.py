@@ -95,9 +95,34 @@ def propagate(state: Array, dt_s: float) -> Array:
 
     The axis of the Earth is taken as that of the ICRS, from which it is 0.1 degrees off.
     """
-    y = np.concatenate([np.asarray(state, float), np.eye(6).ravel()])
-    _advance(y, float(dt_s))
-    return y[:6]
+    return trajectory(state, np.array([dt_s]))[0][0]
+
+
+def trajectory(state: Array, dt_s: Array) -> tuple[Array, Array]:
+    """Return a (6,) state at several times from its own, and how errors of it are carried there.
+
+    Parameters
+    ----------
+    state : (6,) float
+        Position [km] and velocity [km/s], GCRF; forces as in `propagate`.
+    dt_s : (n,) float
+        Times [s] since the state's; cheapest in order.
+
+    Returns
+    -------
+    state : (n, 6) float
+    transition : (n, 6, 6) float
+        Derivatives of the states by the one given, of two bodies.
+    """
+    out = np.empty((len(dt_s), 42))
+    begin = np.concatenate([np.asarray(state, float), np.eye(6).ravel()])
+    y, now = begin.copy(), 0.0
+    for k, t in enumerate(np.asarray(dt_s, float).tolist()):
+        if (t - now) * t < 0.0 or now * t < 0.0:  # nearer than the last, or on the other side
+            y, now = begin.copy(), 0.0
+        _advance(y, t - now)
+        out[k], now = y, t
+    return out[:, :6], out[:, 6:].reshape(-1, 6, 6)
 
 
 @njit(cache=True, nogil=True)
