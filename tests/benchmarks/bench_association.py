@@ -22,6 +22,7 @@ from epipole.schemas.settings import AssociationSettings
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
 from epipole.tasks.algorithms.association.samples import Groups, Samples
+from epipole.tasks.algorithms.orbit_fit import propagate
 from epipole.tasks.algorithms.sky import ARCSEC, tangent_basis
 
 FALSE = (10, 100, 300, 1000)
@@ -107,6 +108,11 @@ def scale_table(seeds: int) -> None:
         )
 
 
+def orbit(state: np.ndarray, ahead_s: np.ndarray) -> np.ndarray:
+    """Return where an object is, ahead_s from its state."""
+    return np.array([propagate(state, t)[:3] for t in ahead_s])
+
+
 def tracklets(seed: int, n_sensors: int, n_lone: int, times_s: np.ndarray, n_objects: int = 20):
     """Return tracklets at instants that share no detection, and whose they are.
 
@@ -115,6 +121,7 @@ def tracklets(seed: int, n_sensors: int, n_lone: int, times_s: np.ndarray, n_obj
     """
     rng = np.random.default_rng(seed)
     geo, v = np.array([-39359.89, 15125.76, 64.30]), np.array([-1.103, -2.870, 0.0])
+    ahead_s = times_s - times_s.mean()
     r = np.empty((n_sensors, len(times_s), 3))
     for s in range(n_sensors):
         while True:
@@ -124,15 +131,15 @@ def tracklets(seed: int, n_sensors: int, n_lone: int, times_s: np.ndarray, n_obj
                 break
         along = np.cross(out, along)
         along /= np.linalg.norm(along)
-        angle = (times_s - times_s.mean())[:, None] * 7.5 / 7000.0
+        angle = ahead_s[:, None] * 7.5 / 7000.0
         r[s] = 7000.0 * (np.cos(angle) * out + np.sin(angle) * along)
-    centre = geo + times_s[:, None] * v
+    centre = orbit(np.concatenate([geo, v]), ahead_s)
     look = centre - r
     look /= np.linalg.norm(look, axis=2, keepdims=True)
     u, sensor, who = [], [], []
     for k in range(n_objects):
         start, drift = rng.normal(size=3) * 200.0, rng.normal(size=3) * 0.02
-        path = centre + start + times_s[:, None] * drift
+        path = orbit(np.concatenate([geo + start, v + drift]), ahead_s)
         for s in range(n_sensors):
             u.append(path - r[s])
             sensor.append(s)
@@ -140,7 +147,7 @@ def tracklets(seed: int, n_sensors: int, n_lone: int, times_s: np.ndarray, n_obj
     for s in range(n_sensors):
         rate = rng.normal(size=(n_lone, 2)) * 2 * ARCSEC
         off = rng.uniform(-1, 1, (n_lone, 2)) * np.radians(1.0)
-        steps = off[:, None] + (times_s - times_s.mean())[:, None] * rate[:, None]
+        steps = off[:, None] + ahead_s[:, None] * rate[:, None]
         u.extend(look[s] + np.einsum("nka,kai->nki", steps, tangent_basis(look[s])))
         sensor += [s] * n_lone
         who += [-1] * n_lone

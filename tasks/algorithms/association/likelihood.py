@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.hypotheses import EARTH_RADIUS_KM, grow_all
+from epipole.tasks.algorithms.association.growth import grow_all
+from epipole.tasks.algorithms.association.object_density import revised_odds, visible_volume
 from epipole.tasks.algorithms.association.pool import Hypothesis, Pool, distinct
 from epipole.tasks.algorithms.association.samples import (
     FREE,
@@ -23,6 +24,7 @@ from epipole.tasks.algorithms.association.samples import (
     views_of,
 )
 from epipole.tasks.algorithms.association.seeds import SensorPairs, seeds_between
+from epipole.tasks.algorithms.association.visibility import EARTH_RADIUS_KM
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -32,7 +34,8 @@ FEW_SENSORS = 6  # up to this many, every pair of sensors seeds; objects of two 
 SEED_SIGMA = 2.5  # with more sensors: an object that one pair just misses, the next one has
 UNSEEDED = 0.05  # objects that may be left without a seed, with more sensors than that
 CLEAR_LOG_ODDS = 15.0  # with more sensors, such a group is taken before the next pair seeds
-CERTAIN_LOG_ODDS = 8.0  # groups that count from the start in how many objects there are
+WORTH_A_LOOK = -3.0  # log-odds at which a group waits for what the number of objects says
+BEYOND_DOUBT = 20.0  # log-odds that no number of objects brings down
 
 
 class Shell(NamedTuple):
@@ -115,6 +118,7 @@ class _Search:
         self.taken = np.zeros(n, np.bool_)
         self.group, self.ambiguous = np.full(n, FREE), np.zeros(n, np.bool_)
         self.scores: list[float] = []
+        self.radius_km: list[float] = []
 
     def run(self, min_log_odds: float) -> Groups:
         """Return the groups: seed by seed, the clear ones at once, the others at the end."""
@@ -130,7 +134,7 @@ class _Search:
             if many:
                 self.take([h for h in waiting if h.score > CLEAR_LOG_ODDS], CLEAR_LOG_ODDS)
                 waiting = [h for h in waiting if not self.taken[list(h.seed)].any()]
-        self.take(waiting, 0.0)
+        self.take(waiting, WORTH_A_LOOK)
         scores = self._withdraw_doubtful(min_log_odds)
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
         group[self.order], ambiguous[self.order] = self.group, self.ambiguous
@@ -147,23 +151,25 @@ class _Search:
     def _withdraw_doubtful(self, min_log_odds: float) -> Array:
         """Withdraw groups that are not sure enough once the number of objects is known.
 
-        The search takes every tracklet for a possible object. The groups found tell how many
-        there really are, and by as much all odds are lower. Returns the scores that are left.
+        Returns the log-odds of those that are left.
         """
-        scores = np.array(self.scores)
-        if not len(scores):
-            return scores
-        believed = self.chance.objects_in_view
-        there = float(np.sum(scores > CERTAIN_LOG_ODDS))
-        for _ in range(50):  # upwards, to the smallest number that explains itself
-            shift = min(np.log(max(there, 0.5) / believed), 0.0)
-            there = float(np.sum(1 / (1 + np.exp(-np.clip(scores + shift, -50, 50)))))
-        kept = scores + shift >= min_log_odds
+        scores = self._revised()
+        kept = scores >= min_log_odds
         new = np.where(kept, np.cumsum(kept) - 1, FREE)
         member = self.group != FREE
-        self.ambiguous[member] |= ~kept[self.group[member]]
+        likely = ~kept & (scores > 0)
+        self.ambiguous[member] |= likely[self.group[member]]
         self.group[member] = new[self.group[member]]
-        return scores[kept] + shift
+        return scores[kept]
+
+    def _revised(self) -> Array:
+        scores = np.array(self.scores)
+        if not len(scores) or scores.min() > BEYOND_DOUBT:
+            return scores
+        anywhere = np.array([[0.0, np.inf, 1.0]])
+        shells = self.shells if len(self.shells) else anywhere
+        volume = visible_volume(self.views, shells, self.limits[1])
+        return revised_odds(scores, np.array(self.radius_km), shells, volume, self.chance)
 
     def hypotheses(self, a: int, b: int) -> list[Hypothesis]:
         """Return what the pairs of two sensors' tracklets grow into."""
@@ -175,16 +181,16 @@ class _Search:
     def grow(self, seeds: Indices) -> list[Hypothesis]:
         """Return what (n, 2) seeds grow into among the tracklets that are free."""
         n = len(seeds)
-        sizes, scores = np.zeros(n, np.int64), np.empty(n)
+        sizes, scores, radius_km = np.zeros(n, np.int64), np.empty(n), np.empty(n)
         # More than two fragments a sensor are not kept; the next span has them again.
         grown = np.empty((n, min(2 * len(self.views.half_field), len(self.taken))), np.int64)
         grow_all(
             self.views, self.chance, seeds, self.taken, *self.limits, self.gate_sigma, self.shells,
-            -self.margin, sizes, scores, grown,
+            WORTH_A_LOOK - self.margin, sizes, scores, radius_km, grown,
         )  # fmt: skip
         return [
             Hypothesis(float(scores[q]), tuple(seeds[q].tolist()),
-                       tuple(sorted(grown[q, : sizes[q]].tolist())))
+                       tuple(sorted(grown[q, : sizes[q]].tolist())), float(radius_km[q]))
             for q in np.flatnonzero(sizes)
         ]  # fmt: skip
 
@@ -201,13 +207,14 @@ class _Search:
                     for again in self.grow(np.array([best.seed])):
                         pool.push(again)
                 continue
-            rivals = pool.rivals(best, self.margin, self.taken)
+            rivals = pool.rivals(best, self.margin, self.group != FREE)
             kept = set(best.members).intersection(*(h.members for h in rivals))
             sensors = {int(self.views.sensor[i]) for i in kept}
             # What is left of a group that lost most of its views is no object by itself.
             if len(sensors) >= 2 and 2 * len(kept) >= len(best.members):
                 self.group[sorted(kept)] = len(self.scores)
                 self.scores.append(best.score)
+                self.radius_km.append(best.radius_km)
             else:
                 kept = set()
             self.ambiguous[sorted(set(best.members) - kept)] = True

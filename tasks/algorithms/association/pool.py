@@ -10,11 +10,15 @@ import numpy.typing as npt
 
 
 class Hypothesis(NamedTuple):
-    """Tracklets that may be one object; `seed` are the two it grew from."""
+    """Tracklets that may be one object; `seed` are the two it grew from.
+
+    `radius_km` is how far from the Earth's centre they meet.
+    """
 
     score: float
     seed: tuple[int, int]
     members: tuple[int, ...]
+    radius_km: float
 
 
 class Pool:
@@ -33,25 +37,20 @@ class Pool:
             self._holding[i].add(h)
 
     def pop(self) -> Hypothesis | None:
-        """Take out the best hypothesis; none where the pool is empty."""
-        if not self._heap:
-            return None
-        h = heapq.heappop(self._heap)[2]
-        for i in h.members:
-            self._holding[i].discard(h)
-        return h
+        """Take out the best hypothesis; none where the pool is empty. It stays a rival."""
+        return heapq.heappop(self._heap)[2] if self._heap else None
 
     def rest(self) -> list[Hypothesis]:
         """Return what is left, in no order."""
         return [entry[2] for entry in self._heap]
 
     def rivals(
-        self, best: Hypothesis, closer_than: float, taken: npt.NDArray[np.bool_]
+        self, best: Hypothesis, closer_than: float, grouped: npt.NDArray[np.bool_]
     ) -> list[Hypothesis]:
         """Return hypotheses about as likely as `best` that contradict it.
 
-        They share a tracklet with it, neither contains the other, and all their tracklets are
-        still free.
+        They share a tracklet with it, neither contains the other, and none of their tracklets
+        is known to be another object's. One that itself was ambiguous contests still.
         """
         near = {h for i in best.members for h in self._holding[i]}
         return [
@@ -59,7 +58,7 @@ class Pool:
             for h in near
             if h.score > best.score - closer_than
             and not (set(h.members) <= set(best.members) or set(best.members) <= set(h.members))
-            and not taken[list(h.members)].any()
+            and not grouped[list(h.members)].any()
         ]
 
 

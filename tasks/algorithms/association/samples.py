@@ -188,8 +188,10 @@ class Chance(NamedTuple):
 
     density : (s,) float
         Tracklets a steradian.
+    drift : (s, 3) float
+        How its tracklets move, the median rate of their directions [1/s].
     spread : (s,) float
-        How differently the tracklets of a sensor move [rad/s].
+        How differently the tracklets of a sensor move, 1-sigma an axis [rad/s].
     objects_in_view, objects_km3 : float
         How many objects there are, at most, and that a km^3 of the space in view.
     detected : float
@@ -197,6 +199,7 @@ class Chance(NamedTuple):
     """
 
     density: Array
+    drift: Array
     spread: Array
     objects_in_view: float
     objects_km3: float
@@ -212,15 +215,16 @@ def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
     share = np.bincount(samples.sensor, samples.seen.sum(axis=1), minlength=n_sensors) / instants
     density = np.maximum(share, 1.0) / samples.field_sr
     rate = _rates(samples)
-    spread = np.empty(n_sensors)
+    drift, spread = np.zeros((n_sensors, 3)), np.empty(n_sensors)
     for s in range(n_sensors):
         own = rate[(samples.sensor == s) & np.isfinite(rate[:, 0])]
         # One made-up tracklet at 10 arcsec/s keeps the estimate sane where there are few.
-        squares = np.sum((own - np.median(own, axis=0)) ** 2) / 2 if len(own) else 0.0
+        drift[s] = np.median(own, axis=0) if len(own) else 0.0
+        squares = np.sum((own - drift[s]) ** 2) / 2
         spread[s] = np.sqrt((squares + (10 * ARCSEC) ** 2) / (len(own) + 1))
     volume = float(np.median(samples.field_sr)) * farthest_km**3 / 3
     objects = max(float(np.median(count)), 1.0)
-    return Chance(density, spread, objects, objects / volume, detected)
+    return Chance(density, drift, spread, objects, objects / volume, detected)
 
 
 def _rates(samples: Samples) -> Array:

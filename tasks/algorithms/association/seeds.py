@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from epipole.tasks.algorithms.association.hypotheses import pair_miss, quantile
 from epipole.tasks.algorithms.association.samples import Views
+from epipole.tasks.algorithms.association.sight_lines import pair_miss, quantile
 from epipole.tasks.algorithms.sky import tangent_basis
 
 Array = npt.NDArray[np.float64]

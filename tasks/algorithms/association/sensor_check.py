@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.hypotheses import sees
 from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
+from epipole.tasks.algorithms.association.visibility import sees
 from epipole.tasks.algorithms.triangulation import triangulate
 
 Array = npt.NDArray[np.float64]
