@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
+from epipole.flows.summary import many
 from epipole.io.log_listing import list_logs
 from epipole.io.log_reader import MARGIN_NS as LOGGED_WITHIN_NS
 from epipole.io.log_reader import read_log_times
@@ -71,7 +72,7 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
             spans.append(logged_ns)
     if not chosen:
         raise LogError(f"{', '.join(named)}: {_none_chosen(night, spans, broken)}")
-    LOGGER.info("found %d logs%s", len(chosen), f" of {night}" if night else "")
+    LOGGER.info("found %s%s", many(len(chosen), "log"), f" of {night}" if night else "")
     return FoundLogs(chosen, _rejects(broken, night))
 
 

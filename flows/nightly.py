@@ -10,6 +10,7 @@ from prefect import flow
 
 from epipole.flows.clocks import read_clocks, set_right
 from epipole.flows.log_choice import BEYOND_NS, find_logs
+from epipole.flows.page import shown_on_page
 from epipole.flows.parameters import Night, night_asked, run_name
 from epipole.flows.progress import step
 from epipole.flows.sensors import calibrated, sensor_ids, unplaced
@@ -39,6 +40,7 @@ LOGGER = logging.getLogger(__name__)
 
 
 @flow(name="nightly", flow_run_name=run_name)  # on threads, unless told otherwise
+@shown_on_page
 def nightly(
     logs: str | list[str],
     out: str,

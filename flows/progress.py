@@ -1,10 +1,12 @@
-"""How far a run is: lines of log everywhere, a moving bar on a terminal.
+"""How far a run is: lines of log everywhere, a moving bar on a terminal and on Prefect's page.
 
-Stages say what they did as log records; a record that carries a stage's name and counts
-moves the bar. So a flow knows nothing of terminals.
+Stages say what they did as log records. How far they are they say as records of a logger of
+its own, `STEPS`, which moves the bars and prints nothing. So a flow knows nothing of terminals
+and pages.
 """
 
 import contextlib
+import itertools
 import logging
 import sys
 from collections.abc import Iterator, Sequence
@@ -15,14 +17,33 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 ROOT = logging.getLogger("epipole")
-LOGGER = logging.getLogger(__name__)
+STEPS = logging.getLogger("epipole.steps")
+STEPS.propagate = False
+STEPS.setLevel(logging.INFO)
+
+# The stages in their order, with their shares in the time of a night (%).
+_SHARES = {
+    "read logs": 10,
+    "place sensors": 2,
+    "identify stars": 50,
+    "calibrate sensors": 3,
+    "build tracklets": 15,
+    "view objects": 5,
+    "associate objects": 5,
+    "solve positions": 4,
+    "estimate clocks": 1,
+    "fit states": 2,
+    "publish": 3,
+}
+_BEFORE = dict(zip(_SHARES, itertools.accumulate(_SHARES.values(), initial=0), strict=False))
 
 
 def step(stage: str, done: int, total: int) -> None:
     """Say that so many of a stage's tasks are done."""
-    LOGGER.debug(
-        "%s: %d of %d", stage, done, total, extra={"stage": stage, "done": done, "total": total}
-    )
+    share = _SHARES.get(stage, 0) * done / total if total else 0.0
+    percent = min(100.0, _BEFORE.get(stage, 0) + share)
+    counts = {"stage": stage, "done": done, "total": total, "percent": percent}
+    STEPS.info("%s: %d of %d", stage, done, total, extra=counts)
 
 
 def results(stage: str, futures: Sequence[PrefectFuture[Any]]) -> list[Any]:
@@ -50,11 +71,12 @@ def shown(quiet: bool, verbose: bool) -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         if sys.stderr.isatty():
             handler: logging.Handler = StageDisplay(stack)
-            ROOT.setLevel(logging.DEBUG)
+            STEPS.addHandler(handler)
+            stack.callback(STEPS.removeHandler, handler)
         else:
             handler = logging.StreamHandler()
             handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
-            ROOT.setLevel(logging.INFO)
+        ROOT.setLevel(logging.INFO)
         if not verbose:
             handler.addFilter(_is_of_the_flow)
         ROOT.addHandler(handler)
@@ -90,8 +112,7 @@ class StageDisplay(logging.Handler):
         """Move the bar, or print a line above it."""
         stage: str | None = getattr(record, "stage", None)
         if stage is None:
-            if record.levelno >= logging.INFO:
-                self._bar.console.print(record.getMessage(), highlight=False, markup=False)
+            self._bar.console.print(record.getMessage(), highlight=False, markup=False)
             return
         if stage != self._stage:
             self._bar.remove_task(self._task)

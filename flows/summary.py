@@ -4,10 +4,33 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.tasks.estimate_clocks import Clock
+
+
+@dataclass(frozen=True)
+class SensorSummary:
+    """Counts of one sensor; the residual is the median of its frames, None without stars."""
+
+    sensor_id: str
+    frames: int
+    identified: int
+    residual_px: float | None
+    tracks: int
+
+    def as_row(self) -> dict[str, Any]:
+        """Return the counts as a row of a table that people read."""
+        residual = "" if self.residual_px is None else f"{self.residual_px:.3f}"
+        return {
+            "sensor": self.sensor_id,
+            "frames": self.frames,
+            "identified": self.identified,
+            "residual px": residual,
+            "tracks": self.tracks,
+        }
 
 
 @dataclass(frozen=True)
@@ -28,6 +51,7 @@ class Summary:
     positions: int
     rejects: dict[str, int]
     clocks: list[str]
+    by_sensor: list[SensorSummary]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts by name, as JSON takes them."""
@@ -71,6 +95,22 @@ def summarise(
         positions=tables["positions"].num_rows,
         rejects=_by_reason(tables["rejects"]),
         clocks=[str(clock) for clock in clocks if clock.is_off],
+        by_sensor=[
+            _of_sensor(frames.filter(pc.field("sensor_id") == name), tables["tracklets"], name)
+            for name in sorted(pc.unique(frames["sensor_id"]).to_pylist())
+        ],
+    )
+
+
+def _of_sensor(frames: pa.Table, tracklets: pa.Table, sensor_id: str) -> SensorSummary:
+    own = tracklets.filter(pc.field("sensor_id") == sensor_id)
+    residual_px = frames["residual_px"].drop_null().to_numpy()
+    return SensorSummary(
+        sensor_id=sensor_id,
+        frames=frames.num_rows,
+        identified=pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
+        residual_px=float(np.median(residual_px)) if len(residual_px) else None,
+        tracks=pc.count_distinct(own["track_id"]).as_py(),
     )
 
 

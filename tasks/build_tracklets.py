@@ -21,6 +21,7 @@ from epipole.tasks.algorithms.track_linking.likelihood_ratio import link_by_like
 from epipole.tasks.algorithms.track_linking.prediction import link_by_prediction
 from epipole.tasks.algorithms.tracking import NONE, follow_detections
 from epipole.tasks.detection_kinds import at_star, is_hot_pixel, is_planet, sighting_sigma
+from epipole.tasks.run_names import sensor_and_span
 from epipole.tasks.sightings import (
     Frames,
     Sightings,
@@ -43,7 +44,11 @@ class Tracked(NamedTuple):
     tracklets: pa.Table
 
 
-@task(name="build tracklets", cache_policy=NO_CACHE)
+@task(
+    name="build tracklets",
+    task_run_name=sensor_and_span("track", "solutions"),
+    cache_policy=NO_CACHE,  # hashing a table costs more than the task
+)
 def build_tracklets(
     solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
 ) -> Tracked:

@@ -14,6 +14,7 @@ from epipole.schemas.tables import CALIBRATIONS
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.camera import Camera, unproject
 from epipole.tasks.algorithms.optics_calibration import OPTICS, OpticsFit, calibrate_optics
+from epipole.tasks.run_names import sensor_and_span
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +33,11 @@ class Calibrated(NamedTuple):
     departed: list[str]
 
 
-@task(name="calibrate sensors", cache_policy=NO_CACHE)  # hashing a table costs more than the task
+@task(
+    name="calibrate sensors",
+    task_run_name=sensor_and_span("calibrate", "stars"),
+    cache_policy=NO_CACHE,  # hashing a table costs more than the task
+)
 def calibrate_sensors(stars: pa.Table, cameras: pa.Table) -> Calibrated:
     """Optics as the stars show them. `stars` of a sensor are in order of time."""
     rows, changed = [], {}

@@ -38,6 +38,7 @@ from epipole.tasks.algorithms.star_identification.sensor import Spots, identify_
 from epipole.tasks.algorithms.star_identification.sequence import Prior
 from epipole.tasks.algorithms.time_scales import DAY_NS, earth_barycentric
 from epipole.tasks.cached_skies import CachedSkies, Catalogue
+from epipole.tasks.run_names import sensor_and_span
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -52,7 +53,11 @@ class Identified(NamedTuple):
     rejects: pa.Table
 
 
-@task(name="identify stars", cache_policy=NO_CACHE)  # hashing a table costs more than the task
+@task(
+    name="identify stars",
+    task_run_name=sensor_and_span("identify", "exposures"),
+    cache_policy=NO_CACHE,  # hashing a table costs more than the task
+)
 def identify_stars(
     exposures: pa.Table,
     places: pa.Table,
