@@ -37,9 +37,9 @@ class CameraColumns:
                     sensor_id=known_id(calibration.sensor_id),
                 )
 
-    def table(self) -> pa.Table:
-        """Return CAMERAS."""
-        rows = self._rows
+    def take(self) -> pa.Table:
+        """Return CAMERAS of the calibrations since the last time."""
+        rows, self._rows = self._rows, []
         matrices = np.array([c.K for c in rows], float).reshape(-1, 9)
         distortion = np.zeros((len(rows), 5))
         for i, c in enumerate(rows):

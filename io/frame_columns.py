@@ -25,6 +25,7 @@ BATCH = 65536  # frames in one piece of the table
 BATCH_CENTROIDS = 1 << 21
 # A centroid's x and y take 8 bytes in binary and at least 4 as text.
 BYTES_OF_A_CENTROID = 4
+CENTROID_BYTES, ROW_BYTES = 16, 80  # in the table
 
 
 class _Rows:
@@ -85,10 +86,17 @@ class FrameColumns:
 
         part.take(scan, self._judge)
 
-    def table(self) -> pa.Table:
-        """Return EXPOSURES, in the order of the log."""
+    @property
+    def n_bytes(self) -> int:
+        """What the rows that wait to be taken take, about."""
+        waiting = self._rows.n_centroids * CENTROID_BYTES + self._rows.n * ROW_BYTES
+        return waiting + sum(rows.nbytes for rows in self._tables)
+
+    def take(self) -> pa.Table:
+        """Return EXPOSURES of the frames since the last time, in the order of the log."""
         self._close()
-        return pa.concat_tables([EXPOSURES.empty_table(), *self._tables])
+        tables, self._tables = self._tables, []
+        return pa.concat_tables([EXPOSURES.empty_table(), *tables])
 
     def _watch_clock(self, part: Part, first: int, last: int, n: int) -> None:
         if self.span is None or first == last:

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from epipole.io.log_bytes import forget
 from epipole.io.log_channels import string
 from epipole.io.log_compression import ChunkError, decompress, decompress_part
 from epipole.io.log_summary import RECORD
@@ -14,6 +13,10 @@ from epipole.io.record_scan import RecordIndex, index_records
 
 # A chunk holds a few MiB; one that claims more than this is damage or an attack.
 MAX_CHUNK_BYTES = 256 << 20
+
+# What its record may take in the file: bytes that cannot be made smaller grow a little.
+MAX_RECORD_BYTES = MAX_CHUNK_BYTES + (4 << 20)
+HEAD_BYTES = 256  # of a record's beginning, with room for the name of a compression
 
 _HEAD = struct.Struct("<QQQI")
 
@@ -40,35 +43,34 @@ class OpenedChunk(NamedTuple):
 
 
 def read_head(data: memoryview, at: int) -> ChunkHead:
-    """Return the head of the chunk at `at`.
+    """Return the head of the chunk at `at`, of which `data` are the first bytes.
 
     Raises
     ------
     ChunkError
         Where it is none.
     """
-    body = at + RECORD.size
     try:
-        start_ns, end_ns, size, checksum = _HEAD.unpack_from(data, body)
-        compression, body = string(data, body + _HEAD.size, len(data))
+        start_ns, end_ns, size, checksum = _HEAD.unpack_from(data, RECORD.size)
+        compression, body = string(data, RECORD.size + _HEAD.size, len(data))
         (length,) = struct.unpack_from("<Q", data, body)
     except (struct.error, UnicodeDecodeError) as error:
         raise ChunkError("damaged_chunk") from error
-    return ChunkHead(start_ns, end_ns, size, checksum, compression, body + 8, body + 8 + length)
+    body += at + 8
+    return ChunkHead(start_ns, end_ns, size, checksum, compression, body, body + length)
 
 
-def open_chunk(data: memoryview, at: int, after: int) -> OpenedChunk:
-    """Return the records of a chunk that lies from `at` to `after`."""
+def open_chunk(chunk: memoryview) -> OpenedChunk:
+    """Return the records of a chunk, given whole."""
     start_ns = 0
     try:
-        head = read_head(data, at)
-        if head.end != after:
+        head = read_head(chunk, 0)
+        if head.end != len(chunk):
             raise ChunkError("damaged_chunk")
         start_ns = head.start_ns
         if head.size > MAX_CHUNK_BYTES:
             raise ChunkError("chunk_too_large")
-        records = decompress(data[head.body : after], head.compression, head.size)
-        forget(data, at, after)
+        records = decompress(chunk[head.body :], head.compression, head.size)
         if head.checksum and zlib.crc32(records) != head.checksum:
             raise ChunkError("bad_checksum")
     except ChunkError as error:
@@ -76,17 +78,17 @@ def open_chunk(data: memoryview, at: int, after: int) -> OpenedChunk:
     return _opened(start_ns, records)
 
 
-def open_cut_chunk(data: memoryview, at: int) -> OpenedChunk:
+def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
     """Return the first records of a chunk in which the file ends.
 
     Its checksum cannot be verified; that it was cut is known, that it is wrong is not.
     """
     try:
-        head = read_head(data, at)
+        head = read_head(chunk, 0)
     except ChunkError:
         return _opened(0, b"")
     size = min(head.size, MAX_CHUNK_BYTES)
-    return _opened(head.start_ns, decompress_part(data[head.body :], head.compression, size))
+    return _opened(head.start_ns, decompress_part(chunk[head.body :], head.compression, size))
 
 
 def _opened(start_ns: int, records: bytes, reason: str = "") -> OpenedChunk:

@@ -1,10 +1,9 @@
 """Where logs lie: a folder, a glob or a URL to the logs that it names."""
 
 import glob
-import sys
 from pathlib import Path
-from typing import Any
 
+from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.errors import LogError
 
 PATTERN = "*.mcap"  # what a log is called in a folder
@@ -61,8 +60,8 @@ def _list_url(where: str) -> tuple[list[str], bool]:
         return [storage.unstrip_protocol(name) for name in files], False
     except FileNotFoundError as error:
         raise LogError(f"{where}: no such folder; check the URL") from error
-    except _storage_errors() as error:
-        raise LogError(f"{where}: cannot be read: {_line(error)}") from error
+    except storage_errors() as error:
+        raise LogError(f"{where}: cannot be read: {line_of(error)}") from error
 
 
 def _nothing(where: str) -> str:
@@ -73,16 +72,3 @@ def _nothing(where: str) -> str:
     if Path(where).is_dir():
         return f"no logs in this folder ({PATTERN}); check the path"
     return "no such file; check the path"
-
-
-def _storage_errors() -> tuple[type[Exception], ...]:
-    """Return what a store may raise: S3's client has errors that are no OSError."""
-    errors: list[Any] = [OSError, ValueError, ImportError]
-    client = sys.modules.get("botocore.exceptions")
-    if client is not None:
-        errors += [client.BotoCoreError, client.ClientError]
-    return tuple(errors)
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

@@ -5,11 +5,10 @@ they may be. Nothing that is in the file stops the reading: what cannot be used 
 in `rejects`. Only a log that gives no frame at all is an error.
 """
 
-import hashlib
 import os
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +16,7 @@ import pyarrow as pa
 
 from epipole.io.camera_columns import CameraColumns
 from epipole.io.frame_columns import FrameColumns
-from epipole.io.log_bytes import forget, open_log
+from epipole.io.log_bytes import LogBytes, open_log
 from epipole.io.log_channels import ChannelTable
 from epipole.io.log_records import Block, RecordWalk
 from epipole.io.log_rejects import RejectList
@@ -27,11 +26,12 @@ from epipole.io.message_parts import Part
 from epipole.io.state_columns import StateColumns
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
-from epipole.schemas.log_tables import LogPart, LogSource
+from epipole.schemas.log_tables import LogPart, LogPiece, LogSource
 from epipole.schemas.messages import CALIBRATION, CARRIES, FRAME, STATE
+from epipole.schemas.tables import REJECTS
 
 THREADS = 2  # that unpack and check chunks, beside the one that decodes
-HASHED_BYTES = 4 << 20  # of a file at once
+PART_BYTES = 64 << 20  # of frames and states in one piece of a log
 KINDS = (FRAME, STATE, CALIBRATION)
 # A frame's time and the time it was logged at may be so far apart, no further, for chunks
 # to be judged by the latter. States that far beyond a range help its first and last frames.
@@ -44,7 +44,7 @@ ALWAYS_READ = frozenset(name for name, carries in CARRIES.items() if carries == 
 def read_log(
     path: str | os.PathLike[str], start_ns: int | None = None, end_ns: int | None = None
 ) -> LogPart:
-    """Return what a log holds, in the order of the file.
+    """Return what a log holds, in the order of the file (see `read_log_parts`).
 
     Parameters
     ----------
@@ -67,25 +67,41 @@ def read_log(
         No such file, a folder, no MCAP, messages in an unknown encoding, no frame. That none
         lies in the range is no error.
     """
+    pieces = list(read_log_parts(path, start_ns, end_ns))
+    exposures, states, cameras, rejects = (
+        pa.concat_tables([getattr(piece, name) for piece in pieces])
+        for name in ("exposures", "states", "cameras", "rejects")
+    )
+    source = pieces[-1].source
+    assert source is not None  # the last piece has it
+    return LogPart(exposures, states, cameras, rejects, source)
+
+
+def read_log_parts(
+    path: str | os.PathLike[str],
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    part_bytes: int = PART_BYTES,
+) -> Iterator[LogPiece]:
+    """Yield what `read_log` returns in pieces, so that it need not be in memory at once.
+
+    A piece has about `part_bytes` of frames and states, at most a chunk of the log more. Each
+    message comes once, in the order of the file; only where the log's times turn out to be
+    wrong, chunks that were passed over come last. The last piece has the rejects and the
+    source; the errors that need the whole log come in its place. There is at least one piece.
+    """
     where = os.fspath(path)
-    data = _open_mcap(where)
-    name = where.rstrip("/").rpartition("/")[2]
     span = None
     if start_ns is not None or end_ns is not None:
         span = (FIRST_NS if start_ns is None else start_ns, LAST_NS if end_ns is None else end_ns)
-    with ThreadPoolExecutor(THREADS, "open chunks") as pool:
-        sha256 = pool.submit(_sha256, data)
-        columns, sure = _read_columns(data, where, name, span, pool)
-        if not sure:
-            columns, _ = _read_columns(data, where, name, span, pool, pass_over=False)
-    frames, states, cameras, rejects = columns
-    exposures, log_states = frames.table(), states.table()
-    if exposures.num_rows == 0 and span is None:
-        raise LogError(f"{where}: no frames in it; {_advice(rejects)}")
-    first, last = _time_span(exposures, log_states, span)
-    source = LogSource(name, len(data), sha256.result(), first, last)
-    left_out = rejects.table(first, last, span)
-    return LogPart(exposures, log_states, cameras.table(), left_out, source)
+    with _open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
+        reading = _Reading(where, data, span, pool)
+        for block in reading.blocks():
+            for i, chosen in _kinds(block, where):
+                reading.takers[i].add(Part(block, KINDS[i], chosen, reading.rejects))
+            if reading.n_bytes >= part_bytes:
+                yield reading.piece()
+        yield reading.last_piece()
 
 
 def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
@@ -99,72 +115,103 @@ def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     LogError
         No such file, a folder, no MCAP.
     """
-    data = _open_mcap(os.fspath(path))
-    return read_summary(data, ChannelTable(frozenset())).logged_ns
+    with _open_mcap(os.fspath(path)) as data:
+        return read_summary(data, ChannelTable(frozenset())).logged_ns
 
 
-def _open_mcap(where: str) -> memoryview:
+def _open_mcap(where: str) -> LogBytes:
     data = open_log(where)
-    if data[: len(MAGIC)] != MAGIC:
+    if len(data) < len(MAGIC) or data.view(0, len(MAGIC)) != MAGIC:
+        data.close()
         raise LogError(f"{where}: not an MCAP file; give a log as MCAP (https://mcap.dev)")
     return data
 
 
-class Columns(NamedTuple):
-    """What a log's messages become."""
+class _Reading:
+    """One log that is being read: what has come of its messages, not yet taken."""
 
-    frames: FrameColumns
-    states: StateColumns
-    cameras: CameraColumns
-    rejects: RejectList
+    def __init__(
+        self, where: str, data: LogBytes, span: tuple[int, int] | None, pool: Executor
+    ) -> None:
+        self._where, self._data, self._span = where, data, span
+        wide = None if span is None else (span[0] - MARGIN_NS, span[1] + MARGIN_NS)
+        self._name = where.rstrip("/").rpartition("/")[2]
+        self.rejects = RejectList(self._name)
+        self._frames = FrameColumns(self.rejects, span)
+        self._states = StateColumns(self.rejects, wide)
+        self._cameras = CameraColumns(self.rejects)
+        self.takers = (self._frames, self._states, self._cameras)  # as in `KINDS`
+        self._walk = RecordWalk(data, frozenset(CARRIES), pool, wide, ALWAYS_READ)
+        self._frames_ns = _TimeSpan()
+        self._states_ns = _TimeSpan()
+
+    def blocks(self) -> Iterator[Block]:
+        """Yield the wanted messages of the log.
+
+        Chunks may be passed over as long as frames are of the time they were logged at; where
+        one is not, those that were passed come at the end.
+        """
+        for block in self._walk.blocks():
+            yield block
+            if (self._frames.clock_off_ns or 0) > MARGIN_NS:
+                self._walk.pass_no_more()
+        off_ns = self._frames.clock_off_ns
+        if off_ns is None or off_ns > MARGIN_NS:
+            yield from self._walk.passed_blocks()
+
+    @property
+    def n_bytes(self) -> int:
+        """What waits to be taken."""
+        return self._frames.n_bytes + self._states.n_bytes
+
+    def piece(self) -> LogPiece:
+        """Return what has come since the last piece."""
+        exposures, states = self._frames.take(), self._states.take()
+        self._frames_ns.add(exposures)
+        self._states_ns.add(states)
+        return LogPiece(exposures, states, self._cameras.take(), REJECTS.empty_table(), None)
+
+    def last_piece(self) -> LogPiece:
+        """Return the rest, what was left out of the whole log, and its source.
+
+        Raises
+        ------
+        LogError
+            Where the whole log has no frames.
+        """
+        piece = self.piece()
+        for damage in self._walk.damage:
+            self.rejects.add(
+                damage.reason, time_ns=damage.time_ns, offset=damage.offset, count=damage.n
+            )
+        if self._frames_ns.first is None and self._span is None:
+            raise LogError(f"{self._where}: no frames in it; {_advice(self.rejects)}")
+        first, last = self._frames_ns.ends() or self._states_ns.ends() or self._nowhere()
+        source = LogSource(self._name, len(self._data), self._data.sha256(), first, last)
+        return piece._replace(rejects=self.rejects.table(first, last, self._span), source=source)
+
+    def _nowhere(self) -> tuple[int, int]:
+        return (0, 0) if self._span is None else (self._span[0], self._span[0])
 
 
-def _read_columns(
-    data: memoryview,
-    where: str,
-    name: str,
-    span: tuple[int, int] | None,
-    pool: Executor,
-    pass_over: bool = True,
-) -> tuple[Columns, bool]:
-    """Take every wanted message of a span into the columns of its kind.
+@dataclass
+class _TimeSpan:
+    """The first and the last time of rows."""
 
-    Return also whether all are there. They may not be where chunks were passed over and the
-    frames that were read are of another time than they were logged at.
-    """
-    wide = None if span is None else (span[0] - MARGIN_NS, span[1] + MARGIN_NS)
-    rejects = RejectList(name)
-    columns = Columns(
-        FrameColumns(rejects, span), StateColumns(rejects, wide), CameraColumns(rejects), rejects
-    )
-    takers = (columns.frames, columns.states, columns.cameras)  # as in `KINDS`
-    walk = RecordWalk(data, frozenset(CARRIES), pool, wide if pass_over else None, ALWAYS_READ)
-    for block in walk.blocks():
-        for i, chosen in _kinds(block, where):
-            takers[i].add(Part(block, KINDS[i], chosen, rejects))
-    for damage in walk.damage:
-        rejects.add(damage.reason, time_ns=damage.time_ns, offset=damage.offset, count=damage.n)
-    off_ns = columns.frames.clock_off_ns
-    return columns, not walk.n_passed or (off_ns is not None and off_ns <= MARGIN_NS)
+    first: int | None = None
+    last: int = 0
 
-
-def _sha256(data: memoryview) -> str:
-    digest = hashlib.sha256()
-    for at in range(0, len(data), HASHED_BYTES):
-        digest.update(data[at : at + HASHED_BYTES])
-        forget(data, at, at + HASHED_BYTES)
-    return digest.hexdigest()
-
-
-def _time_span(
-    exposures: pa.Table, states: pa.Table, span: tuple[int, int] | None
-) -> tuple[int, int]:
-    """Return the first and the last time of what was read: of frames, if there are any."""
-    for rows in (exposures, states):
+    def add(self, rows: pa.Table) -> None:
+        """Take rows, which have a `time`."""
         if rows.num_rows:
             time_ns = array(rows, "time")
-            return int(time_ns.min()), int(time_ns.max())
-    return (0, 0) if span is None else (span[0], span[0])
+            low, high = int(time_ns.min()), int(time_ns.max())
+            self.first = low if self.first is None else min(low, self.first)
+            self.last = max(high, self.last)
+
+    def ends(self) -> tuple[int, int] | None:
+        """Return both, or None of no rows."""
+        return None if self.first is None else (self.first, self.last)
 
 
 def _kinds(block: Block, where: str) -> Iterator[tuple[int, npt.NDArray[np.int64]]]:

@@ -9,9 +9,8 @@ behind a damaged record), and the number of messages (to know that one is missin
 
 import struct
 import zlib
-from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,23 +19,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.io.log_bytes import BLOCK_BYTES, LogBytes
 from epipole.io.log_channels import Channel, ChannelTable
-from epipole.io.log_chunks import OpenedChunk, open_chunk, open_cut_chunk, read_head
+from epipole.io.log_chunks import OpenedChunk, open_chunk, open_cut_chunk
 from epipole.io.log_compression import ChunkError
-from epipole.io.log_summary import DATA_END, MAGIC, RECORD, Summary, next_log, read_summary
-from epipole.io.record_scan import (
-    CHANNEL,
-    MESSAGE,
-    PRIVATE,
-    SCHEMA,
-    Bytes,
-    RecordIndex,
-    index_records,
-)
+from epipole.io.log_places import CHUNK, CUT, LOOSE, PASSED, LogPlaces, Place
+from epipole.io.log_summary import RECORD, Summary, read_summary
+from epipole.io.record_scan import MESSAGE, Bytes, RecordIndex, index_records
 
-HEADER, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA = 0x01, 0x06, 0x07, 0x09, 0x0C
-IGNORED = (ATTACHMENT, METADATA)
-LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # may lie in a chunk or outside
 AHEAD_BYTES = 32 << 20  # of chunks that are opened while the ones before them are decoded
 
 Numbers = npt.NDArray[np.int64]
@@ -63,175 +53,85 @@ class Damage(NamedTuple):
     n: int
 
 
-class Place(NamedTuple):
-    """Part of the data section: a record, a run of loose ones, or damage, which has a reason."""
-
-    opcode: int
-    at: int
-    after: int
-    reason: str = ""
-
-
 @dataclass
 class RecordWalk:
     """A walk over the bytes of one log; `damage` is complete when `blocks` has ended."""
 
-    data: memoryview
+    data: LogBytes
     wanted: frozenset[str]  # names of the schemas whose messages are asked for
     pool: Executor | None = None  # opens chunks while the ones before them are decoded
     span: tuple[int, int] | None = None  # chunks logged wholly outside it need not be opened
     always: frozenset[str] = frozenset()  # but for those with messages of these schemas
-    n_passed: int = 0  # chunks that were not opened
     damage: list[Damage] = field(default_factory=list)
     _summary: Summary = field(default_factory=Summary)
     _unknown: dict[int, int] = field(default_factory=dict)
     _counts: dict[int, int] = field(default_factory=dict)
     _lost: dict[int, int] = field(default_factory=dict)  # messages of a damage, by its index
     _lost_chunk: int | None = None  # the damage that message indexes now belong to
-    _passing: bool = False  # whether message indexes now belong to a chunk that is not opened
+    _passed: list[Place] = field(default_factory=list)  # chunks that were not opened
+    _passing: bool = False  # whether message indexes now belong to one of them
 
     def __post_init__(self) -> None:
         self._channels = ChannelTable(self.wanted)
+        self._places = LogPlaces(self.data, self._summary, self._channels, self.span, self.always)
 
     def blocks(self) -> Iterator[Block]:
         """Yield the wanted messages in the order of the file."""
-        self._summary = read_summary(self.data, self._channels)
-        for place, opening in self._opened_ahead():
-            yield from self._walk_place(place, opening)
+        self._places.summary = self._summary = read_summary(self.data, self._channels)
+        self.data.stream()
+        yield from self._walk(self._places)
         self._report_missing()
 
-    # Where things are, by the lengths of records alone
+    def pass_no_more(self) -> None:
+        """Open every chunk from now on: the times of the log cannot be trusted."""
+        self._places.span = None
 
-    def _places(self) -> Iterator[Place]:
-        data, end, at = self.data, len(self.data), len(MAGIC)
-        while at + RECORD.size <= end:
-            opcode, length = RECORD.unpack_from(data, at)
-            after = at + RECORD.size + length
-            skipped_to = self._next_chunk(at)
-            limit = end if skipped_to is None else skipped_to
-            if opcode == CHUNK:
-                after = self._end_of_chunk(at, after, limit)
-            if opcode == 0 or after > limit:
-                if skipped_to is None:
-                    if opcode == CHUNK:
-                        yield Place(CHUNK, at, end, "cut")
-                    break
-                yield Place(opcode, at, skipped_to, "damaged_record")
-                at = skipped_to
-            elif opcode == DATA_END and (another := next_log(data, after)) is not None:
-                yield Place(0, another, another, "log_behind_log")
-                at = another + len(MAGIC)
-            elif opcode == DATA_END and length == 4 and self._summary.data_end in (None, at):
-                return
-            else:
-                if opcode in LOOSE:
-                    run = index_records(_bytes(data[at:limit]), only_known=True)
-                    after = max(after, at + run.walked)
-                passed = opcode == CHUNK and self._may_pass(at, after)
-                yield Place(opcode, at, after, "passed" if passed else "")
-                at = after
-        yield Place(0, at, end, "truncated")
+    def passed_blocks(self) -> Iterator[Block]:
+        """Yield the wanted messages of the chunks that `blocks` has passed over."""
+        passed, self._passed = self._passed, []
+        yield from self._walk(self._places.chunk(place.at, place.after) for place in passed)
 
-    def _end_of_chunk(self, at: int, after: int, limit: int) -> int:
-        """Return where a chunk ends: as its record says, unless only its own length can be."""
-        try:
-            own = read_head(self.data, at).end
-        except ChunkError:
-            return after
-        return own if own <= limit else after
+    def _walk(self, places: Iterable[Place]) -> Iterator[Block]:
+        for place, opening in self._opened_ahead(places):
+            yield from self._walk_place(place, opening)
 
-    def _next_chunk(self, at: int) -> int | None:
-        """Return the first place behind `at` where the summary knows of a chunk."""
-        offsets = self._summary.chunk_offsets
-        i = bisect_right(offsets, at)
-        return offsets[i] if i < len(offsets) else None
-
-    def _opened_ahead(self) -> Iterator[tuple[Place, Future[OpenedChunk] | None]]:
+    def _opened_ahead(
+        self, places: Iterable[Place]
+    ) -> Iterator[tuple[Place, Future[OpenedChunk] | None]]:
         """Yield the places, each chunk with its opening under way if there is a pool."""
-        waiting: deque[tuple[Place, Future[OpenedChunk] | None, int]] = deque()
+        waiting: deque[tuple[Place, Future[OpenedChunk] | None]] = deque()
         ahead = 0
-        for place in self._places():
-            opening, size = None, 0
+        for place in places:
+            opening = None
             if self.pool is not None and place.opcode == CHUNK and not place.reason:
-                opening = self.pool.submit(open_chunk, self.data, place.at, place.after)
-                size = self._size(place)
-            waiting.append((place, opening, size))
-            ahead += size
+                opening = self.pool.submit(open_chunk, place.data)
+            waiting.append((place, opening))
+            ahead += place.size
             while waiting and (ahead > AHEAD_BYTES or waiting[0][1] is None):
-                first, opening, size = waiting.popleft()
-                ahead -= size
+                first, opening = waiting.popleft()
+                ahead -= first.size
                 yield first, opening
-        for place, opening, _ in waiting:
-            yield place, opening
-
-    def _size(self, place: Place) -> int:
-        try:
-            return read_head(self.data, place.at).size
-        except ChunkError:
-            return 0
-
-    def _may_pass(self, at: int, after: int) -> bool:
-        """Return whether a chunk is of another time for certain, and nothing else needs it.
-
-        The log must have been closed: its summary has the channels that a chunk may declare.
-        The chunk's times must be those of the indexes behind it. The first and the last are
-        always opened: they show whether messages are logged at the time that they are of.
-        """
-        places = self._summary.chunk_offsets
-        if self.span is None or not self._summary.sound or at in (places[:1] + places[-1:]):
-            return False
-        try:
-            head = read_head(self.data, at)
-        except ChunkError:
-            return False
-        low, high = self.span
-        if not (head.start_ns <= head.end_ns < low or high <= head.start_ns <= head.end_ns):
-            return False
-        indexes = list(self._indexes_behind(after))
-        return bool(indexes) and all(
-            self._channels.knows(number)
-            and getattr(self._channels.find(number), "schema", "") not in self.always
-            and len(time_ns)
-            and head.start_ns <= time_ns.min()
-            and time_ns.max() <= head.end_ns
-            for number, time_ns in indexes
-        )
-
-    def _indexes_behind(self, at: int) -> Iterator[tuple[int, npt.NDArray[np.uint64]]]:
-        """Yield the channel and the times of each message index from `at` on."""
-        while at + RECORD.size <= len(self.data):
-            opcode, length = RECORD.unpack_from(self.data, at)
-            body, at = at + RECORD.size, at + RECORD.size + length
-            if opcode != MESSAGE_INDEX or at > len(self.data):
-                return
-            if not self._is_message_index(body, at):
-                return
-            number, size = struct.unpack_from("<HI", self.data, body)
-            yield number, np.frombuffer(self.data, "<u8", size // 8, body + 6)[::2]
+        yield from waiting
 
     # What is there
 
     def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
-        opcode, at, after, reason = place
-        body = at + RECORD.size
-        if reason == "cut":
-            yield from self._walk_chunk(at, open_cut_chunk(self.data, at), cut=True)
-        elif reason == "passed":
-            self.n_passed += 1
+        if place.reason == CUT:
+            yield from self._walk_chunk(place.at, open_cut_chunk(place.data), cut=True)
+        elif place.reason == PASSED:
+            self._passed.append(place)
             self._passing = True
-        elif reason:
-            self._leave_out(at, 0, reason)
-        elif opcode == CHUNK:
-            opened = open_chunk(self.data, at, after) if opening is None else opening.result()
-            yield from self._walk_chunk(at, opened)
-        elif opcode == MESSAGE_INDEX and self._is_message_index(body, after):
-            self._count_lost(body)
-        elif opcode in LOOSE:
-            yield from self._walk_loose(at, after)
-        elif opcode == HEADER and self.data[at - len(MAGIC) : at] == MAGIC:
-            pass
-        elif opcode < PRIVATE and opcode not in IGNORED:
-            self._leave_out(at, 0, "damaged_record")  # no such record in a data section
+        elif place.reason:
+            self._leave_out(place.at, 0, place.reason)
+            if place.opcode == CHUNK:
+                self._lost_chunk, self._passing = len(self.damage) - 1, False
+        elif place.opcode == CHUNK:
+            opened = open_chunk(place.data) if opening is None else opening.result()
+            yield from self._walk_chunk(place.at, opened)
+        elif place.counted is not None:
+            self._count_lost(*place.counted)
+        elif place.opcode in LOOSE:
+            yield from self._walk_loose(place)
 
     def _walk_chunk(self, at: int, opened: OpenedChunk, cut: bool = False) -> Iterator[Block]:
         """Yield the messages of a chunk; `cut`: its last record may be incomplete."""
@@ -248,9 +148,9 @@ class RecordWalk:
         if index.walked < len(records) and not cut:
             self._leave_out(at, start_ns, "damaged_chunk")
 
-    def _walk_loose(self, at: int, after: int) -> Iterator[Block]:
+    def _walk_loose(self, place: Place) -> Iterator[Block]:
         """Yield the messages of a run of records outside chunks."""
-        data = _bytes(self.data[at:after])
+        data, at = _bytes(place.data), place.at
         index = index_records(data)
         offset = at + index.start - RECORD.size
         offset[index.opcode == MESSAGE] -= 22
@@ -260,8 +160,8 @@ class RecordWalk:
             if self._sound_outside_chunks:
                 yield block
             else:
-                for place, time_ns in zip(block.offset, block.time_ns, strict=True):
-                    self._leave_out(int(place), int(time_ns), "bad_checksum")
+                for lost, time_ns in zip(block.offset, block.time_ns, strict=True):
+                    self._leave_out(int(lost), int(time_ns), "bad_checksum")
 
     @cached_property
     def _sound_outside_chunks(self) -> bool:
@@ -269,8 +169,11 @@ class RecordWalk:
         at = self._summary.data_end
         if at is None:
             return True  # an unclosed log has none
-        (checksum,) = struct.unpack_from("<I", self.data, at + RECORD.size)
-        return checksum in (0, zlib.crc32(self.data[:at]))
+        (expected,) = struct.unpack("<I", self.data.view(at + RECORD.size, at + RECORD.size + 4))
+        checksum = 0
+        for low in range(0, at if expected else 0, BLOCK_BYTES):
+            checksum = zlib.crc32(self.data.view(low, min(low + BLOCK_BYTES, at)), checksum)
+        return checksum == expected
 
     def _walk_index(
         self, data: Bytes, index: RecordIndex, offset: Numbers, start_ns: int
@@ -325,23 +228,16 @@ class RecordWalk:
     def _leave_out(self, offset: int, time_ns: int, reason: str, count: int = 1) -> None:
         self.damage.append(Damage(offset, time_ns, reason, count))
 
-    def _is_message_index(self, body: int, after: int) -> bool:
-        if after - body < 6:
-            return False
-        size = struct.unpack_from("<HI", self.data, body)[1]
-        return size == after - body - 6 and size % 16 == 0
-
-    def _count_lost(self, body: int) -> None:
+    def _count_lost(self, number: int, n: int) -> None:
         """Count the messages of a chunk that is left out or passed, by an index behind it."""
-        number, size = struct.unpack_from("<HI", self.data, body)
         if self._passing:
-            self._counts[number] = self._counts.get(number, 0) + size // 16
+            self._counts[number] = self._counts.get(number, 0) + n
             return
         if self._lost_chunk is None or (self._channels and not self._channels.find(number)):
             return
-        self._counts[number] = self._counts.get(number, 0) + size // 16
+        self._counts[number] = self._counts.get(number, 0) + n
         index = self._lost_chunk
-        self._lost[index] = self._lost.get(index, 0) + size // 16
+        self._lost[index] = self._lost.get(index, 0) + n
         self.damage[index] = self.damage[index]._replace(n=max(1, self._lost[index]))
 
     def _report_missing(self) -> None:

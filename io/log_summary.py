@@ -4,6 +4,7 @@ import struct
 import zlib
 from dataclasses import dataclass, field
 
+from epipole.io.log_bytes import LogBytes
 from epipole.io.log_channels import ChannelTable
 from epipole.io.log_compression import ChunkError
 from epipole.io.record_scan import CHANNEL, PRIVATE, SCHEMA
@@ -15,6 +16,8 @@ SUMMARY = frozenset((SCHEMA, CHANNEL, CHUNK_INDEX, 0x0A, STATISTICS, 0x0D, 0x0E)
 RECORD = struct.Struct("<BQ")  # its type, its length
 DATA_END_BYTES = RECORD.size + 4
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)
+# An index entry of a chunk takes about 100 bytes; a summary that claims more than this is none.
+MAX_SUMMARY_BYTES = 256 << 20
 
 
 @dataclass
@@ -32,23 +35,29 @@ class Summary:
         return self.data_end is not None and bool(self.declared)
 
 
-def read_summary(data: memoryview, channels: ChannelTable) -> Summary:
+def read_summary(data: LogBytes, channels: ChannelTable) -> Summary:
     """Return what the summary says, and declare its channels; empty where it is not sound."""
     end = len(data)
     at = end - _FOOTER_BYTES
-    if at < len(MAGIC) or data[end - len(MAGIC) :] != MAGIC:
+    if at < len(MAGIC):
         return Summary()
-    if RECORD.unpack_from(data, at) != (FOOTER, 20):
+    footer = data.view(at, end)
+    if footer[-len(MAGIC) :] != MAGIC or RECORD.unpack_from(footer) != (FOOTER, 20):
         return Summary()
-    start, _, checksum = struct.unpack_from("<QQI", data, at + RECORD.size)
+    start, _, checksum = struct.unpack_from("<QQI", footer, RECORD.size)
     data_end = (start or at) - DATA_END_BYTES
-    if not len(MAGIC) <= data_end < at or RECORD.unpack_from(data, data_end) != (DATA_END, 4):
+    if not max(len(MAGIC), at - MAX_SUMMARY_BYTES) <= data_end < at:
         return Summary()
-    if checksum and zlib.crc32(data[start or at : end - len(MAGIC) - 4]) != checksum:
+    tail = data.view(data_end, end)
+    if RECORD.unpack_from(tail) != (DATA_END, 4):
+        return Summary()
+    records = tail[DATA_END_BYTES : at - data_end]
+    covered = tail[DATA_END_BYTES : len(tail) - len(MAGIC) - 4]
+    if checksum and zlib.crc32(covered) != checksum:
         return Summary()
     summary = Summary(data_end)
     try:
-        _read_records(data, start or at, at, summary, channels)
+        _read_records(records, at, summary, channels)
     except (struct.error, ChunkError):
         return Summary()  # the walk does without
     summary.chunk_offsets.sort()
@@ -56,18 +65,19 @@ def read_summary(data: memoryview, channels: ChannelTable) -> Summary:
 
 
 def _read_records(
-    data: memoryview, at: int, end: int, summary: Summary, channels: ChannelTable
+    data: memoryview, file_end: int, summary: Summary, channels: ChannelTable
 ) -> None:
-    while at < end:
+    at = 0
+    while at < len(data):
         opcode, length = RECORD.unpack_from(data, at)
         body, at = at + RECORD.size, at + RECORD.size + length
-        if at > end or _is_foreign(opcode):
+        if at > len(data) or _is_foreign(opcode):
             raise ChunkError("damaged_summary")  # or the start is that of another log
         if opcode in (SCHEMA, CHANNEL):
             channels.declare(opcode, data, body, at)
         elif opcode == CHUNK_INDEX:
             offset = struct.unpack_from("<Q", data, body + 16)[0]
-            if len(MAGIC) <= offset < end:
+            if len(MAGIC) <= offset < file_end:
                 summary.chunk_offsets.append(offset)
         elif opcode == STATISTICS:
             *logged_ns, size = struct.unpack_from("<QQI", data, body + 26)
@@ -77,14 +87,15 @@ def _read_records(
                 summary.declared[number] = count
 
 
-def next_log(data: memoryview, at: int) -> int | None:
+def next_log(data: LogBytes, at: int) -> int | None:
     """Return where another log begins behind the one whose data section ends at `at`."""
     while at + RECORD.size <= len(data):
-        opcode, length = RECORD.unpack_from(data, at)
+        opcode, length = RECORD.unpack(data.view(at, at + RECORD.size))
         at += RECORD.size + length
         if opcode == FOOTER:
             at += len(MAGIC)
-            return at if data[at : at + len(MAGIC)] == MAGIC else None
+            another = at + len(MAGIC) <= len(data) and data.view(at, at + len(MAGIC)) == MAGIC
+            return at if another else None
         if _is_foreign(opcode):
             return None
     return None

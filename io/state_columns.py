@@ -24,6 +24,7 @@ EARTH_RADIUS_KM = 6340.0
 FARTHEST_KM = 1.0e7  # well behind the Moon; a number in metres lands here
 QUATERNION_TOLERANCE = 1e-2  # |q| further from 1 is not a rounded unit quaternion
 BATCH = 16384  # states in one piece of the table
+ROW_BYTES = 150  # in the table
 _FRAMES = NameCodes(STATE_FRAMES)
 
 
@@ -63,10 +64,16 @@ class StateColumns:
 
         part.take(scan, self._judge)
 
-    def table(self) -> pa.Table:
-        """Return LOG_STATES, in the order of the log."""
+    @property
+    def n_bytes(self) -> int:
+        """What the rows that wait to be taken take, about."""
+        return self._n * ROW_BYTES + sum(rows.nbytes for rows in self._tables)
+
+    def take(self) -> pa.Table:
+        """Return LOG_STATES of the states since the last time, in the order of the log."""
         self._close()
-        return pa.concat_tables([LOG_STATES.empty_table(), *self._tables])
+        tables, self._tables = self._tables, []
+        return pa.concat_tables([LOG_STATES.empty_table(), *tables])
 
     def _close(self) -> None:
         """Add the rows so far to the table."""

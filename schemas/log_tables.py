@@ -37,6 +37,16 @@ class LogSource(NamedTuple):
     last_time_ns: int
 
 
+class LogPiece(NamedTuple):
+    """What a stretch of one log holds."""
+
+    exposures: pa.Table  # EXPOSURES, in the order of the log
+    states: pa.Table  # LOG_STATES
+    cameras: pa.Table  # CAMERAS
+    rejects: pa.Table  # REJECTS; all with the last piece
+    source: LogSource | None  # with the last piece
+
+
 class LogPart(NamedTuple):
     """What one log holds."""
 

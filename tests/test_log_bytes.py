@@ -1,7 +1,9 @@
 """Logs in places other than a folder, an S3 server of its own among them."""
 
 import contextlib
+import hashlib
 import os
+import random
 import socket
 import subprocess
 import sys
@@ -10,8 +12,9 @@ import urllib.request
 
 import pytest
 
-from epipole.io.log_bytes import forget, open_log
-from epipole.io.log_reader import read_log
+from epipole.io import log_bytes
+from epipole.io.log_bytes import LogBytes
+from epipole.io.log_reader import read_log, read_log_parts
 from epipole.io.log_writer import LogWriter
 from epipole.schemas.errors import LogError
 
@@ -124,21 +127,52 @@ def test_missing_credentials_are_an_error_of_one_line(s3, monkeypatch, tmp_path)
     assert "credentials" in line.lower()
 
 
-def test_a_temporary_copy_is_not_left_behind(s3, log, monkeypatch, tmp_path):
-    monkeypatch.setenv("TMPDIR", str(tmp_path / "scratch"))
-    (tmp_path / "scratch").mkdir()
-    monkeypatch.setattr("tempfile.tempdir", None)
+def test_a_log_in_a_bucket_is_fetched_by_ranges_and_once(s3, log, monkeypatch):
     s3.put_file(str(log), "logs/a.mcap")
-    assert bytes(open_log("s3://logs/a.mcap")) == log.read_bytes()
-    assert list((tmp_path / "scratch").iterdir()) == []
+    monkeypatch.setattr(log_bytes, "BLOCK_BYTES", 1000)
+    fetched = []
+    cat_file = s3.cat_file
+
+    def counted(path, start, end):
+        fetched.append((start, end))
+        return cat_file(path, start=start, end=end)
+
+    monkeypatch.setattr(s3, "cat_file", counted)
+    assert read_log("s3://logs/a.mcap").source == read_log(log).source
+    whole = len(log.read_bytes()) // 1000
+    blocks = [start for start, end in fetched if start % 1000 == 0 and end == start + 1000]
+    assert sorted(blocks) == [1000 * k for k in range(whole)]
 
 
-def test_bytes_that_were_forgotten_are_there_again(log):
-    data = open_log(str(log))
-    whole = bytes(data)
-    for start, end in ((0, len(data)), (1, 5000), (4095, 4097), (5, 5), (0, 10 * len(data))):
-        forget(data, start, end)
-        assert bytes(data) == whole
+def test_a_log_that_changes_in_its_bucket_while_it_is_read_is_an_error(s3, log):
+    s3.put_file(str(log), "logs/a.mcap")
+    parts = read_log_parts("s3://logs/a.mcap", part_bytes=1)
+    next(parts)
+    s3.pipe_file("logs/a.mcap", bytes(log.stat().st_size))
+    with pytest.raises(LogError, match="has changed while it was read"):
+        list(parts)
+
+
+def test_a_log_that_vanishes_from_its_bucket_while_it_is_read_is_an_error(s3, log):
+    s3.put_file(str(log), "logs/gone.mcap")
+    parts = read_log_parts("s3://logs/gone.mcap", part_bytes=1)
+    next(parts)
+    s3.rm("logs/gone.mcap")
+    with pytest.raises(LogError, match=r"gone\.mcap: no such file"):
+        list(parts)
+
+
+@pytest.mark.parametrize("block_bytes", [1, 7, 100, 1 << 20])
+@pytest.mark.parametrize("streaming", [True, False])
+def test_any_bytes_of_a_log_can_be_viewed_in_any_order(block_bytes, streaming, monkeypatch):
+    monkeypatch.setattr(log_bytes, "BLOCK_BYTES", block_bytes)
+    data = random.Random(0).randbytes(1000)
+    with LogBytes.of(data) as log:
+        if streaming:
+            log.stream()
+        for start, end in [(0, 0), (0, 9), (990, 1000), (5, 800), (3, 4), (1000, 1000), (0, 1000)]:
+            assert log.view(start, end) == data[start:end]
+        assert log.sha256() == hashlib.sha256(data).hexdigest()
 
 
 def test_an_unreadable_file_is_an_error_of_one_line(log):
