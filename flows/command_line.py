@@ -1,4 +1,5 @@
-"""The command line: ``epipole run``, ``simulate``, ``info``, ``evaluate``, ``settings``.
+"""The command line: ``epipole run``, ``simulate``, ``info``, ``evaluate``, ``settings``,
+``catalog build``.
 
 What a command needs is imported when it runs, so that ``epipole --help`` answers at once.
 """
@@ -272,6 +273,57 @@ def settings() -> None:
     from epipole.schemas.settings import Settings
 
     typer.echo(settings_text(Settings()), nl=False)
+
+
+catalog = typer.Typer(
+    help="Build the star catalogue that sensors are identified with.", no_args_is_help=True
+)
+app.add_typer(catalog, name="catalog")
+
+
+@catalog.callback()
+def _catalog() -> None:
+    """Keep `build` a command of its own."""
+
+
+@catalog.command()
+def build(
+    source: Annotated[
+        str,
+        typer.Argument(metavar="SOURCE", help="hipparcos, deep, or a CSV or Parquet file."),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Parquet file to write.")],
+    epoch: Annotated[
+        float | None,
+        typer.Option(metavar="YEAR", help="Julian year of a file's places, such as 2016.0."),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Of the catalogue; default: the file's.")
+    ] = None,
+    magnitude_limit: Annotated[
+        float | None, typer.Option("--limit", metavar="MAG", help="Leave fainter stars out.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a star catalogue for the setting identification.catalogue.
+
+    hipparcos: the default of a run, complete to magnitude 7.3
+
+    deep: Gaia DR3 to G 10 with Hipparcos' motions, for fields below 5 degrees;
+    needs the extra "deep" of epipole; its data are share-alike (CC BY-SA 3.0)
+
+    A file has the columns star_id (whole numbers), ra_deg, dec_deg (ICRS) and
+    magnitude (V), and may have pm_ra_mas_yr (times cos dec), pm_dec_mas_yr,
+    parallax_mas, sigma_mas, pm_sigma_mas_yr (1-sigma an axis) and variable
+    (true or false). Bad rows are named, counted from 1 without the header.
+    """
+    from epipole.flows.catalog import build_catalogue
+
+    built = build_catalogue(source, out, epoch, name, magnitude_limit)
+    if as_json:
+        _print_json(built.as_dict())
+    else:
+        typer.echo("\n".join(built.lines()))
 
 
 def _print_json(value: Any) -> None:

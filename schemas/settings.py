@@ -39,6 +39,11 @@ class IdentificationSettings(Group):
         "likelihood",
         description="How stars are identified; the others are published methods, for comparison.",
     )
+    catalogue: str = Field(
+        "hipparcos",
+        min_length=1,
+        description='Stars: "hipparcos", or the path of a file of `epipole catalog build`.',
+    )
     magnitude_limit: float | None = Field(
         None, description="Faintest star looked for; none: from the number of centroids."
     )

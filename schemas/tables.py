@@ -93,7 +93,7 @@ STARS = schema(
     [
         *FRAME_KEY,
         CENTROID,
-        column("star_id", I64, doc="Number in the star catalogue (Hipparcos unless said)."),
+        column("star_id", I64, doc="Number in the catalogue that the table's metadata names."),
         column("magnitude", F64, unit="mag", doc="V magnitude in the catalogue."),
         *PIXEL,
         *axes("d{}_px", unit="px", frame="image", doc="Measured minus predicted place", names="xy"),

@@ -124,21 +124,6 @@ VIEWS = schema(
     ],
 )
 
-STAR_CATALOGUE = schema(
-    "star_catalogue",
-    "One row a star at the catalogue's epoch.",
-    [
-        column("star_id", I64, doc="Number in the catalogue (Hipparcos unless said)."),
-        column("ra_rad", F64, unit="rad", frame="ICRS", doc="Right ascension at the epoch."),
-        column("dec_rad", F64, unit="rad", frame="ICRS", doc="Declination at the epoch."),
-        column("parallax_mas", F64, unit="mas", doc="Parallax."),
-        column("pm_ra_mas_yr", F64, unit="mas/yr", doc="Proper motion times cos(dec)."),
-        column("pm_dec_mas_yr", F64, unit="mas/yr", doc="Proper motion."),
-        column("magnitude", F64, unit="mag", doc="V magnitude."),
-        column("variable", pa.bool_(), doc="Flagged as variable by the catalogue."),
-    ],
-)
-
 TRUE_FRAMES = schema(
     "true_frames",
     "Simulation truth, one row a frame.",

@@ -1,19 +1,31 @@
-"""Skies made from a catalogue table, kept in the process: sensors of one kind share them."""
+"""Skies made from a catalogue table, kept in the process and on disk: sensors share them."""
 
-import zlib
-from functools import lru_cache
+import hashlib
+import inspect
+import sys
+from functools import cache, lru_cache
+from types import ModuleType
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
+import scipy
 
-from epipole.io.star_catalogue import HIPPARCOS_EPOCH
+from epipole.io.array_cache import cached
 from epipole.schemas.bridge import array
+from epipole.schemas.star_catalogue import STAR_CATALOGUE, label_of
+from epipole.tasks.algorithms import kvector, star_catalogue, time_scales
+from epipole.tasks.algorithms.kvector import KVector
 from epipole.tasks.algorithms.star_catalogue import (
     NavigationCatalogue,
     limit_for_density,
     navigation_catalogue,
+    place_errors,
     places_at,
 )
+from epipole.tasks.algorithms.star_identification import pair_table
+from epipole.tasks.algorithms.star_identification import sky as skies
 from epipole.tasks.algorithms.star_identification.frame import Optics
 from epipole.tasks.algorithms.star_identification.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky import (
@@ -26,16 +38,23 @@ from epipole.tasks.algorithms.star_identification.sky import (
 from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid
 from epipole.tasks.algorithms.time_scales import DAY_NS, earth_barycentric, julian_year
 
+# A star whose place at the date is less sure than this is none to navigate by [pixels, 1-sigma].
+SURE_PX = 0.5
+
+# What the arrays on disk are made by: other code, other arrays.
+_MADE_BY: tuple[ModuleType, ...] = (star_catalogue, time_scales, pair_table, kvector, skies)
+
 
 class Catalogue:
-    """A catalogue table as a key of caches: two with the same content are the same."""
+    """A labelled catalogue as a key of caches: two with the same content are the same."""
 
     def __init__(self, stars: pa.Table) -> None:
         self.stars = stars
-        key = 0
-        for name in ("star_id", "ra_rad", "dec_rad", "magnitude"):
-            key = zlib.crc32(array(stars, name).tobytes(), key)
-        self.key = (stars.num_rows, key)
+        self.epoch = label_of(stars.schema).epoch
+        digest = hashlib.blake2b(repr(self.epoch).encode(), digest_size=16)
+        for name in STAR_CATALOGUE.names:
+            digest.update(array(stars, name).tobytes())
+        self.key = digest.hexdigest()
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -45,10 +64,10 @@ class Catalogue:
 
 
 class CachedSkies:
-    """Skies of one day for one size of pixel, kept in the process: sensors share them."""
+    """Skies of one day for one size of pixel; stars within `merge_px` pixels are one."""
 
-    def __init__(self, catalogue: Catalogue, day: int, merge_rad: float) -> None:
-        self.key = (catalogue, day, merge_rad)
+    def __init__(self, catalogue: Catalogue, day: int, pixel_rad: float, merge_px: float) -> None:
+        self.key = (catalogue, day, round(pixel_rad, 9), merge_px)
 
     def limit_for(self, stars_per_sr: float) -> float:
         limit = limit_for_density(_navigation(*self.key).magnitude, stars_per_sr)
@@ -66,28 +85,77 @@ class CachedSkies:
 
 
 @lru_cache(maxsize=4)
-def _navigation(catalogue: Catalogue, day: int, merge_rad: float) -> NavigationCatalogue:
+def _navigation(
+    catalogue: Catalogue, day: int, pixel_rad: float, merge_px: float
+) -> NavigationCatalogue:
+    def make() -> dict[str, npt.NDArray[Any]]:
+        return dict(_make_navigation(catalogue, day, pixel_rad, merge_px)._asdict())
+
+    kept = cached(_disk_key("stars", catalogue, day, pixel_rad, merge_px), make)
+    return NavigationCatalogue(**kept)
+
+
+def _make_navigation(
+    catalogue: Catalogue, day: int, pixel_rad: float, merge_px: float
+) -> NavigationCatalogue:
+    stars = catalogue.stars
     time_ns = np.array(day * DAY_NS + DAY_NS // 2, np.int64)
     r_earth_km, _ = earth_barycentric(time_ns)
-    names = ("ra_rad", "dec_rad", "parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")
-    ra, dec, parallax, pm_ra, pm_dec = (array(catalogue.stars, name) for name in names)
-    epoch = float((catalogue.stars.schema.metadata or {}).get(b"epoch", HIPPARCOS_EPOCH))
-    years = float(julian_year(time_ns)) - epoch
-    u = places_at(ra, dec, parallax, pm_ra, pm_dec, years, r_earth_km)
-    star_id, magnitude = array(catalogue.stars, "star_id"), array(catalogue.stars, "magnitude")
-    return navigation_catalogue(star_id, u, magnitude, merge_rad)
+    years = float(julian_year(time_ns)) - catalogue.epoch
+    u = places_at(
+        np.radians(array(stars, "ra_deg")),
+        np.radians(array(stars, "dec_deg")),
+        array(stars, "parallax_mas"),
+        array(stars, "pm_ra_mas_yr"),
+        array(stars, "pm_dec_mas_yr"),
+        years,
+        r_earth_km,
+    )
+    error = place_errors(array(stars, "sigma_mas"), array(stars, "pm_sigma_mas_yr"), years)
+    sure = error <= SURE_PX * pixel_rad
+    star_id, magnitude = array(stars, "star_id"), array(stars, "magnitude")
+    return navigation_catalogue(star_id[sure], u[sure], magnitude[sure], merge_px * pixel_rad)
 
 
 @lru_cache(maxsize=16)
-def _sky(catalogue: Catalogue, day: int, merge_rad: float, limit: float) -> Sky:
-    return sky_to_limit(_navigation(catalogue, day, merge_rad), limit)
+def _sky(catalogue: Catalogue, day: int, pixel_rad: float, merge_px: float, limit: float) -> Sky:
+    return sky_to_limit(_navigation(catalogue, day, pixel_rad, merge_px), limit)
 
 
 @lru_cache(maxsize=16)
-def _grid(catalogue: Catalogue, day: int, merge_rad: float, limit: float, radius: float) -> SkyGrid:
-    return sky_grid(_sky(catalogue, day, merge_rad, limit), radius)
+def _grid(
+    catalogue: Catalogue, day: int, pixel_rad: float, merge_px: float, limit: float, radius: float
+) -> SkyGrid:
+    return sky_grid(_sky(catalogue, day, pixel_rad, merge_px, limit), radius)
 
 
 @lru_cache(maxsize=8)
-def _pairs(catalogue: Catalogue, day: int, merge_rad: float, n: int, diagonal: float) -> PairTable:
-    return pattern_pairs(_navigation(catalogue, day, merge_rad).u_icrs[:n], diagonal)
+def _pairs(
+    catalogue: Catalogue, day: int, pixel_rad: float, merge_px: float, n: int, diagonal: float
+) -> PairTable:
+    def make() -> dict[str, npt.NDArray[Any]]:
+        u_icrs = _navigation(catalogue, day, pixel_rad, merge_px).u_icrs[:n]
+        table = pattern_pairs(u_icrs, diagonal)
+        line = np.array([table.chord.slope, table.chord.intercept])
+        return {
+            "s": table.chord.s, "below": table.chord.below, "line": line,
+            "first": table.first, "second": table.second,
+        }  # fmt: skip
+
+    key = _disk_key("pairs", catalogue, day, pixel_rad, merge_px, n, diagonal)
+    kept: dict[str, npt.NDArray[Any]] = dict(cached(key, make))
+    slope, intercept = kept.pop("line").tolist()
+    chord = KVector(kept.pop("s"), kept.pop("below"), slope, intercept)
+    return PairTable(chord, **kept)
+
+
+def _disk_key(what: str, catalogue: Catalogue, *inputs: float) -> str:
+    words = repr((catalogue.key, inputs, _code())).encode()
+    return f"{what}-{hashlib.blake2b(words, digest_size=16).hexdigest()}"
+
+
+@cache
+def _code() -> str:
+    """Return a digest of the code that makes the arrays, and of the libraries it stands on."""
+    text = "".join(inspect.getsource(module) for module in (*_MADE_BY, sys.modules[__name__]))
+    return hashlib.blake2b(f"{np.__version__} {scipy.__version__} {text}".encode()).hexdigest()

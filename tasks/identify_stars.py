@@ -20,6 +20,7 @@ from epipole.schemas.bridge import (
     unstack_covariance,
 )
 from epipole.schemas.settings import Settings
+from epipole.schemas.star_catalogue import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.camera import Camera, pixel_angle, project, undistort, unproject
@@ -75,6 +76,7 @@ def identify_stars(
     attitudes = _attitudes(places, found, settings)
     matches = _matches(found, rows)
     stars = _stars_table(exposures, places, centroids, attitudes, matches)
+    stars = with_catalogue(stars, catalogue.schema)
     result = Identified(
         _solutions_table(exposures, places, centroids, attitudes, matches, stars),
         stars,
@@ -189,7 +191,7 @@ def _identify(
     ]
     day = int(time_ns[len(time_ns) // 2] // DAY_NS)
     pixel_rad = next(iter(c.cameras.values())).pixel_rad
-    skies = CachedSkies(Catalogue(catalogue), day, round(rule.merge_px * pixel_rad, 9))
+    skies = CachedSkies(Catalogue(catalogue), day, pixel_rad, rule.merge_px)
     how = Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
     if rule.method != "likelihood":
         return identify_published(spots, skies, rule.magnitude_limit, rule.method, how), rows

@@ -13,6 +13,8 @@ sys.path.append(str(Path(__file__).parent))  # helpers beside the tests: random_
 # changes them.
 _PREFECT_HOME = tempfile.TemporaryDirectory(prefix="epipole-prefect-")
 os.environ["PREFECT_HOME"] = _PREFECT_HOME.name
+_CACHE = tempfile.TemporaryDirectory(prefix="epipole-cache-")
+os.environ["EPIPOLE_CACHE"] = _CACHE.name
 for name in ("PREFECT_API_URL", "PREFECT_PROFILE"):
     os.environ.pop(name, None)
 

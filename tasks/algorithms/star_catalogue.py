@@ -63,6 +63,11 @@ def places_at(
     return place / np.linalg.norm(place, axis=1, keepdims=True)
 
 
+def place_errors(sigma_mas: Array, pm_sigma_mas_yr: Array, years: float) -> Array:
+    """Return 1-sigma an axis [rad] of places `years` after the catalogue's epoch."""
+    return np.hypot(sigma_mas, pm_sigma_mas_yr * years) * MAS
+
+
 def navigation_catalogue(
     star_id: npt.NDArray[np.int64], u_icrs: Array, magnitude: Array, merge_rad: float
 ) -> NavigationCatalogue:

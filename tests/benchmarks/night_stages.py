@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.flows.sensors import calibrated, of_sensor, sensor_ids, spans
-from epipole.io.star_catalogue import read_hipparcos
+from epipole.io.hipparcos import read_hipparcos
 from epipole.schemas.bridge import concat
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import DETECTIONS, TRACKLETS

