@@ -1,0 +1,142 @@
+"""A Prefect server and worker of their own for a test: real processes, on a free port."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+
+POOL = "nights"
+# A worker asks for runs every second (default: ten), a run that waits for its turn asks as
+# often (default: every half minute).
+QUICK = {
+    "PREFECT_SERVER_CONCURRENCY_MAXIMUM_CONCURRENCY_SLOT_WAIT_SECONDS": "1",
+    "PREFECT_WORKER_QUERY_SECONDS": "1",
+}
+QUIET = {
+    "DO_NOT_TRACK": "1",
+    "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+    "PREFECT_SERVER_UI_SHOW_PROMOTIONAL_CONTENT": "false",
+}
+
+
+class Prefect:
+    """Prefect's command line and API against one server; everything lies in one folder."""
+
+    def __init__(self, folder: Path, **settings: str) -> None:
+        self.folder = folder
+        self.home = folder / "prefect"
+        self.port = _free_port()
+        self.url = f"http://127.0.0.1:{self.port}/api"
+        kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
+        own = {"PREFECT_HOME": str(self.home), "PREFECT_API_URL": self.url, "NO_COLOR": "1"}
+        self.environment = kept | QUICK | QUIET | own | settings
+
+    def command(self, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
+        """Run a command of Prefect's to its end."""
+        return subprocess.run(
+            [sys.executable, "-m", "prefect", *arguments], cwd=self.folder, env=self.environment,
+            capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+
+    def start(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
+        """Start a command that goes on, in a session of its own."""
+        with (self.folder / f"{name}.txt").open("ab") as output:
+            return subprocess.Popen(
+                [sys.executable, "-m", "prefect", *arguments], cwd=self.folder,
+                env=self.environment, stdout=output, stderr=subprocess.STDOUT,
+                stdin=subprocess.DEVNULL, start_new_session=True,
+            )  # fmt: skip
+
+    def start_worker(self) -> subprocess.Popen[bytes]:
+        """Start a worker of the pool."""
+        return self.start("worker", "worker", "start", "--pool", POOL)
+
+    def get(self, path: str) -> Any:
+        """Return what the API has at a path."""
+        return httpx.get(f"{self.url}/{path}", timeout=30).raise_for_status().json()
+
+    def post(self, path: str, asked: dict[str, Any]) -> Any:
+        """Return what the API answers."""
+        return httpx.post(f"{self.url}/{path}", json=asked, timeout=30).raise_for_status().json()
+
+    def find(self, what: str, **asked: Any) -> list[dict[str, Any]]:
+        """Return what the API has of flow runs, task runs, logs or artifacts."""
+        found: list[dict[str, Any]] = []
+        while rows := self.post(f"{what}/filter", asked | {"offset": len(found)}):
+            found += rows
+        return found
+
+    def run(self, run_id: str) -> dict[str, Any]:
+        """Return a flow run."""
+        (run,) = self.find("flow_runs", flow_runs={"id": {"any_": [run_id]}})
+        return run
+
+    def flow_processes(self, worker: subprocess.Popen[bytes]) -> list[int]:
+        """Return the processes of the flow runs that a worker has started."""
+        return [pid for pid in self._processes() if _parent(pid) == worker.pid]
+
+    def kill_all(self) -> None:
+        """Kill every process of this server and its workers, orphans too."""
+        for pid in self._processes():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+    def _processes(self) -> list[int]:
+        """Return the processes with this Prefect's home in their environment."""
+        mark = f"PREFECT_HOME={self.home}\0".encode()
+        found = []
+        for entry in Path("/proc").iterdir():
+            with contextlib.suppress(OSError):
+                if entry.name.isdigit() and mark in (entry / "environ").read_bytes():
+                    found.append(int(entry.name))
+        return found
+
+
+@contextlib.contextmanager
+def serving(folder: Path, **settings: str) -> Iterator[Prefect]:
+    """Run a server for a while; whatever happens, none of its processes is left."""
+    prefect = Prefect(folder, **settings)
+    try:
+        prefect.start("server", "server", "start", "--port", str(prefect.port))
+        wait_for(lambda: _answers(prefect.url), "the server to start")
+        yield prefect
+    finally:
+        prefect.kill_all()
+
+
+def wait_for(what: Callable[[], Any], why: str, seconds: float = 120) -> Any:
+    """Return what becomes true; fail where it does not in time."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        value = what()
+        if value:
+            return value
+        time.sleep(0.1)
+    raise AssertionError(f"waited {seconds:.0f} s for {why}")
+
+
+def _answers(url: str) -> bool:
+    with contextlib.suppress(httpx.HTTPError):
+        return httpx.get(f"{url}/health", timeout=5).is_success
+    return False
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _parent(pid: int) -> int:
+    with contextlib.suppress(OSError):
+        stat = Path(f"/proc/{pid}/stat").read_text()
+        return int(stat.rpartition(")")[2].split()[1])
+    return -1
