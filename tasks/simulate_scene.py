@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.io.simulated_sky import HipparcosStars, read_hipparcos_stars
+from epipole.io.simulated_sky import SkyStars, read_stars
 from epipole.schemas.bridge import table, unstack
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Orbit, Scene, SceneCamera, SceneSensor
@@ -75,7 +75,7 @@ def simulate_scene(scene: Scene) -> Simulation:
 def expose_blocks(simulation: Simulation) -> Iterator[list[Exposures]]:
     """Yield what each sensor sees, in blocks of time that bound the memory."""
     faintest = max(s.magnitude_limit for s in simulation.sensors)
-    stars = read_hipparcos_stars(faintest)
+    stars = read_stars(simulation.scene.catalogue, faintest)
     fields: dict[tuple[float, float], StarField] = {}
     work = []
     for sensor in simulation.sensors:
@@ -150,7 +150,7 @@ def true_optics(camera: SceneCamera) -> Optics:
     )
 
 
-def _field(stars: HipparcosStars, magnitude_limit: float, radius_rad: float) -> StarField:
+def _field(stars: SkyStars, magnitude_limit: float, radius_rad: float) -> StarField:
     seen = stars.magnitude <= magnitude_limit
     return star_field(
         stars.star_id[seen],
@@ -160,6 +160,7 @@ def _field(stars: HipparcosStars, magnitude_limit: float, radius_rad: float) -> 
         stars.pm_dec_mas_yr[seen],
         stars.parallax_mas[seen],
         stars.magnitude[seen],
+        epoch=stars.epoch,
         radius_rad=radius_rad,
     )
 

@@ -205,7 +205,7 @@ def little_sky(places_px, magnitudes, focal_px=585.0):
     zeros = np.zeros(n)
     return star_field(
         np.arange(1, n + 1) * 100, ra, np.radians(5.0) + at[:, 1], zeros, zeros, zeros,
-        np.array(magnitudes, float), radius_rad=0.2,
+        np.array(magnitudes, float), epoch=1991.25, radius_rad=0.2,
     )  # fmt: skip
 
 
@@ -243,7 +243,7 @@ def test_stars_in_cones_are_those_that_a_search_of_all_stars_finds(radius_deg):
     zeros = np.zeros(3000)
     field = star_field(
         np.arange(3000), rng.uniform(0, 2 * np.pi, 3000), np.arcsin(z), zeros, zeros, zeros,
-        zeros, radius_rad=np.radians(radius_deg),
+        zeros, epoch=1991.25, radius_rad=np.radians(radius_deg),
     )  # fmt: skip
     u = rng.normal(size=(40, 3))
     u = np.concatenate([u / np.linalg.norm(u, axis=1)[:, None], np.eye(3), -np.eye(3)])

@@ -20,13 +20,17 @@ from skyfield.vectorlib import VectorFunction
 
 from epipole.io.log_reader import read_log
 from epipole.io.scene_files import read_scene
-from epipole.io.simulated_sky import read_hipparcos_stars
-from epipole.schemas.bridge import flatten
+from epipole.io.simulated_sky import read_hipparcos_stars, read_stars
+from epipole.io.star_catalogue import write_star_catalogue
+from epipole.schemas.bridge import flatten, table
+from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import validate_scene
+from epipole.schemas.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
+from epipole.tasks.algorithms.catalogue_join import moved
 from epipole.tasks.algorithms.simulation.ephemeris import (
     barycentric_julian_date,
     earth_at,
-    julian_years_since_hipparcos,
+    julian_years_since,
 )
 from epipole.tasks.algorithms.simulation.optics import Optics, image_place
 from epipole.tasks.algorithms.simulation.orbits import GM_KM3_S2, elements_from_state, state_at
@@ -156,6 +160,58 @@ def field_of(stars, **changes):
     return star_field(**(stars._asdict() | changes), radius_rad=0.05)
 
 
+def test_a_scene_with_a_catalogue_file_shows_its_stars(tmp_path):
+    # Hipparcos' stars of the truth below at another epoch and under other numbers.
+    hipparcos = read_stars("hipparcos", 6.5)
+    ra, dec, pm_ra, pm_dec = moved(
+        hipparcos.ra, hipparcos.dec, hipparcos.pm_ra_mas_yr, hipparcos.pm_dec_mas_yr, 20.0
+    )
+    none = np.zeros(len(ra))
+    columns = {
+        "star_id": hipparcos.star_id + 10**6,
+        "ra_deg": np.degrees(ra),
+        "dec_deg": np.degrees(dec),
+        "pm_ra_mas_yr": pm_ra,
+        "pm_dec_mas_yr": pm_dec,
+        "parallax_mas": hipparcos.parallax_mas,
+        "sigma_mas": none,
+        "pm_sigma_mas_yr": none,
+        "magnitude": hipparcos.magnitude,
+        "variable": none > 0,
+    }
+    label = CatalogueLabel("later", 2011.25, "a test")
+    path = tmp_path / "later.parquet"
+    write_star_catalogue(path, labelled(table(STAR_CATALOGUE, columns), label))
+    sensor = {
+        "id": "a",
+        "orbit": {"a_km": 7000.0},
+        "camera": {"fov_deg": 15.0},
+        "pointing": {"mode": "fixed", "ra_deg": 85.0, "dec_deg": 0.0},
+        "magnitude_limit": 6.0,
+    }
+    scene = {"name": "s", "duration_s": 1.0, "sensors": [sensor]}
+    seen = []
+    for catalogue in ("hipparcos", str(path)):
+        simulation = simulate_scene(validate_scene(scene | {"catalogue": catalogue}, "s"))
+        ((exposures,),) = expose_blocks(simulation)
+        order = np.argsort(exposures.source)
+        place = np.stack([exposures.x_px, exposures.y_px], axis=1)[order]
+        seen.append((exposures.source[order], place))
+    assert len(seen[0][0]) > 20
+    np.testing.assert_array_equal(seen[0][0] + 10**6, seen[1][0])
+    # Noise is drawn by the order of stars, which is the same: 0.001 px are 0.05 arcsec.
+    np.testing.assert_allclose(seen[0][1], seen[1][1], atol=1e-3)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"text"])
+def test_a_scene_names_a_catalogue_that_cannot_be_read(content, tmp_path):
+    path = tmp_path / "stars.parquet"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(SceneError, match=r"stars\.parquet: no star catalogue"):
+        read_stars(str(path), 9.0)
+
+
 def test_stars_are_seen_where_skyfield_sees_them():
     stars = read_hipparcos_stars(4.0)
     field = field_of(stars)
@@ -166,7 +222,7 @@ def test_stars_are_seen_where_skyfield_sees_them():
         r_km, v_km_s = state_at(LOW, np.array([t_s]))
         earth_km, earth_km_s = earth_at(time_ns(t_s))
         n = len(row)
-        years = np.repeat(julian_years_since_hipparcos(time_ns(t_s)), n)
+        years = np.repeat(julian_years_since(1991.25, time_ns(t_s)), n)
         u = star_directions(field, np.arange(n), years, np.repeat(earth_km + r_km, n, axis=0))
         u = boost(u, np.repeat(earth_km_s + v_km_s, n, axis=0))
         assert angle(u, expected).max() < 0.05 * MAS
@@ -236,7 +292,7 @@ def test_it_reproduces_the_logs_of_another_simulator_to_their_noise(name):
     order = np.argsort(field.star_id)
     star = order[np.searchsorted(field.star_id[order], source[is_star])]
     d = np.empty((len(spots), 3))
-    years = julian_years_since_hipparcos(t_ns[is_star])
+    years = julian_years_since(1991.25, t_ns[is_star])
     d[is_star] = star_directions(field, star, years, (earth_km + r_km)[is_star])
     if scenario["targets"]:
         orbits = np.array([target["elements"] for target in scenario["targets"]])

@@ -9,21 +9,21 @@ from epipole.tasks.algorithms.time_scales import AU_KM, DAY_S, tt_julian_date
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 
-HIPPARCOS_EPOCH_JD = 2448349.0625  # J1991.25
+J2000_JD = 2451545.0
 NODE_S = 1200  # a cubic between such nodes is right to 1e-6 km
 
 
 def barycentric_julian_date(time_ns: Nanoseconds) -> tuple[Array, Array]:
     """Return the two-part TDB Julian date of UTC nanoseconds since 1970."""
     jd1, jd2 = tt_julian_date(time_ns)
-    g = np.radians(357.53 + 0.98560028 * (jd1 - 2451545.0 + jd2))
+    g = np.radians(357.53 + 0.98560028 * (jd1 - J2000_JD + jd2))
     return jd1, jd2 + 0.001657 * np.sin(g) / DAY_S
 
 
-def julian_years_since_hipparcos(time_ns: Nanoseconds) -> Array:
-    """Return TDB Julian years since J1991.25, the epoch of the Hipparcos places."""
+def julian_years_since(epoch: float, time_ns: Nanoseconds) -> Array:
+    """Return TDB Julian years since an epoch such as 1991.25, that of Hipparcos' places."""
     jd1, jd2 = barycentric_julian_date(time_ns)
-    return ((jd1 - HIPPARCOS_EPOCH_JD) + jd2) / 365.25
+    return ((jd1 - J2000_JD) + jd2) / 365.25 + (2000.0 - epoch)
 
 
 def earth_at(time_ns: Nanoseconds) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from epipole.tasks.algorithms.simulation.ephemeris import earth_at, julian_years_since_hipparcos
+from epipole.tasks.algorithms.simulation.ephemeris import earth_at, julian_years_since
 from epipole.tasks.algorithms.simulation.optics import field_radius, image_place, on_image
 from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.sensor import (
@@ -114,7 +114,7 @@ class Exposing:
     ) -> Spots:
         s, field = self.sensor, self.stars
         frame, star = stars_in_cones(field, R[:, 2], self._radius + ABERRATION_ROOM)
-        years = julian_years_since_hipparcos(time_ns)
+        years = julian_years_since(field.epoch, time_ns)
         u = star_directions(field, star, years[frame], (earth_km + r_km)[frame])
         clear = ~hidden_by_earth(r_km[frame], u, np.inf)
         frame, star, u = frame[clear], star[clear], u[clear]

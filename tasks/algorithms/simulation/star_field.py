@@ -24,6 +24,7 @@ class StarField:
     place: Array  # (n, 3) unit vectors at the epoch
     motion: Array  # (n, 3) rad a Julian year
     parallax: Array  # rad
+    epoch: float  # Julian year
     key: Array  # zone times 2 pi plus right ascension, increasing
     zone_rad: float
 
@@ -37,6 +38,7 @@ def star_field(
     parallax_mas: Array,
     magnitude: Array,
     *,
+    epoch: float,
     radius_rad: float,
 ) -> StarField:
     """Return the stars prepared for look-ups in cones of a radius; angles in rad.
@@ -59,6 +61,7 @@ def star_field(
         motion=motion * MAS,
         # A negative parallax is a measuring error, not a place.
         parallax=np.maximum(parallax_mas[order], 0.0) * MAS,
+        epoch=epoch,
         key=key,
         zone_rad=zone_rad,
     )
