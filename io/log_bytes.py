@@ -1,4 +1,4 @@
-"""The bytes of a log, wherever it is kept, read in blocks of which only a few are held.
+"""The bytes of a log, wherever it is kept.
 
 A file is read, not mapped: a mapped file that is cut short by someone else ends the process
 that looks at it, without a word.
@@ -6,44 +6,49 @@ that looks at it, without a word.
 
 import hashlib
 import os
-from collections import OrderedDict, deque
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self
 
+from epipole.io.log_blocks import BlockReader
 from epipole.io.remote_files import open_remote
 from epipole.schemas.errors import LogError
 
-BLOCK_BYTES = 4 << 20
-AHEAD = 2  # blocks that are fetched while the ones before them are looked at
-KEPT = 4  # blocks held at most: those ahead, and the latest
+HASHED_BYTES = 1 << 20  # of a file at once
+NEAR_BYTES = 1 << 16  # read at once where little is asked for: what follows is mostly next
 
-Read = Callable[[int, int], bytes]
+
+class Reader(Protocol):
+    """How the bytes of a log are had."""
+
+    def stream(self) -> None:
+        """Prepare for being read from front to back."""
+
+    def read(self, start: int, end: int) -> bytes | memoryview:
+        """Return the bytes from `start` to before `end`, or fewer where there are no more."""
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the whole."""
+
+    def close(self) -> None:
+        """End what is under way, and let go of what is held."""
 
 
 class LogBytes:
-    """The bytes of one log, of a size that is fixed when it is opened; a context manager.
+    """The bytes of one log, of the size that it has when it is opened; a context manager.
 
-    For one thread at a time. Before `stream` every view is a read of its own, for what lies
-    scattered; from then on blocks are read ahead, and the SHA-256 is made of them as they pass.
+    For one thread at a time.
     """
 
-    def __init__(
-        self, where: str, size: int, read: Read, check: Callable[[], None] = lambda: None
-    ) -> None:
-        self._where, self._size, self._read, self._check = where, size, read, check
-        self._held = ExitStack()
-        self._loads: ThreadPoolExecutor | None = None
-        self._blocks: OrderedDict[int, Future[memoryview]] = OrderedDict()
-        self._hash = _BlockHash()
+    def __init__(self, where: str, size: int, reader: Reader) -> None:
+        self._where, self._size, self._reader = where, size, reader
+        self.stream, self.close = reader.stream, reader.close
 
     @classmethod
     def of(cls, data: bytes) -> Self:
         """Return bytes in memory as those of a log."""
-        return cls("memory", len(data), lambda start, end: data[start:end])
+        return cls("memory", len(data), BlockReader(len(data), lambda start, end: data[start:end]))
 
     def __len__(self) -> int:
         return self._size
@@ -59,22 +64,6 @@ class LogBytes:
     ) -> None:
         self.close()
 
-    def close(self) -> None:
-        """End what reads ahead, and close the file."""
-        self._held.close()
-
-    def close_with(self, close: Callable[[], object]) -> Self:
-        """Have something done at the end; return this."""
-        self._held.callback(close)
-        return self
-
-    def stream(self) -> None:
-        """Read blocks ahead from now on: the log is about to be walked from front to back."""
-        if self._loads is None:
-            self._loads = ThreadPoolExecutor(AHEAD, "read log")
-            self._held.callback(self._loads.shutdown, cancel_futures=True)
-            self._held.callback(self._hash.close)
-
     def view(self, start: int, end: int) -> memoryview:
         """Return the bytes from `start` to before `end`; both lie in the log.
 
@@ -83,91 +72,20 @@ class LogBytes:
         LogError
             Where they cannot be read, or are there no more.
         """
-        if self._loads is None or start >= end:
-            return self._exactly(start, end)
-        first, last = start // BLOCK_BYTES, (end - 1) // BLOCK_BYTES
-        parts = []
-        for k in range(first, last + 1):
-            low = k * BLOCK_BYTES
-            parts.append(self._block(k)[max(start - low, 0) : end - low])
-        return parts[0] if len(parts) == 1 else memoryview(b"".join(parts))
+        data = self._reader.read(start, end)
+        if len(data) < end - start:
+            raise _has_shrunk(self._where, self._size)
+        return memoryview(data)
 
     def sha256(self) -> str:
-        """Return the SHA-256 of the whole log, of which the rest is read now.
+        """Return the SHA-256 of the whole log.
 
         Raises
         ------
         LogError
-            Also where the log is no longer the one that was opened.
+            Where it cannot be read, or is no longer the log that was opened.
         """
-        self.stream()
-        for k in range(self._hash.n_taken, -(-self._size // BLOCK_BYTES)):
-            self._block(k)
-        self._check()
-        return self._hash.hexdigest()
-
-    def _block(self, k: int) -> memoryview:
-        """Return a block; those before it that were never looked at are hashed first."""
-        for passed in range(self._hash.n_taken, k):
-            self._hash.take(self._loaded(passed))
-        block = self._loaded(k)
-        if k == self._hash.n_taken:
-            self._hash.take(block)
-        return block
-
-    def _loaded(self, k: int) -> memoryview:
-        for i in range(k, k + 1 + AHEAD):
-            if i in self._blocks:
-                self._blocks.move_to_end(i)
-            elif i * BLOCK_BYTES < self._size and self._loads is not None:
-                self._blocks[i] = self._loads.submit(self._load, i)
-        loading = self._blocks[k]
-        while len(self._blocks) > KEPT:
-            self._blocks.popitem(last=False)
-        return loading.result()
-
-    def _load(self, k: int) -> memoryview:
-        start = k * BLOCK_BYTES
-        return self._exactly(start, min(start + BLOCK_BYTES, self._size))
-
-    def _exactly(self, start: int, end: int) -> memoryview:
-        data = self._read(start, end)
-        if len(data) != end - start:
-            raise LogError(
-                f"{self._where}: has become shorter than {self._size:,} bytes while it was read; "
-                "read it when nobody writes it"
-            )
-        return memoryview(data)
-
-
-class _BlockHash:
-    """The SHA-256 of blocks, one behind the other, made beside the work on them."""
-
-    def __init__(self) -> None:
-        self.n_taken = 0
-        self._digest = hashlib.sha256()
-        self._worker: ThreadPoolExecutor | None = None
-        self._waiting: deque[Future[None]] = deque()
-
-    def take(self, block: memoryview) -> None:
-        """Add the next block."""
-        if self._worker is None:
-            self._worker = ThreadPoolExecutor(1, "hash log")
-        self._waiting.append(self._worker.submit(self._digest.update, block))
-        self.n_taken += 1
-        if len(self._waiting) > AHEAD:
-            self._waiting.popleft().result()
-
-    def hexdigest(self) -> str:
-        """Return the hash of all that was taken."""
-        while self._waiting:
-            self._waiting.popleft().result()
-        return self._digest.hexdigest()
-
-    def close(self) -> None:
-        """End the worker."""
-        if self._worker is not None:
-            self._worker.shutdown(cancel_futures=True)
+        return self._reader.sha256()
 
 
 def open_log(where: str) -> LogBytes:
@@ -181,7 +99,8 @@ def open_log(where: str) -> LogBytes:
         Where there is no such file, or it cannot be read.
     """
     if "://" in where:
-        return LogBytes(where, *open_remote(where))
+        size, fetch, check = open_remote(where)
+        return LogBytes(where, size, BlockReader(size, fetch, check))
     if Path(where).is_dir():
         raise LogError(f"{where}: is a folder; give the logs in it, such as {where}/*.mcap")
     try:
@@ -190,16 +109,72 @@ def open_log(where: str) -> LogBytes:
         raise LogError(f"{where}: no such file; check the path") from error
     except OSError as error:
         raise LogError(f"{where}: cannot be read: {error.strerror}") from error
+    size = os.fstat(descriptor).st_size
+    return LogBytes(where, size, _FileReader(where, size, descriptor))
 
-    def read(start: int, end: int) -> bytes:
+
+class _FileReader:
+    """A file, read where it is looked at, and hashed beside that by a thread of its own."""
+
+    def __init__(self, where: str, size: int, descriptor: int) -> None:
+        self._where, self._size, self._descriptor = where, size, descriptor
+        self._worker = ThreadPoolExecutor(1, "hash log")
+        self._hashing: Future[str] | None = None
+        self._closed = False
+        self._near, self._near_at = b"", 0
+
+    def stream(self) -> None:
+        self._hashing = self._hashing or self._worker.submit(self._hash)
+
+    def read(self, start: int, end: int) -> bytes:
+        if end - start > NEAR_BYTES // 4:
+            return self._read(start, end)
+        low = start - self._near_at
+        if not 0 <= low <= len(self._near) - (end - start):
+            self._near, self._near_at = self._read(start, start + NEAR_BYTES), start
+            low = 0
+        return self._near[low : low + end - start]
+
+    def _read(self, start: int, end: int) -> bytes:
         data = b""
         try:
-            while start < end and (part := os.pread(descriptor, end - start, start)):
+            while start < end and (part := os.pread(self._descriptor, end - start, start)):
                 data = data + part if data else part
                 start += len(part)
         except OSError as error:
-            raise LogError(f"{where}: cannot be read: {error.strerror}") from error
+            raise self._unreadable(error) from error
         return data
 
-    size = os.fstat(descriptor).st_size
-    return LogBytes(where, size, read).close_with(lambda: os.close(descriptor))
+    def sha256(self) -> str:
+        self.stream()
+        assert self._hashing is not None  # `stream` has begun it
+        return self._hashing.result()
+
+    def close(self) -> None:
+        self._closed = True
+        self._worker.shutdown()
+        os.close(self._descriptor)
+
+    def _hash(self) -> str:
+        digest, at = hashlib.sha256(), 0
+        piece = memoryview(bytearray(HASHED_BYTES))
+        try:
+            while at < self._size and not self._closed:
+                n = os.preadv(self._descriptor, [piece[: self._size - at]], at)
+                if n == 0:
+                    raise _has_shrunk(self._where, self._size)
+                digest.update(piece[:n])
+                at += n
+        except OSError as error:
+            raise self._unreadable(error) from error
+        return digest.hexdigest()
+
+    def _unreadable(self, error: OSError) -> LogError:
+        return LogError(f"{self._where}: cannot be read: {error.strerror}")
+
+
+def _has_shrunk(where: str, size: int) -> LogError:
+    return LogError(
+        f"{where}: has become shorter than {size:,} bytes while it was read; "
+        "read it when nobody writes it"
+    )

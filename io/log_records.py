@@ -19,7 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.io.log_bytes import BLOCK_BYTES, LogBytes
+from epipole.io.log_blocks import BLOCK_BYTES
+from epipole.io.log_bytes import LogBytes
 from epipole.io.log_channels import Channel, ChannelTable
 from epipole.io.log_chunks import OpenedChunk, open_chunk, open_cut_chunk
 from epipole.io.log_compression import ChunkError
@@ -27,7 +28,7 @@ from epipole.io.log_places import CHUNK, CUT, LOOSE, PASSED, LogPlaces, Place
 from epipole.io.log_summary import RECORD, Summary, read_summary
 from epipole.io.record_scan import MESSAGE, Bytes, RecordIndex, index_records
 
-AHEAD_BYTES = 32 << 20  # of chunks that are opened while the ones before them are decoded
+AHEAD_BYTES = 8 << 20  # of chunks that are opened while the ones before them are decoded
 
 Numbers = npt.NDArray[np.int64]
 

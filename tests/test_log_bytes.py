@@ -12,7 +12,7 @@ import urllib.request
 
 import pytest
 
-from epipole.io import log_bytes
+from epipole.io import log_blocks
 from epipole.io.log_bytes import LogBytes
 from epipole.io.log_reader import read_log, read_log_parts
 from epipole.io.log_writer import LogWriter
@@ -129,7 +129,7 @@ def test_missing_credentials_are_an_error_of_one_line(s3, monkeypatch, tmp_path)
 
 def test_a_log_in_a_bucket_is_fetched_by_ranges_and_once(s3, log, monkeypatch):
     s3.put_file(str(log), "logs/a.mcap")
-    monkeypatch.setattr(log_bytes, "BLOCK_BYTES", 1000)
+    monkeypatch.setattr(log_blocks, "BLOCK_BYTES", 1000)
     fetched = []
     cat_file = s3.cat_file
 
@@ -165,7 +165,7 @@ def test_a_log_that_vanishes_from_its_bucket_while_it_is_read_is_an_error(s3, lo
 @pytest.mark.parametrize("block_bytes", [1, 7, 100, 1 << 20])
 @pytest.mark.parametrize("streaming", [True, False])
 def test_any_bytes_of_a_log_can_be_viewed_in_any_order(block_bytes, streaming, monkeypatch):
-    monkeypatch.setattr(log_bytes, "BLOCK_BYTES", block_bytes)
+    monkeypatch.setattr(log_blocks, "BLOCK_BYTES", block_bytes)
     data = random.Random(0).randbytes(1000)
     with LogBytes.of(data) as log:
         if streaming:

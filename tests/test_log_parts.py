@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from epipole.io import log_bytes, log_records
+from epipole.io import log_records
 from epipole.io.log_reader import read_log, read_log_parts
 from epipole.io.log_writer import LogWriter
 from epipole.io.message_encoding import encode_protobuf
@@ -112,7 +112,6 @@ def test_the_memory_of_reading_is_bounded_by_its_pieces_not_by_the_log(tmp_path,
 
 
 def test_a_log_that_is_cut_while_it_is_read_is_an_error_of_one_line(tmp_path, log, monkeypatch):
-    monkeypatch.setattr(log_bytes, "BLOCK_BYTES", 10_000)
     monkeypatch.setattr(log_records, "AHEAD_BYTES", 10_000)
     path = tmp_path / "a.mcap"
     path.write_bytes(log.read_bytes())
