@@ -7,7 +7,6 @@ import pyarrow as pa
 from epipole.flows.progress import step
 from epipole.flows.stages import place
 from epipole.schemas.settings import Settings
-from epipole.tasks.associate_objects import Associated
 from epipole.tasks.estimate_clocks import Clock, estimate_clocks, set_clocks, set_places
 from epipole.tasks.identify_stars import Identified
 from epipole.tasks.solve_positions import Solved
@@ -16,12 +15,12 @@ LOGGER = logging.getLogger(__name__)
 
 
 def read_clocks(
-    associated: Associated, solved: Solved, identified: Identified, settings: Settings
+    views: pa.Table, solved: Solved, identified: Identified, settings: Settings
 ) -> list[Clock]:
     """Estimate each sensor's clock from the residuals of the positions."""
     step("estimate clocks", 0, 1)
     clocks: list[Clock] = estimate_clocks(
-        associated.views, solved.associations, solved.positions, identified.solutions, settings
+        views, solved.associations, solved.positions, identified.solutions, settings
     )
     for clock in clocks:
         if clock.is_off:
@@ -37,12 +36,14 @@ def set_right(
     states: pa.Table,
     clocks: list[Clock],
     settings: Settings,
-) -> Identified:
-    """Put frames at their true times, and their sensors where they then were."""
-    places = place(set_clocks(exposures, clocks), states, settings)
+) -> tuple[Identified, pa.Table]:
+    """Put frames and exposures at their true times, and their sensors where they then were."""
+    exposures = set_clocks(exposures, clocks)
+    places = place(exposures, states, settings)
     solutions = set_places(set_clocks(identified.solutions, clocks), places)
-    return identified._replace(
+    identified = identified._replace(
         solutions=solutions,
         stars=set_clocks(identified.stars, clocks),
         detections=set_clocks(identified.detections, clocks),
     )
+    return identified, exposures

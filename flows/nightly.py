@@ -33,6 +33,7 @@ from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import FRAMES, REJECTS
 from epipole.tasks.align_epochs import align_epochs
+from epipole.tasks.estimate_clocks import Clock, added, of_sound_clocks
 from epipole.tasks.link_objects import renamed
 from epipole.tasks.publish_night import publish_night, source_table
 
@@ -85,23 +86,31 @@ def nightly(
     identified, cameras, calibrations = calibrate(
         identified, exposures, places, log.cameras, settings
     )
-    for correcting in (settings.alignment.correct_clocks, False):
+    clocks: list[Clock] = []
+    for passes_left in (2, 1, 0):  # the second time a sensor takes part that had not
         tracked = track(identified, cameras, settings)
         epochs = align_epochs(identified.solutions, settings)
         views = view(epochs, identified, tracked, cameras, settings)
         associated = associate(views, identified, tracked, cameras, settings)
         solved = triangulate(associated, settings)
-        clocks = read_clocks(associated, solved, identified, settings)
-        if not correcting or not any(clock.is_off for clock in clocks):
+        still = read_clocks(views, solved, identified, settings)
+        clocks = added(clocks, still)
+        off = settings.alignment.correct_clocks and any(clock.is_off for clock in still)
+        if not off or not passes_left:
             break
-        identified = set_right(identified, exposures, log.states, clocks, settings)
+        identified, exposures = set_right(identified, exposures, log.states, still, settings)
 
+    # A clock that is off and stays so: its sensor would spoil what the others see.
+    sound, of_clocks = of_sound_clocks(views, solved.associations, still)
+    if sound.num_rows < views.num_rows:
+        associated = associate(sound, identified, tracked, cameras, settings)
+        solved = triangulate(associated, settings)
     states = fit(associated, solved, settings)
     new_id = link(solved, states, settings)
 
     rejects = [
         found.rejects, log.rejects, uncalibrated, unplaced(places),
-        identified.rejects, associated.rejects, solved.rejects,
+        identified.rejects, of_clocks, associated.rejects, solved.rejects,
     ]  # fmt: skip
     tables = {
         "frames": conform(FRAMES, identified.solutions),

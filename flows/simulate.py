@@ -215,7 +215,8 @@ def _send(messages: list[_Message], writers: list[LogWriter], bounds: np.ndarray
 
 
 def _frames(simulation: Simulation, k: int, seen: Exposures) -> Iterator[_Message]:
-    sensor, detection = simulation.sensors[k], simulation.told[k].detection
+    sensor, told = simulation.sensors[k], simulation.told[k]
+    detection, late_ns = told.detection, round(told.clock_offset_s * SECOND_NS)
     x, y = seen.x_px.astype(np.float32), seen.y_px.astype(np.float32)
     flux, sigma = seen.flux.astype(np.float32), seen.sigma_px.astype(np.float32)
     offsets = seen.offsets.tolist()
@@ -230,7 +231,7 @@ def _frames(simulation: Simulation, k: int, seen: Exposures) -> Iterator[_Messag
             "flux": flux[part] if detection.send_flux else None,
             "sigma_px": sigma[part] if detection.send_sigma else None,
         }
-        yield time_ns, sensor.sensor_id, "frame", values
+        yield time_ns + late_ns, sensor.sensor_id, "frame", values
 
 
 class _States:

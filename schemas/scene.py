@@ -171,6 +171,9 @@ class SceneSensor(Group):
     )
     exposure_s: float = Field(0.1, gt=0)
     time_jitter_s: float = Field(0.0, ge=0, description="1-sigma of a frame's time.")
+    clock_offset_s: float = Field(
+        0.0, gt=-60, lt=60, description="Told minus true time of its frames; states have the true."
+    )
     frame_drop: float = Field(0.0, ge=0, lt=1, description="Share of frames missing.")
     outages_s: list[tuple[float, float]] = Field(
         [], description="From and to, since the start: no frames."

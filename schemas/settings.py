@@ -102,7 +102,9 @@ class AlignmentSettings(Group):
         "the interval between epochs where that is longer.",
     )
     correct_clocks: bool = Field(
-        False, description="Put frames at their true times where a sensor's clock is surely off."
+        False,
+        description="Put frames at their true times where a sensor's clock is surely off; or else "
+        "the sensor is left out.",
     )
 
 

@@ -1,40 +1,44 @@
 """Estimate clocks: each sensor's clock offset over the night, and frames put right by it."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
+import pyarrow.compute as pc
 from prefect import task
 from prefect.cache_policies import NO_CACHE
 
-from epipole.schemas.bridge import array, table
+from epipole.schemas.bridge import array, empty, table
 from epipole.schemas.settings import Settings
+from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.clock_offset import Lines, clock_offsets
+from epipole.tasks.algorithms.clock_search import Meetings, search_offset
 from epipole.tasks.algorithms.object_motion import velocities
 
 Array = npt.NDArray[np.float64]
 
 VELOCITY_WINDOW_S = 30.0  # positions this near give an object's velocity
-SURE_SIGMA = 5.0  # an offset this far from zero is real
+MOST_EPOCHS = 300  # more tell nothing new of a constant
+MOST_PAIRS = 200_000  # of a view and an object: bounds the memory
 KNOWN_S = 1.0  # a sigma above this says nothing of a clock
+POSITION_COV = [f"cov_{ab}" for ab in ("xx", "xy", "xz", "xy", "yy", "yz", "xz", "yz", "zz")]
 PLACE = ["x_km", "y_km", "z_km"]
 VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 
 
 class Clock(NamedTuple):
-    """A sensor's clock: reported minus true time of its frames, and its 1-sigma error."""
+    """A sensor's clock: reported minus true time of its frames, and its 1-sigma error.
+
+    `is_off`: the offset is real.
+    """
 
     sensor_id: str
     offset_s: float
     sigma_s: float
-
-    @property
-    def is_off(self) -> bool:
-        """Whether the offset is real."""
-        return abs(self.offset_s) > SURE_SIGMA * self.sigma_s
+    is_off: bool
 
     def __str__(self) -> str:
         """Return it as people read it."""
@@ -55,62 +59,122 @@ def estimate_clocks(
 ) -> list[Clock]:
     """Return the clocks that the lines of sight tell something of, by sensor.
 
+    `views` are all views, not only those of objects: a sensor whose clock is seconds off sees
+    none of the objects where they are, and is held against those that the others found.
+
     Epochs that share detections would count twice: one in each width of the local motion is
-    used. Only views that the positions used take part.
+    used, `MOST_EPOCHS` at most.
     """
-    lines, bias = _used_views(views, associations, positions, solutions, settings)
-    if not len(bias):
+    rows = _objects_views(views, associations, positions, solutions, settings)
+    claimed = rows.filter(pl.col("claimed"))
+    guess, found = {}, [claimed]
+    for (name,), own in rows.group_by("sensor_id", maintain_order=True):
+        match = _search(own.filter(~pl.col("claimed")))
+        if match is not None:
+            guess[str(name)], met = match
+            found.append(met.join(claimed, on=["epoch", "object_id", "sensor_id"], how="anti"))
+    rows = pl.concat(found).sort("epoch", "object_id", "sensor_id")
+    if not len(rows):
         return []
-    offset_s, sigma_s = clock_offsets(
-        lines, bias["position_sigma_km"].to_numpy(), bias["attitude_sigma_rad"].to_numpy()
+    spread = (pl.col("cov_bias_11_rad2") + pl.col("cov_bias_22_rad2")) / 2
+    bias = rows.group_by("sensor_id").agg(
+        pl.col("position_sigma_km").max(), attitude_sigma_rad=spread.max().sqrt()
+    ).sort("sensor_id")  # fmt: skip
+    offsets = clock_offsets(
+        _lines(rows, bias["sensor_id"]),
+        bias["position_sigma_km"].to_numpy(),
+        bias["attitude_sigma_rad"].to_numpy(),
+        np.array([guess.get(name, 0.0) for name in bias["sensor_id"]]),
     )
     return [
-        Clock(name, float(offset), float(sigma))
-        for name, offset, sigma in zip(bias["sensor_id"], offset_s, sigma_s, strict=True)
+        Clock(name, float(offset), float(sigma), bool(off))
+        for name, offset, sigma, off in zip(bias["sensor_id"], *offsets, strict=True)
         if sigma < KNOWN_S
     ]
 
 
-def _used_views(
+def _objects_views(
     views: pa.Table,
     associations: pa.Table,
     positions: pa.Table,
     solutions: pa.Table,
     settings: Settings,
-) -> tuple[Lines, pl.DataFrame]:
-    """Return the used views as lines of sight, and a row a sensor with its biases."""
+) -> pl.DataFrame:
+    """Return views beside objects: those of each object, and all others beside all of them."""
     key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
-    claimed = _frame(associations).filter("used").select([*key, "object_id"])
+    whose = _frame(associations).select([*key, "object_id"])
     objects = _with_velocities(_frame(positions))
     epochs = _apart(objects["epoch"].unique().sort(), 2 * settings.alignment.window_s)
     frames = _frame(solutions).select(["sensor_id", "frame_number", *VELOCITY])
-    rows = (
+    seen = (
         _frame(views)
         .rename({name: f"sensor_{name}" for name in PLACE})
         .filter(pl.col("epoch").is_in(epochs.implode()))
-        .join(claimed, on=key)
-        .join(objects, on=["epoch", "object_id"])
-        .join(frames, on=["sensor_id", "frame_number"], suffix="_sensor")
-        .drop_nulls([f"{name}_sensor" for name in VELOCITY])
-        .sort("epoch", "object_id", "sensor_id")
+        .join(whose, on=key, how="left")
+        .join(frames.rename({name: f"sensor_{name}" for name in VELOCITY}),
+              on=["sensor_id", "frame_number"])
+        .drop_nulls([f"sensor_{name}" for name in VELOCITY])
+        .with_columns(claimed=pl.col("object_id").is_not_null())
+    )  # fmt: skip
+    of_objects = seen.filter(pl.col("claimed")).join(objects, on=["epoch", "object_id"])
+    free = _thinned(seen.filter(~pl.col("claimed")).drop("object_id"), objects).join(
+        objects, on="epoch"
     )
-    spread = (pl.col("cov_bias_11_rad2") + pl.col("cov_bias_22_rad2")) / 2
-    bias = rows.group_by("sensor_id").agg(
-        pl.col("position_sigma_km").max(), attitude_sigma_rad=spread.max().sqrt()
-    ).sort("sensor_id")  # fmt: skip
-    sensor: Any = bias["sensor_id"].search_sorted(rows["sensor_id"]) if len(rows) else []
-    lines = Lines(
+    return pl.concat([of_objects, free.select(of_objects.columns)]).sort(
+        "sensor_id", "epoch", "tracklet_id", "object_id"
+    )
+
+
+def _thinned(free: pl.DataFrame, objects: pl.DataFrame) -> pl.DataFrame:
+    """Return the views of so few epochs that beside all objects they are not too many."""
+    n_objects = objects.group_by("epoch").agg(n=pl.len())
+    pairs = free.select("epoch").join(n_objects, on="epoch")["n"].sum()
+    epochs = free["epoch"].unique().sort()[:: max(-(-pairs // MOST_PAIRS), 1)]
+    return free.filter(pl.col("epoch").is_in(epochs.implode()))
+
+
+def _search(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:
+    """Return the offset that lets a sensor see the objects, and its views of them then."""
+    if not len(free):
+        return None
+    match = search_offset(
+        Meetings(
+            tracklet=free["tracklet_id"].rank("dense").to_numpy().astype(np.int64),
+            item=free["object_id"].rank("dense").to_numpy().astype(np.int64),
+            u=free.select("ux", "uy", "uz").to_numpy(),
+            cov=_covariance(free, "noise") + _covariance(free, "bias"),
+            r_km=free.select([f"sensor_{name}" for name in PLACE]).to_numpy(),
+            v_sensor_km_s=free.select([f"sensor_{name}" for name in VELOCITY]).to_numpy(),
+            sigma_km=free["position_sigma_km"].to_numpy(),
+            x_km=free.select(PLACE).to_numpy(),
+            v_km_s=free.select(VELOCITY).to_numpy(),
+            cov_km2=_stacked(free, POSITION_COV).reshape(-1, 3, 3),
+        )
+    )
+    return None if match is None else (match.offset_s, free[match.row])
+
+
+def _lines(rows: pl.DataFrame, sensors: pl.Series) -> Lines:
+    """Return views of objects as lines of sight, the sensors numbered in order."""
+    return Lines(
         group=rows.select(pl.struct("epoch", "object_id").rle_id()).to_series().to_numpy(),
-        sensor=np.asarray(sensor, np.int64),
+        sensor=np.asarray(sensors.search_sorted(rows["sensor_id"]), np.int64),
         u=rows.select("ux", "uy", "uz").to_numpy(),
-        cov=np.stack([rows[f"cov_noise_{ab}_rad2"].to_numpy() for ab in ("11", "12", "12", "22")],
-                     axis=1).reshape(-1, 2, 2),
+        cov=_covariance(rows, "noise"),
         x_km=rows.select(PLACE).to_numpy(),
         v_km_s=rows.select(VELOCITY).to_numpy(),
         r_km=rows.select([f"sensor_{name}" for name in PLACE]).to_numpy(),
-        v_sensor_km_s=rows.select([f"{name}_sensor" for name in VELOCITY]).to_numpy(),
-    )  # fmt: skip
-    return lines, bias
+        v_sensor_km_s=rows.select([f"sensor_{name}" for name in VELOCITY]).to_numpy(),
+    )
+
+
+def _covariance(rows: pl.DataFrame, which: str) -> Array:
+    names = [f"cov_{which}_{ab}_rad2" for ab in ("11", "12", "12", "22")]
+    return _stacked(rows, names).reshape(-1, 2, 2)
+
+
+def _stacked(rows: pl.DataFrame, names: list[str]) -> Array:
+    return np.stack([rows[name].to_numpy() for name in names], axis=1)
 
 
 def _frame(rows: pa.Table) -> pl.DataFrame:
@@ -119,13 +183,13 @@ def _frame(rows: pa.Table) -> pl.DataFrame:
 
 
 def _apart(epochs: pl.Series, apart_s: float) -> pl.Series:
-    """Return epochs that lie at least so far apart."""
+    """Return epochs that lie at least so far apart, evenly thinned where they are too many."""
     kept: list[int] = []
     time_ns = epochs.cast(pl.Int64).to_numpy()
     for k, t in enumerate(time_ns):
         if not kept or t - time_ns[kept[-1]] >= apart_s * 1e9:
             kept.append(k)
-    return epochs[kept]
+    return epochs[kept[:: max(-(-len(kept) // MOST_EPOCHS), 1)]]
 
 
 def _with_velocities(positions: pl.DataFrame) -> pl.DataFrame:
@@ -137,7 +201,50 @@ def _with_velocities(positions: pl.DataFrame) -> pl.DataFrame:
     time_s = (time_ns - (time_ns.min() if len(time_ns) else 0)) / 1e9
     v = velocities(offsets, time_s, positions.select(PLACE).to_numpy(), VELOCITY_WINDOW_S)
     columns = [pl.Series(name, v[:, k]) for k, name in enumerate(VELOCITY)]
-    return positions.select(["epoch", "object_id", *PLACE]).with_columns(columns)
+    own = ["epoch", "object_id", *PLACE, *sorted(set(POSITION_COV))]
+    return positions.select(own).with_columns(columns)
+
+
+def added(before: list[Clock], now: list[Clock]) -> list[Clock]:
+    """Return clocks as the logs have them: what was put right before, and what is left."""
+    done = {clock.sensor_id: clock for clock in before if clock.is_off}
+    out = [
+        clock._replace(
+            offset_s=clock.offset_s + done[clock.sensor_id].offset_s, is_off=True
+        ) if clock.sensor_id in done else clock
+        for clock in now
+    ]  # fmt: skip
+    left = {clock.sensor_id for clock in now}
+    out += [clock for name, clock in done.items() if name not in left]
+    return sorted(out)
+
+
+def of_sound_clocks(
+    views: pa.Table, associations: pa.Table, clocks: list[Clock]
+) -> tuple[pa.Table, pa.Table]:
+    """Return the views without those of clocks that are off, and a row of rejects for each.
+
+    A sensor that is in no association spoils none, and stays.
+    """
+    off = [clock.sensor_id for clock in clocks if clock.is_off]
+    wrong = pc.is_in(views["sensor_id"], pa.array(off, pa.string()))
+    taking_part = pc.is_in(associations["sensor_id"], pa.array(off, pa.string()))
+    if not pc.any(taking_part).as_py():
+        return views, empty(REJECTS)
+    found = pl.DataFrame(views.filter(wrong)).group_by("sensor_id").agg(
+        time=pl.col("epoch").min(), count=pl.len()
+    ).sort("sensor_id")  # fmt: skip
+    n = len(found)
+    rejects = {
+        "source": pa.nulls(n, pa.string()),
+        "offset": pa.nulls(n, pa.int64()),
+        "sensor_id": found["sensor_id"].to_arrow(),
+        "time": found["time"].to_arrow(),
+        "stage": ["clocks"] * n,
+        "reason": ["clock_off"] * n,
+        "count": found["count"].cast(pl.Int64).to_arrow(),
+    }
+    return views.filter(pc.invert(wrong)), table(REJECTS, rejects)
 
 
 def set_clocks(rows: pa.Table, clocks: list[Clock]) -> pa.Table:
