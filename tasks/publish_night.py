@@ -14,11 +14,18 @@ from epipole.schemas.bridge import array, concat, table
 from epipole.schemas.log_tables import LogSource
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS, SOURCES, TABLES
+from epipole.tasks.retries import DELAYS_S, RETRIES, storage_failed
 
 DAY_NS = 86_400_000_000_000
 
 
-@task(name="publish night", cache_policy=NO_CACHE)
+@task(
+    name="publish night",
+    cache_policy=NO_CACHE,
+    retries=RETRIES,
+    retry_delay_seconds=DELAYS_S,
+    retry_condition_fn=storage_failed,
+)
 def publish_night(
     dataset: str,
     tables: Mapping[str, pa.Table],

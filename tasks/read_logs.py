@@ -29,6 +29,7 @@ from epipole.tasks.algorithms.frame_order import (
 )
 from epipole.tasks.algorithms.list_order import take_lists
 from epipole.tasks.algorithms.reference_frames import orientation_at, to_gcrf
+from epipole.tasks.retries import DELAYS_S, RETRIES, storage_failed
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +42,13 @@ _DUPLICATES = {
 }
 
 
-@task(name="read logs", cache_policy=NO_CACHE)
+@task(
+    name="read logs",
+    cache_policy=NO_CACHE,
+    retries=RETRIES,
+    retry_delay_seconds=DELAYS_S,
+    retry_condition_fn=storage_failed,
+)
 def read_logs(
     paths: Sequence[str | os.PathLike[str]],
     settings: Settings,
