@@ -52,7 +52,7 @@ class IdentificationSettings(Group):
     )
     gate_sigma: float = Field(3.7, gt=0, description="A star lies within this of its place.")
     false_alarm: float = Field(
-        1e-6, gt=0, lt=1, description="Accepted probability that a reported attitude is by chance."
+        1e-5, gt=0, lt=1, description="Accepted probability that a reported attitude is by chance."
     )
     time_limit_s: float = Field(0.5, gt=0, description="Longest search for one frame.")
     calibrate: Literal["use", "report", "off"] = Field(

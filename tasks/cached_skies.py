@@ -140,6 +140,7 @@ def _pairs(
         return {
             "s": table.chord.s, "below": table.chord.below, "line": line,
             "first": table.first, "second": table.second,
+            "at_first": table.at_first, "at_second": table.at_second,
         }  # fmt: skip
 
     key = _disk_key("pairs", catalogue, day, pixel_rad, merge_px, n, diagonal)

@@ -16,7 +16,6 @@ from epipole.tasks.algorithms.star_identification.evidence import (
 
 SIGMA = 1e-4
 AREA = 0.04
-NO_FLUX = np.full(3, np.nan)
 FLAT = log_magnitude_density(np.linspace(-2, 16, 10_000))
 
 
@@ -33,24 +32,28 @@ def _evidence(star_of, chi2=0.0, n_stars=5, instrumental=None, magnitude=None, z
 def test_the_evidence_of_three_matches_is_what_the_formula_gives():
     total, matches = _evidence([0, 1, -1, 4], chi2=2.0)
     one = math.log(AREA / (2 * math.pi * SIGMA**2)) - 1.0
-    # n! / (n - k)!, and the integral of 4 p^3 p^k (1 - p)^(m - k).
+    # n! / (n - k)!, the integral of 4 p^3 p^k (1 - p)^(m - k), and one false rather than four.
     ways = math.factorial(4) / (4 * math.factorial(6) * math.factorial(2) / math.factorial(9))
+    ways *= (1 + 1) / (4 + 1)
     assert matches == 3
     assert total == pytest.approx(3 * one - math.log(ways))
 
 
 def test_averaged_over_chance_the_evidence_is_below_one():
     # Markov's inequality rests on this: the mean of its exponential over random frames of
-    # three centroids and one star, the best assignment taken.
+    # up to six centroids, as often as the prior has them, and one star, the best assignment taken.
     rng = np.random.default_rng(0)
     side, sigma = math.sqrt(AREA), 0.01
-    u = rng.uniform(0, side, (40_000, 3, 2))
-    d2 = np.sum((u - side / 2) ** 2, axis=2).min(axis=1) / sigma**2
-    lone = match_evidence(
-        np.array([0, -1, -1]), np.zeros(3), np.full(3, sigma), NO_FLUX, np.array([5.0]), FLAT,
-        math.nan, 0.4, 1.0, AREA,
-    )[0]  # fmt: skip
-    assert np.mean(np.exp(lone - 0.5 * d2)) < 1.0
+    mean, weight = np.zeros(7), 1.0 / np.arange(1.0, 8.0)
+    for n in range(1, 7):
+        u = rng.uniform(0, side, (20_000, n, 2))
+        d2 = np.sum((u - side / 2) ** 2, axis=2).min(axis=1) / sigma**2
+        lone = match_evidence(
+            np.where(np.arange(n) == 0, 0, -1), np.zeros(n), np.full(n, sigma),
+            np.full(n, np.nan), np.array([5.0]), FLAT, math.nan, 0.4, 1.0, AREA,
+        )[0]  # fmt: skip
+        mean[n] = np.mean(np.exp(lone - 0.5 * d2))
+    assert 0.5 < np.sum(mean * weight) / np.sum(weight) < 1.0
 
 
 def test_right_brightness_adds_and_wrong_brightness_takes_away():
@@ -63,11 +66,11 @@ def test_right_brightness_adds_and_wrong_brightness_takes_away():
     assert swapped < none < right
 
 
-def test_the_zero_point_is_the_median_and_needs_four_matches():
+def test_the_zero_point_is_the_median_and_needs_three_matches():
     magnitude = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
     instrumental = np.array([-19.0, -18.0, -17.0, -10.0, -15.0])
     assert median_zero_point(np.arange(5), instrumental, magnitude) == 20.0
-    assert math.isnan(median_zero_point(np.array([0, 1, 2, -1, -1]), instrumental, magnitude))
+    assert math.isnan(median_zero_point(np.array([0, 1, -1, -1, -1]), instrumental, magnitude))
 
 
 def test_choosing_among_all_attitudes_costs_their_number():

@@ -63,6 +63,18 @@ def attitude_covariance(u_sensor: Array, sigma_rad: Array) -> Array:
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
+def attitude_information(u_sensor, sigma_rad, A):
+    """Write the sum of (I - u u') / sigma^2 [rad^-2] about the sensor axes (compiled)."""
+    A[:] = 0.0
+    for k in range(len(u_sensor)):
+        w = 1.0 / (sigma_rad[k] * sigma_rad[k])
+        for i in range(3):
+            A[i, i] += w
+            for j in range(3):
+                A[i, j] -= w * u_sensor[k, i] * u_sensor[k, j]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
 def invert_symmetric(A, out):
     """Write the inverse of a symmetric 3x3 matrix; return its determinant (compiled)."""
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]

@@ -13,7 +13,8 @@ anywhere in the image. Its parts:
   that is sqrt(det 2 pi P) / (8 pi^2).
 
 So it does not depend on how many hypotheses were tried, and the probability that chance
-alone reaches x is below exp(-x) (Markov's inequality).
+alone reaches x is below exp(-x) (Markov's inequality; over frames with as many false
+centroids as the prior of `log_ways` has them).
 """
 
 import math
@@ -55,7 +56,7 @@ def log_brightness_ratio(difference, magnitude, log_density, spread):
 def median_zero_point(star_of, instrumental, magnitude):
     """Return the median of star minus instrumental magnitude over the matches (compiled).
 
-    NaN with fewer than four matches that have a flux.
+    NaN with fewer than three matches that have a flux.
     """
     found = np.empty(len(star_of))
     n = 0
@@ -63,7 +64,7 @@ def median_zero_point(star_of, instrumental, magnitude):
         if star_of[k] >= 0 and not math.isnan(instrumental[k]):
             found[n] = magnitude[star_of[k]] - instrumental[k]
             n += 1
-    if n < 4:
+    if n < 3:
         return math.nan
     return np.median(found[:n])
 
@@ -74,10 +75,12 @@ def log_ways(n, matches, in_view):
     are just these of the stars in view (compiled).
 
     The share p of the stars in view that the sensor sees is not known: 4 p^3, as most
-    sensors see most stars to their limit.
+    sensors see most stars to their limit. Nor is the number f of false centroids: 1 / (f + 1),
+    every order of magnitude alike.
     """
     k, m = float(matches), max(in_view, float(matches))
     centroids = math.lgamma(n + 1.0) - math.lgamma(n - k + 1.0)
+    centroids += math.log((n - k + 1.0) / (n + 1.0))
     seen = math.log(4.0) + math.lgamma(k + 4.0) + math.lgamma(m - k + 1.0) - math.lgamma(m + 5.0)
     return centroids - seen
 
@@ -100,23 +103,34 @@ def match_evidence(
     in_view, area : float
         Stars in the image (matched or not), and its solid angle [sr].
     """
-    n = len(star_of)
-    zero, total = zero_point, 0.0
-    if math.isnan(zero):
+    total, matches = 0.0, 0
+    for k in range(len(star_of)):
+        if star_of[k] >= 0:
+            matches += 1
+            total += math.log(area / (2.0 * math.pi * sigma[k] * sigma[k])) - 0.5 * chi2_of[k]
+    if math.isnan(zero_point):
         zero = median_zero_point(star_of, instrumental, magnitude)
         if not math.isnan(zero):
+            tight = _brightness(star_of, instrumental, magnitude, log_density, zero, 0.5 * spread)
+            loose = _brightness(star_of, instrumental, magnitude, log_density, zero, spread)
+            more = max(tight, loose)
+            total += more + math.log(0.5 * (math.exp(tight - more) + math.exp(loose - more)))
             total -= 3.0  # one more number chosen from the data: ln(range / its error)
-    matches = 0
-    for k in range(n):
+    else:
+        total += _brightness(star_of, instrumental, magnitude, log_density, zero_point, spread)
+    return total - log_ways(len(star_of), matches, in_view), matches
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _brightness(star_of, instrumental, magnitude, log_density, zero, spread):
+    """Return the log of how much better the matches' brightness fits than by chance."""
+    total = 0.0
+    for k in range(len(star_of)):
         s = star_of[k]
-        if s < 0:
-            continue
-        matches += 1
-        total += math.log(area / (2.0 * math.pi * sigma[k] * sigma[k])) - 0.5 * chi2_of[k]
-        if not (math.isnan(zero) or math.isnan(instrumental[k])):
+        if s >= 0 and not math.isnan(instrumental[k]):
             difference = magnitude[s] - instrumental[k] - zero
             total += log_brightness_ratio(difference, magnitude[s], log_density, spread)
-    return total - log_ways(n, matches, in_view), matches
+    return total
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")

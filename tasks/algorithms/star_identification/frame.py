@@ -11,11 +11,7 @@ from epipole.tasks.algorithms.star_identification.field import (
     stars_in_cone,
 )
 from epipole.tasks.algorithms.star_identification.lost_in_space import (
-    CLEAR_LEAD,
-    ENOUGH_LOOKUPS,
-    MAX_LOOKUPS_PER_S,
-    PASSES,
-    Verdict,
+    WORK_PER_S,
     search,
 )
 from epipole.tasks.algorithms.star_identification.pair_table import PairTable
@@ -27,6 +23,10 @@ Array = npt.NDArray[np.float64]
 # Chance reaches a log evidence x, lost in space, with a probability below exp(-(x + 6)):
 # measured on 12,000 random frames of three cameras. Markov's inequality has exp(-x).
 LOST_MARGIN = 6.0
+# The best attitude must be this much (in log) more probable than any other.
+CLEAR_LEAD = 7.0
+# Prior odds (ln) that a frame shows stars that identify: what most sensors do, 99 in 100.
+STARLIT = 4.6
 N_SEARCHED = 200  # brightest centroids that take part in a search of the whole sky
 N_PATTERN_CENTROIDS = 40  # brightest centroids that are paired lost in space
 
@@ -99,6 +99,22 @@ class Search(NamedTuple):
     spread_mag: float = TYPICAL_SPREAD_MAG
 
 
+class Verdict(NamedTuple):
+    """What a search found.
+
+    found : the attitude is beyond doubt
+    R_sensor_from_icrs : (3, 3), of the best hypothesis
+    evidence, runner_up : log evidence of the best and of the best different attitude
+    exhausted : the search ended because its bound was reached
+    """
+
+    found: bool
+    R_sensor_from_icrs: Array
+    evidence: float
+    runner_up: float
+    exhausted: bool
+
+
 def identify_predicted(
     frame: Frame, sky: Sky, R0: Array, P0: Array, how: Search, lost: bool = False
 ) -> Solution | None:
@@ -128,7 +144,7 @@ def identify_predicted(
         frame.optics.box, how.gate_sigma, sky.log_density, how.zero_point_mag,
         how.spread_mag, how.threshold + CLEAR_LEAD, R, P, star, chi2,
     )  # fmt: skip
-    if not evidence > how.threshold - (LOST_MARGIN if lost else 0.0):
+    if not evidence > how.threshold - (LOST_MARGIN + STARLIT if lost else 0.0):
         return None
     return Solution(R, P, np.where(star >= 0, row[star], -1), chi2, evidence)
 
@@ -149,24 +165,19 @@ def search_lost(frame: Frame, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Se
         sigma_rad=frame.sigma_rad[:N_SEARCHED],
         instrumental_mag=frame.instrumental_mag[:N_SEARCHED],
     )
-    R = np.zeros((3, 3))
+    R, least = np.zeros((3, 3)), how.threshold - LOST_MARGIN - STARLIT
     area = frame.optics.solid_angle_sr
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))
-    budget = int(how.time_limit_s * MAX_LOOKUPS_PER_S)
-    flux = bool(np.isfinite(frame.instrumental_mag).any())
-    if flux and np.isfinite(how.zero_point_mag):
-        budget = min(budget, ENOUGH_LOOKUPS)
-    passes = PASSES if flux and np.isnan(how.zero_point_mag) else PASSES[:2]
     best, runner_up, work = search(
         frame.u, frame.sigma_rad, frame.instrumental_mag, frame.beta,
         sky.catalogue.u_icrs, sky.catalogue.magnitude, grid.first, grid.star, grid.n_face,
-        grid.radius_rad, *pairs.chord, pairs.first, pairs.second, min_chord,
-        N_PATTERN_CENTROIDS, how.gate_sigma, sky.log_density, how.zero_point_mag,
-        how.spread_mag, sky.rho * area, area, frame.optics.box,
-        passes, how.threshold + CLEAR_LEAD, budget, R,
+        grid.radius_rad, *pairs.chord, pairs.first, pairs.second, pairs.at_first,
+        pairs.at_second, min_chord, N_PATTERN_CENTROIDS, how.gate_sigma, sky.log_density,
+        how.zero_point_mag, how.spread_mag, sky.rho * area, area, frame.optics.box,
+        least, least + CLEAR_LEAD + 2.0, how.time_limit_s * WORK_PER_S, R,
     )  # fmt: skip
-    found = best > how.threshold - LOST_MARGIN and best - runner_up > CLEAR_LEAD
-    return Verdict(found, R, best, runner_up, work > budget)
+    found = best > least and best - runner_up > CLEAR_LEAD
+    return Verdict(found, R, best, runner_up, work > how.time_limit_s * WORK_PER_S)
 
 
 def identify_lost(
