@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -161,3 +163,22 @@ def test_a_killed_worker_leaves_the_dataset_and_the_next_one_goes_on(deployed, n
     assert freed.returncode == 0, freed.stdout + freed.stderr
     deployed.ends_as(next_id, "COMPLETED")
     assert contents(deployed.out) == before
+
+
+def test_a_run_from_the_command_line_goes_to_the_server_of_the_users_profile(
+    deployed, night_log, tmp_path
+):
+    (tmp_path / "profiles.toml").write_text(
+        f'active = "ours"\n[profiles.ours]\nPREFECT_API_URL = "{deployed.prefect.url}"\n'
+    )
+    kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
+    command = "from epipole.flows.command_line import main; main()"
+    ran = subprocess.run(
+        [sys.executable, "-c", command, "run", str(night_log), "--out", str(tmp_path / "out")],
+        env=kept | {"PREFECT_HOME": str(tmp_path)}, cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    named = {"name": {"any_": ["every night"]}}
+    (run,) = deployed.prefect.find("flow_runs", flow_runs=named)
+    assert run["state_type"] == "COMPLETED"
+    assert not list(tmp_path.glob("*.db*"))  # no embedded server's database
