@@ -9,7 +9,7 @@ and its drift), not one an instant, and is weighed so.
 import numpy as np
 from numba import njit
 
-from epipole.tasks.algorithms.association.instant_points import residual
+from epipole.tasks.algorithms.association.views import PLANE, X, Y, direction, residual
 
 GM_KM3_S2 = 398600.4418
 STEP_S = 60.0  # Runge-Kutta is good to 0.1 m over it in a low orbit
@@ -72,7 +72,7 @@ def _fall(y, dt_s, k):
 
 
 @njit(cache=True, nogil=True)
-def _begin(views, X, seen_by, state):
+def _begin(views, x, seen_by, state):
     """Write the state at the first solved instant from the points; return that instant.
 
     The line through the points, bent by gravity.
@@ -86,7 +86,7 @@ def _begin(views, X, seen_by, state):
             mean_t += views.time_s[m] - views.time_s[first]
     mean_t /= n
     state[:] = 0.0
-    r2 = X[first, 0] ** 2 + X[first, 1] ** 2 + X[first, 2] ** 2
+    r2 = x[first, 0] ** 2 + x[first, 1] ** 2 + x[first, 2] ** 2
     pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
     square = 0.0
     for m in range(first, len(views.time_s)):
@@ -95,7 +95,7 @@ def _begin(views, X, seen_by, state):
         t = views.time_s[m] - views.time_s[first]
         square += (t - mean_t) ** 2
         for a in range(3):
-            straight = X[m, a] + 0.5 * pull * X[first, a] * t * t
+            straight = x[m, a] + 0.5 * pull * x[first, a] * t * t
             state[a] += straight / n
             state[3 + a] += straight * (t - mean_t)
     for a in range(3):
@@ -113,7 +113,7 @@ def _normal_equations(views, members, n, first, state, at, k, N, rhs):
     """
     N[:] = 0.0
     rhs[:] = 0.0
-    e, W, y = np.empty(2), np.empty(3), state.copy()
+    part, y = np.empty(11), state.copy()
     G, H = np.empty((2, 6)), np.empty((2, 6))
     chi2 = 0.0
     for m in range(first, len(views.time_s)):
@@ -125,18 +125,18 @@ def _normal_equations(views, members, n, first, state, at, k, N, rhs):
             i = members[q]
             if not views.seen[i, m]:
                 continue
-            rho = residual(views, i, m, y, e, W)
-            if rho == 0.0:
+            if residual(views, i, m, y, part) == 0.0:
                 return np.nan
             for a in range(3):
                 for c in range(2):
-                    G[c, a] = views.basis[i, m, c, a] / rho
+                    G[c, a] = part[2 + 3 * c + a]
                     G[c, 3 + a] = G[c, a] * t
-            g0, g1 = W[0] * e[0] + W[1] * e[1], W[1] * e[0] + W[2] * e[1]
-            chi2 += e[0] * g0 + e[1] * g1
+            g0 = part[8] * part[0] + part[9] * part[1]
+            g1 = part[9] * part[0] + part[10] * part[1]
+            chi2 += part[0] * g0 + part[1] * g1
             for a in range(6):
-                H[0, a] = W[0] * G[0, a] + W[1] * G[1, a]
-                H[1, a] = W[1] * G[0, a] + W[2] * G[1, a]
+                H[0, a] = part[8] * G[0, a] + part[9] * G[1, a]
+                H[1, a] = part[9] * G[0, a] + part[10] * G[1, a]
                 rhs[a] -= G[0, a] * g0 + G[1, a] * g1
             for a in range(6):
                 for b in range(6):
@@ -162,9 +162,11 @@ def _scatter(views, chance, i, begun, ended, b):
     A rate far from all others is as rare as its square is large, not as a Gaussian's tail.
     """
     s, dt = views.sensor[i], views.time_s[ended] - views.time_s[begun]
-    square = 0.0
+    square, u = 0.0, np.empty(3)
+    direction(views, i, begun, u)
+    direction(views, i, ended, b)
     for a in range(3):
-        b[a] = (views.u[i, ended, a] - views.u[i, begun, a]) / dt - chance.drift[s, a]
+        b[a] = (b[a] - u[a]) / dt - chance.drift[s, a]
         square += b[a] * b[a]
     return max(chance.spread[s] ** 2, square / 2.0)
 
@@ -191,7 +193,8 @@ def _usual_velocity(views, chance, members, n, first, state, prior, usual):
             cost = 0.5 * (b[0] * b[0] + b[1] * b[1] + b[2] * b[2]) / variance
     if across == 0.0:
         across = along
-    u, radial = views.u[chosen, _ends(views, chosen, first)[0]], 0.0
+    u, radial = np.empty(3), 0.0
+    direction(views, chosen, _ends(views, chosen, first)[0], u)
     for a in range(3):
         radial += state[3 + a] * u[a]
     for a in range(3):
@@ -206,7 +209,7 @@ def _usual_velocity(views, chance, members, n, first, state, prior, usual):
 def _range(views, i, m, x):
     total = 0.0
     for a in range(3):
-        total += (x[a] - views.r_km[views.sensor[i], m, a]) ** 2
+        total += (x[a] - views.camera[views.sensor[i], m, a]) ** 2
     return np.sqrt(total)
 
 
@@ -218,7 +221,7 @@ def _own_odds(views, chance, i, first, at):
     whose states are `at`: so they need not be said to curve as a distant object's do.
     """
     s = views.sensor[i]
-    J, h, e, W = np.zeros((4, 4)), np.zeros(4), np.empty(2), np.empty(3)
+    J, h, part = np.zeros((4, 4)), np.zeros(4), np.empty(11)
     begun, ended = _ends(views, i, first)
     variance, chi2, b = 1.0, 0.0, np.zeros(3)
     if begun < ended:
@@ -227,30 +230,34 @@ def _own_odds(views, chance, i, first, at):
         # The residual drifts as the tracklet itself does beside what is usual.
         mean = 0.0
         for a in range(3):
-            mean += views.basis[i, begun, c, a] * b[a]
+            mean += views.camera[s, begun, PLANE + 3 * c + a] * b[a]
         J[2 + c, 2 + c] = 1.0 / variance
         h[2 + c] = mean / variance
         chi2 += mean * mean / variance
     for m in range(begun, ended + 1):
         if not views.seen[i, m]:
             continue
-        residual(views, i, m, at[m], e, W)
+        residual(views, i, m, at[m], part)
         t = views.time_s[m] - views.time_s[begun]
-        g0, g1 = W[0] * e[0] + W[1] * e[1], W[1] * e[0] + W[2] * e[1]
-        chi2 += e[0] * g0 + e[1] * g1
+        g0 = part[8] * part[0] + part[9] * part[1]
+        g1 = part[9] * part[0] + part[10] * part[1]
+        chi2 += part[0] * g0 + part[1] * g1
         for p, tp in ((0, 1.0), (2, t)):
             h[p] += tp * g0
             h[p + 1] += tp * g1
             for o, to in ((0, 1.0), (2, t)):
-                J[p, o] += tp * to * W[0]
-                J[p, o + 1] += tp * to * W[1]
-                J[p + 1, o] += tp * to * W[1]
-                J[p + 1, o + 1] += tp * to * W[2]
+                J[p, o] += tp * to * part[8]
+                J[p, o + 1] += tp * to * part[9]
+                J[p + 1, o] += tp * to * part[9]
+                J[p + 1, o + 1] += tp * to * part[10]
     own = h.copy()
     log_det = factor(J, own)
     for p in range(4):
         chi2 -= own[p] * h[p]
-    return np.log(chance.density[s] / variance) + LN_2PI - 0.5 * log_det - 0.5 * chi2
+    # The density is one on the sky, the place one in the plane.
+    flat = 1.0 + views.sight[i, begun, X] ** 2 + views.sight[i, begun, Y] ** 2
+    prior = np.log(chance.density[s] / variance) - 1.5 * np.log(flat)
+    return prior + LN_2PI - 0.5 * log_det - 0.5 * chi2
 
 
 @njit(cache=True, nogil=True)
@@ -271,7 +278,7 @@ def _leaves(state, L):
 
 
 @njit(cache=True, nogil=True)
-def arc_odds(views, chance, members, n, X, seen_by):
+def arc_odds(views, chance, members, n, x, seen_by):
     """Return the log-odds that the members' directions are one orbit's rather than their own.
 
     Without what the place is worth (see `score`) and without absences. -inf where there is no
@@ -280,7 +287,7 @@ def arc_odds(views, chance, members, n, X, seen_by):
     state, k = np.empty(6), np.empty((5, 6))
     at = np.empty((len(views.time_s), 6))
     N, rhs, prior, usual = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty(3)
-    first = _begin(views, X, seen_by, state)
+    first = _begin(views, x, seen_by, state)
     log_prior = _usual_velocity(views, chance, members, n, first, state, prior, usual)
     chi2 = log_det = gain = np.inf
     for _ in range(ITERATIONS):

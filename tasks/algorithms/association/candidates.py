@@ -4,36 +4,81 @@ import numpy as np
 from numba import njit
 
 from epipole.tasks.algorithms.association.sight_lines import quantile
+from epipole.tasks.algorithms.association.views import (
+    CORNER,
+    PLANE,
+    SCALE,
+    SIGMA_KM,
+    WIDEST,
+    XX,
+    XY,
+    YY,
+    X,
+    Y,
+)
+
+A0, A1, H00, H01, H11, DEPTH, STRETCH = range(7)  # columns of what is predicted
 
 
 @njit(cache=True, nogil=True)
-def fit(views, chance, c, X, P, seen_by):
+def _predict(views, s, points, predicted):
+    """Write where sensor s should see the points, and how well that is known; false: behind."""
+    x, _, P, seen_by = points
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2:
+            continue
+        cam = views.camera[s, m]
+        d0, d1, d2 = x[m, 0] - cam[0], x[m, 1] - cam[1], x[m, 2] - cam[2]
+        n0, n1, n2 = cam[PLANE + 6], cam[PLANE + 7], cam[PLANE + 8]
+        depth = n0 * d0 + n1 * d1 + n2 * d2
+        predicted[m, DEPTH] = depth
+        if not depth > 0.0:
+            continue
+        p0, p1, p2 = cam[PLANE], cam[PLANE + 1], cam[PLANE + 2]
+        q0, q1, q2 = cam[PLANE + 3], cam[PLANE + 4], cam[PLANE + 5]
+        a0 = (p0 * d0 + p1 * d1 + p2 * d2) / depth
+        a1 = (q0 * d0 + q1 * d1 + q2 * d2) / depth
+        p0, p1, p2 = (p0 - a0 * n0) / depth, (p1 - a0 * n1) / depth, (p2 - a0 * n2) / depth
+        q0, q1, q2 = (q0 - a1 * n0) / depth, (q1 - a1 * n1) / depth, (q2 - a1 * n2) / depth
+        t0 = P[m, 0, 0] * p0 + P[m, 0, 1] * p1 + P[m, 0, 2] * p2
+        t1 = P[m, 1, 0] * p0 + P[m, 1, 1] * p1 + P[m, 1, 2] * p2
+        t2 = P[m, 2, 0] * p0 + P[m, 2, 1] * p1 + P[m, 2, 2] * p2
+        predicted[m, A0], predicted[m, A1] = a0, a1
+        predicted[m, H00] = p0 * t0 + p1 * t1 + p2 * t2
+        predicted[m, H01] = q0 * t0 + q1 * t1 + q2 * t2
+        t0 = P[m, 0, 0] * q0 + P[m, 0, 1] * q1 + P[m, 0, 2] * q2
+        t1 = P[m, 1, 0] * q0 + P[m, 1, 1] * q1 + P[m, 1, 2] * q2
+        t2 = P[m, 2, 0] * q0 + P[m, 2, 1] * q1 + P[m, 2, 2] * q2
+        predicted[m, H11] = q0 * t0 + q1 * t1 + q2 * t2
+        predicted[m, STRETCH] = 1.0 + a0 * a0 + a1 * a1
+
+
+@njit(cache=True, nogil=True)
+def _fit(views, chance, s, c, seen_by, predicted):
     """Return what tracklet c adds to the odds, its chi-square, and how many instants it shares.
 
-    The log of how much likelier the points make its directions than chance does; see `score`.
+    The log of how much likelier the points make its directions than chance does. At later
+    instants than the first, chance is known to within how differently tracklets move.
     """
     gain, total, n, begun_at = 0.0, 0.0, 0, 0.0
-    s = views.sensor[c]
     for m in range(len(views.time_s)):
         if seen_by[m] < 2 or not views.seen[c, m]:
             continue
-        r = views.r_km[s, m]
-        basis, u, cov = views.basis[c, m], views.u[c, m], views.cov[c, m]
-        d0, d1, d2 = X[m, 0] - r[0], X[m, 1] - r[1], X[m, 2] - r[2]
-        if d0 * u[0] + d1 * u[1] + d2 * u[2] <= 0.0:
+        depth = predicted[m, DEPTH]
+        if not depth > 0.0:
             return -np.inf, np.inf, 0
-        rho2 = d0 * d0 + d1 * d1 + d2 * d2
-        rho = np.sqrt(rho2)
-        e0 = (basis[0, 0] * d0 + basis[0, 1] * d1 + basis[0, 2] * d2) / rho
-        e1 = (basis[1, 0] * d0 + basis[1, 1] * d1 + basis[1, 2] * d2) / rho
-        extra = views.sigma_km[c, m] ** 2 / rho2
-        h00, h01, h11 = _image_error(basis, P[m], rho2)
-        c00, c01, c11 = cov[0, 0] + extra + h00, cov[0, 1] + h01, cov[1, 1] + extra + h11
+        see = views.sight[c, m]
+        e0, e1 = predicted[m, A0] - see[X], predicted[m, A1] - see[Y]
+        extra = (see[SIGMA_KM] / depth) ** 2
+        c00 = see[XX] + extra * (1.0 + see[X] * see[X]) + predicted[m, H00]
+        c01 = see[XY] + extra * see[X] * see[Y] + predicted[m, H01]
+        c11 = see[YY] + extra * (1.0 + see[Y] * see[Y]) + predicted[m, H11]
         det = c00 * c11 - c01 * c01
         chi2 = (e0 * e0 * c11 - 2 * e0 * e1 * c01 + e1 * e1 * c00) / det
-        spot = 2 * np.pi * np.sqrt(det)
+        stretch = predicted[m, STRETCH]
+        spot = 2 * np.pi * np.sqrt(det / (stretch * stretch * stretch))
         if n == 0:
-            gain += np.log(chance.detected / (chance.density[s] * spot)) - 0.5 * chi2
+            gain += np.log(chance.detected[s] / (chance.density[s] * spot)) - 0.5 * chi2
             begun_at = views.time_s[m]
         else:
             room = np.pi * (chance.spread[s] * (views.time_s[m] - begun_at)) ** 2
@@ -44,7 +89,7 @@ def fit(views, chance, c, X, P, seen_by):
 
 
 @njit(cache=True, nogil=True)
-def best_of_sensor(views, chance, s, members, n, taken, X, P, seen_by, gate_sigma, least):
+def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_sigma, least):
     """Return the free tracklet of sensor s that adds most to the odds, how much, and the next.
 
     -1 where there is none; the last is what the second best adds, `least` without one.
@@ -53,38 +98,33 @@ def best_of_sensor(views, chance, s, members, n, taken, X, P, seen_by, gate_sigm
     that the gate touches are looked at; a tracklet is weighed once, at the first instant that
     it shares with the points.
     """
-    best, best_gain, second = -1, least, least
+    best, best_gain, second, seen_by = -1, least, least, points[3]
+    _predict(views, s, points, predicted)
+    gate = np.sqrt(quantile(2, gate_sigma))
     for m in range(len(views.time_s)):
         side = views.grid[s, m, 1]
-        if seen_by[m] < 2 or side == 0:
+        if seen_by[m] < 2 or side == 0 or not predicted[m, DEPTH] > 0.0:
             continue
-        r, plane = views.r_km[s, m], views.plane[s, m]
-        d0, d1, d2 = X[m, 0] - r[0], X[m, 1] - r[1], X[m, 2] - r[2]
-        depth = plane[2, 0] * d0 + plane[2, 1] * d1 + plane[2, 2] * d2
-        if depth <= 0.0:
-            continue
-        a0 = (plane[0, 0] * d0 + plane[0, 1] * d1 + plane[0, 2] * d2) / depth
-        a1 = (plane[1, 0] * d0 + plane[1, 1] * d1 + plane[1, 2] * d2) / depth
-        rho2 = d0 * d0 + d1 * d1 + d2 * d2
-        h00, _, h11 = _image_error(plane, P[m], rho2)
-        own = views.widest[s, m] + views.sigma_km[views.first[s], m] ** 2 / rho2
-        # The gnomonic plane stretches away from its middle.
-        reach = np.sqrt(quantile(2, gate_sigma)) * (1.0 + a0 * a0 + a1 * a1)
-        reach0, reach1 = reach * np.sqrt(h00 + own), reach * np.sqrt(h11 + own)
-        low, scale = views.corner[s, m], views.cells_per_unit[s, m]
-        lo0 = max(int(np.floor((a0 - reach0 - low[0]) * scale[0])), 0)
-        hi0 = min(int(np.floor((a0 + reach0 - low[0]) * scale[0])), side - 1)
-        lo1 = max(int(np.floor((a1 - reach1 - low[1]) * scale[1])), 0)
-        hi1 = min(int(np.floor((a1 + reach1 - low[1]) * scale[1])), side - 1)
+        cam, begin = views.camera[s, m], views.grid[s, m, 0]
+        place = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
+        own = (cam[WIDEST] + place * place) * predicted[m, STRETCH]
+        reach = gate * np.sqrt(predicted[m, H00] + own)
+        here = predicted[m, A0] - cam[CORNER]
+        lo0 = max(int(np.floor((here - reach) * cam[SCALE])), 0)
+        hi0 = min(int(np.floor((here + reach) * cam[SCALE])), side - 1)
+        reach = gate * np.sqrt(predicted[m, H11] + own)
+        here = predicted[m, A1] - cam[CORNER + 1]
+        lo1 = max(int(np.floor((here - reach) * cam[SCALE + 1])), 0)
+        hi1 = min(int(np.floor((here + reach) * cam[SCALE + 1])), side - 1)
         if hi1 < lo1:
             continue
         for g0 in range(lo0, hi0 + 1):
-            row = views.grid[s, m, 0] + g0 * side
+            row = begin + g0 * side
             for k in range(views.cell_start[row + lo1], views.cell_start[row + hi1 + 1]):
                 c = views.cell_item[k]
                 if taken[c] or _shared_before(views, c, m, seen_by):
                     continue
-                gain, chi2, shared = fit(views, chance, c, X, P, seen_by)
+                gain, chi2, shared = _fit(views, chance, s, c, seen_by, predicted)
                 fits = gain > second and chi2 <= quantile(2 * shared, gate_sigma)
                 if fits and not _clashes(views, c, members, n):
                     if gain > best_gain:
@@ -95,28 +135,11 @@ def best_of_sensor(views, chance, s, members, n, taken, X, P, seen_by, gate_sigm
 
 
 @njit(cache=True, nogil=True)
-def _image_error(plane, P, rho2):
-    """Return the point's covariance on two axes across the sight, as angles squared."""
-    h00, h01, h11 = 0.0, 0.0, 0.0
-    for a in range(3):
-        p0 = P[a, 0] * plane[0, 0] + P[a, 1] * plane[0, 1] + P[a, 2] * plane[0, 2]
-        p1 = P[a, 0] * plane[1, 0] + P[a, 1] * plane[1, 1] + P[a, 2] * plane[1, 2]
-        h00 += plane[0, a] * p0
-        h01 += plane[0, a] * p1
-        h11 += plane[1, a] * p1
-    return h00 / rho2, h01 / rho2, h11 / rho2
-
-
-@njit(cache=True, nogil=True)
 def _shared_before(views, c, m, seen_by):
+    shared = False
     for earlier in range(m):
-        if (
-            seen_by[earlier] >= 2
-            and views.seen[c, earlier]
-            and (views.grid[views.sensor[c], earlier, 1] > 0)
-        ):
-            return True
-    return False
+        shared |= seen_by[earlier] >= 2 and views.seen[c, earlier]
+    return shared
 
 
 @njit(cache=True, nogil=True)

@@ -221,7 +221,8 @@ def associate_by_lines(samples: Samples, focal_px: Array, threshold_px: float) -
     for s, tracklets in enumerate(own):
         shown = table[:, s] != FREE
         group[tracklets[table[shown, s]]] = np.flatnonzero(shown)
-    return Groups(group, np.full(len(table), np.nan), np.zeros(len(group), bool))
+    nan = np.full(len(samples.half_field), np.nan)
+    return Groups(group, np.full(len(table), np.nan), np.zeros(len(group), bool), nan)
 
 
 def _vote(

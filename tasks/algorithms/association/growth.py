@@ -4,156 +4,172 @@ import numpy as np
 from numba import njit
 
 from epipole.tasks.algorithms.association.candidates import best_of_sensor
-from epipole.tasks.algorithms.association.instant_points import possible, residual, solve
+from epipole.tasks.algorithms.association.instant_points import join, possible, solve
 from epipole.tasks.algorithms.association.odds import score
 from epipole.tasks.algorithms.association.sight_lines import quantile
-from epipole.tasks.algorithms.association.visibility import looks_at
+from epipole.tasks.algorithms.association.views import misfit, residual
+from epipole.tasks.algorithms.association.visibility import looks_at, near_fields
 
 FEW = 3  # sensors that must have looked before a hypothesis is given up
-SPEAKS = 2.0  # log-odds at which a view of a well-known point is clearly of the object
-CONTESTED = 3.0  # log-odds by which the best view of a sensor must lead the next one
-REVIEWS = 2  # the first may still rest on a stray
-ENOUGH = 4  # views that fix a point well enough to choose them all again
 GIVEN_UP = -4.0  # log-odds of the sensors beside the seed's at which it is
+SPEAKS = 2.0  # log-odds at which a view of a well-known point is clearly of the object
+CONTESTED = 5.0  # log-odds by which the best view of a sensor must lead the next one
+ENOUGH = 4  # views that fix a point well enough to choose them all again
+WELL_KNOWN = 8  # views after which a sensor's choice needs no review
+REVIEWS = 2  # the first may still rest on a stray
 
 
 @njit(cache=True, nogil=True)
-def _holds(members, n, c):
-    return (members[:n] == c).any()
+def grow_all(views, chance, seeds, taken, limits, gate_sigma, shells, clear, found):
+    """Grow every seed and write what comes of it.
 
-
-@njit(cache=True, nogil=True)
-def workspace(n_instants):
-    """Return the arrays that `grow` works in, made once."""
-    return np.zeros((n_instants, 3)), np.zeros((n_instants, 3, 3)), np.zeros(n_instants, np.int64)
-
-
-@njit(cache=True, nogil=True)
-def grow_all(
-    views, chance, seeds, taken, lowest, farthest, gate_sigma, shells, least, sizes, scores,
-    radius_km, grown,
-):  # fmt: skip
-    """Grow every seed; write sizes (0: fails, or scores below `least`), scores, where, members."""
-    work = workspace(len(views.time_s))
+    Parameters
+    ----------
+    seeds : (n, 2) int
+        Pairs of tracklets; one that was taken meanwhile is passed over.
+    taken : (t,) bool
+        Tracklets of known objects; those of clear hypotheses are added.
+    limits : (2,) float
+        Lowest and farthest distance from the Earth's centre [km].
+    clear
+        A hypothesis of `WELL_KNOWN` views or more with such log-odds is taken at once.
+    found
+        To write to: sizes (0: fails), scores, distances from the Earth's centre [km], who looks
+        (see `odds`), members.
+    """
+    sizes, scores, radius_km, looks, grown = found
+    k = len(views.time_s)
+    points = np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3)), np.zeros(k, np.int64)
+    part = np.empty(11)
+    predicted, near = np.empty((k, 7)), np.empty(views.camera.shape[0], np.bool_)
     members = np.empty(len(views.sensor) + 2, np.int64)
     for q in range(len(seeds)):
-        n, value = grow(
-            views, chance, seeds[q, 0], seeds[q, 1], taken, lowest, farthest, gate_sigma, shells,
-            members, work,
-        )  # fmt: skip
-        sizes[q], scores[q] = min(n, grown.shape[1]) if value > least else 0, value
-        if sizes[q] > 0:
-            x = work[0][np.argmax(work[2] >= 2)]
-            radius_km[q] = np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
-        for k in range(sizes[q]):
-            grown[q, k] = members[k]
+        sizes[q] = 0
+        if taken[seeds[q, 0]] or taken[seeds[q, 1]]:
+            continue
+        members[0], members[1] = seeds[q, 0], seeds[q, 1]
+        n = _grow(views, chance, members, taken, limits, gate_sigma, points, part, predicted, near)
+        if n < 2 or not possible(views, members, n, points, limits[0], limits[1]):
+            continue
+        scores[q] = score(views, chance, members, n, points, part, shells, near, looks[q])
+        sizes[q] = min(n, grown.shape[1])
+        x = points[0][np.argmax(points[3] >= 2)]
+        radius_km[q] = np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
+        grown[q, : sizes[q]] = members[: sizes[q]]
+        if scores[q] > clear and n >= WELL_KNOWN:
+            for i in members[:n]:
+                taken[i] = True
 
 
 @njit(cache=True, nogil=True)
-def grow(
-    views, chance, seed_i, seed_j, taken, lowest, farthest, gate_sigma, shells, members, work
-):  # fmt: skip
-    """Grow two tracklets into a hypothesis; return its size and score, 0 where it fails.
+def _grow(views, chance, members, taken, limits, gate_sigma, points, part, predicted, near):
+    """Grow the first two members; return the size, 0 where it fails.
 
     Sensor after sensor, the tracklet that adds most to the odds joins. A sensor that looks and
     has none counts against the hypothesis, which is given up as soon as its other sensors speak
-    clearly against it (Wald's sequential test). The points are solved again as the hypothesis
-    doubles, and at the end, when a member that no longer fits goes.
+    clearly against it (Wald's sequential test).
     """
-    X, P, seen_by = work
-    n_sensors = len(views.half_field)
-    seen_by[:] = 0
-    members[0], members[1] = seed_i, seed_j
-    n, again = np.int64(2), 3  # a plain 2 is a type of its own to numba: all would compile twice
-    chi2, dof = solve(views, members, n, X, P, seen_by)
+    n_sensors = views.camera.shape[0]
+    points[3][:] = 0
+    n = np.int64(2)  # a plain 2 is a type of its own to numba: all would compile twice
+    chi2, dof = solve(views, members, n, points, part)
     if not chi2 <= quantile(max(dof, 1), gate_sigma):
-        return 0, -np.inf
-    if not possible(views, members, n, X, P, seen_by, lowest, farthest):
-        return 0, -np.inf
-    a, b = views.sensor[seed_i], views.sensor[seed_j]
-    evidence, looked, absent = 0.0, 0, np.log(1.0 - chance.detected)
+        return 0
+    if not possible(views, members, n, points, limits[0], limits[1]):
+        return 0
+    near_fields(views, points[0], points[2], points[3], near)
+    a, b = views.sensor[members[0]], views.sensor[members[1]]
+    evidence, looked, early = 0.0, 0, np.int64(0)
     for turn in range(n_sensors + 2):
         # The seed's own sensors come last: they may hold another fragment of the object.
         s = (a + turn) % n_sensors
         if turn >= n_sensors:
             s = a if turn == n_sensors else b
-        elif s in (a, b):
+        elif s in (a, b) or not near[s]:
             continue
+        absent = np.log(1.0 - chance.detected[s])
         found = False
-        while True:
-            c, gain, _ = best_of_sensor(
-                views, chance, s, members, n, taken, X, P, seen_by, gate_sigma, absent
+        while n < len(members):
+            known = n >= WELL_KNOWN
+            least = SPEAKS if known else absent
+            c, gain, second = best_of_sensor(
+                views, chance, s, members, n, taken, points, predicted, gate_sigma, least
             )
-            if c < 0:
+            if c < 0 or (known and second > SPEAKS and gain - second < CONTESTED):
+                found |= c >= 0
                 break
             found = True
             evidence += gain
             members[n] = c
             n += 1
-            if n >= again:
-                n, chi2 = _settle(views, members, n, X, P, seen_by, gate_sigma)
-                again = n + max(n // 2, 1)
-                if n < 2:
-                    return 0, -np.inf
-            # A sensor has one tracklet of an object at a time; one that was let go again would
-            # only come back.
-            if len(views.time_s) == 1 or not _holds(members, n, c):
+            early = n if n <= WELL_KNOWN else early
+            if not join(views, c, points, part):
+                return 0
+            # A sensor has one tracklet of an object at a time.
+            if len(views.time_s) == 1:
                 break
         if turn < n_sensors:
-            looks = found or looks_at(views, s, X, seen_by)
+            looks = found or looks_at(views, s, points[0], points[3])
             looked += looks
             if looks and not found:
                 evidence += absent
             if looked >= FEW and evidence < GIVEN_UP:
-                return 0, -np.inf
-    n, chi2 = _settle(views, members, n, X, P, seen_by, gate_sigma)
-    for _ in range(REVIEWS):
+                return 0
+    if n < 2 * WELL_KNOWN:
+        n = _settle(views, members, n, points, part, gate_sigma)
+    for _ in range(REVIEWS if n < 2 * WELL_KNOWN else 1):
         if n >= ENOUGH:
-            n = _review(views, chance, members, n, taken, X, P, seen_by, gate_sigma)
-            n, chi2 = _settle(views, members, n, X, P, seen_by, gate_sigma)
-    if n < 2 or not possible(views, members, n, X, P, seen_by, lowest, farthest):
-        return 0, -np.inf
-    return n, score(views, chance, members, n, X, P, seen_by, chi2, shells)
-
-
-@njit(cache=True, nogil=True)
-def _review(views, chance, members, n, taken, X, P, seen_by, gate_sigma):
-    """Choose every sensor's tracklet again, now that the points are well known.
-
-    The first members were chosen by points that two or three views gave. A stray does more harm
-    than an absence: what does not speak for the object by itself stays out, and so does a
-    sensor in which two tracklets do about equally. Returns the size.
-    """
-    before = members[:n].copy()
-    n = 0
-    for s in range(len(views.half_field)):
-        while n < len(members):
-            c, gain, second = best_of_sensor(
-                views, chance, s, members, n, taken, X, P, seen_by, gate_sigma, SPEAKS
+            n = _review(
+                views, chance, members, n, early, taken, points, part, predicted, gate_sigma
             )
-            if c < 0 or (second > SPEAKS and gain - second < CONTESTED):
-                break
-            members[n] = c
-            n += 1
-            if len(views.time_s) == 1:
-                break
-    if n < ENOUGH - 1:
-        n = len(before)
-        members[:n] = before
     return n
 
 
 @njit(cache=True, nogil=True)
-def _settle(views, members, n, X, P, seen_by, gate_sigma):
-    """Solve, and let go the member that fits worst until all fit; return size and chi-square.
+def _review(views, chance, members, n, early, taken, points, part, predicted, gate_sigma):
+    """Choose the early members again, now that the points are well known; return the size.
 
-    The seed is not spared. 0 members where fewer than two of them fit.
+    They were chosen by points that a few views gave. A stray does more harm than an absence:
+    what does not speak for the object by itself stays out, and so does a sensor in which two
+    tracklets do about equally.
     """
-    e, W = np.empty(2), np.empty(3)
+    before = members[:n].copy()
+    again = np.zeros(views.camera.shape[0], np.bool_)
+    for q in range(min(early, n)):
+        again[views.sensor[members[q]]] = True
+    kept = np.int64(0)
+    for q in range(n):
+        if not again[views.sensor[before[q]]]:
+            members[kept] = before[q]
+            kept += 1
+    for s in range(len(again)):
+        while again[s] and kept < len(members):
+            c, gain, second = best_of_sensor(
+                views, chance, s, members, kept, taken, points, predicted, gate_sigma, SPEAKS
+            )
+            if c < 0 or (second > SPEAKS and gain - second < CONTESTED):
+                break
+            members[kept] = c
+            kept += 1
+            if len(views.time_s) == 1:
+                break
+    if kept < ENOUGH - 1:
+        kept = n
+        members[:n] = before
+    return _settle(views, members, kept, points, part, gate_sigma)
+
+
+@njit(cache=True, nogil=True)
+def _settle(views, members, n, points, part, gate_sigma):
+    """Solve, and let go the member that fits worst until all fit; return the size.
+
+    The seed is not spared. 0 where fewer than two of them fit.
+    """
+    X, _, _, seen_by = points
     while n >= 2:
-        chi2, dof = solve(views, members, n, X, P, seen_by)
+        chi2, dof = solve(views, members, n, points, part)
         if dof > 0 and chi2 <= quantile(dof, gate_sigma):
-            return n, chi2
+            return n
         if n == 2:
             break
         worst, largest = 0, -1.0
@@ -162,9 +178,9 @@ def _settle(views, members, n, X, P, seen_by, gate_sigma):
             for m in range(len(views.time_s)):
                 if seen_by[m] < 2 or not views.seen[members[q], m]:
                     continue
-                if residual(views, members[q], m, X[m], e, W) == 0.0:
+                if residual(views, members[q], m, X[m], part) == 0.0:
                     own = np.inf
-                own += W[0] * e[0] ** 2 + 2 * W[1] * e[0] * e[1] + W[2] * e[1] ** 2
+                own += misfit(part)
                 shared += 1
             if own / shared > largest:
                 worst, largest = q, own / shared
@@ -172,4 +188,4 @@ def _settle(views, members, n, X, P, seen_by, gate_sigma):
             members[q] = members[q + 1]
         n -= 1
         seen_by[:] = 0
-    return 0, np.inf
+    return np.int64(0)

@@ -4,28 +4,30 @@ import numpy as np
 from numba import njit
 
 from epipole.tasks.algorithms.association.sight_lines import BEYOND, SLACK_SIGMA
+from epipole.tasks.algorithms.association.views import direction, residual
 from epipole.tasks.algorithms.association.visibility import EARTH_RADIUS_KM, blocked
 from epipole.tasks.algorithms.triangulation import invert3
 
 ITERATIONS = 6
+CONVERGED = 1e-4  # sigmas squared
 
 
 @njit(cache=True, nogil=True)
 def _start(views, members, n, m, x):
     """Write the point nearest to the members' lines; false where they are parallel."""
-    N, inverse, rhs = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3)
+    N, inverse, rhs, u = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
     count = 0
     for q in range(n):
         i = members[q]
         if not views.seen[i, m]:
             continue
         count += 1
-        r = views.r_km[views.sensor[i], m]
+        direction(views, i, m, u)
         for a in range(3):
             for b in range(3):
-                p = (1.0 if a == b else 0.0) - views.u[i, m, a] * views.u[i, m, b]
+                p = (1.0 if a == b else 0.0) - u[a] * u[b]
                 N[a, b] += p
-                rhs[a] += p * r[b]
+                rhs[a] += p * views.camera[views.sensor[i], m, b]
     if invert3(N, inverse) < 1e-12 * count**3:
         return False
     for a in range(3):
@@ -34,71 +36,43 @@ def _start(views, members, n, m, x):
 
 
 @njit(cache=True, nogil=True)
-def residual(views, i, m, x, e, W):
-    """Write a view's residual [rad] and its weight; return the range, or 0 behind the sensor."""
-    r = views.r_km[views.sensor[i], m]
-    d0, d1, d2 = x[0] - r[0], x[1] - r[1], x[2] - r[2]
-    u, basis, cov = views.u[i, m], views.basis[i, m], views.cov[i, m]
-    if d0 * u[0] + d1 * u[1] + d2 * u[2] <= 0.0:
-        return 0.0
-    rho = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
-    e[0] = (basis[0, 0] * d0 + basis[0, 1] * d1 + basis[0, 2] * d2) / rho
-    e[1] = (basis[1, 0] * d0 + basis[1, 1] * d1 + basis[1, 2] * d2) / rho
-    extra = (views.sigma_km[i, m] / rho) ** 2
-    c00, c01, c11 = cov[0, 0] + extra, cov[0, 1], cov[1, 1] + extra
-    det = c00 * c11 - c01 * c01
-    W[0], W[1], W[2] = c11 / det, -c01 / det, c00 / det
-    return rho
+def add_view(views, i, m, x, N, rhs, part):
+    """Add a view to the normal equations (upper half); return its chi-square, NaN behind."""
+    if residual(views, i, m, x, part) == 0.0:
+        return np.nan
+    g0 = part[8] * part[0] + part[9] * part[1]
+    g1 = part[9] * part[0] + part[10] * part[1]
+    for a in range(3):
+        u, v = part[2 + a], part[5 + a]
+        rhs[a] -= u * g0 + v * g1
+        h0, h1 = part[8] * u + part[9] * v, part[9] * u + part[10] * v
+        for b in range(a, 3):
+            N[a, b] += h0 * part[2 + b] + h1 * part[5 + b]
+    return part[0] * g0 + part[1] * g1
 
 
 @njit(cache=True, nogil=True)
-def solve_instant(views, members, n, m, x, P):
-    """Solve one instant's point; x has its start. Return chi-square, NaN where it fails."""
-    N, rhs, e, W = np.empty((3, 3)), np.empty(3), np.empty(2), np.empty(3)
-    chi2 = np.nan
-    for _ in range(ITERATIONS):
-        N[:] = 0.0
-        rhs[:] = 0.0
-        chi2 = 0.0
-        for q in range(n):
-            i = members[q]
-            if not views.seen[i, m]:
-                continue
-            rho = residual(views, i, m, x, e, W)
-            if rho == 0.0:
-                return np.nan
-            basis = views.basis[i, m]
-            g0, g1 = W[0] * e[0] + W[1] * e[1], W[1] * e[0] + W[2] * e[1]
-            chi2 += e[0] * g0 + e[1] * g1
-            for a in range(3):
-                rhs[a] -= (basis[0, a] * g0 + basis[1, a] * g1) / rho
-                h0 = (W[0] * basis[0, a] + W[1] * basis[1, a]) / (rho * rho)
-                h1 = (W[1] * basis[0, a] + W[2] * basis[1, a]) / (rho * rho)
-                for b in range(a, 3):
-                    N[a, b] += h0 * basis[0, b] + h1 * basis[1, b]
-        N[1, 0], N[2, 0], N[2, 1] = N[0, 1], N[0, 2], N[1, 2]
-        if invert3(N, P) == 0.0:
-            return np.nan
-        gain = 0.0
-        for a in range(3):
-            step = P[a, 0] * rhs[0] + P[a, 1] * rhs[1] + P[a, 2] * rhs[2]
-            x[a] += step
-            gain += step * rhs[a]
-        if not gain < 1e12:  # ran off to infinity: as good as parallel
-            return np.nan
-        if gain < 1e-6:  # sigmas squared: nothing that matters is left
-            return chi2 - gain
-    return chi2
+def step(x, N, rhs, P):
+    """Invert N into P and move x; return how much chi-square falls, NaN where it runs off."""
+    if invert3(N, P) == 0.0:
+        return np.nan
+    gain = 0.0
+    for a in range(3):
+        move = P[a, 0] * rhs[0] + P[a, 1] * rhs[1] + P[a, 2] * rhs[2]
+        x[a] += move
+        gain += move * rhs[a]
+    return gain if gain < 1e12 else np.nan  # as good as parallel
 
 
 @njit(cache=True, nogil=True)
-def solve(views, members, n, X, P, seen_by):
+def solve(views, members, n, points, part):
     """Solve every instant at which two members are seen; return chi-square and freedom.
 
-    Where `seen_by` tells that an instant was solved before, its point is the start. NaN where
-    an instant has no solution.
+    `points` are (x, N, P, seen_by) of each instant. Where `seen_by` tells that an instant was
+    solved before, its point is the start. NaN where an instant has no solution.
     """
-    total, dof = 0.0, 0
+    X, N, P, seen_by = points
+    total, dof, rhs = 0.0, 0, np.empty(3)
     for m in range(len(views.time_s)):
         count = 0
         for q in range(n):
@@ -109,7 +83,18 @@ def solve(views, members, n, X, P, seen_by):
             continue
         if not solved and not _start(views, members, n, m, X[m]):
             return np.nan, 0
-        chi2 = solve_instant(views, members, n, m, X[m], P[m])
+        chi2 = np.nan
+        for _ in range(ITERATIONS):
+            N[m] = 0.0
+            rhs[:] = 0.0
+            chi2 = 0.0
+            for q in range(n):
+                if views.seen[members[q], m]:
+                    chi2 += add_view(views, members[q], m, X[m], N[m], rhs, part)
+            gain = step(X[m], N[m], rhs, P[m])
+            chi2 -= gain
+            if not gain >= CONVERGED:
+                break
         if np.isnan(chi2):
             return np.nan, 0
         total += chi2
@@ -118,8 +103,26 @@ def solve(views, members, n, X, P, seen_by):
 
 
 @njit(cache=True, nogil=True)
-def possible(views, members, n, X, P, seen_by, lowest, farthest):
+def join(views, c, points, part):
+    """Add tracklet c to the points that are solved (Kalman's update); false where it fails."""
+    X, N, P, seen_by = points
+    rhs = np.empty(3)
+    for m in range(len(views.time_s)):
+        if not views.seen[c, m]:
+            continue
+        if seen_by[m] >= 2:
+            rhs[:] = 0.0
+            chi2 = add_view(views, c, m, X[m], N[m], rhs, part)
+            if np.isnan(chi2 + step(X[m], N[m], rhs, P[m])):
+                return False
+        seen_by[m] += seen_by[m] >= 2
+    return True
+
+
+@njit(cache=True, nogil=True)
+def possible(views, members, n, points, lowest, farthest):
     """Return whether the points lie, within 3 sigma, where their sensors can see an object."""
+    X, _, P, seen_by = points
     for m in range(len(views.time_s)):
         if seen_by[m] < 2:
             continue
@@ -131,7 +134,7 @@ def possible(views, members, n, X, P, seen_by, lowest, farthest):
         for q in range(n):
             i = members[q]
             if views.seen[i, m] and blocked(
-                views.r_km[views.sensor[i], m], X[m], EARTH_RADIUS_KM - slack
+                views.camera[views.sensor[i], m], X[m], EARTH_RADIUS_KM - slack
             ):
                 return False
     return True

@@ -12,18 +12,18 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.growth import grow_all
+from epipole.tasks.algorithms.association.chance import Chance, chance_of
+from epipole.tasks.algorithms.association.detection import (
+    CERTAIN_LOG_ODDS,
+    detection_odds,
+    estimated_detection,
+)
+from epipole.tasks.algorithms.association.growth import WELL_KNOWN, grow_all
 from epipole.tasks.algorithms.association.object_density import revised_odds, visible_volume
 from epipole.tasks.algorithms.association.pool import Hypothesis, Pool, distinct
-from epipole.tasks.algorithms.association.samples import (
-    FREE,
-    Chance,
-    Groups,
-    Samples,
-    chance_of,
-    views_of,
-)
+from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.seeds import SensorPairs, seeds_between
+from epipole.tasks.algorithms.association.views import views_of
 from epipole.tasks.algorithms.association.visibility import EARTH_RADIUS_KM
 
 Array = npt.NDArray[np.float64]
@@ -80,7 +80,8 @@ def associate_tracklets(
     grows with the number of tracklets times sensors, not with its square: see `seeds`.
     """
     if len(samples.sensor) == 0:
-        return Groups(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool))
+        nothing = np.full(len(samples.half_field), np.nan)
+        return Groups(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool), nothing)
     limits = (EARTH_RADIUS_KM + min_altitude_km, max_range_km)
     chance = chance_of(samples, max_range_km, DETECTED)
     search = _Search(
@@ -112,96 +113,101 @@ class _Search:
         margin: float,
     ) -> None:
         self.views, self.order = views_of(samples)
-        self.chance, self.gate_sigma, self.limits = chance, float(gate_sigma), limits
+        self.chance, self.gate_sigma, self.limits = chance, float(gate_sigma), np.array(limits)
         self.shells, self.margin = shells.astype(float), float(margin)
+        self.many = len(self.views.half_field) > FEW_SENSORS
         n = len(self.order)
         self.taken = np.zeros(n, np.bool_)
         self.group, self.ambiguous = np.full(n, FREE), np.zeros(n, np.bool_)
-        self.scores: list[float] = []
-        self.radius_km: list[float] = []
+        self.groups: list[Hypothesis] = []
 
     def run(self, min_log_odds: float) -> Groups:
-        """Return the groups: seed by seed, the clear ones at once, the others at the end."""
-        pairs = SensorPairs(self.views, self.limits[1])
-        many = len(self.views.half_field) > FEW_SENSORS
+        """Return the groups: with many sensors the clear ones at once, the others at the end."""
+        pairs = SensorPairs(self.views, float(self.limits[1]))
         waiting: list[Hypothesis] = []
-        done: list[int] = []
-        for k in pairs.in_turn():
-            if many and pairs.covering(k, done) >= self._enough_pairs():
-                continue
-            waiting += self.hypotheses(*pairs.sensors(k))
-            done.append(k)
-            if many:
-                self.take([h for h in waiting if h.score > CLEAR_LOG_ODDS], CLEAR_LOG_ODDS)
-                waiting = [h for h in waiting if not self.taken[list(h.seed)].any()]
+        while (pair := pairs.next(self._enough_pairs())) is not None:
+            waiting += self.hypotheses(*pair)
+        waiting = self._learn_detection(waiting)
         self.take(waiting, WORTH_A_LOOK)
         scores = self._withdraw_doubtful(min_log_odds)
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
         group[self.order], ambiguous[self.order] = self.group, self.ambiguous
-        return Groups(group, scores, ambiguous & (group == FREE))
+        return Groups(group, scores, ambiguous & (group == FREE), self.chance.detected)
 
-    def _enough_pairs(self) -> int:
+    def _enough_pairs(self) -> float:
         """Return how many pairs must look at a place until no object there is likely unseeded.
 
-        A pair misses an object where either sensor did.
+        A pair misses an object where either sensor did. With few sensors: all.
         """
-        missed = 1 - self.chance.detected**2
-        return int(np.ceil(np.log(UNSEEDED / max(len(self.scores), 1)) / np.log(missed)))
-
-    def _withdraw_doubtful(self, min_log_odds: float) -> Array:
-        """Withdraw groups that are not sure enough once the number of objects is known.
-
-        Returns the log-odds of those that are left.
-        """
-        scores = self._revised()
-        kept = scores >= min_log_odds
-        new = np.where(kept, np.cumsum(kept) - 1, FREE)
-        member = self.group != FREE
-        likely = ~kept & (scores > 0)
-        self.ambiguous[member] |= likely[self.group[member]]
-        self.group[member] = new[self.group[member]]
-        return scores[kept]
-
-    def _revised(self) -> Array:
-        scores = np.array(self.scores)
-        if not len(scores) or scores.min() > BEYOND_DOUBT:
-            return scores
-        anywhere = np.array([[0.0, np.inf, 1.0]])
-        shells = self.shells if len(self.shells) else anywhere
-        volume = visible_volume(self.views, shells, self.limits[1])
-        return revised_odds(scores, np.array(self.radius_km), shells, volume, self.chance)
+        if not self.many:
+            return np.inf
+        missed = 1 - float(np.mean(self.chance.detected)) ** 2
+        return float(np.ceil(np.log(UNSEEDED / max(len(self.groups), 1)) / np.log(missed)))
 
     def hypotheses(self, a: int, b: int) -> list[Hypothesis]:
-        """Return what the pairs of two sensors' tracklets grow into."""
-        many = len(self.views.half_field) > FEW_SENSORS
-        gate_sigma = min(self.gate_sigma, SEED_SIGMA) if many else self.gate_sigma
-        seeds = seeds_between(self.views, a, b, self.taken, *self.limits, gate_sigma)
-        return distinct(self.grow(seeds))
+        """Return what the pairs of two sensors' tracklets grow into, beside clear groups."""
+        gate_sigma = min(self.gate_sigma, SEED_SIGMA) if self.many else self.gate_sigma
+        lowest, farthest = self.limits.tolist()
+        seeds = seeds_between(self.views, a, b, self.taken, lowest, farthest, gate_sigma)
+        clear = CLEAR_LOG_ODDS if self.many else np.inf
+        out = []
+        for h in self.grow(seeds, clear):
+            if h.score > clear and len(h.members) >= WELL_KNOWN:
+                self._accept(h, h.members)
+            else:
+                out.append(h)
+        return distinct(out)
 
-    def grow(self, seeds: Indices) -> list[Hypothesis]:
-        """Return what (n, 2) seeds grow into among the tracklets that are free."""
-        n = len(seeds)
+    def grow(self, seeds: Indices, clear: float = np.inf) -> list[Hypothesis]:
+        """Return what (n, 2) seeds grow into among the tracklets that are free.
+
+        All tracklets of a clear hypothesis are taken then.
+        """
+        n, n_sensors = len(seeds), len(self.views.half_field)
         sizes, scores, radius_km = np.zeros(n, np.int64), np.empty(n), np.empty(n)
+        looks = np.zeros((n, n_sensors), np.int8)
         # More than two fragments a sensor are not kept; the next span has them again.
-        grown = np.empty((n, min(2 * len(self.views.half_field), len(self.taken))), np.int64)
+        grown = np.empty((n, min(2 * n_sensors, len(self.taken))), np.int64)
         grow_all(
-            self.views, self.chance, seeds, self.taken, *self.limits, self.gate_sigma, self.shells,
-            WORTH_A_LOOK - self.margin, sizes, scores, radius_km, grown,
+            self.views, self.chance, seeds, self.taken, self.limits, self.gate_sigma, self.shells,
+            float(clear), (sizes, scores, radius_km, looks, grown),
         )  # fmt: skip
+        worth = np.flatnonzero((sizes > 0) & (scores > WORTH_A_LOOK - self.margin))
         return [
-            Hypothesis(float(scores[q]), tuple(seeds[q].tolist()),
-                       tuple(sorted(grown[q, : sizes[q]].tolist())), float(radius_km[q]))
-            for q in np.flatnonzero(sizes)
-        ]  # fmt: skip
+            Hypothesis(
+                float(scores[q]),
+                tuple(seeds[q].tolist()),
+                tuple(sorted(grown[q, : sizes[q]].tolist())),
+                float(radius_km[q]),
+                tuple(looks[q].tolist()),
+            )
+            for q in worth
+        ]
+
+    def _learn_detection(self, waiting: list[Hypothesis]) -> list[Hypothesis]:
+        """Estimate how likely sensors detect, from the surest; return all with their new odds."""
+        used: set[int] = set()
+        sure = []
+        for h in sorted(waiting, key=lambda h: (-h.score, h.members)):
+            if h.score > CERTAIN_LOG_ODDS and used.isdisjoint(h.members):
+                used.update(h.members)
+                sure.append(h)
+        believed = self.chance.detected
+        detected = estimated_detection(
+            self.views, self.chance, [*self.groups, *sure], float(believed.mean())
+        )
+        self.chance = self.chance._replace(detected=detected)
+        self.groups = _with_detection(self.groups, believed, detected)
+        return _with_detection(waiting, believed, detected)
+
+    def _accept(self, h: Hypothesis, members: Iterable[int]) -> None:
+        self.group[sorted(members)] = len(self.groups)
+        self.groups.append(h)
 
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
         """Accept hypotheses, best first; what rivals contest is ambiguous."""
         pool = Pool(hypotheses)
-        while (best := pool.pop()) is not None:
-            if best.score < min_log_odds:
-                for h in (best, *pool.rest()):  # likelier than not, and not sure enough
-                    self.ambiguous[list(h.members)] |= h.score > 0
-                break
+        while (best := pool.pop()) is not None and best.score >= min_log_odds:
             if self.taken[list(best.members)].any():
                 if not self.taken[list(best.seed)].any():
                     for again in self.grow(np.array([best.seed])):
@@ -212,10 +218,45 @@ class _Search:
             sensors = {int(self.views.sensor[i]) for i in kept}
             # What is left of a group that lost most of its views is no object by itself.
             if len(sensors) >= 2 and 2 * len(kept) >= len(best.members):
-                self.group[sorted(kept)] = len(self.scores)
-                self.scores.append(best.score)
-                self.radius_km.append(best.radius_km)
+                self._accept(best, kept)
             else:
                 kept = set()
             self.ambiguous[sorted(set(best.members) - kept)] = True
             self.taken[list(best.members)] = True
+
+    def _withdraw_doubtful(self, min_log_odds: float) -> Array:
+        """Withdraw groups that are not sure enough once the number of objects is known.
+
+        Returns the log-odds of those that are left.
+        """
+        scores = self._revised()
+        kept = scores >= min_log_odds
+        new = np.where(kept, np.cumsum(kept) - 1, FREE)
+        member = self.group != FREE
+        undecided = ~kept & (scores > -self.margin)
+        self.ambiguous[member] |= undecided[self.group[member]]
+        self.group[member] = new[self.group[member]]
+        return np.asarray(scores[kept])
+
+    def _revised(self) -> Array:
+        scores = np.array([h.score for h in self.groups])
+        if not len(scores) or scores.min() > BEYOND_DOUBT:
+            return scores
+        anywhere = np.array([[0.0, np.inf, 1.0]])
+        shells = self.shells if len(self.shells) else anywhere
+        volume = visible_volume(self.views, shells, float(self.limits[1]))
+        radius_km = np.array([h.radius_km for h in self.groups])
+        return revised_odds(scores, radius_km, shells, volume, self.chance)
+
+
+def _with_detection(
+    hypotheses: list[Hypothesis], believed: Array, detected: Array
+) -> list[Hypothesis]:
+    """Return the hypotheses with the odds that they have with other detection probabilities."""
+    if not hypotheses:
+        return []
+    looks = np.array([h.looks for h in hypotheses])
+    change = detection_odds(looks, detected) - detection_odds(looks, believed)
+    return [
+        h._replace(score=h.score + float(more)) for h, more in zip(hypotheses, change, strict=True)
+    ]

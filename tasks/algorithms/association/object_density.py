@@ -8,15 +8,17 @@ prior about the common one.
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
-from epipole.tasks.algorithms.association.samples import Chance, Views
-from epipole.tasks.algorithms.association.visibility import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.association.chance import Chance
+from epipole.tasks.algorithms.association.views import Views
+from epipole.tasks.algorithms.association.visibility import in_view
 
 Array = npt.NDArray[np.float64]
 
-SIGHTS = 5  # a side: lines of sight that sample a field
-STEPS = 40  # along a line of sight, beside the shells' edges
-ORIGINS = 8  # sensors whose fields are sampled
+SIGHTS = 4  # a side: lines of sight that sample a field
+STEPS = 24  # along a line of sight, beside the shells' edges
+ORIGINS = 6  # sensors whose fields are sampled
 PRIOR_OBJECTS = 1.0  # as good as so many objects does a shell's own share count
 CERTAIN_LOG_ODDS = 8.0  # groups that count from the start
 ROUNDS = 100
@@ -25,18 +27,17 @@ ROUNDS = 100
 def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
     """Return the volume [km^3] that two sensors see, weighed by each of the shells, (j,).
 
-    `shells` are rows of (lowest, highest radius [km], weight). At the middle instant, by lines
-    of sight of up to eight sensors.
+    `shells` are rows of (lowest, highest radius [km], weight). At the instant at which most
+    sensors' attitudes are known, by lines of sight of some of them. Zero where fewer than two are.
     """
-    n = len(views.half_field)
-    m = views.seen.shape[1] // 2
-    known = np.flatnonzero(
-        np.isfinite(views.r_km[:, m, 0]) & np.isfinite(views.attitude[:, m, 0, 0])
-    )
-    chosen = known[np.unique(np.linspace(0, len(known) - 1, ORIGINS).astype(int))] if n else known
+    ready = np.isfinite(views.place_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
+    m = int(np.argmax(ready.sum(axis=0)))
+    known = np.flatnonzero(ready[:, m])
     out = np.zeros(len(shells))
     if len(known) < 2:
         return out
+    chosen = known[np.unique(np.linspace(0, len(known) - 1, ORIGINS).astype(int))]
+    camera = np.ascontiguousarray(views.camera[known, m])
     middle = (np.arange(SIGHTS) + 0.5) / SIGHTS * 2 - 1
     for s in chosen.tolist():
         a, b = np.meshgrid(*(middle * side for side in views.half_field[s]), indexing="ij")
@@ -44,11 +45,9 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
         toward = np.stack([a.ravel(), b.ravel(), np.ones(a.size)], axis=1) / stretch[:, None]
         u = toward @ views.attitude[s, m]
         cell_sr = np.prod(views.half_field[s]) * 4 / SIGHTS**2 / stretch**3
-        rho, edges = _steps(views.r_km[s, m], u, shells, farthest_km)
-        x = views.r_km[s, m] + rho[..., None] * u[:, None]
-        count = np.zeros(rho.shape)
-        for other in known.tolist():
-            count += _in_field(views, other, m, x)
+        rho, edges = _steps(views.place_km[s, m], u, shells, farthest_km)
+        x = views.place_km[s, m] + rho[..., None] * u[:, None]
+        count = _in_view_of(camera, x.reshape(-1, 3)).reshape(rho.shape)
         volume = np.diff(edges**3, axis=1) / 3 * cell_sr[:, None]
         volume = np.where(count >= 2, volume / np.maximum(count, 1), 0.0)
         radius = np.linalg.norm(x, axis=2)
@@ -56,6 +55,16 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
             inside = (radius >= lowest) & (radius < highest)
             out[j] += weight * volume[inside].sum() * len(known) / len(chosen)
     return out
+
+
+@njit(cache=True, nogil=True)
+def _in_view_of(camera, x):
+    """Return how many sensors see each point, (n,)."""
+    count = np.zeros(len(x), np.int64)
+    for i in range(len(x)):
+        for s in range(len(camera)):
+            count[i] += in_view(camera[s], x[i])
+    return count
 
 
 def _steps(r_km: Array, u: Array, shells: Array, farthest_km: float) -> tuple[Array, Array]:
@@ -69,18 +78,6 @@ def _steps(r_km: Array, u: Array, shells: Array, farthest_km: float) -> tuple[Ar
             edges += [np.maximum(-along - root, 0)[:, None], np.maximum(-along + root, 0)[:, None]]
     edge = np.sort(np.clip(np.concatenate(edges, axis=1), 0, farthest_km), axis=1)
     return (edge[:, 1:] + edge[:, :-1]) / 2, edge
-
-
-def _in_field(views: Views, s: int, m: int, x: Array) -> Array:
-    """Return 1 where sensor s sees points (..., 3), else 0."""
-    d = (x - views.r_km[s, m]) @ views.attitude[s, m].T
-    inside = (np.abs(d[..., :2]) < views.half_field[s] * d[..., 2:]).all(axis=-1)
-    sight = x - views.r_km[s, m]
-    along = sight @ views.r_km[s, m]
-    length2 = np.maximum((sight**2).sum(axis=-1), 1e-9)
-    closest2 = views.r_km[s, m] @ views.r_km[s, m] - along**2 / length2
-    hidden = (along < 0) & (-along < length2) & (closest2 < EARTH_RADIUS_KM**2)
-    return (inside & ~hidden).astype(float)
 
 
 def revised_odds(
@@ -105,6 +102,8 @@ def revised_odds(
     """
     inside = (radius_km[:, None] >= shells[:, 0]) & (radius_km[:, None] < shells[:, 1])
     believed = inside * shells[:, 2] + 1e-9
+    if not volume_km3.any():  # unknown: as if all that sensors look at were seen by two
+        volume_km3 = np.full(len(shells), chance.objects_in_view / chance.objects_km3)
     expected = chance.objects_km3 * volume_km3 + 1e-9
     sure = (scores > CERTAIN_LOG_ODDS).astype(float)
     revised = scores

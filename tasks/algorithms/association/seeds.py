@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from epipole.tasks.algorithms.association.samples import Views
 from epipole.tasks.algorithms.association.sight_lines import pair_miss, quantile
+from epipole.tasks.algorithms.association.views import SIGMA_KM, XX, YY, Views
 from epipole.tasks.algorithms.sky import tangent_basis
 
 Array = npt.NDArray[np.float64]
@@ -25,11 +25,16 @@ def plane_angles(
 ) -> tuple[Array, Array]:
     """Return the angle of each tracklet's plane about the baseline, and its 1-sigma [rad]."""
     unit = baseline_km / np.linalg.norm(baseline_km)
-    u = views.u[items, m]
+    u = _directions(views, s, m, items)
     across = np.maximum(np.sqrt(np.maximum(1 - (u @ unit) ** 2, 0)), 1e-9)
-    variance = views.cov[items, m, 0, 0] + views.cov[items, m, 1, 1]  # no less than any axis has
-    place = 2 * (views.sigma_km[items, m] / NEAREST_KM) ** 2
+    variance = views.sight[items, m, XX] + views.sight[items, m, YY]  # no less than any axis has
+    place = 2 * (views.sight[items, m, SIGMA_KM] / NEAREST_KM) ** 2
     return np.arctan2(u @ axes[1], u @ axes[0]), np.sqrt(variance + place) / across
+
+
+def _directions(views: Views, s: int, m: int, items: Indices) -> Array:
+    sight = np.column_stack([views.sight[items, m, :XX], np.ones(len(items))]) @ views.plane[s, m]
+    return np.asarray(sight / np.linalg.norm(sight, axis=1, keepdims=True))
 
 
 @njit(cache=True, nogil=True)
@@ -39,6 +44,7 @@ def _meeting(
 ):  # fmt: skip
     """Write the pairs that meet at all instants they share, and how well; return how many."""
     widest, n = 0.0, 0
+    ui, uj = np.empty(3), np.empty(3)
     for k in range(len(sigma_b)):
         widest = max(widest, sigma_b[k])
     for q in range(len(items_a)):
@@ -58,7 +64,7 @@ def _meeting(
                     if h < m:
                         before = True  # was weighed at the first instant they share
                         break
-                    total += pair_miss(views, i, j, h, lowest, farthest)
+                    total += pair_miss(views, i, j, h, lowest, farthest, ui, uj)
                     shared += 1
             if before or not total <= quantile(shared, gate_sigma):  # false for NaN
                 continue
@@ -80,7 +86,7 @@ def seeds_between(
     """Return (n, 2): free tracklets of sensors a and b whose lines of sight meet."""
     found = []
     for m in range(len(views.time_s)):
-        baseline = views.r_km[b, m] - views.r_km[a, m]
+        baseline = views.place_km[b, m] - views.place_km[a, m]
         if not np.linalg.norm(baseline) > SHORTEST_BASELINE_KM:  # false for NaN
             continue
         sides = [
@@ -92,7 +98,7 @@ def seeds_between(
         ]  # fmt: skip
         if not len(sides[0]) or not len(sides[1]):
             continue
-        axes = _axes(baseline, views.u[sides[0], m].sum(axis=0))
+        axes = _axes(baseline, views.plane[a, m, 2])
         angle_a, sigma_a = plane_angles(views, a, m, sides[0], baseline, axes)
         angle_b, sigma_b = plane_angles(views, b, m, sides[1], baseline, axes)
         order = np.argsort(angle_b, kind="stable")
@@ -146,39 +152,33 @@ class SensorPairs:
         reach = np.where(range_a > 0, np.minimum(range_a, farthest_km), farthest_km)
         self._middle = (place[a] + reach[:, None] * look[a])[meet][order]
         self._look, self._place, self._half = look, place, half
+        self._waiting = np.ones(len(self._a), bool)
+        self._busy = np.zeros(len(look), bool)
+        self._covered = np.zeros(len(self._a), np.int64)
 
-    def __len__(self) -> int:
-        return len(self._a)
+    def next(self, enough: float = np.inf) -> tuple[int, int] | None:
+        """Return the next pair, none where all are done; round after round.
 
-    def in_turn(self) -> list[int]:
-        """Return the pairs' numbers, round after round: no sensor twice in a round."""
-        waiting, out = list(range(len(self._a))), []
-        while waiting:
-            busy: set[int] = set()
-            later = []
-            for k in waiting:
-                pair = {int(self._a[k]), int(self._b[k])}
-                if busy & pair:
-                    later.append(k)
-                else:
-                    busy |= pair
-                    out.append(k)
-            waiting = later
-        return out
-
-    def sensors(self, k: int) -> tuple[int, int]:
-        """Return the two sensors of a pair."""
-        return int(self._a[k]), int(self._b[k])
-
-    def covering(self, k: int, done: list[int]) -> int:
-        """Return how many of the pairs that are done look at the middle of what this one sees."""
-        other = np.array(done, np.int64)
-        both = np.ones(len(other), bool)
-        for s in (self._a[other], self._b[other]):
-            toward = self._middle[k] - self._place[s]
-            cosine = np.sum(toward * self._look[s], axis=1) / np.linalg.norm(toward, axis=1)
+        A pair is passed over where `enough` of those that had their turn look at what it sees.
+        """
+        wanted = self._waiting & (self._covered < enough)
+        ready = wanted & ~self._busy[self._a] & ~self._busy[self._b]
+        if not ready.any():
+            self._busy[:] = False
+            ready = wanted
+            if not ready.any():
+                return None
+        k = int(np.argmax(ready))
+        a, b = int(self._a[k]), int(self._b[k])
+        self._waiting[k] = False
+        self._busy[[a, b]] = True
+        both = np.ones(len(self._a), bool)
+        for s in (a, b):
+            toward = self._middle - self._place[s]
+            cosine = (toward @ self._look[s]) / np.linalg.norm(toward, axis=1)
             both &= cosine > np.cos(self._half[s] / 2)
-        return int(both.sum())
+        self._covered += both
+        return a, b
 
 
 def _middle(views: Views) -> tuple[Array, Array, Array]:
@@ -190,10 +190,9 @@ def _middle(views: Views) -> tuple[Array, Array, Array]:
         if not seen.any():
             continue
         m = int(np.argmax(seen.sum(axis=0)))
-        u = views.u[views.first[s] : views.first[s + 1]][seen[:, m], m]
-        look[s] = u.sum(axis=0) / np.linalg.norm(u.sum(axis=0))
-        place[s] = views.r_km[s, m]
-        half[s] = np.arccos(np.clip((u @ look[s]).min(), -1, 1)) + 1e-3
+        look[s], place[s] = views.plane[s, m, 2], views.place_km[s, m]
+        at = views.sight[views.first[s] : views.first[s + 1], m, :XX][seen[:, m]]
+        half[s] = np.arctan(np.sqrt((at**2).sum(axis=1).max())) + 1e-3
     return look, place, half
 
 

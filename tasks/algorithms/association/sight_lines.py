@@ -3,6 +3,8 @@
 import numpy as np
 from numba import njit
 
+from epipole.tasks.algorithms.association.views import PLANE, SIGMA_KM, XX, XY, YY, X, Y, direction
+
 BEYOND = 0.2  # share of the farthest distance
 SLACK_SIGMA = 3.0  # a point may lie this far outside where objects can be
 
@@ -18,14 +20,15 @@ def quantile(dof, sigma):
 
 
 @njit(cache=True, nogil=True)
-def pair_miss(views, i, j, m, lowest, farthest):
+def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
     """Return the squared miss of two lines of sight over its variance; NaN where impossible.
 
     Impossible: parallel, meeting behind a sensor, or not, by 3 sigma of the range, between the
-    lowest and the farthest place of an object.
+    lowest and the farthest place of an object. `ui`, `uj` are (3,) to work in.
     """
-    ui, uj = views.u[i, m], views.u[j, m]
-    ri, rj = views.r_km[views.sensor[i], m], views.r_km[views.sensor[j], m]
+    direction(views, i, m, ui)
+    direction(views, j, m, uj)
+    ri, rj = views.camera[views.sensor[i], m], views.camera[views.sensor[j], m]
     n0 = ui[1] * uj[2] - ui[2] * uj[1]
     n1 = ui[2] * uj[0] - ui[0] * uj[2]
     n2 = ui[0] * uj[1] - ui[1] * uj[0]
@@ -41,23 +44,33 @@ def pair_miss(views, i, j, m, lowest, farthest):
     if range_i <= 0.0 or range_j <= 0.0:
         return np.nan
     sine = np.sqrt(sine2)
-    ci, cj = views.cov[i, m], views.cov[j, m]
     radius2 = 0.0
     for a in range(3):
         radius2 += (ri[a] + range_i * ui[a]) ** 2
-    si, sj = views.sigma_km[i, m], views.sigma_km[j, m]
-    spread = range_i * range_i * (ci[0, 0] + ci[1, 1]) + range_j * range_j * (cj[0, 0] + cj[1, 1])
+    si, sj = views.sight[i, m, SIGMA_KM], views.sight[j, m, SIGMA_KM]
+    spread = range_i**2 * _spread(views, i, m) + range_j**2 * _spread(views, j, m)
     slack = SLACK_SIGMA * np.sqrt(spread + 2 * (si * si + sj * sj)) / sine
     radius = np.sqrt(radius2)
     if radius + slack < lowest or radius - min(slack, BEYOND * farthest) > farthest:
         return np.nan
     variance = si * si + sj * sj
-    bi, bj = views.basis[i, m], views.basis[j, m]
-    p0 = (bi[0, 0] * n0 + bi[0, 1] * n1 + bi[0, 2] * n2) / sine * range_i
-    p1 = (bi[1, 0] * n0 + bi[1, 1] * n1 + bi[1, 2] * n2) / sine * range_i
-    q0 = (bj[0, 0] * n0 + bj[0, 1] * n1 + bj[0, 2] * n2) / sine * range_j
-    q1 = (bj[1, 0] * n0 + bj[1, 1] * n1 + bj[1, 2] * n2) / sine * range_j
-    variance += p0 * p0 * ci[0, 0] + 2 * p0 * p1 * ci[0, 1] + p1 * p1 * ci[1, 1]
-    variance += q0 * q0 * cj[0, 0] + 2 * q0 * q1 * cj[0, 1] + q1 * q1 * cj[1, 1]
+    variance += range_i**2 * _across(views, i, m, n0 / sine, n1 / sine, n2 / sine)
+    variance += range_j**2 * _across(views, j, m, n0 / sine, n1 / sine, n2 / sine)
     miss = (b0 * n0 + b1 * n1 + b2 * n2) / sine
     return miss * miss / variance
+
+
+@njit(cache=True, nogil=True)
+def _spread(views, i, m):
+    """Return the trace of a direction's covariance in its plane."""
+    return views.sight[i, m, XX] + views.sight[i, m, YY]
+
+
+@njit(cache=True, nogil=True)
+def _across(views, i, m, n0, n1, n2):
+    """Return the variance of a direction along a unit vector across it [rad^2]."""
+    cam, see = views.camera[views.sensor[i], m], views.sight[i, m]
+    a = cam[PLANE] * n0 + cam[PLANE + 1] * n1 + cam[PLANE + 2] * n2
+    b = cam[PLANE + 3] * n0 + cam[PLANE + 4] * n1 + cam[PLANE + 5] * n2
+    total = a * a * see[XX] + 2 * a * b * see[XY] + b * b * see[YY]
+    return total / (1.0 + see[X] ** 2 + see[Y] ** 2)

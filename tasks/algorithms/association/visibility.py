@@ -1,6 +1,9 @@
 """Visibility: whether a sensor could see a point at all."""
 
+import numpy as np
 from numba import njit
+
+from epipole.tasks.algorithms.association.views import HALF, PLANE, REACH, TURN
 
 EARTH_RADIUS_KM = 6378.137
 INSIDE = 0.98  # of the half field: nearer to the edge a sensor may well miss an object
@@ -36,13 +39,47 @@ def sees(r, R, half_field, x):
 
 
 @njit(cache=True, nogil=True)
+def in_view(cam, x):
+    """Return what `sees` does, by a row of `Views.camera`."""
+    d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
+    depth = cam[TURN + 6] * d0 + cam[TURN + 7] * d1 + cam[TURN + 8] * d2
+    if not depth > 0.0:
+        return False
+    for a in range(2):
+        t = TURN + 3 * a
+        if abs(cam[t] * d0 + cam[t + 1] * d1 + cam[t + 2] * d2) > INSIDE * cam[HALF + a] * depth:
+            return False
+    return not blocked(cam, x, EARTH_RADIUS_KM)
+
+
+@njit(cache=True, nogil=True)
 def looks_at(views, s, X, seen_by):
     """Return whether sensor s has the point in its field at every solved instant."""
     looked = False
     for m in range(len(views.time_s)):
         if seen_by[m] < 2:
             continue
-        if not sees(views.r_km[s, m], views.attitude[s, m], views.half_field[s], X[m]):
+        if not in_view(views.camera[s, m], X[m]):
             return False
         looked = True
     return looked
+
+
+@njit(cache=True, nogil=True)
+def near_fields(views, X, P, seen_by, near):
+    """Write which sensors have a point, by far, near what they see at any solved instant.
+
+    A quick look: within the cone about all of a sensor's tracklets and its field, and 6 sigma.
+    """
+    near[:] = False
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2:
+            continue
+        slack = 6.0 * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
+        for s in range(len(near)):
+            cam = views.camera[s, m]
+            d0, d1, d2 = X[m, 0] - cam[0], X[m, 1] - cam[1], X[m, 2] - cam[2]
+            depth = cam[PLANE + 6] * d0 + cam[PLANE + 7] * d1 + cam[PLANE + 8] * d2
+            away2 = d0 * d0 + d1 * d1 + d2 * d2 - depth * depth
+            if cam[REACH] > 0.0 and depth > 0.0 and away2 <= (cam[REACH] * depth + slack) ** 2:
+                near[s] = True
