@@ -102,14 +102,28 @@ STARS = schema(
 
 DETECTIONS = schema(
     "detections",
-    "One row a centroid that is no star, in a frame with an attitude.",
+    "One row a centroid that is no star.",
     [
         *FRAME_KEY,
         CENTROID,
         *PIXEL,
         column("flux", F64, null=True, doc="Linear, any unit; null where unknown."),
-        column("ra_deg", F64, unit="deg", frame="ICRS", doc="Apparent direction."),
-        column("dec_deg", F64, unit="deg", frame="ICRS", doc="Apparent direction."),
+        column(
+            "ra_deg",
+            F64,
+            unit="deg",
+            frame="ICRS",
+            null=True,
+            doc="Apparent direction; null in a frame without attitude.",
+        ),
+        column(
+            "dec_deg",
+            F64,
+            unit="deg",
+            frame="ICRS",
+            null=True,
+            doc="Apparent direction; null in a frame without attitude.",
+        ),
         column(
             "sigma_arcsec",
             F64,

@@ -1,6 +1,7 @@
 """Build tracklets: detections of one sensor, frame after frame, become runs of one object."""
 
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ import pyarrow as pa
 from prefect import task
 from prefect.cache_policies import NO_CACHE
 
-from epipole.schemas.bridge import empty, nullable, table
+from epipole.schemas.bridge import array, concat, empty, nullable, table
 from epipole.schemas.settings import Settings, TrackletSettings
 from epipole.schemas.tables import DETECTIONS, TRACKLETS
 from epipole.tasks.algorithms.camera import Camera
@@ -20,15 +21,23 @@ from epipole.tasks.algorithms.track_linking.chains import Links, chain_heads
 from epipole.tasks.algorithms.track_linking.likelihood_ratio import link_by_likelihood
 from epipole.tasks.algorithms.track_linking.prediction import link_by_prediction
 from epipole.tasks.algorithms.tracking import NONE, follow_detections
-from epipole.tasks.detection_kinds import at_star, is_hot_pixel, is_planet, sighting_sigma
+from epipole.tasks.detection_kinds import (
+    at_hot_pixel,
+    at_star,
+    is_hot_pixel,
+    is_planet,
+    sighting_sigma,
+)
 from epipole.tasks.run_names import sensor_and_span
 from epipole.tasks.sightings import (
     Frames,
     Sightings,
     camera_of,
+    image_sightings_of,
     part_of,
     sightings_of,
     solved_frames,
+    unsolved_frames,
 )
 
 Array = npt.NDArray[np.float64]
@@ -52,27 +61,66 @@ class Tracked(NamedTuple):
 def build_tracklets(
     solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
 ) -> Tracked:
-    """Return one sensor's detections with tracklet_id, track_id and kind, and its tracklets."""
-    frames = solved_frames(solutions)
-    if not detections.num_rows or not len(frames.number):
+    """Return one sensor's detections with tracklet_id, track_id and kind, and its tracklets.
+
+    Frames with an attitude are tracked on the sky. Those without are tracked in the image, a
+    run of them for itself: there stars move with the objects and cannot be told from them.
+    """
+    if not detections.num_rows:
         return Tracked(detections, empty(TRACKLETS))
-    camera = camera_of(cameras, int(frames.camera[0]))
-    seen = sightings_of(frames, detections)
-    kind = np.full(detections.num_rows, "unknown", dtype=object)
-    hot = is_hot_pixel(frames, seen, detections, camera)
-    kind[seen.row[hot]] = "hot_pixel"
-    planet = is_planet(frames, seen, camera) & ~hot
-    kind[seen.row[planet]] = "planet"
-    seen = part_of(seen, ~hot & ~planet)
-    track = _follow(frames, seen, camera, settings.tracklets)
-    return _label(frames, seen, track, detections, kind, camera, settings)
+    labels = _Labels(
+        np.full(detections.num_rows, "unknown", dtype=object),
+        *(np.full(detections.num_rows, None, dtype=object) for _ in range(2)),
+    )
+    tracklets = [
+        _label(part, labels, detections, settings)
+        for part in _parts(solutions, detections, cameras)
+    ]
+    columns = {name: detections[name] for name in DETECTIONS.names} | labels._asdict()
+    built = concat(TRACKLETS, tracklets)
+    return Tracked(
+        table(DETECTIONS, columns),
+        built.sort_by([("start_time", "ascending"), ("tracklet_id", "ascending")]),
+    )
 
 
-def _follow(
-    frames: Frames, seen: Sightings, camera: Camera, settings: TrackletSettings
-) -> npt.NDArray[np.int64]:
+class _Labels(NamedTuple):
+    """What is said of each detection; written as it is found."""
+
+    kind: npt.NDArray[np.object_]
+    tracklet_id: npt.NDArray[np.object_]
+    track_id: npt.NDArray[np.object_]
+
+
+class _Part(NamedTuple):
+    """Frames that are tracked together, and what they show."""
+
+    frames: Frames
+    seen: Sightings
+    camera: Camera
+    interval_s: float
+    on_sky: bool
+
+
+def _parts(solutions: pa.Table, detections: pa.Table, cameras: pa.Table) -> Iterator[_Part]:
+    """Yield the frames with an attitude, and those without."""
+    frames = solved_frames(solutions)
+    if len(frames.number):
+        camera = camera_of(cameras, int(frames.camera[0]))
+        interval_s = frame_interval_ns(frames.time_ns) / 1e9
+        yield _Part(frames, sightings_of(frames, detections), camera, interval_s, True)
+    lost = unsolved_frames(solutions)
+    if len(lost.number):
+        camera = camera_of(cameras, int(lost.camera[0]))
+        # Of all frames: those that were lost may be far between.
+        interval_s = frame_interval_ns(np.sort(array(solutions, "time"))) / 1e9
+        seen = image_sightings_of(lost, detections, camera)
+        yield _Part(lost, seen, camera, interval_s, False)
+
+
+def _follow(part: _Part, seen: Sightings, settings: TrackletSettings) -> npt.NDArray[np.int64]:
     """Return the track number of every sighting."""
-    interval_s = frame_interval_ns(frames.time_ns) / 1e9
+    frames, camera, interval_s = part.frames, part.camera, part.interval_s
     return follow_detections(
         (frames.time_ns - frames.time_ns[0]) / 1e9,
         seen.offsets,
@@ -98,39 +146,44 @@ class _Run(NamedTuple):
     residual_px: float
 
 
-def _label(
-    frames: Frames,
-    seen: Sightings,
-    track: npt.NDArray[np.int64],
-    detections: pa.Table,
-    kind: npt.NDArray[np.object_],
-    camera: Camera,
-    settings: Settings,
-) -> Tracked:
+def _label(part: _Part, labels: _Labels, detections: pa.Table, settings: Settings) -> pa.Table:
+    """Say what the detections of some frames are; return their tracklets."""
+    frames, seen, camera = part.frames, part.seen, part.camera
+    known = labels.kind == "hot_pixel"
+    hot = is_hot_pixel(frames, seen, detections, camera)
+    hot |= at_hot_pixel(seen, detections, known, camera)
+    labels.kind[seen.row[hot]] = "hot_pixel"
+    planet = np.zeros_like(hot)
+    if part.on_sky:
+        planet = is_planet(frames, seen, camera) & ~hot
+        labels.kind[seen.row[planet]] = "planet"
+    seen = part_of(seen, ~hot & ~planet)
+    track = _follow(part, seen, settings.tracklets)
     runs = _runs(frames, seen, track, camera, settings.alignment.window_s)
+    if part.on_sky:
+        stars = [run for run in runs if run.stands_still]
+        runs = [run for run in runs if not run.stands_still]
+        _label_stars(labels, seen, stars, np.flatnonzero(track == NONE))
     sensor_id = str(detections["sensor_id"][0])
-    for run in runs:
-        kind[seen.row[run.members]] = "star_unlisted" if run.stands_still else "object"
-    stars = np.array([seen.u_icrs[run.members].mean(axis=0) for run in runs if run.stands_still])
-    single = np.flatnonzero(track == NONE)
-    kind[seen.row[single[at_star(seen, single, stars)]]] = "star_unlisted"
-    objects = sorted(
-        (run for run in runs if not run.stands_still), key=lambda run: int(run.members[0])
-    )
+    objects = sorted(runs, key=lambda run: int(run.members[0]))
     names = [_name(sensor_id, frames, seen, detections, run) for run in objects]
-    links = _link(frames, seen, objects, camera, settings)
+    links = _link(part, seen, objects, settings)
     heads = [names[head] for head in chain_heads(links.before)]
-    tracklet_id = np.full(detections.num_rows, None, dtype=object)
-    track_id = tracklet_id.copy()
     for run, name, head in zip(objects, names, heads, strict=True):
-        tracklet_id[seen.row[run.members]] = name
-        track_id[seen.row[run.members]] = head
-    columns = {name: detections[name] for name in DETECTIONS.names}
-    columns |= {"kind": kind, "tracklet_id": tracklet_id, "track_id": track_id}
-    return Tracked(
-        table(DETECTIONS, columns),
-        _tracklet_table(frames, seen, objects, names, heads, links.chi2, sensor_id),
-    )
+        labels.kind[seen.row[run.members]] = "object"
+        labels.tracklet_id[seen.row[run.members]] = name
+        labels.track_id[seen.row[run.members]] = head
+    return _tracklet_table(frames, seen, objects, names, heads, links.chi2, sensor_id)
+
+
+def _label_stars(
+    labels: _Labels, seen: Sightings, stars: list[_Run], single: npt.NDArray[np.int64]
+) -> None:
+    """Label runs that stand still, and single sightings at their places, as unlisted stars."""
+    for run in stars:
+        labels.kind[seen.row[run.members]] = "star_unlisted"
+    places = np.array([seen.u_icrs[run.members].mean(axis=0) for run in stars])
+    labels.kind[seen.row[single[at_star(seen, single, places)]]] = "star_unlisted"
 
 
 def _name(sensor_id: str, frames: Frames, seen: Sightings, detections: pa.Table, run: _Run) -> str:
@@ -143,11 +196,9 @@ def _name(sensor_id: str, frames: Frames, seen: Sightings, detections: pa.Table,
     return f"{sensor_id}-{frames.number[seen.frame[first]]}-{centroid}"
 
 
-def _link(
-    frames: Frames, seen: Sightings, runs: list[_Run], camera: Camera, settings: Settings
-) -> Links:
+def _link(part: _Part, seen: Sightings, runs: list[_Run], settings: Settings) -> Links:
     """Return which run continues which, by the method that the settings name."""
-    chosen = settings.tracklets
+    chosen, frames, camera = settings.tracklets, part.frames, part.camera
     if chosen.link_method == "none" or not runs:
         return Links(np.full(len(runs), NONE), np.full(len(runs), np.nan))
     members = np.concatenate([run.members for run in runs])
@@ -163,7 +214,7 @@ def _link(
             *fragments,
             gap_s=chosen.link_gap_s,
             kept=chosen.link_kept,
-            interval_s=frame_interval_ns(frames.time_ns) / 1e9,
+            interval_s=part.interval_s,
             q_rad2_s3=chosen.link_noise_px * camera.pixel_rad**2,
         )
     return link_by_likelihood(
@@ -222,7 +273,7 @@ def _tracklet_table(
     sensor_id: str,
 ) -> pa.Table:
     time_ns = frames.time_ns[seen.frame]
-    built = table(
+    return table(
         TRACKLETS,
         {
             "tracklet_id": names,
@@ -236,4 +287,3 @@ def _tracklet_table(
             "link_chi2": nullable(link_chi2),
         },
     )
-    return built.sort_by([("start_time", "ascending"), ("tracklet_id", "ascending")])

@@ -33,6 +33,16 @@ def is_hot_pixel(frames: Frames, seen: Sightings, detections: pa.Table, camera: 
     )
 
 
+def at_hot_pixel(seen: Sightings, detections: pa.Table, known: Flags, camera: Camera) -> Flags:
+    """Return which sightings stand in the image where known hot pixels (rows) do."""
+    place_px = np.column_stack([array(detections, "x_px"), array(detections, "y_px")])
+    if not known.any() or not len(seen.row):
+        return np.zeros(len(seen.row), bool)
+    off_px, _ = cKDTree(place_px[known]).query(place_px[seen.row])
+    sigma_px = array(detections, "sigma_arcsec")[seen.row] * ARCSEC / camera.pixel_rad
+    return np.asarray(off_px < GATE_SIGMA * sigma_px)
+
+
 def is_planet(frames: Frames, seen: Sightings, camera: Camera) -> Flags:
     """Return which sightings lie where a planet does, to its ephemeris's and their own error."""
     here, moving = np.nan_to_num(frames.r_gcrf_km), np.nan_to_num(frames.v_gcrf_km_s)

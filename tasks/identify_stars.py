@@ -81,7 +81,7 @@ def identify_stars(
         _solutions_table(exposures, places, centroids, attitudes, matches, stars),
         stars,
         _detections_table(exposures, centroids, attitudes, matches),
-        _rejects_table(exposures, centroids, attitudes),
+        _rejects_table(exposures, centroids),
     )
     log.info(
         "%s: identified %d of %d frames, %d stars, %d other centroids",
@@ -342,8 +342,8 @@ def _solutions_table(
 
 
 def _detections_table(exposures: pa.Table, c: _Centroids, a: _Attitudes, m: _Matches) -> pa.Table:
-    """Every centroid that is no star, in a frame with attitude and camera."""
-    left = ((a.source != "none") & (c.camera_of_frame >= 0))[c.frame]
+    """Every centroid that is no star, in a frame with a camera; no direction without attitude."""
+    left = (c.camera_of_frame >= 0)[c.frame]
     left[m.at] = False
     at = np.flatnonzero(left)
     frame = c.frame[at]
@@ -358,8 +358,8 @@ def _detections_table(exposures: pa.Table, c: _Centroids, a: _Attitudes, m: _Mat
             "x_px": c.x_px[at],
             "y_px": c.y_px[at],
             "flux": nullable(c.flux[at]),
-            "ra_deg": np.degrees(ra),
-            "dec_deg": np.degrees(dec),
+            "ra_deg": nullable(np.degrees(ra)),
+            "dec_deg": nullable(np.degrees(dec)),
             "sigma_arcsec": sigma_px * c.pixel_rad[at] / ARCSEC,
             "kind": np.full(len(at), "unknown", object),
             "tracklet_id": pa.nulls(len(at), pa.string()),
@@ -368,19 +368,16 @@ def _detections_table(exposures: pa.Table, c: _Centroids, a: _Attitudes, m: _Mat
     )
 
 
-def _rejects_table(exposures: pa.Table, c: _Centroids, a: _Attitudes) -> pa.Table:
-    """One row for each log and reason: centroids of frames without attitude or camera."""
-    counts = np.diff(c.first)
-    no_camera = c.camera_of_frame < 0
-    lost = {"no_calibration": no_camera, "no_attitude": (a.source == "none") & ~no_camera}
+def _rejects_table(exposures: pa.Table, c: _Centroids) -> pa.Table:
+    """One row for each log: centroids of frames without camera."""
+    counts, frames = np.diff(c.first), c.camera_of_frame < 0
     sources, times = array(exposures, "source"), array(exposures, "time")
     rows = []
-    for reason, frames in lost.items():
-        for source in sorted(set(sources[frames])):
-            at = np.flatnonzero(frames & (sources == source) & (counts > 0))
-            if len(at):
-                rows.append((source, int(times[at[0]]), reason, int(counts[at].sum())))
-    source, time, why, count = zip(*rows, strict=True) if rows else ((), (), (), ())
+    for source in sorted(set(sources[frames])):
+        at = np.flatnonzero(frames & (sources == source) & (counts > 0))
+        if len(at):
+            rows.append((source, int(times[at[0]]), int(counts[at].sum())))
+    source, time, count = zip(*rows, strict=True) if rows else ((), (), ())
     return table(
         REJECTS,
         {
@@ -389,7 +386,7 @@ def _rejects_table(exposures: pa.Table, c: _Centroids, a: _Attitudes) -> pa.Tabl
             "sensor_id": [exposures["sensor_id"][0].as_py()] * len(rows),
             "time": np.array(time, np.int64),
             "stage": ["identify"] * len(rows),
-            "reason": list(why),
+            "reason": ["no_calibration"] * len(rows),
             "count": list(count),
         },
     )

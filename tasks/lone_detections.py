@@ -41,7 +41,8 @@ def with_lone_detections(detections: pa.Table, lone: npt.NDArray[np.bool_]) -> p
 
 
 def with_lone_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
-    """Return the tracklets with a row for each lone detection among the views."""
+    """Return the tracklets that have views, with a row for each lone detection among these."""
+    tracklets = tracklets.filter(pc.is_in(tracklets["tracklet_id"], views["tracklet_id"]))
     lone = views.filter(is_lone(views["tracklet_id"]))
     if not lone.num_rows:
         return tracklets

@@ -7,16 +7,20 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, stack, stack_covariance
-from epipole.tasks.algorithms.camera import Camera
+from epipole.tasks.algorithms.camera import Camera, unproject
 from epipole.tasks.algorithms.direction_errors import attitude_covariance, centroid_covariance
 from epipole.tasks.algorithms.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.sky import ARCSEC, unit_from_radec
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 
 class Frames(NamedTuple):
-    """The frames of one sensor that have an attitude, in time order."""
+    """Frames of one sensor, in time order.
+
+    Those without an attitude have their own axes in its place: identity.
+    """
 
     table: pa.Table
     number: npt.NDArray[np.int64]
@@ -32,7 +36,21 @@ class Frames(NamedTuple):
 
 def solved_frames(solutions: pa.Table) -> Frames:
     """Return the frames of a `solutions` table that have an attitude, in time order."""
-    solved = solutions.filter(pa.compute.field("attitude_source") != "none").sort_by("time")
+    return _frames(solutions.filter(pa.compute.field("attitude_source") != "none"))
+
+
+def unsolved_frames(solutions: pa.Table) -> Frames:
+    """Return the frames of a `solutions` table with a camera but no attitude, in time order."""
+    lost = (pa.compute.field("attitude_source") == "none") & (pa.compute.field("camera") >= 0)
+    frames = _frames(solutions.filter(lost))
+    n = len(frames.number)
+    return frames._replace(
+        q_sensor_from_icrs=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), cov_att_rad2=np.zeros((n, 3, 3))
+    )
+
+
+def _frames(solutions: pa.Table) -> Frames:
+    solved = solutions.sort_by("time")
     return Frames(
         solved,
         array(solved, "frame_number"),
@@ -64,15 +82,7 @@ class Sightings(NamedTuple):
 
 def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
     """Return the detections of one sensor that lie in its solved frames, by frame."""
-    by_number = np.argsort(frames.number, kind="stable")
-    number = array(detections, "frame_number")
-    at = np.searchsorted(frames.number[by_number], number)
-    at = np.minimum(at, max(len(by_number) - 1, 0))
-    known = frames.number[by_number][at] == number if len(by_number) else np.zeros(0, bool)
-    row = np.flatnonzero(known)
-    frame = by_number[at[row]] if len(row) else np.zeros(0, np.int64)
-    order = np.lexsort((array(detections, "centroid")[row], frame))
-    row, frame = row[order], frame[order]
+    row, frame = _in_frames(frames, detections)
     u = unit_from_radec(
         np.radians(array(detections, "ra_deg")[row]), np.radians(array(detections, "dec_deg")[row])
     )
@@ -81,15 +91,36 @@ def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
         u, matrix_from_quaternion(frames.q_sensor_from_icrs[frame]), frames.cov_att_rad2[frame]
     )
     stars = frames.from_stars[frame][:, None, None]
-    offsets = np.searchsorted(frame, np.arange(len(frames.number) + 1))
     return Sightings(
         row,
         frame,
-        offsets,
+        np.searchsorted(frame, np.arange(len(frames.number) + 1)),
         u,
         noise + np.where(stars, attitude, 0.0),
         np.where(stars, 0.0, attitude),
     )
+
+
+def image_sightings_of(frames: Frames, detections: pa.Table, camera: Camera) -> Sightings:
+    """Return the detections that lie in unsolved frames, by frame; directions in sensor axes."""
+    row, frame = _in_frames(frames, detections)
+    u = unproject(camera, array(detections, "x_px")[row], array(detections, "y_px")[row])
+    noise = centroid_covariance(u, array(detections, "sigma_arcsec")[row] * ARCSEC)
+    offsets = np.searchsorted(frame, np.arange(len(frames.number) + 1))
+    return Sightings(row, frame, offsets, u, noise, np.zeros_like(noise))
+
+
+def _in_frames(frames: Frames, detections: pa.Table) -> tuple[Indices, Indices]:
+    """Return the rows of detections in these frames, by frame and centroid, and their frames."""
+    by_number = np.argsort(frames.number, kind="stable")
+    number = array(detections, "frame_number")
+    at = np.searchsorted(frames.number[by_number], number)
+    at = np.minimum(at, max(len(by_number) - 1, 0))
+    known = frames.number[by_number][at] == number if len(by_number) else np.zeros(0, bool)
+    row = np.flatnonzero(known)
+    frame = by_number[at[row]] if len(row) else np.zeros(0, np.int64)
+    order = np.lexsort((array(detections, "centroid")[row], frame))
+    return row[order], frame[order]
 
 
 def part_of(seen: Sightings, kept: npt.NDArray[np.bool_]) -> Sightings:

@@ -46,7 +46,9 @@ def view_objects(
     """
     frames = solved_frames(solutions)
     detections = _with_lone(frames, detections, settings)
-    tracked = detections.filter(pa.compute.field("tracklet_id").is_valid())
+    # What has no direction was tracked in the image alone.
+    placed = pa.compute.field("tracklet_id").is_valid() & pa.compute.field("ra_deg").is_valid()
+    tracked = detections.filter(placed)
     if not tracked.num_rows or not epochs.num_rows:
         return empty(VIEWS)
     seen = sightings_of(frames, tracked)

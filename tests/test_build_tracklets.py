@@ -99,6 +99,42 @@ def test_joining_can_be_switched_off(seen):
     assert tracklets["link_chi2"].null_count == 10
 
 
+def without_attitude(found, lost):
+    """What was found, as if these frames (from the first) had no attitude."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    solutions, detections = of_sensor(found.solutions, "a"), of_sensor(found.detections, "a")
+    first = solutions["frame_number"].to_numpy().min()
+    numbers = pa.array(first + np.array(lost), pa.int64())
+    for name, rows in (("attitude_source", solutions), ("ra_deg", detections)):
+        at = rows.schema.get_field_index(name)
+        gone = pc.is_in(rows["frame_number"], numbers)
+        value = pa.scalar("none" if name == "attitude_source" else None, rows.schema.field(at).type)
+        rows = rows.set_column(at, rows.schema.field(at), pc.if_else(gone, value, rows[name]))
+        solutions, detections = (rows, detections) if rows.num_columns > 20 else (solutions, rows)
+    return solutions, detections
+
+
+def test_frames_without_attitude_are_tracked_in_the_image(seen):
+    found, cameras, _ = seen
+    settings = validate_settings({}, "test")
+    solutions, detections = without_attitude(found, range(20, 32))
+    built = build_tracklets.fn(solutions, detections, cameras, settings)
+    assert built.tracklets.num_rows == 15  # five before, five after, five in between
+    assert len(set(built.tracklets["tracklet_id"].to_pylist())) == 15
+    assert built.tracklets["link_chi2"].null_count == 10
+    kind = np.array(built.detections["kind"].to_pylist())
+    assert (kind == "object").sum() > 0.9 * 5 * 60
+
+
+def test_lost_frames_far_between_make_no_track(seen):
+    found, cameras, _ = seen
+    solutions, detections = without_attitude(found, range(0, 60, 8))
+    built = build_tracklets.fn(solutions, detections, cameras, validate_settings({}, "test"))
+    assert built.tracklets.num_rows == 5
+
+
 def test_no_detections_give_no_tracklets(seen):
     found, cameras, _ = seen
     settings = validate_settings({}, "test")
