@@ -33,10 +33,11 @@ from epipole.tasks.algorithms.sky import (
     radec_from_unit,
 )
 from epipole.tasks.algorithms.star_identification.frame import Optics, Search
+from epipole.tasks.algorithms.star_identification.frames import Spots, brightest_first
 from epipole.tasks.algorithms.star_identification.published import identify_published
 from epipole.tasks.algorithms.star_identification.sensor import Identified as Found
-from epipole.tasks.algorithms.star_identification.sensor import Spots, identify_sensor
-from epipole.tasks.algorithms.star_identification.sequence import Prior
+from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
+from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.time_scales import DAY_NS, earth_barycentric
 from epipole.tasks.cached_skies import CachedSkies, Catalogue
 from epipole.tasks.run_names import sensor_and_span
@@ -165,30 +166,25 @@ def _optics(camera: Camera) -> Optics:
 
 def _identify(
     exposures: pa.Table, places: pa.Table, c: _Centroids, catalogue: pa.Table, settings: Settings
-) -> tuple[Found | None, list[npt.NDArray[np.int64]]]:
-    """Return what the stars tell, and for each frame the rows of its centroids, brightest first."""
+) -> tuple[Found | None, npt.NDArray[np.int64]]:
+    """Return what the stars tell, and the rows of the centroids, brightest first in each frame."""
     time_ns = array(exposures, "time")
-    # Unknown flux last, in the message's order.
-    brightest = np.lexsort((np.arange(len(c.frame)), -np.nan_to_num(c.flux, nan=-np.inf), c.frame))
-    rows = [brightest[a:b] for a, b in zip(c.first[:-1], c.first[1:], strict=True)]
+    rows = brightest_first(c.first, c.flux)
     if not c.cameras:
         return None, rows
     rule = settings.identification
     _, v_earth = earth_barycentric(time_ns)
     beta = (v_earth + np.nan_to_num(stack(places, "v{}_km_s"))) / SPEED_OF_LIGHT_KM_S
-    optics = {row: _optics(camera) for row, camera in c.cameras.items()}
-    mag = -2.5 * np.log10(c.flux)
-    spots = [
-        Spots(
-            c.u[r],
-            c.pixel_rad[r],
-            c.sigma_px[r],
-            mag[r],
-            beta[k],
-            optics[int(c.camera_of_frame[k])],
-        )
-        for k, r in enumerate(rows)
-    ]
+    spots = Spots(
+        c.first,
+        c.u[rows],
+        c.pixel_rad[rows],
+        c.sigma_px[rows],
+        -2.5 * np.log10(c.flux[rows]),
+        beta,
+        [_optics(camera) for camera in c.cameras.values()],
+        np.searchsorted(np.array(list(c.cameras)), c.camera_of_frame),
+    )
     day = int(time_ns[len(time_ns) // 2] // DAY_NS)
     pixel_rad = next(iter(c.cameras.values())).pixel_rad
     skies = CachedSkies(Catalogue(catalogue), day, pixel_rad, rule.merge_px)
@@ -200,10 +196,9 @@ def _identify(
     return found, rows
 
 
-def _priors(places: pa.Table, settings: Settings) -> list[Prior | None]:
+def _priors(places: pa.Table, settings: Settings) -> Priors:
     q, sigma = stack(places, "q{}", "xyzw"), _prior_sigma(places, settings) * ARCSEC
-    R = matrix_from_quaternion(q)
-    return [Prior(R[k], sigma[k]) if np.isfinite(q[k, 3]) else None for k in range(len(q))]
+    return Priors(matrix_from_quaternion(q), np.where(np.isfinite(q[:, 3]), sigma, np.nan))
 
 
 def _prior_sigma(places: pa.Table, settings: Settings) -> Array:
@@ -230,10 +225,10 @@ def _attitudes(places: pa.Table, found: Found | None, settings: Settings) -> _At
     cov[source == "none"] = np.nan
     if found is None:
         return _Attitudes(source, ["no_calibration"] * n, R, cov)
-    for k, solution in enumerate(found.solutions):
-        if solution is not None:
-            source[k] = "stars"
-            R[k], cov[k] = solution.R_sensor_from_icrs, solution.cov_rad2 / ARCSEC**2
+    solved = found.solutions.solved
+    source[solved] = "stars"
+    R[solved] = found.solutions.R_sensor_from_icrs[solved]
+    cov[solved] = found.solutions.cov_rad2[solved] / ARCSEC**2
     return _Attitudes(source, found.status, R, cov)
 
 
@@ -247,19 +242,14 @@ class _Matches(NamedTuple):
     scale: float
 
 
-def _matches(found: Found | None, rows: list[npt.NDArray[np.int64]]) -> _Matches:
-    at, star = np.empty(0, np.int64), np.empty(0, np.int64)
+def _matches(found: Found | None, rows: npt.NDArray[np.int64]) -> _Matches:
     if found is None:
-        return _Matches(at, star, np.empty(0), np.empty((0, 3)), 1.0)
-    solved = [
-        (r[s.star >= 0], s.star[s.star >= 0])
-        for r, s in zip(rows, found.solutions, strict=True)
-        if s
-    ]
-    if solved:
-        at, star = (np.concatenate(column) for column in zip(*solved, strict=True))
-        order = np.argsort(at)
-        at, star = at[order], star[order]
+        none = np.empty(0, np.int64)
+        return _Matches(none, none, np.empty(0), np.empty((0, 3)), 1.0)
+    star = np.empty_like(rows)
+    star[rows] = found.solutions.star
+    at = np.flatnonzero(star >= 0)
+    star = star[at]
     stars = found.sky.catalogue
     return _Matches(
         at, stars.star_id[star], stars.magnitude[star], stars.u_icrs[star], found.sigma_scale

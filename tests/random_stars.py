@@ -6,6 +6,7 @@ from epipole.tasks.algorithms.camera import Camera, inside, pixel_angle, project
 from epipole.tasks.algorithms.rotations import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue
 from epipole.tasks.algorithms.star_identification.frame import Frame, Optics, Search, aberrate_all
+from epipole.tasks.algorithms.star_identification.frames import Frames, Spots
 
 CAMERA = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)  # 16 degrees
 BETA = np.array([0.6e-4, -0.7e-4, 0.3e-4])  # an Earth's year's worth of aberration
@@ -52,6 +53,27 @@ def frame(catalogue, R, seed, sigma_px=0.3, n_false=0, missing=0.0, flux=True, c
     u = unproject(camera, x[order], y[order])
     mag = mag[order] if flux else np.full(len(x), np.nan)
     return Frame(u, sigma_px * pixel_angle(camera, u), mag, BETA, optics(camera)), row[order]
+
+
+def join(frames):
+    """Return frames as one, flat."""
+    optics_of = np.zeros(len(frames), np.int64)
+    first = np.concatenate([[0], np.cumsum([len(f.u) for f in frames])]).astype(np.int64)
+    return Frames(
+        first, np.concatenate([f.u for f in frames]),
+        np.concatenate([f.sigma_rad for f in frames]),
+        np.concatenate([f.instrumental_mag for f in frames]),
+        np.array([f.beta for f in frames]), [frames[0].optics], optics_of,
+    )  # fmt: skip
+
+
+def join_spots(frames, sigma_px, pixel_rad):
+    """Return frames as one, flat, with these (n,) errors and pixel sizes of their centroids."""
+    flat = join(frames)
+    return Spots(
+        flat.first, flat.u, np.concatenate(pixel_rad), np.concatenate(sigma_px),
+        flat.instrumental_mag, flat.beta, flat.optics, flat.optics_of,
+    )  # fmt: skip
 
 
 def angle_between(R, S):

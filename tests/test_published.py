@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from random_stars import CAMERA, HOW, angle_between, frame, optics, random_attitude
+from random_stars import CAMERA, HOW, angle_between, frame, join_spots, optics, random_attitude
 from random_stars import random_catalogue as random_sky
 from star_maps import SEEDS, contest_maps, hipparcos_at_epoch
 
@@ -14,7 +14,6 @@ from epipole.tasks.algorithms.star_identification.published import (
     matcher,
     solve_matches,
 )
-from epipole.tasks.algorithms.star_identification.sensor import Spots
 from epipole.tasks.algorithms.star_identification.sky import (
     pattern_pairs,
     pattern_size,
@@ -131,37 +130,39 @@ class OneSky:
         return self.whole
 
 
-def spots(seen, camera):
-    pixel_rad = pixel_angle(camera, seen.u)
-    sigma_px = seen.sigma_rad / pixel_rad
-    return Spots(seen.u, pixel_rad, sigma_px, seen.instrumental_mag, seen.beta, seen.optics)
+def spots(frames, camera):
+    pixel_rad = [pixel_angle(camera, f.u) for f in frames]
+    sigma_px = [f.sigma_rad / p for f, p in zip(frames, pixel_rad, strict=True)]
+    return join_spots(frames, sigma_px, pixel_rad)
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_frames_get_their_attitude_and_a_status(method):
     catalogue = random_sky(3000)
     frames = [frame(catalogue, random_attitude(k), k)[0] for k in range(12)]
-    given = [spots(f, CAMERA) for f in frames]
-    empty = Spots(*[column[:0] for column in given[0][:4]], *given[0][4:])
-    found = identify_published([*given, empty], OneSky(catalogue), None, method, HOW)
+    empty = frames[0]._replace(
+        u=np.empty((0, 3)), sigma_rad=np.empty(0), instrumental_mag=np.empty(0)
+    )
+    found = identify_published(
+        spots([*frames, empty], CAMERA), OneSky(catalogue), None, method, HOW
+    )
     off = [
         angle_between(s.R_sensor_from_icrs, random_attitude(k))
-        for k, s in enumerate(found.solutions)
+        for k, s in enumerate(found.solutions.each())
         if s is not None
     ]
     assert len(off) >= 11
     assert np.degrees(max(off)) < 0.5
     assert found.status[-1] == "no_centroids"
-    assert found.solutions[-1] is None
+    assert not found.solutions.solved[-1]
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_errors_that_are_not_stated_follow_from_the_residuals(method):
     catalogue = random_sky(3000)
-    given = [
-        spots(frame(catalogue, random_attitude(k), k, sigma_px=0.3)[0], CAMERA) for k in range(12)
-    ]
-    unknown = [s._replace(sigma_px=np.full(len(s.u), np.nan)) for s in given]
+    frames = [frame(catalogue, random_attitude(k), k, sigma_px=0.3)[0] for k in range(12)]
+    given = spots(frames, CAMERA)
+    unknown = given._replace(sigma_px=np.full(len(given.u), np.nan))
     found = identify_published(unknown, OneSky(catalogue), None, method, HOW)
     assert 0.25 < found.sigma_scale < 0.35
 
@@ -170,7 +171,7 @@ def test_errors_that_are_not_stated_follow_from_the_residuals(method):
 def test_centroids_all_on_one_spot_are_refused(method):
     catalogue = random_sky(3000)
     seen = frame(catalogue, random_attitude(0), 0)[0]
-    spot = spots(seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0)), CAMERA)
-    found = identify_published([spot], OneSky(catalogue), None, method, HOW)
-    assert found.solutions == [None]
+    spot = spots([seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0))], CAMERA)
+    found = identify_published(spot, OneSky(catalogue), None, method, HOW)
+    assert not found.solutions.solved.any()
     assert found.status == ["no_match"]

@@ -2,16 +2,19 @@
 
 import numpy as np
 import pytest
-from random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
+from random_stars import HOW, angle_between, frame, join, random_attitude, random_catalogue
 from scipy.spatial.transform import Rotation
 
-from epipole.tasks.algorithms.star_identification.sequence import (
+from epipole.tasks.algorithms.star_identification.following import (
     ACCELERATION_SIGMA,
-    Fix,
-    Prior,
-    Tracker,
-    identify_sequence,
+    new_memory,
     predict,
+    remember,
+)
+from epipole.tasks.algorithms.star_identification.sequence import (
+    Priors,
+    identify_sequence,
+    no_priors,
 )
 from epipole.tasks.algorithms.star_identification.sky import (
     pattern_pairs,
@@ -21,6 +24,7 @@ from epipole.tasks.algorithms.star_identification.sky import (
 )
 
 ARCSEC = np.pi / 648000
+P_FIX = np.eye(3) * ARCSEC**2
 CATALOGUE = random_catalogue()
 SKY = sky_to_limit(CATALOGUE, 99.0)
 GRID = sky_grid(SKY, 0.005)
@@ -40,39 +44,74 @@ def _turning(n, rate=0.005, seed=0):
 
 
 def _identify(frames, priors=None, t_s=None, pairs=_pairs):
-    t_s = np.arange(len(frames)) * 1.0 if t_s is None else t_s
-    priors = [None] * len(frames) if priors is None else priors
-    return identify_sequence(t_s, frames, priors, SKY, GRID, pairs, HOW)
+    n = len(frames)
+    t_s = np.arange(n) * 1.0 if t_s is None else t_s
+    priors = no_priors(n) if priors is None else priors
+    found, status = identify_sequence(t_s, join(frames), priors, SKY, GRID, pairs, HOW)
+    return found.each(), status
+
+
+def _remembering(*fixes):
+    """Return the memory of a sensor with these times and attitudes, known to an arc second."""
+    memory = new_memory(1)
+    for t_s, R in fixes:
+        remember(t_s, R, P_FIX, memory.t_s, memory.R, memory.P, memory.held)
+    return memory
+
+
+def _predict(memory, t_s):
+    R, P = np.empty((3, 3)), np.empty((3, 3))
+    return predict(t_s, memory.t_s, memory.R, memory.P, memory.held, R, P), R, P
 
 
 def test_a_turning_sensor_is_predicted_to_where_it_turns():
+    for rate in (0.0, 1e-6, 0.005, 0.3):
+        R = _turning(3, rate)
+        useful, found, cov = _predict(_remembering((0.0, R[0]), (1.0, R[1])), 2.0)
+        assert useful
+        assert angle_between(found, R[2]) < 1e-9
+        # (1 + 1)^2 + 1 of the errors, and what an uneven turn adds.
+        assert cov[0, 0] == pytest.approx(5 * ARCSEC**2 + ACCELERATION_SIGMA**2)
+
+
+def test_backward_in_time_the_turn_is_the_other_way():
     R = _turning(3)
-    P = np.eye(3) * ARCSEC**2
-    found, cov = predict([Fix(0.0, R[0], P), Fix(1.0, R[1], P)], 2.0)
-    assert angle_between(found, R[2]) < 1e-9
-    # (1 + 1)^2 + 1 of the errors, and what an uneven turn adds.
-    assert cov[0, 0] == pytest.approx(5 * ARCSEC**2 + ACCELERATION_SIGMA**2)
+    _, found, _ = _predict(_remembering((2.0, R[2]), (1.0, R[1])), 0.0)
+    assert angle_between(found, R[0]) < 1e-9
 
 
-def test_predictions_grow_useless_with_the_gap():
+def test_predictions_grow_useless_with_the_gap_and_after_a_slew():
     R = _turning(2)
-    P = np.eye(3) * ARCSEC**2
-    assert predict([], 0.0) is None
-    assert predict([Fix(0.0, R[0], P)], 5.0) is not None
-    assert predict([Fix(0.0, R[0], P)], 1000.0) is None
-    assert predict([Fix(0.0, R[0], P), Fix(1.0, R[1], P)], 1000.0) is None
+    assert not _predict(_remembering(), 0.0)[0]
+    assert _predict(_remembering((0.0, R[0])), 5.0)[0]
+    assert not _predict(_remembering((0.0, R[0])), 1000.0)[0]
+    assert not _predict(_remembering((0.0, R[0]), (1.0, R[1])), 1000.0)[0]
+    assert not _predict(_remembering((0.0, R[0]), (1.0, _turning(2, 1.0)[1])), 2.0)[0]
 
 
-def test_after_the_first_frame_no_search_is_needed():
+def test_after_the_first_frames_no_search_is_needed():
     R = _turning(12)
     frames = [frame(CATALOGUE, r, k, n_false=10)[0] for k, r in enumerate(R)]
-    tracker = Tracker(SKY, GRID, _pairs, HOW)
-    for k in range(3):
-        assert tracker.step(float(k), frames[k], None)[0] is not None
-    tracker.pairs = None
-    for k in range(3, 12):
-        found, _ = tracker.step(float(k), frames[k], None)
-        assert angle_between(found.R_sensor_from_icrs, R[k]) < 300 * ARCSEC
+    searched = []
+
+    def counted():
+        searched.append(1)
+        return _pairs()
+
+    solutions, _ = _identify(frames, pairs=counted)
+    assert len(searched) <= 2  # then its rate is known
+    for r, s in zip(R, solutions, strict=True):
+        assert angle_between(s.R_sensor_from_icrs, r) < 300 * ARCSEC
+
+
+def test_stars_of_a_sensor_that_turns_far_are_those_of_its_field():
+    # Ten times as far as stars are kept around a field.
+    R = _turning(100, rate=0.006)
+    frames, true = zip(*[frame(CATALOGUE, r, k, n_false=3) for k, r in enumerate(R)], strict=True)
+    for solution, star in zip(_identify(list(frames))[0], true, strict=True):
+        claimed = solution.star >= 0
+        np.testing.assert_array_equal(solution.star[claimed], star[claimed])
+        assert claimed.sum() >= 0.9 * (star >= 0).sum()
 
 
 def test_after_a_slew_the_sensor_is_found_again():
@@ -115,9 +154,10 @@ def test_a_right_prior_spares_the_search_and_a_wrong_one_is_overruled():
     def never():
         raise AssertionError("searched the whole sky")
 
-    right = [Prior(r, 60 * ARCSEC) for r in R]
+    sigma = np.full(3, 60 * ARCSEC)
+    right = Priors(np.array(R), sigma)
     assert _identify(frames, right, pairs=never)[1] == [None] * 3
-    wrong = [Prior(random_attitude(77), 60 * ARCSEC)] * 3
+    wrong = Priors(np.array([random_attitude(77)] * 3), sigma)
     solutions, _ = _identify(frames, wrong)
     for r, s in zip(R, solutions, strict=True):
         assert angle_between(s.R_sensor_from_icrs, r) < 300 * ARCSEC
@@ -134,7 +174,3 @@ def test_a_dark_log_is_searched_ever_more_rarely():
     table = _pairs()
     _identify([dark] * 300, pairs=counted)
     assert 10 <= len(calls) <= 40
-
-
-def test_no_frames_give_no_solutions():
-    assert _identify([]) == ([], [])

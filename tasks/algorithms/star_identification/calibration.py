@@ -29,13 +29,18 @@ class Scale(NamedTuple):
 
 def residual_scale(solutions: list[Solution | None]) -> Scale:
     """Return the rms of normalised residuals, an axis, over all solutions."""
-    chi2, dof = 0.0, 0
-    for solution in solutions:
-        if solution is not None:
-            matched = solution.star >= 0
-            chi2 += float(solution.chi2[matched].sum())
-            dof += 2 * int(matched.sum()) - 3
-    return Scale(float(np.sqrt(chi2 / dof)) if dof > 0 else 1.0, dof)
+    solved = [s for s in solutions if s is not None]
+    star = np.concatenate([np.empty(0, np.int64), *[s.star for s in solved]])
+    chi2 = np.concatenate([np.empty(0), *[s.chi2 for s in solved]])
+    return scale_of(star, chi2, len(solved))
+
+
+def scale_of(star: npt.NDArray[np.int64], chi2: Array, n_solved: int) -> Scale:
+    """Return the same of all centroids of so many solved frames: stars (-1 none) and squared
+    distances over sigma squared."""
+    matched = star >= 0
+    dof = 2 * int(matched.sum()) - 3 * n_solved
+    return Scale(float(np.sqrt(chi2[matched].sum() / dof)) if dof > 0 else 1.0, dof)
 
 
 def is_significant(found: Scale) -> bool:

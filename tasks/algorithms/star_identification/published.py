@@ -4,14 +4,14 @@ A method gives the star of each centroid; the attitude is the optimal one of all
 those out of their place left out. There is no verdict by likelihood, no tracking, no prior.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.attitude import optimal_attitude
-from epipole.tasks.algorithms.star_identification.calibration import residual_scale
+from epipole.tasks.algorithms.star_identification.calibration import scale_of
 from epipole.tasks.algorithms.star_identification.four_base_stars import match_four_base_stars
 from epipole.tasks.algorithms.star_identification.frame import (
     Frame,
@@ -20,18 +20,14 @@ from epipole.tasks.algorithms.star_identification.frame import (
     Solution,
     aberrate_all,
 )
+from epipole.tasks.algorithms.star_identification.frames import Spots, unsolved
 from epipole.tasks.algorithms.star_identification.match_group import match_group
 from epipole.tasks.algorithms.star_identification.radial_cyclic import (
     RADIUS_OF_FIELD,
     build_features,
     match_radial_cyclic,
 )
-from epipole.tasks.algorithms.star_identification.sensor import (
-    Identified,
-    Skies,
-    Spots,
-    frame_of,
-)
+from epipole.tasks.algorithms.star_identification.sensor import Identified, Skies
 from epipole.tasks.algorithms.star_identification.sky import Sky, pattern_pairs
 
 Array = npt.NDArray[np.float64]
@@ -79,7 +75,7 @@ def solve_matches(
 
 
 def identify_published(
-    spots: Sequence[Spots], skies: Skies, magnitude_limit: float | None, method: Method, how: Search
+    spots: Spots, skies: Skies, magnitude_limit: float | None, method: Method, how: Search
 ) -> Identified:
     """Identify the stars of a sensor's frames by a published method.
 
@@ -87,33 +83,31 @@ def identify_published(
     as the frames have centroids. Where no errors are stated, 0.5 px is assumed, and the
     reported ones follow from the residuals.
     """
-    counts = np.array([len(s.u) for s in spots])
+    counts = spots.counts
     usable = counts[counts >= 4]
     if magnitude_limit is None:
         density = float(np.median(usable)) if len(usable) else 10.0
-        magnitude_limit = skies.limit_for(density / spots[0].optics.solid_angle_sr)
+        magnitude_limit = skies.limit_for(density / spots.optics[0].solid_angle_sr)
     sky = skies.sky(magnitude_limit)
-    stated = any(np.isfinite(s.sigma_px).any() for s in spots)
-    match = matcher(method, sky, spots[0].optics)
-    solutions: list[Solution | None] = []
-    for one in spots:
-        assumed = np.where(np.isnan(one.sigma_px), ASSUMED_SIGMA_PX, one.sigma_px)
-        frame = frame_of(one._replace(sigma_px=assumed), 1.0)
-        star = match(frame.u, frame.sigma_rad)
-        solutions.append(solve_matches(frame, sky, star, how.gate_sigma))
-    status = [_status(n, s) for n, s in zip(counts, solutions, strict=True)]
-    found, scale = residual_scale(solutions), 1.0
+    stated = bool(np.isfinite(spots.sigma_px).any())
+    match = matcher(method, sky, spots.optics[0])
+    assumed = np.where(np.isnan(spots.sigma_px), ASSUMED_SIGMA_PX, spots.sigma_px)
+    frames, solutions = spots._replace(sigma_px=assumed).frames(1.0), unsolved(spots.first)
+    for k in range(len(counts)):
+        frame = frames.one(k)
+        solution = solve_matches(frame, sky, match(frame.u, frame.sigma_rad), how.gate_sigma)
+        if solution is not None:
+            solutions.enter(k, solution)
+    status = [_status(n, s) for n, s in zip(counts, solutions.solved, strict=True)]
+    found, scale = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum())), 1.0
     if found.dof > 0 and not stated:
         scale = found.scale
-        solutions = [
-            s and s._replace(cov_rad2=s.cov_rad2 * scale**2, chi2=s.chi2 / scale**2)
-            for s in solutions
-        ]
+        solutions = solutions.rescaled(scale)
     return Identified(solutions, status, sky, scale if stated else scale * ASSUMED_SIGMA_PX)
 
 
-def _status(n: int, solution: Solution | None) -> str | None:
-    if solution is not None:
+def _status(n: int, solved: bool) -> str | None:
+    if solved:
         return None
     if n < 3:
         return "too_few_stars" if n else "no_centroids"

@@ -1,7 +1,6 @@
 """All frames of one sensor over a span: what it can see is learned first, then every frame
 identified with that."""
 
-from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple, Protocol
 
@@ -14,11 +13,18 @@ from epipole.tasks.algorithms.star_identification.calibration import (
     is_significant,
     rematch,
     residual_scale,
+    scale_of,
     zero_point,
 )
-from epipole.tasks.algorithms.star_identification.frame import Frame, Optics, Search, Solution
+from epipole.tasks.algorithms.star_identification.frame import Optics, Search, Solution
+from epipole.tasks.algorithms.star_identification.frames import (
+    Frames,
+    Solutions,
+    Spots,
+    unsolved,
+)
 from epipole.tasks.algorithms.star_identification.pair_table import PairTable
-from epipole.tasks.algorithms.star_identification.sequence import Prior, identify_sequence
+from epipole.tasks.algorithms.star_identification.sequence import Priors, identify_sequence
 from epipole.tasks.algorithms.star_identification.sky import Sky
 from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid
 
@@ -48,23 +54,6 @@ class Skies(Protocol):
         """Return its pattern pairs for a camera."""
 
 
-class Spots(NamedTuple):
-    """Centroids of one frame, brightest first, before their errors are settled.
-
-    u, pixel_rad : (n, 3), (n,) float, directions, and the angle a pixel spans there
-    sigma_px : (n,) float, NaN where unknown
-    instrumental_mag : (n,) float, NaN where unknown
-    beta, optics : as in `Frame`
-    """
-
-    u: Array
-    pixel_rad: Array
-    sigma_px: Array
-    instrumental_mag: Array
-    beta: Array
-    optics: Optics
-
-
 class Identified(NamedTuple):
     """What was found.
 
@@ -73,23 +62,16 @@ class Identified(NamedTuple):
     sigma_scale : factor on the centroid errors as stated (or, where not stated, on 1 px)
     """
 
-    solutions: list[Solution | None]
+    solutions: Solutions
     status: list[str | None]
     sky: Sky
     sigma_scale: float
 
 
-def frame_of(spots: Spots, scale: float, use_flux: bool = True) -> Frame:
-    """Return the frame with its errors scaled; 1 px stands where none is stated."""
-    sigma_px = np.where(np.isnan(spots.sigma_px), 1.0, spots.sigma_px) * scale
-    mag = spots.instrumental_mag if use_flux else np.full(len(sigma_px), np.nan)
-    return Frame(spots.u, sigma_px * spots.pixel_rad, mag, spots.beta, spots.optics)
-
-
 def identify_sensor(
     t_s: Array,
-    spots: Sequence[Spots],
-    priors: list[Prior | None],
+    spots: Spots,
+    priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,
     how: Search,
@@ -100,12 +82,11 @@ def identify_sensor(
     where residuals contradict them beyond doubt, so that reported sigmas are honest.
     """
     spots, stated = _fill_sigmas(spots)
-    counts = np.array([len(s.u) for s in spots])
-    usable = np.flatnonzero(counts >= 4)
+    usable = np.flatnonzero(spots.counts >= 4)
     limit = magnitude_limit
     if limit is None:
-        density = 1.2 * float(np.median(counts[usable])) if len(usable) else 10.0
-        limit = skies.limit_for(density / spots[0].optics.solid_angle_sr)
+        density = 1.2 * float(np.median(spots.counts[usable])) if len(usable) else 10.0
+        limit = skies.limit_for(density / spots.optics[0].solid_angle_sr)
     known = _Known(1.0, limit, magnitude_limit is None, how, True, not stated)
     whole = _Sample(t_s, spots, priors)
     sample = whole.take(usable[_runs(len(usable), SAMPLED)])
@@ -114,21 +95,16 @@ def identify_sensor(
     )
     known = _learn(sample.spots, sampled, skies, known)
     solutions, status = _identify(whole, skies, known)
-    if not any(sampled) and any(solutions):  # the sample was poor: learn from what was found
-        solved = np.flatnonzero([s is not None for s in solutions])
+    if not any(sampled) and solutions.solved.any():  # the sample was poor: learn from what is found
+        solved = np.flatnonzero(solutions.solved)
         rows = solved[_runs(len(solved), SAMPLED)]
-        known = _learn(whole.take(rows).spots, [solutions[i] for i in rows], skies, known)
+        known = _learn(whole.take(rows).spots, [solutions.one(i) for i in rows], skies, known)
         solutions, status = _identify(whole, skies, known)
-    found = residual_scale(solutions)
+    found = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
     if found.dof > 0 and (known.adjusted or is_significant(found)):
         known = known._replace(scale=known.scale * found.scale)
-        solutions = [s and _rescaled(s, found.scale) for s in solutions]
+        solutions = solutions.rescaled(found.scale)
     return Identified(solutions, status, skies.sky(known.limit), known.scale)
-
-
-def _rescaled(solution: Solution, scale: float) -> Solution:
-    """Return the solution as if the errors had been this many times as large."""
-    return solution._replace(cov_rad2=solution.cov_rad2 * scale**2, chi2=solution.chi2 / scale**2)
 
 
 class _Known(NamedTuple):
@@ -144,13 +120,12 @@ class _Known(NamedTuple):
 
 class _Sample(NamedTuple):
     t_s: Array
-    spots: Sequence[Spots]
-    priors: Sequence[Prior | None]
+    spots: Spots
+    priors: Priors
 
     def take(self, rows: npt.NDArray[np.int64]) -> "_Sample":
-        return _Sample(
-            self.t_s[rows], [self.spots[i] for i in rows], [self.priors[i] for i in rows]
-        )
+        priors = Priors(self.priors.R_sensor_from_icrs[rows], self.priors.sigma_rad[rows])
+        return _Sample(self.t_s[rows], self.spots.take(rows), priors)
 
 
 def _runs(n: int, wanted: tuple[int, int]) -> npt.NDArray[np.int64]:
@@ -162,21 +137,16 @@ def _runs(n: int, wanted: tuple[int, int]) -> npt.NDArray[np.int64]:
     return rows[rows < n]
 
 
-def _fill_sigmas(spots: Sequence[Spots]) -> tuple[list[Spots], bool]:
+def _fill_sigmas(spots: Spots) -> tuple[Spots, bool]:
     """Return spots with no sigma missing where any is stated (the median stands in), and
     whether any is."""
-    sigma_px = np.concatenate([s.sigma_px for s in spots])
-    if not np.isfinite(sigma_px).any():
-        return list(spots), False
-    middle = float(np.nanmedian(sigma_px))
-    return [
-        s._replace(sigma_px=np.where(np.isnan(s.sigma_px), middle, s.sigma_px)) for s in spots
-    ], True
+    if not np.isfinite(spots.sigma_px).any():
+        return spots, False
+    middle = float(np.nanmedian(spots.sigma_px))
+    return spots._replace(sigma_px=np.where(np.isnan(spots.sigma_px), middle, spots.sigma_px)), True
 
 
-def _learn(
-    spots: Sequence[Spots], solutions: list[Solution | None], skies: Skies, known: _Known
-) -> _Known:
+def _learn(spots: Spots, solutions: list[Solution | None], skies: Skies, known: _Known) -> _Known:
     """Return centroid errors, zero point and faintest star as a sample of solved frames tells."""
     if not any(solutions):
         return known
@@ -186,13 +156,11 @@ def _learn(
         adjusted |= is_significant(found)
         if found.dof < 10 or not adjusted or abs(found.scale - 1) < 0.01:
             break
-        again = rematch(
-            [frame_of(s, scale * found.scale) for s in spots], solutions, sky, known.how
-        )
+        again = rematch(spots.frames(scale * found.scale).each(), solutions, sky, known.how)
         if not any(again):
             break
         scale, solutions = scale * found.scale, again
-    zero, scatter = zero_point([frame_of(s, scale) for s in spots], solutions, sky)
+    zero, scatter = zero_point(spots.frames(scale).each(), solutions, sky)
     use_flux = not scatter > USELESS_SCATTER_MAG
     how = known.how
     if use_flux and not np.isnan(zero):
@@ -202,13 +170,11 @@ def _learn(
     return known._replace(limit=_faintest(spots, solutions, skies, known))
 
 
-def _faintest(
-    spots: Sequence[Spots], solutions: list[Solution | None], skies: Skies, known: _Known
-) -> float:
+def _faintest(spots: Spots, solutions: list[Solution | None], skies: Skies, known: _Known) -> float:
     """Return the faintest star that the sensor sees, where the settings leave it open."""
     if not known.limit_is_open:
         return known.limit
-    frames = [frame_of(s, known.scale, known.use_flux) for s in spots]
+    frames = spots.frames(known.scale, known.use_flux).each()
     sky, deep = skies.sky(known.limit), skies.sky(known.limit + DEEPER_MAG)
     seen = [sky.catalogue.magnitude[s.star[s.star >= 0]] for s in solutions if s is not None]
     least = float(np.floor(4 * np.median(np.concatenate(seen))) / 4)
@@ -220,35 +186,37 @@ def _first_scale(
     sample: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...]
 ) -> tuple[_Known, list[Solution | None]]:
     """Return a scale of the errors with which frames can be identified, and the solutions."""
-    probe = sample.take(_runs(len(sample.spots), PROBED))
+    probe = sample.take(_runs(len(sample.t_s), PROBED))
     quick = known.how._replace(time_limit_s=known.how.time_limit_s / 4)
+    flux = bool(np.isfinite(probe.spots.instrumental_mag).any())
     best, best_count = known._replace(scale=scales[0]), 0
-    for scale in scales:
-        tried = known._replace(scale=scale, how=quick)
-        count = sum(s is not None for s in _identify(probe, skies, tried)[0])
+    # Flux may tell nothing of a star, and then mislead.
+    for use_flux, scale in [(f, s) for f in ([True, False] if flux else [True]) for s in scales]:
+        if not use_flux and best_count:
+            break
+        tried = known._replace(scale=scale, how=quick, use_flux=use_flux)
+        count = int(_identify(probe, skies, tried)[0].solved.sum())
         if count > best_count:
-            best, best_count = known._replace(scale=scale), count
-        if 3 * count >= 2 * len(probe.spots):
+            best, best_count = known._replace(scale=scale, use_flux=use_flux), count
+        if 3 * count >= 2 * len(probe.t_s):
             break
     if best_count == 0:
-        return best, [None] * len(sample.spots)
-    return best, _identify(sample, skies, best)[0]
+        return best, [None] * len(sample.t_s)
+    return best, _identify(sample, skies, best)[0].each()
 
 
-def _identify(
-    sample: _Sample, skies: Skies, known: _Known
-) -> tuple[list[Solution | None], list[str | None]]:
+def _identify(sample: _Sample, skies: Skies, known: _Known) -> tuple[Solutions, list[str | None]]:
     """Return the frames' solutions and status with what is known of the sensor."""
-    if not sample.spots:
-        return [], []
-    frames = [frame_of(s, known.scale, known.use_flux) for s in sample.spots]
+    if not len(sample.t_s):
+        return unsolved(sample.spots.first), []
+    frames = sample.spots.frames(known.scale, known.use_flux)
     sky, grid = skies.sky(known.limit), skies.grid(known.limit, _grid_radius(frames, known.how))
-    pairs = partial(skies.pairs, known.limit, sample.spots[0].optics)
-    return identify_sequence(sample.t_s, frames, list(sample.priors), sky, grid, pairs, known.how)
+    pairs = partial(skies.pairs, known.limit, frames.optics[0])
+    return identify_sequence(sample.t_s, frames, sample.priors, sky, grid, pairs, known.how)
 
 
-def _grid_radius(frames: list[Frame], how: Search) -> float:
+def _grid_radius(frames: Frames, how: Search) -> float:
     """Return the widest look-up, rounded up so that like sensors share a grid [rad]."""
-    sigma = np.concatenate([f.sigma_rad for f in frames]) if frames else np.empty(0)
+    sigma = frames.sigma_rad
     widest = 2.5 * how.gate_sigma * float(np.median(sigma)) if len(sigma) else 1e-3
     return float(min(2.0 ** (np.ceil(2 * np.log2(widest)) / 2), 0.1))
