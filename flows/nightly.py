@@ -35,6 +35,7 @@ from epipole.schemas.tables import FRAMES, REJECTS
 from epipole.tasks.align_epochs import align_epochs
 from epipole.tasks.estimate_clocks import Clock, added, of_sound_clocks
 from epipole.tasks.link_objects import renamed
+from epipole.tasks.lone_detections import with_objects_found
 from epipole.tasks.publish_night import publish_night, source_table
 
 LOGGER = logging.getLogger(__name__)
@@ -115,7 +116,7 @@ def nightly(
     tables = {
         "frames": conform(FRAMES, identified.solutions),
         "stars": identified.stars,
-        "detections": tracked.detections,
+        "detections": with_objects_found(tracked.detections, solved.associations),
         "tracklets": tracked.tracklets,
         "epochs": epochs,
         "associations": renamed(solved.associations, new_id),

@@ -6,6 +6,7 @@ nowhere: a dataset's tracklet_id is null for them.
 
 import numpy as np
 import numpy.typing as npt
+import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -64,6 +65,24 @@ def with_lone_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
         },
     )
     return concat(TRACKLETS, [tracklets, rows])
+
+
+def with_objects_found(detections: pa.Table, associations: pa.Table) -> pa.Table:
+    """Return the detections; what served a position without a tracklet is an object's too.
+
+    One detection alone can be anything; what several sensors agree on is an object.
+    """
+    served = pc.and_(associations["used"], pc.is_null(associations["tracklet_id"]))
+    key = ["sensor_id", "frame_number", "centroid"]
+    lone = pl.DataFrame(associations.filter(served).select(key)).drop_nulls().unique()
+    if not len(lone):
+        return detections
+    known = pl.DataFrame(detections.select(key)).join(
+        lone.with_columns(found=True), on=key, how="left", maintain_order="left"
+    )  # fmt: skip
+    at = detections.schema.get_field_index("kind")
+    kind = pc.if_else(known["found"].fill_null(False).to_arrow(), "object", detections["kind"])
+    return detections.set_column(at, detections.schema.field(at), kind)
 
 
 def is_lone(tracklet_id: pa.ChunkedArray) -> pa.ChunkedArray:

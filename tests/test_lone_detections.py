@@ -92,3 +92,14 @@ def test_views_of_lone_detections_have_no_tracklet(one_frame_dataset):
     assert len(views) == 12
     assert views["tracklet_id"].null_count() == 12
     assert views["centroid"].null_count() == 0
+
+
+def test_lone_detections_that_positions_used_are_objects(one_frame_dataset):
+    views = pl.read_parquet(one_frame_dataset / "out/night=*/associations/*.parquet")
+    detections = pl.read_parquet(one_frame_dataset / "out/night=*/detections/*.parquet")
+    key = ["sensor_id", "frame_number", "centroid"]
+    used = detections.join(views.filter("used"), on=key, how="semi")
+    assert used["kind"].to_list() == ["object"] * 12
+    assert used["tracklet_id"].null_count() == 12
+    others = detections.join(views.filter("used"), on=key, how="anti")
+    assert set(others["kind"]) == {"unknown"}
