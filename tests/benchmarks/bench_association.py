@@ -1,6 +1,6 @@
 """Association measured: points at one instant, many sensors, tracklets; the published beside it.
 
-``python tests/benchmarks/bench_association.py [points] [scale] [tracklets] [--seeds N]``
+``python tests/benchmarks/bench_association.py [points] [floor] [scale] [tracklets] [--seeds N]``
 
 Points: F1 over the objects that at least three sensors detect; a group is right if it holds at
 least three of its object's points and no other. OpenPTV stands beside it where `optv` is
@@ -16,7 +16,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from points import PIXEL_RAD, Points, Score, judge, scene
+from points import PIXEL_RAD, Points, Score, judge, scene, told
 
 from epipole.schemas.settings import AssociationSettings
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
@@ -184,6 +184,27 @@ def pair_score(who: np.ndarray, group: np.ndarray) -> tuple[int, int, int]:
     return len(true), len(found), len(true & found)
 
 
+def floor_table(seeds: int) -> None:
+    """Print what one who is told the true places could do, by how sure he wants to be."""
+    print("\nTold where the objects are: objects with a stray %, F1 %, true views kept %")
+    for n_sensors, n_objects, n_false in ((8, 20, 1000), (20, 20, 1000), (100, 1000, 1000)):
+        scenes = [scene(k, n_sensors, n_objects, n_false) for k in range(seeds)]
+        for least, lead in ((0.0, 0.0), (5.0, 3.0), (5.0, 5.0), (7.0, 5.0), (8.5, 5.0)):
+            total, kept, true = np.zeros(4), 0, 0
+            for points in scenes[: 1 if n_sensors == 100 else None]:
+                group = told(points, least, lead)
+                total += np.array(judge_once(points, group))
+                kept += int(((group == points.who) & (group >= 0)).sum())
+                true += int((points.who >= 0).sum())
+            score = Score(*total.astype(int).tolist())
+            print(
+                f"{n_sensors} | {n_false} | {least:.1f}, {lead:.1f} | "
+                f"{100 * score.strays / score.wanted:.2f} | {100 * score.f1:.2f} | "
+                f"{100 * kept / true:.1f}",
+                flush=True,
+            )
+
+
 def tracklet_table(seeds: int) -> None:
     """Print pair precision and recall of tracklets, by the length of the data."""
     cases = (
@@ -212,11 +233,13 @@ def tracklet_table(seeds: int) -> None:
 def main() -> None:
     """Run the tables asked for, or all."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("tables", nargs="*", default=["points", "scale", "tracklets"])
+    parser.add_argument("tables", nargs="*", default=["points", "floor", "scale", "tracklets"])
     parser.add_argument("--seeds", type=int, default=30, help="scenes a cell")
     args = parser.parse_args()
     if "points" in args.tables:
         points_table(args.seeds)
+    if "floor" in args.tables:
+        floor_table(args.seeds)
     if "scale" in args.tables:
         scale_table(min(args.seeds, 3))
     if "tracklets" in args.tables:

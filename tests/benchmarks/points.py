@@ -31,10 +31,11 @@ DETECTED = 0.95
 
 
 class Points(NamedTuple):
-    """Samples of one instant, and who each point is (-1: false)."""
+    """Samples of one instant, who each point is (-1: false), and where the objects are [km]."""
 
     samples: Samples
     who: npt.NDArray[np.int64]
+    x_km: npt.NDArray[np.float64]
 
 
 def low_orbits(rng: np.random.Generator, n: int) -> npt.NDArray[np.float64]:
@@ -103,7 +104,35 @@ def scene(
         R_sensor_from_icrs=np.array(look)[:, None],
         half_field=np.full((n_sensors, 2), FIELD_RAD / 2),
     )
-    return Points(samples, np.concatenate(who))
+    return Points(samples, np.concatenate(who), x)
+
+
+def told(points: Points, least: float, lead: float) -> npt.NDArray[np.int64]:
+    """Return the groups of one who is told where the objects are: the floor of what errors leave.
+
+    In each sensor an object has the point that explains it best, if its log-odds against "missed,
+    and a false point here" are `least` or more and lead those of the next point by `lead`.
+    """
+    s = points.samples
+    group = np.full(len(points.who), -1)
+    for sensor, r in enumerate(s.sensor_km[:, 0]):
+        own = np.flatnonzero(s.sensor == sensor)
+        toward = points.x_km - r
+        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+        e = np.einsum("tai,ni->nta", tangent_basis(s.u[own, 0]), toward)
+        weight = np.linalg.inv(s.cov[own, 0])
+        spot = 2 * np.pi * np.sqrt(np.linalg.det(s.cov[own, 0]))
+        clutter = len(own) / FIELD_RAD**2
+        odds = np.log(DETECTED / (1 - DETECTED) / (clutter * spot))
+        odds = odds - np.einsum("nta,tab,ntb->nt", e, weight, e) / 2
+        odds[toward @ s.u[own, 0].mean(axis=0) < 0] = -np.inf
+        order = np.argsort(-odds, axis=1)[:, :2]
+        best, second = np.take_along_axis(odds, order, axis=1).T
+        sure = np.flatnonzero((best >= least) & (best - second >= lead))
+        # A point that two objects claim is the likelier one's.
+        for k in sure[np.argsort(best[sure])].tolist():
+            group[own[order[k, 0]]] = k
+    return group
 
 
 class Score(NamedTuple):

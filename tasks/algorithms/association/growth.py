@@ -7,7 +7,7 @@ from epipole.tasks.algorithms.association.candidates import best_of_sensor
 from epipole.tasks.algorithms.association.instant_points import join, possible, solve
 from epipole.tasks.algorithms.association.odds import score
 from epipole.tasks.algorithms.association.sight_lines import quantile
-from epipole.tasks.algorithms.association.views import misfit, residual
+from epipole.tasks.algorithms.association.views import SPOT_SR, misfit, residual
 from epipole.tasks.algorithms.association.visibility import looks_at, near_fields
 
 FEW = 3  # sensors that must have looked before a hypothesis is given up
@@ -139,7 +139,7 @@ def _review(views, chance, members, n, early, taken, points, part, predicted, ga
         again[views.sensor[members[q]]] = True
     kept = np.int64(0)
     for q in range(n):
-        if not again[views.sensor[before[q]]]:
+        if not again[views.sensor[before[q]]] and _speaks(views, chance, before[q], points, part):
             members[kept] = before[q]
             kept += 1
     for s in range(len(again)):
@@ -157,6 +157,19 @@ def _review(views, chance, members, n, early, taken, points, part, predicted, ga
         kept = n
         members[:n] = before
     return _settle(views, members, kept, points, part, gate_sigma)
+
+
+@njit(cache=True, nogil=True)
+def _speaks(views, chance, i, points, part):
+    """Return whether a member still speaks for the object, by the first instant it shares."""
+    for m in range(len(views.time_s)):
+        if points[3][m] >= 2 and views.seen[i, m]:
+            s, spot = views.sensor[i], views.sight[i, m, SPOT_SR]
+            if residual(views, i, m, points[0][m], part) == 0.0:
+                return False
+            odds = np.log(chance.detected[s] / (chance.density[s] * spot))
+            return odds - 0.5 * misfit(part) >= SPEAKS
+    return True
 
 
 @njit(cache=True, nogil=True)

@@ -16,9 +16,9 @@ from epipole.tasks.algorithms.association.visibility import in_view
 
 Array = npt.NDArray[np.float64]
 
-SIGHTS = 4  # a side: lines of sight that sample a field
+SIGHTS = 100  # lines of sight in all that sample the fields, at least one a sensor
 STEPS = 24  # along a line of sight, beside the shells' edges
-ORIGINS = 6  # sensors whose fields are sampled
+MOST = 10.0  # times the common rate: no shell is taken to be fuller
 PRIOR_OBJECTS = 1.0  # as good as so many objects does a shell's own share count
 CERTAIN_LOG_ODDS = 8.0  # groups that count from the start
 ROUNDS = 100
@@ -28,7 +28,7 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
     """Return the volume [km^3] that two sensors see, weighed by each of the shells, (j,).
 
     `shells` are rows of (lowest, highest radius [km], weight). At the instant at which most
-    sensors' attitudes are known, by lines of sight of some of them. Zero where fewer than two are.
+    sensors' attitudes are known, by some lines of sight of each. Zero where fewer than two are.
     """
     ready = np.isfinite(views.place_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
     m = int(np.argmax(ready.sum(axis=0)))
@@ -36,15 +36,15 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
     out = np.zeros(len(shells))
     if len(known) < 2:
         return out
-    chosen = known[np.unique(np.linspace(0, len(known) - 1, ORIGINS).astype(int))]
+    side = max(int(np.sqrt(SIGHTS / len(known))), 1)
     camera = np.ascontiguousarray(views.camera[known, m])
-    middle = (np.arange(SIGHTS) + 0.5) / SIGHTS * 2 - 1
-    for s in chosen.tolist():
-        a, b = np.meshgrid(*(middle * side for side in views.half_field[s]), indexing="ij")
+    middle = (np.arange(side) + 0.5) / side * 2 - 1
+    for s in known.tolist():
+        a, b = np.meshgrid(*(middle * half for half in views.half_field[s]), indexing="ij")
         stretch = np.sqrt(1 + a * a + b * b).ravel()
         toward = np.stack([a.ravel(), b.ravel(), np.ones(a.size)], axis=1) / stretch[:, None]
         u = toward @ views.attitude[s, m]
-        cell_sr = np.prod(views.half_field[s]) * 4 / SIGHTS**2 / stretch**3
+        cell_sr = np.prod(views.half_field[s]) * 4 / side**2 / stretch**3
         rho, edges = _steps(views.place_km[s, m], u, shells, farthest_km)
         x = views.place_km[s, m] + rho[..., None] * u[:, None]
         count = _in_view_of(camera, x.reshape(-1, 3)).reshape(rho.shape)
@@ -53,7 +53,7 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
         radius = np.linalg.norm(x, axis=2)
         for j, (lowest, highest, weight) in enumerate(shells):
             inside = (radius >= lowest) & (radius < highest)
-            out[j] += weight * volume[inside].sum() * len(known) / len(chosen)
+            out[j] += weight * volume[inside].sum()
     return out
 
 
@@ -124,5 +124,5 @@ def _rates(sure: Array, believed: Array, expected: Array) -> Array:
         belongs = believed * factor
         count = (sure[:, None] * belongs / belongs.sum(axis=1, keepdims=True)).sum(axis=0)
         own = (count + PRIOR_OBJECTS) / (common * expected + PRIOR_OBJECTS)
-        factor = common * own
+        factor = common * np.minimum(own, MOST)
     return factor
