@@ -76,6 +76,18 @@ def deployed(tmp_path_factory, night_log) -> Iterator[Deployed]:
         yield Deployed(prefect)
 
 
+def test_the_commands_that_are_run_here_stand_in_the_readme():
+    readme = (ROOT / "README.md").read_text()
+    for command in (
+        "prefect server start",
+        f"prefect work-pool create {POOL} --type process",
+        "prefect deploy --all",
+        f"prefect worker start --pool {POOL}",
+        f"prefect deployment run 'nightly/nightly' --param night={NIGHT} --watch",
+    ):
+        assert f"\n{command}" in readme, command
+
+
 def test_runs_are_scheduled_for_six_in_the_morning(deployed):
     def scheduled() -> list[dict]:
         return deployed.prefect.find(
