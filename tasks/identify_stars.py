@@ -38,7 +38,7 @@ from epipole.tasks.algorithms.star_identification.published import identify_publ
 from epipole.tasks.algorithms.star_identification.sensor import Identified as Found
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
-from epipole.tasks.algorithms.time_scales import DAY_NS, earth_barycentric
+from epipole.tasks.algorithms.time_scales import DAY_NS, earth_velocity
 from epipole.tasks.cached_skies import CachedSkies, Catalogue
 from epipole.tasks.run_names import sensor_and_span
 
@@ -173,8 +173,7 @@ def _identify(
     if not c.cameras:
         return None, rows
     rule = settings.identification
-    _, v_earth = earth_barycentric(time_ns)
-    beta = (v_earth + np.nan_to_num(stack(places, "v{}_km_s"))) / SPEED_OF_LIGHT_KM_S
+    beta = _velocity(time_ns, places) / SPEED_OF_LIGHT_KM_S
     spots = Spots(
         c.first,
         c.u[rows],
@@ -194,6 +193,11 @@ def _identify(
     t_s = (time_ns - time_ns[0]) / 1e9
     found = identify_sensor(t_s, spots, _priors(places, settings), skies, rule.magnitude_limit, how)
     return found, rows
+
+
+def _velocity(time_ns: npt.NDArray[np.int64], places: pa.Table) -> Array:
+    """Return the sensor's barycentric velocity [km/s]; Earth's alone where its own is not known."""
+    return earth_velocity(time_ns) + np.nan_to_num(stack(places, "v{}_km_s"))
 
 
 def _priors(places: pa.Table, settings: Settings) -> Priors:
@@ -264,8 +268,7 @@ def _stars_table(
     exposures: pa.Table, places: pa.Table, c: _Centroids, attitudes: _Attitudes, m: _Matches
 ) -> pa.Table:
     frame = c.frame[m.at]
-    _, v_earth = earth_barycentric(array(exposures, "time"))
-    v_km_s = v_earth + np.nan_to_num(stack(places, "v{}_km_s"))
+    v_km_s = _velocity(array(exposures, "time"), places)
     u = np.einsum("nij,nj->ni", attitudes.R[frame], aberrate(m.u_icrs, v_km_s[frame]))
     dx, dy = np.full((2, len(frame)), np.nan)
     for row, camera in c.cameras.items():

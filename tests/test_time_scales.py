@@ -11,6 +11,7 @@ from astropy.time import Time
 from epipole.tasks.algorithms.time_scales import (
     DAY_NS,
     earth_barycentric,
+    earth_velocity,
     julian_year,
     tai_minus_utc_s,
     tt_julian_date,
@@ -79,3 +80,12 @@ def test_earth_moves_as_astropy_says_in_its_own_time_scale():
 def test_one_time_gives_one_vector():
     r_km, v_km_s = earth_barycentric(np.int64(0))
     assert r_km.shape == v_km_s.shape == (3,)
+
+
+def test_the_interpolated_velocity_of_earth_is_the_exact_one_and_that_of_its_time_alone():
+    rng = np.random.default_rng(0)
+    times = 1_500_000_000_000_000_000 + rng.integers(0, 86_400_000_000_000 * 400, 500)
+    got = earth_velocity(times)
+    np.testing.assert_allclose(got, earth_barycentric(times)[1], rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(earth_velocity(times[7:9]), got[7:9])
+    assert earth_velocity(times[:0]).shape == (0, 3)

@@ -61,6 +61,8 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     for _ in range(8):
         ex, ey = distort(camera, x, y)
         ex, ey = ex - xd, ey - yd
+        # A step is quadratic: after one from 1e-9 the rest is rounding.
+        last = max(np.abs(ex).max(initial=0.0), np.abs(ey).max(initial=0.0)) < 1e-9
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # d radial / d r2, times 2
@@ -72,6 +74,8 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
             x - (jyy * ex - jxy * ey) / determinant,
             y - (jxx * ey - jxy * ex) / determinant,
         )
+        if last:
+            break
     return x, y
 
 
@@ -80,8 +84,8 @@ def unproject(camera: Camera, x_px: Array, y_px: Array) -> Array:
     x, y = undistort(
         camera, (x_px - camera.cx_px) / camera.fx_px, (y_px - camera.cy_px) / camera.fy_px
     )
-    u = np.stack([x, y, np.ones_like(x)], axis=-1)
-    return u / np.linalg.norm(u, axis=-1, keepdims=True)
+    z = 1.0 / np.sqrt(1.0 + x * x + y * y)
+    return np.stack([x * z, y * z, z], axis=-1)
 
 
 def project(camera: Camera, u: Array) -> tuple[Array, Array]:

@@ -35,10 +35,11 @@ def aberrate(u: Array, v_km_s: Array) -> Array:
     Explanatory Supplement to the Astronomical Almanac (2013), eq. 7.40.
     """
     beta = np.asarray(v_km_s) / SPEED_OF_LIGHT_KM_S
-    projection = np.sum(u * beta, axis=-1, keepdims=True)
-    inverse_gamma = np.sqrt(1 - np.sum(beta * beta, axis=-1, keepdims=True))
+    # einsum: a sum along a short axis costs NumPy ten times as much.
+    projection = np.einsum("...i,...i->...", u, beta)[..., None]
+    inverse_gamma = np.sqrt(1 - np.einsum("...i,...i->...", beta, beta)[..., None])
     seen = inverse_gamma * u + beta * (1 + projection / (1 + inverse_gamma))
-    return seen / np.linalg.norm(seen, axis=-1, keepdims=True)
+    return seen / np.sqrt(np.einsum("...i,...i->...", seen, seen)[..., None])
 
 
 def tangent_basis(u: Array) -> Array:
