@@ -71,7 +71,7 @@ def _options(
     """Options of every command."""
 
 
-Logs = Annotated[list[str], typer.Argument(metavar="LOG...", help="MCAP files, in any order.")]
+Logs = Annotated[list[str], typer.Argument(metavar="LOG...", help="MCAP files, folders, globs or URLs.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
 
 
@@ -150,8 +150,9 @@ def _check_night(night: str | None) -> None:
 def info(logs: Logs, as_json: AsJson = False) -> None:
     """Say what is in logs: sensors, times, counts, and what cannot be used."""
     from epipole.flows.log_info import describe, lines
+    from epipole.io.log_listing import list_logs
 
-    described = [describe(log) for log in logs]
+    described = [describe(log) for where in logs for log in list_logs(where)[0]]
     if as_json:
         _print_json(described)
     else:
