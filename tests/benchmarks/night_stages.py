@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.flows.sensors import calibrated, of_sensor, sensor_ids, spans
-from epipole.io.hipparcos import read_hipparcos
+from epipole.io.star_catalogue import read_star_catalogue
 from epipole.schemas.bridge import concat
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import DETECTIONS, TRACKLETS
@@ -44,7 +44,7 @@ def see(log: Path, settings: Settings) -> Seen:
     read = read_logs.fn([str(log)], settings)
     exposures, _ = calibrated(read.exposures, read.cameras)
     places = place_sensors.fn(exposures, read.states, settings)
-    catalogue = read_hipparcos()
+    catalogue = read_star_catalogue(settings.identification.catalogue)
     parts = [
         identify_stars.fn(
             exposures.take(rows), places.take(rows), read.cameras, catalogue, settings
