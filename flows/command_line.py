@@ -71,7 +71,9 @@ def _options(
     """Options of every command."""
 
 
-Logs = Annotated[list[str], typer.Argument(metavar="LOG...", help="MCAP files, folders, globs or URLs.")]
+Logs = Annotated[
+    list[str], typer.Argument(metavar="LOG...", help="MCAP files, folders, globs or URLs.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
 
 
