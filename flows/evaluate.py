@@ -1,14 +1,13 @@
 """A dataset and the truth of a simulation go in, a report comes out."""
 
 import os
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 from rich.console import Console
 from rich.table import Table
 
-from epipole.io.dataset import nights_of, read_table
+from epipole.io.dataset import nights_in, nights_of, read_table
 from epipole.io.truth import Truth, read_truth
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.report import Report
@@ -23,7 +22,7 @@ def evaluate(dataset: str | os.PathLike[str], truth: str | os.PathLike[str]) -> 
     Parameters
     ----------
     dataset
-        The folder that `epipole run` published to. Only the nights of the truth count.
+        The folder or URL that `epipole run` published to. Only the nights of the truth count.
     truth
         The truth's folder, ``LOG.truth``, or the log beside it.
 
@@ -33,7 +32,7 @@ def evaluate(dataset: str | os.PathLike[str], truth: str | os.PathLike[str]) -> 
         Where either is missing or cannot be read, or the dataset has no night of the truth.
     """
     true = read_truth(truth)
-    dataset = Path(dataset)
+    dataset = os.fspath(dataset)
     nights = _nights(dataset, true)
     tables = {
         name: pa.concat_tables([read_table(dataset, name, night) for night in nights])
@@ -42,11 +41,14 @@ def evaluate(dataset: str | os.PathLike[str], truth: str | os.PathLike[str]) -> 
     return evaluate_dataset(tables, true)
 
 
-def _nights(dataset: Path, truth: Truth) -> list[str]:
-    if not dataset.is_dir():
-        raise DatasetError(f"{dataset}: no such folder; `epipole run LOG --out {dataset}` makes it")
+def _nights(dataset: str, truth: Truth) -> list[str]:
+    published = nights_in(dataset)
+    if not published:
+        raise DatasetError(
+            f"{dataset}: no dataset there; `epipole run LOG --out {dataset}` makes it"
+        )
     wanted = nights_of(np.asarray(truth.frames["t_ns"], np.int64))
-    there = [night for night in wanted if (dataset / f"night={night}").is_dir()]
+    there = [night for night in wanted if night in published]
     if not there:
         raise DatasetError(
             f"{dataset}: has no night={' or night='.join(wanted) or '...'} of this truth; "

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -73,7 +72,7 @@ def nightly(
     nights = nights_of(array(log.exposures, "time"))
     chosen = choose_nights(nights, night)
     sources = source_table(log.sources, settings)
-    check_sources(Path(out), chosen, sources, replace)
+    check_sources(out, chosen, sources, replace)
     exposures, uncalibrated = calibrated(near(log.exposures, night), log.cameras)
     if not exposures.num_rows:
         raise LogError(

@@ -1,14 +1,18 @@
 """Datasets: a folder a night, a folder a table, published night by night.
 
-``DATASET/night=YYYY-MM-DD/<table>/part-0.parquet``. A night is made in ``DATASET/.staging``
-and put in place by one rename, so a reader never sees half a night, and a run that fails
-or is killed leaves the dataset as it was.
+``DATASET/night=YYYY-MM-DD/<table>/part-0.parquet``, in a local folder (`local_nights`: put in
+place by one rename) or behind an fsspec URL such as ``s3://bucket/dataset`` (`store_nights`:
+committed by one object). A reader never sees half a night, and a run that fails or is killed
+leaves the dataset as it was.
 """
 
 import contextlib
 import datetime
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +22,8 @@ import pyarrow.parquet as pq
 from epipole.io import local_nights
 from epipole.io.folder_swap import sync
 from epipole.io.local_nights import STAGING
+from epipole.io.remote_files import line_of, storage_errors
+from epipole.io.store_nights import StoreNights, store_nights
 from epipole.schemas.bridge import array, conform, empty
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
@@ -31,7 +37,10 @@ _NIGHT_COLUMN = {"tracklets": "start_time"}
 _WHOLE_NIGHT = {"calibrations", "sources"}
 
 
-def check_folder(dataset: Path | str) -> None:
+Where = Path | str
+
+
+def check_folder(dataset: Where) -> None:
     """Raise unless a dataset is here, or can be made here.
 
     Raises
@@ -39,27 +48,33 @@ def check_folder(dataset: Path | str) -> None:
     DatasetError
         Where it is a file, or a folder that holds other things than a dataset.
     """
-    if "://" in str(dataset):
-        raise DatasetError(f"{dataset}: a night is published by a rename; give a local folder")
-    dataset = Path(dataset)
-    try:
-        if dataset.exists() and not dataset.is_dir():
-            raise DatasetError(f"{dataset}: is a file, not a folder; give another --out")
-        if dataset.is_dir() and not _is_dataset(dataset):
-            raise DatasetError(
-                f"{dataset}: holds other files and no dataset (no night=... folder); "
-                "give an empty folder or a dataset"
-            )
-    except OSError as error:
-        raise DatasetError(f"{dataset}: {error.strerror}; give another --out") from error
+    if (store := _store(dataset)) is not None:
+        with _read(dataset):
+            names = store.names()
+    else:
+        try:
+            folder = _folder(dataset)
+            if folder.exists() and not folder.is_dir():
+                raise DatasetError(f"{dataset}: is a file, not a folder; give another --out")
+            names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+        except OSError as error:
+            raise DatasetError(f"{dataset}: {error.strerror}; give another --out") from error
+    if names and not any(name == STAGING or name.startswith("night=") for name in names):
+        raise DatasetError(
+            f"{dataset}: holds other files and no dataset (no night=... folder); "
+            "give an empty folder or a dataset"
+        )
 
 
-def _is_dataset(folder: Path) -> bool:
-    names = [entry.name for entry in folder.iterdir()]
-    return not names or any(name == STAGING or name.startswith("night=") for name in names)
+def nights_in(dataset: Where) -> list[str]:
+    """Return the nights of a dataset, ``YYYY-MM-DD``, in order; none where there is no dataset."""
+    if (store := _store(dataset)) is not None:
+        with _read(dataset):
+            return store.nights()
+    return sorted(p.name.removeprefix("night=") for p in _folder(dataset).glob("night=*"))
 
 
-def check_sources(dataset: Path, nights: Sequence[str], sources: pa.Table, replace: bool) -> None:
+def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, replace: bool) -> None:
     """Raise where a night was made of a log that is not among these sources.
 
     Raises
@@ -80,7 +95,7 @@ def check_sources(dataset: Path, nights: Sequence[str], sources: pa.Table, repla
             )
 
 
-def read_table(dataset: Path, table: str, night: str) -> pa.Table:
+def read_table(dataset: Where, table: str, night: str) -> pa.Table:
     """Return a table of a night; with no rows where the night is not there.
 
     Raises
@@ -89,7 +104,11 @@ def read_table(dataset: Path, table: str, night: str) -> pa.Table:
         Where its files cannot be read as this table.
     """
     schema = TABLES[table]
-    parts = sorted((dataset / f"night={night}" / table).glob("*.parquet"))
+    if (store := _store(dataset)) is not None:
+        with _read(dataset):
+            parts: Sequence[Any] = [pa.BufferReader(part) for part in store.read(night, table)]
+    else:
+        parts = sorted((_folder(dataset) / f"night={night}" / table).glob("*.parquet"))
     try:
         rows = [conform(schema, pq.read_table(part, partitioning=None)) for part in parts]
     except (OSError, ValueError) as error:
@@ -101,7 +120,7 @@ def read_table(dataset: Path, table: str, night: str) -> pa.Table:
 
 
 def publish(
-    dataset: Path | str,
+    dataset: Where,
     tables: Mapping[str, pa.Table],
     nights: Sequence[str],
     replace: bool = False,
@@ -135,7 +154,7 @@ def publish(
 
 
 @contextlib.contextmanager
-def claim_nights(dataset: Path | str, nights: Sequence[str]) -> Iterator[Path]:
+def claim_nights(dataset: Where, nights: Sequence[str]) -> Iterator[Path]:
     """Keep other runs off these nights while this one works on them.
 
     Yields
@@ -154,12 +173,16 @@ def claim_nights(dataset: Path | str, nights: Sequence[str]) -> Iterator[Path]:
     check_folder(dataset)
     with contextlib.ExitStack() as held:
         with _written(dataset):
-            work = held.enter_context(local_nights.claim(Path(dataset), nights))
+            if (store := _store(dataset)) is not None:
+                held.enter_context(store.claims.claim(nights))
+                work = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="epipole-")))
+            else:
+                work = held.enter_context(local_nights.claim(_folder(dataset), nights))
         yield work
 
 
 def publish_folders(
-    dataset: Path | str, staged: Mapping[str, Path], sources: pa.Table, replace: bool = False
+    dataset: Where, staged: Mapping[str, Path], sources: pa.Table, replace: bool = False
 ) -> None:
     """Put whole nights in place: all of them, or none.
 
@@ -180,15 +203,22 @@ def publish_folders(
         While another run publishes here, this one waits.
     """
     check_folder(dataset)
-    dataset = Path(dataset)
+    for folder in staged.values():
+        _require_whole(folder)
+    nights = list(staged)
     with _written(dataset):
+        if (store := _store(dataset)) is not None:
+            with store.claims.claim(store.claims.missing(nights)):
+                store.recover()
+                check_sources(dataset, nights, sources, replace)
+                store.publish(staged)
+            return
         for folder in staged.values():
-            _require_whole(folder)
             for path in [*folder.rglob("*"), folder]:
                 sync(path)
-        with local_nights.alone(dataset):
-            check_sources(dataset, list(staged), sources, replace)
-            local_nights.put_all_in_place(dataset, staged)
+        with local_nights.alone(_folder(dataset)):
+            check_sources(dataset, nights, sources, replace)
+            local_nights.put_all_in_place(_folder(dataset), staged)
 
 
 def _require_whole(folder: Path) -> None:
@@ -197,15 +227,39 @@ def _require_whole(folder: Path) -> None:
         raise ValueError(f"{folder}: is no whole night, without {', '.join(missing)}")
 
 
+def _store(dataset: Where) -> StoreNights | None:
+    """Return the object store that a URL names; None: it is a local folder."""
+    where = str(dataset)
+    return store_nights(where) if "://" in where and not where.startswith("file://") else None
+
+
+def _folder(dataset: Where) -> Path:
+    return Path(unquote(urlsplit(str(dataset)).path)) if "://" in str(dataset) else Path(dataset)
+
+
 @contextlib.contextmanager
-def _written(dataset: Path | str) -> Iterator[None]:
+def _written(dataset: Where) -> Iterator[None]:
     """Have what the system says of a write told as an error of the dataset."""
+    kinds = (OSError,) if _store(dataset) is None else storage_errors()
     try:
         yield
-    except OSError as error:
+    except DatasetError:
+        raise
+    except kinds as error:
+        reason = getattr(error, "strerror", None) or line_of(error)
         raise DatasetError(
-            f"{dataset}: cannot be written ({error.strerror or error}); nothing was changed"
+            f"{dataset}: cannot be written ({reason}); nothing was changed"
         ) from error
+
+
+@contextlib.contextmanager
+def _read(dataset: Where) -> Iterator[None]:
+    try:
+        yield
+    except DatasetError:
+        raise
+    except storage_errors() as error:
+        raise DatasetError(f"{dataset}: cannot be read: {line_of(error)}") from error
 
 
 def _write_night(folder: Path, tables: Mapping[str, pa.Table], night: str) -> None:

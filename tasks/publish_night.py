@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -45,7 +44,7 @@ def publish_night(
     tables = dict(tables)
     tables["rejects"] = concat(REJECTS, [tables["rejects"], _outside(tables, nights)])
     tables["rejects"] = _into_nights(tables["rejects"], nights)
-    publish(Path(dataset), tables, chosen, replace)
+    publish(dataset, tables, chosen, replace)
     return {
         name: concat(TABLES[name], [rows_of_night(name, rows, night) for night in chosen])
         for name, rows in tables.items()

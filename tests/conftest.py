@@ -1,13 +1,20 @@
-"""What tests share: an embedded Prefect of their own, and one simulated night."""
+"""What tests share: an embedded Prefect of their own, one simulated night, an S3 server."""
 
+import contextlib
 import os
+import socket
+import subprocess
 import sys
 import tempfile
+import time
+import urllib.request
 from pathlib import Path
 
 import pytest
 
 sys.path.append(str(Path(__file__).parent))  # helpers beside the tests: random_stars
+
+START_S = 60  # that the S3 server may take to start
 
 # Before anything imports prefect: a developer's own Prefect neither sees these runs nor
 # changes them.
@@ -47,3 +54,53 @@ def night_dataset(prefect, night_log, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("dataset") / "out"
     nightly([str(night_log)], str(out))
     return out
+
+
+@pytest.fixture(scope="session")
+def s3_server():
+    """Run an S3 server on a free port, and return its address; skip where none is installed."""
+    for package in ("moto", "flask", "s3fs"):
+        pytest.importorskip(package)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    address = f"http://127.0.0.1:{port}"
+    try:
+        for _ in range(10 * START_S):
+            with contextlib.suppress(OSError):
+                urllib.request.urlopen(address, timeout=1).close()
+                break
+            time.sleep(0.1)
+        else:
+            pytest.fail("the S3 server did not start")
+        yield address
+    finally:
+        server.terminate()
+        server.wait(10)
+
+
+@pytest.fixture
+def s3(s3_server, monkeypatch):
+    """Point s3:// at the server, as a user would: by the environment."""
+    import s3fs
+
+    for name, value in {
+        "AWS_ENDPOINT_URL": s3_server,
+        "AWS_ACCESS_KEY_ID": "any",
+        "AWS_SECRET_ACCESS_KEY": "any",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "AWS_CONFIG_FILE": os.devnull,
+        "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
+        "AWS_EC2_METADATA_DISABLED": "true",
+        "AWS_MAX_ATTEMPTS": "1",
+    }.items():
+        monkeypatch.setenv(name, value)
+    s3fs.S3FileSystem.clear_instance_cache()
+    storage = s3fs.S3FileSystem()
+    for bucket in ("logs", "nights"):
+        if not storage.exists(bucket):
+            storage.mkdir(bucket)
+    yield storage
+    s3fs.S3FileSystem.clear_instance_cache()

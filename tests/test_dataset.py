@@ -122,11 +122,6 @@ def test_a_folder_of_other_things_is_refused(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["holiday.jpg"]
 
 
-def test_a_url_is_refused_because_it_cannot_be_renamed():
-    with pytest.raises(DatasetError, match="local folder"):
-        check_folder("s3://bucket/nights")
-
-
 def _disk_full(*_args, **_kwargs):
     raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -1,14 +1,8 @@
 """Logs in places other than a folder, an S3 server of its own among them."""
 
-import contextlib
 import hashlib
 import os
 import random
-import socket
-import subprocess
-import sys
-import time
-import urllib.request
 
 import pytest
 
@@ -19,7 +13,6 @@ from epipole.io.log_writer import LogWriter
 from epipole.schemas.errors import LogError
 
 START_NS = 1_554_091_200_000_000_000
-SECONDS = 60  # that the server may take to start
 
 
 @pytest.fixture
@@ -29,55 +22,6 @@ def log(tmp_path):
         for i in range(100):
             out.frame("s", START_NS + i, frame_number=i, exposure_s=1.0, x_px=[i] * 9, y_px=[i] * 9)
     return path
-
-
-@pytest.fixture(scope="module")
-def s3_server():
-    """Run an S3 server on a free port, and return its address; skip where none is installed."""
-    for package in ("moto", "flask", "s3fs"):
-        pytest.importorskip(package)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    address = f"http://127.0.0.1:{port}"
-    try:
-        for _ in range(10 * SECONDS):
-            with contextlib.suppress(OSError):
-                urllib.request.urlopen(address, timeout=1).close()
-                break
-            time.sleep(0.1)
-        else:
-            pytest.fail("the S3 server did not start")
-        yield address
-    finally:
-        server.terminate()
-        server.wait(10)
-
-
-@pytest.fixture
-def s3(s3_server, monkeypatch):
-    """Point s3:// at the server, as a user would: by the environment."""
-    import s3fs
-
-    for name, value in {
-        "AWS_ENDPOINT_URL": s3_server,
-        "AWS_ACCESS_KEY_ID": "any",
-        "AWS_SECRET_ACCESS_KEY": "any",
-        "AWS_DEFAULT_REGION": "us-east-1",
-        "AWS_CONFIG_FILE": os.devnull,
-        "AWS_SHARED_CREDENTIALS_FILE": os.devnull,
-        "AWS_EC2_METADATA_DISABLED": "true",
-        "AWS_MAX_ATTEMPTS": "1",
-    }.items():
-        monkeypatch.setenv(name, value)
-    s3fs.S3FileSystem.clear_instance_cache()
-    storage = s3fs.S3FileSystem()
-    if not storage.exists("logs"):
-        storage.mkdir("logs")
-    yield storage
-    s3fs.S3FileSystem.clear_instance_cache()
 
 
 def line_of(url):
