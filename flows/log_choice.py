@@ -2,7 +2,7 @@
 
 import datetime
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,9 +42,10 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
     night
         UTC date, ``YYYY-MM-DD``; none: all logs.
 
-    Logs are chosen by when their messages were logged. One that was never closed does not say
-    so and is taken: reading it tells. A file that was found, not named, and is no MCAP is left
-    out with a warning, so that one broken recording does not stop every night.
+    A log that is named itself is taken. Those found in a folder or by a glob are chosen by when
+    their messages were logged; one that was never closed does not say so and is taken too:
+    reading it tells. A found file that is no MCAP is left out with a warning, so that one broken
+    recording does not stop every night.
 
     Raises
     ------
@@ -57,16 +58,16 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
     chosen: list[str] = []
     spans: list[tuple[int, int]] = []
     broken: list[str] = []
-    for path, is_named in _listed(named):
+    for path, is_named in _listed(named).items():
         try:
             logged_ns = read_log_times(path)
         except LogError as error:
-            if is_named:
+            if is_named or error.__cause__ is not None:  # it may be a log, but cannot be read
                 raise
             LOGGER.warning("left out: %s", error)
             broken.append(path)
             continue
-        if night is None or logged_ns is None or _touches(logged_ns, night):
+        if is_named or night is None or logged_ns is None or _touches(logged_ns, night):
             chosen.append(path)
         else:
             spans.append(logged_ns)
@@ -76,15 +77,14 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
     return FoundLogs(chosen, _rejects(broken, night))
 
 
-def _listed(named: Sequence[str]) -> Iterator[tuple[str, bool]]:
-    """Yield each log once, and whether it was named itself."""
-    seen = set()
+def _listed(named: Sequence[str]) -> dict[str, bool]:
+    """Return each log once, and whether it was named itself."""
+    listed: dict[str, bool] = {}
     for where in named:
         paths, is_named = list_logs(where)
         for path in paths:
-            if path not in seen:
-                seen.add(path)
-                yield path, is_named
+            listed[path] = is_named or listed.get(path, False)
+    return listed
 
 
 def _touches(logged_ns: tuple[int, int], night: str) -> bool:

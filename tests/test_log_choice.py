@@ -6,6 +6,7 @@ import fsspec
 import numpy as np
 import pytest
 
+from epipole.flows import log_choice
 from epipole.flows.log_choice import find_logs
 from epipole.io.log_writer import LogWriter
 from epipole.schemas.errors import LogError
@@ -86,6 +87,13 @@ def test_a_log_that_was_never_closed_is_taken_for_every_night(folder):
     assert "open" in names(str(folder), "2019-04-03")
 
 
+def test_a_log_that_is_named_itself_is_taken_whenever_it_was_logged(folder):
+    where = [str(folder), str(folder / "d3h13.mcap")]
+    assert names(where[1:], "2019-04-02") == ["d3h13"]
+    assert names(where[::-1], "2019-04-02") == ["d3h13", *OF_THE_SECOND]
+    assert names(where, "2019-04-02") == [*OF_THE_SECOND, "d3h13"]  # also if found before
+
+
 def test_a_file_that_is_no_log_is_left_out_with_a_row_of_rejects(folder, caplog):
     (folder / "empty.mcap").touch()
     found = find_logs(str(folder), "2019-04-02")
@@ -101,6 +109,16 @@ def test_a_file_that_is_named_and_no_log_is_an_error(folder):
     (folder / "empty.mcap").touch()
     with pytest.raises(LogError, match=r"empty\.mcap: not an MCAP file"):
         find_logs(str(folder / "empty.mcap"), "2019-04-02")
+
+
+def test_a_found_log_that_cannot_be_read_stops_the_night(folder, monkeypatch):
+    def refused(path):
+        if path.endswith("d1h01.mcap"):
+            raise LogError(f"{path}: cannot be read: Input/output error") from OSError(5, "x")
+
+    monkeypatch.setattr(log_choice, "read_log_times", refused)
+    with pytest.raises(LogError, match=r"d1h01\.mcap: cannot be read"):
+        find_logs(str(folder), "2019-04-02")
 
 
 def test_a_night_without_logs_is_an_error_that_says_what_there_is(folder):
