@@ -135,6 +135,13 @@ def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_
 
 
 @njit(cache=True, nogil=True)
+def odds_of_view(views, chance, s, c, points, predicted):
+    """Return what tracklet c of sensor s adds to the odds of an object with these points."""
+    _predict(views, s, points, predicted)
+    return _fit(views, chance, s, c, points[3], predicted)[0]
+
+
+@njit(cache=True, nogil=True)
 def _shared_before(views, c, m, seen_by):
     shared = False
     for earlier in range(m):

@@ -16,6 +16,7 @@ SPEAKS = 2.0  # log-odds at which a view of a well-known point is clearly of the
 CONTESTED = 5.0  # log-odds by which the best view of a sensor must lead the next one
 ENOUGH = 4  # views that fix a point well enough to choose them all again
 WELL_KNOWN = 8  # views after which a sensor's choice needs no review
+COMPLETE = 0.85  # of the views that are usual, those of a clear hypothesis
 REVIEWS = 2  # the first may still rest on a stray
 
 
@@ -32,12 +33,12 @@ def grow_all(views, chance, seeds, taken, limits, gate_sigma, shells, clear, fou
     limits : (2,) float
         Lowest and farthest distance from the Earth's centre [km].
     clear
-        A hypothesis of `WELL_KNOWN` views or more with such log-odds is taken at once.
+        Log-odds at which a hypothesis is taken at once, see `clear_of_doubt`.
     found
-        To write to: sizes (0: fails), scores, distances from the Earth's centre [km], who looks
-        (see `odds`), members.
+        To write to: sizes (0: fails), scores, places at the first instant [km], who looks (see
+        `odds`), members.
     """
-    sizes, scores, radius_km, looks, grown = found
+    sizes, scores, x_km, looks, grown = found
     k = len(views.time_s)
     points = np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3)), np.zeros(k, np.int64)
     part = np.empty(11)
@@ -53,12 +54,25 @@ def grow_all(views, chance, seeds, taken, limits, gate_sigma, shells, clear, fou
             continue
         scores[q] = score(views, chance, members, n, points, part, shells, near, looks[q])
         sizes[q] = min(n, grown.shape[1])
-        x = points[0][np.argmax(points[3] >= 2)]
-        radius_km[q] = np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
+        x_km[q] = points[0][np.argmax(points[3] >= 2)]
         grown[q, : sizes[q]] = members[: sizes[q]]
-        if scores[q] > clear and n >= WELL_KNOWN:
+        if clear_of_doubt(chance, looks[q], n, scores[q], clear):
             for i in members[:n]:
                 taken[i] = True
+
+
+@njit(cache=True, nogil=True)
+def clear_of_doubt(chance, looks, n, value, clear):
+    """Return whether a hypothesis may be taken at once.
+
+    It has many views, and nearly as many of the sensors that look have it as usually do: two
+    objects' tracklets, mixed, fit in a part of the sensors only.
+    """
+    has, usual = 0, 0.0
+    for s in range(len(looks)):
+        has += looks[s] > 0
+        usual += chance.detected[s] * (looks[s] != 0)
+    return value > clear and n >= WELL_KNOWN and has >= COMPLETE * usual
 
 
 @njit(cache=True, nogil=True)

@@ -13,12 +13,13 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.chance import Chance, chance_of
+from epipole.tasks.algorithms.association.contests import settle_contests
 from epipole.tasks.algorithms.association.detection import (
     CERTAIN_LOG_ODDS,
     detection_odds,
     estimated_detection,
 )
-from epipole.tasks.algorithms.association.growth import WELL_KNOWN, grow_all
+from epipole.tasks.algorithms.association.growth import clear_of_doubt, grow_all
 from epipole.tasks.algorithms.association.object_density import revised_odds, visible_volume
 from epipole.tasks.algorithms.association.pool import Hypothesis, Pool, distinct
 from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
@@ -129,6 +130,7 @@ class _Search:
             waiting += self.hypotheses(*pair)
         waiting = self._learn_detection(waiting)
         self.take(waiting, WORTH_A_LOOK)
+        settle_contests(self.views, self.chance, self.group, len(self.groups), self.gate_sigma)
         scores = self._withdraw_doubtful(min_log_odds)
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
         group[self.order], ambiguous[self.order] = self.group, self.ambiguous
@@ -152,7 +154,8 @@ class _Search:
         clear = CLEAR_LOG_ODDS if self.many else np.inf
         out = []
         for h in self.grow(seeds, clear):
-            if h.score > clear and len(h.members) >= WELL_KNOWN:
+            looks = np.array(h.looks, np.int8)
+            if clear_of_doubt(self.chance, looks, len(h.members), h.score, clear):
                 self._accept(h, h.members)
             else:
                 out.append(h)
@@ -164,13 +167,13 @@ class _Search:
         All tracklets of a clear hypothesis are taken then.
         """
         n, n_sensors = len(seeds), len(self.views.half_field)
-        sizes, scores, radius_km = np.zeros(n, np.int64), np.empty(n), np.empty(n)
+        sizes, scores, x_km = np.zeros(n, np.int64), np.empty(n), np.empty((n, 3))
         looks = np.zeros((n, n_sensors), np.int8)
         # More than two fragments a sensor are not kept; the next span has them again.
         grown = np.empty((n, min(2 * n_sensors, len(self.taken))), np.int64)
         grow_all(
             self.views, self.chance, seeds, self.taken, self.limits, self.gate_sigma, self.shells,
-            float(clear), (sizes, scores, radius_km, looks, grown),
+            float(clear), (sizes, scores, x_km, looks, grown),
         )  # fmt: skip
         worth = np.flatnonzero((sizes > 0) & (scores > WORTH_A_LOOK - self.margin))
         return [
@@ -178,7 +181,7 @@ class _Search:
                 float(scores[q]),
                 tuple(seeds[q].tolist()),
                 tuple(sorted(grown[q, : sizes[q]].tolist())),
-                float(radius_km[q]),
+                tuple(x_km[q].tolist()),
                 tuple(looks[q].tolist()),
             )
             for q in worth
@@ -245,7 +248,7 @@ class _Search:
         anywhere = np.array([[0.0, np.inf, 1.0]])
         shells = self.shells if len(self.shells) else anywhere
         volume = visible_volume(self.views, shells, float(self.limits[1]))
-        radius_km = np.array([h.radius_km for h in self.groups])
+        radius_km = np.linalg.norm([h.x_km for h in self.groups], axis=1)
         return revised_odds(scores, radius_km, shells, volume, self.chance)
 
 

@@ -12,14 +12,14 @@ import numpy.typing as npt
 class Hypothesis(NamedTuple):
     """Tracklets that may be one object; `seed` are the two it grew from.
 
-    `radius_km` is how far from the Earth's centre they meet; `looks` is 1 for each sensor that
+    `x_km` is where they meet at the first instant; `looks` is 1 for each sensor that
     has it, -1 for one that looks in vain, else 0.
     """
 
     score: float
     seed: tuple[int, int]
     members: tuple[int, ...]
-    radius_km: float
+    x_km: tuple[float, ...]
     looks: tuple[int, ...]
 
 
