@@ -81,3 +81,30 @@ def test_a_handful_of_centroids_is_never_answered_wrongly(grid, pairs):
         )
         found, _ = identify_lost(few, SKY, grid, pairs, HOW)
         assert found is None or angle_between(found.R_sensor_from_icrs, R) < 0.01
+
+
+def test_a_place_that_is_none_is_left_aside(grid, pairs):
+    seen, _ = frame(CATALOGUE, random_attitude(3), 3)
+    seen.u[[1, 4]] = np.nan
+    found, _ = identify_lost(seen, SKY, grid, pairs, HOW)
+    assert angle_between(found.R_sensor_from_icrs, random_attitude(3)) < 1200 * ARCSEC
+    assert np.all(found.star[[1, 4]] == -1)
+    seen.u[:] = np.nan
+    assert identify_lost(seen, SKY, grid, pairs, HOW) == (None, False)
+
+
+@pytest.mark.parametrize("sigma_px", [0.05, 0.5, 4.0])
+def test_thousands_of_false_centroids_end_without_an_answer(sigma_px, grid, pairs):
+    crowd, _ = frame(CATALOGUE, random_attitude(0), 0, sigma_px, 4000, 1.0)
+    found, _ = identify_lost(crowd, SKY, grid, pairs, HOW)
+    assert found is None
+
+
+def test_the_work_of_a_search_is_bounded_by_the_time_it_is_given(grid, pairs):
+    # What work costs is measured in the benchmark: a test asserts no time.
+    crowd, _ = frame(CATALOGUE, random_attitude(0), 0, 4.0, 4000, 1.0)
+    exhausted = [
+        search_lost(crowd, SKY, grid, pairs, HOW._replace(time_limit_s=t)).exhausted
+        for t in (1e-3, 1e3)
+    ]
+    assert exhausted == [True, False]

@@ -6,14 +6,17 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from random_stars import (
+    CAMERA,
     HOW,
     angle_between,
     frame,
     join_spots,
+    optics,
     random_attitude,
     random_catalogue,
 )
 
+from epipole.tasks.algorithms.camera import pixel_angle, project, unproject
 from epipole.tasks.algorithms.star_catalogue import limit_for_density
 from epipole.tasks.algorithms.star_identification import sensor
 from epipole.tasks.algorithms.star_identification.frame import Frame
@@ -146,3 +149,23 @@ def test_what_a_poor_sample_hides_is_learned_from_the_frames_that_are_solved(mon
     found = _identify(spots)
     assert found.sigma_scale * 0.3 == pytest.approx(0.4, rel=0.06)
     assert found.sky.catalogue.magnitude[-1] <= 6.25
+
+
+@pytest.mark.parametrize(("corner_px", "least_solved"), [(2.0, 15), (5.0, 15), (10.0, 12)])
+@pytest.mark.parametrize("stated_px", [0.2, np.nan])
+def test_a_lens_that_departs_from_its_calibration_is_lived_with(corner_px, least_solved, stated_px):
+    # Radial, growing with the cube to so many pixels in the corners, and calibrated as none.
+    lens = CAMERA._replace(k1=-corner_px / CAMERA.fx_px / np.tan(CAMERA.half_diagonal_rad) ** 3)
+    shots = []
+    for k in range(15):
+        seen, _ = frame(SEEN, random_attitude(k), k, 0.2, n_false=3, camera=lens)
+        u = unproject(CAMERA, *project(lens, seen.u))
+        believed = seen._replace(u=u, optics=optics())
+        shots.append(Shot(believed, np.full(len(u), stated_px), pixel_angle(CAMERA, u)))
+    # Too far apart in time to be tracked.
+    spots = join_spots(*zip(*shots, strict=True))
+    found = identify_sensor(np.arange(15) * 100.0, spots, no_priors(15), SKIES, None, HOW)
+    assert found.solutions.solved.sum() >= least_solved
+    for k in np.flatnonzero(found.solutions.solved):
+        R = found.solutions.R_sensor_from_icrs[k]
+        assert angle_between(R, random_attitude(k)) < np.radians(0.05)

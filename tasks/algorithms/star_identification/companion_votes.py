@@ -85,7 +85,7 @@ def companion(u, sigma, i, j, gate, min_chord):
     tolerance, both in parts of `TURN` (compiled)."""
     dx, dy, dz = u[j, 0] - u[i, 0], u[j, 1] - u[i, 1], u[j, 2] - u[i, 2]
     c = math.sqrt(dx * dx + dy * dy + dz * dz)
-    if c < min_chord:
+    if not c >= min_chord:
         return 0.0, 0.0, 0, 0
     x, y, z = u[i, 0], u[i, 1], u[i, 2]
     h = math.sqrt(x * x + z * z)  # axes: y cross u, and u cross that

@@ -160,11 +160,13 @@ def aberrate_all(u_icrs: Array, beta: Array) -> Array:
 
 def search_lost(frame: Frame, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search) -> Verdict:
     """Search the whole sky for the frame's attitude; see `lost_in_space.search`."""
+    # A place far outside any image has no direction.
+    at = np.flatnonzero(np.isfinite(frame.u[:, 0]))[:N_SEARCHED]
     frame = frame._replace(
-        u=frame.u[:N_SEARCHED],
-        sigma_rad=frame.sigma_rad[:N_SEARCHED],
-        instrumental_mag=frame.instrumental_mag[:N_SEARCHED],
+        u=frame.u[at], sigma_rad=frame.sigma_rad[at], instrumental_mag=frame.instrumental_mag[at]
     )
+    if len(at) < 3:
+        return Verdict(False, np.eye(3), -np.inf, -np.inf, False)
     R, least = np.zeros((3, 3)), how.threshold - LOST_MARGIN - STARLIT
     area = frame.optics.solid_angle_sr
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))

@@ -50,7 +50,7 @@ ROUNDS = ((6, 8, 0.5, 10_000, 32), (99, 0, 1.0, 0, 400))
 # Hardly a field has fewer stars than this share of the mean.
 SPARSE = 0.35
 # Work is counted in about this many units a second of CPU time.
-WORK_PER_S = 5e7
+WORK_PER_S = 4e7
 
 
 @numba.njit(nogil=True, cache=True, error_model="numpy")
