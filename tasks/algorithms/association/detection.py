@@ -5,13 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.chance import Chance
 from epipole.tasks.algorithms.association.pool import Hypothesis
-from epipole.tasks.algorithms.association.views import SPOT_SR, Views
+from epipole.tasks.algorithms.association.views import Views
 
 Array = npt.NDArray[np.float64]
 
-CERTAIN_LOG_ODDS = 8.0  # of a group that tells, even without the view of the sensor asked about
+CERTAIN_LOG_ODDS = 8.0  # of a group that tells
+OTHERS, OTHERS_AT_ONCE = 3, 4  # sensors that have it, at several instants and at a single one
 PRIOR_LOOKS = 10.0  # as good as so many looks does the prior count, and all sensors for each
 LEAST, MOST = 0.05, 0.99
 
@@ -25,28 +25,18 @@ def detection_odds(looks: Array, detected: Array) -> Array:
     return np.asarray(total, float)
 
 
-def estimated_detection(
-    views: Views, chance: Chance, groups: Sequence[Hypothesis], prior: float
-) -> Array:
+def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float) -> Array:
     """Return each sensor's probability of detection, (s,).
 
-    Every sensor is asked about the groups that would be certain without it: so it does not
-    matter that an object which few have is rarely found. Hits over looks, drawn to what all
-    sensors have, and that to `prior`.
+    Every sensor is asked about the sure groups that enough others have: these are found whether
+    it has them or not, so it does not matter that an object which few have rarely is. Hits over
+    looks, drawn to what all sensors have, and that to `prior`.
     """
     n_sensors = len(views.half_field)
-    hits, looked = np.zeros(n_sensors), np.zeros(n_sensors)
-    several = 1.0 if len(views.time_s) == 1 else 2.0  # a tracklet's drift is worth its place
-    for h in groups:
-        members = np.array(h.members)
-        looks = np.array(h.looks)
-        own = views.sensor[members]
-        worth = np.zeros(n_sensors)
-        m = views.seen[members].argmax(axis=1)
-        worth[own] = -several * np.log(chance.density[own] * views.sight[members, m, SPOT_SR])
-        without = h.score - (looks > 0) * (worth + np.log(chance.detected / (1 - chance.detected)))
-        asked = (looks != 0) & (without > CERTAIN_LOG_ODDS)
-        looked += asked
-        hits += asked & (looks > 0)
+    looks = np.array([h.looks for h in groups]).reshape(-1, n_sensors)
+    has = looks > 0
+    others = has.sum(axis=1)[:, None] - has
+    asked = (looks != 0) & (others >= (OTHERS if len(views.time_s) > 1 else OTHERS_AT_ONCE))
+    looked, hits = asked.sum(axis=0), (asked & has).sum(axis=0)
     common = (hits.sum() + PRIOR_LOOKS * prior) / (looked.sum() + PRIOR_LOOKS)
     return np.clip((hits + PRIOR_LOOKS * common) / (looked + PRIOR_LOOKS), LEAST, MOST)

@@ -127,8 +127,11 @@ class _Search:
         pairs = SensorPairs(self.views, float(self.limits[1]))
         waiting: list[Hypothesis] = []
         while (pair := pairs.next(self._enough_pairs())) is not None:
-            waiting += self.hypotheses(*pair)
-        waiting = self._learn_detection(waiting)
+            while pair is not None:
+                waiting += self.hypotheses(*pair)
+                pair = pairs.next(self._enough_pairs())
+            # Where sensors miss more than was thought, more pairs are needed.
+            waiting = self._learn_detection(waiting)
         self.take(waiting, WORTH_A_LOOK)
         settle_contests(self.views, self.chance, self.group, len(self.groups), self.gate_sigma)
         scores = self._withdraw_doubtful(min_log_odds)
@@ -196,9 +199,7 @@ class _Search:
                 used.update(h.members)
                 sure.append(h)
         believed = self.chance.detected
-        detected = estimated_detection(
-            self.views, self.chance, [*self.groups, *sure], float(believed.mean())
-        )
+        detected = estimated_detection(self.views, [*self.groups, *sure], DETECTED)
         self.chance = self.chance._replace(detected=detected)
         self.groups = _with_detection(self.groups, believed, detected)
         return _with_detection(waiting, believed, detected)
