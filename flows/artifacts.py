@@ -45,6 +45,7 @@ class ProgressBar(logging.Handler):
         super().__init__()
         self._id: UUID | None = None
         self._next_s = 0.0
+        self._percent = 0.0
         with _softly("progress"):
             self._id = cast(UUID, create_progress_artifact(0.0, "progress", "start"))
 
@@ -61,10 +62,11 @@ class ProgressBar(logging.Handler):
             self._show(100.0, how)
 
     def _show(self, percent: float, description: str) -> None:
+        self._percent = max(self._percent, percent)  # a stage may be done again
         artifact, self._id = self._id, None  # a page that cannot be written is not asked again
         with _softly("progress"):
             if artifact is not None:
-                update_progress_artifact(artifact, percent, description)
+                update_progress_artifact(artifact, self._percent, description)
             self._id = artifact
             self._next_s = time.monotonic() + UPDATED_EVERY_S
 

@@ -21,18 +21,19 @@ STEPS = logging.getLogger("epipole.steps")
 STEPS.propagate = False
 STEPS.setLevel(logging.INFO)
 
-# The stages in their order, with their shares in the time of a night (%).
+# The stages in their order, with their shares in the time of a night (%), as measured on half
+# an hour of four sensors at 5 Hz.
 _SHARES = {
-    "read logs": 10,
-    "place sensors": 2,
-    "identify stars": 50,
-    "calibrate sensors": 3,
-    "build tracklets": 15,
-    "view objects": 5,
-    "associate objects": 5,
-    "solve positions": 4,
+    "read logs": 2,
+    "place sensors": 5,
+    "identify stars": 57,
+    "calibrate sensors": 18,
+    "build tracklets": 6,
+    "view objects": 2,
+    "associate objects": 3,
+    "solve positions": 2,
     "estimate clocks": 1,
-    "fit states": 2,
+    "fit states": 1,
     "publish": 3,
 }
 _BEFORE = dict(zip(_SHARES, itertools.accumulate(_SHARES.values(), initial=0), strict=False))
