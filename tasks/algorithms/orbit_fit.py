@@ -171,17 +171,9 @@ def _accumulate(y, view, shared, N, rhs, at):
 
 
 @njit(cache=True, nogil=True)
-def _equations(state, errors, prior, time_s, sensor, r, u, basis, weight, N, rhs):
-    """Write the normal equations at a state; return chi-square."""
+def _add_views(state, errors, time_s, sensor, r, u, basis, weight, N, rhs):
+    """Add all views to the normal equations at a state; return their chi-square."""
     chi2 = 0.0
-    N[:] = 0.0
-    rhs[:] = 0.0
-    for s in range(len(errors)):
-        at = 6 + 6 * s
-        N[at : at + 6, at : at + 6] = prior[s]
-        pull = prior[s] @ errors[s]
-        rhs[at : at + 6] = -pull
-        chi2 += (errors[s] * pull).sum()
     middle = np.searchsorted(time_s, 0.0)
     for later in range(2):
         y = np.zeros(42)
@@ -198,36 +190,35 @@ def _equations(state, errors, prior, time_s, sensor, r, u, basis, weight, N, rhs
     return chi2
 
 
-@njit(cache=True, nogil=True)
-def _fit(state, prior, time_s, sensor, r, u, basis, weight, cov):
-    """Fit one arc; `state` has its start. Return chi-square, NaN where it fails."""
+def _fit(state: Array, prior: Array, views: tuple[Array, ...]) -> tuple[Array, Array, float]:
+    """Return state, covariance and chi-square of one arc from a start; NaN where it fails."""
+    failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan
     n_sensors = len(prior)
     errors = np.zeros((n_sensors, 6))
     size = 6 + 6 * n_sensors
-    N, rhs = np.empty((size, size)), np.empty(size)
-    # Kilometres, km/s and radians: scaled alike before anything is solved.
-    scale = np.empty(size)
+    at_prior = np.zeros((size, size))
+    for s in range(n_sensors):
+        at_prior[6 + 6 * s : 12 + 6 * s, 6 + 6 * s : 12 + 6 * s] = prior[s]
     for _ in range(ITERATIONS):
-        chi2 = _equations(state, errors, prior, time_s, sensor, r, u, basis, weight, N, rhs)
-        if not np.isfinite(chi2):
-            return np.nan
-        for k in range(size):
-            if not N[k, k] > 0.0:
-                return np.nan
-            scale[k] = 1.0 / np.sqrt(N[k, k])
-        inverse = np.linalg.inv(N * scale.reshape(-1, 1) * scale)
+        pull = (prior @ errors[:, :, None])[:, :, 0]
+        N, rhs = at_prior.copy(), np.concatenate([np.zeros(6), -pull.ravel()])
+        chi2 = float(np.sum(errors * pull)) + _add_views(state, errors, *views, N, rhs)
+        if not (np.isfinite(chi2) and (np.diag(N) > 0.0).all()):
+            return failed
+        # Kilometres, km/s and radians: scaled alike before anything is solved.
+        scale = 1.0 / np.sqrt(np.diag(N))
+        try:
+            inverse = np.linalg.inv(N * scale[:, None] * scale)
+        except np.linalg.LinAlgError:
+            return failed
         step = scale * (inverse @ (scale * rhs))
-        gain = (step * rhs).sum()
+        gain = float(step @ rhs)
         if not abs(gain) < 1e14:
-            return np.nan
-        state += step[:6]
-        errors += step[6:].reshape(n_sensors, 6)
+            return failed
+        state, errors = state + step[:6], errors + step[6:].reshape(n_sensors, 6)
         if gain < CONVERGED:
-            for a in range(6):
-                for b in range(6):
-                    cov[a, b] = inverse[a, b] * scale[a] * scale[b]
-            return chi2 - gain
-    return np.nan
+            return state, inverse[:6, :6] * scale[:6, None] * scale[:6], chi2 - gain
+    return failed
 
 
 def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
@@ -268,12 +259,13 @@ def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
         own = slice(arcs.offsets[k], arcs.offsets[k + 1])
         names, sensor = np.unique(arcs.sensor[own], return_inverse=True)
         if own.stop - own.start < 3:
+            state[k] = np.nan
             continue
-        chi2[k] = _fit(
-            state[k], _prior(arcs, own, basis, sensor, len(names)), arcs.time_s[own], sensor,
-            arcs.r_km[own], arcs.u[own], basis[own], weight[own], cov[k],
+        views = (
+            arcs.time_s[own], sensor, arcs.r_km[own], arcs.u[own], basis[own], weight[own]
         )  # fmt: skip
-    state[np.isnan(chi2)] = np.nan
+        prior = _prior(arcs, own, basis, sensor, len(names))
+        state[k], cov[k], chi2[k] = _fit(state[k], prior, views)
     return state, cov, chi2
 
 

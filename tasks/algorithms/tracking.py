@@ -85,21 +85,17 @@ def _claim(
 
 @njit(cache=True, nogil=True)
 def _follow(
-    times, offsets, directions, variances, max_rate, max_coast, max_missed, need, gate2, field_sr,
-    enough,
+    times, offsets, frame_of, most, directions, variances, max_rate, max_coast, max_missed, need,
+    gate2, field_sr, enough,
 ):  # fmt: skip
     n, n_frames = len(directions), len(times)
-    frame_of = np.empty(n, np.int64)
-    most = 0
-    for f in range(n_frames):
-        frame_of[offsets[f] : offsets[f + 1]] = f
-        most = max(most, offsets[f + 1] - offsets[f])
     track = np.full(n, NONE)
     room = n // max(need, 1) + 1
     U, W, P = np.empty((room, 3)), np.empty((room, 3)), np.empty((room, 3))
     at, missed = np.empty(room), np.zeros(room, np.int64)
     live = np.empty(0, np.int64)
-    n_tracks, deepest = 0, need + DEEPEST
+    # Not the literal 0, for which what it is given to would be compiled once more.
+    n_tracks, deepest = len(live), need + DEEPEST
     n_slots = deepest + 1
     grids = make_grids(n_slots, most)
     smallest, largest = np.full(n_slots, np.inf), np.zeros(n_slots)
@@ -174,9 +170,12 @@ def follow_detections(
     (n,) int
         Tracks count from 0 by the frame in which they were confirmed.
     """
+    n_in = np.diff(offsets)
     return _follow(
         np.ascontiguousarray(time_s, float),
         np.ascontiguousarray(offsets, np.int64),
+        np.repeat(np.arange(len(n_in)), n_in),
+        int(n_in.max(initial=0)),
         np.ascontiguousarray(u_icrs, float),
         np.ascontiguousarray(sigma_rad, float) ** 2,
         float(max_rate_rad_s),
