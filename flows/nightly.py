@@ -27,6 +27,7 @@ from epipole.flows.stages import (
 )
 from epipole.flows.summary import Summary, summarise
 from epipole.io.dataset import check_folder, check_sources, nights_of
+from epipole.io.star_catalogue import check_star_catalogue
 from epipole.schemas.bridge import array, concat, conform
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
@@ -66,6 +67,7 @@ def nightly(
     """
     night = night_asked(night)
     check_folder(out)
+    check_star_catalogue(chosen_settings.identification.catalogue)
     found = find_logs(logs, night)
 
     log = read(found.paths, settings)
