@@ -67,7 +67,7 @@ def nightly(
     """
     night = night_asked(night)
     check_folder(out)
-    check_star_catalogue(chosen_settings.identification.catalogue)
+    check_star_catalogue(settings.identification.catalogue)
     found = find_logs(logs, night)
 
     log = read(found.paths, settings)
