@@ -190,7 +190,18 @@ def _add_views(state, errors, time_s, sensor, r, u, basis, weight, N, rhs):
     return chi2
 
 
-def _fit(state: Array, prior: Array, views: tuple[Array, ...]) -> tuple[Array, Array, float]:
+class _Views(NamedTuple):
+    """One arc's views: as in `Arcs`, with the tangent basis and the inverse of the noise."""
+
+    time_s: Array
+    sensor: Indices
+    r_km: Array
+    u: Array
+    basis: Array
+    weight: Array
+
+
+def _fit(state: Array, prior: Array, views: _Views) -> tuple[Array, Array, float]:
     """Return state, covariance and chi-square of one arc from a start; NaN where it fails."""
     failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan
     n_sensors = len(prior)
@@ -202,7 +213,18 @@ def _fit(state: Array, prior: Array, views: tuple[Array, ...]) -> tuple[Array, A
     for _ in range(ITERATIONS):
         pull = (prior @ errors[:, :, None])[:, :, 0]
         N, rhs = at_prior.copy(), np.concatenate([np.zeros(6), -pull.ravel()])
-        chi2 = float(np.sum(errors * pull)) + _add_views(state, errors, *views, N, rhs)
+        chi2 = float(np.sum(errors * pull)) + _add_views(
+            state,
+            errors,
+            views.time_s,
+            views.sensor,
+            views.r_km,
+            views.u,
+            views.basis,
+            views.weight,
+            N,
+            rhs,
+        )
         if not (np.isfinite(chi2) and (np.diag(N) > 0.0).all()):
             return failed
         # Kilometres, km/s and radians: scaled alike before anything is solved.
@@ -254,15 +276,16 @@ def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
     g = len(arcs.offsets) - 1
     state, cov = np.array(start, float).reshape(g, 6), np.full((g, 6, 6), np.nan)
     chi2 = np.full(g, np.nan)
-    basis, weight = tangent_basis(arcs.u), np.linalg.inv(arcs.cov_noise)
+    basis, weight = tangent_basis(arcs.u), np.asarray(np.linalg.inv(arcs.cov_noise), float)
     for k in range(g):
         own = slice(arcs.offsets[k], arcs.offsets[k + 1])
         names, sensor = np.unique(arcs.sensor[own], return_inverse=True)
         if own.stop - own.start < 3:
             state[k] = np.nan
             continue
-        views = (
-            arcs.time_s[own], sensor, arcs.r_km[own], arcs.u[own], basis[own], weight[own]
+        views = _Views(
+            arcs.time_s[own], sensor.astype(np.int64), arcs.r_km[own], arcs.u[own], basis[own],
+            weight[own],
         )  # fmt: skip
         prior = _prior(arcs, own, basis, sensor, len(names))
         state[k], cov[k], chi2[k] = _fit(state[k], prior, views)
