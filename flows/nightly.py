@@ -4,39 +4,32 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
-import pyarrow as pa
 from prefect import flow
 
-from epipole.flows.clocks import read_clocks, set_right
-from epipole.flows.log_choice import BEYOND_NS, find_logs
+from epipole.flows.clocks import read_clocks
+from epipole.flows.log_choice import find_logs
 from epipole.flows.page import shown_on_page
 from epipole.flows.parameters import Night, night_asked, run_name
-from epipole.flows.progress import step
-from epipole.flows.sensors import calibrated, sensor_ids, unplaced
 from epipole.flows.stages import (
-    associate,
     calibrate,
-    fit,
     identify,
-    link,
-    place,
+    name,
     read,
+    set_clocks_right,
+    solve,
+    stage,
     track,
-    triangulate,
-    view,
 )
 from epipole.flows.summary import Summary, summarise
-from epipole.io.dataset import check_folder, check_sources, nights_of
+from epipole.flows.work import frames_wanted
+from epipole.io.dataset import check_folder, check_sources, claim_nights, nights_of, publish_folders
+from epipole.io.work_folder import work_folder, work_key, work_root
+from epipole.schemas.bridge import concat
 from epipole.io.star_catalogue import check_star_catalogue
-from epipole.schemas.bridge import array, concat, conform
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
-from epipole.schemas.tables import FRAMES, REJECTS
-from epipole.tasks.align_epochs import align_epochs
-from epipole.tasks.estimate_clocks import Clock, added, of_sound_clocks
-from epipole.tasks.link_objects import renamed
-from epipole.tasks.lone_detections import with_objects_found
-from epipole.tasks.publish_night import publish_night, source_table
+from epipole.schemas.tables import REJECTS
+from epipole.tasks.stage_night import into_nights, source_table
 
 LOGGER = logging.getLogger(__name__)
 
@@ -69,85 +62,49 @@ def nightly(
     check_folder(out)
     check_star_catalogue(settings.identification.catalogue)
     found = find_logs(logs, night)
-
-    log = read(found.paths, settings)
-    nights = nights_of(array(log.exposures, "time"))
-    chosen = choose_nights(nights, night)
-    sources = source_table(log.sources, settings)
-    check_sources(out, chosen, sources, replace)
-    exposures, uncalibrated = calibrated(near(log.exposures, night), log.cameras)
-    if not exposures.num_rows:
-        raise LogError(
-            f"{', '.join(found.paths)}: no sensor has a calibration "
-            f"({', '.join(sensor_ids(uncalibrated))}); record foxglove.CameraCalibration "
-            "with the sensor's id as frame_id"
-        )
-
-    places = place(exposures, log.states, settings)
-    identified = identify(exposures, places, log.cameras, settings)
-    identified, cameras, calibrations = calibrate(
-        identified, exposures, places, log.cameras, settings
-    )
-    clocks: list[Clock] = []
-    for passes_left in (2, 1, 0):  # the second time a sensor takes part that had not
-        tracked = track(identified, cameras, settings)
-        epochs = align_epochs(identified.solutions, settings)
-        views = view(epochs, identified, tracked, cameras, settings)
-        associated = associate(views, identified, tracked, cameras, settings)
-        solved = triangulate(associated, settings)
-        still = read_clocks(views, solved, identified, settings)
-        clocks = added(clocks, still)
-        off = settings.alignment.correct_clocks and any(clock.is_off for clock in still)
-        if not off or not passes_left:
-            break
-        identified, exposures = set_right(identified, exposures, log.states, still, settings)
-
-    # A clock that is off and stays so: its sensor would spoil what the others see.
-    sound, of_clocks = of_sound_clocks(views, solved.associations, still)
-    if sound.num_rows < views.num_rows:
-        associated = associate(sound, identified, tracked, cameras, settings)
-        solved = triangulate(associated, settings)
-    states = fit(associated, solved, settings)
-    new_id = link(solved, states, settings)
-
-    rejects = [
-        found.rejects, log.rejects, uncalibrated, unplaced(places),
-        identified.rejects, of_clocks, associated.rejects, solved.rejects,
-    ]  # fmt: skip
-    tables = {
-        "frames": conform(FRAMES, identified.solutions),
-        "stars": identified.stars,
-        "detections": with_objects_found(tracked.detections, solved.associations),
-        "tracklets": tracked.tracklets,
-        "epochs": epochs,
-        "associations": renamed(solved.associations, new_id),
-        "positions": renamed(solved.positions, new_id),
-        "states": renamed(states, new_id),
-        "calibrations": calibrations,
-        "pairs": solved.pairs,
-        "sources": sources,
-        "rejects": concat(REJECTS, rejects),
-    }
-    step("publish", 0, 1)
-    published = publish_night(out, tables, nights, chosen, replace)
-    LOGGER.info("published %s", ", ".join(f"{out}/night={n}" for n in chosen))
-    return summarise(out, chosen, published, clocks)
+    with claim_nights(out, [night] if night else []) as run:
+        frames = read(found.paths, run, settings)
+        nights = nights_of(np.concatenate(frames.time_ns))
+        chosen = choose_nights(found.paths, nights, night)
+        sources = source_table(frames.sources, settings)
+        check_sources(out, chosen, sources, replace)
+        spans, uncalibrated = frames_wanted(frames, chosen)
+        key = work_key([log.sha256 for log in frames.sources], settings, chosen)
+        with (
+            claim_nights(out, [] if night else chosen) as staging,
+            work_folder(work_root(out), chosen, key) as folder,
+        ):
+            work = identify(frames, spans, folder, settings)
+            work, calibrations = calibrate(work, settings)
+            for attempt in ("", "-on-time"):
+                parts = track(work, settings, attempt)
+                solved, clocks = solve(work, parts, settings, attempt)
+                clocks = read_clocks(clocks)
+                off = any(clock.is_off for clock in clocks)
+                if attempt or not off or not settings.alignment.correct_clocks:
+                    break
+                work = set_clocks_right(work, clocks, settings)
+            names = name(work, solved, settings)
+            rejects = concat(REJECTS, [found.rejects, frames.rejects, uncalibrated])
+            whole = {
+                "calibrations": calibrations,
+                "sources": sources,
+                "rejects": into_nights(rejects, nights),
+            }
+            staged = {one: staging / f"night={one}" for one in chosen}
+            stage(work, parts, solved, names, whole, staged)
+            summary = summarise(out, staged, clocks)
+            publish_folders(out, staged, sources, replace)
+    LOGGER.info("published %s", ", ".join(f"{out}/night={one}" for one in chosen))
+    return summary
 
 
-def choose_nights(nights: Sequence[str], night: str | None) -> list[str]:
+def choose_nights(logs: Sequence[str], nights: Sequence[str], night: str | None) -> list[str]:
     """Return the nights to publish: all that the logs have frames of, or the one asked for."""
     if night is None:
+        if not nights:
+            raise LogError(f"{', '.join(logs)}: no frames in these logs; check the recording")
         return list(nights)
     if night not in nights:
         raise LogError(f"no frames on {night} in these logs; they have {', '.join(nights)}")
     return [night]
-
-
-def near(exposures: pa.Table, night: str | None) -> pa.Table:
-    """Return the frames of a night and of a margin beyond both its ends."""
-    if night is None:
-        return exposures
-    start = int(np.datetime64(night, "ns").astype(np.int64))
-    end = int((np.datetime64(night) + 1).astype("datetime64[ns]").astype(np.int64))
-    time_ns = array(exposures, "time")
-    return exposures.filter(pa.array((time_ns >= start - BEYOND_NS) & (time_ns < end + BEYOND_NS)))

@@ -24,17 +24,14 @@ STEPS.setLevel(logging.INFO)
 # The stages in their order, with their shares in the time of a night (%), as measured on half
 # an hour of four sensors at 5 Hz.
 _SHARES = {
-    "read logs": 2,
-    "place sensors": 5,
-    "identify stars": 57,
-    "calibrate sensors": 18,
-    "build tracklets": 6,
-    "view objects": 2,
-    "associate objects": 3,
-    "solve positions": 2,
-    "estimate clocks": 1,
-    "fit states": 1,
-    "publish": 3,
+    "read logs": 4,
+    "identify stars": 55,
+    "calibrate sensors": 3,
+    "build tracklets": 15,
+    "join tracklets": 1,
+    "solve objects": 15,
+    "link objects": 1,
+    "publish": 7,
 }
 _BEFORE = dict(zip(_SHARES, itertools.accumulate(_SHARES.values(), initial=0), strict=False))
 

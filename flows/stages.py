@@ -1,216 +1,202 @@
 """The stages of a night, each shared out over tasks of a sensor and a span of time.
 
-Every stage puts its tasks' tables together in the order the tasks were made, so the result
-does not depend on the number of workers.
+Tasks take paths and small tables and leave their own in the work folder, whole or not at all.
+A part that is there is not made again: the folder's name tells what it was made of. What is
+made of the parts does not depend on which worker made which, or when.
 """
 
 import logging
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.flows.progress import results, step
-from epipole.flows.sensors import of_sensor, sensor_ids, spans
 from epipole.flows.summary import many
-from epipole.io.star_catalogue import read_star_catalogue
+from epipole.flows.work import DAY_NS, Spans, Work
+from epipole.io.work_files import is_written, read_part
 from epipole.schemas.bridge import array, concat
-from epipole.schemas.log_tables import Log
 from epipole.schemas.settings import Settings
-from epipole.schemas.tables import CALIBRATIONS, DETECTIONS, REJECTS, STARS, TRACKLETS
-from epipole.schemas.work_tables import CAMERAS, SOLUTIONS, VIEWS
-from epipole.tasks.associate_objects import Associated, associate_objects
-from epipole.tasks.build_tracklets import Tracked, build_tracklets
-from epipole.tasks.calibrate_sensors import Calibrated, calibrate_sensors
-from epipole.tasks.fit_states import fit_states
-from epipole.tasks.identify_stars import Identified, identify_stars
-from epipole.tasks.link_objects import link_objects
-from epipole.tasks.lone_detections import with_lone_tracklets
-from epipole.tasks.place_sensors import place_sensors
-from epipole.tasks.read_logs import read_logs
-from epipole.tasks.solve_positions import Solved, solve_positions
-from epipole.tasks.view_objects import view_objects
+from epipole.schemas.tables import CALIBRATIONS, POSITIONS, STATES
+from epipole.schemas.work_tables import CAMERAS
+from epipole.tasks.align_epochs import EpochGrid, frames_that_serve, grid_of
+from epipole.tasks.calibrate_sensors import Calibrated, calibrate_sensor
+from epipole.tasks.correct_clock import correct_clock
+from epipole.tasks.estimate_clocks import Clock
+from epipole.tasks.identify_span import identify_span
+from epipole.tasks.join_tracklets import join_tracklets
+from epipole.tasks.link_objects import link_objects, outermost, renamed
+from epipole.tasks.name_objects import name_objects
+from epipole.tasks.order_frames import OrderedFrames, order_logs
+from epipole.tasks.read_logs import read_log_into
+from epipole.tasks.solve_span import SensorParts, solve_span
+from epipole.tasks.stage_night import stage_night
+from epipole.tasks.track_span import track_span
 
 LOGGER = logging.getLogger(__name__)
 
-SPAN_NS = 600_000_000_000  # long enough that tracking pays, short enough to share out
+Names = Mapping[str, Mapping[str, str]]
 
 
-def read(logs: Sequence[str], settings: Settings) -> Log:
-    """Read the logs, sorted and each frame once."""
-    step("read logs", 0, len(logs))
-    log = read_logs(list(logs), settings)
-    LOGGER.info("read %s of %s", many(len(log.exposures), "frame"), many(len(logs), "log"))
-    return log
+def read(logs: Sequence[str], folder: Path, settings: Settings) -> OrderedFrames:
+    """Read the logs, a task a log, and order what they hold."""
+    futures = [read_log_into.submit(folder / f"log-{k}", log) for k, log in enumerate(logs)]
+    frames = order_logs(folder, results("read logs", futures), settings)
+    count = sum(len(time_ns) for time_ns in frames.time_ns)
+    LOGGER.info("read %s of %s", many(count, "frame"), many(len(frames.sources), "log"))
+    return frames
 
 
-def place(exposures: pa.Table, states: pa.Table, settings: Settings) -> pa.Table:
-    """Interpolate each sensor's state to its frames."""
-    step("place sensors", 0, 1)
-    places: pa.Table = place_sensors(exposures, states, settings)
-    placed = places.num_rows - places["x_km"].null_count
-    LOGGER.info("placed %s of %s frames", f"{placed:,}", f"{places.num_rows:,}")
-    return places
+def identify(frames: OrderedFrames, spans: Spans, folder: Path, settings: Settings) -> Work:
+    """Place sensors, tell stars from the rest and solve attitudes, a task a sensor and span."""
+    return _identify(Work(frames.folder, folder, spans, frames.cameras, {}), settings, "identified")
 
 
-def identify(
-    exposures: pa.Table, places: pa.Table, cameras: pa.Table, settings: Settings
-) -> Identified:
-    """Tell stars from the rest and solve attitudes, a task a sensor and span of time."""
-    catalogue = read_star_catalogue(settings.identification.catalogue)
+def _identify(work: Work, settings: Settings, stage: str) -> Work:
+    where = {sensor: work.parts(stage, sensor) for sensor in work.spans}
     futures = [
-        identify_stars.submit(exposures.take(rows), places.take(rows), cameras, catalogue, settings)
-        for rows in spans(exposures, SPAN_NS)
+        identify_span.submit(work.frames, sensor, span, work.cameras, settings, where[sensor])
+        for sensor, span in work.by_span()
     ]
-    parts: list[Identified] = results("identify stars", futures)
-    solutions, stars, detections, rejects = zip(*parts, strict=True)
-    identified = Identified(
-        concat(SOLUTIONS, solutions),
-        concat(STARS, stars),
-        concat(DETECTIONS, detections),
-        concat(REJECTS, rejects),
-    )
-    by_stars = pc.sum(pc.equal(identified.solutions["attitude_source"], "stars")).as_py() or 0
-    LOGGER.info(
-        "identified %s of %s frames by %s stars",
-        f"{by_stars:,}", f"{identified.solutions.num_rows:,}", f"{identified.stars.num_rows:,}",
-    )  # fmt: skip
-    return identified
+    by_stars = sum(results("identify stars", futures))
+    LOGGER.info("identified %s by their stars", many(by_stars, "frame"))
+    return work._replace(identified={**work.identified, **where})
 
 
-class Calibration(NamedTuple):
-    """The stars' verdict on the optics, and what was identified and is to be used with it."""
-
-    identified: Identified
-    cameras: pa.Table
-    calibrations: pa.Table
-
-
-def calibrate(
-    identified: Identified,
-    exposures: pa.Table,
-    places: pa.Table,
-    cameras: pa.Table,
-    settings: Settings,
-) -> Calibration:
+def calibrate(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     """Fit each sensor's optics to its stars; identify again those whose calibration is off."""
     mode = settings.identification.calibrate
     calibrations = CALIBRATIONS.empty_table()
-    for _ in range(2 if mode == "use" else 1):  # with better optics more stars take part
+    for number in range(2 if mode == "use" else 1):  # with better optics more stars take part
         if mode == "off":
             break
-        names = sensor_ids(cameras)
         futures = [
-            calibrate_sensors.submit(of_sensor(identified.stars, n), of_sensor(cameras, n))
-            for n in names
+            calibrate_sensor.submit(sensor, work.identified[sensor], spans, work.cameras)
+            for sensor, spans in work.spans.items()
         ]
-        parts: list[Calibrated] = results("calibrate sensors", futures)
-        calibrations = concat(CALIBRATIONS, [part.calibrations for part in parts])
-        departed = [name for part in parts for name in part.departed]
+        fits: list[Calibrated] = results("calibrate sensors", futures)
+        calibrations = concat(CALIBRATIONS, [fit.calibrations for fit in fits])
+        departed = {name for fit in fits for name in fit.departed}
         if mode == "report" or not departed:
             break
-        LOGGER.info("optics of %s depart from the calibration", ", ".join(departed))
-        cameras = concat(CAMERAS, [part.cameras for part in parts])
-        again = pc.is_in(exposures["sensor_id"], pa.array(departed, pa.string()))
-        new = identify(exposures.filter(again), places.filter(again), cameras, settings)
-        identified = Identified(
-            *[_replaced(old, part, departed) for old, part in zip(identified, new, strict=True)]
+        LOGGER.info("optics of %s depart from the calibration", ", ".join(sorted(departed)))
+        known = work.cameras.filter(
+            pc.invert(pc.is_in(work.cameras["sensor_id"], pa.array(sorted(departed))))
         )
-    return Calibration(identified, cameras, calibrations)
+        found = [fit.cameras for fit in fits if fit.departed]
+        cameras = concat(CAMERAS, [known, *found]).sort_by(
+            [("sensor_id", "ascending"), ("time", "ascending")]
+        )
+        again = {s: spans for s, spans in work.spans.items() if s.sensor_id in departed}
+        some = work._replace(cameras=cameras, spans=again)
+        identified = _identify(some, settings, f"identified-{number + 2}").identified
+        work = work._replace(cameras=cameras, identified=identified)
+    return work, calibrations
 
 
-def _replaced(old: pa.Table, new: pa.Table, sensors: list[str]) -> pa.Table:
-    """Return a table with these sensors' rows from the new one, by sensor as before."""
-    kept = old.filter(~pc.is_in(pc.field("sensor_id"), pa.array(sensors, pa.string())))
-    both = pa.concat_tables([kept, new])
-    return both.take(np.argsort(array(both, "sensor_id").astype(str), kind="stable"))
-
-
-def track(identified: Identified, cameras: pa.Table, settings: Settings) -> Tracked:
-    """Follow detections from frame to frame, a task a sensor."""
+def track(work: Work, settings: Settings, attempt: str) -> list[SensorParts]:
+    """Follow detections from frame to frame, a task a sensor and span, and name tracklets."""
+    parts = {
+        sensor: SensorParts(
+            work.identified[sensor],
+            work.parts(f"tracked{attempt}", sensor),
+            work.parts(f"named{attempt}", sensor),
+        )
+        for sensor in work.spans
+    }
     futures = [
-        build_tracklets.submit(
-            of_sensor(identified.solutions, name),
-            of_sensor(identified.detections, name),
-            cameras,
-            settings,
+        track_span.submit(
+            sensor, parts[sensor].identified, span, work.cameras, settings, parts[sensor].tracked
         )
-        for name in sensor_ids(identified.solutions)
+        for sensor, span in work.by_span()
     ]
-    detections, tracklets = zip(*results("build tracklets", futures), strict=True)
-    tracked = Tracked(concat(DETECTIONS, detections), concat(TRACKLETS, tracklets))
-    LOGGER.info(
-        "tracked %s of %s detections in %s tracklets",
-        f"{tracked.detections.num_rows - tracked.detections['tracklet_id'].null_count:,}",
-        f"{tracked.detections.num_rows:,}", f"{tracked.tracklets.num_rows:,}",
-    )  # fmt: skip
-    return tracked
-
-
-def view(
-    epochs: pa.Table,
-    identified: Identified,
-    tracked: Tracked,
-    cameras: pa.Table,
-    settings: Settings,
-) -> pa.Table:
-    """Say where each sensor sees its tracklets at the epochs, a task a sensor."""
+    results("build tracklets", futures)
     futures = [
-        view_objects.submit(
-            of_sensor(epochs, name),
-            of_sensor(identified.solutions, name),
-            of_sensor(tracked.detections, name),
-            cameras,
-            settings,
-        )
-        for name in sensor_ids(epochs)
+        join_tracklets.submit(sensor, parts[sensor].tracked, spans, settings, parts[sensor].named)
+        for sensor, spans in work.spans.items()
     ]
-    views = concat(VIEWS, results("view objects", futures))
-    LOGGER.info("aligned %s", many(pc.count_distinct(epochs["epoch"]).as_py(), "epoch"))
-    return views
+    count = sum(results("join tracklets", futures))
+    LOGGER.info("followed %s", many(count, "tracklet"))
+    return list(parts.values())
 
 
-def associate(
-    views: pa.Table,
-    identified: Identified,
-    tracked: Tracked,
-    cameras: pa.Table,
-    settings: Settings,
-) -> Associated:
-    """Say which sensors' tracklets are one object."""
-    step("associate objects", 0, 1)
-    associated: Associated = associate_objects(
-        views,
-        with_lone_tracklets(tracked.tracklets, views),
-        identified.solutions,
-        cameras,
-        settings,
-    )
-    LOGGER.info("associated %s of %s views", f"{associated.views.num_rows:,}", f"{len(views):,}")
-    return associated
+def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
+    """Return the grid of epochs of the night."""
+    columns = ["time", "attitude_source", "x_km"]
+    times = []
+    for sensor, spans in work.spans.items():
+        rows = [
+            read_part(work.identified[sensor] / span.folder, "solutions", columns) for span in spans
+        ]
+        serving = [array(frames_that_serve(part), "time") for part in rows]
+        times.append(np.concatenate([np.zeros(0, np.int64), *serving]))
+    return grid_of(times, settings)
 
 
-def triangulate(associated: Associated, settings: Settings) -> Solved:
-    """Solve each object's position at each epoch."""
-    step("solve positions", 0, 1)
-    solved: Solved = solve_positions(associated.views, associated.object_number, settings)
-    LOGGER.info("solved %s", many(len(solved.positions), "position"))
-    return solved
+def solve(
+    work: Work, parts: Sequence[SensorParts], settings: Settings, attempt: str
+) -> tuple[Path, list[Clock]]:
+    """Find and solve objects, a task a span of all sensors."""
+    grid = epoch_grid(work, settings)
+    where = work.folder / f"solved{attempt}"
+    futures = [
+        solve_span.submit(parts, span, grid, work.cameras, settings, where)
+        for span in work.all_spans()
+    ]
+    clocks = [clock for part in results("solve objects", futures) for clock in part]
+    return where, clocks
 
 
-def fit(associated: Associated, solved: Solved, settings: Settings) -> pa.Table:
-    """Fit a state to each arc of each object."""
-    step("fit states", 0, 1)
-    states: pa.Table = fit_states(associated.views, solved.associations, solved.positions, settings)
-    LOGGER.info("fitted %s", many(len(states), "state"))
-    return states
-
-
-def link(solved: Solved, states: pa.Table, settings: Settings) -> dict[str, str]:
-    """Return the ids of objects that are one with an earlier one, each with its first id."""
+def name(work: Work, solved: Path, settings: Settings) -> Names:
+    """Return, for each span, what its objects are called in the night."""
     step("link objects", 0, 1)
-    new_id: dict[str, str] = link_objects(solved.positions, states, settings)
-    LOGGER.info("knew %s again", many(len(new_id), "object"))
-    return new_id
+    spans = [span for span in work.all_spans() if is_written(solved / span.folder)]
+    names = name_objects(solved, spans)
+    ends: dict[str, list[pa.Table]] = {"positions": [], "states": []}
+    for span in spans:
+        for table, found in ends.items():
+            rows = outermost(read_part(solved / span.folder, table))
+            found.append(renamed(rows, names[span.folder]))
+    new_id: dict[str, str] = link_objects(
+        concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
+    )
+    objects = {new_id.get(one, one) for own in names.values() for one in own.values()}
+    LOGGER.info("solved %s, knew %d again", many(len(objects), "object"), len(new_id))
+    return {
+        span: {old: new_id.get(one, one) for old, one in own.items()} for span, own in names.items()
+    }
+
+
+def set_clocks_right(work: Work, clocks: Sequence[Clock], settings: Settings) -> Work:
+    """Put the frames of clocks that are off at their true times."""
+    off = {clock.sensor_id: clock for clock in clocks if clock.is_off}
+    where = {s: work.parts("identified-on-time", s) for s in work.spans if s.sensor_id in off}
+    futures = [
+        correct_clock.submit(
+            work.frames, sensor, work.identified[sensor], span, off[sensor.sensor_id], settings,
+            where[sensor],
+        )
+        for sensor, span in work.by_span()
+        if sensor in where
+    ]  # fmt: skip
+    results("correct clocks", futures)
+    return work._replace(identified={**work.identified, **where})
+
+
+def stage(
+    work: Work,
+    parts: Sequence[SensorParts],
+    solved: Path,
+    names: Names,
+    whole: Mapping[str, pa.Table],
+    staged: Mapping[str, Path],
+) -> None:
+    """Put the parts together as the tables of each night, a task a night."""
+    futures = []
+    for night, folder in staged.items():
+        day = int(np.datetime64(night, "D").astype(np.int64))
+        own = [span for span in work.all_spans() if span.start_ns // DAY_NS == day]
+        futures.append(stage_night.submit(folder, night, own, parts, solved, names, whole))
+    results("publish", futures)

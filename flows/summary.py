@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.io.night_files import read_columns
 from epipole.tasks.estimate_clocks import Clock
 
 
@@ -75,14 +77,29 @@ class Summary:
         ]
 
 
-def summarise(
-    dataset: str, nights: list[str], tables: Mapping[str, pa.Table], clocks: Sequence[Clock] = ()
-) -> Summary:
-    """Return the summary of published tables, and of clocks that are surely off."""
+# What a summary counts: of a whole night not every column is in memory at once.
+_COLUMNS = {
+    "frames": ["sensor_id", "attitude_source", "residual_px"],
+    "stars": ["centroid"],
+    "detections": ["centroid"],
+    "tracklets": ["sensor_id", "track_id"],
+    "epochs": ["epoch"],
+    "positions": ["object_id"],
+    "sources": ["sha256"],
+    "rejects": ["reason", "count"],
+}
+
+
+def summarise(dataset: str, staged: Mapping[str, Path], clocks: Sequence[Clock] = ()) -> Summary:
+    """Return the summary of nights that are staged, and of clocks that are surely off."""
+    tables = {
+        name: pa.concat_tables([read_columns(folder, name, columns) for folder in staged.values()])
+        for name, columns in _COLUMNS.items()
+    }
     frames = tables["frames"]
     return Summary(
         dataset=dataset,
-        nights=nights,
+        nights=list(staged),
         logs=pc.count_distinct(tables["sources"]["sha256"]).as_py(),
         sensors=pc.count_distinct(frames["sensor_id"]).as_py(),
         frames=frames.num_rows,

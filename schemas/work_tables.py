@@ -124,6 +124,36 @@ VIEWS = schema(
     ],
 )
 
+FRAME_INDEX = schema(
+    "frame_index",
+    "One row a frame of one sensor, in time order, each once: where it lies among what was read.",
+    [
+        time_column(),
+        column("log", pa.int32(), doc="Log of the run, in the order of names."),
+        column("part", pa.int32(), doc="Part of the log."),
+        column("row", I64, doc="Row in the part's exposures."),
+    ],
+)
+
+TRACKLET_NAMES = schema(
+    "tracklet_names",
+    "One row a tracklet of one sensor and span: what it is called in the night.",
+    [
+        id_column("span_name", doc="In the span."),
+        id_column("tracklet_id", doc="In the night."),
+        id_column("track_id", doc="Of the fragments it was joined with."),
+    ],
+)
+
+OBJECT_TRACKS = schema(
+    "object_tracks",
+    "One row a track that an object of a span was seen by, in the order it was last seen.",
+    [
+        id_column("span_name", doc="The object in the span."),
+        id_column("track_id", doc="A track of one sensor."),
+    ],
+)
+
 TRUE_FRAMES = schema(
     "true_frames",
     "Simulation truth, one row a frame.",

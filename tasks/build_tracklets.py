@@ -28,7 +28,6 @@ from epipole.tasks.detection_kinds import (
     is_planet,
     sighting_sigma,
 )
-from epipole.tasks.run_names import sensor_and_span
 from epipole.tasks.sightings import (
     Frames,
     Sightings,
@@ -53,11 +52,7 @@ class Tracked(NamedTuple):
     tracklets: pa.Table
 
 
-@task(
-    name="build tracklets",
-    task_run_name=sensor_and_span("track", "solutions"),
-    cache_policy=NO_CACHE,  # hashing a table costs more than the task
-)
+@task(name="build tracklets", cache_policy=NO_CACHE)
 def build_tracklets(
     solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
 ) -> Tracked:

@@ -1,6 +1,8 @@
 """The stage that says what a sensor's optics are, as its stars of the night show them."""
 
 import logging
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,12 +11,13 @@ import pyarrow.compute as pc
 from prefect import task
 from prefect.cache_policies import NO_CACHE
 
+from epipole.io.work_files import read_part
 from epipole.schemas.bridge import array, concat, empty, table
-from epipole.schemas.tables import CALIBRATIONS
+from epipole.schemas.tables import CALIBRATIONS, STARS
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.camera import Camera, unproject
 from epipole.tasks.algorithms.optics_calibration import OPTICS, OpticsFit, calibrate_optics
-from epipole.tasks.run_names import sensor_and_span
+from epipole.tasks.spans import Sensor, Span
 
 log = logging.getLogger(__name__)
 
@@ -33,11 +36,33 @@ class Calibrated(NamedTuple):
     departed: list[str]
 
 
-@task(
-    name="calibrate sensors",
-    task_run_name=sensor_and_span("calibrate", "stars"),
-    cache_policy=NO_CACHE,  # hashing a table costs more than the task
-)
+@task(name="calibrate", task_run_name="calibrate {sensor}", cache_policy=NO_CACHE)
+def calibrate_sensor(
+    sensor: Sensor, identified: Path, spans: Sequence[Span], cameras: pa.Table
+) -> Calibrated:
+    """Optics as one sensor's stars of all spans show them; `identified` holds its parts."""
+    own = cameras.filter(pc.field("sensor_id") == sensor.sensor_id)
+    return calibrate_sensors(_spread(identified, spans), own)
+
+
+def _spread(identified: Path, spans: Sequence[Span]) -> pa.Table:
+    """Return the stars of whole frames, spread evenly over the night, and not too many."""
+    parts = [read_part(identified / span.folder, "stars") for span in spans]
+    total = sum(part.num_rows for part in parts)
+    # A tenth to spare, as frames differ in stars.
+    step = 1 if total <= MAX_STARS else -(-total * 10 // (MAX_STARS * 9))
+    return concat(STARS, [_every(part, step) for part in parts])
+
+
+def _every(stars: pa.Table, step: int) -> pa.Table:
+    """Return the stars of every so many-th frame."""
+    if step == 1 or not stars.num_rows:
+        return stars
+    frame = array(stars, "frame_number")
+    number = np.cumsum(np.diff(frame, prepend=frame[:1]) != 0)
+    return stars.take(np.flatnonzero(number % step == 0))
+
+
 def calibrate_sensors(stars: pa.Table, cameras: pa.Table) -> Calibrated:
     """Optics as the stars show them. `stars` of a sensor are in order of time."""
     rows, changed = [], {}

@@ -40,7 +40,6 @@ from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.time_scales import DAY_NS, earth_velocity
 from epipole.tasks.cached_skies import CachedSkies, Catalogue
-from epipole.tasks.run_names import sensor_and_span
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -55,11 +54,7 @@ class Identified(NamedTuple):
     rejects: pa.Table
 
 
-@task(
-    name="identify stars",
-    task_run_name=sensor_and_span("identify", "exposures"),
-    cache_policy=NO_CACHE,  # hashing a table costs more than the task
-)
+@task(name="identify stars", cache_policy=NO_CACHE)
 def identify_stars(
     exposures: pa.Table,
     places: pa.Table,

@@ -16,6 +16,7 @@ from epipole.tasks.algorithms.object_motion import velocities
 from epipole.tasks.algorithms.sky import SPEED_OF_LIGHT_KM_S, tangent_basis
 from epipole.tasks.algorithms.triangulation import triangulate
 from epipole.tasks.lone_detections import published_ids
+from epipole.tasks.spans import Span
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -55,13 +56,17 @@ class _Groups(NamedTuple):
 
 
 @task(name="solve positions", cache_policy=NO_CACHE)
-def solve_positions(views: pa.Table, object_number: Indices, settings: Settings) -> Solved:
+def solve_positions(
+    views: pa.Table, object_number: Indices, settings: Settings, span: Span | None = None
+) -> Solved:
     """Return positions with covariance of objects seen by two sensors or more.
 
     Solved twice: the first positions give the velocities that the difference in light time
-    between near and far sensors needs.
+    between near and far sensors needs. With a span, what is returned is of its epochs only.
     """
     groups = _solve(views, object_number, settings)
+    if span is not None:
+        groups = _within(groups, span)
     pairs = _pair_up(groups)
     return Solved(
         _association_table(groups, pairs),
@@ -91,13 +96,34 @@ def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> _Grou
         )
         velocity = _velocities(epoch_ns[start], number[start], x_km)
     return _Groups(
-        views, offsets, _names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
+        views, offsets, object_names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
         x_km, cov_km2, chi2, used, mean_range,
     )  # fmt: skip
 
 
-def _names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
-    """Return an id for each object: the UTC date of its first epoch, and its number."""
+def _within(groups: _Groups, span: Span) -> _Groups:
+    """Return the groups whose epoch lies in a span."""
+    kept = span.holds(groups.epoch_ns)
+    if kept.all():
+        return groups
+    rows = np.flatnonzero(kept[groups.group])
+    size = np.diff(groups.offsets)[kept]
+    return _Groups(
+        groups.views.take(rows),
+        np.concatenate([[0], np.cumsum(size)]).astype(np.int64),
+        *(values[kept] for values in (groups.object_id, groups.epoch_ns)),
+        *(values[rows] for values in (groups.u, groups.r_km, groups.cov)),
+        *(values[kept] for values in (groups.x_km, groups.cov_km2, groups.chi2)),
+        groups.used[rows],
+        groups.mean_range_km[kept],
+    )
+
+
+def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
+    """Return an id for each object: the UTC date of its first epoch, and its number.
+
+    Rows are in order of time.
+    """
     out = np.empty(len(number), dtype=object)
     first: dict[int, str] = {}
     for i, (t, n) in enumerate(zip(epoch_ns.tolist(), number.tolist(), strict=True)):

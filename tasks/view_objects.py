@@ -15,7 +15,6 @@ from epipole.tasks.algorithms.local_motion import directions_at
 from epipole.tasks.algorithms.rotations import interpolate_quaternions, matrix_from_quaternion
 from epipole.tasks.algorithms.sky import aberrate
 from epipole.tasks.lone_detections import in_lone_frames, with_lone_detections
-from epipole.tasks.run_names import sensor_and_span
 from epipole.tasks.sightings import Frames, Sightings, camera_of, sightings_of, solved_frames
 
 Array = npt.NDArray[np.float64]
@@ -24,11 +23,7 @@ Indices = npt.NDArray[np.int64]
 GM_KM3_S2 = 398600.4418
 
 
-@task(
-    name="view objects",
-    task_run_name=sensor_and_span("view", "solutions"),
-    cache_policy=NO_CACHE,  # hashing a table costs more than the task
-)
+@task(name="view objects", cache_policy=NO_CACHE)
 def view_objects(
     epochs: pa.Table,
     solutions: pa.Table,

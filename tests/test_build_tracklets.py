@@ -32,21 +32,20 @@ GAP = (25, 37)  # frames from and to that show no object
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory):
-    from epipole.flows.sensors import calibrated
+    from whole_logs import read_whole
+
     from epipole.flows.simulate import simulate
     from epipole.io.hipparcos import read_hipparcos
     from epipole.tasks.identify_stars import identify_stars
     from epipole.tasks.place_sensors import place_sensors
-    from epipole.tasks.read_logs import read_logs
 
     folder = tmp_path_factory.mktemp("kinds")
     (folder / "scene.toml").write_text(SCENE)
     simulate(str(folder / "scene.toml"), folder / "k.mcap")
     settings = validate_settings({}, "test")
-    log = read_logs.fn([str(folder / "k.mcap")], settings)
-    exposures, _ = calibrated(log.exposures, log.cameras)
-    places = place_sensors.fn(exposures, log.states, settings)
-    found = identify_stars.fn(exposures, places, log.cameras, read_hipparcos(), settings)
+    log = read_whole([str(folder / "k.mcap")], settings)
+    places = place_sensors.fn(log.exposures, log.states, settings)
+    found = identify_stars.fn(log.exposures, places, log.cameras, read_hipparcos(), settings)
     truth = pl.read_parquet(folder / "k.mcap.truth" / "points.parquet")
     return found, log.cameras, truth
 

@@ -47,7 +47,7 @@ def cameras(*sensor_ids, **changes):
 
 def test_only_the_sensor_that_departs_gets_new_optics():
     stars = concat(STARS, [stars_of("a", TRUE), stars_of("b", SENT)])
-    found = calibrate_sensors.fn(stars, cameras("a", "b"))
+    found = calibrate_sensors(stars, cameras("a", "b"))
     assert found.departed == ["a"]
     assert found.calibrations["sensor_id"].to_pylist() == ["a", "b"]
     fx = array(found.cameras, "fx_px")
@@ -58,13 +58,13 @@ def test_only_the_sensor_that_departs_gets_new_optics():
 
 
 def test_few_stars_give_no_row_and_leave_the_camera():
-    found = calibrate_sensors.fn(stars_of("a", TRUE, n_frames=2), cameras("a", "b"))
+    found = calibrate_sensors(stars_of("a", TRUE, n_frames=2), cameras("a", "b"))
     assert found.calibrations.num_rows == 0
     assert found.cameras.equals(cameras("a", "b"))
 
 
 def test_a_sensor_with_two_calibrations_is_left_alone():
     both = concat(CAMERAS, [cameras("a"), cameras("a", fx_px=3700.0)])
-    found = calibrate_sensors.fn(stars_of("a", TRUE), both)
+    found = calibrate_sensors(stars_of("a", TRUE), both)
     assert found.calibrations.num_rows == 0
     assert found.cameras.equals(both)

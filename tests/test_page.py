@@ -4,7 +4,6 @@ import json
 
 import httpx
 import numpy as np
-import pyarrow as pa
 import pytest
 from prefect.client.orchestration import get_client
 from prefect.logging.handlers import APILogHandler
@@ -15,8 +14,7 @@ from epipole.flows.nightly import nightly
 from epipole.flows.page import shown_on_page
 from epipole.flows.progress import ROOT, STEPS, step
 from epipole.flows.summary import Summary
-from epipole.schemas.columns import TIME
-from epipole.tasks.run_names import sensor_and_span
+from epipole.tasks.spans import SPAN_NS, Span
 
 FOUND = {
     "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
@@ -25,27 +23,9 @@ FOUND = {
 }  # fmt: skip
 
 
-def spanning(start: str, end: str) -> pa.Table:
-    """Return a table of one sensor with these first and last times."""
-    times = pa.array(np.array([start, end], "datetime64[ns]")).cast(TIME)
-    return pa.table({"sensor_id": ["sat3", "sat3"], "time": times})
-
-
-@pytest.mark.parametrize(
-    ("start", "end", "name"),
-    [
-        ("2019-04-01T04:00:00", "2019-04-01T04:09:59.8", "identify sat3 04:00-04:10"),
-        ("2019-04-01T04:00:59.9", "2019-04-01T04:01:00", "identify sat3 04:00-04:02"),
-        ("2019-04-01T23:50:00", "2019-04-01T23:59:59", "identify sat3 23:50-00:00"),
-    ],
-)
-def test_a_task_run_is_named_by_sensor_and_whole_minutes(start, end, name):
-    assert sensor_and_span("identify", "rows")({"rows": spanning(start, end)}) == name
-
-
-def test_a_task_without_rows_has_a_name_too():
-    rows = spanning("2019-04-01", "2019-04-01").slice(0, 0)
-    assert sensor_and_span("identify", "rows")({"rows": rows}) == "identify"
+def test_a_span_is_named_by_its_times():
+    start_ns = int(np.datetime64("2019-04-01T23:30", "ns").astype(np.int64))
+    assert str(Span(start_ns, start_ns + SPAN_NS)) == "23:30-00:00"
 
 
 def test_the_page_of_a_night_has_its_counts_and_what_was_left_out_by_reason():
@@ -63,7 +43,7 @@ def test_progress_only_grows_though_a_stage_is_done_again(monkeypatch):
     monkeypatch.setattr(artifacts, "UPDATED_EVERY_S", 0.0)
     bar = ProgressBar()
     STEPS.addHandler(bar)
-    stages = ("read logs", "identify stars", "calibrate sensors", "identify stars", "fit states")
+    stages = ("read logs", "identify stars", "calibrate sensors", "identify stars", "solve objects")
     try:
         for stage in (*stages, "publish"):
             for done in range(4):

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from whole_logs import read_whole
 
 from epipole.io.log_writer import LogWriter
 from epipole.schemas.bridge import array, stack
 from epipole.schemas.settings import Settings
 from epipole.tasks.place_sensors import place_sensors
-from epipole.tasks.read_logs import read_logs
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -31,7 +31,7 @@ def write(path, sensors, n=5, **state):
 
 
 def place(path, settings=None):
-    log = read_logs.fn([path], Settings())
+    log = read_whole([path], Settings())
     return log, place_sensors.fn(log.exposures, log.states, settings or Settings())
 
 

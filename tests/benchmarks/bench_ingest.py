@@ -142,12 +142,11 @@ def peak_mib(path: Path) -> list[float]:
 
 def print_peak(path: str) -> None:
     """Print what `peak_mib` returns, of a process that does nothing else."""
-    from epipole.schemas.settings import Settings
-    from epipole.tasks.read_logs import read_logs
+    from epipole.io.log_reader import read_log
 
     logging.disable()
     before = resident_mib()
-    log = read_logs.fn([path], Settings())
+    log = read_log(path)
     print(before, resident_mib(), (log.exposures.nbytes + log.states.nbytes) / 2**20)
 
 

@@ -1,6 +1,7 @@
 """The stages of a night as plain functions, one after the other, without Prefect."""
 
 import json
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,7 +11,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.flows.sensors import calibrated, of_sensor, sensor_ids, spans
+from epipole.flows.sensors import of_sensor, sensor_ids
 from epipole.io.star_catalogue import read_star_catalogue
 from epipole.schemas.bridge import concat
 from epipole.schemas.settings import Settings
@@ -23,12 +24,13 @@ from epipole.tasks.build_tracklets import Tracked, build_tracklets
 from epipole.tasks.identify_stars import identify_stars
 from epipole.tasks.lone_detections import with_lone_tracklets
 from epipole.tasks.place_sensors import place_sensors
-from epipole.tasks.read_logs import read_logs
 from epipole.tasks.solve_positions import Solved, solve_positions
 from epipole.tasks.view_objects import view_objects
 
 Array = npt.NDArray[np.float64]
-SPAN_NS = 600_000_000_000
+sys.path.append(str(Path(__file__).parents[1]))  # helpers beside the tests
+
+from whole_logs import read_whole  # noqa: E402
 
 
 class Seen(NamedTuple):
@@ -41,15 +43,18 @@ class Seen(NamedTuple):
 
 def see(log: Path, settings: Settings) -> Seen:
     """Read a log and identify its stars."""
-    read = read_logs.fn([str(log)], settings)
-    exposures, _ = calibrated(read.exposures, read.cameras)
-    places = place_sensors.fn(exposures, read.states, settings)
+    read = read_whole([log], settings)
+    places = place_sensors.fn(read.exposures, read.states, settings)
     catalogue = read_star_catalogue(settings.identification.catalogue)
     parts = [
         identify_stars.fn(
-            exposures.take(rows), places.take(rows), read.cameras, catalogue, settings
+            of_sensor(read.exposures, name),
+            of_sensor(places, name),
+            read.cameras,
+            catalogue,
+            settings,
         )
-        for rows in spans(exposures, SPAN_NS)
+        for name in sensor_ids(read.exposures)
     ]
     return Seen(
         concat(SOLUTIONS, [part.solutions for part in parts]),

@@ -1,0 +1,44 @@
+"""The Parquet files of a night in the making: one a table, written span by span."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from epipole.schemas.bridge import conform
+from epipole.schemas.tables import TABLES
+
+PART = "part-0.parquet"
+
+
+def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
+    """Write a table of a night from pieces that follow one another in time.
+
+    Parameters
+    ----------
+    night
+        The night's folder; the table's folder in it is made.
+    pieces
+        Each sorted; at least a row group each, so that a reader can pass over other times.
+
+    Returns
+    -------
+    int
+        How many rows there are.
+    """
+    schema = TABLES[name]
+    folder = night / name
+    folder.mkdir(parents=True)
+    count = 0
+    with pq.ParquetWriter(folder / PART, schema, compression="zstd") as writer:
+        for rows in pieces:
+            if rows.num_rows:
+                writer.write_table(conform(schema, rows))
+                count += rows.num_rows
+    return count
+
+
+def read_columns(night: Path, name: str, columns: Sequence[str]) -> pa.Table:
+    """Return some columns of a table that `write_table` wrote."""
+    return pq.read_table(night / name / PART, columns=list(columns), partitioning=None)

@@ -1,0 +1,162 @@
+"""Solve a span: from all sensors' tracklets to objects, positions and states, file to file.
+
+Epochs, views, association, positions and states of a span of time. A margin at both ends is
+worked on too, so that the span's first and last epochs are solved like all others; the
+margin's rows are the neighbours'.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+
+from epipole.io.work_files import is_written, read_part, write_part
+from epipole.schemas.bridge import array, concat, table
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import TRACKLETS
+from epipole.schemas.work_tables import OBJECT_TRACKS, SOLUTIONS, VIEWS
+from epipole.tasks.align_epochs import EpochGrid, align_epochs
+from epipole.tasks.associate_objects import Associated, associate_objects
+from epipole.tasks.estimate_clocks import Clock, estimate_clocks
+from epipole.tasks.fit_states import fit_states
+from epipole.tasks.lone_detections import with_lone_tracklets
+from epipole.tasks.name_tracklets import detections_within
+from epipole.tasks.solve_positions import Solved, object_names, solve_positions
+from epipole.tasks.spans import Span, rows_within
+from epipole.tasks.view_objects import view_objects
+
+FEWEST_EPOCHS = 6  # of margin, at any rate
+
+
+class SensorParts(NamedTuple):
+    """Where one sensor's parts of a night lie."""
+
+    identified: Path
+    tracked: Path
+    named: Path
+
+
+@task(name="solve", task_run_name="solve {span}", cache_policy=NO_CACHE)
+def solve_span(
+    sensors: Sequence[SensorParts],
+    span: Span,
+    grid: EpochGrid,
+    cameras: pa.Table,
+    settings: Settings,
+    stage: Path,
+) -> list[Clock]:
+    """Find the objects of a span and solve them, unless that has been done.
+
+    Parameters
+    ----------
+    sensors
+        In the order of their ids.
+    stage
+        Where the part goes: the tables that are published, with objects as they are called in
+        the span, `object_tracks` and `rejects`.
+
+    Returns
+    -------
+    list[Clock]
+        What the span tells of the sensors' clocks.
+    """
+    part = stage / span.folder
+    if not is_written(part):
+        write_part(part, _solve(sensors, span, grid, cameras, settings))
+    return [Clock(**row) for row in read_part(part, "clocks").to_pylist()]
+
+
+def _solve(
+    sensors: Sequence[SensorParts],
+    span: Span,
+    grid: EpochGrid,
+    cameras: pa.Table,
+    settings: Settings,
+) -> dict[str, pa.Table]:
+    margin_ns = _margin_ns(grid, settings)
+    about = span.widened(margin_ns)
+    # Motion at an epoch is fitted to what was seen around it.
+    wide = about.widened(round(2e9 * settings.alignment.window_s) + margin_ns)
+    solutions = [rows_within(s.identified, wide, SOLUTIONS, "solutions") for s in sensors]
+    epochs = about.of(align_epochs.fn(concat(SOLUTIONS, solutions), settings, grid), "epoch")
+    views = concat(
+        VIEWS,
+        [
+            view_objects.fn(
+                epochs.filter(pc.field("sensor_id") == frames["sensor_id"][0]),
+                frames,
+                detections_within(sensor.tracked, sensor.named, wide),
+                cameras,
+                settings,
+            )
+            for sensor, frames in zip(sensors, solutions, strict=True)
+            if frames.num_rows
+        ],
+    )
+    tracklets = concat(TRACKLETS, [read_part(s.named / "night", "tracklets") for s in sensors])
+    tracklets = tracklets.filter(pc.is_in(tracklets["tracklet_id"], views["tracklet_id"]))
+    tracklets = with_lone_tracklets(tracklets, views)
+    frames = concat(SOLUTIONS, solutions)
+    associated = associate_objects.fn(views, tracklets, frames, cameras, settings)
+    solved = solve_positions.fn(associated.views, associated.object_number, settings, span)
+    return {
+        "epochs": span.of(epochs, "epoch"),
+        "associations": solved.associations,
+        "positions": solved.positions,
+        "pairs": solved.pairs,
+        "states": fit_states.fn(associated.views, solved.associations, solved.positions, settings),
+        "rejects": pa.concat_tables([span.of(associated.rejects, "time"), solved.rejects]),
+        "object_tracks": _object_tracks(associated, tracklets, solved),
+        "clocks": _clocks(associated, solved, frames, settings),
+    }
+
+
+def _margin_ns(grid: EpochGrid, settings: Settings) -> int:
+    """Return a margin that holds whole spans of evidence and what velocities are taken from."""
+    evidence_ns = round(2e9 * settings.association.span_s)
+    return max(evidence_ns, FEWEST_EPOCHS * grid.interval_ns)
+
+
+def _object_tracks(associated: Associated, tracklets: pa.Table, solved: Solved) -> pa.Table:
+    """Return the tracks of each object of the span, in the order they were last seen."""
+    tracks = dict(
+        zip(tracklets["tracklet_id"].to_pylist(), tracklets["track_id"].to_pylist(), strict=True)
+    )
+    rows = (
+        pl.DataFrame(
+            {
+                "span_name": object_names(
+                    array(associated.views, "epoch"), associated.object_number
+                ),
+                "epoch": array(associated.views, "epoch"),
+                "tracklet_id": associated.views["tracklet_id"].to_numpy(),
+            },
+            schema={"span_name": pl.String, "epoch": pl.Int64, "tracklet_id": pl.String},
+        )
+        .with_columns(track_id=pl.col("tracklet_id").replace_strict(tracks, return_dtype=pl.String))
+        .filter(pl.col("span_name").is_in(solved.associations["object_id"].unique().to_pylist()))
+        .group_by("span_name", "track_id")
+        .agg(pl.col("epoch").max())
+        .sort("epoch", "span_name", "track_id")
+    )
+    return table(OBJECT_TRACKS, {n: rows[n].to_arrow() for n in OBJECT_TRACKS.names})
+
+
+def _clocks(
+    associated: Associated, solved: Solved, frames: pa.Table, settings: Settings
+) -> pa.Table:
+    clocks = estimate_clocks.fn(
+        associated.views, solved.associations, solved.positions, frames, settings
+    )
+    return pa.table(
+        {
+            "sensor_id": pa.array([c.sensor_id for c in clocks], pa.string()),
+            "offset_s": pa.array([c.offset_s for c in clocks], pa.float64()),
+            "sigma_s": pa.array([c.sigma_s for c in clocks], pa.float64()),
+        }
+    )
