@@ -60,8 +60,9 @@ def _identify(work: Work, settings: Settings, stage: str) -> Work:
         identify_span.submit(work.frames, sensor, span, work.cameras, settings, where[sensor])
         for sensor, span in work.by_span()
     ]
-    by_stars = sum(results("identify stars", futures))
-    LOGGER.info("identified %s by their stars", many(by_stars, "frame"))
+    frames, by_stars, stars = map(sum, zip(*results("identify stars", futures), strict=True))
+    LOGGER.info("identified %s of %s by %s", f"{by_stars:,}", many(frames, "frame"),
+                many(stars, "star"))  # fmt: skip
     return work._replace(identified={**work.identified, **where})
 
 

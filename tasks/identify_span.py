@@ -2,6 +2,7 @@
 
 import logging
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -23,10 +24,18 @@ LOGGER = logging.getLogger(__name__)
 BRIDGED_NS = 300_000_000_000  # states this far beyond a span help to place its frames
 
 
+class Counts(NamedTuple):
+    """What a part holds: frames, those with an attitude from stars, identified stars."""
+
+    frames: int
+    by_stars: int
+    stars: int
+
+
 @task(name="identify", task_run_name="identify {sensor} {span}", cache_policy=NO_CACHE)
 def identify_span(
     frames: Path, sensor: Sensor, span: Span, cameras: pa.Table, settings: Settings, stage: Path
-) -> int:
+) -> Counts:
     """Place one sensor's frames of a span and identify them, unless that has been done.
 
     Parameters
@@ -35,11 +44,6 @@ def identify_span(
         Where `order_logs` left the frames.
     stage
         Where the part goes: `solutions`, `stars`, `detections` and `rejects`.
-
-    Returns
-    -------
-    int
-        How many frames have an attitude from stars.
     """
     part = stage / span.folder
     if not is_written(part):
@@ -51,7 +55,8 @@ def identify_span(
         rejects = concat(REJECTS, [found.rejects, _unplaced(places)])
         write_part(part, {**found._asdict(), "rejects": rejects})
     source = read_part(part, "solutions", ["attitude_source"])["attitude_source"]
-    return pc.sum(pc.equal(source, "stars")).as_py() or 0
+    by_stars = pc.sum(pc.equal(source, "stars")).as_py() or 0
+    return Counts(len(source), by_stars, read_part(part, "stars").num_rows)
 
 
 def states_about(frames: Path, sensor: Sensor, span: Span, settings: Settings) -> pa.Table:
