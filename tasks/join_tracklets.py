@@ -72,7 +72,7 @@ def _join(
         start = seen.filter(pl.col("time_ns") < span.start_ns + margin_ns)
         known = _shared(before, start)
         numbers = _numbered(seen, known, count)
-        count = max(count, int(numbers["number"].max() or 0) + 1) if len(numbers) else count
+        count = max([count, *(numbers["number"] + 1).to_list()])
         seen = seen.join(numbers, on="span_name")
         named.append(_links(part, numbers).with_columns(span=pl.lit(k, pl.Int64)))
         owned.append(_summed(seen.filter("owned"), part).with_columns(span=pl.lit(k, pl.Int64)))

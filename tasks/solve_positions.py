@@ -109,13 +109,18 @@ def _within(groups: _Groups, span: Span) -> _Groups:
     rows = np.flatnonzero(kept[groups.group])
     size = np.diff(groups.offsets)[kept]
     return _Groups(
-        groups.views.take(rows),
-        np.concatenate([[0], np.cumsum(size)]).astype(np.int64),
-        *(values[kept] for values in (groups.object_id, groups.epoch_ns)),
-        *(values[rows] for values in (groups.u, groups.r_km, groups.cov)),
-        *(values[kept] for values in (groups.x_km, groups.cov_km2, groups.chi2)),
-        groups.used[rows],
-        groups.mean_range_km[kept],
+        views=groups.views.take(rows),
+        offsets=np.concatenate([[0], np.cumsum(size)]).astype(np.int64),
+        object_id=groups.object_id[kept],
+        epoch_ns=groups.epoch_ns[kept],
+        u=groups.u[rows],
+        r_km=groups.r_km[rows],
+        cov=groups.cov[rows],
+        x_km=groups.x_km[kept],
+        cov_km2=groups.cov_km2[kept],
+        chi2=groups.chi2[kept],
+        used=groups.used[rows],
+        mean_range_km=groups.mean_range_km[kept],
     )
 
 
