@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from prefect import flow
 
-from epipole.flows.clocks import read_clocks
+from epipole.flows.clocks import find_objects
 from epipole.flows.log_choice import find_logs
 from epipole.flows.page import shown_on_page
 from epipole.flows.parameters import Night, night_asked, run_name
@@ -15,10 +15,7 @@ from epipole.flows.stages import (
     identify,
     name,
     read,
-    set_clocks_right,
-    solve,
     stage,
-    track,
 )
 from epipole.flows.summary import Summary, summarise
 from epipole.flows.work import frames_wanted
@@ -76,14 +73,7 @@ def nightly(
         ):
             work = identify(frames, spans, folder, settings)
             work, calibrations = calibrate(work, settings)
-            for attempt in ("", "-on-time"):
-                parts = track(work, settings, attempt)
-                solved, clocks = solve(work, parts, settings, attempt)
-                clocks = read_clocks(clocks)
-                off = any(clock.is_off for clock in clocks)
-                if attempt or not off or not settings.alignment.correct_clocks:
-                    break
-                work = set_clocks_right(work, clocks, settings)
+            work, parts, solved, clocks = find_objects(work, settings)
             names = name(work, solved, settings)
             rejects = concat(REJECTS, [found.rejects, frames.rejects, uncalibrated])
             whole = {

@@ -137,17 +137,22 @@ def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
 
 
 def solve(
-    work: Work, parts: Sequence[SensorParts], settings: Settings, attempt: str
-) -> tuple[Path, list[Clock]]:
-    """Find and solve objects, a task a span of all sensors."""
+    work: Work,
+    parts: Sequence[SensorParts],
+    settings: Settings,
+    attempt: str,
+    left_out: Sequence[str] = (),
+) -> Path:
+    """Find and solve objects, a task a span of all sensors but those left out."""
     grid = epoch_grid(work, settings)
     where = work.folder / f"solved{attempt}"
     futures = [
-        solve_span.submit(parts, span, grid, work.cameras, settings, where)
+        solve_span.submit(parts, span, grid, work.cameras, left_out, settings, where)
         for span in work.all_spans()
     ]
-    clocks = [clock for part in results("solve objects", futures) for clock in part]
-    return where, clocks
+    count = sum(results("solve objects", futures))
+    LOGGER.info("solved %s", many(count, "position"))
+    return where
 
 
 def name(work: Work, solved: Path, settings: Settings) -> Names:
@@ -164,16 +169,16 @@ def name(work: Work, solved: Path, settings: Settings) -> Names:
         concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
     )
     objects = {new_id.get(one, one) for own in names.values() for one in own.values()}
-    LOGGER.info("solved %s, knew %d again", many(len(objects), "object"), len(new_id))
+    LOGGER.info("named %s, knew %s again", many(len(objects), "object"), len(new_id))
     return {
         span: {old: new_id.get(one, one) for old, one in own.items()} for span, own in names.items()
     }
 
 
-def set_clocks_right(work: Work, clocks: Sequence[Clock], settings: Settings) -> Work:
+def set_clocks_right(work: Work, clocks: Sequence[Clock], settings: Settings, attempt: str) -> Work:
     """Put the frames of clocks that are off at their true times."""
     off = {clock.sensor_id: clock for clock in clocks if clock.is_off}
-    where = {s: work.parts("identified-on-time", s) for s in work.spans if s.sensor_id in off}
+    where = {s: work.parts(f"identified{attempt}", s) for s in work.spans if s.sensor_id in off}
     futures = [
         correct_clock.submit(
             work.frames, sensor, work.identified[sensor], span, off[sensor.sensor_id], settings,

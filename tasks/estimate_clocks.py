@@ -1,5 +1,7 @@
 """Estimate clocks: each sensor's clock offset over the night, and frames put right by it."""
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,13 +12,15 @@ import pyarrow.compute as pc
 from prefect import task
 from prefect.cache_policies import NO_CACHE
 
-from epipole.schemas.bridge import array, empty, table
+from epipole.io.work_files import read_part
+from epipole.schemas.bridge import array, table
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.clock_offset import Lines, clock_offsets
 from epipole.tasks.algorithms.clock_search import Meetings, search_offset
 from epipole.tasks.algorithms.object_motion import velocities
+from epipole.tasks.spans import Span
 
 Array = npt.NDArray[np.float64]
 
@@ -50,22 +54,30 @@ class Clock(NamedTuple):
 
 
 @task(name="estimate clocks", cache_policy=NO_CACHE)
-def estimate_clocks(
-    views: pa.Table,
-    associations: pa.Table,
-    positions: pa.Table,
-    solutions: pa.Table,
-    settings: Settings,
-) -> list[Clock]:
-    """Return the clocks that the lines of sight tell something of, by sensor.
+def estimate_clocks(solved: Path, spans: Sequence[Span]) -> list[Clock]:
+    """Return the clocks that a night's lines of sight tell something of, by sensor.
 
-    `views` are all views, not only those of objects: a sensor whose clock is seconds off sees
-    none of the objects where they are, and is held against those that the others found.
-
-    Epochs that share detections would count twice: one in each width of the local motion is
-    used, `MOST_EPOCHS` at most.
+    Parameters
+    ----------
+    solved
+        Parts by `solve_span`, of these spans.
     """
-    rows = _objects_views(views, associations, positions, solutions, settings)
+    parts = []
+    for span in spans:
+        rows = _frame(read_part(solved / span.folder, "clock_views"))
+        # Objects are numbered in each span anew.
+        own = pl.format("{}/{}", pl.lit(span.folder), "object_id")
+        parts.append(rows.with_columns(object_id=own))
+    if not parts:
+        return []
+    rows = pl.concat(parts)
+    epochs = rows["epoch"].unique().sort()
+    kept = epochs[:: max(-(-len(epochs) // MOST_EPOCHS), 1)]
+    return clocks_of(rows.filter(pl.col("epoch").is_in(kept.implode())))
+
+
+def clocks_of(rows: pl.DataFrame) -> list[Clock]:
+    """Return the clocks that views beside objects (`objects_views`) tell something of."""
     claimed = rows.filter(pl.col("claimed"))
     guess, found = {}, [claimed]
     for (name,), own in rows.group_by("sensor_id", maintain_order=True):
@@ -93,14 +105,21 @@ def estimate_clocks(
     ]
 
 
-def _objects_views(
+def objects_views(
     views: pa.Table,
     associations: pa.Table,
     positions: pa.Table,
     solutions: pa.Table,
     settings: Settings,
 ) -> pl.DataFrame:
-    """Return views beside objects: those of each object, and all others beside all of them."""
+    """Return views beside objects: those of each object, and all others beside all of them.
+
+    `views` are all views, not only those of objects: a sensor whose clock is seconds off sees
+    none of the objects where they are, and is held against those that the others found.
+
+    Epochs that share detections would count twice: one in each width of the local motion is
+    used, `MOST_EPOCHS` at most.
+    """
     key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
     whose = _frame(associations).select([*key, "object_id"])
     objects = _with_velocities(_frame(positions))
@@ -219,18 +238,9 @@ def added(before: list[Clock], now: list[Clock]) -> list[Clock]:
     return sorted(out)
 
 
-def of_sound_clocks(
-    views: pa.Table, associations: pa.Table, clocks: list[Clock]
-) -> tuple[pa.Table, pa.Table]:
-    """Return the views without those of clocks that are off, and a row of rejects for each.
-
-    A sensor that is in no association spoils none, and stays.
-    """
-    off = [clock.sensor_id for clock in clocks if clock.is_off]
-    wrong = pc.is_in(views["sensor_id"], pa.array(off, pa.string()))
-    taking_part = pc.is_in(associations["sensor_id"], pa.array(off, pa.string()))
-    if not pc.any(taking_part).as_py():
-        return views, empty(REJECTS)
+def without_sensors(views: pa.Table, left_out: Sequence[str]) -> tuple[pa.Table, pa.Table]:
+    """Return the views without those of sensors whose clocks are off, and a reject for each."""
+    wrong = pc.is_in(views["sensor_id"], pa.array(list(left_out), pa.string()))
     found = pl.DataFrame(views.filter(wrong)).group_by("sensor_id").agg(
         time=pl.col("epoch").min(), count=pl.len()
     ).sort("sensor_id")  # fmt: skip

@@ -11,6 +11,7 @@ from prefect.cache_policies import NO_CACHE
 from epipole.io.log_reader import read_log_parts
 from epipole.io.work_files import write_part
 from epipole.schemas.log_tables import LogSource
+from epipole.tasks.retries import DELAYS_S, RETRIES, storage_failed
 
 LOGGER = logging.getLogger(__name__)
 
@@ -22,7 +23,13 @@ class ReadLog(NamedTuple):
     source: LogSource
 
 
-@task(name="read log", cache_policy=NO_CACHE)
+@task(
+    name="read log",
+    cache_policy=NO_CACHE,
+    retries=RETRIES,
+    retry_delay_seconds=DELAYS_S,
+    retry_condition_fn=storage_failed,
+)
 def read_log_into(folder: Path, path: str | os.PathLike[str]) -> ReadLog:
     """Read one log into parts of bounded size, and say where they are.
 

@@ -18,11 +18,11 @@ from prefect.cache_policies import NO_CACHE
 from epipole.io.work_files import is_written, read_part, write_part
 from epipole.schemas.bridge import array, concat, table
 from epipole.schemas.settings import Settings
-from epipole.schemas.tables import TRACKLETS
+from epipole.schemas.tables import REJECTS, TRACKLETS
 from epipole.schemas.work_tables import OBJECT_TRACKS, SOLUTIONS, VIEWS
 from epipole.tasks.align_epochs import EpochGrid, align_epochs
 from epipole.tasks.associate_objects import Associated, associate_objects
-from epipole.tasks.estimate_clocks import Clock, estimate_clocks
+from epipole.tasks.estimate_clocks import objects_views, without_sensors
 from epipole.tasks.fit_states import fit_states
 from epipole.tasks.lone_detections import with_lone_tracklets
 from epipole.tasks.name_tracklets import detections_within
@@ -47,28 +47,31 @@ def solve_span(
     span: Span,
     grid: EpochGrid,
     cameras: pa.Table,
+    left_out: Sequence[str],
     settings: Settings,
     stage: Path,
-) -> list[Clock]:
+) -> int:
     """Find the objects of a span and solve them, unless that has been done.
 
     Parameters
     ----------
     sensors
         In the order of their ids.
+    left_out
+        Ids of sensors whose clocks are off: what they see is not where they say.
     stage
         Where the part goes: the tables that are published, with objects as they are called in
-        the span, `object_tracks` and `rejects`.
+        the span, `object_tracks`, `clock_views` and `rejects`.
 
     Returns
     -------
-    list[Clock]
-        What the span tells of the sensors' clocks.
+    int
+        How many positions there are.
     """
     part = stage / span.folder
     if not is_written(part):
-        write_part(part, _solve(sensors, span, grid, cameras, settings))
-    return [Clock(**row) for row in read_part(part, "clocks").to_pylist()]
+        write_part(part, _solve(sensors, span, grid, cameras, left_out, settings))
+    return read_part(part, "positions").num_rows
 
 
 def _solve(
@@ -76,6 +79,7 @@ def _solve(
     span: Span,
     grid: EpochGrid,
     cameras: pa.Table,
+    left_out: Sequence[str],
     settings: Settings,
 ) -> dict[str, pa.Table]:
     margin_ns = _margin_ns(grid, settings)
@@ -98,6 +102,8 @@ def _solve(
             if frames.num_rows
         ],
     )
+    views, of_clocks = without_sensors(views, left_out)
+    of_clocks = span.of(of_clocks, "time")
     tracklets = concat(TRACKLETS, [read_part(s.named / "night", "tracklets") for s in sensors])
     tracklets = tracklets.filter(pc.is_in(tracklets["tracklet_id"], views["tracklet_id"]))
     tracklets = with_lone_tracklets(tracklets, views)
@@ -110,9 +116,13 @@ def _solve(
         "positions": solved.positions,
         "pairs": solved.pairs,
         "states": fit_states.fn(associated.views, solved.associations, solved.positions, settings),
-        "rejects": pa.concat_tables([span.of(associated.rejects, "time"), solved.rejects]),
+        "rejects": concat(
+            REJECTS, [of_clocks, span.of(associated.rejects, "time"), solved.rejects]
+        ),
         "object_tracks": _object_tracks(associated, tracklets, solved),
-        "clocks": _clocks(associated, solved, frames, settings),
+        "clock_views": objects_views(
+            span.of(views, "epoch"), solved.associations, solved.positions, frames, settings
+        ).to_arrow(),
     }
 
 
@@ -145,18 +155,3 @@ def _object_tracks(associated: Associated, tracklets: pa.Table, solved: Solved) 
         .sort("epoch", "span_name", "track_id")
     )
     return table(OBJECT_TRACKS, {n: rows[n].to_arrow() for n in OBJECT_TRACKS.names})
-
-
-def _clocks(
-    associated: Associated, solved: Solved, frames: pa.Table, settings: Settings
-) -> pa.Table:
-    clocks = estimate_clocks.fn(
-        associated.views, solved.associations, solved.positions, frames, settings
-    )
-    return pa.table(
-        {
-            "sensor_id": pa.array([c.sensor_id for c in clocks], pa.string()),
-            "offset_s": pa.array([c.offset_s for c in clocks], pa.float64()),
-            "sigma_s": pa.array([c.sigma_s for c in clocks], pa.float64()),
-        }
-    )

@@ -26,7 +26,7 @@ from epipole.tasks.spans import Span, rows_within
 BY_SENSOR = ("frames", "stars", "detections")
 BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
 # What these stages leave out is counted over the night: a row a span says no more.
-COUNTED = ("identify", "place_sensors", "positions")
+COUNTED = ("identify", "place_sensors", "clocks", "positions")
 
 
 @task(name="stage night", cache_policy=NO_CACHE)

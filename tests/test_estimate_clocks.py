@@ -16,10 +16,11 @@ from epipole.schemas.work_tables import PLACES, SOLUTIONS, VIEWS
 from epipole.tasks.estimate_clocks import (
     Clock,
     added,
-    estimate_clocks,
-    of_sound_clocks,
+    clocks_of,
+    objects_views,
     set_clocks,
     set_places,
+    without_sensors,
 )
 
 FOUR_SENSORS = Path(__file__).parent.parent / "io/scenes/four_sensor_geo.toml"
@@ -70,8 +71,8 @@ def test_what_was_put_right_is_told_with_what_is_left():
 
 def test_nothing_seen_tells_nothing_of_clocks():
     tables = (empty(s) for s in (VIEWS, ASSOCIATIONS, POSITIONS, SOLUTIONS))
-    assert estimate_clocks.fn(*tables, Settings()) == []
-    kept, rejects = of_sound_clocks(empty(VIEWS), empty(ASSOCIATIONS), [LATE])
+    assert clocks_of(objects_views(*tables, Settings())) == []
+    kept, rejects = without_sensors(empty(VIEWS), ["a"])
     assert kept.num_rows == rejects.num_rows == 0
 
 
