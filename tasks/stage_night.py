@@ -16,8 +16,9 @@ from epipole.io.work_files import is_written, read_part
 from epipole.schemas.bridge import array, concat, conform, table
 from epipole.schemas.log_tables import LogSource
 from epipole.schemas.settings import Settings
-from epipole.schemas.tables import REJECTS, SOURCES, TABLES, TRACKLETS
+from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES, TRACKLETS
 from epipole.schemas.work_tables import SOLUTIONS
+from epipole.tasks.lone_detections import with_objects_found
 from epipole.tasks.name_tracklets import detections_within
 from epipole.tasks.solve_span import SensorParts
 from epipole.tasks.spans import Span, rows_within
@@ -26,6 +27,7 @@ from epipole.tasks.spans import Span, rows_within
 BY_SENSOR = ("frames", "stars", "detections")
 BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
 # What these stages leave out is counted over the night: a row a span says no more.
+SERVED_NS = 60_000_000_000
 COUNTED = ("identify", "place_sensors", "clocks", "positions")
 
 
@@ -55,7 +57,7 @@ def stage_night(
         Tables of the whole run: `calibrations`, `sources` and the `rejects` of no span.
     """
     for name in BY_SENSOR:
-        write_table(folder, name, (_of_sensors(name, sensors, span) for span in spans))
+        write_table(folder, name, (_of_sensors(name, sensors, solved, span) for span in spans))
     for name in BY_SPAN:
         write_table(folder, name, _of_spans(name, solved, spans, names))
     tracklets = [read_part(s.named / "night", "tracklets") for s in sensors]
@@ -69,7 +71,7 @@ def stage_night(
         write_table(folder, name, [in_order(rows_of_night(name, rows, night))])
 
 
-def _of_sensors(name: str, sensors: Sequence[SensorParts], span: Span) -> pa.Table:
+def _of_sensors(name: str, sensors: Sequence[SensorParts], solved: Path, span: Span) -> pa.Table:
     """Return a span's rows of all sensors by time, then sensor, then as the sensor has them."""
     schema = TABLES[name]
     if name == "detections":
@@ -82,6 +84,11 @@ def _of_sensors(name: str, sensors: Sequence[SensorParts], span: Span) -> pa.Tab
     else:
         rows = [rows_within(s.identified, span, schema, name) for s in sensors]
     together = concat(schema, rows)
+    if name == "detections":  # an epoch may be served by a frame of the span beside its own
+        near = rows_within(
+            solved, span.widened(SERVED_NS), ASSOCIATIONS, "associations", time="epoch"
+        )
+        together = with_objects_found(together, near)
     return together.take(np.argsort(array(together, "time"), kind="stable"))
 
 
