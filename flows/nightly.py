@@ -19,13 +19,14 @@ from epipole.flows.stages import (
 )
 from epipole.flows.summary import Summary, summarise
 from epipole.flows.work import frames_wanted
-from epipole.io.dataset import check_folder, check_sources, claim_nights, nights_of, publish_folders
+from epipole.io.dataset import check_folder, check_sources, claim_nights, nights_of
 from epipole.io.work_folder import work_folder, work_key, work_root
 from epipole.schemas.bridge import concat
 from epipole.io.star_catalogue import check_star_catalogue
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
+from epipole.tasks.publish_nights import publish_nights
 from epipole.tasks.stage_night import into_nights, source_table
 
 LOGGER = logging.getLogger(__name__)
@@ -84,7 +85,7 @@ def nightly(
             staged = {one: staging / f"night={one}" for one in chosen}
             stage(work, parts, solved, names, whole, staged)
             summary = summarise(out, staged, clocks)
-            publish_folders(out, staged, sources, replace)
+            publish_nights(out, staged, sources, replace)
     LOGGER.info("published %s", ", ".join(f"{out}/night={one}" for one in chosen))
     return summary
 

@@ -233,6 +233,11 @@ def _store(dataset: Where) -> StoreNights | None:
     return store_nights(where) if "://" in where and not where.startswith("file://") else None
 
 
+def dataset_folder(dataset: Where) -> Path | None:
+    """Return the local folder of a dataset; None: it is a URL of an object store."""
+    return _folder(dataset) if _store(dataset) is None else None
+
+
 def _folder(dataset: Where) -> Path:
     return Path(unquote(urlsplit(str(dataset)).path)) if "://" in str(dataset) else Path(dataset)
 

@@ -7,12 +7,15 @@ nights, and the code itself with the libraries that compute. So nothing in it ca
 import contextlib
 import hashlib
 import shutil
+import tempfile
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 
 from epipole.io import hipparcos
+from epipole.io.array_cache import cache_folder
+from epipole.io.dataset import dataset_folder
 from epipole.io.local_nights import STAGING
 from epipole.schemas.settings import Settings
 
@@ -43,8 +46,12 @@ def work_folder(root: Path, nights: Sequence[str], key: str) -> Iterator[Path]:
 
 
 def work_root(dataset: str) -> Path:
-    """Return where work folders of a dataset lie: what publishing leaves alone."""
-    return Path(dataset) / STAGING
+    """Return where work folders of a dataset lie, for a URL in the user's cache folder."""
+    folder = dataset_folder(dataset)
+    if folder is not None:
+        return folder / STAGING
+    root = cache_folder() or Path(tempfile.gettempdir()) / "epipole"
+    return root / "work" / hashlib.sha256(dataset.encode()).hexdigest()[:12]
 
 
 def work_key(logs: Sequence[str], settings: Settings, nights: Sequence[str]) -> str:
