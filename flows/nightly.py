@@ -20,9 +20,9 @@ from epipole.flows.stages import (
 from epipole.flows.summary import Summary, summarise
 from epipole.flows.work import frames_wanted
 from epipole.io.dataset import check_folder, check_sources, claim_nights, nights_of
+from epipole.io.star_catalogue import check_star_catalogue
 from epipole.io.work_folder import work_folder, work_key, work_root
 from epipole.schemas.bridge import concat
-from epipole.io.star_catalogue import check_star_catalogue
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
