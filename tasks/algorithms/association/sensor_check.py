@@ -48,34 +48,47 @@ class Agreement(NamedTuple):
 
 def agreement(samples: Samples, groups: Groups) -> Agreement:
     """Return how far each sensor agrees with the objects that the others found."""
-    n_sensors = len(samples.half_field)
+    n_sensors, n_groups = len(samples.half_field), len(groups.score)
     looked, joined = np.zeros(n_sensors, np.int64), np.zeros(n_sensors, np.int64)
-    for g in range(len(groups.score)):
-        members = np.flatnonzero(groups.group == g)
-        m = int(np.argmax(samples.seen[members].sum(axis=0)))
-        members = members[samples.seen[members, m]]
-        for s in range(n_sensors):
-            others = members[samples.sensor[members] != s]
-            if len(others) < 2:
-                continue
+    member, group, instant = _members_at_best(samples, groups)
+    has = np.zeros((n_groups, n_sensors), np.int64)
+    np.add.at(has, (group, samples.sensor[member]), 1)
+    points = _points(samples, member, group, instant, n_groups)
+    for g in np.flatnonzero(np.isfinite(points[:, 0])).tolist():
+        m = instant[g]
+        for s in np.flatnonzero(has[g].sum() - has[g] >= 2).tolist():
             place, attitude = samples.sensor_km[s, m], samples.R_sensor_from_icrs[s, m]
-            if not sees(place, attitude, samples.half_field[s], _point(samples, others, m)):
-                continue
-            looked[s] += 1
-            joined[s] += len(others) < len(members)
+            if has[g, s] or sees(place, attitude, samples.half_field[s], points[g]):
+                looked[s] += 1
+                joined[s] += has[g, s] > 0
     free = np.bincount(samples.sensor[groups.group == FREE], minlength=n_sensors)
     return Agreement(looked, joined, free)
 
 
-def _point(samples: Samples, members: Indices, m: int) -> Array:
-    """Return where the members' lines of sight meet at an instant; NaN where they do not."""
+def _members_at_best(samples: Samples, groups: Groups) -> tuple[Indices, Indices, Indices]:
+    """Return the members that each group has when it has most, their groups; and when that is."""
+    n_groups = len(groups.score)
+    member = np.flatnonzero(groups.group != FREE)
+    member = member[np.argsort(groups.group[member], kind="stable")]
+    count = np.zeros((n_groups, samples.seen.shape[1]), np.int64)
+    np.add.at(count, groups.group[member], samples.seen[member])
+    instant = np.argmax(count, axis=1)
+    member = member[samples.seen[member, instant[groups.group[member]]]]
+    return member, groups.group[member], instant
+
+
+def _points(
+    samples: Samples, member: Indices, group: Indices, instant: Indices, n_groups: int
+) -> Array:
+    """Return where the groups' lines of sight meet, (g, 3); NaN where they do not."""
+    m = instant[group]
     x, *_ = triangulate(
-        np.array([0, len(members)]),
-        samples.sensor_km[samples.sensor[members], m],
-        samples.u[members, m],
-        samples.cov[members, m],
-        samples.sigma_km[members, m],
-        np.zeros((1, 3)),
+        np.searchsorted(group, np.arange(n_groups + 1)),
+        samples.sensor_km[samples.sensor[member], m],
+        samples.u[member, m],
+        samples.cov[member, m],
+        samples.sigma_km[member, m],
+        np.zeros((n_groups, 3)),
         np.inf,
     )
-    return x[0]
+    return x
