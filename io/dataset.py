@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 from epipole.io import local_nights
 from epipole.io.folder_swap import sync
 from epipole.io.local_nights import STAGING
+from epipole.io.part_options import ROWS_IN_GROUP, part_options
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.io.store_nights import StoreNights, store_nights
 from epipole.schemas.bridge import array, conform, empty
@@ -271,7 +272,8 @@ def _write_night(folder: Path, tables: Mapping[str, pa.Table], night: str) -> No
     for name, schema in TABLES.items():
         rows = rows_of_night(name, conform(schema, tables.get(name, empty(schema))), night)
         (folder / name).mkdir(parents=True)
-        pq.write_table(in_order(rows), folder / name / "part-0.parquet", compression="zstd")
+        part = folder / name / "part-0.parquet"
+        pq.write_table(in_order(rows), part, ROWS_IN_GROUP, **part_options(schema))
 
 
 def nights_of(time_ns: np.ndarray) -> list[str]:
