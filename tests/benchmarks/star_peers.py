@@ -5,6 +5,7 @@ first, and a catalogue of its own kind. Where a tool is not installed it is left
 """
 
 import logging
+import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -69,6 +70,7 @@ def cedar_solve(frames: Frames, cache: Path) -> Solver | None:
         from tetra3 import Tetra3
     except ImportError:
         return None
+    np.math = math  # type: ignore[attr-defined]  # 0.5.1 is written for NumPy 1
     logging.getLogger("tetra3.Tetra3").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="tetra3")
     kind = frames.kind

@@ -21,7 +21,7 @@ from epipole.tasks.algorithms.star_identification.pair_table import TURN
 
 LEAST_BINS_LOG2, MOST_BINS_LOG2 = 4, 8  # of a turn
 # Cells enough that chance puts few votes into one [votes a cell].
-THIN = 0.05
+THIN = 0.1
 
 
 class Pairs(NamedTuple):
