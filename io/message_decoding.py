@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import orjson
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from google.protobuf.message import DecodeError
 
@@ -202,7 +203,10 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def _json_values(data: bytes) -> Mapping[str, Any]:
-    values = json.loads(data)
+    try:
+        values = orjson.loads(data)
+    except orjson.JSONDecodeError:
+        values = json.loads(data)  # knows NaN and Infinity too, which some writers put there
     if not isinstance(values, dict):
         raise ValueError("not an object")
     return values
@@ -251,10 +255,10 @@ def _from_json(carries: str) -> Callable[[bytes], Record]:
     def decode(data: bytes) -> Record:
         values = _json_values(data)
         return _RECORDS[carries](
-            *(
-                convert(values.get(name, values.get(other, default)))
+            *[
+                convert(values[name] if name in values else values.get(other, default))
                 for name, other, convert, default in plan
-            )
+            ]
         )
 
     return decode

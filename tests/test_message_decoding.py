@@ -168,3 +168,11 @@ def test_numbers_keep_every_bit_of_a_double():
         state = decoder(STATE, encoding)(encode(SENSOR_STATE, values))
         assert state.position_km.tolist() == [exact] * 3
         assert (state.position_sigma_km, state.attitude_sigma_arcsec) == (0.1, 0.3)
+
+
+@pytest.mark.parametrize("text", ["NaN", "Infinity", "-Infinity"])
+def test_numbers_that_are_none_in_json_are_read_where_writers_put_them(text):
+    data = b'{"timestamp": {"sec": 5, "nsec": 6}, "sensor_id": "a", "x_px": [1.5, %s]}'
+    read = decoder(FRAME, "json")(data % text.encode())
+    assert read.time_ns == 5_000_000_006
+    np.testing.assert_array_equal(read.x_px, [1.5, float(text)])
