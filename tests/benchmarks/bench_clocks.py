@@ -1,0 +1,48 @@
+"""Clocks: offsets told from a minute of data, over their sigmas, and what is made of them."""
+
+from typing import Any
+
+import numpy as np
+from four_sensors import runs
+
+from epipole.flows import nightly as flow
+
+OFFSETS_S = (0.0, 0.005, -0.02, 0.05, -0.1, 0.2, -0.3, 0.5, -0.7, 1.0, -1.3, 2.0)
+
+
+def main() -> None:
+    """Print a row an offset, then the scatter of all estimates over their sigmas."""
+    told: list[Any] = []
+    read = flow.read_clocks
+
+    def noted(*args: Any) -> Any:
+        told.append(read(*args))
+        return told[-1]
+
+    flow.read_clocks = noted
+    scores, wrong = [], 0
+    print("| true s | told s | sigma s | called off | others called off | left out |")
+    with runs() as run:
+        for k, offset_s in enumerate(OFFSETS_S):
+
+            def late(scene: dict[str, Any], k: int = k, offset_s: float = offset_s) -> None:
+                scene["seed"] = 300 + k
+                scene["sensors"][k % 4]["clock_offset_s"] = offset_s
+
+            told.clear()
+            summary, *_ = run(late)
+            name = f"sat{k % 4 + 1}"
+            for clock in told[0]:
+                true = offset_s if clock.sensor_id == name else 0.0
+                scores.append((clock.offset_s - true) / clock.sigma_s)
+                if clock.sensor_id == name:
+                    own = clock
+                else:
+                    wrong += clock.is_off
+            print(f"| {offset_s} | {own.offset_s:.3f} | {own.sigma_s:.3f} | {own.is_off} | "
+                  f"{wrong} | {summary.rejects} |", flush=True)  # fmt: skip
+    print(f"rms over sigma {np.sqrt(np.mean(np.square(scores))):.2f} of {len(scores)}")
+
+
+if __name__ == "__main__":
+    main()
