@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from four_sensors import runs
 
-from epipole.flows import nightly as flow
+from epipole.flows import clocks as flow
 
 OFFSETS_S = (0.0, 0.005, -0.02, 0.05, -0.1, 0.2, -0.3, 0.5, -0.7, 1.0, -1.3, 2.0)
 
@@ -13,13 +13,13 @@ OFFSETS_S = (0.0, 0.005, -0.02, 0.05, -0.1, 0.2, -0.3, 0.5, -0.7, 1.0, -1.3, 2.0
 def main() -> None:
     """Print a row an offset, then the scatter of all estimates over their sigmas."""
     told: list[Any] = []
-    read = flow.read_clocks
+    read = flow.estimate_clocks
 
     def noted(*args: Any) -> Any:
         told.append(read(*args))
         return told[-1]
 
-    flow.read_clocks = noted
+    flow.estimate_clocks = noted
     scores, wrong = [], 0
     print("| true s | told s | sigma s | called off | others called off | left out |")
     with runs() as run:
