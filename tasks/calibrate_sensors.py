@@ -104,7 +104,8 @@ def _fit(stars: pa.Table, row: dict[str, Any]) -> OpticsFit | None:
     step = max(1, -(-len(frame) // MAX_STARS))
     kept = np.isfinite(dx) & np.isfinite(dy) & (number % step == 0)
     x, y, dx, dy = x[kept], y[kept], dx[kept], dy[kept]
-    return calibrate_optics(camera, x, y, unproject(camera, x - dx, y - dy), number[kept])
+    star = array(stars, "star_id")[kept]
+    return calibrate_optics(camera, x, y, unproject(camera, x - dx, y - dy), number[kept], star)
 
 
 def _row(sensor_id: str, fit: OpticsFit) -> pa.Table:

@@ -30,8 +30,8 @@ class OpticsFit(NamedTuple):
     """Optics with their covariance (9, 9), in the order of OPTICS.
 
     residual_px : robust rms of the image residuals, an axis
-    gain : fall of chi-square against the optics as they came, attitudes free in both;
-        about 9 by chance
+    gain : fall of chi-square against the optics as they came, attitudes free in both, and at
+        most their distance in units of `cov`, squared; about 9 by chance
     """
 
     camera: Camera
@@ -44,13 +44,19 @@ class OpticsFit(NamedTuple):
 class _Fit(NamedTuple):
     camera: Camera
     u: Array  # stars in the sensor frame, turned as fitted
-    cov: Array
+    cov: Array  # of the optics, in units of their scale
     residual: Array
     sigma_px: float
+    score: Array  # (n, 9): how each star image pulls at the optics, in units of their scale
 
 
 def calibrate_optics(
-    camera: Camera, x_px: Array, y_px: Array, u_sensor: Array, frame: npt.NDArray[np.int64]
+    camera: Camera,
+    x_px: Array,
+    y_px: Array,
+    u_sensor: Array,
+    frame: npt.NDArray[np.int64],
+    star: npt.NDArray[np.int64],
 ) -> OpticsFit | None:
     """Return the optics that fit identified stars best, None where these are too few.
 
@@ -65,11 +71,15 @@ def calibrate_optics(
         may rest on wrong optics: a turn of each frame is fitted as well.
     frame : (n,) int
         Which stars are in one frame: equal numbers, side by side.
+    star : (n,) int
+        Which star each is. What is off in the catalogue, or in a close pair seen as one, is
+        the same in every frame: the covariance holds that, however many frames there are.
 
     References
     ----------
     Triggs et al. (2000), Bundle adjustment: a modern synthesis, section 6.1 (Schur
-    complement); Huber's weights, scaled by the median absolute residual.
+    complement); Huber's weights, scaled by the median absolute residual. Cameron and Miller
+    (2015), A practitioner's guide to cluster-robust inference: errors shared by a star's images.
     """
     change = np.flatnonzero(np.diff(frame)) + 1
     starts = np.concatenate([[0], change])
@@ -79,7 +89,22 @@ def calibrate_optics(
     fixed = _fit(camera, xy, u_sensor, starts, False)
     free = _fit(camera, xy, fixed.u, starts, True)
     cost = [_huber_cost(f.residual / free.sigma_px) for f in (fixed, free)]
-    return OpticsFit(free.camera, free.cov, len(frame), free.sigma_px, cost[0] - cost[1])
+    cov = _with_shared_errors(free, star) * np.outer(*[_prior_sigma(camera)] * 2)
+    off = _values(free.camera) - _values(camera)
+    distance = float(off @ np.linalg.solve(cov, off))
+    return OpticsFit(free.camera, cov, len(frame), free.sigma_px, min(cost[0] - cost[1], distance))
+
+
+def _with_shared_errors(fit: _Fit, star: npt.NDArray[np.int64]) -> Array:
+    """Return the covariance, in units of the prior's scale, with what a star's images share."""
+    _, of_star = np.unique(star, return_inverse=True)
+    n = of_star.max() + 1
+    pull = np.zeros((n, 9))
+    np.add.at(pull, of_star, fit.score)
+    few = n / max(n - 9, 1)  # the fit took away as much as it has numbers
+    shared = fit.cov @ (few * pull.T @ pull - fit.score.T @ fit.score) @ fit.cov
+    value, vector = np.linalg.eigh(shared)
+    return fit.cov + (vector * np.maximum(value, 0.0)) @ vector.T
 
 
 def _fit(camera: Camera, xy: Array, u: Array, starts: Indices, optics: bool) -> _Fit:
@@ -96,7 +121,7 @@ def _fit(camera: Camera, xy: Array, u: Array, starts: Indices, optics: bool) -> 
         A = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_turn), starts)
         A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # all on a spot
         b = np.add.reduceat(np.einsum("nai,na->ni", J_turn, weight * r), starts)
-        step, cov = np.zeros(9), np.zeros((9, 9))
+        step, cov, score = np.zeros(9), np.zeros((9, 9)), np.zeros((len(xy), 9))
         turn = np.linalg.solve(A, b[..., None])[..., 0]
         if optics:
             B = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_optics), starts)
@@ -107,13 +132,15 @@ def _fit(camera: Camera, xy: Array, u: Array, starts: Indices, optics: bool) -> 
             cov = np.linalg.inv(C)
             step = cov @ (c - np.einsum("fki,fk->i", B, turn))
             turn = turn - lever @ step
+            own = J_optics - J_turn @ lever[of_frame]
+            score = np.einsum("nai,na->ni", own, weight * r)
             camera = _moved(camera, step * scale)
         u = u + np.cross(turn[of_frame], u)
         u = u / np.linalg.norm(u, axis=1, keepdims=True)
         if np.abs(turn).max() < 1e-3 * sigma * camera.pixel_rad and np.abs(step).max() < 1e-6:
             break
     r, _, _ = _linearise(camera, xy, u)
-    return _Fit(camera, u, cov * np.outer(scale, scale), r, _robust_sigma(r, used))
+    return _Fit(camera, u, cov, r, _robust_sigma(r, used), score)
 
 
 def _values(camera: Camera) -> Array:
