@@ -15,14 +15,14 @@ from epipole.io.log_reader import read_log_times
 from epipole.schemas.bridge import table
 from epipole.schemas.errors import LogError
 from epipole.schemas.tables import REJECTS
+from epipole.tasks.spans import SPAN_NS
 
 LOGGER = logging.getLogger(__name__)
 
 DAY_NS = 86_400_000_000_000
-# Frames this far beyond both ends of a night are read too, and a frame's time and the time
-# it was logged at may be `LOGGED_WITHIN_NS` apart.
-BEYOND_NS = 600_000_000_000
-MARGIN_NS = BEYOND_NS + LOGGED_WITHIN_NS
+# Frames up to a span beyond both ends of a night are read too, and a frame's time and the
+# time it was logged at may be `LOGGED_WITHIN_NS` apart.
+MARGIN_NS = SPAN_NS + LOGGED_WITHIN_NS
 
 
 class FoundLogs(NamedTuple):

@@ -25,6 +25,7 @@ class ReadLog(NamedTuple):
 
 @task(
     name="read log",
+    task_run_name="read {path}",
     cache_policy=NO_CACHE,
     retries=RETRIES,
     retry_delay_seconds=DELAYS_S,

@@ -121,7 +121,7 @@ def test_the_page_shows_named_task_runs_logs_and_artifacts(deployed):
     assert run["name"] == f"night {NIGHT}"
     of_run = {"flow_runs": {"id": {"any_": [run["id"]]}}}
     tasks = {task["name"] for task in prefect.find("task_runs", **of_run)}
-    assert {f"identify sat{k} 04:00-04:01" for k in (1, 2, 3, 4)} <= tasks
+    assert {f"identify sat{k} 04:00-04:30" for k in (1, 2, 3, 4)} <= tasks
     lines = [
         line["message"]
         for line in prefect.find("logs", logs={"flow_run_id": {"any_": [run["id"]]}})

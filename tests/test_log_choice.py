@@ -73,12 +73,12 @@ def test_a_log_that_is_named_twice_counts_once(folder):
 
 def test_a_log_that_ends_close_to_midnight_may_have_frames_of_the_night(tmp_path):
     midnight_ns = instant("2019-04-02")
-    for minutes in (5, 19, 21):
+    for minutes in (5, 39, 41):
         end_ns = midnight_ns - minutes * MINUTE_NS
         write_log(tmp_path / f"before{minutes:02}.mcap", end_ns - HOUR_NS, end_ns)
         start_ns = midnight_ns + 24 * HOUR_NS + minutes * MINUTE_NS
         write_log(tmp_path / f"until{minutes:02}.mcap", start_ns, start_ns + HOUR_NS)
-    assert names(str(tmp_path), "2019-04-02") == ["before05", "before19", "until05", "until19"]
+    assert names(str(tmp_path), "2019-04-02") == ["before05", "before39", "until05", "until39"]
 
 
 def test_a_log_that_was_never_closed_is_taken_for_every_night(folder):

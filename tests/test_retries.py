@@ -7,11 +7,11 @@ import pytest
 from prefect import flow
 from prefect.states import Failed
 
-from epipole.io.log_reader import read_log
+from epipole.io.log_reader import read_log_parts
+from epipole.io.work_files import read_part
 from epipole.schemas.errors import DatasetError, LogError
-from epipole.schemas.settings import Settings
 from epipole.tasks import read_logs as module
-from epipole.tasks.read_logs import read_logs
+from epipole.tasks.read_logs import read_log_into
 from epipole.tasks.retries import storage_failed
 
 
@@ -66,25 +66,27 @@ def test_what_stays_as_it_is_is_not_tried_again(error):
     ("error", "reads"), [(wrapped(OSError(errno.EIO, "x")), 2), (wrapped(None), 1)]
 )
 def test_a_log_is_read_again_only_after_a_fault_of_the_storage(
-    error, reads, prefect, night_log, monkeypatch
+    error, reads, prefect, night_log, tmp_path, monkeypatch
 ):
     asked = []
 
-    def faulty(*arguments):
-        asked.append(arguments)
-        if len(asked) == 1:
-            raise error
-        return read_log(*arguments)
+    def faulty(path):
+        asked.append(path)
+        for part in read_log_parts(path):
+            yield part
+            if len(asked) == 1:
+                raise error
 
-    monkeypatch.setattr(module, "read_log", faulty)
+    monkeypatch.setattr(module, "read_log_parts", faulty)
 
     @flow
     def reading():
-        return read_logs.with_options(retry_delay_seconds=0)([str(night_log)], Settings())
+        return read_log_into.with_options(retry_delay_seconds=0)(tmp_path, str(night_log))
 
     if reads == 1:
         with pytest.raises(LogError):
             reading()
     else:
-        assert reading().exposures.num_rows == 240
+        frames = [read_part(part, "exposures").num_rows for part in reading().parts]
+        assert sum(frames) == 240
     assert len(asked) == reads
