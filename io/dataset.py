@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 from epipole.io import local_nights
 from epipole.io.folder_swap import sync
 from epipole.io.local_nights import STAGING
-from epipole.io.part_options import ROWS_IN_GROUP, part_options
+from epipole.io.night_files import write_table
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.io.store_nights import StoreNights, store_nights
 from epipole.schemas.bridge import array, conform, empty
@@ -270,10 +270,8 @@ def _read(dataset: Where) -> Iterator[None]:
 
 def _write_night(folder: Path, tables: Mapping[str, pa.Table], night: str) -> None:
     for name, schema in TABLES.items():
-        rows = rows_of_night(name, conform(schema, tables.get(name, empty(schema))), night)
-        (folder / name).mkdir(parents=True)
-        part = folder / name / "part-0.parquet"
-        pq.write_table(in_order(rows), part, ROWS_IN_GROUP, **part_options(schema))
+        rows = rows_of_night(name, tables.get(name, empty(schema)), night)
+        write_table(folder, name, [in_order(rows)])
 
 
 def nights_of(time_ns: np.ndarray) -> list[str]:

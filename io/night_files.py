@@ -6,6 +6,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from epipole.io.part_options import ROWS_IN_GROUP, part_options
 from epipole.schemas.bridge import conform
 from epipole.schemas.tables import TABLES
 
@@ -36,13 +37,17 @@ def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
         if rows.num_rows == 0:
             continue
         if writer is None:  # what the rows' metadata says beside the schema's goes along
-            writer = pq.ParquetWriter(folder / PART, rows.schema, compression="zstd")
-        writer.write_table(rows)
+            writer = _writer(folder, rows.schema)
+        writer.write_table(rows, ROWS_IN_GROUP)
         count += rows.num_rows
     if writer is None:
-        writer = pq.ParquetWriter(folder / PART, TABLES[name], compression="zstd")
+        writer = _writer(folder, TABLES[name])
     writer.close()
     return count
+
+
+def _writer(folder: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    return pq.ParquetWriter(folder / PART, schema, **part_options(schema))
 
 
 def read_columns(night: Path, name: str, columns: Sequence[str]) -> pa.Table:

@@ -132,7 +132,7 @@ def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path, monkeypatch, there_b
     if there_before:
         publish(out, night_tables(TIMES), [NIGHT])
     before = contents(tmp_path)
-    monkeypatch.setattr(under_test.pq, "write_table", _disk_full)
+    monkeypatch.setattr(under_test, "write_table", _disk_full)
     with pytest.raises(DatasetError, match="No space left on device"):
         publish(out, night_tables(TIMES[:5]), [NIGHT])
     assert contents(tmp_path) == before
