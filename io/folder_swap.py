@@ -63,11 +63,12 @@ def put_in_place(new: Path, target: Path, old: Path) -> None:
             raise
 
 
-def take_back(target: Path, old: Path, aside: Path) -> None:
-    """Undo `put_in_place`: `target` goes to `aside`, and `old`, if there, comes back."""
+def take_back(target: Path, old: Path, new: Path) -> None:
+    """Undo `put_in_place`: `target` goes back to `new`, and `old`, if there, to `target`."""
     if old.exists() and exchange(old, target):
+        old.rename(new)
         return
-    target.rename(aside)
+    target.rename(new)
     if old.exists():
         old.rename(target)
 

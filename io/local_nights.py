@@ -69,7 +69,7 @@ def put_all_in_place(dataset: Path, staged: Mapping[str, Path]) -> None:
     Raises
     ------
     OSError
-        Where the system refuses; the dataset is then as it was.
+        Where the system refuses; the dataset and the folders are then as they were.
     """
     aside = dataset / STAGING / f"swap-{uuid.uuid4().hex[:8]}"
     aside.mkdir()
@@ -82,7 +82,7 @@ def put_all_in_place(dataset: Path, staged: Mapping[str, Path]) -> None:
         sync(dataset)
     except BaseException:
         for name in reversed(done):
-            take_back(dataset / name, aside / f"old-{name}", aside / f"undone-{name}")
+            take_back(dataset / name, aside / f"old-{name}", staged[name.removeprefix("night=")])
         raise
     finally:
         shutil.rmtree(aside, ignore_errors=True)

@@ -8,6 +8,7 @@ import pyarrow.parquet as pq
 
 from epipole.io.part_options import ROWS_IN_GROUP, part_options
 from epipole.schemas.bridge import conform
+from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
 PART = "part-0.parquet"
@@ -27,8 +28,22 @@ def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
     -------
     int
         How many rows there are.
+
+    Raises
+    ------
+    DatasetError
+        Where the disk refuses.
     """
     folder = night / name
+    try:
+        return _write(folder, name, pieces)
+    except OSError as error:
+        raise DatasetError(
+            f"{folder}: cannot be written ({error.strerror or error}); nothing was changed"
+        ) from error
+
+
+def _write(folder: Path, name: str, pieces: Iterable[pa.Table]) -> int:
     folder.mkdir(parents=True)
     count = 0
     writer = None

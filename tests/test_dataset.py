@@ -20,7 +20,7 @@ from dataset_tables import (
 
 from epipole.io import dataset as under_test
 from epipole.io import folder_swap, local_nights
-from epipole.io.dataset import check_folder, publish, read_table
+from epipole.io.dataset import check_folder, publish, publish_folders, read_table
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -158,6 +158,26 @@ def test_a_failure_at_the_second_night_takes_the_first_back(
     with pytest.raises(DatasetError):
         publish(tmp_path, night_tables(OVER_MIDNIGHT, seed=9), [NIGHT, NEXT_NIGHT])
     assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize("exchange_supported", [True, False])
+def test_what_could_not_be_published_is_still_staged_for_another_try(
+    tmp_path, monkeypatch, exchange_supported
+):
+    out, nights = tmp_path / "out", [NIGHT, NEXT_NIGHT]
+    publish(out, night_tables(OVER_MIDNIGHT, seed=9), nights)
+    publish(tmp_path / "new", night_tables(OVER_MIDNIGHT), nights)
+    new = contents(tmp_path / "new")
+    staged = {night: tmp_path / "new" / f"night={night}" for night in nights}
+    if not exchange_supported:
+        monkeypatch.setattr(folder_swap, "exchange", lambda *_: False)
+    with monkeypatch.context() as patch:
+        patch.setattr(local_nights, "sync", _disk_full)
+        with pytest.raises(DatasetError):
+            publish_folders(out, staged, night_tables(OVER_MIDNIGHT)["sources"])
+    assert contents(tmp_path / "new") == new
+    publish_folders(out, staged, night_tables(OVER_MIDNIGHT)["sources"])
+    assert contents(out) == new
 
 
 def test_without_exchange_two_renames_do(tmp_path, monkeypatch):

@@ -76,6 +76,13 @@ def test_the_query_prints_what_the_readme_says(prefect, tmp_path):
     assert output(tmp_path) == part(README.read_text(), "output")
 
 
+def test_the_questions_have_answers(night_dataset):
+    code = part(README.read_text(), "questions").split("```")[1].removeprefix("python\n")
+    names: dict = {}
+    exec(code.replace('"out/', f'"{night_dataset}/'), names)
+    assert all(len(names[name]) for name in ("one_object", "came_near", "ten_minutes"))
+
+
 def test_links_lead_to_files():
     for target in re.findall(r"\]\(([^)#:]+)\)", README.read_text()):
         assert (ROOT / target).exists(), target

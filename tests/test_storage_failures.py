@@ -56,7 +56,8 @@ def test_a_write_that_the_system_refuses_leaves_the_dataset_as_it_was(tmp_path, 
         publish(out, night_tables(TIMES), [NIGHT])
     before = contents(tmp_path)
     error, rows, _ = publish_by([sys.executable, "-c", PUBLISH, str(out), "100000"])
-    assert error.startswith(f"{out}: cannot be written (")
+    assert error.startswith(str(out))
+    assert ": cannot be written (" in error
     assert "File too large" in error
     assert rows == (f"[{len(TIMES)}]" if there_before else "[]")
     assert contents(tmp_path) == before

@@ -12,6 +12,8 @@ import polars as pl
 import pytest
 from dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, TIMES, night_tables
 
+from epipole.flows.evaluate import evaluate
+from epipole.flows.nightly import nightly
 from epipole.io import store_claims
 from epipole.io.dataset import (
     check_folder,
@@ -232,6 +234,15 @@ def test_a_dataset_may_be_named_by_a_file_url(tmp_path):
     publish(f"file://{tmp_path}/a%20b", night_tables(TIMES), [NIGHT])
     assert nights_in(tmp_path / "a b") == [NIGHT]
     assert read_table(f"file://{tmp_path}/a%20b", "frames", NIGHT).num_rows == len(TIMES)
+
+
+def test_a_run_reads_from_a_bucket_and_publishes_to_one(s3, out, prefect, night_log, night_dataset):
+    s3.put_file(str(night_log), "logs/run/night.mcap")
+    nightly(["s3://logs/run/night.mcap"], out)
+    for name in sorted(set(TABLES) - {"sources"}):
+        assert read_table(out, name, NIGHT).equals(read_table(night_dataset, name, NIGHT)), name
+    assert evaluate(out, night_log).as_dict() == evaluate(night_dataset, night_log).as_dict()
+    assert all("/night=" in path for path in s3.find(out))
 
 
 def test_a_store_that_is_not_there_is_an_error_of_one_line(s3, out, monkeypatch):
