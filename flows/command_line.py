@@ -97,6 +97,7 @@ class Runner(StrEnum):
     """Where the tasks of a run are worked on."""
 
     threads = "threads"
+    dask = "dask"
 
 
 @app.command()
@@ -118,6 +119,10 @@ def run(
     workers: Annotated[
         int | None, typer.Option(min=1, metavar="N", help="Tasks at once; default: a CPU each.")
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of a running Dask; default: one of this machine."),
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
     verbose: Annotated[
         bool, typer.Option("--verbose", help="Print more, Prefect's lines too.")
@@ -130,7 +135,7 @@ def run(
     _check_night(night)
     if not verbose:
         warnings.simplefilter("ignore")
-    options = RunOptions(settings, night, replace, workers, quiet, verbose)
+    options = RunOptions(settings, night, replace, runner.value, workers, scheduler, quiet, verbose)
     summary, seconds = run_nightly(logs, out, options)
     if as_json:
         _print_json(summary.as_dict() | {"seconds": round(seconds, 2)})

@@ -10,6 +10,7 @@ from epipole.flows.clocks import find_objects
 from epipole.flows.log_choice import find_logs
 from epipole.flows.page import shown_on_page
 from epipole.flows.parameters import Night, night_asked, run_name
+from epipole.flows.runners import runner_asked
 from epipole.flows.stages import (
     calibrate,
     identify,
@@ -32,7 +33,7 @@ from epipole.tasks.stage_night import into_nights, source_table
 LOGGER = logging.getLogger(__name__)
 
 
-@flow(name="nightly", flow_run_name=run_name)  # on threads, unless told otherwise
+@flow(name="nightly", flow_run_name=run_name, task_runner=runner_asked())
 @shown_on_page
 def nightly(
     logs: str | list[str],

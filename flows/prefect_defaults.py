@@ -15,7 +15,8 @@ from concurrent.futures import ThreadPoolExecutor
 from prefect.client.orchestration import get_client
 from prefect.logging.configuration import setup_logging
 from prefect.logging.handlers import PrefectConsoleHandler
-from prefect.settings import get_current_settings, temporary_settings
+from prefect.server.api.server import SubprocessASGIServer
+from prefect.settings import PREFECT_API_URL, get_current_settings, temporary_settings
 
 # Services of a server that runs on; a run here and now waits for none of them.
 _SERVICES = (
@@ -50,6 +51,9 @@ def embedded_prefect() -> Iterator[None]:
         if get_current_settings().api.url is None:
             stack.enter_context(temporary_settings(set_defaults=_DEFAULTS))
             _start_server()
+            # Or a worker in another process would start an API of its own.
+            url = SubprocessASGIServer().api_url
+            stack.enter_context(temporary_settings({PREFECT_API_URL: url}))
         yield
 
 

@@ -1,11 +1,9 @@
 """The nightly flow started from the command line, on an embedded Prefect."""
 
 import logging
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from epipole.flows.progress import shown, step
 from epipole.flows.summary import Summary
@@ -25,7 +23,9 @@ class RunOptions:
     settings: Path | None = None
     night: str | None = None
     replace: bool = False
+    runner: str = "threads"
     workers: int | None = None
+    scheduler: str | None = None
     quiet: bool = False
     verbose: bool = False
 
@@ -56,11 +56,9 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
 
 
 def _run(logs: list[str], out: str, settings: Settings, options: RunOptions) -> Summary:
-    from prefect.task_runners import ThreadPoolTaskRunner
-
     from epipole.flows.nightly import nightly
+    from epipole.flows.runners import Runner, task_runner
 
-    workers = options.workers or os.cpu_count() or 1
-    runner: Any = ThreadPoolTaskRunner(max_workers=workers)
+    runner = task_runner(Runner(options.runner), options.workers, options.scheduler)
     flow = nightly.with_options(task_runner=runner)
     return flow(logs, out, settings, options.night, options.replace)

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+import epipole.tasks  # noqa: F401  kernels are kept where they always are, before it is said otherwise
+
 sys.path.append(str(Path(__file__).parent))  # helpers beside the tests: random_stars
 
 START_S = 60  # that the S3 server may take to start
