@@ -20,22 +20,22 @@ from epipole.tasks.algorithms.association.views import (
 A0, A1, H00, H01, H11, DEPTH, STRETCH = range(7)  # columns of what is predicted
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _predict(views, s, points, predicted):
     """Write where sensor s should see the points, and how well that is known; false: behind."""
     x, _, P, seen_by = points
+    cam = views.camera  # element by element, see `views.residual`
     for m in range(len(views.time_s)):
         if seen_by[m] < 2:
             continue
-        cam = views.camera[s, m]
-        d0, d1, d2 = x[m, 0] - cam[0], x[m, 1] - cam[1], x[m, 2] - cam[2]
-        n0, n1, n2 = cam[PLANE + 6], cam[PLANE + 7], cam[PLANE + 8]
+        d0, d1, d2 = x[m, 0] - cam[s, m, 0], x[m, 1] - cam[s, m, 1], x[m, 2] - cam[s, m, 2]
+        n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
         depth = n0 * d0 + n1 * d1 + n2 * d2
         predicted[m, DEPTH] = depth
         if not depth > 0.0:
             continue
-        p0, p1, p2 = cam[PLANE], cam[PLANE + 1], cam[PLANE + 2]
-        q0, q1, q2 = cam[PLANE + 3], cam[PLANE + 4], cam[PLANE + 5]
+        p0, p1, p2 = cam[s, m, PLANE], cam[s, m, PLANE + 1], cam[s, m, PLANE + 2]
+        q0, q1, q2 = cam[s, m, PLANE + 3], cam[s, m, PLANE + 4], cam[s, m, PLANE + 5]
         a0 = (p0 * d0 + p1 * d1 + p2 * d2) / depth
         a1 = (q0 * d0 + q1 * d1 + q2 * d2) / depth
         p0, p1, p2 = (p0 - a0 * n0) / depth, (p1 - a0 * n1) / depth, (p2 - a0 * n2) / depth
@@ -53,28 +53,32 @@ def _predict(views, s, points, predicted):
         predicted[m, STRETCH] = 1.0 + a0 * a0 + a1 * a1
 
 
-@njit(cache=True, nogil=True)
-def _fit(views, chance, s, c, seen_by, predicted):
-    """Return what tracklet c adds to the odds, its chi-square, and how many instants it shares.
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
+    """Return what tracklet c adds to the odds; -inf where it does not fit at the shared instants.
 
     The log of how much likelier the points make its directions than chance does. At later
     instants than the first, chance is known to within how differently tracklets move.
     """
-    gain, total, n, begun_at = 0.0, 0.0, 0, 0.0
+    gain, total, n, begun_at, see = 0.0, 0.0, 0, 0.0, views.sight
+    largest = quantile(2 * len(views.time_s), gate_sigma)
     for m in range(len(views.time_s)):
         if seen_by[m] < 2 or not views.seen[c, m]:
             continue
         depth = predicted[m, DEPTH]
         if not depth > 0.0:
-            return -np.inf, np.inf, 0
-        see = views.sight[c, m]
-        e0, e1 = predicted[m, A0] - see[X], predicted[m, A1] - see[Y]
-        extra = (see[SIGMA_KM] / depth) ** 2
-        c00 = see[XX] + extra * (1.0 + see[X] * see[X]) + predicted[m, H00]
-        c01 = see[XY] + extra * see[X] * see[Y] + predicted[m, H01]
-        c11 = see[YY] + extra * (1.0 + see[Y] * see[Y]) + predicted[m, H11]
+            return -np.inf
+        x0, x1 = see[c, m, X], see[c, m, Y]
+        e0, e1 = predicted[m, A0] - x0, predicted[m, A1] - x1
+        extra = (see[c, m, SIGMA_KM] / depth) ** 2
+        c00 = see[c, m, XX] + extra * (1.0 + x0 * x0) + predicted[m, H00]
+        c01 = see[c, m, XY] + extra * x0 * x1 + predicted[m, H01]
+        c11 = see[c, m, YY] + extra * (1.0 + x1 * x1) + predicted[m, H11]
         det = c00 * c11 - c01 * c01
         chi2 = (e0 * e0 * c11 - 2 * e0 * e1 * c01 + e1 * e1 * c00) / det
+        total += chi2
+        if total > largest:  # most candidates end here, before any logarithm
+            return -np.inf
         stretch = predicted[m, STRETCH]
         spot = 2 * np.pi * np.sqrt(det / (stretch * stretch * stretch))
         if n == 0:
@@ -83,12 +87,11 @@ def _fit(views, chance, s, c, seen_by, predicted):
         else:
             room = np.pi * (chance.spread[s] * (views.time_s[m] - begun_at)) ** 2
             gain += np.log1p(room / spot) - 0.5 * chi2
-        total += chi2
         n += 1
-    return gain, total, n
+    return gain if n > 0 and total <= quantile(2 * n, gate_sigma) else -np.inf
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_sigma, least):
     """Return the free tracklet of sensor s that adds most to the odds, how much, and the next.
 
@@ -98,24 +101,24 @@ def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_
     that the gate touches are looked at; a tracklet is weighed once, at the first instant that
     it shares with the points.
     """
-    best, best_gain, second, seen_by = -1, least, least, points[3]
+    best, best_gain, second, seen_by, cam = -1, least, least, points[3], views.camera
     _predict(views, s, points, predicted)
     gate = np.sqrt(quantile(2, gate_sigma))
     for m in range(len(views.time_s)):
         side = views.grid[s, m, 1]
         if seen_by[m] < 2 or side == 0 or not predicted[m, DEPTH] > 0.0:
             continue
-        cam, begin = views.camera[s, m], views.grid[s, m, 0]
+        begin = views.grid[s, m, 0]
         place = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
-        own = (cam[WIDEST] + place * place) * predicted[m, STRETCH]
+        own = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
         reach = gate * np.sqrt(predicted[m, H00] + own)
-        here = predicted[m, A0] - cam[CORNER]
-        lo0 = max(int(np.floor((here - reach) * cam[SCALE])), 0)
-        hi0 = min(int(np.floor((here + reach) * cam[SCALE])), side - 1)
+        here = predicted[m, A0] - cam[s, m, CORNER]
+        lo0 = max(int(np.floor((here - reach) * cam[s, m, SCALE])), 0)
+        hi0 = min(int(np.floor((here + reach) * cam[s, m, SCALE])), side - 1)
         reach = gate * np.sqrt(predicted[m, H11] + own)
-        here = predicted[m, A1] - cam[CORNER + 1]
-        lo1 = max(int(np.floor((here - reach) * cam[SCALE + 1])), 0)
-        hi1 = min(int(np.floor((here + reach) * cam[SCALE + 1])), side - 1)
+        here = predicted[m, A1] - cam[s, m, CORNER + 1]
+        lo1 = max(int(np.floor((here - reach) * cam[s, m, SCALE + 1])), 0)
+        hi1 = min(int(np.floor((here + reach) * cam[s, m, SCALE + 1])), side - 1)
         if hi1 < lo1:
             continue
         for g0 in range(lo0, hi0 + 1):
@@ -124,9 +127,8 @@ def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_
                 c = views.cell_item[k]
                 if taken[c] or _shared_before(views, c, m, seen_by):
                     continue
-                gain, chi2, shared = _fit(views, chance, s, c, seen_by, predicted)
-                fits = gain > second and chi2 <= quantile(2 * shared, gate_sigma)
-                if fits and not _clashes(views, c, members, n):
+                gain = _fit(views, chance, s, c, seen_by, predicted, gate_sigma)
+                if gain > second and not _clashes(views, c, members, n):
                     if gain > best_gain:
                         best, best_gain, second = c, gain, best_gain
                     else:
@@ -134,14 +136,14 @@ def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_
     return best, best_gain, second
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def odds_of_view(views, chance, s, c, points, predicted):
     """Return what tracklet c of sensor s adds to the odds of an object with these points."""
     _predict(views, s, points, predicted)
-    return _fit(views, chance, s, c, points[3], predicted)[0]
+    return _fit(views, chance, s, c, points[3], predicted, np.inf)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _shared_before(views, c, m, seen_by):
     shared = False
     for earlier in range(m):
@@ -149,7 +151,7 @@ def _shared_before(views, c, m, seen_by):
     return shared
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _clashes(views, c, members, n):
     """Return whether a member is c, or of the same sensor at the same time."""
     for q in range(n):

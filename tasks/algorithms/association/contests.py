@@ -14,7 +14,7 @@ from epipole.tasks.algorithms.association.instant_points import solve
 from epipole.tasks.algorithms.association.visibility import near_fields
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def settle_contests(views, chance, group, n_groups, gate_sigma):
     """Write to `group` who has the tracklets that two objects explain; FREE (-1): nobody.
 
@@ -23,7 +23,8 @@ def settle_contests(views, chance, group, n_groups, gate_sigma):
     k, n_sensors = len(views.time_s), views.camera.shape[0]
     X, N = np.zeros((n_groups, k, 3)), np.zeros((k, 3, 3))
     P, seen_by = np.zeros((n_groups, k, 3, 3)), np.zeros((n_groups, k), np.int64)
-    part, predicted, near = np.empty(11), np.empty((k, 7)), np.empty(n_sensors, np.bool_)
+    part, predicted = np.empty(11), np.empty((k, 7))
+    near = np.zeros((n_groups, n_sensors), np.bool_)
     size = np.zeros(n_groups, np.int64)
     has = np.zeros((n_groups, n_sensors), np.bool_)
     members, first = _by_group(group, n_groups)
@@ -36,15 +37,14 @@ def settle_contests(views, chance, group, n_groups, gate_sigma):
             chi2, _ = solve(views, own, len(own), (X[g], N, P[g], seen_by[g]), part)
             if np.isnan(chi2):
                 size[g] = 0
+            else:
+                near_fields(views, X[g], P[g], seen_by[g], near[g])
     nobody = np.zeros(len(group), np.bool_)
-    for g in range(n_groups):
-        if size[g] < 3:
-            continue
-        points = (X[g], N, P[g], seen_by[g])
-        near_fields(views, X[g], P[g], seen_by[g], near)
-        for s in range(n_sensors):
-            if not near[s]:
+    for s in range(n_sensors):  # one sensor's tracklets fit into a processor's cache
+        for g in range(n_groups):
+            if size[g] < 3 or not near[g, s]:
                 continue
+            points = (X[g], N, P[g], seen_by[g])
             c, gain, _ = best_of_sensor(
                 views, chance, s, members, 0, nobody, points, predicted, gate_sigma, SPEAKS
             )
@@ -62,7 +62,7 @@ def settle_contests(views, chance, group, n_groups, gate_sigma):
                     size[g] += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _by_group(group, n_groups):
     """Return the tracklets group after group, and where each group begins."""
     first = np.zeros(n_groups + 1, np.int64)

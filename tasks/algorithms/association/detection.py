@@ -33,7 +33,7 @@ def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float
     looks, drawn to what all sensors have, and that to `prior`.
     """
     n_sensors = len(views.half_field)
-    looks = np.array([h.looks for h in groups]).reshape(-1, n_sensors)
+    looks = np.array([h.looks for h in groups], np.int8).reshape(-1, n_sensors)
     has = looks > 0
     others = has.sum(axis=1)[:, None] - has
     asked = (looks != 0) & (others >= (OTHERS if len(views.time_s) > 1 else OTHERS_AT_ONCE))

@@ -12,7 +12,7 @@ ITERATIONS = 6
 CONVERGED = 1e-4  # sigmas squared
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _start(views, members, n, m, x):
     """Write the point nearest to the members' lines; false where they are parallel."""
     N, inverse, rhs, u = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
@@ -35,7 +35,7 @@ def _start(views, members, n, m, x):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def add_view(views, i, m, x, N, rhs, part):
     """Add a view to the normal equations (upper half); return its chi-square, NaN behind."""
     if residual(views, i, m, x, part) == 0.0:
@@ -51,7 +51,7 @@ def add_view(views, i, m, x, N, rhs, part):
     return part[0] * g0 + part[1] * g1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def step(x, N, rhs, P):
     """Invert N into P and move x; return how much chi-square falls, NaN where it runs off."""
     if invert3(N, P) == 0.0:
@@ -64,7 +64,7 @@ def step(x, N, rhs, P):
     return gain if gain < 1e12 else np.nan  # as good as parallel
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve(views, members, n, points, part):
     """Solve every instant at which two members are seen; return chi-square and freedom.
 
@@ -102,7 +102,7 @@ def solve(views, members, n, points, part):
     return total, dof
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def join(views, c, points, part):
     """Add tracklet c to the points that are solved (Kalman's update); false where it fails."""
     X, N, P, seen_by = points
@@ -119,7 +119,7 @@ def join(views, c, points, part):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def possible(views, members, n, points, lowest, farthest):
     """Return whether the points lie, within 3 sigma, where their sensors can see an object."""
     X, _, P, seen_by = points

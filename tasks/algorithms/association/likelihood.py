@@ -7,6 +7,7 @@ explain about equally well is not decided but called ambiguous.
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -157,8 +158,7 @@ class _Search:
         clear = CLEAR_LOG_ODDS if self.many else np.inf
         out = []
         for h in self.grow(seeds, clear):
-            looks = np.array(h.looks, np.int8)
-            if clear_of_doubt(self.chance, looks, len(h.members), h.score, clear):
+            if clear_of_doubt(self.chance, h.looks, len(h.members), h.score, clear):
                 self._accept(h, h.members)
             else:
                 out.append(h)
@@ -184,8 +184,8 @@ class _Search:
                 float(scores[q]),
                 tuple(seeds[q].tolist()),
                 tuple(sorted(grown[q, : sizes[q]].tolist())),
-                tuple(x_km[q].tolist()),
-                tuple(looks[q].tolist()),
+                x_km[q],
+                looks[q],
             )
             for q in worth
         ]
@@ -210,7 +210,11 @@ class _Search:
 
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
         """Accept hypotheses, best first; what rivals contest is ambiguous."""
-        pool = Pool(hypotheses)
+        # Nearly all of what clear groups took from is nothing without it.
+        stale = [h for h in hypotheses if self.taken[list(h.members)].any()]
+        afresh = self.grow(np.array([h.seed for h in stale], np.int64).reshape(-1, 2))
+        gone = set(map(id, stale))
+        pool = Pool([h for h in hypotheses if id(h) not in gone] + afresh)
         while (best := pool.pop()) is not None and best.score >= min_log_odds:
             if self.taken[list(best.members)].any():
                 if not self.taken[list(best.seed)].any():
@@ -262,5 +266,5 @@ def _with_detection(
     looks = np.array([h.looks for h in hypotheses])
     change = detection_odds(looks, detected) - detection_odds(looks, believed)
     return [
-        h._replace(score=h.score + float(more)) for h, more in zip(hypotheses, change, strict=True)
+        replace(h, score=h.score + float(more)) for h, more in zip(hypotheses, change, strict=True)
     ]

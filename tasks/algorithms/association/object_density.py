@@ -57,7 +57,7 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _in_view_of(camera, x):
     """Return how many sensors see each point, (n,)."""
     count = np.zeros(len(x), np.int64)

@@ -3,48 +3,47 @@
 import heapq
 from collections import defaultdict
 from collections.abc import Iterable
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 
-class Hypothesis(NamedTuple):
+@dataclass(frozen=True, eq=False, slots=True)
+class Hypothesis:
     """Tracklets that may be one object; `seed` are the two it grew from.
 
-    `x_km` is where they meet at the first instant; `looks` is 1 for each sensor that
+    `x_km` (3,) is where they meet at the first instant; `looks` (s,) is 1 for each sensor that
     has it, -1 for one that looks in vain, else 0.
     """
 
     score: float
     seed: tuple[int, int]
     members: tuple[int, ...]
-    x_km: tuple[float, ...]
-    looks: tuple[int, ...]
+    x_km: npt.NDArray[np.float64]
+    looks: npt.NDArray[np.int8]
 
 
 class Pool:
     """Hypotheses, best first; of equal ones that with the lowest tracklets."""
 
     def __init__(self, hypotheses: Iterable[Hypothesis]) -> None:
-        self._heap: list[tuple[float, tuple[int, ...], Hypothesis]] = []
-        self._holding: dict[int, set[Hypothesis]] = defaultdict(set)
+        self._heap: list[tuple[float, tuple[int, ...], int, Hypothesis]] = []
+        self._holding: dict[int, list[Hypothesis]] = defaultdict(list)
+        self._pushed = 0
         for h in distinct(hypotheses):
             self.push(h)
 
     def push(self, h: Hypothesis) -> None:
         """Add a hypothesis."""
-        heapq.heappush(self._heap, (-h.score, h.members, h))
+        heapq.heappush(self._heap, (-h.score, h.members, self._pushed, h))
+        self._pushed += 1
         for i in h.members:
-            self._holding[i].add(h)
+            self._holding[i].append(h)
 
     def pop(self) -> Hypothesis | None:
         """Take out the best hypothesis; none where the pool is empty. It stays a rival."""
-        return heapq.heappop(self._heap)[2] if self._heap else None
-
-    def rest(self) -> list[Hypothesis]:
-        """Return what is left, in no order."""
-        return [entry[2] for entry in self._heap]
+        return heapq.heappop(self._heap)[3] if self._heap else None
 
     def rivals(
         self, best: Hypothesis, closer_than: float, grouped: npt.NDArray[np.bool_]
@@ -54,12 +53,11 @@ class Pool:
         They share a tracklet with it, neither contains the other, and none of their tracklets
         is known to be another object's. One that itself was ambiguous contests still.
         """
-        near = {h for i in best.members for h in self._holding[i]}
+        contest = (h for i in best.members for h in self._holding[i])
         return [
             h
-            for h in near
-            if h.score > best.score - closer_than
-            and not (set(h.members) <= set(best.members) or set(best.members) <= set(h.members))
+            for h in dict.fromkeys(h for h in contest if h.score > best.score - closer_than)
+            if not (set(h.members) <= set(best.members) or set(best.members) <= set(h.members))
             and not grouped[list(h.members)].any()
         ]
 

@@ -37,7 +37,7 @@ def _directions(views: Views, s: int, m: int, items: Indices) -> Array:
     return np.asarray(sight / np.linalg.norm(sight, axis=1, keepdims=True))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _meeting(
     views, m, items_a, angle_a, sigma_a, items_b, angle_b, sigma_b, taken, lowest, farthest,
     gate_sigma, out,

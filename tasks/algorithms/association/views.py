@@ -148,7 +148,7 @@ def _reach(camera: Array, grid: Indices) -> Array:
     return np.where(side[..., 0] > 0, np.tan(np.minimum(widest, 1.5)), 0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _flatten(sensor, seen, u, cov, camera, sight):
     """Project directions and covariances, which are on `sky.tangent_basis`, onto the planes."""
     M, t, p = np.empty((2, 2)), np.empty((2, 3)), np.empty((3, 3))
@@ -184,7 +184,7 @@ def _flatten(sensor, seen, u, cov, camera, sight):
                 sight[i, m, XX + k] = M[a, 0] * along + M[a, 1] * across
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
     """Sort each sensor's tracklets into square cells, about one a cell."""
     begin, filled = 0, 0
@@ -233,7 +233,7 @@ def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
             begin += side * side + 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def direction(views, i, m, u):
     """Write the direction of a tracklet."""
     s, x, y = views.sensor[i], views.sight[i, m, X], views.sight[i, m, Y]
@@ -243,37 +243,39 @@ def direction(views, i, m, u):
         u[a - PLANE] = (along + views.camera[s, m, a + 6]) / length
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def residual(views, i, m, x, part):
     """Write a view's residual, predicted minus seen, its partials and weight; return the depth.
 
     `part` (11,), in the sensor's plane: the residual (2), its partials (2 by 3) [1/km], and the
     inverse covariance (xx, xy, yy). Depth 0: the point is behind.
     """
-    cam, see = views.camera[views.sensor[i], m], views.sight[i, m]
-    d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
-    n0, n1, n2 = cam[PLANE + 6], cam[PLANE + 7], cam[PLANE + 8]
+    # Element by element: numba counts references to every row that is taken out.
+    cam, see, s = views.camera, views.sight, views.sensor[i]
+    d0, d1, d2 = x[0] - cam[s, m, 0], x[1] - cam[s, m, 1], x[2] - cam[s, m, 2]
+    n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
     depth = n0 * d0 + n1 * d1 + n2 * d2
     if not depth > 0.0:
         return 0.0
     for a in range(2):
-        p0, p1, p2 = cam[PLANE + 3 * a], cam[PLANE + 3 * a + 1], cam[PLANE + 3 * a + 2]
+        q = PLANE + 3 * a
+        p0, p1, p2 = cam[s, m, q], cam[s, m, q + 1], cam[s, m, q + 2]
         here = (p0 * d0 + p1 * d1 + p2 * d2) / depth
-        part[a] = here - see[X + a]
+        part[a] = here - see[i, m, X + a]
         part[2 + 3 * a] = (p0 - here * n0) / depth
         part[3 + 3 * a] = (p1 - here * n1) / depth
         part[4 + 3 * a] = (p2 - here * n2) / depth
     # An error of the sensor's place, across the line of sight.
-    extra = (see[SIGMA_KM] / depth) ** 2
-    c00 = see[XX] + extra * (1.0 + see[X] * see[X])
-    c01 = see[XY] + extra * see[X] * see[Y]
-    c11 = see[YY] + extra * (1.0 + see[Y] * see[Y])
+    extra, x0, x1 = (see[i, m, SIGMA_KM] / depth) ** 2, see[i, m, X], see[i, m, Y]
+    c00 = see[i, m, XX] + extra * (1.0 + x0 * x0)
+    c01 = see[i, m, XY] + extra * x0 * x1
+    c11 = see[i, m, YY] + extra * (1.0 + x1 * x1)
     det = c00 * c11 - c01 * c01
     part[8], part[9], part[10] = c11 / det, -c01 / det, c00 / det
     return depth
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def misfit(part):
     """Return the chi-square of what `residual` wrote."""
     e0, e1 = part[0], part[1]

@@ -9,7 +9,7 @@ EARTH_RADIUS_KM = 6378.137
 INSIDE = 0.98  # of the half field: nearer to the edge a sensor may well miss an object
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def blocked(r, x, radius):
     """Return whether the Earth stands between r and x."""
     dot, length2, r2 = 0.0, 0.0, 0.0
@@ -21,7 +21,7 @@ def blocked(r, x, radius):
     return dot < 0.0 and -dot < length2 and r2 - dot * dot / length2 < radius * radius
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def sees(r, R, half_field, x):
     """Return whether a sensor at r has x in its field, not at the edge, the Earth not between.
 
@@ -38,7 +38,7 @@ def sees(r, R, half_field, x):
     return not blocked(r, x, EARTH_RADIUS_KM)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def in_view(cam, x):
     """Return what `sees` does, by a row of `Views.camera`."""
     d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
@@ -52,7 +52,7 @@ def in_view(cam, x):
     return not blocked(cam, x, EARTH_RADIUS_KM)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def looks_at(views, s, X, seen_by):
     """Return whether sensor s has the point in its field at every solved instant."""
     looked = False
@@ -65,21 +65,22 @@ def looks_at(views, s, X, seen_by):
     return looked
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def near_fields(views, X, P, seen_by, near):
     """Write which sensors have a point, by far, near what they see at any solved instant.
 
     A quick look: within the cone about all of a sensor's tracklets and its field, and 6 sigma.
     """
     near[:] = False
+    cam = views.camera
     for m in range(len(views.time_s)):
         if seen_by[m] < 2:
             continue
         slack = 6.0 * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
         for s in range(len(near)):
-            cam = views.camera[s, m]
-            d0, d1, d2 = X[m, 0] - cam[0], X[m, 1] - cam[1], X[m, 2] - cam[2]
-            depth = cam[PLANE + 6] * d0 + cam[PLANE + 7] * d1 + cam[PLANE + 8] * d2
+            d0, d1, d2 = X[m, 0] - cam[s, m, 0], X[m, 1] - cam[s, m, 1], X[m, 2] - cam[s, m, 2]
+            n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
+            depth, reach = n0 * d0 + n1 * d1 + n2 * d2, cam[s, m, REACH]
             away2 = d0 * d0 + d1 * d1 + d2 * d2 - depth * depth
-            if cam[REACH] > 0.0 and depth > 0.0 and away2 <= (cam[REACH] * depth + slack) ** 2:
+            if reach > 0.0 and depth > 0.0 and away2 <= (reach * depth + slack) ** 2:
                 near[s] = True
