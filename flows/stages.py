@@ -32,7 +32,7 @@ from epipole.tasks.name_objects import name_objects
 from epipole.tasks.order_frames import OrderedFrames, order_logs
 from epipole.tasks.read_logs import read_log_into
 from epipole.tasks.solve_span import SensorParts, solve_span
-from epipole.tasks.stage_night import stage_night
+from epipole.tasks.stage_night import SHARES, stage_night
 from epipole.tasks.track_span import track_span
 
 LOGGER = logging.getLogger(__name__)
@@ -199,10 +199,13 @@ def stage(
     whole: Mapping[str, pa.Table],
     staged: Mapping[str, Path],
 ) -> None:
-    """Put the parts together as the tables of each night, a task a night."""
+    """Put the parts together as the tables of each night, three tasks a night."""
     futures = []
     for night, folder in staged.items():
         day = int(np.datetime64(night, "D").astype(np.int64))
         own = [span for span in work.all_spans() if span.start_ns // DAY_NS == day]
-        futures.append(stage_night.submit(folder, night, own, parts, solved, names, whole))
+        futures += [
+            stage_night.submit(tables, folder, night, own, parts, solved, names, whole)
+            for tables in SHARES
+        ]
     results("publish", futures)

@@ -26,13 +26,17 @@ from epipole.tasks.spans import Span, rows_within
 # Of these a night has too many rows to be held at once; they come span by span.
 BY_SENSOR = ("frames", "stars", "detections")
 BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
+WHOLE = ("tracklets", "calibrations", "sources", "rejects")
+# What one task writes: about a third of the work each.
+SHARES = (("stars",), ("detections",), ("frames", *BY_SPAN, *WHOLE))
 # What these stages leave out is counted over the night: a row a span says no more.
 SERVED_NS = 60_000_000_000
 COUNTED = ("identify", "place_sensors", "clocks", "positions")
 
 
-@task(name="stage night", cache_policy=NO_CACHE)
+@task(name="stage", task_run_name="stage {tables[0]} {night}", cache_policy=NO_CACHE)
 def stage_night(
+    tables: Sequence[str],
     folder: Path,
     night: str,
     spans: Sequence[Span],
@@ -41,10 +45,12 @@ def stage_night(
     names: Mapping[str, Mapping[str, str]],
     whole: Mapping[str, pa.Table],
 ) -> None:
-    """Write a night's tables, each sorted by time, from the parts of its spans.
+    """Write tables of a night, each sorted by time, from the parts of its spans.
 
     Parameters
     ----------
+    tables
+        Which: one of `SHARES`.
     folder
         Where the night's tables go.
     spans
@@ -56,19 +62,31 @@ def stage_night(
     whole
         Tables of the whole run: `calibrations`, `sources` and the `rejects` of no span.
     """
-    for name in BY_SENSOR:
-        write_table(folder, name, (_of_sensors(name, sensors, solved, span) for span in spans))
-    for name in BY_SPAN:
-        write_table(folder, name, _of_spans(name, solved, spans, names))
-    tracklets = [read_part(s.named / "night", "tracklets") for s in sensors]
-    rest = {
-        "tracklets": concat(TRACKLETS, tracklets),
-        "calibrations": whole["calibrations"],
-        "sources": whole["sources"],
-        "rejects": _counted([whole["rejects"], *_rejects(sensors, solved, spans)]),
-    }
-    for name, rows in rest.items():
-        write_table(folder, name, [in_order(rows_of_night(name, rows, night))])
+    for name in tables:
+        if name in BY_SENSOR:
+            rows = (_of_sensors(name, sensors, solved, span) for span in spans)
+        elif name in BY_SPAN:
+            rows = _of_spans(name, solved, spans, names)
+        else:
+            rows = iter([_of_night(name, night, sensors, solved, spans, whole)])
+        write_table(folder, name, rows)
+
+
+def _of_night(
+    name: str,
+    night: str,
+    sensors: Sequence[SensorParts],
+    solved: Path,
+    spans: Sequence[Span],
+    whole: Mapping[str, pa.Table],
+) -> pa.Table:
+    if name == "tracklets":
+        rows = concat(TRACKLETS, [read_part(s.named / "night", "tracklets") for s in sensors])
+    elif name == "rejects":
+        rows = _counted([whole[name], *_rejects(sensors, solved, spans)])
+    else:
+        rows = whole[name]
+    return in_order(rows_of_night(name, rows, night))
 
 
 def _of_sensors(name: str, sensors: Sequence[SensorParts], solved: Path, span: Span) -> pa.Table:

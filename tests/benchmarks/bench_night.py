@@ -1,0 +1,155 @@
+"""A whole night: time, memory and where they go; and how they grow with the night.
+
+`python tests/benchmarks/bench_night.py [--shares 16 4 1]`. Each row is `epipole run` of a simulated
+log in a process of its own, kernels cached: 4 sensors at 5 Hz with about 25 centroids a frame.
+"""
+
+import argparse
+import json
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from datetime import datetime
+from pathlib import Path
+
+SCENES = Path(__file__).parents[2] / "io" / "scenes"
+FRAMES = 576_000
+HOURS = 10.3  # of which the Earth hides the field for a fifth
+COMMAND = "from epipole.flows.command_line import main; main()"
+# What a run says at the end of each stage.
+STAGES = (
+    ("find", "found "),
+    ("read", "read "),
+    ("identify", "identified "),
+    ("track", "followed "),
+    ("solve", "solved "),
+    ("name", "named "),
+    ("publish", "published "),
+)
+EMPTY_TASKS = """
+import statistics, sys, time
+from prefect import flow, task
+from prefect.cache_policies import NO_CACHE
+from epipole.flows.prefect_defaults import embedded_prefect, quiet_console
+@task(cache_policy=NO_CACHE)
+def nothing(k):
+    return k
+@flow
+def many(n):
+    [f.result() for f in [nothing.submit(k) for k in range(n)]]
+quiet_console()
+with embedded_prefect():
+    many(3)
+    cpu, wall = [], []
+    for _ in range(5):
+        for n in (0, int(sys.argv[1])):
+            started = time.process_time(), time.monotonic()
+            many(n)
+            cpu.append(time.process_time() - started[0])
+            wall.append(time.monotonic() - started[1])
+for seconds in (cpu, wall):
+    print(statistics.median(b - a for a, b in zip(seconds[::2], seconds[1::2])))
+"""
+
+
+def simulate_night(log: Path, hours: float) -> None:
+    """Write a log of four sensors, three objects, twenty stars and two false points a frame."""
+    from epipole.flows.simulate import simulate
+    from epipole.schemas.scene import validate_scene
+
+    scene = tomllib.loads((SCENES / "night.toml").read_text())
+    scene["start"] = datetime.fromisoformat("2019-04-01T06:00:00+00:00")
+    scene["duration_s"] = hours * 3600
+    (sensors,) = scene["sensors"]
+    sensors |= {"count": 4, "rate_hz": 5.0, "magnitude_limit": 7.15}
+    sensors["detection"] |= {"false_points": 2.0, "hot_pixels": 0}
+    scene["targets"][0]["count"] = 3
+    simulate(validate_scene(scene, "night"), log)
+
+
+def run(log: Path, out: Path) -> dict[str, float]:
+    """Return the seconds of each stage of a run, of CPU in all, and its memory [MiB]."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    started = time.monotonic()
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, "run", str(log), "--out", str(out), "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    times = {"start": 0.0}
+    for line in process.stderr:
+        said = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
+        for stage, word in STAGES:
+            if said.startswith(word):
+                times[stage] = time.monotonic() - started
+    out_text = process.stdout.read() if process.stdout else ""
+    assert process.wait() == 0, out_text
+    found = json.loads(out_text)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    names = [name for name, _ in STAGES if name in times]
+    seconds = {b: times[b] - times[a] for a, b in zip(["start", *names[:-1]], names, strict=True)}
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {
+        **seconds,
+        "night": times["publish"] - times["find"],
+        "all": time.monotonic() - started,
+        "cpu": cpu,
+        "mib": after.ru_maxrss / 1024,
+        "frames": found["frames"],
+        "positions": found["positions"],
+    }
+
+
+def prefect_share(n_tasks: int) -> tuple[float, float]:
+    """Return the CPU and wall seconds that so many tasks which do nothing cost."""
+    done = subprocess.run(
+        [sys.executable, "-c", EMPTY_TASKS, str(n_tasks)],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    cpu, wall = done.stdout.split()[-2:]
+    return float(cpu), float(wall)
+
+
+def main() -> None:
+    """Print the rows of the tables in BENCHMARKS.md."""
+    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    arguments.add_argument("--shares", type=int, nargs="+", default=[16, 4, 1])
+    chosen = arguments.parse_args()
+    columns = [
+        "find",
+        "read",
+        "identify",
+        "track",
+        "solve",
+        "name",
+        "publish",
+        "night",
+        "cpu",
+        "mib",
+    ]
+    print("| night | frames | " + " | ".join(columns) + " | us a frame |")
+    with tempfile.TemporaryDirectory() as folder:
+        where = Path(folder)
+        for share in chosen.shares:
+            log = where / f"night{share}.mcap"
+            simulate_night(log, HOURS / share)
+            got = run(log, where / f"out{share}")
+            values = [f"{got[name]:.1f}" for name in columns]
+            per_frame = f"{got['cpu'] / got['frames'] * 1e6:.0f}"
+            print(f"| 1/{share} | {got['frames']:,} | " + " | ".join([*values, per_frame]) + " |",
+                  flush=True)  # fmt: skip
+            log.unlink()
+    spans = int(HOURS * 2) + 1
+    n_tasks = spans * (4 + 4 + 1) + 3 * 4
+    cpu, wall = prefect_share(n_tasks)
+    print(f"{n_tasks} tasks that do nothing: {cpu:.2f} s CPU, {wall:.2f} s wall")
+
+
+if __name__ == "__main__":
+    main()
