@@ -6,8 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.bridge import array, concat, table
 from epipole.schemas.settings import AlignmentSettings, Settings
@@ -49,7 +47,6 @@ def frames_that_serve(solutions: pa.Table) -> pa.Table:
     )
 
 
-@task(name="align epochs", cache_policy=NO_CACHE)
 def align_epochs(
     solutions: pa.Table, settings: Settings, grid: EpochGrid | None = None
 ) -> pa.Table:

@@ -6,8 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.bridge import array, concat, stack, table
 from epipole.schemas.settings import Settings
@@ -37,7 +35,6 @@ class Associated(NamedTuple):
     rejects: pa.Table
 
 
-@task(name="associate objects", cache_policy=NO_CACHE)
 def associate_objects(
     views: pa.Table,
     tracklets: pa.Table,

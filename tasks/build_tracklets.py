@@ -7,8 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.bridge import array, concat, empty, nullable, table
 from epipole.schemas.settings import Settings, TrackletSettings
@@ -52,7 +50,6 @@ class Tracked(NamedTuple):
     tracklets: pa.Table
 
 
-@task(name="build tracklets", cache_policy=NO_CACHE)
 def build_tracklets(
     solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
 ) -> Tracked:

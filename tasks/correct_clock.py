@@ -32,5 +32,5 @@ def correct_clock(
     tables = {name: set_clocks(read_part(before, name), [clock]) for name in names}
     solutions = tables["solutions"]
     states = states_about(frames, sensor, span, settings)
-    tables["solutions"] = set_places(solutions, place_sensors.fn(solutions, states, settings))
+    tables["solutions"] = set_places(solutions, place_sensors(solutions, states, settings))
     write_part(part, {**tables, "rejects": read_part(before, "rejects")})

@@ -6,8 +6,6 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.bridge import table, unstack
 from epipole.schemas.columns import upper_triangle
@@ -24,7 +22,6 @@ SLOPE_S = 60.0  # positions this near the middle of an arc give the velocity to 
 AXES = ("x", "y", "z", "vx", "vy", "vz")
 
 
-@task(name="fit states", cache_policy=NO_CACHE)
 def fit_states(
     views: pa.Table, associations: pa.Table, positions: pa.Table, settings: Settings
 ) -> pa.Table:

@@ -49,9 +49,9 @@ def identify_span(
     if not is_written(part):
         exposures = frames_between(frames, sensor.number, *span)
         states = states_about(frames, sensor, span, settings)
-        places = place_sensors.fn(exposures, states, settings)
+        places = place_sensors(exposures, states, settings)
         catalogue = read_star_catalogue(settings.identification.catalogue)
-        found = identify_stars.fn(exposures, places, cameras, catalogue, settings)
+        found = identify_stars(exposures, places, cameras, catalogue, settings)
         rejects = concat(REJECTS, [found.rejects, _unplaced(places)])
         write_part(part, {**found._asdict(), "rejects": rejects})
     source = read_part(part, "solutions", ["attitude_source"])["attitude_source"]

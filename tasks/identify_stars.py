@@ -6,8 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.bridge import (
     array,
@@ -54,7 +52,6 @@ class Identified(NamedTuple):
     rejects: pa.Table
 
 
-@task(name="identify stars", cache_policy=NO_CACHE)
 def identify_stars(
     exposures: pa.Table,
     places: pa.Table,

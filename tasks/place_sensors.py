@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.bridge import array, nullable, stack, table, unstack
 from epipole.schemas.settings import SensorSettings, Settings
@@ -17,7 +15,6 @@ from epipole.tasks.algorithms.state_interpolation import Places, States, interpo
 logger = logging.getLogger(__name__)
 
 
-@task(name="place sensors", cache_policy=NO_CACHE)
 def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> pa.Table:
     """PLACES, row by row with the exposures; see `interpolate_states`.
 

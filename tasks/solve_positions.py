@@ -5,8 +5,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.bridge import array, stack, table, unstack, unstack_covariance
 from epipole.schemas.settings import Settings
@@ -55,7 +53,6 @@ class _Groups(NamedTuple):
         return np.repeat(np.arange(len(self.epoch_ns)), np.diff(self.offsets))
 
 
-@task(name="solve positions", cache_policy=NO_CACHE)
 def solve_positions(
     views: pa.Table, object_number: Indices, settings: Settings, span: Span | None = None
 ) -> Solved:

@@ -87,11 +87,11 @@ def _solve(
     # Motion at an epoch is fitted to what was seen around it.
     wide = about.widened(round(2e9 * settings.alignment.window_s) + margin_ns)
     solutions = [rows_within(s.identified, wide, SOLUTIONS, "solutions") for s in sensors]
-    epochs = about.of(align_epochs.fn(concat(SOLUTIONS, solutions), settings, grid), "epoch")
+    epochs = about.of(align_epochs(concat(SOLUTIONS, solutions), settings, grid), "epoch")
     views = concat(
         VIEWS,
         [
-            view_objects.fn(
+            view_objects(
                 epochs.filter(pc.field("sensor_id") == frames["sensor_id"][0]),
                 frames,
                 detections_within(sensor.tracked, sensor.named, wide),
@@ -108,14 +108,14 @@ def _solve(
     tracklets = tracklets.filter(pc.is_in(tracklets["tracklet_id"], views["tracklet_id"]))
     tracklets = with_lone_tracklets(tracklets, views)
     frames = concat(SOLUTIONS, solutions)
-    associated = associate_objects.fn(views, tracklets, frames, cameras, settings)
-    solved = solve_positions.fn(associated.views, associated.object_number, settings, span)
+    associated = associate_objects(views, tracklets, frames, cameras, settings)
+    solved = solve_positions(associated.views, associated.object_number, settings, span)
     return {
         "epochs": span.of(epochs, "epoch"),
         "associations": solved.associations,
         "positions": solved.positions,
         "pairs": solved.pairs,
-        "states": fit_states.fn(associated.views, solved.associations, solved.positions, settings),
+        "states": fit_states(associated.views, solved.associations, solved.positions, settings),
         "rejects": concat(
             REJECTS, [of_clocks, span.of(associated.rejects, "time"), solved.rejects]
         ),

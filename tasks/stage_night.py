@@ -63,6 +63,7 @@ def stage_night(
         Tables of the whole run: `calibrations`, `sources` and the `rejects` of no span.
     """
     for name in tables:
+        rows: Iterator[pa.Table]
         if name in BY_SENSOR:
             rows = (_of_sensors(name, sensors, solved, span) for span in spans)
         elif name in BY_SPAN:

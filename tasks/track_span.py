@@ -44,7 +44,7 @@ def track_span(
     part = stage / span.folder
     if not is_written(part):
         wide = span.widened(track_margin_ns(settings))
-        tracked = build_tracklets.fn(
+        tracked = build_tracklets(
             rows_within(identified, wide, SOLUTIONS, "solutions"),
             rows_within(identified, wide, DETECTIONS, "detections"),
             cameras,

@@ -3,8 +3,6 @@
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.bridge import array, empty, table, unstack
 from epipole.schemas.settings import Settings
@@ -23,7 +21,6 @@ Indices = npt.NDArray[np.int64]
 GM_KM3_S2 = 398600.4418
 
 
-@task(name="view objects", cache_policy=NO_CACHE)
 def view_objects(
     epochs: pa.Table,
     solutions: pa.Table,

@@ -80,7 +80,7 @@ def tables(scene: Scene, names=None) -> tuple[pa.Table, pa.Table, pa.Table, pa.T
 
 def associated(scene: Scene, **changes):
     settings = Settings(association=AssociationSettings(**changes))
-    return associate_objects.fn(*tables(scene), settings)
+    return associate_objects(*tables(scene), settings)
 
 
 def reasons(found) -> dict[str, int]:
@@ -174,7 +174,7 @@ def test_a_clock_a_second_off_gives_no_wrong_object():
 def test_two_sensors_with_one_id_give_no_wrong_object():
     scene = Scene(19, 4).objects(6, spread_km=100.0)
     settings = Settings()
-    found = associate_objects.fn(*tables(scene, ["sat0", "sat1", "sat2", "sat2"]), settings)
+    found = associate_objects(*tables(scene, ["sat0", "sat1", "sat2", "sat2"]), settings)
     assert wrong_views(scene, found) == 0
 
 

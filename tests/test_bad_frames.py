@@ -3,6 +3,7 @@
 import numpy as np
 import pyarrow.compute as pc
 import pytest
+from whole_logs import read_whole
 
 from epipole.io.hipparcos import read_hipparcos
 from epipole.io.log_writer import LogWriter
@@ -10,7 +11,6 @@ from epipole.schemas.settings import Settings
 from epipole.tasks.build_tracklets import build_tracklets
 from epipole.tasks.identify_stars import identify_stars
 from epipole.tasks.place_sensors import place_sensors
-from epipole.tasks.read_logs import read_logs
 
 START_NS = 1_554_091_200_000_000_000
 OPTICS = {
@@ -48,10 +48,10 @@ def track(tmp_path, frames):
                 "a", START_NS + int(at * 1e9), frame_number=number, exposure_s=0.1,
                 x_px=places[:, 0], y_px=places[:, 1], sigma_px=np.full(len(places), SIGMA),
             )  # fmt: skip
-    read = read_logs.fn([str(path)], SETTINGS)
-    places = place_sensors.fn(read.exposures, read.states, SETTINGS)
-    found = identify_stars.fn(read.exposures, places, read.cameras, read_hipparcos(), SETTINGS)
-    return build_tracklets.fn(found.solutions, found.detections, read.cameras, SETTINGS), read
+    read = read_whole([str(path)], SETTINGS)
+    places = place_sensors(read.exposures, read.states, SETTINGS)
+    found = identify_stars(read.exposures, places, read.cameras, read_hipparcos(), SETTINGS)
+    return build_tracklets(found.solutions, found.detections, read.cameras, SETTINGS), read
 
 
 @pytest.fixture(scope="module")

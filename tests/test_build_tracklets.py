@@ -44,8 +44,8 @@ def seen(tmp_path_factory):
     simulate(str(folder / "scene.toml"), folder / "k.mcap")
     settings = validate_settings({}, "test")
     log = read_whole([str(folder / "k.mcap")], settings)
-    places = place_sensors.fn(log.exposures, log.states, settings)
-    found = identify_stars.fn(log.exposures, places, log.cameras, read_hipparcos(), settings)
+    places = place_sensors(log.exposures, log.states, settings)
+    found = identify_stars(log.exposures, places, log.cameras, read_hipparcos(), settings)
     truth = pl.read_parquet(folder / "k.mcap.truth" / "points.parquet")
     return found, log.cameras, truth
 
@@ -58,7 +58,7 @@ def build(seen, broken=False, **tracklets):
         first = frame.min()
         detections = detections.filter((frame < first + GAP[0]) | (frame >= first + GAP[1]))
     settings = validate_settings({"tracklets": tracklets}, "test")
-    built = build_tracklets.fn(of_sensor(found.solutions, "a"), detections, cameras, settings)
+    built = build_tracklets(of_sensor(found.solutions, "a"), detections, cameras, settings)
     key = ["sensor_id", "frame_number", "centroid"]
     cast = [pl.col("frame_number").cast(pl.Int64), pl.col("centroid").cast(pl.Int64)]
     known = pl.from_arrow(built.detections).rename({"kind": "taken_for"}).with_columns(cast)
@@ -119,7 +119,7 @@ def test_frames_without_attitude_are_tracked_in_the_image(seen):
     found, cameras, _ = seen
     settings = validate_settings({}, "test")
     solutions, detections = without_attitude(found, range(20, 32))
-    built = build_tracklets.fn(solutions, detections, cameras, settings)
+    built = build_tracklets(solutions, detections, cameras, settings)
     assert built.tracklets.num_rows == 15  # five before, five after, five in between
     assert len(set(built.tracklets["tracklet_id"].to_pylist())) == 15
     assert built.tracklets["link_chi2"].null_count == 10
@@ -130,14 +130,14 @@ def test_frames_without_attitude_are_tracked_in_the_image(seen):
 def test_lost_frames_far_between_make_no_track(seen):
     found, cameras, _ = seen
     solutions, detections = without_attitude(found, range(0, 60, 8))
-    built = build_tracklets.fn(solutions, detections, cameras, validate_settings({}, "test"))
+    built = build_tracklets(solutions, detections, cameras, validate_settings({}, "test"))
     assert built.tracklets.num_rows == 5
 
 
 def test_no_detections_give_no_tracklets(seen):
     found, cameras, _ = seen
     settings = validate_settings({}, "test")
-    built = build_tracklets.fn(found.solutions, found.detections.slice(0, 0), cameras, settings)
+    built = build_tracklets(found.solutions, found.detections.slice(0, 0), cameras, settings)
     assert built.tracklets.num_rows == 0
 
 
@@ -156,7 +156,7 @@ def test_a_frame_of_ten_thousand_strays_is_no_trouble(seen):
     at = many.schema.get_field_index("centroid")
     numbers = pa.array(np.arange(10_000, dtype=np.int32) + 1000)
     many = many.set_column(at, many.schema.field(at), numbers)
-    built = build_tracklets.fn(
+    built = build_tracklets(
         of_sensor(found.solutions, "a"), pa.concat_tables([detections, many]), cameras,
         validate_settings({}, "test"),
     )  # fmt: skip

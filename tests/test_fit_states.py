@@ -66,24 +66,24 @@ def errors(states):
 def test_a_state_is_as_far_off_as_it_claims():
     square = []
     for seed in range(60):
-        off, cov = errors(fit_states.fn(*night(seed, np.arange(-60.0, 61, 20)), SETTINGS))
+        off, cov = errors(fit_states(*night(seed, np.arange(-60.0, 61, 20)), SETTINGS))
         square.append(off[0] @ np.linalg.solve(cov[0], off[0]))
     assert abs(np.mean(square) / 6 - 1) < 0.22  # three sigma of a mean of 60
 
 
 def test_epochs_that_share_detections_do_not_serve():
-    states = fit_states.fn(*night(1, np.arange(0.0, 61)), SETTINGS)
+    states = fit_states(*night(1, np.arange(0.0, 61)), SETTINGS)
     assert states["n_epochs"].to_pylist() == [6]  # of 61, every twelfth second: 0 to 60
 
 
 def test_a_long_pass_is_cut_into_arcs():
-    states = fit_states.fn(*night(2, np.arange(0.0, 1500, 50)), SETTINGS)
+    states = fit_states(*night(2, np.arange(0.0, 1500, 50)), SETTINGS)
     assert states.num_rows == 3
     assert states["n_epochs"].to_pylist() == [13, 13, 4]
 
 
 def test_an_arc_of_two_epochs_gives_no_state():
-    assert fit_states.fn(*night(3, np.array([0.0, 20.0])), SETTINGS).num_rows == 0
+    assert fit_states(*night(3, np.array([0.0, 20.0])), SETTINGS).num_rows == 0
 
 
 def test_views_that_a_position_rejected_do_not_serve():
@@ -96,7 +96,7 @@ def test_views_that_a_position_rejected_do_not_serve():
         views = views.set_column(k, views.schema.field(k), [u[:, i]])
     used = claimed.schema.get_field_index("used")
     claimed = claimed.set_column(used, claimed.schema.field(used), [~wrong])
-    off, cov = errors(fit_states.fn(views, claimed, positions, SETTINGS))
+    off, cov = errors(fit_states(views, claimed, positions, SETTINGS))
     assert off[0] @ np.linalg.solve(cov[0], off[0]) < 25
 
 
@@ -105,6 +105,6 @@ def test_nothing_gives_no_state(which):
     tables = [empty(VIEWS), empty(ASSOCIATIONS), empty(POSITIONS)]
     if which == "views":
         tables[2] = night(5, np.arange(3.0))[2]
-    states = fit_states.fn(*tables, SETTINGS)
+    states = fit_states(*tables, SETTINGS)
     assert states.schema == STATES
     assert states.num_rows == 0

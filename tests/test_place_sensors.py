@@ -32,7 +32,7 @@ def write(path, sensors, n=5, **state):
 
 def place(path, settings=None):
     log = read_whole([path], Settings())
-    return log, place_sensors.fn(log.exposures, log.states, settings or Settings())
+    return log, place_sensors(log.exposures, log.states, settings or Settings())
 
 
 def test_places_go_row_by_row_with_the_exposures(tmp_path):

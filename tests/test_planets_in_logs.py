@@ -73,12 +73,13 @@ def scene(sky):
 
 def with_planets(sky, log, out):
     """Write a log again with a planet more in each frame, the last centroid."""
+    from whole_logs import read_whole
+
     from epipole.io.log_writer import LogWriter
     from epipole.schemas.bridge import array
     from epipole.schemas.settings import Settings
-    from epipole.tasks.read_logs import read_logs
 
-    read = read_logs.fn([str(log)], Settings())
+    read = read_whole([str(log)], Settings())
     truth = pl.read_parquet(f"{log}.truth/frames.parquet")
     true = {(row["sensor_id"], row["frame_number"]): row for row in truth.iter_rows(named=True)}
     cameras = {row["sensor_id"]: row for row in read.cameras.drop_columns("time").to_pylist()}

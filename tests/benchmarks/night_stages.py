@@ -44,10 +44,10 @@ class Seen(NamedTuple):
 def see(log: Path, settings: Settings) -> Seen:
     """Read a log and identify its stars."""
     read = read_whole([log], settings)
-    places = place_sensors.fn(read.exposures, read.states, settings)
+    places = place_sensors(read.exposures, read.states, settings)
     catalogue = read_star_catalogue(settings.identification.catalogue)
     parts = [
-        identify_stars.fn(
+        identify_stars(
             of_sensor(read.exposures, name),
             of_sensor(places, name),
             read.cameras,
@@ -66,7 +66,7 @@ def see(log: Path, settings: Settings) -> Seen:
 def track(seen: Seen, settings: Settings) -> Tracked:
     """Build the tracklets of every sensor."""
     parts = [
-        build_tracklets.fn(
+        build_tracklets(
             of_sensor(seen.solutions, name),
             of_sensor(seen.detections, name),
             seen.cameras,
@@ -82,11 +82,11 @@ def track(seen: Seen, settings: Settings) -> Tracked:
 
 def solve(seen: Seen, tracked: Tracked, settings: Settings) -> Solved:
     """Align, associate and triangulate."""
-    epochs = align_epochs.fn(seen.solutions, settings)
+    epochs = align_epochs(seen.solutions, settings)
     views = concat(
         VIEWS,
         [
-            view_objects.fn(
+            view_objects(
                 of_sensor(epochs, name),
                 of_sensor(seen.solutions, name),
                 of_sensor(tracked.detections, name),
@@ -96,10 +96,10 @@ def solve(seen: Seen, tracked: Tracked, settings: Settings) -> Solved:
             for name in sensor_ids(epochs)
         ],
     )
-    associated = associate_objects.fn(
+    associated = associate_objects(
         views, with_lone_tracklets(tracked.tracklets, views), seen.solutions, seen.cameras, settings
     )
-    return solve_positions.fn(associated.views, associated.object_number, settings)
+    return solve_positions(associated.views, associated.object_number, settings)
 
 
 def position_errors(log: Path, positions: pa.Table) -> Array:
