@@ -160,7 +160,9 @@ class PositionSettings(Group):
 class StateSettings(Group):
     """Positions and velocities over arcs."""
 
-    arc_s: float = Field(600.0, gt=0, description="Longest arc of one state.")
+    arc_s: float = Field(
+        600.0, gt=0, description="Longest arc of one state; arcs end at half hours too."
+    )
     min_epochs: int = Field(
         3, ge=2, description="Fewest epochs that share no detection: two alone cannot be checked."
     )

@@ -40,6 +40,10 @@ from epipole.tasks.sightings import (
 Array = npt.NDArray[np.float64]
 
 STAR_RATE_SIGMA = 4.0  # a tracklet that moves by less than this many sigmas stands still
+# rad/s: and one slower than this, however well that is known. What drifts so slowly is a star in
+# a field whose optics err by a tenth of a pixel: an object in orbit seen from another moves by
+# arcseconds a second.
+STAR_DRIFT = 0.05 * ARCSEC
 STAR_RATE_KNOWN = 1.0 * ARCSEC  # rad/s: a rate not known this well does not make it a star
 
 
@@ -240,7 +244,7 @@ def _runs(
     for lo, hi in itertools.pairwise(bounds):
         members = order[lo:hi]
         rate, sigma = _mean_rate(time_s[members], seen.u_icrs[members], seen.cov_noise[members])
-        still = rate < STAR_RATE_SIGMA * sigma and sigma < STAR_RATE_KNOWN
+        still = rate < max(STAR_RATE_SIGMA * sigma, STAR_DRIFT) and sigma < STAR_RATE_KNOWN
         residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / camera.pixel_rad
         out.append(_Run(members, rate, still, residual))
     return out

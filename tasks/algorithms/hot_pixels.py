@@ -15,7 +15,7 @@ SHARE = 0.5  # of the frames that show it, and of the pointings that do
 FEWEST = 5  # frames
 FEWEST_STILL = 10  # frames, where only its steadiness tells
 STEADY = 0.1  # of the centroids' variance: light scatters by all of it, a hot pixel by none
-NEAR_CHI2 = 11.8  # of 2 degrees of freedom: 99.7 %
+NEAR_CHI2 = 11.8, 19.3  # of 2 degrees of freedom: 99.7 %; 99.994 % where there are frames enough
 CHANCE_OF_MIDDLE = 0.02  # accepted chance that light falls on the middle of a pixel
 REPOINTED_PX = 20.0  # how far a repointing moves what does not turn along with it
 BOUND = 10.0  # times the physical bound: no object turns with a repointing
@@ -97,14 +97,18 @@ def _is_one_pixel(time_s: Array, x_px: Array, y_px: Array, sigma_px: Array) -> b
     most, and what is followed by the sensor drifts all the same, if only a little.
     """
     n, sigma = len(x_px), float(np.sqrt(np.mean(sigma_px**2)))
-    if n < FEWEST_STILL or np.pi * NEAR_CHI2 * sigma**2 / n > CHANCE_OF_MIDDLE:
+    if n < FEWEST_STILL:
+        return False
+    least, most = NEAR_CHI2
+    near = min(CHANCE_OF_MIDDLE * n / (np.pi * sigma**2), most)
+    if near < least:
         return False
     off_x, off_y = x_px - np.round(x_px.mean()), y_px - np.round(y_px.mean())
     lever = time_s - time_s.mean()
     spread = max(float(lever @ lever), 1e-300)
     middle = n * (off_x.mean() ** 2 + off_y.mean() ** 2) / sigma**2
     drift = ((lever @ off_x) ** 2 + (lever @ off_y) ** 2) / (spread * sigma**2)
-    return bool(middle < NEAR_CHI2 and drift < 2 * NEAR_CHI2)
+    return bool(middle < near and drift < 2 * near)
 
 
 def _rates(time_s: Array, path: Array) -> tuple[Array, Array]:
