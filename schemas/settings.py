@@ -139,6 +139,12 @@ class AssociationSettings(Group):
     min_altitude_km: float = Field(100.0, ge=0, description="Lowest object looked for.")
     max_range_km: float = Field(1.0e5, gt=0, description="Farthest object looked for.")
     span_s: float = Field(30.0, gt=0, description="Evidence is summed over spans of this length.")
+    longest_span_s: float = Field(
+        600.0,
+        ge=0,
+        description="What is not sure then is judged again over 2 and over 10 minutes, no longer "
+        "than this; 0: never.",
+    )
     shells: tuple[AltitudeShell, ...] = Field(
         (LOW_ORBITS, NAVIGATION_ORBITS, GEOSTATIONARY_REGION, GEOSTATIONARY_RING),
         description="A weak prior on altitude: where objects are more likely; empty: off.",

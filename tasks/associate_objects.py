@@ -14,6 +14,7 @@ from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lin
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
 from epipole.tasks.algorithms.association.samples import Groups, Samples
 from epipole.tasks.algorithms.association.sensor_check import agreement
+from epipole.tasks.algorithms.association.verdicts import Seen, Verdicts
 from epipole.tasks.algorithms.object_identity import ObjectRegistry
 from epipole.tasks.algorithms.rotations import matrix_from_quaternion
 from epipole.tasks.sightings import camera_of, solved_frames
@@ -24,6 +25,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MOST_SAMPLES = 12  # instants in a span
+LONGER_S = (120.0, 600.0)  # whole numbers of them make the half hours that nights are cut into
 NEAR_NS = 2_000_000_000  # a frame this near tells where a sensor looks
 
 
@@ -50,31 +52,35 @@ def associate_objects(
     views = views.sort_by([("epoch", "ascending"), ("sensor_id", "ascending"),
                            ("tracklet_id", "ascending")])  # fmt: skip
     night = _Night(views, tracklets, solutions, cameras)
-    registry = ObjectRegistry()
-    number = np.full(views.num_rows, -1)
+    spans = night.spans(settings.association.span_s)
+    verdicts = Verdicts(night.seen(spans))
     rejects: list[pa.Table] = []
     left_out: set[str] = set()
-    for rows in night.spans(settings.association.span_s):
-        samples, tracklet = night.samples(rows, settings.alignment.window_s)
+    believed = np.ones(views.num_rows, bool)
+    for rows in spans:
+        instants = night.instants(rows, settings.alignment.window_s)
+        samples, tracklet = night.samples(rows, instants)
         groups = _solve(night, samples, settings)
         wrong = agreement(samples, groups).disagreeing()
         if len(wrong):
             rejects.append(_disagreeing(night, rows, wrong))
             left_out.update(night.sensors[wrong].tolist())
-            rows = rows[~np.isin(night.sensor[rows], wrong)]
+            believed[rows] = ~np.isin(night.sensor[rows], wrong)
+            rows = rows[believed[rows]]
             if not len(rows):
                 continue
-            samples, tracklet = night.samples(rows, settings.alignment.window_s)
+            instants = night.instants(rows, settings.alignment.window_s)
+            samples, tracklet = night.samples(rows, instants)
             groups = _solve(night, samples, settings)
-        objects = registry.name_groups(
-            [night.track[tracklet[groups.group == g]] for g in range(len(groups.score))]
-        )
-        of_tracklet = np.full(len(night.tracklet_id), -1)
-        grouped = groups.group >= 0
-        of_tracklet[tracklet[grouped]] = np.array(objects, np.int64)[groups.group[grouped]]
-        number[rows] = of_tracklet[night.tracklet[rows]]
-        if groups.ambiguous.any():
-            rejects.append(_ambiguous(night, rows, tracklet[groups.ambiguous]))
+        verdicts.enter(rows, tracklet, groups)
+    if settings.association.method == "likelihood":
+        _judge_again(night, verdicts, believed, settings)
+    number = _numbered(night, verdicts.group, spans)
+    rejects += [
+        _ambiguous(night, rows, np.unique(night.tracklet[rows[verdicts.ambiguous[rows]]]))
+        for rows in spans
+        if verdicts.ambiguous[rows].any()
+    ]
     if left_out:
         LOGGER.warning(
             "%s: lines of sight agree with no other sensor's (clock, position or attitude "
@@ -83,6 +89,39 @@ def associate_objects(
     number = _seen_by_two(night, number)
     chosen = np.flatnonzero(number >= 0)
     return Associated(views.take(chosen), number[chosen], concat(REJECTS, rejects))
+
+
+def _judge_again(
+    night: "_Night", verdicts: Verdicts, believed: npt.NDArray[np.bool_], settings: Settings
+) -> None:
+    """Judge what is not sure over longer and longer windows in which its tracklets go on."""
+    judged_s = settings.association.span_s
+    for window_s in LONGER_S:
+        if not judged_s < window_s <= settings.association.longest_span_s:
+            continue
+        for window in night.spans(window_s):
+            rows = window[believed[window]]
+            open_rows = verdicts.open_rows(rows, judged_s)
+            if len(open_rows):
+                instants = night.even_instants(rows, settings.alignment.window_s)
+                samples, tracklet = night.samples(rows, instants)
+                groups = _solve(night, samples, settings)
+                verdicts.reconsider(rows, open_rows, tracklet, groups)
+        judged_s = window_s
+
+
+def _numbered(night: "_Night", group: Indices, spans: list[Indices]) -> Indices:
+    """Return each view's object number: groups of one track are one object, span after span."""
+    registry = ObjectRegistry()
+    number = np.full(len(group), -1)
+    for rows in spans:
+        own = rows[group[rows] >= 0]
+        groups, of_row = np.unique(group[own], return_inverse=True)
+        objects = registry.name_groups(
+            [np.unique(night.track[night.tracklet[own[of_row == g]]]) for g in range(len(groups))]
+        )
+        number[own] = np.array(objects, np.int64)[of_row]
+    return number
 
 
 def _solve(night: "_Night", samples: Samples, settings: Settings) -> Groups:
@@ -198,9 +237,13 @@ class _Night:
         cuts = np.flatnonzero(np.diff(span)) + 1
         return np.split(np.arange(len(span)), cuts)
 
-    def samples(self, rows: Indices, window_s: float) -> tuple[Samples, Indices]:
-        """Return the tracklets of a span at its sample instants, and which tracklets they are."""
-        instants = self._instants(rows, window_s)
+    def seen(self, spans: list[Indices]) -> Seen:
+        """Return what each row is of."""
+        span = np.repeat(np.arange(len(spans)), [len(rows) for rows in spans])
+        return Seen(self.epoch_ns, span, self.tracklet, self.sensor)
+
+    def samples(self, rows: Indices, instants: Indices) -> tuple[Samples, Indices]:
+        """Return the tracklets that are seen at some epochs, and which tracklets they are."""
         rows = rows[np.isin(self.epoch_ns[rows], instants)]
         tracklet, item = np.unique(self.tracklet[rows], return_inverse=True)
         at = np.searchsorted(instants, self.epoch_ns[rows])
@@ -231,17 +274,24 @@ class _Night:
             half_field=self.half_field,
         ), tracklet
 
-    def _instants(self, rows: Indices, window_s: float) -> Indices:
-        """Return a few epochs of a span: far enough apart to be independent, none left out.
+    def even_instants(self, rows: Indices, window_s: float) -> Indices:
+        """Return a few epochs, evenly spaced and far enough apart to be independent.
 
-        Two epochs within twice the half-window share detections. A tracklet that none of the
-        evenly spaced epochs shows adds the middle one of its own.
+        Two epochs within twice the half-window share detections.
         """
         epochs = np.unique(self.epoch_ns[rows])
         step = 2 * window_s * 1e9
-        n = int(max((epochs[-1] - epochs[0]) // step, 1))
+        n = min(int(max((epochs[-1] - epochs[0]) // step, 1)), MOST_SAMPLES)
         edges = np.linspace(epochs[0], epochs[-1], n + 1)
-        chosen = {int(epochs[np.argmin(np.abs(epochs - m))]) for m in (edges[1:] + edges[:-1]) / 2}
+        middle = (edges[1:] + edges[:-1]) / 2
+        return np.unique([epochs[np.argmin(np.abs(epochs - m))] for m in middle])
+
+    def instants(self, rows: Indices, window_s: float) -> Indices:
+        """Return a few epochs of a span, so that no tracklet is left out.
+
+        One that none of the evenly spaced epochs shows adds the middle one of its own.
+        """
+        chosen = set(self.even_instants(rows, window_s).tolist())
         for tracklet in np.unique(self.tracklet[rows]):
             own = self.epoch_ns[rows[self.tracklet[rows] == tracklet]]
             if len(chosen) < MOST_SAMPLES and not chosen.intersection(own.tolist()):

@@ -5,6 +5,7 @@ import pytest
 
 from epipole.tasks.algorithms.association.likelihood import associate_tracklets
 from epipole.tasks.algorithms.association.samples import Samples
+from epipole.tasks.algorithms.orbit_fit import propagate
 from epipole.tasks.algorithms.sky import ARCSEC, tangent_basis
 
 GEO = np.array([-39359.89, 15125.76, 64.30])
@@ -36,8 +37,9 @@ class Scene:
         for k in range(n):
             start = GEO + self.rng.normal(size=3) * spread_km
             v = V_GEO + self.rng.normal(size=3) * 0.02
+            orbit = np.array([propagate(np.concatenate([start, v]), t)[:3] for t in self.times])
             for s in range(len(self.r)) if seen_by is None else seen_by:
-                path = start + self.times[:, None] * v - self.r[s]
+                path = orbit - self.r[s]
                 self.add(s, k, path / np.linalg.norm(path, axis=1, keepdims=True))
         return self
 
