@@ -12,6 +12,7 @@ from epipole.io.log_listing import list_logs
 from epipole.io.settings_file import read_settings
 from epipole.io.star_catalogue import check_star_catalogue
 from epipole.schemas.settings import Settings
+from epipole.tasks.kernel_warm_up import compile_beside
 
 LOGGER = logging.getLogger(__name__)
 
@@ -44,12 +45,14 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
     check_star_catalogue(settings.identification.catalogue)
     for where in logs:
         list_logs(where)
-    with shown(options.quiet, options.verbose):
+    with shown(options.quiet, options.verbose), compile_beside() as compiling:
         step("start Prefect", 0, 1)
         from epipole.flows.prefect_defaults import embedded_prefect, quiet_console
 
         if not options.verbose:
             quiet_console()
+        if compiling:
+            LOGGER.info("first run of this version: compiling kernels, about a minute")
         with embedded_prefect():
             summary = _run(logs, out, settings, options)
     return summary, time.monotonic() - started

@@ -4,18 +4,22 @@ Numba keeps them beside the code and looks at one file only, so what a kernel ca
 file may change unseen, and an upgrade in place may find signatures of classes that are no more.
 """
 
+import contextlib
+import fcntl
 import hashlib
 import os
 import shutil
 import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from epipole.io.array_cache import cache_folder
 
 KEPT = 8  # folders: of the code as it was last, in several environments
+_USED = "used"  # a file there once a run has ended well
 
 
-def use_kernel_cache(code: Path) -> None:
+def use_kernel_cache(*code: Path) -> None:
     """Have numba keep kernels in the user's cache folder, under a digest of the code.
 
     A user's own NUMBA_CACHE_DIR wins, and so does EPIPOLE_CACHE=off: then they stay beside the
@@ -24,7 +28,7 @@ def use_kernel_cache(code: Path) -> None:
     Parameters
     ----------
     code
-        The folder that holds all kernels and what they call.
+        The folders that hold all kernels and what they call.
     """
     root = cache_folder()
     if root is None or os.environ.get("NUMBA_CACHE_DIR"):
@@ -42,10 +46,39 @@ def use_kernel_cache(code: Path) -> None:
         numba.config.CACHE_DIR = str(folder)
 
 
-def _digest(code: Path) -> str:
+def new_kernel_folder() -> Path | None:
+    """Return where this code's kernels are kept while no run with them has ended well yet."""
+    root, said = cache_folder(), os.environ.get("NUMBA_CACHE_DIR")
+    if root is None or not said or Path(said).parent != root / "kernels":
+        return None
+    folder = Path(said)
+    return folder if folder.is_dir() and not (folder / _USED).exists() else None
+
+
+def mark_used(folder: Path) -> None:
+    """Say that a run has ended well: what it needs is compiled."""
+    with contextlib.suppress(OSError):
+        (folder / _USED).touch()
+
+
+@contextlib.contextmanager
+def only_one(folder: Path) -> Iterator[bool]:
+    """Tell whether no other process is in here for the same folder."""
+    with (folder / "lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            yield False
+        else:
+            yield True
+
+
+def _digest(folders: Iterable[Path]) -> str:
     digest = hashlib.sha256()
-    for file in sorted(code.rglob("*.py")):
-        digest.update(file.relative_to(code).as_posix().encode() + b"\0" + file.read_bytes())
+    for folder in folders:
+        for file in sorted(folder.rglob("*.py")):
+            name = file.relative_to(folder).as_posix()
+            digest.update(name.encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]
 
 

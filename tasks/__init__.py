@@ -4,4 +4,5 @@ from pathlib import Path
 
 from epipole.io.kernel_cache import use_kernel_cache
 
-use_kernel_cache(Path(__file__).parent / "algorithms")
+_HERE = Path(__file__).parent
+use_kernel_cache(_HERE / "algorithms", _HERE.parent / "io")
