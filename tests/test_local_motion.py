@@ -88,3 +88,16 @@ def test_one_detection_holds_still_with_an_error_that_grows():
 def test_no_query_gives_nothing():
     u, w, noise, bias, n = evaluate(np.zeros(1), np.array([[0.0, 0.0, 1.0]]), np.zeros(0), ARCSEC)
     assert len(u) == len(w) == len(noise) == len(bias) == len(n) == 0
+
+
+def test_a_bias_that_some_frames_alone_have_stays_a_covariance():
+    """Attitudes of a few frames are priors, of the others from stars."""
+    t = np.arange(-5.0, 6.0, 2.0)
+    u = passing(t, 3.0, 36000.0)
+    own, shared = np.full(len(t), ARCSEC), np.where(np.arange(len(t)) % 3 == 0, 30 * ARCSEC, 0.0)
+    n = len(t)
+    _, _, _, bias, _ = directions_at(
+        np.zeros(12, np.int64), np.full(12, n), np.linspace(-6, 6, 12), 0.0, t, u,
+        centroid_covariance(u, own), centroid_covariance(u, shared), 6.0,
+    )  # fmt: skip
+    assert np.linalg.eigvalsh(bias).min() > -1e-6 * (30 * ARCSEC) ** 2

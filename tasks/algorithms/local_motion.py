@@ -147,14 +147,22 @@ def _evaluate(
                 moving += slope[k] * (u[lo + k, a] - u[nearest, a])
             out_u[q, a] = u[nearest, a] + mean
             out_w[q, a] = moving
+        # One error, larger in some frames than in others (0 where stars gave the attitude): it
+        # adds up with its signs, and its square is never negative.
+        amplitude, total = 0.0, 0.0
+        for k in range(n):
+            square = np.trace(bias[lo + k])
+            amplitude += value[k] * np.sqrt(square)
+            total += abs(value[k]) * square
+        share = amplitude * amplitude / total if total > 0.0 else 0.0
         for a in range(3):
             for b in range(3):
                 own, shared = 0.0, 0.0
                 for k in range(n):
                     own += value[k] * value[k] * noise[lo + k, a, b]
-                    shared += value[k] * bias[lo + k, a, b]
+                    shared += abs(value[k]) * bias[lo + k, a, b]
                 out_noise[q, a, b] = own + (max(unmodelled, 0.0) if a == b else 0.0)
-                out_bias[q, a, b] = shared
+                out_bias[q, a, b] = share * shared
 
 
 def directions_at(

@@ -1,0 +1,160 @@
+"""Two sensors over ten minutes, end to end: objects that both see, and those that one alone does.
+
+``python tests/benchmarks/bench_long_evidence.py [--seeds N] [--lone N] [--work DIR]`` simulates
+logs, runs them with and without evidence over more than half a minute, and evaluates. Twenty
+geostationary objects; the lone ones stand half way to these, on orbits of their own, and move in
+the image as these do but for 2"/s.
+"""
+
+import argparse
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.orbit_fit import propagate
+from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.sky import ARCSEC, tangent_basis
+
+Array = npt.NDArray[np.float64]
+
+DURATION_S = 600.0
+MIDDLE_S = DURATION_S / 2  # when everything is in the middle of the fields
+GEO_KM = np.array([-39359.89, 15125.76, 64.30])
+EARTH_RATE_RAD_S = np.array([0.0, 0.0, 7.2921159e-5])
+V_GEO_KM_S = np.cross(EARTH_RATE_RAD_S, GEO_KM)
+OBJECTS, SPREAD_KM = 20, 200.0
+NEARER = (0.5, 0.62)  # the lone ones' ranges over the geostationary objects'
+SHORTEST_BASELINE_KM = 2500.0  # across the line of sight: no lone one is in both fields
+
+SHOWN = ("pair_precision", "pair_recall", "groups", "ghosts", "positions", "nees_in_99")
+
+HEAD = """
+name = "lone"
+start = 2019-04-01T04:00:00Z
+duration_s = {duration_s}
+seed = {seed}
+[sensor_defaults]
+magnitude_limit = 10.0
+rate_hz = 0.5
+camera = {{ width = 512, height = 512, fov_deg = 2.0 }}
+detection = {{ sigma_px = 0.15, false_points = 2.0, star_drop = 0.05, target_drop = 0.05 }}
+states = {{ prior_noise_arcsec = 20.0, prior_bias_arcsec = 30.0 }}
+pointing = {{ mode = "track", orbit = {{ position_km = {r}, velocity_km_s = {v} }} }}
+"""
+SENSOR = """
+[[sensors]]
+id = "sat{number}"
+orbit = {{ a_km = {a}, i_deg = {i}, raan_deg = {raan}, mean_anomaly_deg = {anomaly} }}
+"""
+TARGET = """
+[[targets]]
+orbit = {{ position_km = {r}, velocity_km_s = {v} }}
+magnitude = {magnitude}
+"""
+
+
+def low_orbits(rng: np.random.Generator) -> list[Array]:
+    """Return the elements of two orbits that have the objects in view all the time."""
+    toward = GEO_KM / np.linalg.norm(GEO_KM)
+    orbits: list[tuple[Array, Array]] = []
+    while len(orbits) < 2:
+        angles = np.radians([rng.uniform(20, 100), rng.uniform(0, 360), 0, rng.uniform(0, 360)])
+        elements = np.array([rng.uniform(6950, 7500), 0.0, *angles])
+        path = np.array([state_at(elements, np.float64(t))[0] for t in (0, MIDDLE_S, DURATION_S)])
+        apart = [np.cross(path - other, toward) for _, other in orbits]
+        if (path @ toward > 2000).all() and all(
+            np.linalg.norm(a, axis=1).min() > SHORTEST_BASELINE_KM for a in apart
+        ):
+            orbits.append((elements, path))
+    return [elements for elements, _ in orbits]
+
+
+def scene(seed: int, n_lone: int) -> str:
+    """Return a scene as TOML."""
+    rng = np.random.default_rng(seed)
+    orbits = low_orbits(rng)
+    followed = propagate(np.concatenate([GEO_KM, V_GEO_KM_S]), -MIDDLE_S)
+    parts = [
+        HEAD.format(
+            duration_s=DURATION_S, seed=seed, r=followed[:3].tolist(), v=followed[3:].tolist()
+        )
+    ]
+    for number, elements in enumerate(orbits):
+        i, raan, _, anomaly = np.degrees(elements[2:]).tolist()
+        parts.append(
+            SENSOR.format(number=number + 1, a=float(elements[0]), i=i, raan=raan, anomaly=anomaly)
+        )
+    states = [
+        np.concatenate(
+            [
+                GEO_KM + rng.normal(size=3) * SPREAD_KM,
+                V_GEO_KM_S + rng.normal(size=3) * 0.02,
+            ]
+        )
+        for _ in range(OBJECTS)
+    ]
+    for elements in orbits:
+        r, v = state_at(elements, np.float64(MIDDLE_S))
+        states += [lone(rng, r, v) for _ in range(n_lone)]
+    for state in states:
+        start = propagate(state, -MIDDLE_S)
+        parts.append(
+            TARGET.format(
+                r=start[:3].tolist(), v=start[3:].tolist(), magnitude=float(rng.uniform(7, 9))
+            )
+        )
+    return "".join(parts)
+
+
+def lone(rng: np.random.Generator, r_km: Array, v_km_s: Array) -> Array:
+    """Return the state of an object that a sensor at r_km sees among the others."""
+    line = GEO_KM - r_km
+    basis = tangent_basis(line / np.linalg.norm(line))
+    u = line / np.linalg.norm(line) + rng.uniform(-1, 1, 2) * np.radians(0.9) @ basis
+    share = rng.uniform(*NEARER)
+    range_km = share * np.linalg.norm(line)
+    drift = rng.normal(size=2) * 2 * ARCSEC @ basis
+    return np.concatenate(
+        [
+            r_km + range_km * u / np.linalg.norm(u),
+            v_km_s + share * (V_GEO_KM_S - v_km_s) + range_km * drift,
+        ]
+    )
+
+
+def epipole(*arguments: str | Path) -> str:
+    """Run a command and return what it prints."""
+    command = ["epipole", *map(str, arguments)]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+def main() -> None:
+    """Print pair precision and recall with and without longer evidence, scene by scene."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=3, help="scenes")
+    parser.add_argument("--lone", type=int, default=100, help="objects that one alone sees, each")
+    parser.add_argument("--work", type=Path, help="where logs and datasets go; none: nowhere")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        work = args.work or Path(folder)
+        work.mkdir(parents=True, exist_ok=True)
+        for seed in range(1, args.seeds + 1):
+            log, toml = work / f"{seed}.mcap", work / f"{seed}.toml"
+            toml.write_text(scene(seed, args.lone))
+            epipole("simulate", toml, "--out", log)
+            for longest_s in (0.0, 600.0):
+                settings = work / f"{longest_s:.0f}.toml"
+                settings.write_text(f"[association]\nlongest_span_s = {longest_s}\n")
+                out = work / f"{seed}-{longest_s:.0f}"
+                epipole("run", log, "--out", out, "--settings", settings)
+                report = json.loads(epipole("evaluate", out, "--truth", f"{log}.truth", "--json"))
+                shown = ", ".join(f"{name} {report[name]:.4f}" for name in SHOWN)
+                print(f"seed {seed}, up to {longest_s:.0f} s: {shown}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
