@@ -58,12 +58,13 @@ def _text(argument: Any) -> str:
             return f"Array({argument.dtype}, {argument.ndim}, {argument.layout!r}, readonly=True)"
         last = "::1" if argument.layout == "C" else ":"
         return f"{argument.dtype}[{', '.join([':'] * (argument.ndim - 1) + [last])}]"
+    inside = getattr(argument, "types", ())
+    fields = ", ".join(_text(one) for one in inside)
     if isinstance(argument, types.BaseNamedTuple):
-        made = argument.instance_class
-        fields = ", ".join(_text(one) for one in argument.types)
+        made = argument.instance_class  # type: ignore[attr-defined]
         return f"named('{made.__module__}:{made.__name__}', {fields})"
     if isinstance(argument, types.BaseTuple):
-        return f"Tuple(({', '.join(_text(one) for one in argument.types)},))"
+        return f"Tuple(({fields},))"
     return str(argument)
 
 
