@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import poisson
+from scipy.special import pdtrc
 
 from epipole.tasks.algorithms.sky import tangent_basis
 
@@ -127,7 +127,8 @@ def _surest(pairs: Indices, offset: Array, sigma: Array, n_aside: int) -> float 
         if agree < FEWEST:
             continue
         chance = (n_aside + 1) * min(float(np.mean(window)) / LARGEST_S, 1.0)
-        odds = float(poisson.logsf(agree - 2, chance))  # the one in the middle agrees by itself
+        with np.errstate(divide="ignore"):  # no chance at all
+            odds = float(np.log(pdtrc(agree - 2, chance)))  # the middle one agrees by itself
         if best is None or odds < best[0]:
             weight = 1 / sigma[near] ** 2
             best = odds, float(np.sum(weight * offset[near]) / np.sum(weight))

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.special import gammaln
-from scipy.stats import chi2
+from scipy.special import gammaincinv, gammaln
 
 from epipole.tasks.algorithms.orbit_fit import GM_KM3_S2, trajectory
 
@@ -174,7 +173,7 @@ def _gains(seen: Seen, pairs: _Pairs) -> Array:
             i, size = pairs.earlier[k], 6 if np.isfinite(pairs.apart[k]).all() else 3
             S, d = pairs.cov[k, :size, :size], pairs.apart[k, :size]
             d2 = float(d @ np.linalg.solve(S, d))
-            if not d2 < chi2.ppf(KEPT, size):
+            if not d2 < 2 * gammaincinv(size / 2, KEPT):  # chi-square
                 continue
             # Two that were seen at one time are two.
             distinct = (seen.first_s[past] <= seen.last_s[i]) & (
