@@ -16,7 +16,7 @@ import pyarrow.compute as pc
 from epipole.flows.progress import results, step
 from epipole.flows.summary import many
 from epipole.flows.work import DAY_NS, Spans, Work
-from epipole.io.work_files import is_written, read_part
+from epipole.io.work_files import is_written, read_part, write_part
 from epipole.schemas.bridge import array, concat
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import CALIBRATIONS, POSITIONS, STATES
@@ -32,6 +32,7 @@ from epipole.tasks.name_objects import name_objects
 from epipole.tasks.order_frames import OrderedFrames, order_logs
 from epipole.tasks.read_logs import read_log_into
 from epipole.tasks.solve_span import SensorParts, solve_span
+from epipole.tasks.spans import SPAN_NS, Span
 from epipole.tasks.stage_night import SHARES, stage_night
 from epipole.tasks.track_span import track_span
 
@@ -115,7 +116,7 @@ def track(work: Work, settings: Settings, attempt: str) -> list[SensorParts]:
     ]
     results("build tracklets", futures)
     futures = [
-        join_tracklets.submit(sensor, parts[sensor].tracked, spans, settings, parts[sensor].named)
+        join_tracklets.submit(sensor, parts[sensor].tracked, spans, parts[sensor].named)
         for sensor, spans in work.spans.items()
     ]
     count = sum(results("join tracklets", futures))
@@ -188,7 +189,24 @@ def set_clocks_right(work: Work, clocks: Sequence[Clock], settings: Settings, at
         if sensor in where
     ]  # fmt: skip
     results("correct clocks", futures)
-    return work._replace(identified={**work.identified, **where})
+    entered = {s: _entered(where[s], work.spans[s]) for s in where}
+    spans = {s: sorted([*own, *entered.get(s, [])]) for s, own in work.spans.items()}
+    return work._replace(spans=spans, identified={**work.identified, **where})
+
+
+def _entered(parts: Path, spans: Sequence[Span]) -> list[Span]:
+    """Return the spans that frames at their true times have entered; each gets an empty part.
+
+    The frames stay in the parts they were in.
+    """
+    times = [array(read_part(parts / s.folder, "solutions", ["time"]), "time") for s in spans]
+    starts = np.unique(np.concatenate(times) // SPAN_NS * SPAN_NS).tolist()
+    entered = [span for t in starts if (span := Span(t, t + SPAN_NS)) not in spans]
+    for span in entered:
+        names = ("solutions", "stars", "detections", "rejects")
+        empty = {name: read_part(parts / spans[0].folder, name).slice(0, 0) for name in names}
+        write_part(parts / span.folder, empty)
+    return entered
 
 
 def stage(

@@ -15,20 +15,16 @@ from prefect.cache_policies import NO_CACHE
 
 from epipole.io.work_files import is_written, read_part, write_part
 from epipole.schemas.bridge import table
-from epipole.schemas.settings import Settings
 from epipole.schemas.tables import TRACKLETS
 from epipole.schemas.work_tables import TRACKLET_NAMES
 from epipole.tasks.algorithms.track_linking.chains import chain_heads
 from epipole.tasks.spans import Sensor, Span
-from epipole.tasks.track_span import track_margin_ns
 
 KEY = ["frame_number", "centroid"]
 
 
 @task(name="join tracklets", task_run_name="join tracklets {sensor}", cache_policy=NO_CACHE)
-def join_tracklets(
-    sensor: Sensor, tracked: Path, spans: Sequence[Span], settings: Settings, stage: Path
-) -> int:
+def join_tracklets(sensor: Sensor, tracked: Path, spans: Sequence[Span], stage: Path) -> int:
     """Name one sensor's tracklets for the night, unless that has been done.
 
     Parameters
@@ -53,30 +49,24 @@ def join_tracklets(
     """
     night = stage / "night"
     if not is_written(night):
-        _join(sensor, tracked, spans, settings, stage)
+        _join(sensor, tracked, spans, stage)
     return read_part(night, "tracklets").num_rows
 
 
-def _join(
-    sensor: Sensor, tracked: Path, spans: Sequence[Span], settings: Settings, stage: Path
-) -> None:
-    margin_ns = track_margin_ns(settings)
+def _join(sensor: Sensor, tracked: Path, spans: Sequence[Span], stage: Path) -> None:
     count = 0
-    before: pl.DataFrame | None = None  # what the span before says of the time about its end
+    before: pl.DataFrame | None = None  # what the span before says
     owned, named = [], []
     for k, span in enumerate(spans):
         part = tracked / span.folder
         seen = _tracked(part).with_columns(owned=pl.col("time_ns").is_between(*span, closed="left"))
-        if k == 0 or spans[k - 1].end_ns != span.start_ns:
-            before = None
-        start = seen.filter(pl.col("time_ns") < span.start_ns + margin_ns)
-        known = _shared(before, start)
+        known = _shared(before, seen)  # a margin may reach over spans that have no frames
         numbers = _numbered(seen, known, count)
         count = max([count, *(numbers["number"] + 1).to_list()])
         seen = seen.join(numbers, on="span_name")
         named.append(_links(part, numbers).with_columns(span=pl.lit(k, pl.Int64)))
         owned.append(_summed(seen.filter("owned"), part).with_columns(span=pl.lit(k, pl.Int64)))
-        before = seen.filter(pl.col("time_ns") >= span.end_ns - margin_ns).select(*KEY, "number")
+        before = seen.select(*KEY, "number")
     _write(spans, stage, pl.concat(named), pl.concat(owned), sensor.sensor_id)
 
 
