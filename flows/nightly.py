@@ -68,7 +68,8 @@ def nightly(
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
         spans, uncalibrated = frames_wanted(frames, chosen)
-        key = work_key([log.sha256 for log in frames.sources], settings, chosen)
+        logs_read = [f"{log.sha256} {log.name}" for log in frames.sources]
+        key = work_key(logs_read, settings, chosen)
         with (
             claim_nights(out, [] if night else chosen) as staging,
             work_folder(work_root(out), chosen, key) as folder,

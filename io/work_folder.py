@@ -60,7 +60,7 @@ def work_key(logs: Sequence[str], settings: Settings, nights: Sequence[str]) -> 
     Parameters
     ----------
     logs
-        The SHA-256 of each.
+        The SHA-256 and name of each: of frames that contradict each other, names decide.
     """
     digest = hashlib.sha256()
     catalogue = _catalogue_key(settings.identification.catalogue)
