@@ -17,8 +17,7 @@ from datetime import datetime
 from pathlib import Path
 
 SCENES = Path(__file__).parents[2] / "io" / "scenes"
-FRAMES = 576_000
-HOURS = 10.3  # of which the Earth hides the field for a fifth
+HOURS = 11.4  # of which the Earth hides the field for a third
 COMMAND = "from epipole.flows.command_line import main; main()"
 # What a run says at the end of each stage.
 STAGES = (
