@@ -104,7 +104,8 @@ class Runner(StrEnum):
 def run(
     logs: Logs,
     out: Annotated[
-        str, typer.Option(metavar="DATASET", help="Folder to publish to; made if missing.")
+        str,
+        typer.Option(metavar="DATASET", help="Folder or s3:// URL to publish to; made if missing."),
     ],
     settings: Annotated[
         Path | None, typer.Option(metavar="FILE", help="TOML; `epipole settings` prints one.")
