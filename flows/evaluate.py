@@ -7,11 +7,11 @@ import pyarrow as pa
 from rich.console import Console
 from rich.table import Table
 
-from epipole.io.dataset import nights_in, nights_of, read_table
-from epipole.io.truth import Truth, read_truth
+from epipole.io.datasets.dataset import nights_in, nights_of, read_table
+from epipole.io.simulation.truth import Truth, read_truth
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.report import Report
-from epipole.tasks.evaluate_dataset import evaluate_dataset
+from epipole.tasks.evaluate.evaluate_dataset import evaluate_dataset
 
 TABLES = ("frames", "stars", "detections", "epochs", "associations", "positions")
 

@@ -6,29 +6,29 @@ from collections.abc import Sequence
 import numpy as np
 from prefect import flow
 
-from epipole.flows.clocks import find_objects
-from epipole.flows.log_choice import find_logs
-from epipole.flows.page import shown_on_page
-from epipole.flows.parameters import Night, night_asked, run_name
-from epipole.flows.runners import runner_asked
-from epipole.flows.stages import (
+from epipole.flows.night.clocks import find_objects
+from epipole.flows.night.log_choice import find_logs
+from epipole.flows.night.parameters import Night, night_asked, run_name
+from epipole.flows.night.stages import (
     calibrate,
     identify,
     name,
     read,
     stage,
 )
-from epipole.flows.summary import Summary, summarise
-from epipole.flows.work import frames_wanted
-from epipole.io.dataset import check_folder, check_sources, claim_nights, nights_of
-from epipole.io.star_catalogue import check_star_catalogue
-from epipole.io.work_folder import work_folder, work_key, work_root
+from epipole.flows.night.summary import Summary, summarise
+from epipole.flows.night.work import frames_wanted
+from epipole.flows.prefect.page import shown_on_page
+from epipole.flows.prefect.runners import runner_asked
+from epipole.io.catalogues.star_catalogue import check_star_catalogue
+from epipole.io.datasets.dataset import check_folder, check_sources, claim_nights, nights_of
+from epipole.io.work.folder import work_folder, work_key, work_root
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
-from epipole.tasks.publish_nights import publish_nights
-from epipole.tasks.stage_night import into_nights, source_table
+from epipole.tasks.publish.publish_nights import publish_nights
+from epipole.tasks.publish.stage_night import into_nights, source_table
 
 LOGGER = logging.getLogger(__name__)
 

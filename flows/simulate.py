@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from epipole.io.log_writer import LogWriter
-from epipole.io.scene_files import read_scene
-from epipole.io.truth import SUFFIX, TruthWriter
+from epipole.io.logs.writer import LogWriter
+from epipole.io.simulation.scenes import read_scene
+from epipole.io.simulation.truth import SUFFIX, TruthWriter
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Scene, validate_scene
 from epipole.tasks.algorithms.simulation.exposures import Exposures
@@ -27,7 +27,7 @@ from epipole.tasks.algorithms.simulation.sensor import (
     seconds_since,
     state_times,
 )
-from epipole.tasks.simulate_scene import (
+from epipole.tasks.simulate.simulate_scene import (
     Simulation,
     expose_blocks,
     sent_optics,

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from epipole.io.kernel_cache import use_kernel_cache
+from epipole.io.caches.kernels import use_kernel_cache
 
 _HERE = Path(__file__).parent
 use_kernel_cache(_HERE / "algorithms", _HERE.parent / "io")

@@ -14,7 +14,7 @@ import pytest
 
 import epipole.tasks  # noqa: F401  kernels are kept where they always are, before it is said otherwise
 
-sys.path.append(str(Path(__file__).parent))  # helpers beside the tests: random_stars
+sys.path.append(str(Path(__file__).parent))  # what tests share: scenes.random_stars and others
 
 START_S = 60  # that the S3 server may take to start
 
@@ -31,7 +31,7 @@ for name in ("PREFECT_API_URL", "PREFECT_PROFILE"):
 @pytest.fixture(scope="session")
 def prefect():
     """Run flows on one embedded API for the whole session."""
-    from epipole.flows.prefect_defaults import embedded_prefect, quiet_console
+    from epipole.flows.prefect.defaults import embedded_prefect, quiet_console
 
     quiet_console()
     with embedded_prefect():

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from night_stages import position_errors, see, solve, track
 
 from epipole.flows.simulate import simulate
-from epipole.io.scene_files import read_scene
+from epipole.io.simulation.scenes import read_scene
 from epipole.schemas.scene import Scene
 from epipole.schemas.settings import Settings
 

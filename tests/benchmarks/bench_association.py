@@ -22,9 +22,9 @@ from points import PIXEL_RAD, Points, Score, judge, scene, told
 from epipole.schemas.settings import AssociationSettings
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
-from epipole.tasks.algorithms.association.samples import Groups, Samples
-from epipole.tasks.algorithms.orbit_fit import propagate
-from epipole.tasks.algorithms.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.association.sampling.samples import Groups, Samples
+from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 
 FALSE = (10, 100, 300, 1000)
 BANDS_PX = (0.4, 0.5, 0.6, 0.8, 1.0, 1.3)  # widths of OpenPTV's epipolar band, to take the best

@@ -22,15 +22,15 @@ import pyarrow as pa
 from night_stages import see
 
 from epipole.flows.simulate import simulate
-from epipole.io.hipparcos import read_hipparcos
-from epipole.io.star_catalogue import write_star_catalogue
+from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.schemas.bridge import array
 from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import validate_settings
-from epipole.tasks import cached_skies
-from epipole.tasks.algorithms.star_identification.frame import Optics
-from epipole.tasks.build_deep_catalogue import build_deep_catalogue
-from epipole.tasks.cached_skies import CachedSkies, Catalogue
+from epipole.tasks.algorithms.star_identification.frames.frame import Optics
+from epipole.tasks.catalogue.build_deep_catalogue import build_deep_catalogue
+from epipole.tasks.identify import cached_skies
+from epipole.tasks.identify.cached_skies import CachedSkies, Catalogue
 
 # Catalogue, field [degrees], pixels along it, centroids a frame.
 CAMERAS = (

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from four_sensors import runs
 
-from epipole.flows import clocks as flow
+from epipole.flows.night import clocks as flow
 
 OFFSETS_S = (0.0, 0.005, -0.02, 0.05, -0.1, 0.2, -0.3, 0.5, -0.7, 1.0, -1.3, 2.0)
 

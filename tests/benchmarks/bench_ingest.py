@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import zstandard
 
-from epipole.io.log_reader import read_log
-from epipole.io.log_writer import LogWriter
+from epipole.io.logs.reader import read_log
+from epipole.io.logs.writer import LogWriter
 
 START_NS = 1_554_091_200_000_000_000
 FRAME_NS = 200_000_000
@@ -142,7 +142,7 @@ def peak_mib(path: Path) -> list[float]:
 
 def print_peak(path: str) -> None:
     """Print what `peak_mib` returns, of a process that does nothing else."""
-    from epipole.io.log_reader import read_log
+    from epipole.io.logs.reader import read_log
 
     logging.disable()
     before = resident_mib()

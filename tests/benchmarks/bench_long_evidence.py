@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.orbit_fit import propagate
+from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 from epipole.tasks.algorithms.simulation.orbits import state_at
-from epipole.tasks.algorithms.sky import ARCSEC, tangent_basis
 
 Array = npt.NDArray[np.float64]
 

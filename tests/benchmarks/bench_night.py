@@ -16,9 +16,9 @@ import tomllib
 from datetime import datetime
 from pathlib import Path
 
-SCENES = Path(__file__).parents[2] / "io" / "scenes"
+SCENES = Path(__file__).parents[2] / "io" / "simulation" / "built_in"
 HOURS = 11.4  # of which the Earth hides the field for a third
-COMMAND = "from epipole.flows.command_line import main; main()"
+COMMAND = "from epipole.flows.command_line.main import main; main()"
 # What a run says at the end of each stage.
 STAGES = (
     ("find", "found "),
@@ -33,7 +33,7 @@ EMPTY_TASKS = """
 import statistics, sys, time
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
-from epipole.flows.prefect_defaults import embedded_prefect, quiet_console
+from epipole.flows.prefect.defaults import embedded_prefect, quiet_console
 @task(cache_policy=NO_CACHE)
 def nothing(k):
     return k

@@ -62,7 +62,7 @@ def main() -> None:
         from prefect import flow
 
         from epipole.flows.nightly import nightly
-        from epipole.flows.prefect_defaults import embedded_prefect, quiet_console
+        from epipole.flows.prefect.defaults import embedded_prefect, quiet_console
 
         quiet_console()
         logging.getLogger("epipole").setLevel(logging.WARNING)

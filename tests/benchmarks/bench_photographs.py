@@ -19,16 +19,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from epipole.io.hipparcos import read_hipparcos
-from epipole.tasks.algorithms.camera import Camera, pixel_angle, unproject
-from epipole.tasks.algorithms.sky import boresight_angles
-from epipole.tasks.algorithms.star_identification.frame import Optics, Search
+from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
+from epipole.tasks.algorithms.geometry.sky import boresight_angles
+from epipole.tasks.algorithms.star_identification.frames.frame import Optics, Search
 from epipole.tasks.algorithms.star_identification.sensor import (
     Identified,
     Spots,
     identify_sensor,
 )
-from epipole.tasks.cached_skies import CachedSkies, Catalogue
+from epipole.tasks.identify.cached_skies import CachedSkies, Catalogue
 
 Array = npt.NDArray[np.float64]
 HOW = Search(3.7, -np.log(1e-6), 0.5, np.nan)  # the defaults of a run

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from epipole.tasks.algorithms.association.epipolar_lines import intersect_sights
-from epipole.tasks.algorithms.sky import ARCSEC, SPEED_OF_LIGHT_KM_S, tangent_basis
-from epipole.tasks.algorithms.triangulation import triangulate
+from epipole.tasks.algorithms.geometry.sky import ARCSEC, SPEED_OF_LIGHT_KM_S, tangent_basis
+from epipole.tasks.algorithms.geometry.triangulation import triangulate
 
 GEO = np.array([-39359.89, 15125.76, 64.30])
 V_GEO = np.array([-1.103, -2.870, 0.0])

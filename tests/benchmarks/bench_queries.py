@@ -19,7 +19,7 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from epipole.io.dataset import nights_in, publish
+from epipole.io.datasets.dataset import nights_in, publish
 from epipole.schemas.bridge import table
 from epipole.schemas.tables import SOURCES, TABLES
 

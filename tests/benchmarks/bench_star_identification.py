@@ -22,22 +22,26 @@ import numpy.typing as npt
 from star_frames import CELLS, MERGED_PX, Frames, expose, make_frames, read_frames, seen_stars
 from star_peers import Solver, cedar_solve, tetra3rs
 
-from epipole.tasks.algorithms.camera import pixel_angle, unproject
-from epipole.tasks.algorithms.rotations import (
+from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue
+from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
+from epipole.tasks.algorithms.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
-from epipole.tasks.algorithms.star_catalogue import navigation_catalogue
-from epipole.tasks.algorithms.star_identification.frame import (
+from epipole.tasks.algorithms.star_identification.frames.frame import (
     Frame,
     Optics,
     Search,
     identify_lost,
 )
-from epipole.tasks.algorithms.star_identification.frames import Frames as Flat
-from epipole.tasks.algorithms.star_identification.published import Method, matcher, solve_matches
+from epipole.tasks.algorithms.star_identification.frames.spots import Frames as Flat
+from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
+    Method,
+    matcher,
+    solve_matches,
+)
 from epipole.tasks.algorithms.star_identification.sequence import identify_sequence, no_priors
-from epipole.tasks.algorithms.star_identification.sky import (
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
     Sky,
     pattern_pairs,
     pattern_size,

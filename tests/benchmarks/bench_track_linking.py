@@ -6,19 +6,30 @@ The rivals (`pip install '.[bench]'`) get the same fragments, in pixels of one t
 """
 
 import argparse
+import sys
 import time
 import warnings
 from collections.abc import Callable
 from datetime import datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from fragment_scenes import FIELD_PX, FIELD_RAD, PIXEL_RAD, SIGMA_PX, Fragments, broken_tracks
-from identity_score import identity_f1
 
-from epipole.tasks.algorithms.track_linking.chains import chain_heads
-from epipole.tasks.algorithms.track_linking.likelihood_ratio import link_by_likelihood
-from epipole.tasks.algorithms.track_linking.prediction import link_by_prediction
+from epipole.tasks.algorithms.tracking.linking.chains import chain_heads
+from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
+from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction
+
+sys.path.append(str(Path(__file__).parents[1]))  # what tests share
+from scenes.fragment_scenes import (
+    FIELD_PX,
+    FIELD_RAD,
+    PIXEL_RAD,
+    SIGMA_PX,
+    Fragments,
+    broken_tracks,
+)
+from scenes.identity_score import identity_f1
 
 Labels = npt.NDArray[np.int64]
 CASES = [(60, (10, 20)), (60, (30, 60)), (250, (10, 20)), (250, (30, 60))]

@@ -4,14 +4,18 @@ python tests/benchmarks/bench_tracking.py
 """
 
 import argparse
+import sys
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from identity_score import identity_f1
 
-from epipole.tasks.algorithms.tracking import follow_detections
+from epipole.tasks.algorithms.tracking.runs import follow_detections
+
+sys.path.append(str(Path(__file__).parents[1]))  # what tests share
+from scenes.identity_score import identity_f1
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]

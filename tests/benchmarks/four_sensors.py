@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from epipole.flows.nightly import nightly
-from epipole.flows.prefect_defaults import embedded_prefect, quiet_console
+from epipole.flows.prefect.defaults import embedded_prefect, quiet_console
 from epipole.flows.simulate import simulate
 from epipole.schemas.scene import validate_scene
 
-SCENE = Path(__file__).parents[2] / "io/scenes/four_sensor_geo.toml"
+SCENE = Path(__file__).parents[2] / "io/simulation/built_in/four_sensor_geo.toml"
 
 
 @contextmanager

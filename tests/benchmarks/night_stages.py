@@ -11,26 +11,26 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.flows.sensors import of_sensor, sensor_ids
-from epipole.io.star_catalogue import read_star_catalogue
+from epipole.flows.command_line.sensors import of_sensor, sensor_ids
+from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.schemas.bridge import concat
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import DETECTIONS, TRACKLETS
 from epipole.schemas.work_tables import SOLUTIONS, VIEWS
 from epipole.tasks.algorithms.simulation.orbits import state_at
-from epipole.tasks.align_epochs import align_epochs
-from epipole.tasks.associate_objects import associate_objects
-from epipole.tasks.build_tracklets import Tracked, build_tracklets
-from epipole.tasks.identify_stars import identify_stars
-from epipole.tasks.lone_detections import with_lone_tracklets
-from epipole.tasks.place_sensors import place_sensors
-from epipole.tasks.solve_positions import Solved, solve_positions
-from epipole.tasks.view_objects import view_objects
+from epipole.tasks.common.lone_detections import with_lone_tracklets
+from epipole.tasks.identify.identify_stars import identify_stars
+from epipole.tasks.identify.place_sensors import place_sensors
+from epipole.tasks.solve.align_epochs import align_epochs
+from epipole.tasks.solve.associate_objects import associate_objects
+from epipole.tasks.solve.solve_positions import Solved, solve_positions
+from epipole.tasks.solve.view_objects import view_objects
+from epipole.tasks.track.build_tracklets import Tracked, build_tracklets
 
 Array = npt.NDArray[np.float64]
 sys.path.append(str(Path(__file__).parents[1]))  # helpers beside the tests
 
-from whole_logs import read_whole  # noqa: E402
+from scenes.whole_logs import read_whole  # noqa: E402
 
 
 class Seen(NamedTuple):

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from star_frames import EPOCH, Frames
 
-from epipole.io.hipparcos import read_hipparcos
+from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
 
 Array = npt.NDArray[np.float64]

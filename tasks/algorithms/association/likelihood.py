@@ -13,20 +13,23 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.chance import Chance, chance_of
-from epipole.tasks.algorithms.association.contests import settle_contests
-from epipole.tasks.algorithms.association.detection import (
+from epipole.tasks.algorithms.association.evidence.chance import Chance, chance_of
+from epipole.tasks.algorithms.association.evidence.detection import (
     CERTAIN_LOG_ODDS,
     detection_odds,
     estimated_detection,
 )
-from epipole.tasks.algorithms.association.growth import clear_of_doubt, grow_all
-from epipole.tasks.algorithms.association.object_density import revised_odds, visible_volume
-from epipole.tasks.algorithms.association.pool import Hypothesis, Pool, distinct
-from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
-from epipole.tasks.algorithms.association.seeds import SensorPairs, seeds_between
-from epipole.tasks.algorithms.association.views import views_of
-from epipole.tasks.algorithms.association.visibility import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.association.evidence.object_density import (
+    revised_odds,
+    visible_volume,
+)
+from epipole.tasks.algorithms.association.evidence.pool import Hypothesis, Pool, distinct
+from epipole.tasks.algorithms.association.evidence.visibility import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.association.hypotheses.contests import settle_contests
+from epipole.tasks.algorithms.association.hypotheses.growth import clear_of_doubt, grow_all
+from epipole.tasks.algorithms.association.hypotheses.seeds import SensorPairs, seeds_between
+from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
+from epipole.tasks.algorithms.association.sampling.views import views_of
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

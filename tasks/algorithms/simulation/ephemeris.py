@@ -4,7 +4,7 @@ import erfa
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.time_scales import AU_KM, DAY_S, tt_julian_date
+from epipole.tasks.algorithms.time.time_scales import AU_KM, DAY_S, tt_julian_date
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]

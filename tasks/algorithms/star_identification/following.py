@@ -8,8 +8,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.attitude import copy_matrix, turn
-from epipole.tasks.algorithms.star_identification.field import (
+from epipole.tasks.algorithms.geometry.attitude import copy_matrix, turn
+from epipole.tasks.algorithms.star_identification.search.field import (
     aberrated,
     solve_predicted,
     stars_in_cone,

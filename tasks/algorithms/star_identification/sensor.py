@@ -7,7 +7,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.star_identification.calibration import (
+from epipole.tasks.algorithms.star_identification.frames.frame import Optics, Search, Solution
+from epipole.tasks.algorithms.star_identification.frames.spots import (
+    Frames,
+    Solutions,
+    Spots,
+    unsolved,
+)
+from epipole.tasks.algorithms.star_identification.sensor_limits import (
     USELESS_SCATTER_MAG,
     faintest_star,
     is_significant,
@@ -16,17 +23,10 @@ from epipole.tasks.algorithms.star_identification.calibration import (
     scale_of,
     zero_point,
 )
-from epipole.tasks.algorithms.star_identification.frame import Optics, Search, Solution
-from epipole.tasks.algorithms.star_identification.frames import (
-    Frames,
-    Solutions,
-    Spots,
-    unsolved,
-)
-from epipole.tasks.algorithms.star_identification.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sequence import Priors, identify_sequence
-from epipole.tasks.algorithms.star_identification.sky import Sky
-from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
+from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
+from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 

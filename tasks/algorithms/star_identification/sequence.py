@@ -14,15 +14,15 @@ from epipole.tasks.algorithms.star_identification.following import (
     new_memory,
     remember,
 )
-from epipole.tasks.algorithms.star_identification.frame import (
+from epipole.tasks.algorithms.star_identification.frames.frame import (
     CLEAR_LEAD,
     Search,
     identify_lost,
 )
-from epipole.tasks.algorithms.star_identification.frames import Frames, Solutions, unsolved
-from epipole.tasks.algorithms.star_identification.pair_table import PairTable
-from epipole.tasks.algorithms.star_identification.sky import Sky
-from epipole.tasks.algorithms.star_identification.sky_grid import SkyGrid
+from epipole.tasks.algorithms.star_identification.frames.spots import Frames, Solutions, unsolved
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
+from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
+from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 

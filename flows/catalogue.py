@@ -1,0 +1,120 @@
+"""Star catalogues built into files that a run takes."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from epipole.io.catalogues.hipparcos import NAME as HIPPARCOS
+from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.io.catalogues.star_catalogue import write_star_catalogue
+from epipole.io.catalogues.star_list import read_star_list
+from epipole.schemas.bridge import array
+from epipole.schemas.errors import CatalogueError
+from epipole.schemas.star_catalogue import UNKNOWN_MOTION_MAS_YR, label_of
+from epipole.tasks.catalogue.build_deep_catalogue import build_deep_catalogue
+
+DEEP = "deep"
+
+
+@dataclass(frozen=True)
+class Built:
+    """What was written."""
+
+    file: str
+    name: str
+    epoch: float
+    source: str
+    stars: int
+    brightest: float
+    faintest: float
+    without_motion: int
+    variable: int
+    ignored: list[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the facts by name, as JSON takes them."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Return the facts as people read them."""
+        ignored = [f"not used    columns {', '.join(self.ignored)}"] if self.ignored else []
+        return [
+            f"catalogue   {self.name}, places of {self.epoch:g}",
+            f"source      {self.source}",
+            f"stars       {self.stars:,} of magnitude {self.brightest:.2f} to {self.faintest:.2f}; "
+            f"{self.without_motion:,} of unknown motion, {self.variable:,} variable",
+            *ignored,
+            f"file        {self.file}",
+            f"use it by   identification.catalogue = {self.file!r} in the settings",
+        ]
+
+
+def build_catalogue(
+    source: str,
+    out: Path,
+    epoch: float | None = None,
+    name: str | None = None,
+    magnitude_limit: float | None = None,
+) -> Built:
+    """Build a star catalogue and write it as Parquet.
+
+    Parameters
+    ----------
+    source
+        "hipparcos", "deep" (Gaia DR3 with Hipparcos' motions), or a CSV or Parquet file of stars.
+    out
+        The file; one that is there is replaced.
+    epoch, name
+        Of a user's stars, see `read_star_list`.
+    magnitude_limit
+        Leave fainter stars out.
+
+    Raises
+    ------
+    CatalogueError
+        Where the source does not fit; no file is then written.
+    """
+    if source in (HIPPARCOS, DEEP) and (epoch is not None or name is not None):
+        raise CatalogueError(f"{source} has an epoch and a name of its own; leave them out")
+    ignored: list[str] = []
+    if source == HIPPARCOS:
+        stars = read_hipparcos()
+    elif source == DEEP:
+        stars = build_deep_catalogue()
+    else:
+        stars, ignored = _of_user(source, epoch, name)
+    if magnitude_limit is not None:
+        stars = stars.filter(pa.array(array(stars, "magnitude") <= magnitude_limit))
+    if not stars.num_rows:
+        raise CatalogueError(f"{source}: no star of magnitude {magnitude_limit} or brighter")
+    write_star_catalogue(out, stars)
+    return _built(out, stars, ignored)
+
+
+def _of_user(source: str, epoch: float | None, name: str | None) -> tuple[pa.Table, list[str]]:
+    if not Path(source).is_file():
+        raise CatalogueError(
+            f"{source}: neither {HIPPARCOS} nor {DEEP} nor a file; give a CSV or Parquet file"
+        )
+    if (name or Path(source).stem) == HIPPARCOS:
+        raise CatalogueError(f"{source}: the name {HIPPARCOS} is taken; give another by --name")
+    return read_star_list(Path(source), epoch, name)
+
+
+def _built(out: Path, stars: pa.Table, ignored: list[str]) -> Built:
+    label, magnitude = label_of(stars.schema), array(stars, "magnitude")
+    return Built(
+        file=str(out),
+        name=label.name,
+        epoch=label.epoch,
+        source=label.source,
+        stars=stars.num_rows,
+        brightest=float(magnitude.min()),
+        faintest=float(magnitude.max()),
+        without_motion=int(np.sum(array(stars, "pm_sigma_mas_yr") == UNKNOWN_MOTION_MAS_YR)),
+        variable=int(np.sum(array(stars, "variable"))),
+        ignored=ignored,
+    )

@@ -1,0 +1,111 @@
+"""What is in a log, in words: sensors, times, counts, and what cannot be used."""
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from epipole.flows.command_line.sensors import of_sensor, sensor_ids
+from epipole.io.logs.reader import read_log
+from epipole.schemas.bridge import array, flatten
+
+
+def describe(log: str) -> dict[str, Any]:
+    """Return what a log holds, sensor by sensor.
+
+    Raises
+    ------
+    LogError
+        Where it is no log, or has no frames.
+    """
+    part = read_log(log)
+    return {
+        "log": log,
+        "size": part.source.size,
+        "sha256": part.source.sha256,
+        "sensors": [
+            _sensor(name, part.exposures, part.states, part.cameras)
+            for name in sensor_ids(part.exposures)
+        ],
+        "left_out": [
+            {"reason": row["reason"], "sensor_id": row["sensor_id"], "count": row["count_sum"]}
+            for row in part.rejects.group_by(["reason", "sensor_id"])
+            .aggregate([("count", "sum")])
+            .sort_by([("reason", "ascending"), ("sensor_id", "ascending")])
+            .to_pylist()
+        ],
+    }
+
+
+def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table) -> dict[str, Any]:
+    frames, own_states = of_sensor(exposures, name), of_sensor(states, name)
+    time_ns = np.sort(array(frames, "time"))
+    interval_ns = float(np.median(np.diff(time_ns))) if len(time_ns) > 1 else None
+    camera = of_sensor(cameras, name).drop_columns("time").to_pylist()
+    centroids, _ = flatten(frames, "x_px")
+    return {
+        "sensor_id": name,
+        "frames": frames.num_rows,
+        "first": _iso(time_ns[0]),
+        "last": _iso(time_ns[-1]),
+        "rate_hz": 1e9 / interval_ns if interval_ns else None,
+        "centroids_per_frame": len(centroids) / frames.num_rows,
+        "states": own_states.num_rows,
+        "state_frames": sorted(set(own_states["frame"].to_pylist())),
+        "states_with_attitude": own_states.num_rows - own_states["qw"].null_count,
+        "states_with_velocity": own_states.num_rows - own_states["vx_km_s"].null_count,
+        "image_px": [camera[0]["width"], camera[0]["height"]] if camera else None,
+        "field_deg": _field_deg(camera[0]) if camera else None,
+    }
+
+
+def _field_deg(camera: dict[str, Any]) -> list[float]:
+    """Return the field's width and height, distortion left aside."""
+    return [
+        float(np.degrees(2 * np.arctan(camera[size] / 2 / camera[focal])))
+        for size, focal in (("width", "fx_px"), ("height", "fy_px"))
+    ]
+
+
+def _iso(time_ns: int) -> str:
+    return f"{np.datetime64(int(time_ns), 'ns')}"[:23] + "Z"
+
+
+def lines(described: dict[str, Any]) -> list[str]:
+    """Return what `describe` found as people read it."""
+    out = [f"{described['log']}: {described['size']:,} bytes"]
+    for sensor in described["sensors"]:
+        rate = f" at {sensor['rate_hz']:.3g} Hz" if sensor["rate_hz"] else ""
+        out += [
+            f"  {sensor['sensor_id']}",
+            f"    frames       {sensor['frames']:,}{rate}, {sensor['first']} to {sensor['last']}",
+            f"    centroids    {sensor['centroids_per_frame']:.1f} a frame",
+            f"    states       {_states(sensor)}",
+            f"    calibration  {_calibration(sensor)}",
+        ]
+    for row in described["left_out"]:
+        whose = f" of {row['sensor_id']}" if row["sensor_id"] else ""
+        out.append(f"  left out: {row['count']:,} {row['reason']}{whose}")
+    return out
+
+
+def _states(sensor: dict[str, Any]) -> str:
+    if not sensor["states"]:
+        return "none: its frames give no positions"
+    n = sensor["states"]
+    return (
+        f"{n:,} in {', '.join(sensor['state_frames'])}, "
+        f"{_share(sensor['states_with_attitude'], n)} with attitude, "
+        f"{_share(sensor['states_with_velocity'], n)} with velocity"
+    )
+
+
+def _share(count: int, total: int) -> str:
+    return {0: "none", total: "all"}.get(count, f"{count:,}")
+
+
+def _calibration(sensor: dict[str, Any]) -> str:
+    if sensor["image_px"] is None:
+        return "none: a run leaves this sensor out"
+    width, height = sensor["image_px"]
+    return f"{width} x {height} px, {sensor['field_deg'][0]:.1f} x {sensor['field_deg'][1]:.1f} deg"

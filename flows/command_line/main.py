@@ -1,0 +1,339 @@
+"""The command line: ``epipole run``, ``simulate``, ``info``, ``evaluate``, ``settings``,
+``catalog build``.
+
+What a command needs is imported when it runs, so that ``epipole --help`` answers at once.
+"""
+
+import datetime
+import json
+import sys
+import warnings
+from enum import StrEnum
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+import typer.core
+
+from epipole.schemas.errors import EpipoleError
+
+
+class _Commands(typer.core.TyperGroup):
+    """Commands that end in one line where the user has to mend something."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; what is raised besides is a fault of the program, and shown as one."""
+        try:
+            return super().invoke(ctx)
+        except EpipoleError as error:
+            _fail(str(error), 1)
+        except KeyboardInterrupt:
+            _fail("interrupted", 130)
+
+
+def _fail(message: str, code: int) -> None:
+    print(f"epipole: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(code)
+
+
+app = typer.Typer(
+    name="epipole",
+    cls=_Commands,
+    help="Turns logs of star sensors into positions of space objects.",
+    epilog="A first run: epipole simulate four_sensor_geo --out night.mcap; "
+    "epipole run night.mcap --out out/",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"epipole {version('epipole')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print version."),
+    ] = False,
+) -> None:
+    """Options of every command."""
+
+
+Logs = Annotated[
+    list[str], typer.Argument(metavar="LOG...", help="MCAP files, folders, globs or URLs.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
+
+
+class Encoding(StrEnum):
+    """How messages of a log are written."""
+
+    protobuf = "protobuf"
+    json = "json"
+    ros2 = "ros2"
+
+
+class Compression(StrEnum):
+    """How chunks of a log are written."""
+
+    zstd = "zstd"
+    lz4 = "lz4"
+    none = "none"
+
+
+class Runner(StrEnum):
+    """Where the tasks of a run are worked on."""
+
+    threads = "threads"
+    dask = "dask"
+
+
+@app.command()
+def run(
+    logs: Logs,
+    out: Annotated[
+        str,
+        typer.Option(metavar="DATASET", help="Folder or s3:// URL to publish to; made if missing."),
+    ],
+    settings: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="TOML; `epipole settings` prints one.")
+    ] = None,
+    night: Annotated[
+        str | None, typer.Option(metavar="DATE", help="Publish this UTC date only, YYYY-MM-DD.")
+    ] = None,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Publish a night even if a log it had is not given.")
+    ] = False,
+    runner: Annotated[Runner, typer.Option(help="Where tasks are worked on.")] = Runner.threads,
+    workers: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Tasks at once; default: a CPU each.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of a running Dask; default: one of this machine."),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Print more, Prefect's lines too.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Turn logs into a dataset: the nightly flow, here and now."""
+    from epipole.flows.command_line.run import RunOptions, run_nightly
+
+    _check_night(night)
+    if not verbose:
+        warnings.simplefilter("ignore")
+    options = RunOptions(settings, night, replace, runner.value, workers, scheduler, quiet, verbose)
+    summary, seconds = run_nightly(logs, out, options)
+    if as_json:
+        _print_json(summary.as_dict() | {"seconds": round(seconds, 2)})
+    elif not quiet:
+        typer.echo("\n".join([*summary.lines(), f"took        {seconds:.1f} s"]))
+
+
+def _check_night(night: str | None) -> None:
+    try:
+        if night is not None and datetime.date.fromisoformat(night).isoformat() != night:
+            raise ValueError(night)
+    except ValueError:
+        raise typer.BadParameter(
+            f"{night!r} is no date such as 2019-04-01", param_hint="--night"
+        ) from None
+
+
+@app.command()
+def info(logs: Logs, as_json: AsJson = False) -> None:
+    """Say what is in logs: sensors, times, counts, and what cannot be used."""
+    from epipole.flows.command_line.log_info import describe, lines
+    from epipole.io.logs.listing import list_logs
+
+    described = [describe(log) for where in logs for log in list_logs(where)[0]]
+    if as_json:
+        _print_json(described)
+    else:
+        typer.echo("\n".join(line for one in described for line in lines(one)))
+
+
+@app.command()
+def simulate(
+    scene: Annotated[
+        str, typer.Argument(metavar="SCENE", help="A built-in scene's name, or a TOML file.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="LOG", help="Log to write; its truth goes to LOG.truth.")
+    ],
+    seed: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Another seed: the same scene anew.")
+    ] = None,
+    sensors: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Sensors of the first group.")
+    ] = None,
+    objects: Annotated[
+        int | None, typer.Option(min=0, metavar="N", help="Objects of the first group.")
+    ] = None,
+    hours: Annotated[
+        float | None, typer.Option(metavar="H", help="Duration, instead of the scene's.")
+    ] = None,
+    rate_hz: Annotated[
+        float | None, typer.Option("--rate", metavar="HZ", help="Frames a second of a sensor.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(metavar="TIME", help="UTC, such as 2019-04-01T04:00:00Z.")
+    ] = None,
+    logs: Annotated[
+        int, typer.Option(min=1, metavar="N", help="Cut into N logs, one after the other in time.")
+    ] = 1,
+    encoding: Annotated[Encoding, typer.Option(help="Of messages.")] = Encoding.protobuf,
+    compression: Annotated[Compression, typer.Option(help="Of chunks.")] = Compression.zstd,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate a scene: write a log, and its truth beside it.
+
+    Built-in scenes:
+
+    four_sensor_geo: four low sensors, nine geostationary objects, a minute
+
+    six_sensor_wide: wide fields, attitudes unknown, many false points
+
+    lost_in_space: a new attitude in every frame
+
+    night: any number of sensors, objects and hours
+    """
+    from epipole.flows.night.summary import many
+    from epipole.flows.simulate import simulate
+
+    made = simulate(
+        scene,
+        out,
+        seed=seed,
+        sensors=sensors,
+        objects=objects,
+        hours=hours,
+        rate_hz=rate_hz,
+        start=_instant(start),
+        logs=logs,
+        encoding=encoding.value,
+        compression=compression.value,
+    )
+    if as_json:
+        _print_json(vars(made) | {"logs": [str(p) for p in made.logs], "truth": str(made.truth)})
+        return
+    typer.echo(f"log    {', '.join(str(log) for log in made.logs)}")
+    typer.echo(f"truth  {made.truth}")
+    typer.echo(
+        f"{many(made.sensors, 'sensor')}, {many(made.objects, 'object')}, "
+        f"{many(made.frames, 'frame')}, {many(made.centroids, 'centroid')}"
+    )
+
+
+@app.command()
+def evaluate(
+    dataset: Annotated[
+        Path, typer.Argument(metavar="DATASET", help="What `epipole run` published to.")
+    ],
+    truth: Annotated[
+        Path, typer.Option(metavar="DIR", help="LOG.truth, beside the simulated log.")
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Hold a dataset against the truth of the simulated log it was made of.
+
+    Shows precision and recall of stars, pairs and objects, errors and honesty of sigmas.
+    """
+    from epipole.flows.evaluate import evaluate, show
+
+    report = evaluate(dataset, truth)
+    if as_json:
+        _print_json(report.as_dict())
+    else:
+        show(report)
+
+
+def _instant(text: str | None) -> datetime.datetime | None:
+    """Return an aware time; one without a zone is UTC."""
+    if text is None:
+        return None
+    try:
+        instant = datetime.datetime.fromisoformat(text)
+    except ValueError:
+        raise typer.BadParameter(
+            f"{text!r} is no time such as 2019-04-01T04:00:00Z", param_hint="--start"
+        ) from None
+    return instant if instant.tzinfo else instant.replace(tzinfo=datetime.UTC)
+
+
+@app.command()
+def settings() -> None:
+    """Print all settings with their defaults, as TOML for `epipole run --settings`."""
+    from epipole.io.settings_file import settings_text
+    from epipole.schemas.settings import Settings
+
+    typer.echo(settings_text(Settings()), nl=False)
+
+
+catalog = typer.Typer(
+    help="Build the star catalogue that sensors are identified with.", no_args_is_help=True
+)
+app.add_typer(catalog, name="catalog")
+
+
+@catalog.callback()
+def _catalog() -> None:
+    """Keep `build` a command of its own."""
+
+
+@catalog.command()
+def build(
+    source: Annotated[
+        str,
+        typer.Argument(metavar="SOURCE", help="hipparcos, deep, or a CSV or Parquet file."),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Parquet file to write.")],
+    epoch: Annotated[
+        float | None,
+        typer.Option(metavar="YEAR", help="Julian year of a file's places, such as 2016.0."),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Of the catalogue; default: the file's.")
+    ] = None,
+    magnitude_limit: Annotated[
+        float | None, typer.Option("--limit", metavar="MAG", help="Leave fainter stars out.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a star catalogue for the setting identification.catalogue.
+
+    hipparcos: the default of a run, complete to magnitude 7.3
+
+    deep: Gaia DR3 to G 10 with Hipparcos' motions, for fields below 5 degrees;
+    needs the extra "deep" of epipole; its data are share-alike (CC BY-SA 3.0)
+
+    A file has the columns star_id (whole numbers), ra_deg, dec_deg (ICRS) and
+    magnitude (V), and may have pm_ra_mas_yr (times cos dec), pm_dec_mas_yr,
+    parallax_mas, sigma_mas, pm_sigma_mas_yr (1-sigma an axis) and variable
+    (true or false). Bad rows are named, counted from 1 without the header.
+    """
+    from epipole.flows.catalogue import build_catalogue
+
+    built = build_catalogue(source, out, epoch, name, magnitude_limit)
+    if as_json:
+        _print_json(built.as_dict())
+    else:
+        typer.echo("\n".join(built.lines()))
+
+
+def _print_json(value: Any) -> None:
+    typer.echo(json.dumps(value, indent=2))

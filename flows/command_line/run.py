@@ -1,0 +1,67 @@
+"""The nightly flow started from the command line, on an embedded Prefect."""
+
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from epipole.flows.night.summary import Summary
+from epipole.flows.prefect.progress import shown, step
+from epipole.io.catalogues.star_catalogue import check_star_catalogue
+from epipole.io.datasets.dataset import check_folder
+from epipole.io.logs.listing import list_logs
+from epipole.io.settings_file import read_settings
+from epipole.schemas.settings import Settings
+from epipole.tasks.common.kernel_warm_up import compile_beside
+
+LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run is asked for."""
+
+    settings: Path | None = None
+    night: str | None = None
+    replace: bool = False
+    runner: str = "threads"
+    workers: int | None = None
+    scheduler: str | None = None
+    quiet: bool = False
+    verbose: bool = False
+
+
+def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary, float]:
+    """Return what a run found, and how many seconds it took.
+
+    Raises
+    ------
+    EpipoleError
+        Where the work cannot be done. What is plain at once is said before Prefect starts.
+    """
+    started = time.monotonic()
+    settings = read_settings(options.settings) if options.settings else Settings()
+    check_folder(out)
+    check_star_catalogue(settings.identification.catalogue)
+    for where in logs:
+        list_logs(where)
+    with shown(options.quiet, options.verbose), compile_beside() as compiling:
+        step("start Prefect", 0, 1)
+        from epipole.flows.prefect.defaults import embedded_prefect, quiet_console
+
+        if not options.verbose:
+            quiet_console()
+        if compiling:
+            LOGGER.info("first run of this version: compiling kernels, about a minute")
+        with embedded_prefect():
+            summary = _run(logs, out, settings, options)
+    return summary, time.monotonic() - started
+
+
+def _run(logs: list[str], out: str, settings: Settings, options: RunOptions) -> Summary:
+    from epipole.flows.nightly import nightly
+    from epipole.flows.prefect.runners import Runner, task_runner
+
+    runner = task_runner(Runner(options.runner), options.workers, options.scheduler)
+    flow = nightly.with_options(task_runner=runner)
+    return flow(logs, out, settings, options.night, options.replace)

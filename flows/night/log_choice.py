@@ -1,0 +1,127 @@
+"""Which logs are of a night, of all that lie in a folder."""
+
+import datetime
+import logging
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+
+from epipole.flows.night.summary import many
+from epipole.io.logs.listing import list_logs
+from epipole.io.logs.reader import MARGIN_NS as LOGGED_WITHIN_NS
+from epipole.io.logs.reader import read_log_times
+from epipole.schemas.bridge import table
+from epipole.schemas.errors import LogError
+from epipole.schemas.tables import REJECTS
+from epipole.tasks.common.spans import SPAN_NS
+
+LOGGER = logging.getLogger(__name__)
+
+DAY_NS = 86_400_000_000_000
+# Frames up to a span beyond both ends of a night are read too, and a frame's time and the
+# time it was logged at may be `LOGGED_WITHIN_NS` apart.
+MARGIN_NS = SPAN_NS + LOGGED_WITHIN_NS
+
+
+class FoundLogs(NamedTuple):
+    """The logs of a night, and a row of `rejects` for each file that is no log."""
+
+    paths: list[str]
+    rejects: pa.Table
+
+
+def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
+    """Return the logs that may have frames of a night, with a margin beyond both its ends.
+
+    Parameters
+    ----------
+    where
+        A file, folder, glob or URL, or several; see `list_logs`. What comes twice counts once.
+    night
+        UTC date, ``YYYY-MM-DD``; none: all logs.
+
+    A log that is named itself is taken. Those found in a folder or by a glob are chosen by when
+    their messages were logged; one that was never closed does not say so and is taken too:
+    reading it tells. A found file that is no MCAP is left out with a warning, so that one broken
+    recording does not stop every night.
+
+    Raises
+    ------
+    LogError
+        No logs there, none of the night, or one that was named is no MCAP.
+    """
+    named = [where] if isinstance(where, str) else list(where)
+    if not named:
+        raise LogError("no logs given; name a log, or a folder of logs")
+    chosen: list[str] = []
+    spans: list[tuple[int, int]] = []
+    broken: list[str] = []
+    for path, is_named in _listed(named).items():
+        try:
+            logged_ns = read_log_times(path)
+        except LogError as error:
+            if is_named or error.__cause__ is not None:  # it may be a log, but cannot be read
+                raise
+            LOGGER.warning("left out: %s", error)
+            broken.append(path)
+            continue
+        if is_named or night is None or logged_ns is None or _touches(logged_ns, night):
+            chosen.append(path)
+        else:
+            spans.append(logged_ns)
+    if not chosen:
+        raise LogError(f"{', '.join(named)}: {_none_chosen(night, spans, broken)}")
+    LOGGER.info("found %s%s", many(len(chosen), "log"), f" of {night}" if night else "")
+    return FoundLogs(chosen, _rejects(broken, night))
+
+
+def _listed(named: Sequence[str]) -> dict[str, bool]:
+    """Return each log once, and whether it was named itself."""
+    listed: dict[str, bool] = {}
+    for where in named:
+        paths, is_named = list_logs(where)
+        for path in paths:
+            listed[path] = is_named or listed.get(path, False)
+    return listed
+
+
+def _touches(logged_ns: tuple[int, int], night: str) -> bool:
+    start_ns = _start_ns(night)
+    first_ns, last_ns = logged_ns
+    return first_ns < start_ns + DAY_NS + MARGIN_NS and last_ns >= start_ns - MARGIN_NS
+
+
+def _none_chosen(night: str | None, spans: Sequence[tuple[int, int]], broken: Sequence[str]) -> str:
+    if not spans:
+        return f"none of {len(broken)} files is an MCAP log"
+    first, last = (_date(f([span[i] for span in spans])) for i, f in ((0, min), (1, max)))
+    have = first if first == last else f"{first} to {last}"
+    return f"no frames on {night} in these logs; they have {have}"
+
+
+def _rejects(broken: Sequence[str], night: str | None) -> pa.Table:
+    n = len(broken)
+    return table(
+        REJECTS,
+        {
+            "source": [path.rpartition("/")[2] for path in broken],
+            "offset": [None] * n,
+            "sensor_id": [None] * n,
+            "time": np.full(n, _start_ns(night) if night else 0, np.int64),
+            "stage": ["find_logs"] * n,
+            "reason": ["no_mcap"] * n,
+            "count": [1] * n,
+        },
+    )
+
+
+def _start_ns(night: str) -> int:
+    return int(np.datetime64(night, "ns").astype(np.int64))
+
+
+def _date(time_ns: int) -> str:
+    return (
+        datetime.datetime.fromtimestamp(time_ns // 1_000_000_000, datetime.UTC).date().isoformat()
+    )

@@ -1,0 +1,142 @@
+"""What a run found and what it left out, in a few lines."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.io.datasets.night_files import read_columns
+from epipole.tasks.check.estimate_clocks import Clock
+
+
+@dataclass(frozen=True)
+class SensorSummary:
+    """Counts of one sensor; the residual is the median of its frames, None without stars."""
+
+    sensor_id: str
+    frames: int
+    identified: int
+    residual_px: float | None
+    tracks: int
+
+    def as_row(self) -> dict[str, Any]:
+        """Return the counts as a row of a table that people read."""
+        residual = "" if self.residual_px is None else f"{self.residual_px:.3f}"
+        return {
+            "sensor": self.sensor_id,
+            "frames": self.frames,
+            "identified": self.identified,
+            "residual px": residual,
+            "tracks": self.tracks,
+        }
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Counts of what was published."""
+
+    dataset: str
+    nights: list[str]
+    logs: int
+    sensors: int
+    frames: int
+    identified: int
+    stars: int
+    detections: int
+    tracklets: int
+    epochs: int
+    objects: int
+    positions: int
+    rejects: dict[str, int]
+    clocks: list[str]
+    by_sensor: list[SensorSummary]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the counts by name, as JSON takes them."""
+        return asdict(self)
+
+    def lines(self) -> list[str]:
+        """Return the summary as people read it."""
+        left_out = [f"  {count:,} {reason}" for reason, count in self.rejects.items()]
+        return [
+            f"nights      {', '.join(self.nights)}",
+            f"frames      {self.frames:,} of {many(self.sensors, 'sensor')} "
+            f"in {many(self.logs, 'log')}",
+            f"identified  {self.identified:,} by {self.stars:,} stars",
+            f"objects     {self.objects:,} in {self.detections:,} detections, "
+            f"{many(self.tracklets, 'tracklet')}",
+            f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
+            *[f"clock       {clock}" for clock in self.clocks],
+            f"left out    {many(sum(self.rejects.values()), 'thing')}" + (":" if left_out else ""),
+            *left_out,
+            f"dataset     {self.dataset}",
+        ]
+
+
+# What a summary counts: of a whole night not every column is in memory at once.
+_COLUMNS = {
+    "frames": ["sensor_id", "attitude_source", "residual_px"],
+    "stars": ["centroid"],
+    "detections": ["centroid"],
+    "tracklets": ["sensor_id", "track_id"],
+    "epochs": ["epoch"],
+    "positions": ["object_id"],
+    "sources": ["sha256"],
+    "rejects": ["reason", "count"],
+}
+
+
+def summarise(dataset: str, staged: Mapping[str, Path], clocks: Sequence[Clock] = ()) -> Summary:
+    """Return the summary of nights that are staged, and of clocks that are surely off."""
+    tables = {
+        name: pa.concat_tables([read_columns(folder, name, columns) for folder in staged.values()])
+        for name, columns in _COLUMNS.items()
+    }
+    frames = tables["frames"]
+    return Summary(
+        dataset=dataset,
+        nights=list(staged),
+        logs=pc.count_distinct(tables["sources"]["sha256"]).as_py(),
+        sensors=pc.count_distinct(frames["sensor_id"]).as_py(),
+        frames=frames.num_rows,
+        identified=pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
+        stars=tables["stars"].num_rows,
+        detections=tables["detections"].num_rows,
+        tracklets=tables["tracklets"].num_rows,
+        epochs=pc.count_distinct(tables["epochs"]["epoch"]).as_py(),
+        objects=pc.count_distinct(tables["positions"]["object_id"]).as_py(),
+        positions=tables["positions"].num_rows,
+        rejects=_by_reason(tables["rejects"]),
+        clocks=[str(clock) for clock in clocks if clock.is_off],
+        by_sensor=[
+            _of_sensor(frames.filter(pc.field("sensor_id") == name), tables["tracklets"], name)
+            for name in sorted(pc.unique(frames["sensor_id"]).to_pylist())
+        ],
+    )
+
+
+def _of_sensor(frames: pa.Table, tracklets: pa.Table, sensor_id: str) -> SensorSummary:
+    own = tracklets.filter(pc.field("sensor_id") == sensor_id)
+    residual_px = frames["residual_px"].drop_null().to_numpy()
+    return SensorSummary(
+        sensor_id=sensor_id,
+        frames=frames.num_rows,
+        identified=pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
+        residual_px=float(np.median(residual_px)) if len(residual_px) else None,
+        tracks=pc.count_distinct(own["track_id"]).as_py(),
+    )
+
+
+def _by_reason(rejects: pa.Table) -> dict[str, int]:
+    counts = rejects.group_by("reason").aggregate([("count", "sum")])
+    ordered = counts.sort_by([("count_sum", "descending"), ("reason", "ascending")])
+    return {row["reason"]: row["count_sum"] for row in ordered.to_pylist()}
+
+
+def many(count: int, what: str) -> str:
+    """Return a count with its noun, such as ``1 log`` or ``2,000 logs``."""
+    return f"{count:,} {what}" + ("" if count == 1 else "s")

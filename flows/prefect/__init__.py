@@ -1,0 +1,1 @@
+"""Prefect: defaults of an embedded server, task runners, what its page shows."""

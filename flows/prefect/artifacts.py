@@ -1,0 +1,111 @@
+"""Artifacts of a night on Prefect's page: how far it is, what it found, where the dataset is.
+
+A night does not fail because its page cannot be written: that is a warning, and the run goes on.
+"""
+
+import contextlib
+import logging
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import cast
+from uuid import UUID
+
+import httpx
+from prefect.artifacts import (
+    create_link_artifact,
+    create_markdown_artifact,
+    create_progress_artifact,
+    create_table_artifact,
+    update_progress_artifact,
+)
+from prefect.exceptions import PrefectException
+
+from epipole.flows.night.summary import Summary, many
+
+LOGGER = logging.getLogger(__name__)
+
+UPDATED_EVERY_S = 3.0
+_PAGE_ERRORS = (httpx.HTTPError, PrefectException, OSError, RuntimeError)
+
+
+@contextlib.contextmanager
+def _softly(what: str) -> Iterator[None]:
+    try:
+        yield
+    except _PAGE_ERRORS as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        LOGGER.warning("%s could not be shown on Prefect's page: %s", what, reason)
+
+
+class ProgressBar(logging.Handler):
+    """A progress artifact that follows the steps of a run; see `epipole.flows.prefect.progress`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._id: UUID | None = None
+        self._next_s = 0.0
+        self._percent = 0.0
+        with _softly("progress"):
+            self._id = cast(UUID, create_progress_artifact(0.0, "progress", "start"))
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show a step, unless one was shown just now."""
+        if self._id is None or time.monotonic() < self._next_s:
+            return
+        counts = vars(record)
+        self._show(counts["percent"], f"{counts['stage']}: {counts['done']} of {counts['total']}")
+
+    def finish(self, how: str) -> None:
+        """Say how the run ended."""
+        if self._id is not None:
+            self._show(100.0, how)
+
+    def _show(self, percent: float, description: str) -> None:
+        self._percent = max(self._percent, percent)  # a stage may be done again
+        artifact, self._id = self._id, None  # a page that cannot be written is not asked again
+        with _softly("progress"):
+            if artifact is not None:
+                update_progress_artifact(artifact, self._percent, description)
+            self._id = artifact
+            self._next_s = time.monotonic() + UPDATED_EVERY_S
+
+
+def show_summary(summary: Summary) -> None:
+    """Show what a run found: its counts, a table of its sensors, a link to its nights."""
+    nights = ", ".join(summary.nights)
+    with _softly("the summary"):
+        create_markdown_artifact(as_markdown(summary), "night", f"Night {nights}")
+        rows = [sensor.as_row() for sensor in summary.by_sensor]
+        create_table_artifact(rows, "sensors", f"Sensors of {nights}")
+        for night in summary.nights:
+            folder = f"{summary.dataset.rstrip('/')}/night={night}"
+            link = folder if "://" in folder else Path(folder).absolute().as_uri()
+            create_link_artifact(link, folder, "dataset", f"Tables of {night}")
+
+
+def as_markdown(summary: Summary) -> str:
+    """Return the summary as a page of Markdown."""
+    counts = {
+        "logs": summary.logs,
+        "frames": summary.frames,
+        "identified by stars": summary.identified,
+        "stars": summary.stars,
+        "detections": summary.detections,
+        "tracklets": summary.tracklets,
+        "objects": summary.objects,
+        "epochs": summary.epochs,
+        "positions": summary.positions,
+    }
+    lines = [f"# Night {', '.join(summary.nights)}", "", *_table("found", counts)]
+    if summary.clocks:
+        lines += ["", "Clocks that are off:", "", *(f"- {clock}" for clock in summary.clocks)]
+    if summary.rejects:
+        lines += ["", f"Left out: {many(sum(summary.rejects.values()), 'thing')}", ""]
+        lines += _table("reason", summary.rejects)
+    return "\n".join(lines) + "\n"
+
+
+def _table(name: str, counts: dict[str, int]) -> list[str]:
+    rows = [f"| {key} | {count:,} |" for key, count in counts.items()]
+    return [f"| {name} | count |", "|---|---:|", *rows]

@@ -1,0 +1,1 @@
+"""Catalogues: stars, and the orientation of the Earth."""

@@ -1,0 +1,1 @@
+"""Datasets: nights of Parquet tables, published at once in a folder or an object store."""

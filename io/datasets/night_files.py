@@ -1,0 +1,70 @@
+"""The Parquet files of a night in the making: one a table, written span by span."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from epipole.io.datasets.parquet_options import ROWS_IN_GROUP, part_options
+from epipole.schemas.bridge import conform
+from epipole.schemas.errors import DatasetError
+from epipole.schemas.tables import TABLES
+
+PART = "part-0.parquet"
+
+
+def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
+    """Write a table of a night from pieces that follow one another in time.
+
+    Parameters
+    ----------
+    night
+        The night's folder; the table's folder in it is made.
+    pieces
+        Each sorted; at least a row group each, so that a reader can pass over other times.
+
+    Returns
+    -------
+    int
+        How many rows there are.
+
+    Raises
+    ------
+    DatasetError
+        Where the disk refuses.
+    """
+    folder = night / name
+    try:
+        return _write(folder, name, pieces)
+    except OSError as error:
+        raise DatasetError(
+            f"{folder}: cannot be written ({error.strerror or error}); nothing was changed"
+        ) from error
+
+
+def _write(folder: Path, name: str, pieces: Iterable[pa.Table]) -> int:
+    folder.mkdir(parents=True)
+    count = 0
+    writer = None
+    for rows in pieces:
+        rows = conform(TABLES[name], rows)
+        if rows.num_rows == 0:
+            continue
+        if writer is None:  # what the rows' metadata says beside the schema's goes along
+            writer = _writer(folder, rows.schema)
+        writer.write_table(rows, ROWS_IN_GROUP)
+        count += rows.num_rows
+    if writer is None:
+        writer = _writer(folder, TABLES[name])
+    writer.close()
+    return count
+
+
+def _writer(folder: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    return pq.ParquetWriter(folder / PART, schema, **part_options(schema))
+
+
+def read_columns(night: Path, name: str, columns: Sequence[str]) -> pa.Table:
+    """Return some columns of a table that `write_table` wrote."""
+    return pq.read_table(night / name / PART, columns=list(columns), partitioning=None)

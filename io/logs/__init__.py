@@ -1,0 +1,1 @@
+"""Logs: MCAP files in and out, with whatever damage they have."""

@@ -1,0 +1,1 @@
+"""The messages of a log as columns: frames, states and calibrations."""

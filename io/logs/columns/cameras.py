@@ -1,0 +1,77 @@
+"""The calibrations of a log as CAMERAS."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pyarrow as pa
+
+from epipole.io.logs.damage import RejectList
+from epipole.io.logs.messages.batches import Part, fault, known_id
+from epipole.io.logs.messages.decoding import Calibration
+from epipole.schemas.bridge import table
+from epipole.schemas.work_tables import CAMERAS
+
+
+@dataclass
+class CameraColumns:
+    """The calibrations of a log."""
+
+    rejects: RejectList
+    _rows: list[Calibration] = field(default_factory=list)
+
+    def add(self, part: Part) -> None:
+        """Take calibrations, or leave them out with a reason.
+
+        One without a time holds from when it was logged.
+        """
+        for calibration, offset, log_time_ns in part.decoded(0, len(part)):
+            time_ns = calibration.time_ns or log_time_ns or None
+            reason = fault(time_ns, calibration.sensor_id) or _camera_fault(calibration)
+            if reason is None:
+                self._rows.append(calibration._replace(time_ns=time_ns))
+            else:
+                self.rejects.add(
+                    reason,
+                    time_ns=time_ns or 0,
+                    offset=offset,
+                    sensor_id=known_id(calibration.sensor_id),
+                )
+
+    def take(self) -> pa.Table:
+        """Return CAMERAS of the calibrations since the last time."""
+        rows, self._rows = self._rows, []
+        matrices = np.array([c.K for c in rows], float).reshape(-1, 9)
+        distortion = np.zeros((len(rows), 5))
+        for i, c in enumerate(rows):
+            distortion[i, : len(c.D)] = c.D
+        return table(
+            CAMERAS,
+            {
+                "sensor_id": [c.sensor_id for c in rows],
+                "time": np.array([c.time_ns for c in rows], np.int64),
+                "width": np.array([c.width for c in rows], np.int64),
+                "height": np.array([c.height for c in rows], np.int64),
+                "fx_px": matrices[:, 0],
+                "fy_px": matrices[:, 4],
+                "cx_px": matrices[:, 2],
+                "cy_px": matrices[:, 5],
+                **dict(zip(("k1", "k2", "p1", "p2", "k3"), distortion.T, strict=True)),
+            },
+        )
+
+
+def _camera_fault(calibration: Calibration) -> str | None:
+    if calibration.width <= 0 or calibration.height <= 0:
+        return "bad_image_size"
+    if calibration.distortion_model not in ("", "plumb_bob"):
+        return "unknown_distortion_model"
+    if len(calibration.D) not in (0, 4, 5) or not np.isfinite(calibration.D).all():
+        return "bad_distortion"
+    K = calibration.K
+    if len(K) != 9 or not np.isfinite(K).all() or K[0] <= 0 or K[4] <= 0:
+        return "bad_camera_matrix"
+    # A skewed or scaled matrix is a camera that the pipeline has no model of.
+    zeros, scale = (K[1], K[3], K[6], K[7]), 1e-9 * K[0]
+    if any(abs(k) > scale for k in zeros) or abs(K[8] - 1.0) > 1e-9:
+        return "bad_camera_matrix"
+    return None

@@ -1,0 +1,248 @@
+"""The frames of a log as EXPOSURES."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.io.logs.columns.names import NameCodes
+from epipole.io.logs.damage import RejectList
+from epipole.io.logs.messages.batches import Part, Received, fault, known_id
+from epipole.io.logs.messages.decoding import Frame
+from epipole.io.logs.messages.scan import FrameRows, scan_frames
+from epipole.io.logs.messages.wire import FRAME_KINDS
+from epipole.schemas.bridge import table
+from epipole.schemas.work_tables import EXPOSURES
+
+Floats = npt.NDArray[np.float32]
+Bools = npt.NDArray[np.bool_]
+Integers = npt.NDArray[np.int64]
+
+MAX_FRAME_NUMBER = (1 << 63) - 1
+BATCH = 65536  # frames in one piece of the table
+BATCH_CENTROIDS = 1 << 21
+# A centroid's x and y take 8 bytes in binary and at least 4 as text.
+BYTES_OF_A_CENTROID = 4
+CENTROID_BYTES, ROW_BYTES = 16, 80  # in the table
+
+
+class _Rows:
+    """A piece of the table in the making."""
+
+    def __init__(self, n: int, n_centroids: int) -> None:
+        self.n = 0
+        self.offset = np.empty(n, np.int64)
+        self.columns = FrameRows(
+            np.empty(n, np.int32),
+            np.empty(n, np.int64),
+            np.empty(n, np.int64),
+            np.empty(n, np.float64),
+            np.zeros(n + 1, np.int32),
+            np.empty(n, np.bool_),
+            np.empty(n, np.bool_),
+            *(_arrow_floats(n_centroids) for _ in range(4)),
+        )
+
+    @property
+    def n_centroids(self) -> int:
+        return int(self.columns.first[self.n])
+
+    def has_room(self, n: int, n_centroids: int) -> bool:
+        return self.n + n <= len(self.offset) and (
+            self.n_centroids + n_centroids <= len(self.columns.x_px)
+        )
+
+
+@dataclass
+class FrameColumns:
+    """The frames of a log; of those from `span[0]` to before `span[1]`, if there is one."""
+
+    rejects: RejectList
+    span: tuple[int, int] | None = None
+    clock_off_ns: int | None = None  # at most how far a frame's time and its logging were apart
+    _sensors: NameCodes = field(default_factory=NameCodes)
+    _rows: _Rows = field(default_factory=lambda: _Rows(0, 0))
+    _tables: list[pa.Table] = field(default_factory=list)
+
+    def add(self, part: Part) -> None:
+        """Take frames, but for those whose time, sensor, number or arrays are none.
+
+        Flux is never relied on: where it is not a positive finite number it is NaN, and the
+        frame stays. An exposure that is not one is 0, unknown.
+        """
+        messages = part.messages
+        n_bytes = int((messages.end - messages.start).sum())
+        self._make_room(len(part), n_bytes // BYTES_OF_A_CENTROID)
+        rows, names = self._rows, self._sensors.table
+
+        def scan(i: int) -> int:
+            n = rows.n
+            stopped, rows.n = scan_frames(messages, i, names, rows.columns, n, FRAME_KINDS)
+            rows.offset[n : rows.n] = part.offset[i:stopped]
+            self._watch_clock(part, i, stopped, n)
+            return int(stopped)
+
+        part.take(scan, self._judge)
+
+    @property
+    def n_bytes(self) -> int:
+        """What the rows that wait to be taken take, about."""
+        waiting = self._rows.n_centroids * CENTROID_BYTES + self._rows.n * ROW_BYTES
+        return waiting + sum(rows.nbytes for rows in self._tables)
+
+    def take(self) -> pa.Table:
+        """Return EXPOSURES of the frames since the last time, in the order of the log."""
+        self._close()
+        tables, self._tables = self._tables, []
+        return pa.concat_tables([EXPOSURES.empty_table(), *tables])
+
+    def _watch_clock(self, part: Part, first: int, last: int, n: int) -> None:
+        if self.span is None or first == last:
+            return
+        logged = part.block.time_ns[part.chosen[first:last]].astype(np.int64)
+        off = np.abs(self._rows.columns.time_ns[n : n + last - first] - logged)
+        self.clock_off_ns = max(self.clock_off_ns or 0, int(off.max()))
+
+    def _make_room(self, n: int, n_centroids: int) -> None:
+        if not self._rows.has_room(n, n_centroids):
+            self._close()
+            self._rows = _Rows(max(n, BATCH), max(n_centroids, BATCH_CENTROIDS))
+
+    def _close(self) -> None:
+        """Add the rows so far to the table."""
+        rows, n = self._rows, self._rows.n
+        self._rows = _Rows(0, 0)
+        if n == 0:
+            return
+        c, m = rows.columns, int(rows.columns.first[n])
+        offsets = pa.array(c.first[: n + 1])
+        columns = {
+            "sensor_id": self._sensors.strings(c.sensor[:n]),
+            "frame_number": c.number[:n],
+            "time": c.time_ns[:n],
+            "exposure_s": c.exposure_s[:n],
+            "x_px": _lists("x_px", c.x_px[:m], offsets),
+            "y_px": _lists("y_px", c.y_px[:m], offsets),
+            "flux": _lists("flux", c.flux[:m], offsets, c.has_flux[:n]),
+            "sigma_px": _lists("sigma_px", c.sigma_px[:m], offsets, c.has_sigma[:n]),
+            "source": pa.repeat(pa.scalar(self.rejects.source), n),
+            "offset": rows.offset[:n],
+        }
+        exposures = table(EXPOSURES, columns)
+        if self.span is not None:
+            low, high = self.span
+            time_ns = c.time_ns[:n]
+            exposures = exposures.filter(pa.array((time_ns >= low) & (time_ns < high)))
+        self._tables.append(exposures)
+
+    # Frames that were decoded one by one
+
+    def _judge(self, received: Sequence[Received]) -> None:
+        """Take decoded frames, or leave them out with a reason."""
+        sound = []
+        for one in received:
+            frame: Frame = one.record
+            reason = fault(frame.time_ns, frame.sensor_id) or _frame_fault(frame)
+            if reason is None:
+                sound.append(one)
+            else:
+                self._leave_out(one, reason)
+        if sound:
+            self._append(sound)
+
+    def _leave_out(self, one: Received, reason: str) -> None:
+        self.rejects.add(
+            reason,
+            time_ns=one.record.time_ns or one.log_time_ns,
+            offset=one.offset,
+            sensor_id=known_id(one.record.sensor_id),
+        )
+
+    def _append(self, received: Sequence[Received]) -> None:
+        frames: list[Frame] = [one.record for one in received]
+        lengths = np.array([len(f.x_px) for f in frames], np.int64)
+        x = _joined([f.x_px for f in frames])
+        y = _joined([f.y_px for f in frames])
+        sigma, has_sigma = _joined_or_nan([f.sigma_px for f in frames], lengths)
+        flux, has_flux = _joined_or_nan([f.flux for f in frames], lengths)
+        with np.errstate(invalid="ignore"):
+            bad_place = _any(~(np.isfinite(x) & np.isfinite(y)), lengths)
+            bad_sigma = _any(~((sigma > 0) & np.isfinite(sigma)), lengths) & has_sigma
+            flux[~((flux > 0) & np.isfinite(flux))] = np.nan
+        keep = ~(bad_place | bad_sigma)
+        for i in np.flatnonzero(~keep).tolist():
+            self._leave_out(received[i], "nan" if bad_place[i] else "bad_sigma")
+        each = np.repeat(keep, lengths)
+        values = (x[each], y[each], flux[each], sigma[each])
+        kept = np.flatnonzero(keep).tolist()
+        self._write([received[i] for i in kept], lengths[keep], values)
+        rows = self._rows
+        rows.columns.has_flux[rows.n - len(kept) : rows.n] = has_flux[keep]
+        rows.columns.has_sigma[rows.n - len(kept) : rows.n] = has_sigma[keep]
+
+    def _write(
+        self, received: Sequence[Received], lengths: Integers, values: Sequence[Floats]
+    ) -> None:
+        """Put good frames behind the rows so far."""
+        rows, c = self._rows, self._rows.columns
+        low = rows.n_centroids
+        for column, numbers in zip((c.x_px, c.y_px, c.flux, c.sigma_px), values, strict=True):
+            column[low : low + len(numbers)] = numbers
+        for one, length in zip(received, lengths.tolist(), strict=True):
+            n, frame = rows.n, one.record
+            exposure_s = frame.exposure_s
+            c.sensor[n] = self._sensors.code(frame.sensor_id)
+            c.number[n], c.time_ns[n] = frame.frame_number, frame.time_ns
+            c.exposure_s[n] = exposure_s if 0 < exposure_s < np.inf else 0.0
+            c.first[n + 1] = c.first[n] + length
+            rows.offset[n] = one.offset
+            rows.n += 1
+            if self.span is not None:
+                off = abs(frame.time_ns - one.log_time_ns)
+                self.clock_off_ns = max(self.clock_off_ns or 0, off)
+
+
+def _arrow_floats(n: int) -> Floats:
+    """Return room for numbers, of Arrow's memory, which gives back what is no longer needed."""
+    return np.frombuffer(pa.allocate_buffer(4 * n), np.float32)
+
+
+def _frame_fault(frame: Frame) -> str | None:
+    if not 0 <= frame.frame_number <= MAX_FRAME_NUMBER:
+        return "bad_frame_number"
+    n = len(frame.x_px)
+    if len(frame.y_px) != n or len(frame.flux) not in (0, n) or len(frame.sigma_px) not in (0, n):
+        return "unequal_arrays"
+    return None
+
+
+def _joined(arrays: Sequence[npt.NDArray[np.floating]]) -> Floats:
+    """Return arrays behind each other, as the messages have their numbers: float32."""
+    with np.errstate(invalid="ignore", over="ignore"):  # of a text's number that is none
+        return np.concatenate([np.empty(0, np.float32), *arrays], dtype=np.float32)
+
+
+def _joined_or_nan(
+    arrays: Sequence[npt.NDArray[np.floating]], lengths: Integers
+) -> tuple[Floats, Bools]:
+    """Return the arrays joined, NaN in place of those left empty, and which are given."""
+    given = np.array([len(a) for a in arrays], np.int64) == lengths
+    out = np.full(lengths.sum(), np.nan, np.float32)
+    out[np.repeat(given, lengths)] = _joined(arrays)
+    return out, given & (lengths > 0)
+
+
+def _any(bad: Bools, lengths: Integers) -> Bools:
+    """Return for each frame whether any of its centroids is bad."""
+    before = np.concatenate([[0], np.cumsum(bad)])
+    end = np.cumsum(lengths)
+    return before[end] > before[end - lengths]
+
+
+def _lists(name: str, flat: Floats, offsets: pa.Array, given: Bools | None = None) -> pa.ListArray:
+    """Return rows of one list each; where not `given`, no list: its values are skipped over."""
+    kind = EXPOSURES.field(name).type
+    null = None if given is None or given.all() else pa.array(~given)
+    return pa.ListArray.from_arrays(offsets, pa.array(flat, kind.value_type), type=kind, mask=null)

@@ -1,0 +1,154 @@
+"""The states of a log as LOG_STATES."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.io.logs.columns.names import NameCodes
+from epipole.io.logs.damage import RejectList
+from epipole.io.logs.messages.batches import Part, Received, fault, known_id
+from epipole.io.logs.messages.decoding import State
+from epipole.io.logs.messages.scan import StateRows, scan_states
+from epipole.io.logs.messages.wire import STATE_KINDS
+from epipole.schemas.bridge import nullable, table, unstack
+from epipole.schemas.log_tables import LOG_STATES, STATE_FRAMES
+
+Array = npt.NDArray[np.float64]
+
+# Below the poles' radius of 6357 km: no sensor is there, whatever its frame and its errors.
+EARTH_RADIUS_KM = 6340.0
+FARTHEST_KM = 1.0e7  # well behind the Moon; a number in metres lands here
+QUATERNION_TOLERANCE = 1e-2  # |q| further from 1 is not a rounded unit quaternion
+BATCH = 16384  # states in one piece of the table
+ROW_BYTES = 150  # in the table
+_FRAMES = NameCodes(STATE_FRAMES)
+
+
+def _new_rows(n: int) -> StateRows:
+    return StateRows(
+        np.empty(n, np.int32),
+        np.empty(n, np.int32),
+        np.empty(n, np.int64),
+        *(np.empty((n, width)) for width in (3, 3, 4, 2)),
+    )
+
+
+@dataclass
+class StateColumns:
+    """The states of a log; of those from `span[0]` to before `span[1]`, if there is one."""
+
+    rejects: RejectList
+    span: tuple[int, int] | None = None
+    _sensors: NameCodes = field(default_factory=NameCodes)
+    _rows: StateRows = field(default_factory=lambda: _new_rows(0))
+    _n: int = 0
+    _tables: list[pa.Table] = field(default_factory=list)
+
+    def add(self, part: Part) -> None:
+        """Take states, without their attitude where only that is bad; leave out the others."""
+        messages = part.messages
+        if self._n + len(part) > len(self._rows.time_ns):
+            self._close()
+            self._rows = _new_rows(max(len(part), BATCH))
+        sensors, frames = self._sensors.table, _FRAMES.table
+
+        def scan(i: int) -> int:
+            stopped, self._n = scan_states(
+                messages, i, sensors, frames, self._rows, self._n, STATE_KINDS
+            )
+            return int(stopped)
+
+        part.take(scan, self._judge)
+
+    @property
+    def n_bytes(self) -> int:
+        """What the rows that wait to be taken take, about."""
+        return self._n * ROW_BYTES + sum(rows.nbytes for rows in self._tables)
+
+    def take(self) -> pa.Table:
+        """Return LOG_STATES of the states since the last time, in the order of the log."""
+        self._close()
+        tables, self._tables = self._tables, []
+        return pa.concat_tables([LOG_STATES.empty_table(), *tables])
+
+    def _close(self) -> None:
+        """Add the rows so far to the table."""
+        rows = StateRows._make(column[: self._n] for column in self._rows)
+        self._n = 0
+        if len(rows.time_ns) == 0:
+            return
+        q = rows.q / np.linalg.norm(rows.q, axis=1, keepdims=True)
+        optional = {**unstack("v{}_km_s", rows.v_km_s), **unstack("q{}", q, "xyzw")}
+        # A sigma that is not a positive finite number is unknown.
+        sigma = np.where(np.isfinite(rows.sigma) & (rows.sigma > 0), rows.sigma, 0.0)
+        states = table(
+            LOG_STATES,
+            {
+                "sensor_id": self._sensors.strings(rows.sensor),
+                "time": rows.time_ns,
+                "frame": _FRAMES.strings(rows.frame),
+                **{name: values.copy() for name, values in unstack("{}_km", rows.r_km).items()},
+                **{name: nullable(values) for name, values in optional.items()},
+                "position_sigma_km": sigma[:, 0].copy(),
+                "attitude_sigma_arcsec": sigma[:, 1].copy(),
+            },
+        )
+        if self.span is not None:
+            low, high = self.span
+            states = states.filter(pa.array((rows.time_ns >= low) & (rows.time_ns < high)))
+        self._tables.append(states)
+
+    def _judge(self, received: Sequence[Received]) -> None:
+        """Take decoded states, or leave them out with a reason."""
+        for one in received:
+            state: State = one.record
+            reason = fault(state.time_ns, state.sensor_id) or _state_fault(state)
+            if reason is not None:
+                self._leave_out(one, reason)
+                continue
+            if len(state.attitude_xyzw) and not _is_attitude(state.attitude_xyzw):
+                self._leave_out(one, "bad_attitude")
+                state = state._replace(attitude_xyzw=state.attitude_xyzw[:0])
+            self._write(state, one.record.time_ns)
+
+    def _leave_out(self, one: Received, reason: str) -> None:
+        self.rejects.add(
+            reason,
+            time_ns=one.record.time_ns or one.log_time_ns,
+            offset=one.offset,
+            sensor_id=known_id(one.record.sensor_id),
+        )
+
+    def _write(self, state: State, time_ns: int) -> None:
+        rows, n = self._rows, self._n
+        rows.sensor[n] = self._sensors.code(state.sensor_id)
+        rows.frame[n] = _FRAMES.code(state.frame)
+        rows.time_ns[n] = time_ns
+        rows.r_km[n] = state.position_km
+        rows.v_km_s[n] = state.velocity_km_s if len(state.velocity_km_s) else np.nan
+        rows.q[n] = state.attitude_xyzw if len(state.attitude_xyzw) else np.nan
+        rows.sigma[n] = state.position_sigma_km, state.attitude_sigma_arcsec
+        self._n = n + 1
+
+
+def _state_fault(state: State) -> str | None:
+    if state.frame not in STATE_FRAMES:
+        return "unknown_frame"
+    # A length is finite only if every component is.
+    radius_km = math.hypot(*state.position_km)
+    if len(state.position_km) != 3 or not radius_km <= FARTHEST_KM:
+        return "bad_position"
+    velocity = state.velocity_km_s
+    if len(velocity) not in (0, 3) or not math.isfinite(math.hypot(*velocity)):
+        return "bad_velocity"
+    return "inside_earth" if radius_km < EARTH_RADIUS_KM else None
+
+
+def _is_attitude(q: Array) -> bool:
+    """Return whether these are the numbers of a unit quaternion, rounded perhaps."""
+    norm = math.hypot(*q) if len(q) == 4 else math.nan
+    return abs(norm - 1.0) < QUATERNION_TOLERANCE

@@ -1,0 +1,180 @@
+"""The bytes of a log, wherever it is kept.
+
+A file is read, not mapped: a mapped file that is cut short by someone else ends the process
+that looks at it, without a word.
+"""
+
+import hashlib
+import os
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+from epipole.io.logs.mcap.blocks import BlockReader
+from epipole.io.remote_files import open_remote
+from epipole.schemas.errors import LogError
+
+HASHED_BYTES = 1 << 20  # of a file at once
+NEAR_BYTES = 1 << 16  # read at once where little is asked for: what follows is mostly next
+
+
+class Reader(Protocol):
+    """How the bytes of a log are had."""
+
+    def stream(self) -> None:
+        """Prepare for being read from front to back."""
+
+    def read(self, start: int, end: int) -> bytes | memoryview:
+        """Return the bytes from `start` to before `end`, or fewer where there are no more."""
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the whole."""
+
+    def close(self) -> None:
+        """End what is under way, and let go of what is held."""
+
+
+class LogBytes:
+    """The bytes of one log, of the size that it has when it is opened; a context manager.
+
+    For one thread at a time.
+    """
+
+    def __init__(self, where: str, size: int, reader: Reader) -> None:
+        self._where, self._size, self._reader = where, size, reader
+        self.stream, self.close = reader.stream, reader.close
+
+    @classmethod
+    def of(cls, data: bytes) -> Self:
+        """Return bytes in memory as those of a log."""
+        return cls("memory", len(data), BlockReader(len(data), lambda start, end: data[start:end]))
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def view(self, start: int, end: int) -> memoryview:
+        """Return the bytes from `start` to before `end`; both lie in the log.
+
+        Raises
+        ------
+        LogError
+            Where they cannot be read, or are there no more.
+        """
+        data = self._reader.read(start, end)
+        if len(data) < end - start:
+            raise _has_shrunk(self._where, self._size)
+        return memoryview(data)
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the whole log.
+
+        Raises
+        ------
+        LogError
+            Where it cannot be read, or is no longer the log that was opened.
+        """
+        return self._reader.sha256()
+
+
+def open_log(where: str) -> LogBytes:
+    """Return the bytes of a local file, or of an fsspec URL such as ``s3://bucket/a.mcap``.
+
+    Of a URL the ranges that are looked at are fetched.
+
+    Raises
+    ------
+    LogError
+        Where there is no such file, or it cannot be read.
+    """
+    if "://" in where:
+        size, fetch, check = open_remote(where)
+        return LogBytes(where, size, BlockReader(size, fetch, check))
+    if Path(where).is_dir():
+        raise LogError(f"{where}: is a folder; give the logs in it, such as {where}/*.mcap")
+    try:
+        descriptor = os.open(where, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError as error:
+        raise LogError(f"{where}: no such file; check the path") from error
+    except OSError as error:
+        raise LogError(f"{where}: cannot be read: {error.strerror}") from error
+    size = os.fstat(descriptor).st_size
+    return LogBytes(where, size, _FileReader(where, size, descriptor))
+
+
+class _FileReader:
+    """A file, read where it is looked at, and hashed beside that by a thread of its own."""
+
+    def __init__(self, where: str, size: int, descriptor: int) -> None:
+        self._where, self._size, self._descriptor = where, size, descriptor
+        self._worker = ThreadPoolExecutor(1, "hash log")
+        self._hashing: Future[str] | None = None
+        self._closed = False
+        self._near, self._near_at = b"", 0
+
+    def stream(self) -> None:
+        self._hashing = self._hashing or self._worker.submit(self._hash)
+
+    def read(self, start: int, end: int) -> bytes:
+        if end - start > NEAR_BYTES // 4:
+            return self._read(start, end)
+        low = start - self._near_at
+        if not 0 <= low <= len(self._near) - (end - start):
+            self._near, self._near_at = self._read(start, start + NEAR_BYTES), start
+            low = 0
+        return self._near[low : low + end - start]
+
+    def _read(self, start: int, end: int) -> bytes:
+        data = b""
+        try:
+            while start < end and (part := os.pread(self._descriptor, end - start, start)):
+                data = data + part if data else part
+                start += len(part)
+        except OSError as error:
+            raise self._unreadable(error) from error
+        return data
+
+    def sha256(self) -> str:
+        self.stream()
+        assert self._hashing is not None  # `stream` has begun it
+        return self._hashing.result()
+
+    def close(self) -> None:
+        self._closed = True
+        self._worker.shutdown()
+        os.close(self._descriptor)
+
+    def _hash(self) -> str:
+        digest, at = hashlib.sha256(), 0
+        piece = memoryview(bytearray(HASHED_BYTES))
+        try:
+            while at < self._size and not self._closed:
+                n = os.preadv(self._descriptor, [piece[: self._size - at]], at)
+                if n == 0:
+                    raise _has_shrunk(self._where, self._size)
+                digest.update(piece[:n])
+                at += n
+        except OSError as error:
+            raise self._unreadable(error) from error
+        return digest.hexdigest()
+
+    def _unreadable(self, error: OSError) -> LogError:
+        return LogError(f"{self._where}: cannot be read: {error.strerror}")
+
+
+def _has_shrunk(where: str, size: int) -> LogError:
+    return LogError(
+        f"{where}: has become shorter than {size:,} bytes while it was read; "
+        "read it when nobody writes it"
+    )

@@ -1,0 +1,78 @@
+"""The schemas and channels that a log declares, in chunks, outside them and in its summary."""
+
+import struct
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from epipole.io.logs.mcap.compression import ChunkError
+from epipole.io.logs.mcap.record_scan import SCHEMA
+
+
+class Channel(NamedTuple):
+    """What a channel carries, by the name of its schema, and in which encoding."""
+
+    topic: str
+    encoding: str
+    schema: str
+
+
+@dataclass
+class ChannelTable:
+    """Channels by number; a later declaration replaces an earlier one."""
+
+    wanted: frozenset[str]  # names of the schemas whose messages are asked for
+    _schemas: dict[int, str] = field(default_factory=dict)
+    _channels: dict[int, tuple[str, str, int]] = field(default_factory=dict)
+    _found: dict[int, Channel | None] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self._channels)
+
+    def __contains__(self, number: int) -> bool:
+        return number in self._channels
+
+    def knows(self, number: int) -> bool:
+        """Return whether a channel and its schema have been declared."""
+        channel = self._channels.get(number)
+        return channel is not None and (channel[2] == 0 or channel[2] in self._schemas)
+
+    def declare(self, opcode: int, data: Any, at: int, end: int) -> None:
+        """Take the body of a schema or a channel.
+
+        Raises
+        ------
+        ChunkError
+            Where it is none.
+        """
+        try:
+            number = struct.unpack_from("<H", data, at)[0]
+            if opcode == SCHEMA:
+                self._schemas[number] = string(data, at + 2, end)[0]
+            else:
+                schema = struct.unpack_from("<H", data, at + 2)[0]
+                topic, at = string(data, at + 4, end)
+                self._channels[number] = (topic, string(data, at, end)[0], schema)
+        except (struct.error, UnicodeDecodeError) as error:
+            raise ChunkError("damaged_chunk") from error
+        self._found.clear()
+
+    def find(self, number: int) -> Channel | None:
+        """Return a channel, or None where its messages are not asked for or it is unknown."""
+        if number not in self._found:
+            self._found[number] = self._find(number)
+        return self._found[number]
+
+    def _find(self, number: int) -> Channel | None:
+        if number not in self._channels:
+            return None
+        topic, encoding, schema = self._channels[number]
+        name = self._schemas.get(schema, "")
+        return Channel(topic, encoding, name) if name in self.wanted else None
+
+
+def string(data: Any, at: int, end: int) -> tuple[str, int]:
+    """Return a string of MCAP and the place behind it; raise ChunkError where it is longer."""
+    (length,) = struct.unpack_from("<I", data, at)
+    if at + 4 + length > end:
+        raise ChunkError("damaged_chunk")
+    return bytes(data[at + 4 : at + 4 + length]).decode(), at + 4 + length

@@ -1,0 +1,96 @@
+"""Chunks of a log: what their heads say, and their records, checked before they are believed."""
+
+import struct
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+
+from epipole.io.logs.mcap.channels import string
+from epipole.io.logs.mcap.compression import ChunkError, decompress, decompress_part
+from epipole.io.logs.mcap.record_scan import RecordIndex, index_records
+from epipole.io.logs.mcap.summary import RECORD
+
+# A chunk holds a few MiB; one that claims more than this is damage or an attack.
+MAX_CHUNK_BYTES = 256 << 20
+
+# What its record may take in the file: bytes that cannot be made smaller grow a little.
+MAX_RECORD_BYTES = MAX_CHUNK_BYTES + (4 << 20)
+HEAD_BYTES = 256  # of a record's beginning, with room for the name of a compression
+
+_HEAD = struct.Struct("<QQQI")
+
+
+class ChunkHead(NamedTuple):
+    """What a chunk says of itself; `body` to `end` are its compressed records in the file."""
+
+    start_ns: int
+    end_ns: int
+    size: int
+    checksum: int
+    compression: str
+    body: int
+    end: int
+
+
+class OpenedChunk(NamedTuple):
+    """A chunk's records and where they lie, or why they are left out."""
+
+    start_ns: int
+    records: bytes
+    places: RecordIndex
+    reason: str = ""
+
+
+def read_head(data: memoryview, at: int) -> ChunkHead:
+    """Return the head of the chunk at `at`, of which `data` are the first bytes.
+
+    Raises
+    ------
+    ChunkError
+        Where it is none.
+    """
+    try:
+        start_ns, end_ns, size, checksum = _HEAD.unpack_from(data, RECORD.size)
+        compression, body = string(data, RECORD.size + _HEAD.size, len(data))
+        (length,) = struct.unpack_from("<Q", data, body)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise ChunkError("damaged_chunk") from error
+    body += at + 8
+    return ChunkHead(start_ns, end_ns, size, checksum, compression, body, body + length)
+
+
+def open_chunk(chunk: memoryview) -> OpenedChunk:
+    """Return the records of a chunk, given whole."""
+    start_ns = 0
+    try:
+        head = read_head(chunk, 0)
+        if head.end != len(chunk):
+            raise ChunkError("damaged_chunk")
+        start_ns = head.start_ns
+        if head.size > MAX_CHUNK_BYTES:
+            raise ChunkError("chunk_too_large")
+        records = decompress(chunk[head.body :], head.compression, head.size)
+        if head.checksum and zlib.crc32(records) != head.checksum:
+            raise ChunkError("bad_checksum")
+    except ChunkError as error:
+        return _opened(start_ns, b"", str(error))
+    return _opened(start_ns, records)
+
+
+def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
+    """Return the first records of a chunk in which the file ends.
+
+    Its checksum cannot be verified; that it was cut is known, that it is wrong is not.
+    """
+    try:
+        head = read_head(chunk, 0)
+    except ChunkError:
+        return _opened(0, b"")
+    size = min(head.size, MAX_CHUNK_BYTES)
+    return _opened(head.start_ns, decompress_part(chunk[head.body :], head.compression, size))
+
+
+def _opened(start_ns: int, records: bytes, reason: str = "") -> OpenedChunk:
+    index = index_records(np.frombuffer(records, np.uint8))
+    return OpenedChunk(start_ns, records, index, reason)

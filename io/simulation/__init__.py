@@ -1,0 +1,1 @@
+"""The simulator's files: scenes, skies and the truth of a log."""

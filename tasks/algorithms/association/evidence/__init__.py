@@ -1,0 +1,1 @@
+"""Evidence: how much more likely one object is than unrelated tracklets."""

@@ -1,0 +1,86 @@
+"""Visibility: whether a sensor could see a point at all."""
+
+import numpy as np
+from numba import njit
+
+from epipole.tasks.algorithms.association.sampling.views import HALF, PLANE, REACH, TURN
+
+EARTH_RADIUS_KM = 6378.137
+INSIDE = 0.98  # of the half field: nearer to the edge a sensor may well miss an object
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def blocked(r, x, radius):
+    """Return whether the Earth stands between r and x."""
+    dot, length2, r2 = 0.0, 0.0, 0.0
+    for a in range(3):
+        d = x[a] - r[a]
+        dot += r[a] * d
+        length2 += d * d
+        r2 += r[a] * r[a]
+    return dot < 0.0 and -dot < length2 and r2 - dot * dot / length2 < radius * radius
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def sees(r, R, half_field, x):
+    """Return whether a sensor at r has x in its field, not at the edge, the Earth not between.
+
+    False where the sensor's place or attitude is unknown (NaN).
+    """
+    d0, d1, d2 = x[0] - r[0], x[1] - r[1], x[2] - r[2]
+    depth = R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2
+    if not depth > 0.0:
+        return False
+    for a in range(2):
+        side = (R[a, 0] * d0 + R[a, 1] * d1 + R[a, 2] * d2) / depth
+        if abs(side) > INSIDE * half_field[a]:
+            return False
+    return not blocked(r, x, EARTH_RADIUS_KM)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def in_view(cam, x):
+    """Return what `sees` does, by a row of `Views.camera`."""
+    d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
+    depth = cam[TURN + 6] * d0 + cam[TURN + 7] * d1 + cam[TURN + 8] * d2
+    if not depth > 0.0:
+        return False
+    for a in range(2):
+        t = TURN + 3 * a
+        if abs(cam[t] * d0 + cam[t + 1] * d1 + cam[t + 2] * d2) > INSIDE * cam[HALF + a] * depth:
+            return False
+    return not blocked(cam, x, EARTH_RADIUS_KM)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def looks_at(views, s, X, seen_by):
+    """Return whether sensor s has the point in its field at every solved instant."""
+    looked = False
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2:
+            continue
+        if not in_view(views.camera[s, m], X[m]):
+            return False
+        looked = True
+    return looked
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def near_fields(views, X, P, seen_by, near):
+    """Write which sensors have a point, by far, near what they see at any solved instant.
+
+    A quick look: within the cone about all of a sensor's tracklets and its field, and 6 sigma.
+    """
+    near[:] = False
+    cam = views.camera
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2:
+            continue
+        slack = 6.0 * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
+        for s in range(len(near)):
+            d0, d1, d2 = X[m, 0] - cam[s, m, 0], X[m, 1] - cam[s, m, 1], X[m, 2] - cam[s, m, 2]
+            n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
+            depth, reach = n0 * d0 + n1 * d1 + n2 * d2, cam[s, m, REACH]
+            away2 = d0 * d0 + d1 * d1 + d2 * d2 - depth * depth
+            if reach > 0.0 and depth > 0.0 and away2 <= (reach * depth + slack) ** 2:
+                near[s] = True

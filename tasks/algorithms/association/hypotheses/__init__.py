@@ -1,0 +1,1 @@
+"""Hypotheses: pairs of tracklets, and the groups that grow from them."""

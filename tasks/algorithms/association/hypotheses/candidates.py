@@ -1,0 +1,165 @@
+"""Candidates: which tracklet of a sensor a hypothesis' points explain best."""
+
+import numpy as np
+from numba import njit
+
+from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
+from epipole.tasks.algorithms.association.sampling.views import (
+    CORNER,
+    PLANE,
+    SCALE,
+    SIGMA_KM,
+    WIDEST,
+    XX,
+    XY,
+    YY,
+    X,
+    Y,
+)
+
+A0, A1, H00, H01, H11, DEPTH, STRETCH = range(7)  # columns of what is predicted
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _predict(views, s, points, predicted):
+    """Write where sensor s should see the points, and how well that is known; false: behind."""
+    x, _, P, seen_by = points
+    cam = views.camera  # element by element, see `views.residual`
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2:
+            continue
+        d0, d1, d2 = x[m, 0] - cam[s, m, 0], x[m, 1] - cam[s, m, 1], x[m, 2] - cam[s, m, 2]
+        n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
+        depth = n0 * d0 + n1 * d1 + n2 * d2
+        predicted[m, DEPTH] = depth
+        if not depth > 0.0:
+            continue
+        p0, p1, p2 = cam[s, m, PLANE], cam[s, m, PLANE + 1], cam[s, m, PLANE + 2]
+        q0, q1, q2 = cam[s, m, PLANE + 3], cam[s, m, PLANE + 4], cam[s, m, PLANE + 5]
+        a0 = (p0 * d0 + p1 * d1 + p2 * d2) / depth
+        a1 = (q0 * d0 + q1 * d1 + q2 * d2) / depth
+        p0, p1, p2 = (p0 - a0 * n0) / depth, (p1 - a0 * n1) / depth, (p2 - a0 * n2) / depth
+        q0, q1, q2 = (q0 - a1 * n0) / depth, (q1 - a1 * n1) / depth, (q2 - a1 * n2) / depth
+        t0 = P[m, 0, 0] * p0 + P[m, 0, 1] * p1 + P[m, 0, 2] * p2
+        t1 = P[m, 1, 0] * p0 + P[m, 1, 1] * p1 + P[m, 1, 2] * p2
+        t2 = P[m, 2, 0] * p0 + P[m, 2, 1] * p1 + P[m, 2, 2] * p2
+        predicted[m, A0], predicted[m, A1] = a0, a1
+        predicted[m, H00] = p0 * t0 + p1 * t1 + p2 * t2
+        predicted[m, H01] = q0 * t0 + q1 * t1 + q2 * t2
+        t0 = P[m, 0, 0] * q0 + P[m, 0, 1] * q1 + P[m, 0, 2] * q2
+        t1 = P[m, 1, 0] * q0 + P[m, 1, 1] * q1 + P[m, 1, 2] * q2
+        t2 = P[m, 2, 0] * q0 + P[m, 2, 1] * q1 + P[m, 2, 2] * q2
+        predicted[m, H11] = q0 * t0 + q1 * t1 + q2 * t2
+        predicted[m, STRETCH] = 1.0 + a0 * a0 + a1 * a1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
+    """Return what tracklet c adds to the odds; -inf where it does not fit at the shared instants.
+
+    The log of how much likelier the points make its directions than chance does. At later
+    instants than the first, chance is known to within how differently tracklets move.
+    """
+    gain, total, n, begun_at, see = 0.0, 0.0, 0, 0.0, views.sight
+    largest = quantile(2 * len(views.time_s), gate_sigma)
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2 or not views.seen[c, m]:
+            continue
+        depth = predicted[m, DEPTH]
+        if not depth > 0.0:
+            return -np.inf
+        x0, x1 = see[c, m, X], see[c, m, Y]
+        e0, e1 = predicted[m, A0] - x0, predicted[m, A1] - x1
+        extra = (see[c, m, SIGMA_KM] / depth) ** 2
+        c00 = see[c, m, XX] + extra * (1.0 + x0 * x0) + predicted[m, H00]
+        c01 = see[c, m, XY] + extra * x0 * x1 + predicted[m, H01]
+        c11 = see[c, m, YY] + extra * (1.0 + x1 * x1) + predicted[m, H11]
+        det = c00 * c11 - c01 * c01
+        chi2 = (e0 * e0 * c11 - 2 * e0 * e1 * c01 + e1 * e1 * c00) / det
+        total += chi2
+        if total > largest:  # most candidates end here, before any logarithm
+            return -np.inf
+        stretch = predicted[m, STRETCH]
+        spot = 2 * np.pi * np.sqrt(det / (stretch * stretch * stretch))
+        if n == 0:
+            gain += np.log(chance.detected[s] / (chance.density[s] * spot)) - 0.5 * chi2
+            begun_at = views.time_s[m]
+        else:
+            room = np.pi * (chance.spread[s] * (views.time_s[m] - begun_at)) ** 2
+            gain += np.log1p(room / spot) - 0.5 * chi2
+        n += 1
+    return gain if n > 0 and total <= quantile(2 * n, gate_sigma) else -np.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_sigma, least):
+    """Return the free tracklet of sensor s that adds most to the odds, how much, and the next.
+
+    -1 where there is none; the last is what the second best adds, `least` without one.
+
+    One that adds less than `least` is not taken. At each instant only the grid cells
+    that the gate touches are looked at; a tracklet is weighed once, at the first instant that
+    it shares with the points.
+    """
+    best, best_gain, second, seen_by, cam = -1, least, least, points[3], views.camera
+    _predict(views, s, points, predicted)
+    gate = np.sqrt(quantile(2, gate_sigma))
+    for m in range(len(views.time_s)):
+        side = views.grid[s, m, 1]
+        if seen_by[m] < 2 or side == 0 or not predicted[m, DEPTH] > 0.0:
+            continue
+        begin = views.grid[s, m, 0]
+        place = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
+        own = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
+        reach = gate * np.sqrt(predicted[m, H00] + own)
+        here = predicted[m, A0] - cam[s, m, CORNER]
+        lo0 = max(int(np.floor((here - reach) * cam[s, m, SCALE])), 0)
+        hi0 = min(int(np.floor((here + reach) * cam[s, m, SCALE])), side - 1)
+        reach = gate * np.sqrt(predicted[m, H11] + own)
+        here = predicted[m, A1] - cam[s, m, CORNER + 1]
+        lo1 = max(int(np.floor((here - reach) * cam[s, m, SCALE + 1])), 0)
+        hi1 = min(int(np.floor((here + reach) * cam[s, m, SCALE + 1])), side - 1)
+        if hi1 < lo1:
+            continue
+        for g0 in range(lo0, hi0 + 1):
+            row = begin + g0 * side
+            for k in range(views.cell_start[row + lo1], views.cell_start[row + hi1 + 1]):
+                c = views.cell_item[k]
+                if taken[c] or _shared_before(views, c, m, seen_by):
+                    continue
+                gain = _fit(views, chance, s, c, seen_by, predicted, gate_sigma)
+                if gain > second and not _clashes(views, c, members, n):
+                    if gain > best_gain:
+                        best, best_gain, second = c, gain, best_gain
+                    else:
+                        second = gain
+    return best, best_gain, second
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def odds_of_view(views, chance, s, c, points, predicted):
+    """Return what tracklet c of sensor s adds to the odds of an object with these points."""
+    _predict(views, s, points, predicted)
+    return _fit(views, chance, s, c, points[3], predicted, np.inf)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shared_before(views, c, m, seen_by):
+    shared = False
+    for earlier in range(m):
+        shared |= seen_by[earlier] >= 2 and views.seen[c, earlier]
+    return shared
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _clashes(views, c, members, n):
+    """Return whether a member is c, or of the same sensor at the same time."""
+    for q in range(n):
+        o = members[q]
+        if o == c:
+            return True
+        if views.sensor[o] == views.sensor[c] and (
+            views.start_s[c] <= views.end_s[o] and views.start_s[o] <= views.end_s[c]
+        ):
+            return True
+    return False

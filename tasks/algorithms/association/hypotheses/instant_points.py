@@ -1,0 +1,140 @@
+"""Points of a hypothesis: at every instant at which two tracklets are seen, one point."""
+
+import numpy as np
+from numba import njit
+
+from epipole.tasks.algorithms.association.evidence.visibility import EARTH_RADIUS_KM, blocked
+from epipole.tasks.algorithms.association.hypotheses.sight_lines import BEYOND, SLACK_SIGMA
+from epipole.tasks.algorithms.association.sampling.views import direction, residual
+from epipole.tasks.algorithms.geometry.triangulation import invert3
+
+ITERATIONS = 6
+CONVERGED = 1e-4  # sigmas squared
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _start(views, members, n, m, x):
+    """Write the point nearest to the members' lines; false where they are parallel."""
+    N, inverse, rhs, u = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
+    count = 0
+    for q in range(n):
+        i = members[q]
+        if not views.seen[i, m]:
+            continue
+        count += 1
+        direction(views, i, m, u)
+        for a in range(3):
+            for b in range(3):
+                p = (1.0 if a == b else 0.0) - u[a] * u[b]
+                N[a, b] += p
+                rhs[a] += p * views.camera[views.sensor[i], m, b]
+    if invert3(N, inverse) < 1e-12 * count**3:
+        return False
+    for a in range(3):
+        x[a] = inverse[a, 0] * rhs[0] + inverse[a, 1] * rhs[1] + inverse[a, 2] * rhs[2]
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def add_view(views, i, m, x, N, rhs, part):
+    """Add a view to the normal equations (upper half); return its chi-square, NaN behind."""
+    if residual(views, i, m, x, part) == 0.0:
+        return np.nan
+    g0 = part[8] * part[0] + part[9] * part[1]
+    g1 = part[9] * part[0] + part[10] * part[1]
+    for a in range(3):
+        u, v = part[2 + a], part[5 + a]
+        rhs[a] -= u * g0 + v * g1
+        h0, h1 = part[8] * u + part[9] * v, part[9] * u + part[10] * v
+        for b in range(a, 3):
+            N[a, b] += h0 * part[2 + b] + h1 * part[5 + b]
+    return part[0] * g0 + part[1] * g1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def step(x, N, rhs, P):
+    """Invert N into P and move x; return how much chi-square falls, NaN where it runs off."""
+    if invert3(N, P) == 0.0:
+        return np.nan
+    gain = 0.0
+    for a in range(3):
+        move = P[a, 0] * rhs[0] + P[a, 1] * rhs[1] + P[a, 2] * rhs[2]
+        x[a] += move
+        gain += move * rhs[a]
+    return gain if gain < 1e12 else np.nan  # as good as parallel
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def solve(views, members, n, points, part):
+    """Solve every instant at which two members are seen; return chi-square and freedom.
+
+    `points` are (x, N, P, seen_by) of each instant. Where `seen_by` tells that an instant was
+    solved before, its point is the start. NaN where an instant has no solution.
+    """
+    X, N, P, seen_by = points
+    total, dof, rhs = 0.0, 0, np.empty(3)
+    for m in range(len(views.time_s)):
+        count = 0
+        for q in range(n):
+            count += views.seen[members[q], m]
+        solved = seen_by[m] >= 2
+        seen_by[m] = count
+        if count < 2:
+            continue
+        if not solved and not _start(views, members, n, m, X[m]):
+            return np.nan, 0
+        chi2 = np.nan
+        for _ in range(ITERATIONS):
+            N[m] = 0.0
+            rhs[:] = 0.0
+            chi2 = 0.0
+            for q in range(n):
+                if views.seen[members[q], m]:
+                    chi2 += add_view(views, members[q], m, X[m], N[m], rhs, part)
+            gain = step(X[m], N[m], rhs, P[m])
+            chi2 -= gain
+            if not gain >= CONVERGED:
+                break
+        if np.isnan(chi2):
+            return np.nan, 0
+        total += chi2
+        dof += 2 * count - 3
+    return total, dof
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def join(views, c, points, part):
+    """Add tracklet c to the points that are solved (Kalman's update); false where it fails."""
+    X, N, P, seen_by = points
+    rhs = np.empty(3)
+    for m in range(len(views.time_s)):
+        if not views.seen[c, m]:
+            continue
+        if seen_by[m] >= 2:
+            rhs[:] = 0.0
+            chi2 = add_view(views, c, m, X[m], N[m], rhs, part)
+            if np.isnan(chi2 + step(X[m], N[m], rhs, P[m])):
+                return False
+        seen_by[m] += seen_by[m] >= 2
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def possible(views, members, n, points, lowest, farthest):
+    """Return whether the points lie, within 3 sigma, where their sensors can see an object."""
+    X, _, P, seen_by = points
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2:
+            continue
+        radius = np.sqrt(X[m, 0] ** 2 + X[m, 1] ** 2 + X[m, 2] ** 2)
+        slack = SLACK_SIGMA * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
+        # However badly a range is known: far outside, no object is looked for.
+        if radius + slack < lowest or radius - min(slack, BEYOND * farthest) > farthest:
+            return False
+        for q in range(n):
+            i = members[q]
+            if views.seen[i, m] and blocked(
+                views.camera[views.sensor[i], m], X[m], EARTH_RADIUS_KM - slack
+            ):
+                return False
+    return True

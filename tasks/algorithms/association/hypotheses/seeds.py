@@ -1,0 +1,207 @@
+"""Seeds: pairs of tracklets whose lines of sight meet, found by sorting one angle.
+
+The baseline of two sensors and a direction span a plane. The angle of that plane about the
+baseline is one number a direction, the same for both sensors' views of one object: sorted, a
+view's partners are a binary search away, and no pair that cannot meet is ever looked at.
+"""
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from epipole.tasks.algorithms.association.hypotheses.sight_lines import pair_miss, quantile
+from epipole.tasks.algorithms.association.sampling.views import SIGMA_KM, XX, YY, Views
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+SHORTEST_BASELINE_KM = 1.0
+NEAREST_KM = 300.0  # an error of the baseline turns the plane most for a near object
+
+
+def plane_angles(
+    views: Views, s: int, m: int, items: Indices, baseline_km: Array, axes: Array
+) -> tuple[Array, Array]:
+    """Return the angle of each tracklet's plane about the baseline, and its 1-sigma [rad]."""
+    unit = baseline_km / np.linalg.norm(baseline_km)
+    u = _directions(views, s, m, items)
+    across = np.maximum(np.sqrt(np.maximum(1 - (u @ unit) ** 2, 0)), 1e-9)
+    variance = views.sight[items, m, XX] + views.sight[items, m, YY]  # no less than any axis has
+    place = 2 * (views.sight[items, m, SIGMA_KM] / NEAREST_KM) ** 2
+    return np.arctan2(u @ axes[1], u @ axes[0]), np.sqrt(variance + place) / across
+
+
+def _directions(views: Views, s: int, m: int, items: Indices) -> Array:
+    sight = np.column_stack([views.sight[items, m, :XX], np.ones(len(items))]) @ views.plane[s, m]
+    return np.asarray(sight / np.linalg.norm(sight, axis=1, keepdims=True))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _meeting(
+    views, m, items_a, angle_a, sigma_a, items_b, angle_b, sigma_b, taken, lowest, farthest,
+    gate_sigma, out,
+):  # fmt: skip
+    """Write the pairs that meet at all instants they share, and how well; return how many."""
+    widest, n = 0.0, 0
+    ui, uj = np.empty(3), np.empty(3)
+    for k in range(len(sigma_b)):
+        widest = max(widest, sigma_b[k])
+    for q in range(len(items_a)):
+        i = items_a[q]
+        if taken[i]:
+            continue
+        reach = gate_sigma * np.sqrt(sigma_a[q] ** 2 + widest**2)
+        k = np.searchsorted(angle_b, angle_a[q] - reach)
+        while k < len(items_b) and angle_b[k] <= angle_a[q] + reach:
+            j = items_b[k]
+            k += 1
+            if taken[j]:
+                continue
+            total, shared, before = 0.0, 0, False
+            for h in range(len(views.time_s)):
+                if views.seen[i, h] and views.seen[j, h]:
+                    if h < m:
+                        before = True  # was weighed at the first instant they share
+                        break
+                    total += pair_miss(views, i, j, h, lowest, farthest, ui, uj)
+                    shared += 1
+            if before or not total <= quantile(shared, gate_sigma):  # false for NaN
+                continue
+            if n < len(out):
+                out[n, 0], out[n, 1] = i, j
+            n += 1
+    return n
+
+
+def seeds_between(
+    views: Views,
+    a: int,
+    b: int,
+    taken: npt.NDArray[np.bool_],
+    lowest_km: float,
+    farthest_km: float,
+    gate_sigma: float,
+) -> Indices:
+    """Return (n, 2): free tracklets of sensors a and b whose lines of sight meet."""
+    found = []
+    for m in range(len(views.time_s)):
+        baseline = views.place_km[b, m] - views.place_km[a, m]
+        if not np.linalg.norm(baseline) > SHORTEST_BASELINE_KM:  # false for NaN
+            continue
+        sides = [
+            views.first[s] + np.flatnonzero(
+                views.seen[views.first[s] : views.first[s + 1], m]
+                & ~taken[views.first[s] : views.first[s + 1]]
+            )
+            for s in (a, b)
+        ]  # fmt: skip
+        if not len(sides[0]) or not len(sides[1]):
+            continue
+        axes = _axes(baseline, views.plane[a, m, 2])
+        angle_a, sigma_a = plane_angles(views, a, m, sides[0], baseline, axes)
+        angle_b, sigma_b = plane_angles(views, b, m, sides[1], baseline, axes)
+        order = np.argsort(angle_b, kind="stable")
+        out = np.empty((4 * (len(angle_a) + len(angle_b)), 2), np.int64)
+        while True:
+            n = _meeting(
+                views, m, sides[0], angle_a, sigma_a, sides[1][order], angle_b[order],
+                sigma_b[order], taken, lowest_km, farthest_km, gate_sigma, out,
+            )  # fmt: skip
+            if n <= len(out):
+                break
+            out = np.empty((n, 2), np.int64)
+        found.append(out[:n])
+    return np.concatenate([*found, np.zeros((0, 2), np.int64)])
+
+
+def _axes(baseline: Array, towards: Array) -> Array:
+    """Return two axes across the baseline, the first towards the field, where the angle is 0."""
+    unit = baseline / np.linalg.norm(baseline)
+    first = towards - (towards @ unit) * unit
+    if not np.linalg.norm(first) > 1e-9 * np.linalg.norm(towards):
+        first = tangent_basis(unit)[0]
+    first = first / np.linalg.norm(first)
+    return np.stack([first, np.cross(unit, first)])
+
+
+class SensorPairs:
+    """Pairs of sensors that may see one object, in the order in which they should seed.
+
+    The longer the baseline across the line of sight, the better two views fix a point and the
+    fewer chance partners they have; but no sensor seeds a second time before the others had
+    their turn. Pairs whose fields do not meet are left out.
+    """
+
+    def __init__(self, views: Views, farthest_km: float) -> None:
+        look, place, half = _middle(views)
+        a, b = np.triu_indices(len(look), 1)
+        known = np.isfinite(look[a, 0]) & np.isfinite(look[b, 0])
+        a, b = a[known], b[known]
+        baseline = place[b] - place[a]
+        range_a, range_b, miss = _closest_approach(baseline, look[a], look[b])
+        # Nearly parallel axes meet far out, wherever they do.
+        apart = np.arccos(np.clip(np.sum(look[a] * look[b], axis=1), -1, 1))
+        meet = (range_a > 0) & (range_b > 0)
+        meet &= miss <= range_a * np.tan(half[a]) + range_b * np.tan(half[b])
+        meet |= apart < half[a] + half[b]
+        meet &= np.linalg.norm(baseline, axis=1) > SHORTEST_BASELINE_KM
+        across = np.linalg.norm(np.cross(baseline, look[a] + look[b]), axis=1) / 2
+        order = np.argsort(-across[meet], kind="stable")
+        self._a, self._b = a[meet][order], b[meet][order]
+        reach = np.where(range_a > 0, np.minimum(range_a, farthest_km), farthest_km)
+        self._middle = (place[a] + reach[:, None] * look[a])[meet][order]
+        self._look, self._place, self._half = look, place, half
+        self._waiting = np.ones(len(self._a), bool)
+        self._busy = np.zeros(len(look), bool)
+        self._covered = np.zeros(len(self._a), np.int64)
+
+    def next(self, enough: float = np.inf) -> tuple[int, int] | None:
+        """Return the next pair, none where all are done; round after round.
+
+        A pair is passed over where `enough` of those that had their turn look at what it sees.
+        """
+        wanted = self._waiting & (self._covered < enough)
+        ready = wanted & ~self._busy[self._a] & ~self._busy[self._b]
+        if not ready.any():
+            self._busy[:] = False
+            ready = wanted
+            if not ready.any():
+                return None
+        k = int(np.argmax(ready))
+        a, b = int(self._a[k]), int(self._b[k])
+        self._waiting[k] = False
+        self._busy[[a, b]] = True
+        both = np.ones(len(self._a), bool)
+        for s in (a, b):
+            toward = self._middle - self._place[s]
+            cosine = (toward @ self._look[s]) / np.linalg.norm(toward, axis=1)
+            both &= cosine > np.cos(self._half[s] / 2)
+        self._covered += both
+        return a, b
+
+
+def _middle(views: Views) -> tuple[Array, Array, Array]:
+    """Return where each sensor's tracklets lie, where it stands, and their widest angle."""
+    n = len(views.half_field)
+    look, place, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
+    for s in range(n):
+        seen = views.seen[views.first[s] : views.first[s + 1]]
+        if not seen.any():
+            continue
+        m = int(np.argmax(seen.sum(axis=0)))
+        look[s], place[s] = views.plane[s, m, 2], views.place_km[s, m]
+        at = views.sight[views.first[s] : views.first[s + 1], m, :XX][seen[:, m]]
+        half[s] = np.arctan(np.sqrt((at**2).sum(axis=1).max())) + 1e-3
+    return look, place, half
+
+
+def _closest_approach(baseline: Array, u_a: Array, u_b: Array) -> tuple[Array, Array, Array]:
+    """Return the ranges along two lines of the points nearest to each other, and their gap."""
+    cosine = np.sum(u_a * u_b, axis=1)
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    along_a, along_b = np.sum(baseline * u_a, axis=1), np.sum(baseline * u_b, axis=1)
+    range_a = (along_a - cosine * along_b) / sine2
+    range_b = (cosine * along_a - along_b) / sine2
+    gap = baseline + range_b[:, None] * u_b - range_a[:, None] * u_a
+    return range_a, range_b, np.linalg.norm(gap, axis=1)

@@ -1,0 +1,1 @@
+"""What the association works on: tracklets of all sensors at common instants."""

@@ -1,0 +1,282 @@
+"""Views: the samples by sensor, flattened for the compiled search.
+
+Each sensor has, at each instant, a plane that touches the sky in the middle of its directions.
+A tracklet is then two coordinates and their covariance, a point is projected by nine
+multiplications, and a grid of cells tells which tracklets are near.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+# Columns of `Views.sight` and `Views.camera`. One row of each is all that the search reads of a
+# tracklet or a sensor at an instant; few arrays are also quick to compile.
+X, Y, XX, XY, YY, SIGMA_KM, SPOT_SR = range(7)
+R_KM, PLANE, TURN, HALF, CORNER, SCALE, WIDEST, REACH = 0, 3, 12, 21, 23, 25, 27, 28
+N_CAMERA = 29
+
+
+class Views(NamedTuple):
+    """`Samples` by sensor: t tracklets, k instants, s sensors.
+
+    first : (s + 1,) int
+        Tracklets of sensor s are ``first[s]:first[s + 1]``.
+    sensor, start_s, end_s, seen, time_s
+        As in `Samples`.
+    sight : (t, k, 7) float
+        Gnomonic coordinates in the sensor's plane (X, Y), their variances and covariance (XX, XY,
+        YY), the 1-sigma error of the sensor's place [km], and 2 pi times the root of the
+        direction's covariance determinant [sr].
+    camera : (s, k, 29) float
+        Where the sensor is [km], the plane's two axes and its normal, the sensor's axes (NaN where
+        unknown), tangents of half its field; the grid's lowest coordinates and cells a unit; the
+        largest variance of a tracklet in the plane; the tangent of the cone about the normal that
+        holds field and tracklets (0: no tracklet there).
+    grid : (s, k, 2) int
+        Where the cells of a sensor and instant begin in `cell_start`, and how many a side.
+    cell_start, cell_item : (c,), (v,) int
+        Tracklets of a cell are ``cell_item[cell_start[q]:cell_start[q + 1]]``.
+    """
+
+    first: Indices
+    sensor: Indices
+    start_s: Array
+    end_s: Array
+    seen: Flags
+    sight: Array
+    time_s: Array
+    camera: Array
+    grid: Indices
+    cell_start: Indices
+    cell_item: Indices
+
+    @property
+    def place_km(self) -> Array:
+        """Where the sensors are, (s, k, 3)."""
+        return self.camera[..., R_KM:PLANE]
+
+    @property
+    def plane(self) -> Array:
+        """Two axes and the normal of the planes, (s, k, 3, 3)."""
+        return self.camera[..., PLANE:TURN].reshape(*self.camera.shape[:2], 3, 3)
+
+    @property
+    def attitude(self) -> Array:
+        """How the sensors are turned, (s, k, 3, 3); NaN where unknown."""
+        return self.camera[..., TURN:HALF].reshape(*self.camera.shape[:2], 3, 3)
+
+    @property
+    def half_field(self) -> Array:
+        """Tangents of half the fields, (s, 2)."""
+        return self.camera[:, 0, HALF:CORNER]
+
+
+def views_of(samples: Samples) -> tuple[Views, Indices]:
+    """Return the samples sorted by sensor, ready to be searched, and the order that did it."""
+    n_sensors, n_instants = samples.sensor_km.shape[:2]
+    order = np.argsort(samples.sensor, kind="stable")
+    sensor = np.ascontiguousarray(samples.sensor[order], np.int64)
+    seen = np.ascontiguousarray(samples.seen[order])
+    first = np.searchsorted(sensor, np.arange(n_sensors + 1)).astype(np.int64)
+    sight = np.zeros((len(order), n_instants, 7))
+    sight[..., SIGMA_KM] = samples.sigma_km[order]
+    camera = np.zeros((n_sensors, n_instants, N_CAMERA))
+    camera[..., R_KM:PLANE] = samples.sensor_km
+    camera[..., TURN:HALF] = samples.R_sensor_from_icrs.reshape(n_sensors, n_instants, 9)
+    camera[..., HALF:CORNER] = samples.half_field[:, None]
+    u = np.ascontiguousarray(samples.u[order], float)
+    camera[..., PLANE:TURN] = _planes(first, seen, u).reshape(n_sensors, n_instants, 9)
+    cov = np.ascontiguousarray(samples.cov[order], float)
+    _flatten(sensor, seen, u, cov, camera, sight)
+    n_seen = int(np.count_nonzero(seen))
+    grid = np.zeros((n_sensors, n_instants, 2), np.int64)
+    cell_start = np.zeros(n_seen + n_sensors * n_instants + 1, np.int64)
+    cell_item = np.zeros(n_seen, np.int64)
+    _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item)
+    camera[..., REACH] = _reach(camera, grid)
+    views = Views(
+        first=first,
+        sensor=sensor,
+        start_s=samples.start_s[order].astype(float),
+        end_s=samples.end_s[order].astype(float),
+        seen=seen,
+        sight=sight,
+        time_s=samples.time_s.astype(float),
+        camera=camera,
+        grid=grid,
+        cell_start=cell_start,
+        cell_item=cell_item,
+    )
+    return views, order
+
+
+def _planes(first: Indices, seen: Flags, u: Array) -> Array:
+    """Return each sensor's planes; their axes turn with the normal from instant to instant."""
+    plane = np.zeros((len(first) - 1, seen.shape[1], 3, 3))
+    for s in range(len(plane)):
+        own = slice(first[s], first[s + 1])
+        total = np.einsum("tk,tki->ki", seen[own].astype(float), u[own])
+        length = np.linalg.norm(total, axis=1)
+        axis = None
+        for m in np.flatnonzero(length > 0).tolist():
+            normal = total[m] / length[m]
+            across = tangent_basis(normal)[0] if axis is None else axis - (axis @ normal) * normal
+            axis = across / np.linalg.norm(across)
+            plane[s, m] = axis, np.cross(normal, axis), normal
+    return plane
+
+
+def _reach(camera: Array, grid: Indices) -> Array:
+    """Return tangents of the cones about the planes' normals that hold all that is in view."""
+    side = grid[..., 1:]
+    low = camera[..., CORNER:SCALE]
+    high = low + side / np.maximum(camera[..., SCALE:WIDEST], 1e-300)
+    tracklets = np.hypot(*np.moveaxis(np.maximum(np.abs(low), np.abs(high)), -1, 0))
+    turned = np.sum(camera[..., PLANE + 6 : TURN] * camera[..., TURN + 6 : HALF], axis=-1)
+    field = np.arccos(np.clip(turned, -1, 1)) + np.arctan(np.hypot(*camera[..., HALF:CORNER].T).T)
+    widest = np.fmax(np.arctan(tracklets), field)
+    return np.where(side[..., 0] > 0, np.tan(np.minimum(widest, 1.5)), 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _flatten(sensor, seen, u, cov, camera, sight):
+    """Project directions and covariances, which are on `sky.tangent_basis`, onto the planes."""
+    M, t, p = np.empty((2, 2)), np.empty((2, 3)), np.empty((3, 3))
+    for i in range(seen.shape[0]):
+        for m in range(seen.shape[1]):
+            if not seen[i, m]:
+                continue
+            x, y, z = u[i, m, 0], u[i, m, 1], u[i, m, 2]
+            for a in range(9):
+                p[a // 3, a % 3] = camera[sensor[i], m, PLANE + a]
+            if abs(z) < 0.9:
+                length = np.sqrt(x * x + y * y)
+                t[0, 0], t[0, 1], t[0, 2] = -y / length, x / length, 0.0
+            else:
+                length = np.sqrt(y * y + z * z)
+                t[0, 0], t[0, 1], t[0, 2] = 0.0, -z / length, y / length
+            t[1, 0] = y * t[0, 2] - z * t[0, 1]
+            t[1, 1] = z * t[0, 0] - x * t[0, 2]
+            t[1, 2] = x * t[0, 1] - y * t[0, 0]
+            depth = max(p[2, 0] * x + p[2, 1] * y + p[2, 2] * z, 1e-3)
+            for a in range(2):
+                here = (p[a, 0] * x + p[a, 1] * y + p[a, 2] * z) / depth
+                sight[i, m, X + a] = here
+                for b in range(2):
+                    M[a, b] = 0.0
+                    for c in range(3):
+                        M[a, b] += (p[a, c] - here * p[2, c]) * t[b, c] / depth
+            c00, c01, c11 = cov[i, m, 0, 0], cov[i, m, 0, 1], cov[i, m, 1, 1]
+            sight[i, m, SPOT_SR] = 2 * np.pi * np.sqrt(max(c00 * c11 - c01 * c01, 0.0))
+            for k in range(3):
+                a, b = k // 2, (k + 1) // 2  # xx, xy, yy
+                along, across = c00 * M[b, 0] + c01 * M[b, 1], c01 * M[b, 0] + c11 * M[b, 1]
+                sight[i, m, XX + k] = M[a, 0] * along + M[a, 1] * across
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
+    """Sort each sensor's tracklets into square cells, about one a cell."""
+    begin, filled = 0, 0
+    cell = np.empty(seen.shape[0], np.int64)
+    for s in range(grid.shape[0]):
+        for m in range(grid.shape[1]):
+            grid[s, m, 0] = begin
+            n = 0
+            for a in range(2):
+                low, high = np.inf, -np.inf
+                for i in range(first[s], first[s + 1]):
+                    if seen[i, m]:
+                        low, high = min(low, sight[i, m, X + a]), max(high, sight[i, m, X + a])
+                        n += 1
+                camera[s, m, CORNER + a], camera[s, m, SCALE + a] = low, max(high - low, 1e-9)
+            n //= 2
+            if n == 0:
+                continue
+            side = int(np.sqrt(n))
+            grid[s, m, 1] = side
+            for a in range(2):
+                camera[s, m, SCALE + a] = side / camera[s, m, SCALE + a] * (1 - 1e-9)
+            for i in range(first[s], first[s + 1]):
+                if not seen[i, m]:
+                    continue
+                q = 0
+                for a in range(2):
+                    off = sight[i, m, X + a] - camera[s, m, CORNER + a]
+                    q = q * side + min(int(off * camera[s, m, SCALE + a]), side - 1)
+                cell[i] = q
+                cell_start[begin + q + 1] += 1
+                half = (sight[i, m, XX] + sight[i, m, YY]) / 2
+                apart = np.hypot((sight[i, m, XX] - sight[i, m, YY]) / 2, sight[i, m, XY])
+                camera[s, m, WIDEST] = max(camera[s, m, WIDEST], half + apart)
+            cell_start[begin] = filled
+            for q in range(side * side):
+                cell_start[begin + q + 1] += cell_start[begin + q]
+            for i in range(first[s], first[s + 1]):
+                if seen[i, m]:
+                    cell_item[cell_start[begin + cell[i]]] = i
+                    cell_start[begin + cell[i]] += 1
+            for q in range(side * side, 0, -1):
+                cell_start[begin + q] = cell_start[begin + q - 1]
+            cell_start[begin] = filled
+            filled += n
+            begin += side * side + 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def direction(views, i, m, u):
+    """Write the direction of a tracklet."""
+    s, x, y = views.sensor[i], views.sight[i, m, X], views.sight[i, m, Y]
+    length = np.sqrt(1.0 + x * x + y * y)
+    for a in range(PLANE, PLANE + 3):
+        along = views.camera[s, m, a] * x + views.camera[s, m, a + 3] * y
+        u[a - PLANE] = (along + views.camera[s, m, a + 6]) / length
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def residual(views, i, m, x, part):
+    """Write a view's residual, predicted minus seen, its partials and weight; return the depth.
+
+    `part` (11,), in the sensor's plane: the residual (2), its partials (2 by 3) [1/km], and the
+    inverse covariance (xx, xy, yy). Depth 0: the point is behind.
+    """
+    # Element by element: numba counts references to every row that is taken out.
+    cam, see, s = views.camera, views.sight, views.sensor[i]
+    d0, d1, d2 = x[0] - cam[s, m, 0], x[1] - cam[s, m, 1], x[2] - cam[s, m, 2]
+    n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
+    depth = n0 * d0 + n1 * d1 + n2 * d2
+    if not depth > 0.0:
+        return 0.0
+    for a in range(2):
+        q = PLANE + 3 * a
+        p0, p1, p2 = cam[s, m, q], cam[s, m, q + 1], cam[s, m, q + 2]
+        here = (p0 * d0 + p1 * d1 + p2 * d2) / depth
+        part[a] = here - see[i, m, X + a]
+        part[2 + 3 * a] = (p0 - here * n0) / depth
+        part[3 + 3 * a] = (p1 - here * n1) / depth
+        part[4 + 3 * a] = (p2 - here * n2) / depth
+    # An error of the sensor's place, across the line of sight.
+    extra, x0, x1 = (see[i, m, SIGMA_KM] / depth) ** 2, see[i, m, X], see[i, m, Y]
+    c00 = see[i, m, XX] + extra * (1.0 + x0 * x0)
+    c01 = see[i, m, XY] + extra * x0 * x1
+    c11 = see[i, m, YY] + extra * (1.0 + x1 * x1)
+    det = c00 * c11 - c01 * c01
+    part[8], part[9], part[10] = c11 / det, -c01 / det, c00 / det
+    return depth
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def misfit(part):
+    """Return the chi-square of what `residual` wrote."""
+    e0, e1 = part[0], part[1]
+    return part[8] * e0 * e0 + 2 * part[9] * e0 * e1 + part[10] * e1 * e1

@@ -1,0 +1,1 @@
+"""Star catalogues: places of stars at a date, and catalogues joined."""

@@ -1,0 +1,1 @@
+"""Geometry: rotations, directions, cameras, attitudes, lines of sight."""

@@ -1,0 +1,308 @@
+"""Orbit fit: position and velocity of an object over an arc, from all its lines of sight.
+
+The unknowns are the state at one instant and, for each sensor, what all its views share: an
+error of its directions and one of its place, both with their prior covariance. So a shared error
+does not average out over the arc; only what is new in every view does.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from epipole.tasks.algorithms.geometry.sky import SPEED_OF_LIGHT_KM_S, tangent_basis
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+GM_KM3_S2 = 398600.4418
+EARTH_RADIUS_KM = 6378.1363
+J2 = 1.08262668e-3
+LIGHT = SPEED_OF_LIGHT_KM_S
+STEP_S = 10.0  # the Runge-Kutta error of a low orbit over 10 minutes is then below a metre
+ITERATIONS = 20
+CONVERGED = 1e-6  # sigmas squared
+LEAST_BIAS_RAD = 5e-9  # a millarcsecond: keeps the prior invertible where nothing is shared
+LEAST_PLACE_KM = 1e-6
+
+
+class Arcs(NamedTuple):
+    """Views of objects, arc by arc: those of arc k are ``offsets[k]:offsets[k + 1]``.
+
+    time_s : (n,) float
+        When the sensor saw it, from the instant to which the arc's state belongs [s]; in order.
+    sensor : (n,) int
+        Whose view it is; any numbers from 0.
+    r_km, u : (n, 3) float
+        Where the sensor says it is, GCRF [km]; direction to the object without aberration.
+    cov_noise, cov_bias : (n, 2, 2) float
+        What is new in every view, and what all of a sensor's share, on `tangent_basis(u)`
+        [rad^2].
+    sigma_km : (n,) float
+        1-sigma error of the sensor's place an axis, shared by all its views [km].
+    """
+
+    offsets: Indices
+    time_s: Array
+    sensor: Indices
+    r_km: Array
+    u: Array
+    cov_noise: Array
+    cov_bias: Array
+    sigma_km: Array
+
+
+@njit(cache=True, nogil=True)
+def _rates(y, out):
+    """Write the rates of a state (6) and its transition matrix (36, row by row)."""
+    x, v, z = y[:3], y[3:6], y[2]
+    r2 = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
+    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
+    oblate = 1.5 * J2 * EARTH_RADIUS_KM**2 / r2
+    tilt = 5.0 * z * z / r2
+    for a in range(3):
+        out[a] = v[a]
+        out[3 + a] = -pull * x[a] * (1.0 + oblate * ((3.0 if a == 2 else 1.0) - tilt))
+    # The matrix leaves the oblateness out: a thousandth of what it says.
+    for a in range(3):
+        for k in range(6):
+            out[6 + 6 * a + k] = y[6 + 6 * (3 + a) + k]
+            total = 0.0
+            for b in range(3):
+                total += 3.0 * x[a] * x[b] / r2 * y[6 + 6 * b + k]
+            out[6 + 6 * (3 + a) + k] = pull * (total - y[6 + 6 * a + k])
+
+
+@njit(cache=True, nogil=True)
+def _advance(y, dt_s):
+    """Carry a state and its transition matrix over dt_s, in place, by Runge and Kutta."""
+    n = int(np.ceil(abs(dt_s) / STEP_S))
+    if n == 0:
+        return
+    h = dt_s / n
+    k1, k2, k3, k4 = np.empty(42), np.empty(42), np.empty(42), np.empty(42)
+    for _ in range(n):
+        _rates(y, k1)
+        _rates(y + h / 2 * k1, k2)
+        _rates(y + h / 2 * k2, k3)
+        _rates(y + h * k3, k4)
+        y += h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def propagate(state: Array, dt_s: float) -> Array:
+    """Return a (6,) state [km, km/s], GCRF, dt_s later: the Earth a point with oblateness (J2).
+
+    The axis of the Earth is taken as that of the ICRS, from which it is 0.1 degrees off.
+    """
+    return trajectory(state, np.array([dt_s]))[0][0]
+
+
+def trajectory(state: Array, dt_s: Array) -> tuple[Array, Array]:
+    """Return a (6,) state at several times from its own, and how errors of it are carried there.
+
+    Parameters
+    ----------
+    state : (6,) float
+        Position [km] and velocity [km/s], GCRF; forces as in `propagate`.
+    dt_s : (n,) float
+        Times [s] since the state's; cheapest in order.
+
+    Returns
+    -------
+    state : (n, 6) float
+    transition : (n, 6, 6) float
+        Derivatives of the states by the one given, of two bodies.
+    """
+    out = np.empty((len(dt_s), 42))
+    begin = np.concatenate([np.asarray(state, float), np.eye(6).ravel()])
+    y, now = begin.copy(), 0.0
+    for k, t in enumerate(np.asarray(dt_s, float).tolist()):
+        if (t - now) * t < 0.0 or now * t < 0.0:  # nearer than the last, or on the other side
+            y, now = begin.copy(), 0.0
+        _advance(y, t - now)
+        out[k], now = y, t
+    return out[:, :6], out[:, 6:].reshape(-1, 6, 6)
+
+
+@njit(cache=True, nogil=True)
+def _accumulate(y, view, shared, N, rhs, at):
+    """Add one view to the normal equations; return its part of chi-square, NaN where behind.
+
+    `view` is (r, u, basis, weight); `shared` the sensor's errors of direction and place so far,
+    whose unknowns begin at `at`.
+    """
+    r, u, basis, W = view
+    delay = 0.0
+    d = np.empty(3)
+    for _ in range(2):  # light left earlier; the second time is right to a millimetre
+        rho2 = 0.0
+        for a in range(3):
+            r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
+            pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
+            d[a] = y[a] - delay * y[3 + a] - 0.5 * delay * delay * pull * y[a]
+            d[a] += shared[3 + a] - r[a]
+            rho2 += d[a] * d[a]
+        rho = np.sqrt(rho2)
+        delay = rho / LIGHT
+    if d[0] * u[0] + d[1] * u[1] + d[2] * u[2] <= 0.0:
+        return np.nan
+    J, e = np.zeros((2, 12)), np.zeros(2)
+    for i in range(2):
+        for a in range(3):
+            e[i] += basis[i, a] * (d[a] / rho + shared[a])
+            J[i, 6 + a] = basis[i, a]
+            J[i, 9 + a] = basis[i, a] / rho
+            for k in range(6):
+                moved = y[6 + 6 * a + k] - delay * y[6 + 6 * (3 + a) + k]
+                J[i, k] += basis[i, a] / rho * moved
+    chi2 = 0.0
+    where = np.empty(12, np.int64)
+    for k in range(12):
+        where[k] = k if k < 6 else at + k - 6
+    for i in range(2):
+        for j in range(2):
+            chi2 += e[i] * W[i, j] * e[j]
+            for k in range(12):
+                rhs[where[k]] -= J[i, k] * W[i, j] * e[j]
+                for m in range(12):
+                    N[where[k], where[m]] += J[i, k] * W[i, j] * J[j, m]
+    return chi2
+
+
+@njit(cache=True, nogil=True)
+def _add_views(state, errors, time_s, sensor, r, u, basis, weight, N, rhs):
+    """Add all views to the normal equations at a state; return their chi-square."""
+    chi2 = 0.0
+    middle = np.searchsorted(time_s, 0.0)
+    for later in range(2):
+        y = np.zeros(42)
+        y[:6] = state
+        for a in range(6):
+            y[6 + 7 * a] = 1.0
+        now = 0.0
+        for q in range(len(time_s) - middle if later else middle):
+            i = middle + q if later else middle - 1 - q
+            _advance(y, time_s[i] - now)
+            now = time_s[i]
+            view = (r[i], u[i], basis[i], weight[i])
+            chi2 += _accumulate(y, view, errors[sensor[i]], N, rhs, 6 + 6 * sensor[i])
+    return chi2
+
+
+class _Views(NamedTuple):
+    """One arc's views: as in `Arcs`, with the tangent basis and the inverse of the noise."""
+
+    time_s: Array
+    sensor: Indices
+    r_km: Array
+    u: Array
+    basis: Array
+    weight: Array
+
+
+def _fit(state: Array, prior: Array, views: _Views) -> tuple[Array, Array, float]:
+    """Return state, covariance and chi-square of one arc from a start; NaN where it fails."""
+    failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan
+    n_sensors = len(prior)
+    errors = np.zeros((n_sensors, 6))
+    size = 6 + 6 * n_sensors
+    at_prior = np.zeros((size, size))
+    for s in range(n_sensors):
+        at_prior[6 + 6 * s : 12 + 6 * s, 6 + 6 * s : 12 + 6 * s] = prior[s]
+    for _ in range(ITERATIONS):
+        pull = (prior @ errors[:, :, None])[:, :, 0]
+        N, rhs = at_prior.copy(), np.concatenate([np.zeros(6), -pull.ravel()])
+        chi2 = float(np.sum(errors * pull)) + _add_views(
+            state,
+            errors,
+            views.time_s,
+            views.sensor,
+            views.r_km,
+            views.u,
+            views.basis,
+            views.weight,
+            N,
+            rhs,
+        )
+        if not (np.isfinite(chi2) and (np.diag(N) > 0.0).all()):
+            return failed
+        # Kilometres, km/s and radians: scaled alike before anything is solved.
+        scale = 1.0 / np.sqrt(np.diag(N))
+        try:
+            inverse = np.linalg.inv(N * scale[:, None] * scale)
+        except np.linalg.LinAlgError:
+            return failed
+        step = scale * (inverse @ (scale * rhs))
+        gain = float(step @ rhs)
+        if not abs(gain) < 1e14:
+            return failed
+        state, errors = state + step[:6], errors + step[6:].reshape(n_sensors, 6)
+        if gain < CONVERGED:
+            return state, inverse[:6, :6] * scale[:6, None] * scale[:6], chi2 - gain
+    return failed
+
+
+def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
+    """Return the states that fit arcs best, with covariance.
+
+    Parameters
+    ----------
+    arcs
+        The views; no two of a sensor may share a detection, for then their noise is not new.
+    start : (g, 6) float
+        States [km, km/s] to begin with: off by a little against the distances of the sensors.
+
+    Returns
+    -------
+    state : (g, 6) float
+        Position [km] and velocity [km/s], GCRF, at the instant from which the times count;
+        NaN where the fit fails (too few views, an object behind a sensor, no convergence).
+    cov : (g, 6, 6) float
+        Covariance.
+    chi2 : (g,) float
+        Weighted sum of squares, the shared errors' own included; 2 n - 6 degrees of freedom.
+
+    Notes
+    -----
+    Errors that a sensor's views share are taken as fixed in ICRS axes over the arc, as those of a
+    sensor are that keeps its roll. Forces: see `propagate`; over 10 minutes what is left
+    out (Moon, Sun, other harmonics) is below 2 m.
+
+    References
+    ----------
+    Gauss-Newton; Tapley, Schutz, Born (2004), Statistical Orbit Determination, section 4.
+    """
+    g = len(arcs.offsets) - 1
+    state, cov = np.array(start, float).reshape(g, 6), np.full((g, 6, 6), np.nan)
+    chi2 = np.full(g, np.nan)
+    basis, weight = tangent_basis(arcs.u), np.asarray(np.linalg.inv(arcs.cov_noise), float)
+    for k in range(g):
+        own = slice(arcs.offsets[k], arcs.offsets[k + 1])
+        names, sensor = np.unique(arcs.sensor[own], return_inverse=True)
+        if own.stop - own.start < 3:
+            state[k] = np.nan
+            continue
+        views = _Views(
+            arcs.time_s[own], sensor.astype(np.int64), arcs.r_km[own], arcs.u[own], basis[own],
+            weight[own],
+        )  # fmt: skip
+        prior = _prior(arcs, own, basis, sensor, len(names))
+        state[k], cov[k], chi2[k] = _fit(state[k], prior, views)
+    return state, cov, chi2
+
+
+def _prior(arcs: Arcs, own: slice, basis: Array, sensor: Indices, n_sensors: int) -> Array:
+    """Return the inverse covariance of each sensor's shared errors: direction, then place."""
+    out = np.zeros((n_sensors, 6, 6))
+    across = np.swapaxes(basis[own], -1, -2) @ arcs.cov_bias[own] @ basis[own]
+    # Along the sight an error shows nowhere; it only keeps the matrix invertible.
+    along = np.trace(arcs.cov_bias[own], axis1=-2, axis2=-1) / 2
+    full = across + along[:, None, None] * arcs.u[own][:, :, None] * arcs.u[own][:, None, :]
+    for s in range(n_sensors):
+        mine = sensor == s
+        direction = full[mine].mean(axis=0) + LEAST_BIAS_RAD**2 * np.eye(3)
+        out[s, :3, :3] = np.linalg.inv(direction)
+        place = max(float(arcs.sigma_km[own][mine].mean()), LEAST_PLACE_KM)
+        out[s, 3:, 3:] = np.eye(3) / place**2
+    return out

@@ -1,0 +1,259 @@
+"""A sensor's states at the times of its frames.
+
+Between two states the position is the quintic that has their positions, velocities and
+accelerations; an acceleration is gravity at the state's position, which ten metres of
+error do not change. So a path is followed to centimetres over minutes, and the states'
+independent errors are averaged, never amplified: no position is differenced with another
+one nearby. Where velocities are not sent they come from a fit over 20 s of positions, with
+gravity's part of the motion taken off first.
+
+A vehicle below 80 km altitude is on no orbit; its acceleration is taken as zero, which at
+one state a second still follows a point at rest on Earth to a metre.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.geometry.rotations import interpolate_quaternions
+
+Array = npt.NDArray[np.float64]
+Nanoseconds = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+SECOND_NS = 1_000_000_000
+GM_KM3_S2 = 398600.4418
+EARTH_RADIUS_KM = 6378.1366
+J2 = 1.08262668e-3
+LOWEST_ORBIT_KM = EARTH_RADIUS_KM + 80.0
+
+# Widest gap between two states that is bridged: the quintic of a low orbit is then good to
+# 5 cm with velocities. Without, the fitted velocities are good to some m/s.
+MAX_BRIDGE_S = 240.0
+MAX_BRIDGE_FITTED_S = 120.0
+# Positions within this of a state give its velocity, if it has none; the nearest one on
+# each side always does. At most so many of them: more add nothing but work.
+FIT_HALF_WIDTH_S = 10.0
+FIT_POINTS = 21
+# Along an extrapolation a sent velocity doubles the variance after this long.
+VELOCITY_MEMORY_S = 30.0
+# A prior attitude is turned evenly between two states no further apart than this.
+MAX_ATTITUDE_GAP_S = 10.0
+
+
+class States(NamedTuple):
+    """States of one sensor, by strictly increasing time."""
+
+    time_ns: Nanoseconds  # (n,)
+    r_gcrf_km: Array  # (n, 3)
+    v_gcrf_km_s: Array  # (n, 3), NaN where not sent
+    position_sigma_km: Array  # (n,) 1-sigma an axis
+    q_sensor_from_icrs: Array  # (n, 4), NaN where not sent
+    attitude_sigma: Array  # (n,) 1-sigma an axis, any unit
+
+
+class Places(NamedTuple):
+    """A sensor at m times; NaN where no state is near enough."""
+
+    r_gcrf_km: Array  # (m, 3)
+    v_gcrf_km_s: Array  # (m, 3)
+    position_sigma_km: Array  # (m,)
+    q_sensor_from_icrs: Array  # (m, 4)
+    attitude_sigma: Array  # (m,)
+
+
+def interpolate_states(states: States, at_ns: Nanoseconds, state_gap_s: float) -> Places:
+    """Return where a sensor is and how it is turned at given times.
+
+    Parameters
+    ----------
+    states
+        Any number, also one or none.
+    at_ns : (m,) int
+        UTC since 1970, in any order.
+    state_gap_s
+        A time further than this from every state has no position.
+
+    Returns
+    -------
+    Places
+        Beyond the first and last state, and next to a gap that is too wide to bridge, the
+        nearest state is carried on under gravity and its sigma grows. An attitude is never
+        carried on: who knows when a sensor turns.
+    """
+    n, m = len(states.time_ns), len(at_ns)
+    if n == 0 or m == 0:
+        nan = np.full((m, 4), np.nan)
+        return Places(nan[:, :3], nan[:, :3], nan[:, 0], nan, nan[:, 0])
+    v_km_s, growth = _with_velocities(states)
+    right = np.clip(np.searchsorted(states.time_ns, at_ns), 1, max(n - 1, 1)) % n
+    left = np.maximum(right - 1, 0)
+    # In integers first: floating seconds since 1970 are good to a quarter microsecond only.
+    since_left_s = (at_ns - states.time_ns[left]) / SECOND_NS
+    since_right_s = (at_ns - states.time_ns[right]) / SECOND_NS
+    use_left = np.abs(since_left_s) <= np.abs(since_right_s)
+    nearest = np.where(use_left, left, right)
+    since_s = np.where(use_left, since_left_s, since_right_s)
+    fitted = np.isnan(states.v_gcrf_km_s[:, 0])
+    bridge_s = np.where(fitted[left] | fitted[right], MAX_BRIDGE_FITTED_S, MAX_BRIDGE_S)
+    between = (since_left_s >= 0) & (since_right_s <= 0) & (left != right)
+    between &= since_left_s - since_right_s <= bridge_s
+
+    r, v = _carry_on(states.r_gcrf_km[nearest], v_km_s[nearest], np.where(between, 0.0, since_s))
+    linear, square = growth[nearest].T
+    variance = 1 + linear * since_s + square * since_s**2
+    sigma = states.position_sigma_km[nearest] * np.sqrt(variance)
+    i = np.flatnonzero(between)
+    a, b, step_s = left[i], right[i], (since_left_s - since_right_s)[i]
+    share = since_left_s[i] / step_s
+    r[i], v[i] = _bridge(states.r_gcrf_km, v_km_s, a, b, step_s, share)
+    sigma[i] = (1 - share) * states.position_sigma_km[a] + share * states.position_sigma_km[b]
+    far = np.abs(since_s) > state_gap_s
+    r[far], v[far], sigma[far] = np.nan, np.nan, np.nan
+    return Places(r, v, sigma, *_attitudes(states, at_ns))
+
+
+def gravity(r_km: Array) -> Array:
+    """Return the acceleration [km/s^2] of (..., 3) positions: Earth as a point, and J2.
+
+    J2's axis is the GCRF's z, which is within 0.2 degrees of the pole of this century.
+
+    References
+    ----------
+    Vallado (2013), Fundamentals of Astrodynamics and Applications, eq. 8-30.
+    """
+    radius = np.linalg.norm(r_km, axis=-1, keepdims=True)
+    flattening = 1.5 * J2 * (EARTH_RADIUS_KM / radius) ** 2
+    z2 = 5 * (r_km[..., 2:] / radius) ** 2
+    factor = 1 + flattening * (np.array([1.0, 1.0, 3.0]) - z2)
+    acceleration = -GM_KM3_S2 / radius**3 * r_km * factor
+    return np.where(radius > LOWEST_ORBIT_KM, acceleration, 0.0)
+
+
+def _bridge(
+    r_km: Array, v_km_s: Array, a: Nanoseconds, b: Nanoseconds, step_s: Array, share: Array
+) -> tuple[Array, Array]:
+    """Return positions and velocities at a share of the way from states a to states b.
+
+    Positions by quintic Hermite; velocities by the cubic of the velocities and gravity, not
+    by the derivative of the positions, which would amplify their errors.
+    """
+    h, s = step_s[:, None], share[:, None]
+    ra, rb, va, vb = r_km[a], r_km[b], v_km_s[a], v_km_s[b]
+    ga, gb = gravity(ra), gravity(rb)
+    s3, s4, s5 = s**3, s**4, s**5
+    rise = 10 * s3 - 15 * s4 + 6 * s5
+    r = ra + (rb - ra) * rise
+    r += h * ((s - 6 * s3 + 8 * s4 - 3 * s5) * va + (-4 * s3 + 7 * s4 - 3 * s5) * vb)
+    r += 0.5 * h**2 * ((s**2 - 3 * s3 + 3 * s4 - s5) * ga + (s3 - 2 * s4 + s5) * gb)
+    rise = 3 * s**2 - 2 * s3
+    v = va + (vb - va) * rise + h * ((s - 2 * s**2 + s3) * ga + (s3 - s**2) * gb)
+    return r, v
+
+
+def _carry_on(r_km: Array, v_km_s: Array, step_s: Array) -> tuple[Array, Array]:
+    """Return states carried on under gravity, (n,) s each, by four steps of Runge-Kutta.
+
+    Good to centimetres over minutes on a low orbit.
+    """
+    steps = 4
+    h = (step_s / steps)[:, None]
+    r, v = r_km.copy(), v_km_s.copy()
+    for _ in range(steps):
+        v1, g1 = v, gravity(r)
+        v2, g2 = v + h / 2 * g1, gravity(r + h / 2 * v1)
+        v3, g3 = v + h / 2 * g2, gravity(r + h / 2 * v2)
+        v4, g4 = v + h * g3, gravity(r + h * v3)
+        r = r + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
+        v = v + h / 6 * (g1 + 2 * g2 + 2 * g3 + g4)
+    return r, v
+
+
+def _with_velocities(states: States) -> tuple[Array, Array]:
+    """Return every state's velocity, sent or fitted, and what it costs to carry it on.
+
+    The second is (n, 2): after t seconds the variance of the position is that of the state
+    times 1 + a t + b t^2. A lone state without velocity has NaN in both.
+    """
+    v = states.v_gcrf_km_s.copy()
+    growth = np.tile([0.0, VELOCITY_MEMORY_S**-2], (len(v), 1))
+    missing = np.flatnonzero(np.isnan(v[:, 0]))
+    if len(missing):
+        v[missing], growth[missing] = _fit_velocities(states, missing)
+    return v, growth
+
+
+def _fit_velocities(states: States, which: Nanoseconds) -> tuple[Array, Array]:
+    points, used = _fit_points(states.time_ns, which)
+    since_s = (states.time_ns[points] - states.time_ns[which][:, None]) / SECOND_NS
+    r_km = states.r_gcrf_km[points]
+    # Gravity along the path, as a quadratic in time, integrated twice.
+    width_s = np.maximum(np.abs(np.where(used, since_s, 0.0)).max(axis=1), 1e-9)
+    tau = since_s / width_s[:, None]
+    weight = used.astype(float)
+    fall = _double_integral(tau, gravity(r_km), weight) * (width_s**2)[:, None, None]
+    # What is left is a straight line; its slope errs together with the state's own position.
+    mean_s = (weight * since_s).sum(axis=1) / weight.sum(axis=1)
+    lever_s = np.where(used, since_s - mean_s[:, None], 0.0)
+    spread = (lever_s**2).sum(axis=1)
+    spread[spread == 0] = np.nan
+    v = np.einsum("np,npi->ni", lever_s, r_km - fall) / spread[:, None]
+    return v, np.stack([-2 * mean_s / spread, 1 / spread], axis=-1)
+
+
+def _fit_points(time_ns: Nanoseconds, which: Nanoseconds) -> tuple[Nanoseconds, Mask]:
+    """Return (k, FIT_POINTS) indices of the states around each of k, and which count."""
+    n = len(time_ns)
+    reach = int(FIT_HALF_WIDTH_S * SECOND_NS)
+    first = np.searchsorted(time_ns, time_ns[which] - reach)
+    last = np.searchsorted(time_ns, time_ns[which] + reach, side="right") - 1
+    first = np.maximum(np.minimum(first, which - 1), 0)
+    last = np.minimum(np.maximum(last, which + 1), n - 1)
+    # A run's end has no neighbour on one side: take a second one of the other, for gravity.
+    first = np.where(last == which, np.maximum(np.minimum(first, which - 2), 0), first)
+    last = np.where(first == which, np.minimum(np.maximum(last, which + 2), n - 1), last)
+    share = np.linspace(0.0, 1.0, FIT_POINTS)
+    points = np.rint(first[:, None] + share * (last - first)[:, None]).astype(np.int64)
+    used = np.ones_like(points, bool)
+    used[:, 1:] = points[:, 1:] != points[:, :-1]
+    far = np.abs(time_ns[points] - time_ns[which][:, None]) > MAX_BRIDGE_FITTED_S * SECOND_NS
+    return points, used & ~far
+
+
+def _double_integral(tau: Array, values: Array, weight: Array) -> Array:
+    """Return the double integral over tau, from 0, of a quadratic fitted to (n, p, 3) values."""
+    powers = np.stack([np.ones_like(tau), tau, tau**2], axis=-1)
+    weighted = powers * weight[..., None]
+    normal = np.einsum("npi,npj->nij", weighted, powers)
+    # Fewer than three points: the smallest coefficients that pass through them.
+    normal += 1e-9 * np.eye(3)
+    moments = np.einsum("npi,npk->nik", weighted, values)
+    coefficients = np.linalg.solve(normal, moments)
+    integrals = np.stack([tau**2 / 2, tau**3 / 6, tau**4 / 12], axis=-1)
+    return np.einsum("npi,nik->npk", integrals, coefficients)
+
+
+def _attitudes(states: States, at_ns: Nanoseconds) -> tuple[Array, Array]:
+    """Return prior attitudes and their sigmas where a state with one is on either side."""
+    q, sigma = np.full((len(at_ns), 4), np.nan), np.full(len(at_ns), np.nan)
+    having = np.flatnonzero(np.isfinite(states.q_sensor_from_icrs).all(axis=1))
+    if len(having) == 0:
+        return q, sigma
+    time_ns = states.time_ns[having]
+    right = np.minimum(np.searchsorted(time_ns, at_ns), len(time_ns) - 1)
+    left = np.where(time_ns[right] == at_ns, right, np.maximum(right - 1, 0))
+    covered = (time_ns[left] <= at_ns) & (at_ns <= time_ns[right])
+    covered &= time_ns[right] - time_ns[left] <= MAX_ATTITUDE_GAP_S * SECOND_NS
+    i = np.flatnonzero(covered)
+    if len(i) == 0:
+        return q, sigma
+    start_ns = time_ns[0]
+    q[i] = interpolate_quaternions(
+        (time_ns - start_ns) / SECOND_NS,
+        states.q_sensor_from_icrs[having],
+        (at_ns[i] - start_ns) / SECOND_NS,
+    )
+    of_state = states.attitude_sigma[having]
+    sigma[i] = np.maximum(of_state[left[i]], of_state[right[i]])
+    return q, sigma

@@ -1,0 +1,147 @@
+"""Clock search: the offset at which a sensor's lines of sight meet the objects that others found.
+
+A sensor whose clock is seconds off agrees with no other, so none of its lines is told to be of an
+object. But each line and each object give the offset at which the two would meet; the wrong
+ones scatter, the right ones are all the same.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import pdtrc
+
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+LARGEST_S = 5.0  # offset that is looked for
+MEETS_SIGMA = 4.0  # how far a line may pass by its object, any offset allowed
+QUARTER_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
+SAME_SIGMA = 3.0  # offsets that differ by less are one
+FAR = 1e9  # sigmas
+FEWEST = 3  # objects
+FALSE_ALARM = 1e-4  # accepted probability that the offsets agree by chance
+
+
+class Meetings(NamedTuple):
+    """Lines of sight of one sensor beside objects: each line beside every object of its epoch.
+
+    tracklet, item : (n,) int
+        Of which tracklet the line is, and which object stands beside it; any numbers.
+    u, cov : (n, 3), (n, 2, 2) float
+        Direction without aberration and its covariance on `tangent_basis(u)` [rad^2].
+    r_km, v_sensor_km_s : (n, 3) float
+        The sensor, GCRF.
+    sigma_km : (n,) float
+        1-sigma error of its place an axis.
+    x_km, v_km_s, cov_km2 : (n, 3), (n, 3), (n, 3, 3) float
+        The object as the other sensors found it at the epoch.
+    """
+
+    tracklet: Indices
+    item: Indices
+    u: Array
+    cov: Array
+    r_km: Array
+    v_sensor_km_s: Array
+    sigma_km: Array
+    x_km: Array
+    v_km_s: Array
+    cov_km2: Array
+
+
+class Match(NamedTuple):
+    """The offset [s], reported minus true time, and the rows where line and object then meet."""
+
+    offset_s: float
+    row: Indices
+
+
+def search_offset(meetings: Meetings) -> Match | None:
+    """Return the clock offset that lets a sensor see the objects; None where none is sure.
+
+    Notes
+    -----
+    An offset is sure where so many objects agree on it, each with a tracklet of its own, as chance
+    would not give. How often a line meets a wrong object is counted where no right one is: on
+    either side of the way that an offset moves it.
+    """
+    pairs, which = np.unique(
+        np.column_stack([meetings.tracklet, meetings.item]), axis=0, return_inverse=True
+    )
+    which = which.ravel()
+    miss, rate = _passes(meetings)
+    along, sigma = _mean_offset(miss, rate, which, len(pairs))
+    aside, sigma_aside = _mean_offset(miss, rate @ QUARTER_TURN, which, len(pairs))
+    meets = (np.abs(aside) < MEETS_SIGMA * sigma_aside) & (np.abs(along) < LARGEST_S)
+    wrong = (np.abs(along) < MEETS_SIGMA * sigma) & (np.abs(aside) < LARGEST_S) & ~meets
+    good = np.flatnonzero(meets)
+    best = _surest(pairs[good], along[good], sigma[good], int(wrong.sum()))
+    if best is None:
+        return None
+    chosen = good[_one_to_one(pairs[good], along[good], sigma[good], best)]
+    return Match(best, np.flatnonzero(np.isin(which, chosen)))
+
+
+def _passes(m: Meetings) -> tuple[Array, Array]:
+    """Return how far each line passes by its object, and the rate at which an offset moves it.
+
+    (n, 2) each, in units of the errors and those a second.
+    """
+    away = m.x_km - m.r_km
+    reach = np.linalg.norm(away, axis=1)
+    basis = tangent_basis(m.u) / reach[:, None, None]
+    place_cov = m.cov_km2 + (m.sigma_km**2)[:, None, None] * np.eye(3)
+    cov = m.cov + basis @ place_cov @ np.swapaxes(basis, -1, -2)
+    across = np.linalg.inv(np.linalg.cholesky(cov)) @ basis
+    miss = np.einsum("nij,nj->ni", across, -away)
+    ahead = np.einsum("ni,ni->n", m.u, away) > 0.5 * reach
+    # Seen late, an object stands back by its motion.
+    rate = np.einsum("nij,nj->ni", across, m.v_sensor_km_s - m.v_km_s)
+    return np.where(ahead[:, None], miss, FAR), rate
+
+
+def _mean_offset(miss: Array, rate: Array, which: Indices, n: int) -> tuple[Array, Array]:
+    """Return the offset [s] at which each pair of a tracklet and an object is nearest, and sigma.
+
+    The pair's mean over its epochs; large where the object is behind the sensor.
+    """
+    weight = np.bincount(which, np.sum(rate * rate, axis=1), n)
+    weight = np.maximum(weight, 1e-300)
+    return np.bincount(which, np.sum(rate * miss, axis=1), n) / weight, 1 / np.sqrt(weight)
+
+
+def _surest(pairs: Indices, offset: Array, sigma: Array, n_aside: int) -> float | None:
+    """Return the offset on which most objects agree; None where that may be chance.
+
+    `n_aside` pairs met where none is right.
+    """
+    n = len(offset)
+    best: tuple[float, float] | None = None
+    for k in range(n):
+        window = SAME_SIGMA * np.hypot(sigma, sigma[k])
+        near = np.flatnonzero(np.abs(offset - offset[k]) < window)
+        agree = min(len(np.unique(pairs[near, 0])), len(np.unique(pairs[near, 1])))
+        if agree < FEWEST:
+            continue
+        chance = (n_aside + 1) * min(float(np.mean(window)) / LARGEST_S, 1.0)
+        with np.errstate(divide="ignore"):  # no chance at all
+            odds = float(np.log(pdtrc(agree - 2, chance)))  # the middle one agrees by itself
+        if best is None or odds < best[0]:
+            weight = 1 / sigma[near] ** 2
+            best = odds, float(np.sum(weight * offset[near]) / np.sum(weight))
+    if best is None or best[0] + np.log(n) > np.log(FALSE_ALARM):
+        return None
+    return best[1]
+
+
+def _one_to_one(pairs: Indices, offset: Array, sigma: Array, best: float) -> list[int]:
+    """Return the pairs that agree with an offset, no tracklet and no object twice."""
+    off = np.abs(offset - best) / sigma
+    chosen: list[int] = []
+    for k in np.argsort(off, kind="stable").tolist():
+        if off[k] < SAME_SIGMA and not (pairs[chosen] == pairs[k]).any():
+            chosen.append(k)
+    return chosen

@@ -1,0 +1,1 @@
+"""Frames: the centroids of one frame, and of all frames of a sensor."""

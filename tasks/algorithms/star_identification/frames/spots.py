@@ -1,0 +1,165 @@
+"""All frames of one sensor, flat: frame k has the rows first[k]:first[k + 1] of what is a row
+a centroid."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.star_identification.frames.frame import Frame, Optics, Solution
+
+Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int64]
+
+
+class Frames(NamedTuple):
+    """Frames in order of time, centroids brightest first.
+
+    first : (F + 1,) int64
+    u, sigma_rad, instrumental_mag : (N, 3), (N,), (N,) float, as in `frame.Frame`
+    beta : (F, 3) float
+    optics, optics_of : the cameras, and (F,) int64 which of them took a frame
+    """
+
+    first: Rows
+    u: Array
+    sigma_rad: Array
+    instrumental_mag: Array
+    beta: Array
+    optics: Sequence[Optics]
+    optics_of: Rows
+
+    def one(self, k: int) -> Frame:
+        """Return a frame by itself."""
+        at = slice(self.first[k], self.first[k + 1])
+        return Frame(
+            self.u[at], self.sigma_rad[at], self.instrumental_mag[at], self.beta[k],
+            self.optics[self.optics_of[k]],
+        )  # fmt: skip
+
+    def each(self) -> list[Frame]:
+        """Return all frames, one by one."""
+        return [self.one(k) for k in range(len(self.beta))]
+
+
+class Spots(NamedTuple):
+    """Centroids of frames, brightest first in each, before their errors are settled.
+
+    first : (F + 1,) int64
+    u, pixel_rad : (N, 3), (N,) float, directions, and the angle a pixel spans there
+    sigma_px : (N,) float, NaN where unknown
+    instrumental_mag : (N,) float, NaN where unknown
+    beta, optics, optics_of : as in `Frames`
+    """
+
+    first: Rows
+    u: Array
+    pixel_rad: Array
+    sigma_px: Array
+    instrumental_mag: Array
+    beta: Array
+    optics: Sequence[Optics]
+    optics_of: Rows
+
+    @property
+    def counts(self) -> Rows:
+        """(F,) centroids of each frame."""
+        return np.diff(self.first)
+
+    def take(self, frames: Rows) -> "Spots":
+        """Return these frames alone."""
+        n = self.counts[frames]
+        first = np.concatenate([[0], np.cumsum(n)])
+        at = np.arange(first[-1]) + np.repeat(self.first[frames] - first[:-1], n)
+        return Spots(
+            first, self.u[at], self.pixel_rad[at], self.sigma_px[at], self.instrumental_mag[at],
+            self.beta[frames], self.optics, self.optics_of[frames],
+        )  # fmt: skip
+
+    def frames(self, scale: float, use_flux: bool = True) -> Frames:
+        """Return the frames with their errors scaled; 1 px stands where none is stated."""
+        sigma_px = np.where(np.isnan(self.sigma_px), 1.0, self.sigma_px) * scale
+        mag = self.instrumental_mag if use_flux else np.full(len(sigma_px), np.nan)
+        return Frames(
+            self.first, self.u, sigma_px * self.pixel_rad, mag, self.beta, self.optics,
+            self.optics_of,
+        )  # fmt: skip
+
+
+class Solutions(NamedTuple):
+    """What was found in each frame.
+
+    solved : (F,) bool
+    R_sensor_from_icrs, cov_rad2 : (F, 3, 3) float, as in `frame.Solution`; NaN where not solved
+    star, chi2 : (N,) int64 and float; -1 and 0 where there is no star
+    evidence : (F,) float, NaN where not solved
+    first : (F + 1,) int64
+    """
+
+    solved: npt.NDArray[np.bool_]
+    R_sensor_from_icrs: Array
+    cov_rad2: Array
+    star: Rows
+    chi2: Array
+    evidence: Array
+    first: Rows
+
+    def one(self, k: int) -> Solution | None:
+        """Return a frame's solution."""
+        if not self.solved[k]:
+            return None
+        at = slice(self.first[k], self.first[k + 1])
+        return Solution(
+            self.R_sensor_from_icrs[k], self.cov_rad2[k], self.star[at], self.chi2[at],
+            float(self.evidence[k]),
+        )  # fmt: skip
+
+    def each(self) -> list[Solution | None]:
+        """Return all solutions, one by one."""
+        return [self.one(k) for k in range(len(self.solved))]
+
+    def enter(self, k: int, found: Solution) -> None:
+        """Write a frame's solution."""
+        at = slice(self.first[k], self.first[k + 1])
+        self.solved[k] = True
+        self.R_sensor_from_icrs[k], self.cov_rad2[k] = found.R_sensor_from_icrs, found.cov_rad2
+        self.star[at], self.chi2[at], self.evidence[k] = found.star, found.chi2, found.evidence
+
+    def rescaled(self, scale: float) -> "Solutions":
+        """Return the solutions as if the errors had been this many times as large."""
+        return self._replace(cov_rad2=self.cov_rad2 * scale**2, chi2=self.chi2 / scale**2)
+
+
+def unsolved(first: Rows) -> Solutions:
+    """Return solutions of frames of which none is solved."""
+    n = len(first) - 1
+    return Solutions(
+        np.zeros(n, np.bool_), np.full((n, 3, 3), np.nan), np.full((n, 3, 3), np.nan),
+        np.full(first[-1], -1, np.int64), np.zeros(first[-1]), np.full(n, np.nan), first,
+    )  # fmt: skip
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def brightest_first(first, flux):
+    """Return the rows of each frame's centroids, brightest first, NaN last, as they came where
+    equal (compiled)."""
+    row = np.arange(len(flux))
+    for k in range(len(first) - 1):
+        if first[k + 1] - first[k] > 200:  # insertion is quadratic
+            brightness = flux[first[k] : first[k + 1]].copy()
+            for m in range(len(brightness)):
+                if np.isnan(brightness[m]):
+                    brightness[m] = -np.inf
+            row[first[k] : first[k + 1]] = first[k] + np.argsort(-brightness, kind="mergesort")
+            continue
+        for m in range(first[k] + 1, first[k + 1]):
+            at = m
+            while at > first[k] and (
+                flux[m] > flux[row[at - 1]] or (np.isnan(flux[row[at - 1]]) and flux[m] == flux[m])
+            ):
+                row[at] = row[at - 1]
+                at -= 1
+            row[at] = m
+    return row

@@ -1,0 +1,229 @@
+"""Four base stars by identifiers, and the quadrilateral rule for the rest [published].
+
+Yuan, Zhang, Shi: A modified star map identification algorithm based on K vector
+(doi 10.16547/j.cnki.10-1096.20170210). The six separations of four centroids give six sets
+of catalogue pairs; a counter per star finds the stars that stand in all of the first three,
+at the cost of the sum of the set sizes. Every further centroid is matched where the six
+triangles that it forms with two base stars agree with those of a catalogue star.
+
+What the source leaves open: base stars are taken from the brightest centroids, brightest
+first, until four are identified; of several identities the one with most further matches
+counts, and a draw is none.
+"""
+
+import math
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
+from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
+
+Array = npt.NDArray[np.float64]
+
+N_BASE = 8  # brightest centroids of which four are tried at a time
+PAIR_GATE = 3.0  # sigma; of a separation
+# The published limit of 1e-6 rad^2 at 0.5 px of 20.3 degrees / 1024, in units of sigma^2.
+DISSIMILARITY_SIGMA2 = 33.0
+MAX_IDENTITIES = 64  # four centroids with more are passed over
+
+
+def match_four_base_stars(
+    u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable
+) -> npt.NDArray[np.int64]:
+    """Return the star of each centroid, by the method of four base stars.
+
+    Parameters
+    ----------
+    u, sigma_rad : (n, 3), (n,) float
+        Centroids, brightest first: directions (sensor) and errors an axis [rad].
+    star_u : (m, 3) float
+        Catalogue directions (ICRS).
+    pairs
+        All their pairs below the field's diagonal.
+
+    Returns
+    -------
+    (n,) int64
+        Row of star_u, -1 where a centroid is no star; all -1 where the method fails.
+    """
+    star = np.full(len(u), -1, np.int64)
+    if len(u) >= 4 and len(star_u) >= 4:
+        _match(u, sigma_rad, star_u, *pairs.chord, pairs.first, pairs.second, N_BASE, star)
+    return star
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _chord(a, i, b, j):
+    dx, dy, dz = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
+    return math.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _tolerance(sigma, i, j, c):
+    # Aberration stretches by v / c at most.
+    return PAIR_GATE * math.sqrt(sigma[i] * sigma[i] + sigma[j] * sigma[j]) + 1.1e-4 * c
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _same_hand(u, p, s_u, s):
+    """Return whether the first three of the four turn the same way in image and catalogue."""
+    seen = np.linalg.det(np.stack((u[p[0]], u[p[1]], u[p[2]])))
+    listed = np.linalg.det(np.stack((s_u[s[0]], s_u[s[1]], s_u[s[2]])))
+    return seen * listed > 0.0
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _identities(u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pair_b, counter, out):
+    """Write the quadruples of stars whose six separations are those of centroids p; return
+    how many. `counter` is zero, and left so."""
+    low, high = np.zeros(4, np.int64), np.zeros(4, np.int64)
+    for k in range(1, 4):
+        c = _chord(u, p[0], u, p[k])
+        t = _tolerance(sigma, p[0], p[k], c)
+        low[k], high[k] = range_of(chord, below, slope, intercept, c - t, c + t)
+        for i in range(low[k], high[k]):  # a set counts a star once
+            if counter[pair_a[i]] == k - 1:
+                counter[pair_a[i]] = k
+            if counter[pair_b[i]] == k - 1:
+                counter[pair_b[i]] = k
+    n_total = 0
+    for k in range(1, 4):
+        n_total += 2 * (high[k] - low[k])
+    # Partners of the stars that reached 3, by set: (candidate, partner).
+    first, partner = np.empty(n_total, np.int64), np.empty(n_total, np.int64)
+    bound = np.zeros(5, np.int64)
+    n = 0
+    for k in range(1, 4):
+        bound[k] = n
+        for i in range(low[k], high[k]):
+            a, b = pair_a[i], pair_b[i]
+            if counter[a] == 3:
+                first[n], partner[n] = a, b
+                n += 1
+            if counter[b] == 3:
+                first[n], partner[n] = b, a
+                n += 1
+    bound[4] = n
+    for k in range(1, 4):
+        for i in range(low[k], high[k]):
+            counter[pair_a[i]] = 0
+            counter[pair_b[i]] = 0
+    count = 0
+    c23, c24, c34 = _chord(u, p[1], u, p[2]), _chord(u, p[1], u, p[3]), _chord(u, p[2], u, p[3])
+    t23, t24, t34 = (
+        _tolerance(sigma, p[1], p[2], c23),
+        _tolerance(sigma, p[1], p[3], c24),
+        _tolerance(sigma, p[2], p[3], c34),
+    )
+    three = np.argsort(first[bound[2] : bound[3]]) + bound[2]
+    four = np.argsort(first[bound[3] : bound[4]]) + bound[3]
+    first3, first4 = first[three], first[four]
+    for i in range(bound[1], bound[2]):
+        s1, s2 = first[i], partner[i]
+        for j in range(np.searchsorted(first3, s1), np.searchsorted(first3, s1 + 1)):
+            s3 = partner[three[j]]
+            if s3 == s2 or abs(_chord(star_u, s2, star_u, s3) - c23) > t23:
+                continue
+            for k in range(np.searchsorted(first4, s1), np.searchsorted(first4, s1 + 1)):
+                s4 = partner[four[k]]
+                if s4 in (s2, s3) or abs(_chord(star_u, s2, star_u, s4) - c24) > t24:
+                    continue
+                if abs(_chord(star_u, s3, star_u, s4) - c34) > t34:
+                    continue
+                if count == len(out):
+                    return 0
+                out[count, 0], out[count, 1], out[count, 2], out[count, 3] = s1, s2, s3, s4
+                if _same_hand(u, p, star_u, out[count]):
+                    count += 1
+    return count
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _match_rest(u, sigma, p, star_u, s, star):
+    """Write the stars of all centroids by the quadrilateral rule; return how many beside
+    the base stars."""
+    star[:] = -1
+    diagonal = 0.0
+    for k in range(len(u)):
+        for b in range(4):
+            diagonal = max(diagonal, _chord(u, k, u, p[b]))
+    seen, listed = np.empty((4, 4)), np.empty((4, 4))
+    for b in range(4):
+        star[p[b]] = s[b]
+        for c in range(4):
+            seen[b, c] = _chord(u, p[b], u, p[c])
+            listed[b, c] = _chord(star_u, s[b], star_u, s[c])
+    r, big_r = np.empty(4), np.empty(4)
+    best_of = np.full(len(u), 1e9)
+    matches = 0
+    for t in range(len(star_u)):
+        if t in (s[0], s[1], s[2], s[3]):
+            continue
+        inside = True
+        for b in range(4):
+            big_r[b] = _chord(star_u, t, star_u, s[b])
+            inside = big_r[b] < 1.01 * diagonal
+            if not inside:
+                break
+        if not inside:  # the field's part of the catalogue
+            continue
+        for k in range(len(u)):
+            if k in (p[0], p[1], p[2], p[3]):
+                continue
+            worst = 0.0
+            limit = DISSIMILARITY_SIGMA2 * sigma[k] * sigma[k]
+            for b in range(4):
+                r[b] = _chord(u, k, u, p[b])
+                worst = max(worst, (r[b] - big_r[b]) ** 2)
+            if worst > limit:
+                continue
+            for b in range(4):
+                for c in range(b):
+                    d = (r[b] - big_r[b]) ** 2 + (r[c] - big_r[c]) ** 2
+                    worst = max(worst, d + (seen[b, c] - listed[b, c]) ** 2)
+            if worst > limit or worst >= best_of[k]:
+                continue
+            other = -1  # one star, one centroid
+            for j in range(len(u)):
+                if star[j] == t:
+                    other = j
+            if other >= 0:
+                if best_of[other] <= worst:
+                    continue
+                star[other], best_of[other] = -1, 1e9
+                matches -= 1
+            matches += star[k] < 0
+            star[k], best_of[k] = t, worst
+    return matches
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_base, star):
+    n = len(u)
+    m = min(n, n_base)
+    counter = np.zeros(len(star_u), np.int8)
+    identities = np.empty((MAX_IDENTITIES, 4), np.int64)
+    trial = np.empty(n, np.int64)
+    p = np.empty(4, np.int64)
+    for last in range(3, m):
+        for third in range(2, last):
+            for second in range(1, third):
+                for lead in range(second):
+                    p[0], p[1], p[2], p[3] = lead, second, third, last
+                    count = _identities(
+                        u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pair_b,
+                        counter, identities,
+                    )  # fmt: skip
+                    best, draw = -1, False
+                    for q in range(count):
+                        further = _match_rest(u, sigma, p, star_u, identities[q], trial)
+                        draw = further == best or (draw and further < best)
+                        if further > best:
+                            best = further
+                            star[:] = trial
+                    # A chance match of four has no further ones, if there are any to have.
+                    if best >= min(n - 4, 1) and not draw:
+                        return
+                    star[:] = -1

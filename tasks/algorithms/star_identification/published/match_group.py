@@ -1,0 +1,136 @@
+"""Improved match group: a state counter per catalogue star, and the triangle check [published].
+
+Star identification in celestial navigation, 16th "Huawei Cup" graduate modelling contest
+(2019). Each centroid in turn is the main star; its separations from the others, smallest
+first, are looked up in the pair table, in bins of 0.01 degrees; the state of a catalogue
+star rises by one for each pair set that holds it. The star with the highest state is the
+main star's identity; where states tie, the triangle check decides.
+
+What the source leaves open: a set is all bins that the separation's error reaches, and the
+identities of one image must agree with each other in separations before an attitude is made.
+"""
+
+import math
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.star_identification.published.agreement import agreeing_candidates
+from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
+from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
+
+Array = npt.NDArray[np.float64]
+
+BIN_RAD = math.radians(0.01)
+PAIR_GATE = 2.5  # sigma; of a separation
+N_PARTNERS = 24  # nearest centroids whose separations from the main star are looked up
+N_CENTROIDS = 48  # brightest centroids that take part
+
+
+def match_group(
+    u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable
+) -> npt.NDArray[np.int64]:
+    """Return the star of each centroid, by the improved match group.
+
+    Parameters and result as `four_base_stars.match_four_base_stars`.
+    """
+    single = states(u[:N_CENTROIDS], sigma_rad[:N_CENTROIDS], star_u, pairs)
+    centroid = np.flatnonzero(single >= 0)
+    return agreeing_candidates(u, sigma_rad, star_u, centroid, single[centroid], PAIR_GATE)
+
+
+def states(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> npt.NDArray[np.int64]:
+    """Return the star with the highest state for each centroid by itself, -1 where none or tied."""
+    star = np.full(len(u), -1, np.int64)
+    if len(u) >= 3 and len(star_u) >= 3:
+        _match(u, sigma_rad, star_u, *pairs.chord, pairs.first, pairs.second, N_PARTNERS, star)
+    return star
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _chord(a, i, b, j):
+    dx, dy, dz = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
+    return math.sqrt(dx * dx + dy * dy + dz * dz)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _bins(u, sigma, i, j):
+    """Return the chords between which the bins lie that a separation's error reaches."""
+    angle = 2.0 * math.asin(min(0.5 * _chord(u, i, u, j), 1.0))
+    reach = PAIR_GATE * math.sqrt(sigma[i] * sigma[i] + sigma[j] * sigma[j]) + 1.1e-4 * angle
+    low = math.floor((angle - reach) / BIN_RAD) * BIN_RAD
+    high = math.ceil((angle + reach) / BIN_RAD) * BIN_RAD
+    return 2.0 * math.sin(0.5 * max(low, 0.0)), 2.0 * math.sin(0.5 * high)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _triangles(u, sigma, star_u, main, order, n_partners, s, set_low, set_high, pair_a, pair_b):
+    """Return how many triangles of the main star with two partners next to each other in
+    `order` close end to end if the main star is s."""
+    total = 0
+    before = np.empty(0, np.int64)
+    for k in range(n_partners):
+        partners = np.empty(set_high[k] - set_low[k], np.int64)
+        n = 0
+        for i in range(set_low[k], set_high[k]):
+            if pair_a[i] == s:
+                partners[n] = pair_b[i]
+                n += 1
+            elif pair_b[i] == s:
+                partners[n] = pair_a[i]
+                n += 1
+        if k > 0:
+            low, high = _bins(u, sigma, order[k - 1], order[k])
+            closed = False
+            for a in before:
+                for b in partners[:n]:
+                    closed = closed or (a != b and low <= _chord(star_u, a, star_u, b) <= high)
+            total += closed
+        before = partners[:n]
+    return total
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_partners, star):
+    n, m = len(u), len(star_u)
+    state, seen = np.zeros(m, np.int16), np.zeros(m, np.int32)
+    separation = np.empty(n)
+    set_low, set_high = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    stamp = 0
+    for main in range(n):
+        state[:] = 0
+        for k in range(n):
+            separation[k] = _chord(u, main, u, k) if k != main else 1e9
+        order = np.argsort(separation)
+        used = min(n - 1, n_partners)
+        for k in range(used):
+            low, high = _bins(u, sigma, main, order[k])
+            set_low[k], set_high[k] = range_of(chord, below, slope, intercept, low, high)
+            stamp += 1
+            for i in range(set_low[k], set_high[k]):  # a set counts a star once
+                a, b = pair_a[i], pair_b[i]
+                if seen[a] != stamp:
+                    seen[a] = stamp
+                    state[a] += 1
+                if seen[b] != stamp:
+                    seen[b] = stamp
+                    state[b] += 1
+        top = state.max()
+        if top < 2:
+            continue
+        tied = np.flatnonzero(state == top)
+        if len(tied) == 1:
+            star[main] = tied[0]
+            continue
+        best, draw = -1, False
+        for s in tied:
+            closed = _triangles(
+                u, sigma, star_u, main, order, used, s, set_low, set_high, pair_a, pair_b
+            )
+            draw = closed == best or (draw and closed < best)
+            if closed > best:
+                best = closed
+                star[main] = s
+        if draw:
+            star[main] = -1

@@ -1,0 +1,1 @@
+"""The search: hypotheses of an attitude, and the verdict on each."""

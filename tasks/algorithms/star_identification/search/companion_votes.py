@@ -1,0 +1,168 @@
+"""Which star a centroid may be, by votes of its companions.
+
+One centroid is the pivot. Each pair of catalogue stars whose separation is that of the pivot
+and another centroid says which star the pivot is and how the image is turned about it. Votes
+for one star and one turn add up; a right hypothesis gets one from nearly every true star in
+the frame, and counting costs a few nanoseconds a vote, so that all hypotheses of a pivot are
+sifted before any is tried. (A Hough transform over star and turn; identifier counters with
+the turn added.)
+"""
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import MAX_BETA
+from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
+from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
+
+LEAST_BINS_LOG2, MOST_BINS_LOG2 = 4, 8  # of a turn
+# Cells enough that chance puts few votes into one [votes a cell].
+THIN = 0.1
+
+
+class Pairs(NamedTuple):
+    """A `PairTable`, its K-vector flat."""
+
+    chord: npt.NDArray[np.float64]
+    below: npt.NDArray[np.int32]
+    slope: float
+    intercept: float
+    first: npt.NDArray[np.int32]
+    second: npt.NDArray[np.int32]
+    at_first: npt.NDArray[np.uint16]
+    at_second: npt.NDArray[np.uint16]
+
+
+class Votes(NamedTuple):
+    """Votes of one pivot's companions, and room for them.
+
+    cast : (stars << MOST_BINS_LOG2,) uint8, votes for a star and a turn
+    reached : (256,) how many of these have at least so many votes
+    companion, low, high : (n,) the companions and their ranges of pairs
+    angle, wide : (n,) their position angles about the pivot, and how far these may be off, in
+        parts of `TURN`
+    """
+
+    cast: npt.NDArray[np.uint8]
+    reached: npt.NDArray[np.int64]
+    companion: npt.NDArray[np.int64]
+    low: npt.NDArray[np.int64]
+    high: npt.NDArray[np.int64]
+    angle: npt.NDArray[np.int64]
+    wide: npt.NDArray[np.int64]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def make_votes(n_stars, n):
+    """Return room for the votes of n companions (compiled)."""
+    return Votes(
+        np.empty(n_stars << MOST_BINS_LOG2, np.uint8),
+        np.empty(256, np.int64),
+        np.empty(n, np.int64),
+        np.empty(n, np.int64),
+        np.empty(n, np.int64),
+        np.empty(n, np.int64),
+        np.empty(n, np.int64),
+    )
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def turn_bits(n_votes, n_stars, tolerance):
+    """Return log2 of the bins of turn that suit so many votes and a typical tolerance of
+    their turn, in parts of `TURN` (compiled)."""
+    fine = math.log2(TURN / max(2.0 * tolerance, 1.0))
+    sparse = math.log2(max(n_votes / (THIN * n_stars), 1.0)) + 1.0
+    return int(min(max(min(fine, sparse), LEAST_BINS_LOG2), MOST_BINS_LOG2))
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def companion(u, sigma, i, j, gate, min_chord):
+    """Return separation (0: too close), its tolerance, position angle of j about i and its
+    tolerance, both in parts of `TURN` (compiled)."""
+    dx, dy, dz = u[j, 0] - u[i, 0], u[j, 1] - u[i, 1], u[j, 2] - u[i, 2]
+    c = math.sqrt(dx * dx + dy * dy + dz * dz)
+    if not c >= min_chord:
+        return 0.0, 0.0, 0, 0
+    x, y, z = u[i, 0], u[i, 1], u[i, 2]
+    h = math.sqrt(x * x + z * z)  # axes: y cross u, and u cross that
+    along = (z * dx - x * dz) / h
+    across = (y * (-x * dx - z * dz) + h * h * dy) / h
+    angle = math.floor(math.atan2(across, along) * (TURN / (2.0 * math.pi))) & (TURN - 1)
+    noise = gate * math.sqrt(sigma[i] * sigma[i] + sigma[j] * sigma[j])
+    wide = min(noise / c + MAX_BETA, 0.5) * (TURN / (2.0 * math.pi))
+    return c, noise + MAX_BETA * c, angle, int(wide) + 2
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
+    """Tell whether the brightness of two centroids speaks against two stars (compiled).
+
+    m_i, m_j : magnitudes the centroids show, NaN where the zero point is not known
+    m_ij : their difference, NaN where a flux is not known
+    """
+    m_a, m_b = magnitude[a], magnitude[b]
+    # Comparisons with NaN are false.
+    if abs(m_a - m_b - m_ij) > 1.414 * mag_gate:
+        return True
+    return abs(m_a - m_i) > mag_gate or abs(m_b - m_j) > mag_gate
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def count_votes(
+    seen, stars, rule, pairs, i, order, n_least, n_votes, gate, mag_gate, closest, votes
+):
+    """Count the votes of pivot i's companions; return how many companions and votes there
+    are and log2 of the bins of turn (compiled).
+
+    Companions are taken in this order, at least n_least of them, and until there are
+    n_votes; those closer than `closest` are left out.
+    """
+    n, cast, widest = 0, 0, 0
+    for j in order:
+        if j == i:
+            continue
+        c, tolerance, angle, wide = companion(seen.u, seen.sigma, i, j, gate, closest)
+        if c == 0.0:
+            continue
+        lo, hi = range_of(
+            pairs.chord, pairs.below, pairs.slope, pairs.intercept, c - tolerance, c + tolerance
+        )
+        votes.companion[n], votes.low[n], votes.high[n] = j, lo, hi
+        votes.angle[n], votes.wide[n] = angle, wide
+        n, cast, widest = n + 1, cast + 2 * (hi - lo), widest + wide
+        if n >= n_least and cast > n_votes:
+            break
+    log2 = turn_bits(cast, len(stars.u), widest / max(n, 1))
+    votes.cast[: len(stars.u) << log2] = 0
+    votes.reached[:] = 0
+    for m in range(n):
+        _vote(seen, stars, rule, pairs, i, m, log2, mag_gate, votes)
+    return n, cast, log2
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _vote(seen, stars, rule, pairs, i, m, log2, mag_gate, votes):
+    """Count the votes of the pivot's m-th companion."""
+    j = votes.companion[m]
+    m_i, m_j = seen.instrumental[i] + rule.zero_point, seen.instrumental[j] + rule.zero_point
+    m_ij = seen.instrumental[i] - seen.instrumental[j]
+    shift, wide = 16 - log2, votes.wide[m]
+    mask = (1 << log2) - 1
+    for p in range(votes.low[m], votes.high[m]):
+        for way in range(2):
+            if way == 0:
+                a, b, angle = pairs.first[p], pairs.second[p], int(pairs.at_first[p])
+            else:
+                a, b, angle = pairs.second[p], pairs.first[p], int(pairs.at_second[p])
+            if is_odd(stars.magnitude, a, b, m_i, m_j, m_ij, mag_gate):
+                continue
+            low = angle - votes.angle[m] - wide
+            for turn in range(low >> shift, ((low + 2 * wide) >> shift) + 1):
+                cell = (a << log2) + (turn & mask)
+                count = votes.cast[cell] + np.uint8(1)
+                votes.cast[cell] = count
+                votes.reached[count] += 1

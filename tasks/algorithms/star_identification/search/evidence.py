@@ -1,0 +1,173 @@
+"""The verdict: how much better stars explain a frame than chance does.
+
+The log evidence of an attitude is the log of the ratio of two probabilities of the
+centroids' places: with the stars where the attitude puts them, and with every centroid
+anywhere in the image. Its parts:
+
+- a match adds ln(A / (2 pi s^2)) - d^2 / (2 s^2), s the centroid's sigma, d its distance
+  from the star, A the solid angle of the image; with brightness also
+  ln(g(difference) / h(magnitude)), h the magnitudes of the catalogue;
+- which k of n centroids are which of the m stars in view is not known, nor what share of
+  these the sensor sees (`log_ways`);
+- the attitude was chosen: the share of the prior that the data leave. Lost in space,
+  that is sqrt(det 2 pi P) / (8 pi^2).
+
+So it does not depend on how many hypotheses were tried, and the probability that chance
+alone reaches x is below exp(-x) (Markov's inequality; over frames with as many false
+centroids as the prior of `log_ways` has them).
+"""
+
+import math
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.geometry.attitude import invert_symmetric
+
+Array = npt.NDArray[np.float64]
+
+BIN_MAG = 0.25  # of the histogram of magnitudes
+FIRST_MAG = -2.0
+N_BINS = 72
+TYPICAL_SPREAD_MAG = 0.4  # a sensor's magnitude about V, colours included, while not learned
+OUTLIER_SHARE = 0.15  # variables, blends, odd colours
+MAG_RANGE = 6.0
+
+
+def log_magnitude_density(magnitude: Array) -> Array:
+    """Return ln of the catalogue's probability density of magnitudes [1/mag], by bins."""
+    i = np.clip(((magnitude - FIRST_MAG) / BIN_MAG).astype(int), 0, N_BINS - 1)
+    count = np.bincount(i, minlength=N_BINS) + 0.5  # a bin without stars is rare, not impossible
+    return np.log(count / count.sum() / BIN_MAG)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def log_brightness_ratio(difference, magnitude, log_density, spread):
+    """Return ln(g / h) of a match whose magnitudes differ so; `spread` 1-sigma (compiled)."""
+    z = difference / spread
+    g = OUTLIER_SHARE / MAG_RANGE
+    g += (1.0 - OUTLIER_SHARE) * math.exp(-0.5 * z * z) / (spread * 2.5066282746310002)
+    i = min(max(int((magnitude - FIRST_MAG) / BIN_MAG), 0), N_BINS - 1)
+    return math.log(g) - log_density[i]
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def median_zero_point(star_of, instrumental, magnitude):
+    """Return the median of star minus instrumental magnitude over the matches (compiled).
+
+    NaN with fewer than three matches that have a flux.
+    """
+    found = np.empty(len(star_of))
+    n = 0
+    for k in range(len(star_of)):
+        if star_of[k] >= 0 and not math.isnan(instrumental[k]):
+            found[n] = magnitude[star_of[k]] - instrumental[k]
+            n += 1
+    if n < 3:
+        return math.nan
+    return np.median(found[:n])
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def log_ways(n, matches, in_view):
+    """Return -ln of the probability, before the places are seen, that just these centroids of n
+    are just these of the stars in view (compiled).
+
+    The share p of the stars in view that the sensor sees is not known: 4 p^3, as most
+    sensors see most stars to their limit. Nor is the number f of false centroids: 1 / (f + 1),
+    every order of magnitude alike.
+    """
+    k, m = float(matches), max(in_view, float(matches))
+    centroids = math.lgamma(n + 1.0) - math.lgamma(n - k + 1.0)
+    centroids += math.log((n - k + 1.0) / (n + 1.0))
+    seen = math.log(4.0) + math.lgamma(k + 4.0) + math.lgamma(m - k + 1.0) - math.lgamma(m + 5.0)
+    return centroids - seen
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def match_evidence(
+    star_of, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, spread, in_view, area
+):
+    """Return the matches' part of the log evidence, and their number (compiled).
+
+    Parameters
+    ----------
+    star_of, chi2_of, sigma, instrumental : (n,)
+        Each centroid's star (-1 none), d^2 / s^2, s [rad], -2.5 log10 flux (NaN unknown).
+    magnitude : (m,)
+        Of the stars that `star_of` counts.
+    log_density, zero_point, spread : (N_BINS,), float, float
+        Catalogue's magnitudes; star minus instrumental magnitude, NaN where not known; its
+        scatter [mag].
+    in_view, area : float
+        Stars in the image (matched or not), and its solid angle [sr].
+    """
+    total, matches = 0.0, 0
+    for k in range(len(star_of)):
+        if star_of[k] >= 0:
+            matches += 1
+            total += math.log(area / (2.0 * math.pi * sigma[k] * sigma[k])) - 0.5 * chi2_of[k]
+    if math.isnan(zero_point):
+        zero = median_zero_point(star_of, instrumental, magnitude)
+        if not math.isnan(zero):
+            tight = _brightness(star_of, instrumental, magnitude, log_density, zero, 0.5 * spread)
+            loose = _brightness(star_of, instrumental, magnitude, log_density, zero, spread)
+            more = max(tight, loose)
+            total += more + math.log(0.5 * (math.exp(tight - more) + math.exp(loose - more)))
+            total -= 3.0  # one more number chosen from the data: ln(range / its error)
+    else:
+        total += _brightness(star_of, instrumental, magnitude, log_density, zero_point, spread)
+    return total - log_ways(len(star_of), matches, in_view), matches
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _brightness(star_of, instrumental, magnitude, log_density, zero, spread):
+    """Return the log of how much better the matches' brightness fits than by chance."""
+    total = 0.0
+    for k in range(len(star_of)):
+        s = star_of[k]
+        if s >= 0 and not math.isnan(instrumental[k]):
+            difference = magnitude[s] - instrumental[k] - zero
+            total += log_brightness_ratio(difference, magnitude[s], log_density, spread)
+    return total
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def _log_determinant(P):
+    return math.log(
+        max(
+            P[0, 0] * (P[1, 1] * P[2, 2] - P[1, 2] * P[2, 1])
+            - P[0, 1] * (P[1, 0] * P[2, 2] - P[1, 2] * P[2, 0])
+            + P[0, 2] * (P[1, 0] * P[2, 1] - P[1, 1] * P[2, 0]),
+            1e-300,
+        )
+    )
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def choice_lost(P):
+    """Return the attitude's part of the log evidence, every attitude alike (compiled)."""
+    return 0.5 * _log_determinant(P) + 1.5 * math.log(2.0 * math.pi) - math.log(8.0 * math.pi**2)
+
+
+@numba.njit(nogil=True, cache=True, error_model="numpy")
+def choice_predicted(P, P0, R, R0):
+    """Return the attitude's part of the log evidence for a prediction R0 with covariance P0,
+    sensor axes (compiled)."""
+    C, inverse = P + P0, np.empty((3, 3))
+    determinant = invert_symmetric(C, inverse)
+    if determinant <= 0.0:
+        return -1e9
+    # Small rotation R0 -> R: the odd part of R R0'.
+    d = np.empty(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        kj = R[k, 0] * R0[j, 0] + R[k, 1] * R0[j, 1] + R[k, 2] * R0[j, 2]
+        jk = R[j, 0] * R0[k, 0] + R[j, 1] * R0[k, 1] + R[j, 2] * R0[k, 2]
+        d[i] = 0.5 * (kj - jk)
+    chi2 = 0.0
+    for i in range(3):
+        for j in range(3):
+            chi2 += d[i] * inverse[i, j] * d[j]
+    return 0.5 * (_log_determinant(P) - math.log(determinant)) - 0.5 * chi2

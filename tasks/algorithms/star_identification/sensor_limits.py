@@ -1,0 +1,131 @@
+"""What a sensor's own stars tell about it: centroid error, faintest star, brightness zero point."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.star_identification.frames.frame import (
+    Frame,
+    Search,
+    Solution,
+    identify_predicted,
+)
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
+
+Array = npt.NDArray[np.float64]
+
+# Flux that scatters more than this about the catalogue tells nothing of a star [mag].
+USELESS_SCATTER_MAG = 1.0
+MAGNITUDE_STEP = 0.25
+
+
+class Scale(NamedTuple):
+    """Residuals over claimed errors: their rms, and how many degrees of freedom it rests on."""
+
+    scale: float
+    dof: int
+
+
+def residual_scale(solutions: list[Solution | None]) -> Scale:
+    """Return the rms of normalised residuals, an axis, over all solutions."""
+    solved = [s for s in solutions if s is not None]
+    star = np.concatenate([np.empty(0, np.int64), *[s.star for s in solved]])
+    chi2 = np.concatenate([np.empty(0), *[s.chi2 for s in solved]])
+    return scale_of(star, chi2, len(solved))
+
+
+def scale_of(star: npt.NDArray[np.int64], chi2: Array, n_solved: int) -> Scale:
+    """Return the same of all centroids of so many solved frames: stars (-1 none) and squared
+    distances over sigma squared."""
+    matched = star >= 0
+    dof = 2 * int(matched.sum()) - 3 * n_solved
+    return Scale(float(np.sqrt(chi2[matched].sum() / dof)) if dof > 0 else 1.0, dof)
+
+
+def is_significant(found: Scale) -> bool:
+    """Tell whether residuals contradict the errors claimed: by 5 % and three sigma."""
+    return abs(found.scale - 1) > max(0.05, 3 / np.sqrt(2 * max(found.dof, 1)))
+
+
+def zero_point(
+    frames: list[Frame], solutions: list[Solution | None], sky: Sky
+) -> tuple[float, float]:
+    """Return the median of star minus instrumental magnitude, and its scatter (NaN: no flux)."""
+    differences = []
+    for frame, solution in zip(frames, solutions, strict=True):
+        if solution is not None:
+            at = solution.star >= 0
+            differences.append(
+                sky.catalogue.magnitude[solution.star[at]] - frame.instrumental_mag[at]
+            )
+    found = np.concatenate(differences) if differences else np.empty(0)
+    found = found[np.isfinite(found)]
+    if len(found) < 8:
+        return np.nan, np.nan
+    middle = float(np.median(found))
+    return middle, 1.4826 * float(np.median(np.abs(found - middle)))
+
+
+def rematch(
+    frames: list[Frame], solutions: list[Solution | None], sky: Sky, how: Search
+) -> list[Solution | None]:
+    """Return solutions identified anew next to known attitudes, such as with other errors or
+    a deeper sky."""
+    out: list[Solution | None] = []
+    for frame, solution in zip(frames, solutions, strict=True):
+        if solution is None:
+            out.append(None)
+            continue
+        near = solution.cov_rad2 + np.eye(3) * float(np.median(frame.sigma_rad)) ** 2
+        out.append(identify_predicted(frame, sky, solution.R_sensor_from_icrs, near, how, True))
+    return out
+
+
+def faintest_star(
+    frames: list[Frame],
+    solutions: list[Solution | None],
+    deep: Sky,
+    gate_sigma: float,
+    least: float,
+) -> float:
+    """Return the magnitude to which matches stand out from chance.
+
+    `solutions` are of the deep sky. Walking down in steps of a quarter magnitude, a step
+    belongs to what the sensor sees while more than a tenth of its stars in view are matched,
+    and three times as many as by chance.
+
+    Parameters
+    ----------
+    least
+        The magnitude to start at: what an identification needs is not questioned.
+    """
+    edges = np.arange(least, deep.catalogue.magnitude[-1] + MAGNITUDE_STEP, MAGNITUDE_STEP)
+    if len(edges) < 2:
+        return least
+    in_view, matched, by_chance = np.zeros((3, len(edges) - 1))
+    for frame, solution in zip(frames, solutions, strict=True):
+        if solution is None:
+            continue
+        R = solution.R_sensor_from_icrs
+        x0, x1, y0, y1 = frame.optics.box
+        ahead = deep.catalogue.u_icrs @ R[2] > np.cos(frame.optics.half_diagonal_rad)
+        v = deep.catalogue.u_icrs[ahead] @ R.T
+        x, y = v[:, 0] / v[:, 2], v[:, 1] / v[:, 2]
+        seen = (x > x0) & (x < x1) & (y > y0) & (y < y1)
+        n = np.histogram(deep.catalogue.magnitude[ahead][seen], edges)[0]
+        star = solution.star[solution.star >= 0]
+        in_view += n
+        matched += np.histogram(deep.catalogue.magnitude[star], edges)[0]
+        disc = np.pi * gate_sigma**2 * np.median(frame.sigma_rad) ** 2
+        by_chance += n * (len(frame.u) - len(star)) * disc / frame.optics.solid_angle_sr
+    good = (matched > 0.1 * in_view) & (matched > 3 * by_chance)
+    # A step in which a narrow field has no star says nothing, and one of few stars little.
+    last, poor = -1, 0
+    for i in np.flatnonzero(in_view):
+        poor = 0 if good[i] else poor + 1
+        if good[i]:
+            last = int(i)
+        if poor == 3:
+            break
+    return float(edges[last + 1])

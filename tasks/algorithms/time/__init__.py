@@ -1,0 +1,1 @@
+"""Time: scales, the order of frames, the grid of epochs."""

@@ -1,0 +1,1 @@
+"""Tracking: detections of one sensor that are one object."""

@@ -1,0 +1,235 @@
+"""Local motion: where an object stood at an instant, from its detections around it.
+
+A polynomial in time is fitted to the directions in a window around the instant. Its value
+there is a weighted mean of the detections, ``sum c_k d_k`` with ``sum c_k = 1``, so that any
+covariance of the detections, of each its own or shared by all, propagates exactly.
+"""
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, jerk
+
+Array = npt.NDArray[np.float64]
+
+BIAS_SHARE = 0.25  # of one detection's sigma: what the neglected third derivative may amount to
+
+
+@njit(cache=True, nogil=True)
+def _half_width(rate, sigma, widest):
+    """Return the window [s] in which the neglected cubic term stays below the noise."""
+    return min(widest, (6 * BIAS_SHARE * sigma / jerk(rate)) ** (1 / 3))
+
+
+@njit(cache=True, nogil=True)
+def _solve3(S, rhs):
+    """Solve the symmetric 3x3 system S c = rhs by Cramer's rule."""
+    a, b, c = S[0, 0], S[0, 1], S[0, 2]
+    d, e, f = S[1, 1], S[1, 2], S[2, 2]
+    m00, m01, m02 = d * f - e * e, c * e - b * f, b * e - c * d
+    m11, m12, m22 = a * f - c * c, b * c - a * e, a * d - b * b
+    det = a * m00 + b * m01 + c * m02
+    return (
+        (m00 * rhs[0] + m01 * rhs[1] + m02 * rhs[2]) / det,
+        (m01 * rhs[0] + m11 * rhs[1] + m12 * rhs[2]) / det,
+        (m02 * rhs[0] + m12 * rhs[1] + m22 * rhs[2]) / det,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _coefficients(t, weight, scale, curvature_prior, value, slope):
+    """Fill the coefficients of the polynomial's value and slope at t = 0; return the value's
+    variance for detections of variance 1 / weight, the prior's part included.
+
+    `curvature_prior` is the weight of a zero second derivative, in the units of `weight`
+    and of time over `scale`: it holds the curvature where the detections do not.
+    """
+    S = np.zeros((3, 3))
+    for k in range(len(t)):
+        x = t[k] / scale
+        h0, h1, h2 = 1.0, x, 0.5 * x * x
+        S[0, 0] += weight[k] * h0
+        S[0, 1] += weight[k] * h1
+        S[0, 2] += weight[k] * h2
+        S[1, 1] += weight[k] * h1 * h1
+        S[1, 2] += weight[k] * h1 * h2
+        S[2, 2] += weight[k] * h2 * h2
+    S[2, 2] += curvature_prior
+    v0, v1, v2 = _solve3(S, (1.0, 0.0, 0.0))
+    s0, s1, s2 = _solve3(S, (0.0, 1.0, 0.0))
+    for k in range(len(t)):
+        x = t[k] / scale
+        value[k] = weight[k] * (v0 + v1 * x + 0.5 * v2 * x * x)
+        slope[k] = weight[k] * (s0 + s1 * x + 0.5 * s2 * x * x) / scale
+    return v0
+
+
+@njit(cache=True, nogil=True)
+def _about(t, first, last, at, half):
+    """Return the detections within a half-width of an instant, three at least if there are."""
+    lo = first + np.searchsorted(t[first:last], at - half)
+    hi = first + np.searchsorted(t[first:last], at + half, side="right")
+    while hi - lo < min(3, last - first):
+        if hi == last or (lo > first and at - t[lo - 1] <= t[hi] - at):
+            lo -= 1
+        else:
+            hi += 1
+    return lo, hi
+
+
+@njit(cache=True, nogil=True)
+def _window(t, u, first, last, at, sigma, widest):
+    """Return the part of first:last that serves an instant, the rate [rad/s] and half-width.
+
+    Three detections stay, however slow the sensor or fast the object: the prior covers its
+    curvature, and what lies beyond the half-width is paid for.
+    """
+    lo, hi = _about(t, first, last, at, widest)
+    rate = 0.0
+    if hi - lo > 1:
+        chord = 0.0
+        for a in range(3):
+            chord += (u[hi - 1, a] - u[lo, a]) ** 2
+        rate = np.sqrt(chord) / (t[hi - 1] - t[lo])
+    half = _half_width(rate, sigma, widest)
+    lo, hi = _about(t, lo, hi, at, half)
+    return lo, hi, rate, half
+
+
+@njit(cache=True, nogil=True)
+def _evaluate(
+    first,
+    last,
+    at,
+    unknown_rate,
+    t,
+    u,
+    noise,
+    bias,
+    widest,
+    out_u,
+    out_w,
+    out_noise,
+    out_bias,
+    out_n,
+):
+    for q in range(len(at)):
+        nearest = first[q] + np.searchsorted(t[first[q] : last[q]], at[q])
+        if nearest == last[q] or (
+            nearest > first[q] and at[q] - t[nearest - 1] <= t[nearest] - at[q]
+        ):
+            nearest -= 1
+        sigma = np.sqrt(np.trace(noise[nearest]) / 2)
+        lo, hi, rate, half = _window(t, u, first[q], last[q], at[q], sigma, widest)
+        n = hi - lo
+        out_n[q] = n
+        tau, weight = t[lo:hi] - at[q], np.empty(n)
+        for k in range(n):
+            weight[k] = 2.0 / np.trace(noise[lo + k])
+        value, slope = np.empty(n), np.empty(n)
+        if n == 1:
+            value[0], slope[0] = 1.0, 0.0
+            unmodelled = (unknown_rate * tau[0]) ** 2
+        else:
+            scale = max(np.max(np.abs(tau)), 1e-9)
+            prior = 1.0 / (acceleration(rate) * scale * scale) ** 2
+            unmodelled = _coefficients(tau, weight, scale, prior, value, slope)
+            if scale > half:
+                unmodelled += (jerk(rate) * scale**3 / 6) ** 2
+            for k in range(n):
+                unmodelled -= value[k] * value[k] / weight[k]
+        for a in range(3):
+            mean, moving = 0.0, 0.0
+            for k in range(n):
+                # Differences from the nearest detection keep the digits that matter.
+                mean += value[k] * (u[lo + k, a] - u[nearest, a])
+                moving += slope[k] * (u[lo + k, a] - u[nearest, a])
+            out_u[q, a] = u[nearest, a] + mean
+            out_w[q, a] = moving
+        # One error, larger in some frames than in others (0 where stars gave the attitude): it
+        # adds up with its signs, and its square is never negative.
+        amplitude, total = 0.0, 0.0
+        for k in range(n):
+            square = np.trace(bias[lo + k])
+            amplitude += value[k] * np.sqrt(square)
+            total += abs(value[k]) * square
+        share = amplitude * amplitude / total if total > 0.0 else 0.0
+        for a in range(3):
+            for b in range(3):
+                own, shared = 0.0, 0.0
+                for k in range(n):
+                    own += value[k] * value[k] * noise[lo + k, a, b]
+                    shared += abs(value[k]) * bias[lo + k, a, b]
+                out_noise[q, a, b] = own + (max(unmodelled, 0.0) if a == b else 0.0)
+                out_bias[q, a, b] = share * shared
+
+
+def directions_at(
+    first: npt.NDArray[np.int64],
+    last: npt.NDArray[np.int64],
+    at_s: Array,
+    unknown_rate_rad_s: float,
+    time_s: Array,
+    u_icrs: Array,
+    cov_noise: Array,
+    cov_bias: Array,
+    widest_s: float,
+) -> tuple[Array, Array, Array, Array, npt.NDArray[np.int64]]:
+    """Return directions at wanted instants, their rates and covariances.
+
+    Parameters
+    ----------
+    first, last : (q,) int
+        Query q may use the detections ``first[q]:last[q]``, one tracklet's, in time order.
+    at_s : (q,) float
+        Wanted instants [s].
+    unknown_rate_rad_s
+        1-sigma rate an axis of an object that has a single detection [rad/s].
+    time_s, u_icrs : (n,), (n, 3) float
+        Detections: times [s] and unit vectors.
+    cov_noise, cov_bias : (n, 3, 3) float
+        Their errors [rad^2], in ICRS components: independent from frame to frame, and shared
+        by all frames.
+    widest_s
+        Half-width of the widest window.
+
+    Returns
+    -------
+    u : (q, 3) float
+        Unit vectors.
+    w : (q, 3) float
+        Rates of change [rad/s].
+    cov_noise, cov_bias : (q, 3, 3) float
+        Propagated errors [rad^2].
+    n : (q,) int
+        Detections that took part.
+
+    Notes
+    -----
+    A quadratic; its second derivative has a weak prior (the acceleration that the rate
+    allows), so that two detections suffice. The window shrinks for fast objects until the
+    neglected third derivative is a fraction of the noise. The neglected curvature of the
+    sphere over the window is of the same order as that.
+    """
+    q = len(at_s)
+    u, w = np.empty((q, 3)), np.empty((q, 3))
+    noise, bias, n = np.empty((q, 3, 3)), np.empty((q, 3, 3)), np.empty(q, np.int64)
+    _evaluate(
+        np.ascontiguousarray(first, np.int64),
+        np.ascontiguousarray(last, np.int64),
+        np.ascontiguousarray(at_s, float),
+        float(unknown_rate_rad_s),
+        np.ascontiguousarray(time_s, float),
+        np.ascontiguousarray(u_icrs, float),
+        np.ascontiguousarray(cov_noise, float),
+        np.ascontiguousarray(cov_bias, float),
+        float(widest_s),
+        u,
+        w,
+        noise,
+        bias,
+        n,
+    )
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return u, w, noise, bias, n

@@ -1,0 +1,1 @@
+"""Stage `calibrate`: each sensor's optics from its stars."""

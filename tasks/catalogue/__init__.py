@@ -1,0 +1,1 @@
+"""Star catalogues built from the catalogues of others."""

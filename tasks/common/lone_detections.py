@@ -1,0 +1,95 @@
+"""Lone detections: those of frames too few and too far apart for any tracklet.
+
+They take part in the association as tracklets of one detection, under ids that are published
+nowhere: a dataset's tracklet_id is null for them.
+"""
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.schemas.bridge import array, concat, table
+from epipole.schemas.settings import TrackletSettings
+from epipole.schemas.tables import TRACKLETS
+from epipole.tasks.algorithms.time.epoch_grid import frame_interval_ns
+
+MARK = "lone:"  # no sensor id begins like this: it holds a colon
+
+
+def in_lone_frames(
+    frame_time_ns: npt.NDArray[np.int64], settings: TrackletSettings
+) -> npt.NDArray[np.bool_]:
+    """Return which frames of one sensor, in time order, lie among too few for a tracklet."""
+    if not len(frame_time_ns):
+        return np.zeros(0, bool)
+    coast_ns = (settings.max_missed + 1.5) * frame_interval_ns(frame_time_ns)
+    run = np.concatenate([[0], np.cumsum(np.diff(frame_time_ns) > coast_ns)]).astype(np.int64)
+    return np.asarray(np.bincount(run)[run] < settings.min_detections)
+
+
+def with_lone_detections(detections: pa.Table, lone: npt.NDArray[np.bool_]) -> pa.Table:
+    """Return the detections with an id of its own as tracklet_id for each lone one."""
+    names = array(detections, "tracklet_id").copy()
+    rows = np.flatnonzero(lone)
+    sensor, frame = array(detections, "sensor_id"), array(detections, "frame_number")
+    centroid = array(detections, "centroid")
+    for row in rows:
+        names[row] = f"{MARK}{sensor[row]}-{frame[row]}-{centroid[row]}"
+    at = detections.schema.get_field_index("tracklet_id")
+    return detections.set_column(at, detections.schema.field(at), pa.array(names, pa.string()))
+
+
+def with_lone_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
+    """Return the tracklets that have views, with a row for each lone detection among these."""
+    tracklets = tracklets.filter(pc.is_in(tracklets["tracklet_id"], views["tracklet_id"]))
+    lone = views.filter(is_lone(views["tracklet_id"]))
+    if not lone.num_rows:
+        return tracklets
+    names, first = np.unique(array(lone, "tracklet_id").astype(str), return_index=True)
+    lone = lone.take(first)
+    n = lone.num_rows
+    rows = table(
+        TRACKLETS,
+        {
+            "tracklet_id": names,
+            "track_id": names,
+            "sensor_id": lone["sensor_id"],
+            "start_time": lone["epoch"],
+            "end_time": lone["epoch"],
+            "n_detections": np.ones(n, np.int32),
+            "rate_arcsec_s": np.zeros(n),
+            "residual_px": np.zeros(n),
+            "link_chi2": pa.nulls(n, pa.float64()),
+        },
+    )
+    return concat(TRACKLETS, [tracklets, rows])
+
+
+def with_objects_found(detections: pa.Table, associations: pa.Table) -> pa.Table:
+    """Return the detections; what served a position without a tracklet is an object's too.
+
+    One detection alone can be anything; what several sensors agree on is an object.
+    """
+    served = pc.and_(associations["used"], pc.is_null(associations["tracklet_id"]))
+    key = ["sensor_id", "frame_number", "centroid"]
+    lone = pl.DataFrame(associations.filter(served).select(key)).drop_nulls().unique()
+    if not len(lone):
+        return detections
+    known = pl.DataFrame(detections.select(key)).join(
+        lone.with_columns(found=True), on=key, how="left", maintain_order="left"
+    )  # fmt: skip
+    at = detections.schema.get_field_index("kind")
+    kind = pc.if_else(known["found"].fill_null(False).to_arrow(), "object", detections["kind"])
+    return detections.set_column(at, detections.schema.field(at), kind)
+
+
+def is_lone(tracklet_id: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return which ids are those of lone detections."""
+    return pc.starts_with(tracklet_id, MARK)
+
+
+def published_ids(tracklet_id: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return the ids, null where they are those of lone detections."""
+    return pc.if_else(is_lone(tracklet_id), pa.scalar(None, pa.string()), tracklet_id)

@@ -1,0 +1,145 @@
+"""Detections with the attitude and place of the frame they come from."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.tasks.algorithms.geometry.camera import Camera, unproject
+from epipole.tasks.algorithms.geometry.direction_errors import (
+    attitude_covariance,
+    centroid_covariance,
+)
+from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
+from epipole.tasks.algorithms.geometry.sky import ARCSEC, unit_from_radec
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class Frames(NamedTuple):
+    """Frames of one sensor, in time order.
+
+    Those without an attitude have their own axes in its place: identity.
+    """
+
+    table: pa.Table
+    number: npt.NDArray[np.int64]
+    time_ns: npt.NDArray[np.int64]
+    q_sensor_from_icrs: Array
+    cov_att_rad2: Array
+    from_stars: npt.NDArray[np.bool_]
+    r_gcrf_km: Array
+    v_gcrf_km_s: Array
+    position_sigma_km: Array
+    camera: npt.NDArray[np.int64]
+
+
+def solved_frames(solutions: pa.Table) -> Frames:
+    """Return the frames of a `solutions` table that have an attitude, in time order."""
+    return _frames(solutions.filter(pa.compute.field("attitude_source") != "none"))
+
+
+def unsolved_frames(solutions: pa.Table) -> Frames:
+    """Return the frames of a `solutions` table with a camera but no attitude, in time order."""
+    lost = (pa.compute.field("attitude_source") == "none") & (pa.compute.field("camera") >= 0)
+    frames = _frames(solutions.filter(lost))
+    n = len(frames.number)
+    return frames._replace(
+        q_sensor_from_icrs=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), cov_att_rad2=np.zeros((n, 3, 3))
+    )
+
+
+def _frames(solutions: pa.Table) -> Frames:
+    solved = solutions.sort_by("time")
+    return Frames(
+        solved,
+        array(solved, "frame_number"),
+        array(solved, "time"),
+        stack(solved, "q{}", "xyzw"),
+        stack_covariance(solved, "cov_att_{}_arcsec2") * ARCSEC**2,
+        array(solved, "attitude_source") == "stars",
+        stack(solved, "{}_km"),
+        stack(solved, "v{}_km_s"),
+        array(solved, "position_sigma_km").astype(float),
+        array(solved, "camera"),
+    )
+
+
+class Sightings(NamedTuple):
+    """Detections of one sensor in the order of its frames, and the frame each comes from.
+
+    `cov_noise` is what is new in every frame, `cov_bias` what all frames share [rad^2, ICRS]:
+    the error of an attitude from stars is new each time, that of a prior is one bias.
+    """
+
+    row: npt.NDArray[np.int64]
+    frame: npt.NDArray[np.int64]
+    offsets: npt.NDArray[np.int64]
+    u_icrs: Array
+    cov_noise: Array
+    cov_bias: Array
+
+
+def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
+    """Return the detections of one sensor that lie in its solved frames, by frame."""
+    row, frame = _in_frames(frames, detections)
+    u = unit_from_radec(
+        np.radians(array(detections, "ra_deg")[row]), np.radians(array(detections, "dec_deg")[row])
+    )
+    noise = centroid_covariance(u, array(detections, "sigma_arcsec")[row] * ARCSEC)
+    attitude = attitude_covariance(
+        u, matrix_from_quaternion(frames.q_sensor_from_icrs[frame]), frames.cov_att_rad2[frame]
+    )
+    stars = frames.from_stars[frame][:, None, None]
+    return Sightings(
+        row,
+        frame,
+        np.searchsorted(frame, np.arange(len(frames.number) + 1)),
+        u,
+        noise + np.where(stars, attitude, 0.0),
+        np.where(stars, 0.0, attitude),
+    )
+
+
+def image_sightings_of(frames: Frames, detections: pa.Table, camera: Camera) -> Sightings:
+    """Return the detections that lie in unsolved frames, by frame; directions in sensor axes."""
+    row, frame = _in_frames(frames, detections)
+    u = unproject(camera, array(detections, "x_px")[row], array(detections, "y_px")[row])
+    noise = centroid_covariance(u, array(detections, "sigma_arcsec")[row] * ARCSEC)
+    offsets = np.searchsorted(frame, np.arange(len(frames.number) + 1))
+    return Sightings(row, frame, offsets, u, noise, np.zeros_like(noise))
+
+
+def _in_frames(frames: Frames, detections: pa.Table) -> tuple[Indices, Indices]:
+    """Return the rows of detections in these frames, by frame and centroid, and their frames."""
+    by_number = np.argsort(frames.number, kind="stable")
+    number = array(detections, "frame_number")
+    at = np.searchsorted(frames.number[by_number], number)
+    at = np.minimum(at, max(len(by_number) - 1, 0))
+    known = frames.number[by_number][at] == number if len(by_number) else np.zeros(0, bool)
+    row = np.flatnonzero(known)
+    frame = by_number[at[row]] if len(row) else np.zeros(0, np.int64)
+    order = np.lexsort((array(detections, "centroid")[row], frame))
+    return row[order], frame[order]
+
+
+def part_of(seen: Sightings, kept: npt.NDArray[np.bool_]) -> Sightings:
+    """Return the sightings that are kept, still in the order of the frames."""
+    before = np.concatenate([[0], np.cumsum(kept)])
+    return Sightings(
+        seen.row[kept],
+        seen.frame[kept],
+        before[seen.offsets],
+        seen.u_icrs[kept],
+        seen.cov_noise[kept],
+        seen.cov_bias[kept],
+    )
+
+
+def camera_of(cameras: pa.Table, row: int) -> Camera:
+    """Return the camera in a row of `cameras`."""
+    # Without its time: a nanosecond is more than a Python datetime can hold.
+    return Camera(**cameras.select(list(Camera._fields)).slice(row, 1).to_pylist()[0])

@@ -1,0 +1,78 @@
+"""Spans of a night: what a task works on, and what of the neighbouring spans it sees.
+
+Spans are counted from 1970, not from the first frame, and divide a day, so that another log
+of a night does not shift them and none holds a midnight.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.io.work.files import is_written, read_part
+from epipole.schemas.bridge import array, concat
+
+SPAN_NS = 1_800_000_000_000  # tasks enough for many workers, and few beside a night's work
+CLOCK_NS = 10_000_000_000  # farther off no clock is put right
+
+
+class Span(NamedTuple):
+    """From an instant to before another; UTC nanoseconds since 1970."""
+
+    start_ns: int
+    end_ns: int
+
+    def widened(self, margin_ns: int) -> "Span":
+        """Return the span with a margin at both ends."""
+        return Span(self.start_ns - margin_ns, self.end_ns + margin_ns)
+
+    def holds(self, time_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """Return which instants lie in it."""
+        return (time_ns >= self.start_ns) & (time_ns < self.end_ns)
+
+    def of(self, rows: pa.Table, column: str) -> pa.Table:
+        """Return the rows whose time lies in it, as given."""
+        inside = self.holds(array(rows, column))
+        return rows if inside.all() else rows.filter(pa.array(inside))
+
+    @property
+    def folder(self) -> str:
+        """The name of its parts among those of other spans."""
+        return f"{self.start_ns // 1_000_000_000}"
+
+    def __str__(self) -> str:
+        """Return it as people read it: ``04:00-04:30``."""
+        start, end = (np.datetime64(t, "ns").astype("datetime64[m]") for t in self)
+        return f"{str(start)[11:]}-{str(end)[11:]}"
+
+
+class Sensor(NamedTuple):
+    """A sensor: its id, and its number among those of a run, which names its parts."""
+
+    number: int
+    sensor_id: str
+
+    def __str__(self) -> str:
+        """Return its id."""
+        return self.sensor_id
+
+
+def spans_between(start_ns: int, end_ns: int) -> list[Span]:
+    """Return the spans that cover the time from one instant to before another."""
+    first, last = start_ns // SPAN_NS, -(-end_ns // SPAN_NS)
+    return [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in range(first, last)]
+
+
+def rows_within(
+    stage: Path, span: Span, schema: pa.Schema, name: str, time: str = "time"
+) -> pa.Table:
+    """Return the rows of a stage's table that lie in a span, from all parts that it touches.
+
+    A frame whose time was put right may lie in the part beside its own.
+    """
+    parts = [stage / one.folder for one in spans_between(*span.widened(CLOCK_NS))]
+    return concat(
+        schema, [span.of(read_part(part, name), time) for part in parts if is_written(part)]
+    )

@@ -1,0 +1,1 @@
+"""A dataset held against the truth of a simulated log."""

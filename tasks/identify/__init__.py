@@ -1,0 +1,1 @@
+"""Stage `identify`: stars, attitudes, and what is no star."""

@@ -1,0 +1,62 @@
+"""Where each sensor was, and how it was said to be turned, at each of its frames."""
+
+import logging
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, nullable, stack, table, unstack
+from epipole.schemas.settings import SensorSettings, Settings
+from epipole.schemas.work_tables import PLACES
+from epipole.tasks.algorithms.orbits.state_interpolation import Places, States, interpolate_states
+
+logger = logging.getLogger(__name__)
+
+
+def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> pa.Table:
+    """PLACES, row by row with the exposures; see `interpolate_states`.
+
+    `states` are sorted by sensor and time, each time once, as `read_logs` gives them.
+    """
+    sensor, time_ns = array(exposures, "sensor_id"), array(exposures, "time")
+    state_sensor, all_states = array(states, "sensor_id"), _states(states, settings.sensors)
+    n = len(time_ns)
+    placed = Places(*(np.full((n, *width), np.nan) for width in ((3,), (3,), (), (4,), ())))
+    for name in sorted(set(sensor)):
+        frames = np.flatnonzero(sensor == name)
+        own = np.flatnonzero(state_sensor == name)
+        columns: list[npt.NDArray[Any]] = [values[own] for values in all_states]
+        places = interpolate_states(
+            States(*columns),
+            time_ns[frames],
+            settings.sensors.state_gap_s,
+        )
+        for column, values in zip(placed, places, strict=True):
+            column[frames] = values
+    without = np.count_nonzero(np.isnan(placed.r_gcrf_km[:, 0]))
+    logger.info("placed %d frames, %d have no state near", n - without, without)
+    by_name = {
+        **unstack("{}_km", placed.r_gcrf_km),
+        **unstack("v{}_km_s", placed.v_gcrf_km_s),
+        "position_sigma_km": placed.position_sigma_km,
+        **unstack("q{}", placed.q_sensor_from_icrs, "xyzw"),
+        "attitude_sigma_arcsec": placed.attitude_sigma,
+    }
+    key = {name: exposures[name] for name in ("sensor_id", "frame_number", "time")}
+    return table(PLACES, {**key, **{name: nullable(value) for name, value in by_name.items()}})
+
+
+def _states(states: pa.Table, settings: SensorSettings) -> States:
+    """Return the rows' states; a sigma of 0 is unknown and takes the settings' value."""
+    position_sigma_km = array(states, "position_sigma_km")
+    attitude_sigma = array(states, "attitude_sigma_arcsec")
+    return States(
+        array(states, "time"),
+        stack(states, "{}_km"),
+        stack(states, "v{}_km_s"),
+        np.where(position_sigma_km > 0, position_sigma_km, settings.position_sigma_km),
+        stack(states, "q{}", "xyzw"),
+        np.where(attitude_sigma > 0, attitude_sigma, settings.attitude_sigma_arcsec),
+    )

@@ -1,0 +1,1 @@
+"""Stage `name`: one id for each object of the night."""

@@ -1,0 +1,1 @@
+"""Stage `publish`: the tables of each night, put in place at once."""

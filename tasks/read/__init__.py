@@ -1,0 +1,1 @@
+"""Stage `read`: logs to frames, states and calibrations in order of time."""

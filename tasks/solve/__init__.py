@@ -1,0 +1,1 @@
+"""Stage `solve`: epochs, associations, positions and states."""

@@ -1,0 +1,148 @@
+"""Fit states: position and velocity of each object over the arcs that it has."""
+
+import itertools
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+import pyarrow as pa
+
+from epipole.schemas.bridge import table, unstack
+from epipole.schemas.columns import upper_triangle
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import STATES
+from epipole.tasks.algorithms.orbits.object_motion import velocities
+from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, fit_orbits
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+PLACE = ["x_km", "y_km", "z_km"]
+SLOPE_S = 60.0  # positions this near the middle of an arc give the velocity to begin with
+AXES = ("x", "y", "z", "vx", "vy", "vz")
+
+
+def fit_states(
+    views: pa.Table, associations: pa.Table, positions: pa.Table, settings: Settings
+) -> pa.Table:
+    """Return a state for each object and arc, at the arc's middle epoch.
+
+    Epochs nearer to each other than twice the half-window share detections, so only some serve,
+    none nearer than that. What a sensor's views share is estimated along with the state.
+    """
+    rows = _used_views(views, associations, positions, settings)
+    if not len(rows):
+        return table(STATES, {name: [] for name in STATES.names})
+    arc = rows["arc"].to_numpy()
+    begins = np.flatnonzero(np.append(True, arc[1:] != arc[:-1]))
+    offsets = np.append(begins, len(arc)).astype(np.int64)
+    epoch_ns = rows["epoch"].cast(pl.Int64).to_numpy()
+    epochs = [np.unique(epoch_ns[lo:hi]) for lo, hi in itertools.pairwise(offsets)]
+    n_epochs = np.array([len(own) for own in epochs])
+    middle = np.array([own[len(own) // 2] for own in epochs])
+    object_id = rows["object_id"].to_numpy()[begins]
+    arcs = Arcs(
+        offsets=offsets,
+        time_s=(epoch_ns - np.repeat(middle, np.diff(offsets))) / 1e9,
+        sensor=rows["sensor"].to_numpy().astype(np.int64),
+        r_km=rows.select(PLACE).to_numpy(),
+        u=rows.select("ux", "uy", "uz").to_numpy(),
+        cov_noise=_symmetric(rows, "noise"),
+        cov_bias=_symmetric(rows, "bias"),
+        sigma_km=rows["position_sigma_km"].to_numpy(),
+    )
+    state, cov, chi2 = fit_orbits(arcs, _starts(positions, object_id, middle))
+    return _state_table(object_id, middle, state, cov, chi2, n_epochs)
+
+
+def _used_views(
+    views: pa.Table, associations: pa.Table, positions: pa.Table, settings: Settings
+) -> pl.DataFrame:
+    """Return the views that served positions at epochs apart, with the number of their arc."""
+    key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
+    claimed = _frame(associations).filter("used").select([*key, "object_id"])
+    solved = _frame(positions).select("epoch", "object_id").sort("object_id", "epoch")
+    name = solved["object_id"].to_numpy()
+    epoch_ns = solved["epoch"].cast(pl.Int64).to_numpy()
+    arc, kept = _arcs(name, epoch_ns, settings.states.arc_s, 2 * settings.alignment.window_s)
+    arc = np.where(_long_enough(arc, kept, settings.states.min_epochs), arc, -1)
+    solved = solved.with_columns(arc=arc).filter(pl.Series(kept & (arc >= 0)))
+    return (
+        _frame(views)
+        .join(claimed, on=key)
+        .join(solved, on=["epoch", "object_id"])
+        .with_columns(sensor=pl.col("sensor_id").rank("dense").cast(pl.Int64) - 1)
+        .sort("arc", "epoch", "sensor")
+    )
+
+
+def _arcs(
+    name: npt.NDArray[np.object_], epoch_ns: Indices, arc_s: float, apart_s: float
+) -> tuple[Indices, npt.NDArray[np.bool_]]:
+    """Return the arc of each epoch of sorted objects, and which epochs serve."""
+    arc, kept = np.zeros(len(name), np.int64), np.zeros(len(name), bool)
+    number, begun, last = -1, 0, 0
+    for k, t in enumerate(epoch_ns.tolist()):
+        if k == 0 or name[k] != name[k - 1] or t - begun > arc_s * 1e9:
+            number, begun = number + 1, t
+            # The last epoch of the arc before shares nothing with this one that matters: each
+            # arc's covariance stands for itself.
+            last = t - round(apart_s * 1e9)
+        arc[k], kept[k] = number, t - last >= apart_s * 1e9
+        last = t if kept[k] else last
+    return arc, kept
+
+
+def _long_enough(arc: Indices, kept: npt.NDArray[np.bool_], least: int) -> npt.NDArray[np.bool_]:
+    count = np.bincount(arc, kept, minlength=1)
+    return count[arc] >= least if len(arc) else np.zeros(0, bool)
+
+
+def _starts(positions: pa.Table, object_id: npt.NDArray[np.object_], middle_ns: Indices) -> Array:
+    """Return states to begin with: the position at each arc's middle, and the slope there."""
+    rows = _frame(positions).sort("object_id", "epoch")
+    name, epoch_ns = rows["object_id"].to_numpy(), rows["epoch"].cast(pl.Int64).to_numpy()
+    begins = np.flatnonzero(np.append(True, name[1:] != name[:-1]))
+    offsets = np.append(begins, len(name)).astype(np.int64)
+    x_km = rows.select(PLACE).to_numpy()
+    v_km_s = velocities(offsets, (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)
+    at = dict(zip(zip(name, epoch_ns.tolist(), strict=True), range(len(name)), strict=True))
+    chosen = [at[key] for key in zip(object_id, middle_ns.tolist(), strict=True)]
+    return np.hstack([x_km[chosen], v_km_s[chosen]])
+
+
+def _state_table(
+    object_id: npt.NDArray[np.object_],
+    epoch_ns: Indices,
+    state: Array,
+    cov: Array,
+    chi2: Array,
+    n_epochs: Indices,
+) -> pa.Table:
+    """Return the states that were found, in order of time."""
+    found = np.flatnonzero(np.isfinite(chi2))
+    found = found[np.lexsort((object_id[found].astype(str), epoch_ns[found]))]
+    columns = {
+        "epoch": epoch_ns,
+        "object_id": object_id,
+        **unstack("{}_km", state[:, :3]),
+        **unstack("v{}_km_s", state[:, 3:]),
+        **{f"cov_{a}{b}": cov[:, AXES.index(a), AXES.index(b)] for a, b in upper_triangle(AXES)},
+        "n_epochs": n_epochs.astype(np.int32),
+        "chi2": chi2,
+    }
+    return table(STATES, {name: values[found] for name, values in columns.items()})
+
+
+def _symmetric(rows: pl.DataFrame, which: str) -> Array:
+    names = [f"cov_{which}_{ab}_rad2" for ab in ("11", "12", "12", "22")]
+    return (
+        rows.select(pl.col(n).alias(str(i)) for i, n in enumerate(names))
+        .to_numpy()
+        .reshape(-1, 2, 2)
+    )
+
+
+def _frame(rows: pa.Table) -> pl.DataFrame:
+    frame = pl.from_arrow(rows)
+    return frame if isinstance(frame, pl.DataFrame) else frame.to_frame()

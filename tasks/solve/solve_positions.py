@@ -1,0 +1,273 @@
+"""Solve positions: each object at each epoch, by weighted least squares over all its views."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, stack, table, unstack, unstack_covariance
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import ASSOCIATIONS, PAIRS, POSITIONS, REJECTS
+from epipole.tasks.algorithms.geometry.epipolar import epipolar_angle, epipolar_sigma
+from epipole.tasks.algorithms.geometry.sky import SPEED_OF_LIGHT_KM_S, tangent_basis
+from epipole.tasks.algorithms.geometry.triangulation import triangulate
+from epipole.tasks.algorithms.orbits.object_motion import velocities
+from epipole.tasks.common.lone_detections import published_ids
+from epipole.tasks.common.spans import Span
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+VELOCITY_WINDOW_S = 30.0  # positions this near give an object's velocity
+
+
+class Solved(NamedTuple):
+    """Associations, the pairs of detections they imply, positions, and what was left out."""
+
+    associations: pa.Table
+    pairs: pa.Table
+    positions: pa.Table
+    rejects: pa.Table
+
+
+class _Groups(NamedTuple):
+    """Views in groups of one epoch and object, the objects' names, and the solution."""
+
+    views: pa.Table
+    offsets: Indices
+    object_id: npt.NDArray[np.object_]
+    epoch_ns: Indices
+    u: Array
+    r_km: Array
+    cov: Array
+    x_km: Array
+    cov_km2: Array
+    chi2: Array
+    used: npt.NDArray[np.bool_]
+    mean_range_km: Array
+
+    @property
+    def group(self) -> Indices:
+        """Group of each view."""
+        return np.repeat(np.arange(len(self.epoch_ns)), np.diff(self.offsets))
+
+
+def solve_positions(
+    views: pa.Table, object_number: Indices, settings: Settings, span: Span | None = None
+) -> Solved:
+    """Return positions with covariance of objects seen by two sensors or more.
+
+    Solved twice: the first positions give the velocities that the difference in light time
+    between near and far sensors needs. With a span, what is returned is of its epochs only.
+    """
+    groups = _solve(views, object_number, settings)
+    if span is not None:
+        groups = _within(groups, span)
+    pairs = _pair_up(groups)
+    return Solved(
+        _association_table(groups, pairs),
+        _pair_table(groups, pairs),
+        _position_table(groups),
+        _reject_table(groups),
+    )
+
+
+def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> _Groups:
+    order = np.lexsort(
+        (array(views, "sensor_id").astype(str), object_number, array(views, "epoch"))
+    )
+    views, number = views.take(order), object_number[order]
+    epoch_ns = array(views, "epoch")
+    begins = np.ones(len(number), bool)
+    begins[1:] = (epoch_ns[1:] != epoch_ns[:-1]) | (number[1:] != number[:-1])
+    offsets = np.append(np.flatnonzero(begins), len(number)).astype(np.int64)
+    u, r_km = stack(views, "u{}"), stack(views, "{}_km")
+    cov = _direction_covariance(views)
+    sigma_km = array(views, "position_sigma_km")
+    start = offsets[:-1]
+    velocity = np.zeros((len(start), 3))
+    for _ in range(2):
+        x_km, cov_km2, chi2, used, mean_range = triangulate(
+            offsets, r_km, u, cov, sigma_km, velocity, settings.positions.reject_sigma
+        )
+        velocity = _velocities(epoch_ns[start], number[start], x_km)
+    return _Groups(
+        views, offsets, object_names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
+        x_km, cov_km2, chi2, used, mean_range,
+    )  # fmt: skip
+
+
+def _within(groups: _Groups, span: Span) -> _Groups:
+    """Return the groups whose epoch lies in a span."""
+    kept = span.holds(groups.epoch_ns)
+    if kept.all():
+        return groups
+    rows = np.flatnonzero(kept[groups.group])
+    size = np.diff(groups.offsets)[kept]
+    return _Groups(
+        views=groups.views.take(rows),
+        offsets=np.concatenate([[0], np.cumsum(size)]).astype(np.int64),
+        object_id=groups.object_id[kept],
+        epoch_ns=groups.epoch_ns[kept],
+        u=groups.u[rows],
+        r_km=groups.r_km[rows],
+        cov=groups.cov[rows],
+        x_km=groups.x_km[kept],
+        cov_km2=groups.cov_km2[kept],
+        chi2=groups.chi2[kept],
+        used=groups.used[rows],
+        mean_range_km=groups.mean_range_km[kept],
+    )
+
+
+def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
+    """Return an id for each object: the UTC date of its first epoch, and its number.
+
+    Rows are in order of time.
+    """
+    out = np.empty(len(number), dtype=object)
+    first: dict[int, str] = {}
+    for i, (t, n) in enumerate(zip(epoch_ns.tolist(), number.tolist(), strict=True)):
+        if n not in first:
+            date = np.datetime64(t, "ns").astype("datetime64[D]")
+            first[n] = f"{str(date).replace('-', '')}-{n + 1:05d}"
+        out[i] = first[n]
+    return out
+
+
+def _direction_covariance(views: pa.Table) -> Array:
+    cov = np.empty((views.num_rows, 2, 2))
+    for ab, i, j in (("11", 0, 0), ("12", 0, 1), ("22", 1, 1)):
+        total = array(views, f"cov_noise_{ab}_rad2") + array(views, f"cov_bias_{ab}_rad2")
+        cov[:, i, j] = cov[:, j, i] = total
+    return cov
+
+
+def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> Array:
+    order = np.lexsort((epoch_ns, number))
+    cuts = np.flatnonzero(np.diff(number[order])) + 1
+    offsets = np.concatenate([[0], cuts, [len(number)]]).astype(np.int64)
+    out = np.empty_like(x_km)
+    origin = epoch_ns[0] if len(epoch_ns) else 0
+    time_s = (epoch_ns[order] - origin) / 1e9
+    out[order] = velocities(offsets, time_s, x_km[order], VELOCITY_WINDOW_S)
+    return out
+
+
+class _Pairs(NamedTuple):
+    """All pairs of views of one group: their rows, epipolar distance [px] and its sigmas."""
+
+    first: Indices
+    second: Indices
+    epipolar_px: Array
+    mahalanobis: Array
+
+
+def _pair_up(groups: _Groups) -> _Pairs:
+    """Return every ordered pair of views of one object at one epoch."""
+    first, second = [], []
+    for lo, hi in zip(groups.offsets[:-1], groups.offsets[1:], strict=True):
+        i, j = np.nonzero(~np.eye(hi - lo, dtype=bool))
+        first.append(lo + i)
+        second.append(lo + j)
+    a = np.concatenate([*first, np.zeros(0, np.int64)])
+    b = np.concatenate([*second, np.zeros(0, np.int64)])
+    r, u = groups.r_km, groups.u
+    angle = epipolar_angle(r[a], u[a], r[b], u[b])
+    basis = tangent_basis(u)
+    cov = np.swapaxes(basis, -1, -2) @ groups.cov @ basis
+    sigma_km = array(groups.views, "position_sigma_km")
+    sigma = epipolar_sigma(
+        r[a], u[a], cov[a], r[b], u[b], cov[b], sigma_km[a], sigma_km[b],
+        groups.x_km[groups.group[a]],
+    )  # fmt: skip
+    pixel = array(groups.views, "pixel_rad")
+    return _Pairs(a, b, np.abs(angle) / pixel[b], np.abs(angle) / sigma)
+
+
+def _association_table(groups: _Groups, pairs: _Pairs) -> pa.Table:
+    n = groups.views.num_rows
+    square = np.bincount(pairs.second, pairs.epipolar_px**2, minlength=n)
+    count = np.maximum(np.bincount(pairs.second, minlength=n), 1)
+    views = groups.views
+    shared = ("epoch", "sensor_id", "frame_number", "centroid", "x_px", "y_px")
+    return table(
+        ASSOCIATIONS,
+        {name: views[name] for name in shared}
+        | {
+            "tracklet_id": published_ids(views["tracklet_id"]),
+            "object_id": groups.object_id[groups.group],
+            "epipolar_px": np.sqrt(square / count),
+            "used": groups.used,
+        },
+    )
+
+
+def _pair_table(groups: _Groups, pairs: _Pairs) -> pa.Table:
+    """Return the pairs of used views that have a centroid each, the first sensor before."""
+    seen = groups.views["centroid"].is_valid().to_numpy() & groups.used
+    kept = seen[pairs.first] & seen[pairs.second] & (pairs.first < pairs.second)
+    columns = {
+        "epoch": groups.epoch_ns[groups.group[pairs.first[kept]]],
+        "epipolar_px": pairs.epipolar_px[kept],
+        "mahalanobis": pairs.mahalanobis[kept],
+    }
+    for side, rows in (("1", pairs.first[kept]), ("2", pairs.second[kept])):
+        for name in ("sensor_id", "frame_number", "centroid"):
+            columns[f"{name}_{side}"] = groups.views[name].take(rows)
+    return table(PAIRS, columns)
+
+
+def _position_table(groups: _Groups) -> pa.Table:
+    solved = np.isfinite(groups.chi2)
+    n_used = np.bincount(groups.group, groups.used, minlength=len(solved)).astype(np.int32)
+    light_ns = np.nan_to_num(groups.mean_range_km / SPEED_OF_LIGHT_KM_S * 1e9)
+    columns = {
+        "epoch": groups.epoch_ns,
+        "time": groups.epoch_ns - np.round(light_ns).astype(np.int64),
+        "object_id": groups.object_id,
+        **unstack("{}_km", groups.x_km),
+        **unstack_covariance("cov_{}", groups.cov_km2),
+        "n_sensors": n_used,
+        "n_rejected": np.diff(groups.offsets).astype(np.int32) - n_used,
+        "residual_px": _residual_px(groups),
+        "chi2": groups.chi2,
+    }
+    return table(POSITIONS, {name: values[solved] for name, values in columns.items()})
+
+
+def _residual_px(groups: _Groups) -> Array:
+    """Return the rms image distance of each group's used views from its position."""
+    sight = groups.x_km[groups.group] - groups.r_km
+    sight /= np.linalg.norm(sight, axis=1, keepdims=True)
+    pixel = array(groups.views, "pixel_rad")
+    square = np.where(groups.used, np.sum((sight - groups.u) ** 2, axis=1) / pixel**2, 0.0)
+    size = len(groups.epoch_ns)
+    count = np.maximum(np.bincount(groups.group, groups.used, minlength=size), 1)
+    return np.sqrt(np.bincount(groups.group, square, minlength=size) / count)
+
+
+def _reject_table(groups: _Groups) -> pa.Table:
+    """Return a row a sensor and reason: views rejected, and epochs without a solution."""
+    unsolved = ~np.isfinite(groups.chi2)[groups.group]
+    reasons = (("view_rejected", ~groups.used & ~unsolved), ("no_position", unsolved))
+    rows = []
+    sensor = array(groups.views, "sensor_id").astype(str)
+    epoch_ns = array(groups.views, "epoch")
+    for reason, which in reasons:
+        for name in np.unique(sensor[which]):
+            own = which & (sensor == name)
+            rows.append((name, int(epoch_ns[own].min()), reason, int(own.sum())))
+    return table(
+        REJECTS,
+        {
+            "source": pa.nulls(len(rows), pa.string()),
+            "offset": pa.nulls(len(rows), pa.int64()),
+            "sensor_id": [r[0] for r in rows],
+            "time": np.array([r[1] for r in rows], np.int64),
+            "stage": ["positions"] * len(rows),
+            "reason": [r[2] for r in rows],
+            "count": [r[3] for r in rows],
+        },
+    )

@@ -1,0 +1,1 @@
+"""Stage `track`: detections to tracklets, tracklets to tracks."""

@@ -1,0 +1,214 @@
+"""Join tracklets: what one sensor's spans found becomes the tracklets and tracks of its night.
+
+Two neighbouring spans both follow what is seen about the instant between them. Tracklets of
+the two that share detections there are one.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+
+from epipole.io.work.files import is_written, read_part, write_part
+from epipole.schemas.bridge import table
+from epipole.schemas.tables import TRACKLETS
+from epipole.schemas.work_tables import TRACKLET_NAMES
+from epipole.tasks.algorithms.tracking.linking.chains import chain_heads
+from epipole.tasks.common.spans import Sensor, Span
+
+KEY = ["frame_number", "centroid"]
+
+
+@task(name="join tracklets", task_run_name="join tracklets {sensor}", cache_policy=NO_CACHE)
+def join_tracklets(sensor: Sensor, tracked: Path, spans: Sequence[Span], stage: Path) -> int:
+    """Name one sensor's tracklets for the night, unless that has been done.
+
+    Parameters
+    ----------
+    tracked
+        The sensor's tracked parts.
+    spans
+        Those it has parts of, in order.
+    stage
+        Where the parts go: `names` of each span, and `tracklets` under ``night``.
+
+    Returns
+    -------
+    int
+        How many tracklets there are.
+
+    Notes
+    -----
+    A detection belongs to the tracklet that the span it lies in says. A tracklet's number in
+    the night is that of the span before, if they share more detections than either shares with
+    another; what it continues is said by the span in which it begins.
+    """
+    night = stage / "night"
+    if not is_written(night):
+        _join(sensor, tracked, spans, stage)
+    return read_part(night, "tracklets").num_rows
+
+
+def _join(sensor: Sensor, tracked: Path, spans: Sequence[Span], stage: Path) -> None:
+    count = 0
+    before: pl.DataFrame | None = None  # what the span before says
+    owned, named = [], []
+    for k, span in enumerate(spans):
+        part = tracked / span.folder
+        seen = _tracked(part).with_columns(owned=pl.col("time_ns").is_between(*span, closed="left"))
+        known = _shared(before, seen)  # a margin may reach over spans that have no frames
+        numbers = _numbered(seen, known, count)
+        count = max([count, *(numbers["number"] + 1).to_list()])
+        seen = seen.join(numbers, on="span_name")
+        named.append(_links(part, numbers).with_columns(span=pl.lit(k, pl.Int64)))
+        owned.append(_summed(seen.filter("owned"), part).with_columns(span=pl.lit(k, pl.Int64)))
+        before = seen.select(*KEY, "number")
+    _write(spans, stage, pl.concat(named), pl.concat(owned), sensor.sensor_id)
+
+
+def _tracked(part: Path) -> pl.DataFrame:
+    """Return a row a detection of a tracklet, in order of time."""
+    rows = read_part(part, "detections", [*KEY, "time", "tracklet_id"])
+    rows = rows.filter(rows["tracklet_id"].is_valid())
+    return (
+        _frame(rows)
+        .with_columns(time_ns=pl.col("time").cast(pl.Int64))
+        .rename({"tracklet_id": "span_name"})
+        .drop("time")
+        .sort("time_ns", *KEY)
+    )
+
+
+def _shared(before: pl.DataFrame | None, seen: pl.DataFrame) -> pl.DataFrame:
+    """Return which tracklet of a span is which of the one before: most detections shared."""
+    if before is None:
+        return pl.DataFrame(schema={"span_name": pl.String, "number": pl.Int64})
+    both = (
+        seen.join(before, on=KEY)
+        .group_by("span_name", "number")
+        .len()
+        .sort(["len", "number", "span_name"], descending=[True, False, False])
+    )
+    names: dict[str, int] = {}
+    taken: set[int] = set()
+    for name, number, _ in both.iter_rows():
+        if name not in names and number not in taken:
+            names[name] = number
+            taken.add(number)
+    return pl.DataFrame(
+        {"span_name": list(names), "number": list(names.values())},
+        schema={"span_name": pl.String, "number": pl.Int64},
+    )
+
+
+def _numbered(seen: pl.DataFrame, known: pl.DataFrame, count: int) -> pl.DataFrame:
+    """Return the night's number of each tracklet of a span; new ones count on from `count`."""
+    names = seen.select(pl.col("span_name").unique(maintain_order=True))
+    numbers = names.join(known, on="span_name", how="left", maintain_order="left")
+    new = numbers["number"].is_null()
+    fresh = pl.Series(np.cumsum(new.to_numpy()) - 1 + count, dtype=pl.Int64)
+    return numbers.with_columns(number=pl.when(new).then(fresh).otherwise(pl.col("number")))
+
+
+def _links(part: Path, numbers: pl.DataFrame) -> pl.DataFrame:
+    """Return, for each tracklet of a span, what it continues there, and how well."""
+    rows = _frame(
+        read_part(part, "tracklets", ["tracklet_id", "track_id", "start_time", "link_chi2"])
+    ).rename({"tracklet_id": "span_name"})
+    rows = rows.join(numbers, on="span_name").sort("track_id", "start_time", "span_name")
+    return rows.select(
+        "span_name",
+        "number",
+        "link_chi2",
+        after=pl.col("number").shift(1).over("track_id"),
+    )
+
+
+def _summed(owned: pl.DataFrame, part: Path) -> pl.DataFrame:
+    """Return a row a tracklet and span: its share of the detections, its motion and residual."""
+    found = _frame(read_part(part, "tracklets", ["tracklet_id", "rate_arcsec_s", "residual_px"]))
+    return (
+        owned.group_by("number", "span_name")
+        .agg(
+            start_ns=pl.col("time_ns").first(),
+            end_ns=pl.col("time_ns").last(),
+            n=pl.len(),
+            frame_number=pl.col("frame_number").first(),
+            centroid=pl.col("centroid").first(),
+        )
+        .join(found.rename({"tracklet_id": "span_name"}), on="span_name")
+        .sort("number")
+    )
+
+
+def _write(
+    spans: Sequence[Span], stage: Path, named: pl.DataFrame, owned: pl.DataFrame, sensor_id: str
+) -> None:
+    night = (
+        owned.sort("number", "span")
+        .group_by("number", maintain_order=True)
+        .agg(
+            pl.col("frame_number", "centroid", "span", "start_ns").first(),
+            pl.col("end_ns").last(),
+            n_detections=pl.col("n").sum(),
+            rate_arcsec_s=(pl.col("rate_arcsec_s") * pl.col("n")).sum() / pl.col("n").sum(),
+            residual_px=(
+                (pl.col("residual_px") ** 2 * pl.col("n")).sum() / pl.col("n").sum()
+            ).sqrt(),
+        )
+        .join(named.drop("span_name"), on=["number", "span"], how="left")
+        .sort("start_ns", "frame_number", "centroid")
+        .with_columns(
+            tracklet_id=pl.format("{}-{}-{}", pl.lit(sensor_id), "frame_number", "centroid")
+        )
+    )
+    before, chi2 = _before(night)
+    ids = night["tracklet_id"].to_numpy()
+    heads = ids[chain_heads(before)] if len(ids) else ids
+    night = night.with_columns(
+        track_id=pl.Series(heads, dtype=pl.String), link_chi2=pl.Series(chi2, dtype=pl.Float64)
+    )
+    names = named.join(night.select("number", "tracklet_id", "track_id"), on="number")
+    for k, span in enumerate(spans):
+        own = names.filter(span=k).sort("span_name")
+        write_part(stage / span.folder, {"names": _arrow(own, TRACKLET_NAMES)})
+    night = night.rename({"start_ns": "start_time", "end_ns": "end_time"}).with_columns(
+        sensor_id=pl.lit(sensor_id)
+    )
+    night = night.sort("start_time", "tracklet_id")
+    write_part(stage / "night", {"tracklets": _arrow(night, TRACKLETS)})
+
+
+def _before(night: pl.DataFrame) -> tuple[np.ndarray, list[float | None]]:
+    """Return the row that each tracklet continues (-1: none) and the link's chi-square.
+
+    Two spans may each have one tracklet continue the same third: the likelier one does.
+    """
+    row_of = {number: row for row, number in enumerate(night["number"])}
+    before = np.full(len(night), -1)
+    chi2: list[float | None] = [None] * len(night)
+    taken: set[int] = set()
+    claims = [
+        (claim, row, row_of[after])
+        for row, (claim, after) in enumerate(night.select("link_chi2", "after").iter_rows())
+        if claim is not None and after in row_of
+    ]
+    end_ns, start_ns = night["end_ns"].to_list(), night["start_ns"].to_list()
+    for claim, row, after in sorted(claims):
+        if after not in taken and end_ns[after] < start_ns[row]:
+            taken.add(after)
+            before[row], chi2[row] = after, claim
+    return before, chi2
+
+
+def _arrow(rows: pl.DataFrame, schema: pa.Schema) -> pa.Table:
+    return table(schema, {name: rows[name].to_arrow() for name in schema.names})
+
+
+def _frame(rows: pa.Table) -> pl.DataFrame:
+    frame = pl.from_arrow(rows)
+    return frame if isinstance(frame, pl.DataFrame) else frame.to_frame()

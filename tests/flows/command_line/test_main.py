@@ -1,0 +1,261 @@
+"""The command line: what it prints, and one clear line where it could not do its work."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from mcap.writer import Writer
+
+from epipole.flows.command_line.main import main
+from epipole.io.logs.writer import LogWriter
+from epipole.io.settings_file import read_settings, settings_text
+from epipole.schemas.settings import Settings
+
+START_NS = int(np.datetime64("2019-04-01T04:00:00", "ns").astype(np.int64))
+EPIPOLE = [sys.executable, "-c", "from epipole.flows.command_line.main import main; main()"]
+
+
+@pytest.fixture
+def epipole(monkeypatch, capfd, tmp_path):
+    """Return a function that runs a command line and gives (exit code, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["epipole", *map(str, arguments)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return ended.value.code or 0, *capfd.readouterr()
+
+    return call
+
+
+def one_line(err: str) -> str:
+    """Return the line that says what is wrong; the lines of log before it are of stages."""
+    lines = [line for line in err.splitlines() if not re.match(r"\d\d:\d\d:\d\d ", line)]
+    assert len(lines) == 1, err
+    assert lines[0].startswith("epipole: ")
+    return lines[0]
+
+
+def without_frames(path: Path) -> None:
+    with LogWriter(path) as log:
+        log.state("a", START_NS, position_km=[7000.0, 0.0, 0.0])
+
+
+def of_unknown_encoding(path: Path) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("epipole.CentroidFrame", "flatbuffer", b"")
+        channel = writer.register_channel("/a/centroids", "flatbuffer", schema)
+        writer.add_message(channel, START_NS, b"123", START_NS)
+        writer.finish()
+
+
+def of_a_sensor_called(name: str):
+    def write(path: Path) -> None:
+        with LogWriter(path) as log:
+            log.frame(name, START_NS, frame_number=1, exposure_s=0.1, x_px=[1.0], y_px=[2.0])
+
+    return write
+
+
+BAD_LOGS = {
+    "a folder": (Path.mkdir, "no logs in this folder"),
+    "empty": (Path.touch, "not an MCAP file"),
+    "text": (lambda path: path.write_text("PNG"), "not an MCAP file"),
+    "without frames": (without_frames, "no frames in it"),
+    "of an unknown encoding": (of_unknown_encoding, "flatbuffer"),
+    "of a sensor that leaves its folder": (of_a_sensor_called("../x"), "no frames in it"),
+    "without calibration": (of_a_sensor_called("a"), "no sensor has a calibration"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD_LOGS)
+def test_a_log_that_cannot_be_used_is_one_line_and_nothing_is_written(
+    kind, epipole, prefect, tmp_path
+):
+    write, says = BAD_LOGS[kind]
+    write(tmp_path / "bad.mcap")
+    code, out, err = epipole("run", "bad.mcap", "--out", "out")
+    assert code == 1
+    assert out == ""
+    assert "bad.mcap" in one_line(err)
+    assert says in one_line(err)
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.mcap"]
+
+
+def test_a_missing_log_is_said_before_prefect_starts(epipole, tmp_path):
+    code, _, err = epipole("run", "none.mcap", "--out", "out")
+    assert (code, err) == (1, "epipole: none.mcap: no such file; check the path\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[sensors]\nstate_gap_s = -1", r"sensors\.state_gap_s = -1: .*greater than 0"),
+        ("[sensors]\nstate_gap = 1", r"unknown setting sensors\.state_gap; `epipole settings`"),
+        ("[sensors", "not TOML"),
+    ],
+)
+def test_a_bad_setting_is_named(text, says, epipole, night_log, tmp_path):
+    (tmp_path / "s.toml").write_text(text)
+    code, _, err = epipole("run", night_log, "--out", "out", "--settings", "s.toml")
+    assert code == 1
+    assert re.search(rf"s\.toml: {says}", one_line(err))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_settings_file_is_named(epipole, night_log):
+    code, _, err = epipole("run", night_log, "--out", "out", "--settings", "none.toml")
+    assert code == 1
+    assert "none.toml: No such file" in one_line(err)
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_an_output_that_is_no_dataset_is_refused_and_left_alone(kind, epipole, night_log, tmp_path):
+    if kind == "folder":
+        (tmp_path / "out").mkdir()
+    holiday = tmp_path / "out" / "holiday.jpg" if kind == "folder" else tmp_path / "out"
+    holiday.write_text("sun")
+    code, _, err = epipole("run", night_log, "--out", "out")
+    assert code == 1
+    assert "out: " in one_line(err)
+    assert holiday.read_text() == "sun"
+
+
+def test_an_output_that_cannot_be_written_is_one_line(epipole, night_log, prefect, tmp_path):
+    (tmp_path / "file").touch()
+    code, _, err = epipole("run", night_log, "--out", "file/out")
+    assert code == 1
+    assert "file/out: " in one_line(err)
+
+
+@pytest.mark.parametrize("date", ["tonight", "2019-4-1", "20190401"])
+def test_a_night_that_is_no_date_is_a_wrong_use(date, epipole, night_log):
+    code, _, err = epipole("run", night_log, "--out", "out", "--night", date)
+    assert code == 2
+    assert "is no date such as 2019-04-01" in " ".join(err.split())
+
+
+def test_the_settings_it_prints_are_read_back_as_the_defaults(epipole, tmp_path):
+    code, out, _ = epipole("settings")
+    assert code == 0
+    (tmp_path / "s.toml").write_text(out)
+    assert read_settings(tmp_path / "s.toml") == Settings()
+    for group in Settings.model_fields:
+        assert f"[{group}]" in out
+
+
+def test_changed_settings_are_printed_and_read_back(tmp_path):
+    changed = Settings.model_validate(
+        {"sensors": {"centroid_sigma_px": 0.25}, "positions": {"reject_sigma": 1e-7}}
+    )
+    (tmp_path / "s.toml").write_text(settings_text(changed))
+    assert read_settings(tmp_path / "s.toml") == changed
+
+
+def test_a_run_ends_in_a_summary_on_standard_output(epipole, night_log, prefect, tmp_path):
+    code, out, err = epipole("run", night_log, "--out", "out")
+    assert code == 0
+    assert re.search(r"frames +240 of 4 sensors in 1 log\n", out)
+    assert re.search(r"objects +9 in [\d,]+ detections, \d+ tracklets\n", out)
+    assert re.search(r"dataset +out\ntook +[\d.]+ s\n$", out)
+    assert all(re.match(r"\d\d:\d\d:\d\d ", line) for line in err.splitlines())
+    assert "published out/night=2019-04-01" in err
+
+
+def test_a_quiet_run_says_nothing(epipole, night_log, prefect):
+    assert epipole("run", night_log, "--out", "out", "--quiet") == (0, "", "")
+
+
+def test_json_is_all_that_is_on_standard_output(epipole, night_log, prefect, tmp_path):
+    code, out, _ = epipole("run", night_log, "--out", "out", "--json", "--quiet")
+    found = json.loads(out)
+    positions = pl.read_parquet(tmp_path / "out/night=*/positions/*.parquet")
+    assert code == 0
+    assert found["positions"] == len(positions)
+    assert found["nights"] == ["2019-04-01"]
+    assert found["seconds"] > 0
+
+
+def test_info_says_what_a_log_holds(epipole, night_log):
+    code, out, err = epipole("info", night_log)
+    assert (code, err) == (0, "")
+    assert out.count("frames       60 at 1 Hz, 2019-04-01T04:00:") == 4
+    assert out.count("calibration  512 x 512 px, 2.0 x 2.0 deg") == 4
+
+
+def test_info_says_what_cannot_be_used(epipole, tmp_path):
+    with LogWriter(tmp_path / "n.mcap") as log:
+        for k, x in enumerate([[1.0], [np.nan]]):
+            log.frame("a", START_NS + k, frame_number=k, exposure_s=0.1, x_px=x, y_px=[2.0])
+    _, out, _ = epipole("info", "n.mcap")
+    assert "states       none: its frames give no positions" in out
+    assert "calibration  none: a run leaves this sensor out" in out
+    assert re.search(r"left out: 1 \w+ of a", out)
+    _, as_json, _ = epipole("info", "n.mcap", "--json")
+    assert json.loads(as_json)[0]["sensors"][0]["frames"] == 1
+
+
+def test_simulate_writes_the_log_and_says_so(epipole, tmp_path):
+    code, out, _ = epipole("simulate", "four_sensor_geo", "--out", "a.mcap", "--seed", "5")
+    assert code == 0
+    assert "4 sensors, 9 objects, 240 frames" in out
+    epipole("simulate", "four_sensor_geo", "--out", "b.mcap", "--seed", "5")
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_an_unknown_scene_is_one_line(epipole, tmp_path):
+    code, _, err = epipole("simulate", "five_sensor_geo", "--out", "a.mcap")
+    assert code == 1
+    assert "five_sensor_geo" in one_line(err)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_help_and_version_need_neither_prefect_nor_arrow():
+    code = (
+        "import sys; sys.argv = ['epipole', sys.argv[1]]\n"
+        "from epipole.flows.command_line.main import main\n"
+        "try: main()\n"
+        "except SystemExit as e: assert not e.code\n"
+        "assert not {'prefect', 'pyarrow', 'numpy', 'numba'} & set(sys.modules)\n"
+    )
+    for flag in ("--help", "--version"):
+        ran = subprocess.run([sys.executable, "-c", code, flag], capture_output=True, text=True)
+        assert ran.returncode == 0, ran.stderr
+        assert "epipole" in ran.stdout
+
+
+def test_a_run_by_itself_leaves_nothing_of_its_libraries_on_the_terminal(night_log, tmp_path):
+    ran = subprocess.run(
+        [*EPIPOLE, "run", str(night_log), "--out", str(tmp_path / "out")],
+        capture_output=True, text=True, cwd=tmp_path,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.startswith("nights      2019-04-01\n")
+    assert all(re.match(r"\d\d:\d\d:\d\d ", line) for line in ran.stderr.splitlines()), ran.stderr
+
+
+def test_ctrl_c_ends_a_run_with_one_line_and_nothing_half_written(night_log, tmp_path):
+    run = subprocess.Popen(
+        [*EPIPOLE, "run", str(night_log), "--out", "out"], cwd=tmp_path, text=True,
+        stderr=subprocess.PIPE, start_new_session=True,
+    )  # fmt: skip
+    lines = [run.stderr.readline()]  # the first stage has ended: Prefect runs
+    os.killpg(run.pid, signal.SIGINT)  # to its server too, as a terminal does
+    lines += run.stderr.readlines()
+    assert run.wait(timeout=60) == 130
+    assert one_line("".join(lines)) == "epipole: interrupted"
+    time.sleep(0.1)
+    assert list(tmp_path.iterdir()) == []

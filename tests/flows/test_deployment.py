@@ -1,0 +1,202 @@
+"""The deployment for real: a server, a work pool, a worker, a night; and what kills them."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+from scenes.prefect_server import POOL, Prefect, serving, wait_for
+
+from epipole.io.logs.writer import LogWriter
+
+ROOT = Path(__file__).parents[2]
+NIGHT = "2019-04-01"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def published(dataset: Path) -> dict[str, bytes]:
+    """Return what readers of a dataset see: its nights, not what a run has staged."""
+    files = contents(dataset).items()
+    return {name: data for name, data in files if name.startswith("night=")}
+
+
+class Deployed:
+    """The deployment `nightly/nightly` on a server of its own."""
+
+    def __init__(self, prefect: Prefect) -> None:
+        self.prefect = prefect
+        self.out = prefect.folder / "dataset"
+        self.worker = prefect.start_worker()
+
+    def ask(self, **parameters: object) -> str:
+        """Ask for a run, as the page does; return its id."""
+        deployment = self.prefect.get("deployments/name/nightly/nightly")["id"]
+        asked = {"parameters": parameters, "state": {"type": "SCHEDULED"}}
+        return self.prefect.post(f"deployments/{deployment}/create_flow_run", asked)["id"]
+
+    def in_the_middle(self, **parameters: object) -> tuple[str, list[int]]:
+        """Ask for a run; return its id and processes once some of its tasks are done."""
+        run_id = self.ask(**parameters)
+        of_run = {"id": {"any_": [run_id]}}
+        done = {"state": {"type": {"any_": ["COMPLETED"]}}}
+        wait_for(
+            lambda: self.prefect.find("task_runs", flow_runs=of_run, task_runs=done),
+            "the first task to end",
+        )
+        processes = self.prefect.flow_processes(self.worker)
+        assert processes
+        return run_id, processes
+
+    def ends_as(self, run_id: str, state: str) -> dict:
+        wait_for(lambda: self.prefect.run(run_id)["state_type"] == state, f"the run to be {state}")
+        return self.prefect.run(run_id)
+
+
+@pytest.fixture(scope="module")
+def deployed(tmp_path_factory, night_log) -> Iterator[Deployed]:
+    """Go through the README's commands, with its two lines of prefect.yaml changed."""
+    folder = tmp_path_factory.mktemp("deployed")
+    (folder / "logs").mkdir()
+    (folder / "logs" / night_log.name).symlink_to(night_log)
+    with LogWriter(folder / "logs" / "another.mcap") as log:  # of another night
+        log.frame("a", 1_554_000_000 * 10**9, frame_number=0, exposure_s=0.1, x_px=[], y_px=[])
+    text = (ROOT / "prefect.yaml").read_text()
+    assert yaml.safe_load(text)["deployments"][0]["work_pool"]["name"] == POOL
+    for name, place in (("/data/logs", folder / "logs"), ("/data/dataset", folder / "dataset")):
+        assert text.count(f" {name} ") + text.count(f" {name}\n") == 1
+        text = text.replace(f" {name}", f" {place}")
+    (folder / "prefect.yaml").write_text(text)
+    with serving(folder) as prefect:
+        made = prefect.command("work-pool", "create", POOL, "--type", "process")
+        assert made.returncode == 0, made.stderr
+        there = prefect.command("deploy", "--all")
+        assert there.returncode == 0, there.stdout + there.stderr
+        assert "'nightly/nightly' successfully created" in " ".join(there.stdout.split())
+        yield Deployed(prefect)
+
+
+def test_the_commands_that_are_run_here_stand_in_the_readme():
+    readme = (ROOT / "README.md").read_text()
+    for command in (
+        "prefect server start",
+        f"prefect work-pool create {POOL} --type process",
+        "prefect deploy --all",
+        f"prefect worker start --pool {POOL}",
+        f"prefect deployment run 'nightly/nightly' --param night={NIGHT} --watch",
+    ):
+        assert f"\n{command}" in readme, command
+
+
+def test_runs_are_scheduled_for_six_in_the_morning(deployed):
+    def scheduled() -> list[dict]:
+        return deployed.prefect.find(
+            "flow_runs", flow_runs={"state": {"type": {"any_": ["SCHEDULED"]}}}
+        )
+
+    runs = wait_for(scheduled, "the scheduler to make runs")
+    assert {run["expected_start_time"][10:19] for run in runs} == {"T06:00:00"}
+    assert {run["parameters"]["night"] for run in runs} == {"yesterday"}
+
+
+def test_a_killed_run_leaves_nothing_and_the_next_makes_the_night(deployed, night_dataset):
+    run_id, processes = deployed.in_the_middle(night=NIGHT)
+    for pid in processes:
+        os.kill(pid, signal.SIGKILL)
+    deployed.ends_as(run_id, "CRASHED")
+    assert not published(deployed.out)
+
+    ran = deployed.prefect.command(
+        "deployment", "run", "nightly/nightly", "--param", f"night={NIGHT}", "--watch"
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert "finished successfully" in ran.stdout
+    assert contents(deployed.out) == contents(night_dataset)
+
+
+def test_the_page_shows_named_task_runs_logs_and_artifacts(deployed):
+    prefect = deployed.prefect
+    completed = {"state": {"type": {"any_": ["COMPLETED"]}}}
+    (run,) = prefect.find("flow_runs", flow_runs=completed)
+    assert run["name"] == f"night {NIGHT}"
+    of_run = {"flow_runs": {"id": {"any_": [run["id"]]}}}
+    tasks = {task["name"] for task in prefect.find("task_runs", **of_run)}
+    assert {f"identify sat{k} 04:00-04:30" for k in (1, 2, 3, 4)} <= tasks
+    lines = [
+        line["message"]
+        for line in prefect.find("logs", logs={"flow_run_id": {"any_": [run["id"]]}})
+    ]
+    assert f"found 1 log of {NIGHT}" in lines
+    assert any(line.startswith("identified 240 of 240 frames by") for line in lines)
+    shown = {artifact["key"]: artifact["data"] for artifact in prefect.find("artifacts", **of_run)}
+    assert set(shown) == {"progress", "night", "sensors", "dataset"}
+    assert shown["progress"] == 100
+    assert "| objects | 9 |" in shown["night"]
+
+
+def test_a_wrong_parameter_is_refused_before_a_run_is_made(deployed):
+    before = len(deployed.prefect.find("flow_runs"))
+    asked = deployed.prefect.command(
+        "deployment", "run", "nightly/nightly", "--param", "night=tonight"
+    )
+    assert asked.returncode != 0
+    said = " ".join((asked.stdout + asked.stderr).split())
+    assert "field 'night'. Failure reason: 'tonight' does not match" in said
+    assert len(deployed.prefect.find("flow_runs")) == before
+
+
+def test_a_night_without_logs_fails_with_the_line_that_says_why(deployed):
+    before = contents(deployed.out)
+    run_id = deployed.ask(night="2019-05-01")
+    run = deployed.ends_as(run_id, "FAILED")
+    assert run["state"]["message"].endswith(
+        "logs: no frames on 2019-05-01 in these logs; they have 2019-03-31 to 2019-04-01"
+    )
+    assert run["run_count"] == 1
+    assert contents(deployed.out) == before
+
+
+def test_a_killed_worker_leaves_the_dataset_and_the_next_one_goes_on(deployed, night_dataset):
+    before = contents(deployed.out)
+    assert before == contents(night_dataset)
+    run_id, processes = deployed.in_the_middle(night=NIGHT)
+    for pid in (deployed.worker.pid, *processes):
+        os.kill(pid, signal.SIGKILL)
+    deployed.worker.wait(timeout=30)
+    assert published(deployed.out) == before
+    deployed.worker = deployed.prefect.start_worker()
+    next_id = deployed.ask(night=NIGHT)
+    wait_for(
+        lambda: deployed.prefect.run(next_id)["state_name"] == "AwaitingConcurrencySlot",
+        "the next run to wait for the place of the dead one",
+    )
+    assert deployed.prefect.run(run_id)["state_type"] == "RUNNING"  # nobody is left to say better
+    freed = deployed.prefect.command("--no-prompt", "flow-run", "delete", run_id)
+    assert freed.returncode == 0, freed.stdout + freed.stderr
+    deployed.ends_as(next_id, "COMPLETED")
+    assert contents(deployed.out) == before  # nor is anything left of the dead run
+
+
+def test_a_run_from_the_command_line_goes_to_the_server_of_the_users_profile(
+    deployed, night_log, tmp_path
+):
+    (tmp_path / "profiles.toml").write_text(
+        f'active = "ours"\n[profiles.ours]\nPREFECT_API_URL = "{deployed.prefect.url}"\n'
+    )
+    kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
+    command = "from epipole.flows.command_line.main import main; main()"
+    ran = subprocess.run(
+        [sys.executable, "-c", command, "run", str(night_log), "--out", str(tmp_path / "out")],
+        env=kept | {"PREFECT_HOME": str(tmp_path)}, cwd=tmp_path, capture_output=True, text=True,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    named = {"name": {"any_": ["every night"]}}
+    (run,) = deployed.prefect.find("flow_runs", flow_runs=named)
+    assert run["state_type"] == "COMPLETED"
+    assert not list(tmp_path.glob("*.db*"))  # no embedded server's database

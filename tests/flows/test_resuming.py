@@ -1,0 +1,114 @@
+"""A run that was killed: the dataset is as it was, and the next run goes on from what is done."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from epipole.io.work.folder import work_key, work_root
+from epipole.schemas.settings import Settings, validate_settings
+
+NIGHT = "2019-04-01"
+WAIT_S = 240
+COMMAND = "from epipole.flows.command_line.main import main; main()"
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.fixture
+def run(night_log, tmp_path):
+    """Return a function that starts `epipole run` of the shared night in a process of its own."""
+    started = []
+
+    def start(out: Path) -> subprocess.Popen:
+        process = subprocess.Popen(
+            [sys.executable, "-c", COMMAND, "run", str(night_log), "--out", str(out)],
+            env=os.environ | {"PREFECT_HOME": str(tmp_path / "prefect")},
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
+        )  # fmt: skip
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def kill_when(process: subprocess.Popen, ready) -> None:
+    """Kill a run and all it started as soon as something is there."""
+    end = time.monotonic() + WAIT_S
+    while not ready():
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < end
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+
+
+def parts(out: Path, stage: str) -> list[Path]:
+    return [p for p in work_root(str(out)).glob(f"work-*/{stage}/*/*") if p.name.isdigit()]
+
+
+@pytest.mark.parametrize("stage", ["identified", "tracked"])
+def test_a_killed_run_is_gone_on_with_and_gives_the_same_rows(run, tmp_path, night_dataset, stage):
+    out = tmp_path / "out"
+    kill_when(run(out), lambda: parts(out, stage))
+    assert not list(out.glob("night=*"))
+    done = {part: part.stat().st_ino for part in parts(out, "identified")}
+    assert done
+
+    again = run(out)
+    kept = []
+    while again.poll() is None:
+        kept += [part for part, inode in done.items() if part.exists() and _is(part, inode)]
+        time.sleep(0.01)
+    said = again.communicate()[0]
+    assert again.returncode == 0, said
+    assert set(kept) == set(done)  # used as they were, not made again
+    assert contents(out) == contents(night_dataset)
+
+
+def _is(part: Path, inode: int) -> bool:
+    try:
+        return part.stat().st_ino == inode
+    except FileNotFoundError:  # the run has just ended
+        return False
+
+
+def test_a_run_killed_while_it_makes_a_night_again_leaves_the_night_whole(
+    run, tmp_path, night_dataset
+):
+    out = tmp_path / "out"
+    first = run(out)
+    assert first.wait(WAIT_S) == 0, first.communicate()[0]
+    kill_when(run(out), lambda: list(work_root(str(out)).glob("run-*/night=*/stars/*")))
+    night = contents(out / f"night={NIGHT}")
+    assert night == contents(night_dataset / f"night={NIGHT}")
+
+
+def test_two_runs_of_one_night_at_once_end_with_one_night(run, tmp_path, night_dataset):
+    out = tmp_path / "out"
+    both = [run(out), run(out)]
+    said = [process.communicate(timeout=WAIT_S)[0] for process in both]
+    codes = [process.returncode for process in both]
+    assert 0 in codes, said
+    for code, words in zip(codes, said, strict=True):
+        assert code == 0 or "has been at work on it since" in words
+    assert contents(out) == contents(night_dataset)
+
+
+def test_finished_parts_serve_only_the_same_logs_settings_and_nights():
+    key = work_key(["a", "b"], Settings(), [NIGHT])
+    assert key == work_key(["b", "a"], Settings(), [NIGHT])
+    other = validate_settings({"tracklets": {"gate_sigma": 5.0}}, "test")
+    assert key != work_key(["a", "b"], other, [NIGHT])
+    assert key != work_key(["a"], Settings(), [NIGHT])
+    assert key != work_key(["a", "b"], Settings(), ["2019-04-02"])

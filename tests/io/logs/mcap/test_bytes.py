@@ -1,0 +1,126 @@
+"""Logs in places other than a folder, an S3 server of its own among them."""
+
+import hashlib
+import os
+import random
+
+import pytest
+
+from epipole.io.logs.mcap import blocks as log_blocks
+from epipole.io.logs.mcap.bytes import LogBytes
+from epipole.io.logs.reader import read_log, read_log_parts
+from epipole.io.logs.writer import LogWriter
+from epipole.schemas.errors import LogError
+
+START_NS = 1_554_091_200_000_000_000
+
+
+@pytest.fixture
+def log(tmp_path):
+    path = tmp_path / "a.mcap"
+    with LogWriter(path, chunk_size=1000) as out:
+        for i in range(100):
+            out.frame("s", START_NS + i, frame_number=i, exposure_s=1.0, x_px=[i] * 9, y_px=[i] * 9)
+    return path
+
+
+def line_of(url):
+    with pytest.raises(LogError) as caught:
+        read_log(url)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert line.startswith(url)
+    return line
+
+
+def test_a_log_in_a_bucket_is_read_like_a_file(s3, log):
+    s3.put_file(str(log), "logs/2019/a.mcap")
+    there, here = read_log("s3://logs/2019/a.mcap"), read_log(log)
+    assert there.exposures.equals(here.exposures)
+    assert there.source == here.source
+
+
+def test_a_range_of_a_log_in_a_bucket_is_read(s3, log):
+    s3.put_file(str(log), "logs/a.mcap")
+    assert read_log("s3://logs/a.mcap", START_NS + 5, START_NS + 8).exposures.num_rows == 3
+
+
+def test_what_is_not_in_the_bucket_is_an_error_of_one_line(s3, log):
+    s3.put_file(str(log), "logs/folder/a.mcap")
+    assert "no such file" in line_of("s3://logs/none.mcap")
+    assert "no such file" in line_of("s3://no-such-bucket/a.mcap")
+    assert "is a folder" in line_of("s3://logs/folder")
+
+
+def test_a_server_that_is_not_there_is_an_error_of_one_line(s3, monkeypatch):
+    import s3fs
+
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    s3fs.S3FileSystem.clear_instance_cache()
+    assert "cannot be read" in line_of("s3://logs/a.mcap")
+
+
+def test_missing_credentials_are_an_error_of_one_line(s3, monkeypatch, tmp_path):
+    import s3fs
+
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    s3fs.S3FileSystem.clear_instance_cache()
+    line = line_of("s3://logs/a.mcap")
+    assert "credentials" in line.lower()
+
+
+def test_a_log_in_a_bucket_is_fetched_by_ranges_and_once(s3, log, monkeypatch):
+    s3.put_file(str(log), "logs/a.mcap")
+    monkeypatch.setattr(log_blocks, "BLOCK_BYTES", 1000)
+    fetched = []
+    cat_file = s3.cat_file
+
+    def counted(path, start, end):
+        fetched.append((start, end))
+        return cat_file(path, start=start, end=end)
+
+    monkeypatch.setattr(s3, "cat_file", counted)
+    assert read_log("s3://logs/a.mcap").source == read_log(log).source
+    whole = len(log.read_bytes()) // 1000
+    blocks = [start for start, end in fetched if start % 1000 == 0 and end == start + 1000]
+    assert sorted(blocks) == [1000 * k for k in range(whole)]
+
+
+def test_a_log_that_changes_in_its_bucket_while_it_is_read_is_an_error(s3, log):
+    s3.put_file(str(log), "logs/a.mcap")
+    parts = read_log_parts("s3://logs/a.mcap", part_bytes=1)
+    next(parts)
+    s3.pipe_file("logs/a.mcap", bytes(log.stat().st_size))
+    with pytest.raises(LogError, match="has changed while it was read"):
+        list(parts)
+
+
+def test_a_log_that_vanishes_from_its_bucket_while_it_is_read_is_an_error(s3, log):
+    s3.put_file(str(log), "logs/gone.mcap")
+    parts = read_log_parts("s3://logs/gone.mcap", part_bytes=1)
+    next(parts)
+    s3.rm("logs/gone.mcap")
+    with pytest.raises(LogError, match=r"gone\.mcap: no such file"):
+        list(parts)
+
+
+@pytest.mark.parametrize("block_bytes", [1, 7, 100, 1 << 20])
+@pytest.mark.parametrize("streaming", [True, False])
+def test_any_bytes_of_a_log_can_be_viewed_in_any_order(block_bytes, streaming, monkeypatch):
+    monkeypatch.setattr(log_blocks, "BLOCK_BYTES", block_bytes)
+    data = random.Random(0).randbytes(1000)
+    with LogBytes.of(data) as log:
+        if streaming:
+            log.stream()
+        for start, end in [(0, 0), (0, 9), (990, 1000), (5, 800), (3, 4), (1000, 1000), (0, 1000)]:
+            assert log.view(start, end) == data[start:end]
+        assert log.sha256() == hashlib.sha256(data).hexdigest()
+
+
+def test_an_unreadable_file_is_an_error_of_one_line(log):
+    if os.geteuid() == 0:
+        pytest.skip("root reads everything")
+    log.chmod(0)
+    assert "Permission denied" in line_of(str(log))

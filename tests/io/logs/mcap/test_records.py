@@ -1,0 +1,317 @@
+"""Damaged logs: what is still read, and what is said of the rest."""
+
+import io
+import struct
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from epipole.io.logs.mcap.bytes import LogBytes
+from epipole.io.logs.mcap.chunks import MAX_CHUNK_BYTES
+from epipole.io.logs.mcap.records import RecordWalk
+from epipole.io.logs.mcap.summary import MAGIC
+
+N = 40
+SCHEMA = "epipole.CentroidFrame"
+HEAD = struct.Struct("<BQ")
+
+
+def log(compression=CompressionType.ZSTD, **options):
+    """Return the bytes of a log of N messages of 100 bytes, about 5 a chunk."""
+    out = io.BytesIO()
+    writer = Writer(out, chunk_size=500, compression=compression, **options)
+    writer.start()
+    schema = writer.register_schema(SCHEMA, "protobuf", b"")
+    channel = writer.register_channel("/a", "protobuf", schema)
+    other = writer.register_channel("/b", "json", writer.register_schema("other", "", b""))
+    for i in range(N):
+        # Does not compress, so that a cut chunk still has its first messages.
+        body = struct.pack("<I", i) + b"".join(
+            zlib.crc32(bytes([i, j])).to_bytes(4, "little") for j in range(24)
+        )
+        writer.add_message(channel, 1000 + 2 * i, body, 0)
+        writer.add_message(other, 1001 + 2 * i, b"{}", 0)
+    writer.finish()
+    return out.getvalue()
+
+
+def walk(data):
+    """Return the numbers of the messages found, and the damage as (reason, count)."""
+    walked = RecordWalk(LogBytes.of(bytes(data)), frozenset([SCHEMA]))
+    found = [
+        int(block.data[at : at + 4].view("<u4")[0])
+        for block in walked.blocks()
+        for at in block.start
+    ]
+    return found, [(d.reason, d.n) for d in walked.damage]
+
+
+def chunks(data):
+    """Return (place, length) of each chunk."""
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    return [(c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes]
+
+
+def chunk_messages(data, i):
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    c = summary.chunk_indexes[i]
+    return [n for n in range(N) if c.message_start_time <= 1000 + 2 * n <= c.message_end_time]
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_sound_log_gives_every_wanted_message_and_no_damage(compression):
+    assert walk(log(compression)) == (list(range(N)), [])
+
+
+@pytest.mark.parametrize("crc", [True, False])
+def test_a_log_without_chunks_is_read_too(crc):
+    data = log(use_chunking=False, enable_data_crcs=crc)
+    assert walk(data) == (list(range(N)), [])
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_log_cut_anywhere_gives_what_lies_before_and_says_so(compression):
+    data = log(compression)
+    places = chunks(data)
+    for cut in range(200, places[-1][0], 97):
+        found, damage = walk(data[:cut])
+        whole = sum(
+            len(chunk_messages(data, i)) for i, (at, n) in enumerate(places) if at + n <= cut
+        )
+        assert found == list(range(len(found)))
+        assert len(found) >= whole
+        assert damage == [("truncated", 1)]
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4])
+def test_a_cut_chunk_gives_its_first_messages(compression):
+    data = log(compression, use_statistics=False)
+    at, length = chunks(data)[2]
+    found, _ = walk(data[: at + length - 30])
+    before = len(chunk_messages(data, 0)) + len(chunk_messages(data, 1))
+    # LZ4 hands out whole blocks, of which a chunk this small is one.
+    minimum = before + (1 if compression is CompressionType.NONE else 0)
+    assert found == list(range(len(found)))
+    assert len(found) >= minimum
+
+
+def test_a_chunk_with_a_flipped_bit_is_left_out_and_its_messages_counted():
+    data = bytearray(log(CompressionType.NONE))
+    at, length = chunks(data)[3]
+    data[at + length - 20] ^= 1
+    lost = chunk_messages(data, 3)
+    found, damage = walk(data)
+    assert found == [n for n in range(N) if n not in lost]
+    assert damage == [("bad_checksum", len(lost))]
+
+
+def test_schemas_and_channels_of_a_lost_first_chunk_come_from_the_summary():
+    data = bytearray(log(CompressionType.NONE))
+    at, length = chunks(data)[0]
+    data[at + length - 20] ^= 1
+    found, damage = walk(data)
+    assert found == list(range(len(chunk_messages(data, 0)), N))
+    assert damage == [("bad_checksum", len(chunk_messages(data, 0)))]
+
+
+def test_without_a_summary_messages_of_an_unknown_channel_are_counted():
+    data = bytearray(log(CompressionType.NONE))
+    at, length = chunks(data)[0]
+    lost = len(chunk_messages(data, 0))
+    end = chunks(data)[-1][0]
+    data[at + length - 20] ^= 1
+    found, damage = walk(data[:end])
+    assert found == []
+    known = sum(
+        len(chunk_messages(log(CompressionType.NONE), i))
+        for i in range(len(chunks(log(CompressionType.NONE))) - 1)
+    )
+    assert ("unknown_channel_1", known - lost) in damage
+
+
+@pytest.mark.parametrize("length", [0, 5, 1 << 20, 1 << 63])
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_chunk_whose_records_length_is_damaged_is_found_by_its_own(length, closed):
+    data = bytearray(log())
+    last = chunks(data)[-1][0]
+    struct.pack_into("<Q", data, chunks(data)[2][0] + 1, length)
+    expected = list(range(N)) if closed else list(range(chunk_messages(log(), -1)[0]))
+    assert walk(data if closed else data[:last])[0] == expected
+
+
+@pytest.mark.parametrize("length", [0, 5, 1 << 20, 1 << 63])
+def test_behind_a_damaged_record_the_next_chunk_that_the_summary_knows_is_taken(length):
+    data = bytearray(log())
+    at, size = chunks(data)[2]
+    struct.pack_into("<Q", data, at + size + 1, length)  # of the message index that follows
+    found, damage = walk(data)
+    assert found == list(range(N))
+    assert {reason for reason, _ in damage} == {"damaged_record"}
+
+
+@pytest.mark.parametrize("opcode", [0x00, 0x02, 0x04, 0x07, 0x0E, 0x0F, 0x16, 0x46, 0x86])
+def test_a_chunk_that_is_no_longer_called_one_is_missed(opcode):
+    data = bytearray(log())
+    lost = chunk_messages(data, 2)
+    data[chunks(data)[2][0]] = opcode
+    found, damage = walk(data)
+    assert found == [n for n in range(N) if n not in lost]
+    assert ("missing_messages", len(lost)) in damage
+
+
+def test_a_file_that_ends_in_zeros_is_read_to_there():
+    data = log()
+    at = chunks(data)[3][0]
+    assert walk(data[:at] + bytes(5000)) == (
+        list(range(chunk_messages(data, 3)[0])),
+        [("truncated", 1)],
+    )
+
+
+def with_chunk(data, i, change):
+    """Return the log with fields of a chunk replaced: size, or compression."""
+    data = bytearray(data)
+    at = chunks(data)[i][0] + HEAD.size
+    if "size" in change:
+        data[at + 16 : at + 24] = struct.pack("<Q", change["size"])
+    if "compression" in change:
+        data[at + 32 : at + 36] = change["compression"]
+    return data
+
+
+def test_an_absurd_size_is_refused_before_anything_is_unpacked():
+    data = with_chunk(log(), 1, {"size": MAX_CHUNK_BYTES + 1})
+    _, damage = walk(data)
+    assert damage == [("chunk_too_large", len(chunk_messages(log(), 1)))]
+
+
+@pytest.mark.parametrize("size", [0, 10, 100_000])
+def test_another_size_than_declared_is_refused(size):
+    _, damage = walk(with_chunk(log(), 1, {"size": size}))
+    assert damage == [("wrong_chunk_size", len(chunk_messages(log(), 1)))]
+
+
+def test_an_unknown_compression_is_refused_by_name():
+    _, damage = walk(with_chunk(log(), 1, {"compression": b"snap"}))
+    assert damage == [("unknown_compression_snap", len(chunk_messages(log(), 1)))]
+
+
+def test_a_flipped_bit_outside_chunks_spoils_what_only_that_checksum_covers():
+    data = bytearray(log(use_chunking=False, enable_data_crcs=True))
+    data[
+        data.find(struct.pack("<I", 20) + zlib.crc32(bytes([20, 0])).to_bytes(4, "little")) + 9
+    ] ^= 4
+    assert walk(data) == ([], [("bad_checksum", 1)] * N)
+
+
+def test_a_message_that_the_statistics_know_of_is_missed():
+    data = log(use_chunking=False)
+    # Take one message record of the wanted channel out of the data section.
+    place = data.find(struct.pack("<I", 20) + zlib.crc32(bytes([20, 0])).to_bytes(4, "little")) - 31
+    length = HEAD.unpack_from(data, place)[1] + HEAD.size
+    start = len(data) - 8 - 29 + 9
+    summary, offsets = struct.unpack_from("<QQ", data, start)
+    cut = bytearray(data[:place] + data[place + length :])
+    struct.pack_into("<QQI", cut, start - length, summary - length, offsets - length, 0)
+    found, damage = walk(cut)
+    assert found == [n for n in range(N) if n != 20]
+    assert damage == [("missing_messages", 1)]
+
+
+def test_a_summary_that_is_wrong_is_not_believed():
+    data = bytearray(log())
+    summary = make_reader(io.BytesIO(data)).get_summary()
+    assert summary is not None
+    place = data.rfind(b"/b")
+    data[place + 1] = ord("c")
+    assert walk(data) == (list(range(N)), [])
+
+
+# Logs that are made to be a burden
+
+SCHEMA_BODY = struct.pack("<HI", 1, len(SCHEMA)) + SCHEMA.encode() + bytes(8)
+CHANNEL_BODY = struct.pack("<HHI", 1, 1, 2) + b"/a" + struct.pack("<I", 8) + b"protobuf" + bytes(4)
+
+
+def record(opcode, body):
+    return HEAD.pack(opcode, len(body)) + body
+
+
+def message(i):
+    return record(5, struct.pack("<HIQQ", 1, 0, 1000 + i, 0) + struct.pack("<I", i))
+
+
+def chunk(records):
+    head = struct.pack("<QQQI", 1000, 2000, len(records), zlib.crc32(records))
+    return record(6, head + bytes(4) + struct.pack("<Q", len(records)) + records)
+
+
+def hand_made(*parts):
+    """Return a log of these parts of a data section, with no summary."""
+    footer = record(2, bytes(20))
+    head = record(1, bytes(8))
+    return MAGIC + head + b"".join(parts) + record(15, bytes(4)) + footer + MAGIC
+
+
+DECLARED = record(3, SCHEMA_BODY) + record(4, CHANNEL_BODY)
+
+
+def test_a_log_by_hand_is_sound():
+    assert walk(hand_made(chunk(DECLARED + message(3)), DECLARED + message(4))) == ([3, 4], [])
+
+
+def test_channels_may_be_declared_before_every_message():
+    records = b"".join(DECLARED + message(i) for i in range(50))
+    assert walk(hand_made(chunk(records))) == (list(range(50)), [])
+
+
+def test_a_chunk_in_a_chunk_is_said_to_be_left_out():
+    records = DECLARED + message(0) + chunk(message(1)) + message(2)
+    assert walk(hand_made(chunk(records))) == ([0, 2], [("damaged_record", 1)])
+
+
+def test_messages_too_short_to_be_one_are_counted():
+    records = DECLARED + record(5, b"abc") + message(1) + record(5, b"")
+    assert walk(hand_made(chunk(records))) == ([1], [("damaged_record", 2)])
+    assert walk(hand_made(records)) == ([1], [("damaged_record", 2)])
+
+
+def test_records_of_ones_own_are_passed_over():
+    own = record(0x80, b"") * 3 + record(0xFF, b"any")
+    assert walk(hand_made(own, chunk(DECLARED + own + message(1)), own)) == ([1], [])
+
+
+def test_a_declaration_that_is_none_leaves_the_rest():
+    records = DECLARED + record(4, b"") + record(3, b"\1") + message(1)
+    assert walk(hand_made(chunk(records))) == ([1], [("damaged_record", 1)] * 2)
+
+
+def test_the_same_chunk_twice_is_read_twice():
+    part = chunk(DECLARED + message(1))
+    assert walk(hand_made(part, part)) == ([1, 1], [])
+
+
+@pytest.mark.parametrize("crc", [True, False])
+def test_logs_behind_each_other_are_read_and_named(crc):
+    data = log(enable_crcs=crc)
+    found, damage = walk(data * 3)
+    assert found == list(range(N)) * 3
+    assert damage == [("log_behind_log", 1)] * 2
+
+
+def test_a_log_behind_a_log_without_a_summary_is_read():
+    data = hand_made(chunk(DECLARED + message(1)))
+    assert walk(data + data) == ([1, 1], [("log_behind_log", 1)])
+
+
+def test_opening_ahead_changes_nothing():
+    data = bytearray(log())
+    at, length = chunks(data)[3]
+    data[at + length - 20] ^= 1
+    with ThreadPoolExecutor(3) as pool:
+        walked = RecordWalk(LogBytes.of(bytes(data)), frozenset([SCHEMA]), pool)
+        found = [int(b.data[at : at + 4].view("<u4")[0]) for b in walked.blocks() for at in b.start]
+    assert (found, [(d.reason, d.n) for d in walked.damage]) == walk(data)

@@ -1,0 +1,417 @@
+"""Logs in: what is read, what is left out and why, and what is an error."""
+
+import json
+import random
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, Writer
+
+from epipole.io.logs.columns import frames as frame_columns
+from epipole.io.logs.damage import ROWS_ALIKE
+from epipole.io.logs.messages.encoding import encode_calibration, encode_protobuf
+from epipole.io.logs.reader import read_log
+from epipole.io.logs.writer import LogWriter
+from epipole.schemas import messages
+from epipole.schemas.bridge import array, flatten, stack
+from epipole.schemas.errors import LogError
+from epipole.schemas.messages import CENTROID_FRAME, SENSOR_STATE
+
+START_NS = 1_554_091_200_000_000_000
+SECOND_NS = 1_000_000_000
+CAMERA = {
+    "width": 512,
+    "height": 480,
+    "fx_px": 1000.5,
+    "fy_px": 1001.25,
+    "cx_px": 255.5,
+    "cy_px": 239.5,
+    "k1": -0.05,
+    "k2": 0.01,
+    "p1": 1e-4,
+    "p2": -1e-4,
+    "k3": 0.001,
+}
+N_FRAMES = 30
+ENCODINGS = ("protobuf", "json", "ros2")
+COMPRESSIONS = ("zstd", "lz4", "none")
+
+
+def write(path, n=N_FRAMES, **options):
+    """Write a log of one sensor: a frame and a state a second."""
+    rng = np.random.default_rng(0)
+    with LogWriter(path, **options) as log:
+        log.camera("sat1", START_NS, CAMERA)
+        for i in range(n):
+            time_ns = START_NS + i * SECOND_NS
+            x = rng.uniform(0, 500, i % 7).astype(np.float32)
+            log.state("sat1", time_ns, position_km=[7000.0, i, 2.0], velocity_km_s=[0.0, 7.5, 1.0])
+            log.frame(
+                "sat1",
+                time_ns + 7,
+                frame_number=i,
+                exposure_s=0.2,
+                x_px=x,
+                y_px=x + 1,
+                flux=x + 2 if i % 2 else None,
+                sigma_px=np.full(len(x), 0.125),
+            )
+    return path
+
+
+def frame(**changes):
+    """Return the bytes of a good frame of three centroids, but for the changes."""
+    values = {
+        "timestamp": START_NS,
+        "sensor_id": "sat1",
+        "frame_number": 1,
+        "exposure_s": 0.1,
+        "x_px": [1.0, 2.0, 3.0],
+        "y_px": [4.0, 5.0, 6.0],
+        "flux": None,
+        "sigma_px": None,
+    }
+    return encode_protobuf(CENTROID_FRAME, {**values, **changes})
+
+
+def state(**changes):
+    values = {
+        "timestamp": START_NS,
+        "sensor_id": "sat1",
+        "frame": "GCRF",
+        "position_km": [7000.0, 0.0, 0.0],
+        "velocity_km_s": None,
+        "position_sigma_km": 0.0,
+        "attitude_xyzw": None,
+        "attitude_sigma_arcsec": 0.0,
+    }
+    return encode_protobuf(SENSOR_STATE, {**values, **changes})
+
+
+def write_raw(path, *recorded, encoding="protobuf", schema_encoding="protobuf"):
+    """Write messages as bytes: (schema name, data), all with the same log time."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channels = {}
+        for name, data in recorded:
+            if name not in channels:
+                schema = writer.register_schema(name, schema_encoding, b"")
+                channels[name] = writer.register_channel("/any/topic", encoding, schema)
+            writer.add_message(channels[name], START_NS, data, START_NS)
+        writer.finish()
+    return path
+
+
+def read_with_good_frame(tmp_path, *recorded):
+    """Return the log of these messages and one good frame of another sensor."""
+    good = (CENTROID_FRAME.name, frame(sensor_id="good"))
+    return read_log(write_raw(tmp_path / "a.mcap", good, *recorded))
+
+
+def reasons(part):
+    return [
+        (row["reason"], row["sensor_id"], row["count"])
+        for row in part.rejects.drop_columns("time").to_pylist()
+    ]
+
+
+# What is read
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_what_is_written_is_read(tmp_path, encoding, compression):
+    path = write(tmp_path / "a.mcap", encoding=encoding, compression=compression)
+    part = read_log(path)
+    assert array(part.exposures, "frame_number").tolist() == list(range(N_FRAMES))
+    expected_ns = START_NS + 7 + np.arange(N_FRAMES) * SECOND_NS
+    np.testing.assert_array_equal(array(part.exposures, "time"), expected_ns)
+    x, offsets = flatten(part.exposures, "x_px")
+    y, _ = flatten(part.exposures, "y_px")
+    assert np.diff(offsets).tolist() == [i % 7 for i in range(N_FRAMES)]
+    rng = np.random.default_rng(0)
+    expected = np.concatenate([rng.uniform(0, 500, i % 7) for i in range(N_FRAMES)])
+    np.testing.assert_array_equal(x, expected.astype(np.float32))
+    np.testing.assert_array_equal(y, expected.astype(np.float32) + np.float32(1))
+    given = [i for i in range(N_FRAMES) if part.exposures["flux"][i].is_valid]
+    assert given == [i for i in range(N_FRAMES) if i % 2 and i % 7]
+    np.testing.assert_array_equal(stack(part.states, "{}_km")[:, 1], np.arange(N_FRAMES))
+    np.testing.assert_array_equal(stack(part.states, "v{}_km_s")[3], [0.0, 7.5, 1.0])
+    assert np.isnan(array(part.states, "qx")).all()
+    camera = {name: part.cameras[name][0].as_py() for name in CAMERA}
+    assert camera == CAMERA
+    assert part.rejects.num_rows == 0
+    assert part.source.size == path.stat().st_size
+    assert part.source.first_time_ns == START_NS + 7
+
+
+def test_frames_that_come_in_batches_are_one_table(tmp_path, monkeypatch):
+    whole = read_log(write(tmp_path / "a.mcap"))
+    monkeypatch.setattr(frame_columns, "BATCH", 7)
+    assert read_log(tmp_path / "a.mcap").exposures.equals(whole.exposures)
+
+
+def test_a_url_is_read_like_a_file(tmp_path):
+    fsspec = pytest.importorskip("fsspec")
+    path = write(tmp_path / "a.mcap")
+    with fsspec.open("memory://logs/a.mcap", "wb") as file:
+        file.write(path.read_bytes())
+    assert read_log("memory://logs/a.mcap").exposures.equals(read_log(path).exposures)
+    with pytest.raises(LogError, match=r"none\.mcap: no such file"):
+        read_log("memory://logs/none.mcap")
+    with pytest.raises(LogError, match="is a folder"):
+        read_log("memory://logs")
+    with pytest.raises(LogError, match="cannot be read"):
+        read_log("carrier-pigeon://logs/a.mcap")
+
+
+def test_encodings_may_be_mixed_and_other_messages_are_ignored(tmp_path):
+    text = json.dumps(
+        {"timestamp": "2019-04-01T04:00:01.5Z", "sensorId": "b", "frameNumber": "7", "xPx": [1]}
+        | {"y_px": ["NaN"], "exposure_s": 1}
+    )
+    good = json.dumps(
+        {"timestamp": {"sec": 1_554_091_200, "nsec": 5}, "sensor_id": "c", "x_px": [1.1]}
+        | {"y_px": [2], "frame_number": 3, "exposure_s": 0}
+    )
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file, compression=CompressionType.LZ4)
+        writer.start()
+        schema = writer.register_schema(CENTROID_FRAME.name, "jsonschema", b"")
+        as_json = writer.register_channel("/1", "json", schema)
+        schema = writer.register_schema(CENTROID_FRAME.name, "protobuf", b"")
+        as_protobuf = writer.register_channel("/2", "protobuf", schema)
+        other = writer.register_channel("/3", "ros1", writer.register_schema("a/B", "ros1msg", b""))
+        none = writer.register_channel("/4", "what", 0)
+        for channel, data in (
+            (as_json, text.encode()),
+            (as_json, good.encode()),
+            (as_protobuf, frame()),
+            (other, b"?"),
+            (none, b"?"),
+        ):
+            writer.add_message(channel, START_NS, data, START_NS)
+        writer.finish()
+    part = read_log(tmp_path / "a.mcap")
+    assert part.exposures["sensor_id"].to_pylist() == ["c", "sat1"]
+    # A text has more digits than the message type: a float of 32 bits.
+    assert flatten(part.exposures, "x_px")[0].tolist() == [float(np.float32(1.1)), 1.0, 2.0, 3.0]
+    assert reasons(part) == [("nan", "b", 1)]
+    assert array(part.rejects, "time").tolist() == [START_NS + 1_500_000_000]
+
+
+def test_ros_names_with_and_without_msg_are_one():
+    assert messages.CARRIES["epipole_msgs/CentroidFrame"] == messages.FRAME
+    assert messages.CARRIES["epipole_msgs/msg/CentroidFrame"] == messages.FRAME
+
+
+def test_flux_that_is_none_is_nan_and_the_frame_stays(tmp_path):
+    flux = [-1.0, 0.0, 5.0]
+    part = read_log(write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, frame(flux=flux))))
+    np.testing.assert_array_equal(flatten(part.exposures, "flux")[0], [np.nan, np.nan, 5.0])
+    assert part.rejects.num_rows == 0
+
+
+# What is left out
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason", "sensor_id"),
+    [
+        ({"x_px": [1.0, np.nan, 3.0]}, "nan", "sat1"),
+        ({"y_px": [1.0, np.inf, 3.0]}, "nan", "sat1"),
+        ({"x_px": [1.0]}, "unequal_arrays", "sat1"),
+        ({"flux": [1.0, 2.0]}, "unequal_arrays", "sat1"),
+        ({"sigma_px": [0.1]}, "unequal_arrays", "sat1"),
+        ({"sigma_px": [0.1, 0.0, 0.1]}, "bad_sigma", "sat1"),
+        ({"sigma_px": [0.1, -0.1, 0.1]}, "bad_sigma", "sat1"),
+        ({"sigma_px": [0.1, np.nan, 0.1]}, "bad_sigma", "sat1"),
+        ({"sensor_id": "../x"}, "bad_sensor_id", None),
+        ({"sensor_id": ""}, "bad_sensor_id", None),
+        ({"sensor_id": "a" * 64}, "bad_sensor_id", None),
+        ({"sensor_id": "sat1\n"}, "bad_sensor_id", None),
+        ({"timestamp": 0}, "no_timestamp", "sat1"),
+        ({"frame_number": 1 << 63}, "bad_frame_number", "sat1"),
+    ],
+)
+def test_a_bad_frame_is_a_row_and_the_rest_goes_on(tmp_path, changes, reason, sensor_id):
+    part = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, frame(**changes)))
+    assert part.exposures["sensor_id"].to_pylist() == ["good"]
+    assert reasons(part) == [(reason, sensor_id, 1)]
+    assert part.rejects["source"].to_pylist() == ["a.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"frame": "J2000"}, "unknown_frame"),
+        ({"position_km": [1.0, 2.0]}, "bad_position"),
+        ({"position_km": None}, "bad_position"),
+        ({"position_km": [np.nan, 7000.0, 0.0]}, "bad_position"),
+        ({"position_km": [7.0e6, 1.0e8, 0.0]}, "bad_position"),
+        ({"position_km": [100.0, 200.0, 300.0]}, "inside_earth"),
+        ({"velocity_km_s": [1.0, 2.0]}, "bad_velocity"),
+        ({"velocity_km_s": [1.0, 2.0, np.inf]}, "bad_velocity"),
+        ({"sensor_id": "/etc"}, "bad_sensor_id"),
+    ],
+)
+def test_a_bad_state_is_a_row(tmp_path, changes, reason):
+    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(**changes)))
+    assert part.states.num_rows == 0
+    assert [row[0] for row in reasons(part)] == [reason]
+
+
+def test_a_quaternion_near_unit_length_is_scaled_to_it(tmp_path):
+    q = [0.0, 0.0, 0.6006, 0.8008]
+    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
+    np.testing.assert_allclose(stack(part.states, "q{}", "xyzw"), [[0, 0, 0.6, 0.8]], atol=1e-15)
+
+
+@pytest.mark.parametrize("q", [[0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [1.0], [np.nan] * 4])
+def test_a_bad_attitude_is_left_out_and_its_position_stays(tmp_path, q):
+    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
+    assert part.states.num_rows == 1
+    assert np.isnan(stack(part.states, "q{}", "xyzw")).all()
+    assert reasons(part) == [("bad_attitude", "sat1", 1)]
+
+
+@pytest.mark.parametrize("sigma", [-1.0, np.nan, np.inf, 0.0])
+def test_a_sigma_that_is_none_is_unknown(tmp_path, sigma):
+    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(position_sigma_km=sigma)))
+    assert array(part.states, "position_sigma_km").tolist() == [0.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"width": 0}, "bad_image_size"),
+        ({"fx_px": 0.0}, "bad_camera_matrix"),
+        ({"cx_px": np.nan}, "bad_camera_matrix"),
+        ({"k1": np.inf}, "bad_distortion"),
+    ],
+)
+def test_a_calibration_that_cannot_be_used_is_a_row(tmp_path, changes, reason):
+    data = encode_calibration("protobuf", "sat1", START_NS, CAMERA | changes)
+    part = read_with_good_frame(tmp_path, (messages.CALIBRATION_NAME, data))
+    assert part.cameras.num_rows == 0
+    assert reasons(part) == [(reason, "sat1", 1)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"distortion_model": "rational_polynomial"}, "unknown_distortion_model"),
+        ({"D": [0.1, 0.2, 0.3]}, "bad_distortion"),
+        ({"K": [0.0] * 9}, "bad_camera_matrix"),
+        ({"K": [1.0] * 8}, "bad_camera_matrix"),
+        ({"K": [9.0, 0.5, 1.0, 0.0, 9.0, 1.0, 0.0, 0.0, 1.0]}, "bad_camera_matrix"),
+    ],
+)
+def test_a_calibration_of_another_model_is_a_row(tmp_path, changes, reason):
+    values = json.loads(encode_calibration("json", "sat1", START_NS, CAMERA)) | changes
+    part = read_log(
+        write_raw(
+            tmp_path / "a.mcap",
+            (
+                CENTROID_FRAME.name,
+                json.dumps({"timestamp": "2019-04-01T04:00:00Z", "sensor_id": "a"}).encode(),
+            ),
+            (messages.CALIBRATION_NAME, json.dumps(values).encode()),
+            encoding="json",
+        )
+    )
+    assert [row[0] for row in reasons(part)] == [reason]
+
+
+def test_a_distortion_of_four_terms_has_no_k3(tmp_path):
+    values = json.loads(encode_calibration("json", "sat1", START_NS, CAMERA))
+    values["D"], values["distortion_model"] = values["D"][:4], ""
+    good = json.dumps({"timestamp": "2019-04-01T04:00:00Z", "sensor_id": "a"}).encode()
+    path = write_raw(
+        tmp_path / "a.mcap",
+        (CENTROID_FRAME.name, good),
+        (messages.CALIBRATION_NAME, json.dumps(values).encode()),
+        encoding="json",
+    )
+    camera = read_log(path).cameras
+    assert [camera[n][0].as_py() for n in ("k1", "p2", "k3")] == [-0.05, -1e-4, 0.0]
+
+
+@pytest.mark.parametrize("data", [b"\xff\xff\xff", b"\x2a\x03abc", frame()[:-1]])
+def test_an_undecodable_message_is_a_row(tmp_path, data):
+    part = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, data))
+    assert reasons(part) == [("undecodable_frame", None, 1)]
+
+
+def test_many_bad_messages_alike_are_few_rows_that_count_them_all(tmp_path):
+    good = (CENTROID_FRAME.name, frame(sensor_id="good"))
+    path = write_raw(tmp_path / "a.mcap", good, *[(CENTROID_FRAME.name, b"\1")] * 5000)
+    part = read_log(path)
+    assert part.rejects.num_rows == ROWS_ALIKE
+    assert sum(part.rejects["count"].to_pylist()) == 5000
+
+
+# What is an error
+
+
+def line_of(path):
+    with pytest.raises(LogError) as caught:
+        read_log(path)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert str(path) in line
+    return line
+
+
+def test_a_missing_file_is_an_error(tmp_path):
+    assert "no such file" in line_of(tmp_path / "none.mcap")
+
+
+def test_a_folder_is_an_error(tmp_path):
+    assert "folder" in line_of(tmp_path)
+
+
+@pytest.mark.parametrize("data", [b"", b"\x89PNG\r\n\x1a\n" + bytes(100), b"\x89MCAP"])
+def test_a_file_that_is_no_mcap_is_an_error(tmp_path, data):
+    (tmp_path / "a.mcap").write_bytes(data)
+    assert "not an MCAP file" in line_of(tmp_path / "a.mcap")
+
+
+def test_a_log_without_frames_is_an_error(tmp_path):
+    with LogWriter(tmp_path / "a.mcap"):
+        pass
+    assert "no frames" in line_of(tmp_path / "a.mcap")
+    path = write_raw(tmp_path / "b.mcap", (SENSOR_STATE.name, state()))
+    assert "no frames" in line_of(path)
+
+
+def test_a_log_of_bad_frames_alone_says_what_was_wrong(tmp_path):
+    path = write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, frame(x_px=[np.nan] * 3)))
+    assert "nan 1" in line_of(path)
+
+
+def test_an_unknown_message_encoding_is_an_error_that_names_it(tmp_path):
+    path = write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, b"?"), encoding="flatbuffer")
+    assert "'flatbuffer'" in line_of(path)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_no_damage_stops_the_reading_or_goes_unsaid(tmp_path, encoding, compression):
+    path = tmp_path / "a.mcap"
+    whole = write(path, encoding=encoding, compression=compression, chunk_size=1000).read_bytes()
+    rng = random.Random(encoding + compression)
+    for _ in range(60):
+        data = bytearray(whole)
+        if rng.random() < 0.4:
+            del data[rng.randrange(8, len(data)) :]
+        for _ in range(rng.choice((0, 1, 1, 20))):
+            data[rng.randrange(8, len(data))] ^= 1 << rng.randrange(8)
+        path.write_bytes(data)
+        try:
+            part = read_log(path)
+        except LogError:
+            continue
+        assert part.exposures.num_rows == N_FRAMES or part.rejects.num_rows > 0
+        assert part.states.num_rows == N_FRAMES or part.rejects.num_rows > 0

@@ -1,0 +1,1 @@
+"""What tests share: made-up skies, logs, datasets and servers."""

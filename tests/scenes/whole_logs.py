@@ -1,0 +1,47 @@
+"""Logs read whole, as tests and benchmarks want them: frames of all sensors in memory."""
+
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pyarrow as pa
+
+from epipole.schemas.bridge import concat
+from epipole.schemas.log_tables import LogSource
+from epipole.schemas.settings import Settings
+from epipole.schemas.work_tables import EXPOSURES, SENSOR_STATES
+from epipole.tasks.read.order_frames import frames_between, order_logs, states_between
+from epipole.tasks.read.read_logs import read_log_into
+
+EVER = (0, (1 << 63) - 1)
+
+
+class Log(NamedTuple):
+    """What all logs hold together, frames and states by sensor and time."""
+
+    exposures: pa.Table
+    states: pa.Table
+    cameras: pa.Table
+    sources: list[LogSource]
+    rejects: pa.Table
+
+
+def read_whole(
+    paths: Sequence[Path | str], settings: Settings, between: tuple[int, int] = EVER
+) -> Log:
+    """Read logs as the flow does; frames and states of a time only."""
+    with tempfile.TemporaryDirectory() as folder:
+        where = Path(folder)
+        read = [read_log_into.fn(where / f"log-{k}", path) for k, path in enumerate(paths)]
+        frames = order_logs(where, read, settings)
+        numbers = range(len(frames.sensors))
+        exposures = [frames_between(where, n, *between) for n in numbers]
+        states = [states_between(where, n, *between) for n in numbers]
+        return Log(
+            concat(EXPOSURES, exposures),
+            concat(SENSOR_STATES, states),
+            frames.cameras,
+            frames.sources,
+            frames.rejects,
+        )

@@ -1,0 +1,116 @@
+"""Association: what belongs together is found, what does not is left alone or called ambiguous."""
+
+import numpy as np
+import pytest
+from scenes.tracklet_scenes import GEO, V_GEO, Scene, judge, pairs, solve
+
+from epipole.tasks.algorithms.association.sampling.samples import Samples
+
+
+@pytest.mark.parametrize("n_sensors", [3, 4, 8])
+def test_objects_are_found_among_strays(n_sensors):
+    scene = Scene(n_sensors, n_sensors).objects(20).strays(20)
+    precision, recall = judge(scene, solve(scene.samples()))
+    assert precision > 0.995
+    assert recall > 0.97
+
+
+def test_two_sensors_suffice_where_strays_are_few():
+    scene = Scene(1, 2).objects(5).strays(2)
+    precision, recall = judge(scene, solve(scene.samples()))
+    assert precision == 1.0
+    assert recall >= 0.8
+
+
+def test_two_sensors_at_one_instant_in_dense_clutter_report_next_to_nothing_wrong():
+    scene = Scene(2, 2, times=np.array([0.0])).objects(5).strays(200)
+    groups = solve(scene.samples())
+    wrong = pairs(groups.group) - pairs(np.array(scene.who))
+    assert len(wrong) <= 2
+
+
+def test_two_objects_that_two_sensors_cannot_tell_apart_are_ambiguous():
+    scene = Scene(3, 2, times=np.array([0.0]))
+    # Both in one epipolar plane of both sensors: each of the four pairings meets at a point.
+    baseline = scene.r[1, 0] - scene.r[0, 0]
+    towards = (GEO - scene.r[0, 0]) / np.linalg.norm(GEO - scene.r[0, 0])
+    across = baseline - (baseline @ towards) * towards
+    across /= np.linalg.norm(across)
+    for k, off in enumerate((-40.0, 40.0)):
+        for s in range(2):
+            path = GEO + off * across + scene.times[:, None] * V_GEO - scene.r[s]
+            scene.add(s, k, path / np.linalg.norm(path, axis=1, keepdims=True))
+    groups = solve(scene.samples())
+    assert groups.ambiguous.all()
+    assert (groups.group == -1).all()
+
+
+def test_strays_alone_make_no_object():
+    scene = Scene(4, 4).strays(20)
+    groups = solve(scene.samples())
+    assert (groups.group >= 0).sum() <= 4
+
+
+def test_a_sensor_never_has_two_tracklets_of_one_object_at_once():
+    scene = Scene(5, 4).objects(30, spread_km=5.0)
+    samples = scene.samples()
+    groups = solve(samples)
+    for g in range(len(groups.score)):
+        sensors = samples.sensor[groups.group == g]
+        assert len(set(sensors.tolist())) == len(sensors)
+
+
+def test_two_fragments_of_one_sensor_join_one_object():
+    scene = Scene(6, 3).objects(1, seen_by=[0, 1])
+    for seen in ([True, False, False], [False, False, True]):
+        # The same object from the third sensor, in two pieces.
+        sight = _where(scene) - scene.r[2]
+        scene.add(2, 0, sight / np.linalg.norm(sight, axis=1, keepdims=True), np.array(seen))
+    groups = solve(scene.samples())
+    assert groups.group.tolist() == [0, 0, 0, 0]
+
+
+def _where(scene):
+    """The point nearest to the first two tracklets' lines, instant by instant."""
+    out = []
+    for k in range(len(scene.times)):
+        N, b = np.zeros((3, 3)), np.zeros(3)
+        for i in range(2):
+            P = np.eye(3) - np.outer(scene.u[i][k], scene.u[i][k])
+            N, b = N + P, b + P @ scene.r[scene.sensor[i], k]
+        out.append(np.linalg.solve(N, b))
+    return np.array(out)
+
+
+def test_an_object_below_the_ground_or_behind_the_earth_is_none():
+    scene = Scene(7, 3)
+    inside = np.array([6000.0, 0.0, 0.0])
+    for s in range(3):
+        path = np.tile(inside, (3, 1)) - scene.r[s]
+        scene.add(s, 0, path / np.linalg.norm(path, axis=1, keepdims=True))
+    assert (solve(scene.samples()).group == -1).all()
+    scene = Scene(7, 3)
+    scene.r[:] = -scene.r  # the Earth now stands between
+    scene.objects(3)
+    assert (solve(scene.samples()).group == -1).all()
+
+
+def test_the_order_of_the_tracklets_does_not_matter():
+    scene = Scene(8, 4).objects(10).strays(10)
+    order = np.random.default_rng(0).permutation(len(scene.who))
+    one, other = solve(scene.samples()), solve(scene.samples(order))
+    assert pairs(one.group) == {tuple(sorted((order[i], order[j]))) for i, j in pairs(other.group)}
+
+
+def test_one_sensor_alone_has_no_object():
+    scene = Scene(9, 1).objects(5)
+    assert (solve(scene.samples()).group == -1).all()
+
+
+def test_no_tracklet_gives_no_group():
+    scene = Scene(10, 2).objects(1)
+    nothing = Samples(*(
+        value[:0] if i < 7 else value for i, value in enumerate(scene.samples())
+    ))  # fmt: skip
+    groups = solve(nothing)
+    assert len(groups.group) == len(groups.score) == 0

@@ -1,0 +1,81 @@
+"""Verdicts: what half a minute leaves open is judged over ten; what is sure stays as it is."""
+
+import numpy as np
+import pytest
+from scenes.associations import associated, wrong_views
+from scenes.tracklet_scenes import Scene
+
+from epipole.tasks.algorithms.association.sampling.samples import Groups
+from epipole.tasks.algorithms.association.verdicts import Seen, Verdicts
+
+EVERY_S = 6.0
+
+
+def ten_minutes(seed: int) -> Scene:
+    scene = Scene(seed, 2, times=np.arange(3.0, 600.0, EVERY_S))
+    return scene.objects(10).strays(30)
+
+
+def entered(score: float, tracklets=(0, 1)) -> Verdicts:
+    """Two tracklets of two sensors, five spans of 30 s: one group in the first span."""
+    epoch_s = np.repeat(np.arange(0, 150, 10), 2)
+    seen = Seen(
+        epoch_s * 1_000_000_000, epoch_s // 30,
+        np.tile([0, 1], 15), np.tile([0, 1], 15),
+    )  # fmt: skip
+    verdicts = Verdicts(seen)
+    verdicts.enter(np.flatnonzero(seen.span == 0), np.array(tracklets), group_of(2, score))
+    return verdicts
+
+
+def group_of(n: int, *score: float) -> Groups:
+    member = np.zeros(n, np.int64) if score else np.full(n, -1)
+    return Groups(member, np.array(score), np.zeros(n, bool), np.full(2, np.nan))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_two_sensors_find_over_ten_minutes_what_they_cannot_in_half_a_minute(seed):
+    scene = ten_minutes(seed)
+    short, long = associated(scene, longest_span_s=0.0), associated(scene)
+    assert wrong_views(scene, long) == 0
+    everything = 10 * 2 * len(scene.times)
+    assert long.views.num_rows > short.views.num_rows
+    assert long.views.num_rows >= 0.97 * everything
+
+
+def test_a_span_of_ten_minutes_by_settings_is_judged_once():
+    scene = ten_minutes(3)
+    once = associated(scene, span_s=600.0)
+    again = associated(scene, span_s=600.0, longest_span_s=0.0)
+    assert once.views.equals(again.views)
+
+
+def test_a_sure_group_is_not_judged_again_where_it_is_sure():
+    verdicts = entered(score=9.0)
+    rows = verdicts.open_rows(np.arange(30), 30.0)
+    assert set(verdicts.seen.span[rows].tolist()) == {1, 2, 3, 4}
+    unsure = entered(score=3.0).open_rows(np.arange(30), 30.0)
+    assert len(unsure) == 30
+
+
+def test_what_does_not_go_on_for_longer_keeps_its_verdict():
+    assert not len(entered(score=3.0).open_rows(np.arange(12), 30.0))  # 50 s of two times 30 s
+
+
+def test_longer_evidence_against_a_group_dissolves_it():
+    verdicts = entered(score=3.0)
+    rows = np.arange(30)
+    verdicts.reconsider(rows, verdicts.open_rows(rows, 30.0), np.array([0, 1]), group_of(2))
+    assert (verdicts.group == -1).all()
+
+
+def test_what_longer_evidence_adds_to_a_sure_group_joins_it():
+    verdicts = entered(score=9.0, tracklets=(0, 2))
+    # In the first span tracklet 0 is of a sure group and 1 of none; over 150 s they are one.
+    rows = np.arange(30)
+    open_rows = verdicts.open_rows(rows, 30.0)
+    first = open_rows[verdicts.seen.span[open_rows] == 0]
+    assert set(verdicts.seen.tracklet[first].tolist()) == {1}
+    verdicts.reconsider(rows, open_rows, np.array([0, 1]), group_of(2, 12.0))
+    assert (verdicts.group[verdicts.seen.span == 0] == verdicts.group[0]).all()
+    assert len(np.unique(verdicts.group[verdicts.seen.span > 0])) == 1

@@ -1,0 +1,82 @@
+"""The camera, against OpenCV's printed formulas."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from epipole.tasks.algorithms.geometry.camera import (
+    Camera,
+    distort,
+    inside,
+    pixel_angle,
+    project,
+    undistort,
+    unproject,
+)
+
+# The six-sensor log's distortion, stronger, and with every coefficient at work.
+CAMERA = Camera(1024, 768, 1500.0, 1480.0, 508.4, 391.3, -0.21, 0.08, 1.2e-3, -7e-4, 0.015)
+
+
+def _opencv(camera, x, y):
+    """OpenCV 4 documentation, calib3d, "Detailed Description", one point at a time."""
+    r2 = x**2 + y**2
+    k = 1 + camera.k1 * r2 + camera.k2 * r2**2 + camera.k3 * r2**3
+    return (
+        x * k + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x**2),
+        y * k + camera.p1 * (r2 + 2 * y**2) + 2 * camera.p2 * x * y,
+    )
+
+
+@settings(deadline=None)
+@given(st.floats(-0.4, 0.4), st.floats(-0.3, 0.3))
+def test_distortion_is_opencvs_and_undistortion_its_inverse(x, y):
+    got = distort(CAMERA, np.array([x]), np.array([y]))
+    np.testing.assert_allclose(np.ravel(got), _opencv(CAMERA, x, y), atol=1e-15)
+    np.testing.assert_allclose(np.ravel(undistort(CAMERA, *got)), [x, y], atol=1e-12)
+
+
+def test_undistortion_without_distortion_changes_nothing():
+    plain = CAMERA._replace(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)
+    x = np.array([0.1, -0.2])
+    np.testing.assert_array_equal(undistort(plain, x, x), [x, x])
+
+
+def test_the_principal_point_is_the_boresight_and_axes_point_right_and_down():
+    u = unproject(CAMERA, np.array([508.4, 608.4, 508.4]), np.array([391.3, 391.3, 491.3]))
+    np.testing.assert_allclose(u[0], [0, 0, 1], atol=1e-15)
+    assert u[1, 0] > 0.06
+    assert u[2, 1] > 0.06
+
+
+@settings(deadline=None)
+@given(st.floats(0, 1023), st.floats(0, 767))
+def test_projection_undoes_unprojection(x, y):
+    got = project(CAMERA, unproject(CAMERA, np.array([x]), np.array([y])))
+    np.testing.assert_allclose(np.ravel(got), [x, y], atol=1e-7)
+
+
+def test_what_is_behind_the_camera_is_in_no_place():
+    x, y = project(CAMERA, np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
+    assert np.isnan(x).all()
+    assert not inside(CAMERA, x, y).any()
+
+
+def test_the_image_reaches_half_a_pixel_beyond_the_outer_pixels_middles():
+    edge = np.array([-0.5, -0.51, 1023.4, 1023.5])
+    np.testing.assert_array_equal(inside(CAMERA, edge, np.zeros(4)), [True, False, True, False])
+
+
+@settings(deadline=None)
+@given(st.floats(0, 1022), st.floats(0, 766))
+def test_a_pixel_spans_the_root_of_its_solid_angle(x, y):
+    u = unproject(CAMERA, np.array([x, x + 0.01, x]), np.array([y, y, y + 0.01]))
+    solid = np.linalg.norm(np.cross(u[1] - u[0], u[2] - u[0])) / 1e-4
+    assert pixel_angle(CAMERA, u[:1])[0] == pytest.approx(np.sqrt(solid), rel=1e-3)
+
+
+def test_the_half_diagonal_reaches_the_farthest_corner():
+    plain = Camera(100, 100, 50.0, 50.0, 49.5, 49.5)
+    assert plain.half_diagonal_rad == pytest.approx(np.arctan(np.sqrt(2)))
+    assert plain.pixel_rad == pytest.approx(1 / 50)

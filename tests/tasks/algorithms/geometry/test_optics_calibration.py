@@ -1,0 +1,115 @@
+"""A sensor's optics from its stars."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from epipole.tasks.algorithms.geometry.camera import Camera, inside, project
+from epipole.tasks.algorithms.geometry.optics_calibration import OPTICS, calibrate_optics
+
+SENT = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)  # 16 degrees
+TRUE = SENT._replace(fx_px=3671.0, fy_px=3670.0, cx_px=513.0, cy_px=509.0, k1=-0.08, p1=3e-4)
+
+
+def stars(camera, seed=0, n_frames=60, n_stars=25, sigma_px=0.15, wrong=0.0):
+    """Return measured places, directions by slightly turned attitudes, frames and star ids."""
+    rng = np.random.default_rng(seed)
+    u, frame, x, y = [], [], [], []
+    for k in range(n_frames):
+        v = np.column_stack([rng.uniform(-0.15, 0.15, (n_stars, 2)), np.ones(n_stars)])
+        v /= np.linalg.norm(v, axis=1, keepdims=True)
+        px, py = project(camera, v)
+        seen = inside(camera, px, py)
+        u.append(Rotation.from_rotvec(rng.normal(0, 3e-4, 3)).apply(v[seen]))
+        x.append(px[seen]), y.append(py[seen])
+        frame.append(np.full(seen.sum(), k))
+    x, y = np.concatenate(x), np.concatenate(y)
+    x, y = x + rng.normal(0, sigma_px, len(x)), y + rng.normal(0, sigma_px, len(x))
+    x += np.where(rng.uniform(size=len(x)) < wrong, rng.uniform(-5, 5, len(x)), 0.0)
+    return x, y, np.concatenate(u), np.concatenate(frame), np.arange(len(x))
+
+
+def same_stars_drifting(camera, seed, off_px, n_frames=200, n_stars=40):
+    """Return what `stars` does of stars seen again and again, each off its catalogue place."""
+    rng = np.random.default_rng(seed)
+    at = np.column_stack([rng.uniform(-0.2, 0.15, n_stars), rng.uniform(-0.15, 0.15, n_stars)])
+    shift = rng.normal(0, off_px / camera.fx_px, (n_stars, 2))
+    rows = []
+    for k in range(n_frames):
+        drift = np.array([0.05 * k / n_frames, 0.0])
+        v, shown = (
+            np.column_stack([place + drift, np.ones(n_stars)]) for place in (at, at + shift)
+        )
+        px, py = project(camera, shown / np.linalg.norm(shown, axis=1, keepdims=True))
+        v /= np.linalg.norm(v, axis=1, keepdims=True)
+        seen = np.flatnonzero(inside(camera, px, py))
+        noise = rng.normal(0, 0.15, (2, len(seen)))
+        rows.append(
+            (px[seen] + noise[0], py[seen] + noise[1], v[seen], np.full(len(seen), k), seen)
+        )
+    return tuple(np.concatenate(column) for column in zip(*rows, strict=True))
+
+
+def test_optics_come_back_without_noise():
+    fit = calibrate_optics(SENT, *stars(TRUE, sigma_px=0.0))
+    got_x, got_y = project(fit.camera, np.array([[0.12, 0.11, 1.0]]))
+    true_x, true_y = project(TRUE, np.array([[0.12, 0.11, 1.0]]))
+    assert fit.residual_px < 2e-3
+    assert fit.camera.fx_px == pytest.approx(TRUE.fx_px, abs=0.1)
+    assert np.hypot(got_x - true_x, got_y - true_y) < 0.1
+
+
+def test_errors_over_sigmas_are_standard_normal():
+    z = []
+    for seed in range(40):
+        fit = calibrate_optics(SENT, *stars(TRUE, seed))
+        sigma = np.sqrt(np.diagonal(fit.cov))
+        z.append(
+            [
+                (getattr(fit.camera, n) - getattr(TRUE, n)) / s
+                for n, s in zip(OPTICS, sigma, strict=True)
+            ]
+        )
+    z = np.array(z)
+    # What only the prior holds is nearer to it than chance would have it.
+    assert np.all(np.sqrt(np.mean(z**2, axis=0)) < 1.35)
+    assert np.sqrt(np.mean(z[:, :2] ** 2)) == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_few_wrong_stars_change_little():
+    fit = calibrate_optics(SENT, *stars(TRUE, wrong=0.03))
+    sigma = np.sqrt(np.diagonal(fit.cov))
+    assert abs(fit.camera.fx_px - TRUE.fx_px) < 4 * sigma[0]
+    assert fit.residual_px == pytest.approx(0.15, rel=0.1)
+
+
+def test_the_gain_tells_a_departure_from_none():
+    assert calibrate_optics(TRUE, *stars(TRUE)).gain < 40
+    assert calibrate_optics(SENT, *stars(TRUE)).gain > 1000
+
+
+def test_what_is_off_with_a_star_in_every_frame_is_no_departure():
+    z, gains = [], []
+    for seed in range(20):
+        fit = calibrate_optics(TRUE, *same_stars_drifting(TRUE, seed, off_px=0.1))
+        off = np.array([getattr(fit.camera, n) - getattr(TRUE, n) for n in OPTICS[:2]])
+        z.append(off / np.sqrt(np.diagonal(fit.cov)[:2]))
+        gains.append(fit.gain)
+    assert np.sqrt(np.mean(np.square(z))) < 1.7  # 40 stars tell of their own scatter so well
+    assert max(gains) < 60
+
+
+def test_too_few_stars_give_none():
+    assert calibrate_optics(SENT, *stars(TRUE, n_frames=2)) is None
+    none, nothing = np.empty(0), np.empty(0, int)
+    assert calibrate_optics(SENT, none, none, np.empty((0, 3)), nothing, nothing) is None
+
+
+def test_stars_all_on_one_spot_do_no_harm():
+    u = np.tile([0.01, 0.02, 1.0], (100, 1))
+    x, y = project(SENT, u)
+    fit = calibrate_optics(
+        SENT, x, y, u / np.linalg.norm(u[0]), np.arange(100) // 10, np.arange(100) % 10
+    )
+    assert np.all(np.isfinite(fit.cov))
+    assert fit.camera.fx_px == pytest.approx(SENT.fx_px, rel=0.02)

@@ -1,0 +1,75 @@
+"""Clock offsets: found from lines of sight, with honest sigmas; nothing is taken for a clock."""
+
+import numpy as np
+import pytest
+from scenes.late_sensors import POSITION_KM, lines_of
+
+from epipole.tasks.algorithms.geometry.sky import ARCSEC
+from epipole.tasks.algorithms.sensor_faults.clock_offset import PRIOR_S, Lines, clock_offsets
+
+
+def solve(lines, turn_rad=0.0):
+    return clock_offsets(lines, np.full(4, POSITION_KM), np.full(4, turn_rad))
+
+
+def test_the_offset_of_one_sensor_is_found():
+    offset, sigma, _ = solve(lines_of(1, (0.0, 0.0, 0.2, 0.0)))
+    assert (sigma < 0.03).all()
+    assert abs(offset[2] - 0.2) < 4 * sigma[2]
+    assert (abs(offset[[0, 1, 3]]) < 4 * sigma[[0, 1, 3]]).all()
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 30 * ARCSEC])
+def test_errors_over_sigmas_are_standard_normal(turn_rad):
+    true = np.array([0.02, -0.05, 0.1, 0.0])
+    scores = []
+    for seed in range(40):
+        offset, sigma, _ = solve(lines_of(seed, true, turn_rad=turn_rad, n_epochs=20), turn_rad)
+        scores.append((offset - true) / sigma)
+    scores = np.array(scores)
+    # Four offsets a seed share their position biases: some 80 independent draws.
+    assert 0.8 < np.sqrt(np.mean(scores**2)) < 1.2
+
+
+def test_the_clocks_that_are_wrong_are_told_from_right_ones():
+    scores = []
+    for seed in range(20):
+        true = np.array([0.0, -0.5, 2.0, 0.0])
+        found = solve(lines_of(seed, true, n_epochs=20))
+        assert found.wrong.tolist() == [False, True, True, False]
+        scores.append((found.offset_s - true) / found.sigma_s)
+    assert 0.75 < np.sqrt(np.mean(np.square(scores))) < 1.25
+
+
+def test_right_clocks_are_not_called_wrong():
+    for seed in range(20):
+        found = solve(lines_of(seed, np.zeros(4), n_epochs=20))
+        assert not found.wrong.any()
+        assert (np.abs(found.offset_s) < 4.5 * found.sigma_s).all()
+
+
+def test_lines_of_another_object_do_not_count():
+    lines = lines_of(3, (0.0, 0.0, 0.1, 0.0))
+    u = lines.u.copy()
+    u[::40, 0] += 60 * ARCSEC
+    found = solve(lines._replace(u=u / np.linalg.norm(u, axis=1)[:, None]))
+    assert found.wrong.tolist() == [False, False, True, False]
+    assert abs(found.offset_s[2] - 0.1) < 4 * found.sigma_s[2]
+
+
+def test_one_sensor_alone_shows_nothing():
+    lines = lines_of(2, np.zeros(4), used=(1,))
+    offset, sigma, _ = solve(lines)
+    assert np.isnan(offset[[0, 2, 3]]).all()
+    assert sigma[1] == pytest.approx(PRIOR_S)
+    assert offset[1] == pytest.approx(0.0)
+
+
+def test_no_lines_give_no_offsets():
+    empty = Lines(
+        *[np.zeros((0, *shape)) for shape in ((), (), (3,), (2, 2), (3,), (3,), (3,), (3,))]
+    )
+    empty = empty._replace(group=np.zeros(0, np.int64), sensor=np.zeros(0, np.int64))
+    offset, sigma, _ = solve(empty)
+    assert np.isnan(offset).all()
+    assert np.isnan(sigma).all()

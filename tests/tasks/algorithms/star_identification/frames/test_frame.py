@@ -1,0 +1,48 @@
+"""One frame and its field."""
+
+import numpy as np
+import pytest
+from scenes.random_stars import BETA, CAMERA, HOW, frame, optics, random_attitude, random_catalogue
+
+from epipole.tasks.algorithms.geometry.sky import SPEED_OF_LIGHT_KM_S, aberrate
+from epipole.tasks.algorithms.star_identification.frames.frame import (
+    N_SEARCHED,
+    aberrate_all,
+    search_lost,
+)
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+    pattern_pairs,
+    sky_grid,
+    sky_to_limit,
+)
+
+CATALOGUE = random_catalogue()
+
+
+def test_aberration_is_the_one_of_sky():
+    got = aberrate_all(CATALOGUE.u_icrs, BETA)
+    np.testing.assert_allclose(
+        got, aberrate(CATALOGUE.u_icrs, BETA * SPEED_OF_LIGHT_KM_S), atol=1e-15
+    )
+
+
+def test_the_solid_angle_is_that_of_the_image():
+    side = 2 * np.arctan(512 / 3660)
+    assert optics(CAMERA).solid_angle_sr == pytest.approx(side**2, rel=0.03)
+
+
+def test_only_the_brightest_centroids_are_searched():
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    seen, _ = frame(CATALOGUE, random_attitude(0), 0)
+    rng = np.random.default_rng(0)
+    more = frame(CATALOGUE, random_attitude(0), 0, n_false=3000)[0]
+    # 3,000 false points, all fainter than the stars, and of which most are not looked at.
+    n = len(seen.u)
+    crowded = more._replace(
+        u=np.concatenate([seen.u, more.u[rng.permutation(len(more.u))[:3000]]]),
+        sigma_rad=np.concatenate([seen.sigma_rad, np.full(3000, seen.sigma_rad[0])]),
+        instrumental_mag=np.concatenate([seen.instrumental_mag, np.full(3000, -13.0)]),
+    )
+    assert n < N_SEARCHED
+    assert search_lost(crowded, sky, grid, pairs, HOW).found

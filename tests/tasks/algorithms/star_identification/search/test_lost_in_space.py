@@ -1,0 +1,110 @@
+"""Identification with no prior."""
+
+import numpy as np
+import pytest
+from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
+
+from epipole.tasks.algorithms.star_identification.frames.frame import identify_lost, search_lost
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+    pattern_pairs,
+    pattern_size,
+    sky_grid,
+    sky_to_limit,
+)
+
+ARCSEC = np.pi / 648000
+CATALOGUE = random_catalogue()
+SKY = sky_to_limit(CATALOGUE, 99.0)
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    optics = frame(CATALOGUE, np.eye(3), 0)[0].optics
+    n = pattern_size(SKY, optics.solid_angle_sr)
+    return pattern_pairs(CATALOGUE.u_icrs[:n], 2 * optics.half_diagonal_rad)
+
+
+@pytest.fixture(scope="module")
+def grid():
+    return sky_grid(SKY, 0.005)
+
+
+@pytest.mark.parametrize(
+    ("sigma_px", "n_false", "missing", "flux"),
+    [(0.3, 0, 0.0, True), (0.3, 0, 0.0, False), (1.0, 10, 0.2, True), (0.3, 30, 0.3, True)],
+)
+def test_any_attitude_is_found(sigma_px, n_false, missing, flux, grid, pairs):
+    for seed in range(20):
+        R = random_attitude(seed)
+        seen, true = frame(CATALOGUE, R, seed, sigma_px, n_false, missing, flux)
+        found, _ = identify_lost(seen, SKY, grid, pairs, HOW)
+        assert found is not None
+        assert angle_between(found.R_sensor_from_icrs, R) < 1200 * ARCSEC * sigma_px
+        claimed = found.star >= 0
+        assert np.mean(found.star[claimed] == true[claimed]) > 0.97
+
+
+def test_frames_without_stars_are_refused(grid, pairs):
+    rng = np.random.default_rng(0)
+    for seed in range(20):
+        seen, _ = frame(CATALOGUE, random_attitude(seed), seed, 0.5, int(rng.integers(3, 15)), 1.0)
+        found, _ = identify_lost(seen, SKY, grid, pairs, HOW)
+        assert found is None
+
+
+def test_the_search_gives_the_same_bits_again(grid, pairs):
+    seen, _ = frame(CATALOGUE, random_attitude(5), 5, 1.0, 10, 0.2)
+    first, second = (search_lost(seen, SKY, grid, pairs, HOW) for _ in range(2))
+    assert first.evidence == second.evidence
+    np.testing.assert_array_equal(first.R_sensor_from_icrs, second.R_sensor_from_icrs)
+
+
+def test_a_search_ends_when_its_bound_is_reached(grid, pairs):
+    seen, _ = frame(CATALOGUE, random_attitude(0), 0, 1.0, 60, 1.0)
+    verdict = search_lost(seen, SKY, grid, pairs, HOW._replace(time_limit_s=1e-3))
+    assert verdict.exhausted
+    assert not verdict.found
+
+
+def test_centroids_all_on_one_spot_are_refused(grid, pairs):
+    seen, _ = frame(CATALOGUE, random_attitude(0), 0)
+    spot = seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0))
+    assert identify_lost(spot, SKY, grid, pairs, HOW) == (None, False)
+
+
+def test_a_handful_of_centroids_is_never_answered_wrongly(grid, pairs):
+    for seed in range(40):
+        R = random_attitude(seed)
+        seen, _ = frame(CATALOGUE, R, seed, 0.3)
+        few = seen._replace(
+            u=seen.u[:4], sigma_rad=seen.sigma_rad[:4], instrumental_mag=seen.instrumental_mag[:4]
+        )
+        found, _ = identify_lost(few, SKY, grid, pairs, HOW)
+        assert found is None or angle_between(found.R_sensor_from_icrs, R) < 0.01
+
+
+def test_a_place_that_is_none_is_left_aside(grid, pairs):
+    seen, _ = frame(CATALOGUE, random_attitude(3), 3)
+    seen.u[[1, 4]] = np.nan
+    found, _ = identify_lost(seen, SKY, grid, pairs, HOW)
+    assert angle_between(found.R_sensor_from_icrs, random_attitude(3)) < 1200 * ARCSEC
+    assert np.all(found.star[[1, 4]] == -1)
+    seen.u[:] = np.nan
+    assert identify_lost(seen, SKY, grid, pairs, HOW) == (None, False)
+
+
+@pytest.mark.parametrize("sigma_px", [0.05, 0.5, 4.0])
+def test_thousands_of_false_centroids_end_without_an_answer(sigma_px, grid, pairs):
+    crowd, _ = frame(CATALOGUE, random_attitude(0), 0, sigma_px, 4000, 1.0)
+    found, _ = identify_lost(crowd, SKY, grid, pairs, HOW)
+    assert found is None
+
+
+def test_the_work_of_a_search_is_bounded_by_the_time_it_is_given(grid, pairs):
+    # What work costs is measured in the benchmark: a test asserts no time.
+    crowd, _ = frame(CATALOGUE, random_attitude(0), 0, 4.0, 4000, 1.0)
+    exhausted = [
+        search_lost(crowd, SKY, grid, pairs, HOW._replace(time_limit_s=t)).exhausted
+        for t in (1e-3, 1e3)
+    ]
+    assert exhausted == [True, False]

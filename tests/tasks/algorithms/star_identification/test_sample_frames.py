@@ -1,0 +1,91 @@
+"""Lost in space on the shared sample frames of three cameras: right, refused, never wrong."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes.random_stars import angle_between
+
+from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue
+from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
+from epipole.tasks.algorithms.star_identification.frames.frame import (
+    Frame,
+    Optics,
+    Search,
+    identify_lost,
+)
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+    pattern_pairs,
+    pattern_size,
+    sky_grid,
+    sky_to_limit,
+)
+
+FRAMES = Path(__file__).parents[5] / "shared" / "data" / "starid"
+HOW = Search(3.7, np.log(1e5), 0.5, np.nan)
+CALIBRATED = Search(3.7, np.log(1e5), 0.5, 0.0, 0.25)  # brightness as the sensor's stars show it
+
+
+class Sample:
+    """One camera's frames, catalogue and truth."""
+
+    def __init__(self, name):
+        self.data = data = dict(np.load(FRAMES / f"{name}.npz"))
+        width, f = int(data["width"]), float(data["focal_px"])
+        # There the middle of the top-left pixel is (0.5, 0.5).
+        self.camera = Camera(width, width, f, f, width / 2 - 0.5, width / 2 - 0.5)
+        half = width / 2 / f
+        self.optics = Optics(
+            self.camera.half_diagonal_rad, np.array([-half, half, -half, half]), 1 / f
+        )
+        stars = navigation_catalogue(
+            data["cat_hip"].astype(np.int64), data["cat_vec"], data["cat_mag"].astype(float), 2 / f
+        )
+        self.sky = sky_to_limit(stars, float(data["mag_limit"]))
+        n = pattern_size(self.sky, self.optics.solid_angle_sr)
+        self.pairs = pattern_pairs(self.sky.catalogue.u_icrs[:n], 2 * self.optics.half_diagonal_rad)
+
+    def frame(self, k):
+        d, rows = self.data, slice(self.data["offset"][k], self.data["offset"][k + 1])
+        u = unproject(self.camera, d["x"][rows] - 0.5, d["y"][rows] - 0.5)
+        sigma = max(float(d["sigma_px"][k]), 0.05) * pixel_angle(self.camera, u)
+        return Frame(u, sigma, d["mag"][rows].astype(float), np.zeros(3), self.optics)
+
+
+def answers(name, how):
+    """Return how many of the sample frames are answered, right and wrong, as METHODS of the
+    field have it: boresight within 0.05 and roll within 0.5 degrees; boresight 0.25 off."""
+    sample, right, wrong, grids = Sample(name), 0, 0, {}
+    for k in range(180):
+        seen = sample.frame(k)
+        radius = float(2.5 * 3.7 * np.median(seen.sigma_rad))
+        key = round(np.log2(radius), 1)
+        if key not in grids:
+            grids[key] = sky_grid(sample.sky, 1.05 * radius)
+        found, _ = identify_lost(seen, sample.sky, grids[key], sample.pairs, how)
+        if found is None:
+            continue
+        R = found.R_sensor_from_icrs
+        boresight = np.degrees(np.arccos(min(1.0, R[2] @ sample.data["rot"][k][2])))
+        off = np.degrees(angle_between(R, sample.data["rot"][k]))
+        right += boresight < 0.05 and np.sqrt(max(off**2 - boresight**2, 0.0)) < 0.5
+        wrong += boresight > 0.25
+    return right, wrong
+
+
+@pytest.mark.skipif(not FRAMES.is_dir(), reason="the shared sample frames are not here")
+@pytest.mark.parametrize(
+    ("name", "how", "least_right"),
+    [
+        ("a_fov20", CALIBRATED, 1.0),
+        ("b_fov12", CALIBRATED, 0.977),  # 178 have an attitude from their true stars
+        ("c_fov08", CALIBRATED, 1.0),
+        ("a_fov20", HOW, 0.998),
+        ("b_fov12", HOW, 0.972),
+        ("c_fov08", HOW, 0.998),
+    ],
+)
+def test_sample_frames_are_right_or_refused(name, how, least_right):
+    right, wrong = answers(name, how)
+    assert wrong == 0
+    assert right >= least_right * 180

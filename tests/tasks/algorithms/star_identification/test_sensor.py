@@ -1,0 +1,171 @@
+"""A sensor's errors and depth, learned before its frames are identified."""
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from scenes.random_stars import (
+    CAMERA,
+    HOW,
+    angle_between,
+    frame,
+    join_spots,
+    optics,
+    random_attitude,
+    random_catalogue,
+)
+
+from epipole.tasks.algorithms.catalogue.star_catalogue import limit_for_density
+from epipole.tasks.algorithms.geometry.camera import pixel_angle, project, unproject
+from epipole.tasks.algorithms.star_identification import sensor
+from epipole.tasks.algorithms.star_identification.frames.frame import Frame
+from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
+from epipole.tasks.algorithms.star_identification.sequence import no_priors
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+    pattern_pairs,
+    pattern_size,
+    sky_grid,
+    sky_to_limit,
+)
+
+CATALOGUE = random_catalogue(15_000)
+SEEN = sky_to_limit(CATALOGUE, 5.75).catalogue
+
+
+class Skies:
+    """Skies of the random catalogue."""
+
+    def limit_for(self, stars_per_sr):
+        return limit_for_density(CATALOGUE.magnitude, stars_per_sr)
+
+    @cache  # noqa: B019 - as long as the tests
+    def sky(self, limit):
+        return sky_to_limit(CATALOGUE, limit)
+
+    @cache  # noqa: B019
+    def grid(self, limit, radius_rad):
+        return sky_grid(self.sky(limit), radius_rad)
+
+    def pairs(self, limit, optics):
+        n = pattern_size(self.sky(limit), optics.solid_angle_sr)
+        return _pairs(n, 2 * optics.half_diagonal_rad)
+
+
+@cache
+def _pairs(n, diagonal_rad):
+    return pattern_pairs(CATALOGUE.u_icrs[:n], diagonal_rad)
+
+
+SKIES = Skies()
+
+
+class Shot(NamedTuple):
+    """A frame, its centroids' errors as stated [px], and how large a pixel is."""
+
+    frame: Frame
+    sigma_px: np.ndarray
+    pixel_rad: np.ndarray
+
+
+def _shot(k, sigma_px, stated_px=np.nan, **how):
+    """Return a frame with an error that is stated as another, or not at all."""
+    seen, true = frame(SEEN, random_attitude(k), k, sigma_px, **how)
+    return Shot(seen, np.full(len(seen.u), stated_px), seen.sigma_rad / sigma_px), true
+
+
+def _identify(shots, limit=None):
+    n = len(shots)
+    spots = join_spots(*zip(*shots, strict=True))
+    return identify_sensor(np.arange(n) * 1.0, spots, no_priors(n), SKIES, limit, HOW)
+
+
+@pytest.mark.parametrize("sigma_px", [0.08, 0.4, 1.2])
+@pytest.mark.parametrize("stated", [False, True])
+def test_the_centroid_error_is_found_whether_stated_wrongly_or_not_at_all(sigma_px, stated):
+    stated_px = 0.3 if stated else np.nan
+    found = _identify([_shot(k, sigma_px, stated_px, n_false=5)[0] for k in range(25)])
+    assert found.solutions.solved.sum() >= 24
+    assert found.sigma_scale * (stated_px if stated else 1.0) == pytest.approx(sigma_px, rel=0.08)
+
+
+def test_stars_and_attitudes_are_the_true_ones_among_many_false_points():
+    spots, true = zip(*[_shot(k, 0.3, n_false=30, missing=0.1) for k in range(25)], strict=True)
+    found = _identify(list(spots))
+    for k, solution in enumerate(found.solutions.each()):
+        assert angle_between(solution.R_sensor_from_icrs, random_attitude(k)) < 1e-3
+        ids = found.sky.catalogue.star_id[solution.star[solution.star >= 0]]
+        want = SEEN.star_id[true[k][solution.star >= 0]]
+        np.testing.assert_array_equal(ids, want)
+
+
+def test_a_flux_that_tells_nothing_is_left_aside():
+    rng = np.random.default_rng(0)
+    spots = [_shot(k, 0.3)[0] for k in range(15)]
+    spots = [
+        s._replace(frame=s.frame._replace(instrumental_mag=rng.uniform(-20, -10, len(s.sigma_px))))
+        for s in spots
+    ]
+    assert _identify(spots).solutions.solved.sum() == 15
+
+
+def test_a_limit_that_is_set_is_kept():
+    found = _identify([_shot(k, 0.3)[0] for k in range(5)], limit=5.0)
+    assert found.sky.catalogue.magnitude[-1] <= 5.0
+    assert found.solutions.solved.all()
+
+
+def test_one_frame_and_frames_without_stars_are_borne():
+    assert _identify([_shot(0, 0.3)[0]]).status == [None]
+    dark = [_shot(k, 0.3, n_false=5, missing=1.0)[0] for k in range(4)]
+    assert set(_identify(dark).status) <= {"no_match", "time_limit"}
+    seen = dark[0].frame
+    nothing = Shot(
+        seen._replace(u=seen.u[:0], sigma_rad=seen.sigma_rad[:0], instrumental_mag=np.empty(0)),
+        np.empty(0),
+        np.empty(0),
+    )
+    assert _identify([nothing]).status == ["no_centroids"]
+
+
+def test_an_error_missing_in_one_frame_is_taken_from_the_others():
+    spots = [_shot(k, 0.3, 0.3)[0] for k in range(6)]
+    spots[2] = spots[2]._replace(sigma_px=np.full(len(spots[2].sigma_px), np.nan))
+    found = _identify(spots)
+    assert found.sigma_scale == pytest.approx(1.0, abs=0.06)
+
+
+def test_an_error_that_is_nowhere_stated_counts_as_one_pixel_times_the_scale():
+    shot, _ = _shot(0, 0.3)
+    scaled = join_spots(*zip(shot, strict=True)).frames(0.5, use_flux=False)
+    np.testing.assert_allclose(scaled.sigma_rad, 0.5 * shot.pixel_rad)
+    assert np.isnan(scaled.instrumental_mag).all()
+
+
+def test_what_a_poor_sample_hides_is_learned_from_the_frames_that_are_solved(monkeypatch):
+    # The sample is made to fail: then 0.4 px stated as 0.3 would go through as stated.
+    spots = [_shot(k, 0.4, 0.3, n_false=5)[0] for k in range(25)]
+    monkeypatch.setattr(sensor, "_first_scale", lambda sample, skies, known, scales: (known, []))
+    found = _identify(spots)
+    assert found.sigma_scale * 0.3 == pytest.approx(0.4, rel=0.06)
+    assert found.sky.catalogue.magnitude[-1] <= 6.25
+
+
+@pytest.mark.parametrize(("corner_px", "least_solved"), [(2.0, 15), (5.0, 15), (10.0, 12)])
+@pytest.mark.parametrize("stated_px", [0.2, np.nan])
+def test_a_lens_that_departs_from_its_calibration_is_lived_with(corner_px, least_solved, stated_px):
+    # Radial, growing with the cube to so many pixels in the corners, and calibrated as none.
+    lens = CAMERA._replace(k1=-corner_px / CAMERA.fx_px / np.tan(CAMERA.half_diagonal_rad) ** 3)
+    shots = []
+    for k in range(15):
+        seen, _ = frame(SEEN, random_attitude(k), k, 0.2, n_false=3, camera=lens)
+        u = unproject(CAMERA, *project(lens, seen.u))
+        believed = seen._replace(u=u, optics=optics())
+        shots.append(Shot(believed, np.full(len(u), stated_px), pixel_angle(CAMERA, u)))
+    # Too far apart in time to be tracked.
+    spots = join_spots(*zip(*shots, strict=True))
+    found = identify_sensor(np.arange(15) * 100.0, spots, no_priors(15), SKIES, None, HOW)
+    assert found.solutions.solved.sum() >= least_solved
+    for k in np.flatnonzero(found.solutions.solved):
+        R = found.solutions.R_sensor_from_icrs[k]
+        assert angle_between(R, random_attitude(k)) < np.radians(0.05)

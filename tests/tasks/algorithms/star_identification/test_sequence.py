@@ -1,0 +1,176 @@
+"""A sensor followed from frame to frame."""
+
+import numpy as np
+import pytest
+from scenes.random_stars import HOW, angle_between, frame, join, random_attitude, random_catalogue
+from scipy.spatial.transform import Rotation
+
+from epipole.tasks.algorithms.star_identification.following import (
+    ACCELERATION_SIGMA,
+    new_memory,
+    predict,
+    remember,
+)
+from epipole.tasks.algorithms.star_identification.sequence import (
+    Priors,
+    identify_sequence,
+    no_priors,
+)
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+    pattern_pairs,
+    pattern_size,
+    sky_grid,
+    sky_to_limit,
+)
+
+ARCSEC = np.pi / 648000
+P_FIX = np.eye(3) * ARCSEC**2
+CATALOGUE = random_catalogue()
+SKY = sky_to_limit(CATALOGUE, 99.0)
+GRID = sky_grid(SKY, 0.005)
+
+
+def _pairs():
+    optics = frame(CATALOGUE, np.eye(3), 0)[0].optics
+    n = pattern_size(SKY, optics.solid_angle_sr)
+    return pattern_pairs(CATALOGUE.u_icrs[:n], 2 * optics.half_diagonal_rad)
+
+
+def _turning(n, rate=0.005, seed=0):
+    """Return the attitudes of a sensor that turns evenly, one a second."""
+    first = random_attitude(seed)
+    axis = np.array([0.5, -0.7, 0.4])
+    return [Rotation.from_rotvec(rate * k * axis).as_matrix() @ first for k in range(n)]
+
+
+def _identify(frames, priors=None, t_s=None, pairs=_pairs):
+    n = len(frames)
+    t_s = np.arange(n) * 1.0 if t_s is None else t_s
+    priors = no_priors(n) if priors is None else priors
+    found, status = identify_sequence(t_s, join(frames), priors, SKY, GRID, pairs, HOW)
+    return found.each(), status
+
+
+def _remembering(*fixes):
+    """Return the memory of a sensor with these times and attitudes, known to an arc second."""
+    memory = new_memory(1)
+    for t_s, R in fixes:
+        remember(t_s, R, P_FIX, memory.t_s, memory.R, memory.P, memory.held)
+    return memory
+
+
+def _predict(memory, t_s):
+    R, P = np.empty((3, 3)), np.empty((3, 3))
+    return predict(t_s, memory.t_s, memory.R, memory.P, memory.held, R, P), R, P
+
+
+def test_a_turning_sensor_is_predicted_to_where_it_turns():
+    for rate in (0.0, 1e-6, 0.005, 0.3):
+        R = _turning(3, rate)
+        useful, found, cov = _predict(_remembering((0.0, R[0]), (1.0, R[1])), 2.0)
+        assert useful
+        assert angle_between(found, R[2]) < 1e-9
+        # (1 + 1)^2 + 1 of the errors, and what an uneven turn adds.
+        assert cov[0, 0] == pytest.approx(5 * ARCSEC**2 + ACCELERATION_SIGMA**2)
+
+
+def test_backward_in_time_the_turn_is_the_other_way():
+    R = _turning(3)
+    _, found, _ = _predict(_remembering((2.0, R[2]), (1.0, R[1])), 0.0)
+    assert angle_between(found, R[0]) < 1e-9
+
+
+def test_predictions_grow_useless_with_the_gap_and_after_a_slew():
+    R = _turning(2)
+    assert not _predict(_remembering(), 0.0)[0]
+    assert _predict(_remembering((0.0, R[0])), 5.0)[0]
+    assert not _predict(_remembering((0.0, R[0])), 1000.0)[0]
+    assert not _predict(_remembering((0.0, R[0]), (1.0, R[1])), 1000.0)[0]
+    assert not _predict(_remembering((0.0, R[0]), (1.0, _turning(2, 1.0)[1])), 2.0)[0]
+
+
+def test_after_the_first_frames_no_search_is_needed():
+    R = _turning(12)
+    frames = [frame(CATALOGUE, r, k, n_false=10)[0] for k, r in enumerate(R)]
+    searched = []
+
+    def counted():
+        searched.append(1)
+        return _pairs()
+
+    solutions, _ = _identify(frames, pairs=counted)
+    assert len(searched) <= 2  # then its rate is known
+    for r, s in zip(R, solutions, strict=True):
+        assert angle_between(s.R_sensor_from_icrs, r) < 300 * ARCSEC
+
+
+def test_stars_of_a_sensor_that_turns_far_are_those_of_its_field():
+    # Ten times as far as stars are kept around a field.
+    R = _turning(100, rate=0.006)
+    frames, true = zip(*[frame(CATALOGUE, r, k, n_false=3) for k, r in enumerate(R)], strict=True)
+    for solution, star in zip(_identify(list(frames))[0], true, strict=True):
+        claimed = solution.star >= 0
+        np.testing.assert_array_equal(solution.star[claimed], star[claimed])
+        assert claimed.sum() >= 0.9 * (star >= 0).sum()
+
+
+def test_after_a_slew_the_sensor_is_found_again():
+    R = _turning(4) + _turning(4, seed=9)
+    solutions, status = _identify([frame(CATALOGUE, r, k)[0] for k, r in enumerate(R)])
+    assert status == [None] * 8
+    for r, s in zip(R, solutions, strict=True):
+        assert angle_between(s.R_sensor_from_icrs, r) < 300 * ARCSEC
+
+
+def test_a_frame_with_few_stars_is_found_from_the_frame_after_it():
+    R = _turning(4, rate=1e-4)
+    frames = [frame(CATALOGUE, r, k)[0] for k, r in enumerate(R)]
+    few = frames[0]  # four stars: too few for a search, enough next to an attitude
+    frames[0] = few._replace(
+        u=few.u[:4], sigma_rad=few.sigma_rad[:4], instrumental_mag=np.full(4, np.nan)
+    )
+    solutions, status = _identify(frames)
+    assert status[0] is None
+    assert angle_between(solutions[0].R_sensor_from_icrs, R[0]) < 500 * ARCSEC
+
+
+def test_too_few_centroids_and_no_match_are_told_apart():
+    R = _turning(3)
+    frames = [frame(CATALOGUE, r, k)[0] for k, r in enumerate(R)]
+    frames[1] = frames[1]._replace(
+        u=frames[1].u[:2], sigma_rad=frames[1].sigma_rad[:2], instrumental_mag=np.zeros(2)
+    )
+    frames[2] = frame(CATALOGUE, R[2], 2, n_false=8, missing=1.0)[0]
+    solutions, status = _identify(frames)
+    assert status == [None, "too_few_stars", "no_match"]
+    assert solutions[1] is None
+    assert solutions[2] is None
+
+
+def test_a_right_prior_spares_the_search_and_a_wrong_one_is_overruled():
+    R = _turning(3)
+    frames = [frame(CATALOGUE, r, k)[0] for k, r in enumerate(R)]
+
+    def never():
+        raise AssertionError("searched the whole sky")
+
+    sigma = np.full(3, 60 * ARCSEC)
+    right = Priors(np.array(R), sigma)
+    assert _identify(frames, right, pairs=never)[1] == [None] * 3
+    wrong = Priors(np.array([random_attitude(77)] * 3), sigma)
+    solutions, _ = _identify(frames, wrong)
+    for r, s in zip(R, solutions, strict=True):
+        assert angle_between(s.R_sensor_from_icrs, r) < 300 * ARCSEC
+
+
+def test_a_dark_log_is_searched_ever_more_rarely():
+    dark = frame(CATALOGUE, random_attitude(0), 0, n_false=6, missing=1.0)[0]
+    calls = []
+
+    def counted():
+        calls.append(1)
+        return table
+
+    table = _pairs()
+    _identify([dark] * 300, pairs=counted)
+    assert 10 <= len(calls) <= 40

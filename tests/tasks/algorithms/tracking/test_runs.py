@@ -1,0 +1,123 @@
+"""Tracking: objects slow and fast are followed through misses, strays do not make tracks."""
+
+import numpy as np
+import pytest
+
+from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.tracking.runs import follow_detections
+
+FIELD = np.radians(4.0)
+SIGMA = 2 * ARCSEC
+
+
+def scene(seed, *, n_objects, n_false, n_frames, rate_arcsec_s, missed=0.05, axis=(0.3, 0.5, 0.8)):
+    """Detections of objects on great circles among strays: frames, directions, who they are."""
+    rng = np.random.default_rng(seed)
+    centre = np.array(axis) / np.linalg.norm(axis)
+    basis = tangent_basis(centre)
+    times = np.arange(n_frames) * 1.0
+    start = rng.uniform(-FIELD / 2, FIELD / 2, (n_objects, 2))
+    heading = rng.uniform(0, 2 * np.pi, n_objects)
+    rate = rate_arcsec_s * ARCSEC * np.column_stack([np.cos(heading), np.sin(heading)])
+    offsets, u, who = [0], [], []
+    for t in times:
+        place = np.vstack(
+            [start + rate * t, rng.uniform(-FIELD / 2, FIELD / 2, (rng.poisson(n_false), 2))]
+        )
+        label = np.concatenate([np.arange(n_objects), np.full(len(place) - n_objects, -1)])
+        kept = (rng.random(len(place)) > missed) & (np.abs(place) < FIELD / 2).all(axis=1)
+        order = rng.permutation(np.flatnonzero(kept))
+        place = place[order] + rng.normal(size=(len(order), 2)) * SIGMA
+        u.append(centre + place @ basis)
+        who.append(label[order])
+        offsets.append(offsets[-1] + len(order))
+    u = np.concatenate(u)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    return times, np.array(offsets), u, np.concatenate(who)
+
+
+def follow(times, offsets, u, sigma=SIGMA, **changes):
+    options = {
+        "max_rate_rad_s": np.radians(2.0),
+        "max_coast_s": 4.5,
+        "max_missed": 3,
+        "min_detections": 3,
+        "gate_sigma": 4.0,
+        "field_sr": FIELD**2,
+        "false_alarm": 1e-4,
+    }
+    return follow_detections(times, offsets, u, np.full(len(u), sigma), **options | changes)
+
+
+def score(track, who):
+    """Share of tracked detections that are their track's object, of objects' that are tracked.
+
+    Objects that barely touch the field, with fewer than six detections, are not asked for.
+    """
+    pure = sum(
+        np.bincount(who[track == t][who[track == t] >= 0]).max(initial=0)
+        for t in range(track.max(initial=-1) + 1)
+    )
+    count = np.bincount(who[who >= 0], minlength=1)
+    asked = (who >= 0) & (count[who] >= 6)
+    return pure / max((track >= 0).sum(), 1), pure / max(asked.sum(), 1)
+
+
+@pytest.mark.parametrize("rate", [0.0, 40.0, 600.0])
+@pytest.mark.parametrize("axis", [(0.3, 0.5, 0.8), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)])
+def test_objects_are_followed_at_any_rate_and_anywhere_on_the_sky(rate, axis):
+    times, offsets, u, who = scene(
+        1, n_objects=10, n_false=10, n_frames=60, rate_arcsec_s=rate, axis=axis
+    )
+    purity, completeness = score(follow(times, offsets, u), who)
+    assert purity > 0.995
+    assert completeness > 0.98
+
+
+def test_strays_alone_make_next_to_no_tracks():
+    times, offsets, u, _ = scene(2, n_objects=0, n_false=40, n_frames=300, rate_arcsec_s=0)
+    assert follow(times, offsets, u).max(initial=-1) + 1 <= 2
+
+
+def test_an_object_missed_too_long_begins_a_new_track():
+    times, offsets, u, _ = scene(
+        3, n_objects=1, n_false=0, n_frames=40, rate_arcsec_s=40.0, missed=0.0
+    )
+    gone = np.zeros(len(u), bool)
+    gone[15:25] = True
+    offsets = np.concatenate([[0], np.cumsum(np.diff(offsets) * ~gone)])
+    track = follow(times, offsets, u[~gone])
+    assert track[:15].tolist() == [0] * 15
+    assert track[15:].tolist() == [1] * 15
+
+
+def test_an_hour_between_frames_ends_every_track():
+    times, offsets, u, _ = scene(
+        4, n_objects=1, n_false=0, n_frames=20, rate_arcsec_s=0.0, missed=0.0
+    )
+    times[10:] += 3600.0
+    track = follow(times, offsets, u)
+    assert track[0] == 0
+    assert track[-1] == 1
+
+
+def test_all_detections_on_one_spot_are_no_trouble():
+    u = np.tile([0.0, 0.0, 1.0], (50, 1))
+    track = follow(np.arange(5.0), np.arange(6) * 10, u)
+    assert len(track) == 50
+    for f in range(5):  # never two detections of a frame in one track
+        used = track[f * 10 : f * 10 + 10]
+        used = used[used >= 0]
+        assert len(set(used.tolist())) == len(used)
+
+
+@pytest.mark.parametrize("n_frames", [0, 1, 2])
+def test_few_frames_give_no_track(n_frames):
+    u = np.tile([0.0, 0.0, 1.0], (n_frames, 1))
+    track = follow(np.arange(float(n_frames)), np.arange(n_frames + 1), u)
+    assert (track == -1).all()
+
+
+def test_the_same_input_gives_the_same_tracks():
+    times, offsets, u, _ = scene(5, n_objects=20, n_false=50, n_frames=30, rate_arcsec_s=40)
+    assert (follow(times, offsets, u) == follow(times, offsets, u)).all()

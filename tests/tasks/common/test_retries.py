@@ -1,0 +1,92 @@
+"""Another try is for storage that may come back, not for what is wrong with a log."""
+
+import errno
+
+import botocore.exceptions as s3
+import pytest
+from prefect import flow
+from prefect.states import Failed
+
+from epipole.io.logs.reader import read_log_parts
+from epipole.io.work.files import read_part
+from epipole.schemas.errors import DatasetError, LogError
+from epipole.tasks.common.retries import storage_failed
+from epipole.tasks.read import read_logs as module
+from epipole.tasks.read.read_logs import read_log_into
+
+
+def wrapped(cause: Exception | None, kind: type[Exception] = LogError) -> Exception:
+    """Return the error for people that our code raises from another."""
+    error = kind("night.mcap: cannot be read")
+    error.__cause__ = cause
+    return error
+
+
+def answer(status: int) -> Exception:
+    response = {"Error": {"Code": "X"}, "ResponseMetadata": {"HTTPStatusCode": status}}
+    return s3.ClientError(response, "GetObject")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        wrapped(OSError(errno.EIO, "input/output error")),
+        wrapped(OSError(errno.ESTALE, "stale file handle"), DatasetError),
+        wrapped(TimeoutError()),
+        ConnectionResetError(),
+        wrapped(s3.EndpointConnectionError(endpoint_url="s3")),
+        wrapped(s3.ReadTimeoutError(endpoint_url="s3")),
+        wrapped(answer(503)),
+        wrapped(answer(429)),
+    ],
+)
+def test_storage_that_may_come_back_is_tried_again(error):
+    assert storage_failed(None, None, Failed(data=error))
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        wrapped(None),  # no MCAP, no frames, no calibration
+        wrapped(ValueError("bad chunk")),
+        wrapped(FileNotFoundError(errno.ENOENT, "no such file")),
+        wrapped(PermissionError(errno.EACCES, "not allowed"), DatasetError),
+        wrapped(OSError(errno.ENOSPC, "disk full"), DatasetError),
+        wrapped(OSError(errno.EROFS, "read-only"), DatasetError),
+        wrapped(answer(403)),
+        wrapped(s3.NoCredentialsError()),
+        ZeroDivisionError(),
+    ],
+)
+def test_what_stays_as_it_is_is_not_tried_again(error):
+    assert not storage_failed(None, None, Failed(data=error))
+
+
+@pytest.mark.parametrize(
+    ("error", "reads"), [(wrapped(OSError(errno.EIO, "x")), 2), (wrapped(None), 1)]
+)
+def test_a_log_is_read_again_only_after_a_fault_of_the_storage(
+    error, reads, prefect, night_log, tmp_path, monkeypatch
+):
+    asked = []
+
+    def faulty(path):
+        asked.append(path)
+        for part in read_log_parts(path):
+            yield part
+            if len(asked) == 1:
+                raise error
+
+    monkeypatch.setattr(module, "read_log_parts", faulty)
+
+    @flow
+    def reading():
+        return read_log_into.with_options(retry_delay_seconds=0)(tmp_path, str(night_log))
+
+    if reads == 1:
+        with pytest.raises(LogError):
+            reading()
+    else:
+        frames = [read_part(part, "exposures").num_rows for part in reading().parts]
+        assert sum(frames) == 240
+    assert len(asked) == reads

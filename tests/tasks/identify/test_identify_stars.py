@@ -1,0 +1,267 @@
+"""The stage: tables in, tables out."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from scenes.random_stars import CAMERA
+from scipy.spatial.transform import Rotation
+
+from epipole.io.catalogues.hipparcos import HIPPARCOS_EPOCH, read_hipparcos
+from epipole.schemas.bridge import array, stack, stack_covariance, table
+from epipole.schemas.settings import Settings
+from epipole.schemas.work_tables import CAMERAS, EXPOSURES, PLACES
+from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue, places_at
+from epipole.tasks.algorithms.geometry.camera import inside, project
+from epipole.tasks.algorithms.geometry.rotations import canonical
+from epipole.tasks.algorithms.geometry.sky import aberrate
+from epipole.tasks.algorithms.time.time_scales import earth_barycentric, julian_year
+from epipole.tasks.identify.identify_stars import identify_stars
+
+T0_NS = 1_600_000_000_000_000_000
+V_KM_S = np.array([3.0, -5.0, 4.5])
+ARCSEC = np.pi / 648000
+LIMIT = 6.3
+DISTORTED = CAMERA._replace(k1=-0.05, k2=0.01, p1=2e-4, p2=-1e-4)
+
+
+@pytest.fixture(scope="module")
+def catalogue():
+    return read_hipparcos()
+
+
+@pytest.fixture(scope="module")
+def sky(catalogue):
+    """Return the stars' places 2 px merged, to LIMIT."""
+    places = [np.radians(array(catalogue, n)) for n in ("ra_deg", "dec_deg")]
+    names = ("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")
+    time = np.int64(T0_NS)
+    years = float(julian_year(time)) - HIPPARCOS_EPOCH
+    motions = [array(catalogue, n) for n in names]
+    u = places_at(*places, *motions, years, earth_barycentric(time)[0])
+    nav = navigation_catalogue(
+        array(catalogue, "star_id"), u, array(catalogue, "magnitude"), 2 * CAMERA.pixel_rad
+    )
+    n = np.searchsorted(nav.magnitude, LIMIT)
+    return nav.star_id[:n], nav.u_icrs[:n], nav.magnitude[:n]
+
+
+class Log:
+    """Frames of a slowly turning sensor, as tables, and what is true of them."""
+
+    def __init__(self, sky, n, seed=0, sigma_px=0.2, stated=None, n_false=8, flux=True):
+        rng = np.random.default_rng(seed)
+        star_id, u, magnitude = sky
+        time = T0_NS + np.arange(n) * 10**9
+        _, v_earth = earth_barycentric(time)
+        first = Rotation.random(random_state=seed)
+        self.q = np.empty((n, 4))
+        self.ids, x_px, y_px, fluxes = [], [], [], []
+        for k in range(n):
+            R = Rotation.from_rotvec([2e-3 * k, 1e-3 * k, -1e-3 * k]) * first
+            self.q[k] = canonical(R.as_quat())
+            a = aberrate(u, v_earth[k] + V_KM_S) @ R.as_matrix().T
+            x, y = project(DISTORTED, a)
+            near = (a[:, 2] > 0.95) & inside(DISTORTED, x, y)
+            false = rng.uniform(0, 1023, (2, n_false))
+            x, y = np.concatenate([x[near], false[0]]), np.concatenate([y[near], false[1]])
+            mag = np.concatenate([magnitude[near], rng.uniform(3, LIMIT, n_false)])
+            order = rng.permutation(len(x))
+            x_px.append((x + rng.normal(0, sigma_px, len(x)))[order])
+            y_px.append((y + rng.normal(0, sigma_px, len(x)))[order])
+            fluxes.append((10 ** (-0.4 * (mag - 20)))[order])
+            self.ids.append(np.concatenate([star_id[near], np.full(n_false, -1)])[order])
+        self.key = {"sensor_id": ["s"] * n, "frame_number": np.arange(n), "time": time}
+        self.exposures = self.make_exposures(x_px, y_px, fluxes if flux else None, stated)
+        self.places = self.make_places()
+        self.cameras = table(
+            CAMERAS,
+            {"sensor_id": ["s"], "time": [int(time[0])]}
+            | {name: [value] for name, value in DISTORTED._asdict().items()},
+        )
+
+    def make_exposures(self, x_px, y_px, flux=None, stated=None):
+        n = len(x_px)
+        return table(
+            EXPOSURES,
+            self.key
+            | {
+                "exposure_s": [0.1] * n,
+                "x_px": [list(x) for x in x_px],
+                "y_px": [list(y) for y in y_px],
+                "flux": [None] * n if flux is None else [list(f) for f in flux],
+                "sigma_px": [None] * n if stated is None else [[stated] * len(x) for x in x_px],
+                "source": ["a.mcap"] * n,
+                "offset": [None] * n,
+            },
+        )
+
+    def make_places(self, q=None, sigma_arcsec=None):
+        n = len(self.q)
+        prior = [None] * n if q is None else None
+        return table(
+            PLACES,
+            self.key
+            | {f"{a}_km": [7000.0] * n for a in "xyz"}
+            | {f"v{a}_km_s": [V_KM_S[i]] * n for i, a in enumerate("xyz")}
+            | {f"q{a}": prior or q[:, i] for i, a in enumerate("xyzw")}
+            | {"position_sigma_km": [0.05] * n, "attitude_sigma_arcsec": [sigma_arcsec] * n},
+        )
+
+    def errors(self, solutions):
+        """Return the rotation vectors [arcsec] from reported to true attitude."""
+        got = Rotation.from_quat(stack(solutions, "q{}", "xyzw"))
+        return (Rotation.from_quat(self.q) * got.inv()).as_rotvec() / ARCSEC
+
+    def run(self, catalogue, **changes):
+        inputs = {"exposures": self.exposures, "places": self.places, "cameras": self.cameras}
+        return identify_stars(*(inputs | changes).values(), catalogue, Settings())
+
+
+@pytest.fixture(scope="module")
+def log(sky):
+    return Log(sky, 40)
+
+
+@pytest.fixture(scope="module")
+def found(log, catalogue):
+    return log.run(catalogue)
+
+
+def test_every_frame_is_solved_and_no_star_is_another(log, found):
+    assert found.solutions["attitude_source"].to_pylist() == ["stars"] * 40
+    assert found.solutions["status"].null_count == 40
+    frame, centroid = array(found.stars, "frame_number"), array(found.stars, "centroid")
+    true = [log.ids[f][c] for f, c in zip(frame, centroid, strict=True)]
+    np.testing.assert_array_equal(array(found.stars, "star_id"), true)
+    assert len(true) > 0.98 * sum(np.sum(ids > 0) for ids in log.ids)
+
+
+def test_attitude_errors_are_honest(log, found):
+    errors, cov = (
+        log.errors(found.solutions),
+        stack_covariance(found.solutions, "cov_att_{}_arcsec2"),
+    )
+    nees = np.einsum("ni,nij,nj->n", errors, np.linalg.inv(cov), errors)
+    assert abs(np.mean(nees) - 3) < 4 * np.sqrt(6 / 40)
+    sigma = stack(found.solutions, "sigma_{}_arcsec")
+    np.testing.assert_allclose(sigma**2, np.diagonal(cov, axis1=1, axis2=2), rtol=1e-12)
+
+
+def test_the_centroid_error_is_learned_where_it_is_not_stated(found):
+    at_centre = array(found.detections, "sigma_arcsec").max() * ARCSEC / DISTORTED.pixel_rad
+    assert at_centre == pytest.approx(0.2, rel=0.05)
+    assert np.mean(array(found.solutions, "residual_px")) == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize("stated", [0.06, 0.2, 0.6])
+def test_a_stated_centroid_error_is_put_right_where_residuals_contradict_it(stated, sky, catalogue):
+    log = Log(sky, 20, seed=1, stated=stated)
+    found = log.run(catalogue)
+    at_centre = array(found.detections, "sigma_arcsec").max() * ARCSEC / DISTORTED.pixel_rad
+    assert at_centre == pytest.approx(0.2, rel=0.07)
+
+
+def test_every_centroid_is_a_star_or_a_detection_once(log, found):
+    pairs = [
+        set(zip(array(t, "frame_number"), array(t, "centroid"), strict=True))
+        for t in (found.stars, found.detections)
+    ]
+    assert not pairs[0] & pairs[1]
+    assert len(pairs[0] | pairs[1]) == sum(len(ids) for ids in log.ids)
+    assert array(found.solutions, "n_centroids").tolist() == [len(ids) for ids in log.ids]
+
+
+def test_detections_stand_where_the_attitude_puts_their_pixels(log, found):
+    d = found.detections
+    ra, dec = np.radians(array(d, "ra_deg")), np.radians(array(d, "dec_deg"))
+    u = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    q = stack(found.solutions, "q{}", "xyzw")[array(d, "frame_number")]
+    x, y = project(DISTORTED, Rotation.from_quat(q).apply(u))
+    np.testing.assert_allclose(x, array(d, "x_px"), atol=1e-6)
+    np.testing.assert_allclose(y, array(d, "y_px"), atol=1e-6)
+
+
+def test_running_again_gives_the_same_bits(log, found, catalogue):
+    again = log.run(catalogue)
+    assert all(a.equals(b) for a, b in zip(found, again, strict=True))
+
+
+def test_the_order_of_rows_does_not_matter(log, found, catalogue):
+    order = np.random.default_rng(0).permutation(40)
+    again = log.run(catalogue, exposures=log.exposures.take(order), places=log.places.take(order))
+    assert again.solutions.equals(found.solutions)
+
+
+def test_without_velocity_only_the_earths_aberration_is_left(log, catalogue, found):
+    places = log.places
+    for a in "xyz":
+        i = places.column_names.index(f"v{a}_km_s")
+        places = places.set_column(i, places.schema.field(i), pa.nulls(40, pa.float64()))
+    moved = log.errors(log.run(catalogue, places=places).solutions) - log.errors(found.solutions)
+    # 7.4 km/s are 5.1"; what of it lies across the boresight.
+    boresight = Rotation.from_quat(log.q).inv().apply([0, 0, 1])
+    across = np.linalg.norm(np.cross(boresight, V_KM_S), axis=1) / 299792.458 / ARCSEC
+    np.testing.assert_allclose(np.hypot(moved[:, 0], moved[:, 1]), across, atol=0.05)
+
+
+def test_where_stars_fail_the_prior_is_used_as_it_is(sky, log, catalogue):
+    rng = np.random.default_rng(3)
+    x = [rng.uniform(0, 1023, 6) for _ in range(40)]
+    exposures = log.make_exposures(x, x[::-1])
+    places = log.make_places(log.q, 25.0)
+    found = log.run(catalogue, exposures=exposures, places=places)
+    assert found.solutions["attitude_source"].to_pylist() == ["prior"] * 40
+    assert set(found.solutions["status"].to_pylist()) == {"no_match"}
+    np.testing.assert_allclose(stack(found.solutions, "q{}", "xyzw"), log.q, atol=1e-12)
+    np.testing.assert_array_equal(array(found.solutions, "sigma_z_arcsec"), 25.0)
+    assert found.detections.num_rows == 240
+    assert found.rejects.num_rows == found.stars.num_rows == 0
+
+
+def test_frames_without_attitude_are_data_and_their_centroids_have_no_direction(log, catalogue):
+    empty: list[float] = []
+    x = [empty, [5.0, 9.0], [500.0] * 9, *[[1.0 * k, 7.0, 300.0, 20.0] for k in range(37)]]
+    found = log.run(catalogue, exposures=log.make_exposures(x, x))
+    status = found.solutions["status"].to_pylist()
+    assert status[:3] == ["no_centroids", "too_few_stars", "no_match"]
+    assert set(found.solutions["attitude_source"].to_pylist()) == {"none"}
+    assert found.solutions["qx"].null_count == 40
+    assert found.detections.num_rows == sum(len(row) for row in x)
+    for name in ("ra_deg", "dec_deg"):
+        assert found.detections[name].null_count == found.detections.num_rows
+    assert found.rejects.num_rows == 0
+
+
+def test_a_sensor_without_calibration_keeps_its_frames_and_says_so(log, catalogue):
+    found = log.run(catalogue, cameras=log.cameras.slice(0, 0))
+    assert set(found.solutions["status"].to_pylist()) == {"no_calibration"}
+    assert set(found.solutions["camera"].to_pylist()) == {-1}
+    assert found.rejects["reason"].to_pylist() == ["no_calibration"]
+
+
+def test_the_newest_calibration_holds_and_before_the_first_the_first(log, catalogue):
+    late = [T0_NS + 5 * 10**9, T0_NS + 25 * 10**9, T0_NS]
+    cameras = pa.concat_tables([log.cameras] * 3)
+    names = pa.array(["s", "s", "other"])
+    cameras = cameras.set_column(0, cameras.schema.field(0), names)
+    cameras = cameras.set_column(1, cameras.schema.field(1), pa.array(late, cameras.schema[1].type))
+    found = log.run(catalogue, cameras=cameras)
+    assert found.solutions["camera"].to_pylist() == [0] * 25 + [1] * 15
+
+
+def test_thousands_of_centroids_end_in_bounded_time(sky, log, catalogue):
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(0, 1023, (2, 4, 4000))
+    four = log.exposures.slice(0, 4)
+    exposures = table(
+        EXPOSURES,
+        {n: four[n] for n in four.column_names} | {"x_px": list(x), "y_px": list(y)}
+        | {"flux": [None] * 4},
+    )  # fmt: skip
+    found = log.run(catalogue, exposures=exposures, places=log.places.slice(0, 4))
+    assert set(found.solutions["attitude_source"].to_pylist()) == {"none"}
+
+
+def test_no_frames_give_empty_tables(log, catalogue):
+    found = log.run(catalogue, exposures=log.exposures.slice(0, 0), places=log.places.slice(0, 0))
+    assert [t.num_rows for t in found] == [0, 0, 0, 0]

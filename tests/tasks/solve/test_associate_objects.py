@@ -1,0 +1,104 @@
+"""The stage that associates: good views become objects, bad ones a reason and no position."""
+
+import numpy as np
+import pytest
+from scenes.associations import associated, reasons, tables, wrong_views
+from scenes.tracklet_scenes import Scene
+
+from epipole.schemas.settings import Settings
+from epipole.tasks.solve.associate_objects import associate_objects
+
+
+@pytest.mark.parametrize("method", ["likelihood", "epipolar"])
+def test_objects_come_out_with_all_their_views(method):
+    # Far apart against 8 px, so that the published method can tell them.
+    scene = Scene(11, 4).objects(4, spread_km=300.0)
+    found = associated(scene, method=method)
+    assert wrong_views(scene, found) == 0
+    assert len(np.unique(found.object_number)) == 4
+    assert found.views.num_rows >= 0.9 * 4 * 4 * len(scene.times)
+
+
+def test_it_is_the_same_bit_for_bit():
+    one, other = (associated(Scene(12, 5).objects(10).strays(30)) for _ in range(2))
+    assert one.views.equals(other.views)
+    assert one.rejects.equals(other.rejects)
+    assert (one.object_number == other.object_number).all()
+
+
+def test_one_sensor_alone_gives_no_object():
+    found = associated(Scene(13, 1).objects(5))
+    assert found.views.num_rows == 0
+
+
+def test_parallel_lines_of_sight_give_no_object():
+    scene = Scene(14, 2)
+    scene.r[1] = scene.r[0] + [0.05, 0.0, 0.0]  # side by side
+    assert associated(scene.objects(3)).views.num_rows == 0
+
+
+def test_an_object_behind_a_sensor_gives_no_object():
+    scene = Scene(15, 3)
+    for s in range(3):
+        away = scene.r[s] - np.array([42164.0, 0.0, 0.0])
+        scene.add(s, 0, away / np.linalg.norm(away, axis=1, keepdims=True))
+    assert associated(scene).views.num_rows == 0
+
+
+def test_an_object_inside_the_earth_gives_no_object():
+    scene = Scene(16, 3)
+    for s in range(3):
+        inward = np.array([4000.0, 0.0, 0.0]) - scene.r[s]
+        scene.add(s, 0, inward / np.linalg.norm(inward, axis=1, keepdims=True))
+    assert associated(scene).views.num_rows == 0
+
+
+@pytest.mark.parametrize("error", ["attitude", "state", "clock"])
+def test_a_wrong_sensor_is_left_out_named_and_spoils_nothing(error, caplog):
+    scene = Scene(17, 4).objects(8, spread_km=100.0)
+    if error == "attitude":  # by a degree, and it is believed to be turned so
+        axis = np.array([0.0, 0.0, 1.0])
+        for i, s in enumerate(scene.sensor):
+            if s == 3:
+                u = scene.u[i] + np.cross(axis, scene.u[i]) * np.radians(1.0)
+                scene.u[i] = u / np.linalg.norm(u, axis=1, keepdims=True)
+    else:  # a state a minute old, or a clock a second off: it is not where it is said to be
+        v = np.gradient(scene.r[3], scene.times, axis=0)
+        scene.r[3] += v * (60.0 if error == "state" else 4.0)
+    found = associated(scene)
+    assert wrong_views(scene, found) == 0
+    assert "sat3" not in found.views["sensor_id"].to_pylist()
+    assert len(np.unique(found.object_number)) == 8
+    if error != "attitude":  # turned so far that nothing of the others' stands in its field
+        assert reasons(found).get("sensor_disagrees", 0) >= 8
+        assert "sat3" in caplog.text
+
+
+def test_a_clock_a_second_off_gives_no_wrong_object():
+    scene = Scene(18, 4).objects(8, spread_km=100.0)
+    scene.r[3] += np.gradient(scene.r[3], scene.times, axis=0) * 1.0
+    assert wrong_views(scene, associated(scene)) == 0
+
+
+def test_two_sensors_with_one_id_give_no_wrong_object():
+    scene = Scene(19, 4).objects(6, spread_km=100.0)
+    settings = Settings()
+    found = associate_objects(*tables(scene, ["sat0", "sat1", "sat2", "sat2"]), settings)
+    assert wrong_views(scene, found) == 0
+
+
+def test_what_cannot_be_decided_is_called_ambiguous():
+    scene = Scene(3, 2, times=np.array([0.0]))
+    baseline = scene.r[1, 0] - scene.r[0, 0]
+    towards = np.array([-39359.89, 15125.76, 64.30]) - scene.r[0, 0]
+    towards /= np.linalg.norm(towards)
+    across = baseline - (baseline @ towards) * towards
+    across /= np.linalg.norm(across)
+    middle = np.array([-39359.89, 15125.76, 64.30])
+    for k, off in enumerate((-2.0, 2.0)):
+        for s in range(2):
+            path = middle + off * across - scene.r[s]
+            scene.add(s, k, path / np.linalg.norm(path, axis=1, keepdims=True))
+    found = associated(scene)
+    assert found.views.num_rows == 0
+    assert reasons(found) == {"ambiguous": 4}

@@ -1,0 +1,110 @@
+"""States of arcs: from views, what they claim, and which epochs serve."""
+
+import numpy as np
+import pytest
+from scenes.arcs import GEO, trial
+
+from epipole.schemas.bridge import array, empty, stack, table
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import ASSOCIATIONS, POSITIONS, STATES
+from epipole.schemas.work_tables import VIEWS
+from epipole.tasks.algorithms.orbits.orbit_fit import propagate
+from epipole.tasks.solve.fit_states import fit_states
+
+T0 = 1_554_091_200_000_000_000
+SETTINGS = Settings()
+
+
+def night(seed, times):
+    """Views of one object, claimed, and its positions with an error of some kilometres."""
+    arcs = trial(seed, times=times)
+    n = len(arcs.time_s)
+    epoch = T0 + np.round(arcs.time_s * 1e9).astype(np.int64)
+    shared = {
+        "epoch": epoch,
+        "sensor_id": [f"s{s}" for s in arcs.sensor],
+        "frame_number": np.arange(n),
+        "centroid": np.zeros(n, np.int32),
+        "tracklet_id": [f"s{s}-1" for s in arcs.sensor],
+        "x_px": np.arange(n, dtype=float),
+        "y_px": np.zeros(n),
+    }
+    views = shared | {f"u{a}": arcs.u[:, i] for i, a in enumerate("xyz")}
+    views |= {f"{a}_km": arcs.r_km[:, i] for i, a in enumerate("xyz")}
+    for which, cov in (("noise", arcs.cov_noise), ("bias", arcs.cov_bias)):
+        for ab, i, j in (("11", 0, 0), ("12", 0, 1), ("22", 1, 1)):
+            views[f"cov_{which}_{ab}_rad2"] = cov[:, i, j]
+    views |= {"position_sigma_km": arcs.sigma_km, "pixel_rad": np.full(n, 7e-5)}
+    claimed = shared | {"object_id": ["a"] * n, "epipolar_px": np.zeros(n),
+                        "used": np.ones(n, bool)}  # fmt: skip
+    at = np.unique(arcs.time_s)
+    where = np.array([propagate(GEO, t)[:3] for t in at])
+    where += np.random.default_rng(seed).normal(size=where.shape) * 2
+    positions = {"epoch": T0 + np.round(at * 1e9).astype(np.int64), "object_id": ["a"] * len(at)}
+    positions["time"] = positions["epoch"]
+    positions |= {f"{a}_km": where[:, i] for i, a in enumerate("xyz")}
+    for name in POSITIONS.names:
+        if name not in positions:
+            integer = name in ("n_sensors", "n_rejected")
+            positions[name] = np.zeros(len(at), np.int32 if integer else float)
+    return table(VIEWS, views), table(ASSOCIATIONS, claimed), table(POSITIONS, positions)
+
+
+def errors(states):
+    """Each state's error and its covariance."""
+    at = (array(states, "epoch") - T0) / 1e9
+    truth = np.array([propagate(GEO, t) for t in at]).reshape(-1, 6)
+    found = np.hstack([stack(states, "{}_km"), stack(states, "v{}_km_s")])
+    names = ["x", "y", "z", "vx", "vy", "vz"]
+    cov = np.empty((states.num_rows, 6, 6))
+    for i, a in enumerate(names):
+        for j in range(i, 6):
+            cov[:, i, j] = cov[:, j, i] = array(states, f"cov_{a}{names[j]}")
+    return found - truth, cov
+
+
+def test_a_state_is_as_far_off_as_it_claims():
+    square = []
+    for seed in range(60):
+        off, cov = errors(fit_states(*night(seed, np.arange(-60.0, 61, 20)), SETTINGS))
+        square.append(off[0] @ np.linalg.solve(cov[0], off[0]))
+    assert abs(np.mean(square) / 6 - 1) < 0.22  # three sigma of a mean of 60
+
+
+def test_epochs_that_share_detections_do_not_serve():
+    states = fit_states(*night(1, np.arange(0.0, 61)), SETTINGS)
+    assert states["n_epochs"].to_pylist() == [6]  # of 61, every twelfth second: 0 to 60
+
+
+def test_a_long_pass_is_cut_into_arcs():
+    states = fit_states(*night(2, np.arange(0.0, 1500, 50)), SETTINGS)
+    assert states.num_rows == 3
+    assert states["n_epochs"].to_pylist() == [13, 13, 4]
+
+
+def test_an_arc_of_two_epochs_gives_no_state():
+    assert fit_states(*night(3, np.array([0.0, 20.0])), SETTINGS).num_rows == 0
+
+
+def test_views_that_a_position_rejected_do_not_serve():
+    views, claimed, positions = night(4, np.arange(-60.0, 61, 20))
+    wrong = array(views, "sensor_id") == "s0"
+    u = stack(views, "u{}")
+    u[wrong] += 1e-3
+    for i, a in enumerate("xyz"):
+        k = views.schema.get_field_index(f"u{a}")
+        views = views.set_column(k, views.schema.field(k), [u[:, i]])
+    used = claimed.schema.get_field_index("used")
+    claimed = claimed.set_column(used, claimed.schema.field(used), [~wrong])
+    off, cov = errors(fit_states(views, claimed, positions, SETTINGS))
+    assert off[0] @ np.linalg.solve(cov[0], off[0]) < 25
+
+
+@pytest.mark.parametrize("which", ["views", "positions"])
+def test_nothing_gives_no_state(which):
+    tables = [empty(VIEWS), empty(ASSOCIATIONS), empty(POSITIONS)]
+    if which == "views":
+        tables[2] = night(5, np.arange(3.0))[2]
+    states = fit_states(*tables, SETTINGS)
+    assert states.schema == STATES
+    assert states.num_rows == 0

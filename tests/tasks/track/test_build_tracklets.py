@@ -1,0 +1,165 @@
+"""Build tracklets: detections are taken for what they are, broken tracks are one track."""
+
+import numpy as np
+import polars as pl
+import pytest
+
+from epipole.flows.command_line.sensors import of_sensor
+from epipole.schemas.settings import validate_settings
+from epipole.tasks.track.build_tracklets import build_tracklets
+
+SCENE = """
+name = "kinds"
+start = 2019-04-01T04:00:00Z
+duration_s = 60.0
+seed = 11
+[[sensors]]
+id = "a"
+rate_hz = 1.0
+magnitude_limit = 8.0
+orbit = { a_km = 6977.6, i_deg = 35.0, raan_deg = 354.4, argp_deg = 71.8, true_anomaly_deg = 39.8 }
+camera = { width = 1024, height = 1024, fov_deg = 6.0 }
+detection = { sigma_px = 0.15, false_points = 3.0, hot_pixels = 6, target_drop = 0.05 }
+pointing = { mode = "track", orbit = { position_km = [-39359.89, 15125.76, 64.30] } }
+[[targets]]
+count = 5
+orbit = { position_km = [-39359.89, 15125.76, 64.30] }
+spread_km = 400.0
+magnitude = 7.0
+"""
+GAP = (25, 37)  # frames from and to that show no object
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory):
+    from scenes.whole_logs import read_whole
+
+    from epipole.flows.simulate import simulate
+    from epipole.io.catalogues.hipparcos import read_hipparcos
+    from epipole.tasks.identify.identify_stars import identify_stars
+    from epipole.tasks.identify.place_sensors import place_sensors
+
+    folder = tmp_path_factory.mktemp("kinds")
+    (folder / "scene.toml").write_text(SCENE)
+    simulate(str(folder / "scene.toml"), folder / "k.mcap")
+    settings = validate_settings({}, "test")
+    log = read_whole([str(folder / "k.mcap")], settings)
+    places = place_sensors(log.exposures, log.states, settings)
+    found = identify_stars(log.exposures, places, log.cameras, read_hipparcos(), settings)
+    truth = pl.read_parquet(folder / "k.mcap.truth" / "points.parquet")
+    return found, log.cameras, truth
+
+
+def build(seen, broken=False, **tracklets):
+    found, cameras, truth = seen
+    detections = of_sensor(found.detections, "a")
+    if broken:
+        frame = detections["frame_number"].to_numpy()
+        first = frame.min()
+        detections = detections.filter((frame < first + GAP[0]) | (frame >= first + GAP[1]))
+    settings = validate_settings({"tracklets": tracklets}, "test")
+    built = build_tracklets(of_sensor(found.solutions, "a"), detections, cameras, settings)
+    key = ["sensor_id", "frame_number", "centroid"]
+    cast = [pl.col("frame_number").cast(pl.Int64), pl.col("centroid").cast(pl.Int64)]
+    known = pl.from_arrow(built.detections).rename({"kind": "taken_for"}).with_columns(cast)
+    return known.join(truth.with_columns(cast), on=key, how="left"), built.tracklets
+
+
+def test_a_sensor_that_follows_objects_tells_them_from_hot_pixels(seen):
+    detections, tracklets = build(seen)
+    objects = detections.filter(pl.col("kind") == 1)
+    assert (objects["taken_for"] == "object").mean() > 0.99
+    strays = detections.filter(pl.col("kind") == 2)
+    assert (strays["taken_for"] == "hot_pixel").sum() > 0.95 * 6 * 60
+    assert (strays["taken_for"] == "object").sum() == 0
+    assert tracklets.num_rows == 5
+
+
+def test_only_objects_have_tracklets_and_tracks(seen):
+    detections, _ = build(seen)
+    other = detections.filter(pl.col("taken_for") != "object")
+    assert other["tracklet_id"].null_count() == len(other)
+    assert other["track_id"].null_count() == len(other)
+
+
+@pytest.mark.parametrize("method", ["likelihood_ratio", "prediction"])
+def test_a_break_leaves_one_track_an_object(seen, method):
+    detections, tracklets = build(seen, broken=True, link_method=method)
+    assert tracklets.num_rows == 10
+    assert tracklets["link_chi2"].null_count == 5
+    tracked = detections.drop_nulls("track_id")
+    assert tracked["track_id"].n_unique() == 5
+    assert (tracked.group_by("track_id").agg(pl.col("source").n_unique())["source"] == 1).all()
+
+
+def test_joining_can_be_switched_off(seen):
+    detections, tracklets = build(seen, broken=True, link_method="none")
+    assert detections["track_id"].drop_nulls().n_unique() == 10
+    assert tracklets["link_chi2"].null_count == 10
+
+
+def without_attitude(found, lost):
+    """What was found, as if these frames (from the first) had no attitude."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    solutions, detections = of_sensor(found.solutions, "a"), of_sensor(found.detections, "a")
+    first = solutions["frame_number"].to_numpy().min()
+    numbers = pa.array(first + np.array(lost), pa.int64())
+    for name, rows in (("attitude_source", solutions), ("ra_deg", detections)):
+        at = rows.schema.get_field_index(name)
+        gone = pc.is_in(rows["frame_number"], numbers)
+        value = pa.scalar("none" if name == "attitude_source" else None, rows.schema.field(at).type)
+        rows = rows.set_column(at, rows.schema.field(at), pc.if_else(gone, value, rows[name]))
+        solutions, detections = (rows, detections) if rows.num_columns > 20 else (solutions, rows)
+    return solutions, detections
+
+
+def test_frames_without_attitude_are_tracked_in_the_image(seen):
+    found, cameras, _ = seen
+    settings = validate_settings({}, "test")
+    solutions, detections = without_attitude(found, range(20, 32))
+    built = build_tracklets(solutions, detections, cameras, settings)
+    assert built.tracklets.num_rows == 15  # five before, five after, five in between
+    assert len(set(built.tracklets["tracklet_id"].to_pylist())) == 15
+    assert built.tracklets["link_chi2"].null_count == 10
+    kind = np.array(built.detections["kind"].to_pylist())
+    assert (kind == "object").sum() > 0.9 * 5 * 60
+
+
+def test_lost_frames_far_between_make_no_track(seen):
+    found, cameras, _ = seen
+    solutions, detections = without_attitude(found, range(0, 60, 8))
+    built = build_tracklets(solutions, detections, cameras, validate_settings({}, "test"))
+    assert built.tracklets.num_rows == 5
+
+
+def test_no_detections_give_no_tracklets(seen):
+    found, cameras, _ = seen
+    settings = validate_settings({}, "test")
+    built = build_tracklets(found.solutions, found.detections.slice(0, 0), cameras, settings)
+    assert built.tracklets.num_rows == 0
+
+
+def test_a_frame_of_ten_thousand_strays_is_no_trouble(seen):
+    import pyarrow as pa
+
+    found, cameras, _ = seen
+    detections = of_sensor(found.detections, "a")
+    row = detections.slice(detections.num_rows // 2, 1)
+    many = pa.concat_tables([row] * 10_000)
+    rng = np.random.default_rng(0)
+    for name, spread in (("ra_deg", 3.0), ("dec_deg", 3.0), ("x_px", 500.0), ("y_px", 500.0)):
+        at = many.schema.get_field_index(name)
+        values = many[name].to_numpy() + rng.uniform(-spread, spread, 10_000)
+        many = many.set_column(at, many.schema.field(at), pa.array(values))
+    at = many.schema.get_field_index("centroid")
+    numbers = pa.array(np.arange(10_000, dtype=np.int32) + 1000)
+    many = many.set_column(at, many.schema.field(at), numbers)
+    built = build_tracklets(
+        of_sensor(found.solutions, "a"), pa.concat_tables([detections, many]), cameras,
+        validate_settings({}, "test"),
+    )  # fmt: skip
+    kept = built.detections["tracklet_id"].drop_null()
+    assert 5 <= built.tracklets.num_rows <= 6
+    assert len(kept) > 0.97 * 5 * 57
