@@ -7,13 +7,14 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.direction_errors import (
     attitude_covariance,
     centroid_covariance,
 )
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, unit_from_radec
+from epipole.tasks.algorithms.geometry.sky import unit_from_radec
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -14,6 +14,7 @@ import pyarrow as pa
 from epipole.io.simulation.truth import Truth, elements_of
 from epipole.schemas.bridge import array, stack, stack_covariance
 from epipole.schemas.report import Report
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.evaluation import (
     attitude_errors,
     majority,
@@ -32,7 +33,6 @@ CLAIM = ["epoch", "object_id"]
 STAR, TARGET = 0, 1
 WRONG_CROSS_ARCSEC, WRONG_ROLL_ARCSEC = 360.0, 1800.0
 INSIDE_99 = 11.345  # chi-square of 3 degrees of freedom
-ARCSEC = np.pi / 648000.0
 
 
 def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:

@@ -23,6 +23,7 @@ from epipole.tasks.algorithms.catalogue.star_catalogue import (
     place_errors,
     places_at,
 )
+from epipole.tasks.algorithms.constants import DAY_NS
 from epipole.tasks.algorithms.star_identification.frames.frame import Optics
 from epipole.tasks.algorithms.star_identification.sky import camera_sky as skies
 from epipole.tasks.algorithms.star_identification.sky import kvector, pair_table
@@ -37,7 +38,7 @@ from epipole.tasks.algorithms.star_identification.sky.kvector import KVector
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 from epipole.tasks.algorithms.time import time_scales
-from epipole.tasks.algorithms.time.time_scales import DAY_NS, earth_barycentric, julian_year
+from epipole.tasks.algorithms.time.time_scales import earth_barycentric, julian_year
 
 # A star whose place at the date is less sure than this is none to navigate by [pixels, 1-sigma].
 SURE_PX = 0.5

@@ -21,6 +21,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.star_catalogue import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
+from epipole.tasks.algorithms.constants import ARCSEC, DAY_NS, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.camera import (
     Camera,
     pixel_angle,
@@ -32,20 +33,14 @@ from epipole.tasks.algorithms.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_from_matrix,
 )
-from epipole.tasks.algorithms.geometry.sky import (
-    ARCSEC,
-    SPEED_OF_LIGHT_KM_S,
-    aberrate,
-    boresight_angles,
-    radec_from_unit,
-)
+from epipole.tasks.algorithms.geometry.sky import aberrate, boresight_angles, radec_from_unit
 from epipole.tasks.algorithms.star_identification.frames.frame import Optics, Search
 from epipole.tasks.algorithms.star_identification.frames.spots import Spots, brightest_first
 from epipole.tasks.algorithms.star_identification.published.frame_by_frame import identify_published
 from epipole.tasks.algorithms.star_identification.sensor import Identified as Found
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
-from epipole.tasks.algorithms.time.time_scales import DAY_NS, earth_velocity
+from epipole.tasks.algorithms.time.time_scales import earth_velocity
 from epipole.tasks.identify.cached_skies import CachedSkies, Catalogue
 
 Array = npt.NDArray[np.float64]

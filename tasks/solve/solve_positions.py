@@ -9,8 +9,9 @@ import pyarrow as pa
 from epipole.schemas.bridge import array, stack, table, unstack, unstack_covariance
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import ASSOCIATIONS, PAIRS, POSITIONS, REJECTS
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.epipolar import epipolar_angle, epipolar_sigma
-from epipole.tasks.algorithms.geometry.sky import SPEED_OF_LIGHT_KM_S, tangent_basis
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.common.lone_detections import published_ids

@@ -7,6 +7,7 @@ import pyarrow as pa
 from epipole.schemas.bridge import array, empty, table, unstack
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import VIEWS
+from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.geometry.camera import project
 from epipole.tasks.algorithms.geometry.direction_errors import on_tangent_plane
 from epipole.tasks.algorithms.geometry.rotations import (
@@ -20,8 +21,6 @@ from epipole.tasks.common.sightings import Frames, Sightings, camera_of, sightin
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
-
-GM_KM3_S2 = 398600.4418
 
 
 def view_objects(

@@ -11,8 +11,8 @@ import pyarrow as pa
 from epipole.schemas.bridge import array, concat, empty, nullable, table
 from epipole.schemas.settings import Settings, TrackletSettings
 from epipole.schemas.tables import DETECTIONS, TRACKLETS
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
-from epipole.tasks.algorithms.geometry.sky import ARCSEC
 from epipole.tasks.algorithms.time.epoch_grid import frame_interval_ns
 from epipole.tasks.algorithms.tracking.linking.chains import Links, chain_heads
 from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood

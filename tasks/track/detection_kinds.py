@@ -6,9 +6,9 @@ import pyarrow as pa
 from scipy.spatial import cKDTree
 
 from epipole.schemas.bridge import array
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.geometry.sky import ARCSEC
 from epipole.tasks.algorithms.orbits.planets import planet_directions
 from epipole.tasks.algorithms.tracking.hot_pixels import hot_pixels
 from epipole.tasks.common.sightings import Frames, Sightings

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from epipole.tasks.algorithms.constants import ARCSEC
+
 sys.path.insert(0, str(Path(__file__).parent))
 
 from points import PIXEL_RAD, Points, Score, judge, scene, told
@@ -23,7 +25,7 @@ from epipole.schemas.settings import AssociationSettings
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
 from epipole.tasks.algorithms.association.sampling.samples import Groups, Samples
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 
 FALSE = (10, 100, 300, 1000)

@@ -17,11 +17,12 @@ from epipole.tasks.algorithms.association.epipolar_lines import (
     line_distances,
     pair_images,
 )
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.simulation.orbits import mean_from_true_anomaly, state_at
 
 Array = np.ndarray

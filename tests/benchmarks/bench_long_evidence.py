@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 from epipole.tasks.algorithms.simulation.orbits import state_at
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.direction_errors import (
     attitude_covariance,
     centroid_covariance,
@@ -19,7 +20,7 @@ from epipole.tasks.algorithms.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
 
 CENTRE_KM = np.array([-39353.5, 15130.6, 452.2])
 GEO_RADIUS_KM, RING_KM = 42164.2, 15.0

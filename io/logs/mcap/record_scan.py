@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from epipole.io.logs.kernels import kernel
 from epipole.io.logs.mcap.byte_loads import load_uint16, load_uint64
 
 Bytes = npt.NDArray[np.uint8]
@@ -54,7 +54,7 @@ def _columns(n: int) -> list[npt.NDArray[Any]]:
     return [np.zeros(n, kind) for kind in kinds]
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _walk(data, only_known, opcode, channel, time_ns, start, end):
     """Return how many records there are, and write those that the columns have room for."""
     n, n_strange, size, room = 0, 0, len(data), len(opcode)

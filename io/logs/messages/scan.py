@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from epipole.io.logs.kernels import kernel
 from epipole.io.logs.mcap.byte_loads import load_int32, load_uint64
 from epipole.io.logs.mcap.record_scan import Bytes
 from epipole.io.logs.messages.wire import parse
@@ -80,7 +80,7 @@ class StateRows(NamedTuple):
     sigma: npt.NDArray[np.float64]  # (n, 2) of position [km] and attitude [arcsec], as sent
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _valid_id(data, at, n):
     """Return whether a text is a sensor id."""
     if n < 1 or n > NAME_BYTES:
@@ -93,7 +93,7 @@ def _valid_id(data, at, n):
     return True
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _same(data, at, n, names, code):
     if names.length[code] != n:
         return False
@@ -103,7 +103,7 @@ def _same(data, at, n, names, code):
     return True
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _find(data, at, n, names):
     """Return the code of a name, or -1."""
     for code in range(names.n_met[0]):
@@ -112,7 +112,7 @@ def _find(data, at, n, names):
     return -1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _sensor(data, at, n, names, channel):
     """Return the code of a sensor id, new or known; -1 where it is no id or there is no room."""
     code = names.hint[channel]
@@ -132,7 +132,7 @@ def _sensor(data, at, n, names, channel):
     return code
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _copy_places(data, at, bits, low, n):
     """Copy the bits of float32 from byte `at` on; return whether all are finite."""
     to, bad = np.uint64(low), np.int32(0)  # unsigned: no index counts from the end
@@ -143,7 +143,7 @@ def _copy_places(data, at, bits, low, n):
     return bad == 0
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _copy_positive(data, at, n_sent, bits, low, n):
     """Copy the bits of float32, NaN where one is not positive and finite or none was sent.
 
@@ -162,7 +162,7 @@ def _copy_positive(data, at, n_sent, bits, low, n):
     return bad == 0
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def scan_frames(messages, i, names, rows, n, kinds):
     """Take good frames from message `i` on, as rows from `n` on; return both where it ends.
 
@@ -202,7 +202,7 @@ def scan_frames(messages, i, names, rows, n, kinds):
     return i, n
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _copy_doubles(data, at, n_sent, row):
     """Copy a vector, or NaN where none was sent; return the sum of its squares."""
     total = 0.0
@@ -213,7 +213,7 @@ def _copy_doubles(data, at, n_sent, row):
     return total
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def scan_states(messages, i, names, frames, rows, n, kinds):
     """Take good states from message `i` on, as rows from `n` on; return both where it ends.
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from epipole.io.logs.kernels import kernel
 from epipole.io.logs.mcap.byte_loads import load_uint32, load_uint64
 from epipole.schemas.messages import CENTROID_FRAME, SENSOR_STATE, MessageType
 
@@ -35,7 +35,7 @@ FRAME_KINDS, STATE_KINDS = _kinds(CENTROID_FRAME), _kinds(SENSOR_STATE)
 # the time in ns, an integer, a double's bits, or the place and the length of a text or array.
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _varint(data, at, end):
     """Return a varint and the place behind it, which is -1 where it is none.
 
@@ -53,7 +53,7 @@ def _varint(data, at, end):
     return value, -1
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _protobuf_time(data, at, end):
     """Return a Timestamp's nanoseconds, or 0 where it is none that a log can have."""
     seconds, nanos = np.uint64(0), np.uint64(0)
@@ -73,7 +73,7 @@ def _protobuf_time(data, at, end):
     return np.int64(seconds) * SECOND_NS + np.int64(nanos)
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _parse_protobuf(data, at, end, kinds, fields):
     """Fill in the fields of a message; return whether it is one that a scan may take."""
     fields[:] = 0
@@ -125,7 +125,7 @@ def _parse_protobuf(data, at, end, kinds, fields):
     return True
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def _parse_cdr(data, at, end, kinds, fields):
     """Fill in the fields of a little-endian message; return whether a scan may take it."""
     fields[:] = 0
@@ -167,7 +167,7 @@ def _parse_cdr(data, at, end, kinds, fields):
     return True
 
 
-@njit(nogil=True, cache=True)
+@kernel
 def parse(data, start, end, encoding, kinds, fields):
     """Return whether a message is well formed and has a time, and fill in its fields."""
     if encoding == PROTOBUF:

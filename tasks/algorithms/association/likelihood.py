@@ -24,12 +24,12 @@ from epipole.tasks.algorithms.association.evidence.object_density import (
     visible_volume,
 )
 from epipole.tasks.algorithms.association.evidence.pool import Hypothesis, Pool, distinct
-from epipole.tasks.algorithms.association.evidence.visibility import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.association.hypotheses.contests import settle_contests
 from epipole.tasks.algorithms.association.hypotheses.growth import clear_of_doubt, grow_all
 from epipole.tasks.algorithms.association.hypotheses.seeds import SensorPairs, seeds_between
 from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.sampling.views import views_of
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -7,7 +7,8 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from epipole.tasks.algorithms.catalogue.star_catalogue import MAS
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, radec_from_unit, unit_from_radec
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.sky import radec_from_unit, unit_from_radec
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]

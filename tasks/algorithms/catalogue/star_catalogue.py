@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from epipole.tasks.algorithms.constants import AU_KM
+
 Array = npt.NDArray[np.float64]
 
 MAS = np.pi / 648_000_000.0  # rad
-AU_KM = 149597870.7
 
 
 class NavigationCatalogue(NamedTuple):

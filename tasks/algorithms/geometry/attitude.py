@@ -5,9 +5,10 @@ A reported attitude R errs by a small rotation phi about the sensor axes,
 matter to first order.)
 """
 
-import numba
 import numpy as np
 import numpy.typing as npt
+
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 
@@ -62,7 +63,7 @@ def attitude_covariance(u_sensor: Array, sigma_rad: Array) -> Array:
     return np.linalg.inv(information)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def attitude_information(u_sensor, sigma_rad, A):
     """Write the sum of (I - u u') / sigma^2 [rad^-2] about the sensor axes (compiled)."""
     A[:] = 0.0
@@ -74,7 +75,7 @@ def attitude_information(u_sensor, sigma_rad, A):
                 A[i, j] -= w * u_sensor[k, i] * u_sensor[k, j]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def invert_symmetric(A, out):
     """Write the inverse of a symmetric 3x3 matrix; return its determinant (compiled)."""
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
@@ -92,7 +93,7 @@ def invert_symmetric(A, out):
     return determinant
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def copy_matrix(source, target):
     """Copy a 3x3 matrix (compiled); a slice assignment compiles to far more."""
     for i in range(3):
@@ -100,7 +101,7 @@ def copy_matrix(source, target):
             target[i, j] = source[i, j]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def turn(R, x, y, z):
     """Turn R by the rotation vector (x, y, z) about its sensor axes, in place (compiled)."""
     angle = np.sqrt(x * x + y * y + z * z)
@@ -122,7 +123,7 @@ def turn(R, x, y, z):
         R[2, j] = c + 2.0 * (qx * ty - qy * tx)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def orthonormalise(R):
     """Make the rows of R orthonormal again, in place, the boresight's direction kept (compiled)."""
     n = np.sqrt(R[2, 0] ** 2 + R[2, 1] ** 2 + R[2, 2] ** 2)
@@ -139,7 +140,7 @@ def orthonormalise(R):
     R[1, 2] = R[2, 0] * R[0, 1] - R[2, 1] * R[0, 0]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def refine_attitude(R, u, sigma, a, star_of, P):
     """Move R to the weighted least-squares attitude of its matches, in place; write P (compiled).
 

@@ -3,10 +3,9 @@
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 
-SPEED_OF_LIGHT_KM_S = 299792.458
-ARCSEC = np.pi / 648000.0  # rad
+Array = npt.NDArray[np.float64]
 
 
 def unit_from_radec(ra: Array, dec: Array) -> Array:

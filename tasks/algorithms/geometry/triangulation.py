@@ -6,9 +6,10 @@ residual is the angle between the direction and the point, on the direction's ta
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from epipole.tasks.algorithms.geometry.sky import SPEED_OF_LIGHT_KM_S, tangent_basis
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -18,7 +19,7 @@ CONVERGED = 1e-9  # of the range
 LIGHT = SPEED_OF_LIGHT_KM_S
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def invert3(M, out):
     """Write the inverse of a symmetric 3x3 matrix; return its determinant (0: not done)."""
     a, b, c = M[0, 0], M[0, 1], M[0, 2]
@@ -34,7 +35,7 @@ def invert3(M, out):
     return det
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def start_point(use, r, u, x):
     """Write the point nearest to the lines in use (all alike); return false where parallel.
 
@@ -58,7 +59,7 @@ def start_point(use, r, u, x):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _residual(r, u, basis, shift, x, out):
     """Write a view's residual [rad] on its tangent plane; return the range [km]."""
     d0, d1, d2 = x[0] + shift[0] - r[0], x[1] + shift[1] - r[1], x[2] + shift[2] - r[2]
@@ -68,7 +69,7 @@ def _residual(r, u, basis, shift, x, out):
     return rho
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def weight_of(cov, sigma_km, rho, out):
     """Write the inverse of a view's 2x2 covariance, the sensor's place included."""
     extra = (sigma_km / rho) ** 2
@@ -78,7 +79,7 @@ def weight_of(cov, sigma_km, rho, out):
     out[0, 1] = out[1, 0] = -b / det
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def solve_point(use, r, u, basis, cov, sigma_km, velocity, x, P):
     """Solve one point over the views in `use`; x has its start and receives the point.
 
@@ -132,7 +133,7 @@ def solve_point(use, r, u, basis, cov, sigma_km, velocity, x, P):
     return chi2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _worst(use, r, u, basis, cov, sigma_km, velocity, x, P):
     """Return the view with the largest normalised residual, and that residual squared.
 
@@ -175,7 +176,7 @@ def _worst(use, r, u, basis, cov, sigma_km, velocity, x, P):
     return worst, largest
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve_groups(
     offsets, r, u, basis, cov, sigma_km, velocity, reject2, x, P, chi2, used, mean_rho
 ):

@@ -14,7 +14,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.special import gammaincinv, gammaln
 
-from epipole.tasks.algorithms.orbits.orbit_fit import GM_KM3_S2, trajectory
+from epipole.tasks.algorithms.constants import GM_KM3_S2
+from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -9,16 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from epipole.tasks.algorithms.geometry.sky import SPEED_OF_LIGHT_KM_S, tangent_basis
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-GM_KM3_S2 = 398600.4418
-EARTH_RADIUS_KM = 6378.1363
-J2 = 1.08262668e-3
 LIGHT = SPEED_OF_LIGHT_KM_S
 STEP_S = 10.0  # the Runge-Kutta error of a low orbit over 10 minutes is then below a metre
 ITERATIONS = 20
@@ -53,7 +51,7 @@ class Arcs(NamedTuple):
     sigma_km: Array
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rates(y, out):
     """Write the rates of a state (6) and its transition matrix (36, row by row)."""
     x, v, z = y[:3], y[3:6], y[2]
@@ -74,7 +72,7 @@ def _rates(y, out):
             out[6 + 6 * (3 + a) + k] = pull * (total - y[6 + 6 * a + k])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _advance(y, dt_s):
     """Carry a state and its transition matrix over dt_s, in place, by Runge and Kutta."""
     n = int(np.ceil(abs(dt_s) / STEP_S))
@@ -125,7 +123,7 @@ def trajectory(state: Array, dt_s: Array) -> tuple[Array, Array]:
     return out[:, :6], out[:, 6:].reshape(-1, 6, 6)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _accumulate(y, view, shared, N, rhs, at):
     """Add one view to the normal equations; return its part of chi-square, NaN where behind.
 
@@ -170,7 +168,7 @@ def _accumulate(y, view, shared, N, rhs, at):
     return chi2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_views(state, errors, time_s, sensor, r, u, basis, weight, N, rhs):
     """Add all views to the normal equations at a state; return their chi-square."""
     chi2 = 0.0

@@ -7,8 +7,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, SPEED_OF_LIGHT_KM_S, aberrate
-from epipole.tasks.algorithms.time.time_scales import AU_KM, tt_julian_date
+from epipole.tasks.algorithms.constants import ARCSEC, AU_KM, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.sky import aberrate
+from epipole.tasks.algorithms.time.time_scales import tt_julian_date
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]

@@ -15,6 +15,7 @@ import erfa
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.constants import EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.time.time_scales import (
     tai_minus_utc_s,
     tt_julian_date,
@@ -25,7 +26,6 @@ Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 
 FRAMES = ("GCRF", "EME2000", "TEME", "ITRF")
-EARTH_RATE_RAD_S = 7.292115146706979e-5  # of the Earth rotation angle
 MJD_JD = 2400000.5
 # Nutation's fastest term takes days: over ten minutes a line is good to 1e-6 arcsec.
 NODE_NS = 600_000_000_000

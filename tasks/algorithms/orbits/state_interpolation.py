@@ -16,16 +16,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SECOND_NS
 from epipole.tasks.algorithms.geometry.rotations import interpolate_quaternions
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
-SECOND_NS = 1_000_000_000
-GM_KM3_S2 = 398600.4418
-EARTH_RADIUS_KM = 6378.1366
-J2 = 1.08262668e-3
 LOWEST_ORBIT_KM = EARTH_RADIUS_KM + 80.0
 
 # Widest gap between two states that is bridged: the quintic of a low orbit is then good to

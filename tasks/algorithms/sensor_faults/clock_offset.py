@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.geometry.rotations import skew
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
-from epipole.tasks.algorithms.orbits.orbit_fit import GM_KM3_S2
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -4,11 +4,11 @@ call."""
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, turn
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.search.field import (
     aberrated,
     solve_predicted,
@@ -57,7 +57,7 @@ def new_memory(n_stars: int) -> Memory:
     )
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def remember(t_s, R, P, t_fix, R_fix, P_fix, held):
     """Enter an identified attitude (compiled)."""
     t_fix[0], t_fix[1] = t_fix[1], t_s
@@ -68,7 +68,7 @@ def remember(t_s, R, P, t_fix, R_fix, P_fix, held):
     held[0] = min(held[0] + 1, 2)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def predict(t_s, t_fix, R_fix, P_fix, held, R, P):
     """Write attitude and covariance at t_s as the last one or two tell; return whether they
     are of use (compiled)."""
@@ -96,7 +96,7 @@ def predict(t_s, t_fix, R_fix, P_fix, held, R, P):
     return P[0, 0] + P[1, 1] <= 2 * WIDEST_PREDICTION**2
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _rotation_between(A, B):
     """Return the rotation vector of B A', shorter than pi."""
     v = np.empty(3)
@@ -115,7 +115,7 @@ def _rotation_between(A, B):
     return f * v[0], f * v[1], f * v[2]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _field_stars(R, reach, beta, star_u, star_mag, near, cone, a, magnitude, row):
     """Write the apparent directions, magnitudes and rows of the stars within `reach` of the
     boresight; return how many."""
@@ -135,7 +135,7 @@ def _field_stars(R, reach, beta, star_u, star_mag, near, cone, a, magnitude, row
     return n
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def follow(
     k,
     stop,

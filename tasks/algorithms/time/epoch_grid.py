@@ -3,10 +3,11 @@
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.constants import DAY_NS
+
 Nanoseconds = npt.NDArray[np.int64]
 
 MILLISECOND_NS = 1_000_000
-DAY_NS = 86_400_000_000_000
 
 
 def frame_interval_ns(time_ns: Nanoseconds) -> int:

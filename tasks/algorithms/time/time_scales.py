@@ -6,14 +6,13 @@ import erfa
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.constants import AU_KM, DAY_NS, DAY_S
+
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 
-DAY_NS = 86_400_000_000_000
 UNIX_EPOCH_JD = 2440587.5
-AU_KM = 149597870.7
 NODE_NS = 600_000_000_000
-DAY_S = 86400.0
 TT_MINUS_TAI_S = 32.184
 
 

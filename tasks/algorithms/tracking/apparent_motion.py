@@ -7,25 +7,26 @@ further derivative brings one more factor of the rate, or of the angular rate of
 """
 
 import numpy as np
-from numba import njit
+
+from epipole.tasks.algorithms.kernels import kernel
 
 LOW_ORBIT_S = 1e-3  # [1/s] angular rate of a low orbit; also g / v there
 FAR_RAD_S2 = 2.5e-7  # [rad/s^2] a low sensor's own acceleration, seen from a distant object
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def acceleration(rate: float) -> float:
     """Return how fast [rad/s^2] a rate [rad/s] may change."""
     return rate * rate + LOW_ORBIT_S * rate + FAR_RAD_S2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def jerk(rate: float) -> float:
     """Return how fast [rad/s^3] the acceleration at a rate [rad/s] may change."""
     return 2 * rate**3 + LOW_ORBIT_S * acceleration(rate)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cubic_span(rate: float, sigma: float) -> float:
     """Return over how long [s] a cubic describes the motion to a standard deviation [rad].
 

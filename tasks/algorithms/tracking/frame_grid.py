@@ -6,12 +6,13 @@ as compiled code takes them: slot k of each belongs to the frames k, k + size, .
 """
 
 import numpy as np
-from numba import njit
+
+from epipole.tasks.algorithms.kernels import kernel
 
 FINEST = 128  # cells a side
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def make_grids(size, most):
     """Return arrays for `size` frames of at most `most` detections."""
     side = max(min(int(np.sqrt(most)), FINEST), 1)
@@ -22,7 +23,7 @@ def make_grids(size, most):
     return axes, shape, start, items
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _lay_axes(directions, lo, hi, axes):
     """Set two axes across the mean direction of a frame."""
     mean = np.zeros(3)
@@ -47,12 +48,12 @@ def _lay_axes(directions, lo, hi, axes):
     axes[1, two] = -mean[two] * mean[flat] / norm / total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _along(u, axis):
     return u[0] * axis[0] + u[1] * axis[1] + u[2] * axis[2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fill_grid(grids, slot, directions, lo, hi):
     """Lay the detections lo:hi of a frame into a slot."""
     axes, shape, start, items = grids
@@ -84,7 +85,7 @@ def fill_grid(grids, slot, directions, lo, hi):
         at[cell[k]] += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def window(grids, slot, u, reach):
     """Return the cells that a reach about a direction touches: x from, to, y from, to, side.
 

@@ -7,8 +7,8 @@ followed: in dense frames most pairs are never looked at, and no track is lost b
 """
 
 import numpy as np
-from numba import njit
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.frame_grid import window
 from epipole.tasks.algorithms.tracking.sky_filter import (
     advance,
@@ -30,7 +30,7 @@ MOST_PAIRS = 500_000  # a frame: where more are possible, the fastest are not lo
 FEW_PAIRS = 50_000  # up to which pairs two frames apart are tried as well
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def free_density(f, depth, offsets, track, field_sr):
     """Return free detections a steradian in frame f and the frames before it, at least one."""
     out = np.empty(min(depth, f + 1))
@@ -42,7 +42,7 @@ def free_density(f, depth, offsets, track, field_sr):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _class_rates(max_rate):
     """Return the lower ends of the classes of rate, and the end of the last."""
     out = np.zeros(N_RATES + 1)
@@ -52,7 +52,7 @@ def _class_rates(max_rate):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _best_evidence(f, g, times, density, variance, class_rates):
     """Return, a class of rate, the most evidence that frames h < g can still add: [class, h'].
 
@@ -81,7 +81,7 @@ def _best_evidence(f, g, times, density, variance, class_rates):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest_free(u, variance, directions, variances, largest, grids, slot, track, gate2):
     """Return the free detection of a frame that is nearest to u in sigmas, and its chi-square."""
     start, items = grids[2], grids[3]
@@ -101,7 +101,7 @@ def _nearest_free(u, variance, directions, variances, largest, grids, slot, trac
     return best, best_chi2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _foretell(u_f, u_g, chord2, ratio, out):
     """Set out to where the great circle from u_f over u_g leads, `ratio` steps on; no trig.
 
@@ -116,7 +116,7 @@ def _foretell(u_f, u_g, chord2, ratio, out):
         out[a] = u_g[a] * (cosine + along * sines) - u_f[a] * sines
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _chain_back(
     f, g, i, j, directions, variances, largest, times, grids, n_slots, track, density, gate2,
     best, wanted, u, w, P, members,
@@ -159,7 +159,7 @@ def _chain_back(
     return n, evidence
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fastest(best, class_rates, wanted, dt, pairs_sr, max_rate):
     """Return the highest rate looked for: of use, and with no more pairs than are allowed."""
     top = 0.0
@@ -170,7 +170,7 @@ def _fastest(best, class_rates, wanted, dt, pairs_sr, max_rate):
     return min(top, most, max_rate)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _class_of(rate, max_rate):
     if rate < SLOWEST_RAD_S:
         return 0
@@ -179,7 +179,7 @@ def _class_of(rate, max_rate):
     return min(c, N_RATES - 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _may_chain(
     u_f, u_g, var_f, var_g, chord2, dt, dt_back, directions, variances, largest, grids, slot,
     track, gate2, P, ahead,
@@ -194,7 +194,7 @@ def _may_chain(
     return j != NONE
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _try_pairs(
     f, g, reach, times, offsets, directions, variances, largest, grids, n_slots, track, density,
     gate2, need, tries, enough, best, max_rate, held, strength, chains,
@@ -242,7 +242,7 @@ def _try_pairs(
                     chains[row, :got] = members[:got]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _useful_depth(best, wanted):
     """Return how many frames back are worth following: enough for the slowest, with a miss."""
     n_back = best.shape[1] - 1
@@ -253,7 +253,7 @@ def _useful_depth(best, wanted):
     return n_back
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def new_tracks(
     f, depth, deepest, times, offsets, directions, variances, smallest, largest, grids, n_slots,
     track, n_tracks, max_rate, max_coast, need, gate2, field_sr, enough,

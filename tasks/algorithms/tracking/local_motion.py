@@ -7,8 +7,8 @@ covariance of the detections, of each its own or shared by all, propagates exact
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, jerk
 
 Array = npt.NDArray[np.float64]
@@ -16,13 +16,13 @@ Array = npt.NDArray[np.float64]
 BIAS_SHARE = 0.25  # of one detection's sigma: what the neglected third derivative may amount to
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _half_width(rate, sigma, widest):
     """Return the window [s] in which the neglected cubic term stays below the noise."""
     return min(widest, (6 * BIAS_SHARE * sigma / jerk(rate)) ** (1 / 3))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve3(S, rhs):
     """Solve the symmetric 3x3 system S c = rhs by Cramer's rule."""
     a, b, c = S[0, 0], S[0, 1], S[0, 2]
@@ -37,7 +37,7 @@ def _solve3(S, rhs):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _coefficients(t, weight, scale, curvature_prior, value, slope):
     """Fill the coefficients of the polynomial's value and slope at t = 0; return the value's
     variance for detections of variance 1 / weight, the prior's part included.
@@ -65,7 +65,7 @@ def _coefficients(t, weight, scale, curvature_prior, value, slope):
     return v0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _about(t, first, last, at, half):
     """Return the detections within a half-width of an instant, three at least if there are."""
     lo = first + np.searchsorted(t[first:last], at - half)
@@ -78,7 +78,7 @@ def _about(t, first, last, at, half):
     return lo, hi
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _window(t, u, first, last, at, sigma, widest):
     """Return the part of first:last that serves an instant, the rate [rad/s] and half-width.
 
@@ -97,7 +97,7 @@ def _window(t, u, first, last, at, sigma, widest):
     return lo, hi, rate, half
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _evaluate(
     first,
     last,

@@ -7,8 +7,8 @@ left may begin new ones.
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.frame_grid import fill_grid, make_grids, window
 from epipole.tasks.algorithms.tracking.initiation import NONE, new_tracks
 from epipole.tasks.algorithms.tracking.sky_filter import (
@@ -26,7 +26,7 @@ SLACK = 4  # frames beyond the fewest detections in which a track must begin
 DEEPEST = 9  # the same where strays are so dense that it takes more detections
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _state_of(members, frame_of, times, directions, variances, u, w, P):
     """Filter a new track's detections, newest first in `members`, into its state at the newest."""
     last = len(members) - 1
@@ -42,7 +42,7 @@ def _state_of(members, frame_of, times, directions, variances, u, w, P):
         correct(u, w, P, directions[members[m]], variances[members[m]])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _candidates(live, U, P, directions, variances, largest, grids, slot, gate2):
     """Return all (track, detection, chi-square) within the gate."""
     start, items = grids[2], grids[3]
@@ -69,7 +69,7 @@ def _candidates(live, U, P, directions, variances, largest, grids, slot, gate2):
     return who[:count], which[:count], chi2[:count]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _claim(
     live, U, W, P, at, missed, time, directions, variances, largest, grids, slot, track, gate2
 ):
@@ -90,7 +90,7 @@ def _claim(
         correct(U[m], W[m], P[m], directions[j], variances[j])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _follow(
     times, offsets, frame_of, most, directions, variances, max_rate, max_coast, max_missed, need,
     gate2, field_sr, enough,

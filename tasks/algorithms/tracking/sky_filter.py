@@ -5,24 +5,24 @@ acceleration that the rate allows. No chart is involved, so no place on the sky 
 """
 
 import numpy as np
-from numba import njit
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.apparent_motion import acceleration
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rate_of(w):
     """Return the length of a rate vector."""
     return np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def distance2(a, b):
     """Return the squared chord between two directions."""
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def advance(u, w, dt):
     """Turn direction u and rate w (both changed in place) by dt along their great circle."""
     rate = rate_of(w)
@@ -36,7 +36,7 @@ def advance(u, w, dt):
         w[a] = old_w * cosine - old_u * rate * sine
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def grow(P, rate, dt):
     """Let the covariance grow over dt, which may be negative."""
     a = acceleration(rate)
@@ -46,7 +46,7 @@ def grow(P, rate, dt):
     P[2] += a * a * step * step
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shrink(P, variance):
     """Update the covariance by a measured direction; return the gains of direction and rate."""
     s = P[0] + variance
@@ -57,7 +57,7 @@ def shrink(P, variance):
     return gain_u, gain_w
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def correct(u, w, P, measured, variance):
     """Update u, w and P in place by a measured direction."""
     gain_u, gain_w = shrink(P, variance)
@@ -76,7 +76,7 @@ def correct(u, w, P, measured, variance):
         w[a] -= along * u[a]  # a rate stays perpendicular to its direction
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def begin_covariance(rate, dt, var_1, var_2, P):
     """Set P to the covariance at the second of two detections dt apart."""
     a = acceleration(rate)
@@ -85,7 +85,7 @@ def begin_covariance(rate, dt, var_1, var_2, P):
     P[2] = (var_1 + var_2) / (dt * dt) + 0.25 * a * a * dt * dt
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def begin(u_1, t_1, var_1, u_2, t_2, var_2, u, w, P):
     """Set u, w, P to the state at the second of two detections."""
     dt = t_2 - t_1

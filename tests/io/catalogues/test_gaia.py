@@ -11,7 +11,8 @@ from epipole.schemas.bridge import array
 from epipole.schemas.errors import CatalogueError
 from epipole.schemas.star_catalogue import UNKNOWN_MOTION_MAS_YR, label_of
 from epipole.tasks.algorithms.catalogue.star_catalogue import places_at
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, unit_from_radec
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.sky import unit_from_radec
 
 THETA_AURIGAE, POLARIS, BARNARD = 28380, 11767, 87937
 

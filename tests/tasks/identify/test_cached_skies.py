@@ -8,7 +8,8 @@ from scenes.random_stars import optics, random_catalogue
 
 from epipole.schemas.bridge import table
 from epipole.schemas.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, radec_from_unit
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.sky import radec_from_unit
 from epipole.tasks.identify import cached_skies
 from epipole.tasks.identify.cached_skies import CachedSkies, Catalogue
 

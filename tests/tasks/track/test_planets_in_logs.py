@@ -5,7 +5,7 @@ import polars as pl
 import pytest
 
 from epipole.schemas.scene import validate_scene
-from epipole.tasks.algorithms.geometry.sky import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.time.time_scales import tt_julian_date
 
 jplephem = pytest.importorskip("jplephem")

@@ -7,12 +7,12 @@ and its drift), not one an instant, and is weighed so.
 """
 
 import numpy as np
-from numba import njit
 
 from epipole.tasks.algorithms.association.sampling.views import PLANE, X, Y, direction, residual
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
+from epipole.tasks.algorithms.kernels import kernel
 
-GM_KM3_S2 = 398600.4418
-J2_RE2_KM2 = 1.0826e-3 * 6378.137**2  # the Earth's oblateness; GCRF's pole is near enough
+J2_RE2_KM2 = J2 * EARTH_RADIUS_KM**2  # GCRF's pole is near enough
 STEP_S = 60.0  # Runge-Kutta is good to 0.1 m over it in a low orbit
 ITERATIONS = 6
 CONVERGED = 1e-4  # sigmas squared
@@ -21,7 +21,7 @@ LN_2PI = np.log(2 * np.pi)
 SLACK_SIGMA = 3.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def factor(N, b):
     """Solve N x = b in place (Cholesky); return ln det N, NaN where N is not positive."""
     n, log_det = len(b), 0.0
@@ -46,7 +46,7 @@ def factor(N, b):
     return log_det
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _pull(y, dy):
     """Write the rates of a state (6) about an oblate Earth."""
     r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
@@ -58,7 +58,7 @@ def _pull(y, dy):
     dy[5] -= 2.0 * pull * flat * y[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fall(y, dt_s, k):
     """Carry a state over dt_s in place (Runge and Kutta); `k` is (5, 6) to work in."""
     n = int(np.ceil(dt_s / STEP_S))
@@ -74,7 +74,7 @@ def _fall(y, dt_s, k):
         y += h / 6 * (k[0] + 2 * k[1] + 2 * k[2] + k[3])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _begin(views, x, seen_by, state):
     """Write the state at the first solved instant from the points; return that instant.
 
@@ -107,7 +107,7 @@ def _begin(views, x, seen_by, state):
     return first
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _normal_equations(views, members, n, first, state, at, k, N, rhs):
     """Write the normal equations of the orbit; return chi-square, NaN behind a sensor.
 
@@ -153,7 +153,7 @@ def _normal_equations(views, members, n, first, state, at, k, N, rhs):
     return chi2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _ends(views, i, first):
     """Return the first and the last instant at which a tracklet is seen, from `first` on."""
     begun, ended = -1, -1
@@ -164,7 +164,7 @@ def _ends(views, i, first):
     return begun, ended
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _scatter(views, chance, i, begun, ended, b):
     """Write how tracklet i drifts beside its sensor's others; return that drift's variance.
 
@@ -180,7 +180,7 @@ def _scatter(views, chance, i, begun, ended, b):
     return max(chance.spread[s] ** 2, square / 2.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _usual_velocity(views, chance, members, n, first, state, prior, usual):
     """Write the prior of the velocity, its mean and inverse covariance; return its log norm.
 
@@ -214,7 +214,7 @@ def _usual_velocity(views, chance, members, n, first, state, prior, usual):
     return -1.5 * LN_2PI - np.log(along) - 2.0 * np.log(across) - cost
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _range(views, i, m, x):
     total = 0.0
     for a in range(3):
@@ -222,7 +222,7 @@ def _range(views, i, m, x):
     return np.sqrt(total)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _own_odds(views, chance, i, first, at):
     """Return the log-likelihood of a tracklet's directions as something else's.
 
@@ -269,7 +269,7 @@ def _own_odds(views, chance, i, first, at):
     return prior + LN_2PI - 0.5 * log_det - 0.5 * chi2
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _leaves(state, L):
     """Return whether the orbit leaves the Earth, by 3 sigma; L is the factored information."""
     r = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
@@ -286,7 +286,7 @@ def _leaves(state, L):
     return 0.5 * v2 - GM_KM3_S2 / r > SLACK_SIGMA * np.sqrt(variance)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def arc_odds(views, chance, members, n, x, seen_by):
     """Return the log-odds that the members' directions are one orbit's rather than their own.
 

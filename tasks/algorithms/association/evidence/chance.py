@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.sampling.samples import Samples
-from epipole.tasks.algorithms.geometry.sky import ARCSEC
+from epipole.tasks.algorithms.constants import ARCSEC
 
 Array = npt.NDArray[np.float64]
 

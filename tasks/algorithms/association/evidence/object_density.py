@@ -8,11 +8,11 @@ prior about the common one.
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from epipole.tasks.algorithms.association.evidence.chance import Chance
 from epipole.tasks.algorithms.association.evidence.visibility import in_view
 from epipole.tasks.algorithms.association.sampling.views import Views
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _in_view_of(camera, x):
     """Return how many sensors see each point, (n,)."""
     count = np.zeros(len(x), np.int64)

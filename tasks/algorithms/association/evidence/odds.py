@@ -1,14 +1,14 @@
 """Odds: how much likelier one object is than unrelated tracklets."""
 
 import numpy as np
-from numba import njit
 
 from epipole.tasks.algorithms.association.evidence.arcs import LN_2PI, arc_odds
 from epipole.tasks.algorithms.association.evidence.visibility import looks_at
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
+from epipole.tasks.algorithms.kernels import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _det3(M):
     return (
         M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
@@ -17,7 +17,7 @@ def _det3(M):
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def score(views, chance, members, n, points, part, shells, near, looks):
     """Return the log of the odds "one object" against "unrelated tracklets".
 
@@ -46,7 +46,7 @@ def score(views, chance, members, n, points, part, shells, near, looks):
     return total + _detections(views, chance, members, n, X, seen_by, near, looks)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _detections(views, chance, members, n, X, seen_by, near, looks):
     """Return the log-probability that these sensors have it and the others that look do not.
 
@@ -65,7 +65,7 @@ def _detections(views, chance, members, n, X, seen_by, near, looks):
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _altitude_weight(x, shells):
     """Return the log of how much likelier objects are at this height than on average.
 

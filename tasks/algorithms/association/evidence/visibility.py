@@ -1,15 +1,15 @@
 """Visibility: whether a sensor could see a point at all."""
 
 import numpy as np
-from numba import njit
 
 from epipole.tasks.algorithms.association.sampling.views import HALF, PLANE, REACH, TURN
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.kernels import kernel
 
-EARTH_RADIUS_KM = 6378.137
 INSIDE = 0.98  # of the half field: nearer to the edge a sensor may well miss an object
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def blocked(r, x, radius):
     """Return whether the Earth stands between r and x."""
     dot, length2, r2 = 0.0, 0.0, 0.0
@@ -21,7 +21,7 @@ def blocked(r, x, radius):
     return dot < 0.0 and -dot < length2 and r2 - dot * dot / length2 < radius * radius
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def sees(r, R, half_field, x):
     """Return whether a sensor at r has x in its field, not at the edge, the Earth not between.
 
@@ -38,7 +38,7 @@ def sees(r, R, half_field, x):
     return not blocked(r, x, EARTH_RADIUS_KM)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def in_view(cam, x):
     """Return what `sees` does, by a row of `Views.camera`."""
     d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
@@ -52,7 +52,7 @@ def in_view(cam, x):
     return not blocked(cam, x, EARTH_RADIUS_KM)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def looks_at(views, s, X, seen_by):
     """Return whether sensor s has the point in its field at every solved instant."""
     looked = False
@@ -65,7 +65,7 @@ def looks_at(views, s, X, seen_by):
     return looked
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def near_fields(views, X, P, seen_by, near):
     """Write which sensors have a point, by far, near what they see at any solved instant.
 

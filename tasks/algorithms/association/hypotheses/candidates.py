@@ -1,7 +1,6 @@
 """Candidates: which tracklet of a sensor a hypothesis' points explain best."""
 
 import numpy as np
-from numba import njit
 
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
 from epipole.tasks.algorithms.association.sampling.views import (
@@ -16,11 +15,12 @@ from epipole.tasks.algorithms.association.sampling.views import (
     X,
     Y,
 )
+from epipole.tasks.algorithms.kernels import kernel
 
 A0, A1, H00, H01, H11, DEPTH, STRETCH = range(7)  # columns of what is predicted
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _predict(views, s, points, predicted):
     """Write where sensor s should see the points, and how well that is known; false: behind."""
     x, _, P, seen_by = points
@@ -53,7 +53,7 @@ def _predict(views, s, points, predicted):
         predicted[m, STRETCH] = 1.0 + a0 * a0 + a1 * a1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
     """Return what tracklet c adds to the odds; -inf where it does not fit at the shared instants.
 
@@ -91,7 +91,7 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
     return gain if n > 0 and total <= quantile(2 * n, gate_sigma) else -np.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_sigma, least):
     """Return the free tracklet of sensor s that adds most to the odds, how much, and the next.
 
@@ -136,14 +136,14 @@ def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_
     return best, best_gain, second
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def odds_of_view(views, chance, s, c, points, predicted):
     """Return what tracklet c of sensor s adds to the odds of an object with these points."""
     _predict(views, s, points, predicted)
     return _fit(views, chance, s, c, points[3], predicted, np.inf)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _shared_before(views, c, m, seen_by):
     shared = False
     for earlier in range(m):
@@ -151,7 +151,7 @@ def _shared_before(views, c, m, seen_by):
     return shared
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _clashes(views, c, members, n):
     """Return whether a member is c, or of the same sensor at the same time."""
     for q in range(n):

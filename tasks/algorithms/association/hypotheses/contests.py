@@ -6,15 +6,15 @@ explain it about equally well.
 """
 
 import numpy as np
-from numba import njit
 
 from epipole.tasks.algorithms.association.evidence.visibility import near_fields
 from epipole.tasks.algorithms.association.hypotheses.candidates import best_of_sensor, odds_of_view
 from epipole.tasks.algorithms.association.hypotheses.growth import CONTESTED, SPEAKS
 from epipole.tasks.algorithms.association.hypotheses.instant_points import solve
+from epipole.tasks.algorithms.kernels import kernel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def settle_contests(views, chance, group, n_groups, gate_sigma):
     """Write to `group` who has the tracklets that two objects explain; FREE (-1): nobody.
 
@@ -62,7 +62,7 @@ def settle_contests(views, chance, group, n_groups, gate_sigma):
                     size[g] += 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _by_group(group, n_groups):
     """Return the tracklets group after group, and where each group begins."""
     first = np.zeros(n_groups + 1, np.int64)

@@ -1,7 +1,6 @@
 """Growth: two tracklets become a hypothesis as other sensors' tracklets join them."""
 
 import numpy as np
-from numba import njit
 
 from epipole.tasks.algorithms.association.evidence.odds import score
 from epipole.tasks.algorithms.association.evidence.visibility import looks_at, near_fields
@@ -9,6 +8,7 @@ from epipole.tasks.algorithms.association.hypotheses.candidates import best_of_s
 from epipole.tasks.algorithms.association.hypotheses.instant_points import join, possible, solve
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
+from epipole.tasks.algorithms.kernels import kernel
 
 FEW = 3  # sensors that must have looked before a hypothesis is given up
 GIVEN_UP = -4.0  # log-odds of the sensors beside the seed's at which it is
@@ -20,7 +20,7 @@ COMPLETE = 0.85  # of the views that are usual, those of a clear hypothesis
 REVIEWS = 2  # the first may still rest on a stray
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def grow_all(views, chance, seeds, taken, limits, gate_sigma, shells, clear, found):
     """Grow every seed and write what comes of it.
 
@@ -61,7 +61,7 @@ def grow_all(views, chance, seeds, taken, limits, gate_sigma, shells, clear, fou
                 taken[i] = True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def clear_of_doubt(chance, looks, n, value, clear):
     """Return whether a hypothesis may be taken at once.
 
@@ -75,7 +75,7 @@ def clear_of_doubt(chance, looks, n, value, clear):
     return value > clear and n >= WELL_KNOWN and has >= COMPLETE * usual
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _grow(views, chance, members, taken, limits, gate_sigma, points, part, predicted, near):
     """Grow the first two members; return the size, 0 where it fails.
 
@@ -139,7 +139,7 @@ def _grow(views, chance, members, taken, limits, gate_sigma, points, part, predi
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _review(views, chance, members, n, early, taken, points, part, predicted, gate_sigma):
     """Choose the early members again, now that the points are well known; return the size.
 
@@ -173,7 +173,7 @@ def _review(views, chance, members, n, early, taken, points, part, predicted, ga
     return _settle(views, members, kept, points, part, gate_sigma)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _speaks(views, chance, i, points, part):
     """Return whether a member still speaks for the object, by the first instant it shares."""
     for m in range(len(views.time_s)):
@@ -186,7 +186,7 @@ def _speaks(views, chance, i, points, part):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _settle(views, members, n, points, part, gate_sigma):
     """Solve, and let go the member that fits worst until all fit; return the size.
 

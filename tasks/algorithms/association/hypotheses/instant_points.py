@@ -1,18 +1,19 @@
 """Points of a hypothesis: at every instant at which two tracklets are seen, one point."""
 
 import numpy as np
-from numba import njit
 
-from epipole.tasks.algorithms.association.evidence.visibility import EARTH_RADIUS_KM, blocked
+from epipole.tasks.algorithms.association.evidence.visibility import blocked
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import BEYOND, SLACK_SIGMA
 from epipole.tasks.algorithms.association.sampling.views import direction, residual
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.geometry.triangulation import invert3
+from epipole.tasks.algorithms.kernels import kernel
 
 ITERATIONS = 6
 CONVERGED = 1e-4  # sigmas squared
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _start(views, members, n, m, x):
     """Write the point nearest to the members' lines; false where they are parallel."""
     N, inverse, rhs, u = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
@@ -35,7 +36,7 @@ def _start(views, members, n, m, x):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def add_view(views, i, m, x, N, rhs, part):
     """Add a view to the normal equations (upper half); return its chi-square, NaN behind."""
     if residual(views, i, m, x, part) == 0.0:
@@ -51,7 +52,7 @@ def add_view(views, i, m, x, N, rhs, part):
     return part[0] * g0 + part[1] * g1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def step(x, N, rhs, P):
     """Invert N into P and move x; return how much chi-square falls, NaN where it runs off."""
     if invert3(N, P) == 0.0:
@@ -64,7 +65,7 @@ def step(x, N, rhs, P):
     return gain if gain < 1e12 else np.nan  # as good as parallel
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def solve(views, members, n, points, part):
     """Solve every instant at which two members are seen; return chi-square and freedom.
 
@@ -102,7 +103,7 @@ def solve(views, members, n, points, part):
     return total, dof
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def join(views, c, points, part):
     """Add tracklet c to the points that are solved (Kalman's update); false where it fails."""
     X, N, P, seen_by = points
@@ -119,7 +120,7 @@ def join(views, c, points, part):
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def possible(views, members, n, points, lowest, farthest):
     """Return whether the points lie, within 3 sigma, where their sensors can see an object."""
     X, _, P, seen_by = points

@@ -7,11 +7,11 @@ view's partners are a binary search away, and no pair that cannot meet is ever l
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import pair_miss, quantile
 from epipole.tasks.algorithms.association.sampling.views import SIGMA_KM, XX, YY, Views
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -37,7 +37,7 @@ def _directions(views: Views, s: int, m: int, items: Indices) -> Array:
     return np.asarray(sight / np.linalg.norm(sight, axis=1, keepdims=True))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _meeting(
     views, m, items_a, angle_a, sigma_a, items_b, angle_b, sigma_b, taken, lowest, farthest,
     gate_sigma, out,

@@ -1,7 +1,6 @@
 """Lines of sight, two at a time: whether they meet, and where an object can be."""
 
 import numpy as np
-from numba import njit
 
 from epipole.tasks.algorithms.association.sampling.views import (
     PLANE,
@@ -13,12 +12,13 @@ from epipole.tasks.algorithms.association.sampling.views import (
     Y,
     direction,
 )
+from epipole.tasks.algorithms.kernels import kernel
 
 BEYOND = 0.2  # share of the farthest distance
 SLACK_SIGMA = 3.0  # a point may lie this far outside where objects can be
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def quantile(dof, sigma):
     """Return the chi-square with `dof` degrees of freedom that is as rare as `sigma`.
 
@@ -28,7 +28,7 @@ def quantile(dof, sigma):
     return dof * (1.0 - a + sigma * np.sqrt(a)) ** 3
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
     """Return the squared miss of two lines of sight over its variance; NaN where impossible.
 
@@ -69,13 +69,13 @@ def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
     return miss * miss / variance
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _spread(views, i, m):
     """Return the trace of a direction's covariance in its plane."""
     return views.sight[i, m, XX] + views.sight[i, m, YY]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _across(views, i, m, n0, n1, n2):
     """Return the variance of a direction along a unit vector across it [rad^2]."""
     cam, see = views.camera[views.sensor[i], m], views.sight[i, m]

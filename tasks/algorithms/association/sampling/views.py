@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from epipole.tasks.algorithms.association.sampling.samples import Samples
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -148,7 +148,7 @@ def _reach(camera: Array, grid: Indices) -> Array:
     return np.where(side[..., 0] > 0, np.tan(np.minimum(widest, 1.5)), 0.0)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _flatten(sensor, seen, u, cov, camera, sight):
     """Project directions and covariances, which are on `sky.tangent_basis`, onto the planes."""
     M, t, p = np.empty((2, 2)), np.empty((2, 3)), np.empty((3, 3))
@@ -184,7 +184,7 @@ def _flatten(sensor, seen, u, cov, camera, sight):
                 sight[i, m, XX + k] = M[a, 0] * along + M[a, 1] * across
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
     """Sort each sensor's tracklets into square cells, about one a cell."""
     begin, filled = 0, 0
@@ -233,7 +233,7 @@ def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
             begin += side * side + 1
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def direction(views, i, m, u):
     """Write the direction of a tracklet."""
     s, x, y = views.sensor[i], views.sight[i, m, X], views.sight[i, m, Y]
@@ -243,7 +243,7 @@ def direction(views, i, m, u):
         u[a - PLANE] = (along + views.camera[s, m, a + 6]) / length
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def residual(views, i, m, x, part):
     """Write a view's residual, predicted minus seen, its partials and weight; return the depth.
 
@@ -275,7 +275,7 @@ def residual(views, i, m, x, part):
     return depth
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def misfit(part):
     """Return the chi-square of what `residual` wrote."""
     e0, e1 = part[0], part[1]

@@ -4,10 +4,10 @@ a centroid."""
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.frames.frame import Frame, Optics, Solution
 
 Array = npt.NDArray[np.float64]
@@ -141,7 +141,7 @@ def unsolved(first: Rows) -> Solutions:
     )  # fmt: skip
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def brightest_first(first, flux):
     """Return the rows of each frame's centroids, brightest first, NaN last, as they came where
     equal (compiled)."""

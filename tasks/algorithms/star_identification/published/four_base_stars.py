@@ -13,10 +13,10 @@ counts, and a draw is none.
 
 import math
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 
@@ -54,19 +54,19 @@ def match_four_base_stars(
     return star
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _chord(a, i, b, j):
     dx, dy, dz = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _tolerance(sigma, i, j, c):
     # Aberration stretches by v / c at most.
     return PAIR_GATE * math.sqrt(sigma[i] * sigma[i] + sigma[j] * sigma[j]) + 1.1e-4 * c
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _same_hand(u, p, s_u, s):
     """Return whether the first three of the four turn the same way in image and catalogue."""
     seen = np.linalg.det(np.stack((u[p[0]], u[p[1]], u[p[2]])))
@@ -74,7 +74,7 @@ def _same_hand(u, p, s_u, s):
     return seen * listed > 0.0
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _identities(u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pair_b, counter, out):
     """Write the quadruples of stars whose six separations are those of centroids p; return
     how many. `counter` is zero, and left so."""
@@ -140,7 +140,7 @@ def _identities(u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pai
     return count
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _match_rest(u, sigma, p, star_u, s, star):
     """Write the stars of all centroids by the quadrilateral rule; return how many beside
     the base stars."""
@@ -199,7 +199,7 @@ def _match_rest(u, sigma, p, star_u, s, star):
     return matches
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_base, star):
     n = len(u)
     m = min(n, n_base)

@@ -12,10 +12,10 @@ identities of one image must agree with each other in separations before an atti
 
 import math
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.published.agreement import agreeing_candidates
 from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
@@ -48,13 +48,13 @@ def states(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> npt.N
     return star
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _chord(a, i, b, j):
     dx, dy, dz = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _bins(u, sigma, i, j):
     """Return the chords between which the bins lie that a separation's error reaches."""
     angle = 2.0 * math.asin(min(0.5 * _chord(u, i, u, j), 1.0))
@@ -64,7 +64,7 @@ def _bins(u, sigma, i, j):
     return 2.0 * math.sin(0.5 * max(low, 0.0)), 2.0 * math.sin(0.5 * high)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _triangles(u, sigma, star_u, main, order, n_partners, s, set_low, set_high, pair_a, pair_b):
     """Return how many triangles of the main star with two partners next to each other in
     `order` close end to end if the main star is s."""
@@ -91,7 +91,7 @@ def _triangles(u, sigma, star_u, main, order, n_partners, s, set_low, set_high, 
     return total
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_partners, star):
     n, m = len(u), len(star_u)
     state, seen = np.zeros(m, np.int16), np.zeros(m, np.int32)

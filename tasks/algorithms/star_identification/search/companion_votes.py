@@ -11,10 +11,10 @@ the turn added.)
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import MAX_BETA
 from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
 from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
@@ -56,7 +56,7 @@ class Votes(NamedTuple):
     wide: npt.NDArray[np.int64]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def make_votes(n_stars, n):
     """Return room for the votes of n companions (compiled)."""
     return Votes(
@@ -70,7 +70,7 @@ def make_votes(n_stars, n):
     )
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def turn_bits(n_votes, n_stars, tolerance):
     """Return log2 of the bins of turn that suit so many votes and a typical tolerance of
     their turn, in parts of `TURN` (compiled)."""
@@ -79,7 +79,7 @@ def turn_bits(n_votes, n_stars, tolerance):
     return int(min(max(min(fine, sparse), LEAST_BINS_LOG2), MOST_BINS_LOG2))
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def companion(u, sigma, i, j, gate, min_chord):
     """Return separation (0: too close), its tolerance, position angle of j about i and its
     tolerance, both in parts of `TURN` (compiled)."""
@@ -97,7 +97,7 @@ def companion(u, sigma, i, j, gate, min_chord):
     return c, noise + MAX_BETA * c, angle, int(wide) + 2
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
     """Tell whether the brightness of two centroids speaks against two stars (compiled).
 
@@ -111,7 +111,7 @@ def is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
     return abs(m_a - m_i) > mag_gate or abs(m_b - m_j) > mag_gate
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def count_votes(
     seen, stars, rule, pairs, i, order, n_least, n_votes, gate, mag_gate, closest, votes
 ):
@@ -144,7 +144,7 @@ def count_votes(
     return n, cast, log2
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _vote(seen, stars, rule, pairs, i, m, log2, mag_gate, votes):
     """Count the votes of the pivot's m-th companion."""
     j = votes.companion[m]

@@ -19,11 +19,11 @@ centroids as the prior of `log_ways` has them).
 
 import math
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import invert_symmetric
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 
@@ -42,7 +42,7 @@ def log_magnitude_density(magnitude: Array) -> Array:
     return np.log(count / count.sum() / BIN_MAG)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def log_brightness_ratio(difference, magnitude, log_density, spread):
     """Return ln(g / h) of a match whose magnitudes differ so; `spread` 1-sigma (compiled)."""
     z = difference / spread
@@ -52,7 +52,7 @@ def log_brightness_ratio(difference, magnitude, log_density, spread):
     return math.log(g) - log_density[i]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def median_zero_point(star_of, instrumental, magnitude):
     """Return the median of star minus instrumental magnitude over the matches (compiled).
 
@@ -69,7 +69,7 @@ def median_zero_point(star_of, instrumental, magnitude):
     return np.median(found[:n])
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def log_ways(n, matches, in_view):
     """Return -ln of the probability, before the places are seen, that just these centroids of n
     are just these of the stars in view (compiled).
@@ -85,7 +85,7 @@ def log_ways(n, matches, in_view):
     return centroids - seen
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def match_evidence(
     star_of, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, spread, in_view, area
 ):
@@ -121,7 +121,7 @@ def match_evidence(
     return total - log_ways(len(star_of), matches, in_view), matches
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _brightness(star_of, instrumental, magnitude, log_density, zero, spread):
     """Return the log of how much better the matches' brightness fits than by chance."""
     total = 0.0
@@ -133,7 +133,7 @@ def _brightness(star_of, instrumental, magnitude, log_density, zero, spread):
     return total
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _log_determinant(P):
     return math.log(
         max(
@@ -145,13 +145,13 @@ def _log_determinant(P):
     )
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def choice_lost(P):
     """Return the attitude's part of the log evidence, every attitude alike (compiled)."""
     return 0.5 * _log_determinant(P) + 1.5 * math.log(2.0 * math.pi) - math.log(8.0 * math.pi**2)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def choice_predicted(P, P0, R, R0):
     """Return the attitude's part of the log evidence for a prediction R0 with covariance P0,
     sensor axes (compiled)."""

@@ -2,10 +2,10 @@
 
 import math
 
-import numba
 import numpy as np
 
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude, turn
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     choice_lost,
     choice_predicted,
@@ -21,7 +21,7 @@ N_NUDGED = 12
 ODD_MAG = 2.5
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def aberrated(x, y, z, beta, out):
     """Write the direction that an observer at beta (v / c) sees of a unit vector (compiled).
 
@@ -35,7 +35,7 @@ def aberrated(x, y, z, beta, out):
     out[0], out[1], out[2] = ax / norm, ay / norm, az / norm
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def stars_in_cone(u_icrs, n_stars, R, radius, row):
     """Write the rows of the first n_stars within `radius` [rad] of the boresight; return how
     many (compiled)."""
@@ -47,7 +47,7 @@ def stars_in_cone(u_icrs, n_stars, R, radius, row):
     return n
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def turn_stars(R, a, v):
     """Write the stars' directions in the sensor frame (compiled)."""
     for s in range(len(a)):
@@ -55,7 +55,7 @@ def turn_stars(R, a, v):
             v[s, i] = R[i, 0] * a[s, 0] + R[i, 1] * a[s, 1] + R[i, 2] * a[s, 2]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def count_in_view(v, box):
     """Return how many stars are in the image, sensor-frame directions given (compiled).
 
@@ -70,7 +70,7 @@ def count_in_view(v, box):
     return n
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def match_stars(u, sigma, v, radius, star_of, chi2_of, strict):
     """Match each centroid with the star nearest to it within its radius, one to one (compiled).
 
@@ -123,7 +123,7 @@ def match_stars(u, sigma, v, radius, star_of, chi2_of, strict):
                 star_of[k] = -1
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _drop_odd(star_of, instrumental, magnitude, zero_point):
     if math.isnan(zero_point):
         return
@@ -133,7 +133,7 @@ def _drop_odd(star_of, instrumental, magnitude, zero_point):
             star_of[k] = -1
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def settle(
     R, P, s_xy, s_z, u, sigma, instrumental, a, magnitude, gate, zero_point, star_of, chi2_of
 ):
@@ -172,7 +172,7 @@ def settle(
     return matches
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _nudge(R, u, k, a, s):
     """Turn R by the smallest rotation that puts star s on centroid k."""
     x = R[0, 0] * a[s, 0] + R[0, 1] * a[s, 1] + R[0, 2] * a[s, 2]
@@ -185,7 +185,7 @@ def _nudge(R, u, k, a, s):
         turn(R, f * cx, f * cy, f * cz)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def best_nudge(R0, s_xy, s_z, u, sigma, a, gate, n_tried, R):
     """Write to R the attitude near R0, moved so that one star falls on one centroid, that
     brings most other stars onto centroids (compiled).
@@ -223,7 +223,7 @@ def best_nudge(R0, s_xy, s_z, u, sigma, a, gate, n_tried, R):
                 copy_matrix(trial, R)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def solve_predicted(
     R0,
     P0,

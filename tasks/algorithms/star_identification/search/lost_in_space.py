@@ -11,7 +11,6 @@ the same answer on every machine.
 
 import math
 
-import numba
 import numpy as np
 
 from epipole.tasks.algorithms.geometry.attitude import (
@@ -19,6 +18,7 @@ from epipole.tasks.algorithms.geometry.attitude import (
     copy_matrix,
     invert_symmetric,
 )
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.search.companion_votes import (
     Pairs,
     count_votes,
@@ -57,7 +57,7 @@ SPARSE = 0.35
 WORK_PER_S = 4e7
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _keep(evidence, R, top, R_best):
     """Keep the best attitude and the evidence of the best that is another."""
     if evidence <= top[1]:
@@ -76,7 +76,7 @@ def _keep(evidence, R, top, R_best):
         top[1] = evidence
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def matches_needed(seen, rule, least):
     """Return how many matches an attitude needs at least for a log evidence of `least`; more
     than there are centroids where no number is enough (compiled)."""
@@ -104,7 +104,7 @@ def matches_needed(seen, rule, least):
     return n + 1
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _try_counted(
     seen, stars, rule, pairs, i, n_companions, log2, votes, least, enough, room, top, R_best
 ):
@@ -145,7 +145,7 @@ def _try_counted(
     return work
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _mixed_order(n):
     """Return 0 .. n - 1, by turns from the bright end and from the middle on: what is false is
     often bright, or often faint."""
@@ -156,7 +156,7 @@ def _mixed_order(n):
     return order
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def search(
     u,
     sigma,

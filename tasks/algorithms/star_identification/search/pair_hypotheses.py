@@ -3,11 +3,11 @@
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import refine_attitude
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     choice_lost,
     log_ways,
@@ -85,7 +85,7 @@ class Scratch(NamedTuple):
     none: npt.NDArray[np.int64]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def make_scratch(n, n_checked):
     """Return room for frames of n centroids (compiled)."""
     return Scratch(
@@ -102,14 +102,14 @@ def make_scratch(n, n_checked):
     )
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def separation(u, i, j):
     """Return the chord between two of the directions (compiled)."""
     dx, dy, dz = u[j, 0] - u[i, 0], u[j, 1] - u[i, 1], u[j, 2] - u[i, 2]
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _basis(a, b, c, F):
     """Write rows: along the sum of two unit vectors c apart, along the difference, and their
     cross product."""
@@ -121,7 +121,7 @@ def _basis(a, b, c, F):
     F[2, 2] = F[0, 0] * F[1, 1] - F[0, 1] * F[1, 0]
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def prepare_pair(seen, stars, rule, i, j, c, room):
     """Fill the room for centroids i and j, c apart; return in which order the others are to
     be looked up (compiled)."""
@@ -148,7 +148,7 @@ def prepare_pair(seen, stars, rule, i, j, c, room):
     return np.argsort(-fall)[2:].copy()
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def try_pair(stars, a, b, c, order, floor, room):
     """Return how much more likely the other centroids are with the attitude that puts star a
     on the first and b on the second centroid of the pair than by chance (ln), below `floor`
@@ -176,7 +176,7 @@ def try_pair(stars, a, b, c, order, floor, room):
     return odds
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def judge_pair(seen, stars, rule, i, a, j, b, beaten, room):
     """Return the log evidence of the attitude last tried, refined with its matches, or a
     number below `beaten` where it is no more than that; R of the room gets it (compiled)."""
@@ -190,7 +190,7 @@ def judge_pair(seen, stars, rule, i, a, j, b, beaten, room):
     return _judge(seen, stars, rule, beaten, R, room.P, row_of)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _look_up(R, seen, k, radius, stars):
     """Return the star nearest to centroid k, and the squared chord: aberration taken off it."""
     u, beta = seen.u, seen.beta
@@ -211,7 +211,7 @@ def _look_up(R, seen, k, radius, stars):
     )
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _stars_in_image(R, beta, star_u, box):
     """Return how many catalogue stars are in the image."""
     n = 0
@@ -229,7 +229,7 @@ def _stars_in_image(R, beta, star_u, box):
     return n
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _judge(seen, stars, rule, beaten, R, P, row_of):
     """Refine an attitude whose first matches are in row_of; return its log evidence, or a
     number below `beaten` where it is no more than that."""

@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
+
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 
@@ -55,7 +56,7 @@ def build_kvector(s: Array) -> KVector:
     return KVector(s, below, slope, intercept)
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def range_of(s, below, slope, intercept, low, high):
     """Return first and last + 1 of the elements with low <= s <= high (compiled).
 

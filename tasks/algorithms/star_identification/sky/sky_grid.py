@@ -2,9 +2,10 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import numpy.typing as npt
+
+from epipole.tasks.algorithms.kernels import kernel
 
 
 class SkyGrid(NamedTuple):
@@ -36,7 +37,7 @@ def build_sky_grid(u_icrs: npt.NDArray[np.float64], radius_rad: float) -> SkyGri
     return SkyGrid(first, star, n_face, float(radius_rad))
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def _visit_cells(u, radius, n, slot, star):
     """Count each star's cells in `slot`, or, with room in `star`, enter it at the slots."""
     for k in range(len(u)):
@@ -61,7 +62,7 @@ def _visit_cells(u, radius, n, slot, star):
                     slot[cell] += 1
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def cell_of(x, y, z, n):
     """Return the cell of a direction, of any length (compiled)."""
     ax, ay, az = abs(x), abs(y), abs(z)
@@ -76,7 +77,7 @@ def cell_of(x, y, z, n):
     return (face * n + i) * n + j
 
 
-@numba.njit(nogil=True, cache=True, error_model="numpy")
+@kernel
 def nearest_star(x, y, z, radius, u_icrs, first, star, n_face):
     """Return the star nearest to a unit vector within `radius` [rad], -1 if none, and the
     squared chord to it (compiled)."""

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.special import chdtri
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, cubic_span, jerk
 from epipole.tasks.algorithms.tracking.linking.chains import Links, choose_links, fill_in
 
@@ -44,7 +44,7 @@ class _Ends(NamedTuple):
     extra: Array
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sums(time_s, u, sigma, lo, hi, t0, u0, S, B, C):
     for k in range(lo, hi):
         weight, t = 1.0 / sigma[k] ** 2, time_s[k] - t0
@@ -60,7 +60,7 @@ def _sums(time_s, u, sigma, lo, hi, t0, u0, S, B, C):
                 C[a, b] += weight * (u[k, a] - u0[a]) * (u[k, b] - u0[b])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unforeseen(S, B, half, bend):
     """Return the square [rad^2/s^4] of a fragment's acceleration beyond noise and bound.
 
@@ -83,7 +83,7 @@ def _unforeseen(S, B, half, bend):
     return max(square - 16 * noise - bend * bend, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _reduce(
     offsets, time_s, u, sigma, last, t0, u0, S, B, C, at, end_u, end_w, var_u, var_w, extra
 ):
@@ -137,7 +137,7 @@ def _ends(offsets: Indices, time_s: Array, u: Array, sigma: Array, last: bool) -
     return ends
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _shift(S, B, C, e_1, e_2, drift, t0, centre, scale, out_A, out_b):
     """Fill A (4, 4) and b (4, 2) of one fragment about a common instant, in a tangent plane.
 
@@ -181,7 +181,7 @@ def _shift(S, B, C, e_1, e_2, drift, t0, centre, scale, out_A, out_b):
     return c
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _misfit(A, b, prior_2, prior_3, work):
     """Return b' (A + L)^-1 b summed over both axes, and ln det(A + L), by Cholesky."""
     for i in range(4):
@@ -208,7 +208,7 @@ def _misfit(A, b, prior_2, prior_3, work):
     return explained, log_det
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _free_parameters(work, prior_2, prior_3):
     """Return how many of the 4 parameters the data decide: 4 - tr((A + L)^-1 L).
 
@@ -219,7 +219,7 @@ def _free_parameters(work, prior_2, prior_3):
     return 4.0 - prior_2 * corner - prior_3 * last
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _compare(
     i, j, t0_1, u0_1, S_1, B_1, C_1, t0_2, u0_2, S_2, B_2, C_2, at_1, at_2, first, last, extra_2,
     A_1, b_1, A_2, b_2, work,
@@ -275,7 +275,7 @@ def _compare(
     return D, 2 * max(free, 2.0), log_ratio + 2 * np.log(scale) - 0.5 * D
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near(u_1, w_1, var_u_1, var_w_1, u_2, w_2, var_u_2, var_w_2, extra, gap):
     """Return whether straight lines from both ends come near each other in mid-gap."""
     half, miss, arc, rate = 0.5 * gap, 0.0, 0.0, 0.0
@@ -288,7 +288,7 @@ def _near(u_1, w_1, var_u_1, var_w_1, u_2, w_2, var_u_2, var_w_2, extra, gap):
     return arc < FARTHEST_RAD**2 and miss < 2 * SEARCH_SIGMA**2 * allowed
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search(by_start, start, end, gap_s, u_1, w_1, vu_1, vw_1, x_1, u_2, w_2, vu_2, vw_2, x_2):
     """Return the pairs (earlier, later) that the gap and the quick test leave."""
     n, room, count = len(start), 1024, 0
@@ -314,7 +314,7 @@ def _search(by_start, start, end, gap_s, u_1, w_1, vu_1, vw_1, x_1, u_2, w_2, vu
     return first[:count], second[:count]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _compare_all(
     earlier, later, t0_1, u0_1, S_1, B_1, C_1, at_1, t0_2, u0_2, S_2, B_2, C_2, at_2, first, last,
     extra_1, extra_2, out_D, out_free, out_log,

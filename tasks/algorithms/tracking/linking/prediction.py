@@ -12,9 +12,9 @@ vector, which share one covariance, and the comparison is made on the plane of t
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.special import chdtri
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.linking.chains import Links, choose_links
 
 Array = npt.NDArray[np.float64]
@@ -26,7 +26,7 @@ FASTEST_RAD_S = 0.1  # 1-sigma of a rate not yet measured
 HARDEST_RAD_S2 = 1e-3  # 1-sigma of an acceleration not yet measured
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _filter(time_s, u, sigma, first, last, step, q, x, P):
     """Run the constant-acceleration filter over the detections first, first + step .. last.
 
@@ -64,7 +64,7 @@ def _filter(time_s, u, sigma, first, last, step, q, x, P):
                 P[m, j] -= gain[m] * row[j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _filter_all(offsets, time_s, u, sigma, backward, q, X, P):
     for f in range(len(offsets) - 1):
         lo, hi = offsets[f], offsets[f + 1] - 1
@@ -74,7 +74,7 @@ def _filter_all(offsets, time_s, u, sigma, backward, q, X, P):
             _filter(time_s, u, sigma, lo, hi, 1, q, X[f], P[f])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _covariance_at(P, T, q):
     """Return the entries of the constant-velocity covariance predicted over T."""
     noise = q if T >= 0 else -q
@@ -83,7 +83,7 @@ def _covariance_at(P, T, q):
     return p00, p01, P[1, 1] + noise * T
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _distance(x_1, P_1, t_1, x_2, P_2, t_2, interval_s, q):
     """Return the mean over the window of the two predictions' squared Mahalanobis distance."""
     speed_1, speed_2, norm = 0.0, 0.0, 0.0
@@ -125,7 +125,7 @@ def _distance(x_1, P_1, t_1, x_2, P_2, t_2, interval_s, q):
     return total / count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _compare_all(by_start, start, end, gap_s, X_1, P_1, X_2, P_2, interval_s, q, limit):
     """Return the pairs (earlier, later) within the limit and their test quantity."""
     room, count = 1024, 0

@@ -12,7 +12,8 @@ from epipole.tasks.algorithms.catalogue.catalogue_join import (
     joined_magnitude,
     moved,
 )
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, unit_from_radec
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.sky import unit_from_radec
 
 MAS = ARCSEC / 1000
 

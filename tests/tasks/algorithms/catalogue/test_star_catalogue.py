@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from epipole.tasks.algorithms.catalogue.star_catalogue import (
-    AU_KM,
     limit_for_density,
     navigation_catalogue,
     places_at,
 )
+from epipole.tasks.algorithms.constants import AU_KM
 
 ARCSEC = np.pi / 648000
 

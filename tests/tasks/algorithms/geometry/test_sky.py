@@ -8,8 +8,8 @@ from astropy.coordinates import SkyCoord
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.sky import (
-    SPEED_OF_LIGHT_KM_S,
     aberrate,
     boresight_angles,
     radec_from_unit,

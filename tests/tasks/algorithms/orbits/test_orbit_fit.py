@@ -13,7 +13,7 @@ LOW = np.array([5000.0, 4000.0, 3000.0, -4.5, 5.2, 1.1])
 
 def gravity(_, y):
     """Two bodies and J2, written out axis by axis as in the textbooks."""
-    mu, j2, radius = 398600.4418, 1.08262668e-3, 6378.1363
+    mu, j2, radius = 398600.4418, 1.08262668e-3, 6378.137
     x, y_, z = y[:3]
     r = np.linalg.norm(y[:3])
     k = 1.5 * j2 * (radius / r) ** 2

@@ -7,7 +7,8 @@ from astropy.coordinates import GCRS, CartesianRepresentation, get_body, solar_s
 from astropy.time import Time
 from astropy.utils import iers
 
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, aberrate
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.orbits.planets import NUMBERS, planet_directions
 from epipole.tasks.algorithms.time.time_scales import earth_barycentric
 

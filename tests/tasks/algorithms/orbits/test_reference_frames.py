@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from epipole.io.catalogues.earth_orientation import EarthOrientation, read_earth_orientation
+from epipole.tasks.algorithms.constants import EARTH_RATE_RAD_S
 from epipole.tasks.algorithms.orbits.reference_frames import (
-    EARTH_RATE_RAD_S,
     FRAMES,
     gcrf_from_eme2000,
     gcrf_from_itrf,

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry import rotations
-from epipole.tasks.algorithms.geometry.sky import ARCSEC
 from epipole.tasks.algorithms.orbits.state_interpolation import States, gravity, interpolate_states
 
 METRE = 1e-3  # km
@@ -183,7 +183,7 @@ def test_gravity_is_the_gradient_of_the_potential():
     def potential(r):
         radius = np.linalg.norm(r)
         legendre = (3 * (r[2] / radius) ** 2 - 1) / 2
-        return 398600.4418 / radius * (1 - 1.08262668e-3 * (6378.1366 / radius) ** 2 * legendre)
+        return 398600.4418 / radius * (1 - 1.08262668e-3 * (6378.137 / radius) ** 2 * legendre)
 
     r, h = np.array([4000.0, -3000.0, 5000.0]), 0.1
     steps = h * np.eye(3)

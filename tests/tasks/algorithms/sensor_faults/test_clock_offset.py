@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes.late_sensors import POSITION_KM, lines_of
 
-from epipole.tasks.algorithms.geometry.sky import ARCSEC
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.sensor_faults.clock_offset import PRIOR_S, Lines, clock_offsets
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scenes.late_sensors import SENSORS, orbit
 
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.sensor_faults.clock_search import Meetings, search_offset
 from epipole.tasks.algorithms.simulation.orbits import state_at
 

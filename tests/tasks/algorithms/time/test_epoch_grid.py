@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from epipole.tasks.algorithms.constants import DAY_NS
 from epipole.tasks.algorithms.time.epoch_grid import (
-    DAY_NS,
     epoch_grid,
     epoch_interval_ns,
     frame_interval_ns,

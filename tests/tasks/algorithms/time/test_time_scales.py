@@ -8,8 +8,8 @@ import pytest
 from astropy.coordinates import get_body_barycentric_posvel
 from astropy.time import Time
 
+from epipole.tasks.algorithms.constants import DAY_NS
 from epipole.tasks.algorithms.time.time_scales import (
-    DAY_NS,
     earth_barycentric,
     earth_velocity,
     julian_year,

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 
 

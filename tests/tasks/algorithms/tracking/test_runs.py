@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.tracking.runs import follow_detections
 
 FIELD = np.radians(4.0)

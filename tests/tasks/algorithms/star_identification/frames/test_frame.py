@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scenes.random_stars import BETA, CAMERA, HOW, frame, optics, random_attitude, random_catalogue
 
-from epipole.tasks.algorithms.geometry.sky import SPEED_OF_LIGHT_KM_S, aberrate
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.star_identification.frames.frame import (
     N_SEARCHED,
     aberrate_all,

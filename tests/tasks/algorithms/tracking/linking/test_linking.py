@@ -7,7 +7,8 @@ from scenes.identity_score import identity_f1
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2 as chi_square
 
-from epipole.tasks.algorithms.geometry.sky import ARCSEC, tangent_basis
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.tracking.linking.chains import NONE, chain_heads, choose_links
 from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
 from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction

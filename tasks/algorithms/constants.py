@@ -1,0 +1,26 @@
+"""Physical constants and units, each with its source.
+
+The simulator has its own (`simulation/`): what is judged must not judge itself.
+"""
+
+import math
+
+# Units.
+ARCSEC = math.pi / 648_000.0  # [rad]
+SECOND_NS = 1_000_000_000
+DAY_S = 86_400.0
+DAY_NS = 86_400 * SECOND_NS
+
+# IAU resolutions: SI brochure (exact), and IAU 2012 Resolution B2 (exact).
+SPEED_OF_LIGHT_KM_S = 299_792.458
+AU_KM = 149_597_870.7
+
+# The Earth: GM with the atmosphere, IERS Conventions (2010), table 1.1; the equatorial radius,
+# WGS 84 (NGA.STND.0036); J2 of EGM96 (Lemoine et al. 1998, NASA/TP-1998-206861), whose own
+# radius is 0.7 m smaller: 2e-7 of J2's effect.
+GM_KM3_S2 = 398_600.4418
+EARTH_RADIUS_KM = 6378.137
+J2 = 1.08262668e-3
+
+# IERS Conventions (2010), equation 5.15: the rate of the Earth rotation angle [rad/s of UT1].
+EARTH_RATE_RAD_S = 7.292115146706979e-5
