@@ -1,30 +1,36 @@
-"""The bridge between Arrow tables and NumPy arrays, and the gate a table must pass."""
+"""The bridge between Arrow tables, polars frames and NumPy arrays.
 
-from collections.abc import Iterable, Mapping
+Arrow carries the tables, polars joins and groups them, NumPy computes. Every table is checked
+against its schema when it is made.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import polars as pl
 import pyarrow as pa
 
 from epipole.schemas.columns import TIME, upper_triangle
 
 
 def table(schema: pa.Schema, columns: Mapping[str, Any]) -> pa.Table:
-    """Return a table of this schema, or raise: what does not fit its schema cannot exist.
+    """Return a table of this schema.
 
     Parameters
     ----------
     schema
         One of `epipole.schemas`.
     columns
-        One entry a column: NumPy array, Arrow array or list. Times are int64 nanoseconds.
+        One entry per column: a NumPy array, an Arrow array or a list. Times are int64
+        nanoseconds.
 
     Raises
     ------
     ValueError
-        On a missing, unknown, mistyped or unevenly long column, or a null where the
-        schema allows none.
+        Where a column is missing, unknown, of the wrong type or longer than another, or has a
+        null that the schema does not allow.
     """
     name = table_name(schema)
     missing = [n for n in schema.names if n not in columns]
@@ -52,7 +58,8 @@ def _as_arrow(table_name: str, field: pa.Field, values: Any) -> pa.Array | pa.Ch
         ) from error
     if not field.nullable and values.null_count:
         raise ValueError(
-            f"table {table_name}: column {field.name} has {values.null_count} nulls, none allowed"
+            f"table {table_name}: column {field.name} has {values.null_count} nulls; "
+            "it may have none"
         )
     return values
 
@@ -60,17 +67,17 @@ def _as_arrow(table_name: str, field: pa.Field, values: Any) -> pa.Array | pa.Ch
 def conform(schema: pa.Schema, values: pa.Table) -> pa.Table:
     """Return the columns of `values` that `schema` names, checked against it.
 
-    What the table's own metadata says beside the schema's is kept.
+    Metadata of the table that the schema does not have are kept.
     """
     columns = {name: values.column(name) for name in schema.names if name in values.column_names}
-    return _with_words_of([values], table(schema, columns))
+    return _with_metadata_of([values], table(schema, columns))
 
 
-def _with_words_of(tables: Iterable[pa.Table], made: pa.Table) -> pa.Table:
-    words: dict[bytes, bytes] = {}
-    for one in tables:
-        words |= one.schema.metadata or {}
-    return made.replace_schema_metadata(words | (made.schema.metadata or {}))
+def _with_metadata_of(sources: Iterable[pa.Table], made: pa.Table) -> pa.Table:
+    metadata: dict[bytes, bytes] = {}
+    for source in sources:
+        metadata |= source.schema.metadata or {}
+    return made.replace_schema_metadata(metadata | (made.schema.metadata or {}))
 
 
 def empty(schema: pa.Schema) -> pa.Table:
@@ -79,13 +86,13 @@ def empty(schema: pa.Schema) -> pa.Table:
 
 
 def concat(schema: pa.Schema, tables: Iterable[pa.Table]) -> pa.Table:
-    """Return the rows of all tables, in order; with none, a table with no rows.
+    """Return the rows of all tables, in order. Without tables it has no rows.
 
-    What the tables' own metadata says beside the schema's is kept.
+    Metadata of the tables that the schema does not have are kept.
     """
     tables = list(tables)
     rows = pa.concat_tables([empty(schema), *tables]).combine_chunks()
-    return _with_words_of(tables, rows)
+    return _with_metadata_of(tables, rows)
 
 
 def table_name(schema: pa.Schema) -> str:
@@ -94,44 +101,74 @@ def table_name(schema: pa.Schema) -> str:
 
 
 def array(values: pa.Table, name: str) -> npt.NDArray[Any]:
-    """Return a column as a NumPy array: times as int64 nanoseconds, null floats as NaN,
-    strings as objects (null is None)."""
+    """Return a column as a NumPy array.
+
+    Times are int64 nanoseconds, null floats NaN, strings objects (null is None).
+    """
     column = values.column(name)
     if column.type == TIME:
         return column.cast(pa.int64()).to_numpy()
     return column.to_numpy()
 
 
-def stack(values: pa.Table, pattern: str, names: str = "xyz") -> npt.NDArray[np.float64]:
-    """Return the columns of a vector as one (n, len(names)) array."""
-    out = np.empty((values.num_rows, len(names)))
+def stack(
+    values: pa.Table | pl.DataFrame, pattern: str, names: Sequence[str] = "xyz"
+) -> npt.NDArray[np.float64]:
+    """Return the columns of a vector as one (n, len(names)) array, nulls as NaN.
+
+    ``stack(positions, "{}_km")`` reads x_km, y_km and z_km.
+    """
+    out = np.empty((len(values), len(names)))
     for i, a in enumerate(names):
-        out[:, i] = array(values, pattern.format(a))
+        out[:, i] = _floats(values, pattern.format(a))
     return out
 
 
 def unstack(
-    pattern: str, vectors: npt.NDArray[Any], names: str = "xyz"
+    pattern: str, vectors: npt.NDArray[Any], names: Sequence[str] = "xyz"
 ) -> dict[str, npt.NDArray[Any]]:
-    """Return one column an axis of an (n, len(names)) array, named by the pattern."""
+    """Return one column per axis of an (n, len(names)) array: the inverse of `stack`."""
     return {pattern.format(a): vectors[:, i] for i, a in enumerate(names)}
 
 
-def stack_covariance(values: pa.Table, pattern: str) -> npt.NDArray[np.float64]:
-    """Return six upper-triangle columns as (n, 3, 3) symmetric matrices."""
-    out = np.empty((values.num_rows, 3, 3))
-    for a, b in upper_triangle("xyz"):
-        i, j = "xyz".index(a), "xyz".index(b)
-        out[:, i, j] = out[:, j, i] = array(values, pattern.format(a + b))
+def stack_covariance(
+    values: pa.Table | pl.DataFrame, pattern: str, names: Sequence[str] = "xyz"
+) -> npt.NDArray[np.float64]:
+    """Return the columns of an upper triangle as (n, k, k) symmetric matrices, nulls as NaN.
+
+    ``stack_covariance(positions, "cov_{}")`` reads cov_xx, cov_xy, ... cov_zz. `names` are the k
+    axes; `TANGENT_AXES` and `STATE_AXES` are the other ones in use.
+    """
+    out = np.empty((len(values), len(names), len(names)))
+    for (a, b), (i, j) in _triangle(names):
+        out[:, i, j] = out[:, j, i] = _floats(values, pattern.format(a + b))
     return out
 
 
-def unstack_covariance(pattern: str, matrices: npt.NDArray[Any]) -> dict[str, npt.NDArray[Any]]:
-    """Return the six upper-triangle columns of (n, 3, 3) symmetric matrices."""
-    return {
-        pattern.format(a + b): matrices[:, "xyz".index(a), "xyz".index(b)]
-        for a, b in upper_triangle("xyz")
-    }
+def unstack_covariance(
+    pattern: str, matrices: npt.NDArray[Any], names: Sequence[str] = "xyz"
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the upper triangle of (n, k, k) matrices: the inverse of `stack_covariance`."""
+    return {pattern.format(a + b): matrices[:, i, j] for (a, b), (i, j) in _triangle(names)}
+
+
+def _triangle(names: Sequence[str]) -> Iterator[tuple[tuple[str, str], tuple[int, int]]]:
+    """Yield the pairs of axes of an upper triangle, each with its row and column."""
+    return zip(upper_triangle(names), zip(*np.triu_indices(len(names)), strict=True), strict=True)
+
+
+def _floats(values: pa.Table | pl.DataFrame, name: str) -> npt.NDArray[np.float64]:
+    return array(values, name) if isinstance(values, pa.Table) else values[name].to_numpy()
+
+
+def to_polars(rows: pa.Table) -> pl.DataFrame:
+    """Return an Arrow table as a polars frame."""
+    return pl.DataFrame(rows)
+
+
+def from_polars(schema: pa.Schema, rows: pl.DataFrame) -> pa.Table:
+    """Return the columns of a polars frame that `schema` names, checked as `table` does."""
+    return table(schema, {n: rows[n].to_arrow() for n in schema.names if n in rows.columns})
 
 
 def nullable(values: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = None) -> pa.Array:
@@ -151,7 +188,7 @@ def lists(flat: npt.NDArray[Any], offsets: npt.NDArray[Any], kind: pa.DataType) 
 def flatten(values: pa.Table, name: str) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
     """Return a list column as (flat values, (n + 1) offsets), the inverse of `lists`.
 
-    Floating-point values come as float64, whatever the column holds.
+    Values of a float32 column come as float64.
     """
     column = values.column(name).combine_chunks()
     if isinstance(column, pa.ChunkedArray):  # an empty column stays chunked

@@ -1,10 +1,13 @@
 """Building blocks of Arrow schemas: a column with its unit, frame and meaning."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import pyarrow as pa
 
 TIME = pa.timestamp("ns", tz="UTC")
+
+STATE_AXES = ("x", "y", "z", "vx", "vy", "vz")  # of a position and velocity
+TANGENT_AXES = ("1", "2")  # of the plane at right angles to a direction
 
 
 def column(
@@ -42,7 +45,7 @@ def id_column(name: str, *, doc: str, null: bool = False) -> pa.Field:
 def axes(
     pattern: str, *, unit: str, frame: str, doc: str, null: bool = False, names: str = "xyz"
 ) -> list[pa.Field]:
-    """Return one float64 column an axis: ``axes("{}_km")`` gives x_km, y_km, z_km.
+    """Return one float64 column per axis: ``axes("{}_km")`` gives x_km, y_km, z_km.
 
     Three columns rather than a list: a filter on them is three times faster, and their
     Parquet statistics do not mix the axes.
@@ -55,19 +58,25 @@ def axes(
     ]
 
 
-def upper_triangle(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the index pairs of a symmetric matrix's upper triangle, row by row."""
-    names = list(names)
+def upper_triangle(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the pairs of axes of a symmetric matrix's upper triangle, row by row."""
     return [(a, b) for i, a in enumerate(names) for b in names[i:]]
 
 
 def covariance(
-    pattern: str, *, unit: str, frame: str, doc: str, null: bool = False
+    pattern: str,
+    *,
+    unit: str,
+    frame: str,
+    doc: str,
+    null: bool = False,
+    names: Sequence[str] = "xyz",
 ) -> list[pa.Field]:
-    """Return the six columns of a 3x3 covariance: ``covariance("cov_{}")`` gives cov_xx ..."""
+    """Return the columns of a covariance's upper triangle: ``covariance("cov_{}")`` gives cov_xx,
+    cov_xy, ... cov_zz."""
     return [
         column(pattern.format(a + b), pa.float64(), unit=unit, frame=frame, doc=doc, null=null)
-        for a, b in upper_triangle("xyz")
+        for a, b in upper_triangle(names)
     ]
 
 

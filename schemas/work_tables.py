@@ -2,7 +2,15 @@
 
 import pyarrow as pa
 
-from epipole.schemas.columns import axes, column, covariance, id_column, schema, time_column
+from epipole.schemas.columns import (
+    TANGENT_AXES,
+    axes,
+    column,
+    covariance,
+    id_column,
+    schema,
+    time_column,
+)
 from epipole.schemas.tables import EPOCH, F64, FRAME_KEY, FRAMES, I64, SENSOR_ID
 
 
@@ -104,20 +112,20 @@ VIEWS = schema(
         ),
         *axes("{}_px", unit="px", frame="image", doc="Place at the epoch", names="xy"),
         *axes("u{}", unit="", frame="ICRS", doc="Direction, aberration removed"),
-        *[
-            column(
-                f"cov_{which}_{ab}_rad2",
-                F64,
-                unit="rad^2",
-                frame="tangent plane of the direction",
-                doc=doc,
-            )
-            for which, doc in (
-                ("noise", "Error that is new in every frame."),
-                ("bias", "Error that all frames of the sensor share."),
-            )
-            for ab in ("11", "12", "22")
-        ],
+        *covariance(
+            "cov_noise_{}_rad2",
+            unit="rad^2",
+            frame="tangent plane of the direction",
+            doc="Error that is new in every frame.",
+            names=TANGENT_AXES,
+        ),
+        *covariance(
+            "cov_bias_{}_rad2",
+            unit="rad^2",
+            frame="tangent plane of the direction",
+            doc="Error that all frames of the sensor share.",
+            names=TANGENT_AXES,
+        ),
         *axes("{}_km", unit="km", frame="GCRF", doc="Sensor position at the epoch"),
         column("position_sigma_km", F64, unit="km", doc="1-sigma an axis."),
         column("pixel_rad", F64, unit="rad", doc="Angle a pixel spans."),

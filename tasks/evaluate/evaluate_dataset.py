@@ -12,7 +12,7 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.io.simulation.truth import Truth, elements_of
-from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.schemas.bridge import array, stack, stack_covariance, to_polars
 from epipole.schemas.report import Report
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.evaluation import (
@@ -53,27 +53,21 @@ def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:
     detections of its tracklet are of. A pair is two views of a claim with centroids; there
     could have been one for every two centroids of one object in the frames of an epoch.
     """
-    frames, points = _polars(truth.frames), _polars(truth.points)
-    measures = _stars(_polars(tables["stars"]), points)
-    measures |= _attitudes(_polars(tables["frames"]), frames)
+    frames, points = to_polars(truth.frames), to_polars(truth.points)
+    measures = _stars(to_polars(tables["stars"]), points)
+    measures |= _attitudes(to_polars(tables["frames"]), frames)
     if truth.scenario["targets"]:
-        detections = _polars(tables["detections"]).filter(pl.col("kind") == "object")
+        detections = to_polars(tables["detections"]).filter(pl.col("kind") == "object")
         detections = detections.drop("kind").join(
             points, on=SPOT, how="left", maintain_order="left"
         )
-        claims = _claims(_polars(tables["associations"]), detections, points)
-        who, found = _associations(claims, _polars(tables["epochs"]), points)
+        claims = _claims(to_polars(tables["associations"]), detections, points)
+        who, found = _associations(claims, to_polars(tables["epochs"]), points)
         measures |= found
         measures |= _positions(tables["positions"], who, truth)
         measures["positions_per_truth"] = _per_truth(measures["positions"], truth, frames, points)
         measures |= _tracks(detections.drop_nulls("track_id"), points)
     return Report(**measures)
-
-
-def _polars(rows: pa.Table) -> pl.DataFrame:
-    frame = pl.from_arrow(rows)
-    assert isinstance(frame, pl.DataFrame)  # a table is never a series
-    return frame
 
 
 def _share(part: float, whole: float) -> float:
@@ -174,7 +168,7 @@ def _ints(frame: pl.DataFrame, name: str) -> Indices:
 
 
 def _positions(positions: pa.Table, claims: pl.DataFrame, truth: Truth) -> Measures:
-    rows = _polars(positions.select(CLAIM))
+    rows = to_polars(positions.select(CLAIM))
     rows = rows.join(claims, on=CLAIM, how="left", maintain_order="left")
     target = rows["target"].fill_null(-1).to_numpy()
     real = target >= 0
