@@ -6,29 +6,32 @@ from collections.abc import Sequence
 import numpy as np
 from prefect import flow
 
-from epipole.flows.night.clocks import find_objects
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.parameters import Night, night_asked, run_name
 from epipole.flows.night.stages import (
+    Destination,
     calibrate,
+    check,
     identify,
     name,
+    publish,
     read,
-    stage,
+    solve,
+    track,
 )
-from epipole.flows.night.summary import Summary, summarise
-from epipole.flows.night.work import frames_wanted
+from epipole.flows.night.summary import Summary
+from epipole.flows.night.work import plan_spans
 from epipole.flows.prefect.page import shown_on_page
 from epipole.flows.prefect.runners import runner_asked
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder, check_sources, claim_nights, nights_of
 from epipole.io.work.folder import work_folder, work_key, work_root
+from epipole.io.work.places import ReadFolder, WorkFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
-from epipole.tasks.publish.publish_nights import publish_nights
-from epipole.tasks.publish.stage_night import into_nights, source_table
+from epipole.tasks.publish.write_tables import into_nights, source_table
 
 LOGGER = logging.getLogger(__name__)
 
@@ -44,39 +47,47 @@ def nightly(
 ) -> Summary:
     """Turn logs into a dataset.
 
-    Prefect's form for a run shows what stands under Args.
+    Prefect's form for a run shows the text under Args.
 
     Args:
         logs: MCAP files, folders, globs or URLs of them; those of the night are chosen.
         out: The dataset, a folder; it is made where it is missing.
-        settings: Groups of settings, as in a settings file; what is left out keeps its default.
+        settings: Groups of settings, as in a settings file; missing ones keep their defaults.
         night: Publish this UTC date only: YYYY-MM-DD, or yesterday, seen from when the run was
             due. None: every night that the logs have frames of.
         replace: Publish a night even though it was made of a log that is not among these.
 
     Raises:
-        EpipoleError: Where the work cannot be done; the dataset is then as it was.
+        EpipoleError: Where the work cannot be done; the dataset is then unchanged.
     """
     night = night_asked(night)
     check_folder(out)
     check_star_catalogue(settings.identification.catalogue)
     found = find_logs(logs, night)
     with claim_nights(out, [night] if night else []) as run:
-        frames = read(found.paths, run, settings)
+        frames = read(found.paths, ReadFolder(run), settings)
+
         nights = nights_of(np.concatenate(frames.time_ns))
         chosen = choose_nights(found.paths, nights, night)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
-        spans, uncalibrated = frames_wanted(frames, chosen)
+        spans, uncalibrated = plan_spans(frames, chosen)
         logs_read = [f"{log.sha256} {log.name}" for log in frames.sources]
         key = work_key(logs_read, settings, chosen)
         with (
             claim_nights(out, [] if night else chosen) as staging,
             work_folder(work_root(out), chosen, key) as folder,
         ):
-            work = identify(frames, spans, folder, settings)
+            work = identify(frames, spans, WorkFolder(folder), settings)
             work, calibrations = calibrate(work, settings)
-            work, parts, solved, clocks = find_objects(work, settings)
+            while True:
+                track(work, settings)
+                solved = solve(work, settings)
+                work, again, left_out = check(work, solved, settings)
+                if not again:
+                    break  # otherwise clocks were corrected: back to `track`
+            if left_out:
+                solved = solve(work, settings, left_out)
             names = name(work, solved, settings)
             rejects = concat(REJECTS, [found.rejects, frames.rejects, uncalibrated])
             whole = {
@@ -84,11 +95,9 @@ def nightly(
                 "sources": sources,
                 "rejects": into_nights(rejects, nights),
             }
-            staged = {one: staging / f"night={one}" for one in chosen}
-            stage(work, parts, solved, names, whole, staged)
-            summary = summarise(out, staged, clocks)
-            publish_nights(out, staged, sources, replace)
-    LOGGER.info("published %s", ", ".join(f"{out}/night={one}" for one in chosen))
+            staged = {date: staging / f"night={date}" for date in chosen}
+            summary = publish(work, solved, names, whole, Destination(out, staged, replace))
+    LOGGER.info("published %s", ", ".join(f"{out}/night={date}" for date in chosen))
     return summary
 
 

@@ -158,6 +158,7 @@ TRACKLETS = schema(
             null=True,
             doc="Chi-square of the link to the fragment before; null where it is the first.",
         ),
+        column("outcome", pa.string(), doc="What became of it: one of the declared outcomes."),
     ],
 )
 
@@ -316,11 +317,12 @@ REJECTS = schema(
         column("source", pa.string(), null=True, doc="Log file; null where it is no single one."),
         column("offset", I64, unit="byte", null=True, doc="Place in the log."),
         id_column("sensor_id", null=True, doc="Null where unknown, or more than one."),
+        id_column("tracklet_id", null=True, doc="Null where it is not about one tracklet."),
         time_column(
             "time", doc="Time of what was left out, UTC; the night's start where it has none."
         ),
         column("stage", pa.string(), doc="Stage that left it out."),
-        column("reason", pa.string(), doc="Why, in a word: nan, duplicate_number, ambiguous, ..."),
+        column("reason", pa.string(), doc="Why: one of the declared reasons."),
         column("count", I64, doc="How many."),
     ],
 )

@@ -11,7 +11,16 @@ from epipole.schemas.columns import (
     schema,
     time_column,
 )
-from epipole.schemas.tables import EPOCH, F64, FRAME_KEY, FRAMES, I64, SENSOR_ID
+from epipole.schemas.tables import (
+    EPOCH,
+    F64,
+    FRAME_KEY,
+    FRAMES,
+    I64,
+    OBJECT_ID,
+    SENSOR_ID,
+    TRACKLETS,
+)
 
 
 def _floats() -> pa.DataType:
@@ -138,8 +147,8 @@ FRAME_INDEX = schema(
     [
         time_column(),
         column("log", pa.int32(), doc="Log of the run, in the order of names."),
-        column("part", pa.int32(), doc="Part of the log."),
-        column("row", I64, doc="Row in the part's exposures."),
+        column("piece", pa.int32(), doc="Piece of the log."),
+        column("row", I64, doc="Row in the piece's exposures."),
     ],
 )
 
@@ -184,5 +193,40 @@ TRUE_POINTS = schema(
         column("centroid", pa.int32(), doc="Index in the arrays of the frame's message."),
         column("kind", pa.int8(), doc="0 star, 1 object, 2 false."),
         column("source", I64, doc="Hipparcos number, object index, or -1."),
+    ],
+)
+
+TRACKLET_OUTCOMES = schema(
+    "tracklet_outcomes",
+    "One row a tracklet that a span compared with other sensors: what became of it there.",
+    [
+        id_column("tracklet_id", doc="In the night."),
+        column("outcome", pa.string(), doc="One of the declared outcomes."),
+    ],
+)
+
+TRACKLET_RUNS = schema(
+    "tracklet_runs",
+    "A row of `tracklets` whose outcome is not known yet.",
+    [field for field in TRACKLETS if field.name != "outcome"],
+)
+
+CLOCK_VIEWS = schema(
+    "clock_views",
+    "One row a view and an object: those of each object, and views of none beside all objects.",
+    [
+        *[
+            VIEWS.field(name)
+            for name in ("epoch", "sensor_id", "frame_number", "tracklet_id", "ux", "uy", "uz")
+        ],
+        *[field for field in VIEWS if field.name.startswith("cov_")],
+        *axes("sensor_{}_km", unit="km", frame="GCRF", doc="Sensor position at the epoch"),
+        *axes("sensor_v{}_km_s", unit="km/s", frame="GCRF", doc="Sensor velocity"),
+        VIEWS.field("position_sigma_km"),
+        OBJECT_ID,
+        column("claimed", pa.bool_(), doc="Whether the view is one of the object's."),
+        *axes("{}_km", unit="km", frame="GCRF", doc="Object position at the epoch"),
+        *axes("v{}_km_s", unit="km/s", frame="GCRF", doc="Object velocity"),
+        *covariance("cov_{}", unit="km^2", frame="GCRF", doc="Covariance of the position."),
     ],
 )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from epipole.flows.night.summary import Summary
-from epipole.flows.prefect.progress import shown, step
+from epipole.flows.prefect.progress import prepare, shown
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder
 from epipole.io.logs.listing import list_logs
@@ -46,7 +46,7 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
     for where in logs:
         list_logs(where)
     with shown(options.quiet, options.verbose), compile_beside() as compiling:
-        step("start Prefect", 0, 1)
+        prepare("start Prefect")
         from epipole.flows.prefect.defaults import embedded_prefect, quiet_console
 
         if not options.verbose:

@@ -12,14 +12,12 @@ from epipole.flows.night.summary import many
 from epipole.io.logs.listing import list_logs
 from epipole.io.logs.reader import MARGIN_NS as LOGGED_WITHIN_NS
 from epipole.io.logs.reader import read_log_times
-from epipole.schemas.bridge import table
 from epipole.schemas.errors import LogError
-from epipole.schemas.tables import REJECTS
-from epipole.tasks.common.spans import SPAN_NS
+from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.spans import DAY_NS, SPAN_NS
 
 LOGGER = logging.getLogger(__name__)
 
-DAY_NS = 86_400_000_000_000
 # Frames up to a span beyond both ends of a night are read too, and a frame's time and the
 # time it was logged at may be `LOGGED_WITHIN_NS` apart.
 MARGIN_NS = SPAN_NS + LOGGED_WITHIN_NS
@@ -102,18 +100,11 @@ def _none_chosen(night: str | None, spans: Sequence[tuple[int, int]], broken: Se
 
 
 def _rejects(broken: Sequence[str], night: str | None) -> pa.Table:
-    n = len(broken)
-    return table(
-        REJECTS,
-        {
-            "source": [path.rpartition("/")[2] for path in broken],
-            "offset": [None] * n,
-            "sensor_id": [None] * n,
-            "time": np.full(n, _start_ns(night) if night else 0, np.int64),
-            "stage": ["find_logs"] * n,
-            "reason": ["no_mcap"] * n,
-            "count": [1] * n,
-        },
+    return reject_rows(
+        Reason.NO_MCAP,
+        source=[path.rpartition("/")[2] for path in broken],
+        time=[_start_ns(night) if night else 0] * len(broken),
+        count=[1] * len(broken),
     )
 
 

@@ -1,38 +1,42 @@
 """The stages of a night, each shared out over tasks of a sensor and a span of time.
 
-Tasks take paths and small tables and leave their own in the work folder, whole or not at all.
-A part that is there is not made again: the folder's name tells what it was made of. What is
-made of the parts does not depend on which worker made which, or when.
+Tasks take paths and small tables and leave their own tables in the work folder, whole or not at
+all. A part that exists is not made again: the folder's name tells what it was made of. The rows
+do not depend on which worker made which part, or when.
 """
 
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.flows.night.summary import many
-from epipole.flows.night.work import DAY_NS, Spans, Work
+from epipole.flows.night.summary import Summary, many, summarise
+from epipole.flows.night.work import Spans, Work
 from epipole.flows.prefect.progress import results, step
-from epipole.io.work.files import is_written, read_part, write_part
+from epipole.io.work.parts import Parts, write_part
+from epipole.io.work.places import ReadFolder, WorkFolder
 from epipole.schemas.bridge import array, concat
 from epipole.schemas.settings import Settings
+from epipole.schemas.spans import DAY_NS, SPAN_NS, Span
+from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS, POSITIONS, STATES
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensor
 from epipole.tasks.check.correct_clock import correct_clock
-from epipole.tasks.check.estimate_clocks import Clock
-from epipole.tasks.common.spans import SPAN_NS, Span
+from epipole.tasks.check.estimate_clocks import Clock, estimate_clocks, total_offsets
 from epipole.tasks.identify.identify_span import identify_span
 from epipole.tasks.name.link_objects import link_objects, outermost, renamed
 from epipole.tasks.name.name_objects import name_objects
-from epipole.tasks.publish.stage_night import SHARES, stage_night
+from epipole.tasks.publish.publish_nights import publish_nights
+from epipole.tasks.publish.write_tables import SHARES, NightParts, write_tables
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs
 from epipole.tasks.read.read_logs import read_log_into
 from epipole.tasks.solve.align_epochs import EpochGrid, frames_that_serve, grid_of
-from epipole.tasks.solve.solve_span import SensorParts, solve_span
+from epipole.tasks.solve.solve_span import solve_span
 from epipole.tasks.track.join_tracklets import join_tracklets
 from epipole.tasks.track.track_span import track_span
 
@@ -40,190 +44,253 @@ LOGGER = logging.getLogger(__name__)
 
 Names = Mapping[str, Mapping[str, str]]
 
+# The first correction lets a sensor see objects that it saw none of; the second is then exact.
+MOST_CORRECTIONS = 2
 
-def read(logs: Sequence[str], folder: Path, settings: Settings) -> OrderedFrames:
-    """Read the logs, a task a log, and order what they hold."""
-    futures = [read_log_into.submit(folder / f"log-{k}", log) for k, log in enumerate(logs)]
-    frames = order_logs(folder, results("read logs", futures), settings)
+
+def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> OrderedFrames:
+    """Read the logs, a task per log, and order what they hold."""
+    futures = [read_log_into.submit(folder, k, log) for k, log in enumerate(logs)]
+    frames = order_logs(folder, results(Stage.READ, futures), settings)
     count = sum(len(time_ns) for time_ns in frames.time_ns)
     LOGGER.info("read %s of %s", many(count, "frame"), many(len(frames.sources), "log"))
     return frames
 
 
-def identify(frames: OrderedFrames, spans: Spans, folder: Path, settings: Settings) -> Work:
-    """Place sensors, tell stars from the rest and solve attitudes, a task a sensor and span."""
-    return _identify(Work(frames.folder, folder, spans, frames.cameras, {}), settings, "identified")
+def identify(frames: OrderedFrames, spans: Spans, folder: WorkFolder, settings: Settings) -> Work:
+    """Place sensors, identify stars and solve attitudes, a task per sensor and span."""
+    where = {sensor: folder.identified(sensor) for sensor in spans}
+    work = Work(frames.folder, folder, spans, frames.cameras, where)
+    return _identify(Stage.IDENTIFY, work, settings)
 
 
-def _identify(work: Work, settings: Settings, stage: str) -> Work:
-    where = {sensor: work.parts(stage, sensor) for sensor in work.spans}
+def _identify(stage: Stage, work: Work, settings: Settings) -> Work:
+    """Identify the frames of a work's spans; the parts go where `work.identified` says."""
     futures = [
-        identify_span.submit(work.frames, sensor, span, work.cameras, settings, where[sensor])
+        identify_span.submit(
+            work.frames, sensor, span, work.cameras, settings, work.identified[sensor]
+        )
         for sensor, span in work.by_span()
     ]
-    frames, by_stars, stars = map(sum, zip(*results("identify stars", futures), strict=True))
+    frames, by_stars, stars = map(sum, zip(*results(stage, futures), strict=True))
     LOGGER.info("identified %s of %s by %s", f"{by_stars:,}", many(frames, "frame"),
                 many(stars, "star"))  # fmt: skip
-    return work._replace(identified={**work.identified, **where})
+    return work
 
 
 def calibrate(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     """Fit each sensor's optics to its stars; identify again those whose calibration is off."""
     mode = settings.identification.calibrate
     calibrations = CALIBRATIONS.empty_table()
-    for number in range(2 if mode == "use" else 1):  # with better optics more stars take part
+    for number in range(1, 3 if mode == "use" else 2):  # with better optics more stars take part
         if mode == "off":
             break
         futures = [
             calibrate_sensor.submit(sensor, work.identified[sensor], spans, work.cameras)
             for sensor, spans in work.spans.items()
         ]
-        fits: list[Calibrated] = results("calibrate sensors", futures)
+        fits: list[Calibrated] = results(Stage.CALIBRATE, futures)
         calibrations = concat(CALIBRATIONS, [fit.calibrations for fit in fits])
         departed = {name for fit in fits for name in fit.departed}
         if mode == "report" or not departed:
             break
         LOGGER.info("optics of %s depart from the calibration", ", ".join(sorted(departed)))
-        known = work.cameras.filter(
-            pc.invert(pc.is_in(work.cameras["sensor_id"], pa.array(sorted(departed))))
-        )
-        found = [fit.cameras for fit in fits if fit.departed]
-        cameras = concat(CAMERAS, [known, *found]).sort_by(
-            [("sensor_id", "ascending"), ("time", "ascending")]
-        )
-        again = {s: spans for s, spans in work.spans.items() if s.sensor_id in departed}
-        some = work._replace(cameras=cameras, spans=again)
-        identified = _identify(some, settings, f"identified-{number + 2}").identified
-        work = work._replace(cameras=cameras, identified=identified)
+        work = _identify_again(work, [fit.cameras for fit in fits if fit.departed], departed,
+                               number, settings)  # fmt: skip
     return work, calibrations
 
 
-def track(work: Work, settings: Settings, attempt: str) -> list[SensorParts]:
-    """Follow detections from frame to frame, a task a sensor and span, and name tracklets."""
-    parts = {
-        sensor: SensorParts(
-            work.identified[sensor],
-            work.parts(f"tracked{attempt}", sensor),
-            work.parts(f"named{attempt}", sensor),
-        )
-        for sensor in work.spans
-    }
+def _identify_again(
+    work: Work,
+    fitted: Sequence[pa.Table],
+    departed: set[str],
+    number: int,
+    settings: Settings,
+) -> Work:
+    """Identify the sensors whose optics departed with those that were fitted."""
+    unchanged = work.cameras.filter(
+        pc.invert(pc.is_in(work.cameras["sensor_id"], pa.array(sorted(departed))))
+    )
+    cameras = concat(CAMERAS, [unchanged, *fitted]).sort_by(
+        [("sensor_id", "ascending"), ("time", "ascending")]
+    )
+    spans = {sensor: own for sensor, own in work.spans.items() if sensor.sensor_id in departed}
+    where = {sensor: work.folder.identified_again(sensor, number) for sensor in spans}
+    again = work._replace(cameras=cameras, spans=spans, identified=where)
+    _identify(Stage.CALIBRATE, again, settings)
+    return work._replace(cameras=cameras, identified={**work.identified, **where})
+
+
+def track(work: Work, settings: Settings) -> None:
+    """Follow detections from frame to frame, a task per sensor and span, and name tracklets."""
+    parts = work.sensor_parts()
     futures = [
         track_span.submit(
             sensor, parts[sensor].identified, span, work.cameras, settings, parts[sensor].tracked
         )
         for sensor, span in work.by_span()
     ]
-    results("build tracklets", futures)
+    results(Stage.TRACK, futures)
     futures = [
-        join_tracklets.submit(sensor, parts[sensor].tracked, spans, parts[sensor].named)
+        join_tracklets.submit(sensor, parts[sensor].tracked, spans, parts[sensor].names)
         for sensor, spans in work.spans.items()
     ]
-    count = sum(results("join tracklets", futures))
+    count = sum(results(Stage.TRACK, futures))
     LOGGER.info("followed %s", many(count, "tracklet"))
-    return list(parts.values())
 
 
-def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
+def solve(work: Work, settings: Settings, left_out: Sequence[str] = ()) -> Parts:
+    """Find and solve objects, a task per span, of all sensors but those left out."""
+    grid = _epoch_grid(work, settings)
+    sensors = list(work.sensor_parts().values())
+    solved = work.folder.solved(work.round, all_sensors=not left_out)
+    futures = [
+        solve_span.submit(sensors, span, grid, work.cameras, left_out, settings, solved)
+        for span in work.all_spans()
+    ]
+    count = sum(results(Stage.SOLVE, futures))
+    LOGGER.info("solved %s", many(count, "position"))
+    return solved
+
+
+def _epoch_grid(work: Work, settings: Settings) -> EpochGrid:
     """Return the grid of epochs of the night."""
     columns = ["time", "attitude_source", "x_km"]
     times = []
     for sensor, spans in work.spans.items():
-        rows = [
-            read_part(work.identified[sensor] / span.folder, "solutions", columns) for span in spans
-        ]
+        rows = [work.identified[sensor].read(span, "solutions", columns) for span in spans]
         serving = [array(frames_that_serve(part), "time") for part in rows]
         times.append(np.concatenate([np.zeros(0, np.int64), *serving]))
     return grid_of(times, settings)
 
 
-def solve(
-    work: Work,
-    parts: Sequence[SensorParts],
-    settings: Settings,
-    attempt: str,
-    left_out: Sequence[str] = (),
-) -> Path:
-    """Find and solve objects, a task a span of all sensors but those left out."""
-    grid = epoch_grid(work, settings)
-    where = work.folder / f"solved{attempt}"
-    futures = [
-        solve_span.submit(parts, span, grid, work.cameras, left_out, settings, where)
-        for span in work.all_spans()
-    ]
-    count = sum(results("solve objects", futures))
-    LOGGER.info("solved %s", many(count, "position"))
-    return where
+class Checked(NamedTuple):
+    """What the check of the sensors says.
+
+    `again`: clocks were corrected, and the night goes back to `track`. `left_out` are the
+    sensors without which it is solved again: their clocks are wrong and stay so.
+    """
+
+    work: Work
+    again: bool
+    left_out: list[str]
 
 
-def name(work: Work, solved: Path, settings: Settings) -> Names:
-    """Return, for each span, what its objects are called in the night."""
-    step("link objects", 0, 1)
-    spans = [span for span in work.all_spans() if is_written(solved / span.folder)]
-    names = name_objects(solved, spans)
-    ends: dict[str, list[pa.Table]] = {"positions": [], "states": []}
-    for span in spans:
-        for table, found in ends.items():
-            rows = outermost(read_part(solved / span.folder, table))
-            found.append(renamed(rows, names[span.folder]))
-    new_id: dict[str, str] = link_objects(
-        concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
-    )
-    objects = {new_id.get(one, one) for own in names.values() for one in own.values()}
-    LOGGER.info("named %s, knew %s again", many(len(objects), "object"), len(new_id))
-    return {
-        span: {old: new_id.get(one, one) for old, one in own.items()} for span, own in names.items()
+def check(work: Work, solved: Parts, settings: Settings) -> Checked:
+    """Estimate each sensor's clock from all spans together, and correct it if the settings say."""
+    step(Stage.CHECK, 0, 1)
+    clocks: list[Clock] = estimate_clocks(solved, work.all_spans())
+    for clock in clocks:
+        LOGGER.log(logging.WARNING if clock.is_off else logging.INFO, "%s", clock)
+    wrong = [clock for clock in clocks if clock.is_off]
+    work = work._replace(clocks=tuple(total_offsets(work.clocks, clocks)))
+    correctable = settings.alignment.correct_clocks and work.round < MOST_CORRECTIONS
+    if wrong and correctable:
+        return Checked(_correct_clocks(work, wrong, settings), again=True, left_out=[])
+    return Checked(work, again=False, left_out=_taking_part(work, solved, wrong))
+
+
+def _taking_part(work: Work, solved: Parts, clocks: Sequence[Clock]) -> list[str]:
+    """Return the sensors of these clocks that take part in an association, and so distort it."""
+    sensors = {clock.sensor_id for clock in clocks}
+    associated: set[str] = set()
+    for span in work.all_spans() if sensors else []:
+        rows = solved.read(span, "associations", ["sensor_id"])
+        associated |= sensors.intersection(rows["sensor_id"].unique().to_pylist())
+    return sorted(associated)
+
+
+def _correct_clocks(work: Work, wrong: Sequence[Clock], settings: Settings) -> Work:
+    """Put the frames of wrong clocks at their true times; the next round begins."""
+    clocks = {clock.sensor_id: clock for clock in wrong}
+    next_round = work.round + 1
+    where = {
+        sensor: work.folder.corrected(sensor, next_round)
+        for sensor in work.spans
+        if sensor.sensor_id in clocks
     }
-
-
-def set_clocks_right(work: Work, clocks: Sequence[Clock], settings: Settings, attempt: str) -> Work:
-    """Put the frames of clocks that are off at their true times."""
-    off = {clock.sensor_id: clock for clock in clocks if clock.is_off}
-    where = {s: work.parts(f"identified{attempt}", s) for s in work.spans if s.sensor_id in off}
     futures = [
         correct_clock.submit(
-            work.frames, sensor, work.identified[sensor], span, off[sensor.sensor_id], settings,
+            work.frames, sensor, work.identified[sensor], span, clocks[sensor.sensor_id], settings,
             where[sensor],
         )
         for sensor, span in work.by_span()
         if sensor in where
     ]  # fmt: skip
-    results("correct clocks", futures)
-    entered = {s: _entered(where[s], work.spans[s]) for s in where}
-    spans = {s: sorted([*own, *entered.get(s, [])]) for s, own in work.spans.items()}
-    return work._replace(spans=spans, identified={**work.identified, **where})
+    results(Stage.CHECK, futures)
+    entered = {sensor: _enter_spans(where[sensor], work.spans[sensor]) for sensor in where}
+    spans = {sensor: sorted([*own, *entered.get(sensor, [])]) for sensor, own in work.spans.items()}
+    identified = {**work.identified, **where}
+    return work._replace(spans=spans, identified=identified, round=next_round)
 
 
-def _entered(parts: Path, spans: Sequence[Span]) -> list[Span]:
+def _enter_spans(parts: Parts, spans: Sequence[Span]) -> list[Span]:
     """Return the spans that frames at their true times have entered; each gets an empty part.
 
     The frames stay in the parts they were in.
     """
-    times = [array(read_part(parts / s.folder, "solutions", ["time"]), "time") for s in spans]
+    times = [array(parts.read(span, "solutions", ["time"]), "time") for span in spans]
     starts = np.unique(np.concatenate(times) // SPAN_NS * SPAN_NS).tolist()
     entered = [span for t in starts if (span := Span(t, t + SPAN_NS)) not in spans]
     for span in entered:
         names = ("solutions", "stars", "detections", "rejects")
-        empty = {name: read_part(parts / spans[0].folder, name).slice(0, 0) for name in names}
-        write_part(parts / span.folder, empty)
+        write_part(parts.of(span), {name: parts.read(spans[0], name).slice(0, 0) for name in names})
     return entered
 
 
-def stage(
+def name(work: Work, solved: Parts, settings: Settings) -> Names:
+    """Return, for each span, what its objects are called in the night."""
+    step(Stage.NAME, 0, 1)
+    spans = [span for span in work.all_spans() if solved.holds(span)]
+    names = name_objects(solved, spans)
+    ends: dict[str, list[pa.Table]] = {"positions": [], "states": []}
+    for span in spans:
+        for table, rows in ends.items():
+            rows.append(renamed(outermost(solved.read(span, table)), names[span.folder]))
+    new_id: dict[str, str] = link_objects(
+        concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
+    )
+    objects = {new_id.get(known, known) for of_span in names.values() for known in of_span.values()}
+    LOGGER.info("named %s", many(len(objects), "object"))
+    if new_id:
+        LOGGER.info("recognised %s after a gap", many(len(new_id), "object"))
+    return {
+        span: {old: new_id.get(known, known) for old, known in of_span.items()}
+        for span, of_span in names.items()
+    }
+
+
+class Destination(NamedTuple):
+    """Where a run's nights go: staged in a folder each, then put in place in the dataset."""
+
+    dataset: str
+    staged: Mapping[str, Path]
+    replace: bool
+
+
+def publish(
     work: Work,
-    parts: Sequence[SensorParts],
-    solved: Path,
+    solved: Parts,
     names: Names,
     whole: Mapping[str, pa.Table],
-    staged: Mapping[str, Path],
-) -> None:
-    """Put the parts together as the tables of each night, three tasks a night."""
+    destination: Destination,
+) -> Summary:
+    """Write the tables of each night, three tasks per night, and put all nights in place.
+
+    Parameters
+    ----------
+    whole
+        Tables of the whole run: `calibrations`, `sources`, and the `rejects` of no span.
+    """
+    sensors = list(work.sensor_parts().values())
+    all_spans = work.all_spans()
     futures = []
-    for night, folder in staged.items():
+    for night, folder in destination.staged.items():
         day = int(np.datetime64(night, "D").astype(np.int64))
-        own = [span for span in work.all_spans() if span.start_ns // DAY_NS == day]
-        futures += [
-            stage_night.submit(tables, folder, night, own, parts, solved, names, whole)
-            for tables in SHARES
-        ]
-    results("publish", futures)
+        spans = [span for span in all_spans if span.start_ns // DAY_NS == day]
+        parts = NightParts(night, spans, all_spans, sensors, solved, names, whole)
+        futures += [write_tables.submit(tables, folder, parts) for tables in SHARES]
+    results(Stage.PUBLISH, futures)
+    summary = summarise(destination.dataset, destination.staged, work.clocks)
+    publish_nights(destination.dataset, destination.staged, whole["sources"], destination.replace)
+    return summary

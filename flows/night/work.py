@@ -1,36 +1,38 @@
-"""What a night is made of: which sensors saw it and when, and where the parts of it lie."""
+"""The work of a run: its sensors, the spans in which each has frames, and where the parts lie."""
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.schemas.bridge import concat, table
+from epipole.io.work.parts import Parts
+from epipole.io.work.places import ReadFolder, SensorParts, WorkFolder
+from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
+from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span
 from epipole.schemas.tables import REJECTS
-from epipole.tasks.common.spans import SPAN_NS, Sensor, Span
+from epipole.tasks.check.estimate_clocks import Clock
 from epipole.tasks.read.order_frames import OrderedFrames
-
-DAY_NS = 86_400_000_000_000
 
 Spans = dict[Sensor, list[Span]]
 
 
 class Work(NamedTuple):
-    """A night at work."""
+    """The work of a run.
 
-    frames: Path  # as `order_logs` left them
-    folder: Path
+    A round is one pass from `track` to `check`. The check may correct clocks and ask for another.
+    """
+
+    frames: ReadFolder  # as `order_logs` left them
+    folder: WorkFolder
     spans: Spans  # in which a sensor has frames
     cameras: pa.Table
-    identified: dict[Sensor, Path]  # whose parts are the last word on a sensor's attitudes
-
-    def parts(self, stage: str, sensor: Sensor) -> Path:
-        """Return where a stage's parts of a sensor go."""
-        return self.folder / stage / str(sensor.number)
+    identified: dict[Sensor, Parts]  # each sensor's newest attitudes
+    round: int = 0
+    clocks: tuple[Clock, ...] = ()  # as the logs have them, corrected or not
 
     def all_spans(self) -> list[Span]:
         """Return the spans in which any sensor has frames, in order."""
@@ -41,34 +43,46 @@ class Work(NamedTuple):
         pairs = [(sensor, span) for sensor, spans in self.spans.items() for span in spans]
         return sorted(pairs, key=lambda pair: (pair[1], pair[0]))
 
+    def sensor_parts(self) -> dict[Sensor, SensorParts]:
+        """Return where the parts of each sensor lie in this round."""
+        return {
+            sensor: SensorParts(
+                self.identified[sensor],
+                self.folder.tracked(sensor, self.round),
+                self.folder.tracklet_names(sensor, self.round),
+            )
+            for sensor in self.spans
+        }
 
-def frames_wanted(frames: OrderedFrames, nights: Sequence[str]) -> tuple[Spans, pa.Table]:
+
+def plan_spans(frames: OrderedFrames, nights: Sequence[str]) -> tuple[Spans, pa.Table]:
     """Return the spans with frames of these nights and just beyond them, by sensor.
 
-    Also a reject a sensor without calibration: it takes no part.
+    Also a row of `rejects` per sensor without a calibration: it takes no part.
 
     Raises
     ------
     LogError
         Where no sensor has a calibration.
     """
-    known = set(pc.unique(frames.cameras["sensor_id"]).to_pylist())
-    days = {int(np.datetime64(night, "D").astype(np.int64)) for night in nights}
+    calibrated = set(pc.unique(frames.cameras["sensor_id"]).to_pylist())
+    days = [int(np.datetime64(night, "D").astype(np.int64)) for night in nights]
     spans: Spans = {}
     rejects = []
     for number, sensor_id in enumerate(frames.sensors):
-        span = np.unique(frames.time_ns[number] // SPAN_NS)
-        # A span of margin at both ends: no track is cut at midnight.
-        day = (span[:, None] + [-1, 0, 1]) * SPAN_NS // DAY_NS
-        wanted = span[np.isin(day, list(days)).any(axis=1)]
-        if not len(wanted):
-            continue
-        if sensor_id in known:
-            spans[Sensor(number, sensor_id)] = [
-                Span(int(k) * SPAN_NS, int(k + 1) * SPAN_NS) for k in wanted
-            ]
-        else:
-            rejects.append(_without_calibration(sensor_id, frames.time_ns[number]))
+        time_ns = frames.time_ns[number]
+        wanted = _wanted(np.unique(time_ns // SPAN_NS), days)
+        if wanted and sensor_id in calibrated:
+            spans[Sensor(number, sensor_id)] = wanted
+        elif wanted:
+            rejects.append(
+                reject_rows(
+                    Reason.NO_CALIBRATION,
+                    sensor_id=sensor_id,
+                    time=time_ns[:1],
+                    count=[len(time_ns)],
+                )
+            )
     if not spans:
         raise LogError(
             f"{', '.join(log.name for log in frames.sources)}: no sensor has a calibration "
@@ -78,14 +92,8 @@ def frames_wanted(frames: OrderedFrames, nights: Sequence[str]) -> tuple[Spans, 
     return spans, concat(REJECTS, rejects)
 
 
-def _without_calibration(sensor_id: str, time_ns: np.ndarray) -> pa.Table:
-    row: dict[str, Any] = {
-        "source": None,
-        "offset": None,
-        "sensor_id": sensor_id,
-        "time": int(time_ns[0]),
-        "stage": "identify_stars",
-        "reason": "no_calibration",
-        "count": len(time_ns),
-    }
-    return table(REJECTS, {name: [value] for name, value in row.items()})
+def _wanted(numbers: np.ndarray, days: Sequence[int]) -> list[Span]:
+    """Return the spans of these days, and one beyond each end: no track is cut at midnight."""
+    day = (numbers[:, None] + [-1, 0, 1]) * SPAN_NS // DAY_NS
+    wanted = numbers[np.isin(day, days).any(axis=1)]
+    return [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in wanted.tolist()]

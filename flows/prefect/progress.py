@@ -1,8 +1,7 @@
-"""How far a run is: lines of log everywhere, a moving bar on a terminal and on Prefect's page.
+"""How far a run is: log lines everywhere, a moving bar on a terminal and on Prefect's page.
 
-Stages say what they did as log records. How far they are they say as records of a logger of
-its own, `STEPS`, which moves the bars and prints nothing. So a flow knows nothing of terminals
-and pages.
+Stages say what they did as log records. Their progress goes as records to a separate logger,
+`STEPS`, which moves the bars and prints nothing. So a flow knows nothing of terminals and pages.
 """
 
 import contextlib
@@ -16,45 +15,55 @@ from prefect.futures import PrefectFuture
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from epipole.schemas.stages import Stage
+
 ROOT = logging.getLogger("epipole")
 STEPS = logging.getLogger("epipole.steps")
 STEPS.propagate = False
 STEPS.setLevel(logging.INFO)
 
-# The stages in their order, with their shares in the time of a night (%), as measured on half
-# an hour of four sensors at 5 Hz.
+# The share of each stage in the time of a night (%), as measured on half an hour of four sensors
+# at 5 Hz.
 _SHARES = {
-    "read logs": 4,
-    "identify stars": 55,
-    "calibrate sensors": 3,
-    "build tracklets": 15,
-    "join tracklets": 1,
-    "solve objects": 15,
-    "link objects": 1,
-    "publish": 7,
+    Stage.READ: 4,
+    Stage.IDENTIFY: 55,
+    Stage.CALIBRATE: 3,
+    Stage.TRACK: 16,
+    Stage.SOLVE: 15,
+    Stage.CHECK: 0,
+    Stage.NAME: 1,
+    Stage.PUBLISH: 6,
 }
-_BEFORE = dict(zip(_SHARES, itertools.accumulate(_SHARES.values(), initial=0), strict=False))
+_BEFORE = dict(zip(Stage, itertools.accumulate((_SHARES[s] for s in Stage), initial=0)))  # noqa: B905
 
 
-def step(stage: str, done: int, total: int) -> None:
-    """Say that so many of a stage's tasks are done."""
-    share = _SHARES.get(stage, 0) * done / total if total else 0.0
-    percent = min(100.0, _BEFORE.get(stage, 0) + share)
-    counts = {"stage": stage, "done": done, "total": total, "percent": percent}
-    STEPS.info("%s: %d of %d", stage, done, total, extra=counts)
+def step(stage: Stage, done: int, total: int) -> None:
+    """Say how many of a stage's tasks are done."""
+    share = _SHARES[stage] * done / total if total else 0.0
+    _send(stage.value, done, total, min(100.0, _BEFORE[stage] + share))
 
 
-def results(stage: str, futures: Sequence[PrefectFuture[Any]]) -> list[Any]:
+def prepare(what: str) -> None:
+    """Say what is done before the first stage."""
+    _send(what, 0, 1, 0.0)
+
+
+def _send(what: str, done: int, total: int, percent: float) -> None:
+    counts = {"stage": what, "done": done, "total": total, "percent": percent}
+    STEPS.info("%s: %d of %d", what, done, total, extra=counts)
+
+
+def results(stage: Stage, futures: Sequence[PrefectFuture[Any]]) -> list[Any]:
     """Return what the tasks of a stage return, in the order they were submitted.
 
-    The order does not depend on which ends first, so neither does what is made of it.
+    The order does not depend on which task ends first, so neither does what is made of it.
     """
-    found = []
+    returned = []
     step(stage, 0, len(futures))
     for future in futures:
-        found.append(future.result())
-        step(stage, len(found), len(futures))
-    return found
+        returned.append(future.result())
+        step(stage, len(returned), len(futures))
+    return returned
 
 
 @contextlib.contextmanager

@@ -28,9 +28,8 @@ from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.bridge import array, conform, empty
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
+from epipole.schemas.spans import DAY_NS
 from epipole.schemas.tables import TABLES
-
-DAY_NS = 86_400_000_000_000
 
 # The column that says to which night a row belongs; the rest have `time`. Calibrations and
 # sources are of a whole night, not of an instant.

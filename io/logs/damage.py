@@ -1,11 +1,11 @@
 """What a log's reader leaves out, collected until it becomes rows of `rejects`.
 
-The reasons, all of stage `read_logs`:
+The reasons, all of stage `read`:
 
 - of the file: truncated (also: never closed), damaged_record, log_behind_log (which is read),
-  missing_messages (the summary counts more), unknown_channel_N;
+  missing_messages (the summary counts more), unknown_channel;
 - of a chunk, with the number of its messages where an index tells it: bad_checksum,
-  bad_compression, wrong_chunk_size, chunk_too_large, damaged_chunk, unknown_compression_X;
+  bad_compression, wrong_chunk_size, chunk_too_large, damaged_chunk, unknown_compression;
 - of any message: undecodable_frame, _state or _calibration, bad_sensor_id, no_timestamp;
 - of a frame: nan (a place that is none), unequal_arrays, bad_sigma, bad_frame_number, and, among
   all logs: duplicate_frame, duplicate_number, duplicate_time;
@@ -18,12 +18,11 @@ from dataclasses import dataclass, field
 
 import pyarrow as pa
 
-from epipole.schemas.bridge import table
-from epipole.schemas.tables import REJECTS
+from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.spans import DAY_NS
 
-STAGE = "read_logs"
 ROWS_ALIKE = 100  # a log that is broken all through does not need a row a message
-DAY_NS = 86_400_000_000_000
+
 
 _Key = tuple[int | None, str | None, str]
 
@@ -81,15 +80,11 @@ class RejectList:
             for row in self._rows
             if span is None or row[2] not in near_ns or span[0] <= row[2] < span[1]
         ]
-        return table(
-            REJECTS,
-            {
-                "source": [self.source] * len(rows),
-                "offset": [offset for offset, *_ in rows],
-                "sensor_id": [sensor_id for _, sensor_id, *_ in rows],
-                "time": [t if t in near_ns else first_ns for _, _, t, _, _ in rows],
-                "stage": [STAGE] * len(rows),
-                "reason": [reason for *_, reason, _ in rows],
-                "count": [count for *_, count in rows],
-            },
+        return reject_rows(
+            [Reason(reason) for *_, reason, _ in rows],
+            source=self.source,
+            offset=[offset for offset, *_ in rows],
+            sensor_id=[sensor_id for _, sensor_id, *_ in rows],
+            time=[t if t in near_ns else first_ns for _, _, t, _, _ in rows],
+            count=[count for *_, count in rows],
         )

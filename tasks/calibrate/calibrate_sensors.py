@@ -2,22 +2,21 @@
 
 import logging
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
-from epipole.io.work.files import read_part
+from epipole.io.work.parts import Parts
 from epipole.schemas.bridge import array, concat, empty, table
+from epipole.schemas.spans import Sensor, Span
+from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS, STARS
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.optics_calibration import OPTICS, OpticsFit, calibrate_optics
-from epipole.tasks.common.spans import Sensor, Span
+from epipole.tasks.common.stage_tasks import stage_task
 
 log = logging.getLogger(__name__)
 
@@ -36,18 +35,18 @@ class Calibrated(NamedTuple):
     departed: list[str]
 
 
-@task(name="calibrate", task_run_name="calibrate {sensor}", cache_policy=NO_CACHE)
+@stage_task(Stage.CALIBRATE, "{sensor}")
 def calibrate_sensor(
-    sensor: Sensor, identified: Path, spans: Sequence[Span], cameras: pa.Table
+    sensor: Sensor, identified: Parts, spans: Sequence[Span], cameras: pa.Table
 ) -> Calibrated:
     """Optics as one sensor's stars of all spans show them; `identified` holds its parts."""
     own = cameras.filter(pc.field("sensor_id") == sensor.sensor_id)
     return calibrate_sensors(_spread(identified, spans), own)
 
 
-def _spread(identified: Path, spans: Sequence[Span]) -> pa.Table:
+def _spread(identified: Parts, spans: Sequence[Span]) -> pa.Table:
     """Return the stars of whole frames, spread evenly over the night, and not too many."""
-    parts = [read_part(identified / span.folder, "stars") for span in spans]
+    parts = [identified.read(span, "stars") for span in spans]
     total = sum(part.num_rows for part in parts)
     # A tenth to spare, as frames differ in stars.
     step = 1 if total <= MAX_STARS else -(-total * 10 // (MAX_STARS * 9))

@@ -1,36 +1,68 @@
 """Correct a clock: one sensor's identified frames of a span at their true times."""
 
-from pathlib import Path
+import numpy as np
+import pyarrow as pa
 
-from prefect import task
-from prefect.cache_policies import NO_CACHE
-
-from epipole.io.work.files import is_written, read_part, write_part
+from epipole.io.work.parts import Parts, write_part
+from epipole.io.work.places import ReadFolder
+from epipole.schemas.bridge import array, from_polars, to_polars
 from epipole.schemas.settings import Settings
-from epipole.tasks.check.estimate_clocks import Clock, set_clocks, set_places
-from epipole.tasks.common.spans import Sensor, Span
+from epipole.schemas.spans import Sensor, Span
+from epipole.schemas.stages import Stage
+from epipole.schemas.work_tables import SOLUTIONS
+from epipole.tasks.check.estimate_clocks import Clock
+from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.identify_span import states_about
 from epipole.tasks.identify.place_sensors import place_sensors
 
+PLACED = [
+    *("x_km", "y_km", "z_km"),
+    *("vx_km_s", "vy_km_s", "vz_km_s"),
+    "position_sigma_km",
+]
 
-@task(name="correct clock", task_run_name="correct clock {sensor} {span}", cache_policy=NO_CACHE)
+
+@stage_task(Stage.CHECK, "{sensor} {span}")
 def correct_clock(
-    frames: Path,
+    frames: ReadFolder,
     sensor: Sensor,
-    identified: Path,
+    identified: Parts,
     span: Span,
     clock: Clock,
     settings: Settings,
-    stage: Path,
+    parts: Parts,
 ) -> None:
-    """Set a part's frames to their true times, and their sensor to where it then was."""
-    part = stage / span.folder
-    if is_written(part):
+    """Set a part's frames to their true times, and their sensor to where it was then.
+
+    Parameters
+    ----------
+    identified
+        The sensor's parts with the times of its clock.
+    parts
+        Where the corrected part goes, with the same tables.
+    """
+    if parts.holds(span):
         return
-    before = identified / span.folder
     names = ("solutions", "stars", "detections")
-    tables = {name: set_clocks(read_part(before, name), [clock]) for name in names}
-    solutions = tables["solutions"]
+    tables = {name: at_true_times(identified.read(span, name), clock) for name in names}
     states = states_about(frames, sensor, span, settings)
-    tables["solutions"] = set_places(solutions, place_sensors(solutions, states, settings))
-    write_part(part, {**tables, "rejects": read_part(before, "rejects")})
+    places = place_sensors(tables["solutions"], states, settings)
+    tables["solutions"] = at_places(tables["solutions"], places)
+    write_part(parts.of(span), {**tables, "rejects": identified.read(span, "rejects")})
+
+
+def at_true_times(rows: pa.Table, clock: Clock) -> pa.Table:
+    """Return rows of frames at their true times."""
+    at = rows.schema.get_field_index("time")
+    field = rows.schema.field(at)
+    time_ns = array(rows, "time") - np.int64(round(clock.offset_s * 1e9))
+    return rows.set_column(at, field, pa.array(time_ns).cast(field.type))
+
+
+def at_places(solutions: pa.Table, places: pa.Table) -> pa.Table:
+    """Return the solutions with the positions of their sensors from `places`, a row per frame."""
+    key = ["sensor_id", "frame_number"]
+    moved = to_polars(solutions).drop(PLACED).join(
+        to_polars(places).select([*key, *PLACED]), on=key, how="left", maintain_order="left"
+    )  # fmt: skip
+    return from_polars(SOLUTIONS, moved)

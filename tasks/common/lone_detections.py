@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from epipole.schemas.bridge import array, concat, table
 from epipole.schemas.settings import TrackletSettings
-from epipole.schemas.tables import TRACKLETS
+from epipole.schemas.work_tables import TRACKLET_RUNS
 from epipole.tasks.algorithms.time.epoch_grid import frame_interval_ns
 
 MARK = "lone:"  # no sensor id begins like this: it holds a colon
@@ -51,7 +51,7 @@ def with_lone_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
     lone = lone.take(first)
     n = lone.num_rows
     rows = table(
-        TRACKLETS,
+        TRACKLET_RUNS,
         {
             "tracklet_id": names,
             "track_id": names,
@@ -64,7 +64,7 @@ def with_lone_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
             "link_chi2": pa.nulls(n, pa.float64()),
         },
     )
-    return concat(TRACKLETS, [tracklets, rows])
+    return concat(TRACKLET_RUNS, [tracklets, rows])
 
 
 def with_objects_found(detections: pa.Table, associations: pa.Table) -> pa.Table:
@@ -93,3 +93,12 @@ def is_lone(tracklet_id: pa.ChunkedArray) -> pa.ChunkedArray:
 def published_ids(tracklet_id: pa.ChunkedArray) -> pa.ChunkedArray:
     """Return the ids, null where they are those of lone detections."""
     return pc.if_else(is_lone(tracklet_id), pa.scalar(None, pa.string()), tracklet_id)
+
+
+def only_id(tracklet_id: npt.NDArray[np.object_]) -> str | None:
+    """Return the id that all of these are, None where they are several or a lone detection's."""
+    ids = set(tracklet_id.tolist())
+    if len(ids) != 1:
+        return None
+    (name,) = ids
+    return None if name.startswith(MARK) else str(name)

@@ -17,6 +17,7 @@ from epipole.schemas.bridge import (
     unstack,
     unstack_covariance,
 )
+from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.star_catalogue import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
@@ -41,7 +42,7 @@ from epipole.tasks.algorithms.star_identification.sensor import Identified as Fo
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.time.time_scales import earth_velocity
-from epipole.tasks.identify.cached_skies import CachedSkies, Catalogue
+from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
@@ -367,15 +368,10 @@ def _rejects_table(exposures: pa.Table, c: _Centroids) -> pa.Table:
         if len(at):
             rows.append((source, int(times[at[0]]), int(counts[at].sum())))
     source, time, count = zip(*rows, strict=True) if rows else ((), (), ())
-    return table(
-        REJECTS,
-        {
-            "source": list(source),
-            "offset": pa.nulls(len(rows), pa.int64()),
-            "sensor_id": [exposures["sensor_id"][0].as_py()] * len(rows),
-            "time": np.array(time, np.int64),
-            "stage": ["identify"] * len(rows),
-            "reason": ["no_calibration"] * len(rows),
-            "count": list(count),
-        },
+    return reject_rows(
+        Reason.NO_CALIBRATION,
+        source=list(source),
+        sensor_id=exposures["sensor_id"][0].as_py(),
+        time=list(time),
+        count=list(count),
     )

@@ -1,4 +1,4 @@
-"""Link objects: one that was lost and is seen again keeps its object_id."""
+"""Link objects: an object that is seen again after a gap keeps its object_id."""
 
 from collections.abc import Mapping
 from typing import Literal
@@ -8,26 +8,26 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
-from epipole.schemas.columns import upper_triangle
+from epipole.schemas.bridge import stack_covariance
+from epipole.schemas.columns import STATE_AXES
 from epipole.schemas.settings import Settings
+from epipole.schemas.stages import Stage
 from epipole.tasks.algorithms.orbits.object_linking import Seen, chains, link_by_motion
+from epipole.tasks.common.stage_tasks import stage_task
 
 Array = npt.NDArray[np.float64]
 
-AXES = ("x", "y", "z", "vx", "vy", "vz")
 PLACE = ["x_km", "y_km", "z_km"]
 VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 
 
-@task(name="link objects", cache_policy=NO_CACHE)
+@stage_task(Stage.NAME, "objects")
 def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> dict[str, str]:
-    """Return the ids that change: of objects that are one with an earlier one, to its first id.
+    """Return the ids that change: an object that is the same as an earlier one gets its id.
 
-    Of the positions only each object's first and last count (see `outermost`), and of the states
-    too; both of a whole night, in any order.
+    Only each object's first and last position count (see `outermost`), and its first and last
+    state. Both tables are of a whole night, in any order.
     """
     ends = _ends(pl.DataFrame(positions), pl.DataFrame(states))
     if not len(ends):
@@ -36,7 +36,7 @@ def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> d
     seen = Seen(
         *(_seconds(ends, name, origin) for name in ("first", "last", "head_epoch", "tail_epoch")),
         *(ends.select(_named(side, [*PLACE, *VELOCITY])).to_numpy() for side in ("head", "tail")),
-        *(_covariance(ends, side) for side in ("head", "tail")),
+        *(stack_covariance(ends, f"{side}_cov_{{}}", STATE_AXES) for side in ("head", "tail")),
     )
     before, _ = link_by_motion(
         seen, gap_s=settings.states.link_gap_s, log_odds=settings.states.link_log_odds
@@ -46,14 +46,14 @@ def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> d
 
 
 def outermost(rows: pa.Table) -> pa.Table:
-    """Return each object's first and last row: all of `positions` that linking looks at."""
+    """Return each object's first and last row: all that linking needs of `positions`."""
     frame = pl.DataFrame(rows).with_row_index("row").sort("epoch", "row")
     ends = frame.group_by("object_id").agg(first=pl.col("row").first(), last=pl.col("row").last())
     return rows.take(np.unique(ends.select("first", "last").to_numpy().ravel()))
 
 
 def renamed(rows: pa.Table, new_id: Mapping[str, str]) -> pa.Table:
-    """Return rows with the ids that changed changed."""
+    """Return the rows with the new ids of objects that have one."""
     if not new_id:
         return rows
     at = rows.schema.get_field_index("object_id")
@@ -63,9 +63,9 @@ def renamed(rows: pa.Table, new_id: Mapping[str, str]) -> pa.Table:
 
 
 def _ends(positions: pl.DataFrame, states: pl.DataFrame) -> pl.DataFrame:
-    """Return a row an object, sorted by id: when it was seen, and its motion at both ends.
+    """Return a row per object, sorted by id: its time span, and its motion at both ends.
 
-    The motion is that of its first or last state; without any, the position alone.
+    The motion is that of its first or last state. Without a state it is the position alone.
     """
     keys = ["object_id", "epoch"]
     position = positions.sort(keys).select(*keys, *PLACE, pl.col("^cov_.*$"))
@@ -93,11 +93,3 @@ def _named(side: str, names: list[str]) -> list[str]:
 
 def _seconds(ends: pl.DataFrame, name: str, origin: object) -> Array:
     return (ends[name] - origin).cast(pl.Duration("ns")).cast(pl.Int64).to_numpy() / 1e9
-
-
-def _covariance(ends: pl.DataFrame, side: str) -> Array:
-    out = np.empty((len(ends), 6, 6))
-    for a, b in upper_triangle(AXES):
-        i, j = AXES.index(a), AXES.index(b)
-        out[:, i, j] = out[:, j, i] = ends[f"{side}_cov_{a}{b}"].to_numpy()
-    return out

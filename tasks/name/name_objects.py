@@ -1,17 +1,16 @@
-"""Name objects: what each span found becomes the objects of the night."""
+"""Name objects: the objects of the spans become the objects of the night."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 
-from epipole.io.work.files import read_part
+from epipole.io.work.parts import Parts
+from epipole.schemas.spans import Span
 from epipole.tasks.algorithms.orbits.object_identity import ObjectRegistry
-from epipole.tasks.common.spans import Span
 
 
-def name_objects(solved: Path, spans: Sequence[Span]) -> dict[str, dict[str, str]]:
+def name_objects(solved: Parts, spans: Sequence[Span]) -> dict[str, dict[str, str]]:
     """Return, for each span's folder, what its objects are called in the night.
 
     An object is named by the UTC date of the span in which it is first seen and its number in
@@ -29,7 +28,7 @@ def name_objects(solved: Path, spans: Sequence[Span]) -> dict[str, dict[str, str
     ids: dict[int, str] = {}
     out = {}
     for span in spans:
-        tracks = _tracks(read_part(solved / span.folder, "object_tracks"), track_number)
+        tracks = _tracks(solved.read(span, "object_tracks"), track_number)
         numbers = registry.name_groups(list(tracks.values()))
         date = str(np.datetime64(span.start_ns, "ns").astype("datetime64[D]")).replace("-", "")
         for number in numbers:

@@ -1,23 +1,16 @@
-"""Publish nights: what is staged becomes the dataset's, all at once."""
+"""Publish nights: the staged tables become the dataset's, all at once."""
 
 from collections.abc import Mapping
 from pathlib import Path
 
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
 from epipole.io.datasets.dataset import publish_folders
-from epipole.tasks.common.retries import DELAYS_S, RETRIES, storage_failed
+from epipole.schemas.stages import Stage
+from epipole.tasks.common.stage_tasks import stage_task
 
 
-@task(
-    name="publish nights",
-    cache_policy=NO_CACHE,
-    retries=RETRIES,
-    retry_delay_seconds=DELAYS_S,
-    retry_condition_fn=storage_failed,
-)
+@stage_task(Stage.PUBLISH, "all nights", retried=True)
 def publish_nights(
     dataset: str, staged: Mapping[str, Path], sources: pa.Table, replace: bool
 ) -> None:

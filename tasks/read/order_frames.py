@@ -1,11 +1,11 @@
 """Order frames: those of all logs by sensor and time, each once, and states in GCRF.
 
-Frames stay where reading put them; an index a sensor says where. So a night is never in
+Frames stay where reading put them. An index per sensor says where. So a night is never in
 memory, whatever the order of its frames and the number of its logs.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,10 +15,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
-from epipole.io.logs.damage import STAGE
-from epipole.io.work.files import read_part, write_part
+from epipole.io.work.parts import read_part, write_part
+from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import array, concat, conform, nullable, stack, table, unstack
 from epipole.schemas.log_tables import ITRF, LOG_STATES, LogSource
+from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX, SENSOR_STATES
@@ -38,16 +39,16 @@ LOGGER = logging.getLogger(__name__)
 Indices = npt.NDArray[np.int64]
 
 _DUPLICATES = {
-    DUPLICATE_FRAME: "duplicate_frame",
-    DUPLICATE_NUMBER: "duplicate_number",
-    DUPLICATE_TIME: "duplicate_time",
+    DUPLICATE_FRAME: Reason.DUPLICATE_FRAME,
+    DUPLICATE_NUMBER: Reason.DUPLICATE_NUMBER,
+    DUPLICATE_TIME: Reason.DUPLICATE_TIME,
 }
 
 
 class OrderedFrames(NamedTuple):
     """The frames of a run: where they lie and, in memory, what is small."""
 
-    folder: Path
+    folder: ReadFolder
     sensors: list[str]  # sorted; a sensor's number is its place here
     time_ns: list[Indices]  # of each sensor's frames
     cameras: pa.Table
@@ -55,63 +56,59 @@ class OrderedFrames(NamedTuple):
     rejects: pa.Table
 
 
-def order_logs(folder: Path, logs: Sequence[ReadLog], settings: Settings) -> OrderedFrames:
+def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) -> OrderedFrames:
     """Put what was read in order; the order of the logs does not matter.
 
     A frame that comes twice counts once; see `order_frames` for what is a repeat. A log that
     is given twice is used once.
     """
     logs = _distinct(logs)
-    keys = _keys(logs)
-    sensors = sorted(set(_names(logs, "exposures")) | set(_names(logs, "states")))
+    pieces = {(log.number, k): folder.piece(log.number, k) for log in logs
+              for k in range(log.n_pieces)}  # fmt: skip
+    keys = _keys(pieces)
+    sensors = sorted(_names(pieces, "exposures") | _names(pieces, "states"))
     sensor = _numbers(keys["sensor_id"], sensors)
     order, verdict = order_frames(sensor, array(keys, "time"), array(keys, "frame_number"))
-    rejects = [_part_tables(logs, "rejects", REJECTS)]
+    rejects = [_piece_tables(pieces, "rejects", REJECTS)]
     rejects += [
         _repeats(keys.take(order[verdict == code]), reason) for code, reason in _DUPLICATES.items()
     ]
     kept = order[verdict == KEEP]
     time_ns = []
     for number in range(len(sensors)):
-        own = keys.take(kept[sensor[kept] == number])
-        states, repeats = _sorted_states(logs, sensors[number], settings)
+        index = conform(FRAME_INDEX, keys.take(kept[sensor[kept] == number]))
+        states, repeats = _sorted_states(folder, logs, sensors[number], settings)
         rejects.append(repeats)
-        index = conform(FRAME_INDEX, own)
-        write_part(folder / f"sensor-{number}", {"index": index, "states": states})
-        time_ns.append(array(own, "time"))
-    cameras = _sorted_cameras(_part_tables(logs, "cameras", CAMERAS))
+        write_part(folder.sensor(number), {"index": index, "states": states})
+        time_ns.append(array(index, "time"))
+    cameras = _sorted_cameras(_piece_tables(pieces, "cameras", CAMERAS))
     left_out = concat(REJECTS, rejects)
     return OrderedFrames(folder, sensors, time_ns, cameras, [log.source for log in logs], left_out)
 
 
-def frames_between(folder: Path, sensor: int, start_ns: int, end_ns: int) -> pa.Table:
+def frames_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) -> pa.Table:
     """Return EXPOSURES of a sensor's frames from one instant to before another, by time."""
-    index = read_part(folder / f"sensor-{sensor}", "index")
+    index = read_part(folder.sensor(sensor), "index")
     first, last = np.searchsorted(array(index, "time"), [start_ns, end_ns])
     index = index.slice(first, last - first)
-    log, part, row = (array(index, name) for name in ("log", "part", "row"))
-    key = log.astype(np.int64) << 32 | part
-    pieces, rank = [], []
-    for one in np.unique(key):
-        own = np.flatnonzero(key == one)
-        exposures = read_part(_part(folder, int(one >> 32), int(one & 0xFFFFFFFF)), "exposures")
-        pieces.append(exposures.take(row[own]))
-        rank.append(own)
-    frames = concat(EXPOSURES, pieces)
-    if len(pieces) < 2:
+    log, piece, row = (array(index, name) for name in ("log", "piece", "row"))
+    tables, rank = [], []
+    for number, k in sorted(set(zip(log.tolist(), piece.tolist(), strict=True))):
+        rows = np.flatnonzero((log == number) & (piece == k))
+        exposures = read_part(folder.piece(number, k), "exposures")
+        tables.append(exposures.take(row[rows]))
+        rank.append(rows)
+    frames = concat(EXPOSURES, tables)
+    if len(tables) < 2:
         return frames
     return frames.take(np.argsort(np.concatenate(rank), kind="stable"))
 
 
-def states_between(folder: Path, sensor: int, start_ns: int, end_ns: int) -> pa.Table:
+def states_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) -> pa.Table:
     """Return SENSOR_STATES of a sensor from one instant to before another, by time."""
-    states = read_part(folder / f"sensor-{sensor}", "states")
+    states = read_part(folder.sensor(sensor), "states")
     first, last = np.searchsorted(array(states, "time"), [start_ns, end_ns])
     return states.slice(first, last - first)
-
-
-def _part(folder: Path, log: int, part: int) -> Path:
-    return folder / f"log-{log}" / f"part-{part}"
 
 
 def _distinct(logs: Sequence[ReadLog]) -> list[ReadLog]:
@@ -124,39 +121,30 @@ def _distinct(logs: Sequence[ReadLog]) -> list[ReadLog]:
     return list(by_content.values())
 
 
-def _keys(logs: Sequence[ReadLog]) -> pa.Table:
-    """Return a row a frame of all logs: its key, its log and where it lies."""
+def _keys(pieces: Mapping[tuple[int, int], Path]) -> pa.Table:
+    """Return a row per frame of all pieces: its key, its log and where it lies."""
     names = ["sensor_id", "frame_number", "time", "source"]
-    kinds = [EXPOSURES.field(name) for name in names] + [
-        FRAME_INDEX.field(name) for name in ("log", "part", "row")
-    ]
-    rows = [pa.schema(kinds).empty_table()]
-    for log in logs:
-        for part in log.parts:
-            own = read_part(part, "exposures", names)
-            n = own.num_rows
-            number, at = int(part.parent.name[4:]), int(part.name[5:])
-            rows.append(
-                pa.Table.from_arrays(
-                    [
-                        *own.columns,
-                        pa.array(np.full(n, number, np.int32)),
-                        pa.array(np.full(n, at, np.int32)),
-                        pa.array(np.arange(n)),
-                    ],
-                    schema=pa.schema(kinds),
-                )
-            )
+    places = ("log", "piece", "row")
+    schema = pa.schema(
+        [EXPOSURES.field(name) for name in names] + [FRAME_INDEX.field(name) for name in places]
+    )
+    rows = [schema.empty_table()]
+    for (log, piece), part in pieces.items():
+        keys = read_part(part, "exposures", names)
+        n = keys.num_rows
+        place = (
+            pa.array(np.full(n, log, np.int32)),
+            pa.array(np.full(n, piece, np.int32)),
+            pa.array(np.arange(n)),
+        )
+        rows.append(pa.Table.from_arrays([*keys.columns, *place], schema=schema))
     return pa.concat_tables(rows)
 
 
-def _names(logs: Sequence[ReadLog], name: str) -> set[str]:
-    """Return the sensors that a table of the logs names."""
-    found: set[str] = set()
-    for log in logs:
-        for part in log.parts:
-            found |= set(pc.unique(read_part(part, name)["sensor_id"]).to_pylist())
-    return found
+def _names(pieces: Mapping[tuple[int, int], Path], name: str) -> set[str]:
+    """Return the sensors that a table of the pieces names."""
+    tables = (read_part(part, name, ["sensor_id"]) for part in pieces.values())
+    return {sensor for rows in tables for sensor in pc.unique(rows["sensor_id"]).to_pylist()}
 
 
 def _numbers(sensor_id: pa.ChunkedArray, sensors: list[str]) -> Indices:
@@ -164,52 +152,46 @@ def _numbers(sensor_id: pa.ChunkedArray, sensors: list[str]) -> Indices:
     return np.asarray(found.to_numpy(), np.int64)
 
 
-def _part_tables(logs: Sequence[ReadLog], name: str, schema: pa.Schema) -> pa.Table:
-    return concat(schema, [read_part(part, name) for log in logs for part in log.parts])
+def _piece_tables(pieces: Mapping[tuple[int, int], Path], name: str, schema: pa.Schema) -> pa.Table:
+    return concat(schema, [read_part(part, name) for part in pieces.values()])
 
 
-def _repeats(frames: pa.Table, reason: str) -> pa.Table:
-    """Return a row of `rejects` a sensor and log: when the first repeat was, how many."""
+def _repeats(frames: pa.Table, reason: Reason) -> pa.Table:
+    """Return a row of `rejects` per sensor and log: when the first repeat was, how many."""
     grouped = frames.group_by(["sensor_id", "source"], use_threads=False).aggregate(
         [("time", "min"), ("time", "count")]
     )
-    n = grouped.num_rows
-    return table(
-        REJECTS,
-        {
-            "source": grouped["source"],
-            "offset": [None] * n,
-            "sensor_id": grouped["sensor_id"],
-            "time": grouped["time_min"],
-            "stage": [STAGE] * n,
-            "reason": [reason] * n,
-            "count": grouped["time_count"],
-        },
+    return reject_rows(
+        reason,
+        source=grouped["source"],
+        sensor_id=grouped["sensor_id"],
+        time=grouped["time_min"],
+        count=grouped["time_count"],
     )
 
 
 def _sorted_states(
-    logs: Sequence[ReadLog], sensor_id: str, settings: Settings
+    folder: ReadFolder, logs: Sequence[ReadLog], sensor_id: str, settings: Settings
 ) -> tuple[pa.Table, pa.Table]:
     """Return one sensor's states in GCRF, sorted and each once, and the rejects for the rest."""
     states, names = [], []
     for log in logs:
-        for part in log.parts:
-            own = read_part(part, "states").filter(pc.field("sensor_id") == sensor_id)
-            states.append(own)
-            names += [log.source.name] * own.num_rows
+        for k in range(log.n_pieces):
+            all_states = read_part(folder.piece(log.number, k), "states")
+            states.append(all_states.filter(pc.field("sensor_id") == sensor_id))
+            names += [log.source.name] * states[-1].num_rows
     rows = concat(LOG_STATES, states)
     order, repeats = order_states(np.zeros(rows.num_rows, np.int64), array(rows, "time"))
     named = rows.select(["sensor_id", "time"]).append_column("source", pa.array(names, pa.string()))
-    rejects = _repeats(named.take(pa.array(order[repeats])), "duplicate_state")
+    rejects = _repeats(named.take(pa.array(order[repeats])), Reason.DUPLICATE_STATE)
     return _turned_to_gcrf(rows.take(pa.array(order[~repeats])), settings), rejects
 
 
 def _turned_to_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
     """Return SENSOR_STATES of LOG_STATES, row by row.
 
-    Where the Earth-orientation table does not reach, an Earth-fixed position is less well
-    known than its sigma says; the sigma returned says so.
+    Outside the Earth-orientation table an Earth-fixed position is less certain than its sigma
+    says. The sigma that is returned is larger there.
     """
     time_ns, frame = array(states, "time"), array(states, "frame")
     r_km, v_km_s = stack(states, "{}_km"), stack(states, "v{}_km_s")
@@ -220,8 +202,8 @@ def _turned_to_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
         r_km[i], v_km_s[i] = to_gcrf(name, time_ns[i], r_km[i], v_km_s[i], orientation)
         if name == ITRF and orientation.sigma_rad.any():
             turn_km = orientation.sigma_rad * np.linalg.norm(r_km[i], axis=1)
-            own_km = np.where(sigma_km[i] > 0, sigma_km[i], settings.sensors.position_sigma_km)
-            sigma_km[i] = np.where(turn_km > 0, np.hypot(own_km, turn_km), sigma_km[i])
+            known_km = np.where(sigma_km[i] > 0, sigma_km[i], settings.sensors.position_sigma_km)
+            sigma_km[i] = np.where(turn_km > 0, np.hypot(known_km, turn_km), sigma_km[i])
             _warn_of_orientation(turn_km)
     values = {name: states[name] for name in SENSOR_STATES.names}
     values.update(unstack("{}_km", r_km), position_sigma_km=sigma_km)
@@ -232,8 +214,8 @@ def _turned_to_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
 def _warn_of_orientation(turn_km: npt.NDArray[np.float64]) -> None:
     end = np.datetime64("1858-11-17") + int(read_earth_orientation().mjd[-1])
     LOGGER.warning(
-        "%d ITRF states lie outside the Earth-orientation table (it ends %s): their positions "
-        "are uncertain by up to %.3f km more; a newer astropy-iers-data helps",
+        "%d ITRF states lie outside the Earth-orientation table, which ends %s; their positions "
+        "are uncertain by up to %.3f km more; install a newer astropy-iers-data",
         np.count_nonzero(turn_km),
         end,
         turn_km.max(),
@@ -241,6 +223,6 @@ def _warn_of_orientation(turn_km: npt.NDArray[np.float64]) -> None:
 
 
 def _sorted_cameras(cameras: pa.Table) -> pa.Table:
-    """Return the calibrations by sensor and time, those that say the same at one time once."""
+    """Return the calibrations by sensor and time; equal ones of one time count once."""
     unique = cameras.group_by(CAMERAS.names, use_threads=False).aggregate([])
     return conform(CAMERAS, unique.sort_by([(name, "ascending") for name in CAMERAS.names]))

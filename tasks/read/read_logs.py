@@ -1,61 +1,51 @@
-"""Read logs: what each holds goes into the work folder, part by part, as the log has it."""
+"""Read logs: what each holds goes into the work folder, piece by piece."""
 
 import logging
-import os
-from pathlib import Path
 from typing import NamedTuple
 
-from prefect import task
-from prefect.cache_policies import NO_CACHE
-
 from epipole.io.logs.reader import read_log_parts
-from epipole.io.work.files import write_part
+from epipole.io.work.parts import write_part
+from epipole.io.work.places import ReadFolder
 from epipole.schemas.log_tables import LogSource
-from epipole.tasks.common.retries import DELAYS_S, RETRIES, storage_failed
+from epipole.schemas.stages import Stage
+from epipole.tasks.common.stage_tasks import stage_task
 
 LOGGER = logging.getLogger(__name__)
 
 
 class ReadLog(NamedTuple):
-    """A log that was read: where its parts lie."""
+    """A log that was read: its number among those of the run, and how many pieces it has."""
 
-    parts: list[Path]
+    number: int
+    n_pieces: int
     source: LogSource
 
 
-@task(
-    name="read log",
-    task_run_name="read {path}",
-    cache_policy=NO_CACHE,
-    retries=RETRIES,
-    retry_delay_seconds=DELAYS_S,
-    retry_condition_fn=storage_failed,
-)
-def read_log_into(folder: Path, path: str | os.PathLike[str]) -> ReadLog:
-    """Read one log into parts of bounded size, and say where they are.
+@stage_task(Stage.READ, "{path}", retried=True)
+def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
+    """Read one log into pieces of bounded size.
 
-    Each holds `exposures`, `states`, `cameras` and `rejects` as `LogPart` has them.
+    Each piece holds `exposures`, `states`, `cameras` and `rejects` as `LogPiece` has them.
 
     Raises
     ------
     LogError
         Where it is no log; see `read_log_parts`.
     """
-    parts, source, n_frames = [], None, 0
-    for number, part in enumerate(read_log_parts(path)):
-        where = folder / f"part-{number}"
+    n_pieces, n_frames, source = 0, 0, None
+    for piece in read_log_parts(path):
         write_part(
-            where,
+            folder.piece(number, n_pieces),
             {
-                "exposures": part.exposures,
-                "states": part.states,
-                "cameras": part.cameras,
-                "rejects": part.rejects,
+                "exposures": piece.exposures,
+                "states": piece.states,
+                "cameras": piece.cameras,
+                "rejects": piece.rejects,
             },
         )
-        parts.append(where)
-        n_frames += part.exposures.num_rows
-        source = part.source or source
-    assert source is not None, "the last part has it"
-    LOGGER.info("%s: read %d frames in %d parts", source.name, n_frames, len(parts))
-    return ReadLog(parts, source)
+        n_pieces += 1
+        n_frames += piece.exposures.num_rows
+        source = piece.source or source
+    assert source is not None, "the last piece has it"
+    LOGGER.info("%s: read %d frames in %d pieces", source.name, n_frames, n_pieces)
+    return ReadLog(number, n_pieces, source)

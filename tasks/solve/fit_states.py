@@ -7,8 +7,15 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from epipole.schemas.bridge import table, unstack
-from epipole.schemas.columns import upper_triangle
+from epipole.schemas.bridge import (
+    stack,
+    stack_covariance,
+    table,
+    to_polars,
+    unstack,
+    unstack_covariance,
+)
+from epipole.schemas.columns import STATE_AXES, TANGENT_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import STATES
 from epipole.tasks.algorithms.orbits.object_motion import velocities
@@ -17,9 +24,7 @@ from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, fit_orbits
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-PLACE = ["x_km", "y_km", "z_km"]
 SLOPE_S = 60.0  # positions this near the middle of an arc give the velocity to begin with
-AXES = ("x", "y", "z", "vx", "vy", "vz")
 
 
 def fit_states(
@@ -45,10 +50,10 @@ def fit_states(
         offsets=offsets,
         time_s=(epoch_ns - np.repeat(middle, np.diff(offsets))) / 1e9,
         sensor=rows["sensor"].to_numpy().astype(np.int64),
-        r_km=rows.select(PLACE).to_numpy(),
-        u=rows.select("ux", "uy", "uz").to_numpy(),
-        cov_noise=_symmetric(rows, "noise"),
-        cov_bias=_symmetric(rows, "bias"),
+        r_km=stack(rows, "{}_km"),
+        u=stack(rows, "u{}"),
+        cov_noise=stack_covariance(rows, "cov_noise_{}_rad2", TANGENT_AXES),
+        cov_bias=stack_covariance(rows, "cov_bias_{}_rad2", TANGENT_AXES),
         sigma_km=rows["position_sigma_km"].to_numpy(),
     )
     state, cov, chi2 = fit_orbits(arcs, _starts(positions, object_id, middle))
@@ -60,15 +65,15 @@ def _used_views(
 ) -> pl.DataFrame:
     """Return the views that served positions at epochs apart, with the number of their arc."""
     key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
-    claimed = _frame(associations).filter("used").select([*key, "object_id"])
-    solved = _frame(positions).select("epoch", "object_id").sort("object_id", "epoch")
+    claimed = to_polars(associations).filter("used").select([*key, "object_id"])
+    solved = to_polars(positions).select("epoch", "object_id").sort("object_id", "epoch")
     name = solved["object_id"].to_numpy()
     epoch_ns = solved["epoch"].cast(pl.Int64).to_numpy()
     arc, kept = _arcs(name, epoch_ns, settings.states.arc_s, 2 * settings.alignment.window_s)
     arc = np.where(_long_enough(arc, kept, settings.states.min_epochs), arc, -1)
     solved = solved.with_columns(arc=arc).filter(pl.Series(kept & (arc >= 0)))
     return (
-        _frame(views)
+        to_polars(views)
         .join(claimed, on=key)
         .join(solved, on=["epoch", "object_id"])
         .with_columns(sensor=pl.col("sensor_id").rank("dense").cast(pl.Int64) - 1)
@@ -100,11 +105,11 @@ def _long_enough(arc: Indices, kept: npt.NDArray[np.bool_], least: int) -> npt.N
 
 def _starts(positions: pa.Table, object_id: npt.NDArray[np.object_], middle_ns: Indices) -> Array:
     """Return states to begin with: the position at each arc's middle, and the slope there."""
-    rows = _frame(positions).sort("object_id", "epoch")
+    rows = to_polars(positions).sort("object_id", "epoch")
     name, epoch_ns = rows["object_id"].to_numpy(), rows["epoch"].cast(pl.Int64).to_numpy()
     begins = np.flatnonzero(np.append(True, name[1:] != name[:-1]))
     offsets = np.append(begins, len(name)).astype(np.int64)
-    x_km = rows.select(PLACE).to_numpy()
+    x_km = stack(rows, "{}_km")
     v_km_s = velocities(offsets, (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)
     at = dict(zip(zip(name, epoch_ns.tolist(), strict=True), range(len(name)), strict=True))
     chosen = [at[key] for key in zip(object_id, middle_ns.tolist(), strict=True)]
@@ -127,22 +132,8 @@ def _state_table(
         "object_id": object_id,
         **unstack("{}_km", state[:, :3]),
         **unstack("v{}_km_s", state[:, 3:]),
-        **{f"cov_{a}{b}": cov[:, AXES.index(a), AXES.index(b)] for a, b in upper_triangle(AXES)},
+        **unstack_covariance("cov_{}", cov, STATE_AXES),
         "n_epochs": n_epochs.astype(np.int32),
         "chi2": chi2,
     }
     return table(STATES, {name: values[found] for name, values in columns.items()})
-
-
-def _symmetric(rows: pl.DataFrame, which: str) -> Array:
-    names = [f"cov_{which}_{ab}_rad2" for ab in ("11", "12", "12", "22")]
-    return (
-        rows.select(pl.col(n).alias(str(i)) for i, n in enumerate(names))
-        .to_numpy()
-        .reshape(-1, 2, 2)
-    )
-
-
-def _frame(rows: pa.Table) -> pl.DataFrame:
-    frame = pl.from_arrow(rows)
-    return frame if isinstance(frame, pl.DataFrame) else frame.to_frame()

@@ -6,16 +6,26 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, stack, table, unstack, unstack_covariance
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    stack,
+    stack_covariance,
+    table,
+    unstack,
+    unstack_covariance,
+)
+from epipole.schemas.columns import TANGENT_AXES
+from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
+from epipole.schemas.spans import Span
 from epipole.schemas.tables import ASSOCIATIONS, PAIRS, POSITIONS, REJECTS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.epipolar import epipolar_angle, epipolar_sigma
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import velocities
-from epipole.tasks.common.lone_detections import published_ids
-from epipole.tasks.common.spans import Span
+from epipole.tasks.common.lone_detections import only_id, published_ids
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -138,11 +148,11 @@ def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
 
 
 def _direction_covariance(views: pa.Table) -> Array:
-    cov = np.empty((views.num_rows, 2, 2))
-    for ab, i, j in (("11", 0, 0), ("12", 0, 1), ("22", 1, 1)):
-        total = array(views, f"cov_noise_{ab}_rad2") + array(views, f"cov_bias_{ab}_rad2")
-        cov[:, i, j] = cov[:, j, i] = total
-    return cov
+    noise, bias = (
+        stack_covariance(views, f"cov_{which}_{{}}_rad2", TANGENT_AXES)
+        for which in ("noise", "bias")
+    )
+    return noise + bias
 
 
 def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> Array:
@@ -250,25 +260,26 @@ def _residual_px(groups: _Groups) -> Array:
 
 
 def _reject_table(groups: _Groups) -> pa.Table:
-    """Return a row a sensor and reason: views rejected, and epochs without a solution."""
+    """Return a row per sensor and reason: views rejected, and epochs without a solution."""
     unsolved = ~np.isfinite(groups.chi2)[groups.group]
-    reasons = (("view_rejected", ~groups.used & ~unsolved), ("no_position", unsolved))
-    rows = []
+    which = {
+        Reason.VIEW_REJECTED: ~groups.used & ~unsolved,
+        Reason.NO_POSITION: unsolved,
+    }
     sensor = array(groups.views, "sensor_id").astype(str)
+    tracklet_id = array(groups.views, "tracklet_id")
     epoch_ns = array(groups.views, "epoch")
-    for reason, which in reasons:
-        for name in np.unique(sensor[which]):
-            own = which & (sensor == name)
-            rows.append((name, int(epoch_ns[own].min()), reason, int(own.sum())))
-    return table(
-        REJECTS,
-        {
-            "source": pa.nulls(len(rows), pa.string()),
-            "offset": pa.nulls(len(rows), pa.int64()),
-            "sensor_id": [r[0] for r in rows],
-            "time": np.array([r[1] for r in rows], np.int64),
-            "stage": ["positions"] * len(rows),
-            "reason": [r[2] for r in rows],
-            "count": [r[3] for r in rows],
-        },
-    )
+    tables = []
+    for reason, left_out in which.items():
+        for name in np.unique(sensor[left_out]):
+            rows = left_out & (sensor == name)
+            tables.append(
+                reject_rows(
+                    reason,
+                    sensor_id=str(name),
+                    tracklet_id=only_id(tracklet_id[rows]),
+                    time=[int(epoch_ns[rows].min())],
+                    count=[int(rows.sum())],
+                )
+            )
+    return concat(REJECTS, tables)

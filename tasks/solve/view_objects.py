@@ -4,7 +4,8 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, empty, table, unstack
+from epipole.schemas.bridge import array, empty, table, unstack, unstack_covariance
+from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import GM_KM3_S2
@@ -143,8 +144,8 @@ def _view_table(
         "x_px": x_px,
         "y_px": y_px,
         **unstack("u{}", u),
-        **_upper("cov_noise_{}_rad2", cov_noise),
-        **_upper("cov_bias_{}_rad2", cov_bias),
+        **unstack_covariance("cov_noise_{}_rad2", cov_noise, TANGENT_AXES),
+        **unstack_covariance("cov_bias_{}_rad2", cov_bias, TANGENT_AXES),
         **unstack("{}_km", r_km),
         "position_sigma_km": frames.position_sigma_km[served],
         "pixel_rad": np.full(len(row), camera.pixel_rad),
@@ -152,14 +153,6 @@ def _view_table(
     columns = {key: values[kept] for key, values in columns.items()}
     columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
     return table(VIEWS, columns).sort_by([("epoch", "ascending"), ("tracklet_id", "ascending")])
-
-
-def _upper(pattern: str, cov: Array) -> dict[str, Array]:
-    return {
-        pattern.format("11"): cov[:, 0, 0],
-        pattern.format("12"): cov[:, 0, 1],
-        pattern.format("22"): cov[:, 1, 1],
-    }
 
 
 def _centroids(

@@ -10,7 +10,8 @@ import pyarrow as pa
 
 from epipole.schemas.bridge import array, concat, empty, nullable, table
 from epipole.schemas.settings import Settings, TrackletSettings
-from epipole.schemas.tables import DETECTIONS, TRACKLETS
+from epipole.schemas.tables import DETECTIONS
+from epipole.schemas.work_tables import TRACKLET_RUNS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.time.epoch_grid import frame_interval_ns
@@ -29,7 +30,7 @@ from epipole.tasks.common.sightings import (
     solved_frames,
     unsolved_frames,
 )
-from epipole.tasks.track.detection_kinds import (
+from epipole.tasks.track.classify_detections import (
     at_hot_pixel,
     at_star,
     is_hot_pixel,
@@ -63,7 +64,7 @@ def build_tracklets(
     run of them for itself: there stars move with the objects and cannot be told from them.
     """
     if not detections.num_rows:
-        return Tracked(detections, empty(TRACKLETS))
+        return Tracked(detections, empty(TRACKLET_RUNS))
     labels = _Labels(
         np.full(detections.num_rows, "unknown", dtype=object),
         *(np.full(detections.num_rows, None, dtype=object) for _ in range(2)),
@@ -73,7 +74,7 @@ def build_tracklets(
         for part in _parts(solutions, detections, cameras)
     ]
     columns = {name: detections[name] for name in DETECTIONS.names} | labels._asdict()
-    built = concat(TRACKLETS, tracklets)
+    built = concat(TRACKLET_RUNS, tracklets)
     return Tracked(
         table(DETECTIONS, columns),
         built.sort_by([("start_time", "ascending"), ("tracklet_id", "ascending")]),
@@ -270,7 +271,7 @@ def _tracklet_table(
 ) -> pa.Table:
     time_ns = frames.time_ns[seen.frame]
     return table(
-        TRACKLETS,
+        TRACKLET_RUNS,
         {
             "tracklet_id": names,
             "track_id": heads,

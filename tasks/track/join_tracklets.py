@@ -1,6 +1,6 @@
 """Join tracklets: what one sensor's spans found becomes the tracklets and tracks of its night.
 
-Two neighbouring spans both follow what is seen about the instant between them. Tracklets of
+Two neighbouring spans both follow the detections near the instant between them. Tracklets of
 the two that share detections there are one.
 """
 
@@ -9,22 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
-from epipole.io.work.files import is_written, read_part, write_part
-from epipole.schemas.bridge import table
-from epipole.schemas.tables import TRACKLETS
-from epipole.schemas.work_tables import TRACKLET_NAMES
+from epipole.io.work.parts import Parts, is_written, read_part, write_part
+from epipole.schemas.bridge import from_polars, to_polars
+from epipole.schemas.spans import Sensor, Span
+from epipole.schemas.stages import Stage
+from epipole.schemas.work_tables import TRACKLET_NAMES, TRACKLET_RUNS
 from epipole.tasks.algorithms.tracking.linking.chains import chain_heads
-from epipole.tasks.common.spans import Sensor, Span
+from epipole.tasks.common.stage_tasks import stage_task
 
 KEY = ["frame_number", "centroid"]
 
 
-@task(name="join tracklets", task_run_name="join tracklets {sensor}", cache_policy=NO_CACHE)
-def join_tracklets(sensor: Sensor, tracked: Path, spans: Sequence[Span], stage: Path) -> int:
+@stage_task(Stage.TRACK, "{sensor} all spans")
+def join_tracklets(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts: Parts) -> int:
     """Name one sensor's tracklets for the night, unless that has been done.
 
     Parameters
@@ -33,8 +31,8 @@ def join_tracklets(sensor: Sensor, tracked: Path, spans: Sequence[Span], stage: 
         The sensor's tracked parts.
     spans
         Those it has parts of, in order.
-    stage
-        Where the parts go: `names` of each span, and `tracklets` under ``night``.
+    parts
+        Where the parts go: `names` of each span, and `tracklets` of the night.
 
     Returns
     -------
@@ -43,22 +41,21 @@ def join_tracklets(sensor: Sensor, tracked: Path, spans: Sequence[Span], stage: 
 
     Notes
     -----
-    A detection belongs to the tracklet that the span it lies in says. A tracklet's number in
-    the night is that of the span before, if they share more detections than either shares with
-    another; what it continues is said by the span in which it begins.
+    A detection belongs to the tracklet that it has in its own span. A tracklet keeps the number
+    that it has in the span before, if the two share more detections than either shares with
+    another. What it continues is taken from the span in which it begins.
     """
-    night = stage / "night"
-    if not is_written(night):
-        _join(sensor, tracked, spans, stage)
-    return read_part(night, "tracklets").num_rows
+    if not is_written(parts.of_night()):
+        _join(sensor, tracked, spans, parts)
+    return read_part(parts.of_night(), "tracklets").num_rows
 
 
-def _join(sensor: Sensor, tracked: Path, spans: Sequence[Span], stage: Path) -> None:
+def _join(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts: Parts) -> None:
     count = 0
-    before: pl.DataFrame | None = None  # what the span before says
+    before: pl.DataFrame | None = None  # tracklet numbers of the span before
     owned, named = [], []
     for k, span in enumerate(spans):
-        part = tracked / span.folder
+        part = tracked.of(span)
         seen = _tracked(part).with_columns(owned=pl.col("time_ns").is_between(*span, closed="left"))
         known = _shared(before, seen)  # a margin may reach over spans that have no frames
         numbers = _numbered(seen, known, count)
@@ -67,7 +64,7 @@ def _join(sensor: Sensor, tracked: Path, spans: Sequence[Span], stage: Path) -> 
         named.append(_links(part, numbers).with_columns(span=pl.lit(k, pl.Int64)))
         owned.append(_summed(seen.filter("owned"), part).with_columns(span=pl.lit(k, pl.Int64)))
         before = seen.select(*KEY, "number")
-    _write(spans, stage, pl.concat(named), pl.concat(owned), sensor.sensor_id)
+    _write(spans, parts, pl.concat(named), pl.concat(owned), sensor.sensor_id)
 
 
 def _tracked(part: Path) -> pl.DataFrame:
@@ -75,7 +72,7 @@ def _tracked(part: Path) -> pl.DataFrame:
     rows = read_part(part, "detections", [*KEY, "time", "tracklet_id"])
     rows = rows.filter(rows["tracklet_id"].is_valid())
     return (
-        _frame(rows)
+        to_polars(rows)
         .with_columns(time_ns=pl.col("time").cast(pl.Int64))
         .rename({"tracklet_id": "span_name"})
         .drop("time")
@@ -116,7 +113,7 @@ def _numbered(seen: pl.DataFrame, known: pl.DataFrame, count: int) -> pl.DataFra
 
 def _links(part: Path, numbers: pl.DataFrame) -> pl.DataFrame:
     """Return, for each tracklet of a span, what it continues there, and how well."""
-    rows = _frame(
+    rows = to_polars(
         read_part(part, "tracklets", ["tracklet_id", "track_id", "start_time", "link_chi2"])
     ).rename({"tracklet_id": "span_name"})
     rows = rows.join(numbers, on="span_name").sort("track_id", "start_time", "span_name")
@@ -130,7 +127,7 @@ def _links(part: Path, numbers: pl.DataFrame) -> pl.DataFrame:
 
 def _summed(owned: pl.DataFrame, part: Path) -> pl.DataFrame:
     """Return a row a tracklet and span: its share of the detections, its motion and residual."""
-    found = _frame(read_part(part, "tracklets", ["tracklet_id", "rate_arcsec_s", "residual_px"]))
+    found = to_polars(read_part(part, "tracklets", ["tracklet_id", "rate_arcsec_s", "residual_px"]))
     return (
         owned.group_by("number", "span_name")
         .agg(
@@ -146,7 +143,7 @@ def _summed(owned: pl.DataFrame, part: Path) -> pl.DataFrame:
 
 
 def _write(
-    spans: Sequence[Span], stage: Path, named: pl.DataFrame, owned: pl.DataFrame, sensor_id: str
+    spans: Sequence[Span], parts: Parts, named: pl.DataFrame, owned: pl.DataFrame, sensor_id: str
 ) -> None:
     night = (
         owned.sort("number", "span")
@@ -174,13 +171,13 @@ def _write(
     )
     names = named.join(night.select("number", "tracklet_id", "track_id"), on="number")
     for k, span in enumerate(spans):
-        own = names.filter(span=k).sort("span_name")
-        write_part(stage / span.folder, {"names": _arrow(own, TRACKLET_NAMES)})
+        of_span = names.filter(span=k).sort("span_name")
+        write_part(parts.of(span), {"names": from_polars(TRACKLET_NAMES, of_span)})
     night = night.rename({"start_ns": "start_time", "end_ns": "end_time"}).with_columns(
         sensor_id=pl.lit(sensor_id)
     )
     night = night.sort("start_time", "tracklet_id")
-    write_part(stage / "night", {"tracklets": _arrow(night, TRACKLETS)})
+    write_part(parts.of_night(), {"tracklets": from_polars(TRACKLET_RUNS, night)})
 
 
 def _before(night: pl.DataFrame) -> tuple[np.ndarray, list[float | None]]:
@@ -203,12 +200,3 @@ def _before(night: pl.DataFrame) -> tuple[np.ndarray, list[float | None]]:
             taken.add(after)
             before[row], chi2[row] = after, claim
     return before, chi2
-
-
-def _arrow(rows: pl.DataFrame, schema: pa.Schema) -> pa.Table:
-    return table(schema, {name: rows[name].to_arrow() for name in schema.names})
-
-
-def _frame(rows: pa.Table) -> pl.DataFrame:
-    frame = pl.from_arrow(rows)
-    return frame if isinstance(frame, pl.DataFrame) else frame.to_frame()

@@ -1,20 +1,18 @@
 """Track a span: one sensor's tracklets over a span of time and a margin, from file to file."""
 
-from pathlib import Path
-
 import pyarrow as pa
-from prefect import task
-from prefect.cache_policies import NO_CACHE
 
-from epipole.io.work.files import is_written, read_part, write_part
+from epipole.io.work.parts import Parts, write_part
 from epipole.schemas.settings import Settings
+from epipole.schemas.spans import Sensor, Span
+from epipole.schemas.stages import Stage
 from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import SOLUTIONS
-from epipole.tasks.common.spans import Sensor, Span, rows_within
+from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.track.build_tracklets import build_tracklets
 
-# A tracklet that begins before the span is seen for so long that it is the same one, and a
-# broken one is joined across the span's end.
+# A tracklet that begins before the span is followed for so long that both spans find the same
+# one, and a broken one is joined across the span's end.
 MARGIN_S = 90.0
 
 
@@ -23,9 +21,14 @@ def track_margin_ns(settings: Settings) -> int:
     return round((MARGIN_S + settings.tracklets.link_gap_s) * 1e9)
 
 
-@task(name="track", task_run_name="track {sensor} {span}", cache_policy=NO_CACHE)
+@stage_task(Stage.TRACK, "{sensor} {span}")
 def track_span(
-    sensor: Sensor, identified: Path, span: Span, cameras: pa.Table, settings: Settings, stage: Path
+    sensor: Sensor,
+    identified: Parts,
+    span: Span,
+    cameras: pa.Table,
+    settings: Settings,
+    parts: Parts,
 ) -> int:
     """Follow one sensor's detections through a span and its margins, unless that was done.
 
@@ -33,7 +36,7 @@ def track_span(
     ----------
     identified
         The sensor's identified parts.
-    stage
+    parts
         Where the part goes: `detections` and `tracklets`, named within the span.
 
     Returns
@@ -41,14 +44,13 @@ def track_span(
     int
         How many tracklets there are.
     """
-    part = stage / span.folder
-    if not is_written(part):
+    if not parts.holds(span):
         wide = span.widened(track_margin_ns(settings))
         tracked = build_tracklets(
-            rows_within(identified, wide, SOLUTIONS, "solutions"),
-            rows_within(identified, wide, DETECTIONS, "detections"),
+            identified.rows_within(wide, SOLUTIONS, "solutions"),
+            identified.rows_within(wide, DETECTIONS, "detections"),
             cameras,
             settings,
         )
-        write_part(part, tracked._asdict())
-    return read_part(part, "tracklets").num_rows
+        write_part(parts.of(span), tracked._asdict())
+    return parts.read(span, "tracklets").num_rows

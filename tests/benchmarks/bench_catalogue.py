@@ -29,8 +29,8 @@ from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import validate_settings
 from epipole.tasks.algorithms.star_identification.frames.frame import Optics
 from epipole.tasks.catalogue.build_deep_catalogue import build_deep_catalogue
-from epipole.tasks.identify import cached_skies
-from epipole.tasks.identify.cached_skies import CachedSkies, Catalogue
+from epipole.tasks.identify import cache_skies
+from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 # Catalogue, field [degrees], pixels along it, centroids a frame.
 CAMERAS = (
@@ -74,7 +74,7 @@ def bench_build(folder: Path) -> None:
 def sky_cost(catalogue: Catalogue, field: float, pixels: int, centroids: int) -> tuple[float, ...]:
     """Return CPU ms for stars, grid and pairs of a camera, and how many stars and pairs."""
     for kept in ("_navigation", "_sky", "_grid", "_pairs"):
-        getattr(cached_skies, kept).cache_clear()
+        getattr(cache_skies, kept).cache_clear()
     half = np.tan(np.radians(field / 2))
     box = np.array([-half, half, -half, half])
     pixel = np.radians(field) / pixels

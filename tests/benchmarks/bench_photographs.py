@@ -28,7 +28,7 @@ from epipole.tasks.algorithms.star_identification.sensor import (
     Spots,
     identify_sensor,
 )
-from epipole.tasks.identify.cached_skies import CachedSkies, Catalogue
+from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 Array = npt.NDArray[np.float64]
 HOW = Search(3.7, -np.log(1e-6), 0.5, np.nan)  # the defaults of a run

@@ -178,7 +178,7 @@ def test_a_bad_frame_is_a_reject_and_the_rest_goes_on(tmp_path):
     log = write_log(tmp_path / "n.mcap", {"a": {"nan_frame": 4}})
     nightly([str(log)], str(tmp_path / "out"))
     assert scan(tmp_path / "out", "frames")["frame_number"].to_list() == [0, 1, 2, 3, *range(5, 10)]
-    rejects = scan(tmp_path / "out", "rejects").filter(pl.col("stage") == "read_logs")
+    rejects = scan(tmp_path / "out", "rejects").filter(pl.col("stage") == "read")
     assert rejects.select("sensor_id", "source", "count").rows() == [("a", "n.mcap", 1)]
 
 

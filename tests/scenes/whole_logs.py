@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
+from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.log_tables import LogSource
 from epipole.schemas.settings import Settings
@@ -32,8 +33,8 @@ def read_whole(
 ) -> Log:
     """Read logs as the flow does; frames and states of a time only."""
     with tempfile.TemporaryDirectory() as folder:
-        where = Path(folder)
-        read = [read_log_into.fn(where / f"log-{k}", path) for k, path in enumerate(paths)]
+        where = ReadFolder(Path(folder))
+        read = [read_log_into.fn(where, k, path) for k, path in enumerate(paths)]
         frames = order_logs(where, read, settings)
         numbers = range(len(frames.sensors))
         exposures = [frames_between(where, n, *between) for n in numbers]

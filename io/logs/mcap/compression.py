@@ -27,7 +27,7 @@ def decompress(data: memoryview, compression: str, size: int) -> bytes:
         elif compression == "":
             records = bytes(data)
         else:
-            raise ChunkError(f"unknown_compression_{compression}")
+            raise ChunkError("unknown_compression")
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
         raise ChunkError("bad_compression") from error
     if len(records) != size:

@@ -242,8 +242,8 @@ class RecordWalk:
         self.damage[index] = self.damage[index]._replace(n=max(1, self._lost[index]))
 
     def _report_missing(self) -> None:
-        for number, count in sorted(self._unknown.items()):
-            self._leave_out(0, 0, f"unknown_channel_{number}", count)
+        for _, count in sorted(self._unknown.items()):
+            self._leave_out(0, 0, "unknown_channel", count)
         declared = self._summary.declared
         missing = sum(
             max(0, count - self._counts.get(number, 0))

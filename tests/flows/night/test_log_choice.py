@@ -100,7 +100,7 @@ def test_a_file_that_is_no_log_is_left_out_with_a_row_of_rejects(folder, caplog)
     assert [Path(path).stem for path in found.paths] == OF_THE_SECOND
     (row,) = found.rejects.to_pylist()
     assert (row["source"], row["stage"], row["reason"], row["count"]) == (
-        "empty.mcap", "find_logs", "no_mcap", 1,
+        "empty.mcap", "read", "no_mcap", 1,
     )  # fmt: skip
     assert "empty.mcap: not an MCAP file" in caplog.text
 

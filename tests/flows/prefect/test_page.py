@@ -3,7 +3,6 @@
 import json
 
 import httpx
-import numpy as np
 import pytest
 from prefect.client.orchestration import get_client
 from prefect.logging.handlers import APILogHandler
@@ -14,18 +13,13 @@ from epipole.flows.prefect import artifacts
 from epipole.flows.prefect.artifacts import ProgressBar, as_markdown, show_summary
 from epipole.flows.prefect.page import shown_on_page
 from epipole.flows.prefect.progress import ROOT, STEPS, step
-from epipole.tasks.common.spans import SPAN_NS, Span
+from epipole.schemas.stages import Stage
 
 FOUND = {
     "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
     "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "epochs": 6, "objects": 5,
     "positions": 4, "rejects": {"no_state": 34, "bad_crc": 1}, "clocks": [], "by_sensor": [],
 }  # fmt: skip
-
-
-def test_a_span_is_named_by_its_times():
-    start_ns = int(np.datetime64("2019-04-01T23:30", "ns").astype(np.int64))
-    assert str(Span(start_ns, start_ns + SPAN_NS)) == "23:30-00:00"
 
 
 def test_the_page_of_a_night_has_its_counts_and_what_was_left_out_by_reason():
@@ -43,12 +37,12 @@ def test_progress_only_grows_though_a_stage_is_done_again(monkeypatch):
     monkeypatch.setattr(artifacts, "UPDATED_EVERY_S", 0.0)
     bar = ProgressBar()
     STEPS.addHandler(bar)
-    stages = ("read logs", "identify stars", "calibrate sensors", "identify stars", "solve objects")
+    stages = (Stage.READ, Stage.IDENTIFY, Stage.CALIBRATE, Stage.IDENTIFY, Stage.SOLVE)
     try:
-        for stage in (*stages, "publish"):
+        for stage in (*stages, Stage.PUBLISH):
             for done in range(4):
                 step(stage, done, 3)
-        step("build tracklets", 0, 0)  # no sensor can take part
+        step(Stage.TRACK, 0, 0)  # no sensor can take part
     finally:
         STEPS.removeHandler(bar)
     assert percents == sorted(percents)
@@ -131,7 +125,7 @@ def test_a_page_that_fails_in_the_middle_is_not_asked_again(monkeypatch, caplog)
     STEPS.addHandler(bar)
     try:
         for done in range(3):
-            step("identify stars", done, 3)
+            step(Stage.IDENTIFY, done, 3)
     finally:
         STEPS.removeHandler(bar)
     assert len(asked) == 1

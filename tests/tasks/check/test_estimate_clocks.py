@@ -8,20 +8,15 @@ import polars as pl
 import pyarrow as pa
 import pytest
 
-from epipole.schemas.bridge import array, empty, table
+from epipole.schemas.bridge import array, empty, table, to_polars
 from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS
 from epipole.schemas.work_tables import PLACES, SOLUTIONS, VIEWS
-from epipole.tasks.check.estimate_clocks import (
-    Clock,
-    added,
-    clocks_of,
-    objects_views,
-    set_clocks,
-    set_places,
-    without_sensors,
-)
+from epipole.tasks.check.correct_clock import at_places, at_true_times
+from epipole.tasks.check.estimate_clocks import Clock, clocks_of, total_offsets
+from epipole.tasks.solve.collect_clock_views import collect_clock_views
+from epipole.tasks.solve.leave_out_sensors import leave_out_sensors
 
 FOUR_SENSORS = Path(__file__).parents[3] / "io/simulation/built_in/four_sensor_geo.toml"
 LATE, EARLY, SOUND = Clock("a", 0.25, 0.01, True), Clock("b", -0.5, 0.01, True), Clock(
@@ -45,25 +40,26 @@ def frames(schema, **columns):
 
 
 def test_frames_of_wrong_clocks_are_put_at_their_true_times():
-    moved = set_clocks(frames(PLACES), [LATE, EARLY, SOUND])
-    expected = np.array([-0.25, 0.75, 0.5, 1.5, 0.0, 1.0]) * 1e9
-    np.testing.assert_array_equal(array(moved, "time"), expected)
-    assert moved.schema.equals(PLACES)
+    for clock, shift_s in ((LATE, -0.25), (EARLY, 0.5)):
+        moved = at_true_times(frames(PLACES), clock)
+        expected = (np.array([0, 1] * 3) + shift_s) * 1e9
+        np.testing.assert_array_equal(array(moved, "time"), expected)
+        assert moved.schema.equals(PLACES)
 
 
 def test_places_are_taken_by_frame_whatever_their_order():
     places = frames(PLACES, **{f"{a}_km": np.arange(6.0) for a in "xyz"})
     solutions = frames(SOLUTIONS, x_km=np.full(6, 7.0))
-    moved = set_places(solutions, places.take([5, 3, 1, 0, 2, 4]))
+    moved = at_places(solutions, places.take([5, 3, 1, 0, 2, 4]))
     assert moved["x_km"].to_pylist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     assert moved["sensor_id"].equals(solutions["sensor_id"])
-    lost = set_places(solutions, places.slice(1))
+    lost = at_places(solutions, places.slice(1))
     assert lost["x_km"].to_pylist() == [None, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
 def test_what_was_put_right_is_told_with_what_is_left():
     again = [Clock("a", 0.001, 0.008, False), SOUND]
-    told = added([LATE, EARLY], again)
+    told = total_offsets([LATE, EARLY], again)
     assert [clock.sensor_id for clock in told] == ["a", "b", "c"]
     assert told[0] == Clock("a", 0.251, 0.008, True)
     assert told[1:] == [EARLY, SOUND]
@@ -71,9 +67,9 @@ def test_what_was_put_right_is_told_with_what_is_left():
 
 def test_nothing_seen_tells_nothing_of_clocks():
     tables = (empty(s) for s in (VIEWS, ASSOCIATIONS, POSITIONS, SOLUTIONS))
-    assert clocks_of(objects_views(*tables, Settings())) == []
-    kept, rejects = without_sensors(empty(VIEWS), ["a"])
-    assert kept.num_rows == rejects.num_rows == 0
+    assert clocks_of(to_polars(collect_clock_views(*tables, Settings()))) == []
+    remaining = leave_out_sensors(empty(VIEWS), ["a"])
+    assert [rows.num_rows for rows in remaining] == [0, 0, 0]
 
 
 def run(folder, offset_s, **alignment):

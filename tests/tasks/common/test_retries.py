@@ -8,7 +8,8 @@ from prefect import flow
 from prefect.states import Failed
 
 from epipole.io.logs.reader import read_log_parts
-from epipole.io.work.files import read_part
+from epipole.io.work.parts import read_part
+from epipole.io.work.places import ReadFolder
 from epipole.schemas.errors import DatasetError, LogError
 from epipole.tasks.common.retries import storage_failed
 from epipole.tasks.read import read_logs as module
@@ -81,7 +82,9 @@ def test_a_log_is_read_again_only_after_a_fault_of_the_storage(
 
     @flow
     def reading():
-        return read_log_into.with_options(retry_delay_seconds=0)(tmp_path, str(night_log))
+        return read_log_into.with_options(retry_delay_seconds=0)(
+            ReadFolder(tmp_path), 0, str(night_log)
+        )
 
     if reads == 1:
         with pytest.raises(LogError):

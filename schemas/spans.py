@@ -1,25 +1,23 @@
-"""Spans of a night: what a task works on, and what of the neighbouring spans it sees.
+"""Spans of a night and its sensors: what a task works on.
 
-Spans are counted from 1970, not from the first frame, and divide a day, so that another log
-of a night does not shift them and none holds a midnight.
+Spans are counted from 1970, not from the first frame, and divide a day. So another log of a
+night does not shift them, and no span holds a midnight.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.io.work.files import is_written, read_part
-from epipole.schemas.bridge import array, concat
+from epipole.schemas.bridge import array
 
-SPAN_NS = 1_800_000_000_000  # tasks enough for many workers, and few beside a night's work
-CLOCK_NS = 10_000_000_000  # farther off no clock is put right
+DAY_NS = 86_400_000_000_000
+SPAN_NS = 1_800_000_000_000  # half an hour: tasks enough for many workers, few per night
 
 
 class Span(NamedTuple):
-    """From an instant to before another; UTC nanoseconds since 1970."""
+    """From one instant until just before another; UTC nanoseconds since 1970."""
 
     start_ns: int
     end_ns: int
@@ -33,7 +31,7 @@ class Span(NamedTuple):
         return (time_ns >= self.start_ns) & (time_ns < self.end_ns)
 
     def of(self, rows: pa.Table, column: str) -> pa.Table:
-        """Return the rows whose time lies in it, as given."""
+        """Return the rows whose time lies in it, in their order."""
         inside = self.holds(array(rows, column))
         return rows if inside.all() else rows.filter(pa.array(inside))
 
@@ -49,7 +47,7 @@ class Span(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """A sensor: its id, and its number among those of a run, which names its parts."""
+    """A sensor: its number among those of a run, which names its parts, and its id."""
 
     number: int
     sensor_id: str
@@ -60,19 +58,6 @@ class Sensor(NamedTuple):
 
 
 def spans_between(start_ns: int, end_ns: int) -> list[Span]:
-    """Return the spans that cover the time from one instant to before another."""
+    """Return the spans that cover the time from one instant to another."""
     first, last = start_ns // SPAN_NS, -(-end_ns // SPAN_NS)
     return [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in range(first, last)]
-
-
-def rows_within(
-    stage: Path, span: Span, schema: pa.Schema, name: str, time: str = "time"
-) -> pa.Table:
-    """Return the rows of a stage's table that lie in a span, from all parts that it touches.
-
-    A frame whose time was put right may lie in the part beside its own.
-    """
-    parts = [stage / one.folder for one in spans_between(*span.widened(CLOCK_NS))]
-    return concat(
-        schema, [span.of(read_part(part, name), time) for part in parts if is_written(part)]
-    )

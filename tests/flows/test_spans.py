@@ -13,7 +13,7 @@ from epipole.io.datasets.dataset import read_table
 from epipole.schemas.scene import validate_scene
 
 NIGHT = "2019-04-01"
-FOUR_SENSORS = Path(__file__).parents[3] / "io/simulation/built_in/four_sensor_geo.toml"
+FOUR_SENSORS = Path(__file__).parents[2] / "io/simulation/built_in/four_sensor_geo.toml"
 # Sensors high enough to see their objects for hours.
 SLOW = """
 name = "slow"

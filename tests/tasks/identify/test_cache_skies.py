@@ -10,8 +10,8 @@ from epipole.schemas.bridge import table
 from epipole.schemas.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.sky import radec_from_unit
-from epipole.tasks.identify import cached_skies
-from epipole.tasks.identify.cached_skies import CachedSkies, Catalogue
+from epipole.tasks.identify import cache_skies
+from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 PIXEL_RAD = 5e-5
 
@@ -73,7 +73,7 @@ def test_threads_that_ask_at_once_get_the_same_numbers():
 
 
 def _forget():
-    for kept in (cached_skies._navigation, cached_skies._sky, cached_skies._pairs):
+    for kept in (cache_skies._navigation, cache_skies._sky, cache_skies._pairs):
         kept.cache_clear()
 
 
@@ -89,8 +89,8 @@ def folder(tmp_path, monkeypatch):
 def test_what_another_process_left_on_disk_gives_the_same_numbers(folder, monkeypatch):
     made = _skies().sky(5.0), _skies().pairs(5.0, optics())
     _forget()
-    monkeypatch.setattr(cached_skies, "pattern_pairs", None)  # not called again
-    monkeypatch.setattr(cached_skies, "navigation_catalogue", None)
+    monkeypatch.setattr(cache_skies, "pattern_pairs", None)  # not called again
+    monkeypatch.setattr(cache_skies, "navigation_catalogue", None)
     read = _skies().sky(5.0), _skies().pairs(5.0, optics())
     for a, b in zip(made[0].catalogue, read[0].catalogue, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -125,9 +125,9 @@ def test_the_catalogues_epoch_and_the_code_count_in_the_key(monkeypatch):
     stars = _table()
     later = Catalogue(labelled(stars, CatalogueLabel("random", 2010.0, "nowhere")))
     assert later != Catalogue(stars)
-    key = cached_skies._disk_key("stars", later, 1)
-    monkeypatch.setattr(cached_skies, "_code", lambda: "other code")
-    assert cached_skies._disk_key("stars", later, 1) != key
+    key = cache_skies._disk_key("stars", later, 1)
+    monkeypatch.setattr(cache_skies, "_code", lambda: "other code")
+    assert cache_skies._disk_key("stars", later, 1) != key
 
 
 def test_places_are_of_the_day(folder):

@@ -1,0 +1,247 @@
+"""Why something was left out: reasons of `rejects`, outcomes of tracklets, statuses of frames.
+
+Each has a sentence, which the documentation repeats. `reject_rows` makes the rows of `rejects`.
+"""
+
+from collections.abc import Sequence
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from epipole.schemas.bridge import table
+from epipole.schemas.stages import Stage
+from epipole.schemas.tables import REJECTS
+
+
+class Reason(StrEnum):
+    """Why a row stands in `rejects`: its stage and a sentence."""
+
+    stage: Stage
+    sentence: str
+
+    def __new__(cls, reason: str, stage: Stage, sentence: str) -> "Reason":
+        """Return a member whose value is the reason alone."""
+        member = str.__new__(cls, reason)
+        member._value_ = reason
+        member.stage, member.sentence = stage, sentence
+        return member
+
+    # Of a file.
+    NO_MCAP = "no_mcap", Stage.READ, "A file that was found in a folder or by a glob is no MCAP."
+    TRUNCATED = "truncated", Stage.READ, "The log ends too early: cut short, or never closed."
+    LOG_BEHIND_LOG = (
+        "log_behind_log",
+        Stage.READ,
+        "A second log begins behind the end of the first; both are read.",
+    )
+    DAMAGED_RECORD = "damaged_record", Stage.READ, "A record of the log is damaged."
+    DAMAGED_SUMMARY = "damaged_summary", Stage.READ, "The summary at the end of the log is damaged."
+    MISSING_MESSAGES = (
+        "missing_messages",
+        Stage.READ,
+        "The log's summary counts more messages than the log holds.",
+    )
+    UNKNOWN_CHANNEL = (
+        "unknown_channel",
+        Stage.READ,
+        "Messages of a channel that the log does not declare.",
+    )
+    # Of a chunk, with the number of its messages where an index tells it.
+    BAD_CHECKSUM = "bad_checksum", Stage.READ, "The chunk's checksum does not fit its bytes."
+    BAD_COMPRESSION = "bad_compression", Stage.READ, "The chunk cannot be decompressed."
+    UNKNOWN_COMPRESSION = (
+        "unknown_compression",
+        Stage.READ,
+        "The chunk is compressed by a method other than zstd and lz4.",
+    )
+    WRONG_CHUNK_SIZE = (
+        "wrong_chunk_size",
+        Stage.READ,
+        "The chunk's declared size is not the size of its content.",
+    )
+    CHUNK_TOO_LARGE = "chunk_too_large", Stage.READ, "The chunk declares more bytes than allowed."
+    DAMAGED_CHUNK = "damaged_chunk", Stage.READ, "The records in the chunk are damaged."
+    # Of any message.
+    UNDECODABLE_FRAME = "undecodable_frame", Stage.READ, "A frame's message cannot be decoded."
+    UNDECODABLE_STATE = "undecodable_state", Stage.READ, "A state's message cannot be decoded."
+    UNDECODABLE_CALIBRATION = (
+        "undecodable_calibration",
+        Stage.READ,
+        "A calibration's message cannot be decoded.",
+    )
+    BAD_SENSOR_ID = "bad_sensor_id", Stage.READ, "The sensor id is empty or no valid text."
+    NO_TIMESTAMP = "no_timestamp", Stage.READ, "The message has no time, or an impossible one."
+    # Of a frame.
+    NAN = "nan", Stage.READ, "The frame has a centroid whose place is not a finite number."
+    UNEQUAL_ARRAYS = "unequal_arrays", Stage.READ, "The frame's arrays differ in length."
+    BAD_SIGMA = "bad_sigma", Stage.READ, "The frame has a centroid error that is no valid number."
+    BAD_FRAME_NUMBER = "bad_frame_number", Stage.READ, "The frame number is out of range."
+    DUPLICATE_FRAME = "duplicate_frame", Stage.READ, "The frame came before; it counts once."
+    DUPLICATE_NUMBER = (
+        "duplicate_number",
+        Stage.READ,
+        "Another frame of the sensor has the same number.",
+    )
+    DUPLICATE_TIME = "duplicate_time", Stage.READ, "Another frame of the sensor has the same time."
+    # Of a state.
+    UNKNOWN_FRAME = (
+        "unknown_frame",
+        Stage.READ,
+        "The state's reference frame is not GCRF, EME2000, TEME or ITRF.",
+    )
+    BAD_POSITION = "bad_position", Stage.READ, "The state's position is not finite."
+    INSIDE_EARTH = "inside_earth", Stage.READ, "The state's position lies inside the Earth."
+    BAD_VELOCITY = "bad_velocity", Stage.READ, "The state's velocity is invalid."
+    BAD_ATTITUDE = (
+        "bad_attitude",
+        Stage.READ,
+        "The state's attitude is invalid; its position is used.",
+    )
+    DUPLICATE_STATE = (
+        "duplicate_state",
+        Stage.READ,
+        "Another state of the sensor has the same time.",
+    )
+    # Of a calibration.
+    BAD_IMAGE_SIZE = "bad_image_size", Stage.READ, "The calibration's image size is invalid."
+    BAD_CAMERA_MATRIX = (
+        "bad_camera_matrix",
+        Stage.READ,
+        "The calibration's camera matrix is invalid.",
+    )
+    BAD_DISTORTION = "bad_distortion", Stage.READ, "The calibration's distortion is invalid."
+    UNKNOWN_DISTORTION_MODEL = (
+        "unknown_distortion_model",
+        Stage.READ,
+        "The calibration's distortion model is not plumb_bob.",
+    )
+    # Of a sensor's frames.
+    NO_CALIBRATION = "no_calibration", Stage.IDENTIFY, "No calibration holds for the frames."
+    NO_STATE = (
+        "no_state",
+        Stage.IDENTIFY,
+        "No state of the sensor is near enough in time: the frames give no position.",
+    )
+    # Of tracklets and views.
+    SENSOR_DISAGREES = (
+        "sensor_disagrees",
+        Stage.SOLVE,
+        "The sensor's lines of sight agree with no other sensor's; it is left out for that time.",
+    )
+    AMBIGUOUS = (
+        "ambiguous",
+        Stage.SOLVE,
+        "The tracklet could be of more than one object, and the evidence does not decide.",
+    )
+    VIEW_REJECTED = (
+        "view_rejected",
+        Stage.SOLVE,
+        "The view is too far from the object's position, which was solved without it.",
+    )
+    NO_POSITION = "no_position", Stage.SOLVE, "The views of the object have no common point."
+    CLOCK_OFF = (
+        "clock_off",
+        Stage.CHECK,
+        "The sensor's clock is wrong and was not corrected; its views are left out.",
+    )
+
+
+class Outcome(StrEnum):
+    """What became of a tracklet; of two that hold at different times, the earlier one here."""
+
+    sentence: str
+
+    def __new__(cls, outcome: str, sentence: str) -> "Outcome":
+        """Return a member whose value is the outcome alone."""
+        member = str.__new__(cls, outcome)
+        member._value_ = outcome
+        member.sentence = sentence
+        return member
+
+    OBJECT = "object", "It is part of an object and served one of its positions."
+    DISAGREES = (
+        "disagrees",
+        "It was associated with an object, but each position was solved without it.",
+    )
+    AMBIGUOUS = "ambiguous", "It could be of more than one object; the evidence does not decide."
+    SENSOR_LEFT_OUT = (
+        "sensor_left_out",
+        "Its sensor was left out: a wrong clock, or lines of sight that agree with no other's.",
+    )
+    SEEN_BY_ONE = "seen_by_one", "No second sensor has a tracklet that fits it."
+    NOT_COMPARED = (
+        "not_compared",
+        "It was not compared with other sensors: no attitude, no sensor position, or no epoch.",
+    )
+
+
+class FrameStatus(StrEnum):
+    """Why a frame has no attitude from stars."""
+
+    sentence: str
+
+    def __new__(cls, status: str, sentence: str) -> "FrameStatus":
+        """Return a member whose value is the status alone."""
+        member = str.__new__(cls, status)
+        member._value_ = status
+        member.sentence = sentence
+        return member
+
+    NO_CENTROIDS = "no_centroids", "The frame has no centroids."
+    TOO_FEW_STARS = (
+        "too_few_stars",
+        "Too few centroids, or too few stars in the field, to identify.",
+    )
+    NO_MATCH = "no_match", "No attitude explains the centroids surely enough."
+    TIME_LIMIT = "time_limit", "The search was stopped by its time limit."
+    NO_CALIBRATION = "no_calibration", "No calibration holds for the frame."
+
+
+def reject_rows(
+    reason: Reason | Sequence[Reason],
+    *,
+    time: Any,
+    count: Any,
+    sensor_id: Any = None,
+    source: Any = None,
+    offset: Any = None,
+    tracklet_id: Any = None,
+) -> pa.Table:
+    """Return rows of `rejects`: one per entry of `time`.
+
+    Parameters
+    ----------
+    reason
+        Of all rows, or one per row; the stage follows from it.
+    time, count
+        One per row: NumPy array, Arrow array or list. Times are int64 nanoseconds.
+    sensor_id, source, offset, tracklet_id
+        One per row, or one value for all; None: unknown, or more than one.
+    """
+    n = len(time)
+    reasons = [reason] * n if isinstance(reason, Reason) else list(reason)
+    columns = {
+        "source": source,
+        "offset": offset,
+        "sensor_id": sensor_id,
+        "tracklet_id": tracklet_id,
+    }
+    values = {name: _per_row(name, value, n) for name, value in columns.items()}
+    return table(
+        REJECTS,
+        values
+        | {
+            "time": np.asarray(time, np.int64) if isinstance(time, list) else time,
+            "stage": [one.stage.value for one in reasons],
+            "reason": [one.value for one in reasons],
+            "count": count,
+        },
+    )
+
+
+def _per_row(name: str, value: Any, n: int) -> Any:
+    if value is None or isinstance(value, str | int):
+        return pa.array([value] * n, REJECTS.field(name).type)
+    return value

@@ -1,0 +1,55 @@
+"""The stages of a night, in their order, each with one name and a sentence.
+
+The name is that of the stage's package in `tasks/`, of its Prefect tasks, of its progress line,
+of its folder in the work folder, and of `rejects.stage`.
+"""
+
+from enum import StrEnum
+
+
+class Stage(StrEnum):
+    """A stage of the nightly flow; `sentence` says what it does."""
+
+    sentence: str
+
+    def __new__(cls, name: str, sentence: str) -> "Stage":
+        """Return a member whose value is the name alone."""
+        member = str.__new__(cls, name)
+        member._value_ = name
+        member.sentence = sentence
+        return member
+
+    READ = (
+        "read",
+        "Reads any number of logs, in any order and with overlap; damage is skipped and counted.",
+    )
+    IDENTIFY = (
+        "identify",
+        "Finds where each sensor was, which centroids are stars, and each frame's attitude.",
+    )
+    CALIBRATE = (
+        "calibrate",
+        "Fits each sensor's optics to its stars; sensors whose optics differ are identified again.",
+    )
+    TRACK = (
+        "track",
+        "Follows what is no star from frame to frame, and joins the fragments of a track.",
+    )
+    SOLVE = (
+        "solve",
+        "Finds which tracklets of different sensors are one object, and solves its positions and "
+        "states.",
+    )
+    CHECK = (
+        "check",
+        "Estimates each sensor's clock; a wrong one is corrected, and the night is tracked again, "
+        "or its sensor is left out.",
+    )
+    NAME = (
+        "name",
+        "Gives each object one id for the whole night, also across gaps.",
+    )
+    PUBLISH = (
+        "publish",
+        "Writes the tables of each night and puts them in place at once.",
+    )

@@ -1,0 +1,37 @@
+"""Tasks of a stage: named by it, and each run by its stage and what it works on."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+
+from epipole.schemas.stages import Stage
+from epipole.tasks.common.retries import DELAYS_S, RETRIES, storage_failed
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def stage_task(stage: Stage, works_on: str, *, retried: bool = False) -> Callable[[F], Any]:
+    """Return the decorator of a stage's task.
+
+    Parameters
+    ----------
+    works_on
+        What a run works on, by the task's parameters: ``{sensor} {span}``.
+    retried
+        Tried again where storage failed.
+
+    Notes
+    -----
+    Prefect caches no result: hashing the inputs costs more than most tasks, and what was
+    finished lies in the work folder.
+    """
+    options: dict[str, Any] = {"cache_policy": NO_CACHE}
+    if retried:
+        options |= {
+            "retries": RETRIES,
+            "retry_delay_seconds": DELAYS_S,
+            "retry_condition_fn": storage_failed,
+        }
+    return task(name=stage.value, task_run_name=f"{stage} {works_on}".strip(), **options)

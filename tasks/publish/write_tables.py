@@ -1,0 +1,208 @@
+"""Write tables: the parts of a night's spans put together as the tables of a dataset."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.io.datasets.dataset import in_order, rows_of_night
+from epipole.io.datasets.night_files import write_table
+from epipole.io.work.parts import Parts, read_part
+from epipole.io.work.places import SensorParts
+from epipole.schemas.bridge import array, concat, conform, table
+from epipole.schemas.log_tables import LogSource
+from epipole.schemas.rejects import Outcome, Reason, reject_rows
+from epipole.schemas.settings import Settings
+from epipole.schemas.spans import DAY_NS, Span
+from epipole.schemas.stages import Stage
+from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES, TRACKLETS
+from epipole.schemas.work_tables import SOLUTIONS, TRACKLET_RUNS
+from epipole.tasks.common.lone_detections import with_objects_found
+from epipole.tasks.common.named_detections import detections_within
+from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.solve.judge_tracklets import best_outcomes
+
+# Of these a night has too many rows to be held at once; they come span by span.
+BY_SENSOR = ("frames", "stars", "detections")
+BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
+WHOLE = ("tracklets", "calibrations", "sources", "rejects")
+# What one task writes: about a third of the work each.
+SHARES = (("stars",), ("detections",), ("frames", *BY_SPAN, *WHOLE))
+SERVED_NS = 60_000_000_000
+# Counted over the night: a row per span would say no more.
+COUNTED = (
+    Reason.NO_CALIBRATION,
+    Reason.NO_STATE,
+    Reason.CLOCK_OFF,
+    Reason.VIEW_REJECTED,
+    Reason.NO_POSITION,
+)
+
+
+class NightParts(NamedTuple):
+    """What the tables of a night are made of.
+
+    `spans` are the night's, in order, and `all_spans` those of the run. `names` has, for each
+    span's folder, what its objects are called in the night. `whole` are tables of the whole run:
+    `calibrations`, `sources`, and the `rejects` of no span.
+    """
+
+    night: str
+    spans: list[Span]
+    all_spans: list[Span]
+    sensors: list[SensorParts]
+    solved: Parts
+    names: Mapping[str, Mapping[str, str]]
+    whole: Mapping[str, pa.Table]
+
+
+@stage_task(Stage.PUBLISH, "{tables[0]} of {parts.night}")
+def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None:
+    """Write tables of a night, each sorted by time, from the parts of its spans.
+
+    Parameters
+    ----------
+    tables
+        Names of the tables: one of `SHARES`.
+    folder
+        Where the night's tables go.
+    """
+    for name in tables:
+        rows: Iterator[pa.Table]
+        if name in BY_SENSOR:
+            rows = (_of_sensors(name, parts, span) for span in parts.spans)
+        elif name in BY_SPAN:
+            rows = _of_spans(name, parts)
+        else:
+            rows = iter([_of_night(name, parts)])
+        write_table(folder, name, rows)
+
+
+def _of_night(name: str, parts: NightParts) -> pa.Table:
+    if name == "tracklets":
+        rows = _tracklets(parts)
+    elif name == "rejects":
+        rows = _counted([parts.whole[name], *_rejects(parts)])
+    else:
+        rows = parts.whole[name]
+    return in_order(rows_of_night(name, rows, parts.night))
+
+
+def _of_sensors(name: str, parts: NightParts, span: Span) -> pa.Table:
+    """Return a span's rows of all sensors by time, then sensor, then in the sensor's order."""
+    schema = TABLES[name]
+    if name == "detections":
+        rows = [detections_within(sensor, span) for sensor in parts.sensors]
+    elif name == "frames":
+        rows = [
+            conform(schema, sensor.identified.rows_within(span, SOLUTIONS, "solutions"))
+            for sensor in parts.sensors
+        ]
+    else:
+        rows = [sensor.identified.rows_within(span, schema, name) for sensor in parts.sensors]
+    together = concat(schema, rows)
+    if name == "detections":  # an epoch may be served by a frame of the neighbouring span
+        near = parts.solved.rows_within(
+            span.widened(SERVED_NS), ASSOCIATIONS, "associations", time="epoch"
+        )
+        together = with_objects_found(together, near)
+    return together.take(np.argsort(array(together, "time"), kind="stable"))
+
+
+def _of_spans(name: str, parts: NightParts) -> Iterator[pa.Table]:
+    for span in parts.spans:
+        if parts.solved.holds(span):
+            rows = parts.solved.read(span, name)
+            yield in_order(_renamed(rows, parts.names.get(span.folder, {})))
+
+
+def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:
+    if "object_id" not in rows.column_names:
+        return rows
+    at = rows.schema.get_field_index("object_id")
+    old = pa.array(list(names), pa.string())
+    new = pa.array(list(names.values()), pa.string())
+    return rows.set_column(at, rows.schema.field(at), new.take(pc.index_in(rows["object_id"], old)))
+
+
+def _tracklets(parts: NightParts) -> pa.Table:
+    """Return the tracklets of the run, each with what became of it in all spans."""
+    runs = [read_part(sensor.names.of_night(), "tracklets") for sensor in parts.sensors]
+    tracklets = concat(TRACKLET_RUNS, runs)
+    solved = [span for span in parts.all_spans if parts.solved.holds(span)]
+    outcomes = best_outcomes(parts.solved.read(span, "tracklet_outcomes") for span in solved)
+    row = pc.index_in(tracklets["tracklet_id"], outcomes["tracklet_id"].combine_chunks())
+    outcome = pc.coalesce(outcomes["outcome"].take(row), Outcome.NOT_COMPARED.value)
+    return conform(TRACKLETS, tracklets.append_column("outcome", outcome))
+
+
+def _rejects(parts: NightParts) -> Iterator[pa.Table]:
+    for span in parts.spans:
+        for of_stage in [*(sensor.identified for sensor in parts.sensors), parts.solved]:
+            if of_stage.holds(span):
+                yield of_stage.read(span, "rejects")
+
+
+def _counted(rejects: Iterable[pa.Table]) -> pa.Table:
+    """Return the rejects of a night; those that spans counted separately as one row each."""
+    rows = concat(REJECTS, rejects)
+    counted = pc.is_in(rows["reason"], pa.array([reason.value for reason in COUNTED]))
+    key = ["source", "sensor_id", "reason"]
+    sums = (
+        rows.filter(counted)
+        .group_by(key, use_threads=False)
+        .aggregate(
+            [
+                ("time", "min"),
+                ("count", "sum"),
+                ("tracklet_id", "min"),
+                ("tracklet_id", "count_distinct", pc.CountOptions(mode="all")),
+            ]
+        )
+    )
+    one_tracklet = pc.equal(sums["tracklet_id_count_distinct"], 1)
+    summed = reject_rows(
+        [Reason(reason) for reason in sums["reason"].to_pylist()],
+        source=sums["source"],
+        sensor_id=sums["sensor_id"],
+        tracklet_id=pc.if_else(one_tracklet, sums["tracklet_id_min"], pa.scalar(None, pa.string())),
+        time=sums["time_min"],
+        count=sums["count_sum"],
+    )
+    return concat(REJECTS, [rows.filter(pc.invert(counted)), summed])
+
+
+def source_table(sources: Sequence[LogSource], settings: Settings) -> pa.Table:
+    """Return the rows of `sources`: the logs, and by which code and settings they were run."""
+    columns = {name: [getattr(s, name) for s in sources] for name in ("name", "size", "sha256")}
+    return table(
+        SOURCES,
+        {
+            **columns,
+            "first_time": np.array([s.first_time_ns for s in sources], np.int64),
+            "last_time": np.array([s.last_time_ns for s in sources], np.int64),
+            "code_version": [version("epipole")] * len(sources),
+            "settings_key": [settings.key()] * len(sources),
+        },
+    )
+
+
+def into_nights(rejects: pa.Table, nights: Sequence[str]) -> pa.Table:
+    """Return the rejects, each in one of these nights; others move to the nearest night's start."""
+    time_ns = array(rejects, "time")
+    starts = np.array([_start_ns(night) for night in nights])
+    day = time_ns // DAY_NS * DAY_NS
+    nearest = starts[np.argmin(np.abs(day[:, None] - starts), axis=1)]
+    time_ns = np.where(np.isin(day, starts), time_ns, nearest)
+    at = rejects.column_names.index("time")
+    return rejects.set_column(
+        at, REJECTS.field("time"), pa.array(time_ns).cast(REJECTS.field("time").type)
+    )
+
+
+def _start_ns(night: str) -> int:
+    return int(np.datetime64(night, "ns").astype(np.int64))

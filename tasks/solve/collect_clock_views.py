@@ -1,0 +1,89 @@
+"""Collect clock views: what the check of clocks needs of a span.
+
+Views beside objects, with the velocities of both.
+"""
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+
+from epipole.schemas.bridge import table
+from epipole.schemas.settings import Settings
+from epipole.schemas.work_tables import CLOCK_VIEWS
+from epipole.tasks.algorithms.orbits.object_motion import velocities
+
+VELOCITY_WINDOW_S = 30.0  # positions this near give an object's velocity
+MOST_EPOCHS = 300  # more tell nothing new of a constant
+MOST_PAIRS = 200_000  # of a view and an object: bounds the memory
+POSITION_COV = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
+PLACE = ["x_km", "y_km", "z_km"]
+VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
+
+
+def collect_clock_views(
+    views: pa.Table,
+    associations: pa.Table,
+    positions: pa.Table,
+    solutions: pa.Table,
+    settings: Settings,
+) -> pa.Table:
+    """Return CLOCK_VIEWS: the views of each object, and all other views beside all objects.
+
+    `views` are all views, not only those of objects. A sensor whose clock is seconds off sees no
+    object where it is, so its views are held against the objects that the other sensors found.
+
+    Epochs that share detections would count twice. So one in each width of the local motion is
+    used, `MOST_EPOCHS` at most.
+    """
+    key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
+    claims = pl.DataFrame(associations).select([*key, "object_id"])
+    objects = _with_velocities(pl.DataFrame(positions))
+    epochs = _apart(objects["epoch"].unique().sort(), 2 * settings.alignment.window_s)
+    frames = pl.DataFrame(solutions).select(["sensor_id", "frame_number", *VELOCITY])
+    with_sensors = (
+        pl.DataFrame(views)
+        .rename({name: f"sensor_{name}" for name in PLACE})
+        .filter(pl.col("epoch").is_in(epochs.implode()))
+        .join(claims, on=key, how="left")
+        .join(frames.rename({name: f"sensor_{name}" for name in VELOCITY}),
+              on=["sensor_id", "frame_number"])
+        .drop_nulls([f"sensor_{name}" for name in VELOCITY])
+        .with_columns(claimed=pl.col("object_id").is_not_null())
+    )  # fmt: skip
+    claimed = with_sensors.filter(pl.col("claimed")).join(objects, on=["epoch", "object_id"])
+    free = with_sensors.filter(~pl.col("claimed")).drop("object_id")
+    free = _thinned(free, objects).join(objects, on="epoch")
+    rows = pl.concat([claimed, free.select(claimed.columns)]).sort(
+        "sensor_id", "epoch", "tracklet_id", "object_id"
+    )
+    return table(CLOCK_VIEWS, {name: rows[name].to_arrow() for name in CLOCK_VIEWS.names})
+
+
+def _thinned(free: pl.DataFrame, objects: pl.DataFrame) -> pl.DataFrame:
+    """Return the views of fewer epochs, so that there are at most `MOST_PAIRS` with objects."""
+    n_objects = objects.group_by("epoch").agg(n=pl.len())
+    pairs = free.select("epoch").join(n_objects, on="epoch")["n"].sum()
+    epochs = free["epoch"].unique().sort()[:: max(-(-pairs // MOST_PAIRS), 1)]
+    return free.filter(pl.col("epoch").is_in(epochs.implode()))
+
+
+def _apart(epochs: pl.Series, apart_s: float) -> pl.Series:
+    """Return epochs at least so far apart, thinned evenly to `MOST_EPOCHS`."""
+    kept: list[int] = []
+    time_ns = epochs.cast(pl.Int64).to_numpy()
+    for k, t in enumerate(time_ns):
+        if not kept or t - time_ns[kept[-1]] >= apart_s * 1e9:
+            kept.append(k)
+    return epochs[kept[:: max(-(-len(kept) // MOST_EPOCHS), 1)]]
+
+
+def _with_velocities(positions: pl.DataFrame) -> pl.DataFrame:
+    """Return the positions with the velocities that the neighbouring ones show."""
+    positions = positions.sort("object_id", "epoch")
+    size = positions.group_by("object_id", maintain_order=True).len()["len"].to_numpy()
+    offsets = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
+    time_ns = positions["epoch"].cast(pl.Int64).to_numpy()
+    time_s = (time_ns - (time_ns.min() if len(time_ns) else 0)) / 1e9
+    v = velocities(offsets, time_s, positions.select(PLACE).to_numpy(), VELOCITY_WINDOW_S)
+    columns = [pl.Series(name, v[:, k]) for k, name in enumerate(VELOCITY)]
+    return positions.select(["epoch", "object_id", *PLACE, *POSITION_COV]).with_columns(columns)

@@ -1,0 +1,135 @@
+"""Sample views: the views of a span as arrays, and samples of them for the association."""
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.schemas.columns import TANGENT_AXES
+from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.association.verdicts import Seen
+from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
+from epipole.tasks.common.sightings import camera_of, solved_frames
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+MOST_SAMPLES = 12  # instants in a window
+NEAR_NS = 2_000_000_000  # a frame this near gives the sensor's pose
+
+
+class SpanViews:
+    """The views of all sensors in a span as arrays, and samples of them at a few instants."""
+
+    def __init__(
+        self, views: pa.Table, tracklets: pa.Table, solutions: pa.Table, cameras: pa.Table
+    ) -> None:
+        tracklets = tracklets.sort_by("tracklet_id")
+        self.tracklet_id = array(tracklets, "tracklet_id").astype(str)
+        # Fragments that the linking joined are one track: an object keeps its number by it.
+        _, self.track = np.unique(array(tracklets, "track_id").astype(str), return_inverse=True)
+        self.sensors, self.sensor_of_tracklet = np.unique(
+            array(tracklets, "sensor_id").astype(str), return_inverse=True
+        )
+        self.start_ns, self.end_ns = array(tracklets, "start_time"), array(tracklets, "end_time")
+        self.epoch_ns = array(views, "epoch")
+        self.missed = ~views["centroid"].is_valid().to_numpy()
+        self.sensor = np.searchsorted(self.sensors, array(views, "sensor_id").astype(str))
+        self.tracklet = np.searchsorted(self.tracklet_id, array(views, "tracklet_id").astype(str))
+        self.u, self.r_km = stack(views, "u{}"), stack(views, "{}_km")
+        self.noise = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
+        self.bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES)
+        self.sigma_km = array(views, "position_sigma_km")
+        self._read_poses(solutions, cameras)
+
+    def _read_poses(self, solutions: pa.Table, cameras: pa.Table) -> None:
+        """Keep each sensor's position and attitude, frame by frame, and its half field."""
+        self.frames, half_field, focal_px = [], [], []
+        for sensor in self.sensors:
+            frames = solved_frames(solutions.filter(pa.compute.field("sensor_id") == sensor))
+            camera = camera_of(cameras, int(frames.camera[0]))
+            self.frames.append((frames, matrix_from_quaternion(frames.q_sensor_from_icrs)))
+            half_field.append((camera.width / camera.fx_px / 2, camera.height / camera.fy_px / 2))
+            focal_px.append(camera.fx_px)
+        self.half_field = np.array(half_field).reshape(-1, 2)
+        self.focal_px = np.array(focal_px)
+
+    def windows(self, window_s: float) -> list[Indices]:
+        """Return the rows of each window of time, counted from midnight, in order."""
+        if not len(self.epoch_ns):
+            return []
+        window = self.epoch_ns // max(round(window_s * 1e9), 1)
+        cuts = np.flatnonzero(np.diff(window)) + 1
+        return np.split(np.arange(len(window)), cuts)
+
+    def keys(self, windows: list[Indices]) -> Seen:
+        """Return the epoch, window, tracklet and sensor of each row."""
+        window = np.repeat(np.arange(len(windows)), [len(rows) for rows in windows])
+        return Seen(self.epoch_ns, window, self.tracklet, self.sensor)
+
+    def samples(self, rows: Indices, instants: Indices) -> tuple[Samples, Indices]:
+        """Return the samples of the tracklets at some epochs, and the tracklets' numbers."""
+        rows = rows[np.isin(self.epoch_ns[rows], instants)]
+        tracklet, item = np.unique(self.tracklet[rows], return_inverse=True)
+        at = np.searchsorted(instants, self.epoch_ns[rows])
+        t, k = len(tracklet), len(instants)
+        seen, u = np.zeros((t, k), bool), np.tile([0.0, 0.0, 1.0], (t, k, 1))
+        cov, sigma_km = np.tile(np.eye(2), (t, k, 1, 1)), np.ones((t, k))
+        seen[item, at] = True
+        u[item, at] = self.u[rows]
+        # An error that all frames share is drawn once. In k samples it gets k times its
+        # variance, so that together they count as one draw.
+        n_samples = seen.sum(axis=1)[item].astype(float)
+        cov[item, at] = self.noise[rows] + n_samples[:, None, None] * self.bias[rows]
+        sigma_km[item, at] = np.sqrt(n_samples) * self.sigma_km[rows]
+        attitude, sensor_km = self._poses_at(instants)
+        sensor_km[self.sensor[rows], at] = self.r_km[rows]
+        origin = self.epoch_ns[0]
+        return Samples(
+            sensor=self.sensor_of_tracklet[tracklet].astype(np.int64),
+            start_s=(self.start_ns[tracklet] - origin) / 1e9,
+            end_s=(self.end_ns[tracklet] - origin) / 1e9,
+            seen=seen,
+            u=u,
+            cov=cov,
+            sigma_km=sigma_km,
+            time_s=(instants - origin) / 1e9,
+            sensor_km=sensor_km,
+            R_sensor_from_icrs=attitude,
+            half_field=self.half_field,
+        ), tracklet
+
+    def even_instants(self, rows: Indices, window_s: float) -> Indices:
+        """Return a few epochs, evenly spaced and far enough apart to be independent.
+
+        Two epochs within twice the half-window share detections.
+        """
+        epochs = np.unique(self.epoch_ns[rows])
+        step = 2 * window_s * 1e9
+        n = min(int(max((epochs[-1] - epochs[0]) // step, 1)), MOST_SAMPLES)
+        edges = np.linspace(epochs[0], epochs[-1], n + 1)
+        middle = (edges[1:] + edges[:-1]) / 2
+        return np.unique([epochs[np.argmin(np.abs(epochs - m))] for m in middle])
+
+    def instants(self, rows: Indices, window_s: float) -> Indices:
+        """Return a few epochs of a window, so that no tracklet is left out.
+
+        A tracklet that has no view at the evenly spaced epochs adds the middle one of its own.
+        """
+        chosen = set(self.even_instants(rows, window_s).tolist())
+        for tracklet in np.unique(self.tracklet[rows]):
+            epochs = self.epoch_ns[rows[self.tracklet[rows] == tracklet]]
+            if len(chosen) < MOST_SAMPLES and not chosen.intersection(epochs.tolist()):
+                chosen.add(int(epochs[len(epochs) // 2]))
+        return np.array(sorted(chosen), np.int64)
+
+    def _poses_at(self, instants: Indices) -> tuple[Array, Array]:
+        """Return the sensors' attitudes and positions; NaN where no frame is near."""
+        attitude = np.full((len(self.sensors), len(instants), 3, 3), np.nan)
+        sensor_km = np.full((len(self.sensors), len(instants), 3), np.nan)
+        for s, (frames, turned) in enumerate(self.frames):
+            near = np.clip(np.searchsorted(frames.time_ns, instants), 0, len(turned) - 1)
+            there = np.abs(frames.time_ns[near] - instants) < NEAR_NS
+            attitude[s, there] = turned[near[there]]
+            sensor_km[s, there] = frames.r_gcrf_km[near[there]]
+        return attitude, sensor_km
