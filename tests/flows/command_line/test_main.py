@@ -16,7 +16,7 @@ from mcap.writer import Writer
 
 from epipole.flows.command_line.main import main
 from epipole.io.logs.writer import LogWriter
-from epipole.io.settings_file import read_settings, settings_text
+from epipole.io.settings_file import read_settings
 from epipole.schemas.settings import Settings
 
 START_NS = int(np.datetime64("2019-04-01T04:00:00", "ns").astype(np.int64))
@@ -155,14 +155,6 @@ def test_the_settings_it_prints_are_read_back_as_the_defaults(epipole, tmp_path)
     assert read_settings(tmp_path / "s.toml") == Settings()
     for group in Settings.model_fields:
         assert f"[{group}]" in out
-
-
-def test_changed_settings_are_printed_and_read_back(tmp_path):
-    changed = Settings.model_validate(
-        {"sensors": {"centroid_sigma_px": 0.25}, "positions": {"reject_sigma": 1e-7}}
-    )
-    (tmp_path / "s.toml").write_text(settings_text(changed))
-    assert read_settings(tmp_path / "s.toml") == changed
 
 
 def test_a_run_ends_in_a_summary_on_standard_output(epipole, night_log, prefect, tmp_path):
