@@ -55,13 +55,3 @@ class LogPart(NamedTuple):
     cameras: pa.Table  # CAMERAS
     rejects: pa.Table  # REJECTS
     source: LogSource
-
-
-class Log(NamedTuple):
-    """What all logs of a run hold together."""
-
-    exposures: pa.Table  # EXPOSURES, sorted by sensor, time
-    states: pa.Table  # SENSOR_STATES, sorted by sensor, time
-    cameras: pa.Table  # CAMERAS, sorted by sensor, time
-    sources: list[LogSource]  # sorted by name
-    rejects: pa.Table  # REJECTS

@@ -121,7 +121,7 @@ class Pointing(Group):
         return self
 
 
-class Detection(Group):
+class SceneDetection(Group):
     """What the image processing makes of the light: noise, losses and false points."""
 
     sigma_px: float = Field(0.15, gt=0, description="1-sigma an axis of a bright centroid.")
@@ -137,7 +137,7 @@ class Detection(Group):
     target_drop: float = Field(0.0, ge=0, le=1, description="Share of objects missed.")
 
 
-class States(Group):
+class SceneStates(Group):
     """The sensor's states in the log, and how wrong they are."""
 
     rate_hz: float = Field(1.0, gt=0)
@@ -162,8 +162,8 @@ class SceneSensor(Group):
     )
     camera: SceneCamera
     pointing: Pointing
-    detection: Detection = Detection()
-    states: States = States()
+    detection: SceneDetection = SceneDetection()
+    states: SceneStates = SceneStates()
     magnitude_limit: float = Field(7.5, description="Faintest star seen, V.")
     rate_hz: float = Field(1.0, gt=0, le=1000)
     phase: float | None = Field(

@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
-from epipole.flows.command_line.sensors import of_sensor, sensor_ids
 from epipole.io.logs.reader import read_log
 from epipole.schemas.bridge import array, flatten
 
@@ -35,6 +35,16 @@ def describe(log: str) -> dict[str, Any]:
             .to_pylist()
         ],
     }
+
+
+def sensor_ids(rows: pa.Table) -> list[str]:
+    """Return the sensors of a table, sorted."""
+    return sorted(pc.unique(rows["sensor_id"]).to_pylist())
+
+
+def of_sensor(rows: pa.Table, sensor_id: str) -> pa.Table:
+    """Return the rows of one sensor, in their order."""
+    return rows.filter(pc.field("sensor_id") == sensor_id)
 
 
 def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import typer
 import typer.core
 
 from epipole.schemas.errors import EpipoleError
+from epipole.schemas.runner import Runner
 
 
 class _Commands(typer.core.TyperGroup):
@@ -93,13 +94,6 @@ class Compression(StrEnum):
     none = "none"
 
 
-class Runner(StrEnum):
-    """Where the tasks of a run are worked on."""
-
-    threads = "threads"
-    dask = "dask"
-
-
 @app.command()
 def run(
     logs: Logs,
@@ -136,7 +130,7 @@ def run(
     _check_night(night)
     if not verbose:
         warnings.simplefilter("ignore")
-    options = RunOptions(settings, night, replace, runner.value, workers, scheduler, quiet, verbose)
+    options = RunOptions(settings, night, replace, runner, workers, scheduler, quiet, verbose)
     summary, seconds = run_nightly(logs, out, options)
     if as_json:
         _print_json(summary.as_dict() | {"seconds": round(seconds, 2)})

@@ -7,12 +7,13 @@ from pathlib import Path
 
 from epipole.flows.night.summary import Summary
 from epipole.flows.prefect.progress import shown, step
+from epipole.io.caches.kernel_warm_up import compile_beside
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder
 from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
+from epipole.schemas.runner import Runner
 from epipole.schemas.settings import Settings
-from epipole.tasks.common.kernel_warm_up import compile_beside
 
 LOGGER = logging.getLogger(__name__)
 
@@ -24,7 +25,7 @@ class RunOptions:
     settings: Path | None = None
     night: str | None = None
     replace: bool = False
-    runner: str = "threads"
+    runner: Runner = Runner.threads
     workers: int | None = None
     scheduler: str | None = None
     quiet: bool = False
@@ -60,8 +61,8 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
 
 def _run(logs: list[str], out: str, settings: Settings, options: RunOptions) -> Summary:
     from epipole.flows.nightly import nightly
-    from epipole.flows.prefect.runners import Runner, task_runner
+    from epipole.flows.prefect.runners import task_runner
 
-    runner = task_runner(Runner(options.runner), options.workers, options.scheduler)
+    runner = task_runner(options.runner, options.workers, options.scheduler)
     flow = nightly.with_options(task_runner=runner)
     return flow(logs, out, settings, options.night, options.replace)

@@ -2,19 +2,12 @@
 
 import logging
 import os
-from enum import StrEnum
 from typing import Any
 
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from epipole.schemas.errors import EpipoleError
-
-
-class Runner(StrEnum):
-    """Where the tasks of a run are worked on."""
-
-    threads = "threads"
-    dask = "dask"
+from epipole.schemas.runner import Runner
 
 
 def task_runner(

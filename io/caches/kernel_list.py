@@ -15,10 +15,6 @@ from numba import types
 Signature = tuple[types.Type, ...]
 
 KERNELS = Path(__file__).parent / "kernels.toml"
-_HEAD = """\
-# The kernels that a run of the example calls from Python, in the order of their first call,
-# with the types of their arguments. Written by `python tests/test_kernel_list.py`.
-"""
 
 
 def read_kernels(path: Path = KERNELS) -> list[tuple[str, list[str]]]:
@@ -39,34 +35,5 @@ def signature(arguments: Iterable[str]) -> Signature:
     return tuple(eval(text, {"__builtins__": {}}, known) for text in arguments)
 
 
-def kernels_text(called: Iterable[tuple[str, Signature]]) -> str:
-    """Return the list of kernels ("module:name") with their arguments' types, as TOML."""
-    blocks = []
-    for name, arguments in called:
-        lines = "".join(f"    {_quoted(_text(argument))},\n" for argument in arguments)
-        blocks.append(f'"{name}" = [\n{lines}]\n')
-    return "\n".join([_HEAD, *blocks])
-
-
 def _named(name: str, *fields: types.Type) -> types.NamedTuple:
     return types.NamedTuple(fields, kernel(name))
-
-
-def _text(argument: Any) -> str:
-    if isinstance(argument, types.Array):
-        if not argument.mutable:
-            return f"Array({argument.dtype}, {argument.ndim}, {argument.layout!r}, readonly=True)"
-        last = "::1" if argument.layout == "C" else ":"
-        return f"{argument.dtype}[{', '.join([':'] * (argument.ndim - 1) + [last])}]"
-    inside = getattr(argument, "types", ())
-    fields = ", ".join(_text(one) for one in inside)
-    if isinstance(argument, types.BaseNamedTuple):
-        made = argument.instance_class  # type: ignore[attr-defined]
-        return f"named('{made.__module__}:{made.__name__}', {fields})"
-    if isinstance(argument, types.BaseTuple):
-        return f"Tuple(({fields},))"
-    return str(argument)
-
-
-def _quoted(text: str) -> str:
-    return f'"{text}"'

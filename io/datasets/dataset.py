@@ -22,7 +22,6 @@ import pyarrow.parquet as pq
 from epipole.io.datasets import local_nights
 from epipole.io.datasets.folder_swap import sync
 from epipole.io.datasets.local_nights import STAGING
-from epipole.io.datasets.night_files import write_table
 from epipole.io.datasets.store_nights import StoreNights, store_nights
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.bridge import array, conform, empty
@@ -118,40 +117,6 @@ def read_table(dataset: Where, table: str, night: str) -> pa.Table:
             "remove the night's folder and run it again"
         ) from error
     return pa.concat_tables([empty(schema), *rows])
-
-
-def publish(
-    dataset: Where,
-    tables: Mapping[str, pa.Table],
-    nights: Sequence[str],
-    replace: bool = False,
-) -> None:
-    """Write these nights of the tables and put them in place, each by one rename.
-
-    Parameters
-    ----------
-    dataset
-        The folder; it is made where it is missing.
-    tables
-        Tables of `epipole.schemas.tables` by name, `sources` among them. One that is
-        missing is published with no rows. Rows of other nights are not written.
-    nights
-        UTC dates, ``YYYY-MM-DD``. Other nights of the dataset stay as they are.
-    replace
-        Publish a night even though it was made of a log that is not among `sources`.
-
-    Raises
-    ------
-    DatasetError
-        Where the folder is no dataset, a recorded log is missing or the disk refuses. The
-        dataset is then as it was. While another run publishes here, this one waits.
-    """
-    with claim_nights(dataset, []) as work:
-        staged = {night: work / f"night={night}" for night in nights}
-        with _written(dataset):
-            for night, folder in staged.items():
-                _write_night(folder, tables, night)
-        publish_folders(dataset, staged, tables["sources"], replace)
 
 
 @contextlib.contextmanager
@@ -266,12 +231,6 @@ def _read(dataset: Where) -> Iterator[None]:
         raise
     except storage_errors() as error:
         raise DatasetError(f"{dataset}: cannot be read: {line_of(error)}") from error
-
-
-def _write_night(folder: Path, tables: Mapping[str, pa.Table], night: str) -> None:
-    for name, schema in TABLES.items():
-        rows = rows_of_night(name, tables.get(name, empty(schema)), night)
-        write_table(folder, name, [in_order(rows)])
 
 
 def nights_of(time_ns: np.ndarray) -> list[str]:

@@ -28,9 +28,7 @@ from epipole.tasks.algorithms.geometry.sky import unit_from_radec
 GAIA_SIGMA_MAS = 1.0
 
 
-def build_deep_catalogue(
-    gaia: GaiaStars | None = None, hipparcos: pa.Table | None = None
-) -> pa.Table:
+def build_deep_catalogue() -> pa.Table:
     """Return Gaia DR3's stars to G 10 at 2016.0, with motions, as a table STAR_CATALOGUE.
 
     Gaia's stars have Gaia's places and ids. Motion and parallax are Hipparcos' where a star is

@@ -10,6 +10,7 @@ the CPU (all threads), medians of runs in turns, files in the page cache.
 import argparse
 import datetime
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,9 +20,13 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from epipole.io.datasets.dataset import nights_in, publish
+from epipole.io.datasets.dataset import nights_in
 from epipole.schemas.bridge import table
 from epipole.schemas.tables import SOURCES, TABLES
+
+sys.path.append(str(Path(__file__).parents[1]))  # helpers beside the tests
+
+from scenes.published import publish
 
 FIRST_DAY = 17897  # 2019-01-01
 DAY_NS = 86_400_000_000_000

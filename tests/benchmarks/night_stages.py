@@ -11,7 +11,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.flows.command_line.sensors import of_sensor, sensor_ids
+from epipole.flows.command_line.log_info import of_sensor, sensor_ids
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.schemas.bridge import concat
 from epipole.schemas.settings import Settings
@@ -33,7 +33,7 @@ sys.path.append(str(Path(__file__).parents[1]))  # helpers beside the tests
 from scenes.whole_logs import read_whole  # noqa: E402
 
 
-class Seen(NamedTuple):
+class IdentifiedLog(NamedTuple):
     """What a log shows before any object is looked for."""
 
     solutions: pa.Table
@@ -41,7 +41,7 @@ class Seen(NamedTuple):
     cameras: pa.Table
 
 
-def see(log: Path, settings: Settings) -> Seen:
+def see(log: Path, settings: Settings) -> IdentifiedLog:
     """Read a log and identify its stars."""
     read = read_whole([log], settings)
     places = place_sensors(read.exposures, read.states, settings)
@@ -56,14 +56,14 @@ def see(log: Path, settings: Settings) -> Seen:
         )
         for name in sensor_ids(read.exposures)
     ]
-    return Seen(
+    return IdentifiedLog(
         concat(SOLUTIONS, [part.solutions for part in parts]),
         concat(DETECTIONS, [part.detections for part in parts]),
         read.cameras,
     )
 
 
-def track(seen: Seen, settings: Settings) -> Tracked:
+def track(seen: IdentifiedLog, settings: Settings) -> Tracked:
     """Build the tracklets of every sensor."""
     parts = [
         build_tracklets(
@@ -80,7 +80,7 @@ def track(seen: Seen, settings: Settings) -> Tracked:
     )
 
 
-def solve(seen: Seen, tracked: Tracked, settings: Settings) -> Solved:
+def solve(seen: IdentifiedLog, tracked: Tracked, settings: Settings) -> Solved:
     """Align, associate and triangulate."""
     epochs = align_epochs(seen.solutions, settings)
     views = concat(

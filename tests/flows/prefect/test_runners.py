@@ -10,9 +10,10 @@ import pytest
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from epipole.flows.nightly import nightly
-from epipole.flows.prefect.runners import Runner, runner_asked, task_runner
+from epipole.flows.prefect.runners import runner_asked, task_runner
 from epipole.io.work.folder import work_root
 from epipole.schemas.errors import EpipoleError
+from epipole.schemas.runner import Runner
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -17,10 +17,10 @@ from scenes.dataset_tables import (
     contents,
     night_tables,
 )
+from scenes.published import publish
 
-from epipole.io.datasets import dataset as under_test
-from epipole.io.datasets import folder_swap, local_nights
-from epipole.io.datasets.dataset import check_folder, publish, publish_folders, read_table
+from epipole.io.datasets import folder_swap, local_nights, night_files
+from epipole.io.datasets.dataset import check_folder, publish_folders, read_table
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -132,7 +132,7 @@ def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path, monkeypatch, there_b
     if there_before:
         publish(out, night_tables(TIMES), [NIGHT])
     before = contents(tmp_path)
-    monkeypatch.setattr(under_test, "write_table", _disk_full)
+    monkeypatch.setattr(night_files, "_write", _disk_full)
     with pytest.raises(DatasetError, match="No space left on device"):
         publish(out, night_tables(TIMES[:5]), [NIGHT])
     assert contents(tmp_path) == before

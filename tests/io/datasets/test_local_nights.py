@@ -5,8 +5,9 @@ import sys
 
 import pytest
 from scenes.dataset_tables import NEXT_NIGHT, NIGHT, TIMES, night_tables
+from scenes.published import publish
 
-from epipole.io.datasets.dataset import claim_nights, publish, publish_folders, read_table
+from epipole.io.datasets.dataset import claim_nights, publish_folders, read_table
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 

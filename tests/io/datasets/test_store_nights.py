@@ -12,6 +12,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, TIMES, night_tables
+from scenes.published import publish
 
 from epipole.flows.evaluate import evaluate
 from epipole.flows.nightly import nightly
@@ -20,7 +21,6 @@ from epipole.io.datasets.dataset import (
     check_folder,
     claim_nights,
     nights_in,
-    publish,
     read_table,
 )
 from epipole.io.datasets.night_holder import Holder
@@ -125,7 +125,7 @@ KILLED = """
 import os, signal, sys
 import fsspec.asyn
 from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, night_tables
-from epipole.io.datasets.dataset import publish
+from scenes.published import publish
 from epipole.io.datasets.store_nights import store_nights
 
 out, limit = sys.argv[1], int(sys.argv[2])

@@ -39,7 +39,7 @@ def compile_beside() -> Iterator[bool]:
 
 
 def _start() -> Popen[bytes] | None:
-    command = [sys.executable, "-m", "epipole.tasks.common.kernel_warm_up"]
+    command = [sys.executable, "-m", "epipole.io.caches.kernel_warm_up"]
     quiet = DEVNULL
     try:
         return Popen(command, stdin=PIPE, stdout=quiet, stderr=quiet)
