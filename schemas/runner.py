@@ -1,4 +1,4 @@
-"""Where the tasks of a run are worked on."""
+"""What runs the tasks of a run."""
 
 from enum import StrEnum
 

@@ -20,7 +20,7 @@ LOGGER = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is asked for."""
+    """The options of a run."""
 
     settings: Path | None = None
     night: str | None = None
@@ -38,7 +38,8 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
     Raises
     ------
     EpipoleError
-        Where the work cannot be done. What is plain at once is said before Prefect starts.
+        Where the work cannot be done. Settings, catalogue, output and logs are checked before
+        Prefect starts.
     """
     started = time.monotonic()
     settings = read_settings(options.settings) if options.settings else Settings()
@@ -53,7 +54,7 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
         if not options.verbose:
             quiet_console()
         if compiling:
-            LOGGER.info("first run of this version: compiling kernels, about a minute")
+            LOGGER.info("first run of this version: compiling takes about a minute")
         with embedded_prefect():
             summary = _run(logs, out, settings, options)
     return summary, time.monotonic() - started

@@ -78,5 +78,5 @@ def test_a_run_that_fails_says_so_and_leaves_no_handler(monkeypatch):
 
     with pytest.raises(ValueError, match="no"):
         failing()
-    assert shown[-1][2] == "failed: the log says why"
+    assert shown[-1][2] == "failed; see the log"
     assert ([*ROOT.handlers], [*STEPS.handlers], ROOT.level) == before
