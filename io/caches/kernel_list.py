@@ -1,7 +1,7 @@
-"""Which kernels a run calls from Python, and with which types: a list that comes with the code.
+"""The list of the kernels that a run calls from Python, with the types of their arguments.
 
-With it they can be compiled before there is anything to call them with. The list is made from a
-run of the example; a test holds the two against each other.
+With it the kernels can be compiled before a run needs them. The list is made from a run of the
+example, and a test compares the two.
 """
 
 import importlib
@@ -18,19 +18,19 @@ KERNELS = Path(__file__).parent / "kernels.toml"
 
 
 def read_kernels(path: Path = KERNELS) -> list[tuple[str, list[str]]]:
-    """Return kernels as "module:name", each with its arguments' types as text, in order."""
+    """Return the kernels as "module:name", each with the types of its arguments as text."""
     kernels = tomllib.loads(path.read_text(encoding="utf-8"))
     return [(name, arguments) for name, arguments in kernels.items()]
 
 
 def kernel(name: str) -> Any:
-    """Return what "module:name" names."""
+    """Return the object called "module:name"."""
     module, _, attribute = name.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
 
 def signature(arguments: Iterable[str]) -> Signature:
-    """Return numba's types of text that `kernels_text` wrote."""
+    """Return numba's types for the types of arguments as text."""
     known = {**vars(types), "named": _named}
     return tuple(eval(text, {"__builtins__": {}}, known) for text in arguments)
 

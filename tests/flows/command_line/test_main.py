@@ -145,7 +145,7 @@ def test_an_output_that_cannot_be_written_is_one_line(epipole, night_log, prefec
 def test_a_night_that_is_no_date_is_a_wrong_use(date, epipole, night_log):
     code, _, err = epipole("run", night_log, "--out", "out", "--night", date)
     assert code == 2
-    assert "is no date such as 2019-04-01" in " ".join(err.split())
+    assert "is not a date such as 2019-04-01" in " ".join(err.split())
 
 
 def test_the_settings_it_prints_are_read_back_as_the_defaults(epipole, tmp_path):

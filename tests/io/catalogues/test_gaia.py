@@ -46,7 +46,7 @@ def test_a_version_with_motions_in_these_columns_is_refused(tmp_path):
 def test_a_file_of_another_layout_is_refused(content, tmp_path):
     path = tmp_path / "stars.bin"
     path.write_bytes(content)
-    with pytest.raises(CatalogueError, match=r"stars\.bin: not laid out"):
+    with pytest.raises(CatalogueError, match=r"stars\.bin: not in the format"):
         read_gaia(path)
 
 

@@ -89,7 +89,7 @@ def test_a_published_night_replaces_the_old_one_whole(tmp_path):
 def test_a_run_without_a_recorded_log_is_refused_and_names_it(tmp_path):
     publish(tmp_path, night_tables(TIMES, ("a", "b")), [NIGHT])
     before = contents(tmp_path)
-    with pytest.raises(DatasetError, match=r"night=2019-04-01: was also made of b\.mcap"):
+    with pytest.raises(DatasetError, match=r"night=2019-04-01: was also made from b\.mcap"):
         publish(tmp_path, night_tables(TIMES, ("a", "c")), [NIGHT])
     assert contents(tmp_path) == before
     publish(tmp_path, night_tables(TIMES, ("a", "c")), [NIGHT], replace=True)
@@ -222,5 +222,5 @@ def test_two_runs_at_once_publish_whole_nights_and_a_reader_never_misses_one(tmp
 def test_a_damaged_night_is_named(tmp_path):
     publish(tmp_path, night_tables(TIMES), [NIGHT])
     (tmp_path / f"night={NIGHT}/sources/part-0.parquet").write_bytes(b"not parquet")
-    with pytest.raises(DatasetError, match="remove the night's folder"):
+    with pytest.raises(DatasetError, match="remove the folder of the night"):
         publish(tmp_path, night_tables(TIMES), [NIGHT])

@@ -82,7 +82,7 @@ def test_a_folder_that_lacks_a_table_is_never_a_night(tmp_path):
     with claim_nights(tmp_path / "out", [NIGHT]) as work:
         for name in TABLES:
             (work / "made" / name).mkdir(parents=True)
-        with pytest.raises(ValueError, match="no whole night"):
+        with pytest.raises(ValueError, match="not a whole night"):
             publish_folders(
                 tmp_path / "out", {NIGHT: work / "made"}, night_tables(TIMES)["sources"]
             )

@@ -183,7 +183,7 @@ def test_a_second_run_of_a_night_is_refused_and_told_of_the_first(s3, out):
         other = Holder(["2019-04-05"], "far", 7, "2026-01-01T00:00:00Z", "", "t")
         s3.pipe_file(f"{out}/.staging/claim-night=2019-04-05.json", other.text().encode())
         with (
-            pytest.raises(DatasetError, match=r"2019-04-05: process 7 on far has been at work"),
+            pytest.raises(DatasetError, match=r"2019-04-05: process 7 on far has worked on it"),
             claim_nights(out, ["2019-04-05"]),
         ):
             pytest.fail("two runs of one night")
@@ -216,7 +216,7 @@ def test_a_claim_is_renewed_while_its_run_works(s3, out, monkeypatch):
     with claim_nights(out, [NIGHT]):
         time.sleep(4.0)
         other = store_claims.StoreClaims(s3, store_nights(out)._root, out)
-        with pytest.raises(DatasetError, match="at work"), other.claim([NIGHT]):
+        with pytest.raises(DatasetError, match="has worked on"), other.claim([NIGHT]):
             pytest.fail("it was taken over")
 
 

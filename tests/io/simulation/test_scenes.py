@@ -7,7 +7,7 @@ from epipole.schemas.errors import SceneError
 
 
 def test_an_unknown_scene_is_an_error_that_lists_the_built_in_scenes(tmp_path):
-    with pytest.raises(SceneError, match=r"nor a built-in one \(.*night"):
+    with pytest.raises(SceneError, match=r"the built-in scenes are .*night"):
         read_scene(tmp_path / "none.toml")
 
 
