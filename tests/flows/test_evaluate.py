@@ -112,12 +112,12 @@ def test_the_command_line_prints_a_table_or_json(night_log, night_dataset):
 def test_what_is_not_there_is_one_line_on_the_command_line(night_log, tmp_path):
     gone = CliRunner().invoke(app, ["evaluate", str(tmp_path / "no"), "--truth", str(night_log)])
     assert gone.exit_code == 1
-    assert gone.stderr.startswith(f"epipole: {tmp_path}/no: no dataset there; ")
+    assert gone.stderr.startswith(f"epipole: {tmp_path}/no: no dataset here; ")
     assert gone.stderr.count("\n") == 1
 
 
 def test_what_is_not_there_is_said(night_log, tmp_path):
-    with pytest.raises(DatasetError, match=r"none: no dataset there; `epipole run"):
+    with pytest.raises(DatasetError, match=r"none: no dataset here; `epipole run"):
         evaluate(tmp_path / "none", night_log)
     (tmp_path / "night=2020-01-01").mkdir()
     with pytest.raises(DatasetError, match=r"has no night=2019-04-01 of this truth"):

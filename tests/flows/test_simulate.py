@@ -50,7 +50,7 @@ def test_options_take_the_place_of_what_the_scene_says(tmp_path):
 
 
 def test_an_option_or_a_place_that_does_not_fit_is_refused(tmp_path):
-    with pytest.raises(SceneError, match="has no targets to take 3 of"):
+    with pytest.raises(SceneError, match="has no targets, so their number"):
         simulate("lost_in_space", tmp_path / "n.mcap", objects=3)
     (tmp_path / "file").touch()
     with pytest.raises(SceneError, match=r"file/n.mcap: cannot be written"):

@@ -193,8 +193,8 @@ def test_info_says_what_cannot_be_used(epipole, tmp_path):
         for k, x in enumerate([[1.0], [np.nan]]):
             log.frame("a", START_NS + k, frame_number=k, exposure_s=0.1, x_px=x, y_px=[2.0])
     _, out, _ = epipole("info", "n.mcap")
-    assert "states       none: its frames give no positions" in out
-    assert "calibration  none: a run leaves this sensor out" in out
+    assert "states       none; the frames give no positions" in out
+    assert "calibration  none; a run leaves this sensor out" in out
     assert re.search(r"left out: 1 \w+ of a", out)
     _, as_json, _ = epipole("info", "n.mcap", "--json")
     assert json.loads(as_json)[0]["sensors"][0]["frames"] == 1

@@ -102,7 +102,7 @@ def test_bad_rows_are_named_by_row_and_column(csv):
     with pytest.raises(CatalogueError) as error:
         read_star_list(path, epoch=2000.0)
     message = str(error.value)
-    assert "8 of 9 rows bad" in message
+    assert "8 of 9 rows are invalid" in message
     assert "row 2: dec_deg = 97.2, not within -90 to 90" in message
     assert "row 3: star_id = x3, not a whole number" in message
     assert "row 4: magnitude is empty" in message

@@ -46,7 +46,7 @@ def test_a_scene_that_cannot_be_simulated_is_refused():
         stage.simulate_scene(two)
     away = {"position_km": (7000.0, 0.0, 0.0), "velocity_km_s": (0.0, 12.0, 0.0)}
     away = scene_of({"orbit": away})
-    with pytest.raises(SceneError, match="faster than escape"):
+    with pytest.raises(SceneError, match="faster than escape velocity"):
         stage.simulate_scene(away)
 
 
