@@ -73,7 +73,7 @@ def _options(
 
 
 Logs = Annotated[
-    list[str], typer.Argument(metavar="LOG...", help="MCAP files, folders, glob patterns or URLs.")
+    list[str], typer.Argument(metavar="LOG", help="MCAP files, folders, glob patterns or URLs.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
 
@@ -116,7 +116,9 @@ def run(
             "--replace", help="Replace a night even if one of its earlier logs is not given."
         ),
     ] = False,
-    runner: Annotated[Runner, typer.Option(help="What runs the tasks.")] = Runner.threads,
+    runner: Annotated[
+        Runner, typer.Option(help="Run the tasks in threads or with Dask.")
+    ] = Runner.threads,
     workers: Annotated[
         int | None,
         typer.Option(min=1, metavar="N", help="Tasks at the same time; default: one per CPU."),
@@ -129,7 +131,8 @@ def run(
     ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors.")] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Print the lines of all tasks and of Prefect.")
+        bool,
+        typer.Option("--verbose", help="Also print the log lines of all tasks and of Prefect."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -253,7 +256,7 @@ def simulate(
 @app.command()
 def evaluate(
     dataset: Annotated[
-        Path,
+        str,
         typer.Argument(metavar="DATASET", help="Folder or URL that `epipole run` published to."),
     ],
     truth: Annotated[

@@ -61,7 +61,7 @@ def check_folder(dataset: Where) -> None:
             raise DatasetError(f"{dataset}: {error.strerror}; give another folder") from error
     if names and not any(name == STAGING or name.startswith("night=") for name in names):
         raise DatasetError(
-            f"{dataset}: holds other files, and no dataset (no night=... folder); "
+            f"{dataset}: holds other files and no dataset (no night=... folder); "
             "give an empty folder or a dataset"
         )
 

@@ -32,7 +32,7 @@ def epipole(monkeypatch, capfd, tmp_path):
 def test_hipparcos_is_built_and_told_in_a_few_lines(epipole, tmp_path):
     code, out, _ = epipole("catalog", "build", "hipparcos", "--out", "hip.parquet", "--limit", 7)
     assert code == 0
-    assert "hipparcos, places of 1991.25" in out
+    assert "hipparcos, positions at 1991.25" in out
     assert "identification.catalogue = 'hip.parquet'" in out
     stars = read_star_catalogue(str(tmp_path / "hip.parquet"))
     assert stars.num_rows == pytest.approx(15_500, rel=0.05)

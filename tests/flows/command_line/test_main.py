@@ -251,3 +251,9 @@ def test_ctrl_c_ends_a_run_with_one_line_and_nothing_half_written(night_log, tmp
     assert one_line("".join(lines)) == "epipole: interrupted"
     time.sleep(0.1)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_dataset_of_an_evaluation_may_be_a_url(epipole, s3, night_log):
+    code, _, err = epipole("evaluate", "s3://nights/none", "--truth", night_log)
+    assert code == 1
+    assert "s3://nights/none: no dataset here" in one_line(err)

@@ -77,7 +77,7 @@ def test_publishing_again_replaces_a_night_whole(s3, out):
 def test_a_run_without_a_recorded_log_is_refused(s3, out):
     publish(out, night_tables(TIMES, ("a", "b")), [NIGHT])
     before = files(s3, out)
-    with pytest.raises(DatasetError, match=r"was also made of b\.mcap"):
+    with pytest.raises(DatasetError, match=r"was also made from b\.mcap"):
         publish(out, night_tables(TIMES, ("a",)), [NIGHT])
     assert files(s3, out) == before
     publish(out, night_tables(TIMES, ("a",)), [NIGHT], replace=True)
