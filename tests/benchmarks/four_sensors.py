@@ -1,4 +1,4 @@
-"""The scene of four low sensors and nine geostationary objects, changed, and run in this process."""
+"""The scene of four low sensors and nine geostationary objects, changed and run in-process."""
 
 import tempfile
 import tomllib

@@ -58,7 +58,7 @@ def parts(out: Path, stage: str) -> list[Path]:
 
 
 @pytest.mark.parametrize("stage", ["identified", "tracked"])
-def test_a_run_after_a_killed_one_reuses_its_parts_and_gives_the_same_rows(
+def test_a_run_reuses_the_parts_of_a_killed_one_and_gives_the_same_rows(
     run, tmp_path, night_dataset, stage
 ):
     out = tmp_path / "out"
