@@ -63,8 +63,8 @@ def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:
             points, on=SPOT, how="left", maintain_order="left"
         )
         claims = _claims(to_polars(tables["associations"]), detections, points)
-        of_claims, found = _associations(claims, to_polars(tables["epochs"]), points)
-        measures |= found
+        of_claims, associations = _associations(claims, to_polars(tables["epochs"]), points)
+        measures |= associations
         measures |= _positions(tables["positions"], of_claims, truth)
         measures["positions_per_truth"] = _per_truth(measures["positions"], truth, frames, points)
         measures |= _tracks(detections.drop_nulls("track_id"), points)
@@ -78,16 +78,16 @@ def _share(part: float, whole: float) -> float:
 def _stars(stars: pl.DataFrame, points: pl.DataFrame) -> Measures:
     held = stars.select(*SPOT, "star_id").join(points, on=SPOT, how="inner")
     right = held.filter((pl.col("kind") == STAR) & (pl.col("source") == pl.col("star_id"))).height
-    there = points.filter(pl.col("kind") == STAR).height
+    n_true = points.filter(pl.col("kind") == STAR).height
     return {
         "stars_claimed": stars.height,
         "star_precision": _share(right, stars.height),
-        "star_recall": _share(right, there),
+        "star_recall": _share(right, n_true),
     }
 
 
-def _attitudes(found: pl.DataFrame, true: pl.DataFrame) -> Measures:
-    once = found.unique(FRAME, keep="first", maintain_order=True)
+def _attitudes(frames: pl.DataFrame, true: pl.DataFrame) -> Measures:
+    once = frames.unique(FRAME, keep="first", maintain_order=True)
     solved = once.filter(pl.col("attitude_source") == "stars").join(
         true, on=FRAME, how="inner", suffix="_true"
     )
@@ -97,8 +97,8 @@ def _attitudes(found: pl.DataFrame, true: pl.DataFrame) -> Measures:
     cross, roll = (v / ARCSEC for v in attitude_errors(q_found, q_true))
     roll = np.abs(roll)
     measures: Measures = {
-        "frames": found.height,
-        "frames_duplicated": found.height - once.height,
+        "frames": frames.height,
+        "frames_duplicated": frames.height - once.height,
         "frames_solved": _share(solved.height, true.height),
     }
     if solved.height:
@@ -125,13 +125,13 @@ def _claims(
     views = views.join(numbers, on="tracklet_id", how="left", maintain_order="left")
     views = views.with_columns(
         claim=pl.struct(CLAIM).rank("dense").cast(pl.Int64) - 1,
-        seen=pl.col("centroid").is_not_null(),
+        has_centroid=pl.col("centroid").is_not_null(),
         target=pl.Series(_target(views), dtype=pl.Int64),
     )
     missed = pl.col("of_tracklet").fill_null(-1)
-    views = views.with_columns(target=pl.when("seen").then("target").otherwise(missed))
+    views = views.with_columns(target=pl.when("has_centroid").then("target").otherwise(missed))
     # Views with a centroid come first: they decide where two true objects have as many views.
-    return views.sort("seen", descending=True, maintain_order=True)
+    return views.sort("has_centroid", descending=True, maintain_order=True)
 
 
 def _target(spots: pl.DataFrame) -> Indices:
@@ -148,18 +148,20 @@ def _associations(
     mostly = majority(_ints(views, "claim"), _ints(views, "target"), claims.height)
     of = np.where(mostly.votes >= 2, mostly.value, -1)
     claims = claims.with_columns(target=pl.Series(of, dtype=pl.Int64))
-    seen = views.filter("seen")
-    n_pairs, n_right = pairs_within(_ints(seen, "claim"), _ints(seen, "target"), claims.height)
-    could = points.filter(pl.col("kind") == TARGET).join(epochs, on=FRAME, how="inner")
-    could = could.group_by("epoch", target="source").len().filter(pl.col("len") >= 2)
-    n = _ints(could, "len")
-    found = claims.join(could, on=["epoch", "target"], how="semi").select("epoch", "target")
+    with_centroid = views.filter("has_centroid")
+    n_pairs, n_right = pairs_within(
+        _ints(with_centroid, "claim"), _ints(with_centroid, "target"), claims.height
+    )
+    possible = points.filter(pl.col("kind") == TARGET).join(epochs, on=FRAME, how="inner")
+    possible = possible.group_by("epoch", target="source").len().filter(pl.col("len") >= 2)
+    n = _ints(possible, "len")
+    recalled = claims.join(possible, on=["epoch", "target"], how="semi").select("epoch", "target")
     return claims, {
         "epochs": epochs["epoch"].n_unique(),
         "groups": claims.height,
         "pair_precision": _share(n_right, n_pairs),
         "pair_recall": _share(n_right, int(np.sum(n * (n - 1) // 2))),
-        "object_recall": _share(found.unique().height, could.height),
+        "object_recall": _share(recalled.unique().height, possible.height),
         "ghosts": int(np.sum(of < 0)),
     }
 
@@ -207,10 +209,10 @@ def _per_truth(n: int, truth: Truth, frames: pl.DataFrame, points: pl.DataFrame)
     """
     rate = min(sensor["rate_hz"] for sensor in truth.scenario["sensors"])
     since = pl.col("t_ns") - int(truth.scenario["t0_ns"])
-    could = points.filter(pl.col("kind") == TARGET).join(frames.select(*FRAME, "t_ns"), on=FRAME)
-    could = could.with_columns(interval=(since * (rate / 1e9)).floor())
-    could = could.group_by("interval", "source").agg(n=pl.col("sensor_id").n_unique())
-    return _share(n, could.filter(pl.col("n") >= 2).height)
+    possible = points.filter(pl.col("kind") == TARGET).join(frames.select(*FRAME, "t_ns"), on=FRAME)
+    possible = possible.with_columns(interval=(since * (rate / 1e9)).floor())
+    possible = possible.group_by("interval", "source").agg(n=pl.col("sensor_id").n_unique())
+    return _share(n, possible.filter(pl.col("n") >= 2).height)
 
 
 def _tracks(tracked: pl.DataFrame, points: pl.DataFrame) -> Measures:
@@ -223,10 +225,10 @@ def _tracks(tracked: pl.DataFrame, points: pl.DataFrame) -> Measures:
     right = int(mostly.votes.sum())
     of = tracks.select("sensor_id", target=pl.Series(mostly.value)).filter(pl.col("target") >= 0)
     each = of.group_by("sensor_id", "target").len()["len"]
-    there = points.filter(pl.col("kind") == TARGET).height
+    n_true = points.filter(pl.col("kind") == TARGET).height
     return {
         "tracks": tracks.height,
         "track_purity": _share(right, tracked.height),
-        "track_completeness": _share(right, there),
+        "track_completeness": _share(right, n_true),
         "tracks_per_target": float(np.mean(each.to_numpy())) if len(each) else None,
     }
