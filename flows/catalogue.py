@@ -1,4 +1,4 @@
-"""Star catalogues built into files that a run takes."""
+"""Build a star catalogue file for a run."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,8 +20,8 @@ DEEP = "deep"
 
 
 @dataclass(frozen=True)
-class Built:
-    """What was written."""
+class BuiltCatalogue:
+    """The catalogue that was written."""
 
     file: str
     name: str
@@ -35,20 +35,20 @@ class Built:
     ignored: list[str]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the facts by name, as JSON takes them."""
+        """Return the fields by name, for JSON."""
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """Return the facts as people read them."""
-        ignored = [f"not used    columns {', '.join(self.ignored)}"] if self.ignored else []
+        """Return the fields as lines for people."""
+        ignored = [f"ignored     columns {', '.join(self.ignored)}"] if self.ignored else []
         return [
-            f"catalogue   {self.name}, places of {self.epoch:g}",
+            f"catalogue   {self.name}, positions at {self.epoch:g}",
             f"source      {self.source}",
             f"stars       {self.stars:,} of magnitude {self.brightest:.2f} to {self.faintest:.2f}; "
-            f"{self.without_motion:,} of unknown motion, {self.variable:,} variable",
+            f"{self.without_motion:,} without a motion, {self.variable:,} variable",
             *ignored,
             f"file        {self.file}",
-            f"use it by   identification.catalogue = {self.file!r} in the settings",
+            f"to use it   set identification.catalogue = {self.file!r} in the settings",
         ]
 
 
@@ -58,7 +58,7 @@ def build_catalogue(
     epoch: float | None = None,
     name: str | None = None,
     magnitude_limit: float | None = None,
-) -> Built:
+) -> BuiltCatalogue:
     """Build a star catalogue and write it as Parquet.
 
     Parameters
@@ -66,19 +66,19 @@ def build_catalogue(
     source
         "hipparcos", "deep" (Gaia DR3 with Hipparcos' motions), or a CSV or Parquet file of stars.
     out
-        The file; one that is there is replaced.
+        The file to write. An existing file is replaced.
     epoch, name
-        Of a user's stars, see `read_star_list`.
+        For a file of stars only, see `read_star_list`.
     magnitude_limit
-        Leave fainter stars out.
+        Fainter stars are left out.
 
     Raises
     ------
     CatalogueError
-        Where the source does not fit; no file is then written.
+        Where the source is invalid; no file is then written.
     """
     if source in (HIPPARCOS, DEEP) and (epoch is not None or name is not None):
-        raise CatalogueError(f"{source} has an epoch and a name of its own; leave them out")
+        raise CatalogueError(f"{source} has its own epoch and name; leave these options out")
     ignored: list[str] = []
     if source == HIPPARCOS:
         stars = read_hipparcos()
@@ -97,16 +97,18 @@ def build_catalogue(
 def _of_user(source: str, epoch: float | None, name: str | None) -> tuple[pa.Table, list[str]]:
     if not Path(source).is_file():
         raise CatalogueError(
-            f"{source}: neither {HIPPARCOS} nor {DEEP} nor a file; give a CSV or Parquet file"
+            f"{source}: no such file; give {HIPPARCOS}, {DEEP}, or a CSV or Parquet file"
         )
     if (name or Path(source).stem) == HIPPARCOS:
-        raise CatalogueError(f"{source}: the name {HIPPARCOS} is taken; give another by --name")
+        raise CatalogueError(
+            f"{source}: the name {HIPPARCOS} is reserved; give another with --name"
+        )
     return read_star_list(Path(source), epoch, name)
 
 
-def _built(out: Path, stars: pa.Table, ignored: list[str]) -> Built:
+def _built(out: Path, stars: pa.Table, ignored: list[str]) -> BuiltCatalogue:
     label, magnitude = label_of(stars.schema), array(stars, "magnitude")
-    return Built(
+    return BuiltCatalogue(
         file=str(out),
         name=label.name,
         epoch=label.epoch,

@@ -1,4 +1,4 @@
-"""A dataset and the truth of a simulation go in, a report comes out."""
+"""Compare a dataset with the truth of a simulation, and report the result."""
 
 import os
 
@@ -17,14 +17,14 @@ TABLES = ("frames", "stars", "detections", "epochs", "associations", "positions"
 
 
 def evaluate(dataset: str | os.PathLike[str], truth: str | os.PathLike[str]) -> Report:
-    """Hold a dataset against the truth of the simulation it was made of.
+    """Return the report of a dataset against the truth of the simulation it was made from.
 
     Parameters
     ----------
     dataset
-        The folder or URL that `epipole run` published to. Only the nights of the truth count.
+        The folder or URL that `epipole run` published to. Only the nights of the truth are used.
     truth
-        The truth's folder, ``LOG.truth``, or the log beside it.
+        The folder ``LOG.truth``, or the log beside it.
 
     Raises
     ------
@@ -45,16 +45,16 @@ def _nights(dataset: str, truth: Truth) -> list[str]:
     published = nights_in(dataset)
     if not published:
         raise DatasetError(
-            f"{dataset}: no dataset there; `epipole run LOG --out {dataset}` makes it"
+            f"{dataset}: no dataset here; `epipole run LOG --out {dataset}` makes one"
         )
     wanted = nights_of(np.asarray(truth.frames["t_ns"], np.int64))
-    there = [night for night in wanted if night in published]
-    if not there:
+    nights = [night for night in wanted if night in published]
+    if not nights:
         raise DatasetError(
             f"{dataset}: has no night={' or night='.join(wanted) or '...'} of this truth; "
-            "give the truth of a log that the dataset was made of"
+            "give the truth of a log that the dataset was made from"
         )
-    return there
+    return nights
 
 
 def show(report: Report, console: Console | None = None) -> None:

@@ -1,4 +1,4 @@
-"""A scene goes in, a log and its truth come out."""
+"""Simulate a scene: write a log and its truth."""
 
 import os
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ from epipole.tasks.simulate.simulate_scene import (
 
 @dataclass(frozen=True)
 class Simulated:
-    """What was written."""
+    """The files that were written, and their counts."""
 
     logs: list[Path]
     truth: Path
@@ -67,30 +67,30 @@ def simulate(
     Parameters
     ----------
     scene
-        A built-in scene's name, a TOML file, or a scene.
+        The name of a built-in scene, a TOML file, or a scene.
     out
-        The log, an MCAP file.
+        The log to write, an MCAP file.
     seed, hours, start
-        Instead of the scene's own seed, duration and start (an aware datetime).
+        Used instead of the scene's seed, duration and start (an aware datetime).
     sensors, objects
-        How many, in the scene's first group of sensors and of targets.
+        The number of them in the scene's first group of sensors and of targets.
     rate_hz
-        Frames a second, of every sensor.
+        Frames per second of every sensor.
     logs
-        Into how many logs the scene is cut, one after the other in time; with more than one they
-        are called ``<stem>-1.mcap`` and so on, and the truth is still ``<out>.truth``.
+        The number of logs, one after the other in time. Several logs are called
+        ``<stem>-1.mcap`` and so on. The truth is still ``<out>.truth``.
     encoding, compression
-        Of the log, see `LogWriter`.
+        See `LogWriter`.
 
     Raises
     ------
     SceneError
-        Where the scene or an option does not fit, or the log cannot be written.
+        Where the scene or an option is invalid, or the log cannot be written.
     """
     settled = scene if isinstance(scene, Scene) else read_scene(scene)
     settled = _with_options(settled, seed, sensors, objects, hours, rate_hz, start)
     if logs < 1:
-        raise SceneError(f"logs = {logs}: at least one is needed")
+        raise SceneError(f"logs = {logs}: give 1 or more")
     out = Path(out)
     names = [out] if logs == 1 else [out.with_stem(f"{out.stem}-{k + 1}") for k in range(logs)]
     truth = Path(str(out) + SUFFIX)
@@ -112,7 +112,7 @@ def simulate(
 
 
 def scenario(simulation: Simulation) -> dict[str, Any]:
-    """Return how a log was made: the scene, and what chance settled of it."""
+    """Return how a log was made: the scene, and what was drawn at random for it."""
     return {
         "t0_ns": simulation.t0_ns,
         "duration_s": simulation.scene.duration_s,
@@ -159,7 +159,7 @@ def _with_options(
         values["sensors"][0]["count"] = sensors
     if objects is not None:
         if not values.get("targets"):
-            raise SceneError(f"{scene.name}: has no targets to take {objects} of")
+            raise SceneError(f"{scene.name}: has no targets, so their number cannot be {objects}")
         values["targets"][0]["count"] = objects
     if rate_hz is not None:
         for sensor in values["sensors"]:
@@ -168,22 +168,22 @@ def _with_options(
 
 
 def _write(simulation: Simulation, writers: list[LogWriter], true: TruthWriter) -> tuple[int, int]:
-    """Write all messages in order of time, calibrations first; return frames and centroids."""
-    for sensor, told in zip(simulation.sensors, simulation.told, strict=True):
+    """Write all messages in order of time, calibrations first. Return the counts."""
+    for sensor, group in zip(simulation.sensors, simulation.groups, strict=True):
         for writer in writers:
-            writer.camera(sensor.sensor_id, simulation.t0_ns, sent_optics(told.camera))
+            writer.camera(sensor.sensor_id, simulation.t0_ns, sent_optics(group.camera))
     bounds = _log_bounds(simulation, len(writers))
     states = [_States(simulation, k) for k in range(len(simulation.sensors))]
     n_frames = n_centroids = 0
     for block in expose_blocks(simulation):
         _write_truth(simulation, block, true)
-        ends = [int(seen.time_ns[-1]) for seen in block if len(seen.time_ns)]
+        ends = [int(exposed.time_ns[-1]) for exposed in block if len(exposed.time_ns)]
         until = max(ends, default=0) + 1
         messages = [m for s in states for m in s.until(until)]
-        for k, seen in enumerate(block):
-            messages += _frames(simulation, k, seen)
-            n_frames += len(seen.time_ns)
-            n_centroids += int(seen.offsets[-1])
+        for k, exposed in enumerate(block):
+            messages += _frames(simulation, k, exposed)
+            n_frames += len(exposed.time_ns)
+            n_centroids += int(exposed.offsets[-1])
         _send(messages, writers, bounds)
     _send([m for s in states for m in s.until(None)], writers, bounds)
     return n_frames, n_centroids
@@ -191,8 +191,8 @@ def _write(simulation: Simulation, writers: list[LogWriter], true: TruthWriter) 
 
 def _write_truth(simulation: Simulation, block: list[Exposures], true: TruthWriter) -> None:
     tables = [
-        true_tables(sensor.sensor_id, seen)
-        for sensor, seen in zip(simulation.sensors, block, strict=True)
+        true_tables(sensor.sensor_id, exposed)
+        for sensor, exposed in zip(simulation.sensors, block, strict=True)
     ]
     frames, points = zip(*tables, strict=True)
     true.write(pa.concat_tables(frames), pa.concat_tables(points))
@@ -203,7 +203,7 @@ def _log_bounds(simulation: Simulation, n: int) -> np.ndarray:
     return simulation.t0_ns + np.arange(1, n) * (length_ns // n)
 
 
-# A message's time, the sensor, the writer's method and its arguments.
+# The time of a message, the sensor, the method of the writer and its arguments.
 _Message = tuple[int, str, str, dict[str, Any]]
 
 
@@ -214,13 +214,13 @@ def _send(messages: list[_Message], writers: list[LogWriter], bounds: np.ndarray
         getattr(writers[k], method)(sensor_id, time_ns, **values)
 
 
-def _frames(simulation: Simulation, k: int, seen: Exposures) -> Iterator[_Message]:
-    sensor, told = simulation.sensors[k], simulation.told[k]
-    detection, late_ns = told.detection, round(told.clock_offset_s * SECOND_NS)
-    x, y = seen.x_px.astype(np.float32), seen.y_px.astype(np.float32)
-    flux, sigma = seen.flux.astype(np.float32), seen.sigma_px.astype(np.float32)
-    offsets = seen.offsets.tolist()
-    numbers, times = seen.frame_number.tolist(), seen.time_ns.tolist()
+def _frames(simulation: Simulation, k: int, exposed: Exposures) -> Iterator[_Message]:
+    sensor, group = simulation.sensors[k], simulation.groups[k]
+    detection, late_ns = group.detection, round(group.clock_offset_s * SECOND_NS)
+    x, y = exposed.x_px.astype(np.float32), exposed.y_px.astype(np.float32)
+    flux, sigma = exposed.flux.astype(np.float32), exposed.sigma_px.astype(np.float32)
+    offsets = exposed.offsets.tolist()
+    numbers, times = exposed.frame_number.tolist(), exposed.time_ns.tolist()
     for i, time_ns in enumerate(times):
         part = slice(offsets[i], offsets[i + 1])
         values = {
@@ -235,11 +235,11 @@ def _frames(simulation: Simulation, k: int, seen: Exposures) -> Iterator[_Messag
 
 
 class _States:
-    """The states of one sensor, sent in order of time up to a moment."""
+    """The states of one sensor, sent block by block in order of time."""
 
     def __init__(self, simulation: Simulation, k: int) -> None:
         self.sensor: Sensor = simulation.sensors[k]
-        self._told = simulation.told[k].states
+        self._settings = simulation.groups[k].states
         self._attitudes, self._beliefs = Attitudes(self.sensor), Beliefs(self.sensor)
         self._times, self._sent = state_times(self.sensor), 0
 
@@ -258,7 +258,7 @@ class _States:
         for i, at in enumerate(times.tolist()):
             values: dict[str, Any] = {
                 "position_km": place[i],
-                "velocity_km_s": v_km_s[i] if self._told.send_velocity else None,
+                "velocity_km_s": v_km_s[i] if self._settings.send_velocity else None,
                 "position_sigma_km": sigma_km,
                 "attitude_xyzw": None if q is None else q[i],
                 "attitude_sigma_arcsec": sigma_q,

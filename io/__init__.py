@@ -1,1 +1,1 @@
-"""Everything that touches bytes: logs, datasets, catalogues, Earth orientation."""
+"""Everything that reads or writes files: logs, datasets, catalogues, caches, the work area."""

@@ -1,4 +1,4 @@
-"""Files behind fsspec URLs, and the errors of their stores as lines for people."""
+"""Files behind fsspec URLs, and the errors of object stores as one-line messages."""
 
 import contextlib
 import sys
@@ -9,14 +9,14 @@ from epipole.schemas.errors import LogError
 
 
 def open_remote(where: str) -> tuple[int, Callable[[int, int], bytes], Callable[[], None]]:
-    """Return the size of what a URL names, and functions that fetch a range and that check it.
+    """Return the size of the file behind a URL, and two functions: read a range, and check it.
 
-    The latter raises where what is there is no longer what was opened.
+    The check raises where the file has changed since it was opened.
 
     Raises
     ------
     LogError
-        Where there is no such file, or it cannot be read.
+        Where the file is missing or cannot be read.
     """
     try:
         import fsspec
@@ -25,10 +25,12 @@ def open_remote(where: str) -> tuple[int, Callable[[int, int], bytes], Callable[
 
     with _as_log_errors(where):
         storage, path = fsspec.core.url_to_fs(where)
-        storage.invalidate_cache()  # a listing of earlier may be out of date
+        storage.invalidate_cache()  # an earlier listing may be out of date
         info, version = storage.info(path), storage.ukey(path)
     if info["type"] == "directory":
-        raise LogError(f"{where}: is a folder; give the logs in it, such as {where}/*.mcap")
+        raise LogError(
+            f"{where}: is a folder; give the logs in it by a glob pattern, such as {where}/*.mcap"
+        )
 
     def read(start: int, end: int) -> bytes:
         if start >= end:
@@ -41,7 +43,7 @@ def open_remote(where: str) -> tuple[int, Callable[[int, int], bytes], Callable[
         with _as_log_errors(where):
             storage.invalidate_cache()
             if storage.ukey(path) != version:
-                raise LogError(f"{where}: has changed while it was read; run again")
+                raise LogError(f"{where}: changed while it was read; run again")
 
     return int(info["size"]), read, check
 
@@ -59,7 +61,7 @@ def _as_log_errors(where: str) -> Iterator[None]:
 
 
 def storage_errors() -> tuple[type[Exception], ...]:
-    """Return what a store may raise: S3's client has errors that are no OSError."""
+    """Return the errors that a store may raise. Those of S3's client are not all OSErrors."""
     errors: list[Any] = [OSError, ValueError, ImportError]
     client = sys.modules.get("botocore.exceptions")
     if client is not None:
@@ -68,5 +70,5 @@ def storage_errors() -> tuple[type[Exception], ...]:
 
 
 def line_of(error: BaseException) -> str:
-    """Return what an error says, in one line."""
+    """Return the message of an error as one line."""
     return " ".join(str(error).split()) or type(error).__name__

@@ -12,17 +12,19 @@ WIDTH = 88
 
 
 def read_settings(path: Path) -> Settings:
-    """Return the settings of a TOML file; what it leaves out keeps its default.
+    """Return the settings of a TOML file. A setting that it does not have keeps its default.
 
     Raises
     ------
     SettingsError
-        Where the file cannot be read, or names the setting that does not fit.
+        Where the file cannot be read, or a setting is invalid or unknown.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise SettingsError(f"{path}: not a text file; `epipole settings` prints one") from error
+        raise SettingsError(
+            f"{path}: not a text file; `epipole settings` prints a file to start from"
+        ) from error
     except OSError as error:
         raise SettingsError(
             f"{path}: {error.strerror}; `epipole settings` prints a file to start from"
@@ -31,11 +33,11 @@ def read_settings(path: Path) -> Settings:
 
 
 def settings_text(settings: Settings) -> str:
-    """Return the settings as commented TOML that `read_settings` reads back as they are.
+    """Return the settings as commented TOML for `read_settings`.
 
-    A setting without a value is a comment, as TOML has no null.
+    A setting without a value is commented out, because TOML has no null.
     """
-    lines = ["# Settings of epipole. What is left out keeps its default."]
+    lines = ["# Settings of epipole. A setting that is left out keeps its default."]
     for name in type(settings).model_fields:
         group: Group = getattr(settings, name)
         lines += ["", *_comment((type(group).__doc__ or "").strip()), f"[{name}]"]
@@ -47,7 +49,7 @@ def settings_text(settings: Settings) -> str:
 
 
 def _toml(value: Any) -> str:
-    """Return a value as TOML writes it: a group inside a list is an inline table."""
+    """Return a value in TOML. A group inside a list is an inline table."""
     if isinstance(value, Group):
         inside = (f"{key} = {_toml(getattr(value, key))}" for key in type(value).model_fields)
         return f"{{ {', '.join(inside)} }}"

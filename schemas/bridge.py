@@ -177,16 +177,10 @@ def nullable(values: npt.NDArray[Any], valid: npt.NDArray[np.bool_] | None = Non
     return pa.array(values, mask=~valid)
 
 
-def lists(flat: npt.NDArray[Any], offsets: npt.NDArray[Any], kind: pa.DataType) -> pa.ListArray:
-    """Return row i as the list ``flat[offsets[i]:offsets[i + 1]]``."""
-    kind = pa.list_(pa.field("element", kind, nullable=False))
-    return pa.ListArray.from_arrays(
-        pa.array(offsets, pa.int32()), pa.array(flat, kind.value_type), type=kind
-    )
-
-
 def flatten(values: pa.Table, name: str) -> tuple[npt.NDArray[Any], npt.NDArray[np.int64]]:
-    """Return a list column as (flat values, (n + 1) offsets), the inverse of `lists`.
+    """Return a list column as flat values and (n + 1) offsets.
+
+    Row i is ``flat[offsets[i]:offsets[i + 1]]``.
 
     Values of a float32 column come as float64.
     """

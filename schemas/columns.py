@@ -19,9 +19,9 @@ def column(
     frame: str = "",
     null: bool = False,
 ) -> pa.Field:
-    """Return a field that carries its unit, its frame and its meaning as metadata.
+    """Return a field with its unit, frame and meaning as metadata.
 
-    Columns are non-null unless `null` says otherwise; the doc then says what null means.
+    With `null` the column may have nulls; `doc` then says what a null means.
     """
     metadata = {"doc": doc, "unit": unit, "frame": frame}
     return pa.field(
@@ -38,7 +38,7 @@ def time_column(name: str = "time", *, doc: str = "Mid-exposure time, UTC.") -> 
 
 
 def id_column(name: str, *, doc: str, null: bool = False) -> pa.Field:
-    """Return a column that identifies something by a string."""
+    """Return a column of strings that identify something."""
     return column(name, pa.string(), doc=doc, null=null)
 
 
@@ -47,8 +47,8 @@ def axes(
 ) -> list[pa.Field]:
     """Return one float64 column per axis: ``axes("{}_km")`` gives x_km, y_km, z_km.
 
-    Three columns rather than a list: a filter on them is three times faster, and their
-    Parquet statistics do not mix the axes.
+    Three columns, not a list: a filter on them is three times faster, and each axis has Parquet
+    statistics of its own.
     """
     return [
         column(
@@ -83,6 +83,6 @@ def covariance(
 def schema(name: str, doc: str, fields: Iterable[pa.Field], version: str = "1") -> pa.Schema:
     """Return a table's schema with its name, meaning and version in the metadata.
 
-    Renaming a column or changing its unit raises `version`.
+    `version` is raised when a column is renamed or its unit changes.
     """
     return pa.schema(list(fields), metadata={"table": name, "doc": doc, "version": version})

@@ -1,29 +1,29 @@
-"""The errors a user can cause, each with a message of what, where and what to do.
+"""Errors that a user can put right. Each message says what is wrong, where, and what to do.
 
-The command line prints the message as one line and exits with a non-zero code; anything
-else that is raised is a fault of the program and shows its traceback.
+The command line prints the message as one line and exits with a non-zero code. Any other error
+is a fault of the program and shows its traceback.
 """
 
 
 class EpipoleError(ValueError):
-    """Base of every error that the user, not the program, has to mend."""
+    """Base of all errors that a user can put right."""
 
 
 class LogError(EpipoleError):
-    """A log that cannot be read: missing, no MCAP, without frames, of an unknown encoding."""
+    """A log that cannot be used: missing, not MCAP, without frames, of an unknown encoding."""
 
 
 class SettingsError(EpipoleError):
-    """A settings file or value that does not fit."""
+    """A settings file that cannot be read, or an invalid setting."""
 
 
 class SceneError(EpipoleError):
-    """A simulation scene that does not fit."""
+    """A simulation scene that is missing or invalid."""
 
 
 class CatalogueError(EpipoleError):
-    """A star catalogue that is missing or malformed."""
+    """A star catalogue that is missing or invalid."""
 
 
 class DatasetError(EpipoleError):
-    """An output folder that is no dataset, or that cannot be published to."""
+    """An output folder that is not a dataset, or that cannot be read or written."""

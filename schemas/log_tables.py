@@ -1,4 +1,4 @@
-"""What one log gives, before its states are turned to GCRF and logs are put together."""
+"""The content of one log, before its states are converted to GCRF."""
 
 from typing import NamedTuple
 
@@ -12,13 +12,19 @@ STATE_FRAMES = (GCRF, EME2000, TEME, ITRF)
 
 LOG_STATES = schema(
     "log_states",
-    "One row a state as the log has it, in the log's own frame.",
+    "One row per state, in the frame that the log uses.",
     [
         id_column("sensor_id", doc="Star sensor."),
         time_column(doc="Time of the state, UTC."),
         column("frame", pa.string(), doc="GCRF, EME2000, TEME or ITRF."),
         *axes("{}_km", unit="km", frame="frame", doc="Sensor position"),
-        *axes("v{}_km_s", unit="km/s", frame="frame", null=True, doc="Velocity; null: not sent"),
+        *axes(
+            "v{}_km_s",
+            unit="km/s",
+            frame="frame",
+            null=True,
+            doc="Velocity; null where the log has none",
+        ),
         *[
             SENSOR_STATES.field(name)
             for name in ("position_sigma_km", "qx", "qy", "qz", "qw", "attitude_sigma_arcsec")
@@ -28,7 +34,7 @@ LOG_STATES = schema(
 
 
 class LogSource(NamedTuple):
-    """A log that was read: a row of `sources` without what publishing adds."""
+    """A log that was read: a row of `sources` without the columns that publishing adds."""
 
     name: str
     size: int  # bytes
@@ -38,30 +44,20 @@ class LogSource(NamedTuple):
 
 
 class LogPiece(NamedTuple):
-    """What a stretch of one log holds."""
+    """The content of a piece of one log."""
 
     exposures: pa.Table  # EXPOSURES, in the order of the log
     states: pa.Table  # LOG_STATES
     cameras: pa.Table  # CAMERAS
-    rejects: pa.Table  # REJECTS; all with the last piece
-    source: LogSource | None  # with the last piece
+    rejects: pa.Table  # REJECTS; all of the log in the last piece
+    source: LogSource | None  # in the last piece only
 
 
 class LogPart(NamedTuple):
-    """What one log holds."""
+    """The content of one log."""
 
     exposures: pa.Table  # EXPOSURES, in the order of the log
     states: pa.Table  # LOG_STATES
     cameras: pa.Table  # CAMERAS
     rejects: pa.Table  # REJECTS
     source: LogSource
-
-
-class Log(NamedTuple):
-    """What all logs of a run hold together."""
-
-    exposures: pa.Table  # EXPOSURES, sorted by sensor, time
-    states: pa.Table  # SENSOR_STATES, sorted by sensor, time
-    cameras: pa.Table  # CAMERAS, sorted by sensor, time
-    sources: list[LogSource]  # sorted by name
-    rejects: pa.Table  # REJECTS

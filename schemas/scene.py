@@ -1,7 +1,7 @@
 """A simulation scene: sensors, objects and noise, from a TOML file.
 
-A scene may leave things to chance (``count``, ``random`` orbits, an object's spread); its
-seed then settles them.
+A scene may leave values to chance (``count``, ``random`` orbits, the spread of objects). They are
+then drawn with the scene's seed.
 """
 
 import tomllib
@@ -18,7 +18,7 @@ _NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,62}$"
 
 
 class Orbit(Group):
-    """An orbit about the Earth at the scene's start: elements, a place, or one by chance."""
+    """An orbit about the Earth at the start of the scene: by elements, by a position, or random."""
 
     a_km: float | None = Field(None, gt=6378.0, description="Semi-major axis.")
     e: float = Field(0.0, ge=0, lt=1, description="Eccentricity.")
@@ -26,12 +26,14 @@ class Orbit(Group):
     raan_deg: float = Field(0.0, description="Right ascension of the ascending node.")
     argp_deg: float = Field(0.0, description="Argument of perigee.")
     mean_anomaly_deg: float | None = Field(None, description="Mean anomaly at the start.")
-    true_anomaly_deg: float | None = Field(None, description="The same as a true anomaly.")
-    position_km: Vector | None = Field(None, description="GCRF place at the start.")
+    true_anomaly_deg: float | None = Field(None, description="The true anomaly instead.")
+    position_km: Vector | None = Field(None, description="GCRF position at the start.")
     velocity_km_s: Vector | None = Field(
-        None, description="GCRF velocity there; none: a circular orbit eastward."
+        None, description="GCRF velocity there. Default: a circular orbit eastward."
     )
-    random: Literal["leo", "meo", "geo"] | None = Field(None, description="By chance.")
+    random: Literal["leo", "meo", "geo"] | None = Field(
+        None, description="A random orbit of this kind."
+    )
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -41,7 +43,7 @@ class Orbit(Group):
         if self.mean_anomaly_deg is not None and self.true_anomaly_deg is not None:
             raise ValueError("an orbit takes mean_anomaly_deg or true_anomaly_deg, not both")
         if self.position_km is not None and not any(self.position_km[:2]):
-            raise ValueError("position_km lies on the Earth's axis or in its middle")
+            raise ValueError("position_km lies on the Earth's axis")
         if self.velocity_km_s is not None and self.position_km is None:
             raise ValueError("velocity_km_s goes with position_km")
         if self.a_km is not None and self.a_km * (1 - self.e) < 6378.0:
@@ -50,7 +52,7 @@ class Orbit(Group):
 
 
 class LensDeparture(Group):
-    """How the true optics depart from the calibration that is sent: true minus sent."""
+    """How the true optics differ from the calibration in the log: true minus log."""
 
     focal: float = Field(0.0, gt=-0.5, lt=0.5, description="Relative error of the focal length.")
     cx_px: float = 0.0
@@ -63,13 +65,15 @@ class LensDeparture(Group):
 
 
 class SceneCamera(Group):
-    """A sensor's optics, as the log tells them."""
+    """The optics of a sensor, as the log reports them."""
 
     width: int = Field(1024, ge=16, le=65536)
     height: int = Field(1024, ge=16, le=65536)
-    fov_deg: float | None = Field(None, gt=0, lt=150, description="Full field along the columns.")
-    focal_px: float | None = Field(None, gt=0, description="The same as a focal length.")
-    cx_px: float | None = Field(None, description="Principal point; none: the middle.")
+    fov_deg: float | None = Field(None, gt=0, lt=150, description="Full field of view along x.")
+    focal_px: float | None = Field(None, gt=0, description="The focal length instead.")
+    cx_px: float | None = Field(
+        None, description="Principal point. Default: the middle of the image."
+    )
     cy_px: float | None = None
     k1: float = 0.0
     k2: float = 0.0
@@ -86,29 +90,39 @@ class SceneCamera(Group):
 
 
 class Pointing(Group):
-    """How a sensor is turned."""
+    """The pointing of a sensor."""
 
     mode: Literal["track", "fixed", "spin", "random"] = "track"
-    orbit: Orbit | None = Field(None, description="track: what is followed.")
-    target: int | None = Field(None, ge=0, description="track: an object of the scene instead.")
-    up: Vector = Field(
-        (0.0, 0.0, 1.0), description="track, fixed, spin: inertial, up in the image."
+    orbit: Orbit | None = Field(None, description="track: the orbit to follow.")
+    target: int | None = Field(
+        None, ge=0, description="track: the object of the scene to follow instead."
     )
-    roll_deg: float = Field(0.0, description="track, fixed, spin: then turned about the boresight.")
-    ra_deg: float | None = Field(None, description="fixed, spin: the boresight (at the start).")
+    up: Vector = Field(
+        (0.0, 0.0, 1.0),
+        description="track, fixed, spin: inertial direction that is up in the image.",
+    )
+    roll_deg: float = Field(
+        0.0, description="track, fixed, spin: rotation about the boresight after that."
+    )
+    ra_deg: float | None = Field(None, description="fixed, spin: boresight at the start.")
     dec_deg: float | None = Field(None, ge=-90, le=90)
-    axis: Vector = Field((0.0, 0.0, 1.0), description="spin: inertial axis.")
-    rate_deg_s: float = Field(0.0, description="spin: about the axis.")
+    axis: Vector = Field((0.0, 0.0, 1.0), description="spin: inertial axis of rotation.")
+    rate_deg_s: float = Field(0.0, description="spin: rate about the axis.")
     hold_s: float | None = Field(
-        None, gt=0, description="random: time until the next jump; none: one frame."
+        None, gt=0, description="random: time until the next jump. Default: one frame."
     )
     clear_of_earth_deg: float | None = Field(
-        None, ge=0, le=60, description="random: least angle of the boresight above the limb."
+        None,
+        ge=0,
+        le=60,
+        description="random: least angle of the boresight above the Earth's limb.",
     )
     skip_hidden: bool = Field(
-        False, description="No exposure while the Earth stands in the boresight's way."
+        False, description="No exposures while the Earth covers the boresight."
     )
-    jitter_arcsec: float = Field(0.0, ge=0, description="1-sigma an axis, anew each frame.")
+    jitter_arcsec: float = Field(
+        0.0, ge=0, description="1-sigma per axis, independent in each frame."
+    )
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -121,85 +135,107 @@ class Pointing(Group):
         return self
 
 
-class Detection(Group):
-    """What the image processing makes of the light: noise, losses and false points."""
+class SceneDetection(Group):
+    """Errors of the image processing: noise, losses and false points."""
 
-    sigma_px: float = Field(0.15, gt=0, description="1-sigma an axis of a bright centroid.")
+    sigma_px: float = Field(0.15, gt=0, description="1-sigma per axis of a bright centroid.")
     faint_sigma_px: float = Field(
-        0.0, ge=0, description="Added in squares at the magnitude limit, less for brighter ones."
+        0.0,
+        ge=0,
+        description="Added in quadrature at the magnitude limit, less at brighter magnitudes.",
     )
     send_sigma: bool = True
     send_flux: bool = True
     flux_error: float = Field(0.05, ge=0, lt=1, description="Relative, 1-sigma.")
-    false_points: float = Field(0.0, ge=0, description="Mean a frame (Poisson).")
-    hot_pixels: int = Field(0, ge=0, description="Places that show a point in every frame.")
+    false_points: float = Field(0.0, ge=0, description="Mean number per frame (Poisson).")
+    hot_pixels: int = Field(0, ge=0, description="Pixels that show a point in every frame.")
     star_drop: float = Field(0.0, ge=0, le=1, description="Share of stars missed.")
     target_drop: float = Field(0.0, ge=0, le=1, description="Share of objects missed.")
 
 
-class States(Group):
-    """The sensor's states in the log, and how wrong they are."""
+class SceneStates(Group):
+    """The states of the sensor in the log, and their errors."""
 
     rate_hz: float = Field(1.0, gt=0)
-    margin_s: float = Field(2.0, ge=0, description="Before the first and after the last frame.")
-    send_velocity: bool = True
-    position_noise_km: float = Field(0.01, ge=0, description="1-sigma an axis, each state.")
-    position_bias_km: float = Field(0.02, ge=0, description="1-sigma an axis, once a sensor.")
-    prior_noise_arcsec: float | None = Field(
-        None, ge=0, description="1-sigma an axis of the attitude sent; none: no attitude is sent."
+    margin_s: float = Field(
+        2.0, ge=0, description="Time covered by states before the first and after the last frame."
     )
-    prior_bias_arcsec: float = Field(0.0, ge=0, description="1-sigma an axis, once a sensor.")
+    send_velocity: bool = True
+    position_noise_km: float = Field(
+        0.01, ge=0, description="1-sigma per axis, independent in each state."
+    )
+    position_bias_km: float = Field(
+        0.02, ge=0, description="1-sigma per axis, constant for each sensor."
+    )
+    prior_noise_arcsec: float | None = Field(
+        None,
+        ge=0,
+        description="1-sigma per axis of the attitude. Default: the log has no attitudes.",
+    )
+    prior_bias_arcsec: float = Field(
+        0.0, ge=0, description="1-sigma per axis, constant for each sensor."
+    )
 
 
 class SceneSensor(Group):
-    """A sensor, or several that differ in what chance decides."""
+    """One sensor, or several that differ only in their random values."""
 
-    id: str = Field(pattern=_NAME, description="With a count above 1, a number is added.")
+    id: str = Field(pattern=_NAME, description="With a count above 1, a number is appended.")
     count: int = Field(1, ge=1, le=10000)
     orbit: Orbit
     in_view: bool = Field(
-        False, description="A random orbit is drawn until what is tracked is seen all the time."
+        False, description="Draw the random orbit again until the tracked object is always visible."
     )
     camera: SceneCamera
     pointing: Pointing
-    detection: Detection = Detection()
-    states: States = States()
-    magnitude_limit: float = Field(7.5, description="Faintest star seen, V.")
+    detection: SceneDetection = SceneDetection()
+    states: SceneStates = SceneStates()
+    magnitude_limit: float = Field(
+        7.5, description="V magnitude of the faintest star that is detected."
+    )
     rate_hz: float = Field(1.0, gt=0, le=1000)
     phase: float | None = Field(
-        None, ge=0, lt=1, description="First frame, in frame intervals; none: by chance."
+        None,
+        ge=0,
+        lt=1,
+        description="Time of the first frame, in frame intervals. Default: random.",
     )
     exposure_s: float = Field(0.1, gt=0)
-    time_jitter_s: float = Field(0.0, ge=0, description="1-sigma of a frame's time.")
+    time_jitter_s: float = Field(0.0, ge=0, description="1-sigma of the time of a frame.")
     clock_offset_s: float = Field(
-        0.0, gt=-60, lt=60, description="Told minus true time of its frames; states have the true."
+        0.0,
+        gt=-60,
+        lt=60,
+        description="Reported minus true time of the frames. States have the true time.",
     )
     frame_drop: float = Field(0.0, ge=0, lt=1, description="Share of frames missing.")
     outages_s: list[tuple[float, float]] = Field(
-        [], description="From and to, since the start: no frames."
+        [], description="Start and end of intervals without frames, since the start."
     )
 
 
 class SceneTargets(Group):
-    """An object, or several about the same orbit."""
+    """One object, or several near the same orbit."""
 
     count: int = Field(1, ge=0, le=1000000)
     orbit: Orbit
     spread_km: float = Field(
-        0.0, ge=0, description="1-sigma an axis about the orbit's place at the start."
+        0.0, ge=0, description="1-sigma per axis about the position of the orbit at the start."
     )
-    magnitude: float | tuple[float, float] = Field(8.0, description="Or from and to, by chance.")
+    magnitude: float | tuple[float, float] = Field(
+        8.0, description="A value, or the limits of a random one."
+    )
 
 
 class Scene(Group):
-    """What is simulated."""
+    """A scene to simulate."""
 
     name: str = Field(pattern=_NAME)
     start: AwareDatetime = datetime(2019, 4, 1, 4, tzinfo=UTC)
     duration_s: float = Field(60.0, gt=0, le=31 * 86400)
     seed: int = Field(1, ge=0)
     sensors: list[SceneSensor] = Field(min_length=1)
-    targets: list[SceneTargets] = Field([], description="Objects, or groups of them.")
+    targets: list[SceneTargets] = Field([], description="Objects or groups of objects.")
     catalogue: str = Field(
         "hipparcos",
         min_length=1,
@@ -223,12 +259,12 @@ class Scene(Group):
 def parse_scene(text: str, where: str) -> Scene:
     """Return the scene of a TOML text; `where` names it in messages.
 
-    A table ``[sensor_defaults]`` is merged under every sensor.
+    A table ``[sensor_defaults]`` gives the defaults of every sensor.
 
     Raises
     ------
     SceneError
-        Names the field, what came and what was expected.
+        Names the field, the value given and the value expected.
     """
     try:
         return validate_scene(tomllib.loads(text), where)

@@ -1,7 +1,6 @@
-"""The settings: one frozen group a stage, validated, each field with its unit in its name.
+"""The settings of a run: one frozen, validated group per subject.
 
-They come from a TOML file and from flow parameters, and are passed in, never read from
-a global.
+They come from a TOML file or from flow parameters. They are passed in, never read from a global.
 """
 
 import hashlib
@@ -14,21 +13,28 @@ from epipole.schemas.errors import SettingsError
 
 
 class Group(BaseModel):
-    """A group of settings: frozen, and an unknown name is an error."""
+    """A frozen group of settings. An unknown name is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class SensorSettings(Group):
-    """What to assume of a sensor where its log does not say."""
+    """Values for what a log does not say about its sensors."""
 
-    attitude_sigma_arcsec: float = Field(60.0, gt=0, description="Prior attitude without sigma.")
-    position_sigma_km: float = Field(0.05, gt=0, description="Position without sigma.")
+    attitude_sigma_arcsec: float = Field(
+        60.0, gt=0, description="1-sigma of a prior attitude that has no sigma in the log."
+    )
+    position_sigma_km: float = Field(
+        0.05, gt=0, description="1-sigma of a position that has no sigma in the log."
+    )
     centroid_sigma_px: float | None = Field(
-        None, gt=0, description="Centroids without sigma; none: estimated from the stars."
+        None,
+        gt=0,
+        description="1-sigma of centroids that have no sigma in the log. "
+        "Default: estimated from the stars.",
     )
     state_gap_s: float = Field(
-        30.0, gt=0, description="A frame further than this from any state has no position."
+        30.0, gt=0, description="A frame farther than this from the nearest state gets no position."
     )
 
 
@@ -37,7 +43,9 @@ class IdentificationSettings(Group):
 
     method: Literal["likelihood", "four_base_stars", "match_group", "radial_cyclic"] = Field(
         "likelihood",
-        description="How stars are identified; the others are published methods, for comparison.",
+        description="How stars are identified. The methods other than likelihood are published "
+        "ones, "
+        "for comparison.",
     )
     catalogue: str = Field(
         "hipparcos",
@@ -45,143 +53,181 @@ class IdentificationSettings(Group):
         description='Stars: "hipparcos", or the path of a file of `epipole catalog build`.',
     )
     magnitude_limit: float | None = Field(
-        None, description="Faintest star looked for; none: from the number of centroids."
+        None,
+        description="Faintest star to search for. Default: from the number of centroids.",
     )
     merge_px: float = Field(
-        2.0, ge=0, description="Stars closer than this are one spot, with the brighter one's id."
+        2.0,
+        ge=0,
+        description="Stars closer than this make one spot. It gets the id of the brighter star.",
     )
-    gate_sigma: float = Field(3.7, gt=0, description="A star lies within this of its place.")
+    gate_sigma: float = Field(
+        3.7, gt=0, description="Farthest centroid from the predicted place of its star."
+    )
     false_alarm: float = Field(
-        1e-5, gt=0, lt=1, description="Accepted probability that a reported attitude is by chance."
+        1e-5,
+        gt=0,
+        lt=1,
+        description="Accepted probability that a reported attitude is a chance match.",
     )
     time_limit_s: float = Field(0.5, gt=0, description="Longest search for one frame.")
     calibrate: Literal["use", "report", "off"] = Field(
         "use",
-        description="Optics from the night's stars: use them where they depart from the log's "
-        "calibration, only report them, or neither.",
+        description="The optics are also measured from the stars of the night. 'use' takes them "
+        "where "
+        "they differ from the log's calibration, 'report' only publishes them, 'off' does neither.",
     )
 
 
 class TrackletSettings(Group):
-    """Detections of one sensor, frame after frame."""
+    """How detections of one sensor are joined to tracklets."""
 
-    gate_sigma: float = Field(4.0, gt=0, description="A detection continues a track within this.")
-    max_rate_deg_s: float = Field(2.0, gt=0, description="Fastest apparent motion looked for.")
-    max_missed: int = Field(3, ge=0, description="Frames an object may be missed in a row.")
-    min_detections: int = Field(3, ge=2, description="Shortest run that is an object.")
+    gate_sigma: float = Field(
+        4.0, gt=0, description="Farthest detection from the prediction of its track."
+    )
+    max_rate_deg_s: float = Field(2.0, gt=0, description="Fastest apparent motion to search for.")
+    max_missed: int = Field(3, ge=0, description="Most misses in a row within a tracklet.")
+    min_detections: int = Field(3, ge=2, description="Fewest detections of a tracklet.")
     false_alarm: float = Field(
-        1e-4, gt=0, lt=1, description="Accepted runs made of strays, a frame."
+        1e-4, gt=0, lt=1, description="Accepted number of false tracklets per frame."
     )
     link_method: Literal["likelihood_ratio", "prediction", "none"] = Field(
-        "likelihood_ratio", description="How broken tracks are joined."
+        "likelihood_ratio", description="How tracklets of one object are joined after a gap."
     )
-    link_gap_s: float = Field(90.0, gt=0, description="Longest break that is joined.")
+    link_gap_s: float = Field(
+        90.0, gt=0, description="Longest gap across which tracklets are joined."
+    )
     link_kept: float = Field(
-        0.9999, gt=0, lt=1, description="Share of true joins that the chi-square test lets pass."
+        0.9999, gt=0, lt=1, description="Share of true links that the chi-square test accepts."
     )
     link_noise_px: float = Field(
         1e-3,
         gt=0,
-        description="Process noise of the method 'prediction': px^2/s^3 across the gap.",
+        description="Process noise of the method 'prediction', in px^2/s^3.",
     )
 
 
 class AlignmentSettings(Group):
-    """Common instants of sensors that expose at different times."""
+    """Common epochs of sensors that expose at different times."""
 
     interval_s: float | None = Field(
-        None, gt=0, description="Between epochs; none: the slowest sensor's frame interval."
+        None,
+        gt=0,
+        description="Time between epochs. Default: the frame interval of the slowest sensor.",
     )
     window_s: float = Field(
-        6.0, gt=0, description="Half-width of the local motion fitted around an epoch."
+        6.0,
+        gt=0,
+        description="Half-width of the time window in which the motion around an epoch is fitted.",
     )
     max_gap_s: float | None = Field(
         None,
         gt=0,
-        description="Farthest frame that serves an epoch; none: half its frame interval, or half "
-        "the interval between epochs where that is longer.",
+        description="Longest time between an epoch and the frame used for it. Default: half the "
+        "frame interval or half the interval between epochs, whichever is longer.",
     )
     correct_clocks: bool = Field(
         False,
-        description="Put frames at their true times where a sensor's clock is surely off; or else "
-        "the sensor is left out.",
+        description="What to do with a sensor whose clock is certainly off: true corrects the "
+        "times "
+        "of its frames, false leaves the sensor out.",
     )
 
 
 class AltitudeShell(Group):
-    """Heights above the equator's radius at which a share of all objects is."""
+    """Altitudes (above the equatorial radius) that hold a share of all objects."""
 
-    lowest_km: float = Field(ge=0, description="Lower edge.")
-    highest_km: float = Field(gt=0, description="Upper edge.")
-    share: float = Field(gt=0, lt=1, description="Share of all objects that are in between.")
+    lowest_km: float = Field(ge=0, description="Lower altitude.")
+    highest_km: float = Field(gt=0, description="Upper altitude.")
+    share: float = Field(gt=0, lt=1, description="Share of all objects between them.")
 
 
 LOW_ORBITS = AltitudeShell(lowest_km=200, highest_km=2000, share=0.35)
 NAVIGATION_ORBITS = AltitudeShell(lowest_km=19000, highest_km=24500, share=0.1)
-# The protected region of the geostationary ring (IADC: 200 km either side), and its core.
+# The protected region around the geostationary altitude (IADC: 200 km on both sides), and its core.
 GEOSTATIONARY_REGION = AltitudeShell(lowest_km=35586, highest_km=35986, share=0.2)
 GEOSTATIONARY_RING = AltitudeShell(lowest_km=35746, highest_km=35826, share=0.2)
 
 
 class AssociationSettings(Group):
-    """Which views of different sensors are one object."""
+    """Which tracklets of different sensors show one object."""
 
     method: Literal["likelihood", "epipolar"] = Field(
         "likelihood",
-        description="How views are associated; the other is a published method, for comparison.",
+        description="How tracklets are associated. 'epipolar' is a published method, for "
+        "comparison.",
     )
     threshold_px: float = Field(
         8.0,
         gt=0,
-        description="Method 'epipolar': farthest from a line; published best are 8 to 12 px.",
+        description="Farthest view from the epipolar line, of the method 'epipolar'. Published "
+        "values are 8 to 12 px.",
     )
-    gate_sigma: float = Field(4.5, gt=0, description="Views of one object agree within this.")
-    min_altitude_km: float = Field(100.0, ge=0, description="Lowest object looked for.")
-    max_range_km: float = Field(1.0e5, gt=0, description="Farthest object looked for.")
-    span_s: float = Field(30.0, gt=0, description="Evidence is summed over spans of this length.")
+    gate_sigma: float = Field(
+        4.5, gt=0, description="Largest disagreement between views of one object."
+    )
+    min_altitude_km: float = Field(
+        100.0, ge=0, description="Altitude of the lowest object to search for."
+    )
+    max_range_km: float = Field(
+        1.0e5, gt=0, description="Range of the farthest object to search for."
+    )
+    span_s: float = Field(
+        30.0, gt=0, description="Length of the time spans over which evidence is first summed."
+    )
     longest_span_s: float = Field(
         600.0,
         ge=0,
-        description="What is not sure then is judged again over 2 and over 10 minutes, no longer "
-        "than this; 0: never.",
+        description="Undecided tracklets are judged again over spans of 2 and then 10 minutes, "
+        "up to "
+        "this length. 0: never.",
     )
     shells: tuple[AltitudeShell, ...] = Field(
         (LOW_ORBITS, NAVIGATION_ORBITS, GEOSTATIONARY_REGION, GEOSTATIONARY_RING),
-        description="A weak prior on altitude: where objects are more likely; empty: off.",
+        description="A weak prior: the altitudes at which objects are more likely. Empty: no "
+        "prior.",
     )
     min_log_odds: float = Field(
-        0.5, description="An object is reported if it is this much likelier than chance (ln)."
+        0.5, description="Least log-odds (ln) of a reported object against chance."
     )
     ambiguity_log_odds: float = Field(
-        2.0, ge=0, description="Where a rival comes closer than this (ln), neither is reported."
+        2.0,
+        ge=0,
+        description="Least difference in log-odds (ln) between two rival hypotheses. Below it, "
+        "neither is "
+        "reported.",
     )
 
 
 class PositionSettings(Group):
-    """Least-squares positions."""
+    """Positions of objects at epochs, by least squares."""
 
-    reject_sigma: float = Field(4.0, gt=0, description="A view further off than this is rejected.")
+    reject_sigma: float = Field(4.0, gt=0, description="Largest residual of a view that is used.")
 
 
 class StateSettings(Group):
-    """Positions and velocities over arcs."""
+    """States (position and velocity) of objects over arcs, and objects that are seen again."""
 
     arc_s: float = Field(
-        600.0, gt=0, description="Longest arc of one state; arcs end at half hours too."
+        600.0, gt=0, description="Longest arc of one state. Arcs also end at every half hour."
     )
     min_epochs: int = Field(
-        3, ge=2, description="Fewest epochs that share no detection: two alone cannot be checked."
+        3,
+        ge=2,
+        description="Fewest independent epochs of an arc. A state from only two cannot be checked.",
     )
     link_gap_s: float = Field(
         7200.0,
         ge=0,
-        description="Longest time unseen after which an object is known again by its motion: "
-        "more than half a low orbit, for which its sensors may look elsewhere; 0: never.",
+        description="Longest time without detections after which an object is recognised by its "
+        "motion. The default is more than half a low orbit. 0: never.",
     )
     link_log_odds: float = Field(
         4.6,
         gt=0,
-        description="It must be this much likelier (ln) the same than another one: 1 in 100 errs.",
+        description="Least log-odds (ln) that it is the same object. At the default, 1 in 100 "
+        "links "
+        "is wrong.",
     )
 
 
@@ -197,7 +243,7 @@ class Settings(Group):
     states: StateSettings = StateSettings()
 
     def key(self) -> str:
-        """Return a digest that is the same for the same settings."""
+        """Return a digest of the settings."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
 
@@ -207,7 +253,7 @@ def parse_settings(text: str, where: str) -> Settings:
     Raises
     ------
     SettingsError
-        Names the setting, what came and what was expected.
+        Names the setting, the value given and the value expected.
     """
     try:
         return validate_settings(tomllib.loads(text), where)

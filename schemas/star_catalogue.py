@@ -1,4 +1,4 @@
-"""A star catalogue as a table: what `epipole catalog build` writes and a run reads."""
+"""The table of a star catalogue. `epipole catalog build` writes it and a run reads it."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ _F64 = pa.float64()
 
 STAR_CATALOGUE = schema(
     "star_catalogue",
-    "One row a star at the catalogue's epoch.",
+    "One row per star, at the catalogue's epoch.",
     [
         column("star_id", pa.int64(), doc="Number in the catalogue."),
         column("ra_deg", _F64, unit="deg", frame="ICRS", doc="Right ascension at the epoch."),
@@ -18,24 +18,24 @@ STAR_CATALOGUE = schema(
         column("pm_ra_mas_yr", _F64, unit="mas/yr", doc="Proper motion times cos(dec)."),
         column("pm_dec_mas_yr", _F64, unit="mas/yr", doc="Proper motion."),
         column("parallax_mas", _F64, unit="mas", doc="Parallax; 0 where unknown."),
-        column("sigma_mas", _F64, unit="mas", doc="1-sigma an axis of the place at the epoch."),
-        column("pm_sigma_mas_yr", _F64, unit="mas/yr", doc="1-sigma an axis of the motion."),
+        column("sigma_mas", _F64, unit="mas", doc="1-sigma per axis of the place at the epoch."),
+        column("pm_sigma_mas_yr", _F64, unit="mas/yr", doc="1-sigma per axis of the motion."),
         column("magnitude", _F64, unit="mag", doc="V magnitude."),
         column("variable", pa.bool_(), doc="Flagged as variable by the catalogue."),
     ],
 )
 
-# 1-sigma an axis of a motion that is not known, taken as none [mas/yr]: of Hipparcos' stars of V
-# 7 to 8, nearly all there are, 84 % move by less than 68 mas a year.
+# 1-sigma per axis of an unknown motion, which is taken as zero [mas/yr]. Of Hipparcos' stars of V 7
+# to 8 (nearly all stars of that magnitude), 84 % move by less than 68 mas per year.
 UNKNOWN_MOTION_MAS_YR = 35.0
 
 
 class CatalogueLabel(NamedTuple):
-    """What a catalogue is.
+    """Name, epoch and source of a catalogue.
 
-    name : whose numbers the star ids are, such as "hipparcos"
-    epoch : Julian year of all its places
-    source : what it was made of
+    name : the catalogue that the star ids belong to, such as "hipparcos"
+    epoch : Julian year of all positions
+    source : the data that it was made from
     """
 
     name: str
@@ -55,7 +55,7 @@ def label_of(stars: pa.Schema) -> CatalogueLabel:
     Raises
     ------
     ValueError
-        Where there is none.
+        Where it has no label.
     """
     words = stars.metadata or {}
     try:
@@ -63,11 +63,11 @@ def label_of(stars: pa.Schema) -> CatalogueLabel:
             words[b"catalogue"].decode(), float(words[b"epoch"]), words[b"source"].decode()
         )
     except KeyError as error:
-        raise ValueError(f"a catalogue without {error.args[0].decode()} in its metadata") from None
+        raise ValueError(f"no {error.args[0].decode()} in the metadata") from None
 
 
 def with_catalogue(stars: pa.Table, catalogue: pa.Schema) -> pa.Table:
-    """Return a table of identified stars that says whose numbers its star ids are."""
+    """Return a table of identified stars with the name and source of their catalogue."""
     label = label_of(catalogue)
     words = {"catalogue": label.name, "catalogue_source": label.source}
     return _with_words(stars, words)

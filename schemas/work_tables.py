@@ -1,4 +1,4 @@
-"""Tables that pass from stage to stage but are not published."""
+"""Tables that pass from stage to stage and are not published."""
 
 import pyarrow as pa
 
@@ -24,13 +24,13 @@ from epipole.schemas.tables import (
 
 
 def _floats() -> pa.DataType:
-    # As the messages have them: twice the bits would be twice the memory of a night.
+    # float32 as in the messages: float64 would double the memory of a night.
     return pa.list_(pa.field("element", pa.float32(), nullable=False))
 
 
 EXPOSURES = schema(
     "exposures",
-    "One row a frame as the log has it; arrays of one row have equal length.",
+    "One row per frame of the log. The arrays of a row have equal length.",
     [
         *FRAME_KEY,
         column("exposure_s", F64, unit="s", doc="Exposure time."),
@@ -45,13 +45,19 @@ EXPOSURES = schema(
 
 SENSOR_STATES = schema(
     "sensor_states",
-    "One row a state as the log has it, turned to GCRF.",
+    "One row per state of the log, converted to GCRF.",
     [
         SENSOR_ID,
         time_column(doc="Time of the state, UTC."),
         *axes("{}_km", unit="km", frame="GCRF", doc="Sensor position"),
-        *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity; null: not sent"),
-        column("position_sigma_km", F64, unit="km", doc="1-sigma an axis; 0 where unknown."),
+        *axes(
+            "v{}_km_s",
+            unit="km/s",
+            frame="GCRF",
+            null=True,
+            doc="Velocity; null where the log has none",
+        ),
+        column("position_sigma_km", F64, unit="km", doc="1-sigma per axis; 0 where unknown."),
         *[
             column(f"q{a}", F64, null=True, frame="sensor from ICRS", doc="Prior attitude.")
             for a in "xyzw"
@@ -62,10 +68,10 @@ SENSOR_STATES = schema(
 
 CAMERAS = schema(
     "cameras",
-    "One row a calibration as the log has it.",
+    "One row per calibration of the log.",
     [
         SENSOR_ID,
-        time_column(doc="From when it holds, UTC; before the first, the first holds."),
+        time_column(doc="Start of its validity, UTC. The first also holds before."),
         column("width", I64, unit="px", doc="Image width."),
         column("height", I64, unit="px", doc="Image height."),
         *[
@@ -77,14 +83,22 @@ CAMERAS = schema(
 
 PLACES = schema(
     "places",
-    "One row a frame, row by row with exposures: the state interpolated to the frame's time.",
+    "One row per frame, in the order of exposures: the state interpolated to the frame's time.",
     [
         *FRAME_KEY,
-        *axes("{}_km", unit="km", frame="GCRF", null=True, doc="Position; null: no state near"),
+        *axes(
+            "{}_km", unit="km", frame="GCRF", null=True, doc="Position; null where no state is near"
+        ),
         *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity"),
-        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma an axis."),
+        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma per axis."),
         *[
-            column(f"q{a}", F64, null=True, frame="sensor from ICRS", doc="Prior; null: none")
+            column(
+                f"q{a}",
+                F64,
+                null=True,
+                frame="sensor from ICRS",
+                doc="Prior attitude; null where there is none",
+            )
             for a in "xyzw"
         ],
         column("attitude_sigma_arcsec", F64, unit="arcsec", null=True, doc="1-sigma of the prior."),
@@ -93,7 +107,7 @@ PLACES = schema(
 
 SOLUTIONS = schema(
     "solutions",
-    "A row of `frames` with what later stages need beside it.",
+    "One row per frame: the columns of `frames`, and those that later stages need.",
     [
         *FRAMES,
         *covariance(
@@ -103,77 +117,75 @@ SOLUTIONS = schema(
             null=True,
             doc="Covariance of the small rotation from the true to the reported sensor axes.",
         ),
-        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma an axis."),
-        column("camera", I64, doc="Row of `cameras` that holds for the frame."),
+        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma per axis."),
+        column("camera", I64, doc="Row of `cameras` that is valid for the frame."),
     ],
 )
 
 VIEWS = schema(
     "views",
-    "One row a tracklet at an epoch, as its sensor saw it.",
+    "One row per tracklet and epoch: the object's direction from the sensor.",
     [
         EPOCH,
         SENSOR_ID,
         column("frame_number", I64, doc="The nearest frame."),
-        id_column("tracklet_id", doc="Whose local motion it is."),
-        column(
-            "centroid", pa.int32(), null=True, doc="Centroid in that frame; null: missed in it."
-        ),
+        id_column("tracklet_id", doc="Tracklet whose motion gives the direction."),
+        column("centroid", pa.int32(), null=True, doc="Centroid in that frame; null: a miss."),
         *axes("{}_px", unit="px", frame="image", doc="Place at the epoch", names="xy"),
         *axes("u{}", unit="", frame="ICRS", doc="Direction, aberration removed"),
         *covariance(
             "cov_noise_{}_rad2",
             unit="rad^2",
             frame="tangent plane of the direction",
-            doc="Error that is new in every frame.",
+            doc="Error that is independent in each frame.",
             names=TANGENT_AXES,
         ),
         *covariance(
             "cov_bias_{}_rad2",
             unit="rad^2",
             frame="tangent plane of the direction",
-            doc="Error that all frames of the sensor share.",
+            doc="Error that is common to all frames of the sensor.",
             names=TANGENT_AXES,
         ),
         *axes("{}_km", unit="km", frame="GCRF", doc="Sensor position at the epoch"),
-        column("position_sigma_km", F64, unit="km", doc="1-sigma an axis."),
+        column("position_sigma_km", F64, unit="km", doc="1-sigma per axis."),
         column("pixel_rad", F64, unit="rad", doc="Angle a pixel spans."),
     ],
 )
 
 FRAME_INDEX = schema(
     "frame_index",
-    "One row a frame of one sensor, in time order, each once: where it lies among what was read.",
+    "One row per frame of one sensor, each once, in time order: where its exposure was read to.",
     [
         time_column(),
-        column("log", pa.int32(), doc="Log of the run, in the order of names."),
-        column("piece", pa.int32(), doc="Piece of the log."),
-        column("row", I64, doc="Row in the piece's exposures."),
+        column("log", pa.int32(), doc="Index of the log in the run, in the order of names."),
+        column("piece", pa.int32(), doc="Index of the piece of the log."),
+        column("row", I64, doc="Row in the exposures of the piece."),
     ],
 )
 
 TRACKLET_NAMES = schema(
     "tracklet_names",
-    "One row a tracklet of one sensor and span: what it is called in the night.",
+    "One row per tracklet of one sensor and span: its ids in the night.",
     [
-        id_column("span_name", doc="In the span."),
-        id_column("tracklet_id", doc="In the night."),
-        id_column("track_id", doc="Of the fragments it was joined with."),
+        id_column("span_name", doc="Id in the span."),
+        id_column("tracklet_id", doc="Id in the night."),
+        id_column("track_id", doc="Track in the night that it was joined to."),
     ],
 )
 
 OBJECT_TRACKS = schema(
     "object_tracks",
-    "One row a track that an object of a span was seen by, in the order it was last seen.",
+    "One row per object of a span and track of it, in the order of the last detection.",
     [
-        id_column("span_name", doc="The object in the span."),
+        id_column("span_name", doc="Id of the object in the span."),
         id_column("track_id", doc="A track of one sensor."),
     ],
 )
 
 TRUE_FRAMES = schema(
     "true_frames",
-    "Simulation truth, one row a frame.",
+    "Simulation truth, one row per frame.",
     [
         id_column("sensor_id", doc="Star sensor."),
         column("frame_number", I64, doc="Exposure of the sensor."),
@@ -186,13 +198,13 @@ TRUE_FRAMES = schema(
 
 TRUE_POINTS = schema(
     "true_points",
-    "Simulation truth, one row a centroid.",
+    "Simulation truth, one row per centroid.",
     [
         id_column("sensor_id", doc="Star sensor."),
         column("frame_number", I64, doc="Exposure of the sensor."),
         column("centroid", pa.int32(), doc="Index in the arrays of the frame's message."),
-        column("kind", pa.int8(), doc="0 star, 1 object, 2 false."),
-        column("source", I64, doc="Hipparcos number, object index, or -1."),
+        column("kind", pa.int8(), doc="0 star, 1 object, 2 false point."),
+        column("source", I64, doc="Star number, object index, or -1."),
     ],
 )
 

@@ -1,4 +1,4 @@
-"""What tests share: an embedded Prefect of their own, one simulated night, an S3 server."""
+"""Fixtures of all tests: an embedded Prefect, one simulated night, an S3 server."""
 
 import contextlib
 import os
@@ -12,14 +12,13 @@ from pathlib import Path
 
 import pytest
 
-import epipole.tasks  # noqa: F401  kernels are kept where they always are, before it is said otherwise
+import epipole.tasks  # noqa: F401  before EPIPOLE_CACHE is set, so that kernels stay cached
 
-sys.path.append(str(Path(__file__).parent))  # what tests share: scenes.random_stars and others
+sys.path.append(str(Path(__file__).parent))  # for the helpers in tests/scenes
 
-START_S = 60  # that the S3 server may take to start
+START_S = 60  # longest start of the S3 server
 
-# Before anything imports prefect: a developer's own Prefect neither sees these runs nor
-# changes them.
+# Before anything imports prefect: these runs must not use the Prefect of the developer.
 _PREFECT_HOME = tempfile.TemporaryDirectory(prefix="epipole-prefect-")
 os.environ["PREFECT_HOME"] = _PREFECT_HOME.name
 _CACHE = tempfile.TemporaryDirectory(prefix="epipole-cache-")
@@ -40,7 +39,7 @@ def prefect():
 
 @pytest.fixture(scope="session")
 def night_log(tmp_path_factory) -> Path:
-    """Return a log of four sensors and nine objects over a minute; its truth is beside it."""
+    """Return a log of four sensors and nine objects over a minute, with its truth beside it."""
     from epipole.flows.simulate import simulate
 
     log = tmp_path_factory.mktemp("night") / "night.mcap"
@@ -85,7 +84,7 @@ def s3_server():
 
 @pytest.fixture
 def s3(s3_server, monkeypatch):
-    """Point s3:// at the server, as a user would: by the environment."""
+    """Direct s3:// to the server, as a user would, by environment variables."""
     import s3fs
 
     for name, value in {

@@ -1,22 +1,22 @@
-"""What is in a log, in words: sensors, times, counts, and what cannot be used."""
+"""What is in a log: sensors, times, counts, and what cannot be used."""
 
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
-from epipole.flows.command_line.sensors import of_sensor, sensor_ids
 from epipole.io.logs.reader import read_log
 from epipole.schemas.bridge import array, flatten
 
 
 def describe(log: str) -> dict[str, Any]:
-    """Return what a log holds, sensor by sensor.
+    """Return what a log holds, by sensor.
 
     Raises
     ------
     LogError
-        Where it is no log, or has no frames.
+        Where the file is not a log, or has no frames.
     """
     part = read_log(log)
     return {
@@ -37,8 +37,18 @@ def describe(log: str) -> dict[str, Any]:
     }
 
 
+def sensor_ids(rows: pa.Table) -> list[str]:
+    """Return the sensors of a table, sorted."""
+    return sorted(pc.unique(rows["sensor_id"]).to_pylist())
+
+
+def of_sensor(rows: pa.Table, sensor_id: str) -> pa.Table:
+    """Return the rows of one sensor, in their order."""
+    return rows.filter(pc.field("sensor_id") == sensor_id)
+
+
 def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table) -> dict[str, Any]:
-    frames, own_states = of_sensor(exposures, name), of_sensor(states, name)
+    frames, states = of_sensor(exposures, name), of_sensor(states, name)
     time_ns = np.sort(array(frames, "time"))
     interval_ns = float(np.median(np.diff(time_ns))) if len(time_ns) > 1 else None
     camera = of_sensor(cameras, name).drop_columns("time").to_pylist()
@@ -50,17 +60,17 @@ def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table)
         "last": _iso(time_ns[-1]),
         "rate_hz": 1e9 / interval_ns if interval_ns else None,
         "centroids_per_frame": len(centroids) / frames.num_rows,
-        "states": own_states.num_rows,
-        "state_frames": sorted(set(own_states["frame"].to_pylist())),
-        "states_with_attitude": own_states.num_rows - own_states["qw"].null_count,
-        "states_with_velocity": own_states.num_rows - own_states["vx_km_s"].null_count,
+        "states": states.num_rows,
+        "state_frames": sorted(set(states["frame"].to_pylist())),
+        "states_with_attitude": states.num_rows - states["qw"].null_count,
+        "states_with_velocity": states.num_rows - states["vx_km_s"].null_count,
         "image_px": [camera[0]["width"], camera[0]["height"]] if camera else None,
         "field_deg": _field_deg(camera[0]) if camera else None,
     }
 
 
 def _field_deg(camera: dict[str, Any]) -> list[float]:
-    """Return the field's width and height, distortion left aside."""
+    """Return the width and height of the field of view, without distortion."""
     return [
         float(np.degrees(2 * np.arctan(camera[size] / 2 / camera[focal])))
         for size, focal in (("width", "fx_px"), ("height", "fy_px"))
@@ -72,14 +82,14 @@ def _iso(time_ns: int) -> str:
 
 
 def lines(described: dict[str, Any]) -> list[str]:
-    """Return what `describe` found as people read it."""
+    """Return what `describe` returned as lines for people."""
     out = [f"{described['log']}: {described['size']:,} bytes"]
     for sensor in described["sensors"]:
         rate = f" at {sensor['rate_hz']:.3g} Hz" if sensor["rate_hz"] else ""
         out += [
             f"  {sensor['sensor_id']}",
             f"    frames       {sensor['frames']:,}{rate}, {sensor['first']} to {sensor['last']}",
-            f"    centroids    {sensor['centroids_per_frame']:.1f} a frame",
+            f"    centroids    {sensor['centroids_per_frame']:.1f} per frame",
             f"    states       {_states(sensor)}",
             f"    calibration  {_calibration(sensor)}",
         ]
@@ -91,7 +101,7 @@ def lines(described: dict[str, Any]) -> list[str]:
 
 def _states(sensor: dict[str, Any]) -> str:
     if not sensor["states"]:
-        return "none: its frames give no positions"
+        return "none; the frames give no positions"
     n = sensor["states"]
     return (
         f"{n:,} in {', '.join(sensor['state_frames'])}, "
@@ -106,6 +116,6 @@ def _share(count: int, total: int) -> str:
 
 def _calibration(sensor: dict[str, Any]) -> str:
     if sensor["image_px"] is None:
-        return "none: a run leaves this sensor out"
+        return "none; a run leaves this sensor out"
     width, height = sensor["image_px"]
     return f"{width} x {height} px, {sensor['field_deg'][0]:.1f} x {sensor['field_deg'][1]:.1f} deg"

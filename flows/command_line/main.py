@@ -17,13 +17,14 @@ import typer
 import typer.core
 
 from epipole.schemas.errors import EpipoleError
+from epipole.schemas.runner import Runner
 
 
 class _Commands(typer.core.TyperGroup):
-    """Commands that end in one line where the user has to mend something."""
+    """Commands that end in one line where the user can put the error right."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; what is raised besides is a fault of the program, and shown as one."""
+        """Run the command. An error that is not the user's shows its traceback."""
         try:
             return super().invoke(ctx)
         except EpipoleError as error:
@@ -72,13 +73,13 @@ def _options(
 
 
 Logs = Annotated[
-    list[str], typer.Argument(metavar="LOG...", help="MCAP files, folders, globs or URLs.")
+    list[str], typer.Argument(metavar="LOG", help="MCAP files, folders, glob patterns or URLs.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
 
 
 class Encoding(StrEnum):
-    """How messages of a log are written."""
+    """How the messages of a log are encoded."""
 
     protobuf = "protobuf"
     json = "json"
@@ -86,18 +87,11 @@ class Encoding(StrEnum):
 
 
 class Compression(StrEnum):
-    """How chunks of a log are written."""
+    """How the chunks of a log are compressed."""
 
     zstd = "zstd"
     lz4 = "lz4"
     none = "none"
-
-
-class Runner(StrEnum):
-    """Where the tasks of a run are worked on."""
-
-    threads = "threads"
-    dask = "dask"
 
 
 @app.command()
@@ -105,38 +99,50 @@ def run(
     logs: Logs,
     out: Annotated[
         str,
-        typer.Option(metavar="DATASET", help="Folder or s3:// URL to publish to; made if missing."),
+        typer.Option(
+            metavar="DATASET", help="Folder or s3:// URL to publish to. Created if missing."
+        ),
     ],
     settings: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="TOML; `epipole settings` prints one.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Settings in TOML; `epipole settings` prints them all."),
     ] = None,
     night: Annotated[
-        str | None, typer.Option(metavar="DATE", help="Publish this UTC date only, YYYY-MM-DD.")
+        str | None, typer.Option(metavar="DATE", help="Publish only this UTC date (YYYY-MM-DD).")
     ] = None,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Publish a night even if a log it had is not given.")
+        bool,
+        typer.Option(
+            "--replace", help="Replace a night even if one of its earlier logs is not given."
+        ),
     ] = False,
-    runner: Annotated[Runner, typer.Option(help="Where tasks are worked on.")] = Runner.threads,
+    runner: Annotated[
+        Runner, typer.Option(help="Run the tasks in threads or with Dask.")
+    ] = Runner.threads,
     workers: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Tasks at once; default: a CPU each.")
+        int | None,
+        typer.Option(min=1, metavar="N", help="Tasks at the same time; default: one per CPU."),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Of a running Dask; default: one of this machine."),
+        typer.Option(
+            metavar="ADDRESS", help="A running Dask scheduler; default: Dask on this machine."
+        ),
     ] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print errors only.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only errors.")] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", help="Print more, Prefect's lines too.")
+        bool,
+        typer.Option("--verbose", help="Also print the log lines of all tasks and of Prefect."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Turn logs into a dataset: the nightly flow, here and now."""
+    """Turn logs into a dataset: run the nightly flow on this machine now."""
     from epipole.flows.command_line.run import RunOptions, run_nightly
 
     _check_night(night)
     if not verbose:
         warnings.simplefilter("ignore")
-    options = RunOptions(settings, night, replace, runner.value, workers, scheduler, quiet, verbose)
+    options = RunOptions(settings, night, replace, runner, workers, scheduler, quiet, verbose)
     summary, seconds = run_nightly(logs, out, options)
     if as_json:
         _print_json(summary.as_dict() | {"seconds": round(seconds, 2)})
@@ -150,13 +156,13 @@ def _check_night(night: str | None) -> None:
             raise ValueError(night)
     except ValueError:
         raise typer.BadParameter(
-            f"{night!r} is no date such as 2019-04-01", param_hint="--night"
+            f"{night!r} is not a date such as 2019-04-01", param_hint="--night"
         ) from None
 
 
 @app.command()
 def info(logs: Logs, as_json: AsJson = False) -> None:
-    """Say what is in logs: sensors, times, counts, and what cannot be used."""
+    """Show what is in logs: sensors, times, counts, and what cannot be used."""
     from epipole.flows.command_line.log_info import describe, lines
     from epipole.io.logs.listing import list_logs
 
@@ -164,49 +170,57 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
     if as_json:
         _print_json(described)
     else:
-        typer.echo("\n".join(line for one in described for line in lines(one)))
+        typer.echo("\n".join(line for log in described for line in lines(log)))
 
 
 @app.command()
 def simulate(
     scene: Annotated[
-        str, typer.Argument(metavar="SCENE", help="A built-in scene's name, or a TOML file.")
+        str, typer.Argument(metavar="SCENE", help="Name of a built-in scene, or a TOML file.")
     ],
     out: Annotated[
-        Path, typer.Option(metavar="LOG", help="Log to write; its truth goes to LOG.truth.")
+        Path, typer.Option(metavar="LOG", help="Log to write. Its truth goes to LOG.truth.")
     ],
     seed: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Another seed: the same scene anew.")
+        int | None,
+        typer.Option(
+            min=0, metavar="N", help="Seed of the random numbers, instead of the scene's."
+        ),
     ] = None,
     sensors: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Sensors of the first group.")
+        int | None, typer.Option(min=1, metavar="N", help="Number of sensors in the first group.")
     ] = None,
     objects: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="Objects of the first group.")
+        int | None, typer.Option(min=0, metavar="N", help="Number of objects in the first group.")
     ] = None,
     hours: Annotated[
-        float | None, typer.Option(metavar="H", help="Duration, instead of the scene's.")
+        float | None, typer.Option(metavar="H", help="Duration in hours, instead of the scene's.")
     ] = None,
     rate_hz: Annotated[
-        float | None, typer.Option("--rate", metavar="HZ", help="Frames a second of a sensor.")
+        float | None,
+        typer.Option("--rate", metavar="HZ", help="Frames per second of every sensor."),
     ] = None,
     start: Annotated[
-        str | None, typer.Option(metavar="TIME", help="UTC, such as 2019-04-01T04:00:00Z.")
+        str | None, typer.Option(metavar="TIME", help="Start in UTC, such as 2019-04-01T04:00:00Z.")
     ] = None,
     logs: Annotated[
-        int, typer.Option(min=1, metavar="N", help="Cut into N logs, one after the other in time.")
+        int, typer.Option(min=1, metavar="N", help="Write N logs, one after the other in time.")
     ] = 1,
-    encoding: Annotated[Encoding, typer.Option(help="Of messages.")] = Encoding.protobuf,
-    compression: Annotated[Compression, typer.Option(help="Of chunks.")] = Compression.zstd,
+    encoding: Annotated[
+        Encoding, typer.Option(help="Encoding of the messages.")
+    ] = Encoding.protobuf,
+    compression: Annotated[
+        Compression, typer.Option(help="Compression of the chunks.")
+    ] = Compression.zstd,
     as_json: AsJson = False,
 ) -> None:
     """Simulate a scene: write a log, and its truth beside it.
 
     Built-in scenes:
 
-    four_sensor_geo: four low sensors, nine geostationary objects, a minute
+    four_sensor_geo: four sensors in low orbits, nine geostationary objects, one minute
 
-    six_sensor_wide: wide fields, attitudes unknown, many false points
+    six_sensor_wide: wide fields, no prior attitudes, many false points
 
     lost_in_space: a new attitude in every frame
 
@@ -242,16 +256,18 @@ def simulate(
 @app.command()
 def evaluate(
     dataset: Annotated[
-        Path, typer.Argument(metavar="DATASET", help="What `epipole run` published to.")
+        str,
+        typer.Argument(metavar="DATASET", help="Folder or URL that `epipole run` published to."),
     ],
     truth: Annotated[
-        Path, typer.Option(metavar="DIR", help="LOG.truth, beside the simulated log.")
+        Path, typer.Option(metavar="DIR", help="The folder LOG.truth beside the simulated log.")
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Hold a dataset against the truth of the simulated log it was made of.
+    """Compare a dataset with the truth of the simulated log it was made from.
 
-    Shows precision and recall of stars, pairs and objects, errors and honesty of sigmas.
+    Shows the precision and recall of stars, pairs and objects, the errors, and whether the
+    sigmas agree with the errors.
     """
     from epipole.flows.evaluate import evaluate, show
 
@@ -263,14 +279,14 @@ def evaluate(
 
 
 def _instant(text: str | None) -> datetime.datetime | None:
-    """Return an aware time; one without a zone is UTC."""
+    """Return an aware time. A time without a zone is UTC."""
     if text is None:
         return None
     try:
         instant = datetime.datetime.fromisoformat(text)
     except ValueError:
         raise typer.BadParameter(
-            f"{text!r} is no time such as 2019-04-01T04:00:00Z", param_hint="--start"
+            f"{text!r} is not a time such as 2019-04-01T04:00:00Z", param_hint="--start"
         ) from None
     return instant if instant.tzinfo else instant.replace(tzinfo=datetime.UTC)
 
@@ -284,30 +300,33 @@ def settings() -> None:
     typer.echo(settings_text(Settings()), nl=False)
 
 
-catalog = typer.Typer(
-    help="Build the star catalogue that sensors are identified with.", no_args_is_help=True
-)
+catalog = typer.Typer(help="Build a star catalogue for star identification.", no_args_is_help=True)
 app.add_typer(catalog, name="catalog")
 
 
 @catalog.callback()
 def _catalog() -> None:
-    """Keep `build` a command of its own."""
+    """Make `build` a subcommand, though it is the only one."""
 
 
 @catalog.command()
 def build(
     source: Annotated[
         str,
-        typer.Argument(metavar="SOURCE", help="hipparcos, deep, or a CSV or Parquet file."),
+        typer.Argument(
+            metavar="SOURCE", help="hipparcos, deep, or a CSV or Parquet file of stars."
+        ),
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Parquet file to write.")],
     epoch: Annotated[
         float | None,
-        typer.Option(metavar="YEAR", help="Julian year of a file's places, such as 2016.0."),
+        typer.Option(
+            metavar="YEAR", help="Julian year of the positions in the file, such as 2016.0."
+        ),
     ] = None,
     name: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Of the catalogue; default: the file's.")
+        str | None,
+        typer.Option(metavar="NAME", help="Name of the catalogue; default: the name of the file."),
     ] = None,
     magnitude_limit: Annotated[
         float | None, typer.Option("--limit", metavar="MAG", help="Leave fainter stars out.")
@@ -316,15 +335,15 @@ def build(
 ) -> None:
     """Write a star catalogue for the setting identification.catalogue.
 
-    hipparcos: the default of a run, complete to magnitude 7.3
+    hipparcos: what a run uses by default, complete to magnitude 7.3
 
-    deep: Gaia DR3 to G 10 with Hipparcos' motions, for fields below 5 degrees;
-    needs the extra "deep" of epipole; its data are share-alike (CC BY-SA 3.0)
+    deep: Gaia DR3 to G 10 with the motions of Hipparcos, for fields below 5 degrees.
+    Needs the extra "deep" of epipole. Its data are share-alike (CC BY-SA 3.0).
 
-    A file has the columns star_id (whole numbers), ra_deg, dec_deg (ICRS) and
-    magnitude (V), and may have pm_ra_mas_yr (times cos dec), pm_dec_mas_yr,
-    parallax_mas, sigma_mas, pm_sigma_mas_yr (1-sigma an axis) and variable
-    (true or false). Bad rows are named, counted from 1 without the header.
+    A file needs the columns star_id (whole numbers), ra_deg, dec_deg (ICRS) and
+    magnitude (V). It may have pm_ra_mas_yr (times cos dec), pm_dec_mas_yr,
+    parallax_mas, sigma_mas, pm_sigma_mas_yr (1-sigma per axis) and variable
+    (true or false). Invalid rows are reported by number, from 1 without the header.
     """
     from epipole.flows.catalogue import build_catalogue
 

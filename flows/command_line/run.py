@@ -7,24 +7,25 @@ from pathlib import Path
 
 from epipole.flows.night.summary import Summary
 from epipole.flows.prefect.progress import prepare, shown
+from epipole.io.caches.kernel_warm_up import compile_beside
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder
 from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
+from epipole.schemas.runner import Runner
 from epipole.schemas.settings import Settings
-from epipole.tasks.common.kernel_warm_up import compile_beside
 
 LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is asked for."""
+    """The options of a run."""
 
     settings: Path | None = None
     night: str | None = None
     replace: bool = False
-    runner: str = "threads"
+    runner: Runner = Runner.threads
     workers: int | None = None
     scheduler: str | None = None
     quiet: bool = False
@@ -37,7 +38,8 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
     Raises
     ------
     EpipoleError
-        Where the work cannot be done. What is plain at once is said before Prefect starts.
+        Where the work cannot be done. Settings, catalogue, output and logs are checked before
+        Prefect starts.
     """
     started = time.monotonic()
     settings = read_settings(options.settings) if options.settings else Settings()
@@ -52,7 +54,7 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
         if not options.verbose:
             quiet_console()
         if compiling:
-            LOGGER.info("first run of this version: compiling kernels, about a minute")
+            LOGGER.info("first run of this version: compiling takes about a minute")
         with embedded_prefect():
             summary = _run(logs, out, settings, options)
     return summary, time.monotonic() - started
@@ -60,8 +62,8 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
 
 def _run(logs: list[str], out: str, settings: Settings, options: RunOptions) -> Summary:
     from epipole.flows.nightly import nightly
-    from epipole.flows.prefect.runners import Runner, task_runner
+    from epipole.flows.prefect.runners import task_runner
 
-    runner = task_runner(Runner(options.runner), options.workers, options.scheduler)
+    runner = task_runner(options.runner, options.workers, options.scheduler)
     flow = nightly.with_options(task_runner=runner)
     return flow(logs, out, settings, options.night, options.replace)

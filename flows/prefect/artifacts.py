@@ -1,6 +1,6 @@
-"""Artifacts of a night on Prefect's page: how far it is, what it found, where the dataset is.
+"""Artifacts of a night on Prefect's page: its progress, its results, where the dataset is.
 
-A night does not fail because its page cannot be written: that is a warning, and the run goes on.
+A page that cannot be written is a warning, never an error.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ _PAGE_ERRORS = (httpx.HTTPError, PrefectException, OSError, RuntimeError)
 
 
 @contextlib.contextmanager
-def _softly(what: str) -> Iterator[None]:
+def _as_warning(what: str) -> Iterator[None]:
     try:
         yield
     except _PAGE_ERRORS as error:
@@ -46,25 +46,25 @@ class ProgressBar(logging.Handler):
         self._id: UUID | None = None
         self._next_s = 0.0
         self._percent = 0.0
-        with _softly("progress"):
+        with _as_warning("progress"):
             self._id = cast(UUID, create_progress_artifact(0.0, "progress", "start"))
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Show a step, unless one was shown just now."""
+        """Show a step, at most one every `UPDATED_EVERY_S`."""
         if self._id is None or time.monotonic() < self._next_s:
             return
         counts = vars(record)
         self._show(counts["percent"], f"{counts['stage']}: {counts['done']} of {counts['total']}")
 
     def finish(self, how: str) -> None:
-        """Say how the run ended."""
+        """Show how the run ended."""
         if self._id is not None:
             self._show(100.0, how)
 
     def _show(self, percent: float, description: str) -> None:
-        self._percent = max(self._percent, percent)  # a stage may be done again
-        artifact, self._id = self._id, None  # a page that cannot be written is not asked again
-        with _softly("progress"):
+        self._percent = max(self._percent, percent)  # a stage may run twice
+        artifact, self._id = self._id, None  # after an error it is not updated again
+        with _as_warning("progress"):
             if artifact is not None:
                 update_progress_artifact(artifact, self._percent, description)
             self._id = artifact
@@ -72,9 +72,9 @@ class ProgressBar(logging.Handler):
 
 
 def show_summary(summary: Summary) -> None:
-    """Show what a run found: its counts, a table of its sensors, a link to its nights."""
+    """Show the results of a run: its counts, a table of its sensors, a link to its nights."""
     nights = ", ".join(summary.nights)
-    with _softly("the summary"):
+    with _as_warning("the summary"):
         create_markdown_artifact(as_markdown(summary), "night", f"Night {nights}")
         rows = [sensor.as_row() for sensor in summary.by_sensor]
         create_table_artifact(rows, "sensors", f"Sensors of {nights}")
@@ -97,7 +97,7 @@ def as_markdown(summary: Summary) -> str:
         "epochs": summary.epochs,
         "positions": summary.positions,
     }
-    lines = [f"# Night {', '.join(summary.nights)}", "", *_table("found", counts)]
+    lines = [f"# Night {', '.join(summary.nights)}", "", *_table("what", counts)]
     if summary.clocks:
         lines += ["", "Clocks that are off:", "", *(f"- {clock}" for clock in summary.clocks)]
     if summary.rejects:
@@ -106,6 +106,6 @@ def as_markdown(summary: Summary) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _table(name: str, counts: dict[str, int]) -> list[str]:
+def _table(heading: str, counts: dict[str, int]) -> list[str]:
     rows = [f"| {key} | {count:,} |" for key, count in counts.items()]
-    return [f"| {name} | count |", "|---|---:|", *rows]
+    return [f"| {heading} | count |", "|---|---:|", *rows]

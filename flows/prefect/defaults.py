@@ -1,8 +1,8 @@
-"""What an embedded Prefect needs in order to be quiet and quick.
+"""Settings that make an embedded Prefect quiet and quick.
 
-The command line starts Prefect's API inside the run. Most of what its server does besides
-(schedules, automations, telemetry) has nothing to do there, and competes for its SQLite
-file: "database is locked". A user's own settings, profile or server win over all of this.
+The command line starts Prefect's API inside the run. Its server also runs schedules, automations
+and telemetry, which a single run does not need. They compete for the SQLite file ("database is
+locked"), so they are off. A user's own settings, profile or server take precedence.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from prefect.logging.handlers import PrefectConsoleHandler
 from prefect.server.api.server import SubprocessASGIServer
 from prefect.settings import PREFECT_API_URL, get_current_settings, temporary_settings
 
-# Services of a server that runs on; a run here and now waits for none of them.
+# Services that only a permanent server needs.
 _SERVICES = (
     "cancellation_cleanup",
     "cleanup_reconciler",
@@ -40,28 +40,28 @@ _DEFAULTS = {
     "server.ephemeral.startup_timeout_seconds": 120,
 }
 
-# Their errors end in the exception that the caller gets, and shows.
+# Their errors are also raised to the caller, who prints them.
 _RUN_LOGGERS = ("prefect.flow_runs", "prefect.task_runs")
 
 
 @contextlib.contextmanager
 def embedded_prefect() -> Iterator[None]:
-    """Run flows inside on an embedded API, unless the user's Prefect has an API set."""
+    """Run flows on an embedded API, unless the user's Prefect has an API set."""
     with contextlib.ExitStack() as stack:
         if get_current_settings().api.url is None:
             stack.enter_context(temporary_settings(set_defaults=_DEFAULTS))
             _start_server()
-            # Or a worker in another process would start an API of its own.
+            # Without it, a worker in another process would start a second API.
             url = SubprocessASGIServer().api_url
             stack.enter_context(temporary_settings({PREFECT_API_URL: url}))
         yield
 
 
 def _start_server() -> None:
-    """Start the embedded server so that Ctrl-C, which reaches it too, does not stop it.
+    """Start the embedded server so that Ctrl-C does not stop it.
 
-    It has to outlive the run to be told how it ended. The signals a thread has blocked stay
-    blocked in the processes it starts.
+    The server also gets the signal, but it must record how the run ended. Signals that are
+    blocked in a thread stay blocked in the processes that the thread starts.
     """
 
     def start() -> None:
@@ -73,13 +73,13 @@ def _start_server() -> None:
 
 
 def quiet_console() -> None:
-    """Keep Prefect's lines off the terminal, but for warnings; its API still gets them.
+    """Print only warnings and errors of Prefect on the terminal. Its API still gets all lines.
 
-    It holds for the process: the last lines come when the server stops, at its exit.
+    This is not undone: the last lines come when the server stops, at the end of the process.
     """
     setup_logging()
     for handler in _all_handlers():
-        # A filter, because Prefect sets the levels again when a flow starts.
+        # A filter, because Prefect resets the levels when a flow starts.
         if isinstance(handler, PrefectConsoleHandler):
             handler.addFilter(_is_worth_showing)
 

@@ -1,4 +1,4 @@
-"""What Prefect's page shows of a run beside its tasks: lines of log, progress, a summary."""
+"""What Prefect's page shows of a run besides its tasks: log lines, progress, a summary."""
 
 import contextlib
 import functools
@@ -17,7 +17,7 @@ P = ParamSpec("P")
 
 
 def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, Summary]:
-    """Return the flow's function so that Prefect's page shows how it goes and what it found."""
+    """Return the flow's function, with its log lines, progress and summary on Prefect's page."""
 
     @functools.wraps(flow)
     def shown(*args: P.args, **kwargs: P.kwargs) -> Summary:
@@ -26,7 +26,7 @@ def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, Summary]:
             try:
                 summary = flow(*args, **kwargs)
             except BaseException:
-                bar.finish("failed: the log says why")
+                bar.finish("failed; see the log")
                 raise
             bar.finish("done")
             show_summary(summary)
@@ -36,16 +36,16 @@ def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, Summary]:
 
 
 class _RunLog(APILogHandler):
-    """Sends lines of log to the run, or the task's run, that they are written in."""
+    """Sends log lines to the flow run or task run in which they are written."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        if TaskRunContext.get() or FlowRunContext.get():  # a library's own thread has neither
+        if TaskRunContext.get() or FlowRunContext.get():  # neither in a thread of a library
             super().emit(record)
 
 
 @contextlib.contextmanager
 def _added(logger: logging.Logger, handler: logging.Handler) -> Iterator[None]:
-    """Lend a handler to a logger; a user who sent these lines to Prefect has them once."""
+    """Add a handler to a logger, unless the user's logging already sends its lines to Prefect."""
     if any(type(other) is APILogHandler for other in logger.handlers):
         yield
         return

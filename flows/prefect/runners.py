@@ -1,44 +1,39 @@
-"""Where the tasks of a run are worked on: threads of one machine, or Dask."""
+"""What runs the tasks of a run: threads of this process, or Dask."""
 
 import logging
 import os
-from enum import StrEnum
 from typing import Any
 
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
 from epipole.schemas.errors import EpipoleError
-
-
-class Runner(StrEnum):
-    """Where the tasks of a run are worked on."""
-
-    threads = "threads"
-    dask = "dask"
+from epipole.schemas.runner import Runner
 
 
 def task_runner(
     runner: Runner, workers: int | None = None, scheduler: str | None = None
 ) -> TaskRunner[Any]:
-    """Return what a flow hands its tasks to.
+    """Return the task runner of a flow.
 
     Parameters
     ----------
     workers
-        Tasks at once; none: one a CPU.
+        Tasks at the same time; default: one per CPU.
     scheduler
-        With Dask, the address of a running one, whose workers share the dataset's storage with
-        this process and have epipole installed; none: processes of this machine.
+        Address of a running Dask scheduler. Its workers need epipole and access to the dataset's
+        storage. Default: Dask processes on this machine.
 
     Raises
     ------
     EpipoleError
-        Dask is not installed, or a scheduler is named for threads.
+        Where Dask is not installed, or a scheduler is given for threads.
     """
     count = workers or os.cpu_count() or 1
     if runner == Runner.threads:
         if scheduler is not None:
-            raise EpipoleError(f"scheduler {scheduler}: threads have none; choose --runner dask")
+            raise EpipoleError(
+                f"scheduler {scheduler}: only Dask has a scheduler; choose --runner dask"
+            )
         return ThreadPoolTaskRunner(max_workers=count)
     try:
         from prefect_dask.task_runners import DaskTaskRunner
@@ -48,7 +43,7 @@ def task_runner(
         ) from error
     if scheduler is not None:
         return DaskTaskRunner(address=scheduler)
-    # It says so of every worker that ends with the run.
+    # It logs a warning for every worker that ends with the run.
     logging.getLogger("distributed.nanny").setLevel(logging.ERROR)
     quiet = {"PREFECT_LOGGING_HANDLERS_CONSOLE_LEVEL": "WARNING"}
     return DaskTaskRunner(
@@ -62,21 +57,21 @@ def task_runner(
 
 
 def runner_asked() -> TaskRunner[Any]:
-    """Return the task runner that the environment asks for: what a deployment's job sets.
+    """Return the task runner that the environment variables name; a deployment sets them.
 
     EPIPOLE_RUNNER ("threads", "dask"), EPIPOLE_WORKERS and EPIPOLE_SCHEDULER.
 
     Raises
     ------
     EpipoleError
-        Where they make no sense.
+        Where a value is invalid.
     """
-    asked = os.environ.get("EPIPOLE_RUNNER", Runner.threads)
+    name = os.environ.get("EPIPOLE_RUNNER", Runner.threads)
     workers = os.environ.get("EPIPOLE_WORKERS")
-    if asked not in list(Runner):
-        raise EpipoleError(f"EPIPOLE_RUNNER={asked}: give one of {', '.join(Runner)}")
+    if name not in list(Runner):
+        raise EpipoleError(f"EPIPOLE_RUNNER={name}: give one of {', '.join(Runner)}")
     if workers is not None and not (workers.isdecimal() and int(workers)):
-        raise EpipoleError(f"EPIPOLE_WORKERS={workers}: give how many tasks may run at once")
+        raise EpipoleError(f"EPIPOLE_WORKERS={workers}: give a number of tasks, 1 or more")
     return task_runner(
-        Runner(asked), int(workers) if workers else None, os.environ.get("EPIPOLE_SCHEDULER")
+        Runner(name), int(workers) if workers else None, os.environ.get("EPIPOLE_SCHEDULER")
     )

@@ -1,1 +1,1 @@
-"""What is kept on disk between runs: arrays and compiled kernels."""
+"""Caches on the disk: arrays and compiled kernels."""

@@ -1,7 +1,7 @@
-"""Arrays kept on disk between runs: what is costly to make and the same for the same inputs.
+"""A cache of arrays on the disk: those that are costly to make and depend only on their inputs.
 
-A file is written under another name and renamed, so processes that make the same arrays at
-once do each other no harm; one that is damaged is made again.
+A file is written under a temporary name and renamed, so several processes can write the same file.
+A damaged file is written again.
 """
 
 import contextlib
@@ -19,33 +19,33 @@ import numpy.typing as npt
 Arrays = Mapping[str, npt.NDArray[Any]]
 log = logging.getLogger(__name__)
 
-LARGEST_BYTES = 500_000_000  # of all files; those not used for longest go first
+LARGEST_BYTES = 500_000_000  # of all files together; the least recently used are removed first
 OFF = "off"
 
 
 def cache_folder() -> Path | None:
-    """Return where arrays are kept, None where the user wants none.
+    """Return the cache folder. None: the user has switched the cache off.
 
-    EPIPOLE_CACHE names the folder ("off": keep none); otherwise it is epipole's in the user's
-    cache folder, as the XDG base directory specification has it.
+    EPIPOLE_CACHE names the folder ("off": no cache). Otherwise it is ``epipole`` in the cache
+    folder of the user, by the XDG base directory specification.
     """
-    said = os.environ.get("EPIPOLE_CACHE")
-    if said:
-        return None if said == OFF else Path(said)
+    folder = os.environ.get("EPIPOLE_CACHE")
+    if folder:
+        return None if folder == OFF else Path(folder)
     home = os.environ.get("XDG_CACHE_HOME")
     try:
         return (Path(home) if home else Path.home() / ".cache") / "epipole"
-    except RuntimeError:  # a user without a home
+    except RuntimeError:  # the user has no home folder
         return None
 
 
 def cached(key: str, make: Callable[[], Arrays]) -> Arrays:
-    """Return the arrays kept under a key; where there are none, make and keep them.
+    """Return the arrays of a key from the cache; if it has none, make them and keep them.
 
     Parameters
     ----------
     key
-        A digest of all that the arrays depend on; it is the file's name.
+        A digest of everything that the arrays depend on. It is the name of the file.
     """
     folder = cache_folder()
     if folder is None:
@@ -58,21 +58,21 @@ def cached(key: str, make: Callable[[], Arrays]) -> Arrays:
     try:
         _write(path, made)
         _prune(folder)
-    except OSError as error:  # a cache is no reason to fail
-        log.info("%s: nothing is kept (%s)", folder, error.strerror or error)
+    except OSError as error:  # without a cache the run is only slower
+        log.info("%s: cannot keep arrays here (%s)", folder, error.strerror or error)
     return made
 
 
 def _read(path: Path) -> dict[str, npt.NDArray[Any]] | None:
     try:
-        with np.load(path, allow_pickle=False) as file:  # checks every array's CRC
+        with np.load(path, allow_pickle=False) as file:  # checks the CRC of every array
             arrays = {name: file[name] for name in file.files}
         with contextlib.suppress(OSError):
-            os.utime(path)  # just used
+            os.utime(path)  # marks it as used
     except FileNotFoundError:
         return None
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        log.info("%s: damaged, made again (%s)", path, error)
+        log.info("%s: damaged and written again (%s)", path, error)
         return None
     return arrays
 
@@ -89,7 +89,7 @@ def _write(path: Path, arrays: Arrays) -> None:
 
 
 def _prune(folder: Path) -> None:
-    """Remove what was not used for longest until the rest is small enough.
+    """Remove the least recently used files until the rest is small enough.
 
     Another process may remove the same files at the same time.
     """

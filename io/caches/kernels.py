@@ -1,7 +1,9 @@
-"""Where compiled kernels are kept: a folder that is another one for other code.
+"""The folder of compiled kernels: its name contains a digest of the code.
 
-Numba keeps them beside the code and looks at one file only, so what a kernel calls in another
-file may change unseen, and an upgrade in place may find signatures of classes that are no more.
+By default numba keeps a kernel beside its source file and checks only that file. It does not notice
+a change in a function of another file that the kernel calls. After an upgrade it may also find
+signatures with classes that no longer exist. With a digest of all code in the folder's name,
+neither can happen.
 """
 
 import contextlib
@@ -15,15 +17,14 @@ from pathlib import Path
 
 from epipole.io.caches.arrays import cache_folder
 
-KEPT = 8  # folders: of the code as it was last, in several environments
-_USED = "used"  # a file there once a run has ended well
+KEPT = 8  # folders: several versions and environments of one user
+_USED = "used"  # this file exists after a run has succeeded
 
 
 def use_kernel_cache(*code: Path) -> None:
-    """Have numba keep kernels in the user's cache folder, under a digest of the code.
+    """Let numba keep kernels in the user's cache folder, under a digest of the code.
 
-    A user's own NUMBA_CACHE_DIR wins, and so does EPIPOLE_CACHE=off: then they stay beside the
-    code.
+    A user's NUMBA_CACHE_DIR takes precedence. With EPIPOLE_CACHE=off they are kept beside the code.
 
     Parameters
     ----------
@@ -38,7 +39,7 @@ def use_kernel_cache(*code: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         os.utime(folder)
         _prune(folder.parent)
-    except OSError:  # numba finds a place of its own
+    except OSError:  # numba uses its default place
         return
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     numba = sys.modules.get("numba")
@@ -47,23 +48,23 @@ def use_kernel_cache(*code: Path) -> None:
 
 
 def new_kernel_folder() -> Path | None:
-    """Return where this code's kernels are kept while no run with them has ended well yet."""
-    root, said = cache_folder(), os.environ.get("NUMBA_CACHE_DIR")
-    if root is None or not said or Path(said).parent != root / "kernels":
+    """Return the kernel folder of this code, as long as no run of this code has succeeded."""
+    root, path = cache_folder(), os.environ.get("NUMBA_CACHE_DIR")
+    if root is None or not path or Path(path).parent != root / "kernels":
         return None
-    folder = Path(said)
+    folder = Path(path)
     return folder if folder.is_dir() and not (folder / _USED).exists() else None
 
 
 def mark_used(folder: Path) -> None:
-    """Say that a run has ended well: what it needs is compiled."""
+    """Record that a run has succeeded: all kernels that it needs are compiled."""
     with contextlib.suppress(OSError):
         (folder / _USED).touch()
 
 
 @contextlib.contextmanager
 def only_one(folder: Path) -> Iterator[bool]:
-    """Tell whether no other process is in here for the same folder."""
+    """Yield whether no other process has called this for the same folder, and keep others out."""
     with (folder / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

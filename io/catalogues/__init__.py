@@ -1,1 +1,1 @@
-"""Catalogues: stars, and the orientation of the Earth."""
+"""Star catalogues, and the table of the Earth's orientation."""

@@ -11,12 +11,12 @@ import numpy.typing as npt
 ARCSEC = np.pi / 648000.0
 
 # Columns of finals2000A (its ReadMe, counted from 1): MJD 8-15, polar motion x 19-27 and
-# y 38-46 [arcsec], UT1-UTC 59-68 [s]. Behind the last prediction they are blank.
+# y 38-46 [arcsec], UT1-UTC 59-68 [s]. After the last prediction they are blank.
 _MJD, _X, _Y, _UT1 = slice(7, 15), slice(18, 27), slice(37, 46), slice(58, 68)
 
 
 class EarthOrientation(NamedTuple):
-    """One value a day, measured and then predicted."""
+    """One value per day: measured ones, then predicted ones."""
 
     mjd: npt.NDArray[np.float64]  # (n,) UTC, increasing
     ut1_utc_s: npt.NDArray[np.float64]  # (n,)
@@ -31,7 +31,7 @@ def read_earth_orientation() -> EarthOrientation:
 
 
 def parse_earth_orientation(text: str) -> EarthOrientation:
-    """Return the days of a finals2000A text that have all values."""
+    """Return the days of a finals2000A text for which all values are given."""
     lines = [line for line in text.splitlines() if line[_UT1].strip() and line[_X].strip()]
     columns = [[float(line[part]) for line in lines] for part in (_MJD, _UT1, _X, _Y)]
     mjd, ut1_utc_s, xp, yp = (np.array(column) for column in columns)

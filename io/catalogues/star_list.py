@@ -1,4 +1,4 @@
-"""Star lists of users, CSV or Parquet, as a catalogue: every column and row is checked."""
+"""Star lists of users (CSV or Parquet) as a catalogue. Every column and row is checked."""
 
 import hashlib
 from pathlib import Path
@@ -21,11 +21,11 @@ from epipole.schemas.star_catalogue import (
 
 REQUIRED = ("star_id", "ra_deg", "dec_deg", "magnitude")
 MOTION = ("pm_ra_mas_yr", "pm_dec_mas_yr")
-SHOWN = 5  # faults that a message names
+SHOWN = 5  # invalid rows that a message names
 EPOCHS = (1850.0, 2150.0)
 
-# Least and greatest value. The fastest star moves by 10.4" a year and the nearest has a parallax
-# of 0.77"; measured parallaxes may be below zero.
+# Least and greatest value. The fastest star moves 10.4" per year, and the nearest has a parallax of
+# 0.77". Measured parallaxes may be negative.
 _BOUNDS = {
     "ra_deg": (0.0, 360.0),
     "dec_deg": (-90.0, 90.0),
@@ -37,14 +37,14 @@ _BOUNDS = {
     "pm_sigma_mas_yr": (0.0, 11_000.0),
 }
 _TRUTH = {"true": True, "1": True, "false": False, "0": False}
-# So few stars may well lie where degrees look like radians or hours.
+# Fewer stars than this may all lie where degrees look like radians or hours.
 _MANY = 100
 
 Array = npt.NDArray[np.float64]
 
 
 class StarList(NamedTuple):
-    """A user's stars as a labelled table STAR_CATALOGUE, and the columns that were not used."""
+    """A user's stars as a labelled table STAR_CATALOGUE, and the columns that are ignored."""
 
     stars: pa.Table
     ignored: list[str]
@@ -53,23 +53,23 @@ class StarList(NamedTuple):
 def read_star_list(path: Path, epoch: float | None = None, name: str | None = None) -> StarList:
     """Return a user's stars.
 
-    Needed are the columns star_id, ra_deg, dec_deg and magnitude; all others of STAR_CATALOGUE
-    may be missing or empty. A motion that is not given counts as none, with the sigma
+    The columns star_id, ra_deg, dec_deg and magnitude are required. The other columns of
+    STAR_CATALOGUE may be missing or empty. A missing motion is taken as zero, with the sigma
     UNKNOWN_MOTION_MAS_YR.
 
     Parameters
     ----------
     path
-        CSV with a header line, or Parquet (by its suffix .parquet).
+        CSV with a header line, or Parquet (suffix .parquet).
     epoch
-        Julian year of the places, ICRS; none: `epoch` in the Parquet file's metadata.
+        Julian year of the positions. Default: `epoch` in the metadata of the Parquet file.
     name
-        Of the catalogue; none: the file's.
+        Name of the catalogue. Default: the name of the file.
 
     Raises
     ------
     CatalogueError
-        Names the columns that are missing, or the rows and columns that are bad.
+        Names the missing columns, or the invalid rows and their columns.
     """
     read = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     missing = [column for column in REQUIRED if column not in read.columns]
@@ -79,7 +79,7 @@ def read_star_list(path: Path, epoch: float | None = None, name: str | None = No
             f"columns are {', '.join(STAR_CATALOGUE.names)}"
         )
     if not read.height:
-        raise CatalogueError(f"{path}: no stars in it")
+        raise CatalogueError(f"{path}: no stars in this file")
     faults = _Faults(path, read)
     columns = _columns(read, faults)
     faults.raise_if_any()
@@ -92,7 +92,7 @@ def read_star_list(path: Path, epoch: float | None = None, name: str | None = No
 
 
 class _Faults:
-    """Bad rows, named by row (from 1, the header not counted) and column."""
+    """Invalid rows, named by row (from 1, without the header) and column."""
 
     def __init__(self, path: Path, read: pl.DataFrame) -> None:
         self.path, self.read = path, read
@@ -101,8 +101,8 @@ class _Faults:
     def add(self, bad: npt.NDArray[np.bool_], column: str, why: str) -> None:
         for row in np.flatnonzero(bad).tolist():
             value = self.read[column][row]
-            said = f"{column} is empty" if value is None else f"{column} = {value}"
-            self._found.setdefault(row, f"row {row + 1}: {said}, {why}")
+            what = f"{column} is empty" if value is None else f"{column} = {value}"
+            self._found.setdefault(row, f"row {row + 1}: {what}, {why}")
 
     def raise_if_any(self) -> None:
         if not self._found:
@@ -110,9 +110,8 @@ class _Faults:
         first = [self._found[row] for row in sorted(self._found)[:SHOWN]]
         more = len(self._found) - len(first)
         raise CatalogueError(
-            f"{self.path}: {len(self._found)} of {self.read.height} rows bad; mend or remove them: "
-            + "; ".join(first)
-            + (f"; and {more} more" if more else "")
+            f"{self.path}: {len(self._found)} of {self.read.height} rows are invalid; "
+            "correct or remove them: " + "; ".join(first) + (f"; and {more} more" if more else "")
         )
 
 
@@ -135,7 +134,7 @@ def _read_parquet(path: Path) -> pl.DataFrame:
         unit = (fields.field(ours.name).metadata or {}).get(b"unit", b"").decode()
         wanted = (ours.metadata or {}).get(b"unit", b"").decode()
         if unit and unit != wanted:
-            raise CatalogueError(f"{path}: column {ours.name} is in {unit}; {wanted} is wanted")
+            raise CatalogueError(f"{path}: column {ours.name} is in {unit}; it must be in {wanted}")
     return read
 
 
@@ -149,7 +148,11 @@ def _columns(read: pl.DataFrame, faults: _Faults) -> dict[str, npt.NDArray[Any]]
         columns[name] = _numbers(read, name, bounds, faults)
     half = np.isnan(columns[MOTION[0]]) != np.isnan(columns[MOTION[1]])
     if half.any():
-        faults.add(half, next(m for m in MOTION if m in read.columns), "half of a motion is given")
+        faults.add(
+            half,
+            next(m for m in MOTION if m in read.columns),
+            "the other component of the motion is missing",
+        )
     unknown = np.isnan(columns["pm_sigma_mas_yr"]) & np.isnan(columns[MOTION[0]])
     columns["pm_sigma_mas_yr"][unknown] = UNKNOWN_MOTION_MAS_YR
     for name in (*MOTION, "parallax_mas", "sigma_mas", "pm_sigma_mas_yr"):
@@ -160,28 +163,28 @@ def _columns(read: pl.DataFrame, faults: _Faults) -> dict[str, npt.NDArray[Any]]
 
 
 def _identities(read: pl.DataFrame, faults: _Faults) -> npt.NDArray[np.int64]:
-    """Return the numbers of the stars; each must be whole, and there once."""
+    """Return the ids of the stars. Each must be a whole number, and occur once."""
     numbers = read["star_id"].cast(pl.Int64, strict=False)
     missing = numbers.is_null().to_numpy()
-    faults.add(missing, "star_id", "no whole number")
+    faults.add(missing, "star_id", "not a whole number")
     star_id = numbers.fill_null(0).to_numpy().astype(np.int64)
     twice = numbers.is_duplicated().to_numpy() & ~missing
-    faults.add(twice, "star_id", "not the only row of this number")
+    faults.add(twice, "star_id", "another row has the same number")
     return star_id
 
 
 def _numbers(read: pl.DataFrame, name: str, bounds: tuple[float, float], faults: _Faults) -> Array:
-    """Return a column, NaN where it is empty or missing."""
+    """Return a column of numbers, NaN where a value or the column is missing."""
     if name not in read.columns:
         return np.full(read.height, np.nan)
     values = read[name].cast(pl.Float64, strict=False)
     empty = read[name].is_null().to_numpy()
     numbers = values.fill_null(np.nan).to_numpy().copy()
     if read[name].dtype.is_float():
-        empty = empty | np.isnan(numbers)  # how Parquet files of other tools say so
-    faults.add(np.isnan(numbers) & ~empty, name, "no number")
+        empty = empty | np.isnan(numbers)  # Parquet files of other tools use NaN for it
+    faults.add(np.isnan(numbers) & ~empty, name, "not a number")
     if name in REQUIRED:
-        faults.add(empty, name, "a value is needed")
+        faults.add(empty, name, "a value is required")
     low, high = bounds
     faults.add((numbers < low) | (numbers > high), name, f"not within {low:g} to {high:g}")
     return numbers
@@ -197,30 +200,30 @@ def _flags(read: pl.DataFrame, faults: _Faults) -> npt.NDArray[np.bool_]:
 
 
 def _check_units(path: Path, columns: dict[str, npt.NDArray[Any]]) -> None:
-    """Refuse angles that fill the sky in another unit than degrees."""
+    """Raise where the stars fill the sky, but in another unit than degrees."""
     ra, dec = np.asarray(columns["ra_deg"], float), np.asarray(columns["dec_deg"], float)
     if len(ra) < _MANY:
         return
     if ra.max() <= 2 * np.pi and ra.max() > 5 and np.abs(dec).max() <= np.pi / 2:
         raise CatalogueError(
             f"{path}: ra_deg ends at {ra.max():.3f} and dec_deg lies within "
-            f"{np.abs(dec).max():.3f}, as radians do; degrees are wanted"
+            f"{np.abs(dec).max():.3f}, as radians do; give degrees"
         )
     if 20 < ra.max() <= 24 and np.ptp(dec) > 90:
-        raise CatalogueError(
-            f"{path}: ra_deg ends at {ra.max():.3f}, as hours do; degrees are wanted"
-        )
+        raise CatalogueError(f"{path}: ra_deg ends at {ra.max():.3f}, as hours do; give degrees")
 
 
 def _epoch(path: Path, epoch: float | None) -> float:
     if epoch is None and path.suffix == ".parquet":
-        said = (pq.read_schema(path).metadata or {}).get(b"epoch")
+        text = (pq.read_schema(path).metadata or {}).get(b"epoch")
         try:
-            epoch = None if said is None else float(said)
+            epoch = None if text is None else float(text)
         except ValueError:
-            raise CatalogueError(f"{path}: epoch {said!r} in its metadata is no year") from None
+            raise CatalogueError(f"{path}: epoch {text!r} in its metadata is not a year") from None
     if epoch is None:
-        raise CatalogueError(f"{path}: of which epoch are its places? Give --epoch, such as 2016.0")
+        raise CatalogueError(
+            f"{path}: the epoch of its positions is unknown; give --epoch, such as 2016.0"
+        )
     if not EPOCHS[0] <= epoch <= EPOCHS[1]:
-        raise CatalogueError(f"{path}: epoch {epoch:g} is no Julian year such as 2016.0")
+        raise CatalogueError(f"{path}: epoch {epoch:g} is not a Julian year such as 2016.0")
     return epoch

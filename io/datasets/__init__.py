@@ -1,1 +1,1 @@
-"""Datasets: nights of Parquet tables, published at once in a folder or an object store."""
+"""Datasets: nights of Parquet tables in a folder or an object store, published as a whole."""

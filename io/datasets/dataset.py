@@ -1,9 +1,9 @@
-"""Datasets: a folder a night, a folder a table, published night by night.
+"""Datasets: one folder per night, with one folder per table, published night by night.
 
-``DATASET/night=YYYY-MM-DD/<table>/part-0.parquet``, in a local folder (`local_nights`: put in
-place by one rename) or behind an fsspec URL such as ``s3://bucket/dataset`` (`store_nights`:
-committed by one object). A reader never sees half a night, and a run that fails or is killed
-leaves the dataset as it was.
+The layout is ``DATASET/night=YYYY-MM-DD/<table>/part-0.parquet``. A dataset is a local folder
+(`local_nights`: a night is put in place by one rename) or lies behind an fsspec URL such as
+``s3://bucket/dataset`` (`store_nights`: nights are committed by one object). A reader never sees
+half a night. A run that fails or is killed leaves the dataset unchanged.
 """
 
 import contextlib
@@ -22,7 +22,6 @@ import pyarrow.parquet as pq
 from epipole.io.datasets import local_nights
 from epipole.io.datasets.folder_swap import sync
 from epipole.io.datasets.local_nights import STAGING
-from epipole.io.datasets.night_files import write_table
 from epipole.io.datasets.store_nights import StoreNights, store_nights
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.bridge import array, conform, empty
@@ -31,8 +30,8 @@ from epipole.schemas.errors import DatasetError
 from epipole.schemas.spans import DAY_NS
 from epipole.schemas.tables import TABLES
 
-# The column that says to which night a row belongs; the rest have `time`. Calibrations and
-# sources are of a whole night, not of an instant.
+# The time column that decides to which night a row belongs, where it is not `time`. Calibrations
+# and sources belong to a whole night.
 _NIGHT_COLUMN = {"tracklets": "start_time"}
 _WHOLE_NIGHT = {"calibrations", "sources"}
 
@@ -41,24 +40,24 @@ Where = Path | str
 
 
 def check_folder(dataset: Where) -> None:
-    """Raise unless a dataset is here, or can be made here.
+    """Raise unless this is a dataset, or a place where a dataset can be created.
 
     Raises
     ------
     DatasetError
-        Where it is a file, or a folder that holds other things than a dataset.
+        Where it is a file, or a folder with other contents than a dataset.
     """
     if (store := _store(dataset)) is not None:
-        with _read(dataset):
+        with _reading(dataset):
             names = store.names()
     else:
         try:
             folder = _folder(dataset)
             if folder.exists() and not folder.is_dir():
-                raise DatasetError(f"{dataset}: is a file, not a folder; give another --out")
+                raise DatasetError(f"{dataset}: is a file, not a folder; give another folder")
             names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
         except OSError as error:
-            raise DatasetError(f"{dataset}: {error.strerror}; give another --out") from error
+            raise DatasetError(f"{dataset}: {error.strerror}; give another folder") from error
     if names and not any(name == STAGING or name.startswith("night=") for name in names):
         raise DatasetError(
             f"{dataset}: holds other files and no dataset (no night=... folder); "
@@ -67,20 +66,20 @@ def check_folder(dataset: Where) -> None:
 
 
 def nights_in(dataset: Where) -> list[str]:
-    """Return the nights of a dataset, ``YYYY-MM-DD``, in order; none where there is no dataset."""
+    """Return the nights of a dataset, ``YYYY-MM-DD``, in order. A missing dataset has none."""
     if (store := _store(dataset)) is not None:
-        with _read(dataset):
+        with _reading(dataset):
             return store.nights()
     return sorted(p.name.removeprefix("night=") for p in _folder(dataset).glob("night=*"))
 
 
 def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, replace: bool) -> None:
-    """Raise where a night was made of a log that is not among these sources.
+    """Raise where a published night was made from a log that is not among these sources.
 
     Raises
     ------
     DatasetError
-        Names the logs; not raised with `replace`.
+        Names the missing logs. With `replace` it is not raised.
     """
     if replace:
         return
@@ -90,22 +89,22 @@ def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, repl
         missing = [row["name"] for row in recorded.to_pylist() if row["sha256"] not in given]
         if missing:
             raise DatasetError(
-                f"{dataset}/night={night}: was also made of {', '.join(missing)}; "
-                "give all logs of the night, or --replace to publish it without"
+                f"{dataset}/night={night}: was also made from {', '.join(missing)}; "
+                "give all logs of the night, or --replace to publish it without them"
             )
 
 
 def read_table(dataset: Where, table: str, night: str) -> pa.Table:
-    """Return a table of a night; with no rows where the night is not there.
+    """Return a table of a night. It has no rows where the night is missing.
 
     Raises
     ------
     DatasetError
-        Where its files cannot be read as this table.
+        Where its files cannot be read, or do not hold this table.
     """
     schema = TABLES[table]
     if (store := _store(dataset)) is not None:
-        with _read(dataset):
+        with _reading(dataset):
             parts: Sequence[Any] = [pa.BufferReader(part) for part in store.read(night, table)]
     else:
         parts = sorted((_folder(dataset) / f"night={night}" / table).glob("*.parquet"))
@@ -114,65 +113,31 @@ def read_table(dataset: Where, table: str, night: str) -> pa.Table:
     except (OSError, ValueError) as error:
         raise DatasetError(
             f"{dataset}/night={night}/{table}: cannot be read ({error}); "
-            "remove the night's folder and run it again"
+            "remove the folder of the night and run the night again"
         ) from error
     return pa.concat_tables([empty(schema), *rows])
 
 
-def publish(
-    dataset: Where,
-    tables: Mapping[str, pa.Table],
-    nights: Sequence[str],
-    replace: bool = False,
-) -> None:
-    """Write these nights of the tables and put them in place, each by one rename.
-
-    Parameters
-    ----------
-    dataset
-        The folder; it is made where it is missing.
-    tables
-        Tables of `epipole.schemas.tables` by name, `sources` among them. One that is
-        missing is published with no rows. Rows of other nights are not written.
-    nights
-        UTC dates, ``YYYY-MM-DD``. Other nights of the dataset stay as they are.
-    replace
-        Publish a night even though it was made of a log that is not among `sources`.
-
-    Raises
-    ------
-    DatasetError
-        Where the folder is no dataset, a recorded log is missing or the disk refuses. The
-        dataset is then as it was. While another run publishes here, this one waits.
-    """
-    with claim_nights(dataset, []) as work:
-        staged = {night: work / f"night={night}" for night in nights}
-        with _written(dataset):
-            for night, folder in staged.items():
-                _write_night(folder, tables, night)
-        publish_folders(dataset, staged, tables["sources"], replace)
-
-
 @contextlib.contextmanager
 def claim_nights(dataset: Where, nights: Sequence[str]) -> Iterator[Path]:
-    """Keep other runs off these nights while this one works on them.
+    """Reserve these nights for this run: no other run can work on them.
 
     Yields
     ------
     Path
-        An empty folder of this run's own, on the dataset's file system: what is staged in it
-        can be put in place by a rename. It is removed at the end. What a run that was killed
-        has left there is removed by the next one.
+        An empty folder for this run, on the dataset's file system, so that a folder staged in it
+        can be put in place by a rename. It is removed at the end. The folder of a killed run is
+        removed by the next run.
 
     Raises
     ------
     DatasetError
-        Where another run is at work on one of the nights (names the night, the process, its
-        host and since when), the folder is no dataset, or it cannot be written.
+        Where another run works on one of the nights (the message names the night, the process,
+        its host and its start), the folder is not a dataset, or it cannot be written.
     """
     check_folder(dataset)
     with contextlib.ExitStack() as held:
-        with _written(dataset):
+        with _writing(dataset):
             if (store := _store(dataset)) is not None:
                 held.enter_context(store.claims.claim(nights))
                 work = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="epipole-")))
@@ -184,29 +149,33 @@ def claim_nights(dataset: Where, nights: Sequence[str]) -> Iterator[Path]:
 def publish_folders(
     dataset: Where, staged: Mapping[str, Path], sources: pa.Table, replace: bool = False
 ) -> None:
-    """Put whole nights in place: all of them, or none.
+    """Put whole nights in place: all or none.
 
     Parameters
     ----------
     staged
-        By night, ``YYYY-MM-DD``, a folder that holds every table: ``<table>/*.parquet``. It
-        lies on the dataset's file system (see `claim_nights`) and is gone afterwards.
+        For each night, ``YYYY-MM-DD``, a folder with every table: ``<table>/*.parquet``. It lies
+        on the dataset's file system (see `claim_nights`) and is moved from there.
     sources
-        The logs that the nights were made of.
+        The logs that the nights were made from.
     replace
-        Publish a night even though it was made of a log that is not among `sources`.
+        Replace a night even if it was made from a log that is not among `sources`.
 
     Raises
     ------
     DatasetError
-        Where a recorded log is missing or the disk refuses. The dataset is then as it was.
-        While another run publishes here, this one waits.
+        Where a recorded log is missing or a file cannot be written. The dataset is then
+        unchanged.
+
+    Notes
+    -----
+    Waits while another run publishes to the same dataset.
     """
     check_folder(dataset)
     for folder in staged.values():
         _require_whole(folder)
     nights = list(staged)
-    with _written(dataset):
+    with _writing(dataset):
         if (store := _store(dataset)) is not None:
             with store.claims.claim(store.claims.missing(nights)):
                 store.recover()
@@ -224,17 +193,17 @@ def publish_folders(
 def _require_whole(folder: Path) -> None:
     missing = [name for name in TABLES if not any((folder / name).glob("*.parquet"))]
     if missing:
-        raise ValueError(f"{folder}: is no whole night, without {', '.join(missing)}")
+        raise ValueError(f"{folder}: is not a whole night: {', '.join(missing)} missing")
 
 
 def _store(dataset: Where) -> StoreNights | None:
-    """Return the object store that a URL names; None: it is a local folder."""
+    """Return the object store that a URL names. None: the dataset is a local folder."""
     where = str(dataset)
     return store_nights(where) if "://" in where and not where.startswith("file://") else None
 
 
 def dataset_folder(dataset: Where) -> Path | None:
-    """Return the local folder of a dataset; None: it is a URL of an object store."""
+    """Return the local folder of a dataset. None: it lies in an object store."""
     return _folder(dataset) if _store(dataset) is None else None
 
 
@@ -243,8 +212,8 @@ def _folder(dataset: Where) -> Path:
 
 
 @contextlib.contextmanager
-def _written(dataset: Where) -> Iterator[None]:
-    """Have what the system says of a write told as an error of the dataset."""
+def _writing(dataset: Where) -> Iterator[None]:
+    """Turn errors of writing into `DatasetError`."""
     kinds = (OSError,) if _store(dataset) is None else storage_errors()
     try:
         yield
@@ -253,12 +222,12 @@ def _written(dataset: Where) -> Iterator[None]:
     except kinds as error:
         reason = getattr(error, "strerror", None) or line_of(error)
         raise DatasetError(
-            f"{dataset}: cannot be written ({reason}); nothing was changed"
+            f"{dataset}: cannot be written ({reason}); the dataset is unchanged"
         ) from error
 
 
 @contextlib.contextmanager
-def _read(dataset: Where) -> Iterator[None]:
+def _reading(dataset: Where) -> Iterator[None]:
     try:
         yield
     except DatasetError:
@@ -267,22 +236,16 @@ def _read(dataset: Where) -> Iterator[None]:
         raise DatasetError(f"{dataset}: cannot be read: {line_of(error)}") from error
 
 
-def _write_night(folder: Path, tables: Mapping[str, pa.Table], night: str) -> None:
-    for name, schema in TABLES.items():
-        rows = rows_of_night(name, tables.get(name, empty(schema)), night)
-        write_table(folder, name, [in_order(rows)])
-
-
 def nights_of(time_ns: np.ndarray) -> list[str]:
-    """Return the UTC dates, ``YYYY-MM-DD``, in which these instants lie, in order."""
+    """Return the UTC dates, ``YYYY-MM-DD``, of these times, each once and in order."""
     return [_date(day) for day in np.unique(time_ns // DAY_NS)]
 
 
 def rows_of_night(name: str, rows: pa.Table, night: str) -> pa.Table:
     """Return the rows of a table that belong to a night.
 
-    A row belongs to the UTC date of its epoch where it has one, of its time otherwise; a
-    log to every night between its first and last frame; a calibration to all.
+    A row belongs to the UTC date of its epoch or, without an epoch, of its time. A log belongs
+    to every night between its first and last frame. A calibration belongs to all nights.
     """
     day = _day(night)
     if name == "sources":
@@ -297,7 +260,7 @@ def rows_of_night(name: str, rows: pa.Table, night: str) -> pa.Table:
 def in_order(rows: pa.Table) -> pa.Table:
     """Return the rows sorted by time, then by the columns that identify them.
 
-    Rows that agree in all of these keep their order.
+    Rows that are equal in all of these keep their order.
     """
     times = [field.name for field in rows.schema if field.type == TIME]
     keys = [f.name for f in rows.schema if pa.types.is_integer(f.type) or f.type == pa.string()]

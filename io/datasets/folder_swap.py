@@ -1,4 +1,4 @@
-"""Folders put in place at once, so that a reader sees the old or the new, never half."""
+"""Folders replaced in one step: a reader sees the old or the new folder, never a mixture."""
 
 import ctypes
 import errno
@@ -8,22 +8,22 @@ from pathlib import Path
 AT_FDCWD = -100
 RENAME_EXCHANGE = 2
 
-# What a kernel, a C library or a file system without the exchange answers.
+# The errors of a kernel, C library or file system that has no exchange.
 _UNSUPPORTED = {errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP}
 
 
 def exchange(first: Path, second: Path) -> bool:
-    """Swap two paths of one file system at once (Linux's renameat2, RENAME_EXCHANGE).
+    """Swap two paths of one file system in one step (Linux's renameat2, RENAME_EXCHANGE).
 
     Returns
     -------
     bool
-        False where it is not supported; then nothing has happened.
+        False where it is not supported; the paths are then unchanged.
 
     Raises
     ------
     OSError
-        Where the system refuses for another reason.
+        Where it fails for another reason.
     """
     renameat2 = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if renameat2 is None:
@@ -40,15 +40,15 @@ def exchange(first: Path, second: Path) -> bool:
 
 
 def put_in_place(new: Path, target: Path, old: Path) -> None:
-    """Make the folder `new` the folder `target`; what stood there goes to `old`.
+    """Move the folder `new` to `target`, and what was there to `old`.
 
-    One rename where nothing stood there or the two can be exchanged; two renames otherwise,
-    in which `target` is missing for an instant (`old` then holds it, whole).
+    Where `target` is missing, or the two can be exchanged, a reader never misses it. Otherwise it
+    takes two renames, and `target` is missing for an instant; `old` then holds it.
 
     Raises
     ------
     OSError
-        Where the system refuses; `target` is then as it was.
+        Where a rename fails; `target` is then unchanged.
     """
     if not target.exists():
         new.rename(target)
@@ -64,7 +64,7 @@ def put_in_place(new: Path, target: Path, old: Path) -> None:
 
 
 def take_back(target: Path, old: Path, new: Path) -> None:
-    """Undo `put_in_place`: `target` goes back to `new`, and `old`, if there, to `target`."""
+    """Undo `put_in_place`: move `target` back to `new`, and `old`, if it exists, to `target`."""
     if old.exists() and exchange(old, target):
         old.rename(new)
         return
@@ -74,7 +74,7 @@ def take_back(target: Path, old: Path, new: Path) -> None:
 
 
 def sync(path: Path) -> None:
-    """Have a file's bytes, or a folder's entries, on the disk before going on."""
+    """Wait until the bytes of a file, or the entries of a folder, are on the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

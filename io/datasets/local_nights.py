@@ -1,14 +1,14 @@
 """Nights in a local folder: claimed by a lock, put in place by a rename, recovered after a kill.
 
-Everything that is not finished lies in ``DATASET/.staging``:
+Unfinished work lies in ``DATASET/.staging``:
 
-- ``lock``: held for instants, by whoever changes what is in staging or puts nights in place;
-- ``run-*/``: a run's own folder, with the file ``claim``, which is locked as long as the run
-  lives and says what it works on;
+- ``lock``: held briefly by a run that changes the staging folder or puts nights in place;
+- ``run-*/``: the folder of one run. Its file ``claim`` is locked as long as the run lives, and
+  names the nights that the run works on;
 - ``swap-*/``: nights that are being replaced.
 
-The kernel gives a lock back when its process ends, however it ends. So a claim that can be
-locked was left by a run that is no more, and its folder is removed by the next one.
+The kernel releases a lock when its process ends, however it ends. So a claim that can be locked
+belongs to a run that has ended, and the next run removes its folder.
 """
 
 import contextlib
@@ -28,12 +28,12 @@ CLAIM = "claim"
 
 @contextlib.contextmanager
 def claim(dataset: Path, nights: Sequence[str]) -> Iterator[Path]:
-    """Keep other runs off these nights, and lend a folder on the dataset's file system.
+    """Reserve these nights, and yield a folder for this run on the dataset's file system.
 
     Raises
     ------
     DatasetError
-        Where a run that is alive has claimed one of them; names it.
+        Where a living run has claimed one of them. The message names the run.
     OSError
         Where the folder cannot be written.
     """
@@ -57,19 +57,19 @@ def claim(dataset: Path, nights: Sequence[str]) -> Iterator[Path]:
                 shutil.rmtree(run, ignore_errors=True)
     finally:
         if made:
-            with contextlib.suppress(OSError):  # where nights were published it is not empty
+            with contextlib.suppress(OSError):  # not empty if nights were published
                 dataset.rmdir()
 
 
 def put_all_in_place(dataset: Path, staged: Mapping[str, Path]) -> None:
-    """Make these folders the nights of a dataset, each by one rename; all of them or none.
+    """Make these folders the nights of a dataset, each by one rename: all or none.
 
-    The caller is inside `alone`.
+    Must be called inside `alone`.
 
     Raises
     ------
     OSError
-        Where the system refuses; the dataset and the folders are then as they were.
+        Where a rename fails; the dataset and the folders are then unchanged.
     """
     aside = dataset / STAGING / f"swap-{uuid.uuid4().hex[:8]}"
     aside.mkdir()
@@ -90,7 +90,7 @@ def put_all_in_place(dataset: Path, staged: Mapping[str, Path]) -> None:
 
 @contextlib.contextmanager
 def alone(dataset: Path) -> Iterator[None]:
-    """Wait until nobody else publishes here, and keep others out; left-overs are cleared."""
+    """Wait until no other run publishes here, and keep others out. Clear what killed runs left."""
     with _locked(dataset) as staging:
         _clear(dataset, staging)
         yield
@@ -101,7 +101,7 @@ def _locked(dataset: Path) -> Iterator[Path]:
     staging = dataset / STAGING
     path = staging / "lock"
     while True:
-        with contextlib.suppress(FileNotFoundError):  # the last holder has just tidied up
+        with contextlib.suppress(FileNotFoundError):  # the last holder has just removed the folder
             staging.mkdir(parents=True, exist_ok=True)
             lock = path.open("w")
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -111,17 +111,17 @@ def _locked(dataset: Path) -> Iterator[Path]:
     try:
         yield staging
     finally:
-        # The lock's file goes while it is held; who waits for it sees that, above.
+        # The file is removed while it is locked. A waiting process notices this in the loop above.
         path.unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # another run has its folder there
+        with contextlib.suppress(OSError):  # not empty if another run has its folder there
             staging.rmdir()
         lock.close()
 
 
 def _clear(dataset: Path, staging: Path) -> None:
-    """Remove what killed runs left; a night that one had taken away first goes back.
+    """Remove what killed runs left. A night that was moved away but not replaced goes back.
 
-    Whoever holds the lock is alone, so nights in `swap-*` are nobody's.
+    The caller holds the lock, so no living run is replacing the nights in `swap-*`.
     """
     for swap in staging.glob("swap-*"):
         for old in swap.glob("old-night=*"):
@@ -141,5 +141,5 @@ def _is_alive(run: Path) -> bool:
     except BlockingIOError:
         return True
     except FileNotFoundError:
-        return False  # it was killed before it could make the claim
+        return False  # killed before it wrote its claim
     return False

@@ -1,4 +1,4 @@
-"""The Parquet files of a night in the making: one a table, written span by span."""
+"""The Parquet files of an unpublished night: one per table, written span by span."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -20,26 +20,26 @@ def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
     Parameters
     ----------
     night
-        The night's folder; the table's folder in it is made.
+        The night's folder. The table's folder is created in it.
     pieces
-        Each sorted; at least a row group each, so that a reader can pass over other times.
+        Each sorted. Each makes at least one row group, so that a reader can skip other times.
 
     Returns
     -------
     int
-        How many rows there are.
+        The number of rows.
 
     Raises
     ------
     DatasetError
-        Where the disk refuses.
+        Where a file cannot be written.
     """
     folder = night / name
     try:
         return _write(folder, name, pieces)
     except OSError as error:
         raise DatasetError(
-            f"{folder}: cannot be written ({error.strerror or error}); nothing was changed"
+            f"{folder}: cannot be written ({error.strerror or error}); the dataset is unchanged"
         ) from error
 
 
@@ -51,7 +51,7 @@ def _write(folder: Path, name: str, pieces: Iterable[pa.Table]) -> int:
         rows = conform(TABLES[name], rows)
         if rows.num_rows == 0:
             continue
-        if writer is None:  # what the rows' metadata says beside the schema's goes along
+        if writer is None:  # metadata of the rows that the schema does not have are kept
             writer = _writer(folder, rows.schema)
         writer.write_table(rows, ROWS_IN_GROUP)
         count += rows.num_rows

@@ -1,4 +1,4 @@
-"""Who is at work on which nights of a dataset: what a claim says, wherever it is kept."""
+"""The content of a claim: which run works on which nights of a dataset."""
 
 import json
 import os
@@ -21,27 +21,27 @@ class Holder:
     host: str
     pid: int
     since: str
-    machine: str  # within which a process number means one process; empty: unknown
-    token: str  # no two claims have the same
+    machine: str  # where process numbers are unique; empty: unknown
+    token: str  # unique to the claim
 
     @classmethod
     def of(cls, nights: Sequence[str]) -> Self:
-        """Return this process, as from now."""
+        """Return a holder for this process, from now on."""
         since = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         host, token = socket.gethostname(), uuid.uuid4().hex
         return cls(sorted(nights), host, os.getpid(), since, _machine(), token)
 
     @classmethod
     def read(cls, text: str | bytes) -> Self:
-        """Return what `text` wrote."""
+        """Return the holder that `text` wrote."""
         return cls(**json.loads(text))
 
     def text(self) -> str:
-        """Return it as a line of JSON."""
+        """Return the holder as a line of JSON."""
         return json.dumps(asdict(self)) + "\n"
 
     def is_gone(self) -> bool:
-        """Return whether the process has ended for certain: it was one of this machine."""
+        """Return whether the process has ended. On another machine it counts as running."""
         if not self.machine or self.machine != _machine():
             return False
         try:
@@ -49,27 +49,27 @@ class Holder:
         except ProcessLookupError:
             return True
         except PermissionError:
-            pass  # it is another user's
+            pass  # it runs, as another user
         return False
 
     def refuse(self, dataset: object, nights: Sequence[str]) -> None:
-        """Raise where one of these nights is this holder's.
+        """Raise where this holder has claimed one of these nights.
 
         Raises
         ------
         DatasetError
-            Names the night, the process, its host and since when.
+            Names the night, the process, its host and its start.
         """
         for night in nights:
             if night in self.nights:
                 raise DatasetError(
-                    f"{dataset}/night={night}: process {self.pid} on {self.host} has been at work "
-                    f"on it since {self.since}; wait for it to end, or stop it"
+                    f"{dataset}/night={night}: process {self.pid} on {self.host} has worked on "
+                    f"it since {self.since}; wait for it to end, or stop it"
                 )
 
 
 def _machine() -> str:
-    """Return this boot of this machine, and the container that process numbers count in."""
+    """Return an id of this boot of this machine, and of the container of this process."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot}-{Path('/proc/self/ns/pid').stat().st_ino}"

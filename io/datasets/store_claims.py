@@ -1,9 +1,10 @@
-"""Nights of a dataset in an object store, claimed by objects that are renewed.
+"""Claims of nights in an object store: objects that a run renews.
 
-``.staging/claim-night=YYYY-MM-DD.json`` is created only where there is none (on S3 by
-``If-None-Match: *``). Its run renews it every minute. One that has not been renewed for
-`LEASE_S` was left by a run that is no more, and is taken over; one of a process of this very
-machine that has ended, at once. Clocks need to agree with the store's to a minute or so.
+``.staging/claim-night=YYYY-MM-DD.json`` is created only if it does not exist (on S3 by
+``If-None-Match: *``). Its run renews it every minute. A claim that was not renewed for `LEASE_S`
+belongs to a run that has ended, and may be taken over. If that run was a process of this machine
+that has ended, this is known at once. The machine's clock must agree with the store's to about a
+minute.
 """
 
 import contextlib
@@ -22,7 +23,7 @@ LEASE_S = 300.0
 
 
 class StoreClaims:
-    """The claims of one dataset, and which of them this process holds."""
+    """The claims of one dataset, and those of them that this process holds."""
 
     def __init__(self, storage: Any, root: str, dataset: str) -> None:
         self._storage, self._root, self._dataset = storage, root, dataset
@@ -30,12 +31,12 @@ class StoreClaims:
 
     @contextlib.contextmanager
     def claim(self, nights: Sequence[str]) -> Iterator[None]:
-        """Keep other runs off these nights.
+        """Reserve these nights for this run.
 
         Raises
         ------
         DatasetError
-            Where a run that is alive has claimed one of them; names it.
+            Where a living run has claimed one of them. The message names the run.
         """
         holder, ended = Holder.of(nights), threading.Event()
         taken: list[str] = []
@@ -56,31 +57,31 @@ class StoreClaims:
                 renewing.join()
             for night in taken:
                 self._held.pop(night, None)
-                with contextlib.suppress(*storage_errors()):  # it will be taken over later
+                with contextlib.suppress(*storage_errors()):  # else the next run takes it over
                     if self._is_held(night, holder):
                         self._storage.rm_file(self._path(night))
 
     def missing(self, nights: Sequence[str]) -> list[str]:
-        """Return those of these nights that this process has not claimed."""
+        """Return the nights among these that this process has not claimed."""
         return [night for night in nights if night not in self._held]
 
     def verify(self, nights: Sequence[str]) -> None:
-        """Raise unless these nights are still this process's.
+        """Raise unless this process still holds the claims of these nights.
 
         Raises
         ------
         DatasetError
-            Where another run took one over, because it was not renewed in time.
+            Where another run has taken over a claim that was not renewed in time.
         """
         for night in nights:
             if not self._is_held(night, self._held[night]):
                 raise DatasetError(
-                    f"{self._dataset}/night={night}: another run has taken it over, as this one "
-                    "was not heard of for too long; run again"
+                    f"{self._dataset}/night={night}: another run has taken it over, because this "
+                    "run did not renew its claim in time; run again"
                 )
 
     def alive(self) -> set[str]:
-        """Return the tokens of the runs that are alive; the claims of the dead go."""
+        """Return the tokens of the living runs, and remove the claims of runs that have ended."""
         tokens = set()
         for path in self._storage.glob(f"{self._root}/{STAGING}/claim-*.json"):
             holder = self._read(path)
@@ -111,7 +112,7 @@ class StoreClaims:
                     other.refuse(self._dataset, [night])
                 with contextlib.suppress(FileNotFoundError):
                     self._storage.rm_file(path)
-        raise DatasetError(f"{self._dataset}/night={night}: another run has just begun on it")
+        raise DatasetError(f"{self._dataset}/night={night}: another run has just claimed it")
 
     def _read(self, path: str) -> Holder | None:
         try:
@@ -120,8 +121,8 @@ class StoreClaims:
             return None
 
     def _is_held(self, night: str, holder: Holder) -> bool:
-        found = self._read(self._path(night))
-        return found is not None and found.token == holder.token
+        current = self._read(self._path(night))
+        return current is not None and current.token == holder.token
 
     def _is_dead(self, path: str, holder: Holder) -> bool:
         if holder.is_gone():
@@ -138,6 +139,6 @@ class StoreClaims:
     def _renew(self, holder: Holder, nights: list[str], ended: threading.Event) -> None:
         while not ended.wait(RENEWED_EVERY_S):
             for night in nights:
-                with contextlib.suppress(*storage_errors()):  # the next time, within the lease
+                with contextlib.suppress(*storage_errors()):  # tried again before the lease ends
                     if self._is_held(night, holder):
                         self._storage.pipe_file(self._path(night), holder.text().encode())

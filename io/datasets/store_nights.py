@@ -1,16 +1,16 @@
 """Nights in an object store, which has no rename: staged, committed by one object, copied.
 
-1. Every file of the nights goes to ``.staging/run-<token>/``.
-2. ``.staging/commit-<token>.json`` is written: one PUT, which publishes all nights of a run.
-   From here on `read` takes the staged files.
-3. The files are copied to ``night=YYYY-MM-DD/<table>/`` inside the store, each at once;
-   `sources` is the last. What the old night had besides goes.
-4. The commit goes, then the staged files.
+1. Every file of the nights is written to ``.staging/run-<token>/``.
+2. ``.staging/commit-<token>.json`` is written by one PUT. This publishes all nights of the run:
+   from now on `read` takes the staged files.
+3. The store copies the files to ``night=YYYY-MM-DD/<table>/``; each copy is atomic, and `sources`
+   comes last. Other files of the old night are removed.
+4. The commit is removed, then the staged files.
 
-A publisher that is killed before 2 has published nothing, and after it everything: the next
-run on the night goes on with 3. Who reads objects by a glob meets, at every instant, whole
-tables; in step 3, a fraction of a second, some are of the old night and some of the new. A
-night that is published for the first time is whole where it has `sources`.
+A run that is killed before step 2 has published nothing. A run that is killed later has published
+everything, and the next run on the night finishes step 3. A reader that lists the objects by a
+glob pattern always gets whole tables. During step 3, a fraction of a second, some tables are of
+the old night and some of the new one. A new night is complete when it has `sources`.
 """
 
 import contextlib
@@ -26,13 +26,13 @@ from epipole.io.datasets.store_claims import STAGING, StoreClaims
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.errors import DatasetError
 
-REQUESTS = 8  # at once
-LAST = "sources"  # the table that says that a night is whole
+REQUESTS = 8  # at the same time
+LAST = "sources"  # the table that completes a night
 
 
 @dataclass(frozen=True)
 class Commit:
-    """Nights that are published, though not all of their files are in place yet."""
+    """Nights that are published, but whose files are not all in place yet."""
 
     path: str
     staged: str  # the folder of the run, which holds night=.../<table>/*.parquet
@@ -47,7 +47,7 @@ class StoreNights:
         self.claims = StoreClaims(storage, root, dataset)
 
     def names(self) -> list[str]:
-        """Return what lies at the top of the dataset: folders by their names."""
+        """Return the names at the top of the dataset."""
         self._storage.invalidate_cache()
         try:
             return [entry.rstrip("/").rpartition("/")[2] for entry in self._ls(self._root)]
@@ -56,19 +56,19 @@ class StoreNights:
 
     def nights(self) -> list[str]:
         """Return the nights that are published, in order."""
-        there = {n.removeprefix("night=") for n in self.names() if n.startswith("night=")}
-        return sorted(there.union(*(commit.files for commit in self._commits())))
+        in_place = {n.removeprefix("night=") for n in self.names() if n.startswith("night=")}
+        return sorted(in_place.union(*(commit.files for commit in self._commits())))
 
     def read(self, night: str, table: str) -> list[bytes]:
-        """Return the files of a table of a night, in order; none where it is not there."""
+        """Return the files of a table of a night, in order; none where the night is missing."""
         for _ in range(3):
-            with contextlib.suppress(FileNotFoundError):  # put in place, or replaced, just now
+            with contextlib.suppress(FileNotFoundError):  # put in place or replaced meanwhile
                 paths = self._paths(night, table)
                 return [bytes(self._storage.cat_file(path)) for path in paths]
         raise DatasetError(f"{self._dataset}/night={night}: is being replaced; try again")
 
     def publish(self, staged: Mapping[str, Path]) -> None:
-        """Publish these nights, which this process has claimed: all of them or none.
+        """Publish these nights, which this process has claimed: all or none.
 
         Raises
         ------
@@ -94,28 +94,28 @@ class StoreNights:
             text = json.dumps({"staged": f"run-{token}", "files": files})
             self._storage.pipe_file(commit.path, text.encode())
         except BaseException:
-            with contextlib.suppress(Exception):  # what is left there, a later run clears
+            with contextlib.suppress(Exception):  # a later run clears what is left
                 self._storage.rm(run, recursive=True)
             raise
         try:
             self._finish(commit)
         except storage_errors() as error:
             raise DatasetError(
-                f"{self._dataset}: {', '.join(nights)} is published, but not all of its files are "
-                f"in place ({line_of(error)}); run again to have that finished"
+                f"{self._dataset}: {', '.join(nights)} published, but not all files are in place "
+                f"({line_of(error)}); run again to finish this"
             ) from error
 
     def recover(self) -> None:
-        """Finish what killed runs had committed, as far as nobody else is at work on it.
+        """Finish the commits of killed runs, except on nights that another run has claimed.
 
-        The caller has claimed its nights, so commits of them are nobody's.
+        The caller has claimed its own nights, so no living run has commits of them.
         """
         for commit in self._commits():
             others = self.claims.missing(list(commit.files))
             with contextlib.suppress(DatasetError), self.claims.claim(others):
-                self._finish(commit)  # else whose nights they are will finish it
-        # A run claims before it stages and stages before it commits: so what is listed first and
-        # has neither claim nor commit then is of a run that is no more.
+                self._finish(commit)  # else the run that claimed them will
+        # A run claims, then stages, then commits. So a staged folder that is listed first, and then
+        # has neither a claim nor a commit, belongs to a run that has ended.
         runs = [entry.rstrip("/") for entry in self._ls(f"{self._root}/{STAGING}")]
         used = {f"run-{token}" for token in self.claims.alive()}
         used |= {commit.staged.rpartition("/")[2] for commit in self._commits()}
@@ -125,7 +125,7 @@ class StoreNights:
                 self._storage.rm(run, recursive=True)
 
     def _finish(self, commit: Commit) -> None:
-        """Copy what is committed into place, and remove the commit."""
+        """Copy the committed files into place, and remove the commit."""
         for night, names in commit.files.items():
             folder = f"{self._root}/night={night}"
             moves = [(f"{commit.staged}/night={night}/{n}", f"{folder}/{n}") for n in names]
@@ -144,19 +144,19 @@ class StoreNights:
             if night in commit.files:
                 names = [name for name in commit.files[night] if name.startswith(f"{table}/")]
                 return [f"{commit.staged}/night={night}/{name}" for name in names]
-        found: list[str] = sorted(
+        paths: list[str] = sorted(
             self._storage.glob(f"{self._root}/night={night}/{table}/*.parquet")
         )
-        return found
+        return paths
 
     def _commits(self) -> list[Commit]:
         self._storage.invalidate_cache()
         staging = f"{self._root}/{STAGING}"
         commits = []
         for path in sorted(self._storage.glob(f"{staging}/commit-*.json")):
-            with contextlib.suppress(FileNotFoundError):  # finished just now
-                said = json.loads(self._storage.cat_file(path))
-                commits.append(Commit(path, f"{staging}/{said['staged']}", said["files"]))
+            with contextlib.suppress(FileNotFoundError):  # finished meanwhile
+                commit = json.loads(self._storage.cat_file(path))
+                commits.append(Commit(path, f"{staging}/{commit['staged']}", commit["files"]))
         return commits
 
     def _ls(self, folder: str) -> Iterator[str]:
@@ -173,7 +173,7 @@ class StoreNights:
 
 
 def store_nights(dataset: str) -> StoreNights:
-    """Return the nights behind a URL: each time the same object, which knows what is claimed."""
+    """Return the nights behind a URL; the same object each time, as it holds the claims."""
     return _store_nights(dataset.rstrip("/"))
 
 

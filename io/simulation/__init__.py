@@ -1,1 +1,1 @@
-"""The simulator's files: scenes, skies and the truth of a log."""
+"""The files of the simulator: scenes, star catalogues and the truth of a log."""

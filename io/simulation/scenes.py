@@ -1,4 +1,4 @@
-"""Scenes in: the built-in ones and TOML files."""
+"""Simulation scenes: built-in ones and TOML files."""
 
 import os
 from pathlib import Path
@@ -15,12 +15,12 @@ def built_in_scenes() -> list[str]:
 
 
 def read_scene(scene: str | os.PathLike[str]) -> Scene:
-    """Return a built-in scene by its name, or the one in a TOML file.
+    """Return the built-in scene of this name, or the scene in a TOML file.
 
     Raises
     ------
     SceneError
-        Where there is neither, or the file does not fit.
+        Where there is neither, or the file is invalid.
     """
     name = os.fspath(scene)
     path = _BUILT_IN / f"{name}.toml" if name in built_in_scenes() else Path(name)
@@ -28,7 +28,7 @@ def read_scene(scene: str | os.PathLike[str]) -> Scene:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         known = ", ".join(built_in_scenes())
-        raise SceneError(f"{name}: no such scene file, nor a built-in one ({known})") from None
+        raise SceneError(f"{name}: no such scene file; the built-in scenes are {known}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{name}: cannot be read as a scene: {error}") from error
     return parse_scene(text, name)

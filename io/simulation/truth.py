@@ -1,4 +1,4 @@
-"""The truth of a simulated log: a folder beside it."""
+"""The truth of a simulated log: a folder beside the log."""
 
 import json
 import os
@@ -21,7 +21,7 @@ _FILES = {"frames": TRUE_FRAMES, "points": TRUE_POINTS}
 
 @dataclass(frozen=True)
 class Truth:
-    """What a simulated log is: its frames, its centroids, and how it was made."""
+    """The truth of a simulated log: its frames, its centroids, and the scene."""
 
     frames: pa.Table
     points: pa.Table
@@ -29,7 +29,7 @@ class Truth:
 
 
 class TruthWriter:
-    """Writes a truth folder, frames and points as they come; a context manager."""
+    """Writes a truth folder, block by block; a context manager."""
 
     def __init__(self, folder: str | os.PathLike[str], scenario: dict[str, Any]) -> None:
         self._folder = Path(folder)
@@ -61,7 +61,7 @@ class TruthWriter:
 
 
 def read_truth(path: str | os.PathLike[str]) -> Truth:
-    """Return the truth in a folder; the log it lies beside may be named instead.
+    """Return the truth in a folder. The log beside the folder may be named instead.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def read_truth(path: str | os.PathLike[str]) -> Truth:
     if not folder.is_dir() and Path(os.fspath(path) + SUFFIX).is_dir():
         folder = Path(os.fspath(path) + SUFFIX)
     if not folder.is_dir():
-        raise DatasetError(f"{path}: no truth folder; `epipole simulate` writes LOG{SUFFIX}/")
+        raise DatasetError(f"{path}: no truth folder; `epipole simulate` writes it as LOG{SUFFIX}")
     tables = {}
     for name, schema in _FILES.items():
         tables[name] = _read(folder / f"{name}.parquet", schema)
@@ -83,7 +83,7 @@ def read_truth(path: str | os.PathLike[str]) -> Truth:
         raise DatasetError(f"{where}: cannot be read: {error}") from error
     missing = [key for key in ("t0_ns", "sensors", "targets") if key not in scenario]
     if missing:
-        raise DatasetError(f"{where}: has no {', '.join(missing)}")
+        raise DatasetError(f"{where}: {', '.join(missing)} missing")
     return Truth(tables["frames"], tables["points"], scenario)
 
 
@@ -96,6 +96,6 @@ def _read(path: Path, schema: pa.Schema) -> pa.Table:
 
 
 def elements_of(truth: Truth) -> np.ndarray:
-    """Return the (n, 6) orbital elements of the truth's targets at its t0 (km and rad)."""
+    """Return the (n, 6) orbital elements of the true objects at `t0_ns` [km and rad]."""
     elements = [target["elements"] for target in truth.scenario["targets"]]
     return np.array(elements, float).reshape(-1, 6)

@@ -1,1 +1,1 @@
-"""Star catalogues built from the catalogues of others."""
+"""Star catalogues built from published catalogues."""

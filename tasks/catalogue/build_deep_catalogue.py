@@ -1,6 +1,6 @@
 """The deep star catalogue: Gaia's stars with Hipparcos' motions, as a labelled table.
 
-A plain function rather than a Prefect task: a catalogue is built once, by hand.
+A plain function, not a Prefect task, because a catalogue is built once, by hand.
 """
 
 import numpy as np
@@ -24,18 +24,17 @@ from epipole.tasks.algorithms.catalogue.catalogue_join import (
 )
 from epipole.tasks.algorithms.geometry.sky import unit_from_radec
 
-# Gaia DR3's own errors are some 0.02 mas, and below this for all but a few of the brightest.
+# The errors of Gaia DR3 are about 0.02 mas, and below this value for all but a few bright stars.
 GAIA_SIGMA_MAS = 1.0
 
 
-def build_deep_catalogue(
-    gaia: GaiaStars | None = None, hipparcos: pa.Table | None = None
-) -> pa.Table:
+def build_deep_catalogue() -> pa.Table:
     """Return Gaia DR3's stars to G 10 at 2016.0, with motions, as a table STAR_CATALOGUE.
 
-    Gaia's stars have Gaia's places and ids. Motion and parallax are Hipparcos' where a star is
-    in both; the others' are taken as none, with a sigma that says so. Hipparcos' stars that Gaia
-    lacks, the brightest of all among them, stand at 2016.0 with their numbers below zero.
+    Gaia's stars have Gaia's positions and ids. A star that is in both catalogues has the motion and
+    parallax of Hipparcos. For the others both are zero, with the sigma UNKNOWN_MOTION_MAS_YR. Stars
+    that only Hipparcos has, such as the brightest, are moved to 2016.0. Their id is minus the
+    Hipparcos number.
 
     Raises
     ------
@@ -43,8 +42,8 @@ def build_deep_catalogue(
         Where a data package is missing or damaged.
     """
     gaia, hipparcos = read_gaia(), _at_gaia_epoch(read_hipparcos())
-    own = gaia.star_id > 0
-    gaia = GaiaStars(*[column[own] for column in gaia])  # type: ignore[arg-type]
+    from_gaia = gaia.star_id > 0
+    gaia = GaiaStars(*[column[from_gaia] for column in gaia])  # type: ignore[arg-type]
     v = johnson_v_of_gaia(gaia.g, gaia.bp, gaia.rp)
     joined = join(
         unit_from_radec(np.radians(gaia.ra_deg), np.radians(gaia.dec_deg)),
@@ -74,7 +73,7 @@ def build_deep_catalogue(
     added = hipparcos.take(joined.missing)
     added = added.set_column(0, STAR_CATALOGUE.field("star_id"), pa.array(-array(added, "star_id")))
     source = (
-        f"{gaia_source()}; motions, parallaxes and stars with ids below zero: "
+        f"{gaia_source()}; motions, parallaxes and stars with negative ids: "
         + label_of(hipparcos.schema).source
     )
     both = pa.concat_tables([table(STAR_CATALOGUE, columns), added]).combine_chunks()
@@ -82,7 +81,7 @@ def build_deep_catalogue(
 
 
 def _at_gaia_epoch(hipparcos: pa.Table) -> pa.Table:
-    """Return Hipparcos' stars at Gaia's epoch, with what their places' errors have grown to."""
+    """Return Hipparcos' stars at Gaia's epoch, with the errors of their positions there."""
     label = label_of(hipparcos.schema)
     years = GAIA_EPOCH - label.epoch
     ra, dec, pm_ra, pm_dec = moved(

@@ -1,1 +1,1 @@
-"""A dataset held against the truth of a simulated log."""
+"""Comparison of a dataset with the truth of a simulated log."""

@@ -1,6 +1,6 @@
-"""Hold the tables of a dataset against the truth of the simulated logs they were made of.
+"""Evaluate a dataset: compare its tables with the truth of the simulated logs.
 
-A plain function rather than a Prefect task: nobody schedules an evaluation.
+A plain function, not a Prefect task, because an evaluation is not scheduled.
 """
 
 from collections.abc import Mapping
@@ -36,22 +36,23 @@ INSIDE_99 = 11.345  # chi-square of 3 degrees of freedom
 
 
 def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:
-    """Return how tables of a dataset compare with the truth.
+    """Return the measures of the tables of a dataset against the truth.
 
     Parameters
     ----------
     tables
-        `frames`, `stars`, `detections`, `epochs`, `associations` and `positions`, of the
-        truth's nights.
+        `frames`, `stars`, `detections`, `epochs`, `associations` and `positions` of the nights
+        of the truth.
     truth
-        Of all logs of these nights.
+        The truth of all logs of these nights.
 
     Notes
     -----
-    An object claimed at an epoch is the true object that most of its views are of, if these
-    are two or more, and a ghost otherwise. A view whose centroid was missed is of what most
-    detections of its tracklet are of. A pair is two views of a claim with centroids; there
-    could have been one for every two centroids of one object in the frames of an epoch.
+    A claim is an object that the dataset reports at an epoch. The true object of a claim is the one
+    that most of its views show; with fewer than two views of one true object it is a ghost. A view
+    without a centroid (a miss) shows what most detections of its tracklet show. A pair is two views
+    of a claim that have centroids. The number of possible pairs is that of any two centroids of one
+    object in the frames of an epoch.
     """
     frames, points = to_polars(truth.frames), to_polars(truth.points)
     measures = _stars(to_polars(tables["stars"]), points)
@@ -62,9 +63,9 @@ def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:
             points, on=SPOT, how="left", maintain_order="left"
         )
         claims = _claims(to_polars(tables["associations"]), detections, points)
-        who, found = _associations(claims, to_polars(tables["epochs"]), points)
-        measures |= found
-        measures |= _positions(tables["positions"], who, truth)
+        of_claims, associations = _associations(claims, to_polars(tables["epochs"]), points)
+        measures |= associations
+        measures |= _positions(tables["positions"], of_claims, truth)
         measures["positions_per_truth"] = _per_truth(measures["positions"], truth, frames, points)
         measures |= _tracks(detections.drop_nulls("track_id"), points)
     return Report(**measures)
@@ -77,16 +78,16 @@ def _share(part: float, whole: float) -> float:
 def _stars(stars: pl.DataFrame, points: pl.DataFrame) -> Measures:
     held = stars.select(*SPOT, "star_id").join(points, on=SPOT, how="inner")
     right = held.filter((pl.col("kind") == STAR) & (pl.col("source") == pl.col("star_id"))).height
-    there = points.filter(pl.col("kind") == STAR).height
+    n_true = points.filter(pl.col("kind") == STAR).height
     return {
         "stars_claimed": stars.height,
         "star_precision": _share(right, stars.height),
-        "star_recall": _share(right, there),
+        "star_recall": _share(right, n_true),
     }
 
 
-def _attitudes(found: pl.DataFrame, true: pl.DataFrame) -> Measures:
-    once = found.unique(FRAME, keep="first", maintain_order=True)
+def _attitudes(frames: pl.DataFrame, true: pl.DataFrame) -> Measures:
+    once = frames.unique(FRAME, keep="first", maintain_order=True)
     solved = once.filter(pl.col("attitude_source") == "stars").join(
         true, on=FRAME, how="inner", suffix="_true"
     )
@@ -96,8 +97,8 @@ def _attitudes(found: pl.DataFrame, true: pl.DataFrame) -> Measures:
     cross, roll = (v / ARCSEC for v in attitude_errors(q_found, q_true))
     roll = np.abs(roll)
     measures: Measures = {
-        "frames": found.height,
-        "frames_duplicated": found.height - once.height,
+        "frames": frames.height,
+        "frames_duplicated": frames.height - once.height,
         "frames_solved": _share(solved.height, true.height),
     }
     if solved.height:
@@ -113,7 +114,7 @@ def _attitudes(found: pl.DataFrame, true: pl.DataFrame) -> Measures:
 def _claims(
     associations: pl.DataFrame, detections: pl.DataFrame, points: pl.DataFrame
 ) -> pl.DataFrame:
-    """Return the views still claimed: `claim` numbers epochs' objects, `target` is of what."""
+    """Return the used views: `claim` is the number of the claim, `target` the true object."""
     tracked = detections.drop_nulls("tracklet_id")
     numbers = tracked.select("tracklet_id").unique(maintain_order=True).with_row_index("number")
     number = tracked.join(numbers, on="tracklet_id", how="left", maintain_order="left")["number"]
@@ -124,17 +125,17 @@ def _claims(
     views = views.join(numbers, on="tracklet_id", how="left", maintain_order="left")
     views = views.with_columns(
         claim=pl.struct(CLAIM).rank("dense").cast(pl.Int64) - 1,
-        seen=pl.col("centroid").is_not_null(),
+        has_centroid=pl.col("centroid").is_not_null(),
         target=pl.Series(_target(views), dtype=pl.Int64),
     )
     missed = pl.col("of_tracklet").fill_null(-1)
-    views = views.with_columns(target=pl.when("seen").then("target").otherwise(missed))
-    # What was seen comes first: it decides where as many views say one thing as another.
-    return views.sort("seen", descending=True, maintain_order=True)
+    views = views.with_columns(target=pl.when("has_centroid").then("target").otherwise(missed))
+    # Views with a centroid come first: they decide where two true objects have as many views.
+    return views.sort("has_centroid", descending=True, maintain_order=True)
 
 
 def _target(spots: pl.DataFrame) -> Indices:
-    """Return the true object of each spot, -1 where it is none."""
+    """Return the true object of each spot, -1 where it shows none."""
     of_target = pl.when(pl.col("kind") == TARGET).then("source").otherwise(-1)
     return spots.select(of_target.cast(pl.Int64)).to_series().to_numpy()
 
@@ -142,23 +143,25 @@ def _target(spots: pl.DataFrame) -> Indices:
 def _associations(
     views: pl.DataFrame, epochs: pl.DataFrame, points: pl.DataFrame
 ) -> tuple[pl.DataFrame, Measures]:
-    """Return which object each claim is (-1: a ghost), and the measures of claims and pairs."""
+    """Return the true object of each claim (-1: a ghost), and the measures of claims and pairs."""
     claims = views.select(*CLAIM, "claim").unique("claim").sort("claim")
     mostly = majority(_ints(views, "claim"), _ints(views, "target"), claims.height)
     of = np.where(mostly.votes >= 2, mostly.value, -1)
     claims = claims.with_columns(target=pl.Series(of, dtype=pl.Int64))
-    seen = views.filter("seen")
-    n_pairs, n_right = pairs_within(_ints(seen, "claim"), _ints(seen, "target"), claims.height)
-    could = points.filter(pl.col("kind") == TARGET).join(epochs, on=FRAME, how="inner")
-    could = could.group_by("epoch", target="source").len().filter(pl.col("len") >= 2)
-    n = _ints(could, "len")
-    found = claims.join(could, on=["epoch", "target"], how="semi").select("epoch", "target")
+    with_centroid = views.filter("has_centroid")
+    n_pairs, n_right = pairs_within(
+        _ints(with_centroid, "claim"), _ints(with_centroid, "target"), claims.height
+    )
+    possible = points.filter(pl.col("kind") == TARGET).join(epochs, on=FRAME, how="inner")
+    possible = possible.group_by("epoch", target="source").len().filter(pl.col("len") >= 2)
+    n = _ints(possible, "len")
+    recalled = claims.join(possible, on=["epoch", "target"], how="semi").select("epoch", "target")
     return claims, {
         "epochs": epochs["epoch"].n_unique(),
         "groups": claims.height,
         "pair_precision": _share(n_right, n_pairs),
         "pair_recall": _share(n_right, int(np.sum(n * (n - 1) // 2))),
-        "object_recall": _share(found.unique().height, could.height),
+        "object_recall": _share(recalled.unique().height, possible.height),
         "ghosts": int(np.sum(of < 0)),
     }
 
@@ -200,13 +203,16 @@ def _positions(positions: pa.Table, claims: pl.DataFrame, truth: Truth) -> Measu
 
 
 def _per_truth(n: int, truth: Truth, frames: pl.DataFrame, points: pl.DataFrame) -> float:
-    """Return positions per object and frame interval of the slowest sensor that two sensors saw."""
+    """Return the number of positions as a share of the possible ones.
+
+    One is possible per object and frame interval of the slowest sensor, if two sensors see it.
+    """
     rate = min(sensor["rate_hz"] for sensor in truth.scenario["sensors"])
     since = pl.col("t_ns") - int(truth.scenario["t0_ns"])
-    could = points.filter(pl.col("kind") == TARGET).join(frames.select(*FRAME, "t_ns"), on=FRAME)
-    could = could.with_columns(interval=(since * (rate / 1e9)).floor())
-    could = could.group_by("interval", "source").agg(n=pl.col("sensor_id").n_unique())
-    return _share(n, could.filter(pl.col("n") >= 2).height)
+    possible = points.filter(pl.col("kind") == TARGET).join(frames.select(*FRAME, "t_ns"), on=FRAME)
+    possible = possible.with_columns(interval=(since * (rate / 1e9)).floor())
+    possible = possible.group_by("interval", "source").agg(n=pl.col("sensor_id").n_unique())
+    return _share(n, possible.filter(pl.col("n") >= 2).height)
 
 
 def _tracks(tracked: pl.DataFrame, points: pl.DataFrame) -> Measures:
@@ -219,10 +225,10 @@ def _tracks(tracked: pl.DataFrame, points: pl.DataFrame) -> Measures:
     right = int(mostly.votes.sum())
     of = tracks.select("sensor_id", target=pl.Series(mostly.value)).filter(pl.col("target") >= 0)
     each = of.group_by("sensor_id", "target").len()["len"]
-    there = points.filter(pl.col("kind") == TARGET).height
+    n_true = points.filter(pl.col("kind") == TARGET).height
     return {
         "tracks": tracks.height,
         "track_purity": _share(right, tracked.height),
-        "track_completeness": _share(right, there),
+        "track_completeness": _share(right, n_true),
         "tracks_per_target": float(np.mean(each.to_numpy())) if len(each) else None,
     }

@@ -1,1 +1,1 @@
-"""A scene to what its sensors see."""
+"""Simulation of a scene: what its sensors see."""

@@ -1,6 +1,7 @@
-"""A scene becomes sensors, objects and, block by block, what the sensors see.
+"""Simulate a scene: its sensors and objects, and block by block what the sensors see.
 
-Plain functions rather than Prefect tasks: a simulation runs by itself, and streams.
+These are plain functions, not Prefect tasks, because a simulation is not scheduled and streams its
+results.
 """
 
 import math
@@ -38,42 +39,42 @@ from epipole.tasks.algorithms.simulation.star_field import StarField, star_field
 Array = npt.NDArray[np.float64]
 
 FRAMES_AT_ONCE = 4096
-NOBODY = 1_000_000  # index of the streams of random numbers that belong to no sensor
+NO_SENSOR = 1_000_000  # first index of the random streams that belong to no sensor
 _DRAWS = 10_000
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """A scene with everything settled that it left to chance."""
+    """A scene whose random choices have been made."""
 
     scene: Scene
     t0_ns: int
     sensors: list[Sensor]
-    told: list[SceneSensor]  # the scene's words on each of them
+    groups: list[SceneSensor]  # the group of the scene that each sensor belongs to
     targets: Array  # (n, 6) elements at t0
     target_magnitude: Array
 
 
 def simulate_scene(scene: Scene) -> Simulation:
-    """Return the sensors and objects of a scene; the same scene gives the same ones."""
+    """Return the sensors and objects of a scene. The same scene always gives the same ones."""
     t0_ns = round(scene.start.timestamp() * 1e6) * 1000
     targets, magnitude = _targets(scene)
     sensors: list[Sensor] = []
-    told: list[SceneSensor] = []
+    groups: list[SceneSensor] = []
     for group in scene.sensors:
         for number in range(1, group.count + 1):
             name = group.id if group.count == 1 else f"{group.id}{number}"
             sensors.append(_sensor(scene, group, name, len(sensors), t0_ns, targets))
-            told.append(group)
+            groups.append(group)
     names = [s.sensor_id for s in sensors]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise SceneError(f"{scene.name}: two sensors would be called {twice}")
-    return Simulation(scene, t0_ns, sensors, told, targets, magnitude)
+    return Simulation(scene, t0_ns, sensors, groups, targets, magnitude)
 
 
 def expose_blocks(simulation: Simulation) -> Iterator[list[Exposures]]:
-    """Yield what each sensor sees, in blocks of time that bound the memory."""
+    """Yield what each sensor sees, in blocks of time that limit the memory."""
     faintest = max(s.magnitude_limit for s in simulation.sensors)
     stars = read_stars(simulation.scene.catalogue, faintest)
     fields: dict[tuple[float, float], StarField] = {}
@@ -95,38 +96,38 @@ def expose_blocks(simulation: Simulation) -> Iterator[list[Exposures]]:
         yield block
 
 
-def true_tables(sensor_id: str, seen: Exposures) -> tuple[pa.Table, pa.Table]:
-    """Return the truth of a block of one sensor, as TRUE_FRAMES and TRUE_POINTS."""
-    q = seen.attitude.as_quat()
+def true_tables(sensor_id: str, exposed: Exposures) -> tuple[pa.Table, pa.Table]:
+    """Return the truth of a block of one sensor: TRUE_FRAMES and TRUE_POINTS."""
+    q = exposed.attitude.as_quat()
     q = np.where(q[:, 3:] < 0, -q, q)
-    n = np.diff(seen.offsets)
+    n = np.diff(exposed.offsets)
     frames = table(
         TRUE_FRAMES,
         {
             "sensor_id": [sensor_id] * len(q),
-            "frame_number": seen.frame_number,
-            "t_ns": seen.time_ns,
+            "frame_number": exposed.frame_number,
+            "t_ns": exposed.time_ns,
             **unstack("q{}", q, "xyzw"),
-            **unstack("{}", seen.r_km),
-            **unstack("v{}", seen.v_km_s),
+            **unstack("{}", exposed.r_km),
+            **unstack("v{}", exposed.v_km_s),
         },
     )
-    first = np.repeat(seen.offsets[:-1], n)
+    first = np.repeat(exposed.offsets[:-1], n)
     points = table(
         TRUE_POINTS,
         {
             "sensor_id": pa.repeat(pa.scalar(sensor_id), len(first)),
-            "frame_number": np.repeat(seen.frame_number, n),
+            "frame_number": np.repeat(exposed.frame_number, n),
             "centroid": (np.arange(len(first)) - first).astype(np.int32),
-            "kind": seen.kind,
-            "source": seen.source,
+            "kind": exposed.kind,
+            "source": exposed.source,
         },
     )
     return frames, points
 
 
 def sent_optics(camera: SceneCamera) -> Optics:
-    """Return the optics that the log tells of."""
+    """Return the optics that the log reports."""
     if camera.focal_px is not None:
         focal = camera.focal_px
     else:
@@ -138,7 +139,7 @@ def sent_optics(camera: SceneCamera) -> Optics:
 
 
 def true_optics(camera: SceneCamera) -> Optics:
-    """Return the optics that make the image."""
+    """Return the true optics, which make the image."""
     sent, off = sent_optics(camera), camera.departure
     return sent._replace(
         fx_px=sent.fx_px * (1 + off.focal),
@@ -151,22 +152,22 @@ def true_optics(camera: SceneCamera) -> Optics:
 
 
 def _field(stars: SkyStars, magnitude_limit: float, radius_rad: float) -> StarField:
-    seen = stars.magnitude <= magnitude_limit
+    bright = stars.magnitude <= magnitude_limit
     return star_field(
-        stars.star_id[seen],
-        stars.ra[seen],
-        stars.dec[seen],
-        stars.pm_ra_mas_yr[seen],
-        stars.pm_dec_mas_yr[seen],
-        stars.parallax_mas[seen],
-        stars.magnitude[seen],
+        stars.star_id[bright],
+        stars.ra[bright],
+        stars.dec[bright],
+        stars.pm_ra_mas_yr[bright],
+        stars.pm_dec_mas_yr[bright],
+        stars.parallax_mas[bright],
+        stars.magnitude[bright],
         epoch=stars.epoch,
         radius_rad=radius_rad,
     )
 
 
 def _elements(orbit: Orbit, rng: np.random.Generator) -> Array:
-    """Return the (6,) elements of an orbit; only one left to chance draws from `rng`."""
+    """Return the (6,) elements of an orbit. Only a random orbit draws from `rng`."""
     if orbit.random is not None:
         return _random_elements(orbit.random, rng)
     if orbit.position_km is not None:
@@ -174,7 +175,7 @@ def _elements(orbit: Orbit, rng: np.random.Generator) -> Array:
         v = orbit.velocity_km_s
         v_km_s = circular_velocity(r_km) if v is None else np.array(v)
         if v_km_s @ v_km_s >= 2 * GM_KM3_S2 / np.linalg.norm(r_km):
-            raise SceneError(f"velocity_km_s {v}: faster than escape, no orbit about the Earth")
+            raise SceneError(f"velocity_km_s {v}: faster than escape velocity")
         return elements_from_state(r_km, v_km_s)
     angles = np.radians([orbit.i_deg, orbit.raan_deg, orbit.argp_deg])
     if orbit.true_anomaly_deg is not None:
@@ -198,7 +199,7 @@ def _random_elements(kind: str, rng: np.random.Generator) -> Array:
 def _targets(scene: Scene) -> tuple[Array, Array]:
     elements, magnitudes = [np.empty((0, 6))], [np.empty(0)]
     for k, group in enumerate(scene.targets):
-        rng = random_stream(scene.seed, NOBODY + k, "targets")
+        rng = random_stream(scene.seed, NO_SENSOR + k, "targets")
         made = np.array([_spread(group.orbit, group.spread_km, rng) for _ in range(group.count)])
         elements.append(made.reshape(-1, 6))
         low, high = np.broadcast_to(np.asarray(group.magnitude, float), 2)
@@ -212,7 +213,7 @@ def _spread(orbit: Orbit, spread_km: float, rng: np.random.Generator) -> Array:
         return elements
     r_km, v_km_s = state_at(elements, np.zeros(()))
     moved = r_km + rng.standard_normal(3) * spread_km
-    # The same direction and energy of motion, level and circular at the new place.
+    # The same direction of motion, but horizontal and circular at the new position.
     level = v_km_s - moved * (v_km_s @ moved) / (moved @ moved)
     speed = np.linalg.norm(circular_velocity(moved))
     return elements_from_state(moved, level / np.linalg.norm(level) * speed)
@@ -292,4 +293,6 @@ def _sensor_elements(
         distance = np.linalg.norm(d, axis=1)
         if not hidden_by_earth(r_km, d / distance[:, None], distance).any():
             return elements
-    raise SceneError(f"{scene.name}: sensor {group.id}: no orbit keeps what it tracks in view")
+    raise SceneError(
+        f"{scene.name}: sensor {group.id}: no random orbit keeps the tracked object in view"
+    )

@@ -1,7 +1,8 @@
-"""A whole night: time, memory and where they go; and how they grow with the night.
+"""Time and memory of a whole night, by stage, and how they grow with the length of the night.
 
-`python tests/benchmarks/bench_night.py [--shares 16 4 1]`. Each row is `epipole run` of a simulated
-log in a process of its own, kernels cached: 4 sensors at 5 Hz with about 25 centroids a frame.
+`python tests/benchmarks/bench_night.py [--shares 16 4 1]`. Each row is one `epipole run` of a
+simulated log, in its own process and with cached kernels: 4 sensors at 5 Hz with about 25 centroids
+per frame.
 """
 
 import argparse
@@ -17,9 +18,9 @@ from datetime import datetime
 from pathlib import Path
 
 SCENES = Path(__file__).parents[2] / "io" / "simulation" / "built_in"
-HOURS = 11.4  # of which the Earth hides the field for a third
+HOURS = 11.4  # the Earth hides the field of view for a third of it
 COMMAND = "from epipole.flows.command_line.main import main; main()"
-# What a run says at the end of each stage.
+# How the log line at the end of each stage begins.
 STAGES = (
     ("find", "found "),
     ("read", "read "),
@@ -56,7 +57,7 @@ for seconds in (cpu, wall):
 
 
 def simulate_night(log: Path, hours: float) -> None:
-    """Write a log of four sensors, three objects, twenty stars and two false points a frame."""
+    """Write a log of four sensors, three objects, twenty stars and two false points per frame."""
     from epipole.flows.simulate import simulate
     from epipole.schemas.scene import validate_scene
 
@@ -71,7 +72,7 @@ def simulate_night(log: Path, hours: float) -> None:
 
 
 def run(log: Path, out: Path) -> dict[str, float]:
-    """Return the seconds of each stage of a run, of CPU in all, and its memory [MiB]."""
+    """Return the seconds of each stage of a run, its total CPU seconds, and its memory [MiB]."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     started = time.monotonic()
     process = subprocess.Popen(
@@ -81,9 +82,9 @@ def run(log: Path, out: Path) -> dict[str, float]:
     assert process.stderr is not None
     times = {"start": 0.0}
     for line in process.stderr:
-        said = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
+        text = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
         for stage, word in STAGES:
-            if said.startswith(word):
+            if text.startswith(word):
                 times[stage] = time.monotonic() - started
     out_text = process.stdout.read() if process.stdout else ""
     assert process.wait() == 0, out_text
@@ -104,7 +105,7 @@ def run(log: Path, out: Path) -> dict[str, float]:
 
 
 def prefect_share(n_tasks: int) -> tuple[float, float]:
-    """Return the CPU and wall seconds that so many tasks which do nothing cost."""
+    """Return the CPU and wall seconds of this many tasks that do nothing."""
     done = subprocess.run(
         [sys.executable, "-c", EMPTY_TASKS, str(n_tasks)],
         check=True,
@@ -132,7 +133,7 @@ def main() -> None:
         "cpu",
         "mib",
     ]
-    print("| night | frames | " + " | ".join(columns) + " | us a frame |")
+    print("| night | frames | " + " | ".join(columns) + " | us per frame |")
     with tempfile.TemporaryDirectory() as folder:
         where = Path(folder)
         for share in chosen.shares:

@@ -2,7 +2,8 @@
 
 python tests/benchmarks/bench_page.py [--rounds N]
 
-One run of the example after the other, alternately, on one embedded API whose server counts too.
+Runs of the example with and without the page, in turns, on one embedded API. The CPU time of the
+server is included.
 """
 
 import argparse
@@ -18,7 +19,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "four_sensor_geo.mcap"
 
 
 def cpu_s() -> float:
-    """Return the CPU seconds of this process and of its children that live."""
+    """Return the CPU seconds of this process and of its living children."""
     parents: dict[int, tuple[int, float]] = {}
     for entry in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -45,7 +46,7 @@ def measure(runs: dict[str, Callable[[], object]], rounds: int) -> None:
             cpu_before, before = cpu_s(), time.monotonic()
             run()
             wall[name].append(time.monotonic() - before)
-            time.sleep(0.5)  # the server writes behind
+            time.sleep(0.5)  # the server writes with a delay
             cpu[name].append(cpu_s() - cpu_before)
     for name in runs:
         medians = statistics.median(cpu[name]), statistics.median(wall[name])

@@ -2,14 +2,15 @@
 
     python tests/benchmarks/bench_queries.py [--nights 365] [--rows 100000] [--keep DIR]
 
-Writes the nights with the pipeline's own publishing: objects near geostationary height, all
-seen at each of a night's epochs, with errors of a kilometre. Seconds are of the wall and of
-the CPU (all threads), medians of runs in turns, files in the page cache.
+Publishes the nights as a run does: objects near geostationary altitude, with a position at every
+epoch of a night and errors of a kilometre. Times are wall and CPU seconds (all threads), medians of
+several runs in turns, with the files in the page cache.
 """
 
 import argparse
 import datetime
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,15 +20,19 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from epipole.io.datasets.dataset import nights_in, publish
+from epipole.io.datasets.dataset import nights_in
 from epipole.schemas.bridge import table
 from epipole.schemas.tables import SOURCES, TABLES
+
+sys.path.append(str(Path(__file__).parents[1]))  # helpers beside the tests
+
+from scenes.published import publish
 
 FIRST_DAY = 17897  # 2019-01-01
 DAY_NS = 86_400_000_000_000
 SIDEREAL_DAY_S = 86164.0905
 OBJECTS = 1000
-POINT_KM = (30000.0, 29620.0, 0.0)  # in the belt: something comes by every night
+POINT_KM = (30000.0, 29620.0, 0.0)  # in the geostationary belt: objects pass it every night
 WITHIN_KM = 50.0
 NIGHT = datetime.date(2019, 1, 10)
 OBJECT = "20190110-00037"
@@ -59,7 +64,7 @@ def positions(day: int, n_rows: int) -> pa.Table:
 
 
 def write_year(folder: Path, n_nights: int, n_rows: int) -> None:
-    """Publish the nights that are not there yet."""
+    """Publish the nights that are missing."""
     there = set(nights_in(folder))
     for day in range(FIRST_DAY, FIRST_DAY + n_nights):
         night = (datetime.date(1970, 1, 1) + datetime.timedelta(days=day)).isoformat()
@@ -74,14 +79,14 @@ def one_object_of_a_night(scan: pl.LazyFrame) -> pl.LazyFrame:
 
 
 def near_a_point(scan: pl.LazyFrame) -> pl.LazyFrame:
-    """Return everything that came near a point over the year: all that is known of it."""
+    """Return the positions near a point over the year, with all columns."""
     x, y, z = POINT_KM
     away2 = (pl.col("x_km") - x) ** 2 + (pl.col("y_km") - y) ** 2 + (pl.col("z_km") - z) ** 2
     return scan.filter(away2 < WITHIN_KM**2)
 
 
-def who_was_near_a_point(scan: pl.LazyFrame) -> pl.LazyFrame:
-    """Return what came near a point over the year, when and where."""
+def objects_near_a_point(scan: pl.LazyFrame) -> pl.LazyFrame:
+    """Return the objects near a point over the year, with time and position."""
     return near_a_point(scan).select("epoch", "object_id", "x_km", "y_km", "z_km")
 
 
@@ -94,8 +99,8 @@ def ten_minutes_of_a_night(scan: pl.LazyFrame) -> pl.LazyFrame:
 
 QUERIES: dict[str, tuple[Callable[[pl.LazyFrame], pl.LazyFrame], float]] = {
     "one object of one night": (one_object_of_a_night, 0.1),
-    "within 50 km of a point, all nights: who, when, where": (who_was_near_a_point, 0.5),
-    "the same, all columns": (near_a_point, 0.5),
+    "within 50 km of a point, all nights: object, time and place": (objects_near_a_point, 0.5),
+    "within 50 km of a point, all nights: all columns": (near_a_point, 0.5),
     "ten minutes of a night": (ten_minutes_of_a_night, 0.05),
 }
 
@@ -104,9 +109,9 @@ def main() -> None:
     """Print the rows of the table in BENCHMARKS.md."""
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--nights", type=int, default=365)
-    arguments.add_argument("--rows", type=int, default=100_000, help="positions a night")
+    arguments.add_argument("--rows", type=int, default=100_000, help="positions per night")
     arguments.add_argument("--runs", type=int, default=7)
-    arguments.add_argument("--keep", metavar="DIR", help="write the year here, and leave it")
+    arguments.add_argument("--keep", metavar="DIR", help="write the year here and keep it")
     chosen = arguments.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(chosen.keep or temporary) / "year"
@@ -119,7 +124,7 @@ def main() -> None:
 
 
 def ask(path: str, runs: int) -> None:
-    """Print what each query takes."""
+    """Print the time of each query."""
     wall_s: dict[str, list[float]] = {name: [] for name in QUERIES}
     cpu_s: dict[str, list[float]] = {name: [] for name in QUERIES}
     rows = {}

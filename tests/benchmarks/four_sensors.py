@@ -1,4 +1,4 @@
-"""The scene of four low sensors and nine geostationary objects, changed and run in this process."""
+"""The scene of four low sensors and nine geostationary objects, changed and run in-process."""
 
 import tempfile
 import tomllib
@@ -17,7 +17,7 @@ SCENE = Path(__file__).parents[2] / "io/simulation/built_in/four_sensor_geo.toml
 
 @contextmanager
 def runs() -> Iterator[Callable[..., tuple[Any, Path, Path]]]:
-    """Give a function that simulates a changed scene and runs it: summary, dataset and log."""
+    """Yield a function that simulates a changed scene and runs it: summary, dataset and log."""
     quiet_console()
     with embedded_prefect(), tempfile.TemporaryDirectory() as folder:
         count = 0

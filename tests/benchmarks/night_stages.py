@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.flows.command_line.sensors import of_sensor, sensor_ids
+from epipole.flows.command_line.log_info import of_sensor, sensor_ids
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
-from epipole.schemas.bridge import concat
+from epipole.schemas.bridge import concat, stack
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import DETECTIONS, TRACKLETS
 from epipole.schemas.work_tables import SOLUTIONS, VIEWS
@@ -33,15 +32,15 @@ sys.path.append(str(Path(__file__).parents[1]))  # helpers beside the tests
 from scenes.whole_logs import read_whole  # noqa: E402
 
 
-class Seen(NamedTuple):
-    """What a log shows before any object is looked for."""
+class IdentifiedLog(NamedTuple):
+    """A log after star identification."""
 
     solutions: pa.Table
     detections: pa.Table
     cameras: pa.Table
 
 
-def see(log: Path, settings: Settings) -> Seen:
+def see(log: Path, settings: Settings) -> IdentifiedLog:
     """Read a log and identify its stars."""
     read = read_whole([log], settings)
     places = place_sensors(read.exposures, read.states, settings)
@@ -56,14 +55,14 @@ def see(log: Path, settings: Settings) -> Seen:
         )
         for name in sensor_ids(read.exposures)
     ]
-    return Seen(
+    return IdentifiedLog(
         concat(SOLUTIONS, [part.solutions for part in parts]),
         concat(DETECTIONS, [part.detections for part in parts]),
         read.cameras,
     )
 
 
-def track(seen: Seen, settings: Settings) -> Tracked:
+def track(seen: IdentifiedLog, settings: Settings) -> Tracked:
     """Build the tracklets of every sensor."""
     parts = [
         build_tracklets(
@@ -80,7 +79,7 @@ def track(seen: Seen, settings: Settings) -> Tracked:
     )
 
 
-def solve(seen: Seen, tracked: Tracked, settings: Settings) -> Solved:
+def solve(seen: IdentifiedLog, tracked: Tracked, settings: Settings) -> Solved:
     """Align, associate and triangulate."""
     epochs = align_epochs(seen.solutions, settings)
     views = concat(
@@ -103,10 +102,10 @@ def solve(seen: Seen, tracked: Tracked, settings: Settings) -> Solved:
 
 
 def position_errors(log: Path, positions: pa.Table) -> Array:
-    """Return how far each position lies from the nearest object of the simulation [km]."""
+    """Return the distance of each position from the nearest object of the simulation [km]."""
     truth = json.loads((Path(f"{log}.truth") / "scenario.json").read_text())
     at_s = (pc.cast(positions["time"], pa.int64()).to_numpy() - int(truth["t0_ns"])) / 1e9
-    here = pl.from_arrow(positions).select("x_km", "y_km", "z_km").to_numpy()
+    here = stack(positions, "{}_km")
     best = np.full(len(here), np.inf)
     for target in truth["targets"]:
         r, _ = state_at(np.array(target["elements"]), at_s)

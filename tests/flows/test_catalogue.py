@@ -32,7 +32,7 @@ def epipole(monkeypatch, capfd, tmp_path):
 def test_hipparcos_is_built_and_told_in_a_few_lines(epipole, tmp_path):
     code, out, _ = epipole("catalog", "build", "hipparcos", "--out", "hip.parquet", "--limit", 7)
     assert code == 0
-    assert "hipparcos, places of 1991.25" in out
+    assert "hipparcos, positions at 1991.25" in out
     assert "identification.catalogue = 'hip.parquet'" in out
     stars = read_star_catalogue(str(tmp_path / "hip.parquet"))
     assert stars.num_rows == pytest.approx(15_500, rel=0.05)
@@ -56,11 +56,14 @@ def test_a_list_of_ones_own_is_built_and_told_as_json(epipole, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ("none.csv", "none.csv: neither hipparcos nor deep nor a file"),
-        ("hipparcos --epoch 2000", "hipparcos has an epoch and a name of its own"),
+        ("none.csv", "none.csv: no such file; give hipparcos, deep, or"),
+        ("hipparcos --epoch 2000", "hipparcos has its own epoch and name"),
         ("hipparcos --limit -5", "no star of magnitude -5.0 or brighter"),
-        ("mine.csv --epoch 2000", "1 of 2 rows bad; mend or remove them: row 2: dec_deg = 90.5"),
-        ("mine.csv --epoch 2000 --name hipparcos", "the name hipparcos is taken"),
+        (
+            "mine.csv --epoch 2000",
+            "1 of 2 rows are invalid; correct or remove them: row 2: dec_deg = 90.5",
+        ),
+        ("mine.csv --epoch 2000 --name hipparcos", "the name hipparcos is reserved"),
     ],
 )
 def test_what_cannot_be_built_is_told_in_one_line_and_nothing_written(

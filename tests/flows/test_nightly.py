@@ -125,7 +125,7 @@ def test_a_run_without_a_log_of_the_night_is_refused_and_names_it(tmp_path):
     out = tmp_path / "out"
     nightly(parts, str(out))
     before = contents(out)
-    with pytest.raises(DatasetError, match=r"was also made of cut-2\.mcap"):
+    with pytest.raises(DatasetError, match=r"was also made from cut-2\.mcap"):
         nightly(parts[:1], str(out))
     assert contents(out) == before
     nightly(parts[:1], str(out), replace=True)

@@ -1,4 +1,4 @@
-"""A run that was killed: the dataset is as it was, and the next run goes on from what is done."""
+"""A run that was killed: the dataset is unchanged, and the next run reuses the finished parts."""
 
 import os
 import signal
@@ -23,7 +23,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def run(night_log, tmp_path):
-    """Return a function that starts `epipole run` of the shared night in a process of its own."""
+    """Return a function that starts `epipole run` of the shared night in its own process."""
     started = []
 
     def start(out: Path) -> subprocess.Popen:
@@ -43,7 +43,7 @@ def run(night_log, tmp_path):
 
 
 def kill_when(process: subprocess.Popen, ready) -> None:
-    """Kill a run and all it started as soon as something is there."""
+    """Kill a run and its child processes as soon as `ready` returns something true."""
     end = time.monotonic() + WAIT_S
     while not ready():
         assert process.poll() is None, process.communicate()[0]
@@ -58,7 +58,9 @@ def parts(out: Path, stage: str) -> list[Path]:
 
 
 @pytest.mark.parametrize("stage", ["identify/*", "track/0/*"])
-def test_a_killed_run_is_gone_on_with_and_gives_the_same_rows(run, tmp_path, night_dataset, stage):
+def test_a_run_reuses_the_parts_of_a_killed_one_and_gives_the_same_rows(
+    run, tmp_path, night_dataset, stage
+):
     out = tmp_path / "out"
     kill_when(run(out), lambda: parts(out, stage))
     assert not list(out.glob("night=*"))
@@ -72,7 +74,7 @@ def test_a_killed_run_is_gone_on_with_and_gives_the_same_rows(run, tmp_path, nig
         time.sleep(0.01)
     said = again.communicate()[0]
     assert again.returncode == 0, said
-    assert set(kept) == set(done)  # used as they were, not made again
+    assert set(kept) == set(done)  # reused, not written again
     assert contents(out) == contents(night_dataset)
 
 
@@ -83,7 +85,7 @@ def _is(part: Path, inode: int) -> bool:
         return False
 
 
-def test_a_run_killed_while_it_makes_a_night_again_leaves_the_night_whole(
+def test_a_run_killed_while_it_replaces_a_night_leaves_the_night_whole(
     run, tmp_path, night_dataset
 ):
     out = tmp_path / "out"
@@ -101,11 +103,11 @@ def test_two_runs_of_one_night_at_once_end_with_one_night(run, tmp_path, night_d
     codes = [process.returncode for process in both]
     assert 0 in codes, said
     for code, words in zip(codes, said, strict=True):
-        assert code == 0 or "has been at work on it since" in words
+        assert code == 0 or "has worked on it since" in words
     assert contents(out) == contents(night_dataset)
 
 
-def test_finished_parts_serve_only_the_same_logs_settings_and_nights():
+def test_finished_parts_are_reused_only_for_the_same_logs_settings_and_nights():
     key = work_key(["a", "b"], Settings(), [NIGHT])
     assert key == work_key(["b", "a"], Settings(), [NIGHT])
     other = validate_settings({"tracklets": {"gate_sigma": 5.0}}, "test")

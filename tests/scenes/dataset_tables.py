@@ -1,4 +1,4 @@
-"""Made-up nights of a dataset, for tests of how they are kept."""
+"""Made-up nights of a dataset, for tests of storage."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ NIGHT, NEXT_NIGHT = "2019-04-01", "2019-04-02"
 
 
 def rows(schema: pa.Schema, times: np.ndarray, seed: int = 0) -> pa.Table:
-    """Return a table with one made-up row a time."""
+    """Return a table with one made-up row per time."""
     rng = np.random.default_rng(seed)
 
     def values(field: pa.Field) -> pa.Array:
@@ -48,7 +48,7 @@ def night_tables(times: np.ndarray, logs: tuple[str, ...] = ("a",), seed: int = 
     return tables
 
 
-# Times that no microsecond holds: Arrow refuses to make them Python's.
+# Not whole microseconds: Arrow cannot convert them to Python's datetime.
 TIMES = FIRST_DAY * DAY_NS + np.arange(20) * 1_000_000_001 + 7
 OVER_MIDNIGHT = (FIRST_DAY + 1) * DAY_NS + np.arange(-10, 10) * 1_000_000_001 + 7
 

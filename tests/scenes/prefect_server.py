@@ -1,4 +1,4 @@
-"""A Prefect server and worker of their own for a test: real processes, on a free port."""
+"""A Prefect server and worker for a test: real processes, on a free port."""
 
 import contextlib
 import os
@@ -14,8 +14,8 @@ from typing import Any
 import httpx
 
 POOL = "nights"
-# A worker asks for runs every second (default: ten), a run that waits for its turn asks as
-# often (default: every half minute).
+# A worker asks for runs every second (default: every ten), and so does a run that waits for a free
+# slot (default: every thirty).
 QUICK = {
     "PREFECT_SERVER_CONCURRENCY_MAXIMUM_CONCURRENCY_SLOT_WAIT_SECONDS": "1",
     "PREFECT_WORKER_QUERY_SECONDS": "1",
@@ -28,7 +28,7 @@ QUIET = {
 
 
 class Prefect:
-    """Prefect's command line and API against one server; everything lies in one folder."""
+    """Prefect's command line and API with one server, all in one folder."""
 
     def __init__(self, folder: Path, **settings: str) -> None:
         self.folder = folder
@@ -40,14 +40,14 @@ class Prefect:
         self.environment = kept | QUICK | QUIET | own | settings
 
     def command(self, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
-        """Run a command of Prefect's to its end."""
+        """Run a command of Prefect to its end."""
         return subprocess.run(
             [sys.executable, "-m", "prefect", *arguments], cwd=self.folder, env=self.environment,
             capture_output=True, text=True, timeout=timeout, stdin=subprocess.DEVNULL,
         )  # fmt: skip
 
     def start(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
-        """Start a command that goes on, in a session of its own."""
+        """Start a command in the background, in its own session."""
         with (self.folder / f"{name}.txt").open("ab") as output:
             return subprocess.Popen(
                 [sys.executable, "-m", "prefect", *arguments], cwd=self.folder,
@@ -60,15 +60,15 @@ class Prefect:
         return self.start("worker", "worker", "start", "--pool", POOL)
 
     def get(self, path: str) -> Any:
-        """Return what the API has at a path."""
+        """Return the API's answer to GET."""
         return httpx.get(f"{self.url}/{path}", timeout=30).raise_for_status().json()
 
     def post(self, path: str, asked: dict[str, Any]) -> Any:
-        """Return what the API answers."""
+        """Return the API's answer to POST."""
         return httpx.post(f"{self.url}/{path}", json=asked, timeout=30).raise_for_status().json()
 
     def find(self, what: str, **asked: Any) -> list[dict[str, Any]]:
-        """Return what the API has of flow runs, task runs, logs or artifacts."""
+        """Return all flow runs, task runs, logs or artifacts that match a filter."""
         found: list[dict[str, Any]] = []
         while rows := self.post(f"{what}/filter", asked | {"offset": len(found)}):
             found += rows
@@ -80,7 +80,7 @@ class Prefect:
         return run
 
     def flow_processes(self, worker: subprocess.Popen[bytes]) -> list[int]:
-        """Return the processes of the flow runs that a worker has started."""
+        """Return the processes of the flow runs that a worker started."""
         return [pid for pid in self._processes() if _parent(pid) == worker.pid]
 
     def kill_all(self) -> None:
@@ -102,7 +102,7 @@ class Prefect:
 
 @contextlib.contextmanager
 def serving(folder: Path, **settings: str) -> Iterator[Prefect]:
-    """Run a server for a while; whatever happens, none of its processes is left."""
+    """Run a server. At the end all its processes are killed, whatever happened."""
     prefect = Prefect(folder, **settings)
     try:
         prefect.start("server", "server", "start", "--port", str(prefect.port))
@@ -113,7 +113,7 @@ def serving(folder: Path, **settings: str) -> Iterator[Prefect]:
 
 
 def wait_for(what: Callable[[], Any], why: str, seconds: float = 120) -> Any:
-    """Return what becomes true; fail where it does not in time."""
+    """Wait until `what` returns something true, and return it; fail after `seconds`."""
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         value = what()

@@ -1,53 +1,15 @@
-"""What Prefect's page shows of a run: names of task runs, lines of log, artifacts."""
+"""What Prefect's page shows of a run: its name, lines of log, artifacts, how it ended."""
 
 import json
 
-import httpx
 import pytest
 from prefect.client.orchestration import get_client
 from prefect.logging.handlers import APILogHandler
 
-from epipole.flows.night.summary import Summary
 from epipole.flows.nightly import nightly
 from epipole.flows.prefect import artifacts
-from epipole.flows.prefect.artifacts import ProgressBar, as_markdown, show_summary
 from epipole.flows.prefect.page import shown_on_page
-from epipole.flows.prefect.progress import ROOT, STEPS, step
-from epipole.schemas.stages import Stage
-
-FOUND = {
-    "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
-    "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "epochs": 6, "objects": 5,
-    "positions": 4, "rejects": {"no_state": 34, "bad_crc": 1}, "clocks": [], "by_sensor": [],
-}  # fmt: skip
-
-
-def test_the_page_of_a_night_has_its_counts_and_what_was_left_out_by_reason():
-    page = as_markdown(Summary(**FOUND))
-    assert "# Night 2019-04-01" in page
-    assert "| frames | 1,234 |" in page
-    assert "Left out: 35 things" in page
-    assert "| no_state | 34 |\n| bad_crc | 1 |" in page
-
-
-def test_progress_only_grows_though_a_stage_is_done_again(monkeypatch):
-    percents = []
-    monkeypatch.setattr(artifacts, "create_progress_artifact", lambda *_: "an id")
-    monkeypatch.setattr(artifacts, "update_progress_artifact", lambda _, p, __: percents.append(p))
-    monkeypatch.setattr(artifacts, "UPDATED_EVERY_S", 0.0)
-    bar = ProgressBar()
-    STEPS.addHandler(bar)
-    stages = (Stage.READ, Stage.IDENTIFY, Stage.CALIBRATE, Stage.IDENTIFY, Stage.SOLVE)
-    try:
-        for stage in (*stages, Stage.PUBLISH):
-            for done in range(4):
-                step(stage, done, 3)
-        step(Stage.TRACK, 0, 0)  # no sensor can take part
-    finally:
-        STEPS.removeHandler(bar)
-    assert percents == sorted(percents)
-    assert len(set(percents)) > 12
-    assert 0 <= percents[0] < percents[-1] <= 100
+from epipole.flows.prefect.progress import ROOT, STEPS
 
 
 @pytest.fixture(scope="module")
@@ -97,41 +59,6 @@ def test_the_run_is_named_and_has_its_artifacts(page):
     assert "out/night=2019-04-01](file:///" in shown["dataset"]["data"]
 
 
-def test_a_page_that_cannot_be_written_is_one_warning_and_no_failure(monkeypatch, caplog):
-    def refused(*_, **__):
-        raise httpx.ConnectError("connection refused")
-
-    for name in ("progress", "markdown", "table", "link"):
-        monkeypatch.setattr(artifacts, f"create_{name}_artifact", refused)
-    monkeypatch.setattr(artifacts, "update_progress_artifact", refused)
-    bar = ProgressBar()
-    bar.finish("done")
-    show_summary(Summary(**FOUND))
-    assert [record.levelname for record in caplog.records] == ["WARNING", "WARNING"]
-    assert "the summary could not be shown on Prefect's page: connection refused" in caplog.text
-
-
-def test_a_page_that_fails_in_the_middle_is_not_asked_again(monkeypatch, caplog):
-    asked = []
-
-    def refused(*arguments):
-        asked.append(arguments)
-        raise httpx.ConnectError("connection refused")
-
-    monkeypatch.setattr(artifacts, "create_progress_artifact", lambda *_: "an id")
-    monkeypatch.setattr(artifacts, "update_progress_artifact", refused)
-    monkeypatch.setattr(artifacts, "UPDATED_EVERY_S", 0.0)
-    bar = ProgressBar()
-    STEPS.addHandler(bar)
-    try:
-        for done in range(3):
-            step(Stage.IDENTIFY, done, 3)
-    finally:
-        STEPS.removeHandler(bar)
-    assert len(asked) == 1
-    assert caplog.text.count("could not be shown") == 1
-
-
 def test_a_run_that_fails_says_so_and_leaves_no_handler(monkeypatch):
     shown = []
     monkeypatch.setattr(artifacts, "create_progress_artifact", lambda *_: "an id")
@@ -144,5 +71,5 @@ def test_a_run_that_fails_says_so_and_leaves_no_handler(monkeypatch):
 
     with pytest.raises(ValueError, match="no"):
         failing()
-    assert shown[-1][2] == "failed: the log says why"
+    assert shown[-1][2] == "failed; see the log"
     assert ([*ROOT.handlers], [*STEPS.handlers], ROOT.level) == before

@@ -10,9 +10,10 @@ import pytest
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from epipole.flows.nightly import nightly
-from epipole.flows.prefect.runners import Runner, runner_asked, task_runner
+from epipole.flows.prefect.runners import runner_asked, task_runner
 from epipole.io.work.folder import work_root
 from epipole.schemas.errors import EpipoleError
+from epipole.schemas.runner import Runner
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -31,11 +32,11 @@ def test_threads_are_the_default_one_a_cpu(monkeypatch):
     ("asked", "said"),
     [
         ({"EPIPOLE_RUNNER": "spark"}, "EPIPOLE_RUNNER=spark: give one of threads, dask"),
-        ({"EPIPOLE_WORKERS": "many"}, "EPIPOLE_WORKERS=many: give how many tasks"),
-        ({"EPIPOLE_SCHEDULER": "tcp://a:1"}, "scheduler tcp://a:1: threads have none"),
+        ({"EPIPOLE_WORKERS": "many"}, "EPIPOLE_WORKERS=many: give a number of tasks"),
+        ({"EPIPOLE_SCHEDULER": "tcp://a:1"}, "scheduler tcp://a:1: only Dask has"),
     ],
 )
-def test_an_environment_that_makes_no_sense_is_named(monkeypatch, asked, said):
+def test_invalid_environment_variables_are_named(monkeypatch, asked, said):
     for name, value in asked.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(EpipoleError, match=said):

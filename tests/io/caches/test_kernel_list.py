@@ -1,17 +1,55 @@
-"""The list of kernels is that of a run. `python tests/test_kernel_list.py` writes it again."""
+"""The list of kernels is that of a run; `python tests/io/caches/test_kernel_list.py` writes it."""
 
 import os
 import pickle
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from numba import types
 
-from epipole.io.caches.kernel_list import KERNELS, kernel, kernels_text, read_kernels, signature
+from epipole.io.caches.kernel_list import KERNELS, Signature, kernel, read_kernels, signature
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "four_sensor_geo.mcap"
+
+_HEAD = """\
+# The kernels that a run of the example calls from Python, in the order of their first call,
+# with the types of their arguments. Written by `python tests/io/caches/test_kernel_list.py`.
+"""
+
+
+def kernels_text(called: Iterable[tuple[str, Signature]]) -> str:
+    """Return the list of kernels ("module:name") with their arguments' types, as TOML."""
+    blocks = []
+    for name, arguments in called:
+        lines = "".join(f"    {_quoted(_text(argument))},\n" for argument in arguments)
+        blocks.append(f'"{name}" = [\n{lines}]\n')
+    return "\n".join([_HEAD, *blocks])
+
+
+def _text(argument: Any) -> str:
+    if isinstance(argument, types.Array):
+        if not argument.mutable:
+            return f"Array({argument.dtype}, {argument.ndim}, {argument.layout!r}, readonly=True)"
+        last = "::1" if argument.layout == "C" else ":"
+        return f"{argument.dtype}[{', '.join([':'] * (argument.ndim - 1) + [last])}]"
+    inside = getattr(argument, "types", ())
+    fields = ", ".join(_text(one) for one in inside)
+    if isinstance(argument, types.BaseNamedTuple):
+        made = argument.instance_class  # type: ignore[attr-defined]
+        return f"named('{made.__module__}:{made.__name__}', {fields})"
+    if isinstance(argument, types.BaseTuple):
+        return f"Tuple(({fields},))"
+    return str(argument)
+
+
+def _quoted(text: str) -> str:
+    return f'"{text}"'
+
 
 # What numba is asked for: by Python, or by another kernel that it compiles.
 RUN = """
@@ -58,9 +96,7 @@ def kernels_of_a_run(folder):
 
 @pytest.fixture(scope="module")
 def after_compiling(tmp_path_factory):
-    compile_all = (
-        "from epipole.tasks.common.kernel_warm_up import compile_kernels; compile_kernels()"
-    )
+    compile_all = "from epipole.io.caches.kernel_warm_up import compile_kernels; compile_kernels()"
     subprocess.run([sys.executable, "-c", compile_all], check=True)
     return kernels_of_a_run(tmp_path_factory.mktemp("run"))
 
@@ -76,7 +112,7 @@ def test_a_run_of_the_example_has_nothing_to_compile_once_the_list_is_compiled(a
 
 def test_a_run_of_the_example_calls_what_the_list_says_and_nothing_else(asked):
     listed = {(name, signature(arguments)) for name, arguments in read_kernels()}
-    hint = "python tests/test_kernel_list.py writes the list again"
+    hint = "python tests/io/caches/test_kernel_list.py writes the list again"
     assert not {key for key, from_python in asked.items() if from_python} - listed, hint
     assert not listed - set(asked), hint
 

@@ -102,11 +102,11 @@ def test_bad_rows_are_named_by_row_and_column(csv):
     with pytest.raises(CatalogueError) as error:
         read_star_list(path, epoch=2000.0)
     message = str(error.value)
-    assert "8 of 9 rows bad" in message
+    assert "8 of 9 rows are invalid" in message
     assert "row 2: dec_deg = 97.2, not within -90 to 90" in message
-    assert "row 3: star_id = x3, no whole number" in message
+    assert "row 3: star_id = x3, not a whole number" in message
     assert "row 4: magnitude is empty" in message
-    assert "row 5: magnitude = bright, no number" in message
+    assert "row 5: magnitude = bright, not a number" in message
     assert "row 6: pm_" in message
     assert "and 3 more" in message
 
@@ -121,7 +121,7 @@ def test_bad_rows_are_named_by_row_and_column(csv):
         ("parallax_mas", "2000", "not within"),
         ("sigma_mas", "-1", "not within 0"),
         ("variable", "maybe", "not true or false"),
-        ("star_id", "1.5", "no whole number"),
+        ("star_id", "1.5", "not a whole number"),
     ],
 )
 def test_each_column_has_its_bounds(csv, column, value, why):
@@ -132,7 +132,9 @@ def test_each_column_has_its_bounds(csv, column, value, why):
 
 
 def test_a_number_that_two_stars_have_is_named_in_both_rows(csv):
-    with pytest.raises(CatalogueError, match=r"row 1: star_id = 5, not the only.*row 3: star_id"):
+    with pytest.raises(
+        CatalogueError, match=r"row 1: star_id = 5, another row has.*row 3: star_id"
+    ):
         read_star_list(csv(HEADER, "5,1,1,1", "6,2,2,2", "5,3,3,3"), epoch=2000.0)
 
 
@@ -171,7 +173,7 @@ def test_parquet_files_of_other_tools_give_the_same_stars(parquet):
     ],
 )
 def test_a_sky_in_another_unit_is_told_from_degrees(parquet, changes, unit):
-    with pytest.raises(CatalogueError, match=f"as {unit} do; degrees are wanted"):
+    with pytest.raises(CatalogueError, match=f"as {unit} do; give degrees"):
         read_star_list(parquet(many(**changes)), epoch=2016.0)
 
 
@@ -186,7 +188,7 @@ def test_a_column_that_says_another_unit_is_refused(tmp_path):
     stars = read_hipparcos().slice(0, 3)
     path = tmp_path / "rad.parquet"
     pq.write_table(pa.Table.from_arrays(stars.columns, schema=pa.schema(fields)), path)
-    with pytest.raises(CatalogueError, match="ra_deg is in rad; deg is wanted"):
+    with pytest.raises(CatalogueError, match="ra_deg is in rad; it must be in deg"):
         read_star_list(path, epoch=2000.0)
 
 

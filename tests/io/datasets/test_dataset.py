@@ -17,10 +17,10 @@ from scenes.dataset_tables import (
     contents,
     night_tables,
 )
+from scenes.published import publish
 
-from epipole.io.datasets import dataset as under_test
-from epipole.io.datasets import folder_swap, local_nights
-from epipole.io.datasets.dataset import check_folder, publish, publish_folders, read_table
+from epipole.io.datasets import folder_swap, local_nights, night_files
+from epipole.io.datasets.dataset import check_folder, publish_folders, read_table
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -89,7 +89,7 @@ def test_a_published_night_replaces_the_old_one_whole(tmp_path):
 def test_a_run_without_a_recorded_log_is_refused_and_names_it(tmp_path):
     publish(tmp_path, night_tables(TIMES, ("a", "b")), [NIGHT])
     before = contents(tmp_path)
-    with pytest.raises(DatasetError, match=r"night=2019-04-01: was also made of b\.mcap"):
+    with pytest.raises(DatasetError, match=r"night=2019-04-01: was also made from b\.mcap"):
         publish(tmp_path, night_tables(TIMES, ("a", "c")), [NIGHT])
     assert contents(tmp_path) == before
     publish(tmp_path, night_tables(TIMES, ("a", "c")), [NIGHT], replace=True)
@@ -132,7 +132,7 @@ def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path, monkeypatch, there_b
     if there_before:
         publish(out, night_tables(TIMES), [NIGHT])
     before = contents(tmp_path)
-    monkeypatch.setattr(under_test, "write_table", _disk_full)
+    monkeypatch.setattr(night_files, "_write", _disk_full)
     with pytest.raises(DatasetError, match="No space left on device"):
         publish(out, night_tables(TIMES[:5]), [NIGHT])
     assert contents(tmp_path) == before
@@ -222,5 +222,5 @@ def test_two_runs_at_once_publish_whole_nights_and_a_reader_never_misses_one(tmp
 def test_a_damaged_night_is_named(tmp_path):
     publish(tmp_path, night_tables(TIMES), [NIGHT])
     (tmp_path / f"night={NIGHT}/sources/part-0.parquet").write_bytes(b"not parquet")
-    with pytest.raises(DatasetError, match="remove the night's folder"):
+    with pytest.raises(DatasetError, match="remove the folder of the night"):
         publish(tmp_path, night_tables(TIMES), [NIGHT])

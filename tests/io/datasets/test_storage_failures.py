@@ -11,8 +11,9 @@ from pathlib import Path
 
 import pytest
 from scenes.dataset_tables import NIGHT, TIMES, contents, night_tables
+from scenes.published import publish
 
-from epipole.io.datasets.dataset import claim_nights, publish, read_table
+from epipole.io.datasets.dataset import claim_nights, read_table
 from epipole.io.logs.reader import read_log
 from epipole.schemas.errors import DatasetError, LogError
 
@@ -21,7 +22,8 @@ PUBLISH = """
 import os, resource, signal, sys
 import numpy as np
 from scenes.dataset_tables import NIGHT, TIMES, night_tables
-from epipole.io.datasets.dataset import nights_in, publish, read_table
+from scenes.published import publish
+from epipole.io.datasets.dataset import nights_in, read_table
 from epipole.schemas.errors import DatasetError
 
 tables = night_tables(TIMES[0] + np.arange(20_000))

@@ -12,6 +12,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, TIMES, night_tables
+from scenes.published import publish
 
 from epipole.flows.evaluate import evaluate
 from epipole.flows.nightly import nightly
@@ -20,7 +21,6 @@ from epipole.io.datasets.dataset import (
     check_folder,
     claim_nights,
     nights_in,
-    publish,
     read_table,
 )
 from epipole.io.datasets.night_holder import Holder
@@ -77,7 +77,7 @@ def test_publishing_again_replaces_a_night_whole(s3, out):
 def test_a_run_without_a_recorded_log_is_refused(s3, out):
     publish(out, night_tables(TIMES, ("a", "b")), [NIGHT])
     before = files(s3, out)
-    with pytest.raises(DatasetError, match=r"was also made of b\.mcap"):
+    with pytest.raises(DatasetError, match=r"was also made from b\.mcap"):
         publish(out, night_tables(TIMES, ("a",)), [NIGHT])
     assert files(s3, out) == before
     publish(out, night_tables(TIMES, ("a",)), [NIGHT], replace=True)
@@ -125,7 +125,7 @@ KILLED = """
 import os, signal, sys
 import fsspec.asyn
 from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, night_tables
-from epipole.io.datasets.dataset import publish
+from scenes.published import publish
 from epipole.io.datasets.store_nights import store_nights
 
 out, limit = sys.argv[1], int(sys.argv[2])
@@ -183,7 +183,7 @@ def test_a_second_run_of_a_night_is_refused_and_told_of_the_first(s3, out):
         other = Holder(["2019-04-05"], "far", 7, "2026-01-01T00:00:00Z", "", "t")
         s3.pipe_file(f"{out}/.staging/claim-night=2019-04-05.json", other.text().encode())
         with (
-            pytest.raises(DatasetError, match=r"2019-04-05: process 7 on far has been at work"),
+            pytest.raises(DatasetError, match=r"2019-04-05: process 7 on far has worked on it"),
             claim_nights(out, ["2019-04-05"]),
         ):
             pytest.fail("two runs of one night")
@@ -216,7 +216,7 @@ def test_a_claim_is_renewed_while_its_run_works(s3, out, monkeypatch):
     with claim_nights(out, [NIGHT]):
         time.sleep(4.0)
         other = store_claims.StoreClaims(s3, store_nights(out)._root, out)
-        with pytest.raises(DatasetError, match="at work"), other.claim([NIGHT]):
+        with pytest.raises(DatasetError, match="has worked on"), other.claim([NIGHT]):
             pytest.fail("it was taken over")
 
 

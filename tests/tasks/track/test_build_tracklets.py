@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from epipole.flows.command_line.sensors import of_sensor
+from epipole.flows.command_line.log_info import of_sensor
 from epipole.schemas.settings import validate_settings
 from epipole.tasks.track.build_tracklets import build_tracklets
 

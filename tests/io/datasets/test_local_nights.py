@@ -5,8 +5,9 @@ import sys
 
 import pytest
 from scenes.dataset_tables import NEXT_NIGHT, NIGHT, TIMES, night_tables
+from scenes.published import publish
 
-from epipole.io.datasets.dataset import claim_nights, publish, publish_folders, read_table
+from epipole.io.datasets.dataset import claim_nights, publish_folders, read_table
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
@@ -81,7 +82,7 @@ def test_a_folder_that_lacks_a_table_is_never_a_night(tmp_path):
     with claim_nights(tmp_path / "out", [NIGHT]) as work:
         for name in TABLES:
             (work / "made" / name).mkdir(parents=True)
-        with pytest.raises(ValueError, match="no whole night"):
+        with pytest.raises(ValueError, match="not a whole night"):
             publish_folders(
                 tmp_path / "out", {NIGHT: work / "made"}, night_tables(TIMES)["sources"]
             )

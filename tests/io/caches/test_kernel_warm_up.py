@@ -5,9 +5,9 @@ import sys
 
 import pytest
 
+from epipole.io.caches import kernel_warm_up
+from epipole.io.caches.kernel_warm_up import compile_beside, compile_kernels
 from epipole.io.caches.kernels import new_kernel_folder, only_one
-from epipole.tasks.common import kernel_warm_up
-from epipole.tasks.common.kernel_warm_up import compile_beside, compile_kernels
 
 
 class Helper:
@@ -64,7 +64,7 @@ def test_the_helper_ends_with_the_run_also_where_that_fails(started, folder):
 
 
 def test_the_helper_ends_when_the_process_that_started_it_is_gone():
-    module = "epipole.tasks.common.kernel_warm_up"
+    module = "epipole.io.caches.kernel_warm_up"
     code = f"from {module} import _end_with_parent; _end_with_parent(); exit(9)"
     helper = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
     helper.communicate(timeout=60)

@@ -1,8 +1,8 @@
-"""Kernels compiled beside a first run, in a process of their own: numba compiles one at a time.
+"""A second process that compiles kernels during a first run, as numba compiles one at a time.
 
-From the last that a run needs to the first, while the run works from the first to the last;
-where the two meet, the rest is in the cache. Started by `compile_beside` with a pipe as standard
-input, and gone with the process that holds its other end.
+The run compiles from the first kernel on, this process from the last kernel back. When they meet,
+the run finds the rest in the cache. `compile_beside` starts the process with a pipe as standard
+input. It ends when the other end of the pipe is closed.
 """
 
 import contextlib
@@ -20,9 +20,9 @@ LOGGER = logging.getLogger(__name__)
 
 @contextlib.contextmanager
 def compile_beside() -> Iterator[bool]:
-    """Have a second process compile, where kernels of this code were never used before.
+    """Compile in a second process during the first run of this code.
 
-    Gives whether they were not. What goes wrong there only makes the run slower.
+    Yields whether this is the first run. A failure of the process only makes the run slower.
     """
     folder = new_kernel_folder()
     if folder is None:
@@ -39,29 +39,31 @@ def compile_beside() -> Iterator[bool]:
 
 
 def _start() -> Popen[bytes] | None:
-    command = [sys.executable, "-m", "epipole.tasks.common.kernel_warm_up"]
+    command = [sys.executable, "-m", "epipole.io.caches.kernel_warm_up"]
     quiet = DEVNULL
     try:
         return Popen(command, stdin=PIPE, stdout=quiet, stderr=quiet)
     except OSError as error:
-        LOGGER.info("no second process compiles kernels (%s)", error.strerror or error)
+        LOGGER.info(
+            "kernels are compiled by the run alone: no second process (%s)", error.strerror or error
+        )
         return None
 
 
 def compile_kernels() -> None:
-    """Compile what is listed and not yet in the cache, the last one first."""
-    # Numba, which the process that starts this one does not need yet.
+    """Compile the listed kernels that are not in the cache yet, the last one first."""
+    # Imports numba, which the starting process does not need yet.
     from epipole.io.caches.kernel_list import kernel, read_kernels, signature
 
     for name, arguments in reversed(read_kernels()):
         try:
             kernel(name).compile(signature(arguments))
         except Exception as error:
-            LOGGER.info("%s is left to the run: %r", name, error)
+            LOGGER.info("%s could not be compiled beforehand: %r", name, error)
 
 
 def main() -> None:
-    """Compile until it is done, or until the process that started this one is gone."""
+    """Compile all kernels, or until the process that started this one has ended."""
     folder = new_kernel_folder()
     if folder is None:
         return
