@@ -5,8 +5,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from epipole.flows.night.progress import prepare, shown
 from epipole.flows.night.summary import Summary
-from epipole.flows.prefect.progress import prepare, shown
 from epipole.io.caches.kernel_warm_up import compile_beside
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder

@@ -14,9 +14,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.flows.night.progress import results, step
 from epipole.flows.night.summary import Summary, many, summarise
 from epipole.flows.night.work import Spans, Work
-from epipole.flows.prefect.progress import results, step
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import ReadFolder, WorkFolder
 from epipole.schemas.bridge import array, concat

@@ -39,7 +39,7 @@ def _as_warning(what: str) -> Iterator[None]:
 
 
 class ProgressBar(logging.Handler):
-    """A progress artifact that follows the steps of a run; see `epipole.flows.prefect.progress`."""
+    """A progress artifact that follows the steps of a run; see `epipole.flows.night.progress`."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -9,9 +9,9 @@ from typing import ParamSpec
 from prefect.context import FlowRunContext, TaskRunContext
 from prefect.logging.handlers import APILogHandler
 
+from epipole.flows.night.progress import ROOT, STEPS
 from epipole.flows.night.summary import Summary
 from epipole.flows.prefect.artifacts import ProgressBar, show_summary
-from epipole.flows.prefect.progress import ROOT, STEPS
 
 P = ParamSpec("P")
 

@@ -2,10 +2,10 @@
 
 import httpx
 
+from epipole.flows.night.progress import STEPS, step
 from epipole.flows.night.summary import Summary
 from epipole.flows.prefect import artifacts
 from epipole.flows.prefect.artifacts import ProgressBar, as_markdown, show_summary
-from epipole.flows.prefect.progress import STEPS, step
 from epipole.schemas.stages import Stage
 
 FOUND = {

@@ -6,10 +6,10 @@ import pytest
 from prefect.client.orchestration import get_client
 from prefect.logging.handlers import APILogHandler
 
+from epipole.flows.night.progress import ROOT, STEPS
 from epipole.flows.nightly import nightly
 from epipole.flows.prefect import artifacts
 from epipole.flows.prefect.page import shown_on_page
-from epipole.flows.prefect.progress import ROOT, STEPS
 
 
 @pytest.fixture(scope="module")
