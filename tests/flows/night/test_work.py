@@ -1,0 +1,72 @@
+"""Which spans a night takes: its own and one beyond each end; sensors without calibration out."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from epipole.flows.night.work import Work, plan_spans
+from epipole.io.work.places import ReadFolder, WorkFolder
+from epipole.schemas.bridge import empty
+from epipole.schemas.errors import LogError
+from epipole.schemas.log_tables import LogSource
+from epipole.schemas.spans import DAY_NS, SPAN_NS
+from epipole.schemas.tables import REJECTS
+from epipole.schemas.work_tables import CAMERAS
+from epipole.tasks.read.order_frames import OrderedFrames
+
+NIGHT = "2019-04-02"
+MIDNIGHT_NS = int(np.datetime64(NIGHT, "ns").astype(np.int64))
+
+
+def cameras(*sensors: str) -> pa.Table:
+    rows = [
+        {field.name: 0 if field.name != "sensor_id" else name for field in CAMERAS}
+        for name in sensors
+    ]
+    return pa.Table.from_pylist(rows, schema=CAMERAS)
+
+
+def frames(calibrated: list[str], **hours: list[float]) -> OrderedFrames:
+    """Frames of sensors, by hours from midnight."""
+    time_ns = [MIDNIGHT_NS + (np.array(own) * 3600e9).astype(np.int64) for own in hours.values()]
+    sources = [LogSource("log.mcap", 1, "0", 0, 1)]
+    folder = ReadFolder(Path("/nowhere"))
+    return OrderedFrames(
+        folder, list(hours), time_ns, cameras(*calibrated), sources, empty(REJECTS)
+    )
+
+
+def test_a_night_takes_one_span_beyond_each_end():
+    found = frames(["a"], a=[-1.0, -0.4, 0.1, 0.2, 12.0, 24.2, 24.6])
+    spans, rejects = plan_spans(found, [NIGHT])
+    ((sensor, own),) = spans.items()
+    assert (sensor.number, sensor.sensor_id) == (0, "a")
+    hours = [(span.start_ns - MIDNIGHT_NS) / 3600e9 for span in own]
+    assert hours == [-0.5, 0.0, 12.0, 24.0]
+    assert all(span.end_ns - span.start_ns == SPAN_NS for span in own)
+    assert rejects.num_rows == 0
+
+
+def test_a_sensor_without_calibration_has_a_reject_and_no_spans():
+    spans, rejects = plan_spans(frames(["b"], a=[1.0, 2.0], b=[1.0]), [NIGHT])
+    assert [sensor.sensor_id for sensor in spans] == ["b"]
+    (row,) = rejects.select(["sensor_id", "stage", "reason", "count"]).to_pylist()
+    assert row == {
+        "sensor_id": "a", "stage": "identify", "reason": "no_calibration", "count": 2,
+    }  # fmt: skip
+
+
+def test_no_calibration_at_all_is_an_error_that_says_what_to_do():
+    with pytest.raises(LogError, match=r"no sensor has a calibration \(a\).*frame_id"):
+        plan_spans(frames([], a=[1.0]), [NIGHT])
+
+
+def test_neighbours_are_worked_on_together():
+    found = frames(["a", "b"], a=[1.0, 2.0], b=[1.0, 2.0])
+    spans, _ = plan_spans(found, [NIGHT])
+    work = Work(found.folder, WorkFolder(Path("/nowhere")), spans, found.cameras, {})
+    order = [(sensor.sensor_id, span.start_ns % DAY_NS) for sensor, span in work.by_span()]
+    one, two = 2 * SPAN_NS, 4 * SPAN_NS
+    assert order == [("a", one), ("b", one), ("a", two), ("b", two)]

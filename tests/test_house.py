@@ -1,0 +1,70 @@
+"""The house: packages are named, folders are small, class names are unique."""
+
+import ast
+import collections
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = ("schemas", "io", "tasks", "flows")
+MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+MOST_FILES = 13  # in a folder, its __init__.py aside
+LONGEST_LINES, MOST_PARAMETERS = 60, 8
+
+
+def packages() -> list[str]:
+    inits = (path.parent for path in MODULES if path.name == "__init__.py")
+    return sorted("epipole." + ".".join(path.relative_to(ROOT).parts) for path in inits)
+
+
+def functions():
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                yield path.relative_to(ROOT), node
+
+
+def test_every_package_is_installed():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert sorted(project["tool"]["setuptools"]["packages"]) == packages()
+
+
+def test_every_folder_with_modules_is_a_package_that_says_what_it_holds():
+    for folder in {path.parent for path in MODULES}:
+        init = folder / "__init__.py"
+        assert init.exists(), folder
+        assert ast.get_docstring(ast.parse(init.read_text())), folder
+
+
+def test_no_folder_holds_more_than_about_a_dozen_files():
+    count = collections.Counter(
+        path.parent.relative_to(ROOT) for path in MODULES if path.name != "__init__.py"
+    )
+    assert {str(f): n for f, n in count.items() if n > MOST_FILES} == {}
+
+
+def test_a_class_name_is_declared_once():
+    where = collections.defaultdict(list)
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                where[node.name].append(str(path.relative_to(ROOT)))
+    assert {name: files for name, files in where.items() if len(files) > 1} == {}
+
+
+def test_functions_are_short():
+    long = [
+        f"{path}: {node.name}"
+        for path, node in functions()
+        if node.end_lineno - node.lineno >= LONGEST_LINES
+    ]
+    assert long == []
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_a_test_file_lies_where_its_module_lies(folder):
+    """Tests of several modules have a name of their own, but never another folder's."""
+    for path in (ROOT / "tests" / folder).rglob("test_*.py"):
+        assert (ROOT / path.relative_to(ROOT / "tests").parent).is_dir(), path
