@@ -22,23 +22,20 @@ from epipole.io.logs.mcap.bytes import LogBytes, open_log
 from epipole.io.logs.mcap.channels import ChannelTable
 from epipole.io.logs.mcap.records import Block, RecordWalk
 from epipole.io.logs.mcap.summary import MAGIC, read_summary
-from epipole.io.logs.messages.batches import Part
-from epipole.io.logs.messages.decoding import ENCODINGS
+from epipole.io.logs.messages.batches import batches_of
+from epipole.io.logs.messages.encodings.registry import kinds_of_schemas, message_encodings
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
 from epipole.schemas.log_tables import LogPart, LogPiece, LogSource
-from epipole.schemas.messages import CALIBRATION, CARRIES, FRAME, STATE
+from epipole.schemas.messages import CALIBRATION, FRAME, KINDS, STATE
 from epipole.schemas.tables import REJECTS
 
 THREADS = 2  # that unpack and check chunks, beside the one that decodes
 PART_BYTES = 64 << 20  # of frames and states in one piece of a log
-KINDS = (FRAME, STATE, CALIBRATION)
 # A frame's time and the time it was logged at may be so far apart, no further, for chunks
 # to be judged by the latter. States that far beyond a range help its first and last frames.
 MARGIN_NS = 600_000_000_000
 FIRST_NS, LAST_NS = 0, (1 << 63) - 1 - MARGIN_NS
-# A calibration holds until the next one, so it may lie far before a range.
-ALWAYS_READ = frozenset(name for name, carries in CARRIES.items() if carries == CALIBRATION)
 
 
 def read_log(
@@ -97,8 +94,9 @@ def read_log_parts(
     with _open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
         reading = _Reading(where, data, span, pool)
         for block in reading.blocks():
-            for i, chosen in _kinds(block, where):
-                reading.takers[i].add(Part(block, KINDS[i], chosen, reading.rejects))
+            for kind, chosen in _by_kind(block, where):
+                for batch in batches_of(block, kind, chosen, reading.rejects):
+                    reading.columns[kind].add(batch)
             if reading.n_bytes >= part_bytes:
                 yield reading.piece()
         yield reading.last_piece()
@@ -140,8 +138,15 @@ class _Reading:
         self._frames = FrameColumns(self.rejects, span)
         self._states = StateColumns(self.rejects, wide)
         self._cameras = CameraColumns(self.rejects)
-        self.takers = (self._frames, self._states, self._cameras)  # as in `KINDS`
-        self._walk = RecordWalk(data, frozenset(CARRIES), pool, wide, ALWAYS_READ)
+        self.columns: dict[str, FrameColumns | StateColumns | CameraColumns] = {
+            FRAME: self._frames,
+            STATE: self._states,
+            CALIBRATION: self._cameras,
+        }
+        kinds = kinds_of_schemas()
+        # A calibration holds until the next one, so it may lie far before a range.
+        always = frozenset(name for name, kind in kinds.items() if kind == CALIBRATION)
+        self._walk = RecordWalk(data, frozenset(kinds), pool, wide, always)
         self._frames_ns = _TimeSpan()
         self._states_ns = _TimeSpan()
 
@@ -214,19 +219,26 @@ class _TimeSpan:
         return None if self.first is None else (self.first, self.last)
 
 
-def _kinds(block: Block, where: str) -> Iterator[tuple[int, npt.NDArray[np.int64]]]:
-    """Yield the place in `KINDS` of what messages of a block carry, and which do."""
+def _by_kind(block: Block, where: str) -> Iterator[tuple[str, npt.NDArray[np.int64]]]:
+    """Yield the kinds of message in a block, each with the numbers of its messages.
+
+    Raises
+    ------
+    LogError
+        Where a channel is in an encoding that is not registered.
+    """
+    kinds, encodings = kinds_of_schemas(), message_encodings()
     code = np.zeros(max(block.channels) + 1, np.uint8)
     for number, channel in block.channels.items():
-        if channel.encoding not in ENCODINGS:
+        if channel.encoding not in encodings:
             raise LogError(
                 f"{where}: topic {channel.topic}: messages are encoded as {channel.encoding!r}; "
-                f"write {channel.schema} as one of {', '.join(ENCODINGS)}"
+                f"write {channel.schema} as one of {', '.join(encodings)}"
             )
-        code[number] = KINDS.index(CARRIES[channel.schema])
+        code[number] = KINDS.index(kinds[channel.schema])
     of_message = code[block.channel]
     for i in np.unique(code[list(block.channels)]).tolist():
-        yield i, np.flatnonzero(of_message == i)
+        yield KINDS[i], np.flatnonzero(of_message == i)
 
 
 def _advice(rejects: RejectList) -> str:

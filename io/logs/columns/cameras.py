@@ -6,8 +6,8 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.io.logs.damage import RejectList
-from epipole.io.logs.messages.batches import Part, fault, known_id
-from epipole.io.logs.messages.decoding import Calibration
+from epipole.io.logs.messages.batches import MessageBatch, fault, known_id
+from epipole.io.logs.messages.decoded import CalibrationMessage
 from epipole.schemas.bridge import table
 from epipole.schemas.work_tables import CAMERAS
 
@@ -17,14 +17,14 @@ class CameraColumns:
     """The calibrations of a log."""
 
     rejects: RejectList
-    _rows: list[Calibration] = field(default_factory=list)
+    _rows: list[CalibrationMessage] = field(default_factory=list)
 
-    def add(self, part: Part) -> None:
-        """Take calibrations, or leave them out with a reason.
+    def add(self, batch: MessageBatch) -> None:
+        """Take the valid calibrations; the others become rejects.
 
-        One without a time holds from when it was logged.
+        A calibration without a time holds from the time it was logged at.
         """
-        for calibration, offset, log_time_ns in part.decoded(0, len(part)):
+        for calibration, offset, log_time_ns in batch.decoded(0, len(batch)):
             time_ns = calibration.time_ns or log_time_ns or None
             reason = fault(time_ns, calibration.sensor_id) or _camera_fault(calibration)
             if reason is None:
@@ -60,7 +60,7 @@ class CameraColumns:
         )
 
 
-def _camera_fault(calibration: Calibration) -> str | None:
+def _camera_fault(calibration: CalibrationMessage) -> str | None:
     if calibration.width <= 0 or calibration.height <= 0:
         return "bad_image_size"
     if calibration.distortion_model not in ("", "plumb_bob"):

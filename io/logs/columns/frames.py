@@ -9,10 +9,9 @@ import pyarrow as pa
 
 from epipole.io.logs.columns.names import NameCodes
 from epipole.io.logs.damage import RejectList
-from epipole.io.logs.messages.batches import Part, Received, fault, known_id
-from epipole.io.logs.messages.decoding import Frame
+from epipole.io.logs.messages.batches import MessageBatch, Received, fault, known_id
+from epipole.io.logs.messages.decoded import FrameMessage
 from epipole.io.logs.messages.scan import FrameRows, scan_frames
-from epipole.io.logs.messages.wire import FRAME_KINDS
 from epipole.schemas.bridge import table
 from epipole.schemas.work_tables import EXPOSURES
 
@@ -66,25 +65,24 @@ class FrameColumns:
     _rows: _Rows = field(default_factory=lambda: _Rows(0, 0))
     _tables: list[pa.Table] = field(default_factory=list)
 
-    def add(self, part: Part) -> None:
-        """Take frames, but for those whose time, sensor, number or arrays are none.
+    def add(self, batch: MessageBatch) -> None:
+        """Take the frames whose time, sensor, number and arrays are valid.
 
-        Flux is never relied on: where it is not a positive finite number it is NaN, and the
-        frame stays. An exposure that is not one is 0, unknown.
+        Flux is never relied on: an invalid value becomes NaN, and the frame stays. An invalid
+        exposure time becomes 0, which is unknown.
         """
-        messages = part.messages
-        n_bytes = int((messages.end - messages.start).sum())
-        self._make_room(len(part), n_bytes // BYTES_OF_A_CENTROID)
+        messages = batch.messages
+        self._make_room(len(batch), batch.n_bytes // BYTES_OF_A_CENTROID)
         rows, names = self._rows, self._sensors.table
 
         def scan(i: int) -> int:
             n = rows.n
-            stopped, rows.n = scan_frames(messages, i, names, rows.columns, n, FRAME_KINDS)
-            rows.offset[n : rows.n] = part.offset[i:stopped]
-            self._watch_clock(part, i, stopped, n)
+            stopped, rows.n = scan_frames(messages, i, names, rows.columns, n)
+            rows.offset[n : rows.n] = batch.offset[i:stopped]
+            self._watch_clock(batch, i, stopped, n)
             return int(stopped)
 
-        part.take(scan, self._judge)
+        batch.take(scan, self._judge)
 
     @property
     def n_bytes(self) -> int:
@@ -98,10 +96,10 @@ class FrameColumns:
         tables, self._tables = self._tables, []
         return pa.concat_tables([EXPOSURES.empty_table(), *tables])
 
-    def _watch_clock(self, part: Part, first: int, last: int, n: int) -> None:
+    def _watch_clock(self, batch: MessageBatch, first: int, last: int, n: int) -> None:
         if self.span is None or first == last:
             return
-        logged = part.block.time_ns[part.chosen[first:last]].astype(np.int64)
+        logged = batch.block.time_ns[batch.chosen[first:last]].astype(np.int64)
         off = np.abs(self._rows.columns.time_ns[n : n + last - first] - logged)
         self.clock_off_ns = max(self.clock_off_ns or 0, int(off.max()))
 
@@ -143,7 +141,7 @@ class FrameColumns:
         """Take decoded frames, or leave them out with a reason."""
         sound = []
         for one in received:
-            frame: Frame = one.record
+            frame: FrameMessage = one.message
             reason = fault(frame.time_ns, frame.sensor_id) or _frame_fault(frame)
             if reason is None:
                 sound.append(one)
@@ -155,13 +153,13 @@ class FrameColumns:
     def _leave_out(self, one: Received, reason: str) -> None:
         self.rejects.add(
             reason,
-            time_ns=one.record.time_ns or one.log_time_ns,
+            time_ns=one.message.time_ns or one.log_time_ns,
             offset=one.offset,
-            sensor_id=known_id(one.record.sensor_id),
+            sensor_id=known_id(one.message.sensor_id),
         )
 
     def _append(self, received: Sequence[Received]) -> None:
-        frames: list[Frame] = [one.record for one in received]
+        frames: list[FrameMessage] = [one.message for one in received]
         lengths = np.array([len(f.x_px) for f in frames], np.int64)
         x = _joined([f.x_px for f in frames])
         y = _joined([f.y_px for f in frames])
@@ -191,7 +189,7 @@ class FrameColumns:
         for column, numbers in zip((c.x_px, c.y_px, c.flux, c.sigma_px), values, strict=True):
             column[low : low + len(numbers)] = numbers
         for one, length in zip(received, lengths.tolist(), strict=True):
-            n, frame = rows.n, one.record
+            n, frame = rows.n, one.message
             exposure_s = frame.exposure_s
             c.sensor[n] = self._sensors.code(frame.sensor_id)
             c.number[n], c.time_ns[n] = frame.frame_number, frame.time_ns
@@ -209,7 +207,7 @@ def _arrow_floats(n: int) -> Floats:
     return np.frombuffer(pa.allocate_buffer(4 * n), np.float32)
 
 
-def _frame_fault(frame: Frame) -> str | None:
+def _frame_fault(frame: FrameMessage) -> str | None:
     if not 0 <= frame.frame_number <= MAX_FRAME_NUMBER:
         return "bad_frame_number"
     n = len(frame.x_px)

@@ -10,14 +10,13 @@ import pyarrow as pa
 
 from epipole.io.logs.columns.names import NameCodes
 from epipole.io.logs.damage import RejectList
-from epipole.io.logs.messages.batches import Part, Received, fault, known_id
-from epipole.io.logs.messages.decoding import State
+from epipole.io.logs.messages.batches import MessageBatch, Received, fault, known_id
+from epipole.io.logs.messages.decoded import StateMessage
 from epipole.io.logs.messages.scan import StateRows, scan_states
-from epipole.io.logs.messages.wire import STATE_KINDS
 from epipole.schemas.bridge import nullable, table, unstack
 from epipole.schemas.log_tables import LOG_STATES, STATE_FRAMES
 
-Array = npt.NDArray[np.float64]
+Array = npt.NDArray[np.floating]
 
 # Below the poles' radius of 6357 km: no sensor is there, whatever its frame and its errors.
 EARTH_RADIUS_KM = 6340.0
@@ -48,21 +47,19 @@ class StateColumns:
     _n: int = 0
     _tables: list[pa.Table] = field(default_factory=list)
 
-    def add(self, part: Part) -> None:
-        """Take states, without their attitude where only that is bad; leave out the others."""
-        messages = part.messages
-        if self._n + len(part) > len(self._rows.time_ns):
+    def add(self, batch: MessageBatch) -> None:
+        """Take the valid states; a state of which only the attitude is invalid loses that."""
+        messages = batch.messages
+        if self._n + len(batch) > len(self._rows.time_ns):
             self._close()
-            self._rows = _new_rows(max(len(part), BATCH))
+            self._rows = _new_rows(max(len(batch), BATCH))
         sensors, frames = self._sensors.table, _FRAMES.table
 
         def scan(i: int) -> int:
-            stopped, self._n = scan_states(
-                messages, i, sensors, frames, self._rows, self._n, STATE_KINDS
-            )
+            stopped, self._n = scan_states(messages, i, sensors, frames, self._rows, self._n)
             return int(stopped)
 
-        part.take(scan, self._judge)
+        batch.take(scan, self._judge)
 
     @property
     def n_bytes(self) -> int:
@@ -105,7 +102,7 @@ class StateColumns:
     def _judge(self, received: Sequence[Received]) -> None:
         """Take decoded states, or leave them out with a reason."""
         for one in received:
-            state: State = one.record
+            state: StateMessage = one.message
             reason = fault(state.time_ns, state.sensor_id) or _state_fault(state)
             if reason is not None:
                 self._leave_out(one, reason)
@@ -113,17 +110,17 @@ class StateColumns:
             if len(state.attitude_xyzw) and not _is_attitude(state.attitude_xyzw):
                 self._leave_out(one, "bad_attitude")
                 state = state._replace(attitude_xyzw=state.attitude_xyzw[:0])
-            self._write(state, one.record.time_ns)
+            self._write(state, one.message.time_ns)
 
     def _leave_out(self, one: Received, reason: str) -> None:
         self.rejects.add(
             reason,
-            time_ns=one.record.time_ns or one.log_time_ns,
+            time_ns=one.message.time_ns or one.log_time_ns,
             offset=one.offset,
-            sensor_id=known_id(one.record.sensor_id),
+            sensor_id=known_id(one.message.sensor_id),
         )
 
-    def _write(self, state: State, time_ns: int) -> None:
+    def _write(self, state: StateMessage, time_ns: int) -> None:
         rows, n = self._rows, self._n
         rows.sensor[n] = self._sensors.code(state.sensor_id)
         rows.frame[n] = _FRAMES.code(state.frame)
@@ -135,7 +132,7 @@ class StateColumns:
         self._n = n + 1
 
 
-def _state_fault(state: State) -> str | None:
+def _state_fault(state: StateMessage) -> str | None:
     if state.frame not in STATE_FRAMES:
         return "unknown_frame"
     # A length is finite only if every component is.

@@ -9,11 +9,11 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from epipole.io.logs.mcap import records as log_records
-from epipole.io.logs.messages.encoding import encode_protobuf
+from epipole.io.logs.messages.encodings import protobuf
 from epipole.io.logs.reader import read_log, read_log_parts
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.errors import LogError
-from epipole.schemas.messages import CENTROID_FRAME, SENSOR_STATE
+from epipole.schemas.messages import CENTROID_FRAME, FRAME, SENSOR_STATE, STATE
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -101,7 +101,7 @@ def test_the_memory_of_reading_is_bounded_by_its_pieces_not_by_the_log(tmp_path,
         channel = writer.register_channel("/a", "protobuf", schema)
         for i in range(12_000):
             frame = {**values, "frame_number": i + 1, "x_px": x, "y_px": x}
-            writer.add_message(channel, START_NS, encode_protobuf(CENTROID_FRAME, frame), START_NS)
+            writer.add_message(channel, START_NS, protobuf.encode(FRAME, frame), START_NS)
         writer.finish()
     assert path.stat().st_size > 180 * MIB
     command = [sys.executable, "-c", READ, str(log), str(path)]
@@ -137,7 +137,7 @@ def test_a_log_that_is_deleted_while_it_is_read_is_read(tmp_path, log):
 def test_messages_outside_chunks_are_read_in_pieces(tmp_path):
     state = {"timestamp": START_NS, "sensor_id": "sat1", "frame": "GCRF", "velocity_km_s": None}
     state |= {"position_km": [7e3, 0, 0], "position_sigma_km": 0.1, "attitude_xyzw": None}
-    data = encode_protobuf(SENSOR_STATE, state | {"attitude_sigma_arcsec": 0.0})
+    data = protobuf.encode(STATE, state | {"attitude_sigma_arcsec": 0.0})
     frame = {"timestamp": START_NS, "sensor_id": "sat1", "exposure_s": 0.1, "flux": None}
     frame |= {"frame_number": 1, "x_px": [1.0], "y_px": [1.0], "sigma_px": None}
     path = tmp_path / "a.mcap"
@@ -149,7 +149,7 @@ def test_messages_outside_chunks_are_read_in_pieces(tmp_path):
             channel = writer.register_channel("/a", "protobuf", schema)
         for _ in range(100_000):
             writer.add_message(1, START_NS, data, START_NS)
-        writer.add_message(channel, START_NS, encode_protobuf(CENTROID_FRAME, frame), START_NS)
+        writer.add_message(channel, START_NS, protobuf.encode(FRAME, frame), START_NS)
         writer.finish()
     parts = list(read_log_parts(path, part_bytes=MIB))
     assert len(parts) > 1

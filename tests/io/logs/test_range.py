@@ -8,12 +8,19 @@ from mcap.writer import Writer
 
 from epipole.io.logs.mcap import chunks as log_chunks
 from epipole.io.logs.mcap import records as log_records
-from epipole.io.logs.messages.encoding import encode_calibration, encode_protobuf
+from epipole.io.logs.messages.encodings import protobuf
 from epipole.io.logs.reader import MARGIN_NS, read_log, read_log_times
-from epipole.io.logs.writer import LogWriter
+from epipole.io.logs.writer import LogWriter, calibration_values
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
-from epipole.schemas.messages import CALIBRATION_NAME, CENTROID_FRAME, SENSOR_STATE
+from epipole.schemas.messages import (
+    CALIBRATION,
+    CALIBRATION_NAME,
+    CENTROID_FRAME,
+    FRAME,
+    SENSOR_STATE,
+    STATE,
+)
 
 START_NS = 1_554_091_200_000_000_000
 MINUTE_NS = 60_000_000_000
@@ -31,14 +38,14 @@ FROM, TO = START_NS + 50 * MINUTE_NS, START_NS + 60 * MINUTE_NS
 def frame(i):
     values = {"timestamp": START_NS + i * MINUTE_NS, "sensor_id": "sat1", "frame_number": i}
     values |= {"exposure_s": 0.1, "x_px": [1.0] * 20, "y_px": [2.0] * 20}
-    return encode_protobuf(CENTROID_FRAME, values | {"flux": None, "sigma_px": None})
+    return protobuf.encode(FRAME, values | {"flux": None, "sigma_px": None})
 
 
 def state(i):
     values = {"timestamp": START_NS + i * MINUTE_NS, "sensor_id": "sat1", "frame": "GCRF"}
     values |= {"position_km": [7000.0, i, 0.0], "velocity_km_s": None, "position_sigma_km": 0.1}
     values |= {"attitude_xyzw": None, "attitude_sigma_arcsec": 0.0}
-    return encode_protobuf(SENSOR_STATE, values)
+    return protobuf.encode(STATE, values)
 
 
 def write(path, *, logged_ns=lambda i: START_NS + i * MINUTE_NS, cameras=(0,), **options):
@@ -52,7 +59,8 @@ def write(path, *, logged_ns=lambda i: START_NS + i * MINUTE_NS, cameras=(0,), *
             channels[name] = writer.register_channel(f"/{name}", "protobuf", schema)
         for i in range(N):
             if i in cameras:
-                data = encode_calibration("protobuf", "sat1", START_NS + i * MINUTE_NS, CAMERA)
+                values = calibration_values("sat1", START_NS + i * MINUTE_NS, CAMERA)
+                data = protobuf.encode(CALIBRATION, values)
                 writer.add_message(channels[CALIBRATION_NAME], logged_ns(i), data, 0)
             writer.add_message(channels[SENSOR_STATE.name], logged_ns(i), state(i), 0)
             writer.add_message(channels[CENTROID_FRAME.name], logged_ns(i), frame(i), 0)

@@ -9,13 +9,20 @@ from mcap.writer import CompressionType, Writer
 
 from epipole.io.logs.columns import frames as frame_columns
 from epipole.io.logs.damage import ROWS_ALIKE
-from epipole.io.logs.messages.encoding import encode_calibration, encode_protobuf
+from epipole.io.logs.messages.encodings import json_text, protobuf
+from epipole.io.logs.messages.encodings.registry import kinds_of_schemas
 from epipole.io.logs.reader import read_log
-from epipole.io.logs.writer import LogWriter
-from epipole.schemas import messages
+from epipole.io.logs.writer import LogWriter, calibration_values
 from epipole.schemas.bridge import array, flatten, stack
 from epipole.schemas.errors import LogError
-from epipole.schemas.messages import CENTROID_FRAME, SENSOR_STATE
+from epipole.schemas.messages import (
+    CALIBRATION,
+    CALIBRATION_NAME,
+    CENTROID_FRAME,
+    FRAME,
+    SENSOR_STATE,
+    STATE,
+)
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -71,7 +78,7 @@ def frame(**changes):
         "flux": None,
         "sigma_px": None,
     }
-    return encode_protobuf(CENTROID_FRAME, {**values, **changes})
+    return protobuf.encode(FRAME, {**values, **changes})
 
 
 def state(**changes):
@@ -85,7 +92,13 @@ def state(**changes):
         "attitude_xyzw": None,
         "attitude_sigma_arcsec": 0.0,
     }
-    return encode_protobuf(SENSOR_STATE, {**values, **changes})
+    return protobuf.encode(STATE, {**values, **changes})
+
+
+def json_calibration():
+    """Return the values of a good calibration in JSON."""
+    values = calibration_values("sat1", START_NS, CAMERA)
+    return json.loads(json_text.encode(CALIBRATION, values))
 
 
 def write_raw(path, *recorded, encoding="protobuf", schema_encoding="protobuf"):
@@ -201,9 +214,10 @@ def test_encodings_may_be_mixed_and_other_messages_are_ignored(tmp_path):
     assert array(part.rejects, "time").tolist() == [START_NS + 1_500_000_000]
 
 
-def test_ros_names_with_and_without_msg_are_one():
-    assert messages.CARRIES["epipole_msgs/CentroidFrame"] == messages.FRAME
-    assert messages.CARRIES["epipole_msgs/msg/CentroidFrame"] == messages.FRAME
+def test_ros_names_with_and_without_msg_are_the_same():
+    kinds = kinds_of_schemas()
+    assert kinds["epipole_msgs/CentroidFrame"] == FRAME
+    assert kinds["epipole_msgs/msg/CentroidFrame"] == FRAME
 
 
 def test_flux_that_is_none_is_nan_and_the_frame_stays(tmp_path):
@@ -292,8 +306,8 @@ def test_a_sigma_that_is_none_is_unknown(tmp_path, sigma):
     ],
 )
 def test_a_calibration_that_cannot_be_used_is_a_row(tmp_path, changes, reason):
-    data = encode_calibration("protobuf", "sat1", START_NS, CAMERA | changes)
-    part = read_with_good_frame(tmp_path, (messages.CALIBRATION_NAME, data))
+    data = protobuf.encode(CALIBRATION, calibration_values("sat1", START_NS, CAMERA | changes))
+    part = read_with_good_frame(tmp_path, (CALIBRATION_NAME, data))
     assert part.cameras.num_rows == 0
     assert reasons(part) == [(reason, "sat1", 1)]
 
@@ -309,7 +323,7 @@ def test_a_calibration_that_cannot_be_used_is_a_row(tmp_path, changes, reason):
     ],
 )
 def test_a_calibration_of_another_model_is_a_row(tmp_path, changes, reason):
-    values = json.loads(encode_calibration("json", "sat1", START_NS, CAMERA)) | changes
+    values = json_calibration() | changes
     part = read_log(
         write_raw(
             tmp_path / "a.mcap",
@@ -317,7 +331,7 @@ def test_a_calibration_of_another_model_is_a_row(tmp_path, changes, reason):
                 CENTROID_FRAME.name,
                 json.dumps({"timestamp": "2019-04-01T04:00:00Z", "sensor_id": "a"}).encode(),
             ),
-            (messages.CALIBRATION_NAME, json.dumps(values).encode()),
+            (CALIBRATION_NAME, json.dumps(values).encode()),
             encoding="json",
         )
     )
@@ -325,13 +339,13 @@ def test_a_calibration_of_another_model_is_a_row(tmp_path, changes, reason):
 
 
 def test_a_distortion_of_four_terms_has_no_k3(tmp_path):
-    values = json.loads(encode_calibration("json", "sat1", START_NS, CAMERA))
+    values = json_calibration()
     values["D"], values["distortion_model"] = values["D"][:4], ""
     good = json.dumps({"timestamp": "2019-04-01T04:00:00Z", "sensor_id": "a"}).encode()
     path = write_raw(
         tmp_path / "a.mcap",
         (CENTROID_FRAME.name, good),
-        (messages.CALIBRATION_NAME, json.dumps(values).encode()),
+        (CALIBRATION_NAME, json.dumps(values).encode()),
         encoding="json",
     )
     camera = read_log(path).cameras
