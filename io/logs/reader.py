@@ -26,12 +26,12 @@ from epipole.io.logs.messages.batches import batches_of
 from epipole.io.logs.messages.encodings.registry import kinds_of_schemas, message_encodings
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
-from epipole.schemas.log_tables import LogPart, LogPiece, LogSource
+from epipole.schemas.log_tables import LogContents, LogPiece, LogSource
 from epipole.schemas.messages import CALIBRATION, FRAME, KINDS, STATE
 from epipole.schemas.tables import REJECTS
 
 THREADS = 2  # that unpack and check chunks, beside the one that decodes
-PART_BYTES = 64 << 20  # of frames and states in one piece of a log
+PIECE_BYTES = 64 << 20  # of frames and states in one piece of a log
 # A frame's time and the time it was logged at may be so far apart, no further, for chunks
 # to be judged by the latter. States that far beyond a range help its first and last frames.
 MARGIN_NS = 600_000_000_000
@@ -40,8 +40,8 @@ FIRST_NS, LAST_NS = 0, (1 << 63) - 1 - MARGIN_NS
 
 def read_log(
     path: str | os.PathLike[str], start_ns: int | None = None, end_ns: int | None = None
-) -> LogPart:
-    """Return what a log holds, in the order of the file (see `read_log_parts`).
+) -> LogContents:
+    """Return what a log holds, in the order of the file (see `read_log_pieces`).
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def read_log(
 
     Returns
     -------
-    LogPart
+    LogContents
         Exposures, states (in their own frames), cameras, rejects and the source's row.
         The offset of a row is the place of its message's chunk in the file.
 
@@ -64,25 +64,25 @@ def read_log(
         No such file, a folder, no MCAP, messages in an unknown encoding, no frame. That none
         lies in the range is no error.
     """
-    pieces = list(read_log_parts(path, start_ns, end_ns))
+    pieces = list(read_log_pieces(path, start_ns, end_ns))
     exposures, states, cameras, rejects = (
         pa.concat_tables([getattr(piece, name) for piece in pieces])
         for name in ("exposures", "states", "cameras", "rejects")
     )
     source = pieces[-1].source
     assert source is not None  # the last piece has it
-    return LogPart(exposures, states, cameras, rejects, source)
+    return LogContents(exposures, states, cameras, rejects, source)
 
 
-def read_log_parts(
+def read_log_pieces(
     path: str | os.PathLike[str],
     start_ns: int | None = None,
     end_ns: int | None = None,
-    part_bytes: int = PART_BYTES,
+    piece_bytes: int = PIECE_BYTES,
 ) -> Iterator[LogPiece]:
     """Yield what `read_log` returns in pieces, so that it need not be in memory at once.
 
-    A piece has about `part_bytes` of frames and states, at most a chunk of the log more. Each
+    A piece has about `piece_bytes` of frames and states, at most a chunk of the log more. Each
     message comes once, in the order of the file; only where the log's times turn out to be
     wrong, chunks that were passed over come last. The last piece has the rejects and the
     source; the errors that need the whole log come in its place. There is at least one piece.
@@ -97,7 +97,7 @@ def read_log_parts(
             for kind, chosen in _by_kind(block, where):
                 for batch in batches_of(block, kind, chosen, reading.rejects):
                     reading.columns[kind].add(batch)
-            if reading.n_bytes >= part_bytes:
+            if reading.n_bytes >= piece_bytes:
                 yield reading.piece()
         yield reading.last_piece()
 

@@ -38,11 +38,11 @@ class BlockReader:
         if self._pool is None or start >= end:
             return self._fetch(start, end)
         first, last = start // BLOCK_BYTES, (end - 1) // BLOCK_BYTES
-        parts = []
+        pieces = []
         for k in range(first, last + 1):
             low = k * BLOCK_BYTES
-            parts.append(self._block(k)[max(start - low, 0) : end - low])
-        return parts[0] if len(parts) == 1 else b"".join(parts)
+            pieces.append(self._block(k)[max(start - low, 0) : end - low])
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def sha256(self) -> str:
         """Return the SHA-256 of the whole, of which the rest is fetched now.

@@ -138,9 +138,9 @@ class _FileReader:
     def _read(self, start: int, end: int) -> bytes:
         data = b""
         try:
-            while start < end and (part := os.pread(self._descriptor, end - start, start)):
-                data = data + part if data else part
-                start += len(part)
+            while start < end and (piece := os.pread(self._descriptor, end - start, start)):
+                data = data + piece if data else piece
+                start += len(piece)
         except OSError as error:
             raise self._unreadable(error) from error
         return data

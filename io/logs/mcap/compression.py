@@ -40,11 +40,11 @@ def decompress_part(data: memoryview, compression: str, size: int) -> bytes:
     try:
         if compression == "zstd":
             reader = zstandard.ZstdDecompressor().stream_reader(data)
-            parts = []
-            while size > 0 and (part := reader.read(min(size, 1 << 20))):
-                parts.append(part)
-                size -= len(part)
-            return b"".join(parts)
+            pieces = []
+            while size > 0 and (piece := reader.read(min(size, 1 << 20))):
+                pieces.append(piece)
+                size -= len(piece)
+            return b"".join(pieces)
         if compression == "lz4":
             return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):

@@ -195,10 +195,10 @@ class RecordWalk:
                 self._leave_out(int(offset[i]), start_ns, "damaged_record")
 
     def _wanted(
-        self, data: Bytes, index: RecordIndex, offset: Numbers, part: slice
+        self, data: Bytes, index: RecordIndex, offset: Numbers, run: slice
     ) -> Iterator[Block]:
         """Yield the messages of a run that are asked for; all of them are counted."""
-        channel = index.channel[part]
+        channel = index.channel[run]
         wanted: dict[int, Channel] = {}
         counts = np.bincount(channel)
         for number in np.flatnonzero(counts).tolist():
@@ -211,10 +211,10 @@ class RecordWalk:
                 self._unknown[number] = self._unknown.get(number, 0) + n
         columns: list[npt.NDArray[Any]] = [
             channel,
-            index.time_ns[part],
-            index.start[part],
-            index.end[part],
-            offset[part],
+            index.time_ns[run],
+            index.start[run],
+            index.end[run],
+            offset[run],
         ]
         if np.count_nonzero(counts) > len(wanted):
             asked = np.zeros(len(counts), bool)

@@ -81,24 +81,24 @@ def opened(monkeypatch):
     return lengths
 
 
-def numbers(part):
-    return array(part.exposures, "frame_number").tolist()
+def numbers(contents):
+    return array(contents.exposures, "frame_number").tolist()
 
 
 def minutes(table):
     return ((array(table, "time") - START_NS) // MINUTE_NS).tolist()
 
 
-def check(part):
+def check(contents):
     """Hold what was read to the frames and states of the ten minutes.
 
     Their order is that of the file unless the log's times are wrong.
     """
     margin = MARGIN_NS // MINUTE_NS
-    assert sorted(numbers(part)) == list(range(50, 60))
-    assert sorted(minutes(part.states)) == list(range(50 - margin, 60 + margin))
-    assert part.rejects.num_rows == 0
-    assert (part.source.first_time_ns, part.source.last_time_ns) == (FROM, TO - MINUTE_NS)
+    assert sorted(numbers(contents)) == list(range(50, 60))
+    assert sorted(minutes(contents.states)) == list(range(50 - margin, 60 + margin))
+    assert contents.rejects.num_rows == 0
+    assert (contents.source.first_time_ns, contents.source.last_time_ns) == (FROM, TO - MINUTE_NS)
 
 
 def test_a_range_opens_the_chunks_it_needs(tmp_path, opened):
@@ -106,25 +106,25 @@ def test_a_range_opens_the_chunks_it_needs(tmp_path, opened):
     whole = read_log(path)
     n_chunks = len(opened)
     opened.clear()
-    part = read_log(path, FROM, TO)
-    check(part)
+    contents = read_log(path, FROM, TO)
+    check(contents)
     assert len(opened) < n_chunks / 2
-    assert part.exposures.equals(whole.exposures.slice(50, 10))
-    assert part.cameras.equals(whole.cameras)
-    assert part.source.sha256 == whole.source.sha256
+    assert contents.exposures.equals(whole.exposures.slice(50, 10))
+    assert contents.cameras.equals(whole.cameras)
+    assert contents.source.sha256 == whole.source.sha256
 
 
 def test_a_calibration_far_before_the_range_is_read(tmp_path):
-    part = read_log(write(tmp_path / "a.mcap", cameras=(0, 20, 100)), FROM, TO)
-    assert minutes(part.cameras) == [0, 20, 100]
-    check(part)
+    contents = read_log(write(tmp_path / "a.mcap", cameras=(0, 20, 100)), FROM, TO)
+    assert minutes(contents.cameras) == [0, 20, 100]
+    check(contents)
 
 
 @pytest.mark.parametrize("limits", [(FROM, None), (None, FROM), (None, None)])
 def test_either_end_may_be_open(tmp_path, limits):
-    part = read_log(write(tmp_path / "a.mcap"), *limits)
+    contents = read_log(write(tmp_path / "a.mcap"), *limits)
     first = 50 if limits[0] else 0
-    assert numbers(part) == list(range(first, 50 if limits[1] else N))
+    assert numbers(contents) == list(range(first, 50 if limits[1] else N))
 
 
 @pytest.mark.parametrize(
@@ -145,9 +145,9 @@ def test_a_log_that_was_logged_at_another_time_is_read_whole(tmp_path, logged_ns
     ["use_statistics", "use_summary_offsets", "repeat_channels", "repeat_schemas", "enable_crcs"],
 )
 def test_without_a_full_summary_the_same_is_read(tmp_path, option):
-    part = read_log(write(tmp_path / "a.mcap", cameras=(0, 20), **{option: False}), FROM, TO)
-    check(part)
-    assert minutes(part.cameras) == [0, 20]
+    contents = read_log(write(tmp_path / "a.mcap", cameras=(0, 20), **{option: False}), FROM, TO)
+    check(contents)
+    assert minutes(contents.cameras) == [0, 20]
 
 
 def test_an_unclosed_log_is_read_whole(tmp_path, opened):
@@ -155,8 +155,8 @@ def test_an_unclosed_log_is_read_whole(tmp_path, opened):
     data = path.read_bytes()
     end = data.rfind(struct.pack("<BQ", 0x0F, 4))
     path.write_bytes(data[:end])
-    part = read_log(path, FROM, TO)
-    assert numbers(part) == list(range(50, 60))
+    contents = read_log(path, FROM, TO)
+    assert numbers(contents) == list(range(50, 60))
     n_opened = len(opened)
     opened.clear()
     read_log(path)
@@ -192,17 +192,17 @@ def test_damage_of_another_time_is_not_of_the_range(tmp_path):
     for at, length in (places[3], places[len(places) // 2]):
         data[at + 9 + length - 10] ^= 0xFF
     path.write_bytes(data)
-    whole, part = read_log(path), read_log(path, FROM, TO)
+    whole, contents = read_log(path), read_log(path, FROM, TO)
     assert whole.rejects.num_rows == 2
-    assert part.rejects.num_rows == 1
-    assert len(numbers(part)) < 10
+    assert contents.rejects.num_rows == 1
+    assert len(numbers(contents)) < 10
 
 
 def test_a_range_without_frames_is_empty_and_no_error(tmp_path):
     far_ns = START_NS + 10**6 * MINUTE_NS
-    part = read_log(write(tmp_path / "a.mcap"), far_ns, far_ns + MINUTE_NS)
-    assert (part.exposures.num_rows, part.states.num_rows) == (0, 0)
-    assert part.rejects.num_rows == 0
+    contents = read_log(write(tmp_path / "a.mcap"), far_ns, far_ns + MINUTE_NS)
+    assert (contents.exposures.num_rows, contents.states.num_rows) == (0, 0)
+    assert contents.rejects.num_rows == 0
 
 
 def test_the_times_of_a_log_are_known_without_reading_it(tmp_path, opened):

@@ -122,10 +122,10 @@ def read_with_good_frame(tmp_path, *recorded):
     return read_log(write_raw(tmp_path / "a.mcap", good, *recorded))
 
 
-def reasons(part):
+def reasons(contents):
     return [
         (row["reason"], row["sensor_id"], row["count"])
-        for row in part.rejects.drop_columns("time").to_pylist()
+        for row in contents.rejects.drop_columns("time").to_pylist()
     ]
 
 
@@ -136,27 +136,27 @@ def reasons(part):
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_what_is_written_is_read(tmp_path, encoding, compression):
     path = write(tmp_path / "a.mcap", encoding=encoding, compression=compression)
-    part = read_log(path)
-    assert array(part.exposures, "frame_number").tolist() == list(range(N_FRAMES))
+    contents = read_log(path)
+    assert array(contents.exposures, "frame_number").tolist() == list(range(N_FRAMES))
     expected_ns = START_NS + 7 + np.arange(N_FRAMES) * SECOND_NS
-    np.testing.assert_array_equal(array(part.exposures, "time"), expected_ns)
-    x, offsets = flatten(part.exposures, "x_px")
-    y, _ = flatten(part.exposures, "y_px")
+    np.testing.assert_array_equal(array(contents.exposures, "time"), expected_ns)
+    x, offsets = flatten(contents.exposures, "x_px")
+    y, _ = flatten(contents.exposures, "y_px")
     assert np.diff(offsets).tolist() == [i % 7 for i in range(N_FRAMES)]
     rng = np.random.default_rng(0)
     expected = np.concatenate([rng.uniform(0, 500, i % 7) for i in range(N_FRAMES)])
     np.testing.assert_array_equal(x, expected.astype(np.float32))
     np.testing.assert_array_equal(y, expected.astype(np.float32) + np.float32(1))
-    given = [i for i in range(N_FRAMES) if part.exposures["flux"][i].is_valid]
+    given = [i for i in range(N_FRAMES) if contents.exposures["flux"][i].is_valid]
     assert given == [i for i in range(N_FRAMES) if i % 2 and i % 7]
-    np.testing.assert_array_equal(stack(part.states, "{}_km")[:, 1], np.arange(N_FRAMES))
-    np.testing.assert_array_equal(stack(part.states, "v{}_km_s")[3], [0.0, 7.5, 1.0])
-    assert np.isnan(array(part.states, "qx")).all()
-    camera = {name: part.cameras[name][0].as_py() for name in CAMERA}
+    np.testing.assert_array_equal(stack(contents.states, "{}_km")[:, 1], np.arange(N_FRAMES))
+    np.testing.assert_array_equal(stack(contents.states, "v{}_km_s")[3], [0.0, 7.5, 1.0])
+    assert np.isnan(array(contents.states, "qx")).all()
+    camera = {name: contents.cameras[name][0].as_py() for name in CAMERA}
     assert camera == CAMERA
-    assert part.rejects.num_rows == 0
-    assert part.source.size == path.stat().st_size
-    assert part.source.first_time_ns == START_NS + 7
+    assert contents.rejects.num_rows == 0
+    assert contents.source.size == path.stat().st_size
+    assert contents.source.first_time_ns == START_NS + 7
 
 
 def test_frames_that_come_in_batches_are_one_table(tmp_path, monkeypatch):
@@ -206,12 +206,17 @@ def test_encodings_may_be_mixed_and_other_messages_are_ignored(tmp_path):
         ):
             writer.add_message(channel, START_NS, data, START_NS)
         writer.finish()
-    part = read_log(tmp_path / "a.mcap")
-    assert part.exposures["sensor_id"].to_pylist() == ["c", "sat1"]
+    contents = read_log(tmp_path / "a.mcap")
+    assert contents.exposures["sensor_id"].to_pylist() == ["c", "sat1"]
     # A text has more digits than the message type: a float of 32 bits.
-    assert flatten(part.exposures, "x_px")[0].tolist() == [float(np.float32(1.1)), 1.0, 2.0, 3.0]
-    assert reasons(part) == [("nan", "b", 1)]
-    assert array(part.rejects, "time").tolist() == [START_NS + 1_500_000_000]
+    assert flatten(contents.exposures, "x_px")[0].tolist() == [
+        float(np.float32(1.1)),
+        1.0,
+        2.0,
+        3.0,
+    ]
+    assert reasons(contents) == [("nan", "b", 1)]
+    assert array(contents.rejects, "time").tolist() == [START_NS + 1_500_000_000]
 
 
 def test_ros_names_with_and_without_msg_are_the_same():
@@ -222,9 +227,9 @@ def test_ros_names_with_and_without_msg_are_the_same():
 
 def test_flux_that_is_none_is_nan_and_the_frame_stays(tmp_path):
     flux = [-1.0, 0.0, 5.0]
-    part = read_log(write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, frame(flux=flux))))
-    np.testing.assert_array_equal(flatten(part.exposures, "flux")[0], [np.nan, np.nan, 5.0])
-    assert part.rejects.num_rows == 0
+    contents = read_log(write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, frame(flux=flux))))
+    np.testing.assert_array_equal(flatten(contents.exposures, "flux")[0], [np.nan, np.nan, 5.0])
+    assert contents.rejects.num_rows == 0
 
 
 # What is left out
@@ -250,10 +255,10 @@ def test_flux_that_is_none_is_nan_and_the_frame_stays(tmp_path):
     ],
 )
 def test_a_bad_frame_is_a_row_and_the_rest_goes_on(tmp_path, changes, reason, sensor_id):
-    part = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, frame(**changes)))
-    assert part.exposures["sensor_id"].to_pylist() == ["good"]
-    assert reasons(part) == [(reason, sensor_id, 1)]
-    assert part.rejects["source"].to_pylist() == ["a.mcap"]
+    contents = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, frame(**changes)))
+    assert contents.exposures["sensor_id"].to_pylist() == ["good"]
+    assert reasons(contents) == [(reason, sensor_id, 1)]
+    assert contents.rejects["source"].to_pylist() == ["a.mcap"]
 
 
 @pytest.mark.parametrize(
@@ -271,29 +276,31 @@ def test_a_bad_frame_is_a_row_and_the_rest_goes_on(tmp_path, changes, reason, se
     ],
 )
 def test_a_bad_state_is_a_row(tmp_path, changes, reason):
-    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(**changes)))
-    assert part.states.num_rows == 0
-    assert [row[0] for row in reasons(part)] == [reason]
+    contents = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(**changes)))
+    assert contents.states.num_rows == 0
+    assert [row[0] for row in reasons(contents)] == [reason]
 
 
 def test_a_quaternion_near_unit_length_is_scaled_to_it(tmp_path):
     q = [0.0, 0.0, 0.6006, 0.8008]
-    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
-    np.testing.assert_allclose(stack(part.states, "q{}", "xyzw"), [[0, 0, 0.6, 0.8]], atol=1e-15)
+    contents = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
+    np.testing.assert_allclose(
+        stack(contents.states, "q{}", "xyzw"), [[0, 0, 0.6, 0.8]], atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("q", [[0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [1.0], [np.nan] * 4])
 def test_a_bad_attitude_is_left_out_and_its_position_stays(tmp_path, q):
-    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
-    assert part.states.num_rows == 1
-    assert np.isnan(stack(part.states, "q{}", "xyzw")).all()
-    assert reasons(part) == [("bad_attitude", "sat1", 1)]
+    contents = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
+    assert contents.states.num_rows == 1
+    assert np.isnan(stack(contents.states, "q{}", "xyzw")).all()
+    assert reasons(contents) == [("bad_attitude", "sat1", 1)]
 
 
 @pytest.mark.parametrize("sigma", [-1.0, np.nan, np.inf, 0.0])
 def test_a_sigma_that_is_none_is_unknown(tmp_path, sigma):
-    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(position_sigma_km=sigma)))
-    assert array(part.states, "position_sigma_km").tolist() == [0.0]
+    contents = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(position_sigma_km=sigma)))
+    assert array(contents.states, "position_sigma_km").tolist() == [0.0]
 
 
 @pytest.mark.parametrize(
@@ -307,9 +314,9 @@ def test_a_sigma_that_is_none_is_unknown(tmp_path, sigma):
 )
 def test_a_calibration_that_cannot_be_used_is_a_row(tmp_path, changes, reason):
     data = protobuf.encode(CALIBRATION, calibration_values("sat1", START_NS, CAMERA | changes))
-    part = read_with_good_frame(tmp_path, (CALIBRATION_NAME, data))
-    assert part.cameras.num_rows == 0
-    assert reasons(part) == [(reason, "sat1", 1)]
+    contents = read_with_good_frame(tmp_path, (CALIBRATION_NAME, data))
+    assert contents.cameras.num_rows == 0
+    assert reasons(contents) == [(reason, "sat1", 1)]
 
 
 @pytest.mark.parametrize(
@@ -324,7 +331,7 @@ def test_a_calibration_that_cannot_be_used_is_a_row(tmp_path, changes, reason):
 )
 def test_a_calibration_of_another_model_is_a_row(tmp_path, changes, reason):
     values = json_calibration() | changes
-    part = read_log(
+    contents = read_log(
         write_raw(
             tmp_path / "a.mcap",
             (
@@ -335,7 +342,7 @@ def test_a_calibration_of_another_model_is_a_row(tmp_path, changes, reason):
             encoding="json",
         )
     )
-    assert [row[0] for row in reasons(part)] == [reason]
+    assert [row[0] for row in reasons(contents)] == [reason]
 
 
 def test_a_distortion_of_four_terms_has_no_k3(tmp_path):
@@ -354,16 +361,16 @@ def test_a_distortion_of_four_terms_has_no_k3(tmp_path):
 
 @pytest.mark.parametrize("data", [b"\xff\xff\xff", b"\x2a\x03abc", frame()[:-1]])
 def test_an_undecodable_message_is_a_row(tmp_path, data):
-    part = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, data))
-    assert reasons(part) == [("undecodable_frame", None, 1)]
+    contents = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, data))
+    assert reasons(contents) == [("undecodable_frame", None, 1)]
 
 
 def test_many_bad_messages_alike_are_few_rows_that_count_them_all(tmp_path):
     good = (CENTROID_FRAME.name, frame(sensor_id="good"))
     path = write_raw(tmp_path / "a.mcap", good, *[(CENTROID_FRAME.name, b"\1")] * 5000)
-    part = read_log(path)
-    assert part.rejects.num_rows == ROWS_ALIKE
-    assert sum(part.rejects["count"].to_pylist()) == 5000
+    contents = read_log(path)
+    assert contents.rejects.num_rows == ROWS_ALIKE
+    assert sum(contents.rejects["count"].to_pylist()) == 5000
 
 
 # What is an error
@@ -424,8 +431,8 @@ def test_no_damage_stops_the_reading_or_goes_unsaid(tmp_path, encoding, compress
             data[rng.randrange(8, len(data))] ^= 1 << rng.randrange(8)
         path.write_bytes(data)
         try:
-            part = read_log(path)
+            contents = read_log(path)
         except LogError:
             continue
-        assert part.exposures.num_rows == N_FRAMES or part.rejects.num_rows > 0
-        assert part.states.num_rows == N_FRAMES or part.rejects.num_rows > 0
+        assert contents.exposures.num_rows == N_FRAMES or contents.rejects.num_rows > 0
+        assert contents.states.num_rows == N_FRAMES or contents.rejects.num_rows > 0

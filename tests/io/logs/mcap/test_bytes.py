@@ -8,7 +8,7 @@ import pytest
 
 from epipole.io.logs.mcap import blocks as log_blocks
 from epipole.io.logs.mcap.bytes import LogBytes
-from epipole.io.logs.reader import read_log, read_log_parts
+from epipole.io.logs.reader import read_log, read_log_pieces
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.errors import LogError
 
@@ -90,20 +90,20 @@ def test_a_log_in_a_bucket_is_fetched_by_ranges_and_once(s3, log, monkeypatch):
 
 def test_a_log_that_changes_in_its_bucket_while_it_is_read_is_an_error(s3, log):
     s3.put_file(str(log), "logs/a.mcap")
-    parts = read_log_parts("s3://logs/a.mcap", part_bytes=1)
-    next(parts)
+    pieces = read_log_pieces("s3://logs/a.mcap", piece_bytes=1)
+    next(pieces)
     s3.pipe_file("logs/a.mcap", bytes(log.stat().st_size))
     with pytest.raises(LogError, match="has changed while it was read"):
-        list(parts)
+        list(pieces)
 
 
 def test_a_log_that_vanishes_from_its_bucket_while_it_is_read_is_an_error(s3, log):
     s3.put_file(str(log), "logs/gone.mcap")
-    parts = read_log_parts("s3://logs/gone.mcap", part_bytes=1)
-    next(parts)
+    pieces = read_log_pieces("s3://logs/gone.mcap", piece_bytes=1)
+    next(pieces)
     s3.rm("logs/gone.mcap")
     with pytest.raises(LogError, match=r"gone\.mcap: no such file"):
-        list(parts)
+        list(pieces)
 
 
 @pytest.mark.parametrize("block_bytes", [1, 7, 100, 1 << 20])

@@ -249,11 +249,11 @@ def chunk(records):
     return record(6, head + bytes(4) + struct.pack("<Q", len(records)) + records)
 
 
-def hand_made(*parts):
-    """Return a log of these parts of a data section, with no summary."""
+def hand_made(*records):
+    """Return a log of these records of a data section, with no summary."""
     footer = record(2, bytes(20))
     head = record(1, bytes(8))
-    return MAGIC + head + b"".join(parts) + record(15, bytes(4)) + footer + MAGIC
+    return MAGIC + head + b"".join(records) + record(15, bytes(4)) + footer + MAGIC
 
 
 DECLARED = record(3, SCHEMA_BODY) + record(4, CHANNEL_BODY)
@@ -290,8 +290,8 @@ def test_a_declaration_that_is_none_leaves_the_rest():
 
 
 def test_the_same_chunk_twice_is_read_twice():
-    part = chunk(DECLARED + message(1))
-    assert walk(hand_made(part, part)) == ([1, 1], [])
+    whole = chunk(DECLARED + message(1))
+    assert walk(hand_made(whole, whole)) == ([1, 1], [])
 
 
 @pytest.mark.parametrize("crc", [True, False])

@@ -157,8 +157,8 @@ def test_a_good_log_is_read_by_the_scans_alone(tmp_path, monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr(frame_columns.FrameColumns, "_judge", None)
             patch.setattr(state_columns.StateColumns, "_judge", None)
-            part = read_log(path)
-        assert (part.exposures.num_rows, part.states.num_rows) == (10, 10)
+            contents = read_log(path)
+        assert (contents.exposures.num_rows, contents.states.num_rows) == (10, 10)
 
 
 # Protobuf that is written in other ways
@@ -302,10 +302,10 @@ def test_every_message_of_a_log_is_read_or_left_out(tmp_path, encoding):
             log.frame(
                 "sat1", START_NS + i, frame_number=i, exposure_s=0.1, x_px=x, y_px=x[: i % 2 + 2]
             )
-    part = read_log(tmp_path / "a.mcap")
-    read = part.exposures.num_rows + part.states.num_rows
+    contents = read_log(tmp_path / "a.mcap")
+    read = contents.exposures.num_rows + contents.states.num_rows
     assert 0 < read < 400
-    assert read + sum(part.rejects["count"].to_pylist()) == 400
+    assert read + sum(contents.rejects["count"].to_pylist()) == 400
 
 
 def test_a_log_of_odd_messages_alone_has_no_frames(tmp_path):
