@@ -67,19 +67,14 @@ class RejectList:
         ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
         return ", ".join(f"{reason} {count}" for reason, count in ordered)
 
-    def table(self, first_ns: int, last_ns: int, span: tuple[int, int] | None = None) -> pa.Table:
-        """Return the rows; `first_ns` to `last_ns` is the time that the log's frames span.
+    def table(self, first_ns: int, last_ns: int) -> pa.Table:
+        """Return the rows of `rejects`; the log's frames are of `first_ns` to `last_ns`.
 
-        A row whose time is unknown, or a day or more outside that span (damage has made it
-        up), gets the span's start: it must fall into a night that is being made. Of rows
-        whose time is known, those before `span[0]` or from `span[1]` on are left out.
+        A row gets the time of the first frame if its own is unknown, or a day or more outside
+        the log, which only damage can explain. Else no night that is made would have the row.
         """
         near_ns = range(first_ns - DAY_NS + 1, last_ns + DAY_NS)
-        rows = [
-            row
-            for row in self._rows
-            if span is None or row[2] not in near_ns or span[0] <= row[2] < span[1]
-        ]
+        rows = self._rows
         return reject_rows(
             [Reason(reason) for *_, reason, _ in rows],
             source=self.source,

@@ -56,11 +56,9 @@ class _Rows:
 
 @dataclass
 class FrameColumns:
-    """The frames of a log; of those from `span[0]` to before `span[1]`, if there is one."""
+    """The frames of a log."""
 
     rejects: RejectList
-    span: tuple[int, int] | None = None
-    clock_off_ns: int | None = None  # at most how far a frame's time and its logging were apart
     _sensors: NameCodes = field(default_factory=NameCodes)
     _rows: _Rows = field(default_factory=lambda: _Rows(0, 0))
     _tables: list[pa.Table] = field(default_factory=list)
@@ -79,7 +77,6 @@ class FrameColumns:
             n = rows.n
             stopped, rows.n = scan_frames(messages, i, names, rows.columns, n)
             rows.offset[n : rows.n] = batch.offset[i:stopped]
-            self._watch_clock(batch, i, stopped, n)
             return int(stopped)
 
         batch.take(scan, self._judge)
@@ -95,13 +92,6 @@ class FrameColumns:
         self._close()
         tables, self._tables = self._tables, []
         return pa.concat_tables([EXPOSURES.empty_table(), *tables])
-
-    def _watch_clock(self, batch: MessageBatch, first: int, last: int, n: int) -> None:
-        if self.span is None or first == last:
-            return
-        logged = batch.block.time_ns[batch.chosen[first:last]].astype(np.int64)
-        off = np.abs(self._rows.columns.time_ns[n : n + last - first] - logged)
-        self.clock_off_ns = max(self.clock_off_ns or 0, int(off.max()))
 
     def _make_room(self, n: int, n_centroids: int) -> None:
         if not self._rows.has_room(n, n_centroids):
@@ -128,12 +118,7 @@ class FrameColumns:
             "source": pa.repeat(pa.scalar(self.rejects.source), n),
             "offset": rows.offset[:n],
         }
-        exposures = table(EXPOSURES, columns)
-        if self.span is not None:
-            low, high = self.span
-            time_ns = c.time_ns[:n]
-            exposures = exposures.filter(pa.array((time_ns >= low) & (time_ns < high)))
-        self._tables.append(exposures)
+        self._tables.append(table(EXPOSURES, columns))
 
     # Frames that were decoded one by one
 
@@ -197,9 +182,6 @@ class FrameColumns:
             c.first[n + 1] = c.first[n] + length
             rows.offset[n] = one.offset
             rows.n += 1
-            if self.span is not None:
-                off = abs(frame.time_ns - one.log_time_ns)
-                self.clock_off_ns = max(self.clock_off_ns or 0, off)
 
 
 def _arrow_floats(n: int) -> Floats:

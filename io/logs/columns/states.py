@@ -38,10 +38,9 @@ def _new_rows(n: int) -> StateRows:
 
 @dataclass
 class StateColumns:
-    """The states of a log; of those from `span[0]` to before `span[1]`, if there is one."""
+    """The states of a log."""
 
     rejects: RejectList
-    span: tuple[int, int] | None = None
     _sensors: NameCodes = field(default_factory=NameCodes)
     _rows: StateRows = field(default_factory=lambda: _new_rows(0))
     _n: int = 0
@@ -94,9 +93,6 @@ class StateColumns:
                 "attitude_sigma_arcsec": sigma[:, 1].copy(),
             },
         )
-        if self.span is not None:
-            low, high = self.span
-            states = states.filter(pa.array((rows.time_ns >= low) & (rows.time_ns < high)))
         self._tables.append(states)
 
     def _judge(self, received: Sequence[Received]) -> None:

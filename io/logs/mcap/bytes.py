@@ -45,11 +45,6 @@ class LogBytes:
         self._where, self._size, self._reader = where, size, reader
         self.stream, self.close = reader.stream, reader.close
 
-    @classmethod
-    def of(cls, data: bytes) -> Self:
-        """Return bytes in memory as those of a log."""
-        return cls("memory", len(data), BlockReader(len(data), lambda start, end: data[start:end]))
-
     def __len__(self) -> int:
         return self._size
 

@@ -31,11 +31,6 @@ class ChannelTable:
     def __contains__(self, number: int) -> bool:
         return number in self._channels
 
-    def knows(self, number: int) -> bool:
-        """Return whether a channel and its schema have been declared."""
-        channel = self._channels.get(number)
-        return channel is not None and (channel[2] == 0 or channel[2] in self._schemas)
-
     def declare(self, opcode: int, data: Any, at: int, end: int) -> None:
         """Take the body of a schema or a channel.
 

@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from epipole.io.logs.mcap.bytes import LogBytes
-from epipole.io.logs.mcap.channels import ChannelTable
 from epipole.io.logs.mcap.chunks import HEAD_BYTES, MAX_RECORD_BYTES, ChunkHead, read_head
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.record_scan import CHANNEL, MESSAGE, PRIVATE, SCHEMA, index_records
@@ -26,7 +24,7 @@ LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # may lie in a chunk or outside
 RUN_BYTES = 4 << 20  # of records outside chunks that are walked at once
 
 # Reasons that are no damage, or not only.
-CUT, PASSED, ANOTHER_LOG = "cut", "passed", "log_behind_log"
+CUT, ANOTHER_LOG = "cut", "log_behind_log"
 
 _INDEX = struct.Struct("<HI")  # of a message index: its channel, the bytes of its entries
 
@@ -49,9 +47,6 @@ class LogPlaces:
 
     data: LogBytes
     summary: Summary
-    channels: ChannelTable
-    span: tuple[int, int] | None = None  # chunks logged wholly outside it need not be opened
-    always: frozenset[str] = frozenset()  # but for those with messages of these schemas
 
     def __iter__(self) -> Iterator[Place]:
         data, end, at = self.data, len(self.data), len(MAGIC)
@@ -82,19 +77,13 @@ class LogPlaces:
                 at = place.after
         yield Place(0, at, end, "truncated")
 
-    def chunk(self, at: int, after: int) -> Place:
-        """Return a chunk, to be opened."""
-        if after - at > MAX_RECORD_BYTES:
-            return Place(CHUNK, at, after, "chunk_too_large")
-        head = self._head(at)
-        return Place(CHUNK, at, after, "", self.data.view(at, after), head.size if head else 0)
-
     def _place(self, opcode: int, at: int, after: int, limit: int, head: ChunkHead | None) -> Place:
         """Return the record from `at` to `after`, with more loose ones behind a loose one."""
         if opcode == CHUNK:
-            if head is not None and self._may_pass(head, at, after):
-                return Place(CHUNK, at, after, PASSED)
-            return self.chunk(at, after)
+            if after - at > MAX_RECORD_BYTES:
+                return Place(CHUNK, at, after, "chunk_too_large")
+            size = 0 if head is None else head.size
+            return Place(CHUNK, at, after, "", self.data.view(at, after), size)
         if opcode == MESSAGE_INDEX and (index := self._index(at, after)) is not None:
             return Place(opcode, at, after, counted=index)
         if opcode in LOOSE:
@@ -120,41 +109,6 @@ class LogPlaces:
             return read_head(self.data.view(at, min(at + HEAD_BYTES, len(self.data))), at)
         except ChunkError:
             return None
-
-    def _may_pass(self, head: ChunkHead, at: int, after: int) -> bool:
-        """Return whether a chunk is of another time for certain, and nothing else needs it.
-
-        The log must have been closed: its summary has the channels that a chunk may declare.
-        The chunk's times must be those of the indexes behind it. The first and the last are
-        always opened: they show whether messages are logged at the time that they are of.
-        """
-        offsets = self.summary.chunk_offsets
-        if self.span is None or not self.summary.sound or at in (offsets[:1] + offsets[-1:]):
-            return False
-        low, high = self.span
-        if not (head.start_ns <= head.end_ns < low or high <= head.start_ns <= head.end_ns):
-            return False
-        indexes = list(self._indexes_behind(after))
-        return bool(indexes) and all(
-            self.channels.knows(number)
-            and getattr(self.channels.find(number), "schema", "") not in self.always
-            and len(time_ns)
-            and head.start_ns <= time_ns.min()
-            and time_ns.max() <= head.end_ns
-            for number, time_ns in indexes
-        )
-
-    def _indexes_behind(self, at: int) -> Iterator[tuple[int, npt.NDArray[np.uint64]]]:
-        """Yield the channel and the times of each message index from `at` on."""
-        while at + RECORD.size <= len(self.data):
-            opcode, length = RECORD.unpack(self.data.view(at, at + RECORD.size))
-            start, at = at, at + RECORD.size + length
-            if opcode != MESSAGE_INDEX or at > len(self.data) or length > MAX_RECORD_BYTES:
-                return
-            if (index := self._index(start, at)) is None:
-                return
-            entries = self.data.view(start + RECORD.size + _INDEX.size, at)
-            yield index[0], np.frombuffer(entries, "<u8")[::2]
 
     def _index(self, at: int, after: int) -> tuple[int, int] | None:
         """Return the channel of a message index and how many messages it has; None: it is none."""

@@ -24,7 +24,7 @@ from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.channels import Channel, ChannelTable
 from epipole.io.logs.mcap.chunks import OpenedChunk, open_chunk, open_cut_chunk
 from epipole.io.logs.mcap.compression import ChunkError
-from epipole.io.logs.mcap.places import CHUNK, CUT, LOOSE, PASSED, LogPlaces, Place
+from epipole.io.logs.mcap.places import CHUNK, CUT, LOOSE, LogPlaces, Place
 from epipole.io.logs.mcap.record_scan import MESSAGE, Bytes, RecordIndex, index_records
 from epipole.io.logs.mcap.summary import RECORD, Summary, read_summary
 
@@ -61,40 +61,24 @@ class RecordWalk:
     data: LogBytes
     wanted: frozenset[str]  # names of the schemas whose messages are asked for
     pool: Executor | None = None  # opens chunks while the ones before them are decoded
-    span: tuple[int, int] | None = None  # chunks logged wholly outside it need not be opened
-    always: frozenset[str] = frozenset()  # but for those with messages of these schemas
     damage: list[Damage] = field(default_factory=list)
     _summary: Summary = field(default_factory=Summary)
     _unknown: dict[int, int] = field(default_factory=dict)
     _counts: dict[int, int] = field(default_factory=dict)
     _lost: dict[int, int] = field(default_factory=dict)  # messages of a damage, by its index
     _lost_chunk: int | None = None  # the damage that message indexes now belong to
-    _passed: list[Place] = field(default_factory=list)  # chunks that were not opened
-    _passing: bool = False  # whether message indexes now belong to one of them
 
     def __post_init__(self) -> None:
         self._channels = ChannelTable(self.wanted)
-        self._places = LogPlaces(self.data, self._summary, self._channels, self.span, self.always)
+        self._places = LogPlaces(self.data, self._summary)
 
     def blocks(self) -> Iterator[Block]:
         """Yield the wanted messages in the order of the file."""
         self._places.summary = self._summary = read_summary(self.data, self._channels)
         self.data.stream()
-        yield from self._walk(self._places)
-        self._report_missing()
-
-    def pass_no_more(self) -> None:
-        """Open every chunk from now on: the times of the log cannot be trusted."""
-        self._places.span = None
-
-    def passed_blocks(self) -> Iterator[Block]:
-        """Yield the wanted messages of the chunks that `blocks` has passed over."""
-        passed, self._passed = self._passed, []
-        yield from self._walk(self._places.chunk(place.at, place.after) for place in passed)
-
-    def _walk(self, places: Iterable[Place]) -> Iterator[Block]:
-        for place, opening in self._opened_ahead(places):
+        for place, opening in self._opened_ahead(self._places):
             yield from self._walk_place(place, opening)
+        self._report_missing()
 
     def _opened_ahead(
         self, places: Iterable[Place]
@@ -119,13 +103,10 @@ class RecordWalk:
     def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
         if place.reason == CUT:
             yield from self._walk_chunk(place.at, open_cut_chunk(place.data), cut=True)
-        elif place.reason == PASSED:
-            self._passed.append(place)
-            self._passing = True
         elif place.reason:
             self._leave_out(place.at, 0, place.reason)
             if place.opcode == CHUNK:
-                self._lost_chunk, self._passing = len(self.damage) - 1, False
+                self._lost_chunk = len(self.damage) - 1
         elif place.opcode == CHUNK:
             opened = open_chunk(place.data) if opening is None else opening.result()
             yield from self._walk_chunk(place.at, opened)
@@ -136,7 +117,7 @@ class RecordWalk:
 
     def _walk_chunk(self, at: int, opened: OpenedChunk, cut: bool = False) -> Iterator[Block]:
         """Yield the messages of a chunk; `cut`: its last record may be incomplete."""
-        self._lost_chunk, self._passing = None, False
+        self._lost_chunk = None
         start_ns, records, index, reason = opened
         if reason:
             self._leave_out(at, start_ns, reason)
@@ -230,10 +211,7 @@ class RecordWalk:
         self.damage.append(Damage(offset, time_ns, reason, count))
 
     def _count_lost(self, number: int, n: int) -> None:
-        """Count the messages of a chunk that is left out or passed, by an index behind it."""
-        if self._passing:
-            self._counts[number] = self._counts.get(number, 0) + n
-            return
+        """Count the messages of a chunk that is left out, by an index after it."""
         if self._lost_chunk is None or (self._channels and not self._channels.find(number)):
             return
         self._counts[number] = self._counts.get(number, 0) + n

@@ -29,11 +29,6 @@ class Summary:
     declared: dict[int, int] = field(default_factory=dict)  # messages of each channel
     logged_ns: tuple[int, int] | None = None  # when the first and the last message were logged
 
-    @property
-    def sound(self) -> bool:
-        """Whether there is a summary that is what its log was closed with."""
-        return self.data_end is not None and bool(self.declared)
-
 
 def read_summary(data: LogBytes, channels: ChannelTable) -> Summary:
     """Return what the summary says, and declare its channels; empty where it is not sound."""

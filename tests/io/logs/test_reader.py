@@ -9,9 +9,10 @@ from mcap.writer import CompressionType, Writer
 
 from epipole.io.logs.columns import frames as frame_columns
 from epipole.io.logs.damage import ROWS_ALIKE
+from epipole.io.logs.mcap import records as log_records
 from epipole.io.logs.messages.encodings import json_text, protobuf
 from epipole.io.logs.messages.encodings.registry import kinds_of_schemas
-from epipole.io.logs.reader import read_log
+from epipole.io.logs.reader import read_log, read_log_times
 from epipole.io.logs.writer import LogWriter, calibration_values
 from epipole.schemas.bridge import array, flatten, stack
 from epipole.schemas.errors import LogError
@@ -436,3 +437,14 @@ def test_no_damage_stops_the_reading_or_goes_unsaid(tmp_path, encoding, compress
             continue
         assert contents.exposures.num_rows == N_FRAMES or contents.rejects.num_rows > 0
         assert contents.states.num_rows == N_FRAMES or contents.rejects.num_rows > 0
+
+
+def test_the_times_of_a_log_are_known_without_reading_it(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.mcap")
+    monkeypatch.setattr(log_records, "open_chunk", None)  # no chunk is opened
+    assert read_log_times(path) == (START_NS, START_NS + 7 + (N_FRAMES - 1) * SECOND_NS)
+    path.write_bytes(path.read_bytes()[:-1])
+    assert read_log_times(path) is None
+    (tmp_path / "b.mcap").write_bytes(b"no log")
+    with pytest.raises(LogError, match="not an MCAP file"):
+        read_log_times(tmp_path / "b.mcap")

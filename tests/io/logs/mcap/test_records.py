@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from scenes.log_bytes import log_bytes
 
-from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.chunks import MAX_CHUNK_BYTES
 from epipole.io.logs.mcap.records import RecordWalk
 from epipole.io.logs.mcap.summary import MAGIC
@@ -40,7 +40,7 @@ def log(compression=CompressionType.ZSTD, **options):
 
 def walk(data):
     """Return the numbers of the messages found, and the damage as (reason, count)."""
-    walked = RecordWalk(LogBytes.of(bytes(data)), frozenset([SCHEMA]))
+    walked = RecordWalk(log_bytes(bytes(data)), frozenset([SCHEMA]))
     found = [
         int(block.data[at : at + 4].view("<u4")[0])
         for block in walked.blocks()
@@ -312,6 +312,6 @@ def test_opening_ahead_changes_nothing():
     at, length = chunks(data)[3]
     data[at + length - 20] ^= 1
     with ThreadPoolExecutor(3) as pool:
-        walked = RecordWalk(LogBytes.of(bytes(data)), frozenset([SCHEMA]), pool)
+        walked = RecordWalk(log_bytes(bytes(data)), frozenset([SCHEMA]), pool)
         found = [int(b.data[at : at + 4].view("<u4")[0]) for b in walked.blocks() for at in b.start]
     assert (found, [(d.reason, d.n) for d in walked.damage]) == walk(data)
