@@ -38,7 +38,7 @@ class CameraColumns:
                 )
 
     def take(self) -> pa.Table:
-        """Return CAMERAS of the calibrations since the last time."""
+        """Return CAMERAS of the calibrations since the last call."""
         rows, self._rows = self._rows, []
         matrices = np.array([c.K for c in rows], float).reshape(-1, 9)
         distortion = np.zeros((len(rows), 5))
@@ -70,7 +70,7 @@ def _camera_fault(calibration: CalibrationMessage) -> str | None:
     K = calibration.K
     if len(K) != 9 or not np.isfinite(K).all() or K[0] <= 0 or K[4] <= 0:
         return "bad_camera_matrix"
-    # A skewed or scaled matrix is a camera that the pipeline has no model of.
+    # The pipeline has no camera model with skew or scale.
     zeros, scale = (K[1], K[3], K[6], K[7]), 1e-9 * K[0]
     if any(abs(k) > scale for k in zeros) or abs(K[8] - 1.0) > 1e-9:
         return "bad_camera_matrix"

@@ -20,15 +20,15 @@ Bools = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
 MAX_FRAME_NUMBER = (1 << 63) - 1
-BATCH = 65536  # frames in one piece of the table
+BATCH = 65536  # frames in one table of those that are joined
 BATCH_CENTROIDS = 1 << 21
-# A centroid's x and y take 8 bytes in binary and at least 4 as text.
+# The x and y of a centroid take 8 bytes in binary and at least 4 as text.
 BYTES_OF_A_CENTROID = 4
 CENTROID_BYTES, ROW_BYTES = 16, 80  # in the table
 
 
 class _Rows:
-    """A piece of the table in the making."""
+    """Rows of one of the tables that are joined, while they are filled in."""
 
     def __init__(self, n: int, n_centroids: int) -> None:
         self.n = 0
@@ -83,12 +83,12 @@ class FrameColumns:
 
     @property
     def n_bytes(self) -> int:
-        """What the rows that wait to be taken take, about."""
+        """About the size of the rows that have not been taken."""
         waiting = self._rows.n_centroids * CENTROID_BYTES + self._rows.n * ROW_BYTES
         return waiting + sum(rows.nbytes for rows in self._tables)
 
     def take(self) -> pa.Table:
-        """Return EXPOSURES of the frames since the last time, in the order of the log."""
+        """Return EXPOSURES of the frames since the last call, in the order of the log."""
         self._close()
         tables, self._tables = self._tables, []
         return pa.concat_tables([EXPOSURES.empty_table(), *tables])
@@ -99,7 +99,7 @@ class FrameColumns:
             self._rows = _Rows(max(n, BATCH), max(n_centroids, BATCH_CENTROIDS))
 
     def _close(self) -> None:
-        """Add the rows so far to the table."""
+        """Make a table of the rows so far."""
         rows, n = self._rows, self._rows.n
         self._rows = _Rows(0, 0)
         if n == 0:
@@ -120,31 +120,31 @@ class FrameColumns:
         }
         self._tables.append(table(EXPOSURES, columns))
 
-    # Frames that were decoded one by one
+    # Frames that were decoded one at a time
 
     def _judge(self, received: Sequence[Received]) -> None:
-        """Take decoded frames, or leave them out with a reason."""
+        """Take decoded frames; invalid ones become rejects."""
         sound = []
-        for one in received:
-            frame: FrameMessage = one.message
+        for item in received:
+            frame: FrameMessage = item.message
             reason = fault(frame.time_ns, frame.sensor_id) or _frame_fault(frame)
             if reason is None:
-                sound.append(one)
+                sound.append(item)
             else:
-                self._leave_out(one, reason)
+                self._leave_out(item, reason)
         if sound:
             self._append(sound)
 
-    def _leave_out(self, one: Received, reason: str) -> None:
+    def _leave_out(self, item: Received, reason: str) -> None:
         self.rejects.add(
             reason,
-            time_ns=one.message.time_ns or one.log_time_ns,
-            offset=one.offset,
-            sensor_id=known_id(one.message.sensor_id),
+            time_ns=item.message.time_ns or item.log_time_ns,
+            offset=item.offset,
+            sensor_id=known_id(item.message.sensor_id),
         )
 
     def _append(self, received: Sequence[Received]) -> None:
-        frames: list[FrameMessage] = [one.message for one in received]
+        frames: list[FrameMessage] = [item.message for item in received]
         lengths = np.array([len(f.x_px) for f in frames], np.int64)
         x = _joined([f.x_px for f in frames])
         y = _joined([f.y_px for f in frames])
@@ -168,24 +168,24 @@ class FrameColumns:
     def _write(
         self, received: Sequence[Received], lengths: Integers, values: Sequence[Floats]
     ) -> None:
-        """Put good frames behind the rows so far."""
+        """Add good frames to the rows."""
         rows, c = self._rows, self._rows.columns
         low = rows.n_centroids
         for column, numbers in zip((c.x_px, c.y_px, c.flux, c.sigma_px), values, strict=True):
             column[low : low + len(numbers)] = numbers
-        for one, length in zip(received, lengths.tolist(), strict=True):
-            n, frame = rows.n, one.message
+        for item, length in zip(received, lengths.tolist(), strict=True):
+            n, frame = rows.n, item.message
             exposure_s = frame.exposure_s
             c.sensor[n] = self._sensors.code(frame.sensor_id)
             c.number[n], c.time_ns[n] = frame.frame_number, frame.time_ns
             c.exposure_s[n] = exposure_s if 0 < exposure_s < np.inf else 0.0
             c.first[n + 1] = c.first[n] + length
-            rows.offset[n] = one.offset
+            rows.offset[n] = item.offset
             rows.n += 1
 
 
 def _arrow_floats(n: int) -> Floats:
-    """Return room for numbers, of Arrow's memory, which gives back what is no longer needed."""
+    """Return an empty array in memory of Arrow, which returns freed memory to the system."""
     return np.frombuffer(pa.allocate_buffer(4 * n), np.float32)
 
 
@@ -199,15 +199,15 @@ def _frame_fault(frame: FrameMessage) -> str | None:
 
 
 def _joined(arrays: Sequence[npt.NDArray[np.floating]]) -> Floats:
-    """Return arrays behind each other, as the messages have their numbers: float32."""
-    with np.errstate(invalid="ignore", over="ignore"):  # of a text's number that is none
+    """Return the arrays joined as float32, which is the type in the messages."""
+    with np.errstate(invalid="ignore", over="ignore"):  # JSON may have larger numbers
         return np.concatenate([np.empty(0, np.float32), *arrays], dtype=np.float32)
 
 
 def _joined_or_nan(
     arrays: Sequence[npt.NDArray[np.floating]], lengths: Integers
 ) -> tuple[Floats, Bools]:
-    """Return the arrays joined, NaN in place of those left empty, and which are given."""
+    """Return the arrays joined, with NaN for empty arrays, and which arrays are not empty."""
     given = np.array([len(a) for a in arrays], np.int64) == lengths
     out = np.full(lengths.sum(), np.nan, np.float32)
     out[np.repeat(given, lengths)] = _joined(arrays)
@@ -222,7 +222,7 @@ def _any(bad: Bools, lengths: Integers) -> Bools:
 
 
 def _lists(name: str, flat: Floats, offsets: pa.Array, given: Bools | None = None) -> pa.ListArray:
-    """Return rows of one list each; where not `given`, no list: its values are skipped over."""
+    """Return a list per row; null where not `given`, whose values are skipped."""
     kind = EXPOSURES.field(name).type
     null = None if given is None or given.all() else pa.array(~given)
     return pa.ListArray.from_arrays(offsets, pa.array(flat, kind.value_type), type=kind, mask=null)

@@ -18,11 +18,11 @@ from epipole.schemas.log_tables import LOG_STATES, STATE_FRAMES
 
 Array = npt.NDArray[np.floating]
 
-# Below the poles' radius of 6357 km: no sensor is there, whatever its frame and its errors.
-EARTH_RADIUS_KM = 6340.0
-FARTHEST_KM = 1.0e7  # well behind the Moon; a number in metres lands here
-QUATERNION_TOLERANCE = 1e-2  # |q| further from 1 is not a rounded unit quaternion
-BATCH = 16384  # states in one piece of the table
+# Less than the polar radius of 6357 km: no sensor is there, in any frame and with any error.
+LOWEST_KM = 6340.0
+FARTHEST_KM = 1.0e7  # far beyond the Moon; positions in metres are farther
+QUATERNION_TOLERANCE = 1e-2  # a larger |q| - 1 is more than rounding of a unit quaternion
+BATCH = 16384  # states in one table of those that are joined
 ROW_BYTES = 150  # in the table
 _FRAMES = NameCodes(STATE_FRAMES)
 
@@ -47,7 +47,7 @@ class StateColumns:
     _tables: list[pa.Table] = field(default_factory=list)
 
     def add(self, batch: MessageBatch) -> None:
-        """Take the valid states; a state of which only the attitude is invalid loses that."""
+        """Take the valid states; where only the attitude is invalid, the state stays without it."""
         messages = batch.messages
         if self._n + len(batch) > len(self._rows.time_ns):
             self._close()
@@ -62,17 +62,17 @@ class StateColumns:
 
     @property
     def n_bytes(self) -> int:
-        """What the rows that wait to be taken take, about."""
+        """About the size of the rows that have not been taken."""
         return self._n * ROW_BYTES + sum(rows.nbytes for rows in self._tables)
 
     def take(self) -> pa.Table:
-        """Return LOG_STATES of the states since the last time, in the order of the log."""
+        """Return LOG_STATES of the states since the last call, in the order of the log."""
         self._close()
         tables, self._tables = self._tables, []
         return pa.concat_tables([LOG_STATES.empty_table(), *tables])
 
     def _close(self) -> None:
-        """Add the rows so far to the table."""
+        """Make a table of the rows so far."""
         rows = StateRows._make(column[: self._n] for column in self._rows)
         self._n = 0
         if len(rows.time_ns) == 0:
@@ -96,24 +96,24 @@ class StateColumns:
         self._tables.append(states)
 
     def _judge(self, received: Sequence[Received]) -> None:
-        """Take decoded states, or leave them out with a reason."""
-        for one in received:
-            state: StateMessage = one.message
+        """Take decoded states; invalid ones become rejects."""
+        for item in received:
+            state: StateMessage = item.message
             reason = fault(state.time_ns, state.sensor_id) or _state_fault(state)
             if reason is not None:
-                self._leave_out(one, reason)
+                self._leave_out(item, reason)
                 continue
             if len(state.attitude_xyzw) and not _is_attitude(state.attitude_xyzw):
-                self._leave_out(one, "bad_attitude")
+                self._leave_out(item, "bad_attitude")
                 state = state._replace(attitude_xyzw=state.attitude_xyzw[:0])
-            self._write(state, one.message.time_ns)
+            self._write(state, item.message.time_ns)
 
-    def _leave_out(self, one: Received, reason: str) -> None:
+    def _leave_out(self, item: Received, reason: str) -> None:
         self.rejects.add(
             reason,
-            time_ns=one.message.time_ns or one.log_time_ns,
-            offset=one.offset,
-            sensor_id=known_id(one.message.sensor_id),
+            time_ns=item.message.time_ns or item.log_time_ns,
+            offset=item.offset,
+            sensor_id=known_id(item.message.sensor_id),
         )
 
     def _write(self, state: StateMessage, time_ns: int) -> None:
@@ -131,17 +131,17 @@ class StateColumns:
 def _state_fault(state: StateMessage) -> str | None:
     if state.frame not in STATE_FRAMES:
         return "unknown_frame"
-    # A length is finite only if every component is.
+    # The length is finite only if every component is finite.
     radius_km = math.hypot(*state.position_km)
     if len(state.position_km) != 3 or not radius_km <= FARTHEST_KM:
         return "bad_position"
     velocity = state.velocity_km_s
     if len(velocity) not in (0, 3) or not math.isfinite(math.hypot(*velocity)):
         return "bad_velocity"
-    return "inside_earth" if radius_km < EARTH_RADIUS_KM else None
+    return "inside_earth" if radius_km < LOWEST_KM else None
 
 
 def _is_attitude(q: Array) -> bool:
-    """Return whether these are the numbers of a unit quaternion, rounded perhaps."""
+    """Return whether the numbers are a unit quaternion, but for rounding."""
     norm = math.hypot(*q) if len(q) == 4 else math.nan
     return abs(norm - 1.0) < QUATERNION_TOLERANCE

@@ -1,4 +1,4 @@
-"""Chunks of a log: what their heads say, and their records, checked before they are believed."""
+"""Chunks of a log: their heads and their records, checked before they are used."""
 
 import struct
 import zlib
@@ -11,18 +11,18 @@ from epipole.io.logs.mcap.compression import ChunkError, decompress, decompress_
 from epipole.io.logs.mcap.record_scan import RecordIndex, index_records
 from epipole.io.logs.mcap.summary import RECORD
 
-# A chunk holds a few MiB; one that claims more than this is damage or an attack.
+# A chunk has a few MiB. A chunk that declares more than this is damaged or an attack.
 MAX_CHUNK_BYTES = 256 << 20
 
-# What its record may take in the file: bytes that cannot be made smaller grow a little.
+# Limit of its record in the file: compression enlarges random bytes a little.
 MAX_RECORD_BYTES = MAX_CHUNK_BYTES + (4 << 20)
-HEAD_BYTES = 256  # of a record's beginning, with room for the name of a compression
+HEAD_BYTES = 256  # of the beginning of a chunk record; its head is shorter
 
 _HEAD = struct.Struct("<QQQI")
 
 
 class ChunkHead(NamedTuple):
-    """What a chunk says of itself; `body` to `end` are its compressed records in the file."""
+    """The head of a chunk; its compressed records lie from `body` to `end` in the file."""
 
     start_ns: int
     end_ns: int
@@ -34,7 +34,7 @@ class ChunkHead(NamedTuple):
 
 
 class OpenedChunk(NamedTuple):
-    """A chunk's records and where they lie, or why they are left out."""
+    """The records of a chunk and where they lie, or the reason for leaving them out."""
 
     start_ns: int
     records: bytes
@@ -48,7 +48,7 @@ def read_head(data: memoryview, at: int) -> ChunkHead:
     Raises
     ------
     ChunkError
-        Where it is none.
+        Where the head is invalid.
     """
     try:
         start_ns, end_ns, size, checksum = _HEAD.unpack_from(data, RECORD.size)
@@ -61,7 +61,7 @@ def read_head(data: memoryview, at: int) -> ChunkHead:
 
 
 def open_chunk(chunk: memoryview) -> OpenedChunk:
-    """Return the records of a chunk, given whole."""
+    """Return the records of a complete chunk."""
     start_ns = 0
     try:
         head = read_head(chunk, 0)
@@ -79,9 +79,9 @@ def open_chunk(chunk: memoryview) -> OpenedChunk:
 
 
 def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
-    """Return the first records of a chunk in which the file ends.
+    """Return the first records of a chunk that the end of the file cuts.
 
-    Its checksum cannot be verified; that it was cut is known, that it is wrong is not.
+    Its checksum cannot be verified, so the records are used without.
     """
     try:
         head = read_head(chunk, 0)

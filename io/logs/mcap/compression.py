@@ -1,4 +1,4 @@
-"""Chunks of a log to plain bytes, never more of them than the chunk declares."""
+"""Chunks of a log to plain bytes, never more bytes than the chunk declares."""
 
 import lz4.frame
 import zstandard
@@ -9,7 +9,7 @@ class ChunkError(Exception):
 
 
 def decompress(data: memoryview, compression: str, size: int) -> bytes:
-    """Return the `size` bytes that a chunk's records take when they are not compressed.
+    """Return the records of a chunk, decompressed to `size` bytes.
 
     Raises
     ------
@@ -18,7 +18,7 @@ def decompress(data: memoryview, compression: str, size: int) -> bytes:
     """
     try:
         if compression == "zstd":
-            # The frame's own size comes first: the decoder would allocate that, whatever the cap.
+            # Checked first: the decoder allocates the size that the frame declares, without limit.
             if zstandard.frame_content_size(data) not in (-1, size):
                 raise ChunkError("wrong_chunk_size")
             records = zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))

@@ -1,7 +1,7 @@
-"""Where the records of an MCAP file lie, by their lengths alone, with whatever damage it has.
+"""Where the records of an MCAP file lie, found by their lengths, in a damaged file too.
 
-The data section is walked from its start; the summary helps where a length is damaged: it
-knows the places of the chunks.
+The data section is walked from its start. Where a length is damaged, the walk goes on at the
+next chunk that the summary lists.
 """
 
 import struct
@@ -16,37 +16,37 @@ from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.chunks import HEAD_BYTES, MAX_RECORD_BYTES, ChunkHead, read_head
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.record_scan import CHANNEL, MESSAGE, PRIVATE, SCHEMA, index_records
-from epipole.io.logs.mcap.summary import DATA_END, MAGIC, RECORD, Summary, next_log
+from epipole.io.logs.mcap.summary import DATA_END, MAGIC, RECORD, LogSummary, next_log
 
 HEADER, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA = 0x01, 0x06, 0x07, 0x09, 0x0C
 IGNORED = (ATTACHMENT, METADATA)
-LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # may lie in a chunk or outside
-RUN_BYTES = 4 << 20  # of records outside chunks that are walked at once
+LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # records that may lie in a chunk or outside chunks
+RUN_BYTES = 4 << 20  # of records outside chunks that are indexed at once
 
-# Reasons that are no damage, or not only.
+# Reasons that are not damage: what lies there is read.
 CUT, ANOTHER_LOG = "cut", "log_behind_log"
 
 _INDEX = struct.Struct("<HI")  # of a message index: its channel, the bytes of its entries
 
 
 class Place(NamedTuple):
-    """Part of the data section: a record, a run of loose ones, or damage, which has a reason."""
+    """A stretch of the data section: a record, a run of loose records, or damage with a reason."""
 
     opcode: int
     at: int
     after: int
     reason: str = ""
-    data: memoryview = memoryview(b"")  # whole, of a chunk that is to be opened or of a loose run
-    size: int = 0  # bytes of memory that its records take
-    counted: tuple[int, int] | None = None  # by a message index: channel, number of messages
+    data: memoryview = memoryview(b"")  # of a chunk that is to be opened, or of a loose run
+    size: int = 0  # of its records in memory, in bytes
+    counted: tuple[int, int] | None = None  # of a message index: channel, number of messages
 
 
 @dataclass
 class LogPlaces:
-    """The parts of one log's data section, in the order of the file."""
+    """The places in the data section of one log, in the order of the file."""
 
     data: LogBytes
-    summary: Summary
+    summary: LogSummary
 
     def __iter__(self) -> Iterator[Place]:
         data, end, at = self.data, len(self.data), len(MAGIC)
@@ -57,7 +57,7 @@ class LogPlaces:
             limit = end if skipped_to is None else skipped_to
             head = self._head(at) if opcode == CHUNK else None
             if head is not None and head.end <= limit:
-                after = head.end  # its own length, whatever its record says
+                after = head.end  # the length in the chunk counts, not that of its record
             if opcode == 0 or after > limit:
                 if skipped_to is None:
                     if opcode == CHUNK:
@@ -78,7 +78,7 @@ class LogPlaces:
         yield Place(0, at, end, "truncated")
 
     def _place(self, opcode: int, at: int, after: int, limit: int, head: ChunkHead | None) -> Place:
-        """Return the record from `at` to `after`, with more loose ones behind a loose one."""
+        """Return the record from `at` to `after`; a loose one together with those that follow."""
         if opcode == CHUNK:
             if after - at > MAX_RECORD_BYTES:
                 return Place(CHUNK, at, after, "chunk_too_large")
@@ -95,11 +95,11 @@ class LogPlaces:
             return Place(opcode, at, after, "", window[: after - at], after - at)
         if opcode == HEADER and self.data.view(at - len(MAGIC), at) == MAGIC:
             return Place(opcode, at, after)
-        foreign = opcode < PRIVATE and opcode not in IGNORED  # no such record in a data section
+        foreign = opcode < PRIVATE and opcode not in IGNORED  # not of a data section
         return Place(opcode, at, after, "damaged_record" if foreign else "")
 
     def _next_chunk(self, at: int) -> int | None:
-        """Return the first place behind `at` where the summary knows of a chunk."""
+        """Return the first place after `at` where the summary lists a chunk."""
         offsets = self.summary.chunk_offsets
         i = bisect_right(offsets, at)
         return offsets[i] if i < len(offsets) else None
@@ -111,7 +111,7 @@ class LogPlaces:
             return None
 
     def _index(self, at: int, after: int) -> tuple[int, int] | None:
-        """Return the channel of a message index and how many messages it has; None: it is none."""
+        """Return the channel and the number of messages of a message index; None if invalid."""
         body = at + RECORD.size
         if after - body < _INDEX.size:
             return None

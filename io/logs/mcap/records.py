@@ -1,10 +1,9 @@
-"""The records of an MCAP file, walked one by one, with whatever damage the file has.
+"""The records of an MCAP file, which may be damaged.
 
-The data section is walked from its start and the summary is not trusted to be complete:
-a log that was cut off, or never closed, gives the messages it holds. A chunk whose
-checksum, size or compression does not hold is left out and reported. The summary helps
-where it can: it has the schemas and channels again, the places of the chunks (to go on
-behind a damaged record), and the number of messages (to know that one is missing).
+The data section is read from its start, so that a log that was cut short or never closed gives
+the messages that it has. A chunk with a wrong checksum, size or compression is left out and
+reported. The summary is used where it is valid. It repeats the schemas and channels, lists the
+chunks (to continue after a damaged record) and counts the messages (to notice missing ones).
 """
 
 import struct
@@ -26,9 +25,9 @@ from epipole.io.logs.mcap.chunks import OpenedChunk, open_chunk, open_cut_chunk
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.places import CHUNK, CUT, LOOSE, LogPlaces, Place
 from epipole.io.logs.mcap.record_scan import MESSAGE, Bytes, RecordIndex, index_records
-from epipole.io.logs.mcap.summary import RECORD, Summary, read_summary
+from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
 
-AHEAD_BYTES = 8 << 20  # of chunks that are opened while the ones before them are decoded
+AHEAD_BYTES = 8 << 20  # of chunks that are opened while the chunk before them is decoded
 
 Numbers = npt.NDArray[np.int64]
 
@@ -42,11 +41,11 @@ class Block(NamedTuple):
     time_ns: npt.NDArray[np.uint64]  # when it was logged
     start: Numbers
     end: Numbers
-    offset: Numbers  # place in the file of its chunk, or its own outside chunks
+    offset: Numbers  # place in the file of its chunk; outside chunks, of the message
 
 
 class Damage(NamedTuple):
-    """Something of the file that was left out: where, when (0: unknown), why, how many."""
+    """Messages that were left out: where, when (0: unknown), why, how many."""
 
     offset: int
     time_ns: int
@@ -56,17 +55,17 @@ class Damage(NamedTuple):
 
 @dataclass
 class RecordWalk:
-    """A walk over the bytes of one log; `damage` is complete when `blocks` has ended."""
+    """Reads the records of one log; `damage` is complete when `blocks` has ended."""
 
     data: LogBytes
-    wanted: frozenset[str]  # names of the schemas whose messages are asked for
-    pool: Executor | None = None  # opens chunks while the ones before them are decoded
+    wanted: frozenset[str]  # names of the schemas whose messages are wanted
+    pool: Executor | None = None  # opens chunks while the chunk before them is decoded
     damage: list[Damage] = field(default_factory=list)
-    _summary: Summary = field(default_factory=Summary)
+    _summary: LogSummary = field(default_factory=LogSummary)
     _unknown: dict[int, int] = field(default_factory=dict)
     _counts: dict[int, int] = field(default_factory=dict)
-    _lost: dict[int, int] = field(default_factory=dict)  # messages of a damage, by its index
-    _lost_chunk: int | None = None  # the damage that message indexes now belong to
+    _lost: dict[int, int] = field(default_factory=dict)  # lost messages, by index of `damage`
+    _lost_chunk: int | None = None  # index in `damage` of the chunk that message indexes follow
 
     def __post_init__(self) -> None:
         self._channels = ChannelTable(self.wanted)
@@ -83,7 +82,7 @@ class RecordWalk:
     def _opened_ahead(
         self, places: Iterable[Place]
     ) -> Iterator[tuple[Place, Future[OpenedChunk] | None]]:
-        """Yield the places, each chunk with its opening under way if there is a pool."""
+        """Yield the places; if there is a pool, it is already opening their chunks."""
         waiting: deque[tuple[Place, Future[OpenedChunk] | None]] = deque()
         ahead = 0
         for place in places:
@@ -98,7 +97,7 @@ class RecordWalk:
                 yield first, opening
         yield from waiting
 
-    # What is there
+    # What is in the file
 
     def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
         if place.reason == CUT:
@@ -142,15 +141,15 @@ class RecordWalk:
             if self._sound_outside_chunks:
                 yield block
             else:
-                for lost, time_ns in zip(block.offset, block.time_ns, strict=True):
-                    self._leave_out(int(lost), int(time_ns), "bad_checksum")
+                for offset_of_lost, time_ns in zip(block.offset, block.time_ns, strict=True):
+                    self._leave_out(int(offset_of_lost), int(time_ns), "bad_checksum")
 
     @cached_property
     def _sound_outside_chunks(self) -> bool:
-        """Whether the data section holds its checksum, the only one of messages outside chunks."""
+        """Whether the data section fits its checksum; messages outside chunks have no other."""
         at = self._summary.data_end
         if at is None:
-            return True  # an unclosed log has none
+            return True  # a log that was never closed has no checksum
         (expected,) = struct.unpack("<I", self.data.view(at + RECORD.size, at + RECORD.size + 4))
         checksum = 0
         for low in range(0, at if expected else 0, BLOCK_BYTES):
@@ -160,7 +159,7 @@ class RecordWalk:
     def _walk_index(
         self, data: Bytes, index: RecordIndex, offset: Numbers, start_ns: int
     ) -> Iterator[Block]:
-        """Yield the runs of messages between declarations."""
+        """Yield the runs of messages between declarations of schemas and channels."""
         declared = np.flatnonzero(index.opcode != MESSAGE)
         at = 0
         for i in [*declared.tolist(), len(index.opcode)]:
@@ -178,16 +177,16 @@ class RecordWalk:
     def _wanted(
         self, data: Bytes, index: RecordIndex, offset: Numbers, run: slice
     ) -> Iterator[Block]:
-        """Yield the messages of a run that are asked for; all of them are counted."""
+        """Yield the wanted messages of a run; all messages are counted."""
         channel = index.channel[run]
         wanted: dict[int, Channel] = {}
         counts = np.bincount(channel)
         for number in np.flatnonzero(counts).tolist():
             n = int(counts[number])
             self._counts[number] = self._counts.get(number, 0) + n
-            found = self._channels.find(number)
-            if found is not None:
-                wanted[number] = found
+            known = self._channels.find(number)
+            if known is not None:
+                wanted[number] = known
             elif number not in self._channels:
                 self._unknown[number] = self._unknown.get(number, 0) + n
         columns: list[npt.NDArray[Any]] = [
@@ -205,7 +204,7 @@ class RecordWalk:
         if wanted:
             yield Block(data, wanted, *columns)
 
-    # What is missing
+    # What is missing in it
 
     def _leave_out(self, offset: int, time_ns: int, reason: str, count: int = 1) -> None:
         self.damage.append(Damage(offset, time_ns, reason, count))

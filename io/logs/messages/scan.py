@@ -85,7 +85,7 @@ class StateRows(NamedTuple):
 
 @kernel
 def _valid_id(data, at, n):
-    """Return whether a text is a sensor id."""
+    """Return whether a text is a valid sensor id."""
     if n < 1 or n > NAME_BYTES:
         return False
     for k in range(n):
@@ -100,7 +100,7 @@ def _valid_id(data, at, n):
 def _same(data, at, n, names, code):
     if names.length[code] != n:
         return False
-    for k in range(n):  # noqa: SIM110 (numba knows no generator expressions)
+    for k in range(n):  # noqa: SIM110 (numba has no generator expressions)
         if names.text[code, k] != data[at + k]:
             return False
     return True
@@ -138,7 +138,7 @@ def _sensor(data, at, n, names, channel):
 @kernel
 def _copy_places(data, at, bits, low, n):
     """Copy the bits of `n` float32 from byte `at` on; return whether all are finite."""
-    to, bad = np.uint64(low), np.int32(0)  # unsigned: no index counts from the end
+    to, bad = np.uint64(low), np.int32(0)  # unsigned: numba need not check for negative indices
     for k in range(n):
         value = load_int32(data, at + 4 * k)
         bits[to + np.uint64(k)] = value
@@ -167,7 +167,7 @@ def _copy_positive(data, at, n_sent, bits, low, n):
 
 @kernel
 def scan_frames(messages, i, names, rows, n):
-    """Take good frames from message `i` on, into rows from `n` on; return both ends.
+    """Copy good frames from message `i` on to rows from `n` on; return both where it stops.
 
     The rows must have room for all messages, and for an eighth of their bytes in centroids.
     """
@@ -220,7 +220,7 @@ def _copy_doubles(data, at, n_sent, row):
 
 @kernel
 def scan_states(messages, i, names, frames, rows, n):
-    """Take good states from message `i` on, into rows from `n` on; return both ends.
+    """Copy good states from message `i` on to rows from `n` on; return both where it stops.
 
     `frames` are the known reference frames.
     """

@@ -1,4 +1,4 @@
-"""A log read in pieces: the same as at once, in bounded memory."""
+"""A log that is read in pieces: the same rows as at once, in bounded memory."""
 
 import subprocess
 import sys
@@ -51,20 +51,20 @@ def test_the_pieces_are_the_log(log, piece_bytes):
     assert (len(pieces) == 1) == (piece_bytes == 1 << 30)
 
 
-def test_a_piece_is_no_larger_than_asked_for_but_for_a_chunk(log):
+def test_a_piece_is_at_most_a_chunk_larger_than_asked_for(log):
     pieces = list(read_log_pieces(log, piece_bytes=50_000))
     sizes = [piece.exposures.nbytes + piece.states.nbytes for piece in pieces]
     assert all(40_000 < size < 60_000 for size in sizes[:-1])
 
 
-def test_a_log_without_frames_says_so_after_its_states(tmp_path):
+def test_a_log_without_frames_is_an_error_after_its_states(tmp_path):
     with LogWriter(tmp_path / "a.mcap") as out:
         out.state("sat1", START_NS, position_km=[7000.0, 0.0, 2.0])
     with pytest.raises(LogError, match="no frames in it"):
         list(read_log_pieces(tmp_path / "a.mcap"))
 
 
-def test_reading_may_be_given_up(log):
+def test_reading_may_stop_early(log):
     for _ in read_log_pieces(log, piece_bytes=1):
         break
 

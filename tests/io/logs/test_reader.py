@@ -46,7 +46,7 @@ COMPRESSIONS = ("zstd", "lz4", "none")
 
 
 def write(path, n=N_FRAMES, **options):
-    """Write a log of one sensor: a frame and a state a second."""
+    """Write a log of one sensor: a frame and a state per second."""
     rng = np.random.default_rng(0)
     with LogWriter(path, **options) as log:
         log.camera("sat1", START_NS, CAMERA)
@@ -226,7 +226,7 @@ def test_ros_names_with_and_without_msg_are_the_same():
     assert kinds["epipole_msgs/msg/CentroidFrame"] == FRAME
 
 
-def test_flux_that_is_none_is_nan_and_the_frame_stays(tmp_path):
+def test_invalid_flux_is_nan_and_the_frame_stays(tmp_path):
     flux = [-1.0, 0.0, 5.0]
     contents = read_log(write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, frame(flux=flux))))
     np.testing.assert_array_equal(flatten(contents.exposures, "flux")[0], [np.nan, np.nan, 5.0])
@@ -299,7 +299,7 @@ def test_a_bad_attitude_is_left_out_and_its_position_stays(tmp_path, q):
 
 
 @pytest.mark.parametrize("sigma", [-1.0, np.nan, np.inf, 0.0])
-def test_a_sigma_that_is_none_is_unknown(tmp_path, sigma):
+def test_an_invalid_sigma_is_unknown(tmp_path, sigma):
     contents = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(position_sigma_km=sigma)))
     assert array(contents.states, "position_sigma_km").tolist() == [0.0]
 
@@ -313,7 +313,7 @@ def test_a_sigma_that_is_none_is_unknown(tmp_path, sigma):
         ({"k1": np.inf}, "bad_distortion"),
     ],
 )
-def test_a_calibration_that_cannot_be_used_is_a_row(tmp_path, changes, reason):
+def test_an_unusable_calibration_is_a_row(tmp_path, changes, reason):
     data = protobuf.encode(CALIBRATION, calibration_values("sat1", START_NS, CAMERA | changes))
     contents = read_with_good_frame(tmp_path, (CALIBRATION_NAME, data))
     assert contents.cameras.num_rows == 0
@@ -408,7 +408,7 @@ def test_a_log_without_frames_is_an_error(tmp_path):
     assert "no frames" in line_of(path)
 
 
-def test_a_log_of_bad_frames_alone_says_what_was_wrong(tmp_path):
+def test_the_error_of_a_log_of_bad_frames_alone_names_the_reasons(tmp_path):
     path = write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, frame(x_px=[np.nan] * 3)))
     assert "nan 1" in line_of(path)
 
@@ -420,7 +420,7 @@ def test_an_unknown_message_encoding_is_an_error_that_names_it(tmp_path):
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_no_damage_stops_the_reading_or_goes_unsaid(tmp_path, encoding, compression):
+def test_no_damage_stops_the_reading_or_stays_unreported(tmp_path, encoding, compression):
     path = tmp_path / "a.mcap"
     whole = write(path, encoding=encoding, compression=compression, chunk_size=1000).read_bytes()
     rng = random.Random(encoding + compression)

@@ -1,4 +1,4 @@
-"""Logs in places other than a folder, an S3 server of its own among them."""
+"""Logs in memory and in a bucket of an S3 server that the tests start."""
 
 import hashlib
 import os
@@ -40,14 +40,14 @@ def test_a_log_in_a_bucket_is_read_like_a_file(s3, log):
     assert there.source == here.source
 
 
-def test_what_is_not_in_the_bucket_is_an_error_of_one_line(s3, log):
+def test_a_log_that_is_not_in_the_bucket_is_an_error_of_one_line(s3, log):
     s3.put_file(str(log), "logs/folder/a.mcap")
     assert "no such file" in line_of("s3://logs/none.mcap")
     assert "no such file" in line_of("s3://no-such-bucket/a.mcap")
     assert "is a folder" in line_of("s3://logs/folder")
 
 
-def test_a_server_that_is_not_there_is_an_error_of_one_line(s3, monkeypatch):
+def test_a_server_that_does_not_answer_is_an_error_of_one_line(s3, monkeypatch):
     import s3fs
 
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")

@@ -1,4 +1,4 @@
-"""The compiled scans take what the decoders take, bit for bit, and nothing is lost between."""
+"""The compiled scans and the decoders give the same rows, bit for bit, and lose no message."""
 
 import random
 import struct
@@ -92,7 +92,7 @@ def write_raw(path, recorded, encoding="protobuf", **options):
 
 
 def read_both_ways(path, monkeypatch):
-    """Return a log as it is read, and as the decoders alone read it."""
+    """Return a log as it is read normally, and as the decoders alone read it."""
     fast = read_log(path)
     with monkeypatch.context() as patch:
         patch.setattr(frame_columns, "scan_frames", lambda m, i, s, c, n: (i, n))
@@ -101,7 +101,7 @@ def read_both_ways(path, monkeypatch):
 
 
 def check_same(path, monkeypatch, n_messages):
-    """Hold the two ways to each other and to the number of messages."""
+    """Check that both ways agree, and that no message is lost."""
     fast, slow = read_both_ways(path, monkeypatch)
     assert_same_exposures(fast.exposures, slow.exposures)
     assert fast.states.equals(slow.states)
@@ -125,7 +125,7 @@ def assert_same_exposures(fast, slow):
 
 
 def encoded(encoding):
-    """Return every frame and state, good or bad, in one encoding, good ones among them."""
+    """Return every frame and state of the lists in one encoding, each followed by a good one."""
     encode, out = encoding_named(encoding).encode, []
     for change in FRAME_CHANGES:
         out.append((FRAME, encode(FRAME, {**GOOD_FRAME, **change})))
@@ -274,7 +274,7 @@ def test_more_sensors_than_the_scans_know_are_told_apart(tmp_path, monkeypatch):
     assert fast.states["sensor_id"].to_pylist() == names
 
 
-def test_a_scan_that_always_stops_is_left_alone_for_longer_and_longer(tmp_path, monkeypatch):
+def test_a_scan_that_always_stops_is_tried_less_and_less_often(tmp_path, monkeypatch):
     calls = []
 
     def stop(messages, i, names, rows, n):
