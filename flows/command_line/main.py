@@ -203,9 +203,9 @@ def simulate(
     logs: Annotated[
         int, typer.Option(min=1, metavar="N", help="Write N logs, one after the other in time.")
     ] = 1,
-    encoding: Annotated[
-        Encoding, typer.Option(help="Encoding of the messages.")
-    ] = Encoding["protobuf"],
+    encoding: Annotated[Encoding, typer.Option(help="Encoding of the messages.")] = Encoding[
+        "protobuf"
+    ],
     compression: Annotated[
         Compression, typer.Option(help="Compression of the chunks.")
     ] = Compression.zstd,

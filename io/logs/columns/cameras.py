@@ -9,6 +9,7 @@ from epipole.io.logs.damage import RejectList
 from epipole.io.logs.messages.batches import MessageBatch, fault, known_id
 from epipole.io.logs.messages.decoded import CalibrationMessage
 from epipole.schemas.bridge import table
+from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import CAMERAS
 
 
@@ -60,18 +61,18 @@ class CameraColumns:
         )
 
 
-def _camera_fault(calibration: CalibrationMessage) -> str | None:
+def _camera_fault(calibration: CalibrationMessage) -> Reason | None:
     if calibration.width <= 0 or calibration.height <= 0:
-        return "bad_image_size"
+        return Reason.BAD_IMAGE_SIZE
     if calibration.distortion_model not in ("", "plumb_bob"):
-        return "unknown_distortion_model"
+        return Reason.UNKNOWN_DISTORTION_MODEL
     if len(calibration.D) not in (0, 4, 5) or not np.isfinite(calibration.D).all():
-        return "bad_distortion"
+        return Reason.BAD_DISTORTION
     K = calibration.K
     if len(K) != 9 or not np.isfinite(K).all() or K[0] <= 0 or K[4] <= 0:
-        return "bad_camera_matrix"
+        return Reason.BAD_CAMERA_MATRIX
     # The pipeline has no camera model with skew or scale.
     zeros, scale = (K[1], K[3], K[6], K[7]), 1e-9 * K[0]
     if any(abs(k) > scale for k in zeros) or abs(K[8] - 1.0) > 1e-9:
-        return "bad_camera_matrix"
+        return Reason.BAD_CAMERA_MATRIX
     return None

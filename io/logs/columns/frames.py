@@ -13,6 +13,7 @@ from epipole.io.logs.messages.batches import MessageBatch, Received, fault, know
 from epipole.io.logs.messages.decoded import FrameMessage
 from epipole.io.logs.messages.scan import FrameRows, scan_frames
 from epipole.schemas.bridge import table
+from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import EXPOSURES
 
 Floats = npt.NDArray[np.float32]
@@ -135,7 +136,7 @@ class FrameColumns:
         if sound:
             self._append(sound)
 
-    def _leave_out(self, item: Received, reason: str) -> None:
+    def _leave_out(self, item: Received, reason: Reason) -> None:
         self.rejects.add(
             reason,
             time_ns=item.message.time_ns or item.log_time_ns,
@@ -156,7 +157,7 @@ class FrameColumns:
             flux[~((flux > 0) & np.isfinite(flux))] = np.nan
         keep = ~(bad_place | bad_sigma)
         for i in np.flatnonzero(~keep).tolist():
-            self._leave_out(received[i], "nan" if bad_place[i] else "bad_sigma")
+            self._leave_out(received[i], Reason.NAN if bad_place[i] else Reason.BAD_SIGMA)
         each = np.repeat(keep, lengths)
         values = (x[each], y[each], flux[each], sigma[each])
         kept = np.flatnonzero(keep).tolist()
@@ -189,12 +190,12 @@ def _arrow_floats(n: int) -> Floats:
     return np.frombuffer(pa.allocate_buffer(4 * n), np.float32)
 
 
-def _frame_fault(frame: FrameMessage) -> str | None:
+def _frame_fault(frame: FrameMessage) -> Reason | None:
     if not 0 <= frame.frame_number <= MAX_FRAME_NUMBER:
-        return "bad_frame_number"
+        return Reason.BAD_FRAME_NUMBER
     n = len(frame.x_px)
     if len(frame.y_px) != n or len(frame.flux) not in (0, n) or len(frame.sigma_px) not in (0, n):
-        return "unequal_arrays"
+        return Reason.UNEQUAL_ARRAYS
     return None
 
 

@@ -15,6 +15,7 @@ from epipole.io.logs.messages.decoded import StateMessage
 from epipole.io.logs.messages.scan import StateRows, scan_states
 from epipole.schemas.bridge import nullable, table, unstack
 from epipole.schemas.log_tables import LOG_STATES, STATE_FRAMES
+from epipole.schemas.rejects import Reason
 
 Array = npt.NDArray[np.floating]
 
@@ -104,11 +105,11 @@ class StateColumns:
                 self._leave_out(item, reason)
                 continue
             if len(state.attitude_xyzw) and not _is_attitude(state.attitude_xyzw):
-                self._leave_out(item, "bad_attitude")
+                self._leave_out(item, Reason.BAD_ATTITUDE)
                 state = state._replace(attitude_xyzw=state.attitude_xyzw[:0])
             self._write(state, item.message.time_ns)
 
-    def _leave_out(self, item: Received, reason: str) -> None:
+    def _leave_out(self, item: Received, reason: Reason) -> None:
         self.rejects.add(
             reason,
             time_ns=item.message.time_ns or item.log_time_ns,
@@ -128,17 +129,17 @@ class StateColumns:
         self._n = n + 1
 
 
-def _state_fault(state: StateMessage) -> str | None:
+def _state_fault(state: StateMessage) -> Reason | None:
     if state.frame not in STATE_FRAMES:
-        return "unknown_frame"
+        return Reason.UNKNOWN_FRAME
     # The length is finite only if every component is finite.
     radius_km = math.hypot(*state.position_km)
     if len(state.position_km) != 3 or not radius_km <= FARTHEST_KM:
-        return "bad_position"
+        return Reason.BAD_POSITION
     velocity = state.velocity_km_s
     if len(velocity) not in (0, 3) or not math.isfinite(math.hypot(*velocity)):
-        return "bad_velocity"
-    return "inside_earth" if radius_km < LOWEST_KM else None
+        return Reason.BAD_VELOCITY
+    return Reason.INSIDE_EARTH if radius_km < LOWEST_KM else None
 
 
 def _is_attitude(q: Array) -> bool:

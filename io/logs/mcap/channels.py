@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.record_scan import SCHEMA
+from epipole.schemas.rejects import Reason
 
 
 class Channel(NamedTuple):
@@ -48,7 +49,7 @@ class ChannelTable:
                 topic, at = string(data, at + 4, end)
                 self._channels[number] = (topic, string(data, at, end)[0], schema)
         except (struct.error, UnicodeDecodeError) as error:
-            raise ChunkError("damaged_chunk") from error
+            raise ChunkError(Reason.DAMAGED_CHUNK) from error
         self._known.clear()
 
     def find(self, number: int) -> Channel | None:
@@ -69,5 +70,5 @@ def string(data: Any, at: int, end: int) -> tuple[str, int]:
     """Return an MCAP string and the place after it; raise ChunkError where it passes `end`."""
     (length,) = struct.unpack_from("<I", data, at)
     if at + 4 + length > end:
-        raise ChunkError("damaged_chunk")
+        raise ChunkError(Reason.DAMAGED_CHUNK)
     return bytes(data[at + 4 : at + 4 + length]).decode(), at + 4 + length

@@ -10,6 +10,7 @@ from epipole.io.logs.mcap.channels import string
 from epipole.io.logs.mcap.compression import ChunkError, decompress, decompress_part
 from epipole.io.logs.mcap.record_scan import RecordIndex, index_records
 from epipole.io.logs.mcap.summary import RECORD
+from epipole.schemas.rejects import Reason
 
 # A chunk has a few MiB. A chunk that declares more than this is damaged or an attack.
 MAX_CHUNK_BYTES = 256 << 20
@@ -39,7 +40,7 @@ class OpenedChunk(NamedTuple):
     start_ns: int
     records: bytes
     places: RecordIndex
-    reason: str = ""
+    reason: Reason | None = None
 
 
 def read_head(data: memoryview, at: int) -> ChunkHead:
@@ -55,7 +56,7 @@ def read_head(data: memoryview, at: int) -> ChunkHead:
         compression, body = string(data, RECORD.size + _HEAD.size, len(data))
         (length,) = struct.unpack_from("<Q", data, body)
     except (struct.error, UnicodeDecodeError) as error:
-        raise ChunkError("damaged_chunk") from error
+        raise ChunkError(Reason.DAMAGED_CHUNK) from error
     body += at + 8
     return ChunkHead(start_ns, end_ns, size, checksum, compression, body, body + length)
 
@@ -66,15 +67,15 @@ def open_chunk(chunk: memoryview) -> OpenedChunk:
     try:
         head = read_head(chunk, 0)
         if head.end != len(chunk):
-            raise ChunkError("damaged_chunk")
+            raise ChunkError(Reason.DAMAGED_CHUNK)
         start_ns = head.start_ns
         if head.size > MAX_CHUNK_BYTES:
-            raise ChunkError("chunk_too_large")
+            raise ChunkError(Reason.CHUNK_TOO_LARGE)
         records = decompress(chunk[head.body :], head.compression, head.size)
         if head.checksum and zlib.crc32(records) != head.checksum:
-            raise ChunkError("bad_checksum")
+            raise ChunkError(Reason.BAD_CHECKSUM)
     except ChunkError as error:
-        return _opened(start_ns, b"", str(error))
+        return _opened(start_ns, b"", error.reason)
     return _opened(start_ns, records)
 
 
@@ -91,6 +92,6 @@ def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
     return _opened(head.start_ns, decompress_part(chunk[head.body :], head.compression, size))
 
 
-def _opened(start_ns: int, records: bytes, reason: str = "") -> OpenedChunk:
+def _opened(start_ns: int, records: bytes, reason: Reason | None = None) -> OpenedChunk:
     index = index_records(np.frombuffer(records, np.uint8))
     return OpenedChunk(start_ns, records, index, reason)

@@ -3,9 +3,15 @@
 import lz4.frame
 import zstandard
 
+from epipole.schemas.rejects import Reason
+
 
 class ChunkError(Exception):
-    """A chunk that does not hold what it says; the message is the reason, in a word."""
+    """A chunk, or a record in it, that cannot be used."""
+
+    def __init__(self, reason: Reason) -> None:
+        super().__init__(reason.value)
+        self.reason = reason
 
 
 def decompress(data: memoryview, compression: str, size: int) -> bytes:
@@ -20,18 +26,18 @@ def decompress(data: memoryview, compression: str, size: int) -> bytes:
         if compression == "zstd":
             # Checked first: the decoder allocates the size that the frame declares, without limit.
             if zstandard.frame_content_size(data) not in (-1, size):
-                raise ChunkError("wrong_chunk_size")
+                raise ChunkError(Reason.WRONG_CHUNK_SIZE)
             records = zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))
         elif compression == "lz4":
             records = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif compression == "":
             records = bytes(data)
         else:
-            raise ChunkError("unknown_compression")
+            raise ChunkError(Reason.UNKNOWN_COMPRESSION)
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
-        raise ChunkError("bad_compression") from error
+        raise ChunkError(Reason.BAD_COMPRESSION) from error
     if len(records) != size:
-        raise ChunkError("wrong_chunk_size")
+        raise ChunkError(Reason.WRONG_CHUNK_SIZE)
     return records
 
 

@@ -17,14 +17,12 @@ from epipole.io.logs.mcap.chunks import HEAD_BYTES, MAX_RECORD_BYTES, ChunkHead,
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.record_scan import CHANNEL, MESSAGE, PRIVATE, SCHEMA, index_records
 from epipole.io.logs.mcap.summary import DATA_END, MAGIC, RECORD, LogSummary, next_log
+from epipole.schemas.rejects import Reason
 
 HEADER, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA = 0x01, 0x06, 0x07, 0x09, 0x0C
 IGNORED = (ATTACHMENT, METADATA)
 LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # records that may lie in a chunk or outside chunks
 RUN_BYTES = 4 << 20  # of records outside chunks that are indexed at once
-
-# Reasons that are not damage: what lies there is read.
-CUT, ANOTHER_LOG = "cut", "log_behind_log"
 
 _INDEX = struct.Struct("<HI")  # of a message index: its channel, the bytes of its entries
 
@@ -35,9 +33,10 @@ class Place(NamedTuple):
     opcode: int
     at: int
     after: int
-    reason: str = ""
+    reason: Reason | None = None
     data: memoryview = memoryview(b"")  # of a chunk that is to be opened, or of a loose run
     size: int = 0  # of its records in memory, in bytes
+    cut: bool = False  # whether the file ends in this chunk
     counted: tuple[int, int] | None = None  # of a message index: channel, number of messages
 
 
@@ -62,12 +61,12 @@ class LogPlaces:
                 if skipped_to is None:
                     if opcode == CHUNK:
                         cut = data.view(at, min(end, at + MAX_RECORD_BYTES))
-                        yield Place(CHUNK, at, end, CUT, cut)
+                        yield Place(CHUNK, at, end, data=cut, cut=True)
                     break
-                yield Place(opcode, at, skipped_to, "damaged_record")
+                yield Place(opcode, at, skipped_to, Reason.DAMAGED_RECORD)
                 at = skipped_to
             elif opcode == DATA_END and (another := next_log(data, after)) is not None:
-                yield Place(0, another, another, ANOTHER_LOG)
+                yield Place(0, another, another, Reason.LOG_BEHIND_LOG)
                 at = another + len(MAGIC)
             elif opcode == DATA_END and length == 4 and self.summary.data_end in (None, at):
                 return
@@ -75,28 +74,28 @@ class LogPlaces:
                 place = self._place(opcode, at, after, limit, head)
                 yield place
                 at = place.after
-        yield Place(0, at, end, "truncated")
+        yield Place(0, at, end, Reason.TRUNCATED)
 
     def _place(self, opcode: int, at: int, after: int, limit: int, head: ChunkHead | None) -> Place:
         """Return the record from `at` to `after`; a loose one together with those that follow."""
         if opcode == CHUNK:
             if after - at > MAX_RECORD_BYTES:
-                return Place(CHUNK, at, after, "chunk_too_large")
+                return Place(CHUNK, at, after, Reason.CHUNK_TOO_LARGE)
             size = 0 if head is None else head.size
-            return Place(CHUNK, at, after, "", self.data.view(at, after), size)
+            return Place(CHUNK, at, after, None, self.data.view(at, after), size)
         if opcode == MESSAGE_INDEX and (index := self._index(at, after)) is not None:
             return Place(opcode, at, after, counted=index)
         if opcode in LOOSE:
             if after - at > MAX_RECORD_BYTES:
-                return Place(opcode, at, after, "damaged_record")
+                return Place(opcode, at, after, Reason.DAMAGED_RECORD)
             window = self.data.view(at, min(max(after, at + RUN_BYTES), limit))
             run = index_records(np.frombuffer(window, np.uint8), only_known=True)
             after = max(after, at + run.walked)
-            return Place(opcode, at, after, "", window[: after - at], after - at)
+            return Place(opcode, at, after, None, window[: after - at], after - at)
         if opcode == HEADER and self.data.view(at - len(MAGIC), at) == MAGIC:
             return Place(opcode, at, after)
         foreign = opcode < PRIVATE and opcode not in IGNORED  # not of a data section
-        return Place(opcode, at, after, "damaged_record" if foreign else "")
+        return Place(opcode, at, after, Reason.DAMAGED_RECORD if foreign else None)
 
     def _next_chunk(self, at: int) -> int | None:
         """Return the first place after `at` where the summary lists a chunk."""

@@ -23,9 +23,10 @@ from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.channels import Channel, ChannelTable
 from epipole.io.logs.mcap.chunks import OpenedChunk, open_chunk, open_cut_chunk
 from epipole.io.logs.mcap.compression import ChunkError
-from epipole.io.logs.mcap.places import CHUNK, CUT, LOOSE, LogPlaces, Place
+from epipole.io.logs.mcap.places import CHUNK, LOOSE, LogPlaces, Place
 from epipole.io.logs.mcap.record_scan import MESSAGE, Bytes, RecordIndex, index_records
 from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
+from epipole.schemas.rejects import Reason
 
 AHEAD_BYTES = 8 << 20  # of chunks that are opened while the chunk before them is decoded
 
@@ -49,7 +50,7 @@ class Damage(NamedTuple):
 
     offset: int
     time_ns: int
-    reason: str
+    reason: Reason
     n: int
 
 
@@ -87,7 +88,7 @@ class RecordWalk:
         ahead = 0
         for place in places:
             opening = None
-            if self.pool is not None and place.opcode == CHUNK and not place.reason:
+            if self.pool is not None and place.opcode == CHUNK and not (place.reason or place.cut):
                 opening = self.pool.submit(open_chunk, place.data)
             waiting.append((place, opening))
             ahead += place.size
@@ -100,7 +101,7 @@ class RecordWalk:
     # What is in the file
 
     def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
-        if place.reason == CUT:
+        if place.cut:
             yield from self._walk_chunk(place.at, open_cut_chunk(place.data), cut=True)
         elif place.reason:
             self._leave_out(place.at, 0, place.reason)
@@ -125,9 +126,9 @@ class RecordWalk:
         offset = np.full(len(index.start), at)
         yield from self._walk_index(_bytes(records), index, offset, start_ns)
         if index.n_strange:
-            self._leave_out(at, start_ns, "damaged_record", index.n_strange)
+            self._leave_out(at, start_ns, Reason.DAMAGED_RECORD, index.n_strange)
         if index.walked < len(records) and not cut:
-            self._leave_out(at, start_ns, "damaged_chunk")
+            self._leave_out(at, start_ns, Reason.DAMAGED_CHUNK)
 
     def _walk_loose(self, place: Place) -> Iterator[Block]:
         """Yield the messages of a run of records outside chunks."""
@@ -136,13 +137,13 @@ class RecordWalk:
         offset = at + index.start - RECORD.size
         offset[index.opcode == MESSAGE] -= 22
         if index.n_strange:
-            self._leave_out(at, 0, "damaged_record", index.n_strange)
+            self._leave_out(at, 0, Reason.DAMAGED_RECORD, index.n_strange)
         for block in self._walk_index(data, index, offset, 0):
             if self._sound_outside_chunks:
                 yield block
             else:
                 for offset_of_lost, time_ns in zip(block.offset, block.time_ns, strict=True):
-                    self._leave_out(int(offset_of_lost), int(time_ns), "bad_checksum")
+                    self._leave_out(int(offset_of_lost), int(time_ns), Reason.BAD_CHECKSUM)
 
     @cached_property
     def _sound_outside_chunks(self) -> bool:
@@ -172,7 +173,7 @@ class RecordWalk:
             try:
                 self._channels.declare(int(index.opcode[i]), data.data, start, end)
             except ChunkError:
-                self._leave_out(int(offset[i]), start_ns, "damaged_record")
+                self._leave_out(int(offset[i]), start_ns, Reason.DAMAGED_RECORD)
 
     def _wanted(
         self, data: Bytes, index: RecordIndex, offset: Numbers, run: slice
@@ -206,7 +207,7 @@ class RecordWalk:
 
     # What is missing in it
 
-    def _leave_out(self, offset: int, time_ns: int, reason: str, count: int = 1) -> None:
+    def _leave_out(self, offset: int, time_ns: int, reason: Reason, count: int = 1) -> None:
         self.damage.append(Damage(offset, time_ns, reason, count))
 
     def _count_lost(self, number: int, n: int) -> None:
@@ -220,7 +221,7 @@ class RecordWalk:
 
     def _report_missing(self) -> None:
         for _, count in sorted(self._unknown.items()):
-            self._leave_out(0, 0, "unknown_channel", count)
+            self._leave_out(0, 0, Reason.UNKNOWN_CHANNEL, count)
         declared = self._summary.declared
         missing = sum(
             max(0, count - self._counts.get(number, 0))
@@ -228,7 +229,7 @@ class RecordWalk:
             if self._channels.find(number)
         )
         if missing:
-            self._leave_out(0, 0, "missing_messages", missing)
+            self._leave_out(0, 0, Reason.MISSING_MESSAGES, missing)
 
 
 def _bytes(data: bytes | memoryview) -> Bytes:

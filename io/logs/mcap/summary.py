@@ -8,6 +8,7 @@ from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.channels import ChannelTable
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.record_scan import CHANNEL, PRIVATE, SCHEMA
+from epipole.schemas.rejects import Reason
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, CHUNK_INDEX, STATISTICS, DATA_END = 0x02, 0x08, 0x0B, 0x0F
@@ -67,7 +68,7 @@ def _read_records(
         opcode, length = RECORD.unpack_from(data, at)
         body, at = at + RECORD.size, at + RECORD.size + length
         if at > len(data) or _is_foreign(opcode):
-            raise ChunkError("damaged_summary")  # or `start` belongs to another log
+            raise ChunkError(Reason.DAMAGED_RECORD)  # or `start` belongs to another log
         if opcode in (SCHEMA, CHANNEL):
             channels.declare(opcode, data, body, at)
         elif opcode == CHUNK_INDEX:

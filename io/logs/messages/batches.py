@@ -15,10 +15,17 @@ from epipole.io.logs.messages.encodings.encoding import MessageEncoding, Undecod
 from epipole.io.logs.messages.encodings.registry import message_encodings
 from epipole.io.logs.messages.fields import FIELD_TYPES, no_fields
 from epipole.io.logs.messages.scan import Messages
+from epipole.schemas.messages import CALIBRATION, FRAME, STATE
+from epipole.schemas.rejects import Reason
 
 SENSOR_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}")
 MOST_AT_ONCE = 4096  # messages decoded one at a time before the scan is tried again
 BATCH_MESSAGES = 8192  # so that the located fields of a batch stay small
+UNDECODABLE = {
+    FRAME: Reason.UNDECODABLE_FRAME,
+    STATE: Reason.UNDECODABLE_STATE,
+    CALIBRATION: Reason.UNDECODABLE_CALIBRATION,
+}
 Indices = npt.NDArray[np.int64]
 
 
@@ -28,11 +35,11 @@ def valid_sensor_id(sensor_id: str) -> bool:
     return SENSOR_ID.fullmatch(sensor_id) is not None
 
 
-def fault(time_ns: int | None, sensor_id: str) -> str | None:
+def fault(time_ns: int | None, sensor_id: str) -> Reason | None:
     """Return why a message with this time and sensor cannot be used, or None if it can."""
     if not valid_sensor_id(sensor_id):
-        return "bad_sensor_id"
-    return "no_timestamp" if time_ns is None else None
+        return Reason.BAD_SENSOR_ID
+    return Reason.NO_TIMESTAMP if time_ns is None else None
 
 
 def known_id(sensor_id: str) -> str | None:
@@ -124,6 +131,6 @@ class MessageBatch:
             try:
                 message = encoding.decoded(self.kind, b.data[b.start[i] : b.end[i]].tobytes())
             except UndecodableError:
-                self.rejects.add(f"undecodable_{self.kind}", time_ns=time_ns, offset=offset)
+                self.rejects.add(UNDECODABLE[self.kind], time_ns=time_ns, offset=offset)
                 continue
             yield Received(message, offset, time_ns)

@@ -88,7 +88,7 @@ def test_a_log_that_changes_in_its_bucket_while_it_is_read_is_an_error(s3, log):
     pieces = read_log_pieces("s3://logs/a.mcap", piece_bytes=1)
     next(pieces)
     s3.pipe_file("logs/a.mcap", bytes(log.stat().st_size))
-    with pytest.raises(LogError, match="has changed while it was read"):
+    with pytest.raises(LogError, match=": changed while it was read"):
         list(pieces)
 
 
