@@ -44,17 +44,17 @@ class LogSource(NamedTuple):
 
 
 class LogPiece(NamedTuple):
-    """The content of a piece of one log."""
+    """A piece of one log: what reading yields, so that a log need not fit into memory."""
 
     exposures: pa.Table  # EXPOSURES, in the order of the log
     states: pa.Table  # LOG_STATES
     cameras: pa.Table  # CAMERAS
-    rejects: pa.Table  # REJECTS; all of the log in the last piece
-    source: LogSource | None  # in the last piece only
+    rejects: pa.Table  # REJECTS; empty but in the last piece
+    source: LogSource | None  # None but in the last piece
 
 
-class LogPart(NamedTuple):
-    """The content of one log."""
+class LogContents(NamedTuple):
+    """All that one log holds."""
 
     exposures: pa.Table  # EXPOSURES, in the order of the log
     states: pa.Table  # LOG_STATES

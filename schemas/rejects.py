@@ -37,7 +37,6 @@ class Reason(StrEnum):
         "A second log begins behind the end of the first; both are read.",
     )
     DAMAGED_RECORD = "damaged_record", Stage.READ, "A record of the log is damaged."
-    DAMAGED_SUMMARY = "damaged_summary", Stage.READ, "The summary at the end of the log is damaged."
     MISSING_MESSAGES = (
         "missing_messages",
         Stage.READ,
@@ -91,7 +90,11 @@ class Reason(StrEnum):
         Stage.READ,
         "The state's reference frame is not GCRF, EME2000, TEME or ITRF.",
     )
-    BAD_POSITION = "bad_position", Stage.READ, "The state's position is not finite."
+    BAD_POSITION = (
+        "bad_position",
+        Stage.READ,
+        "The state's position is not three finite numbers, or is farther than ten million km.",
+    )
     INSIDE_EARTH = "inside_earth", Stage.READ, "The state's position lies inside the Earth."
     BAD_VELOCITY = "bad_velocity", Stage.READ, "The state's velocity is invalid."
     BAD_ATTITUDE = (

@@ -18,18 +18,18 @@ def describe(log: str) -> dict[str, Any]:
     LogError
         Where the file is not a log, or has no frames.
     """
-    part = read_log(log)
+    contents = read_log(log)
     return {
         "log": log,
-        "size": part.source.size,
-        "sha256": part.source.sha256,
+        "size": contents.source.size,
+        "sha256": contents.source.sha256,
         "sensors": [
-            _sensor(name, part.exposures, part.states, part.cameras)
-            for name in sensor_ids(part.exposures)
+            _sensor(name, contents.exposures, contents.states, contents.cameras)
+            for name in sensor_ids(contents.exposures)
         ],
         "left_out": [
             {"reason": row["reason"], "sensor_id": row["sensor_id"], "count": row["count_sum"]}
-            for row in part.rejects.group_by(["reason", "sensor_id"])
+            for row in contents.rejects.group_by(["reason", "sensor_id"])
             .aggregate([("count", "sum")])
             .sort_by([("reason", "ascending"), ("sensor_id", "ascending")])
             .to_pylist()

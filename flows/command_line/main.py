@@ -16,6 +16,7 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
+from epipole.io.logs.messages.encodings.registry import ENCODINGS
 from epipole.schemas.errors import EpipoleError
 from epipole.schemas.runner import Runner
 
@@ -78,12 +79,8 @@ Logs = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
 
 
-class Encoding(StrEnum):
-    """How the messages of a log are encoded."""
-
-    protobuf = "protobuf"
-    json = "json"
-    ros2 = "ros2"
+# How the messages of a log are encoded.
+Encoding = StrEnum("Encoding", {name: name for name in ENCODINGS})  # type: ignore[misc]
 
 
 class Compression(StrEnum):
@@ -206,9 +203,9 @@ def simulate(
     logs: Annotated[
         int, typer.Option(min=1, metavar="N", help="Write N logs, one after the other in time.")
     ] = 1,
-    encoding: Annotated[
-        Encoding, typer.Option(help="Encoding of the messages.")
-    ] = Encoding.protobuf,
+    encoding: Annotated[Encoding, typer.Option(help="Encoding of the messages.")] = Encoding[
+        "protobuf"
+    ],
     compression: Annotated[
         Compression, typer.Option(help="Compression of the chunks.")
     ] = Compression.zstd,

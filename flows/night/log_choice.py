@@ -10,7 +10,6 @@ import pyarrow as pa
 
 from epipole.flows.night.summary import many
 from epipole.io.logs.listing import list_logs
-from epipole.io.logs.reader import MARGIN_NS as LOGGED_WITHIN_NS
 from epipole.io.logs.reader import read_log_times
 from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import Reason, reject_rows
@@ -18,8 +17,9 @@ from epipole.schemas.spans import DAY_NS, SPAN_NS
 
 LOGGER = logging.getLogger(__name__)
 
-# Frames up to a span beyond both ends of a night are read too, and a frame's time and the
-# time it was logged at may be `LOGGED_WITHIN_NS` apart.
+# A frame's time and the time it was logged at may differ by this much.
+LOGGED_WITHIN_NS = 600_000_000_000
+# Frames up to a span beyond both ends of a night are read too.
 MARGIN_NS = SPAN_NS + LOGGED_WITHIN_NS
 
 

@@ -1,7 +1,6 @@
-"""How the compiled loops over a log's bytes are compiled.
+"""How the loops over the bytes of a log are compiled.
 
-The same as `epipole.tasks.algorithms.kernels`, which reading may not import; a test holds the
-two against each other.
+The same as `epipole.tasks.algorithms.kernels`, which io may not import. A test compares the two.
 """
 
 from numba import njit

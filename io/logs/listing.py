@@ -1,4 +1,4 @@
-"""Where logs lie: a folder, a glob or a URL to the logs that it names."""
+"""The logs in a folder, of a glob or at a URL."""
 
 import glob
 from pathlib import Path
@@ -6,28 +6,28 @@ from pathlib import Path
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.errors import LogError
 
-PATTERN = "*.mcap"  # what a log is called in a folder
+PATTERN = "*.mcap"  # the logs in a folder
 
 
 def list_logs(where: str) -> tuple[list[str], bool]:
-    """Return the logs that a path or URL names, sorted, and whether it is one log itself.
+    """Return the logs that a path or URL names, sorted, and whether it names one log directly.
 
     Parameters
     ----------
     where
-        A file, a folder (its ``*.mcap``, not those of folders in it) or a glob (``**`` goes
-        into folders): local, or an fsspec URL such as ``s3://bucket/logs``. A ``file://`` URL
-        becomes a local path.
+        A file, a folder (its ``*.mcap``, without those in sub-folders) or a glob (``**`` matches
+        sub-folders). It is local or an fsspec URL such as ``s3://bucket/logs``. A ``file://``
+        URL becomes a local path.
 
     Raises
     ------
     LogError
-        Where nothing is there, or the storage cannot be asked.
+        Where there are no logs, or the storage does not answer.
     """
-    found, is_one = _list_url(where) if "://" in where else _list_local(where)
-    if not found:
+    logs, is_one = _list_url(where) if "://" in where else _list_local(where)
+    if not logs:
         raise LogError(f"{where}: {_nothing(where)}")
-    return sorted(found), is_one
+    return sorted(logs), is_one
 
 
 def _list_local(where: str) -> tuple[list[str], bool]:
@@ -50,7 +50,7 @@ def _list_url(where: str) -> tuple[list[str], bool]:
         storage, path = fsspec.core.url_to_fs(where)
         if isinstance(storage, LocalFileSystem):
             return _list_local(path)
-        storage.invalidate_cache()  # a worker lives for weeks; the logs are of last night
+        storage.invalidate_cache()  # a worker runs for weeks, and new logs come every night
         is_glob = glob.has_magic(path)
         if not is_glob and storage.isfile(path):
             return [where], True
@@ -68,7 +68,7 @@ def _nothing(where: str) -> str:
     if glob.has_magic(where):
         return "no file matches; check the pattern"
     if "://" in where:
-        return f"no such log, nor a folder with logs ({PATTERN}); check the URL"
+        return f"no such log, and no folder with logs ({PATTERN}); check the URL"
     if Path(where).is_dir():
         return f"no logs in this folder ({PATTERN}); check the path"
     return "no such file; check the path"

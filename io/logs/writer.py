@@ -9,50 +9,40 @@ from typing import Any, Self
 import numpy.typing as npt
 from mcap.writer import CompressionType, Writer
 
-from epipole.io.logs.messages.encoding import (
-    encode_calibration,
-    encode_cdr,
-    encode_json,
-    encode_protobuf,
-)
-from epipole.schemas import messages
-from epipole.schemas.messages import CENTROID_FRAME, SENSOR_STATE, MessageType
+from epipole.io.logs.messages.encodings.encoding import Values
+from epipole.io.logs.messages.encodings.registry import encoding_named
+from epipole.schemas.messages import CALIBRATION, FRAME, STATE
 
 COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,
     "lz4": CompressionType.LZ4,
     "none": CompressionType.NONE,
 }
-# The message encoding, the schema encoding, and how a message becomes bytes.
-ENCODINGS = {
-    "protobuf": ("protobuf", "protobuf", encode_protobuf),
-    "json": ("json", "jsonschema", encode_json),
-    "ros2": ("cdr", "ros2msg", encode_cdr),
-}
-_TOPICS = {
-    messages.FRAME: "centroids",
-    messages.STATE: "state",
-    messages.CALIBRATION: "calibration",
-}
+_TOPICS = {FRAME: "centroids", STATE: "state", CALIBRATION: "calibration"}
 Numbers = npt.ArrayLike
 
 
 class LogWriter:
-    """Writes one log; a context manager. The file appears under its name when it is whole.
+    """Writes one log; a context manager. The file gets its name when it is complete.
 
-    The bytes depend on the messages and their order alone, not on the clock. Messages may
-    come in any order of time; `log_time` and `publish_time` are a message's own time.
+    The bytes depend only on the messages and their order. Messages may come in any order of
+    time; `log_time` and `publish_time` are the time of the message.
 
     Parameters
     ----------
     path
         The file to write.
     encoding
-        protobuf, json or ros2.
+        A name in `messages.encodings.registry`: protobuf, json or ros2.
     compression
         Of chunks: zstd, lz4 or none.
     chunk_size
         Bytes in a chunk before compression.
+
+    Raises
+    ------
+    ValueError
+        Where the encoding or the compression is unknown.
     """
 
     def __init__(
@@ -63,19 +53,17 @@ class LogWriter:
         compression: str = "zstd",
         chunk_size: int = 1 << 20,
     ) -> None:
-        if encoding not in ENCODINGS:
-            raise ValueError(f"encoding {encoding!r} is none of {', '.join(ENCODINGS)}")
+        self._encoding = encoding_named(encoding)
         if compression not in COMPRESSIONS:
-            raise ValueError(f"compression {compression!r} is none of {', '.join(COMPRESSIONS)}")
-        self._encoding, self._schema_encoding, self._encode = ENCODINGS[encoding]
+            raise ValueError(f"compression {compression!r}: not one of {', '.join(COMPRESSIONS)}")
         self._path = Path(path)
         self._partial = self._path.with_name(self._path.name + ".partial")
         self._file = self._partial.open("wb")
         self._writer = Writer(
             self._file, compression=COMPRESSIONS[compression], chunk_size=chunk_size
         )
-        # Not the library's own name, which carries its version into the bytes.
-        self._writer.start(profile="ros2" if encoding == "ros2" else "", library="epipole")
+        # The default library name has a version in it, which would change the bytes.
+        self._writer.start(profile=self._encoding.profile, library="epipole")
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._sequences: dict[int, int] = {}
@@ -112,8 +100,7 @@ class LogWriter:
             camera = {
                 name: getattr(camera, name) for name in (*names, "k1", "k2", "p1", "p2", "k3")
             }
-        data = encode_calibration(self._encoding, sensor_id, time_ns, camera)
-        self._write(messages.CALIBRATION, sensor_id, time_ns, data)
+        self._write(CALIBRATION, time_ns, sensor_id, calibration_values(sensor_id, time_ns, camera))
 
     def state(
         self,
@@ -127,7 +114,7 @@ class LogWriter:
         attitude_xyzw: Numbers | None = None,
         attitude_sigma_arcsec: float = 0.0,
     ) -> None:
-        """Write a state: (3) position, (3) velocity and (4) attitude, sensor from ICRS."""
+        """Write a state: (3) position, (3) velocity and (4) attitude, sensor from GCRF."""
         values = {
             "timestamp": time_ns,
             "sensor_id": sensor_id,
@@ -138,7 +125,7 @@ class LogWriter:
             "attitude_xyzw": attitude_xyzw,
             "attitude_sigma_arcsec": float(attitude_sigma_arcsec),
         }
-        self._write(messages.STATE, sensor_id, time_ns, self._encode(SENSOR_STATE, values))
+        self._write(STATE, time_ns, sensor_id, values)
 
     def frame(
         self,
@@ -154,8 +141,8 @@ class LogWriter:
     ) -> None:
         """Write a frame; arrays of (n) centroids, `flux` and `sigma_px` where known.
 
-        The arrays are written as they come, equal in length or not: a simulator must be able
-        to make the damage that a reader is to survive.
+        The arrays are written as given, equal in length or not: a simulator must be able to
+        write the errors that a reader has to survive.
         """
         values = {
             "timestamp": time_ns,
@@ -167,28 +154,41 @@ class LogWriter:
             "flux": flux,
             "sigma_px": sigma_px,
         }
-        self._write(messages.FRAME, sensor_id, time_ns, self._encode(CENTROID_FRAME, values))
+        self._write(FRAME, time_ns, sensor_id, values)
 
-    def _write(self, carries: str, sensor_id: str, time_ns: int, data: bytes) -> None:
-        channel = self._channels.get((carries, sensor_id)) or self._open(carries, sensor_id)
+    def _write(self, kind: str, time_ns: int, sensor_id: str, values: Values) -> None:
+        data = self._encoding.encode(kind, values)
+        channel = self._channels.get((kind, sensor_id)) or self._open(kind, sensor_id)
         sequence = self._sequences[channel]
         self._sequences[channel] = sequence + 1
         self._writer.add_message(channel, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
 
-    def _open(self, carries: str, sensor_id: str) -> int:
-        message: MessageType | None = messages.OWN_MESSAGES.get(carries)
-        if self._encoding == "cdr":
-            name = message.ros_name if message else messages.CAMERA_INFO_NAME
-            text = messages.ros_schema(name)
-        else:
-            name = message.name if message else messages.CALIBRATION_NAME
-            as_json = self._encoding == "json"
-            text = messages.json_schema(name) if as_json else messages.protobuf_schema(name)
+    def _open(self, kind: str, sensor_id: str) -> int:
+        encoding = self._encoding
+        name = encoding.schema_names[kind][0]
         if name not in self._schemas:
-            self._schemas[name] = self._writer.register_schema(name, self._schema_encoding, text)
+            self._schemas[name] = self._writer.register_schema(
+                name, encoding.schema_encoding, encoding.schema(kind)
+            )
         channel = self._writer.register_channel(
-            f"/{sensor_id}/{_TOPICS[carries]}", self._encoding, self._schemas[name]
+            f"/{sensor_id}/{_TOPICS[kind]}", encoding.message_encoding, self._schemas[name]
         )
-        self._channels[(carries, sensor_id)] = channel
+        self._channels[(kind, sensor_id)] = channel
         self._sequences[channel] = 0
         return channel
+
+
+def calibration_values(sensor_id: str, time_ns: int, camera: Values) -> dict[str, Any]:
+    """Return a camera as the values of a calibration message; see `LogWriter.camera`."""
+    fx, fy, cx, cy = (float(camera[n]) for n in ("fx_px", "fy_px", "cx_px", "cy_px"))
+    return {
+        "timestamp": time_ns,
+        "frame_id": sensor_id,
+        "width": int(camera["width"]),
+        "height": int(camera["height"]),
+        "distortion_model": "plumb_bob",
+        "D": [float(camera[n]) for n in ("k1", "k2", "p1", "p2", "k3")],
+        "K": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        "P": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    }

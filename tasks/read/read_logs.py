@@ -3,7 +3,7 @@
 import logging
 from typing import NamedTuple
 
-from epipole.io.logs.reader import read_log_parts
+from epipole.io.logs.reader import read_log_pieces
 from epipole.io.work.parts import write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.log_tables import LogSource
@@ -30,10 +30,10 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
     Raises
     ------
     LogError
-        Where it is no log; see `read_log_parts`.
+        Where it is no log; see `read_log_pieces`.
     """
     n_pieces, n_frames, source = 0, 0, None
-    for piece in read_log_parts(path):
+    for piece in read_log_pieces(path):
         write_part(
             folder.piece(number, n_pieces),
             {

@@ -1,12 +1,12 @@
-"""How fast a log becomes columns, beside the least it can cost and the plain reader.
+"""How fast a log becomes columns, compared with the least possible work and the plain reader.
 
     python tests/benchmarks/bench_ingest.py [--frames 200000] [--encoding protobuf]
 
-CPU seconds of all threads, medians of runs that take turns. "raw" reads the same file,
-unpacks its chunks and checks them, and nothing more. "plain" is the `mcap` package's reader
-with the public decoder of the encoding, an object a message; "plain to columns" also puts
-the centroids of those objects into four arrays. "epipole" gives checked tables, and the
-file's SHA-256.
+CPU seconds of all threads, medians of alternating runs. "raw" reads the same file, decompresses
+its chunks and checks them, and does nothing else. "plain" is the reader of the `mcap` package
+with the public decoder of the encoding, which makes an object per message. "plain to columns"
+also puts the centroids of those objects into four arrays. "epipole" gives checked tables and the
+SHA-256 of the file.
 """
 
 import argparse
@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 import zstandard
 
+from epipole.io.logs.messages.encodings.registry import ENCODINGS
 from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import LogWriter
 
@@ -73,7 +74,7 @@ def write_log(path: Path, n_frames: int, encoding: str) -> None:
 
 
 def raw(path: Path) -> None:
-    """Read a file, unpack its chunks and check them."""
+    """Read a file, decompress its chunks and check them."""
     data = memoryview(path.read_bytes())
     at = 8
     while True:
@@ -134,16 +135,14 @@ def cpu_seconds(work: Callable[[], object]) -> float:
 
 
 def peak_mib(path: Path) -> list[float]:
-    """Return the resident memory [MiB] before and at most while reading, and of the columns."""
+    """Return the memory [MiB]: before reading, the peak while reading, and of the columns."""
     command = [sys.executable, __file__, "--peak", str(path)]
     out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    return [float(part) for part in out.split()]
+    return [float(number) for number in out.split()]
 
 
 def print_peak(path: str) -> None:
-    """Print what `peak_mib` returns, of a process that does nothing else."""
-    from epipole.io.logs.reader import read_log
-
+    """Print what `peak_mib` returns; called in a process that does nothing else."""
     logging.disable()
     before = resident_mib()
     log = read_log(path)
@@ -151,7 +150,7 @@ def print_peak(path: str) -> None:
 
 
 def resident_mib() -> float:
-    """Return the most memory that this program has had (Linux; its parent's is not counted)."""
+    """Return the peak memory of this process, without its parent (Linux)."""
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmHWM:")[1].split()[0]) / 1024
 
@@ -160,7 +159,7 @@ def main() -> None:
     """Print a row of the table in BENCHMARKS.md."""
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--frames", type=int, default=200_000)
-    arguments.add_argument("--encoding", default="protobuf", choices=["protobuf", "json", "ros2"])
+    arguments.add_argument("--encoding", default="protobuf", choices=[*ENCODINGS])
     arguments.add_argument("--runs", type=int, default=7)
     arguments.add_argument("--peak", metavar="LOG", help="print the memory that reading takes")
     chosen = arguments.parse_args()

@@ -1,4 +1,4 @@
-"""Logs read whole, as tests and benchmarks want them: frames of all sensors in memory."""
+"""Logs read into memory for tests and benchmarks, with the frames of all sensors."""
 
 import tempfile
 from collections.abc import Sequence
@@ -18,8 +18,8 @@ from epipole.tasks.read.read_logs import read_log_into
 EVER = (0, (1 << 63) - 1)
 
 
-class Log(NamedTuple):
-    """What all logs hold together, frames and states by sensor and time."""
+class WholeLogs(NamedTuple):
+    """What several logs hold together, with frames and states by sensor and time."""
 
     exposures: pa.Table
     states: pa.Table
@@ -30,8 +30,8 @@ class Log(NamedTuple):
 
 def read_whole(
     paths: Sequence[Path | str], settings: Settings, between: tuple[int, int] = EVER
-) -> Log:
-    """Read logs as the flow does; frames and states of a time only."""
+) -> WholeLogs:
+    """Read logs as the flow does, with frames and states of a range of time [ns] only."""
     with tempfile.TemporaryDirectory() as folder:
         where = ReadFolder(Path(folder))
         read = [read_log_into.fn(where, k, path) for k, path in enumerate(paths)]
@@ -39,7 +39,7 @@ def read_whole(
         numbers = range(len(frames.sensors))
         exposures = [frames_between(where, n, *between) for n in numbers]
         states = [states_between(where, n, *between) for n in numbers]
-        return Log(
+        return WholeLogs(
             concat(EXPOSURES, exposures),
             concat(SENSOR_STATES, states),
             frames.cameras,

@@ -6,9 +6,10 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.io.logs.damage import RejectList
-from epipole.io.logs.messages.batches import Part, fault, known_id
-from epipole.io.logs.messages.decoding import Calibration
+from epipole.io.logs.messages.batches import MessageBatch, fault, known_id
+from epipole.io.logs.messages.decoded import CalibrationMessage
 from epipole.schemas.bridge import table
+from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import CAMERAS
 
 
@@ -17,14 +18,14 @@ class CameraColumns:
     """The calibrations of a log."""
 
     rejects: RejectList
-    _rows: list[Calibration] = field(default_factory=list)
+    _rows: list[CalibrationMessage] = field(default_factory=list)
 
-    def add(self, part: Part) -> None:
-        """Take calibrations, or leave them out with a reason.
+    def add(self, batch: MessageBatch) -> None:
+        """Take the valid calibrations; the others become rejects.
 
-        One without a time holds from when it was logged.
+        A calibration without a time holds from the time it was logged at.
         """
-        for calibration, offset, log_time_ns in part.decoded(0, len(part)):
+        for calibration, offset, log_time_ns in batch.decoded(0, len(batch)):
             time_ns = calibration.time_ns or log_time_ns or None
             reason = fault(time_ns, calibration.sensor_id) or _camera_fault(calibration)
             if reason is None:
@@ -38,7 +39,7 @@ class CameraColumns:
                 )
 
     def take(self) -> pa.Table:
-        """Return CAMERAS of the calibrations since the last time."""
+        """Return CAMERAS of the calibrations since the last call."""
         rows, self._rows = self._rows, []
         matrices = np.array([c.K for c in rows], float).reshape(-1, 9)
         distortion = np.zeros((len(rows), 5))
@@ -60,18 +61,18 @@ class CameraColumns:
         )
 
 
-def _camera_fault(calibration: Calibration) -> str | None:
+def _camera_fault(calibration: CalibrationMessage) -> Reason | None:
     if calibration.width <= 0 or calibration.height <= 0:
-        return "bad_image_size"
+        return Reason.BAD_IMAGE_SIZE
     if calibration.distortion_model not in ("", "plumb_bob"):
-        return "unknown_distortion_model"
+        return Reason.UNKNOWN_DISTORTION_MODEL
     if len(calibration.D) not in (0, 4, 5) or not np.isfinite(calibration.D).all():
-        return "bad_distortion"
+        return Reason.BAD_DISTORTION
     K = calibration.K
     if len(K) != 9 or not np.isfinite(K).all() or K[0] <= 0 or K[4] <= 0:
-        return "bad_camera_matrix"
-    # A skewed or scaled matrix is a camera that the pipeline has no model of.
+        return Reason.BAD_CAMERA_MATRIX
+    # The pipeline has no camera model with skew or scale.
     zeros, scale = (K[1], K[3], K[6], K[7]), 1e-9 * K[0]
     if any(abs(k) > scale for k in zeros) or abs(K[8] - 1.0) > 1e-9:
-        return "bad_camera_matrix"
+        return Reason.BAD_CAMERA_MATRIX
     return None

@@ -9,11 +9,11 @@ import pyarrow as pa
 
 from epipole.io.logs.columns.names import NameCodes
 from epipole.io.logs.damage import RejectList
-from epipole.io.logs.messages.batches import Part, Received, fault, known_id
-from epipole.io.logs.messages.decoding import Frame
+from epipole.io.logs.messages.batches import MessageBatch, Received, fault, known_id
+from epipole.io.logs.messages.decoded import FrameMessage
 from epipole.io.logs.messages.scan import FrameRows, scan_frames
-from epipole.io.logs.messages.wire import FRAME_KINDS
 from epipole.schemas.bridge import table
+from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import EXPOSURES
 
 Floats = npt.NDArray[np.float32]
@@ -21,15 +21,15 @@ Bools = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
 MAX_FRAME_NUMBER = (1 << 63) - 1
-BATCH = 65536  # frames in one piece of the table
+BATCH = 65536  # frames in one table of those that are joined
 BATCH_CENTROIDS = 1 << 21
-# A centroid's x and y take 8 bytes in binary and at least 4 as text.
+# The x and y of a centroid take 8 bytes in binary and at least 4 as text.
 BYTES_OF_A_CENTROID = 4
 CENTROID_BYTES, ROW_BYTES = 16, 80  # in the table
 
 
 class _Rows:
-    """A piece of the table in the making."""
+    """Rows of one of the tables that are joined, while they are filled in."""
 
     def __init__(self, n: int, n_centroids: int) -> None:
         self.n = 0
@@ -57,53 +57,42 @@ class _Rows:
 
 @dataclass
 class FrameColumns:
-    """The frames of a log; of those from `span[0]` to before `span[1]`, if there is one."""
+    """The frames of a log."""
 
     rejects: RejectList
-    span: tuple[int, int] | None = None
-    clock_off_ns: int | None = None  # at most how far a frame's time and its logging were apart
     _sensors: NameCodes = field(default_factory=NameCodes)
     _rows: _Rows = field(default_factory=lambda: _Rows(0, 0))
     _tables: list[pa.Table] = field(default_factory=list)
 
-    def add(self, part: Part) -> None:
-        """Take frames, but for those whose time, sensor, number or arrays are none.
+    def add(self, batch: MessageBatch) -> None:
+        """Take the frames whose time, sensor, number and arrays are valid.
 
-        Flux is never relied on: where it is not a positive finite number it is NaN, and the
-        frame stays. An exposure that is not one is 0, unknown.
+        Flux is never relied on: an invalid value becomes NaN, and the frame stays. An invalid
+        exposure time becomes 0, which is unknown.
         """
-        messages = part.messages
-        n_bytes = int((messages.end - messages.start).sum())
-        self._make_room(len(part), n_bytes // BYTES_OF_A_CENTROID)
+        messages = batch.messages
+        self._make_room(len(batch), batch.n_bytes // BYTES_OF_A_CENTROID)
         rows, names = self._rows, self._sensors.table
 
         def scan(i: int) -> int:
             n = rows.n
-            stopped, rows.n = scan_frames(messages, i, names, rows.columns, n, FRAME_KINDS)
-            rows.offset[n : rows.n] = part.offset[i:stopped]
-            self._watch_clock(part, i, stopped, n)
+            stopped, rows.n = scan_frames(messages, i, names, rows.columns, n)
+            rows.offset[n : rows.n] = batch.offset[i:stopped]
             return int(stopped)
 
-        part.take(scan, self._judge)
+        batch.take(scan, self._judge)
 
     @property
     def n_bytes(self) -> int:
-        """What the rows that wait to be taken take, about."""
+        """About the size of the rows that have not been taken."""
         waiting = self._rows.n_centroids * CENTROID_BYTES + self._rows.n * ROW_BYTES
         return waiting + sum(rows.nbytes for rows in self._tables)
 
     def take(self) -> pa.Table:
-        """Return EXPOSURES of the frames since the last time, in the order of the log."""
+        """Return EXPOSURES of the frames since the last call, in the order of the log."""
         self._close()
         tables, self._tables = self._tables, []
         return pa.concat_tables([EXPOSURES.empty_table(), *tables])
-
-    def _watch_clock(self, part: Part, first: int, last: int, n: int) -> None:
-        if self.span is None or first == last:
-            return
-        logged = part.block.time_ns[part.chosen[first:last]].astype(np.int64)
-        off = np.abs(self._rows.columns.time_ns[n : n + last - first] - logged)
-        self.clock_off_ns = max(self.clock_off_ns or 0, int(off.max()))
 
     def _make_room(self, n: int, n_centroids: int) -> None:
         if not self._rows.has_room(n, n_centroids):
@@ -111,7 +100,7 @@ class FrameColumns:
             self._rows = _Rows(max(n, BATCH), max(n_centroids, BATCH_CENTROIDS))
 
     def _close(self) -> None:
-        """Add the rows so far to the table."""
+        """Make a table of the rows so far."""
         rows, n = self._rows, self._rows.n
         self._rows = _Rows(0, 0)
         if n == 0:
@@ -130,38 +119,33 @@ class FrameColumns:
             "source": pa.repeat(pa.scalar(self.rejects.source), n),
             "offset": rows.offset[:n],
         }
-        exposures = table(EXPOSURES, columns)
-        if self.span is not None:
-            low, high = self.span
-            time_ns = c.time_ns[:n]
-            exposures = exposures.filter(pa.array((time_ns >= low) & (time_ns < high)))
-        self._tables.append(exposures)
+        self._tables.append(table(EXPOSURES, columns))
 
-    # Frames that were decoded one by one
+    # Frames that were decoded one at a time
 
     def _judge(self, received: Sequence[Received]) -> None:
-        """Take decoded frames, or leave them out with a reason."""
+        """Take decoded frames; invalid ones become rejects."""
         sound = []
-        for one in received:
-            frame: Frame = one.record
+        for item in received:
+            frame: FrameMessage = item.message
             reason = fault(frame.time_ns, frame.sensor_id) or _frame_fault(frame)
             if reason is None:
-                sound.append(one)
+                sound.append(item)
             else:
-                self._leave_out(one, reason)
+                self._leave_out(item, reason)
         if sound:
             self._append(sound)
 
-    def _leave_out(self, one: Received, reason: str) -> None:
+    def _leave_out(self, item: Received, reason: Reason) -> None:
         self.rejects.add(
             reason,
-            time_ns=one.record.time_ns or one.log_time_ns,
-            offset=one.offset,
-            sensor_id=known_id(one.record.sensor_id),
+            time_ns=item.message.time_ns or item.log_time_ns,
+            offset=item.offset,
+            sensor_id=known_id(item.message.sensor_id),
         )
 
     def _append(self, received: Sequence[Received]) -> None:
-        frames: list[Frame] = [one.record for one in received]
+        frames: list[FrameMessage] = [item.message for item in received]
         lengths = np.array([len(f.x_px) for f in frames], np.int64)
         x = _joined([f.x_px for f in frames])
         y = _joined([f.y_px for f in frames])
@@ -173,7 +157,7 @@ class FrameColumns:
             flux[~((flux > 0) & np.isfinite(flux))] = np.nan
         keep = ~(bad_place | bad_sigma)
         for i in np.flatnonzero(~keep).tolist():
-            self._leave_out(received[i], "nan" if bad_place[i] else "bad_sigma")
+            self._leave_out(received[i], Reason.NAN if bad_place[i] else Reason.BAD_SIGMA)
         each = np.repeat(keep, lengths)
         values = (x[each], y[each], flux[each], sigma[each])
         kept = np.flatnonzero(keep).tolist()
@@ -185,49 +169,46 @@ class FrameColumns:
     def _write(
         self, received: Sequence[Received], lengths: Integers, values: Sequence[Floats]
     ) -> None:
-        """Put good frames behind the rows so far."""
+        """Add good frames to the rows."""
         rows, c = self._rows, self._rows.columns
         low = rows.n_centroids
         for column, numbers in zip((c.x_px, c.y_px, c.flux, c.sigma_px), values, strict=True):
             column[low : low + len(numbers)] = numbers
-        for one, length in zip(received, lengths.tolist(), strict=True):
-            n, frame = rows.n, one.record
+        for item, length in zip(received, lengths.tolist(), strict=True):
+            n, frame = rows.n, item.message
             exposure_s = frame.exposure_s
             c.sensor[n] = self._sensors.code(frame.sensor_id)
             c.number[n], c.time_ns[n] = frame.frame_number, frame.time_ns
             c.exposure_s[n] = exposure_s if 0 < exposure_s < np.inf else 0.0
             c.first[n + 1] = c.first[n] + length
-            rows.offset[n] = one.offset
+            rows.offset[n] = item.offset
             rows.n += 1
-            if self.span is not None:
-                off = abs(frame.time_ns - one.log_time_ns)
-                self.clock_off_ns = max(self.clock_off_ns or 0, off)
 
 
 def _arrow_floats(n: int) -> Floats:
-    """Return room for numbers, of Arrow's memory, which gives back what is no longer needed."""
+    """Return an empty array in memory of Arrow, which returns freed memory to the system."""
     return np.frombuffer(pa.allocate_buffer(4 * n), np.float32)
 
 
-def _frame_fault(frame: Frame) -> str | None:
+def _frame_fault(frame: FrameMessage) -> Reason | None:
     if not 0 <= frame.frame_number <= MAX_FRAME_NUMBER:
-        return "bad_frame_number"
+        return Reason.BAD_FRAME_NUMBER
     n = len(frame.x_px)
     if len(frame.y_px) != n or len(frame.flux) not in (0, n) or len(frame.sigma_px) not in (0, n):
-        return "unequal_arrays"
+        return Reason.UNEQUAL_ARRAYS
     return None
 
 
 def _joined(arrays: Sequence[npt.NDArray[np.floating]]) -> Floats:
-    """Return arrays behind each other, as the messages have their numbers: float32."""
-    with np.errstate(invalid="ignore", over="ignore"):  # of a text's number that is none
+    """Return the arrays joined as float32, which is the type in the messages."""
+    with np.errstate(invalid="ignore", over="ignore"):  # JSON may have larger numbers
         return np.concatenate([np.empty(0, np.float32), *arrays], dtype=np.float32)
 
 
 def _joined_or_nan(
     arrays: Sequence[npt.NDArray[np.floating]], lengths: Integers
 ) -> tuple[Floats, Bools]:
-    """Return the arrays joined, NaN in place of those left empty, and which are given."""
+    """Return the arrays joined, with NaN for empty arrays, and which arrays are not empty."""
     given = np.array([len(a) for a in arrays], np.int64) == lengths
     out = np.full(lengths.sum(), np.nan, np.float32)
     out[np.repeat(given, lengths)] = _joined(arrays)
@@ -242,7 +223,7 @@ def _any(bad: Bools, lengths: Integers) -> Bools:
 
 
 def _lists(name: str, flat: Floats, offsets: pa.Array, given: Bools | None = None) -> pa.ListArray:
-    """Return rows of one list each; where not `given`, no list: its values are skipped over."""
+    """Return a list per row; null where not `given`, whose values are skipped."""
     kind = EXPOSURES.field(name).type
     null = None if given is None or given.all() else pa.array(~given)
     return pa.ListArray.from_arrays(offsets, pa.array(flat, kind.value_type), type=kind, mask=null)

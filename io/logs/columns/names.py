@@ -1,4 +1,4 @@
-"""Names as small integers, shared by the compiled scans and what is decoded beside them."""
+"""Names as small integers, which the compiled scans and the decoded messages share."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ from epipole.io.logs.messages.scan import MAX_NAMES, NAME_BYTES, new_names
 
 
 class NameCodes:
-    """Codes of names, counted from 0 in the order they are met."""
+    """Codes of names, counted from 0 in the order in which the names appear."""
 
     def __init__(self, names: Sequence[str] = ()) -> None:
         self.table = new_names()
@@ -20,9 +20,9 @@ class NameCodes:
             self.code(name)
 
     def names(self) -> list[str]:
-        """Return the names by code, those that a scan has met among them."""
-        met = int(self.table.n_met[0])
-        for code in range(len(self._names), met):  # none, once the table is full
+        """Return the names by code, with those that a scan has added."""
+        n = int(self.table.n[0])
+        for code in range(len(self._names), n):  # empty once the table is full
             name = self.table.text[code, : self.table.length[code]].tobytes().decode()
             self._codes[name] = code
             self._names.append(name)
@@ -38,12 +38,12 @@ class NameCodes:
         return code
 
     def _enter(self, code: int, text: bytes) -> None:
-        """Tell the scans of a name, if their table has room: they pass over those it lacks."""
+        """Add a name to the table of the scans, if there is room; they stop at a name without."""
         if code >= MAX_NAMES or len(text) > NAME_BYTES:
             return
         self.table.text[code, : len(text)] = np.frombuffer(text, np.uint8)
         self.table.length[code] = len(text)
-        self.table.n_met[0] = code + 1
+        self.table.n[0] = code + 1
 
     def strings(self, codes: npt.NDArray[np.int32]) -> pa.Array:
         """Return the names of codes as a column."""

@@ -10,20 +10,20 @@ import pyarrow as pa
 
 from epipole.io.logs.columns.names import NameCodes
 from epipole.io.logs.damage import RejectList
-from epipole.io.logs.messages.batches import Part, Received, fault, known_id
-from epipole.io.logs.messages.decoding import State
+from epipole.io.logs.messages.batches import MessageBatch, Received, fault, known_id
+from epipole.io.logs.messages.decoded import StateMessage
 from epipole.io.logs.messages.scan import StateRows, scan_states
-from epipole.io.logs.messages.wire import STATE_KINDS
 from epipole.schemas.bridge import nullable, table, unstack
 from epipole.schemas.log_tables import LOG_STATES, STATE_FRAMES
+from epipole.schemas.rejects import Reason
 
-Array = npt.NDArray[np.float64]
+Array = npt.NDArray[np.floating]
 
-# Below the poles' radius of 6357 km: no sensor is there, whatever its frame and its errors.
-EARTH_RADIUS_KM = 6340.0
-FARTHEST_KM = 1.0e7  # well behind the Moon; a number in metres lands here
-QUATERNION_TOLERANCE = 1e-2  # |q| further from 1 is not a rounded unit quaternion
-BATCH = 16384  # states in one piece of the table
+# Less than the polar radius of 6357 km: no sensor is there, in any frame and with any error.
+LOWEST_KM = 6340.0
+FARTHEST_KM = 1.0e7  # far beyond the Moon; positions in metres are farther
+QUATERNION_TOLERANCE = 1e-2  # a larger |q| - 1 is more than rounding of a unit quaternion
+BATCH = 16384  # states in one table of those that are joined
 ROW_BYTES = 150  # in the table
 _FRAMES = NameCodes(STATE_FRAMES)
 
@@ -39,44 +39,41 @@ def _new_rows(n: int) -> StateRows:
 
 @dataclass
 class StateColumns:
-    """The states of a log; of those from `span[0]` to before `span[1]`, if there is one."""
+    """The states of a log."""
 
     rejects: RejectList
-    span: tuple[int, int] | None = None
     _sensors: NameCodes = field(default_factory=NameCodes)
     _rows: StateRows = field(default_factory=lambda: _new_rows(0))
     _n: int = 0
     _tables: list[pa.Table] = field(default_factory=list)
 
-    def add(self, part: Part) -> None:
-        """Take states, without their attitude where only that is bad; leave out the others."""
-        messages = part.messages
-        if self._n + len(part) > len(self._rows.time_ns):
+    def add(self, batch: MessageBatch) -> None:
+        """Take the valid states; where only the attitude is invalid, the state stays without it."""
+        messages = batch.messages
+        if self._n + len(batch) > len(self._rows.time_ns):
             self._close()
-            self._rows = _new_rows(max(len(part), BATCH))
+            self._rows = _new_rows(max(len(batch), BATCH))
         sensors, frames = self._sensors.table, _FRAMES.table
 
         def scan(i: int) -> int:
-            stopped, self._n = scan_states(
-                messages, i, sensors, frames, self._rows, self._n, STATE_KINDS
-            )
+            stopped, self._n = scan_states(messages, i, sensors, frames, self._rows, self._n)
             return int(stopped)
 
-        part.take(scan, self._judge)
+        batch.take(scan, self._judge)
 
     @property
     def n_bytes(self) -> int:
-        """What the rows that wait to be taken take, about."""
+        """About the size of the rows that have not been taken."""
         return self._n * ROW_BYTES + sum(rows.nbytes for rows in self._tables)
 
     def take(self) -> pa.Table:
-        """Return LOG_STATES of the states since the last time, in the order of the log."""
+        """Return LOG_STATES of the states since the last call, in the order of the log."""
         self._close()
         tables, self._tables = self._tables, []
         return pa.concat_tables([LOG_STATES.empty_table(), *tables])
 
     def _close(self) -> None:
-        """Add the rows so far to the table."""
+        """Make a table of the rows so far."""
         rows = StateRows._make(column[: self._n] for column in self._rows)
         self._n = 0
         if len(rows.time_ns) == 0:
@@ -97,33 +94,30 @@ class StateColumns:
                 "attitude_sigma_arcsec": sigma[:, 1].copy(),
             },
         )
-        if self.span is not None:
-            low, high = self.span
-            states = states.filter(pa.array((rows.time_ns >= low) & (rows.time_ns < high)))
         self._tables.append(states)
 
     def _judge(self, received: Sequence[Received]) -> None:
-        """Take decoded states, or leave them out with a reason."""
-        for one in received:
-            state: State = one.record
+        """Take decoded states; invalid ones become rejects."""
+        for item in received:
+            state: StateMessage = item.message
             reason = fault(state.time_ns, state.sensor_id) or _state_fault(state)
             if reason is not None:
-                self._leave_out(one, reason)
+                self._leave_out(item, reason)
                 continue
             if len(state.attitude_xyzw) and not _is_attitude(state.attitude_xyzw):
-                self._leave_out(one, "bad_attitude")
+                self._leave_out(item, Reason.BAD_ATTITUDE)
                 state = state._replace(attitude_xyzw=state.attitude_xyzw[:0])
-            self._write(state, one.record.time_ns)
+            self._write(state, item.message.time_ns)
 
-    def _leave_out(self, one: Received, reason: str) -> None:
+    def _leave_out(self, item: Received, reason: Reason) -> None:
         self.rejects.add(
             reason,
-            time_ns=one.record.time_ns or one.log_time_ns,
-            offset=one.offset,
-            sensor_id=known_id(one.record.sensor_id),
+            time_ns=item.message.time_ns or item.log_time_ns,
+            offset=item.offset,
+            sensor_id=known_id(item.message.sensor_id),
         )
 
-    def _write(self, state: State, time_ns: int) -> None:
+    def _write(self, state: StateMessage, time_ns: int) -> None:
         rows, n = self._rows, self._n
         rows.sensor[n] = self._sensors.code(state.sensor_id)
         rows.frame[n] = _FRAMES.code(state.frame)
@@ -135,20 +129,20 @@ class StateColumns:
         self._n = n + 1
 
 
-def _state_fault(state: State) -> str | None:
+def _state_fault(state: StateMessage) -> Reason | None:
     if state.frame not in STATE_FRAMES:
-        return "unknown_frame"
-    # A length is finite only if every component is.
+        return Reason.UNKNOWN_FRAME
+    # The length is finite only if every component is finite.
     radius_km = math.hypot(*state.position_km)
     if len(state.position_km) != 3 or not radius_km <= FARTHEST_KM:
-        return "bad_position"
+        return Reason.BAD_POSITION
     velocity = state.velocity_km_s
     if len(velocity) not in (0, 3) or not math.isfinite(math.hypot(*velocity)):
-        return "bad_velocity"
-    return "inside_earth" if radius_km < EARTH_RADIUS_KM else None
+        return Reason.BAD_VELOCITY
+    return Reason.INSIDE_EARTH if radius_km < LOWEST_KM else None
 
 
 def _is_attitude(q: Array) -> bool:
-    """Return whether these are the numbers of a unit quaternion, rounded perhaps."""
+    """Return whether the numbers are a unit quaternion, but for rounding."""
     norm = math.hypot(*q) if len(q) == 4 else math.nan
     return abs(norm - 1.0) < QUATERNION_TOLERANCE

@@ -1,4 +1,4 @@
-"""A log that is fetched in blocks, each once, of which only a few are held."""
+"""A remote log, fetched in blocks. Each block is fetched once, and a few are kept."""
 
 import hashlib
 from collections import OrderedDict, deque
@@ -6,15 +6,15 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 
 BLOCK_BYTES = 4 << 20
-AHEAD = 2  # blocks that are fetched while the ones before them are looked at
-KEPT = 4  # blocks held at most: those ahead, and the latest
+AHEAD = 2  # blocks that are fetched while the block before them is read
+KEPT = 4  # blocks in memory at most: those ahead and the latest
 
 
 class BlockReader:
-    """Ranges of something far away, for one thread at a time.
+    """Reads ranges of a remote file; for one thread at a time.
 
-    Before `stream` every read is one of its own, for what lies scattered; from then on blocks
-    are fetched ahead, and the SHA-256 is made of them as they pass.
+    Before `stream`, each read fetches its own range, which suits scattered reads. After it, blocks
+    are fetched ahead, and the SHA-256 is computed from them.
     """
 
     def __init__(
@@ -29,7 +29,7 @@ class BlockReader:
         self._hash = _BlockHash()
 
     def stream(self) -> None:
-        """Fetch blocks ahead from now on: it is about to be read from front to back."""
+        """Fetch blocks ahead from now on: the file will be read from front to back."""
         if self._pool is None:
             self._pool = ThreadPoolExecutor(AHEAD, "fetch log")
 
@@ -38,14 +38,14 @@ class BlockReader:
         if self._pool is None or start >= end:
             return self._fetch(start, end)
         first, last = start // BLOCK_BYTES, (end - 1) // BLOCK_BYTES
-        parts = []
+        pieces = []
         for k in range(first, last + 1):
             low = k * BLOCK_BYTES
-            parts.append(self._block(k)[max(start - low, 0) : end - low])
-        return parts[0] if len(parts) == 1 else b"".join(parts)
+            pieces.append(self._block(k)[max(start - low, 0) : end - low])
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
     def sha256(self) -> str:
-        """Return the SHA-256 of the whole, of which the rest is fetched now.
+        """Return the SHA-256 of the whole file; what is still missing is fetched now.
 
         What `check` raises is raised here, when everything has been fetched.
         """
@@ -56,13 +56,13 @@ class BlockReader:
         return self._hash.hexdigest()
 
     def close(self) -> None:
-        """End what is under way."""
+        """Cancel the fetches that have not begun, and end the threads."""
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
         self._hash.close()
 
     def _block(self, k: int) -> memoryview:
-        """Return a block; those before it that were never looked at are hashed first."""
+        """Return a block; blocks before it that were not read yet are hashed first."""
         for passed in range(self._hash.n_taken, k):
             self._hash.take(self._fetched(passed))
         block = self._fetched(k)
@@ -87,7 +87,7 @@ class BlockReader:
 
 
 class _BlockHash:
-    """The SHA-256 of blocks, one behind the other, made beside the work on them."""
+    """The SHA-256 of consecutive blocks, computed by a thread while they are read."""
 
     def __init__(self) -> None:
         self.n_taken = 0
@@ -103,7 +103,7 @@ class _BlockHash:
             self._waiting.popleft().result()
 
     def hexdigest(self) -> str:
-        """Return the hash of all that was taken."""
+        """Return the hash of all blocks that were added."""
         while self._waiting:
             self._waiting.popleft().result()
         return self._digest.hexdigest()

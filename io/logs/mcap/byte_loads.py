@@ -1,4 +1,4 @@
-"""Little-endian numbers out of bytes, wherever they begin, for compiled loops."""
+"""Little-endian numbers out of bytes at any place, for compiled loops."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ from numba.extending import intrinsic
 
 
 def _load(bits: int, kind: Any) -> Any:
-    """Return a function of (bytes, place): one load, which numba cannot say of itself.
+    """Return a function of (bytes, place): one load instruction, for which numba has no function.
 
-    The bytes must reach that far: nothing is checked.
+    The bytes must reach beyond the number: no bound is checked.
     """
 
     @intrinsic

@@ -1,7 +1,7 @@
 """The bytes of a log, wherever it is kept.
 
-A file is read, not mapped: a mapped file that is cut short by someone else ends the process
-that looks at it, without a word.
+A file is read, not mapped: if another program cuts a mapped file short, the process that reads it
+is killed without a message.
 """
 
 import hashlib
@@ -15,28 +15,28 @@ from epipole.io.logs.mcap.blocks import BlockReader
 from epipole.io.remote_files import open_remote
 from epipole.schemas.errors import LogError
 
-HASHED_BYTES = 1 << 20  # of a file at once
-NEAR_BYTES = 1 << 16  # read at once where little is asked for: what follows is mostly next
+HASHED_BYTES = 1 << 20  # of a file that are hashed at once
+NEAR_BYTES = 1 << 16  # read at once for a small range: the next range mostly follows it
 
 
 class Reader(Protocol):
-    """How the bytes of a log are had."""
+    """Reads the bytes of one log."""
 
     def stream(self) -> None:
-        """Prepare for being read from front to back."""
+        """Prepare for reading from front to back."""
 
     def read(self, start: int, end: int) -> bytes | memoryview:
-        """Return the bytes from `start` to before `end`, or fewer where there are no more."""
+        """Return the bytes from `start` to before `end`, or fewer where the log ends."""
 
     def sha256(self) -> str:
         """Return the SHA-256 of the whole."""
 
     def close(self) -> None:
-        """End what is under way, and let go of what is held."""
+        """End all work in the background, and release the file."""
 
 
 class LogBytes:
-    """The bytes of one log, of the size that it has when it is opened; a context manager.
+    """The bytes of one log, of the size that it had when it was opened; a context manager.
 
     For one thread at a time.
     """
@@ -44,11 +44,6 @@ class LogBytes:
     def __init__(self, where: str, size: int, reader: Reader) -> None:
         self._where, self._size, self._reader = where, size, reader
         self.stream, self.close = reader.stream, reader.close
-
-    @classmethod
-    def of(cls, data: bytes) -> Self:
-        """Return bytes in memory as those of a log."""
-        return cls("memory", len(data), BlockReader(len(data), lambda start, end: data[start:end]))
 
     def __len__(self) -> int:
         return self._size
@@ -70,7 +65,7 @@ class LogBytes:
         Raises
         ------
         LogError
-            Where they cannot be read, or are there no more.
+            Where they cannot be read, or the log has become shorter.
         """
         data = self._reader.read(start, end)
         if len(data) < end - start:
@@ -83,7 +78,7 @@ class LogBytes:
         Raises
         ------
         LogError
-            Where it cannot be read, or is no longer the log that was opened.
+            Where it cannot be read, or has changed since it was opened.
         """
         return self._reader.sha256()
 
@@ -91,7 +86,7 @@ class LogBytes:
 def open_log(where: str) -> LogBytes:
     """Return the bytes of a local file, or of an fsspec URL such as ``s3://bucket/a.mcap``.
 
-    Of a URL the ranges that are looked at are fetched.
+    Of a URL only the ranges that are read are fetched.
 
     Raises
     ------
@@ -114,7 +109,7 @@ def open_log(where: str) -> LogBytes:
 
 
 class _FileReader:
-    """A file, read where it is looked at, and hashed beside that by a thread of its own."""
+    """A local file; a thread hashes it while it is read."""
 
     def __init__(self, where: str, size: int, descriptor: int) -> None:
         self._where, self._size, self._descriptor = where, size, descriptor
@@ -138,16 +133,16 @@ class _FileReader:
     def _read(self, start: int, end: int) -> bytes:
         data = b""
         try:
-            while start < end and (part := os.pread(self._descriptor, end - start, start)):
-                data = data + part if data else part
-                start += len(part)
+            while start < end and (piece := os.pread(self._descriptor, end - start, start)):
+                data = data + piece if data else piece
+                start += len(piece)
         except OSError as error:
             raise self._unreadable(error) from error
         return data
 
     def sha256(self) -> str:
         self.stream()
-        assert self._hashing is not None  # `stream` has begun it
+        assert self._hashing is not None  # `stream` starts it
         return self._hashing.result()
 
     def close(self) -> None:
@@ -176,5 +171,5 @@ class _FileReader:
 def _has_shrunk(where: str, size: int) -> LogError:
     return LogError(
         f"{where}: has become shorter than {size:,} bytes while it was read; "
-        "read it when nobody writes it"
+        "read it when no program writes to it"
     )

@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.record_scan import SCHEMA
+from epipole.schemas.rejects import Reason
 
 
 class Channel(NamedTuple):
-    """What a channel carries, by the name of its schema, and in which encoding."""
+    """A channel: its topic, the encoding of its messages and the name of their schema."""
 
     topic: str
     encoding: str
@@ -20,10 +21,10 @@ class Channel(NamedTuple):
 class ChannelTable:
     """Channels by number; a later declaration replaces an earlier one."""
 
-    wanted: frozenset[str]  # names of the schemas whose messages are asked for
+    wanted: frozenset[str]  # names of the schemas whose messages are wanted
     _schemas: dict[int, str] = field(default_factory=dict)
     _channels: dict[int, tuple[str, str, int]] = field(default_factory=dict)
-    _found: dict[int, Channel | None] = field(default_factory=dict)
+    _known: dict[int, Channel | None] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
         return bool(self._channels)
@@ -31,18 +32,13 @@ class ChannelTable:
     def __contains__(self, number: int) -> bool:
         return number in self._channels
 
-    def knows(self, number: int) -> bool:
-        """Return whether a channel and its schema have been declared."""
-        channel = self._channels.get(number)
-        return channel is not None and (channel[2] == 0 or channel[2] in self._schemas)
-
     def declare(self, opcode: int, data: Any, at: int, end: int) -> None:
-        """Take the body of a schema or a channel.
+        """Read the body of a schema or channel record.
 
         Raises
         ------
         ChunkError
-            Where it is none.
+            Where the body is invalid.
         """
         try:
             number = struct.unpack_from("<H", data, at)[0]
@@ -53,14 +49,14 @@ class ChannelTable:
                 topic, at = string(data, at + 4, end)
                 self._channels[number] = (topic, string(data, at, end)[0], schema)
         except (struct.error, UnicodeDecodeError) as error:
-            raise ChunkError("damaged_chunk") from error
-        self._found.clear()
+            raise ChunkError(Reason.DAMAGED_CHUNK) from error
+        self._known.clear()
 
     def find(self, number: int) -> Channel | None:
-        """Return a channel, or None where its messages are not asked for or it is unknown."""
-        if number not in self._found:
-            self._found[number] = self._find(number)
-        return self._found[number]
+        """Return a channel, or None where it is unknown or its messages are not wanted."""
+        if number not in self._known:
+            self._known[number] = self._find(number)
+        return self._known[number]
 
     def _find(self, number: int) -> Channel | None:
         if number not in self._channels:
@@ -71,8 +67,8 @@ class ChannelTable:
 
 
 def string(data: Any, at: int, end: int) -> tuple[str, int]:
-    """Return a string of MCAP and the place behind it; raise ChunkError where it is longer."""
+    """Return an MCAP string and the place after it; raise ChunkError where it passes `end`."""
     (length,) = struct.unpack_from("<I", data, at)
     if at + 4 + length > end:
-        raise ChunkError("damaged_chunk")
+        raise ChunkError(Reason.DAMAGED_CHUNK)
     return bytes(data[at + 4 : at + 4 + length]).decode(), at + 4 + length

@@ -1,4 +1,4 @@
-"""Chunks of a log: what their heads say, and their records, checked before they are believed."""
+"""Chunks of a log: their heads and their records, checked before they are used."""
 
 import struct
 import zlib
@@ -10,19 +10,20 @@ from epipole.io.logs.mcap.channels import string
 from epipole.io.logs.mcap.compression import ChunkError, decompress, decompress_part
 from epipole.io.logs.mcap.record_scan import RecordIndex, index_records
 from epipole.io.logs.mcap.summary import RECORD
+from epipole.schemas.rejects import Reason
 
-# A chunk holds a few MiB; one that claims more than this is damage or an attack.
+# A chunk has a few MiB. A chunk that declares more than this is damaged or an attack.
 MAX_CHUNK_BYTES = 256 << 20
 
-# What its record may take in the file: bytes that cannot be made smaller grow a little.
+# Limit of its record in the file: compression enlarges random bytes a little.
 MAX_RECORD_BYTES = MAX_CHUNK_BYTES + (4 << 20)
-HEAD_BYTES = 256  # of a record's beginning, with room for the name of a compression
+HEAD_BYTES = 256  # of the beginning of a chunk record; its head is shorter
 
 _HEAD = struct.Struct("<QQQI")
 
 
 class ChunkHead(NamedTuple):
-    """What a chunk says of itself; `body` to `end` are its compressed records in the file."""
+    """The head of a chunk; its compressed records lie from `body` to `end` in the file."""
 
     start_ns: int
     end_ns: int
@@ -34,12 +35,12 @@ class ChunkHead(NamedTuple):
 
 
 class OpenedChunk(NamedTuple):
-    """A chunk's records and where they lie, or why they are left out."""
+    """The records of a chunk and where they lie, or the reason for leaving them out."""
 
     start_ns: int
     records: bytes
     places: RecordIndex
-    reason: str = ""
+    reason: Reason | None = None
 
 
 def read_head(data: memoryview, at: int) -> ChunkHead:
@@ -48,40 +49,40 @@ def read_head(data: memoryview, at: int) -> ChunkHead:
     Raises
     ------
     ChunkError
-        Where it is none.
+        Where the head is invalid.
     """
     try:
         start_ns, end_ns, size, checksum = _HEAD.unpack_from(data, RECORD.size)
         compression, body = string(data, RECORD.size + _HEAD.size, len(data))
         (length,) = struct.unpack_from("<Q", data, body)
     except (struct.error, UnicodeDecodeError) as error:
-        raise ChunkError("damaged_chunk") from error
+        raise ChunkError(Reason.DAMAGED_CHUNK) from error
     body += at + 8
     return ChunkHead(start_ns, end_ns, size, checksum, compression, body, body + length)
 
 
 def open_chunk(chunk: memoryview) -> OpenedChunk:
-    """Return the records of a chunk, given whole."""
+    """Return the records of a complete chunk."""
     start_ns = 0
     try:
         head = read_head(chunk, 0)
         if head.end != len(chunk):
-            raise ChunkError("damaged_chunk")
+            raise ChunkError(Reason.DAMAGED_CHUNK)
         start_ns = head.start_ns
         if head.size > MAX_CHUNK_BYTES:
-            raise ChunkError("chunk_too_large")
+            raise ChunkError(Reason.CHUNK_TOO_LARGE)
         records = decompress(chunk[head.body :], head.compression, head.size)
         if head.checksum and zlib.crc32(records) != head.checksum:
-            raise ChunkError("bad_checksum")
+            raise ChunkError(Reason.BAD_CHECKSUM)
     except ChunkError as error:
-        return _opened(start_ns, b"", str(error))
+        return _opened(start_ns, b"", error.reason)
     return _opened(start_ns, records)
 
 
 def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
-    """Return the first records of a chunk in which the file ends.
+    """Return the first records of a chunk that the end of the file cuts.
 
-    Its checksum cannot be verified; that it was cut is known, that it is wrong is not.
+    Its checksum cannot be verified, so the records are used without.
     """
     try:
         head = read_head(chunk, 0)
@@ -91,6 +92,6 @@ def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
     return _opened(head.start_ns, decompress_part(chunk[head.body :], head.compression, size))
 
 
-def _opened(start_ns: int, records: bytes, reason: str = "") -> OpenedChunk:
+def _opened(start_ns: int, records: bytes, reason: Reason | None = None) -> OpenedChunk:
     index = index_records(np.frombuffer(records, np.uint8))
     return OpenedChunk(start_ns, records, index, reason)

@@ -1,15 +1,21 @@
-"""Chunks of a log to plain bytes, never more of them than the chunk declares."""
+"""Chunks of a log to plain bytes, never more bytes than the chunk declares."""
 
 import lz4.frame
 import zstandard
 
+from epipole.schemas.rejects import Reason
+
 
 class ChunkError(Exception):
-    """A chunk that does not hold what it says; the message is the reason, in a word."""
+    """A chunk, or a record in it, that cannot be used."""
+
+    def __init__(self, reason: Reason) -> None:
+        super().__init__(reason.value)
+        self.reason = reason
 
 
 def decompress(data: memoryview, compression: str, size: int) -> bytes:
-    """Return the `size` bytes that a chunk's records take when they are not compressed.
+    """Return the records of a chunk, decompressed to `size` bytes.
 
     Raises
     ------
@@ -18,20 +24,20 @@ def decompress(data: memoryview, compression: str, size: int) -> bytes:
     """
     try:
         if compression == "zstd":
-            # The frame's own size comes first: the decoder would allocate that, whatever the cap.
+            # Checked first: the decoder allocates the size that the frame declares, without limit.
             if zstandard.frame_content_size(data) not in (-1, size):
-                raise ChunkError("wrong_chunk_size")
+                raise ChunkError(Reason.WRONG_CHUNK_SIZE)
             records = zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))
         elif compression == "lz4":
             records = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
         elif compression == "":
             records = bytes(data)
         else:
-            raise ChunkError("unknown_compression")
+            raise ChunkError(Reason.UNKNOWN_COMPRESSION)
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError) as error:
-        raise ChunkError("bad_compression") from error
+        raise ChunkError(Reason.BAD_COMPRESSION) from error
     if len(records) != size:
-        raise ChunkError("wrong_chunk_size")
+        raise ChunkError(Reason.WRONG_CHUNK_SIZE)
     return records
 
 
@@ -40,11 +46,11 @@ def decompress_part(data: memoryview, compression: str, size: int) -> bytes:
     try:
         if compression == "zstd":
             reader = zstandard.ZstdDecompressor().stream_reader(data)
-            parts = []
-            while size > 0 and (part := reader.read(min(size, 1 << 20))):
-                parts.append(part)
-                size -= len(part)
-            return b"".join(parts)
+            pieces = []
+            while size > 0 and (piece := reader.read(min(size, 1 << 20))):
+                pieces.append(piece)
+                size -= len(piece)
+            return b"".join(pieces)
         if compression == "lz4":
             return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size))
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError):

@@ -1,7 +1,7 @@
-"""Where the records of an MCAP file lie, by their lengths alone, with whatever damage it has.
+"""Where the records of an MCAP file lie, found by their lengths, in a damaged file too.
 
-The data section is walked from its start; the summary helps where a length is damaged: it
-knows the places of the chunks.
+The data section is walked from its start. Where a length is damaged, the walk goes on at the
+next chunk that the summary lists.
 """
 
 import struct
@@ -11,47 +11,41 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from epipole.io.logs.mcap.bytes import LogBytes
-from epipole.io.logs.mcap.channels import ChannelTable
 from epipole.io.logs.mcap.chunks import HEAD_BYTES, MAX_RECORD_BYTES, ChunkHead, read_head
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.record_scan import CHANNEL, MESSAGE, PRIVATE, SCHEMA, index_records
-from epipole.io.logs.mcap.summary import DATA_END, MAGIC, RECORD, Summary, next_log
+from epipole.io.logs.mcap.summary import DATA_END, MAGIC, RECORD, LogSummary, next_log
+from epipole.schemas.rejects import Reason
 
 HEADER, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA = 0x01, 0x06, 0x07, 0x09, 0x0C
 IGNORED = (ATTACHMENT, METADATA)
-LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # may lie in a chunk or outside
-RUN_BYTES = 4 << 20  # of records outside chunks that are walked at once
-
-# Reasons that are no damage, or not only.
-CUT, PASSED, ANOTHER_LOG = "cut", "passed", "log_behind_log"
+LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # records that may lie in a chunk or outside chunks
+RUN_BYTES = 4 << 20  # of records outside chunks that are indexed at once
 
 _INDEX = struct.Struct("<HI")  # of a message index: its channel, the bytes of its entries
 
 
 class Place(NamedTuple):
-    """Part of the data section: a record, a run of loose ones, or damage, which has a reason."""
+    """A stretch of the data section: a record, a run of loose records, or damage with a reason."""
 
     opcode: int
     at: int
     after: int
-    reason: str = ""
-    data: memoryview = memoryview(b"")  # whole, of a chunk that is to be opened or of a loose run
-    size: int = 0  # bytes of memory that its records take
-    counted: tuple[int, int] | None = None  # by a message index: channel, number of messages
+    reason: Reason | None = None
+    data: memoryview = memoryview(b"")  # of a chunk that is to be opened, or of a loose run
+    size: int = 0  # of its records in memory, in bytes
+    cut: bool = False  # whether the file ends in this chunk
+    counted: tuple[int, int] | None = None  # of a message index: channel, number of messages
 
 
 @dataclass
 class LogPlaces:
-    """The parts of one log's data section, in the order of the file."""
+    """The places in the data section of one log, in the order of the file."""
 
     data: LogBytes
-    summary: Summary
-    channels: ChannelTable
-    span: tuple[int, int] | None = None  # chunks logged wholly outside it need not be opened
-    always: frozenset[str] = frozenset()  # but for those with messages of these schemas
+    summary: LogSummary
 
     def __iter__(self) -> Iterator[Place]:
         data, end, at = self.data, len(self.data), len(MAGIC)
@@ -62,17 +56,17 @@ class LogPlaces:
             limit = end if skipped_to is None else skipped_to
             head = self._head(at) if opcode == CHUNK else None
             if head is not None and head.end <= limit:
-                after = head.end  # its own length, whatever its record says
+                after = head.end  # the length in the chunk counts, not that of its record
             if opcode == 0 or after > limit:
                 if skipped_to is None:
                     if opcode == CHUNK:
                         cut = data.view(at, min(end, at + MAX_RECORD_BYTES))
-                        yield Place(CHUNK, at, end, CUT, cut)
+                        yield Place(CHUNK, at, end, data=cut, cut=True)
                     break
-                yield Place(opcode, at, skipped_to, "damaged_record")
+                yield Place(opcode, at, skipped_to, Reason.DAMAGED_RECORD)
                 at = skipped_to
             elif opcode == DATA_END and (another := next_log(data, after)) is not None:
-                yield Place(0, another, another, ANOTHER_LOG)
+                yield Place(0, another, another, Reason.LOG_BEHIND_LOG)
                 at = another + len(MAGIC)
             elif opcode == DATA_END and length == 4 and self.summary.data_end in (None, at):
                 return
@@ -80,37 +74,31 @@ class LogPlaces:
                 place = self._place(opcode, at, after, limit, head)
                 yield place
                 at = place.after
-        yield Place(0, at, end, "truncated")
-
-    def chunk(self, at: int, after: int) -> Place:
-        """Return a chunk, to be opened."""
-        if after - at > MAX_RECORD_BYTES:
-            return Place(CHUNK, at, after, "chunk_too_large")
-        head = self._head(at)
-        return Place(CHUNK, at, after, "", self.data.view(at, after), head.size if head else 0)
+        yield Place(0, at, end, Reason.TRUNCATED)
 
     def _place(self, opcode: int, at: int, after: int, limit: int, head: ChunkHead | None) -> Place:
-        """Return the record from `at` to `after`, with more loose ones behind a loose one."""
+        """Return the record from `at` to `after`; a loose one together with those that follow."""
         if opcode == CHUNK:
-            if head is not None and self._may_pass(head, at, after):
-                return Place(CHUNK, at, after, PASSED)
-            return self.chunk(at, after)
+            if after - at > MAX_RECORD_BYTES:
+                return Place(CHUNK, at, after, Reason.CHUNK_TOO_LARGE)
+            size = 0 if head is None else head.size
+            return Place(CHUNK, at, after, None, self.data.view(at, after), size)
         if opcode == MESSAGE_INDEX and (index := self._index(at, after)) is not None:
             return Place(opcode, at, after, counted=index)
         if opcode in LOOSE:
             if after - at > MAX_RECORD_BYTES:
-                return Place(opcode, at, after, "damaged_record")
+                return Place(opcode, at, after, Reason.DAMAGED_RECORD)
             window = self.data.view(at, min(max(after, at + RUN_BYTES), limit))
             run = index_records(np.frombuffer(window, np.uint8), only_known=True)
             after = max(after, at + run.walked)
-            return Place(opcode, at, after, "", window[: after - at], after - at)
+            return Place(opcode, at, after, None, window[: after - at], after - at)
         if opcode == HEADER and self.data.view(at - len(MAGIC), at) == MAGIC:
             return Place(opcode, at, after)
-        foreign = opcode < PRIVATE and opcode not in IGNORED  # no such record in a data section
-        return Place(opcode, at, after, "damaged_record" if foreign else "")
+        foreign = opcode < PRIVATE and opcode not in IGNORED  # not of a data section
+        return Place(opcode, at, after, Reason.DAMAGED_RECORD if foreign else None)
 
     def _next_chunk(self, at: int) -> int | None:
-        """Return the first place behind `at` where the summary knows of a chunk."""
+        """Return the first place after `at` where the summary lists a chunk."""
         offsets = self.summary.chunk_offsets
         i = bisect_right(offsets, at)
         return offsets[i] if i < len(offsets) else None
@@ -121,43 +109,8 @@ class LogPlaces:
         except ChunkError:
             return None
 
-    def _may_pass(self, head: ChunkHead, at: int, after: int) -> bool:
-        """Return whether a chunk is of another time for certain, and nothing else needs it.
-
-        The log must have been closed: its summary has the channels that a chunk may declare.
-        The chunk's times must be those of the indexes behind it. The first and the last are
-        always opened: they show whether messages are logged at the time that they are of.
-        """
-        offsets = self.summary.chunk_offsets
-        if self.span is None or not self.summary.sound or at in (offsets[:1] + offsets[-1:]):
-            return False
-        low, high = self.span
-        if not (head.start_ns <= head.end_ns < low or high <= head.start_ns <= head.end_ns):
-            return False
-        indexes = list(self._indexes_behind(after))
-        return bool(indexes) and all(
-            self.channels.knows(number)
-            and getattr(self.channels.find(number), "schema", "") not in self.always
-            and len(time_ns)
-            and head.start_ns <= time_ns.min()
-            and time_ns.max() <= head.end_ns
-            for number, time_ns in indexes
-        )
-
-    def _indexes_behind(self, at: int) -> Iterator[tuple[int, npt.NDArray[np.uint64]]]:
-        """Yield the channel and the times of each message index from `at` on."""
-        while at + RECORD.size <= len(self.data):
-            opcode, length = RECORD.unpack(self.data.view(at, at + RECORD.size))
-            start, at = at, at + RECORD.size + length
-            if opcode != MESSAGE_INDEX or at > len(self.data) or length > MAX_RECORD_BYTES:
-                return
-            if (index := self._index(start, at)) is None:
-                return
-            entries = self.data.view(start + RECORD.size + _INDEX.size, at)
-            yield index[0], np.frombuffer(entries, "<u8")[::2]
-
     def _index(self, at: int, after: int) -> tuple[int, int] | None:
-        """Return the channel of a message index and how many messages it has; None: it is none."""
+        """Return the channel and the number of messages of a message index; None if invalid."""
         body = at + RECORD.size
         if after - body < _INDEX.size:
             return None

@@ -11,7 +11,7 @@ from epipole.io.logs.mcap.byte_loads import load_uint16, load_uint64
 Bytes = npt.NDArray[np.uint8]
 
 SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
-PRIVATE = 0x80  # from here on records are someone's own, and skipped
+PRIVATE = 0x80  # opcodes from here on are private to some program; such records are skipped
 HEAD_BYTES = 9  # of a record: its type, its length
 MESSAGE_BYTES = 22  # of a message before its data: channel, sequence, two times
 
@@ -19,8 +19,8 @@ MESSAGE_BYTES = 22  # of a message before its data: channel, sequence, two times
 class RecordIndex(NamedTuple):
     """The messages, schemas and channels among records, in their order.
 
-    `time_ns` and `channel` are 0 but for messages. `start` to `end` is a message's data, and
-    the whole body of a schema or channel.
+    `time_ns` and `channel` are of messages, and 0 for other records. `start` to `end` are the
+    data of a message, or the whole body of a schema or channel.
     """
 
     opcode: npt.NDArray[np.uint8]
@@ -28,8 +28,8 @@ class RecordIndex(NamedTuple):
     time_ns: npt.NDArray[np.uint64]
     start: npt.NDArray[np.int64]
     end: npt.NDArray[np.int64]
-    n_strange: int  # records that have no place here, and messages too short to be one
-    walked: int  # bytes up to where the walk ended: all of them, unless it met damage
+    n_strange: int  # records that do not belong here, and messages that are too short
+    walked: int  # bytes up to the end of the walk: all bytes, unless there is damage
 
 
 def index_records(data: Bytes, only_known: bool = False) -> RecordIndex:
@@ -38,9 +38,9 @@ def index_records(data: Bytes, only_known: bool = False) -> RecordIndex:
     Parameters
     ----------
     data
-        Records one behind the other.
+        Consecutive records.
     only_known
-        End at the first record that is no message, schema or channel, rather than pass over it.
+        End at the first record that is not a message, schema or channel. Else it is skipped.
     """
     n, walked, n_strange = _walk(data, only_known, *_columns(0))
     columns = _columns(n)

@@ -1,10 +1,9 @@
-"""The records of an MCAP file, walked one by one, with whatever damage the file has.
+"""The records of an MCAP file, which may be damaged.
 
-The data section is walked from its start and the summary is not trusted to be complete:
-a log that was cut off, or never closed, gives the messages it holds. A chunk whose
-checksum, size or compression does not hold is left out and reported. The summary helps
-where it can: it has the schemas and channels again, the places of the chunks (to go on
-behind a damaged record), and the number of messages (to know that one is missing).
+The data section is read from its start, so that a log that was cut short or never closed gives
+the messages that it has. A chunk with a wrong checksum, size or compression is left out and
+reported. The summary is used where it is valid. It repeats the schemas and channels, lists the
+chunks (to continue after a damaged record) and counts the messages (to notice missing ones).
 """
 
 import struct
@@ -24,11 +23,12 @@ from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.channels import Channel, ChannelTable
 from epipole.io.logs.mcap.chunks import OpenedChunk, open_chunk, open_cut_chunk
 from epipole.io.logs.mcap.compression import ChunkError
-from epipole.io.logs.mcap.places import CHUNK, CUT, LOOSE, PASSED, LogPlaces, Place
+from epipole.io.logs.mcap.places import CHUNK, LOOSE, LogPlaces, Place
 from epipole.io.logs.mcap.record_scan import MESSAGE, Bytes, RecordIndex, index_records
-from epipole.io.logs.mcap.summary import RECORD, Summary, read_summary
+from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
+from epipole.schemas.rejects import Reason
 
-AHEAD_BYTES = 8 << 20  # of chunks that are opened while the ones before them are decoded
+AHEAD_BYTES = 8 << 20  # of chunks that are opened while the chunk before them is decoded
 
 Numbers = npt.NDArray[np.int64]
 
@@ -42,69 +42,53 @@ class Block(NamedTuple):
     time_ns: npt.NDArray[np.uint64]  # when it was logged
     start: Numbers
     end: Numbers
-    offset: Numbers  # place in the file of its chunk, or its own outside chunks
+    offset: Numbers  # place in the file of its chunk; outside chunks, of the message
 
 
 class Damage(NamedTuple):
-    """Something of the file that was left out: where, when (0: unknown), why, how many."""
+    """Messages that were left out: where, when (0: unknown), why, how many."""
 
     offset: int
     time_ns: int
-    reason: str
+    reason: Reason
     n: int
 
 
 @dataclass
 class RecordWalk:
-    """A walk over the bytes of one log; `damage` is complete when `blocks` has ended."""
+    """Reads the records of one log; `damage` is complete when `blocks` has ended."""
 
     data: LogBytes
-    wanted: frozenset[str]  # names of the schemas whose messages are asked for
-    pool: Executor | None = None  # opens chunks while the ones before them are decoded
-    span: tuple[int, int] | None = None  # chunks logged wholly outside it need not be opened
-    always: frozenset[str] = frozenset()  # but for those with messages of these schemas
+    wanted: frozenset[str]  # names of the schemas whose messages are wanted
+    pool: Executor | None = None  # opens chunks while the chunk before them is decoded
     damage: list[Damage] = field(default_factory=list)
-    _summary: Summary = field(default_factory=Summary)
+    _summary: LogSummary = field(default_factory=LogSummary)
     _unknown: dict[int, int] = field(default_factory=dict)
     _counts: dict[int, int] = field(default_factory=dict)
-    _lost: dict[int, int] = field(default_factory=dict)  # messages of a damage, by its index
-    _lost_chunk: int | None = None  # the damage that message indexes now belong to
-    _passed: list[Place] = field(default_factory=list)  # chunks that were not opened
-    _passing: bool = False  # whether message indexes now belong to one of them
+    _lost: dict[int, int] = field(default_factory=dict)  # lost messages, by index of `damage`
+    _lost_chunk: int | None = None  # index in `damage` of the chunk that message indexes follow
 
     def __post_init__(self) -> None:
         self._channels = ChannelTable(self.wanted)
-        self._places = LogPlaces(self.data, self._summary, self._channels, self.span, self.always)
+        self._places = LogPlaces(self.data, self._summary)
 
     def blocks(self) -> Iterator[Block]:
         """Yield the wanted messages in the order of the file."""
         self._places.summary = self._summary = read_summary(self.data, self._channels)
         self.data.stream()
-        yield from self._walk(self._places)
-        self._report_missing()
-
-    def pass_no_more(self) -> None:
-        """Open every chunk from now on: the times of the log cannot be trusted."""
-        self._places.span = None
-
-    def passed_blocks(self) -> Iterator[Block]:
-        """Yield the wanted messages of the chunks that `blocks` has passed over."""
-        passed, self._passed = self._passed, []
-        yield from self._walk(self._places.chunk(place.at, place.after) for place in passed)
-
-    def _walk(self, places: Iterable[Place]) -> Iterator[Block]:
-        for place, opening in self._opened_ahead(places):
+        for place, opening in self._opened_ahead(self._places):
             yield from self._walk_place(place, opening)
+        self._report_missing()
 
     def _opened_ahead(
         self, places: Iterable[Place]
     ) -> Iterator[tuple[Place, Future[OpenedChunk] | None]]:
-        """Yield the places, each chunk with its opening under way if there is a pool."""
+        """Yield the places; if there is a pool, it is already opening their chunks."""
         waiting: deque[tuple[Place, Future[OpenedChunk] | None]] = deque()
         ahead = 0
         for place in places:
             opening = None
-            if self.pool is not None and place.opcode == CHUNK and not place.reason:
+            if self.pool is not None and place.opcode == CHUNK and not (place.reason or place.cut):
                 opening = self.pool.submit(open_chunk, place.data)
             waiting.append((place, opening))
             ahead += place.size
@@ -114,18 +98,15 @@ class RecordWalk:
                 yield first, opening
         yield from waiting
 
-    # What is there
+    # What is in the file
 
     def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
-        if place.reason == CUT:
+        if place.cut:
             yield from self._walk_chunk(place.at, open_cut_chunk(place.data), cut=True)
-        elif place.reason == PASSED:
-            self._passed.append(place)
-            self._passing = True
         elif place.reason:
             self._leave_out(place.at, 0, place.reason)
             if place.opcode == CHUNK:
-                self._lost_chunk, self._passing = len(self.damage) - 1, False
+                self._lost_chunk = len(self.damage) - 1
         elif place.opcode == CHUNK:
             opened = open_chunk(place.data) if opening is None else opening.result()
             yield from self._walk_chunk(place.at, opened)
@@ -136,7 +117,7 @@ class RecordWalk:
 
     def _walk_chunk(self, at: int, opened: OpenedChunk, cut: bool = False) -> Iterator[Block]:
         """Yield the messages of a chunk; `cut`: its last record may be incomplete."""
-        self._lost_chunk, self._passing = None, False
+        self._lost_chunk = None
         start_ns, records, index, reason = opened
         if reason:
             self._leave_out(at, start_ns, reason)
@@ -145,9 +126,9 @@ class RecordWalk:
         offset = np.full(len(index.start), at)
         yield from self._walk_index(_bytes(records), index, offset, start_ns)
         if index.n_strange:
-            self._leave_out(at, start_ns, "damaged_record", index.n_strange)
+            self._leave_out(at, start_ns, Reason.DAMAGED_RECORD, index.n_strange)
         if index.walked < len(records) and not cut:
-            self._leave_out(at, start_ns, "damaged_chunk")
+            self._leave_out(at, start_ns, Reason.DAMAGED_CHUNK)
 
     def _walk_loose(self, place: Place) -> Iterator[Block]:
         """Yield the messages of a run of records outside chunks."""
@@ -156,20 +137,20 @@ class RecordWalk:
         offset = at + index.start - RECORD.size
         offset[index.opcode == MESSAGE] -= 22
         if index.n_strange:
-            self._leave_out(at, 0, "damaged_record", index.n_strange)
+            self._leave_out(at, 0, Reason.DAMAGED_RECORD, index.n_strange)
         for block in self._walk_index(data, index, offset, 0):
             if self._sound_outside_chunks:
                 yield block
             else:
-                for lost, time_ns in zip(block.offset, block.time_ns, strict=True):
-                    self._leave_out(int(lost), int(time_ns), "bad_checksum")
+                for offset_of_lost, time_ns in zip(block.offset, block.time_ns, strict=True):
+                    self._leave_out(int(offset_of_lost), int(time_ns), Reason.BAD_CHECKSUM)
 
     @cached_property
     def _sound_outside_chunks(self) -> bool:
-        """Whether the data section holds its checksum, the only one of messages outside chunks."""
+        """Whether the data section fits its checksum; messages outside chunks have no other."""
         at = self._summary.data_end
         if at is None:
-            return True  # an unclosed log has none
+            return True  # a log that was never closed has no checksum
         (expected,) = struct.unpack("<I", self.data.view(at + RECORD.size, at + RECORD.size + 4))
         checksum = 0
         for low in range(0, at if expected else 0, BLOCK_BYTES):
@@ -179,7 +160,7 @@ class RecordWalk:
     def _walk_index(
         self, data: Bytes, index: RecordIndex, offset: Numbers, start_ns: int
     ) -> Iterator[Block]:
-        """Yield the runs of messages between declarations."""
+        """Yield the runs of messages between declarations of schemas and channels."""
         declared = np.flatnonzero(index.opcode != MESSAGE)
         at = 0
         for i in [*declared.tolist(), len(index.opcode)]:
@@ -192,29 +173,29 @@ class RecordWalk:
             try:
                 self._channels.declare(int(index.opcode[i]), data.data, start, end)
             except ChunkError:
-                self._leave_out(int(offset[i]), start_ns, "damaged_record")
+                self._leave_out(int(offset[i]), start_ns, Reason.DAMAGED_RECORD)
 
     def _wanted(
-        self, data: Bytes, index: RecordIndex, offset: Numbers, part: slice
+        self, data: Bytes, index: RecordIndex, offset: Numbers, run: slice
     ) -> Iterator[Block]:
-        """Yield the messages of a run that are asked for; all of them are counted."""
-        channel = index.channel[part]
+        """Yield the wanted messages of a run; all messages are counted."""
+        channel = index.channel[run]
         wanted: dict[int, Channel] = {}
         counts = np.bincount(channel)
         for number in np.flatnonzero(counts).tolist():
             n = int(counts[number])
             self._counts[number] = self._counts.get(number, 0) + n
-            found = self._channels.find(number)
-            if found is not None:
-                wanted[number] = found
+            known = self._channels.find(number)
+            if known is not None:
+                wanted[number] = known
             elif number not in self._channels:
                 self._unknown[number] = self._unknown.get(number, 0) + n
         columns: list[npt.NDArray[Any]] = [
             channel,
-            index.time_ns[part],
-            index.start[part],
-            index.end[part],
-            offset[part],
+            index.time_ns[run],
+            index.start[run],
+            index.end[run],
+            offset[run],
         ]
         if np.count_nonzero(counts) > len(wanted):
             asked = np.zeros(len(counts), bool)
@@ -224,16 +205,13 @@ class RecordWalk:
         if wanted:
             yield Block(data, wanted, *columns)
 
-    # What is missing
+    # What is missing in it
 
-    def _leave_out(self, offset: int, time_ns: int, reason: str, count: int = 1) -> None:
+    def _leave_out(self, offset: int, time_ns: int, reason: Reason, count: int = 1) -> None:
         self.damage.append(Damage(offset, time_ns, reason, count))
 
     def _count_lost(self, number: int, n: int) -> None:
-        """Count the messages of a chunk that is left out or passed, by an index behind it."""
-        if self._passing:
-            self._counts[number] = self._counts.get(number, 0) + n
-            return
+        """Count the messages of a chunk that is left out, by an index after it."""
         if self._lost_chunk is None or (self._channels and not self._channels.find(number)):
             return
         self._counts[number] = self._counts.get(number, 0) + n
@@ -243,7 +221,7 @@ class RecordWalk:
 
     def _report_missing(self) -> None:
         for _, count in sorted(self._unknown.items()):
-            self._leave_out(0, 0, "unknown_channel", count)
+            self._leave_out(0, 0, Reason.UNKNOWN_CHANNEL, count)
         declared = self._summary.declared
         missing = sum(
             max(0, count - self._counts.get(number, 0))
@@ -251,7 +229,7 @@ class RecordWalk:
             if self._channels.find(number)
         )
         if missing:
-            self._leave_out(0, 0, "missing_messages", missing)
+            self._leave_out(0, 0, Reason.MISSING_MESSAGES, missing)
 
 
 def _bytes(data: bytes | memoryview) -> Bytes:

@@ -1,4 +1,4 @@
-"""The summary at the end of a log: channels again, where chunks are, how many messages."""
+"""The summary at the end of a log: its channels, its chunks and how many messages it has."""
 
 import struct
 import zlib
@@ -8,71 +8,67 @@ from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.channels import ChannelTable
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.record_scan import CHANNEL, PRIVATE, SCHEMA
+from epipole.schemas.rejects import Reason
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, CHUNK_INDEX, STATISTICS, DATA_END = 0x02, 0x08, 0x0B, 0x0F
 # Schemas, channels, indexes of chunks, attachments and metadata, statistics, offsets.
 SUMMARY = frozenset((SCHEMA, CHANNEL, CHUNK_INDEX, 0x0A, STATISTICS, 0x0D, 0x0E))
-RECORD = struct.Struct("<BQ")  # its type, its length
+RECORD = struct.Struct("<BQ")  # opcode, length
 DATA_END_BYTES = RECORD.size + 4
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)
-# An index entry of a chunk takes about 100 bytes; a summary that claims more than this is none.
+# The index of a chunk takes about 100 bytes. A summary that declares more than this is invalid.
 MAX_SUMMARY_BYTES = 256 << 20
 
 
 @dataclass
-class Summary:
-    """What a summary says; it is never believed to be complete."""
+class LogSummary:
+    """What a summary declares; it may be incomplete."""
 
-    data_end: int | None = None  # where the data section ends, if the file is whole
+    data_end: int | None = None  # where the data section ends, if the log was closed
     chunk_offsets: list[int] = field(default_factory=list)  # sorted
     declared: dict[int, int] = field(default_factory=dict)  # messages of each channel
     logged_ns: tuple[int, int] | None = None  # when the first and the last message were logged
 
-    @property
-    def sound(self) -> bool:
-        """Whether there is a summary that is what its log was closed with."""
-        return self.data_end is not None and bool(self.declared)
 
-
-def read_summary(data: LogBytes, channels: ChannelTable) -> Summary:
-    """Return what the summary says, and declare its channels; empty where it is not sound."""
+def read_summary(data: LogBytes, channels: ChannelTable) -> LogSummary:
+    """Return the summary, and declare its channels; an invalid summary is empty."""
     end = len(data)
     at = end - _FOOTER_BYTES
     if at < len(MAGIC):
-        return Summary()
+        return LogSummary()
     footer = data.view(at, end)
     if footer[-len(MAGIC) :] != MAGIC or RECORD.unpack_from(footer) != (FOOTER, 20):
-        return Summary()
+        return LogSummary()
     start, _, checksum = struct.unpack_from("<QQI", footer, RECORD.size)
     data_end = (start or at) - DATA_END_BYTES
     if not max(len(MAGIC), at - MAX_SUMMARY_BYTES) <= data_end < at:
-        return Summary()
+        return LogSummary()
     tail = data.view(data_end, end)
     if RECORD.unpack_from(tail) != (DATA_END, 4):
-        return Summary()
+        return LogSummary()
     records = tail[DATA_END_BYTES : at - data_end]
     covered = tail[DATA_END_BYTES : len(tail) - len(MAGIC) - 4]
     if checksum and zlib.crc32(covered) != checksum:
-        return Summary()
-    summary = Summary(data_end)
+        return LogSummary()
+    summary = LogSummary(data_end)
     try:
         _read_records(records, at, summary, channels)
     except (struct.error, ChunkError):
-        return Summary()  # the walk does without
+        return LogSummary()  # the records are found without it
     summary.chunk_offsets.sort()
     return summary
 
 
 def _read_records(
-    data: memoryview, file_end: int, summary: Summary, channels: ChannelTable
+    data: memoryview, file_end: int, summary: LogSummary, channels: ChannelTable
 ) -> None:
     at = 0
     while at < len(data):
         opcode, length = RECORD.unpack_from(data, at)
         body, at = at + RECORD.size, at + RECORD.size + length
         if at > len(data) or _is_foreign(opcode):
-            raise ChunkError("damaged_summary")  # or the start is that of another log
+            raise ChunkError(Reason.DAMAGED_RECORD)  # or `start` belongs to another log
         if opcode in (SCHEMA, CHANNEL):
             channels.declare(opcode, data, body, at)
         elif opcode == CHUNK_INDEX:
@@ -88,7 +84,7 @@ def _read_records(
 
 
 def next_log(data: LogBytes, at: int) -> int | None:
-    """Return where another log begins behind the one whose data section ends at `at`."""
+    """Return where a second log begins after the one whose data section ends at `at`."""
     while at + RECORD.size <= len(data):
         opcode, length = RECORD.unpack(data.view(at, at + RECORD.size))
         at += RECORD.size + length
@@ -102,5 +98,5 @@ def next_log(data: LogBytes, at: int) -> int | None:
 
 
 def _is_foreign(opcode: int) -> bool:
-    """Return whether a record has no place in a summary."""
+    """Return whether a record does not belong into a summary."""
     return opcode not in SUMMARY and opcode < PRIVATE

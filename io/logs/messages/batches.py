@@ -1,4 +1,4 @@
-"""The messages of one kind in a block of a log: scanned where they are good, else decoded."""
+"""Messages of one kind out of a block of a log: scanned where they are good, else decoded."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -11,73 +11,108 @@ import numpy.typing as npt
 
 from epipole.io.logs.damage import RejectList
 from epipole.io.logs.mcap.records import Block
-from epipole.io.logs.messages.decoding import Record, UndecodableError, decoder
+from epipole.io.logs.messages.encodings.encoding import MessageEncoding, UndecodableError
+from epipole.io.logs.messages.encodings.registry import message_encodings
+from epipole.io.logs.messages.fields import FIELD_TYPES, no_fields
 from epipole.io.logs.messages.scan import Messages
-from epipole.io.logs.messages.wire import CDR, OTHER, PROTOBUF
+from epipole.schemas.messages import CALIBRATION, FRAME, STATE
+from epipole.schemas.rejects import Reason
 
 SENSOR_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}")
-MOST_AT_ONCE = 4096  # messages decoded one by one before the scan is tried again
-_SCANNED = {"protobuf": PROTOBUF, "cdr": CDR}
+MOST_AT_ONCE = 4096  # messages decoded one at a time before the scan is tried again
+BATCH_MESSAGES = 8192  # so that the located fields of a batch stay small
+UNDECODABLE = {
+    FRAME: Reason.UNDECODABLE_FRAME,
+    STATE: Reason.UNDECODABLE_STATE,
+    CALIBRATION: Reason.UNDECODABLE_CALIBRATION,
+}
+Indices = npt.NDArray[np.int64]
 
 
 @lru_cache(maxsize=4096)
 def valid_sensor_id(sensor_id: str) -> bool:
-    """Return whether an id is one: it names folders, so it must not leave them."""
+    """Return whether a sensor id is valid; it names folders, so it must not lead out of them."""
     return SENSOR_ID.fullmatch(sensor_id) is not None
 
 
-def fault(time_ns: int | None, sensor_id: str) -> str | None:
-    """Return why no message with this time and sensor can be used, if so."""
+def fault(time_ns: int | None, sensor_id: str) -> Reason | None:
+    """Return why a message with this time and sensor cannot be used, or None if it can."""
     if not valid_sensor_id(sensor_id):
-        return "bad_sensor_id"
-    return "no_timestamp" if time_ns is None else None
+        return Reason.BAD_SENSOR_ID
+    return Reason.NO_TIMESTAMP if time_ns is None else None
 
 
 def known_id(sensor_id: str) -> str | None:
-    """Return a sensor id, or None for what is none."""
+    """Return a sensor id, or None if it is invalid."""
     return sensor_id if valid_sensor_id(sensor_id) else None
 
 
 class Received(NamedTuple):
-    """A decoded message, where it lay and when it was logged."""
+    """A decoded message, its place in the log and when it was logged."""
 
-    record: Any
+    message: Any
     offset: int
     log_time_ns: int
 
 
+def batches_of(
+    block: Block, kind: str, chosen: Indices, rejects: RejectList
+) -> "Iterator[MessageBatch]":
+    """Yield the chosen messages of a block, which are all of one kind, in batches."""
+    for first in range(0, len(chosen), BATCH_MESSAGES):
+        yield MessageBatch(block, kind, chosen[first : first + BATCH_MESSAGES], rejects)
+
+
 @dataclass
-class Part:
-    """The messages of one kind in a block."""
+class MessageBatch:
+    """Messages of one kind in a block."""
 
     block: Block
-    carries: str
-    chosen: npt.NDArray[np.int64]  # which of the block's messages
+    kind: str  # FRAME, STATE or CALIBRATION
+    chosen: Indices  # which of the block's messages
     rejects: RejectList
 
     def __len__(self) -> int:
         return len(self.chosen)
 
+    @property
+    def n_bytes(self) -> int:
+        """The length of all messages together."""
+        return int((self.block.end[self.chosen] - self.block.start[self.chosen]).sum())
+
     @cached_property
-    def offset(self) -> npt.NDArray[np.int64]:
+    def offset(self) -> Indices:
         """The place in the log of each message."""
         return self.block.offset[self.chosen]
 
     @cached_property
     def messages(self) -> Messages:
-        """The messages as the scans take them."""
-        b = self.block
-        encodings = np.full(max(b.channels) + 1, OTHER, np.uint8)
-        for n, channel in b.channels.items():
-            encodings[n] = _SCANNED.get(channel.encoding, OTHER)
-        number = b.channel[self.chosen]
-        return Messages(b.data, b.start[self.chosen], b.end[self.chosen], encodings[number], number)
+        """The messages as the scans take them: those of encodings that locate fields are located.
+
+        Frames and states only: there is no scan of calibrations.
+        """
+        b, fields = self.block, no_fields(self.kind, len(self))
+        start, end, channel = b.start[self.chosen], b.end[self.chosen], b.channel[self.chosen]
+        for encoding in {e.message_encoding: e for e in self._encodings.values()}.values():
+            if encoding.locate is not None:
+                of_encoding = np.zeros(max(b.channels) + 1, bool)
+                of_encoding[[n for n, e in self._encodings.items() if e == encoding]] = True
+                mine = of_encoding[channel]
+                encoding.locate(b.data, start, end, mine, FIELD_TYPES[self.kind], fields)
+        return Messages(b.data, channel, fields)
+
+    @cached_property
+    def _encodings(self) -> dict[int, MessageEncoding]:
+        """The encoding of each channel, by its number."""
+        known = message_encodings()
+        return {n: known[channel.encoding] for n, channel in self.block.channels.items()}
 
     def take(self, scan: Callable[[int], int], judge: Callable[[list[Received]], None]) -> None:
-        """Take every message in order: `scan` from one on, as far as it goes, `judge` the next.
+        """Take every message in order.
 
-        Where the scan stops at once again, it is left alone for twice as many as before:
-        a log that it cannot read at all costs it nothing.
+        `scan` takes messages from one number on and returns the number that it stopped at.
+        `judge` takes decoded messages. Where the scan stops at once, twice as many messages as
+        before are decoded until it is tried again: a log that no scan can read loses no time.
         """
         i, at_once = 0, 1
         while i < len(self):
@@ -88,19 +123,14 @@ class Part:
                 judge(list(self.decoded(stopped, i)))
 
     def decoded(self, first: int, last: int) -> Iterator[Received]:
-        """Yield the messages from `first` to before `last`; what is none is left out."""
+        """Yield the messages from `first` to before `last`; undecodable ones become rejects."""
         b = self.block
         for i in self.chosen[first:last].tolist():
-            decode = _decoder(self.carries, b.channels[int(b.channel[i])].encoding)
+            encoding = self._encodings[int(b.channel[i])]
             offset, time_ns = int(b.offset[i]), int(b.time_ns[i])
             try:
-                record = decode(b.data[b.start[i] : b.end[i]].tobytes())
+                message = encoding.decoded(self.kind, b.data[b.start[i] : b.end[i]].tobytes())
             except UndecodableError:
-                self.rejects.add(f"undecodable_{self.carries}", time_ns=time_ns, offset=offset)
+                self.rejects.add(UNDECODABLE[self.kind], time_ns=time_ns, offset=offset)
                 continue
-            yield Received(record, offset, time_ns)
-
-
-@lru_cache(maxsize=64)
-def _decoder(carries: str, encoding: str) -> Callable[[bytes], Record]:
-    return decoder(carries, encoding)
+            yield Received(message, offset, time_ns)

@@ -1,10 +1,10 @@
-"""Messages as they mostly are, read from a chunk's bytes by compiled loops.
+"""The compiled loops that take most messages straight into columns.
 
-A scan takes messages one after the other, straight into columns, as long as they are
-good: of known encoding, well formed, every value usable. At the first one that is not it
-stops, and the decoder of `message_decoding` judges that one: it knows all that is allowed
-(arrays in pieces, numbers one by one, big-endian CDR, JSON) and why something is not. So
-what a scan takes is what the decoder would take, and nothing is judged in two ways.
+An encoding has located the fields of each message (see `messages.fields`). A scan takes the
+messages one after the other as long as they are good: well formed, with every value usable. It
+stops at the first other one. That one is decoded and judged in Python, which knows all forms
+that are allowed (arrays in pieces, numbers one by one, big-endian CDR, JSON) and the reason for
+leaving a message out. A scan takes nothing that Python would leave out or read differently.
 """
 
 from typing import NamedTuple
@@ -15,51 +15,54 @@ import numpy.typing as npt
 from epipole.io.logs.kernels import kernel
 from epipole.io.logs.mcap.byte_loads import load_int32, load_uint64
 from epipole.io.logs.mcap.record_scan import Bytes
-from epipole.io.logs.messages.wire import parse
 
-MAX_NAMES = 1024  # sensors that a scan can tell apart; the decoder knows no limit
+MAX_NAMES = 1024  # sensors that a scan can tell apart; decoding has no limit
 NAME_BYTES = 63
 INFINITY_BITS, NAN_BITS = np.int32(0x7F800000), np.int32(0x7FC00000)  # of a float32
 
-# What a state may have for a scan to take it: narrower than the decoder's limits by more
-# than rounding, which it is left to judge.
+# Limits within which a scan takes a state. They are narrower than those of `columns.states` by
+# more than rounding, so that a state near a limit is judged in one place.
 NEAREST_KM, FARTHEST_KM = 6341.0, 9.9e6
 MIN_NORM2, MAX_NORM2 = 0.985, 1.015  # of a quaternion, squared
 
 
+# Columns of `fields`: where a field of a CentroidFrame begins, and of a SensorState.
+LOCATED = 0
+TIME, ID, NUMBER, EXPOSURE, X, Y, FLUX, SIGMA = range(2, 18, 2)
+REFERENCE, POSITION, VELOCITY, POSITION_SIGMA, ATTITUDE, ATTITUDE_SIGMA = range(6, 18, 2)
+
+
 class Messages(NamedTuple):
-    """Messages of one kind in a chunk's bytes."""
+    """Messages of one kind in the bytes of a chunk."""
 
     data: Bytes
-    start: npt.NDArray[np.int64]
-    end: npt.NDArray[np.int64]
-    encoding: npt.NDArray[np.uint8]  # as in `message_wire`
     channel: npt.NDArray[np.uint16]
+    fields: npt.NDArray[np.int64]  # as in `messages.fields`
 
 
 class Names(NamedTuple):
-    """Names met so far; a name's code is its row."""
+    """Names so far; the code of a name is its row."""
 
     text: npt.NDArray[np.uint8]  # (MAX_NAMES, NAME_BYTES)
     length: npt.NDArray[np.int64]
-    n_met: npt.NDArray[np.int64]  # (1,)
-    hint: npt.NDArray[np.int64]  # (65536,) the code last met on a channel
+    n: npt.NDArray[np.int64]  # (1,)
+    hint: npt.NDArray[np.int64]  # (65536,) the last code on a channel
 
 
 def new_names() -> Names:
-    """Return a table of no names."""
+    """Return an empty table of names."""
     text = np.zeros((MAX_NAMES, NAME_BYTES), np.uint8)
     return Names(text, *(np.zeros(n, np.int64) for n in (MAX_NAMES, 1, 65536)))
 
 
 class FrameRows(NamedTuple):
-    """Columns of frames, and of the centroids of all of them, with room at their ends."""
+    """Columns of frames and of their centroids, with room at their ends."""
 
     sensor: npt.NDArray[np.int32]
     number: npt.NDArray[np.int64]
     time_ns: npt.NDArray[np.int64]
     exposure_s: npt.NDArray[np.float64]
-    first: npt.NDArray[np.int32]  # one more than frames: where a frame's centroids begin
+    first: npt.NDArray[np.int32]  # (frames + 1,): where the centroids of a frame begin
     has_flux: npt.NDArray[np.bool_]
     has_sigma: npt.NDArray[np.bool_]
     x_px: npt.NDArray[np.float32]
@@ -82,7 +85,7 @@ class StateRows(NamedTuple):
 
 @kernel
 def _valid_id(data, at, n):
-    """Return whether a text is a sensor id."""
+    """Return whether a text is a valid sensor id."""
     if n < 1 or n > NAME_BYTES:
         return False
     for k in range(n):
@@ -97,7 +100,7 @@ def _valid_id(data, at, n):
 def _same(data, at, n, names, code):
     if names.length[code] != n:
         return False
-    for k in range(n):  # noqa: SIM110 (numba knows no generator expressions)
+    for k in range(n):  # noqa: SIM110 (numba has no generator expressions)
         if names.text[code, k] != data[at + k]:
             return False
     return True
@@ -106,7 +109,7 @@ def _same(data, at, n, names, code):
 @kernel
 def _find(data, at, n, names):
     """Return the code of a name, or -1."""
-    for code in range(names.n_met[0]):
+    for code in range(names.n[0]):
         if _same(data, at, n, names, code):
             return code
     return -1
@@ -114,28 +117,28 @@ def _find(data, at, n, names):
 
 @kernel
 def _sensor(data, at, n, names, channel):
-    """Return the code of a sensor id, new or known; -1 where it is no id or there is no room."""
+    """Return the code of a sensor id, new or known; -1 where it is invalid or there is no room."""
     code = names.hint[channel]
-    if code < names.n_met[0] and _same(data, at, n, names, code):
+    if code < names.n[0] and _same(data, at, n, names, code):
         return code
     if not _valid_id(data, at, n):
         return -1
     code = _find(data, at, n, names)
     if code < 0:
-        code = names.n_met[0]
+        code = names.n[0]
         if code == MAX_NAMES:
             return -1
         names.text[code, :n] = data[at : at + n]
         names.length[code] = n
-        names.n_met[0] = code + 1
+        names.n[0] = code + 1
     names.hint[channel] = code
     return code
 
 
 @kernel
 def _copy_places(data, at, bits, low, n):
-    """Copy the bits of float32 from byte `at` on; return whether all are finite."""
-    to, bad = np.uint64(low), np.int32(0)  # unsigned: no index counts from the end
+    """Copy the bits of `n` float32 from byte `at` on; return whether all are finite."""
+    to, bad = np.uint64(low), np.int32(0)  # unsigned: numba need not check for negative indices
     for k in range(n):
         value = load_int32(data, at + 4 * k)
         bits[to + np.uint64(k)] = value
@@ -145,9 +148,9 @@ def _copy_places(data, at, bits, low, n):
 
 @kernel
 def _copy_positive(data, at, n_sent, bits, low, n):
-    """Copy the bits of float32, NaN where one is not positive and finite or none was sent.
+    """Copy the bits of float32, NaN where a value is not positive and finite or was not sent.
 
-    Return whether all that were sent are.
+    Return whether all values that were sent are positive and finite.
     """
     to, bad = np.uint64(low), np.int32(0)
     if not n_sent:
@@ -163,38 +166,40 @@ def _copy_positive(data, at, n_sent, bits, low, n):
 
 
 @kernel
-def scan_frames(messages, i, names, rows, n, kinds):
-    """Take good frames from message `i` on, as rows from `n` on; return both where it ends.
+def scan_frames(messages, i, names, rows, n):
+    """Copy good frames from message `i` on to rows from `n` on; return both where it stops.
 
     The rows must have room for all messages, and for an eighth of their bytes in centroids.
     """
-    fields = np.zeros(2 * len(kinds), np.int64)
-    # Each array taken out of its tuple once: that counts references, which takes its time.
-    data, start, end, encoding, channel = messages
+    # Each array is taken out of its tuple once: this counts references, which takes time.
+    data, channel, fields = messages
     sensor, number, time_ns, exposure_s, first, has_flux, has_sigma = rows[:7]
     x_bits, y_bits = rows.x_px.view(np.int32), rows.y_px.view(np.int32)
     flux_bits, sigma_bits = rows.flux.view(np.int32), rows.sigma_px.view(np.int32)
     low = np.int64(first[n])
-    while i < len(start):
-        if not parse(data, start[i], end[i], encoding[i], kinds, fields):
+    while i < len(fields) and fields[i, LOCATED]:
+        size, n_flux, n_sigma = fields[i, X + 1], fields[i, FLUX + 1], fields[i, SIGMA + 1]
+        if fields[i, Y + 1] != size or n_flux not in (0, size) or n_sigma not in (0, size):
             break
-        size, n_flux, n_sigma = fields[11], fields[15], fields[17]
-        if fields[13] != size or (n_flux and n_flux != size) or (n_sigma and n_sigma != size):
+        if fields[i, NUMBER] < 0:  # a number of 2**63 or more
             break
-        if fields[6] < 0:  # a number of 2**63 or more
-            break
-        good = _copy_places(data, fields[10], x_bits, low, size)
-        good &= _copy_places(data, fields[12], y_bits, low, size)
-        good &= _copy_positive(data, fields[16], n_sigma, sigma_bits, low, size)
+        good = _copy_places(data, fields[i, X], x_bits, low, size)
+        good &= _copy_places(data, fields[i, Y], y_bits, low, size)
+        good &= _copy_positive(data, fields[i, SIGMA], n_sigma, sigma_bits, low, size)
         if not good:
             break
-        _copy_positive(data, fields[14], n_flux, flux_bits, low, size)
-        code = _sensor(data, fields[4], fields[5], names, channel[i])
+        _copy_positive(data, fields[i, FLUX], n_flux, flux_bits, low, size)
+        code = _sensor(data, fields[i, ID], fields[i, ID + 1], names, channel[i])
         if code < 0:
             break
         low += size
-        sensor[n], number[n], time_ns[n], first[n + 1] = code, fields[6], fields[2], low
-        exposed_s = np.uint64(fields[8]).view(np.float64)
+        sensor[n], number[n], time_ns[n], first[n + 1] = (
+            code,
+            fields[i, NUMBER],
+            fields[i, TIME],
+            low,
+        )
+        exposed_s = np.uint64(fields[i, EXPOSURE]).view(np.float64)
         exposure_s[n] = exposed_s if 0 < exposed_s < np.inf else 0.0
         has_flux[n], has_sigma[n] = n_flux > 0, n_sigma > 0
         i += 1
@@ -204,7 +209,7 @@ def scan_frames(messages, i, names, rows, n, kinds):
 
 @kernel
 def _copy_doubles(data, at, n_sent, row):
-    """Copy a vector, or NaN where none was sent; return the sum of its squares."""
+    """Copy a vector, or NaN if it was not sent; return the sum of the squares."""
     total = 0.0
     for k in range(len(row)):
         bits = load_uint64(data, at + 8 * k) if n_sent else np.uint64(0)
@@ -214,35 +219,32 @@ def _copy_doubles(data, at, n_sent, row):
 
 
 @kernel
-def scan_states(messages, i, names, frames, rows, n, kinds):
-    """Take good states from message `i` on, as rows from `n` on; return both where it ends.
+def scan_states(messages, i, names, frames, rows, n):
+    """Copy good states from message `i` on to rows from `n` on; return both where it stops.
 
-    `frames` are the names of reference frames that are known.
+    `frames` are the known reference frames.
     """
-    fields = np.zeros(2 * len(kinds), np.int64)
-    data, start, end, encoding, channel = messages
-    while i < len(start):
-        if not parse(data, start[i], end[i], encoding[i], kinds, fields):
+    data, channel, fields = messages
+    while i < len(fields) and fields[i, LOCATED]:
+        n_velocity, n_attitude = fields[i, VELOCITY + 1], fields[i, ATTITUDE + 1]
+        if fields[i, POSITION + 1] != 3 or n_velocity not in (0, 3) or n_attitude not in (0, 4):
             break
-        n_velocity, n_attitude = fields[11], fields[15]
-        if fields[9] != 3 or n_velocity not in (0, 3) or n_attitude not in (0, 4):
-            break
-        radius2 = _copy_doubles(data, fields[8], 3, rows.r_km[n])
+        radius2 = _copy_doubles(data, fields[i, POSITION], 3, rows.r_km[n])
         if not NEAREST_KM**2 < radius2 < FARTHEST_KM**2:
             break
-        speed2 = _copy_doubles(data, fields[10], n_velocity, rows.v_km_s[n])
+        speed2 = _copy_doubles(data, fields[i, VELOCITY], n_velocity, rows.v_km_s[n])
         if n_velocity and not speed2 < np.inf:
             break
-        norm2 = _copy_doubles(data, fields[14], n_attitude, rows.q[n])
+        norm2 = _copy_doubles(data, fields[i, ATTITUDE], n_attitude, rows.q[n])
         if n_attitude and not MIN_NORM2 < norm2 < MAX_NORM2:
             break
-        frame = _find(data, fields[6], fields[7], frames)
-        code = _sensor(data, fields[4], fields[5], names, channel[i])
+        frame = _find(data, fields[i, REFERENCE], fields[i, REFERENCE + 1], frames)
+        code = _sensor(data, fields[i, ID], fields[i, ID + 1], names, channel[i])
         if frame < 0 or code < 0:
             break
-        rows.sensor[n], rows.frame[n], rows.time_ns[n] = code, frame, fields[2]
-        rows.sigma[n, 0] = np.uint64(fields[12]).view(np.float64)
-        rows.sigma[n, 1] = np.uint64(fields[16]).view(np.float64)
+        rows.sensor[n], rows.frame[n], rows.time_ns[n] = code, frame, fields[i, TIME]
+        rows.sigma[n, 0] = np.uint64(fields[i, POSITION_SIGMA]).view(np.float64)
+        rows.sigma[n, 1] = np.uint64(fields[i, ATTITUDE_SIGMA]).view(np.float64)
         i += 1
         n += 1
     return i, n

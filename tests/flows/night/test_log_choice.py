@@ -135,8 +135,8 @@ def test_a_night_without_logs_is_an_error_that_says_what_there_is(folder):
         ("{}/none.mcap", "no such file; check the path"),
         ("{}/*.bag", "no file matches; check the pattern"),
         ("{}/bare", r"no logs in this folder \(\*\.mcap\); check the path"),
-        ("file://{}/none", "no such log, nor a folder with logs"),
-        ("memory://none", r"no such log, nor a folder with logs \(\*\.mcap\); check the URL"),
+        ("file://{}/none", "no such log, and no folder with logs"),
+        ("memory://none", r"no such log, and no folder with logs \(\*\.mcap\); check the URL"),
         ("nostore://x", "cannot be read: .*nostore"),
     ],
 )

@@ -1,4 +1,4 @@
-"""A log read in pieces: the same as at once, in bounded memory."""
+"""A log that is read in pieces: the same rows as at once, in bounded memory."""
 
 import subprocess
 import sys
@@ -9,11 +9,11 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from epipole.io.logs.mcap import records as log_records
-from epipole.io.logs.messages.encoding import encode_protobuf
-from epipole.io.logs.reader import read_log, read_log_parts
+from epipole.io.logs.messages.encodings import protobuf
+from epipole.io.logs.reader import read_log, read_log_pieces
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.errors import LogError
-from epipole.schemas.messages import CENTROID_FRAME, SENSOR_STATE
+from epipole.schemas.messages import CENTROID_FRAME, FRAME, SENSOR_STATE, STATE
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -24,7 +24,7 @@ MIB = 1 << 20
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     """Return a log of many small chunks, one of them damaged."""
-    path = tmp_path_factory.mktemp("parts") / "a.mcap"
+    path = tmp_path_factory.mktemp("pieces") / "a.mcap"
     rng = np.random.default_rng(0)
     with LogWriter(path, chunk_size=4000, compression="none") as out:
         for i in range(N):
@@ -39,50 +39,49 @@ def log(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("part_bytes", [5_000, 50_000, 1 << 30])
-@pytest.mark.parametrize("span", [(None, None), (START_NS + 500 * SECOND_NS, None)])
-def test_the_pieces_are_the_log(log, part_bytes, span):
-    whole = read_log(log, *span)
-    parts = list(read_log_parts(log, *span, part_bytes=part_bytes))
+@pytest.mark.parametrize("piece_bytes", [5_000, 50_000, 1 << 30])
+def test_the_pieces_are_the_log(log, piece_bytes):
+    whole = read_log(log)
+    pieces = list(read_log_pieces(log, piece_bytes=piece_bytes))
     for name in ("exposures", "states", "cameras", "rejects"):
-        joined = pa.concat_tables([getattr(part, name) for part in parts])
+        joined = pa.concat_tables([getattr(piece, name) for piece in pieces])
         assert joined.equals(getattr(whole, name))
-    assert [part.source for part in parts] == [None] * (len(parts) - 1) + [whole.source]
+    assert [piece.source for piece in pieces] == [None] * (len(pieces) - 1) + [whole.source]
     assert whole.rejects.num_rows == 1
-    assert (len(parts) == 1) == (part_bytes == 1 << 30)
+    assert (len(pieces) == 1) == (piece_bytes == 1 << 30)
 
 
-def test_a_piece_is_no_larger_than_asked_for_but_for_a_chunk(log):
-    parts = list(read_log_parts(log, part_bytes=50_000))
-    sizes = [part.exposures.nbytes + part.states.nbytes for part in parts]
+def test_a_piece_is_at_most_a_chunk_larger_than_asked_for(log):
+    pieces = list(read_log_pieces(log, piece_bytes=50_000))
+    sizes = [piece.exposures.nbytes + piece.states.nbytes for piece in pieces]
     assert all(40_000 < size < 60_000 for size in sizes[:-1])
 
 
-def test_a_log_without_frames_says_so_after_its_states(tmp_path):
+def test_a_log_without_frames_is_an_error_after_its_states(tmp_path):
     with LogWriter(tmp_path / "a.mcap") as out:
         out.state("sat1", START_NS, position_km=[7000.0, 0.0, 2.0])
     with pytest.raises(LogError, match="no frames in it"):
-        list(read_log_parts(tmp_path / "a.mcap"))
+        list(read_log_pieces(tmp_path / "a.mcap"))
 
 
-def test_reading_may_be_given_up(log):
-    for _ in read_log_parts(log, part_bytes=1):
+def test_reading_may_stop_early(log):
+    for _ in read_log_pieces(log, piece_bytes=1):
         break
 
 
 READ = """
 import sys
-from epipole.io.logs.reader import read_log_parts
+from epipole.io.logs.reader import read_log_pieces
 
 def resident_mib():
     return int(open("/proc/self/status").read().split("VmHWM:")[1].split()[0]) / 1024
 
-for part in read_log_parts(sys.argv[1], part_bytes=1 << 20):
+for piece in read_log_pieces(sys.argv[1], piece_bytes=1 << 20):
     pass
 open("/proc/self/clear_refs", "w").write("5")  # the peak so far is forgotten: kernels were loaded
 before, n = resident_mib(), 0
-for part in read_log_parts(sys.argv[2], part_bytes=8 << 20):
-    n += part.exposures.num_rows
+for piece in read_log_pieces(sys.argv[2], piece_bytes=8 << 20):
+    n += piece.exposures.num_rows
 print(n, resident_mib() - before)
 """
 
@@ -101,7 +100,7 @@ def test_the_memory_of_reading_is_bounded_by_its_pieces_not_by_the_log(tmp_path,
         channel = writer.register_channel("/a", "protobuf", schema)
         for i in range(12_000):
             frame = {**values, "frame_number": i + 1, "x_px": x, "y_px": x}
-            writer.add_message(channel, START_NS, encode_protobuf(CENTROID_FRAME, frame), START_NS)
+            writer.add_message(channel, START_NS, protobuf.encode(FRAME, frame), START_NS)
         writer.finish()
     assert path.stat().st_size > 180 * MIB
     command = [sys.executable, "-c", READ, str(log), str(path)]
@@ -116,28 +115,28 @@ def test_a_log_that_is_cut_while_it_is_read_is_an_error_of_one_line(tmp_path, lo
     path = tmp_path / "a.mcap"
     path.write_bytes(log.read_bytes())
     size = path.stat().st_size
-    parts = read_log_parts(path, part_bytes=1)
-    next(parts)
+    pieces = read_log_pieces(path, piece_bytes=1)
+    next(pieces)
     with path.open("r+b") as file:
         file.truncate(1000)
     with pytest.raises(LogError, match=f"a.mcap: has become shorter than {size:,} bytes"):
-        list(parts)
+        list(pieces)
 
 
 def test_a_log_that_is_deleted_while_it_is_read_is_read(tmp_path, log):
     path = tmp_path / "a.mcap"
     path.write_bytes(log.read_bytes())
-    parts = read_log_parts(path, part_bytes=1)
-    first = next(parts)
+    pieces = read_log_pieces(path, piece_bytes=1)
+    first = next(pieces)
     path.unlink()
-    n = first.exposures.num_rows + sum(part.exposures.num_rows for part in parts)
+    n = first.exposures.num_rows + sum(piece.exposures.num_rows for piece in pieces)
     assert n == read_log(log).exposures.num_rows
 
 
 def test_messages_outside_chunks_are_read_in_pieces(tmp_path):
     state = {"timestamp": START_NS, "sensor_id": "sat1", "frame": "GCRF", "velocity_km_s": None}
     state |= {"position_km": [7e3, 0, 0], "position_sigma_km": 0.1, "attitude_xyzw": None}
-    data = encode_protobuf(SENSOR_STATE, state | {"attitude_sigma_arcsec": 0.0})
+    data = protobuf.encode(STATE, state | {"attitude_sigma_arcsec": 0.0})
     frame = {"timestamp": START_NS, "sensor_id": "sat1", "exposure_s": 0.1, "flux": None}
     frame |= {"frame_number": 1, "x_px": [1.0], "y_px": [1.0], "sigma_px": None}
     path = tmp_path / "a.mcap"
@@ -149,9 +148,9 @@ def test_messages_outside_chunks_are_read_in_pieces(tmp_path):
             channel = writer.register_channel("/a", "protobuf", schema)
         for _ in range(100_000):
             writer.add_message(1, START_NS, data, START_NS)
-        writer.add_message(channel, START_NS, encode_protobuf(CENTROID_FRAME, frame), START_NS)
+        writer.add_message(channel, START_NS, protobuf.encode(FRAME, frame), START_NS)
         writer.finish()
-    parts = list(read_log_parts(path, part_bytes=MIB))
-    assert len(parts) > 1
-    assert sum(part.states.num_rows for part in parts) == 100_000
-    assert parts[-1].exposures.num_rows == 1
+    pieces = list(read_log_pieces(path, piece_bytes=MIB))
+    assert len(pieces) > 1
+    assert sum(piece.states.num_rows for piece in pieces) == 100_000
+    assert pieces[-1].exposures.num_rows == 1

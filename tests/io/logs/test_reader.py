@@ -9,13 +9,21 @@ from mcap.writer import CompressionType, Writer
 
 from epipole.io.logs.columns import frames as frame_columns
 from epipole.io.logs.damage import ROWS_ALIKE
-from epipole.io.logs.messages.encoding import encode_calibration, encode_protobuf
-from epipole.io.logs.reader import read_log
-from epipole.io.logs.writer import LogWriter
-from epipole.schemas import messages
+from epipole.io.logs.mcap import records as log_records
+from epipole.io.logs.messages.encodings import json_text, protobuf
+from epipole.io.logs.messages.encodings.registry import kinds_of_schemas
+from epipole.io.logs.reader import read_log, read_log_times
+from epipole.io.logs.writer import LogWriter, calibration_values
 from epipole.schemas.bridge import array, flatten, stack
 from epipole.schemas.errors import LogError
-from epipole.schemas.messages import CENTROID_FRAME, SENSOR_STATE
+from epipole.schemas.messages import (
+    CALIBRATION,
+    CALIBRATION_NAME,
+    CENTROID_FRAME,
+    FRAME,
+    SENSOR_STATE,
+    STATE,
+)
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -38,7 +46,7 @@ COMPRESSIONS = ("zstd", "lz4", "none")
 
 
 def write(path, n=N_FRAMES, **options):
-    """Write a log of one sensor: a frame and a state a second."""
+    """Write a log of one sensor: a frame and a state per second."""
     rng = np.random.default_rng(0)
     with LogWriter(path, **options) as log:
         log.camera("sat1", START_NS, CAMERA)
@@ -71,7 +79,7 @@ def frame(**changes):
         "flux": None,
         "sigma_px": None,
     }
-    return encode_protobuf(CENTROID_FRAME, {**values, **changes})
+    return protobuf.encode(FRAME, {**values, **changes})
 
 
 def state(**changes):
@@ -85,7 +93,13 @@ def state(**changes):
         "attitude_xyzw": None,
         "attitude_sigma_arcsec": 0.0,
     }
-    return encode_protobuf(SENSOR_STATE, {**values, **changes})
+    return protobuf.encode(STATE, {**values, **changes})
+
+
+def json_calibration():
+    """Return the values of a good calibration in JSON."""
+    values = calibration_values("sat1", START_NS, CAMERA)
+    return json.loads(json_text.encode(CALIBRATION, values))
 
 
 def write_raw(path, *recorded, encoding="protobuf", schema_encoding="protobuf"):
@@ -109,10 +123,10 @@ def read_with_good_frame(tmp_path, *recorded):
     return read_log(write_raw(tmp_path / "a.mcap", good, *recorded))
 
 
-def reasons(part):
+def reasons(contents):
     return [
         (row["reason"], row["sensor_id"], row["count"])
-        for row in part.rejects.drop_columns("time").to_pylist()
+        for row in contents.rejects.drop_columns("time").to_pylist()
     ]
 
 
@@ -123,27 +137,27 @@ def reasons(part):
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_what_is_written_is_read(tmp_path, encoding, compression):
     path = write(tmp_path / "a.mcap", encoding=encoding, compression=compression)
-    part = read_log(path)
-    assert array(part.exposures, "frame_number").tolist() == list(range(N_FRAMES))
+    contents = read_log(path)
+    assert array(contents.exposures, "frame_number").tolist() == list(range(N_FRAMES))
     expected_ns = START_NS + 7 + np.arange(N_FRAMES) * SECOND_NS
-    np.testing.assert_array_equal(array(part.exposures, "time"), expected_ns)
-    x, offsets = flatten(part.exposures, "x_px")
-    y, _ = flatten(part.exposures, "y_px")
+    np.testing.assert_array_equal(array(contents.exposures, "time"), expected_ns)
+    x, offsets = flatten(contents.exposures, "x_px")
+    y, _ = flatten(contents.exposures, "y_px")
     assert np.diff(offsets).tolist() == [i % 7 for i in range(N_FRAMES)]
     rng = np.random.default_rng(0)
     expected = np.concatenate([rng.uniform(0, 500, i % 7) for i in range(N_FRAMES)])
     np.testing.assert_array_equal(x, expected.astype(np.float32))
     np.testing.assert_array_equal(y, expected.astype(np.float32) + np.float32(1))
-    given = [i for i in range(N_FRAMES) if part.exposures["flux"][i].is_valid]
+    given = [i for i in range(N_FRAMES) if contents.exposures["flux"][i].is_valid]
     assert given == [i for i in range(N_FRAMES) if i % 2 and i % 7]
-    np.testing.assert_array_equal(stack(part.states, "{}_km")[:, 1], np.arange(N_FRAMES))
-    np.testing.assert_array_equal(stack(part.states, "v{}_km_s")[3], [0.0, 7.5, 1.0])
-    assert np.isnan(array(part.states, "qx")).all()
-    camera = {name: part.cameras[name][0].as_py() for name in CAMERA}
+    np.testing.assert_array_equal(stack(contents.states, "{}_km")[:, 1], np.arange(N_FRAMES))
+    np.testing.assert_array_equal(stack(contents.states, "v{}_km_s")[3], [0.0, 7.5, 1.0])
+    assert np.isnan(array(contents.states, "qx")).all()
+    camera = {name: contents.cameras[name][0].as_py() for name in CAMERA}
     assert camera == CAMERA
-    assert part.rejects.num_rows == 0
-    assert part.source.size == path.stat().st_size
-    assert part.source.first_time_ns == START_NS + 7
+    assert contents.rejects.num_rows == 0
+    assert contents.source.size == path.stat().st_size
+    assert contents.source.first_time_ns == START_NS + 7
 
 
 def test_frames_that_come_in_batches_are_one_table(tmp_path, monkeypatch):
@@ -193,24 +207,30 @@ def test_encodings_may_be_mixed_and_other_messages_are_ignored(tmp_path):
         ):
             writer.add_message(channel, START_NS, data, START_NS)
         writer.finish()
-    part = read_log(tmp_path / "a.mcap")
-    assert part.exposures["sensor_id"].to_pylist() == ["c", "sat1"]
+    contents = read_log(tmp_path / "a.mcap")
+    assert contents.exposures["sensor_id"].to_pylist() == ["c", "sat1"]
     # A text has more digits than the message type: a float of 32 bits.
-    assert flatten(part.exposures, "x_px")[0].tolist() == [float(np.float32(1.1)), 1.0, 2.0, 3.0]
-    assert reasons(part) == [("nan", "b", 1)]
-    assert array(part.rejects, "time").tolist() == [START_NS + 1_500_000_000]
+    assert flatten(contents.exposures, "x_px")[0].tolist() == [
+        float(np.float32(1.1)),
+        1.0,
+        2.0,
+        3.0,
+    ]
+    assert reasons(contents) == [("nan", "b", 1)]
+    assert array(contents.rejects, "time").tolist() == [START_NS + 1_500_000_000]
 
 
-def test_ros_names_with_and_without_msg_are_one():
-    assert messages.CARRIES["epipole_msgs/CentroidFrame"] == messages.FRAME
-    assert messages.CARRIES["epipole_msgs/msg/CentroidFrame"] == messages.FRAME
+def test_ros_names_with_and_without_msg_are_the_same():
+    kinds = kinds_of_schemas()
+    assert kinds["epipole_msgs/CentroidFrame"] == FRAME
+    assert kinds["epipole_msgs/msg/CentroidFrame"] == FRAME
 
 
-def test_flux_that_is_none_is_nan_and_the_frame_stays(tmp_path):
+def test_invalid_flux_is_nan_and_the_frame_stays(tmp_path):
     flux = [-1.0, 0.0, 5.0]
-    part = read_log(write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, frame(flux=flux))))
-    np.testing.assert_array_equal(flatten(part.exposures, "flux")[0], [np.nan, np.nan, 5.0])
-    assert part.rejects.num_rows == 0
+    contents = read_log(write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, frame(flux=flux))))
+    np.testing.assert_array_equal(flatten(contents.exposures, "flux")[0], [np.nan, np.nan, 5.0])
+    assert contents.rejects.num_rows == 0
 
 
 # What is left out
@@ -236,10 +256,10 @@ def test_flux_that_is_none_is_nan_and_the_frame_stays(tmp_path):
     ],
 )
 def test_a_bad_frame_is_a_row_and_the_rest_goes_on(tmp_path, changes, reason, sensor_id):
-    part = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, frame(**changes)))
-    assert part.exposures["sensor_id"].to_pylist() == ["good"]
-    assert reasons(part) == [(reason, sensor_id, 1)]
-    assert part.rejects["source"].to_pylist() == ["a.mcap"]
+    contents = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, frame(**changes)))
+    assert contents.exposures["sensor_id"].to_pylist() == ["good"]
+    assert reasons(contents) == [(reason, sensor_id, 1)]
+    assert contents.rejects["source"].to_pylist() == ["a.mcap"]
 
 
 @pytest.mark.parametrize(
@@ -257,29 +277,31 @@ def test_a_bad_frame_is_a_row_and_the_rest_goes_on(tmp_path, changes, reason, se
     ],
 )
 def test_a_bad_state_is_a_row(tmp_path, changes, reason):
-    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(**changes)))
-    assert part.states.num_rows == 0
-    assert [row[0] for row in reasons(part)] == [reason]
+    contents = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(**changes)))
+    assert contents.states.num_rows == 0
+    assert [row[0] for row in reasons(contents)] == [reason]
 
 
 def test_a_quaternion_near_unit_length_is_scaled_to_it(tmp_path):
     q = [0.0, 0.0, 0.6006, 0.8008]
-    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
-    np.testing.assert_allclose(stack(part.states, "q{}", "xyzw"), [[0, 0, 0.6, 0.8]], atol=1e-15)
+    contents = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
+    np.testing.assert_allclose(
+        stack(contents.states, "q{}", "xyzw"), [[0, 0, 0.6, 0.8]], atol=1e-15
+    )
 
 
 @pytest.mark.parametrize("q", [[0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0], [1.0], [np.nan] * 4])
 def test_a_bad_attitude_is_left_out_and_its_position_stays(tmp_path, q):
-    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
-    assert part.states.num_rows == 1
-    assert np.isnan(stack(part.states, "q{}", "xyzw")).all()
-    assert reasons(part) == [("bad_attitude", "sat1", 1)]
+    contents = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(attitude_xyzw=q)))
+    assert contents.states.num_rows == 1
+    assert np.isnan(stack(contents.states, "q{}", "xyzw")).all()
+    assert reasons(contents) == [("bad_attitude", "sat1", 1)]
 
 
 @pytest.mark.parametrize("sigma", [-1.0, np.nan, np.inf, 0.0])
-def test_a_sigma_that_is_none_is_unknown(tmp_path, sigma):
-    part = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(position_sigma_km=sigma)))
-    assert array(part.states, "position_sigma_km").tolist() == [0.0]
+def test_an_invalid_sigma_is_unknown(tmp_path, sigma):
+    contents = read_with_good_frame(tmp_path, (SENSOR_STATE.name, state(position_sigma_km=sigma)))
+    assert array(contents.states, "position_sigma_km").tolist() == [0.0]
 
 
 @pytest.mark.parametrize(
@@ -291,11 +313,11 @@ def test_a_sigma_that_is_none_is_unknown(tmp_path, sigma):
         ({"k1": np.inf}, "bad_distortion"),
     ],
 )
-def test_a_calibration_that_cannot_be_used_is_a_row(tmp_path, changes, reason):
-    data = encode_calibration("protobuf", "sat1", START_NS, CAMERA | changes)
-    part = read_with_good_frame(tmp_path, (messages.CALIBRATION_NAME, data))
-    assert part.cameras.num_rows == 0
-    assert reasons(part) == [(reason, "sat1", 1)]
+def test_an_unusable_calibration_is_a_row(tmp_path, changes, reason):
+    data = protobuf.encode(CALIBRATION, calibration_values("sat1", START_NS, CAMERA | changes))
+    contents = read_with_good_frame(tmp_path, (CALIBRATION_NAME, data))
+    assert contents.cameras.num_rows == 0
+    assert reasons(contents) == [(reason, "sat1", 1)]
 
 
 @pytest.mark.parametrize(
@@ -309,29 +331,29 @@ def test_a_calibration_that_cannot_be_used_is_a_row(tmp_path, changes, reason):
     ],
 )
 def test_a_calibration_of_another_model_is_a_row(tmp_path, changes, reason):
-    values = json.loads(encode_calibration("json", "sat1", START_NS, CAMERA)) | changes
-    part = read_log(
+    values = json_calibration() | changes
+    contents = read_log(
         write_raw(
             tmp_path / "a.mcap",
             (
                 CENTROID_FRAME.name,
                 json.dumps({"timestamp": "2019-04-01T04:00:00Z", "sensor_id": "a"}).encode(),
             ),
-            (messages.CALIBRATION_NAME, json.dumps(values).encode()),
+            (CALIBRATION_NAME, json.dumps(values).encode()),
             encoding="json",
         )
     )
-    assert [row[0] for row in reasons(part)] == [reason]
+    assert [row[0] for row in reasons(contents)] == [reason]
 
 
 def test_a_distortion_of_four_terms_has_no_k3(tmp_path):
-    values = json.loads(encode_calibration("json", "sat1", START_NS, CAMERA))
+    values = json_calibration()
     values["D"], values["distortion_model"] = values["D"][:4], ""
     good = json.dumps({"timestamp": "2019-04-01T04:00:00Z", "sensor_id": "a"}).encode()
     path = write_raw(
         tmp_path / "a.mcap",
         (CENTROID_FRAME.name, good),
-        (messages.CALIBRATION_NAME, json.dumps(values).encode()),
+        (CALIBRATION_NAME, json.dumps(values).encode()),
         encoding="json",
     )
     camera = read_log(path).cameras
@@ -340,16 +362,16 @@ def test_a_distortion_of_four_terms_has_no_k3(tmp_path):
 
 @pytest.mark.parametrize("data", [b"\xff\xff\xff", b"\x2a\x03abc", frame()[:-1]])
 def test_an_undecodable_message_is_a_row(tmp_path, data):
-    part = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, data))
-    assert reasons(part) == [("undecodable_frame", None, 1)]
+    contents = read_with_good_frame(tmp_path, (CENTROID_FRAME.name, data))
+    assert reasons(contents) == [("undecodable_frame", None, 1)]
 
 
 def test_many_bad_messages_alike_are_few_rows_that_count_them_all(tmp_path):
     good = (CENTROID_FRAME.name, frame(sensor_id="good"))
     path = write_raw(tmp_path / "a.mcap", good, *[(CENTROID_FRAME.name, b"\1")] * 5000)
-    part = read_log(path)
-    assert part.rejects.num_rows == ROWS_ALIKE
-    assert sum(part.rejects["count"].to_pylist()) == 5000
+    contents = read_log(path)
+    assert contents.rejects.num_rows == ROWS_ALIKE
+    assert sum(contents.rejects["count"].to_pylist()) == 5000
 
 
 # What is an error
@@ -386,7 +408,7 @@ def test_a_log_without_frames_is_an_error(tmp_path):
     assert "no frames" in line_of(path)
 
 
-def test_a_log_of_bad_frames_alone_says_what_was_wrong(tmp_path):
+def test_the_error_of_a_log_of_bad_frames_alone_names_the_reasons(tmp_path):
     path = write_raw(tmp_path / "a.mcap", (CENTROID_FRAME.name, frame(x_px=[np.nan] * 3)))
     assert "nan 1" in line_of(path)
 
@@ -398,7 +420,7 @@ def test_an_unknown_message_encoding_is_an_error_that_names_it(tmp_path):
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 @pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_no_damage_stops_the_reading_or_goes_unsaid(tmp_path, encoding, compression):
+def test_no_damage_stops_the_reading_or_stays_unreported(tmp_path, encoding, compression):
     path = tmp_path / "a.mcap"
     whole = write(path, encoding=encoding, compression=compression, chunk_size=1000).read_bytes()
     rng = random.Random(encoding + compression)
@@ -410,8 +432,19 @@ def test_no_damage_stops_the_reading_or_goes_unsaid(tmp_path, encoding, compress
             data[rng.randrange(8, len(data))] ^= 1 << rng.randrange(8)
         path.write_bytes(data)
         try:
-            part = read_log(path)
+            contents = read_log(path)
         except LogError:
             continue
-        assert part.exposures.num_rows == N_FRAMES or part.rejects.num_rows > 0
-        assert part.states.num_rows == N_FRAMES or part.rejects.num_rows > 0
+        assert contents.exposures.num_rows == N_FRAMES or contents.rejects.num_rows > 0
+        assert contents.states.num_rows == N_FRAMES or contents.rejects.num_rows > 0
+
+
+def test_the_times_of_a_log_are_known_without_reading_it(tmp_path, monkeypatch):
+    path = write(tmp_path / "a.mcap")
+    monkeypatch.setattr(log_records, "open_chunk", None)  # no chunk is opened
+    assert read_log_times(path) == (START_NS, START_NS + 7 + (N_FRAMES - 1) * SECOND_NS)
+    path.write_bytes(path.read_bytes()[:-1])
+    assert read_log_times(path) is None
+    (tmp_path / "b.mcap").write_bytes(b"no log")
+    with pytest.raises(LogError, match="not an MCAP file"):
+        read_log_times(tmp_path / "b.mcap")

@@ -1,4 +1,4 @@
-"""Logs written here, read by the libraries of others."""
+"""Logs that are written here, read with public libraries."""
 
 import io
 import json
@@ -95,7 +95,7 @@ def test_cdr_is_read_by_the_mcap_ros2_library(tmp_path):
     assert list(empty.x_px) == []
 
 
-def test_json_has_the_contracts_names_and_times(tmp_path):
+def test_json_has_the_declared_names_and_times(tmp_path):
     path = write(tmp_path / "a.mcap", encoding="json")
     reader = make_reader(io.BytesIO(path.read_bytes()))
     found = [json.loads(m.data) for _, _, m in reader.iter_messages(log_time_order=False)]

@@ -7,7 +7,7 @@ import pytest
 from prefect import flow
 from prefect.states import Failed
 
-from epipole.io.logs.reader import read_log_parts
+from epipole.io.logs.reader import read_log_pieces
 from epipole.io.work.parts import read_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.errors import DatasetError, LogError
@@ -73,12 +73,12 @@ def test_a_log_is_read_again_only_after_a_fault_of_the_storage(
 
     def faulty(path):
         asked.append(path)
-        for part in read_log_parts(path):
-            yield part
+        for piece in read_log_pieces(path):
+            yield piece
             if len(asked) == 1:
                 raise error
 
-    monkeypatch.setattr(module, "read_log_parts", faulty)
+    monkeypatch.setattr(module, "read_log_pieces", faulty)
 
     @flow
     def reading():

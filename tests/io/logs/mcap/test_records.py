@@ -1,4 +1,4 @@
-"""Damaged logs: what is still read, and what is said of the rest."""
+"""Damaged logs: what is still read, and what is reported of the rest."""
 
 import io
 import struct
@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from scenes.log_bytes import log_bytes
 
-from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.chunks import MAX_CHUNK_BYTES
 from epipole.io.logs.mcap.records import RecordWalk
 from epipole.io.logs.mcap.summary import MAGIC
@@ -20,7 +20,7 @@ HEAD = struct.Struct("<BQ")
 
 
 def log(compression=CompressionType.ZSTD, **options):
-    """Return the bytes of a log of N messages of 100 bytes, about 5 a chunk."""
+    """Return the bytes of a log of N messages of 100 bytes, about 5 per chunk."""
     out = io.BytesIO()
     writer = Writer(out, chunk_size=500, compression=compression, **options)
     writer.start()
@@ -40,7 +40,7 @@ def log(compression=CompressionType.ZSTD, **options):
 
 def walk(data):
     """Return the numbers of the messages found, and the damage as (reason, count)."""
-    walked = RecordWalk(LogBytes.of(bytes(data)), frozenset([SCHEMA]))
+    walked = RecordWalk(log_bytes(bytes(data)), frozenset([SCHEMA]))
     found = [
         int(block.data[at : at + 4].view("<u4")[0])
         for block in walked.blocks()
@@ -73,7 +73,7 @@ def test_a_log_without_chunks_is_read_too(crc):
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_a_log_cut_anywhere_gives_what_lies_before_and_says_so(compression):
+def test_a_log_cut_anywhere_gives_what_lies_before_and_is_reported(compression):
     data = log(compression)
     places = chunks(data)
     for cut in range(200, places[-1][0], 97):
@@ -129,7 +129,7 @@ def test_without_a_summary_messages_of_an_unknown_channel_are_counted():
         len(chunk_messages(log(CompressionType.NONE), i))
         for i in range(len(chunks(log(CompressionType.NONE))) - 1)
     )
-    assert ("unknown_channel_1", known - lost) in damage
+    assert ("unknown_channel", known - lost) in damage
 
 
 @pytest.mark.parametrize("length", [0, 5, 1 << 20, 1 << 63])
@@ -143,7 +143,7 @@ def test_a_chunk_whose_records_length_is_damaged_is_found_by_its_own(length, clo
 
 
 @pytest.mark.parametrize("length", [0, 5, 1 << 20, 1 << 63])
-def test_behind_a_damaged_record_the_next_chunk_that_the_summary_knows_is_taken(length):
+def test_after_a_damaged_record_the_next_chunk_of_the_summary_is_read(length):
     data = bytearray(log())
     at, size = chunks(data)[2]
     struct.pack_into("<Q", data, at + size + 1, length)  # of the message index that follows
@@ -153,7 +153,7 @@ def test_behind_a_damaged_record_the_next_chunk_that_the_summary_knows_is_taken(
 
 
 @pytest.mark.parametrize("opcode", [0x00, 0x02, 0x04, 0x07, 0x0E, 0x0F, 0x16, 0x46, 0x86])
-def test_a_chunk_that_is_no_longer_called_one_is_missed(opcode):
+def test_a_chunk_with_a_damaged_opcode_is_reported(opcode):
     data = bytearray(log())
     lost = chunk_messages(data, 2)
     data[chunks(data)[2][0]] = opcode
@@ -182,7 +182,7 @@ def with_chunk(data, i, change):
     return data
 
 
-def test_an_absurd_size_is_refused_before_anything_is_unpacked():
+def test_an_absurd_size_is_refused_before_decompression():
     data = with_chunk(log(), 1, {"size": MAX_CHUNK_BYTES + 1})
     _, damage = walk(data)
     assert damage == [("chunk_too_large", len(chunk_messages(log(), 1)))]
@@ -194,12 +194,12 @@ def test_another_size_than_declared_is_refused(size):
     assert damage == [("wrong_chunk_size", len(chunk_messages(log(), 1)))]
 
 
-def test_an_unknown_compression_is_refused_by_name():
+def test_a_chunk_of_unknown_compression_is_left_out():
     _, damage = walk(with_chunk(log(), 1, {"compression": b"snap"}))
-    assert damage == [("unknown_compression_snap", len(chunk_messages(log(), 1)))]
+    assert damage == [("unknown_compression", len(chunk_messages(log(), 1)))]
 
 
-def test_a_flipped_bit_outside_chunks_spoils_what_only_that_checksum_covers():
+def test_a_flipped_bit_outside_chunks_costs_all_messages_outside_chunks():
     data = bytearray(log(use_chunking=False, enable_data_crcs=True))
     data[
         data.find(struct.pack("<I", 20) + zlib.crc32(bytes([20, 0])).to_bytes(4, "little")) + 9
@@ -207,7 +207,7 @@ def test_a_flipped_bit_outside_chunks_spoils_what_only_that_checksum_covers():
     assert walk(data) == ([], [("bad_checksum", 1)] * N)
 
 
-def test_a_message_that_the_statistics_know_of_is_missed():
+def test_a_message_that_only_the_statistics_count_is_reported_as_missing():
     data = log(use_chunking=False)
     # Take one message record of the wanted channel out of the data section.
     place = data.find(struct.pack("<I", 20) + zlib.crc32(bytes([20, 0])).to_bytes(4, "little")) - 31
@@ -221,7 +221,7 @@ def test_a_message_that_the_statistics_know_of_is_missed():
     assert damage == [("missing_messages", 1)]
 
 
-def test_a_summary_that_is_wrong_is_not_believed():
+def test_a_wrong_summary_is_not_used():
     data = bytearray(log())
     summary = make_reader(io.BytesIO(data)).get_summary()
     assert summary is not None
@@ -249,11 +249,11 @@ def chunk(records):
     return record(6, head + bytes(4) + struct.pack("<Q", len(records)) + records)
 
 
-def hand_made(*parts):
-    """Return a log of these parts of a data section, with no summary."""
+def hand_made(*records):
+    """Return a log of these records of a data section, with no summary."""
     footer = record(2, bytes(20))
     head = record(1, bytes(8))
-    return MAGIC + head + b"".join(parts) + record(15, bytes(4)) + footer + MAGIC
+    return MAGIC + head + b"".join(records) + record(15, bytes(4)) + footer + MAGIC
 
 
 DECLARED = record(3, SCHEMA_BODY) + record(4, CHANNEL_BODY)
@@ -268,41 +268,41 @@ def test_channels_may_be_declared_before_every_message():
     assert walk(hand_made(chunk(records))) == (list(range(50)), [])
 
 
-def test_a_chunk_in_a_chunk_is_said_to_be_left_out():
+def test_a_chunk_in_a_chunk_is_left_out_and_reported():
     records = DECLARED + message(0) + chunk(message(1)) + message(2)
     assert walk(hand_made(chunk(records))) == ([0, 2], [("damaged_record", 1)])
 
 
-def test_messages_too_short_to_be_one_are_counted():
+def test_messages_that_are_too_short_are_counted():
     records = DECLARED + record(5, b"abc") + message(1) + record(5, b"")
     assert walk(hand_made(chunk(records))) == ([1], [("damaged_record", 2)])
     assert walk(hand_made(records)) == ([1], [("damaged_record", 2)])
 
 
-def test_records_of_ones_own_are_passed_over():
+def test_private_records_are_skipped():
     own = record(0x80, b"") * 3 + record(0xFF, b"any")
     assert walk(hand_made(own, chunk(DECLARED + own + message(1)), own)) == ([1], [])
 
 
-def test_a_declaration_that_is_none_leaves_the_rest():
+def test_after_an_invalid_declaration_the_rest_is_read():
     records = DECLARED + record(4, b"") + record(3, b"\1") + message(1)
     assert walk(hand_made(chunk(records))) == ([1], [("damaged_record", 1)] * 2)
 
 
 def test_the_same_chunk_twice_is_read_twice():
-    part = chunk(DECLARED + message(1))
-    assert walk(hand_made(part, part)) == ([1, 1], [])
+    whole = chunk(DECLARED + message(1))
+    assert walk(hand_made(whole, whole)) == ([1, 1], [])
 
 
 @pytest.mark.parametrize("crc", [True, False])
-def test_logs_behind_each_other_are_read_and_named(crc):
+def test_logs_in_sequence_in_one_file_are_read_and_reported(crc):
     data = log(enable_crcs=crc)
     found, damage = walk(data * 3)
     assert found == list(range(N)) * 3
     assert damage == [("log_behind_log", 1)] * 2
 
 
-def test_a_log_behind_a_log_without_a_summary_is_read():
+def test_a_log_after_a_log_without_a_summary_is_read():
     data = hand_made(chunk(DECLARED + message(1)))
     assert walk(data + data) == ([1, 1], [("log_behind_log", 1)])
 
@@ -312,6 +312,6 @@ def test_opening_ahead_changes_nothing():
     at, length = chunks(data)[3]
     data[at + length - 20] ^= 1
     with ThreadPoolExecutor(3) as pool:
-        walked = RecordWalk(LogBytes.of(bytes(data)), frozenset([SCHEMA]), pool)
+        walked = RecordWalk(log_bytes(bytes(data)), frozenset([SCHEMA]), pool)
         found = [int(b.data[at : at + 4].view("<u4")[0]) for b in walked.blocks() for at in b.start]
     assert (found, [(d.reason, d.n) for d in walked.damage]) == walk(data)

@@ -1,4 +1,4 @@
-"""The compiled scans take what the decoders take, bit for bit, and nothing is lost between."""
+"""The compiled scans and the decoders give the same rows, bit for bit, and lose no message."""
 
 import random
 import struct
@@ -10,16 +10,17 @@ from mcap.writer import Writer
 from epipole.io.logs.columns import frames as frame_columns
 from epipole.io.logs.columns import states as state_columns
 from epipole.io.logs.messages.batches import MOST_AT_ONCE
-from epipole.io.logs.messages.encoding import encode_cdr, encode_json, encode_protobuf, varint
+from epipole.io.logs.messages.encodings import protobuf, ros2_cdr
+from epipole.io.logs.messages.encodings.protobuf import varint
+from epipole.io.logs.messages.encodings.registry import encoding_named
 from epipole.io.logs.messages.scan import MAX_NAMES
 from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import array, flatten
 from epipole.schemas.errors import LogError
-from epipole.schemas.messages import CENTROID_FRAME, SENSOR_STATE
+from epipole.schemas.messages import FRAME, STATE
 
 START_NS = 1_554_091_200_000_000_000
-ENCODERS = {"protobuf": encode_protobuf, "json": encode_json, "cdr": encode_cdr}
 GOOD_FRAME = {
     "timestamp": START_NS,
     "sensor_id": "sat1",
@@ -74,32 +75,33 @@ STATE_CHANGES = [
 
 
 def write_raw(path, recorded, encoding="protobuf", **options):
-    """Write messages as bytes: (message type, data), a nanosecond apart."""
+    """Write messages as bytes: (kind, data), a nanosecond apart."""
+    of_log = encoding_named(encoding)
     with path.open("wb") as file:
         writer = Writer(file, **options)
         writer.start()
         channels = {}
-        for i, (message, data) in enumerate(recorded):
-            name = message.ros_name if encoding == "cdr" else message.name
-            if name not in channels:
-                schema = writer.register_schema(name, encoding, b"")
-                channels[name] = writer.register_channel("/any", encoding, schema)
-            writer.add_message(channels[name], START_NS + i, data, START_NS + i)
+        for i, (kind, data) in enumerate(recorded):
+            if kind not in channels:
+                name = of_log.schema_names[kind][0]
+                schema = writer.register_schema(name, of_log.schema_encoding, b"")
+                channels[kind] = writer.register_channel("/any", of_log.message_encoding, schema)
+            writer.add_message(channels[kind], START_NS + i, data, START_NS + i)
         writer.finish()
     return path
 
 
 def read_both_ways(path, monkeypatch):
-    """Return a log as it is read, and as the decoders alone read it."""
+    """Return a log as it is read normally, and as the decoders alone read it."""
     fast = read_log(path)
     with monkeypatch.context() as patch:
-        patch.setattr(frame_columns, "scan_frames", lambda m, i, s, c, n, k: (i, n))
-        patch.setattr(state_columns, "scan_states", lambda m, i, s, f, r, n, k: (i, n))
+        patch.setattr(frame_columns, "scan_frames", lambda m, i, s, c, n: (i, n))
+        patch.setattr(state_columns, "scan_states", lambda m, i, s, f, r, n: (i, n))
         return fast, read_log(path)
 
 
 def check_same(path, monkeypatch, n_messages):
-    """Hold the two ways to each other and to the number of messages."""
+    """Check that both ways agree, and that no message is lost."""
     fast, slow = read_both_ways(path, monkeypatch)
     assert_same_exposures(fast.exposures, slow.exposures)
     assert fast.states.equals(slow.states)
@@ -123,18 +125,18 @@ def assert_same_exposures(fast, slow):
 
 
 def encoded(encoding):
-    """Return every frame and state, good or bad, in one encoding, good ones among them."""
-    encode, out = ENCODERS[encoding], []
+    """Return every frame and state of the lists in one encoding, each followed by a good one."""
+    encode, out = encoding_named(encoding).encode, []
     for change in FRAME_CHANGES:
-        out.append((CENTROID_FRAME, encode(CENTROID_FRAME, {**GOOD_FRAME, **change})))
-        out.append((CENTROID_FRAME, encode(CENTROID_FRAME, GOOD_FRAME)))
+        out.append((FRAME, encode(FRAME, {**GOOD_FRAME, **change})))
+        out.append((FRAME, encode(FRAME, GOOD_FRAME)))
     for change in STATE_CHANGES:
-        out.append((SENSOR_STATE, encode(SENSOR_STATE, {**GOOD_STATE, **change})))
-        out.append((SENSOR_STATE, encode(SENSOR_STATE, GOOD_STATE)))
+        out.append((STATE, encode(STATE, {**GOOD_STATE, **change})))
+        out.append((STATE, encode(STATE, GOOD_STATE)))
     return out
 
 
-@pytest.mark.parametrize("encoding", ["protobuf", "cdr"])
+@pytest.mark.parametrize("encoding", ["protobuf", "ros2"])
 def test_good_and_bad_messages_are_read_alike(tmp_path, monkeypatch, encoding):
     recorded = encoded(encoding)
     fast = check_same(
@@ -145,18 +147,18 @@ def test_good_and_bad_messages_are_read_alike(tmp_path, monkeypatch, encoding):
 
 
 def test_a_good_log_is_read_by_the_scans_alone(tmp_path, monkeypatch):
-    for encoding in ("protobuf", "cdr"):
-        encode = ENCODERS[encoding]
+    for encoding in ("protobuf", "ros2"):
+        encode = encoding_named(encoding).encode
         recorded = [
-            *[(CENTROID_FRAME, encode(CENTROID_FRAME, GOOD_FRAME))] * 10,
-            *[(SENSOR_STATE, encode(SENSOR_STATE, GOOD_STATE))] * 10,
+            *[(FRAME, encode(FRAME, GOOD_FRAME))] * 10,
+            *[(STATE, encode(STATE, GOOD_STATE))] * 10,
         ]
         path = write_raw(tmp_path / "a.mcap", recorded, encoding)
         with monkeypatch.context() as patch:
             patch.setattr(frame_columns.FrameColumns, "_judge", None)
             patch.setattr(state_columns.StateColumns, "_judge", None)
-            part = read_log(path)
-        assert (part.exposures.num_rows, part.states.num_rows) == (10, 10)
+            contents = read_log(path)
+        assert (contents.exposures.num_rows, contents.states.num_rows) == (10, 10)
 
 
 # Protobuf that is written in other ways
@@ -224,8 +226,8 @@ ODD = {
 
 @pytest.mark.parametrize("name", ODD)
 def test_protobuf_written_in_another_way_is_read_alike(tmp_path, monkeypatch, name):
-    good = (CENTROID_FRAME, b"".join(SOUND))
-    odd = (CENTROID_FRAME, b"".join(ODD[name]))
+    good = (FRAME, b"".join(SOUND))
+    odd = (FRAME, b"".join(ODD[name]))
     fast = check_same(write_raw(tmp_path / "a.mcap", [good, odd, odd, good]), monkeypatch, 4)
     assert array(fast.exposures, "frame_number")[[0, -1]].tolist() == [7, 7]
 
@@ -234,28 +236,28 @@ def test_protobuf_written_in_another_way_is_read_alike(tmp_path, monkeypatch, na
     "header", [b"\0\1\0\0", b"\0\7\0\0", b"\0\0\0\0", b"\0\6\0\0", b"\1\1\0\0"]
 )
 def test_cdr_of_any_header_is_read_alike(tmp_path, monkeypatch, header):
-    good = encode_cdr(CENTROID_FRAME, GOOD_FRAME)
-    recorded = [(CENTROID_FRAME, good), (CENTROID_FRAME, header + good[4:])]
-    recorded += [(CENTROID_FRAME, good[:n]) for n in range(len(good))]
-    recorded += [(CENTROID_FRAME, good + b"\1\2\3")]
-    check_same(write_raw(tmp_path / "a.mcap", recorded, "cdr"), monkeypatch, len(recorded))
+    good = ros2_cdr.encode(FRAME, GOOD_FRAME)
+    recorded = [(FRAME, good), (FRAME, header + good[4:])]
+    recorded += [(FRAME, good[:n]) for n in range(len(good))]
+    recorded += [(FRAME, good + b"\1\2\3")]
+    check_same(write_raw(tmp_path / "a.mcap", recorded, "ros2"), monkeypatch, len(recorded))
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("encoding", ["protobuf", "cdr"])
+@pytest.mark.parametrize("encoding", ["protobuf", "ros2"])
 def test_damaged_messages_are_read_alike(tmp_path, monkeypatch, encoding, seed):
     rng = random.Random(seed)
     sound = encoded(encoding)
-    recorded = [(CENTROID_FRAME, ENCODERS[encoding](CENTROID_FRAME, GOOD_FRAME))]
+    recorded = [(FRAME, encoding_named(encoding).encode(FRAME, GOOD_FRAME))]
     for _ in range(1500):
-        message, data = rng.choice(sound)
+        kind, data = rng.choice(sound)
         data = bytearray(data)
         for _ in range(rng.choice((0, 1, 1, 2, 5))):
             if data:
                 data[rng.randrange(len(data))] = rng.choice((rng.randrange(256), 0, 255))
         if rng.random() < 0.2:
             del data[rng.randrange(len(data) + 1) :]
-        recorded.append((message, bytes(data)))
+        recorded.append((kind, bytes(data)))
     path = write_raw(tmp_path / "a.mcap", recorded, encoding, chunk_size=5000)
     check_same(path, monkeypatch, len(recorded))
 
@@ -263,24 +265,24 @@ def test_damaged_messages_are_read_alike(tmp_path, monkeypatch, encoding, seed):
 def test_more_sensors_than_the_scans_know_are_told_apart(tmp_path, monkeypatch):
     names = [f"s{i % (MAX_NAMES + 50)}" for i in range(2 * MAX_NAMES + 100)]
     recorded = [
-        (message, encode_protobuf(message, {**good, "sensor_id": name}))
+        (kind, protobuf.encode(kind, {**good, "sensor_id": name}))
         for name in names
-        for message, good in ((CENTROID_FRAME, GOOD_FRAME), (SENSOR_STATE, GOOD_STATE))
+        for kind, good in ((FRAME, GOOD_FRAME), (STATE, GOOD_STATE))
     ]
     fast = check_same(write_raw(tmp_path / "a.mcap", recorded), monkeypatch, len(recorded))
     assert fast.exposures["sensor_id"].to_pylist() == names
     assert fast.states["sensor_id"].to_pylist() == names
 
 
-def test_a_scan_that_always_stops_is_left_alone_for_longer_and_longer(tmp_path, monkeypatch):
+def test_a_scan_that_always_stops_is_tried_less_and_less_often(tmp_path, monkeypatch):
     calls = []
 
-    def stop(messages, i, names, rows, n, kinds):
+    def stop(messages, i, names, rows, n):
         calls.append(i)
         return i, n
 
     monkeypatch.setattr(frame_columns, "scan_frames", stop)
-    frame = (CENTROID_FRAME, encode_protobuf(CENTROID_FRAME, GOOD_FRAME))
+    frame = (FRAME, protobuf.encode(FRAME, GOOD_FRAME))
     n = 2 * MOST_AT_ONCE
     path = write_raw(tmp_path / "a.mcap", [frame] * n, chunk_size=1 << 24)
     assert read_log(path).exposures.num_rows == n
@@ -300,13 +302,13 @@ def test_every_message_of_a_log_is_read_or_left_out(tmp_path, encoding):
             log.frame(
                 "sat1", START_NS + i, frame_number=i, exposure_s=0.1, x_px=x, y_px=x[: i % 2 + 2]
             )
-    part = read_log(tmp_path / "a.mcap")
-    read = part.exposures.num_rows + part.states.num_rows
+    contents = read_log(tmp_path / "a.mcap")
+    read = contents.exposures.num_rows + contents.states.num_rows
     assert 0 < read < 400
-    assert read + sum(part.rejects["count"].to_pylist()) == 400
+    assert read + sum(contents.rejects["count"].to_pylist()) == 400
 
 
 def test_a_log_of_odd_messages_alone_has_no_frames(tmp_path):
-    path = write_raw(tmp_path / "a.mcap", [(CENTROID_FRAME, b"\x01")] * 5)
+    path = write_raw(tmp_path / "a.mcap", [(FRAME, b"\x01")] * 5)
     with pytest.raises(LogError, match="undecodable_frame 5"):
         read_log(path)

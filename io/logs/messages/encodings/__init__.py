@@ -1,0 +1,1 @@
+"""The encodings of messages, a module each; `registry` lists them."""
