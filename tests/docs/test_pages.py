@@ -10,7 +10,7 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import TABLES
 
 STALE = "`.ci/generate pages` writes it again"
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [p for where in ("*.md", "docs/**/*.md", "examples/*.md") for p in sorted(ROOT.glob(where))]
 PAGE = pytest.mark.parametrize("page", PAGES, ids=[str(p.relative_to(ROOT)) for p in PAGES])
 
 
