@@ -35,9 +35,9 @@ def draw_pipeline(night: Night) -> Figure:
     height = PANEL_TOP - PANEL_BOTTOM
     lefts, wide = (0.28, 3.02, 5.76), 2.96
     captions = {
-        Stage.IDENTIFY: "stars are known; they give the attitude",
-        Stage.TRACK: "what is no star is followed (a minute)",
-        Stage.SOLVE: "lines of sight meet; the 99 % ellipse",
+        Stage.IDENTIFY: "identified stars give the attitude",
+        Stage.TRACK: "a minute of all that is no star",
+        Stage.SOLVE: "lines of sight meet in a point",
     }
     for left, (stage, caption) in zip(lefts, captions.items(), strict=True):
         _caption(page, left, stage, caption)

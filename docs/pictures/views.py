@@ -117,6 +117,15 @@ def draw_ellipsoid(axes: Axes, night: Night) -> None:
     axes.plot([right - 2, right, right], [low, low, low + 0.4], color=GREY, linewidth=1.2)
     axes.text(right - 2.1, low, "2 km", ha="right", va="center", fontsize=6.8, color=GREY)
     axes.text(right - 0.1, low + 0.25, "0.4 km", ha="right", va="center", fontsize=6.8, color=GREY)
+    axes.text(-0.96 * x, 0.8 * y, "99 % ellipse", va="center", fontsize=7, color=GREEN)
+    axes.text(
+        -0.96 * x,
+        0.55 * y,
+        "\N{MULTIPLICATION SIGN}  true place",
+        va="center",
+        fontsize=7,
+        color=INK,
+    )
     axes.set(xticks=[], yticks=[], xlim=(-x, x), ylim=(-y, y))
 
 
