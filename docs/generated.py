@@ -14,9 +14,11 @@ import sys
 from collections.abc import Callable, Iterable
 from enum import StrEnum
 from pathlib import Path
+from typing import Literal, get_args, get_origin
 
 import polars as pl
 import pyarrow as pa
+from pydantic.fields import FieldInfo
 
 from epipole.schemas.rejects import FrameStatus, Outcome, Reason
 from epipole.schemas.settings import Settings
@@ -102,12 +104,18 @@ def settings() -> str:
     for name, field in Settings.model_fields.items():
         group = type(field.default)
         rows = [
-            (f"`{key}`", _default(option.default), option.description or "")
+            (f"`{key}`", _default(option.default), (option.description or "") + _choices(option))
             for key, option in group.model_fields.items()
         ]
         table = _markdown(("setting", "default", "meaning"), rows)
         sections.append(f"### {name}\n\n{group.__doc__}\n\n{table}")
     return "\n".join(sections)
+
+
+def _choices(option: FieldInfo) -> str:
+    if get_origin(option.annotation) is not Literal:
+        return ""
+    return " One of " + ", ".join(f"`{name}`" for name in get_args(option.annotation)) + "."
 
 
 def _default(value: object) -> str:
