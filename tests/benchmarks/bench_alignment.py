@@ -30,7 +30,7 @@ CASES = {
 
 
 def scene_of(rates_hz: list[float], changes: dict[str, float | None]) -> Scene:
-    """Return METHODS' four low sensors and nine geostationary objects at other frame rates."""
+    """Return four low sensors and nine geostationary objects at other frame rates."""
     scene = read_scene("four_sensor_geo")
     sensors = [
         sensor.model_copy(update={"rate_hz": rate, **changes})

@@ -61,7 +61,7 @@ class Deployed:
 
 @pytest.fixture(scope="module")
 def deployed(tmp_path_factory, night_log) -> Iterator[Deployed]:
-    """Go through the README's commands, with its two lines of prefect.yaml changed."""
+    """Go through the commands of docs/operations.md, with two lines of prefect.yaml changed."""
     folder = tmp_path_factory.mktemp("deployed")
     (folder / "logs").mkdir()
     (folder / "logs" / night_log.name).symlink_to(night_log)
@@ -82,8 +82,8 @@ def deployed(tmp_path_factory, night_log) -> Iterator[Deployed]:
         yield Deployed(prefect)
 
 
-def test_the_commands_that_are_run_here_stand_in_the_readme():
-    readme = (ROOT / "README.md").read_text()
+def test_the_commands_that_are_run_here_stand_on_the_page_of_operations():
+    page = (ROOT / "docs" / "operations.md").read_text()
     for command in (
         "prefect server start",
         f"prefect work-pool create {POOL} --type process",
@@ -91,7 +91,7 @@ def test_the_commands_that_are_run_here_stand_in_the_readme():
         f"prefect worker start --pool {POOL}",
         f"prefect deployment run 'nightly/nightly' --param night={NIGHT} --watch",
     ):
-        assert f"\n{command}" in readme, command
+        assert f"\n{command}" in page, command
 
 
 def test_runs_are_scheduled_for_six_in_the_morning(deployed):

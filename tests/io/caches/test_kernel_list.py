@@ -1,4 +1,4 @@
-"""The list of kernels is that of a run; `python tests/io/caches/test_kernel_list.py` writes it."""
+"""The list of kernels is that of a run; `.ci/generate` writes it again."""
 
 import os
 import pickle
@@ -112,7 +112,7 @@ def test_a_run_of_the_example_has_nothing_to_compile_once_the_list_is_compiled(a
 
 def test_a_run_of_the_example_calls_what_the_list_says_and_nothing_else(asked):
     listed = {(name, signature(arguments)) for name, arguments in read_kernels()}
-    hint = "python tests/io/caches/test_kernel_list.py writes the list again"
+    hint = "`.ci/generate` writes the list again"
     assert not {key for key, from_python in asked.items() if from_python} - listed, hint
     assert not listed - set(asked), hint
 

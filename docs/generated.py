@@ -1,0 +1,216 @@
+"""The parts of the pages that the program itself knows: stages, tables, settings, packages.
+
+A part stands between two marks, ``<!-- name -->`` and ``<!-- end of name -->``. Tests hold the
+pages against the functions here. To write all parts again:
+
+    python docs/generated.py FOLDER      # that holds out/, made by the README's first command
+"""
+
+import ast
+import contextlib
+import io
+import re
+import sys
+from collections.abc import Callable, Iterable
+from enum import StrEnum
+from pathlib import Path
+from typing import Literal, get_args, get_origin
+
+import polars as pl
+import pyarrow as pa
+from pydantic.fields import FieldInfo
+
+from epipole.schemas.rejects import FrameStatus, Outcome, Reason
+from epipole.schemas.settings import Settings
+from epipole.schemas.stages import Stage
+from epipole.schemas.tables import TABLES
+
+ROOT = Path(__file__).parents[1]
+HOMES = ("schemas", "io", "tasks", "flows")
+
+# The published tables, by the stage that makes them.
+MADE_BY = {
+    Stage.IDENTIFY: ("frames", "stars", "detections"),
+    Stage.CALIBRATE: ("calibrations",),
+    Stage.TRACK: ("tracklets",),
+    Stage.SOLVE: ("epochs", "associations", "pairs", "positions", "states"),
+    Stage.PUBLISH: ("sources", "rejects"),
+}
+
+
+def stages() -> str:
+    """Return the README's table of stages."""
+    rows = []
+    for stage in Stage:
+        made = [f"[`{table}`](docs/tables.md#{table})" for table in MADE_BY.get(stage, ())]
+        rows.append((f"[`{stage}`](tasks/{stage}/)", stage.sentence, ", ".join(made)))
+    return _markdown(("stage", "what it does", "tables"), rows)
+
+
+def tables() -> str:
+    """Return the list of tables, with what a row of each is."""
+    rows = [(f"[`{name}`](#{name})", _doc(schema)) for name, schema in TABLES.items()]
+    return _markdown(("table", "contents"), rows)
+
+
+def columns() -> str:
+    """Return a section for each table: all its columns."""
+    return "\n".join(_section(name, schema) for name, schema in TABLES.items())
+
+
+def _section(name: str, schema: pa.Schema) -> str:
+    heading = ("column", "type", "unit", "frame", "null", "meaning")
+    rows = [_column(field) for field in schema]
+    return f"### {name}\n\n{_doc(schema)}\n\n{_markdown(heading, rows)}"
+
+
+def _column(field: pa.Field) -> tuple[str, ...]:
+    about = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+    kind = str(field.type).replace("double", "float64").replace(", tz=UTC", ", UTC")
+    null = "yes" if field.nullable else ""
+    return (
+        f"`{field.name}`", kind, about.get("unit", ""), about.get("frame", ""), null, about["doc"]
+    )  # fmt: skip
+
+
+def _doc(schema: pa.Schema) -> str:
+    return schema.metadata[b"doc"].decode()
+
+
+def reasons() -> str:
+    """Return the reasons of `rejects`, with their stages."""
+    rows = [(f"`{reason}`", str(reason.stage), reason.sentence) for reason in Reason]
+    return _markdown(("reason", "stage", "meaning"), rows)
+
+
+def outcomes() -> str:
+    """Return the outcomes of tracklets."""
+    return _words("outcome", Outcome)
+
+
+def statuses() -> str:
+    """Return the statuses of frames without an attitude from stars."""
+    return _words("status", FrameStatus)
+
+
+def _words(heading: str, words: Iterable[StrEnum]) -> str:
+    rows = [(f"`{word}`", word.sentence) for word in words]  # type: ignore[attr-defined]
+    return _markdown((heading, "meaning"), rows)
+
+
+def settings() -> str:
+    """Return a section for each group of settings: names, defaults, meanings."""
+    sections = []
+    for name, field in Settings.model_fields.items():
+        group = type(field.default)
+        rows = [
+            (f"`{key}`", _default(option.default), (option.description or "") + _choices(option))
+            for key, option in group.model_fields.items()
+        ]
+        table = _markdown(("setting", "default", "meaning"), rows)
+        sections.append(f"### {name}\n\n{group.__doc__}\n\n{table}")
+    return "\n".join(sections)
+
+
+def _choices(option: FieldInfo) -> str:
+    if get_origin(option.annotation) is not Literal:
+        return ""
+    return " One of " + ", ".join(f"`{name}`" for name in get_args(option.annotation)) + "."
+
+
+def _default(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, tuple):
+        return f"{len(value)} entries"
+    return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def rooms() -> str:
+    """Return all packages, each with the first paragraph of its docstring."""
+    rows = [
+        (f"[`{folder}/`]({folder}/)", _first_paragraph(ROOT / folder / "__init__.py"))
+        for folder in packages()
+    ]
+    return _markdown(("folder", "holds"), rows)
+
+
+def packages() -> list[str]:
+    """Return the folders of all packages, from the root of the repository."""
+    files = [f for home in HOMES for f in sorted((ROOT / home).rglob("__init__.py"))]
+    return [file.parent.relative_to(ROOT).as_posix() for file in files]
+
+
+def _first_paragraph(module: Path) -> str:
+    doc = ast.get_docstring(ast.parse(module.read_text())) or ""
+    return " ".join(doc.partition("\n\n")[0].split())
+
+
+def output(folder: Path) -> str:
+    """Return what the README's query prints where `folder` holds out/."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), pl.Config(tbl_width_chars=100):
+        exec(code("README.md", "query", f"{folder}/out/"), {})
+    return f"```\n{printed.getvalue()}```\n"
+
+
+def code(page: str, name: str, out: str) -> str:
+    """Return the Python code of a page's part, which reads its dataset from `out`."""
+    text = part((ROOT / page).read_text(), name)
+    return text.split("```")[1].removeprefix("python\n").replace('"out/', f'"{out}')
+
+
+# Each page's parts. What needs a dataset is `output` alone.
+PARTS: dict[str, dict[str, Callable[[], str]]] = {
+    "README.md": {"stages": stages},
+    "docs/tables.md": {
+        "tables": tables,
+        "columns": columns,
+        "reasons": reasons,
+        "outcomes": outcomes,
+        "statuses": statuses,
+    },
+    "docs/settings.md": {"settings": settings},
+    "CONTRIBUTING.md": {"packages": rooms},
+}
+
+
+def part(text: str, name: str) -> str:
+    """Return what stands between a part's two marks.
+
+    Raises
+    ------
+    ValueError
+        Where the text has no such part.
+    """
+    match = re.search(rf"<!-- {name} -->\n(.*?)<!-- end of {name} -->", text, re.DOTALL)
+    if match is None:
+        raise ValueError(f"there is no part {name}")
+    return match[1]
+
+
+def with_part(text: str, name: str, content: str) -> str:
+    """Return the text with another content between a part's two marks."""
+    start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+    return text.replace(f"{start}{part(text, name)}{end}", f"{start}{content}{end}")
+
+
+def write(folder: Path) -> None:
+    """Write all parts of all pages again."""
+    for page, parts in PARTS.items():
+        text = (ROOT / page).read_text()
+        for name, content in parts.items():
+            text = with_part(text, name, content())
+        (ROOT / page).write_text(text)
+    readme = ROOT / "README.md"
+    readme.write_text(with_part(readme.read_text(), "output", output(folder)))
+
+
+def _markdown(heading: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    lines = [heading, ("---",) * len(heading), *rows]
+    cells = [[cell.replace("|", "\\|") for cell in line] for line in lines]
+    return "".join(f"| {' | '.join(line)} |\n" for line in cells)
+
+
+if __name__ == "__main__":
+    write(Path(sys.argv[1]) if len(sys.argv) > 1 else Path.cwd())

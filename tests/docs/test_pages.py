@@ -1,0 +1,89 @@
+"""The pages: generated parts are current, commands stand as promised, links lead somewhere."""
+
+import re
+from pathlib import Path
+
+import pytest
+from generated import MADE_BY, PARTS, ROOT, code, output, part
+
+from epipole.schemas.stages import Stage
+from epipole.schemas.tables import TABLES
+
+STALE = "`.ci/generate pages` writes it again"
+PAGES = [p for where in ("*.md", "docs/**/*.md", "examples/*.md") for p in sorted(ROOT.glob(where))]
+PAGE = pytest.mark.parametrize("page", PAGES, ids=[str(p.relative_to(ROOT)) for p in PAGES])
+
+
+def links(page: Path) -> list[str]:
+    """Return where the links of a page lead, other sites apart."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    targets = re.findall(r"\]\(([^)]+)\)", text)
+    return [target for target in targets if "://" not in target]
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as public forges make them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize(
+    ("page", "name"), [(page, name) for page, parts in PARTS.items() for name in parts]
+)
+def test_generated_parts_are_current(page, name):
+    assert part((ROOT / page).read_text(), name) == PARTS[page][name](), STALE
+
+
+def test_every_published_table_is_made_by_one_stage():
+    made = [table for tables in MADE_BY.values() for table in tables]
+    assert sorted(made) == sorted(TABLES)
+    assert set(MADE_BY) <= set(Stage)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "python -m pip install . && epipole run examples/four_sensor_geo.mcap --out out/",
+        "python -m pip install '.[test]' && pytest -q",
+    ],
+)
+def test_the_two_commands_stand_as_they_are(command):
+    assert f"\n{command}\n" in (ROOT / "README.md").read_text()
+
+
+def test_the_query_prints_what_the_readme_says(example):
+    assert output(example) == part((ROOT / "README.md").read_text(), "output"), STALE
+
+
+def test_the_questions_have_answers(night_dataset):
+    names: dict = {}
+    exec(code("docs/tables.md", "questions", f"{night_dataset}/"), names)
+    assert all(len(names[name]) for name in ("one_object", "came_near", "ten_minutes"))
+
+
+@PAGE
+def test_links_lead_to_files_and_headings(page):
+    for target in links(page):
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), target
+        assert not anchor or anchor in anchors(file), target
+
+
+def test_every_page_can_be_reached_from_the_readme():
+    reached, fresh = set(), {ROOT / "README.md"}
+    while fresh:
+        reached |= fresh
+        targets = {
+            (page.parent / target.partition("#")[0]).resolve()
+            for page in fresh
+            for target in links(page)
+        }
+        fresh = {target for target in targets if target.suffix == ".md"} - reached
+    assert set(PAGES) <= reached
+
+
+def test_paths_in_benchmark_commands_exist():
+    text = (ROOT / "BENCHMARKS.md").read_text()
+    for path in re.findall(r"(?:tests|tasks|io|flows|schemas)/[\w/]+\.py", text):
+        assert (ROOT / path).exists(), path
