@@ -14,7 +14,12 @@ from epipole.schemas.tables import DETECTIONS, TRACKLETS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.time.epoch_grid import frame_interval_ns
-from epipole.tasks.algorithms.tracking.linking.chains import Links, chain_heads
+from epipole.tasks.algorithms.tracking.linking.chains import (
+    Fragments,
+    LinkRule,
+    Links,
+    chain_heads,
+)
 from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
 from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
@@ -199,26 +204,21 @@ def _link(part: _Part, seen: Sightings, runs: list[_Run], settings: Settings) ->
         return Links(np.full(len(runs), NONE), np.full(len(runs), np.nan))
     members = np.concatenate([run.members for run in runs])
     offsets = np.cumsum([0, *(len(run.members) for run in runs)])
-    fragments = (
+    fragments = Fragments(
         offsets.astype(np.int64),
         (frames.time_ns[seen.frame[members]] - frames.time_ns[0]) / 1e9,
         seen.u_icrs[members],
         sighting_sigma(seen)[members],
     )
-    if chosen.link_method == "prediction":
-        return link_by_prediction(
-            *fragments,
-            gap_s=chosen.link_gap_s,
-            kept=chosen.link_kept,
-            interval_s=part.interval_s,
-            q_rad2_s3=chosen.link_noise_px * camera.pixel_rad**2,
-        )
-    return link_by_likelihood(
-        *fragments,
+    rule = LinkRule(
         gap_s=chosen.link_gap_s,
         kept=chosen.link_kept,
         field_sr=camera.width * camera.height * camera.pixel_rad**2,
+        interval_s=part.interval_s,
+        noise_rad2_s3=chosen.link_noise_px * camera.pixel_rad**2,
     )
+    link = link_by_prediction if chosen.link_method == "prediction" else link_by_likelihood
+    return link(fragments, rule)
 
 
 def _runs(

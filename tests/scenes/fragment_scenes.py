@@ -17,7 +17,7 @@ PIXEL_RAD = FIELD_RAD / FIELD_PX
 SIGMA_PX = 0.15
 
 
-class Fragments(NamedTuple):
+class BrokenTracks(NamedTuple):
     """Fragments in the layout of the linkers, and the object each one is."""
 
     offsets: Indices
@@ -35,7 +35,7 @@ def broken_tracks(
     belt: bool = True,
     field_rad: float = FIELD_RAD,
     duration_s: float = 240.0,
-) -> Fragments:
+) -> BrokenTracks:
     """Return tracks at 1 Hz of objects in a low sensor's field, each with gaps.
 
     In the belt, objects are near geostationary height on orbits inclined up to 15 degrees: they
@@ -81,7 +81,7 @@ def broken_tracks(
             truth.append(k)
             offsets.append(offsets[-1] + len(part))
     n = offsets[-1]
-    return Fragments(
+    return BrokenTracks(
         np.array(offsets), np.concatenate(times), np.concatenate(u),
         np.full(n, sigma), np.array(truth),
     )  # fmt: skip

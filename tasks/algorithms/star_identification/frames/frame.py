@@ -5,14 +5,27 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.star_identification.search.evidence import TYPICAL_SPREAD_MAG
+from epipole.tasks.algorithms.star_identification.search.evidence import (
+    TYPICAL_SPREAD_MAG,
+    Rule,
+)
 from epipole.tasks.algorithms.star_identification.search.field import (
+    Attitude,
+    Centroids,
+    Matches,
+    StarList,
     solve_predicted,
     stars_in_cone,
 )
 from epipole.tasks.algorithms.star_identification.search.lost_in_space import (
     WORK_PER_S,
     search,
+)
+from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import (
+    Image,
+    Limits,
+    Problem,
+    Stars,
 )
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
@@ -115,6 +128,14 @@ class Verdict(NamedTuple):
     exhausted: bool
 
 
+def rule_of(how: Search, sky: Sky) -> Rule:
+    """Return the rule as the kernels take it."""
+    return Rule(
+        how.gate_sigma, sky.log_density, how.zero_point_mag, how.spread_mag, how.threshold,
+        how.threshold + CLEAR_LEAD,
+    )  # fmt: skip
+
+
 def identify_predicted(
     frame: Frame, sky: Sky, R0: Array, P0: Array, how: Search, lost: bool = False
 ) -> Solution | None:
@@ -140,9 +161,8 @@ def identify_predicted(
     R, P = np.empty((3, 3)), np.empty((3, 3))
     star, chi2 = np.full(n, -1, np.int64), np.zeros(n)
     evidence = solve_predicted(
-        R0, P0, lost, frame.u, frame.sigma_rad, frame.instrumental_mag, a, stars.magnitude[row],
-        frame.optics.box, how.gate_sigma, sky.log_density, how.zero_point_mag,
-        how.spread_mag, how.threshold + CLEAR_LEAD, R, P, star, chi2,
+        Attitude(R0, P0), lost, Centroids(*frame[:4]), StarList(a, stars.magnitude[row]),
+        frame.optics.box, rule_of(how, sky), Attitude(R, P), Matches(star, chi2),
     )  # fmt: skip
     if not evidence > how.threshold - (LOST_MARGIN + STARLIT if lost else 0.0):
         return None
@@ -168,18 +188,19 @@ def search_lost(frame: Frame, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Se
     if len(at) < 3:
         return Verdict(False, np.eye(3), -np.inf, -np.inf, False)
     R, least = np.zeros((3, 3)), how.threshold - LOST_MARGIN - STARLIT
-    area = frame.optics.solid_angle_sr
+    area, budget = frame.optics.solid_angle_sr, how.time_limit_s * WORK_PER_S
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))
-    best, runner_up, work = search(
-        frame.u, frame.sigma_rad, frame.instrumental_mag, frame.beta,
-        sky.catalogue.u_icrs, sky.catalogue.magnitude, grid.first, grid.star, grid.n_face,
-        grid.radius_rad, *pairs.chord, pairs.first, pairs.second, pairs.at_first,
-        pairs.at_second, min_chord, N_PATTERN_CENTROIDS, how.gate_sigma, sky.log_density,
-        how.zero_point_mag, how.spread_mag, sky.rho * area, area, frame.optics.box,
-        least, least + CLEAR_LEAD + 2.0, how.time_limit_s * WORK_PER_S, R,
-    )  # fmt: skip
+    problem = Problem(
+        Centroids(*frame[:4]),
+        Stars(sky.catalogue.u_icrs, sky.catalogue.magnitude, grid),
+        pairs,
+        Image(frame.optics.box, area, sky.rho * area),
+        rule_of(how, sky)._replace(least=least, enough=least + CLEAR_LEAD + 2.0),
+        Limits(min_chord, N_PATTERN_CENTROIDS, budget),
+    )
+    best, runner_up, work = search(problem, R)
     found = best > least and best - runner_up > CLEAR_LEAD
-    return Verdict(found, R, best, runner_up, work > how.time_limit_s * WORK_PER_S)
+    return Verdict(found, R, best, runner_up, work > budget)
 
 
 def identify_lost(

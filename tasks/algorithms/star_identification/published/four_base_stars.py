@@ -6,9 +6,9 @@ of catalogue pairs; a counter per star finds the stars that stand in all of the 
 at the cost of the sum of the set sizes. Every further centroid is matched where the six
 triangles that it forms with two base stars agree with those of a catalogue star.
 
-What the source leaves open: base stars are taken from the brightest centroids, brightest
-first, until four are identified; of several identities the one with most further matches
-counts, and a draw is none.
+Decided here, as the source leaves it open: base stars are taken from the brightest centroids,
+brightest first, until four are identified. Of several identities, the one with most further
+matches counts. A tie identifies nothing.
 """
 
 import math
@@ -26,7 +26,7 @@ N_BASE = 8  # brightest centroids of which four are tried at a time
 PAIR_GATE = 3.0  # sigma; of a separation
 # The published limit of 1e-6 rad^2 at 0.5 px of 20.3 degrees / 1024, in units of sigma^2.
 DISSIMILARITY_SIGMA2 = 33.0
-MAX_IDENTITIES = 64  # four centroids with more are passed over
+MAX_IDENTITIES = 64  # four centroids with more are skipped
 
 
 def match_four_base_stars(
@@ -50,7 +50,7 @@ def match_four_base_stars(
     """
     star = np.full(len(u), -1, np.int64)
     if len(u) >= 4 and len(star_u) >= 4:
-        _match(u, sigma_rad, star_u, *pairs.chord, pairs.first, pairs.second, N_BASE, star)
+        _match(u, sigma_rad, star_u, pairs, star)
     return star
 
 
@@ -75,14 +75,14 @@ def _same_hand(u, p, s_u, s):
 
 
 @kernel
-def _identities(u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pair_b, counter, out):
-    """Write the quadruples of stars whose six separations are those of centroids p; return
-    how many. `counter` is zero, and left so."""
-    low, high = np.zeros(4, np.int64), np.zeros(4, np.int64)
+def _common_partners(pairs, low, high, counter):
+    """Return the partners of the stars that stand in all three sets of pairs.
+
+    Set k = 1 .. 3 holds the pairs low[k]:high[k]. Returned are the star, its partner, and where
+    the rows of each set begin. `counter` is zero, and zero again afterwards.
+    """
+    pair_a, pair_b = pairs.first, pairs.second
     for k in range(1, 4):
-        c = _chord(u, p[0], u, p[k])
-        t = _tolerance(sigma, p[0], p[k], c)
-        low[k], high[k] = range_of(chord, below, slope, intercept, c - t, c + t)
         for i in range(low[k], high[k]):  # a set counts a star once
             if counter[pair_a[i]] == k - 1:
                 counter[pair_a[i]] = k
@@ -91,7 +91,6 @@ def _identities(u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pai
     n_total = 0
     for k in range(1, 4):
         n_total += 2 * (high[k] - low[k])
-    # Partners of the stars that reached 3, by set: (candidate, partner).
     first, partner = np.empty(n_total, np.int64), np.empty(n_total, np.int64)
     bound = np.zeros(5, np.int64)
     n = 0
@@ -110,6 +109,19 @@ def _identities(u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pai
         for i in range(low[k], high[k]):
             counter[pair_a[i]] = 0
             counter[pair_b[i]] = 0
+    return first, partner, bound
+
+
+@kernel
+def _identities(u, sigma, p, star_u, pairs, counter, out):
+    """Write the quadruples of stars whose six separations are those of centroids p; return
+    how many. `counter` is zero, and zero again afterwards."""
+    low, high = np.zeros(4, np.int64), np.zeros(4, np.int64)
+    for k in range(1, 4):
+        c = _chord(u, p[0], u, p[k])
+        t = _tolerance(sigma, p[0], p[k], c)
+        low[k], high[k] = range_of(pairs.chord, c - t, c + t)
+    first, partner, bound = _common_partners(pairs, low, high, counter)
     count = 0
     c23, c24, c34 = _chord(u, p[1], u, p[2]), _chord(u, p[1], u, p[3]), _chord(u, p[2], u, p[3])
     t23, t24, t34 = (
@@ -200,9 +212,9 @@ def _match_rest(u, sigma, p, star_u, s, star):
 
 
 @kernel
-def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_base, star):
+def _match(u, sigma, star_u, pairs, star):
     n = len(u)
-    m = min(n, n_base)
+    m = min(n, N_BASE)
     counter = np.zeros(len(star_u), np.int8)
     identities = np.empty((MAX_IDENTITIES, 4), np.int64)
     trial = np.empty(n, np.int64)
@@ -212,10 +224,7 @@ def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_b
             for second in range(1, third):
                 for lead in range(second):
                     p[0], p[1], p[2], p[3] = lead, second, third, last
-                    count = _identities(
-                        u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pair_b,
-                        counter, identities,
-                    )  # fmt: skip
+                    count = _identities(u, sigma, p, star_u, pairs, counter, identities)
                     best, draw = -1, False
                     for q in range(count):
                         further = _match_rest(u, sigma, p, star_u, identities[q], trial)
@@ -223,7 +232,7 @@ def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_b
                         if further > best:
                             best = further
                             star[:] = trial
-                    # A chance match of four has no further ones, if there are any to have.
+                    # Four that match by chance have no further matches, unless n = 4.
                     if best >= min(n - 4, 1) and not draw:
                         return
                     star[:] = -1

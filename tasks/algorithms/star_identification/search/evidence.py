@@ -18,6 +18,7 @@ centroids as the prior of `log_ways` has them).
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +34,24 @@ N_BINS = 72
 TYPICAL_SPREAD_MAG = 0.4  # a sensor's magnitude about V, colours included, while not learned
 OUTLIER_SHARE = 0.15  # variables, blends, odd colours
 MAG_RANGE = 6.0
+
+
+class Rule(NamedTuple):
+    """How matches are weighed.
+
+    gate : a star lies within this many sigma of its place
+    log_density : (N_BINS,) float, ln density of the catalogue's magnitudes
+    zero_point, spread : star minus instrumental magnitude [mag], NaN while not known, and its
+        1-sigma scatter
+    least, enough : log evidence that an attitude needs, and with which no other is tried
+    """
+
+    gate: float
+    log_density: Array
+    zero_point: float
+    spread: float
+    least: float
+    enough: float
 
 
 def log_magnitude_density(magnitude: Array) -> Array:
@@ -86,9 +105,7 @@ def log_ways(n, matches, in_view):
 
 
 @kernel
-def match_evidence(
-    star_of, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, spread, in_view, area
-):
+def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, rule, in_view, area):
     """Return the matches' part of the log evidence, and their number (compiled).
 
     Parameters
@@ -96,10 +113,9 @@ def match_evidence(
     star_of, chi2_of, sigma, instrumental : (n,)
         Each centroid's star (-1 none), d^2 / s^2, s [rad], -2.5 log10 flux (NaN unknown).
     magnitude : (m,)
-        Of the stars that `star_of` counts.
-    log_density, zero_point, spread : (N_BINS,), float, float
-        Catalogue's magnitudes; star minus instrumental magnitude, NaN where not known; its
-        scatter [mag].
+        Magnitudes of the stars, by the numbers in `star_of`.
+    rule : Rule
+        How matches are weighed.
     in_view, area : float
         Stars in the image (matched or not), and its solid angle [sr].
     """
@@ -108,22 +124,23 @@ def match_evidence(
         if star_of[k] >= 0:
             matches += 1
             total += math.log(area / (2.0 * math.pi * sigma[k] * sigma[k])) - 0.5 * chi2_of[k]
-    if math.isnan(zero_point):
+    density, zero, spread = rule.log_density, rule.zero_point, rule.spread
+    if math.isnan(zero):
         zero = median_zero_point(star_of, instrumental, magnitude)
         if not math.isnan(zero):
-            tight = _brightness(star_of, instrumental, magnitude, log_density, zero, 0.5 * spread)
-            loose = _brightness(star_of, instrumental, magnitude, log_density, zero, spread)
+            tight = _brightness(star_of, instrumental, magnitude, density, zero, 0.5 * spread)
+            loose = _brightness(star_of, instrumental, magnitude, density, zero, spread)
             more = max(tight, loose)
             total += more + math.log(0.5 * (math.exp(tight - more) + math.exp(loose - more)))
             total -= 3.0  # one more number chosen from the data: ln(range / its error)
     else:
-        total += _brightness(star_of, instrumental, magnitude, log_density, zero_point, spread)
+        total += _brightness(star_of, instrumental, magnitude, density, zero, spread)
     return total - log_ways(len(star_of), matches, in_view), matches
 
 
 @kernel
 def _brightness(star_of, instrumental, magnitude, log_density, zero, spread):
-    """Return the log of how much better the matches' brightness fits than by chance."""
+    """Return ln of how much better stars explain the matches' brightness than chance does."""
     total = 0.0
     for k in range(len(star_of)):
         s = star_of[k]

@@ -55,13 +55,13 @@ def _remembering(*fixes):
     """Return the memory of a sensor with these times and attitudes, known to an arc second."""
     memory = new_memory(1)
     for t_s, R in fixes:
-        remember(t_s, R, P_FIX, memory.t_s, memory.R, memory.P, memory.held)
+        remember(memory, t_s, R, P_FIX)
     return memory
 
 
 def _predict(memory, t_s):
     R, P = np.empty((3, 3)), np.empty((3, 3))
-    return predict(t_s, memory.t_s, memory.R, memory.P, memory.held, R, P), R, P
+    return predict(memory, t_s, R, P), R, P
 
 
 def test_a_turning_sensor_is_predicted_to_where_it_turns():

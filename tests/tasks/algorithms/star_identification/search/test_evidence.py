@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.star_identification.search.evidence import (
+    Rule,
     choice_lost,
     choice_predicted,
     log_brightness_ratio,
@@ -19,13 +20,17 @@ AREA = 0.04
 FLAT = log_magnitude_density(np.linspace(-2, 16, 10_000))
 
 
+def _rule(zero_point):
+    return Rule(3.7, FLAT, zero_point, 0.4, 11.5, 18.5)
+
+
 def _evidence(star_of, chi2=0.0, n_stars=5, instrumental=None, magnitude=None, zero=math.nan):
     n = len(star_of)
     instrumental = np.full(n, np.nan) if instrumental is None else instrumental
     magnitude = np.full(n_stars, 5.0) if magnitude is None else magnitude
     return match_evidence(
-        np.array(star_of), np.full(n, chi2), np.full(n, SIGMA), instrumental, magnitude, FLAT,
-        zero, 0.4, float(n_stars), AREA,
+        np.array(star_of), np.full(n, chi2), np.full(n, SIGMA), instrumental, magnitude,
+        _rule(zero), float(n_stars), AREA,
     )  # fmt: skip
 
 
@@ -50,7 +55,7 @@ def test_averaged_over_chance_the_evidence_is_below_one():
         d2 = np.sum((u - side / 2) ** 2, axis=2).min(axis=1) / sigma**2
         lone = match_evidence(
             np.where(np.arange(n) == 0, 0, -1), np.zeros(n), np.full(n, sigma),
-            np.full(n, np.nan), np.array([5.0]), FLAT, math.nan, 0.4, 1.0, AREA,
+            np.full(n, np.nan), np.array([5.0]), _rule(math.nan), 1.0, AREA,
         )[0]  # fmt: skip
         mean[n] = np.mean(np.exp(lone - 0.5 * d2))
     assert 0.5 < np.sum(mean * weight) / np.sum(weight) < 1.0

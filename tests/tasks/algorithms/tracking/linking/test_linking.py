@@ -9,24 +9,35 @@ from scipy.stats import chi2 as chi_square
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
-from epipole.tasks.algorithms.tracking.linking.chains import NONE, chain_heads, choose_links
+from epipole.tasks.algorithms.tracking.linking.chains import (
+    NONE,
+    Fragments,
+    LinkRule,
+    chain_heads,
+    choose_links,
+)
 from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
 from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction
 
 SIGMA = 4 * ARCSEC
 
 
-def by_likelihood(offsets, time_s, u, sigma, gap_s=90.0):
-    return link_by_likelihood(
-        offsets, time_s, u, sigma, gap_s=gap_s, kept=0.9999, field_sr=np.radians(8.0) ** 2
+def rule(gap_s):
+    return LinkRule(
+        gap_s=gap_s,
+        kept=0.9999,
+        field_sr=np.radians(8.0) ** 2,
+        interval_s=1.0,
+        noise_rad2_s3=1e-3 * (28 * ARCSEC) ** 2,
     )
 
 
-def by_prediction(offsets, time_s, u, sigma, gap_s=90.0):
-    return link_by_prediction(
-        offsets, time_s, u, sigma, gap_s=gap_s, kept=0.9999, interval_s=1.0,
-        q_rad2_s3=1e-3 * (28 * ARCSEC) ** 2,
-    )  # fmt: skip
+def by_likelihood(*fragments, gap_s=90.0):
+    return link_by_likelihood(Fragments(*fragments), rule(gap_s))
+
+
+def by_prediction(*fragments, gap_s=90.0):
+    return link_by_prediction(Fragments(*fragments), rule(gap_s))
 
 
 METHODS = pytest.mark.parametrize("link", [by_likelihood, by_prediction])
