@@ -6,11 +6,21 @@ a global.
 
 import hashlib
 import tomllib
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from epipole.schemas.errors import SettingsError
+from epipole.schemas.methods import ASSOCIATION, STAR_IDENTIFICATION, TRACK_LINKING
+
+if TYPE_CHECKING:
+    StarMethod = str
+    LinkMethod = str
+    AssociationMethod = str
+else:  # the names that the registries list
+    StarMethod = Literal[tuple(STAR_IDENTIFICATION)]
+    LinkMethod = Literal[tuple(TRACK_LINKING)]
+    AssociationMethod = Literal[tuple(ASSOCIATION)]
 
 
 class Group(BaseModel):
@@ -35,7 +45,7 @@ class SensorSettings(Group):
 class IdentificationSettings(Group):
     """Star identification and attitude."""
 
-    method: Literal["likelihood", "four_base_stars", "match_group", "radial_cyclic"] = Field(
+    method: StarMethod = Field(
         "likelihood",
         description="How stars are identified; the others are published methods, for comparison.",
     )
@@ -72,9 +82,7 @@ class TrackletSettings(Group):
     false_alarm: float = Field(
         1e-4, gt=0, lt=1, description="Accepted runs made of strays, a frame."
     )
-    link_method: Literal["likelihood_ratio", "prediction", "none"] = Field(
-        "likelihood_ratio", description="How broken tracks are joined."
-    )
+    link_method: LinkMethod = Field("likelihood_ratio", description="How broken tracks are joined.")
     link_gap_s: float = Field(90.0, gt=0, description="Longest break that is joined.")
     link_kept: float = Field(
         0.9999, gt=0, lt=1, description="Share of true joins that the chi-square test lets pass."
@@ -126,7 +134,7 @@ GEOSTATIONARY_RING = AltitudeShell(lowest_km=35746, highest_km=35826, share=0.2)
 class AssociationSettings(Group):
     """Which views of different sensors are one object."""
 
-    method: Literal["likelihood", "epipolar"] = Field(
+    method: AssociationMethod = Field(
         "likelihood",
         description="How views are associated; the other is a published method, for comparison.",
     )

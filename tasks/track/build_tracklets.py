@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, concat, empty, nullable, table
+from epipole.schemas.methods import TRACK_LINKING, load_method
 from epipole.schemas.settings import Settings, TrackletSettings
 from epipole.schemas.tables import DETECTIONS, TRACKLETS
 from epipole.tasks.algorithms.constants import ARCSEC
@@ -20,8 +21,6 @@ from epipole.tasks.algorithms.tracking.linking.chains import (
     Links,
     chain_heads,
 )
-from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
-from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.algorithms.tracking.runs import NONE, follow_detections
 from epipole.tasks.common.sightings import (
@@ -200,7 +199,7 @@ def _name(sensor_id: str, frames: Frames, seen: Sightings, detections: pa.Table,
 def _link(part: _Part, seen: Sightings, runs: list[_Run], settings: Settings) -> Links:
     """Return which run continues which, by the method that the settings name."""
     chosen, frames, camera = settings.tracklets, part.frames, part.camera
-    if chosen.link_method == "none" or not runs:
+    if not runs:
         return Links(np.full(len(runs), NONE), np.full(len(runs), np.nan))
     members = np.concatenate([run.members for run in runs])
     offsets = np.cumsum([0, *(len(run.members) for run in runs)])
@@ -217,8 +216,8 @@ def _link(part: _Part, seen: Sightings, runs: list[_Run], settings: Settings) ->
         interval_s=part.interval_s,
         noise_rad2_s3=chosen.link_noise_px * camera.pixel_rad**2,
     )
-    link = link_by_prediction if chosen.link_method == "prediction" else link_by_likelihood
-    return link(fragments, rule)
+    links: Links = load_method(TRACK_LINKING, chosen.link_method)(fragments, rule)
+    return links
 
 
 def _runs(

@@ -6,12 +6,15 @@ from epipole.tasks.algorithms.catalogue.star_catalogue import NavigationCatalogu
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, project, unproject
 from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.frames.frame import (
-    Frame,
-    Optics,
+    FieldOfView,
+    FrameCentroids,
     Search,
     aberrate_all,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import Frames, Spots
+from epipole.tasks.algorithms.star_identification.frames.spots import (
+    SensorCentroids,
+    UnscaledCentroids,
+)
 
 CAMERA = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)  # 16 degrees
 BETA = np.array([0.6e-4, -0.7e-4, 0.3e-4])  # an Earth's year's worth of aberration
@@ -38,7 +41,7 @@ def optics(camera=CAMERA):
     x = np.array([-0.5, camera.width - 0.5]) - camera.cx_px
     y = np.array([-0.5, camera.height - 0.5]) - camera.cy_px
     box = np.concatenate([x / camera.fx_px, y / camera.fy_px])
-    return Optics(camera.half_diagonal_rad, box, camera.pixel_rad)
+    return FieldOfView(camera.half_diagonal_rad, box, camera.pixel_rad)
 
 
 def frame(catalogue, R, seed, sigma_px=0.3, n_false=0, missing=0.0, flux=True, camera=CAMERA):
@@ -57,14 +60,15 @@ def frame(catalogue, R, seed, sigma_px=0.3, n_false=0, missing=0.0, flux=True, c
     order = np.argsort(mag)
     u = unproject(camera, x[order], y[order])
     mag = mag[order] if flux else np.full(len(x), np.nan)
-    return Frame(u, sigma_px * pixel_angle(camera, u), mag, BETA, optics(camera)), row[order]
+    sigma_rad = sigma_px * pixel_angle(camera, u)
+    return FrameCentroids(u, sigma_rad, mag, BETA, optics(camera)), row[order]
 
 
 def join(frames):
     """Return frames as one, flat."""
     optics_of = np.zeros(len(frames), np.int64)
     first = np.concatenate([[0], np.cumsum([len(f.u) for f in frames])]).astype(np.int64)
-    return Frames(
+    return SensorCentroids(
         first, np.concatenate([f.u for f in frames]),
         np.concatenate([f.sigma_rad for f in frames]),
         np.concatenate([f.instrumental_mag for f in frames]),
@@ -75,7 +79,7 @@ def join(frames):
 def join_spots(frames, sigma_px, pixel_rad):
     """Return frames as one, flat, with these (n,) errors and pixel sizes of their centroids."""
     flat = join(frames)
-    return Spots(
+    return UnscaledCentroids(
         flat.first, flat.u, np.concatenate(pixel_rad), np.concatenate(sigma_px),
         flat.instrumental_mag, flat.beta, flat.optics, flat.optics_of,
     )  # fmt: skip

@@ -16,7 +16,7 @@ from epipole.tasks.algorithms.star_identification.search.field import (
     Attitude,
     Centroids,
     Matches,
-    StarList,
+    StarPlaces,
     aberrated,
     solve_predicted,
     stars_in_cone,
@@ -93,7 +93,7 @@ class Walk(NamedTuple):
     searches: bool
 
 
-class _Scratch(NamedTuple):
+class _FieldScratch(NamedTuple):
     """Room for one frame: predicted attitude and covariance; stars of its field.
 
     R, P : (3, 3), (3, 3)
@@ -205,7 +205,7 @@ def _solve_near(k, frames, stars, rule, memory, room, solutions):
         Attitude(room.R, room.P),
         False,
         Centroids(frames.u[lo:hi], frames.sigma[lo:hi], frames.instrumental[lo:hi], frames.beta[k]),
-        StarList(room.u[:n], room.magnitude[:n]),
+        StarPlaces(room.u[:n], room.magnitude[:n]),
         frames.box[camera],
         rule,
         solution,
@@ -263,9 +263,9 @@ def follow(walk, frames, priors, stars, rule, memory, solutions, status):
         The frames, and which of them to go through in which order.
     priors : Priors
         Attitudes that came with the log.
-    stars : StarList
+    stars : StarPlaces
         The sky's stars.
-    rule : Rule
+    rule : MatchRule
         How matches are weighed.
     memory : Memory
         Kept up to date.
@@ -275,7 +275,7 @@ def follow(walk, frames, priors, stars, rule, memory, solutions, status):
         TOO_FEW centroids, NO_MATCH; 0 where solved.
     """
     n = len(stars.u)
-    room = _Scratch(
+    room = _FieldScratch(
         np.empty((3, 3)), np.empty((3, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int64)
     )
     k = walk.start

@@ -21,8 +21,12 @@ from epipole.tasks.algorithms.star_identification.frames.frame import (
     identify_lost,
     rule_of,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import Frames, Solutions, unsolved
-from epipole.tasks.algorithms.star_identification.search.field import StarList
+from epipole.tasks.algorithms.star_identification.frames.spots import (
+    SensorCentroids,
+    Solutions,
+    unsolved,
+)
+from epipole.tasks.algorithms.star_identification.search.field import StarPlaces
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
@@ -51,13 +55,13 @@ class Priors(NamedTuple):
 
 
 def no_priors(n: int) -> Priors:
-    """Return the priors of n frames without prior."""
+    """Return priors of n frames that have none: all NaN."""
     return Priors(np.full((n, 3, 3), np.nan), np.full(n, np.nan))
 
 
 def identify_sequence(
     t_s: Array,
-    frames: Frames,
+    frames: SensorCentroids,
     priors: Priors,
     sky: Sky,
     grid: SkyGrid,
@@ -79,14 +83,14 @@ def identify_sequence(
     n, n_stars = len(frames.beta), len(sky.catalogue.star_id)
     solutions, status = unsolved(frames.first), np.zeros(n, np.int8)
     arrays, rule = _arrays(t_s, frames), rule_of(how, sky)
-    stars = StarList(sky.catalogue.u_icrs, sky.catalogue.magnitude)
+    stars = StarPlaces(sky.catalogue.u_icrs, sky.catalogue.magnitude)
     memory, failures, k = new_memory(n_stars), 0, 0
     while True:
         walk = Walk(k, n, 1, True)
         k = int(follow(walk, arrays, priors, stars, rule, memory, solutions, status))
         if k == n:
             break
-        solution, cut_short = identify_lost(frames.one(k), sky, grid, pairs(), how)
+        solution, cut_short = identify_lost(frames.frame(k), sky, grid, pairs(), how)
         if solution is None:
             # Searches that keep failing (clouds, a night without stars) become rarer and rarer, so
             # that a dark log takes bounded time.
@@ -106,7 +110,7 @@ def identify_sequence(
     return solutions, [STATUS.get(code) for code in status.tolist()]
 
 
-def _arrays(t_s: Array, frames: Frames) -> FrameArrays:
+def _arrays(t_s: Array, frames: SensorCentroids) -> FrameArrays:
     return FrameArrays(
         t_s,
         frames.first,

@@ -123,7 +123,7 @@ class _Chains(NamedTuple):
     members: Indices
 
 
-class _Scratch(NamedTuple):
+class _ChainScratch(NamedTuple):
     """Room for one chain: direction, rate, covariance, a predicted direction, detections."""
 
     u: Array
@@ -326,7 +326,7 @@ def _try_pair(pair, detections, recent, rule, evidence, chains, room):
 def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
     """Follow all pairs within reach; keep the strongest chain of each detection of frame f."""
     directions, track = detections.directions, detections.track
-    room = _Scratch(
+    room = _ChainScratch(
         np.empty(3),
         np.empty(3),
         np.empty(3),

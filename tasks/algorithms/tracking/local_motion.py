@@ -28,7 +28,7 @@ class _Queries(NamedTuple):
     widest: float
 
 
-class _Detections(NamedTuple):
+class _MotionDetections(NamedTuple):
     """Times (n,), directions (n, 3), and errors (n, 3, 3), independent and shared."""
 
     t: Array
@@ -37,7 +37,7 @@ class _Detections(NamedTuple):
     bias: Array
 
 
-class _Places(NamedTuple):
+class _MotionPlaces(NamedTuple):
     """What `directions_at` returns."""
 
     u: Array
@@ -258,10 +258,10 @@ def directions_at(
         float(unknown_rate_rad_s),
         float(widest_s),
     )
-    detections = _Detections(
+    detections = _MotionDetections(
         *(np.ascontiguousarray(a, float) for a in (time_s, u_icrs, cov_noise, cov_bias))
     )
-    places = _Places(
+    places = _MotionPlaces(
         np.empty((q, 3)), np.empty((q, 3)), np.empty((q, 3, 3)), np.empty((q, 3, 3)),
         np.empty(q, np.int64),
     )  # fmt: skip

@@ -3,8 +3,8 @@
 Yuan, Zhang, Shi: A modified star map identification algorithm based on K vector
 (doi 10.16547/j.cnki.10-1096.20170210). The six separations of four centroids give six sets
 of catalogue pairs; a counter per star finds the stars that stand in all of the first three,
-at the cost of the sum of the set sizes. Every further centroid is matched where the six
-triangles that it forms with two base stars agree with those of a catalogue star.
+at the cost of the sum of the set sizes. A further centroid is matched with a star if the six
+triangles that it forms with two base stars agree with those of the star.
 
 Decided here, as the source leaves it open: base stars are taken from the brightest centroids,
 brightest first, until four are identified. Of several identities, the one with most further
@@ -17,6 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
+from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
+    Matcher,
+    identify_each_frame,
+)
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, Skies
+from epipole.tasks.algorithms.star_identification.sequence import Priors
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky, pattern_pairs
 from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 
@@ -46,12 +55,34 @@ def match_four_base_stars(
     Returns
     -------
     (n,) int64
-        Row of star_u, -1 where a centroid is no star; all -1 where the method fails.
+        Row of star_u, -1 where a centroid is not identified; all -1 where the method fails.
     """
     star = np.full(len(u), -1, np.int64)
     if len(u) >= 4 and len(star_u) >= 4:
         _match(u, sigma_rad, star_u, pairs, star)
     return star
+
+
+def identify_by_four_base_stars(
+    t_s: Array,
+    frames: UnscaledCentroids,
+    priors: Priors,
+    skies: Skies,
+    magnitude_limit: float | None,
+    how: Search,
+) -> IdentifiedSensor:
+    """Identify the stars of a sensor's frames by four base stars.
+
+    Parameters and result as `sensor.identify_sensor`; times and priors are not used.
+    """
+    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, how)
+
+
+def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
+    """Return the method as a function of centroids alone, its table of pairs made for a camera."""
+    star_u = sky.catalogue.u_icrs
+    pairs = pattern_pairs(star_u, 2 * optics.half_diagonal_rad)
+    return lambda u, sigma_rad: match_four_base_stars(u, sigma_rad, star_u, pairs)
 
 
 @kernel
@@ -69,9 +100,9 @@ def _tolerance(sigma, i, j, c):
 @kernel
 def _same_hand(u, p, s_u, s):
     """Return whether the first three of the four turn the same way in image and catalogue."""
-    seen = np.linalg.det(np.stack((u[p[0]], u[p[1]], u[p[2]])))
+    measured = np.linalg.det(np.stack((u[p[0]], u[p[1]], u[p[2]])))
     listed = np.linalg.det(np.stack((s_u[s[0]], s_u[s[1]], s_u[s[2]])))
-    return seen * listed > 0.0
+    return measured * listed > 0.0
 
 
 @kernel
@@ -161,11 +192,11 @@ def _match_rest(u, sigma, p, star_u, s, star):
     for k in range(len(u)):
         for b in range(4):
             diagonal = max(diagonal, _chord(u, k, u, p[b]))
-    seen, listed = np.empty((4, 4)), np.empty((4, 4))
+    measured, listed = np.empty((4, 4)), np.empty((4, 4))
     for b in range(4):
         star[p[b]] = s[b]
         for c in range(4):
-            seen[b, c] = _chord(u, p[b], u, p[c])
+            measured[b, c] = _chord(u, p[b], u, p[c])
             listed[b, c] = _chord(star_u, s[b], star_u, s[c])
     r, big_r = np.empty(4), np.empty(4)
     best_of = np.full(len(u), 1e9)
@@ -194,7 +225,7 @@ def _match_rest(u, sigma, p, star_u, s, star):
             for b in range(4):
                 for c in range(b):
                     d = (r[b] - big_r[b]) ** 2 + (r[c] - big_r[c]) ** 2
-                    worst = max(worst, d + (seen[b, c] - listed[b, c]) ** 2)
+                    worst = max(worst, d + (measured[b, c] - listed[b, c]) ** 2)
             if worst > limit or worst >= best_of[k]:
                 continue
             other = -1  # one star, one centroid

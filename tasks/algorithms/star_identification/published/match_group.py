@@ -17,7 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.published.agreement import agreeing_candidates
+from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
+    Matcher,
+    identify_each_frame,
+)
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, Skies
+from epipole.tasks.algorithms.star_identification.sequence import Priors
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky, pattern_pairs
 from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 
@@ -47,6 +56,28 @@ def states(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> npt.N
     if len(u) >= 3 and len(star_u) >= 3:
         _match(u, sigma_rad, star_u, pairs, star)
     return star
+
+
+def identify_by_match_group(
+    t_s: Array,
+    frames: UnscaledCentroids,
+    priors: Priors,
+    skies: Skies,
+    magnitude_limit: float | None,
+    how: Search,
+) -> IdentifiedSensor:
+    """Identify the stars of a sensor's frames by the improved match group.
+
+    Parameters and result as `sensor.identify_sensor`; times and priors are not used.
+    """
+    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, how)
+
+
+def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
+    """Return the method as a function of centroids alone, its table of pairs made for a camera."""
+    star_u = sky.catalogue.u_icrs
+    pairs = pattern_pairs(star_u, 2 * optics.half_diagonal_rad)
+    return lambda u, sigma_rad: match_group(u, sigma_rad, star_u, pairs)
 
 
 @kernel

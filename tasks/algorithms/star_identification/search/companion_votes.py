@@ -21,17 +21,17 @@ from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
 
 GATE, MAG_GATE = 2.0, 2.0  # of a pair's separation [sigma] and brightness [spreads]
 LEAST_BINS_LOG2, MOST_BINS_LOG2 = 4, 8  # of a turn
-# Cells enough that chance puts few votes into one [votes a cell].
+# Most votes per cell, on average: so few that chance hardly adds up.
 THIN = 0.1
 
 
 class Votes(NamedTuple):
-    """Votes of one pivot's companions, and room for them.
+    """Votes of one pivot's companions.
 
     cast : (stars << MOST_BINS_LOG2,) uint8, votes for a star and a turn
-    reached : (256,) how many of these have at least so many votes
+    reached : (256,) how many of these cells have at least so many votes
     companion, low, high : (n,) the companions and their ranges of pairs
-    angle, wide : (n,) their position angles about the pivot, and how far these may be off, in
+    angle, wide : (n,) their position angles about the pivot and the tolerances of these, in
         parts of `TURN`
     """
 
@@ -60,8 +60,8 @@ def make_votes(n_stars, n):
 
 @kernel
 def turn_bits(n_votes, n_stars, tolerance):
-    """Return log2 of the bins of turn that suit so many votes and a typical tolerance of
-    their turn, in parts of `TURN` (compiled)."""
+    """Return log2 of the number of bins of turn for so many votes with such a typical tolerance
+    of turn, in parts of `TURN` (compiled)."""
     fine = math.log2(TURN / max(2.0 * tolerance, 1.0))
     sparse = math.log2(max(n_votes / (THIN * n_stars), 1.0)) + 1.0
     return int(min(max(min(fine, sparse), LEAST_BINS_LOG2), MOST_BINS_LOG2))

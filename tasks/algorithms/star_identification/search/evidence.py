@@ -1,20 +1,20 @@
 """The verdict: how much better stars explain a frame than chance does.
 
 The log evidence of an attitude is the log of the ratio of two probabilities of the
-centroids' places: with the stars where the attitude puts them, and with every centroid
+centroids' places: with stars at the places that the attitude predicts, and with every centroid
 anywhere in the image. Its parts:
 
 - a match adds ln(A / (2 pi s^2)) - d^2 / (2 s^2), s the centroid's sigma, d its distance
   from the star, A the solid angle of the image; with brightness also
   ln(g(difference) / h(magnitude)), h the magnitudes of the catalogue;
-- which k of n centroids are which of the m stars in view is not known, nor what share of
-  these the sensor sees (`log_ways`);
-- the attitude was chosen: the share of the prior that the data leave. Lost in space,
-  that is sqrt(det 2 pi P) / (8 pi^2).
+- it is unknown which k of n centroids are which of the m stars in view, and what share of
+  these the sensor detects (`log_ways`);
+- the attitude was chosen among all: the share of the prior's volume that the data leave. Lost in
+  space, that is sqrt(det 2 pi P) / (8 pi^2).
 
-So it does not depend on how many hypotheses were tried, and the probability that chance
-alone reaches x is below exp(-x) (Markov's inequality; over frames with as many false
-centroids as the prior of `log_ways` has them).
+So the log evidence does not depend on how many hypotheses were tried. The probability that chance
+alone reaches x is below exp(-x), by Markov's inequality, over frames with as many false centroids
+as the prior of `log_ways` assumes.
 """
 
 import math
@@ -31,12 +31,12 @@ Array = npt.NDArray[np.float64]
 BIN_MAG = 0.25  # of the histogram of magnitudes
 FIRST_MAG = -2.0
 N_BINS = 72
-TYPICAL_SPREAD_MAG = 0.4  # a sensor's magnitude about V, colours included, while not learned
+TYPICAL_SPREAD_MAG = 0.4  # of a sensor's magnitudes about V, colours included; until it is learned
 OUTLIER_SHARE = 0.15  # variables, blends, odd colours
 MAG_RANGE = 6.0
 
 
-class Rule(NamedTuple):
+class MatchRule(NamedTuple):
     """How matches are weighed.
 
     gate : a star lies within this many sigma of its place
@@ -63,7 +63,7 @@ def log_magnitude_density(magnitude: Array) -> Array:
 
 @kernel
 def log_brightness_ratio(difference, magnitude, log_density, spread):
-    """Return ln(g / h) of a match whose magnitudes differ so; `spread` 1-sigma (compiled)."""
+    """Return ln(g / h) of a match with this difference of magnitudes; spread 1-sigma (compiled)."""
     z = difference / spread
     g = OUTLIER_SHARE / MAG_RANGE
     g += (1.0 - OUTLIER_SHARE) * math.exp(-0.5 * z * z) / (spread * 2.5066282746310002)
@@ -75,33 +75,35 @@ def log_brightness_ratio(difference, magnitude, log_density, spread):
 def median_zero_point(star_of, instrumental, magnitude):
     """Return the median of star minus instrumental magnitude over the matches (compiled).
 
-    NaN with fewer than three matches that have a flux.
+    NaN where fewer than three matches have a flux.
     """
-    found = np.empty(len(star_of))
+    zero = np.empty(len(star_of))
     n = 0
     for k in range(len(star_of)):
         if star_of[k] >= 0 and not math.isnan(instrumental[k]):
-            found[n] = magnitude[star_of[k]] - instrumental[k]
+            zero[n] = magnitude[star_of[k]] - instrumental[k]
             n += 1
     if n < 3:
         return math.nan
-    return np.median(found[:n])
+    return np.median(zero[:n])
 
 
 @kernel
 def log_ways(n, matches, in_view):
-    """Return -ln of the probability, before the places are seen, that just these centroids of n
-    are just these of the stars in view (compiled).
+    """Return -ln of the prior probability that these matches, and no others, exist (compiled).
 
-    The share p of the stars in view that the sensor sees is not known: 4 p^3, as most
-    sensors see most stars to their limit. Nor is the number f of false centroids: 1 / (f + 1),
-    every order of magnitude alike.
+    That is, that these k of the n centroids are these k of the stars in view, before places are
+    known. The share p of the stars in view that the sensor detects has the prior 4 p^3, as most
+    sensors detect most stars to their limit. The number f of false centroids has the prior
+    1 / (f + 1), the same for every order of magnitude.
     """
     k, m = float(matches), max(in_view, float(matches))
     centroids = math.lgamma(n + 1.0) - math.lgamma(n - k + 1.0)
     centroids += math.log((n - k + 1.0) / (n + 1.0))
-    seen = math.log(4.0) + math.lgamma(k + 4.0) + math.lgamma(m - k + 1.0) - math.lgamma(m + 5.0)
-    return centroids - seen
+    detected = (
+        math.log(4.0) + math.lgamma(k + 4.0) + math.lgamma(m - k + 1.0) - math.lgamma(m + 5.0)
+    )
+    return centroids - detected
 
 
 @kernel
@@ -114,7 +116,7 @@ def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, rule, in_vi
         Each centroid's star (-1 none), d^2 / s^2, s [rad], -2.5 log10 flux (NaN unknown).
     magnitude : (m,)
         Magnitudes of the stars, by the numbers in `star_of`.
-    rule : Rule
+    rule : MatchRule
         How matches are weighed.
     in_view, area : float
         Stars in the image (matched or not), and its solid angle [sr].
@@ -164,7 +166,7 @@ def _log_determinant(P):
 
 @kernel
 def choice_lost(P):
-    """Return the attitude's part of the log evidence, every attitude alike (compiled)."""
+    """Return the attitude's part of the log evidence, all attitudes equally likely (compiled)."""
     return 0.5 * _log_determinant(P) + 1.5 * math.log(2.0 * math.pi) - math.log(8.0 * math.pi**2)
 
 

@@ -16,10 +16,10 @@ from epipole.tasks.algorithms.star_identification.search.evidence import (
 
 Array = npt.NDArray[np.float64]
 
-# A centroid between two stars, or a star between two centroids, goes to the better one only
-# if that is this much better in chi-square (odds 20:1); otherwise to neither.
+# A centroid between two stars, or a star between two centroids, is matched with the nearer one if
+# that is so much better in chi-square (odds 20:1), and with neither otherwise.
 CLEARLY_BETTER = 6.0
-# Brightest centroids on which a prediction is tried to be shifted.
+# Brightest centroids onto which a predicted star is shifted.
 N_NUDGED = 12
 # A match whose brightness is this far off is a coincidence [mag].
 ODD_MAG = 2.5
@@ -39,7 +39,7 @@ class Centroids(NamedTuple):
     beta: Array
 
 
-class StarList(NamedTuple):
+class StarPlaces(NamedTuple):
     """Directions (m, 3) and magnitudes (m,) of stars."""
 
     u: Array
@@ -77,8 +77,8 @@ def aberrated(x, y, z, beta, out):
 
 @kernel
 def stars_in_cone(u_icrs, n_stars, R, radius, row):
-    """Write the rows of the first n_stars within `radius` [rad] of the boresight; return how
-    many (compiled)."""
+    """Write the rows of those of the first n_stars that are within `radius` [rad] of the boresight;
+    return how many (compiled)."""
     x, y, z, c, n = R[2, 0], R[2, 1], R[2, 2], math.cos(radius), 0
     for s in range(n_stars):
         if x * u_icrs[s, 0] + y * u_icrs[s, 1] + z * u_icrs[s, 2] > c:
@@ -97,7 +97,7 @@ def turn_stars(R, a, v):
 
 @kernel
 def count_in_view(v, box):
-    """Return how many stars are in the image, sensor-frame directions given (compiled).
+    """Return how many of the stars, given in the sensor frame, are in the image (compiled).
 
     `box` is x0, x1, y0, y1 of the image in normalised coordinates.
     """
@@ -276,11 +276,11 @@ def solve_predicted(predicted, lost, centroids, stars, box, rule, solution, matc
         look, and the evidence is charged with every attitude there is.
     centroids : Centroids
         The frame's centroids.
-    stars : StarList
+    stars : StarPlaces
         The stars around the field: apparent directions, ICRS axes.
     box : (4,)
         The image in normalised coordinates: x0, x1, y0, y1.
-    rule : Rule
+    rule : MatchRule
         How matches are weighed.
     solution, matches : Attitude, Matches, out
         Of no use where the evidence is -1e9.

@@ -51,7 +51,7 @@ SLACK = 2  # a hypothesis may lack so many of the votes that are needed
 # all centroids that are companions; votes after which no more companions are asked; how many of the
 # cells (a star and a turn) with most votes are tried.
 ROUNDS = ((6, 8, 0.5, 10_000, 32), (99, 0, 1.0, 0, 400))
-# Hardly a field has fewer stars than this share of the mean.
+# Hardly any field has fewer stars than this share of the mean.
 SPARSE = 0.35
 # About so many units of work take a second of CPU time.
 WORK_PER_S = 4e7
@@ -90,8 +90,8 @@ def _keep(evidence, R, best):
 
 @kernel
 def _matches_needed(problem):
-    """Return how many matches an attitude needs at least for the evidence asked for; more than
-    there are centroids where no number is enough."""
+    """Return how many matches an attitude needs at least for `rule.least`; more than there are
+    centroids where no number is enough."""
     centroids, rule, image = problem.centroids, problem.rule, problem.image
     sigma, instrumental = centroids.sigma, centroids.instrumental
     n = len(centroids.u)

@@ -1,4 +1,4 @@
-"""A pair of centroids taken for a pair of stars: its attitude, tried and judged by all others."""
+"""A pair of centroids taken for a pair of stars: its attitude, tried on all other centroids."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.geometry.attitude import refine_attitude
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.search.evidence import (
-    Rule,
+    MatchRule,
     choice_lost,
     log_ways,
     match_evidence,
@@ -46,7 +46,7 @@ class Image(NamedTuple):
     in_view: float
 
 
-class Limits(NamedTuple):
+class SearchLimits(NamedTuple):
     """Bounds of a search.
 
     min_chord : closest centroids that are paired [rad]
@@ -66,11 +66,11 @@ class Problem(NamedTuple):
     stars: Stars
     pairs: PairTable
     image: Image
-    rule: Rule
-    limits: Limits
+    rule: MatchRule
+    limits: SearchLimits
 
 
-class Scratch(NamedTuple):
+class PairScratch(NamedTuple):
     """Room for one pair of centroids and one hypothesis.
 
     E, F, R, P : (3, 3): frames of the pair in the image and in the sky, attitude, covariance
@@ -96,7 +96,7 @@ class Scratch(NamedTuple):
 @kernel
 def make_scratch(n, n_checked):
     """Return scratch for n centroids, of which hypotheses are tried on n_checked (compiled)."""
-    return Scratch(
+    return PairScratch(
         np.empty((3, 3)),
         np.empty((3, 3)),
         np.empty((3, 3)),

@@ -50,7 +50,7 @@ class _Ends(NamedTuple):
     extra: Array
 
 
-class _Scratch(NamedTuple):
+class _FitScratch(NamedTuple):
     """Normal equations of two fragments, A (4, 4) and b (4, 2), and a Cholesky factor (4, 4)."""
 
     A_1: Array
@@ -364,7 +364,7 @@ def _compare_all(tail, head, earlier, later, first, last):
     """Return what `_compare` does for each pair."""
     n = len(earlier)
     D, free, log_ratio = np.empty(n), np.empty(n), np.empty(n)
-    room = _Scratch(
+    room = _FitScratch(
         np.empty((4, 4)), np.empty((4, 2)), np.empty((4, 4)), np.empty((4, 2)), np.zeros((4, 4))
     )
     for p in range(n):

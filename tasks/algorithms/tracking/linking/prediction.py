@@ -33,7 +33,7 @@ FASTEST_RAD_S = 0.1  # 1-sigma of a rate not yet measured
 HARDEST_RAD_S2 = 1e-3  # 1-sigma of an acceleration not yet measured
 
 
-class _States(NamedTuple):
+class _EndStates(NamedTuple):
     """Filtered states at one end of each fragment.
 
     at : (g,) float, times
@@ -89,7 +89,7 @@ def _filter_all(fragments, backward, q):
     """Return the states at the last detection of each fragment, or backward at the first."""
     offsets = fragments.offsets
     n = len(offsets) - 1
-    states = _States(np.empty(n), np.zeros((n, 3, 3)), np.zeros((n, 3, 3)))
+    states = _EndStates(np.empty(n), np.zeros((n, 3, 3)), np.zeros((n, 3, 3)))
     for f in range(n):
         first, last, step = offsets[f], offsets[f + 1] - 1, 1
         if backward:

@@ -9,8 +9,8 @@ from scenes.random_stars import angle_between
 from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.star_identification.frames.frame import (
-    Frame,
-    Optics,
+    FieldOfView,
+    FrameCentroids,
     Search,
     identify_lost,
 )
@@ -35,7 +35,7 @@ class Sample:
         # There the middle of the top-left pixel is (0.5, 0.5).
         self.camera = Camera(width, width, f, f, width / 2 - 0.5, width / 2 - 0.5)
         half = width / 2 / f
-        self.optics = Optics(
+        self.optics = FieldOfView(
             self.camera.half_diagonal_rad, np.array([-half, half, -half, half]), 1 / f
         )
         stars = navigation_catalogue(
@@ -49,7 +49,7 @@ class Sample:
         d, rows = self.data, slice(self.data["offset"][k], self.data["offset"][k + 1])
         u = unproject(self.camera, d["x"][rows] - 0.5, d["y"][rows] - 0.5)
         sigma = max(float(d["sigma_px"][k]), 0.05) * pixel_angle(self.camera, u)
-        return Frame(u, sigma, d["mag"][rows].astype(float), np.zeros(3), self.optics)
+        return FrameCentroids(u, sigma, d["mag"][rows].astype(float), np.zeros(3), self.optics)
 
 
 def answers(name, how):

@@ -19,7 +19,7 @@ from scenes.random_stars import (
 from epipole.tasks.algorithms.catalogue.star_catalogue import limit_for_density
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, project, unproject
 from epipole.tasks.algorithms.star_identification import sensor
-from epipole.tasks.algorithms.star_identification.frames.frame import Frame
+from epipole.tasks.algorithms.star_identification.frames.frame import FrameCentroids
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
@@ -63,7 +63,7 @@ SKIES = Skies()
 class Shot(NamedTuple):
     """A frame, its centroids' errors as stated [px], and how large a pixel is."""
 
-    frame: Frame
+    frame: FrameCentroids
     sigma_px: np.ndarray
     pixel_rad: np.ndarray
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.star_identification.search.evidence import (
-    Rule,
+    MatchRule,
     choice_lost,
     choice_predicted,
     log_brightness_ratio,
@@ -21,7 +21,7 @@ FLAT = log_magnitude_density(np.linspace(-2, 16, 10_000))
 
 
 def _rule(zero_point):
-    return Rule(3.7, FLAT, zero_point, 0.4, 11.5, 18.5)
+    return MatchRule(3.7, FLAT, zero_point, 0.4, 11.5, 18.5)
 
 
 def _evidence(star_of, chi2=0.0, n_stars=5, instrumental=None, magnitude=None, zero=math.nan):
