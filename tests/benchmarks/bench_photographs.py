@@ -45,7 +45,7 @@ def read_list(path: Path) -> tuple[Array, Array, npt.NDArray[np.int64]]:
 def identify(
     x_px: Array, y_px: Array, camera: Camera, catalogue: Catalogue, day: int
 ) -> IdentifiedSensor:
-    """Return what the default makes of one frame without brightness."""
+    """Return the default method's result for one frame without brightness."""
     side = np.array([-0.5, camera.width - 0.5]) - camera.cx_px
     down = np.array([-0.5, camera.height - 0.5]) - camera.cy_px
     box = np.concatenate([side, down]) / camera.fx_px

@@ -77,7 +77,7 @@ PUBLISHED = {
 
 
 class Ours:
-    """One camera as epipole knows it: sky, optics, how to search."""
+    """One camera in this project's terms: sky, field of view, rule of search."""
 
     def __init__(self, frames: Frames) -> None:
         self.kind = kind = frames.kind
@@ -126,7 +126,7 @@ class Ours:
 
 
 class Row(NamedTuple):
-    """What a solver did with frames: right and wrong by frame, CPU milliseconds."""
+    """A solver's results: right and wrong for each frame, CPU milliseconds."""
 
     right: npt.NDArray[np.bool_]
     wrong: npt.NDArray[np.bool_]
@@ -171,7 +171,7 @@ def centroids(frames: Frames, k: int) -> tuple[Array, Array, Array, float]:
 
 
 def solvers(frames: Frames, cache: Path, peers: bool) -> dict[str, Callable[[], Solver | None]]:
-    """Return what makes each solver, by name."""
+    """Return a function that makes each solver, by name."""
     ours = Ours(frames)
     made: dict[str, Callable[[], Solver | None]] = {
         "epipole": lambda: ours.default,
@@ -187,7 +187,7 @@ def solvers(frames: Frames, cache: Path, peers: bool) -> dict[str, Callable[[], 
 
 
 def tracking_us(frames: Frames, n_frames: int = 20_000) -> tuple[float, float]:
-    """Return CPU microseconds a frame of a sensor that is followed, and centroids a frame.
+    """Return CPU microseconds per frame of a sensor that is followed, and centroids per frame.
 
     It turns evenly, sees 90 % of its stars to 0.2 px, and 3 false points.
     """

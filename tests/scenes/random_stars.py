@@ -17,12 +17,12 @@ from epipole.tasks.algorithms.star_identification.frames.spots import (
 )
 
 CAMERA = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)  # 16 degrees
-BETA = np.array([0.6e-4, -0.7e-4, 0.3e-4])  # an Earth's year's worth of aberration
+BETA = np.array([0.6e-4, -0.7e-4, 0.3e-4])  # aberration as of the Earth's motion
 HOW = Search(3.7, np.log(1e6), 0.5, np.nan)
 
 
 def random_catalogue(n=6000, seed=0):
-    """Return n stars all over the sky, ever more the fainter, brightest first."""
+    """Return n stars all over the sky, brightest first; fainter ones are more frequent."""
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(n, 3))
     magnitude = np.sort(6.2 + np.log10(rng.uniform(1e-4, 1, n)) / 0.5)
@@ -32,7 +32,7 @@ def random_catalogue(n=6000, seed=0):
 
 
 def random_attitude(seed):
-    """Return a (3, 3) rotation, every one alike."""
+    """Return a (3, 3) rotation; all are equally likely."""
     return matrix_from_quaternion(canonical(np.random.default_rng(seed).normal(size=4)))
 
 
@@ -45,8 +45,8 @@ def optics(camera=CAMERA):
 
 
 def frame(catalogue, R, seed, sigma_px=0.3, n_false=0, missing=0.0, flux=True, camera=CAMERA):
-    """Return the frame a camera with this attitude takes, brightest first, and the true star
-    (row of the catalogue, -1 none) of each centroid."""
+    """Return the frame of a camera with this attitude, brightest first, and the true star of each
+    centroid (row of the catalogue, -1 where there is none)."""
     rng = np.random.default_rng(seed)
     x, y = project(camera, aberrate_all(catalogue.u_icrs, BETA) @ R.T)
     row = np.flatnonzero(inside(camera, x, y))
@@ -65,7 +65,7 @@ def frame(catalogue, R, seed, sigma_px=0.3, n_false=0, missing=0.0, flux=True, c
 
 
 def join(frames):
-    """Return frames as one, flat."""
+    """Return frames in flat arrays."""
     optics_of = np.zeros(len(frames), np.int64)
     first = np.concatenate([[0], np.cumsum([len(f.u) for f in frames])]).astype(np.int64)
     return SensorCentroids(
@@ -77,7 +77,7 @@ def join(frames):
 
 
 def join_spots(frames, sigma_px, pixel_rad):
-    """Return frames as one, flat, with these (n,) errors and pixel sizes of their centroids."""
+    """Return frames in flat arrays, with these (n,) errors and pixel sizes of their centroids."""
     flat = join(frames)
     return UnscaledCentroids(
         flat.first, flat.u, np.concatenate(pixel_rad), np.concatenate(sigma_px),

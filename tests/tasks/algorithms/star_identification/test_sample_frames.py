@@ -32,7 +32,7 @@ class Sample:
     def __init__(self, name):
         self.data = data = dict(np.load(FRAMES / f"{name}.npz"))
         width, f = int(data["width"]), float(data["focal_px"])
-        # There the middle of the top-left pixel is (0.5, 0.5).
+        # In the samples, the middle of the top-left pixel is (0.5, 0.5).
         self.camera = Camera(width, width, f, f, width / 2 - 0.5, width / 2 - 0.5)
         half = width / 2 / f
         self.optics = FieldOfView(
@@ -53,8 +53,8 @@ class Sample:
 
 
 def answers(name, how):
-    """Return how many of the sample frames are answered, right and wrong, as METHODS of the
-    field have it: boresight within 0.05 and roll within 0.5 degrees; boresight 0.25 off."""
+    """Return how many of the sample frames get a right answer and how many a wrong one. Right:
+    boresight within 0.05 and roll within 0.5 degrees. Wrong: boresight off by 0.25 degrees."""
     sample, right, wrong, grids = Sample(name), 0, 0, {}
     for k in range(180):
         seen = sample.frame(k)
@@ -78,7 +78,7 @@ def answers(name, how):
     ("name", "how", "least_right"),
     [
         ("a_fov20", CALIBRATED, 1.0),
-        ("b_fov12", CALIBRATED, 0.977),  # 178 have an attitude from their true stars
+        ("b_fov12", CALIBRATED, 0.977),  # 178 are solved with their true stars
         ("c_fov08", CALIBRATED, 1.0),
         ("a_fov20", HOW, 0.998),
         ("b_fov12", HOW, 0.972),

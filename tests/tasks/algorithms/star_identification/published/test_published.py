@@ -86,14 +86,14 @@ def test_the_match_group_fails_on_the_noisy_maps_3_and_6_as_published(maps, skie
 
 @NEEDS_MAPS
 def test_radial_and_cyclic_features_fail_where_stars_are_missing_as_published(maps, skies):
-    # Published: 4, 5 and 8 fail. Rebuilt, the noisy maps 3 and 6 fail as well: their fields
-    # show too few stars all of whose neighbours are in view.
+    # Published: 4, 5 and 8 fail. Here the noisy maps 3 and 6 fail as well: in their fields, too few
+    # stars have all their neighbours in view.
     assert solved(maps, skies, radial_cyclic) == {1, 2, 7}
 
 
 @NEEDS_MAPS
 def test_four_base_stars_need_a_fifth_that_agrees(maps, skies):
-    # Map 3 has four stars in their place.
+    # Map 3 has only four stars in place.
     assert solved(maps, skies, four_base_stars) == {1, 2, 4, 5, 6, 7, 8}
 
 
@@ -125,8 +125,8 @@ def test_the_default_solves_all_eight_maps_without_brightness(skies, seed):
 
 @NEEDS_MAPS
 def test_with_ten_times_the_error_only_map_3_may_be_refused(maps, skies):
-    # Four of its seven stars are in their place: without brightness, too few to be sure at
-    # the usual false-alarm probability of one in a million.
+    # Four of its seven stars are in place: without brightness, these are too few at a false-alarm
+    # probability of one in a million.
     for number in maps:
         solution = by_default(maps, skies, number)
         assert solution is not None or number == 3, number
@@ -135,7 +135,7 @@ def test_with_ten_times_the_error_only_map_3_may_be_refused(maps, skies):
 
 
 class OneSky:
-    """Skies that are all one catalogue."""
+    """Skies of one catalogue, whatever the limit."""
 
     def __init__(self, catalogue: NavigationCatalogue):
         self.whole = sky_to_limit(catalogue, 99.0)

@@ -37,7 +37,7 @@ def _evidence(star_of, chi2=0.0, n_stars=5, instrumental=None, magnitude=None, z
 def test_the_evidence_of_three_matches_is_what_the_formula_gives():
     total, matches = _evidence([0, 1, -1, 4], chi2=2.0)
     one = math.log(AREA / (2 * math.pi * SIGMA**2)) - 1.0
-    # n! / (n - k)!, the integral of 4 p^3 p^k (1 - p)^(m - k), and one false rather than four.
+    # n! / (n - k)!, the integral of 4 p^3 p^k (1 - p)^(m - k), and one false centroid, not four.
     ways = math.factorial(4) / (4 * math.factorial(6) * math.factorial(2) / math.factorial(9))
     ways *= (1 + 1) / (4 + 1)
     assert matches == 3
@@ -45,8 +45,8 @@ def test_the_evidence_of_three_matches_is_what_the_formula_gives():
 
 
 def test_averaged_over_chance_the_evidence_is_below_one():
-    # Markov's inequality rests on this: the mean of its exponential over random frames of
-    # up to six centroids, as often as the prior has them, and one star, the best assignment taken.
+    # Markov's inequality rests on this: the mean of the evidence's exponential over random frames
+    # with one star and up to six centroids, weighted by the prior, under the best assignment.
     rng = np.random.default_rng(0)
     side, sigma = math.sqrt(AREA), 0.01
     mean, weight = np.zeros(7), 1.0 / np.arange(1.0, 8.0)

@@ -1,4 +1,4 @@
-"""Track linking: fragments of one object are joined, others stay alone; both methods."""
+"""Track linking, both methods: fragments of one object are joined, others stay alone."""
 
 import numpy as np
 import pytest
@@ -130,7 +130,7 @@ def test_broken_tracks_of_orbiting_objects_are_joined(link, n_objects, gap_s):
 
 
 def test_the_likelihood_statistic_has_its_degrees_of_freedom_where_two_are_one_object():
-    # Motions drawn from the prior: then its mean is 4, two for each axis.
+    # Motions drawn from the prior: then the mean is 4, two for each axis.
     rate = 40 * ARCSEC
     bend = (rate**2 + 1e-3 * rate + 2.5e-7) / ARCSEC
     rng = np.random.default_rng(6)
@@ -184,7 +184,7 @@ def test_the_likelihood_statistic_is_that_of_least_squares():
         return np.sum((z - A / scale @ fit) ** 2)
 
     expected = misfit(slice(None)) - misfit(slice(0, 12)) - misfit(slice(12, None))
-    # The prior acts on what is left after the straight drift, as here: it leaves lines free.
+    # The prior acts on the motion without its straight drift, as here: lines are free.
     assert by_likelihood(offsets, t, u, sigma).chi2[1] == pytest.approx(max(expected, 0), abs=1e-3)
 
 
