@@ -46,4 +46,4 @@ def test_only_the_brightest_centroids_are_searched():
         instrumental_mag=np.concatenate([seen.instrumental_mag, np.full(3000, -13.0)]),
     )
     assert n < N_SEARCHED
-    assert search_lost(crowded, sky, grid, pairs, HOW).found
+    assert search_lost(crowded, sky, grid, pairs, HOW).is_clear

@@ -63,7 +63,7 @@ def test_a_search_ends_when_its_bound_is_reached(grid, pairs):
     seen, _ = frame(CATALOGUE, random_attitude(0), 0, 1.0, 60, 1.0)
     verdict = search_lost(seen, SKY, grid, pairs, HOW._replace(time_limit_s=1e-3))
     assert verdict.exhausted
-    assert not verdict.found
+    assert not verdict.is_clear
 
 
 def test_centroids_all_on_one_spot_are_refused(grid, pairs):
