@@ -5,11 +5,21 @@ They come from a TOML file or from flow parameters. They are passed in, never re
 
 import hashlib
 import tomllib
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from epipole.schemas.errors import SettingsError
+from epipole.schemas.methods import ASSOCIATION, STAR_IDENTIFICATION, TRACK_LINKING
+
+if TYPE_CHECKING:
+    StarMethod = str
+    LinkMethod = str
+    AssociationMethod = str
+else:  # the names that the registries list
+    StarMethod = Literal[tuple(STAR_IDENTIFICATION)]
+    LinkMethod = Literal[tuple(TRACK_LINKING)]
+    AssociationMethod = Literal[tuple(ASSOCIATION)]
 
 
 class Group(BaseModel):
@@ -41,7 +51,7 @@ class SensorSettings(Group):
 class IdentificationSettings(Group):
     """Star identification and attitude."""
 
-    method: Literal["likelihood", "four_base_stars", "match_group", "radial_cyclic"] = Field(
+    method: StarMethod = Field(
         "likelihood",
         description="How stars are identified. The methods other than likelihood are published "
         "ones, "
@@ -91,7 +101,7 @@ class TrackletSettings(Group):
     false_alarm: float = Field(
         1e-4, gt=0, lt=1, description="Accepted number of false tracklets per frame."
     )
-    link_method: Literal["likelihood_ratio", "prediction", "none"] = Field(
+    link_method: LinkMethod = Field(
         "likelihood_ratio", description="How tracklets of one object are joined after a gap."
     )
     link_gap_s: float = Field(
@@ -152,7 +162,7 @@ GEOSTATIONARY_RING = AltitudeShell(lowest_km=35746, highest_km=35826, share=0.2)
 class AssociationSettings(Group):
     """Which tracklets of different sensors show one object."""
 
-    method: Literal["likelihood", "epipolar"] = Field(
+    method: AssociationMethod = Field(
         "likelihood",
         description="How tracklets are associated. 'epipolar' is a published method, for "
         "comparison.",

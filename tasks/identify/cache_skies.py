@@ -24,7 +24,7 @@ from epipole.tasks.algorithms.catalogue.star_catalogue import (
     places_at,
 )
 from epipole.tasks.algorithms.constants import DAY_NS
-from epipole.tasks.algorithms.star_identification.frames.frame import Optics
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView
 from epipole.tasks.algorithms.star_identification.sky import camera_sky as skies
 from epipole.tasks.algorithms.star_identification.sky import kvector, pair_table
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
@@ -81,7 +81,7 @@ class CachedSkies:
     def grid(self, limit: float, radius_rad: float) -> SkyGrid:
         return _grid(*self.key, limit, radius_rad)
 
-    def pairs(self, limit: float, optics: Optics) -> PairTable:
+    def pairs(self, limit: float, optics: FieldOfView) -> PairTable:
         n = pattern_size(_sky(*self.key, limit), optics.solid_angle_sr)
         return _pairs(*self.key, n, 2 * optics.half_diagonal_rad)
 

@@ -17,6 +17,7 @@ from epipole.schemas.bridge import (
     unstack,
     unstack_covariance,
 )
+from epipole.schemas.methods import STAR_IDENTIFICATION, load_method
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.star_catalogue import with_catalogue
@@ -35,11 +36,12 @@ from epipole.tasks.algorithms.geometry.rotations import (
     quaternion_from_matrix,
 )
 from epipole.tasks.algorithms.geometry.sky import aberrate, boresight_angles, radec_from_unit
-from epipole.tasks.algorithms.star_identification.frames.frame import Optics, Search
-from epipole.tasks.algorithms.star_identification.frames.spots import Spots, brightest_first
-from epipole.tasks.algorithms.star_identification.published.frame_by_frame import identify_published
-from epipole.tasks.algorithms.star_identification.sensor import Identified as Found
-from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frames.spots import (
+    UnscaledCentroids,
+    brightest_first,
+)
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.time.time_scales import earth_velocity
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -147,7 +149,7 @@ def _cameras_of(
     return holds, {int(r): Camera(**v) for r, v in zip(used, values, strict=True)}
 
 
-def _optics(camera: Camera) -> Optics:
+def _optics(camera: Camera) -> FieldOfView:
     """Return the field of a camera, its distortion taken into account."""
     n = 9
     side = np.linspace(-0.5, camera.width - 0.5, n)
@@ -158,12 +160,14 @@ def _optics(camera: Camera) -> Optics:
         camera, (x_px - camera.cx_px) / camera.fx_px, (y_px - camera.cy_px) / camera.fy_px
     )
     half_diagonal = float(np.arctan(np.max(np.hypot(x, y))))
-    return Optics(half_diagonal, np.array([x.min(), x.max(), y.min(), y.max()]), camera.pixel_rad)
+    return FieldOfView(
+        half_diagonal, np.array([x.min(), x.max(), y.min(), y.max()]), camera.pixel_rad
+    )
 
 
 def _identify(
     exposures: pa.Table, places: pa.Table, c: _Centroids, catalogue: pa.Table, settings: Settings
-) -> tuple[Found | None, npt.NDArray[np.int64]]:
+) -> tuple[IdentifiedSensor | None, npt.NDArray[np.int64]]:
     """Return what the stars tell, and the rows of the centroids, brightest first in each frame."""
     time_ns = array(exposures, "time")
     rows = brightest_first(c.first, c.flux)
@@ -171,7 +175,7 @@ def _identify(
         return None, rows
     rule = settings.identification
     beta = _velocity(time_ns, places) / SPEED_OF_LIGHT_KM_S
-    spots = Spots(
+    spots = UnscaledCentroids(
         c.first,
         c.u[rows],
         c.pixel_rad[rows],
@@ -185,10 +189,9 @@ def _identify(
     pixel_rad = next(iter(c.cameras.values())).pixel_rad
     skies = CachedSkies(Catalogue(catalogue), day, pixel_rad, rule.merge_px)
     how = Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
-    if rule.method != "likelihood":
-        return identify_published(spots, skies, rule.magnitude_limit, rule.method, how), rows
+    identify = load_method(STAR_IDENTIFICATION, rule.method)
     t_s = (time_ns - time_ns[0]) / 1e9
-    found = identify_sensor(t_s, spots, _priors(places, settings), skies, rule.magnitude_limit, how)
+    found = identify(t_s, spots, _priors(places, settings), skies, rule.magnitude_limit, how)
     return found, rows
 
 
@@ -216,7 +219,7 @@ class _Attitudes(NamedTuple):
     cov_arcsec2: Array
 
 
-def _attitudes(places: pa.Table, found: Found | None, settings: Settings) -> _Attitudes:
+def _attitudes(places: pa.Table, found: IdentifiedSensor | None, settings: Settings) -> _Attitudes:
     """Return the stars' attitude where there is one, else the prior as it is."""
     n = places.num_rows
     q, sigma = stack(places, "q{}", "xyzw"), _prior_sigma(places, settings)
@@ -243,7 +246,7 @@ class _Matches(NamedTuple):
     scale: float
 
 
-def _matches(found: Found | None, rows: npt.NDArray[np.int64]) -> _Matches:
+def _matches(found: IdentifiedSensor | None, rows: npt.NDArray[np.int64]) -> _Matches:
     if found is None:
         none = np.empty(0, np.int64)
         return _Matches(none, none, np.empty(0), np.empty((0, 3)), 1.0)

@@ -8,11 +8,10 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import concat
+from epipole.schemas.methods import ASSOCIATION, load_method
 from epipole.schemas.rejects import Outcome, Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
-from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
-from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
 from epipole.tasks.algorithms.association.sampling.samples import Groups, Samples
 from epipole.tasks.algorithms.association.verdicts import Verdicts
 from epipole.tasks.algorithms.orbits.object_identity import ObjectRegistry
@@ -164,18 +163,9 @@ def _numbered(arrays: SpanViews, group: Indices, windows: list[Indices]) -> Indi
 
 
 def _solve(arrays: SpanViews, samples: Samples, settings: Settings) -> Groups:
-    chosen = settings.association
-    if chosen.method == "epipolar":
-        return associate_by_lines(samples, arrays.focal_px, chosen.threshold_px)
-    return associate_tracklets(
-        samples,
-        gate_sigma=chosen.gate_sigma,
-        min_altitude_km=chosen.min_altitude_km,
-        max_range_km=chosen.max_range_km,
-        min_log_odds=chosen.min_log_odds,
-        ambiguity_log_odds=chosen.ambiguity_log_odds,
-        shells=[Shell(s.lowest_km, s.highest_km, s.share) for s in chosen.shells],
-    )
+    associate = load_method(ASSOCIATION, settings.association.method)
+    groups: Groups = associate(samples, arrays.focal_px, settings.association)
+    return groups
 
 
 def _reject_table(

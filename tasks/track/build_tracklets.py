@@ -9,15 +9,19 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, concat, empty, nullable, table
+from epipole.schemas.methods import TRACK_LINKING, load_method
 from epipole.schemas.settings import Settings, TrackletSettings
 from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import TRACKLET_RUNS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.time.epoch_grid import frame_interval_ns
-from epipole.tasks.algorithms.tracking.linking.chains import Links, chain_heads
-from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
-from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction
+from epipole.tasks.algorithms.tracking.linking.chains import (
+    Fragments,
+    LinkRule,
+    Links,
+    chain_heads,
+)
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.algorithms.tracking.runs import NONE, follow_detections
 from epipole.tasks.common.sightings import (
@@ -196,30 +200,25 @@ def _name(sensor_id: str, frames: Frames, seen: Sightings, detections: pa.Table,
 def _link(part: _Part, seen: Sightings, runs: list[_Run], settings: Settings) -> Links:
     """Return which run continues which, by the method that the settings name."""
     chosen, frames, camera = settings.tracklets, part.frames, part.camera
-    if chosen.link_method == "none" or not runs:
+    if not runs:
         return Links(np.full(len(runs), NONE), np.full(len(runs), np.nan))
     members = np.concatenate([run.members for run in runs])
     offsets = np.cumsum([0, *(len(run.members) for run in runs)])
-    fragments = (
+    fragments = Fragments(
         offsets.astype(np.int64),
         (frames.time_ns[seen.frame[members]] - frames.time_ns[0]) / 1e9,
         seen.u_icrs[members],
         sighting_sigma(seen)[members],
     )
-    if chosen.link_method == "prediction":
-        return link_by_prediction(
-            *fragments,
-            gap_s=chosen.link_gap_s,
-            kept=chosen.link_kept,
-            interval_s=part.interval_s,
-            q_rad2_s3=chosen.link_noise_px * camera.pixel_rad**2,
-        )
-    return link_by_likelihood(
-        *fragments,
+    rule = LinkRule(
         gap_s=chosen.link_gap_s,
         kept=chosen.link_kept,
         field_sr=camera.width * camera.height * camera.pixel_rad**2,
+        interval_s=part.interval_s,
+        noise_rad2_s3=chosen.link_noise_px * camera.pixel_rad**2,
     )
+    links: Links = load_method(TRACK_LINKING, chosen.link_method)(fragments, rule)
+    return links
 
 
 def _runs(

@@ -27,7 +27,7 @@ from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.schemas.bridge import array
 from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import validate_settings
-from epipole.tasks.algorithms.star_identification.frames.frame import Optics
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView
 from epipole.tasks.catalogue.build_deep_catalogue import build_deep_catalogue
 from epipole.tasks.identify import cache_skies
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -78,7 +78,7 @@ def sky_cost(catalogue: Catalogue, field: float, pixels: int, centroids: int) ->
     half = np.tan(np.radians(field / 2))
     box = np.array([-half, half, -half, half])
     pixel = np.radians(field) / pixels
-    optics = Optics(float(np.arctan(half * np.sqrt(2))), box, pixel)
+    optics = FieldOfView(float(np.arctan(half * np.sqrt(2))), box, pixel)
     skies = CachedSkies(catalogue, DAY, pixel, 2.0)
     stars = cpu_ms(lambda: skies.limit_for(centroids / optics.solid_angle_sr))
     limit = skies.limit_for(centroids / optics.solid_angle_sr)

@@ -22,10 +22,10 @@ import numpy.typing as npt
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.sky import boresight_angles
-from epipole.tasks.algorithms.star_identification.frames.frame import Optics, Search
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
 from epipole.tasks.algorithms.star_identification.sensor import (
-    Identified,
-    Spots,
+    IdentifiedSensor,
+    UnscaledCentroids,
     identify_sensor,
 )
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -44,15 +44,15 @@ def read_list(path: Path) -> tuple[Array, Array, npt.NDArray[np.int64]]:
 
 def identify(
     x_px: Array, y_px: Array, camera: Camera, catalogue: Catalogue, day: int
-) -> Identified:
-    """Return what the default makes of one frame without brightness."""
+) -> IdentifiedSensor:
+    """Return the default method's result for one frame without brightness."""
     side = np.array([-0.5, camera.width - 0.5]) - camera.cx_px
     down = np.array([-0.5, camera.height - 0.5]) - camera.cy_px
     box = np.concatenate([side, down]) / camera.fx_px
     unknown = np.full(len(x_px), np.nan)
     u = unproject(camera, x_px, y_px)
-    optics = Optics(camera.half_diagonal_rad, box, camera.pixel_rad)
-    spots = Spots(u, pixel_angle(camera, u), unknown, unknown, np.zeros(3), optics)
+    optics = FieldOfView(camera.half_diagonal_rad, box, camera.pixel_rad)
+    spots = UnscaledCentroids(u, pixel_angle(camera, u), unknown, unknown, np.zeros(3), optics)
     skies = CachedSkies(catalogue, day, camera.pixel_rad, 2.0)
     return identify_sensor(np.zeros(1), [spots], [None], skies, None, HOW)
 

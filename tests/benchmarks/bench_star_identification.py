@@ -13,13 +13,22 @@ Public tools: `pip install '.[bench]'`.
 import argparse
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import gettempdir
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from star_frames import CELLS, MERGED_PX, Frames, expose, make_frames, read_frames, seen_stars
+from star_frames import (
+    CELLS,
+    MERGED_PX,
+    Frames,
+    expose,
+    make_frames,
+    read_frames,
+    seen_stars,
+)
 from star_peers import Solver, cedar_solve, tetra3rs
 
 from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue
@@ -29,15 +38,19 @@ from epipole.tasks.algorithms.geometry.rotations import (
     quaternion_from_rotation_vector,
 )
 from epipole.tasks.algorithms.star_identification.frames.frame import (
-    Frame,
-    Optics,
+    FieldOfView,
+    FrameCentroids,
     Search,
     identify_lost,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import Frames as Flat
+from epipole.tasks.algorithms.star_identification.frames.spots import SensorCentroids
+from epipole.tasks.algorithms.star_identification.published import (
+    four_base_stars,
+    match_group,
+    radial_cyclic,
+)
 from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
-    Method,
-    matcher,
+    Matcher,
     solve_matches,
 )
 from epipole.tasks.algorithms.star_identification.sequence import identify_sequence, no_priors
@@ -56,18 +69,22 @@ RIGHT_DEG, RIGHT_ROLL_DEG, WRONG_DEG = 0.05, 0.5, 0.25
 WRONG_ROLL_DEG = 5.0  # three right stars at 2 px may leave a degree or two
 FALSE_ALARM = 1e-5
 LEAST_SIGMA_PX = 0.05  # stated where there is none
-PUBLISHED: tuple[Method, ...] = ("four_base_stars", "match_group", "radial_cyclic")
+PUBLISHED = {
+    "four_base_stars": four_base_stars.make_matcher,
+    "match_group": match_group.make_matcher,
+    "radial_cyclic": radial_cyclic.make_matcher,
+}
 
 
 class Ours:
-    """One camera as epipole knows it: sky, optics, how to search."""
+    """One camera in this project's terms: sky, field of view, rule of search."""
 
     def __init__(self, frames: Frames) -> None:
         self.kind = kind = frames.kind
         self.camera = kind.camera
         half = kind.width_px / 2 / self.camera.fx_px
         box = np.array([-half, half, -half, half])
-        self.optics = Optics(self.camera.half_diagonal_rad, box, self.camera.pixel_rad)
+        self.optics = FieldOfView(self.camera.half_diagonal_rad, box, self.camera.pixel_rad)
         merged = navigation_catalogue(*frames.stars, MERGED_PX * self.camera.pixel_rad)
         self.sky: Sky = sky_to_limit(merged, kind.magnitude_limit)
         self.how = Search(3.7, -np.log(FALSE_ALARM), 0.5, np.nan)
@@ -79,10 +96,10 @@ class Ours:
             for s in sigmas
         }
 
-    def frame(self, x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> Frame:
+    def frame(self, x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> FrameCentroids:
         u = unproject(self.camera, x_px, y_px)
         sigma_rad = max(sigma_px, LEAST_SIGMA_PX) * pixel_angle(self.camera, u)
-        return Frame(u, sigma_rad, mag, np.zeros(3), self.optics)
+        return FrameCentroids(u, sigma_rad, mag, np.zeros(3), self.optics)
 
     def default(self, x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> Array | None:
         seen = self.frame(x_px, y_px, mag, sigma_px)
@@ -95,9 +112,9 @@ class Ours:
     ) -> Array | None:
         return self.default(x_px, y_px, np.full(len(mag), np.nan), sigma_px)
 
-    def published(self, method: Method) -> Solver:
-        match = matcher(method, sky_to_limit(self.sky.catalogue, self.kind.magnitude_limit),
-                        self.optics)  # fmt: skip
+    def published(self, make_matcher: Callable[[Sky, FieldOfView], Matcher]) -> Solver:
+        sky = sky_to_limit(self.sky.catalogue, self.kind.magnitude_limit)
+        match = make_matcher(sky, self.optics)
 
         def solve(x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> Array | None:
             seen = self.frame(x_px, y_px, mag, sigma_px)
@@ -109,7 +126,7 @@ class Ours:
 
 
 class Row(NamedTuple):
-    """What a solver did with frames: right and wrong by frame, CPU milliseconds."""
+    """A solver's results: right and wrong for each frame, CPU milliseconds."""
 
     right: npt.NDArray[np.bool_]
     wrong: npt.NDArray[np.bool_]
@@ -154,14 +171,14 @@ def centroids(frames: Frames, k: int) -> tuple[Array, Array, Array, float]:
 
 
 def solvers(frames: Frames, cache: Path, peers: bool) -> dict[str, Callable[[], Solver | None]]:
-    """Return what makes each solver, by name."""
+    """Return a function that makes each solver, by name."""
     ours = Ours(frames)
     made: dict[str, Callable[[], Solver | None]] = {
         "epipole": lambda: ours.default,
         "epipole, no brightness": lambda: ours.without_brightness,
     }
-    for method in PUBLISHED:
-        made[f"published: {method}"] = lambda method=method: ours.published(method)  # type: ignore[misc]
+    for name, make_matcher in PUBLISHED.items():
+        made[f"published: {name}"] = partial(ours.published, make_matcher)
     if peers:
         made["tetra3rs, error told"] = lambda: tetra3rs(frames, cache, error_told=True)
         made["tetra3rs, defaults"] = lambda: tetra3rs(frames, cache, error_told=False)
@@ -170,7 +187,7 @@ def solvers(frames: Frames, cache: Path, peers: bool) -> dict[str, Callable[[], 
 
 
 def tracking_us(frames: Frames, n_frames: int = 20_000) -> tuple[float, float]:
-    """Return CPU microseconds a frame of a sensor that is followed, and centroids a frame.
+    """Return CPU microseconds per frame of a sensor that is followed, and centroids per frame.
 
     It turns evenly, sees 90 % of its stars to 0.2 px, and 3 false points.
     """
@@ -183,7 +200,7 @@ def tracking_us(frames: Frames, n_frames: int = 20_000) -> tuple[float, float]:
     shots = [expose(kind, seen, one, 0.2, 3, 0.1, rng)[:3] for one in attitudes]
     each = [ours.frame(x, y, mag, 0.2) for x, y, mag in shots]
     first = np.concatenate([[0], np.cumsum([len(f.u) for f in each])]).astype(np.int64)
-    flat = Flat(
+    flat = SensorCentroids(
         first, np.concatenate([f.u for f in each]), np.concatenate([f.sigma_rad for f in each]),
         np.concatenate([f.instrumental_mag for f in each]), np.zeros((n_frames, 3)),
         [ours.optics], np.zeros(n_frames, np.int64),

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.tracking.linking.chains import chain_heads
+from epipole.tasks.algorithms.tracking.linking.chains import Fragments, LinkRule, chain_heads
 from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
 from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction
 
@@ -26,7 +26,7 @@ from scenes.fragment_scenes import (
     FIELD_RAD,
     PIXEL_RAD,
     SIGMA_PX,
-    Fragments,
+    BrokenTracks,
     broken_tracks,
 )
 from scenes.identity_score import identity_f1
@@ -34,21 +34,26 @@ from scenes.identity_score import identity_f1
 Labels = npt.NDArray[np.int64]
 CASES = [(60, (10, 20)), (60, (30, 60)), (250, (10, 20)), (250, (30, 60))]
 LONGEST_S = 90.0
+RULE = LinkRule(
+    gap_s=LONGEST_S,
+    kept=0.9999,
+    field_sr=FIELD_RAD**2,
+    interval_s=1.0,
+    noise_rad2_s3=1e-3 * PIXEL_RAD**2,
+)
 
 
-def likelihood_ratio(scene: Fragments) -> Labels:
-    links = link_by_likelihood(*scene[:4], gap_s=LONGEST_S, kept=0.9999, field_sr=FIELD_RAD**2)
+def likelihood_ratio(scene: BrokenTracks) -> Labels:
+    links = link_by_likelihood(Fragments(*scene[:4]), RULE)
     return np.repeat(chain_heads(links.before), np.diff(scene.offsets))
 
 
-def prediction(scene: Fragments) -> Labels:
-    links = link_by_prediction(
-        *scene[:4], gap_s=LONGEST_S, kept=0.9999, interval_s=1.0, q_rad2_s3=1e-3 * PIXEL_RAD**2
-    )
+def prediction(scene: BrokenTracks) -> Labels:
+    links = link_by_prediction(Fragments(*scene[:4]), RULE)
     return np.repeat(chain_heads(links.before), np.diff(scene.offsets))
 
 
-def pixels(scene: Fragments) -> npt.NDArray[np.float64]:
+def pixels(scene: BrokenTracks) -> npt.NDArray[np.float64]:
     """Return the detections' places in one image: the plane about their mean direction."""
     middle = scene.u_icrs.mean(axis=0)
     middle /= np.linalg.norm(middle)
@@ -58,7 +63,7 @@ def pixels(scene: Fragments) -> npt.NDArray[np.float64]:
     return plane / (scene.u_icrs @ middle)[:, None] / PIXEL_RAD + FIELD_PX / 2
 
 
-def laptrack(scene: Fragments) -> Labels:
+def laptrack(scene: BrokenTracks) -> Labels:
     """Return the tracks of laptrack: its own linking of the detections, then gap closing.
 
     It closes gaps by distance alone; of three cut-offs the best counts.
@@ -87,7 +92,7 @@ def laptrack(scene: Fragments) -> Labels:
     return max(found, key=lambda label: identity_f1(truth, label))
 
 
-def stone_soup(scene: Fragments) -> Labels:
+def stone_soup(scene: BrokenTracks) -> Labels:
     """Return the chains of Stone Soup's stitcher on fragments filtered with its own filters.
 
     Constant velocity with the process noise that suits the scene; forward, as backward
@@ -140,7 +145,9 @@ def stone_soup(scene: Fragments) -> Labels:
     return np.repeat(head, np.diff(scene.offsets))
 
 
-def measure(method: Callable[[Fragments], Labels], scenes: list[Fragments], repeats: int) -> str:
+def measure(
+    method: Callable[[BrokenTracks], Labels], scenes: list[BrokenTracks], repeats: int
+) -> str:
     """Return median IDF1 and the median CPU time of a method over the scenes, as text."""
     scores, seconds = [], []
     for scene in scenes:

@@ -1,4 +1,4 @@
-"""Frame to frame: IDF1 and CPU time a detection, against the number of false detections.
+"""Frame to frame: IDF1 and CPU time per detection, against the number of false detections.
 
 python tests/benchmarks/bench_tracking.py
 """
@@ -27,7 +27,7 @@ MISSED = 0.05
 
 
 class Night(NamedTuple):
-    """Detections of one sensor at 1 Hz, and the object each one is (-1: false)."""
+    """Detections of one sensor at 1 Hz, and the object of each (-1: false alarm)."""
 
     time_s: Array
     offsets: Labels
@@ -75,7 +75,7 @@ def _rates(rng: np.random.Generator, n: int) -> Array:
 
 
 def _edge(rng: np.random.Generator, rate: Array) -> Array:
-    """Return places on the edge where what moves at these rates comes in."""
+    """Return places on the edge of the field where objects with these rates enter."""
     place = rng.uniform(-0.5, 0.5, rate.shape) * FIELD_RAD
     axis = np.argmax(np.abs(rate), axis=1)
     rows = np.arange(len(rate))

@@ -26,7 +26,7 @@ CELLS = [(s, f, m) for s in SIGMAS_PX for f in FALSE for m in MISSING]
 
 
 class Kind(NamedTuple):
-    """A camera: square field [deg], image [px], faintest star that it sees [V]."""
+    """A camera: square field [deg], image [px], faintest star that it detects [V]."""
 
     name: str
     field_deg: float
@@ -84,7 +84,7 @@ def read_frames(folder: Path, name: str) -> Frames:
 
 
 def hipparcos_at_epoch(limit: float) -> NavigationCatalogue:
-    """Return Hipparcos to a magnitude at EPOCH, brightest first, parallax left aside."""
+    """Return Hipparcos to a magnitude at EPOCH, brightest first, without parallax."""
     table = read_hipparcos()
     places = [np.radians(array(table, name)) for name in ("ra_deg", "dec_deg")]
     motions = [array(table, name) for name in ("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")]
@@ -96,14 +96,14 @@ def hipparcos_at_epoch(limit: float) -> NavigationCatalogue:
 
 
 def seen_stars(stars: NavigationCatalogue, kind: Kind) -> NavigationCatalogue:
-    """Return the stars as the camera shows them: pairs closer than MERGED_PX are one."""
+    """Return the stars that the camera resolves: stars closer than MERGED_PX are merged."""
     merged = navigation_catalogue(*stars, MERGED_PX * kind.camera.pixel_rad)
     n = int(np.searchsorted(merged.magnitude, kind.magnitude_limit, side="right"))
     return NavigationCatalogue(*[column[:n] for column in merged])
 
 
 def make_frames(name: str, cells: npt.NDArray[np.int64], seed: int) -> Frames:
-    """Return one frame of the cell for each entry of `cells`, every attitude alike."""
+    """Return one frame of the cell for each entry of `cells`, all attitudes equally likely."""
     rng = np.random.default_rng(seed)
     kind = KINDS[name]
     stars = hipparcos_at_epoch(kind.magnitude_limit + 1.0)

@@ -1,4 +1,4 @@
-"""Broken tracks with their truth: what a low sensor sees of many far objects."""
+"""Broken tracks with their truth: many far objects in the field of a low sensor."""
 
 from typing import NamedTuple
 
@@ -17,8 +17,8 @@ PIXEL_RAD = FIELD_RAD / FIELD_PX
 SIGMA_PX = 0.15
 
 
-class Fragments(NamedTuple):
-    """Fragments in the layout of the linkers, and the object each one is."""
+class BrokenTracks(NamedTuple):
+    """Fragments in the layout of the linkers, and the object of each."""
 
     offsets: Indices
     time_s: Array
@@ -35,13 +35,13 @@ def broken_tracks(
     belt: bool = True,
     field_rad: float = FIELD_RAD,
     duration_s: float = 240.0,
-) -> Fragments:
+) -> BrokenTracks:
     """Return tracks at 1 Hz of objects in a low sensor's field, each with gaps.
 
-    In the belt, objects are near geostationary height on orbits inclined up to 15 degrees: they
-    all move nearly alike, which is what makes them hard to tell apart. Else they are on every
-    kind of orbit, at ranges of 1,500 to 45,000 km and with velocities in any direction. Each
-    is in the field for part of the time, and is lost once or twice for a time from `gap_s`.
+    In the belt, objects are near geostationary height on orbits inclined up to 15 degrees. They
+    all have nearly the same motion, which makes them hard to tell apart. Otherwise they are at
+    ranges of 1,500 to 45,000 km with velocities in any direction. Each object is in the field
+    for part of the time, and is lost once or twice for a time in the range `gap_s`.
     """
     rng = np.random.default_rng(seed)
     sensor = np.array([7000.0, 0.001, np.radians(60.0), rng.uniform(0, 6), 0.0, rng.uniform(0, 6)])
@@ -81,7 +81,7 @@ def broken_tracks(
             truth.append(k)
             offsets.append(offsets[-1] + len(part))
     n = offsets[-1]
-    return Fragments(
+    return BrokenTracks(
         np.array(offsets), np.concatenate(times), np.concatenate(u),
         np.full(n, sigma), np.array(truth),
     )  # fmt: skip
@@ -97,7 +97,7 @@ def _direction_up(rng: np.random.Generator, r: Array) -> Array:
 
 
 def _reach(r: Array, sight: Array, height_km: float) -> float:
-    """Return how far along a line of sight a sphere about the Earth's middle is crossed."""
+    """Return the distance along a line of sight to a sphere around the Earth's centre."""
     along = r @ sight
     return float(-along + np.sqrt(along * along - r @ r + height_km**2))
 

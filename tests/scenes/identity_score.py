@@ -8,12 +8,12 @@ Labels = npt.NDArray[np.int64]
 
 
 def identity_f1(truth: Labels, found: Labels) -> float:
-    """Return IDF1: how well one label a track can stand for one object over a whole night.
+    """Return IDF1: how well tracks and objects agree, one track per object.
 
     Parameters
     ----------
     truth, found : (n,) int
-        Of each detection the object it is (-1: none) and the track it was given (-1: none).
+        The true object of each detection and the track it was given; -1 where there is none.
 
     References
     ----------

@@ -6,20 +6,23 @@ from epipole.tasks.algorithms.catalogue.star_catalogue import NavigationCatalogu
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, project, unproject
 from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.frames.frame import (
-    Frame,
-    Optics,
+    FieldOfView,
+    FrameCentroids,
     Search,
     aberrate_all,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import Frames, Spots
+from epipole.tasks.algorithms.star_identification.frames.spots import (
+    SensorCentroids,
+    UnscaledCentroids,
+)
 
 CAMERA = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)  # 16 degrees
-BETA = np.array([0.6e-4, -0.7e-4, 0.3e-4])  # an Earth's year's worth of aberration
+BETA = np.array([0.6e-4, -0.7e-4, 0.3e-4])  # aberration as of the Earth's motion
 HOW = Search(3.7, np.log(1e6), 0.5, np.nan)
 
 
 def random_catalogue(n=6000, seed=0):
-    """Return n stars all over the sky, ever more the fainter, brightest first."""
+    """Return n stars all over the sky, brightest first; fainter ones are more frequent."""
     rng = np.random.default_rng(seed)
     u = rng.normal(size=(n, 3))
     magnitude = np.sort(6.2 + np.log10(rng.uniform(1e-4, 1, n)) / 0.5)
@@ -29,7 +32,7 @@ def random_catalogue(n=6000, seed=0):
 
 
 def random_attitude(seed):
-    """Return a (3, 3) rotation, every one alike."""
+    """Return a (3, 3) rotation; all are equally likely."""
     return matrix_from_quaternion(canonical(np.random.default_rng(seed).normal(size=4)))
 
 
@@ -38,12 +41,12 @@ def optics(camera=CAMERA):
     x = np.array([-0.5, camera.width - 0.5]) - camera.cx_px
     y = np.array([-0.5, camera.height - 0.5]) - camera.cy_px
     box = np.concatenate([x / camera.fx_px, y / camera.fy_px])
-    return Optics(camera.half_diagonal_rad, box, camera.pixel_rad)
+    return FieldOfView(camera.half_diagonal_rad, box, camera.pixel_rad)
 
 
 def frame(catalogue, R, seed, sigma_px=0.3, n_false=0, missing=0.0, flux=True, camera=CAMERA):
-    """Return the frame a camera with this attitude takes, brightest first, and the true star
-    (row of the catalogue, -1 none) of each centroid."""
+    """Return the frame of a camera with this attitude, brightest first, and the true star of each
+    centroid (row of the catalogue, -1 where there is none)."""
     rng = np.random.default_rng(seed)
     x, y = project(camera, aberrate_all(catalogue.u_icrs, BETA) @ R.T)
     row = np.flatnonzero(inside(camera, x, y))
@@ -57,14 +60,15 @@ def frame(catalogue, R, seed, sigma_px=0.3, n_false=0, missing=0.0, flux=True, c
     order = np.argsort(mag)
     u = unproject(camera, x[order], y[order])
     mag = mag[order] if flux else np.full(len(x), np.nan)
-    return Frame(u, sigma_px * pixel_angle(camera, u), mag, BETA, optics(camera)), row[order]
+    sigma_rad = sigma_px * pixel_angle(camera, u)
+    return FrameCentroids(u, sigma_rad, mag, BETA, optics(camera)), row[order]
 
 
 def join(frames):
-    """Return frames as one, flat."""
+    """Return frames in flat arrays."""
     optics_of = np.zeros(len(frames), np.int64)
     first = np.concatenate([[0], np.cumsum([len(f.u) for f in frames])]).astype(np.int64)
-    return Frames(
+    return SensorCentroids(
         first, np.concatenate([f.u for f in frames]),
         np.concatenate([f.sigma_rad for f in frames]),
         np.concatenate([f.instrumental_mag for f in frames]),
@@ -73,9 +77,9 @@ def join(frames):
 
 
 def join_spots(frames, sigma_px, pixel_rad):
-    """Return frames as one, flat, with these (n,) errors and pixel sizes of their centroids."""
+    """Return frames in flat arrays, with these (n,) errors and pixel sizes of their centroids."""
     flat = join(frames)
-    return Spots(
+    return UnscaledCentroids(
         flat.first, flat.u, np.concatenate(pixel_rad), np.concatenate(sigma_px),
         flat.instrumental_mag, flat.beta, flat.optics, flat.optics_of,
     )  # fmt: skip

@@ -12,7 +12,7 @@ from epipole.tasks.algorithms.geometry.sky import unit_from_radec
 SEEDS = Path(__file__).parents[3] / "shared" / "data" / "seed_star_maps.csv"
 WIDE = Kind("orbit", 20.3, 1024, 5.5)
 INCLINATION = np.radians(51.6)
-# Of the eight maps: three stars each with large position noise.
+# Two of the eight maps have three stars with a large error.
 NOISY = {3: (1942, 1941, 1900), 6: (1477, 1603, 1488)}
 
 
@@ -45,9 +45,8 @@ def orbit_maps(n, seed=0):
 def contest_maps(seed=0, sigma_px=0.3, large_px=8.0):
     """Return the eight maps by number: (kind, u, stated sigma [rad], true numbers, attitude).
 
-    The stars are the source's; pose, places and the size of the errors are chosen here, as
-    the source does not print them: it only says that three stars of maps 3 and 6 have a
-    large one.
+    The stars are those of the source. Attitudes, places and sizes of errors are chosen here: the
+    source only states that three stars of maps 3 and 6 have a large error.
     """
     rng = np.random.default_rng(seed)
     with SEEDS.open() as file:
@@ -74,7 +73,7 @@ def contest_maps(seed=0, sigma_px=0.3, large_px=8.0):
 
 
 def _holding(u_icrs, kind):
-    """Return an attitude that shows all these stars, as far inside the image as may be."""
+    """Return an attitude that shows all these stars, as far inside the image as possible."""
     middle = u_icrs.mean(axis=0)
     best, best_margin = None, -np.inf
     for roll in np.radians(np.arange(0, 90, 3)):

@@ -1,5 +1,7 @@
-"""A sensor followed from frame to frame: the last attitudes predict the next, many frames a
-call."""
+"""A sensor followed from frame to frame: its last attitudes predict the next one.
+
+A call of `follow` goes through many frames, until one has to be searched lost in space.
+"""
 
 import math
 from typing import NamedTuple
@@ -9,7 +11,12 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, turn
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.star_identification.frames.spots import Rows
 from epipole.tasks.algorithms.star_identification.search.field import (
+    Attitude,
+    Centroids,
+    Matches,
+    StarPlaces,
     aberrated,
     solve_predicted,
     stars_in_cone,
@@ -17,36 +24,36 @@ from epipole.tasks.algorithms.star_identification.search.field import (
 
 Array = npt.NDArray[np.float64]
 
-RATE_SIGMA = 1e-3  # rad/s, of a sensor whose rate is not known yet
+RATE_SIGMA = 1e-3  # rad/s, of a sensor whose rate is unknown so far
 ACCELERATION_SIGMA = 3e-5  # rad/s^2, how unevenly a sensor turns
 WIDEST_PREDICTION = 0.02  # rad; wider ones are no better than being lost
 MOST_TURNED = 0.5  # rad, between two frames of a tracked sensor
-# Stars are kept this far around a field, to be looked through again while the sensor turns [rad].
+# Stars this far around a field are listed once and serve while the sensor turns [rad].
 MARGIN = 0.03
 TOO_FEW, NO_MATCH = 1, 2  # status codes
 
 
 class Memory(NamedTuple):
-    """What is known of a sensor on its way through the frames.
+    """What is known of a sensor while its frames are followed; the kernels change it.
 
     t_s, R, P : (2,), (2, 3, 3), (2, 3, 3): times, attitudes and covariances of the last two
-        identified frames, the later last
-    held : (3,) int64: how many of these there are; whether a prior was borne out; how many
-        more frames are not to be searched
-    near, cone : (stars,) int64 and (5,): the stars around a field, how many, around where and
-        how far [rad]
+        identified frames, the later one last
+    held : (3,) int64: how many of these there are; 1 after a prior was confirmed; how many
+        more frames are not searched
+    near, cone : (stars,) int64 and (5,): the stars around a field; how many, the direction
+        (3 numbers) and the radius [rad] of the cone that holds them
     """
 
     t_s: Array
     R: Array
     P: Array
-    held: npt.NDArray[np.int64]
-    near: npt.NDArray[np.int64]
+    held: Rows
+    near: Rows
     cone: Array
 
 
 def new_memory(n_stars: int) -> Memory:
-    """Return the memory of a sensor of which nothing is known."""
+    """Return the memory of a sensor about which nothing is known."""
     return Memory(
         np.zeros(2),
         np.zeros((2, 3, 3)),
@@ -57,21 +64,66 @@ def new_memory(n_stars: int) -> Memory:
     )
 
 
+class FrameArrays(NamedTuple):
+    """A sensor's frames as the kernels take them; F frames, N centroids, C cameras.
+
+    t_s : (F,) float, times
+    first, u, sigma, instrumental, beta : as in `CentroidFrames`
+    camera : (F,) int64, row of the camera that took the frame
+    box, half_diagonal : (C, 4), (C,) float, as in `FieldOfView`
+    """
+
+    t_s: Array
+    first: Rows
+    u: Array
+    sigma: Array
+    instrumental: Array
+    beta: Array
+    camera: Rows
+    box: Array
+    half_diagonal: Array
+
+
+class Walk(NamedTuple):
+    """The frames start, start + step, ... before stop; whether lost ones are to be searched."""
+
+    start: int
+    stop: int
+    step: int
+    searches: bool
+
+
+class _FieldScratch(NamedTuple):
+    """Room for one frame: predicted attitude and covariance; stars of its field.
+
+    R, P : (3, 3), (3, 3)
+    u, magnitude, row : (stars, 3), (stars,), (stars,) int64; apparent directions, magnitudes
+        and rows of the catalogue
+    """
+
+    R: Array
+    P: Array
+    u: Array
+    magnitude: Array
+    row: Rows
+
+
 @kernel
-def remember(t_s, R, P, t_fix, R_fix, P_fix, held):
+def remember(memory, t_s, R, P):
     """Enter an identified attitude (compiled)."""
-    t_fix[0], t_fix[1] = t_fix[1], t_s
-    copy_matrix(R_fix[1], R_fix[0])
-    copy_matrix(P_fix[1], P_fix[0])
-    copy_matrix(R, R_fix[1])
-    copy_matrix(P, P_fix[1])
-    held[0] = min(held[0] + 1, 2)
+    memory.t_s[0], memory.t_s[1] = memory.t_s[1], t_s
+    copy_matrix(memory.R[1], memory.R[0])
+    copy_matrix(memory.P[1], memory.P[0])
+    copy_matrix(R, memory.R[1])
+    copy_matrix(P, memory.P[1])
+    memory.held[0] = min(memory.held[0] + 1, 2)
 
 
 @kernel
-def predict(t_s, t_fix, R_fix, P_fix, held, R, P):
-    """Write attitude and covariance at t_s as the last one or two tell; return whether they
-    are of use (compiled)."""
+def predict(memory, t_s, R, P):
+    """Write attitude and covariance at t_s, extrapolated from the last one or two; return
+    whether the prediction is precise enough to be used (compiled)."""
+    t_fix, R_fix, P_fix, held = memory.t_s, memory.R, memory.P, memory.held
     if held[0] == 0:
         return False
     dt = t_s - t_fix[1]
@@ -116,140 +168,134 @@ def _rotation_between(A, B):
 
 
 @kernel
-def _field_stars(R, reach, beta, star_u, star_mag, near, cone, a, magnitude, row):
+def _field_stars(R, reach, beta, stars, memory, room):
     """Write the apparent directions, magnitudes and rows of the stars within `reach` of the
     boresight; return how many."""
+    near, cone = memory.near, memory.cone
     dx, dy, dz = R[2, 0] - cone[1], R[2, 1] - cone[2], R[2, 2] - cone[3]
     # A chord is shorter than its angle, by 4 % at a radian.
     if 1.05 * math.sqrt(dx * dx + dy * dy + dz * dz) + reach > cone[4]:
-        cone[0] = stars_in_cone(star_u, len(star_u), R, min(reach + MARGIN, 3.0), near)
+        cone[0] = stars_in_cone(stars.u, len(stars.u), R, min(reach + MARGIN, 3.0), near)
         cone[1], cone[2], cone[3] = R[2, 0], R[2, 1], R[2, 2]
         cone[4] = reach + MARGIN
     c, n = math.cos(reach), 0
     for m in range(int(cone[0])):
         s = near[m]
-        if R[2, 0] * star_u[s, 0] + R[2, 1] * star_u[s, 1] + R[2, 2] * star_u[s, 2] > c:
-            aberrated(star_u[s, 0], star_u[s, 1], star_u[s, 2], beta, a[n])
-            magnitude[n], row[n] = star_mag[s], s
+        x, y, z = stars.u[s, 0], stars.u[s, 1], stars.u[s, 2]
+        if R[2, 0] * x + R[2, 1] * y + R[2, 2] * z > c:
+            aberrated(x, y, z, beta, room.u[n])
+            room.magnitude[n], room.row[n] = stars.magnitude[s], s
             n += 1
     return n
 
 
 @kernel
-def follow(
-    k,
-    stop,
-    step,
-    searches,
-    t_s,
-    first,
-    u,
-    sigma,
-    instrumental,
-    beta,
-    box,
-    half_diagonal,
-    optics_of,
-    prior_R,
-    prior_sigma,
-    star_u,
-    star_mag,
-    gate,
-    log_density,
-    zero_point,
-    spread,
-    threshold,
-    enough,
-    t_fix,
-    R_fix,
-    P_fix,
-    held,
-    near,
-    cone,
-    solved,
-    R_of,
-    P_of,
-    star_of,
-    chi2_of,
-    evidence_of,
-    status,
-):
-    """Identify frames k, k + step, ... from the attitudes before them; return the first whose
-    sky has to be searched, or `stop` (compiled).
+def _solve_near(k, frames, stars, rule, memory, room, solutions):
+    """Identify frame k near the attitude in `room`; return whether its stars confirm it."""
+    camera = frames.camera[k]
+    reach = frames.half_diagonal[camera] + 1e-4
+    reach += 4.0 * math.sqrt(max(room.P[0, 0], room.P[1, 1]))
+    n = _field_stars(room.R, min(reach, 1.5), frames.beta[k], stars, memory, room)
+    if n < 3:
+        return False
+    lo, hi = frames.first[k], frames.first[k + 1]
+    solution = Attitude(solutions.R_sensor_from_icrs[k], solutions.cov_rad2[k])
+    matches = Matches(solutions.star[lo:hi], solutions.chi2[lo:hi])
+    evidence = solve_predicted(
+        Attitude(room.R, room.P),
+        False,
+        Centroids(frames.u[lo:hi], frames.sigma[lo:hi], frames.instrumental[lo:hi], frames.beta[k]),
+        StarPlaces(room.u[:n], room.magnitude[:n]),
+        frames.box[camera],
+        rule,
+        solution,
+        matches,
+    )
+    if not evidence > rule.least:
+        return False
+    solutions.solved[k], solutions.evidence[k] = True, evidence
+    for m in range(hi - lo):
+        if matches.star[m] >= 0:
+            matches.star[m] = room.row[matches.star[m]]
+    remember(memory, frames.t_s[k], solution.R, solution.P)
+    memory.held[2] = 0
+    return True
+
+
+@kernel
+def _identify_next(k, frames, priors, stars, rule, memory, room, solutions):
+    """Identify frame k from the frames before it, or from its prior; return whether it was."""
+    for attempt in range(2):
+        if attempt == 0:
+            if not predict(memory, frames.t_s[k], room.R, room.P):
+                continue
+        else:
+            sigma = priors.sigma_rad[k]
+            if math.isnan(sigma):
+                break
+            copy_matrix(priors.R_sensor_from_icrs[k], room.R)
+            room.P[:] = 0.0
+            for i in range(3):
+                room.P[i, i] = sigma * sigma
+        if _solve_near(k, frames, stars, rule, memory, room, solutions):
+            if attempt == 1:
+                memory.held[1] = 1
+            return True
+    return False
+
+
+@kernel
+def _clear(k, first, solutions):
+    """Erase what attempts left in the solution of frame k."""
+    solutions.R_sensor_from_icrs[k], solutions.cov_rad2[k] = np.nan, np.nan
+    solutions.star[first[k] : first[k + 1]] = -1
+    solutions.chi2[first[k] : first[k + 1]] = 0.0
+
+
+@kernel
+def follow(walk, frames, priors, stars, rule, memory, solutions, status):
+    """Identify frames from the attitudes before them; return the first frame whose sky has to
+    be searched, or `walk.stop` (compiled).
 
     Parameters
     ----------
-    k, stop, step, searches
-        Frames to go through, and whether one that is lost is to be searched.
-    t_s, first, u, sigma, instrumental, beta, box, half_diagonal, optics_of
-        As `Frames` has them; the optics' numbers a row a camera.
-    prior_R, prior_sigma : (F, 3, 3), (F,)
-        Attitudes that came with the log, and their errors an axis [rad]; NaN: none.
-    star_u, star_mag
+    walk, frames : Walk, FrameArrays
+        The frames, and which of them to go through in which order.
+    priors : Priors
+        Attitudes that came with the log.
+    stars : StarPlaces
         The sky's stars.
-    gate, log_density, zero_point, spread, threshold, enough
-        As in `field.solve_predicted`; the least log evidence that is believed.
-    t_fix, R_fix, P_fix, held, near, cone
-        `Memory`, kept up to date.
-    solved, R_of, P_of, star_of, chi2_of, evidence_of : out
-        As in `Solutions`. Frames that are solved already are not changed.
+    rule : MatchRule
+        How matches are weighed.
+    memory : Memory
+        Kept up to date.
+    solutions : Solutions, out
+        Frames that are solved already are not changed.
     status : (F,) int8, out
         TOO_FEW centroids, NO_MATCH; 0 where solved.
     """
-    R0, P0 = np.empty((3, 3)), np.empty((3, 3))
-    a, magnitude = np.empty((len(star_u), 3)), np.empty(len(star_u))
-    row = np.empty(len(star_u), np.int64)
-    while k != stop:
-        lo, hi = first[k], first[k + 1]
-        if solved[k]:
-            remember(t_s[k], R_of[k], P_of[k], t_fix, R_fix, P_fix, held)
-        elif hi - lo < 3:
+    n = len(stars.u)
+    room = _FieldScratch(
+        np.empty((3, 3)), np.empty((3, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int64)
+    )
+    k = walk.start
+    while k != walk.stop:
+        if solutions.solved[k]:
+            R, P = solutions.R_sensor_from_icrs[k], solutions.cov_rad2[k]
+            remember(memory, frames.t_s[k], R, P)
+        elif frames.first[k + 1] - frames.first[k] < 3:
             status[k] = TOO_FEW
+        elif _identify_next(k, frames, priors, stars, rule, memory, room, solutions):
+            status[k] = 0
         else:
-            has_prior = prior_sigma[k] == prior_sigma[k]
-            for way in range(2):
-                if way == 0 and not predict(t_s[k], t_fix, R_fix, P_fix, held, R0, P0):
-                    continue
-                if way == 1:
-                    if not has_prior:
-                        break
-                    copy_matrix(prior_R[k], R0)
-                    P0[:] = 0.0
-                    for i in range(3):
-                        P0[i, i] = prior_sigma[k] * prior_sigma[k]
-                reach = half_diagonal[optics_of[k]] + 1e-4
-                reach += 4.0 * math.sqrt(max(P0[0, 0], P0[1, 1]))
-                n = _field_stars(
-                    R0, min(reach, 1.5), beta[k], star_u, star_mag, near, cone, a, magnitude, row
-                )
-                if n < 3:
-                    continue
-                evidence = solve_predicted(
-                    R0, P0, False, u[lo:hi], sigma[lo:hi], instrumental[lo:hi], a[:n],
-                    magnitude[:n], box[optics_of[k]], gate, log_density, zero_point, spread,
-                    enough, R_of[k], P_of[k], star_of[lo:hi], chi2_of[lo:hi],
-                )  # fmt: skip
-                if evidence > threshold:
-                    solved[k], evidence_of[k], status[k] = True, evidence, 0
-                    for m in range(lo, hi):
-                        if star_of[m] >= 0:
-                            star_of[m] = row[star_of[m]]
-                    remember(t_s[k], R_of[k], P_of[k], t_fix, R_fix, P_fix, held)
-                    if way == 1:
-                        held[1] = 1
-                    held[2] = 0
-                    break
-            if not solved[k]:
-                R_of[k], P_of[k] = np.nan, np.nan
-                star_of[lo:hi] = -1
-                chi2_of[lo:hi] = 0.0
-                # Where priors were borne out, a frame that fails has too few stars, not a
-                # wrong prior.
-                if searches and not (has_prior and held[1] == 1):
-                    if held[2] == 0:
-                        return k
-                    held[2] -= 1
-                if status[k] == 0:
-                    status[k] = NO_MATCH
-        k += step
+            _clear(k, frames.first, solutions)
+            # Where priors were confirmed, a frame that fails has too few stars, not a wrong prior.
+            has_prior = not math.isnan(priors.sigma_rad[k])
+            if walk.searches and not (has_prior and memory.held[1] == 1):
+                if memory.held[2] == 0:
+                    return k
+                memory.held[2] -= 1
+            if status[k] == 0:
+                status[k] = NO_MATCH
+        k += walk.step
     return k

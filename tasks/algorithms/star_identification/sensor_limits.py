@@ -1,4 +1,4 @@
-"""What a sensor's own stars tell about it: centroid error, faintest star, brightness zero point."""
+"""What a sensor's stars tell about it: centroid error, faintest star, zero point of brightness."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.star_identification.frames.frame import (
-    Frame,
+    FrameCentroids,
     Search,
     Solution,
     identify_predicted,
@@ -15,20 +15,20 @@ from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 
 Array = npt.NDArray[np.float64]
 
-# Flux that scatters more than this about the catalogue tells nothing of a star [mag].
+# Flux that scatters more than this about the catalogue is not used [mag].
 USELESS_SCATTER_MAG = 1.0
 MAGNITUDE_STEP = 0.25
 
 
 class Scale(NamedTuple):
-    """Residuals over claimed errors: their rms, and how many degrees of freedom it rests on."""
+    """Residuals over stated errors: their rms, and its degrees of freedom."""
 
     scale: float
     dof: int
 
 
 def residual_scale(solutions: list[Solution | None]) -> Scale:
-    """Return the rms of normalised residuals, an axis, over all solutions."""
+    """Return the rms per axis of normalised residuals over all solutions."""
     solved = [s for s in solutions if s is not None]
     star = np.concatenate([np.empty(0, np.int64), *[s.star for s in solved]])
     chi2 = np.concatenate([np.empty(0), *[s.chi2 for s in solved]])
@@ -36,22 +36,24 @@ def residual_scale(solutions: list[Solution | None]) -> Scale:
 
 
 def scale_of(star: npt.NDArray[np.int64], chi2: Array, n_solved: int) -> Scale:
-    """Return the same of all centroids of so many solved frames: stars (-1 none) and squared
-    distances over sigma squared."""
+    """Return the rms per axis of normalised residuals of n_solved frames.
+
+    star, chi2 : (N,), (N,), each centroid's star (-1 none) and squared distance over sigma squared
+    """
     matched = star >= 0
     dof = 2 * int(matched.sum()) - 3 * n_solved
     return Scale(float(np.sqrt(chi2[matched].sum() / dof)) if dof > 0 else 1.0, dof)
 
 
-def is_significant(found: Scale) -> bool:
-    """Tell whether residuals contradict the errors claimed: by 5 % and three sigma."""
-    return abs(found.scale - 1) > max(0.05, 3 / np.sqrt(2 * max(found.dof, 1)))
+def is_significant(residuals: Scale) -> bool:
+    """Tell whether residuals contradict the stated errors, by 5 % and by three sigma."""
+    return abs(residuals.scale - 1) > max(0.05, 3 / np.sqrt(2 * max(residuals.dof, 1)))
 
 
 def zero_point(
-    frames: list[Frame], solutions: list[Solution | None], sky: Sky
+    frames: list[FrameCentroids], solutions: list[Solution | None], sky: Sky
 ) -> tuple[float, float]:
-    """Return the median of star minus instrumental magnitude, and its scatter (NaN: no flux)."""
+    """Return the median of star minus instrumental magnitude, and its scatter; NaN without flux."""
     differences = []
     for frame, solution in zip(frames, solutions, strict=True):
         if solution is not None:
@@ -59,19 +61,19 @@ def zero_point(
             differences.append(
                 sky.catalogue.magnitude[solution.star[at]] - frame.instrumental_mag[at]
             )
-    found = np.concatenate(differences) if differences else np.empty(0)
-    found = found[np.isfinite(found)]
-    if len(found) < 8:
+    known = np.concatenate(differences) if differences else np.empty(0)
+    known = known[np.isfinite(known)]
+    if len(known) < 8:
         return np.nan, np.nan
-    middle = float(np.median(found))
-    return middle, 1.4826 * float(np.median(np.abs(found - middle)))
+    middle = float(np.median(known))
+    return middle, 1.4826 * float(np.median(np.abs(known - middle)))
 
 
 def rematch(
-    frames: list[Frame], solutions: list[Solution | None], sky: Sky, how: Search
+    frames: list[FrameCentroids], solutions: list[Solution | None], sky: Sky, how: Search
 ) -> list[Solution | None]:
-    """Return solutions identified anew next to known attitudes, such as with other errors or
-    a deeper sky."""
+    """Return the frames identified again near known attitudes, as with other errors or a deeper
+    sky."""
     out: list[Solution | None] = []
     for frame, solution in zip(frames, solutions, strict=True):
         if solution is None:
@@ -83,7 +85,7 @@ def rematch(
 
 
 def faintest_star(
-    frames: list[Frame],
+    frames: list[FrameCentroids],
     solutions: list[Solution | None],
     deep: Sky,
     gate_sigma: float,
@@ -91,14 +93,14 @@ def faintest_star(
 ) -> float:
     """Return the magnitude to which matches stand out from chance.
 
-    `solutions` are of the deep sky. Walking down in steps of a quarter magnitude, a step
-    belongs to what the sensor sees while more than a tenth of its stars in view are matched,
-    and three times as many as by chance.
+    `solutions` are of the deep sky. In steps of a quarter magnitude, the sensor detects the stars
+    of a step if more than a tenth of those in view are matched, and three times as many as by
+    chance.
 
     Parameters
     ----------
     least
-        The magnitude to start at: what an identification needs is not questioned.
+        The magnitude to start at: brighter stars are needed for identification in any case.
     """
     edges = np.arange(least, deep.catalogue.magnitude[-1] + MAGNITUDE_STEP, MAGNITUDE_STEP)
     if len(edges) < 2:
@@ -112,15 +114,15 @@ def faintest_star(
         ahead = deep.catalogue.u_icrs @ R[2] > np.cos(frame.optics.half_diagonal_rad)
         v = deep.catalogue.u_icrs[ahead] @ R.T
         x, y = v[:, 0] / v[:, 2], v[:, 1] / v[:, 2]
-        seen = (x > x0) & (x < x1) & (y > y0) & (y < y1)
-        n = np.histogram(deep.catalogue.magnitude[ahead][seen], edges)[0]
+        inside = (x > x0) & (x < x1) & (y > y0) & (y < y1)
+        n = np.histogram(deep.catalogue.magnitude[ahead][inside], edges)[0]
         star = solution.star[solution.star >= 0]
         in_view += n
         matched += np.histogram(deep.catalogue.magnitude[star], edges)[0]
         disc = np.pi * gate_sigma**2 * np.median(frame.sigma_rad) ** 2
         by_chance += n * (len(frame.u) - len(star)) * disc / frame.optics.solid_angle_sr
     good = (matched > 0.1 * in_view) & (matched > 3 * by_chance)
-    # A step in which a narrow field has no star says nothing, and one of few stars little.
+    # A step without a star in a narrow field is skipped. One with few stars may fail by chance.
     last, poor = -1, 0
     for i in np.flatnonzero(in_view):
         poor = 0 if good[i] else poor + 1

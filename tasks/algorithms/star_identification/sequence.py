@@ -1,4 +1,5 @@
-"""A sensor's frames in order: tracked from frame to frame, lost in space where that fails."""
+"""A sensor's frames in order: followed from frame to frame, searched lost in space where that
+fails."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,24 +10,30 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.star_identification.following import (
     NO_MATCH,
     TOO_FEW,
-    Memory,
+    FrameArrays,
+    Walk,
     follow,
     new_memory,
     remember,
 )
 from epipole.tasks.algorithms.star_identification.frames.frame import (
-    CLEAR_LEAD,
     Search,
     identify_lost,
+    rule_of,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import Frames, Solutions, unsolved
+from epipole.tasks.algorithms.star_identification.frames.spots import (
+    SensorCentroids,
+    Solutions,
+    unsolved,
+)
+from epipole.tasks.algorithms.star_identification.search.field import StarPlaces
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-MAX_SKIPPED = 32  # frames left to the way back between two searches that keep failing
+MAX_SKIPPED = 32  # frames between two searches, where they keep failing; the way back tries them
 TIME_LIMIT, NO_CENTROIDS = 3, 4
 STATUS = {
     TOO_FEW: "too_few_stars",
@@ -39,7 +46,8 @@ STATUS = {
 class Priors(NamedTuple):
     """Attitudes that came with the log.
 
-    R_sensor_from_icrs, sigma_rad : (F, 3, 3), (F,) float, error an axis; NaN where there is none
+    R_sensor_from_icrs, sigma_rad : (F, 3, 3), (F,) float, attitude and its error an axis; NaN
+        where missing
     """
 
     R_sensor_from_icrs: Array
@@ -47,85 +55,70 @@ class Priors(NamedTuple):
 
 
 def no_priors(n: int) -> Priors:
-    """Return the priors of n frames that have none."""
+    """Return priors of n frames that have none: all NaN."""
     return Priors(np.full((n, 3, 3), np.nan), np.full(n, np.nan))
 
 
 def identify_sequence(
     t_s: Array,
-    frames: Frames,
+    frames: SensorCentroids,
     priors: Priors,
     sky: Sky,
     grid: SkyGrid,
     pairs: Callable[[], PairTable],
     how: Search,
 ) -> tuple[Solutions, list[str | None]]:
-    """Identify frames in order of time; what that misses, from the frame after it.
+    """Identify frames in order of time; frames that fail are tried again backward in time.
 
-    `pairs` is called when the whole sky is to be searched: a sensor with good priors needs
-    none.
+    `pairs` is called when the whole sky has to be searched. A sensor with good priors does not
+    need them.
 
     Returns
     -------
     solutions
-        What the stars tell.
-    status : one a frame
+        Attitudes and stars.
+    status : one per frame
         None where solved, else no_centroids, too_few_stars, no_match or time_limit.
     """
-    n = len(frames.beta)
-    found, status = unsolved(frames.first), np.zeros(n, np.int8)
-    memory = new_memory(len(sky.catalogue.star_id))
-    failures, k = 0, 0
+    n, n_stars = len(frames.beta), len(sky.catalogue.star_id)
+    solutions, status = unsolved(frames.first), np.zeros(n, np.int8)
+    arrays, rule = _arrays(t_s, frames), rule_of(how, sky)
+    stars = StarPlaces(sky.catalogue.u_icrs, sky.catalogue.magnitude)
+    memory, failures, k = new_memory(n_stars), 0, 0
     while True:
-        k = _follow(k, n, 1, True, t_s, frames, priors, sky, how, memory, found, status)
+        walk = Walk(k, n, 1, True)
+        k = int(follow(walk, arrays, priors, stars, rule, memory, solutions, status))
         if k == n:
             break
-        solution, cut_short = identify_lost(frames.one(k), sky, grid, pairs(), how)
+        solution, cut_short = identify_lost(frames.frame(k), sky, grid, pairs(), how)
         if solution is None:
-            # Ever more rarely while that keeps failing (clouds, a night without stars), so that
-            # a dark log takes bounded time.
+            # Searches that keep failing (clouds, a night without stars) become rarer and rarer, so
+            # that a dark log takes bounded time.
             failures += 1
             memory.held[2] = min(2 ** min(max(failures - 6, 0), 10) - 1, MAX_SKIPPED)
             status[k] = TIME_LIMIT if cut_short else NO_MATCH
         else:
             failures = 0
-            found.enter(k, solution)
-            remember(
-                t_s[k], solution.R_sensor_from_icrs, solution.cov_rad2, memory.t_s, memory.R,
-                memory.P, memory.held,
-            )  # fmt: skip
+            solutions.enter(k, solution)
+            remember(memory, t_s[k], solution.R_sensor_from_icrs, solution.cov_rad2)
         k += 1
-    if found.solved.any() and not found.solved.all():
-        memory = new_memory(len(sky.catalogue.star_id))
-        # Priors were tried on the way there.
-        _follow(n - 1, -1, -1, False, t_s, frames, no_priors(n), sky, how, memory, found, status)
+    if solutions.solved.any() and not solutions.solved.all():
+        # Backward, without priors: those were tried on the way forward.
+        walk, memory = Walk(n - 1, -1, -1, False), new_memory(n_stars)
+        follow(walk, arrays, no_priors(n), stars, rule, memory, solutions, status)
     status[np.diff(frames.first) == 0] = NO_CENTROIDS
-    return found, [STATUS.get(code) for code in status.tolist()]
+    return solutions, [STATUS.get(code) for code in status.tolist()]
 
 
-def _follow(
-    start: int,
-    stop: int,
-    step: int,
-    searches: bool,
-    t_s: Array,
-    frames: Frames,
-    priors: Priors,
-    sky: Sky,
-    how: Search,
-    memory: Memory,
-    found: Solutions,
-    status: npt.NDArray[np.int8],
-) -> int:
-    box = np.array([o.box for o in frames.optics])
-    half_diagonal = np.array([o.half_diagonal_rad for o in frames.optics])
-    return int(
-        follow(
-            start, stop, step, searches, t_s, frames.first, frames.u, frames.sigma_rad,
-            frames.instrumental_mag, frames.beta, box, half_diagonal, frames.optics_of, *priors,
-            sky.catalogue.u_icrs, sky.catalogue.magnitude, how.gate_sigma, sky.log_density,
-            how.zero_point_mag, how.spread_mag, how.threshold, how.threshold + CLEAR_LEAD,
-            *memory, found.solved, found.R_sensor_from_icrs, found.cov_rad2, found.star,
-            found.chi2, found.evidence, status,
-        )
-    )  # fmt: skip
+def _arrays(t_s: Array, frames: SensorCentroids) -> FrameArrays:
+    return FrameArrays(
+        t_s,
+        frames.first,
+        frames.u,
+        frames.sigma_rad,
+        frames.instrumental_mag,
+        frames.beta,
+        frames.optics_of,
+        np.array([optics.box for optics in frames.optics]),
+        np.array([optics.half_diagonal_rad for optics in frames.optics]),
+    )

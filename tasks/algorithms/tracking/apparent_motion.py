@@ -1,9 +1,10 @@
 """How fast the apparent motion of an object can change: bounds from its apparent rate.
 
-Geometry changes a rate by its square (an object that passes at range d with speed v turns at
-v / d, and its rate changes by up to that squared), gravity by g / v of a low orbit times the
-rate, and a sensor in a low orbit by its own acceleration over the range of a far object. Each
-further derivative brings one more factor of the rate, or of the angular rate of a low orbit.
+Three causes change a rate. Geometry changes it by its square: an object that passes at range d with
+speed v has the rate v / d, which changes by up to (v / d)^2. Gravity changes it by the rate times
+g / v of a low orbit. A sensor in a low orbit changes it by its acceleration over the range of a far
+object. Each further derivative has one more factor of the rate, or of the angular rate of a low
+orbit.
 """
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from epipole.tasks.algorithms.kernels import kernel
 
 LOW_ORBIT_S = 1e-3  # [1/s] angular rate of a low orbit; also g / v there
-FAR_RAD_S2 = 2.5e-7  # [rad/s^2] a low sensor's own acceleration, seen from a distant object
+FAR_RAD_S2 = 2.5e-7  # [rad/s^2] a low sensor's acceleration over the range of a far object
 
 
 @kernel

@@ -1,15 +1,15 @@
 """Grids over the detections of the latest frames, to look up what lies near a direction.
 
-A frame is laid on a plane across its mean direction: no distance grows by that, so that all
-detections within a reach lie in the cells that the reach touches. Arrays instead of a class,
-as compiled code takes them: slot k of each belongs to the frames k, k + size, ...
+A frame is projected on the plane across its mean direction. That makes no distance longer, so that
+all detections within a reach are in the cells that the reach touches. A grid is a tuple of arrays,
+as compiled code takes them; slot k of each belongs to the frames k, k + size, ...
 """
 
 import numpy as np
 
 from epipole.tasks.algorithms.kernels import kernel
 
-FINEST = 128  # cells a side
+FINEST = 128  # most cells along a side
 
 
 @kernel
@@ -17,7 +17,7 @@ def make_grids(size, most):
     """Return arrays for `size` frames of at most `most` detections."""
     side = max(min(int(np.sqrt(most)), FINEST), 1)
     axes = np.zeros((size, 2, 3))
-    shape = np.zeros((size, 4))  # lowest on both axes, cells a unit, cells a side
+    shape = np.zeros((size, 4))  # lowest on both axes, cells per unit, cells along a side
     start = np.zeros((size, side * side + 1), np.int64)
     items = np.zeros((size, max(most, 1)), np.int64)
     return axes, shape, start, items
@@ -34,18 +34,18 @@ def _lay_axes(directions, lo, hi, axes):
     for a in range(1, 3):
         if abs(mean[a]) < abs(mean[flat]):
             flat = a
-    one, two = (flat + 1) % 3, (flat + 2) % 3
-    norm = np.sqrt(mean[one] ** 2 + mean[two] ** 2)
+    second, third = (flat + 1) % 3, (flat + 2) % 3
+    norm = np.sqrt(mean[second] ** 2 + mean[third] ** 2)
     axes[:] = 0.0
     if norm == 0.0:
-        axes[0, one] = 1.0
+        axes[0, second] = 1.0
         axes[1, flat] = 1.0
         return
-    axes[0, one], axes[0, two] = mean[two] / norm, -mean[one] / norm
+    axes[0, second], axes[0, third] = mean[third] / norm, -mean[second] / norm
     total = np.sqrt(norm**2 + mean[flat] ** 2)
     axes[1, flat] = norm / total
-    axes[1, one] = -mean[one] * mean[flat] / norm / total
-    axes[1, two] = -mean[two] * mean[flat] / norm / total
+    axes[1, second] = -mean[second] * mean[flat] / norm / total
+    axes[1, third] = -mean[third] * mean[flat] / norm / total
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Hot pixels: points that stay in the image while the sky moves through it."""
+"""Hot pixels: detections that stay at a place of the image while the sky moves through it."""
 
 import numpy as np
 import numpy.typing as npt
@@ -11,14 +11,14 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-SHARE = 0.5  # of the frames that show it, and of the pointings that do
+SHARE = 0.5  # least share of the frames, and of the pointings, that show a hot pixel
 FEWEST = 5  # frames
-FEWEST_STILL = 10  # frames, where only its steadiness tells
-STEADY = 0.1  # of the centroids' variance: light scatters by all of it, a hot pixel by none
-NEAR_CHI2 = 11.8, 19.3  # of 2 degrees of freedom: 99.7 %; 99.994 % where there are frames enough
+FEWEST_STILL = 10  # frames, where only its steadiness is evidence
+STEADY = 0.1  # most of the centroids' variance: light has all of it, a hot pixel none
+NEAR_CHI2 = 11.8, 19.3  # of 2 degrees of freedom: 99.7 %; 99.994 % where there are many frames
 CHANCE_OF_MIDDLE = 0.02  # accepted chance that light falls on the middle of a pixel
-REPOINTED_PX = 20.0  # how far a repointing moves what does not turn along with it
-BOUND = 10.0  # times the physical bound: no object turns with a repointing
+REPOINTED_PX = 20.0  # least motion of the sky through the image at a repointing
+BOUND = 10.0  # times the bound on apparent motion: no object follows a repointing
 FAST_TURN_RAD_S = 3e-3  # three times a low orbit's: no object is seen to keep it up
 HALF_TURN_RAD = np.pi
 
@@ -45,11 +45,11 @@ def hot_pixels(
 
     Notes
     -----
-    A sensor that follows an object keeps it in place as well, and one that stares keeps the
-    stars. So a point in half of all frames, within the centroids' error, is a hot pixel only
-    where light could not do the same: it stays through repointings that no object follows, or
-    through a fast turn of more than half a circle, it stays more exactly than light can, or it
-    stays on the very middle of a pixel.
+    A sensor that follows an object keeps it in place as well, and a sensor with a fixed attitude
+    keeps the stars. So a place that is detected in half of all frames, within the centroids'
+    error, is a hot pixel only where light cannot do the same. It stays through repointings that
+    no object follows, or through a fast turn of more than half a circle; or it scatters less
+    than light can; or it stays on the very middle of a pixel.
     """
     out = np.zeros(len(frame), bool)
     n_frames = len(time_s)
@@ -78,10 +78,10 @@ def hot_pixels(
 
 
 def _stays_through_repointing(shown: Indices, pointing: Indices) -> bool:
-    """Return whether half the frames show it in half the pointings, and in two at least."""
+    """Return whether half of the frames show it in half of the pointings, at least in two."""
     frames_in = np.bincount(pointing)
-    seen_in = np.bincount(pointing[shown], minlength=len(frames_in)) >= SHARE * frames_in
-    return bool(seen_in.sum() > 1 and seen_in.mean() >= SHARE)
+    shows = np.bincount(pointing[shown], minlength=len(frames_in)) >= SHARE * frames_in
+    return bool(shows.sum() > 1 and shows.mean() >= SHARE)
 
 
 def _too_steady(x_px: Array, y_px: Array, sigma_px: Array) -> bool:
@@ -93,8 +93,8 @@ def _too_steady(x_px: Array, y_px: Array, sigma_px: Array) -> bool:
 def _is_one_pixel(time_s: Array, x_px: Array, y_px: Array, sigma_px: Array) -> bool:
     """Return whether a place is the middle of a pixel and has no drift, to a small error.
 
-    Light falls anywhere on a pixel. By chance it lies so near the middle one time in fifty at
-    most, and what is followed by the sensor drifts all the same, if only a little.
+    Light falls anywhere on a pixel. It is so near the middle by chance in one of fifty cases at
+    most. An object that the sensor follows drifts, if only a little.
     """
     n, sigma = len(x_px), float(np.sqrt(np.mean(sigma_px**2)))
     if n < FEWEST_STILL:
@@ -125,14 +125,14 @@ def _pointings(time_s: Array, path: Array, pixel_rad: float) -> Indices:
     rate, dt = _rates(time_s, path)
     change = np.linalg.norm(np.diff(rate, axis=0, prepend=rate[:1]), axis=1)
     bound = np.array([acceleration(r) for r in np.linalg.norm(rate, axis=1)])
-    # Of a jump there and on, the smaller rate is the one an object may have had.
+    # A repointing enters two rates. The smaller one is the rate an object may have had.
     bound[1:] = np.minimum(bound[1:], bound[:-1])
     jumped = change * dt > REPOINTED_PX * pixel_rad + BOUND * bound * dt * dt
     return np.concatenate([[0], np.cumsum(jumped)]).astype(np.int64)
 
 
 def _turns_fast(time_s: Array, path: Array) -> bool:
-    """Return whether a path is faster and longer than that of anything in orbit."""
+    """Return whether a path is faster and longer than that of any object in orbit."""
     rate, dt = _rates(time_s, path)
     speed = np.linalg.norm(rate, axis=1)
     fast = speed > FAST_TURN_RAD_S
@@ -142,12 +142,12 @@ def _turns_fast(time_s: Array, path: Array) -> bool:
 def _fixed_places(
     x_px: Array, y_px: Array, reach_px: float, size_px: tuple[int, int], n_frames: int
 ) -> list[Indices]:
-    """Return the detections about each place that holds them in many frames, each place once."""
+    """Return the detections at each place that has some in many frames; each place once."""
     cell = max(2 * reach_px, 1.0)
     width, height = (int(s / cell) + 3 for s in size_px)
     out: list[Indices] = []
     taken = np.zeros(len(x_px), bool)
-    # Four grids half a cell apart: in one of them a place lies away from the cells' edges.
+    # Four grids half a cell apart: in one of them, a place is away from the edges of its cell.
     for shift_x, shift_y in ((0.5, 0.5), (1.0, 0.5), (0.5, 1.0), (1.0, 1.0)):
         column = np.clip(x_px / cell + shift_x, 0, width - 1).astype(np.int64)
         row = np.clip(y_px / cell + shift_y, 0, height - 1).astype(np.int64)
@@ -155,7 +155,7 @@ def _fixed_places(
         count = np.bincount(index[~taken], minlength=width * height)
         for busy in np.flatnonzero(count >= max(SHARE * n_frames, FEWEST)):
             inside = np.flatnonzero((index == busy) & ~taken)
-            if not len(inside):  # a neighbouring cell had them
+            if not len(inside):  # they belong to a place in a neighbouring cell
                 continue
             middle_x, middle_y = np.median(x_px[inside]), np.median(y_px[inside])
             near = np.hypot(x_px - middle_x, y_px - middle_y) < reach_px

@@ -1,9 +1,11 @@
 """Local motion: where an object stood at an instant, from its detections around it.
 
 A polynomial in time is fitted to the directions in a window around the instant. Its value
-there is a weighted mean of the detections, ``sum c_k d_k`` with ``sum c_k = 1``, so that any
-covariance of the detections, of each its own or shared by all, propagates exactly.
+there is a weighted mean of the detections, ``sum c_k d_k`` with ``sum c_k = 1``. So covariances of
+the detections propagate exactly, both independent ones and one that all share.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +15,36 @@ from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, jerk
 
 Array = npt.NDArray[np.float64]
 
-BIAS_SHARE = 0.25  # of one detection's sigma: what the neglected third derivative may amount to
+BIAS_SHARE = 0.25  # most that the neglected third derivative may add, in sigmas of a detection
+
+
+class _Queries(NamedTuple):
+    """Wanted instants, as `directions_at` takes them."""
+
+    first: npt.NDArray[np.int64]
+    last: npt.NDArray[np.int64]
+    at: Array
+    unknown_rate: float
+    widest: float
+
+
+class _MotionDetections(NamedTuple):
+    """Times (n,), directions (n, 3), and errors (n, 3, 3), independent and shared."""
+
+    t: Array
+    u: Array
+    noise: Array
+    bias: Array
+
+
+class _MotionPlaces(NamedTuple):
+    """What `directions_at` returns."""
+
+    u: Array
+    w: Array
+    noise: Array
+    bias: Array
+    n: npt.NDArray[np.int64]
 
 
 @kernel
@@ -40,10 +71,10 @@ def _solve3(S, rhs):
 @kernel
 def _coefficients(t, weight, scale, curvature_prior, value, slope):
     """Fill the coefficients of the polynomial's value and slope at t = 0; return the value's
-    variance for detections of variance 1 / weight, the prior's part included.
+    variance for detections of variance 1 / weight, with the prior's part.
 
     `curvature_prior` is the weight of a zero second derivative, in the units of `weight`
-    and of time over `scale`: it holds the curvature where the detections do not.
+    and of time over `scale`. It decides the curvature where the detections do not.
     """
     S = np.zeros((3, 3))
     for k in range(len(t)):
@@ -67,7 +98,7 @@ def _coefficients(t, weight, scale, curvature_prior, value, slope):
 
 @kernel
 def _about(t, first, last, at, half):
-    """Return the detections within a half-width of an instant, three at least if there are."""
+    """Return the detections within a half-width of an instant, at least three if there are any."""
     lo = first + np.searchsorted(t[first:last], at - half)
     hi = first + np.searchsorted(t[first:last], at + half, side="right")
     while hi - lo < min(3, last - first):
@@ -80,10 +111,10 @@ def _about(t, first, last, at, half):
 
 @kernel
 def _window(t, u, first, last, at, sigma, widest):
-    """Return the part of first:last that serves an instant, the rate [rad/s] and half-width.
+    """Return the part of first:last that is fitted, the rate [rad/s] and the half-width.
 
-    Three detections stay, however slow the sensor or fast the object: the prior covers its
-    curvature, and what lies beyond the half-width is paid for.
+    Three detections are kept, however slow the sensor or fast the object. The prior covers the
+    curvature, and a window beyond the half-width adds to the error.
     """
     lo, hi = _about(t, first, last, at, widest)
     rate = 0.0
@@ -98,71 +129,78 @@ def _window(t, u, first, last, at, sigma, widest):
 
 
 @kernel
-def _evaluate(
-    first,
-    last,
-    at,
-    unknown_rate,
-    t,
-    u,
-    noise,
-    bias,
-    widest,
-    out_u,
-    out_w,
-    out_noise,
-    out_bias,
-    out_n,
-):
-    for q in range(len(at)):
-        nearest = first[q] + np.searchsorted(t[first[q] : last[q]], at[q])
-        if nearest == last[q] or (
-            nearest > first[q] and at[q] - t[nearest - 1] <= t[nearest] - at[q]
-        ):
-            nearest -= 1
-        sigma = np.sqrt(np.trace(noise[nearest]) / 2)
-        lo, hi, rate, half = _window(t, u, first[q], last[q], at[q], sigma, widest)
-        n = hi - lo
-        out_n[q] = n
-        tau, weight = t[lo:hi] - at[q], np.empty(n)
+def _nearest(t, first, last, at):
+    """Return the detection of first:last nearest in time to an instant."""
+    nearest = first + np.searchsorted(t[first:last], at)
+    if nearest == last or (nearest > first and at - t[nearest - 1] <= t[nearest] - at):
+        nearest -= 1
+    return nearest
+
+
+@kernel
+def _fit(detections, lo, hi, at, rate, half, unknown_rate):
+    """Return the coefficients of value and slope at an instant, and the variance that neither
+    noise nor bias explains."""
+    n = hi - lo
+    tau, weight = detections.t[lo:hi] - at, np.empty(n)
+    for k in range(n):
+        weight[k] = 2.0 / np.trace(detections.noise[lo + k])
+    value, slope = np.empty(n), np.empty(n)
+    if n == 1:
+        value[0], slope[0] = 1.0, 0.0
+        unmodelled = (unknown_rate * tau[0]) ** 2
+    else:
+        scale = max(np.max(np.abs(tau)), 1e-9)
+        prior = 1.0 / (acceleration(rate) * scale * scale) ** 2
+        unmodelled = _coefficients(tau, weight, scale, prior, value, slope)
+        if scale > half:
+            unmodelled += (jerk(rate) * scale**3 / 6) ** 2
         for k in range(n):
-            weight[k] = 2.0 / np.trace(noise[lo + k])
-        value, slope = np.empty(n), np.empty(n)
-        if n == 1:
-            value[0], slope[0] = 1.0, 0.0
-            unmodelled = (unknown_rate * tau[0]) ** 2
-        else:
-            scale = max(np.max(np.abs(tau)), 1e-9)
-            prior = 1.0 / (acceleration(rate) * scale * scale) ** 2
-            unmodelled = _coefficients(tau, weight, scale, prior, value, slope)
-            if scale > half:
-                unmodelled += (jerk(rate) * scale**3 / 6) ** 2
+            unmodelled -= value[k] * value[k] / weight[k]
+    return value, slope, unmodelled
+
+
+@kernel
+def _enter_errors(q, value, unmodelled, noise, bias, places):
+    """Write the propagated errors of query q."""
+    # One error, larger in some frames than in others (0 where stars gave the attitude): it
+    # adds up with its signs, and its square is never negative.
+    n = len(value)
+    amplitude, total = 0.0, 0.0
+    for k in range(n):
+        square = np.trace(bias[k])
+        amplitude += value[k] * np.sqrt(square)
+        total += abs(value[k]) * square
+    share = amplitude * amplitude / total if total > 0.0 else 0.0
+    for a in range(3):
+        for b in range(3):
+            independent, shared = 0.0, 0.0
             for k in range(n):
-                unmodelled -= value[k] * value[k] / weight[k]
+                independent += value[k] * value[k] * noise[k, a, b]
+                shared += abs(value[k]) * bias[k, a, b]
+            places.noise[q, a, b] = independent + (max(unmodelled, 0.0) if a == b else 0.0)
+            places.bias[q, a, b] = share * shared
+
+
+@kernel
+def _evaluate(queries, detections, places):
+    t, u, noise, bias = detections.t, detections.u, detections.noise, detections.bias
+    for q in range(len(queries.at)):
+        first, last, at = queries.first[q], queries.last[q], queries.at[q]
+        nearest = _nearest(t, first, last, at)
+        sigma = np.sqrt(np.trace(noise[nearest]) / 2)
+        lo, hi, rate, half = _window(t, u, first, last, at, sigma, queries.widest)
+        places.n[q] = hi - lo
+        value, slope, unmodelled = _fit(detections, lo, hi, at, rate, half, queries.unknown_rate)
         for a in range(3):
             mean, moving = 0.0, 0.0
-            for k in range(n):
+            for k in range(hi - lo):
                 # Differences from the nearest detection keep the digits that matter.
                 mean += value[k] * (u[lo + k, a] - u[nearest, a])
                 moving += slope[k] * (u[lo + k, a] - u[nearest, a])
-            out_u[q, a] = u[nearest, a] + mean
-            out_w[q, a] = moving
-        # One error, larger in some frames than in others (0 where stars gave the attitude): it
-        # adds up with its signs, and its square is never negative.
-        amplitude, total = 0.0, 0.0
-        for k in range(n):
-            square = np.trace(bias[lo + k])
-            amplitude += value[k] * np.sqrt(square)
-            total += abs(value[k]) * square
-        share = amplitude * amplitude / total if total > 0.0 else 0.0
-        for a in range(3):
-            for b in range(3):
-                own, shared = 0.0, 0.0
-                for k in range(n):
-                    own += value[k] * value[k] * noise[lo + k, a, b]
-                    shared += abs(value[k]) * bias[lo + k, a, b]
-                out_noise[q, a, b] = own + (max(unmodelled, 0.0) if a == b else 0.0)
-                out_bias[q, a, b] = share * shared
+            places.u[q, a] = u[nearest, a] + mean
+            places.w[q, a] = moving
+        _enter_errors(q, value, unmodelled, noise[lo:hi], bias[lo:hi], places)
 
 
 def directions_at(
@@ -203,33 +241,30 @@ def directions_at(
     cov_noise, cov_bias : (q, 3, 3) float
         Propagated errors [rad^2].
     n : (q,) int
-        Detections that took part.
+        Number of detections fitted.
 
     Notes
     -----
-    A quadratic; its second derivative has a weak prior (the acceleration that the rate
+    A quadratic is fitted. Its second derivative has a weak prior (the acceleration that the rate
     allows), so that two detections suffice. The window shrinks for fast objects until the
-    neglected third derivative is a fraction of the noise. The neglected curvature of the
-    sphere over the window is of the same order as that.
+    neglected third derivative is a fraction of the noise. The curvature of the sphere over the
+    window, which is neglected too, is of the same order.
     """
     q = len(at_s)
-    u, w = np.empty((q, 3)), np.empty((q, 3))
-    noise, bias, n = np.empty((q, 3, 3)), np.empty((q, 3, 3)), np.empty(q, np.int64)
-    _evaluate(
+    queries = _Queries(
         np.ascontiguousarray(first, np.int64),
         np.ascontiguousarray(last, np.int64),
         np.ascontiguousarray(at_s, float),
         float(unknown_rate_rad_s),
-        np.ascontiguousarray(time_s, float),
-        np.ascontiguousarray(u_icrs, float),
-        np.ascontiguousarray(cov_noise, float),
-        np.ascontiguousarray(cov_bias, float),
         float(widest_s),
-        u,
-        w,
-        noise,
-        bias,
-        n,
     )
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    return u, w, noise, bias, n
+    detections = _MotionDetections(
+        *(np.ascontiguousarray(a, float) for a in (time_s, u_icrs, cov_noise, cov_bias))
+    )
+    places = _MotionPlaces(
+        np.empty((q, 3)), np.empty((q, 3)), np.empty((q, 3, 3)), np.empty((q, 3, 3)),
+        np.empty(q, np.int64),
+    )  # fmt: skip
+    _evaluate(queries, detections, places)
+    u = places.u / np.linalg.norm(places.u, axis=1, keepdims=True)
+    return u, places.w, places.noise, places.bias, places.n

@@ -1,16 +1,24 @@
 """Tracking: detections of one sensor, frame after frame, become runs of one object.
 
-Everything happens on the sky, after attitude, so that the sensor's own turning is gone. Each
-frame the tracks that live claim the detections they fit, the nearest in sigmas first; what is
-left may begin new ones.
+Everything happens on the sky, after attitude, so that the sensor's own turning is gone. In each
+frame, live tracks claim the detections that they fit, the nearest in sigmas first. The other
+detections may begin new tracks.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.frame_grid import fill_grid, make_grids, window
-from epipole.tasks.algorithms.tracking.initiation import NONE, new_tracks
+from epipole.tasks.algorithms.tracking.initiation import (
+    NONE,
+    Detections,
+    RecentFrames,
+    TrackRule,
+    new_tracks,
+)
 from epipole.tasks.algorithms.tracking.sky_filter import (
     advance,
     begin,
@@ -22,18 +30,34 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
 
 Array = npt.NDArray[np.float64]
 
-SLACK = 4  # frames beyond the fewest detections in which a track must begin
-DEEPEST = 9  # the same where strays are so dense that it takes more detections
+SLACK = 4  # a track begins within so many frames more than the fewest detections
+DEEPEST = 9  # the same where false alarms are so dense that it takes more detections
+
+
+class _Tracks(NamedTuple):
+    """States of tracks.
+
+    u, w, P : (t, 3), (t, 3), (t, 3) float, direction, rate and covariance, see `sky_filter`
+    at, missed : (t,) float and int64, time of the state, and misses in a row
+    """
+
+    u: Array
+    w: Array
+    P: Array
+    at: Array
+    missed: npt.NDArray[np.int64]
 
 
 @kernel
-def _state_of(members, frame_of, times, directions, variances, u, w, P):
+def _state_of(members, detections, u, w, P):
     """Filter a new track's detections, newest first in `members`, into its state at the newest."""
+    times, frame_of = detections.times, detections.frame_of
+    directions, variances = detections.directions, detections.variances
     last = len(members) - 1
-    one, two = members[last], members[last - 1]
+    first, second = members[last], members[last - 1]
     begin(
-        directions[one], times[frame_of[one]], variances[one],
-        directions[two], times[frame_of[two]], variances[two], u, w, P,
+        directions[first], times[frame_of[first]], variances[first],
+        directions[second], times[frame_of[second]], variances[second], u, w, P,
     )  # fmt: skip
     for m in range(last - 2, -1, -1):
         dt = times[frame_of[members[m]]] - times[frame_of[members[m + 1]]]
@@ -43,93 +67,97 @@ def _state_of(members, frame_of, times, directions, variances, u, w, P):
 
 
 @kernel
-def _candidates(live, U, P, directions, variances, largest, grids, slot, gate2):
+def _candidates(live, tracks, detections, recent, slot, gate2):
     """Return all (track, detection, chi-square) within the gate."""
-    start, items = grids[2], grids[3]
+    start, items = recent.grids[2], recent.grids[3]
+    directions, variances = detections.directions, detections.variances
     room, count = 4 * len(live) + 16, 0
-    who, which, chi2 = np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room)
+    track, detection = np.empty(room, np.int64), np.empty(room, np.int64)
+    chi2 = np.empty(room)
     for m in live:
-        reach = np.sqrt(gate2 * (P[m, 0] + largest))
-        x_from, x_to, y_from, y_to, side = window(grids, slot, U[m], reach)
+        variance = tracks.P[m, 0]
+        reach = np.sqrt(gate2 * (variance + recent.largest[slot]))
+        x_from, x_to, y_from, y_to, side = window(recent.grids, slot, tracks.u[m], reach)
         if x_from > x_to:
             continue
         for y in range(y_from, y_to + 1):
             for k in range(start[slot, y * side + x_from], start[slot, y * side + x_to + 1]):
                 j = items[slot, k]
-                miss = distance2(directions[j], U[m]) / (P[m, 0] + variances[j])
+                miss = distance2(directions[j], tracks.u[m]) / (variance + variances[j])
                 if miss >= gate2:
                     continue
                 if count == room:
-                    who = np.concatenate((who, np.empty(room, np.int64)))
-                    which = np.concatenate((which, np.empty(room, np.int64)))
+                    track = np.concatenate((track, np.empty(room, np.int64)))
+                    detection = np.concatenate((detection, np.empty(room, np.int64)))
                     chi2 = np.concatenate((chi2, np.empty(room)))
                     room *= 2
-                who[count], which[count], chi2[count] = m, j, miss
+                track[count], detection[count], chi2[count] = m, j, miss
                 count += 1
-    return who[:count], which[:count], chi2[:count]
+    return track[:count], detection[:count], chi2[:count]
 
 
 @kernel
-def _claim(
-    live, U, W, P, at, missed, time, directions, variances, largest, grids, slot, track, gate2
-):
-    """Move the live tracks to a frame and give each detection to the track it fits best."""
+def _claim(f, live, tracks, detections, recent, gate2):
+    """Move the live tracks to frame f and give each detection to the track it fits best."""
+    u, w, P = tracks.u, tracks.w, tracks.P
+    time, slot = detections.times[f], f % len(recent.largest)
     for m in live:
-        dt = time - at[m]
-        grow(P[m], rate_of(W[m]), dt)
-        advance(U[m], W[m], dt)
-        at[m] = time
-        missed[m] += 1
-    who, which, chi2 = _candidates(live, U, P, directions, variances, largest, grids, slot, gate2)
+        dt = time - tracks.at[m]
+        grow(P[m], rate_of(w[m]), dt)
+        advance(u[m], w[m], dt)
+        tracks.at[m] = time
+        tracks.missed[m] += 1
+    track, detection, chi2 = _candidates(live, tracks, detections, recent, slot, gate2)
     for p in np.argsort(chi2, kind="mergesort"):
-        m, j = who[p], which[p]
-        if missed[m] == 0 or track[j] != NONE:
+        m, j = track[p], detection[p]
+        if tracks.missed[m] == 0 or detections.track[j] != NONE:
             continue
-        missed[m] = 0
-        track[j] = m
-        correct(U[m], W[m], P[m], directions[j], variances[j])
+        tracks.missed[m] = 0
+        detections.track[j] = m
+        correct(u[m], w[m], P[m], detections.directions[j], detections.variances[j])
 
 
 @kernel
-def _follow(
-    times, offsets, frame_of, most, directions, variances, max_rate, max_coast, max_missed, need,
-    gate2, field_sr, enough,
-):  # fmt: skip
-    n, n_frames = len(directions), len(times)
-    track = np.full(n, NONE)
-    room = n // max(need, 1) + 1
-    U, W, P = np.empty((room, 3)), np.empty((room, 3)), np.empty((room, 3))
-    at, missed = np.empty(room), np.zeros(room, np.int64)
+def _lay_frame(f, detections, recent):
+    """Lay the detections of frame f into its slot."""
+    lo, hi, slot = detections.offsets[f], detections.offsets[f + 1], f % len(recent.largest)
+    fill_grid(recent.grids, slot, detections.directions, lo, hi)
+    recent.smallest[slot] = detections.variances[lo:hi].min() if hi > lo else np.inf
+    recent.largest[slot] = detections.variances[lo:hi].max() if hi > lo else 0.0
+
+
+@kernel
+def _follow(detections, most, rule):
+    """Fill in the tracks of all detections, of which there are at most `most` in a frame."""
+    times, room = detections.times, len(detections.track) // max(rule.need, 1) + 1
+    tracks = _Tracks(
+        np.empty((room, 3)),
+        np.empty((room, 3)),
+        np.empty((room, 3)),
+        np.empty(room),
+        np.zeros(room, np.int64),
+    )
     live = np.empty(0, np.int64)
-    # Not the literal 0, for which what it is given to would be compiled once more.
-    n_tracks, deepest = len(live), need + DEEPEST
-    n_slots = deepest + 1
-    grids = make_grids(n_slots, most)
-    smallest, largest = np.full(n_slots, np.inf), np.zeros(n_slots)
-    for f in range(n_frames):
-        lo, hi, slot = offsets[f], offsets[f + 1], f % n_slots
-        fill_grid(grids, slot, directions, lo, hi)
-        smallest[slot] = variances[lo:hi].min() if hi > lo else np.inf
-        largest[slot] = variances[lo:hi].max() if hi > lo else 0.0
-        # A track that was missed too often has ended.
-        live = live[(missed[live] <= max_missed) & (times[f] - at[live] <= max_coast)]
-        _claim(
-            live, U, W, P, at, missed, times[f], directions, variances, largest[slot], grids,
-            slot, track, gate2,
-        )  # fmt: skip
-        begun, held, chains = new_tracks(
-            f, need + SLACK, deepest, times, offsets, directions, variances, smallest, largest,
-            grids, n_slots, track, n_tracks, max_rate, max_coast, need, gate2, field_sr, enough,
-        )  # fmt: skip
+    # Not the literal 0: `new_tracks` would be compiled for that type as well.
+    n_tracks, n_slots = len(live), rule.need + DEEPEST + 1
+    recent = RecentFrames(make_grids(n_slots, most), np.full(n_slots, np.inf), np.zeros(n_slots))
+    for f in range(len(times)):
+        _lay_frame(f, detections, recent)
+        # A track with too many misses has ended.
+        live = live[
+            (tracks.missed[live] <= rule.max_missed)
+            & (times[f] - tracks.at[live] <= rule.max_coast)
+        ]
+        _claim(f, live, tracks, detections, recent, rule.gate2)
+        begun, held, chains = new_tracks(f, rule.need + SLACK, n_tracks, detections, recent, rule)
         for row in begun:
+            members = chains[row, : held[row]]
             _state_of(
-                chains[row, : held[row]], frame_of, times, directions, variances, U[n_tracks],
-                W[n_tracks], P[n_tracks],
-            )  # fmt: skip
-            at[n_tracks], missed[n_tracks] = times[f], 0
+                members, detections, tracks.u[n_tracks], tracks.w[n_tracks], tracks.P[n_tracks]
+            )
+            tracks.at[n_tracks], tracks.missed[n_tracks] = times[f], 0
             n_tracks += 1
         live = np.concatenate((live, np.arange(n_tracks - len(begun), n_tracks)))
-    return track
 
 
 def follow_detections(
@@ -159,18 +187,18 @@ def follow_detections(
     sigma_rad : (n,) float
         1-sigma error an axis, of centroid and attitude together [rad].
     max_rate_rad_s, max_coast_s
-        Fastest motion looked for; longest time without a frame that a track survives.
+        Fastest motion searched for; longest time without a detection that a track survives.
     max_missed
-        Frames in a row in which a track may miss its object.
+        Most misses in a row that a track survives.
     min_detections
         Fewest detections that begin a track (at least 2), within `SLACK` frames more.
     gate_sigma
         A detection continues a track within this many standard deviations.
     field_sr
-        Solid angle of the field: with it, how dense the detections are.
+        Solid angle of the field, for the density of the detections.
     false_alarm
-        Accepted number of tracks a frame that are made of strays. Where strays are dense, or
-        an object is fast, it takes more detections to begin a track.
+        Accepted number of tracks per frame that consist of false alarms. Where false alarms are
+        dense, or an object is fast, it takes more detections to begin a track.
 
     Returns
     -------
@@ -178,13 +206,15 @@ def follow_detections(
         Tracks count from 0 by the frame in which they were confirmed.
     """
     n_in = np.diff(offsets)
-    return _follow(
+    detections = Detections(
         np.ascontiguousarray(time_s, float),
         np.ascontiguousarray(offsets, np.int64),
         np.repeat(np.arange(len(n_in)), n_in),
-        int(n_in.max(initial=0)),
         np.ascontiguousarray(u_icrs, float),
         np.ascontiguousarray(sigma_rad, float) ** 2,
+        np.full(len(u_icrs), NONE),
+    )
+    rule = TrackRule(
         float(max_rate_rad_s),
         float(max_coast_s),
         int(max_missed),
@@ -193,3 +223,5 @@ def follow_detections(
         float(field_sr),
         -float(np.log(false_alarm)),
     )
+    _follow(detections, int(n_in.max(initial=0)), rule)
+    return detections.track

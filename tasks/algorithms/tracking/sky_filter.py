@@ -1,7 +1,7 @@
-"""A filter on the sky: direction and rate of an object, along its great circle.
+"""A filter on the sky: direction and rate of an object along its great circle.
 
 Both axes share one covariance P = (direction, cross, rate). Between frames it grows with the
-acceleration that the rate allows. No chart is involved, so no place on the sky is special.
+acceleration that the rate allows. There are no coordinates, so no place on the sky is special.
 """
 
 import numpy as np

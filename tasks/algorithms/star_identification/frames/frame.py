@@ -1,12 +1,19 @@
-"""One frame: its centroids as the kernels take them, and what was found in it."""
+"""One frame: its centroids, its solution near a prediction, and its search lost in space."""
 
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.star_identification.search.evidence import TYPICAL_SPREAD_MAG
+from epipole.tasks.algorithms.star_identification.search.evidence import (
+    TYPICAL_SPREAD_MAG,
+    MatchRule,
+)
 from epipole.tasks.algorithms.star_identification.search.field import (
+    Attitude,
+    Centroids,
+    Matches,
+    StarPlaces,
     solve_predicted,
     stars_in_cone,
 )
@@ -14,24 +21,30 @@ from epipole.tasks.algorithms.star_identification.search.lost_in_space import (
     WORK_PER_S,
     search,
 )
+from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import (
+    Image,
+    Problem,
+    SearchLimits,
+    Stars,
+)
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-# Chance reaches a log evidence x, lost in space, with a probability below exp(-(x + 6)):
-# measured on 12,000 random frames of three cameras. Markov's inequality has exp(-x).
+# Lost in space, chance reaches a log evidence x with a probability below exp(-(x + 6)), as measured
+# on 12,000 random frames of three cameras. Markov's inequality only bounds it by exp(-x).
 LOST_MARGIN = 6.0
 # The best attitude must be this much (in log) more probable than any other.
 CLEAR_LEAD = 7.0
-# Prior odds (ln) that a frame shows stars that identify: what most sensors do, 99 in 100.
+# Prior odds (ln) that a frame has enough stars to be identified: 99 in 100 frames do.
 STARLIT = 4.6
-N_SEARCHED = 200  # brightest centroids that take part in a search of the whole sky
-N_PATTERN_CENTROIDS = 40  # brightest centroids that are paired lost in space
+N_SEARCHED = 200  # brightest centroids that are used in a search of the whole sky
+N_PATTERN_CENTROIDS = 40  # brightest centroids that are paired, lost in space
 
 
-class Optics(NamedTuple):
+class FieldOfView(NamedTuple):
     """A camera's field.
 
     half_diagonal_rad : from the boresight to the farthest corner
@@ -49,7 +62,7 @@ class Optics(NamedTuple):
         return float((self.box[1] - self.box[0]) * (self.box[3] - self.box[2]))
 
 
-class Frame(NamedTuple):
+class FrameCentroids(NamedTuple):
     """Centroids of one frame, brightest first.
 
     u : (n, 3) float, directions, sensor frame
@@ -63,7 +76,7 @@ class Frame(NamedTuple):
     sigma_rad: Array
     instrumental_mag: Array
     beta: Array
-    optics: Optics
+    optics: FieldOfView
 
 
 class Solution(NamedTuple):
@@ -85,9 +98,9 @@ class Solution(NamedTuple):
 class Search(NamedTuple):
     """How a frame is judged.
 
-    gate_sigma : a star lies within this of its place
+    gate_sigma : a centroid lies within this of its star's place
     threshold : least log evidence, ln(1 / false alarm probability)
-    time_limit_s : of one search lost in space
+    time_limit_s : CPU time of one search lost in space
     zero_point_mag : star minus instrumental magnitude; NaN while unknown
     spread_mag : its scatter, 1-sigma
     """
@@ -100,25 +113,33 @@ class Search(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What a search found.
+    """The result of a search.
 
-    found : the attitude is beyond doubt
+    is_clear : the attitude is beyond doubt
     R_sensor_from_icrs : (3, 3), of the best hypothesis
     evidence, runner_up : log evidence of the best and of the best different attitude
     exhausted : the search ended because its bound was reached
     """
 
-    found: bool
+    is_clear: bool
     R_sensor_from_icrs: Array
     evidence: float
     runner_up: float
     exhausted: bool
 
 
+def rule_of(how: Search, sky: Sky) -> MatchRule:
+    """Return the rule for matches as the kernels take it."""
+    return MatchRule(
+        how.gate_sigma, sky.log_density, how.zero_point_mag, how.spread_mag, how.threshold,
+        how.threshold + CLEAR_LEAD,
+    )  # fmt: skip
+
+
 def identify_predicted(
-    frame: Frame, sky: Sky, R0: Array, P0: Array, how: Search, lost: bool = False
+    frame: FrameCentroids, sky: Sky, R0: Array, P0: Array, how: Search, lost: bool = False
 ) -> Solution | None:
-    """Return the solution near a predicted attitude, or None where the stars do not bear it out.
+    """Return the solution near a predicted attitude, None where the stars do not confirm one.
 
     Parameters
     ----------
@@ -140,9 +161,8 @@ def identify_predicted(
     R, P = np.empty((3, 3)), np.empty((3, 3))
     star, chi2 = np.full(n, -1, np.int64), np.zeros(n)
     evidence = solve_predicted(
-        R0, P0, lost, frame.u, frame.sigma_rad, frame.instrumental_mag, a, stars.magnitude[row],
-        frame.optics.box, how.gate_sigma, sky.log_density, how.zero_point_mag,
-        how.spread_mag, how.threshold + CLEAR_LEAD, R, P, star, chi2,
+        Attitude(R0, P0), lost, Centroids(*frame[:4]), StarPlaces(a, stars.magnitude[row]),
+        frame.optics.box, rule_of(how, sky), Attitude(R, P), Matches(star, chi2),
     )  # fmt: skip
     if not evidence > how.threshold - (LOST_MARGIN + STARLIT if lost else 0.0):
         return None
@@ -158,9 +178,11 @@ def aberrate_all(u_icrs: Array, beta: Array) -> Array:
     return out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
-def search_lost(frame: Frame, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search) -> Verdict:
+def search_lost(
+    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search
+) -> Verdict:
     """Search the whole sky for the frame's attitude; see `lost_in_space.search`."""
-    # A place far outside any image has no direction.
+    # Centroids far outside any image have no direction.
     at = np.flatnonzero(np.isfinite(frame.u[:, 0]))[:N_SEARCHED]
     frame = frame._replace(
         u=frame.u[at], sigma_rad=frame.sigma_rad[at], instrumental_mag=frame.instrumental_mag[at]
@@ -168,27 +190,28 @@ def search_lost(frame: Frame, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Se
     if len(at) < 3:
         return Verdict(False, np.eye(3), -np.inf, -np.inf, False)
     R, least = np.zeros((3, 3)), how.threshold - LOST_MARGIN - STARLIT
-    area = frame.optics.solid_angle_sr
+    area, budget = frame.optics.solid_angle_sr, how.time_limit_s * WORK_PER_S
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))
-    best, runner_up, work = search(
-        frame.u, frame.sigma_rad, frame.instrumental_mag, frame.beta,
-        sky.catalogue.u_icrs, sky.catalogue.magnitude, grid.first, grid.star, grid.n_face,
-        grid.radius_rad, *pairs.chord, pairs.first, pairs.second, pairs.at_first,
-        pairs.at_second, min_chord, N_PATTERN_CENTROIDS, how.gate_sigma, sky.log_density,
-        how.zero_point_mag, how.spread_mag, sky.rho * area, area, frame.optics.box,
-        least, least + CLEAR_LEAD + 2.0, how.time_limit_s * WORK_PER_S, R,
-    )  # fmt: skip
-    found = best > least and best - runner_up > CLEAR_LEAD
-    return Verdict(found, R, best, runner_up, work > how.time_limit_s * WORK_PER_S)
+    problem = Problem(
+        Centroids(*frame[:4]),
+        Stars(sky.catalogue.u_icrs, sky.catalogue.magnitude, grid),
+        pairs,
+        Image(frame.optics.box, area, sky.rho * area),
+        rule_of(how, sky)._replace(least=least, enough=least + CLEAR_LEAD + 2.0),
+        SearchLimits(min_chord, N_PATTERN_CENTROIDS, budget),
+    )
+    best, runner_up, work = search(problem, R)
+    is_clear = best > least and best - runner_up > CLEAR_LEAD
+    return Verdict(is_clear, R, best, runner_up, work > budget)
 
 
 def identify_lost(
-    frame: Frame, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search
+    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search
 ) -> tuple[Solution | None, bool]:
-    """Return the solution with no prior, None where none is beyond doubt, and whether the
-    search was cut short."""
+    """Return the solution without a prior, None where no attitude is beyond doubt, and whether the
+    search reached its time limit."""
     verdict = search_lost(frame, sky, grid, pairs, how)
-    if not verdict.found:
+    if not verdict.is_clear:
         return None, verdict.exhausted
     near = np.eye(3) * (2.0 * float(np.median(frame.sigma_rad))) ** 2
     return identify_predicted(frame, sky, verdict.R_sensor_from_icrs, near, how, lost=True), False

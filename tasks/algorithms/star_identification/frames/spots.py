@@ -1,5 +1,4 @@
-"""All frames of one sensor, flat: frame k has the rows first[k]:first[k + 1] of what is a row
-a centroid."""
+"""All frames of one sensor in flat arrays: frame k has the centroids first[k]:first[k + 1]."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,19 +7,23 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.star_identification.frames.frame import Frame, Optics, Solution
+from epipole.tasks.algorithms.star_identification.frames.frame import (
+    FieldOfView,
+    FrameCentroids,
+    Solution,
+)
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
 
-class Frames(NamedTuple):
+class SensorCentroids(NamedTuple):
     """Frames in order of time, centroids brightest first.
 
     first : (F + 1,) int64
-    u, sigma_rad, instrumental_mag : (N, 3), (N,), (N,) float, as in `frame.Frame`
+    u, sigma_rad, instrumental_mag : (N, 3), (N,), (N,) float, as in `frame.FrameCentroidsCentroids`
     beta : (F, 3) float
-    optics, optics_of : the cameras, and (F,) int64 which of them took a frame
+    optics, optics_of : the cameras, and (F,) int64, which camera took each frame
     """
 
     first: Rows
@@ -28,30 +31,30 @@ class Frames(NamedTuple):
     sigma_rad: Array
     instrumental_mag: Array
     beta: Array
-    optics: Sequence[Optics]
+    optics: Sequence[FieldOfView]
     optics_of: Rows
 
-    def one(self, k: int) -> Frame:
-        """Return a frame by itself."""
+    def frame(self, k: int) -> FrameCentroids:
+        """Return one frame."""
         at = slice(self.first[k], self.first[k + 1])
-        return Frame(
+        return FrameCentroids(
             self.u[at], self.sigma_rad[at], self.instrumental_mag[at], self.beta[k],
             self.optics[self.optics_of[k]],
         )  # fmt: skip
 
-    def each(self) -> list[Frame]:
+    def each(self) -> list[FrameCentroids]:
         """Return all frames, one by one."""
-        return [self.one(k) for k in range(len(self.beta))]
+        return [self.frame(k) for k in range(len(self.beta))]
 
 
-class Spots(NamedTuple):
-    """Centroids of frames, brightest first in each, before their errors are settled.
+class UnscaledCentroids(NamedTuple):
+    """Centroids of frames, brightest first in each, with their errors as stated.
 
     first : (F + 1,) int64
-    u, pixel_rad : (N, 3), (N,) float, directions, and the angle a pixel spans there
+    u, pixel_rad : (N, 3), (N,) float, directions, and the angle that a pixel spans there
     sigma_px : (N,) float, NaN where unknown
     instrumental_mag : (N,) float, NaN where unknown
-    beta, optics, optics_of : as in `Frames`
+    beta, optics, optics_of : as in `SensorCentroids`
     """
 
     first: Rows
@@ -60,7 +63,7 @@ class Spots(NamedTuple):
     sigma_px: Array
     instrumental_mag: Array
     beta: Array
-    optics: Sequence[Optics]
+    optics: Sequence[FieldOfView]
     optics_of: Rows
 
     @property
@@ -68,28 +71,28 @@ class Spots(NamedTuple):
         """(F,) centroids of each frame."""
         return np.diff(self.first)
 
-    def take(self, frames: Rows) -> "Spots":
-        """Return these frames alone."""
+    def take(self, frames: Rows) -> "UnscaledCentroids":
+        """Return the centroids of these frames."""
         n = self.counts[frames]
         first = np.concatenate([[0], np.cumsum(n)])
         at = np.arange(first[-1]) + np.repeat(self.first[frames] - first[:-1], n)
-        return Spots(
+        return UnscaledCentroids(
             first, self.u[at], self.pixel_rad[at], self.sigma_px[at], self.instrumental_mag[at],
             self.beta[frames], self.optics, self.optics_of[frames],
         )  # fmt: skip
 
-    def frames(self, scale: float, use_flux: bool = True) -> Frames:
-        """Return the frames with their errors scaled; 1 px stands where none is stated."""
+    def frames(self, scale: float, use_flux: bool = True) -> SensorCentroids:
+        """Return the frames with their errors scaled; errors that are not stated count as 1 px."""
         sigma_px = np.where(np.isnan(self.sigma_px), 1.0, self.sigma_px) * scale
         mag = self.instrumental_mag if use_flux else np.full(len(sigma_px), np.nan)
-        return Frames(
+        return SensorCentroids(
             self.first, self.u, sigma_px * self.pixel_rad, mag, self.beta, self.optics,
             self.optics_of,
         )  # fmt: skip
 
 
 class Solutions(NamedTuple):
-    """What was found in each frame.
+    """Solutions of all frames.
 
     solved : (F,) bool
     R_sensor_from_icrs, cov_rad2 : (F, 3, 3) float, as in `frame.Solution`; NaN where not solved
@@ -106,8 +109,8 @@ class Solutions(NamedTuple):
     evidence: Array
     first: Rows
 
-    def one(self, k: int) -> Solution | None:
-        """Return a frame's solution."""
+    def frame(self, k: int) -> Solution | None:
+        """Return a frame's solution, None where it is not solved."""
         if not self.solved[k]:
             return None
         at = slice(self.first[k], self.first[k + 1])
@@ -118,22 +121,24 @@ class Solutions(NamedTuple):
 
     def each(self) -> list[Solution | None]:
         """Return all solutions, one by one."""
-        return [self.one(k) for k in range(len(self.solved))]
+        return [self.frame(k) for k in range(len(self.solved))]
 
-    def enter(self, k: int, found: Solution) -> None:
+    def enter(self, k: int, solution: Solution) -> None:
         """Write a frame's solution."""
         at = slice(self.first[k], self.first[k + 1])
         self.solved[k] = True
-        self.R_sensor_from_icrs[k], self.cov_rad2[k] = found.R_sensor_from_icrs, found.cov_rad2
-        self.star[at], self.chi2[at], self.evidence[k] = found.star, found.chi2, found.evidence
+        self.R_sensor_from_icrs[k] = solution.R_sensor_from_icrs
+        self.cov_rad2[k] = solution.cov_rad2
+        self.star[at], self.chi2[at] = solution.star, solution.chi2
+        self.evidence[k] = solution.evidence
 
     def rescaled(self, scale: float) -> "Solutions":
-        """Return the solutions as if the errors had been this many times as large."""
+        """Return the solutions for errors this many times as large."""
         return self._replace(cov_rad2=self.cov_rad2 * scale**2, chi2=self.chi2 / scale**2)
 
 
 def unsolved(first: Rows) -> Solutions:
-    """Return solutions of frames of which none is solved."""
+    """Return the solutions of frames before any is solved."""
     n = len(first) - 1
     return Solutions(
         np.zeros(n, np.bool_), np.full((n, 3, 3), np.nan), np.full((n, 3, 3), np.nan),
@@ -143,8 +148,8 @@ def unsolved(first: Rows) -> Solutions:
 
 @kernel
 def brightest_first(first, flux):
-    """Return the rows of each frame's centroids, brightest first, NaN last, as they came where
-    equal (compiled)."""
+    """Return the rows of each frame's centroids, brightest first, NaN last; equal ones keep their
+    order (compiled)."""
     row = np.arange(len(flux))
     for k in range(len(first) - 1):
         if first[k + 1] - first[k] > 200:  # insertion is quadratic

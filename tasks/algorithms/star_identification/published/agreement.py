@@ -1,4 +1,4 @@
-"""Matches that hold together: separations in the image equal those in the catalogue."""
+"""Matches that agree with each other: separations in the image equal those in the catalogue."""
 
 import numpy as np
 import numpy.typing as npt
@@ -17,10 +17,10 @@ def agreeing_candidates(
 ) -> Rows:
     """Return the largest set of candidate matches around one that agree with each other.
 
-    Candidate k says that centroid[k] is star[k]. Each is asked how many centroids have a
-    candidate whose separation from it is the same in image and catalogue; the one with
-    most, and those that agree with it and with half of its own, are kept, one star a
-    centroid. A mirror image is none.
+    Candidate k says that centroid[k] is star[k]. Its support is the number of centroids with a
+    candidate whose separation from it is the same in image and catalogue. Kept are the candidate
+    with most support, and those that agree with it and with half of the candidates that do, one
+    star per centroid. Mirror images are refused.
 
     Parameters
     ----------
@@ -36,11 +36,11 @@ def agreeing_candidates(
     Returns
     -------
     (n,) int64
-        Each centroid's star, -1 none. Fewer than three are none at all.
+        Each centroid's star, -1 where it has none; all -1 with fewer than three matches.
     """
-    found = np.full(len(u), -1, np.int64)
+    matched = np.full(len(u), -1, np.int64)
     if len(centroid) < 3:
-        return found
+        return matched
     agree = _agree(u, sigma_rad, star_u, centroid, star, gate_sigma)
     support = _support(agree, centroid, len(u))
     best = int(np.argmax(support))
@@ -51,23 +51,23 @@ def agreeing_candidates(
     kept = inner >= 0.5 * (len(np.unique(centroid[rows])) - 1)
     rows, inner = rows[kept], inner[kept]
     for k in rows[np.lexsort((rows, -inner))]:
-        if found[centroid[k]] < 0 and star[k] not in found:
-            found[centroid[k]] = star[k]
-    at = np.flatnonzero(found >= 0)
-    if len(at) >= 3 and _same_hand(u[at], star_u[found[at]]):
-        return found
+        if matched[centroid[k]] < 0 and star[k] not in matched:
+            matched[centroid[k]] = star[k]
+    at = np.flatnonzero(matched >= 0)
+    if len(at) >= 3 and _same_hand(u[at], star_u[matched[at]]):
+        return matched
     return np.full(len(u), -1, np.int64)
 
 
 def _agree(
     u: Array, sigma_rad: Array, star_u: Array, centroid: Rows, star: Rows, gate_sigma: float
 ) -> npt.NDArray[np.bool_]:
-    seen, listed = chords(u)[np.ix_(centroid, centroid)], chords(star_u[star])
+    measured, listed = chords(u)[np.ix_(centroid, centroid)], chords(star_u[star])
     variance = sigma_rad[centroid] ** 2
     # Aberration stretches by v / c at most.
-    tolerance = gate_sigma * np.sqrt(variance[:, None] + variance) + 1.1e-4 * seen
+    tolerance = gate_sigma * np.sqrt(variance[:, None] + variance) + 1.1e-4 * measured
     other = (centroid[:, None] != centroid) & (star[:, None] != star)
-    return other & (np.abs(seen - listed) < tolerance)
+    return other & (np.abs(measured - listed) < tolerance)
 
 
 def _support(agree: npt.NDArray[np.bool_], centroid: Rows, n: int) -> npt.NDArray[np.int64]:
@@ -78,6 +78,9 @@ def _support(agree: npt.NDArray[np.bool_], centroid: Rows, n: int) -> npt.NDArra
 
 
 def _same_hand(u: Array, s: Array) -> bool:
-    """Return whether the set is no mirror image: the sum over triples of the products of
-    their triple products, by the theorem of Cauchy and Binet."""
+    """Return whether the set is not a mirror image.
+
+    By the theorem of Cauchy and Binet, the determinant is the sum over all triples of the product
+    of their triple products in image and catalogue.
+    """
     return bool(np.linalg.det(u.T @ s) > 0.0)

@@ -3,12 +3,12 @@
 Yuan, Zhang, Shi: A modified star map identification algorithm based on K vector
 (doi 10.16547/j.cnki.10-1096.20170210). The six separations of four centroids give six sets
 of catalogue pairs; a counter per star finds the stars that stand in all of the first three,
-at the cost of the sum of the set sizes. Every further centroid is matched where the six
-triangles that it forms with two base stars agree with those of a catalogue star.
+at the cost of the sum of the set sizes. A further centroid is matched with a star if the six
+triangles that it forms with two base stars agree with those of the star.
 
-What the source leaves open: base stars are taken from the brightest centroids, brightest
-first, until four are identified; of several identities the one with most further matches
-counts, and a draw is none.
+Decided here, as the source leaves it open: base stars are taken from the brightest centroids,
+brightest first, until four are identified. Of several identities, the one with most further
+matches counts. A tie identifies nothing.
 """
 
 import math
@@ -17,6 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
+from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
+    Matcher,
+    identify_each_frame,
+)
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, Skies
+from epipole.tasks.algorithms.star_identification.sequence import Priors
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky, pattern_pairs
 from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 
@@ -26,7 +35,7 @@ N_BASE = 8  # brightest centroids of which four are tried at a time
 PAIR_GATE = 3.0  # sigma; of a separation
 # The published limit of 1e-6 rad^2 at 0.5 px of 20.3 degrees / 1024, in units of sigma^2.
 DISSIMILARITY_SIGMA2 = 33.0
-MAX_IDENTITIES = 64  # four centroids with more are passed over
+MAX_IDENTITIES = 64  # four centroids with more are skipped
 
 
 def match_four_base_stars(
@@ -46,12 +55,34 @@ def match_four_base_stars(
     Returns
     -------
     (n,) int64
-        Row of star_u, -1 where a centroid is no star; all -1 where the method fails.
+        Row of star_u, -1 where a centroid is not identified; all -1 where the method fails.
     """
     star = np.full(len(u), -1, np.int64)
     if len(u) >= 4 and len(star_u) >= 4:
-        _match(u, sigma_rad, star_u, *pairs.chord, pairs.first, pairs.second, N_BASE, star)
+        _match(u, sigma_rad, star_u, pairs, star)
     return star
+
+
+def identify_by_four_base_stars(
+    t_s: Array,
+    frames: UnscaledCentroids,
+    priors: Priors,
+    skies: Skies,
+    magnitude_limit: float | None,
+    how: Search,
+) -> IdentifiedSensor:
+    """Identify the stars of a sensor's frames by four base stars.
+
+    Parameters and result as `sensor.identify_sensor`; times and priors are not used.
+    """
+    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, how)
+
+
+def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
+    """Return the method as a function of centroids alone, its table of pairs made for a camera."""
+    star_u = sky.catalogue.u_icrs
+    pairs = pattern_pairs(star_u, 2 * optics.half_diagonal_rad)
+    return lambda u, sigma_rad: match_four_base_stars(u, sigma_rad, star_u, pairs)
 
 
 @kernel
@@ -69,20 +100,20 @@ def _tolerance(sigma, i, j, c):
 @kernel
 def _same_hand(u, p, s_u, s):
     """Return whether the first three of the four turn the same way in image and catalogue."""
-    seen = np.linalg.det(np.stack((u[p[0]], u[p[1]], u[p[2]])))
+    measured = np.linalg.det(np.stack((u[p[0]], u[p[1]], u[p[2]])))
     listed = np.linalg.det(np.stack((s_u[s[0]], s_u[s[1]], s_u[s[2]])))
-    return seen * listed > 0.0
+    return measured * listed > 0.0
 
 
 @kernel
-def _identities(u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pair_b, counter, out):
-    """Write the quadruples of stars whose six separations are those of centroids p; return
-    how many. `counter` is zero, and left so."""
-    low, high = np.zeros(4, np.int64), np.zeros(4, np.int64)
+def _common_partners(pairs, low, high, counter):
+    """Return the partners of the stars that stand in all three sets of pairs.
+
+    Set k = 1 .. 3 holds the pairs low[k]:high[k]. Returned are the star, its partner, and where
+    the rows of each set begin. `counter` is zero, and zero again afterwards.
+    """
+    pair_a, pair_b = pairs.first, pairs.second
     for k in range(1, 4):
-        c = _chord(u, p[0], u, p[k])
-        t = _tolerance(sigma, p[0], p[k], c)
-        low[k], high[k] = range_of(chord, below, slope, intercept, c - t, c + t)
         for i in range(low[k], high[k]):  # a set counts a star once
             if counter[pair_a[i]] == k - 1:
                 counter[pair_a[i]] = k
@@ -91,7 +122,6 @@ def _identities(u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pai
     n_total = 0
     for k in range(1, 4):
         n_total += 2 * (high[k] - low[k])
-    # Partners of the stars that reached 3, by set: (candidate, partner).
     first, partner = np.empty(n_total, np.int64), np.empty(n_total, np.int64)
     bound = np.zeros(5, np.int64)
     n = 0
@@ -110,6 +140,19 @@ def _identities(u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pai
         for i in range(low[k], high[k]):
             counter[pair_a[i]] = 0
             counter[pair_b[i]] = 0
+    return first, partner, bound
+
+
+@kernel
+def _identities(u, sigma, p, star_u, pairs, counter, out):
+    """Write the quadruples of stars whose six separations are those of centroids p; return
+    how many. `counter` is zero, and zero again afterwards."""
+    low, high = np.zeros(4, np.int64), np.zeros(4, np.int64)
+    for k in range(1, 4):
+        c = _chord(u, p[0], u, p[k])
+        t = _tolerance(sigma, p[0], p[k], c)
+        low[k], high[k] = range_of(pairs.chord, c - t, c + t)
+    first, partner, bound = _common_partners(pairs, low, high, counter)
     count = 0
     c23, c24, c34 = _chord(u, p[1], u, p[2]), _chord(u, p[1], u, p[3]), _chord(u, p[2], u, p[3])
     t23, t24, t34 = (
@@ -149,11 +192,11 @@ def _match_rest(u, sigma, p, star_u, s, star):
     for k in range(len(u)):
         for b in range(4):
             diagonal = max(diagonal, _chord(u, k, u, p[b]))
-    seen, listed = np.empty((4, 4)), np.empty((4, 4))
+    measured, listed = np.empty((4, 4)), np.empty((4, 4))
     for b in range(4):
         star[p[b]] = s[b]
         for c in range(4):
-            seen[b, c] = _chord(u, p[b], u, p[c])
+            measured[b, c] = _chord(u, p[b], u, p[c])
             listed[b, c] = _chord(star_u, s[b], star_u, s[c])
     r, big_r = np.empty(4), np.empty(4)
     best_of = np.full(len(u), 1e9)
@@ -182,7 +225,7 @@ def _match_rest(u, sigma, p, star_u, s, star):
             for b in range(4):
                 for c in range(b):
                     d = (r[b] - big_r[b]) ** 2 + (r[c] - big_r[c]) ** 2
-                    worst = max(worst, d + (seen[b, c] - listed[b, c]) ** 2)
+                    worst = max(worst, d + (measured[b, c] - listed[b, c]) ** 2)
             if worst > limit or worst >= best_of[k]:
                 continue
             other = -1  # one star, one centroid
@@ -200,9 +243,9 @@ def _match_rest(u, sigma, p, star_u, s, star):
 
 
 @kernel
-def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_base, star):
+def _match(u, sigma, star_u, pairs, star):
     n = len(u)
-    m = min(n, n_base)
+    m = min(n, N_BASE)
     counter = np.zeros(len(star_u), np.int8)
     identities = np.empty((MAX_IDENTITIES, 4), np.int64)
     trial = np.empty(n, np.int64)
@@ -212,10 +255,7 @@ def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_b
             for second in range(1, third):
                 for lead in range(second):
                     p[0], p[1], p[2], p[3] = lead, second, third, last
-                    count = _identities(
-                        u, sigma, p, star_u, chord, below, slope, intercept, pair_a, pair_b,
-                        counter, identities,
-                    )  # fmt: skip
+                    count = _identities(u, sigma, p, star_u, pairs, counter, identities)
                     best, draw = -1, False
                     for q in range(count):
                         further = _match_rest(u, sigma, p, star_u, identities[q], trial)
@@ -223,7 +263,7 @@ def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_b
                         if further > best:
                             best = further
                             star[:] = trial
-                    # A chance match of four has no further ones, if there are any to have.
+                    # Four that match by chance have no further matches, unless n = 4.
                     if best >= min(n - 4, 1) and not draw:
                         return
                     star[:] = -1

@@ -1,64 +1,40 @@
-"""A sensor's frames by one of the published methods: each by itself, lost in space.
+"""A sensor's frames by a published method: each frame alone, lost in space.
 
-A method gives the star of each centroid; the attitude is the optimal one of all matches,
-those out of their place left out. There is no verdict by likelihood, no tracking, no prior.
+A method says which star each centroid is. The attitude is the optimal one of all matches, without
+those that are out of place. There is no verdict by likelihood, no tracking and no prior.
 """
 
 from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import optimal_attitude
 from epipole.tasks.algorithms.star_identification.frames.frame import (
-    Frame,
-    Optics,
+    FieldOfView,
+    FrameCentroids,
     Search,
     Solution,
     aberrate_all,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import Spots, unsolved
-from epipole.tasks.algorithms.star_identification.published.four_base_stars import (
-    match_four_base_stars,
-)
-from epipole.tasks.algorithms.star_identification.published.match_group import match_group
-from epipole.tasks.algorithms.star_identification.published.radial_cyclic import (
-    RADIUS_OF_FIELD,
-    build_features,
-    match_radial_cyclic,
-)
-from epipole.tasks.algorithms.star_identification.sensor import Identified, Skies
+from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids, unsolved
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, Skies
 from epipole.tasks.algorithms.star_identification.sensor_limits import scale_of
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky, pattern_pairs
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 
 Array = npt.NDArray[np.float64]
-Method = Literal["four_base_stars", "match_group", "radial_cyclic"]
-Matcher = Callable[[Array, Array], npt.NDArray[np.int64]]
+Rows = npt.NDArray[np.int64]
+# Takes (n, 3) directions, brightest first, and (n,) sigmas [rad]; returns (n,) rows of the sky's
+# catalogue, -1 where a centroid is no star.
+Matcher = Callable[[Array, Array], Rows]
 
 ASSUMED_SIGMA_PX = 0.5  # of centroids without sigma; the published maps have it
 
 
-def matcher(method: Method, sky: Sky, optics: Optics) -> Matcher:
-    """Return a method as a function of centroids alone, its tables made for a camera.
-
-    The function takes (n, 3) directions, brightest first, and (n,) sigmas [rad], and
-    returns rows of the sky's catalogue, -1 none.
-    """
-    star_u = sky.catalogue.u_icrs
-    if method == "radial_cyclic":
-        side = float(np.sqrt(optics.solid_angle_sr))
-        features = build_features(star_u, RADIUS_OF_FIELD * 2 * np.arctan(side / 2))
-        return lambda u, sigma_rad: match_radial_cyclic(u, sigma_rad, star_u, features)
-    pairs = pattern_pairs(star_u, 2 * optics.half_diagonal_rad)
-    match = match_four_base_stars if method == "four_base_stars" else match_group
-    return lambda u, sigma_rad: match(u, sigma_rad, star_u, pairs)
-
-
 def solve_matches(
-    frame: Frame, sky: Sky, star: npt.NDArray[np.int64], gate_sigma: float
+    frame: FrameCentroids, sky: Sky, star: npt.NDArray[np.int64], gate_sigma: float
 ) -> Solution | None:
-    """Return the attitude of a frame's matches, None with fewer than three in their place."""
+    """Return the attitude of a frame's matches; None where fewer than three are in place."""
     star = star.copy()
     for _ in range(3):  # one wrong match bends the first attitude
         at = np.flatnonzero(star >= 0)
@@ -76,14 +52,23 @@ def solve_matches(
     return None
 
 
-def identify_published(
-    spots: Spots, skies: Skies, magnitude_limit: float | None, method: Method, how: Search
-) -> Identified:
-    """Identify the stars of a sensor's frames by a published method.
+def identify_each_frame(
+    make_matcher: Callable[[Sky, FieldOfView], Matcher],
+    spots: UnscaledCentroids,
+    skies: Skies,
+    magnitude_limit: float | None,
+    how: Search,
+) -> IdentifiedSensor:
+    """Identify the stars of a sensor's frames, each frame alone.
 
-    Without `magnitude_limit`, the faintest star is the one that gives as many stars a field
+    Without `magnitude_limit`, the faintest star is the one that gives as many stars in a field
     as the frames have centroids. Where no errors are stated, 0.5 px is assumed, and the
     reported ones follow from the residuals.
+
+    Parameters
+    ----------
+    make_matcher
+        Prepares a method for a camera and its sky.
     """
     counts = spots.counts
     usable = counts[counts >= 4]
@@ -92,20 +77,20 @@ def identify_published(
         magnitude_limit = skies.limit_for(density / spots.optics[0].solid_angle_sr)
     sky = skies.sky(magnitude_limit)
     stated = bool(np.isfinite(spots.sigma_px).any())
-    match = matcher(method, sky, spots.optics[0])
+    match = make_matcher(sky, spots.optics[0])
     assumed = np.where(np.isnan(spots.sigma_px), ASSUMED_SIGMA_PX, spots.sigma_px)
     frames, solutions = spots._replace(sigma_px=assumed).frames(1.0), unsolved(spots.first)
     for k in range(len(counts)):
-        frame = frames.one(k)
+        frame = frames.frame(k)
         solution = solve_matches(frame, sky, match(frame.u, frame.sigma_rad), how.gate_sigma)
         if solution is not None:
             solutions.enter(k, solution)
     status = [_status(n, s) for n, s in zip(counts, solutions.solved, strict=True)]
-    found, scale = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum())), 1.0
-    if found.dof > 0 and not stated:
-        scale = found.scale
+    residuals, scale = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum())), 1.0
+    if residuals.dof > 0 and not stated:
+        scale = residuals.scale
         solutions = solutions.rescaled(scale)
-    return Identified(solutions, status, sky, scale if stated else scale * ASSUMED_SIGMA_PX)
+    return IdentifiedSensor(solutions, status, sky, scale if stated else scale * ASSUMED_SIGMA_PX)
 
 
 def _status(n: int, solved: bool) -> str | None:

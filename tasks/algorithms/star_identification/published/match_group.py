@@ -6,8 +6,9 @@ first, are looked up in the pair table, in bins of 0.01 degrees; the state of a 
 star rises by one for each pair set that holds it. The star with the highest state is the
 main star's identity; where states tie, the triangle check decides.
 
-What the source leaves open: a set is all bins that the separation's error reaches, and the
-identities of one image must agree with each other in separations before an attitude is made.
+Decided here, as the source leaves it open: a set is all bins that the separation's error reaches.
+The identities of one image must agree with each other in separations before an attitude is
+computed from them.
 """
 
 import math
@@ -16,7 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.published.agreement import agreeing_candidates
+from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
+    Matcher,
+    identify_each_frame,
+)
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, Skies
+from epipole.tasks.algorithms.star_identification.sequence import Priors
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky, pattern_pairs
 from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 
@@ -25,7 +35,7 @@ Array = npt.NDArray[np.float64]
 BIN_RAD = math.radians(0.01)
 PAIR_GATE = 2.5  # sigma; of a separation
 N_PARTNERS = 24  # nearest centroids whose separations from the main star are looked up
-N_CENTROIDS = 48  # brightest centroids that take part
+N_CENTROIDS = 48  # brightest centroids that are used
 
 
 def match_group(
@@ -41,11 +51,33 @@ def match_group(
 
 
 def states(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> npt.NDArray[np.int64]:
-    """Return the star with the highest state for each centroid by itself, -1 where none or tied."""
+    """Return the star with the highest state for each centroid alone; -1: none, or a tie."""
     star = np.full(len(u), -1, np.int64)
     if len(u) >= 3 and len(star_u) >= 3:
-        _match(u, sigma_rad, star_u, *pairs.chord, pairs.first, pairs.second, N_PARTNERS, star)
+        _match(u, sigma_rad, star_u, pairs, star)
     return star
+
+
+def identify_by_match_group(
+    t_s: Array,
+    frames: UnscaledCentroids,
+    priors: Priors,
+    skies: Skies,
+    magnitude_limit: float | None,
+    how: Search,
+) -> IdentifiedSensor:
+    """Identify the stars of a sensor's frames by the improved match group.
+
+    Parameters and result as `sensor.identify_sensor`; times and priors are not used.
+    """
+    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, how)
+
+
+def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
+    """Return the method as a function of centroids alone, its table of pairs made for a camera."""
+    star_u = sky.catalogue.u_icrs
+    pairs = pattern_pairs(star_u, 2 * optics.half_diagonal_rad)
+    return lambda u, sigma_rad: match_group(u, sigma_rad, star_u, pairs)
 
 
 @kernel
@@ -65,12 +97,13 @@ def _bins(u, sigma, i, j):
 
 
 @kernel
-def _triangles(u, sigma, star_u, main, order, n_partners, s, set_low, set_high, pair_a, pair_b):
-    """Return how many triangles of the main star with two partners next to each other in
-    `order` close end to end if the main star is s."""
+def _triangles(u, sigma, star_u, pairs, partners_in_order, s, set_low, set_high):
+    """Return how many triangles of the main star with two partners that follow each other in
+    order are triangles of the catalogue too, if the main star is s."""
+    pair_a, pair_b, order = pairs.first, pairs.second, partners_in_order
     total = 0
     before = np.empty(0, np.int64)
-    for k in range(n_partners):
+    for k in range(len(order)):
         partners = np.empty(set_high[k] - set_low[k], np.int64)
         n = 0
         for i in range(set_low[k], set_high[k]):
@@ -92,9 +125,9 @@ def _triangles(u, sigma, star_u, main, order, n_partners, s, set_low, set_high, 
 
 
 @kernel
-def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_partners, star):
+def _match(u, sigma, star_u, pairs, star):
     n, m = len(u), len(star_u)
-    state, seen = np.zeros(m, np.int16), np.zeros(m, np.int32)
+    state, counted_in = np.zeros(m, np.int16), np.zeros(m, np.int32)
     separation = np.empty(n)
     set_low, set_high = np.zeros(n, np.int64), np.zeros(n, np.int64)
     stamp = 0
@@ -103,18 +136,18 @@ def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_p
         for k in range(n):
             separation[k] = _chord(u, main, u, k) if k != main else 1e9
         order = np.argsort(separation)
-        used = min(n - 1, n_partners)
+        used = min(n - 1, N_PARTNERS)
         for k in range(used):
             low, high = _bins(u, sigma, main, order[k])
-            set_low[k], set_high[k] = range_of(chord, below, slope, intercept, low, high)
+            set_low[k], set_high[k] = range_of(pairs.chord, low, high)
             stamp += 1
             for i in range(set_low[k], set_high[k]):  # a set counts a star once
-                a, b = pair_a[i], pair_b[i]
-                if seen[a] != stamp:
-                    seen[a] = stamp
+                a, b = pairs.first[i], pairs.second[i]
+                if counted_in[a] != stamp:
+                    counted_in[a] = stamp
                     state[a] += 1
-                if seen[b] != stamp:
-                    seen[b] = stamp
+                if counted_in[b] != stamp:
+                    counted_in[b] = stamp
                     state[b] += 1
         top = state.max()
         if top < 2:
@@ -125,9 +158,7 @@ def _match(u, sigma, star_u, chord, below, slope, intercept, pair_a, pair_b, n_p
             continue
         best, draw = -1, False
         for s in tied:
-            closed = _triangles(
-                u, sigma, star_u, main, order, used, s, set_low, set_high, pair_a, pair_b
-            )
+            closed = _triangles(u, sigma, star_u, pairs, order[:used], s, set_low, set_high)
             draw = closed == best or (draw and closed < best)
             if closed > best:
                 best = closed

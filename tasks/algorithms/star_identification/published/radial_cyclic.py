@@ -3,16 +3,16 @@
 Star identification in celestial navigation, 16th "Huawei Cup" graduate modelling contest
 (2019). Three bit vectors describe the surroundings of a star: the rings in which it has
 neighbours, the separations of its neighbours from each other, and the eight sectors in
-which they lie. Bits next to a bin's edge are set on both sides in the image, so that noise
-does not change the pattern. A star's dissimilarity from a centroid is the sum over the
-three vectors of (common bits - bits of the catalogue vector)^2; the limit on it is lowered
-while more than one star remains and raised while none does, which leaves the stars of
-least dissimilarity. The candidates of one image then must agree in separations.
+which they lie. Near a bin's edge, an image sets the bits on both sides, so that noise does not
+change the pattern. A star's dissimilarity from a centroid is the sum over the three vectors of
+(common bits - bits of the catalogue vector)^2. The limit on it is lowered while more than one star
+remains and raised while none does, which leaves the stars of least dissimilarity. The candidates
+of one image then must agree in separations.
 
-What the source leaves open: the radius (a quarter of the field), the rings (64), the sectors'
-start (the first side, in the sense of rotation, of the smallest angle between two
-neighbours), and which of the stars of equal dissimilarity go on to the agreement (those with
-most bits in common, up to 12).
+Decided here, as the source leaves it open: the radius (a quarter of the field), the number of
+rings (64), the start of the sectors (the first side, in the sense of rotation, of the smallest
+angle between two neighbours), and which stars of equal dissimilarity are compared in separations
+(those with most bits in common, up to 12).
 """
 
 from typing import NamedTuple
@@ -21,7 +21,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.published.agreement import agreeing_candidates
+from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
+    Matcher,
+    identify_each_frame,
+)
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, Skies
+from epipole.tasks.algorithms.star_identification.sequence import Priors
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 
 Array = npt.NDArray[np.float64]
 Bits = npt.NDArray[np.float32]
@@ -29,7 +38,7 @@ Bits = npt.NDArray[np.float32]
 N_RINGS = 64
 N_SECTORS = 8
 COMPENSATED = 0.3  # a feature closer than this to a bin's edge sets the bit beyond as well
-N_CENTROIDS = 48  # brightest centroids that take part
+N_CENTROIDS = 48  # brightest centroids that are used
 MAX_EQUAL = 12
 PAIR_GATE = 3.0  # sigma; of a separation
 RADIUS_OF_FIELD = 0.25
@@ -63,26 +72,49 @@ def match_radial_cyclic(
     """
     n = min(len(u), N_CENTROIDS)
     centroid, star = least_dissimilar(u[:n], features)
-    found = np.full(len(u), -1, np.int64)
-    found[:n] = agreeing_candidates(u[:n], sigma_rad[:n], star_u, centroid, star, PAIR_GATE)
-    return found
+    out = np.full(len(u), -1, np.int64)
+    out[:n] = agreeing_candidates(u[:n], sigma_rad[:n], star_u, centroid, star, PAIR_GATE)
+    return out
+
+
+def identify_by_radial_cyclic(
+    t_s: Array,
+    frames: UnscaledCentroids,
+    priors: Priors,
+    skies: Skies,
+    magnitude_limit: float | None,
+    how: Search,
+) -> IdentifiedSensor:
+    """Identify the stars of a sensor's frames by radial companions and cyclic features.
+
+    Parameters and result as `sensor.identify_sensor`; times and priors are not used.
+    """
+    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, how)
+
+
+def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
+    """Return the method as a function of centroids alone, its features made for a camera."""
+    star_u = sky.catalogue.u_icrs
+    side = float(np.sqrt(optics.solid_angle_sr))
+    features = build_features(star_u, RADIUS_OF_FIELD * 2 * np.arctan(side / 2))
+    return lambda u, sigma_rad: match_radial_cyclic(u, sigma_rad, star_u, features)
 
 
 def least_dissimilar(
     u: Array, features: Features
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return (centroid, star) of all pairs in which no other star is less dissimilar."""
+    """Return (centroid, star) for the stars least dissimilar to each centroid."""
     none = np.empty(0, np.int64)
     if len(u) < 3 or len(features.radial) == 0:
         return none, none
-    seen = _features(u, features.radius_rad, compensated=True)
+    measured = _features(u, features.radius_rad, compensated=True)
     dissimilarity, in_common = np.zeros((2, len(u), len(features.radial)), np.float32)
-    for measured, listed in zip(seen, features[1:], strict=True):
-        common = measured @ listed.T
+    for bits, listed in zip(measured, features[1:], strict=True):
+        common = bits @ listed.T
         dissimilarity += (common - listed.sum(axis=1)) ** 2
         in_common += common
-    alone = seen[0].sum(axis=1) < 2  # too few neighbours to be like anything
-    # A star without neighbours is like everything: of equals, those with most in common.
+    alone = measured[0].sum(axis=1) < 2  # too few neighbours to identify it
+    # A star without neighbours has no dissimilarity: of equals, those with most bits in common.
     rank = dissimilarity - in_common / 1024
     centroid, star = np.nonzero(rank == rank.min(axis=1, keepdims=True))
     equal = np.bincount(centroid, minlength=len(u))

@@ -19,31 +19,19 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
 from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
 from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
 
+GATE, MAG_GATE = 2.0, 2.0  # of a pair's separation [sigma] and brightness [spreads]
 LEAST_BINS_LOG2, MOST_BINS_LOG2 = 4, 8  # of a turn
-# Cells enough that chance puts few votes into one [votes a cell].
+# Most votes per cell, on average: so few that chance hardly adds up.
 THIN = 0.1
 
 
-class Pairs(NamedTuple):
-    """A `PairTable`, its K-vector flat."""
-
-    chord: npt.NDArray[np.float64]
-    below: npt.NDArray[np.int32]
-    slope: float
-    intercept: float
-    first: npt.NDArray[np.int32]
-    second: npt.NDArray[np.int32]
-    at_first: npt.NDArray[np.uint16]
-    at_second: npt.NDArray[np.uint16]
-
-
 class Votes(NamedTuple):
-    """Votes of one pivot's companions, and room for them.
+    """Votes of one pivot's companions.
 
     cast : (stars << MOST_BINS_LOG2,) uint8, votes for a star and a turn
-    reached : (256,) how many of these have at least so many votes
+    reached : (256,) how many of these cells have at least so many votes
     companion, low, high : (n,) the companions and their ranges of pairs
-    angle, wide : (n,) their position angles about the pivot, and how far these may be off, in
+    angle, wide : (n,) their position angles about the pivot and the tolerances of these, in
         parts of `TURN`
     """
 
@@ -72,17 +60,18 @@ def make_votes(n_stars, n):
 
 @kernel
 def turn_bits(n_votes, n_stars, tolerance):
-    """Return log2 of the bins of turn that suit so many votes and a typical tolerance of
-    their turn, in parts of `TURN` (compiled)."""
+    """Return log2 of the number of bins of turn for so many votes with such a typical tolerance
+    of turn, in parts of `TURN` (compiled)."""
     fine = math.log2(TURN / max(2.0 * tolerance, 1.0))
     sparse = math.log2(max(n_votes / (THIN * n_stars), 1.0)) + 1.0
     return int(min(max(min(fine, sparse), LEAST_BINS_LOG2), MOST_BINS_LOG2))
 
 
 @kernel
-def companion(u, sigma, i, j, gate, min_chord):
+def companion(centroids, i, j, min_chord):
     """Return separation (0: too close), its tolerance, position angle of j about i and its
     tolerance, both in parts of `TURN` (compiled)."""
+    u, sigma = centroids.u, centroids.sigma
     dx, dy, dz = u[j, 0] - u[i, 0], u[j, 1] - u[i, 1], u[j, 2] - u[i, 2]
     c = math.sqrt(dx * dx + dy * dy + dz * dz)
     if not c >= min_chord:
@@ -92,17 +81,25 @@ def companion(u, sigma, i, j, gate, min_chord):
     along = (z * dx - x * dz) / h
     across = (y * (-x * dx - z * dz) + h * h * dy) / h
     angle = math.floor(math.atan2(across, along) * (TURN / (2.0 * math.pi))) & (TURN - 1)
-    noise = gate * math.sqrt(sigma[i] * sigma[i] + sigma[j] * sigma[j])
+    noise = GATE * math.sqrt(sigma[i] * sigma[i] + sigma[j] * sigma[j])
     wide = min(noise / c + MAX_BETA, 0.5) * (TURN / (2.0 * math.pi))
     return c, noise + MAX_BETA * c, angle, int(wide) + 2
 
 
 @kernel
-def is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
-    """Tell whether the brightness of two centroids speaks against two stars (compiled).
+def shown_magnitudes(problem, i, j):
+    """Return the magnitudes that two centroids show, NaN where the zero point is not known, and
+    their difference, NaN where a flux is not known (compiled)."""
+    instrumental, zero_point = problem.centroids.instrumental, problem.rule.zero_point
+    m_i, m_j = instrumental[i] + zero_point, instrumental[j] + zero_point
+    return m_i, m_j, instrumental[i] - instrumental[j]
 
-    m_i, m_j : magnitudes the centroids show, NaN where the zero point is not known
-    m_ij : their difference, NaN where a flux is not known
+
+@kernel
+def is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
+    """Tell whether the brightness of two centroids contradicts two stars (compiled).
+
+    m_i, m_j, m_ij as from `shown_magnitudes`.
     """
     m_a, m_b = magnitude[a], magnitude[b]
     # Comparisons with NaN are false.
@@ -112,44 +109,41 @@ def is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
 
 
 @kernel
-def count_votes(
-    seen, stars, rule, pairs, i, order, n_least, n_votes, gate, mag_gate, closest, votes
-):
-    """Count the votes of pivot i's companions; return how many companions and votes there
-    are and log2 of the bins of turn (compiled).
+def count_votes(problem, i, order, n_least, n_votes, votes):
+    """Count the votes of pivot i's companions; return companions, votes cast and log2 of the
+    bins of turn (compiled).
 
-    Companions are taken in this order, at least n_least of them, and until there are
-    n_votes; those closer than `closest` are left out.
+    Companions are taken in this order, at least n_least of them, and more until there are
+    n_votes. Centroids too close to the pivot are skipped.
     """
+    centroids, pairs = problem.centroids, problem.pairs
     n, cast, widest = 0, 0, 0
     for j in order:
         if j == i:
             continue
-        c, tolerance, angle, wide = companion(seen.u, seen.sigma, i, j, gate, closest)
+        c, tolerance, angle, wide = companion(centroids, i, j, problem.limits.min_chord)
         if c == 0.0:
             continue
-        lo, hi = range_of(
-            pairs.chord, pairs.below, pairs.slope, pairs.intercept, c - tolerance, c + tolerance
-        )
+        lo, hi = range_of(pairs.chord, c - tolerance, c + tolerance)
         votes.companion[n], votes.low[n], votes.high[n] = j, lo, hi
         votes.angle[n], votes.wide[n] = angle, wide
         n, cast, widest = n + 1, cast + 2 * (hi - lo), widest + wide
         if n >= n_least and cast > n_votes:
             break
-    log2 = turn_bits(cast, len(stars.u), widest / max(n, 1))
-    votes.cast[: len(stars.u) << log2] = 0
+    log2 = turn_bits(cast, len(problem.stars.u), widest / max(n, 1))
+    votes.cast[: len(problem.stars.u) << log2] = 0
     votes.reached[:] = 0
     for m in range(n):
-        _vote(seen, stars, rule, pairs, i, m, log2, mag_gate, votes)
+        _vote(problem, i, m, log2, votes)
     return n, cast, log2
 
 
 @kernel
-def _vote(seen, stars, rule, pairs, i, m, log2, mag_gate, votes):
+def _vote(problem, i, m, log2, votes):
     """Count the votes of the pivot's m-th companion."""
-    j = votes.companion[m]
-    m_i, m_j = seen.instrumental[i] + rule.zero_point, seen.instrumental[j] + rule.zero_point
-    m_ij = seen.instrumental[i] - seen.instrumental[j]
+    pairs, magnitude = problem.pairs, problem.stars.magnitude
+    m_i, m_j, m_ij = shown_magnitudes(problem, i, votes.companion[m])
+    mag_gate = MAG_GATE * problem.rule.spread
     shift, wide = 16 - log2, votes.wide[m]
     mask = (1 << log2) - 1
     for p in range(votes.low[m], votes.high[m]):
@@ -158,7 +152,7 @@ def _vote(seen, stars, rule, pairs, i, m, log2, mag_gate, votes):
                 a, b, angle = pairs.first[p], pairs.second[p], int(pairs.at_first[p])
             else:
                 a, b, angle = pairs.second[p], pairs.first[p], int(pairs.at_second[p])
-            if is_odd(stars.magnitude, a, b, m_i, m_j, m_ij, mag_gate):
+            if is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
                 continue
             low = angle - votes.angle[m] - wide
             for turn in range(low >> shift, ((low + 2 * wide) >> shift) + 1):

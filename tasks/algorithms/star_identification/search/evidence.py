@@ -1,23 +1,24 @@
 """The verdict: how much better stars explain a frame than chance does.
 
 The log evidence of an attitude is the log of the ratio of two probabilities of the
-centroids' places: with the stars where the attitude puts them, and with every centroid
+centroids' places: with stars at the places that the attitude predicts, and with every centroid
 anywhere in the image. Its parts:
 
 - a match adds ln(A / (2 pi s^2)) - d^2 / (2 s^2), s the centroid's sigma, d its distance
   from the star, A the solid angle of the image; with brightness also
   ln(g(difference) / h(magnitude)), h the magnitudes of the catalogue;
-- which k of n centroids are which of the m stars in view is not known, nor what share of
-  these the sensor sees (`log_ways`);
-- the attitude was chosen: the share of the prior that the data leave. Lost in space,
-  that is sqrt(det 2 pi P) / (8 pi^2).
+- it is unknown which k of n centroids are which of the m stars in view, and what share of
+  these the sensor detects (`log_ways`);
+- the attitude was chosen among all: the share of the prior's volume that the data leave. Lost in
+  space, that is sqrt(det 2 pi P) / (8 pi^2).
 
-So it does not depend on how many hypotheses were tried, and the probability that chance
-alone reaches x is below exp(-x) (Markov's inequality; over frames with as many false
-centroids as the prior of `log_ways` has them).
+So the log evidence does not depend on how many hypotheses were tried. The probability that chance
+alone reaches x is below exp(-x), by Markov's inequality, over frames with as many false centroids
+as the prior of `log_ways` assumes.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -30,9 +31,27 @@ Array = npt.NDArray[np.float64]
 BIN_MAG = 0.25  # of the histogram of magnitudes
 FIRST_MAG = -2.0
 N_BINS = 72
-TYPICAL_SPREAD_MAG = 0.4  # a sensor's magnitude about V, colours included, while not learned
+TYPICAL_SPREAD_MAG = 0.4  # of a sensor's magnitudes about V, colours included; until it is learned
 OUTLIER_SHARE = 0.15  # variables, blends, odd colours
 MAG_RANGE = 6.0
+
+
+class MatchRule(NamedTuple):
+    """How matches are weighed.
+
+    gate : a star lies within this many sigma of its place
+    log_density : (N_BINS,) float, ln density of the catalogue's magnitudes
+    zero_point, spread : star minus instrumental magnitude [mag], NaN while not known, and its
+        1-sigma scatter
+    least, enough : log evidence that an attitude needs, and with which no other is tried
+    """
+
+    gate: float
+    log_density: Array
+    zero_point: float
+    spread: float
+    least: float
+    enough: float
 
 
 def log_magnitude_density(magnitude: Array) -> Array:
@@ -44,7 +63,7 @@ def log_magnitude_density(magnitude: Array) -> Array:
 
 @kernel
 def log_brightness_ratio(difference, magnitude, log_density, spread):
-    """Return ln(g / h) of a match whose magnitudes differ so; `spread` 1-sigma (compiled)."""
+    """Return ln(g / h) of a match with this difference of magnitudes; spread 1-sigma (compiled)."""
     z = difference / spread
     g = OUTLIER_SHARE / MAG_RANGE
     g += (1.0 - OUTLIER_SHARE) * math.exp(-0.5 * z * z) / (spread * 2.5066282746310002)
@@ -56,39 +75,39 @@ def log_brightness_ratio(difference, magnitude, log_density, spread):
 def median_zero_point(star_of, instrumental, magnitude):
     """Return the median of star minus instrumental magnitude over the matches (compiled).
 
-    NaN with fewer than three matches that have a flux.
+    NaN where fewer than three matches have a flux.
     """
-    found = np.empty(len(star_of))
+    zero = np.empty(len(star_of))
     n = 0
     for k in range(len(star_of)):
         if star_of[k] >= 0 and not math.isnan(instrumental[k]):
-            found[n] = magnitude[star_of[k]] - instrumental[k]
+            zero[n] = magnitude[star_of[k]] - instrumental[k]
             n += 1
     if n < 3:
         return math.nan
-    return np.median(found[:n])
+    return np.median(zero[:n])
 
 
 @kernel
 def log_ways(n, matches, in_view):
-    """Return -ln of the probability, before the places are seen, that just these centroids of n
-    are just these of the stars in view (compiled).
+    """Return -ln of the prior probability that these matches, and no others, exist (compiled).
 
-    The share p of the stars in view that the sensor sees is not known: 4 p^3, as most
-    sensors see most stars to their limit. Nor is the number f of false centroids: 1 / (f + 1),
-    every order of magnitude alike.
+    That is, that these k of the n centroids are these k of the stars in view, before places are
+    known. The share p of the stars in view that the sensor detects has the prior 4 p^3, as most
+    sensors detect most stars to their limit. The number f of false centroids has the prior
+    1 / (f + 1), the same for every order of magnitude.
     """
     k, m = float(matches), max(in_view, float(matches))
     centroids = math.lgamma(n + 1.0) - math.lgamma(n - k + 1.0)
     centroids += math.log((n - k + 1.0) / (n + 1.0))
-    seen = math.log(4.0) + math.lgamma(k + 4.0) + math.lgamma(m - k + 1.0) - math.lgamma(m + 5.0)
-    return centroids - seen
+    detected = (
+        math.log(4.0) + math.lgamma(k + 4.0) + math.lgamma(m - k + 1.0) - math.lgamma(m + 5.0)
+    )
+    return centroids - detected
 
 
 @kernel
-def match_evidence(
-    star_of, chi2_of, sigma, instrumental, magnitude, log_density, zero_point, spread, in_view, area
-):
+def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, rule, in_view, area):
     """Return the matches' part of the log evidence, and their number (compiled).
 
     Parameters
@@ -96,10 +115,9 @@ def match_evidence(
     star_of, chi2_of, sigma, instrumental : (n,)
         Each centroid's star (-1 none), d^2 / s^2, s [rad], -2.5 log10 flux (NaN unknown).
     magnitude : (m,)
-        Of the stars that `star_of` counts.
-    log_density, zero_point, spread : (N_BINS,), float, float
-        Catalogue's magnitudes; star minus instrumental magnitude, NaN where not known; its
-        scatter [mag].
+        Magnitudes of the stars, by the numbers in `star_of`.
+    rule : MatchRule
+        How matches are weighed.
     in_view, area : float
         Stars in the image (matched or not), and its solid angle [sr].
     """
@@ -108,22 +126,23 @@ def match_evidence(
         if star_of[k] >= 0:
             matches += 1
             total += math.log(area / (2.0 * math.pi * sigma[k] * sigma[k])) - 0.5 * chi2_of[k]
-    if math.isnan(zero_point):
+    density, zero, spread = rule.log_density, rule.zero_point, rule.spread
+    if math.isnan(zero):
         zero = median_zero_point(star_of, instrumental, magnitude)
         if not math.isnan(zero):
-            tight = _brightness(star_of, instrumental, magnitude, log_density, zero, 0.5 * spread)
-            loose = _brightness(star_of, instrumental, magnitude, log_density, zero, spread)
+            tight = _brightness(star_of, instrumental, magnitude, density, zero, 0.5 * spread)
+            loose = _brightness(star_of, instrumental, magnitude, density, zero, spread)
             more = max(tight, loose)
             total += more + math.log(0.5 * (math.exp(tight - more) + math.exp(loose - more)))
             total -= 3.0  # one more number chosen from the data: ln(range / its error)
     else:
-        total += _brightness(star_of, instrumental, magnitude, log_density, zero_point, spread)
+        total += _brightness(star_of, instrumental, magnitude, density, zero, spread)
     return total - log_ways(len(star_of), matches, in_view), matches
 
 
 @kernel
 def _brightness(star_of, instrumental, magnitude, log_density, zero, spread):
-    """Return the log of how much better the matches' brightness fits than by chance."""
+    """Return ln of how much better stars explain the matches' brightness than chance does."""
     total = 0.0
     for k in range(len(star_of)):
         s = star_of[k]
@@ -147,7 +166,7 @@ def _log_determinant(P):
 
 @kernel
 def choice_lost(P):
-    """Return the attitude's part of the log evidence, every attitude alike (compiled)."""
+    """Return the attitude's part of the log evidence, all attitudes equally likely (compiled)."""
     return 0.5 * _log_determinant(P) + 1.5 * math.log(2.0 * math.pi) - math.log(8.0 * math.pi**2)
 
 

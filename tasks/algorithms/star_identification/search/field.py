@@ -1,8 +1,10 @@
 """Stars of a known field: which centroid is which star, given nearly the right attitude."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude, turn
 from epipole.tasks.algorithms.kernels import kernel
@@ -12,13 +14,51 @@ from epipole.tasks.algorithms.star_identification.search.evidence import (
     match_evidence,
 )
 
-# A centroid between two stars, or a star between two centroids, goes to the better one only
-# if that is this much better in chi-square (odds 20:1); otherwise to neither.
+Array = npt.NDArray[np.float64]
+
+# A centroid between two stars, or a star between two centroids, is matched with the nearer one if
+# that is so much better in chi-square (odds 20:1), and with neither otherwise.
 CLEARLY_BETTER = 6.0
-# Brightest centroids on which a prediction is tried to be shifted.
+# Brightest centroids onto which a predicted star is shifted.
 N_NUDGED = 12
 # A match whose brightness is this far off is a coincidence [mag].
 ODD_MAG = 2.5
+
+
+class Centroids(NamedTuple):
+    """A frame's centroids, brightest first.
+
+    u, sigma, instrumental : (n, 3), (n,), (n,) float, directions (sensor frame), error an
+        axis [rad], -2.5 log10 flux (NaN unknown)
+    beta : (3,) float, the sensor's barycentric velocity over that of light, ICRS axes
+    """
+
+    u: Array
+    sigma: Array
+    instrumental: Array
+    beta: Array
+
+
+class StarPlaces(NamedTuple):
+    """Directions (m, 3) and magnitudes (m,) of stars."""
+
+    u: Array
+    magnitude: Array
+
+
+class Attitude(NamedTuple):
+    """An attitude: R (3, 3), sensor from ICRS, and P (3, 3), its covariance about the sensor axes
+    [rad^2]."""
+
+    R: Array
+    P: Array
+
+
+class Matches(NamedTuple):
+    """Each centroid's star (n,) int64, -1 none, and squared distance over sigma squared (n,)."""
+
+    star: npt.NDArray[np.int64]
+    chi2: Array
 
 
 @kernel
@@ -37,8 +77,8 @@ def aberrated(x, y, z, beta, out):
 
 @kernel
 def stars_in_cone(u_icrs, n_stars, R, radius, row):
-    """Write the rows of the first n_stars within `radius` [rad] of the boresight; return how
-    many (compiled)."""
+    """Write the rows of those of the first n_stars that are within `radius` [rad] of the boresight;
+    return how many (compiled)."""
     x, y, z, c, n = R[2, 0], R[2, 1], R[2, 2], math.cos(radius), 0
     for s in range(n_stars):
         if x * u_icrs[s, 0] + y * u_icrs[s, 1] + z * u_icrs[s, 2] > c:
@@ -57,7 +97,7 @@ def turn_stars(R, a, v):
 
 @kernel
 def count_in_view(v, box):
-    """Return how many stars are in the image, sensor-frame directions given (compiled).
+    """Return how many of the stars, given in the sensor frame, are in the image (compiled).
 
     `box` is x0, x1, y0, y1 of the image in normalised coordinates.
     """
@@ -81,9 +121,9 @@ def match_stars(u, sigma, v, radius, star_of, chi2_of, strict):
     v : (m, 3)
         Stars' directions, sensor frame.
     star_of, chi2_of : (n,), out
-        The star, -1 none; squared distance over sigma squared.
+        The star, -1 where there is none; squared distance over sigma squared.
     strict : bool
-        Where two could be meant, neither.
+        Where two are possible, match neither.
     """
     n, m = len(u), len(v)
     owner = np.full(m, -1, np.int64)
@@ -134,20 +174,19 @@ def _drop_odd(star_of, instrumental, magnitude, zero_point):
 
 
 @kernel
-def settle(
-    R, P, s_xy, s_z, u, sigma, instrumental, a, magnitude, gate, zero_point, star_of, chi2_of
-):
+def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
     """Match, refine, match again until nothing changes; return the number of matches (compiled).
 
-    Starts at R with an error of s_xy across and s_z about the boresight [rad]; R is moved in
-    place, P gets its covariance, star_of and chi2_of the matches. 0: no attitude.
+    Starts at R with an error of s_xy across and s_z about the boresight [rad]. R is refined in
+    place; its covariance P and the matches are written. Returns 0 where there is no attitude.
     """
+    u, sigma = centroids.u, centroids.sigma
     n = len(u)
-    v = np.empty((len(a), 3))
+    v = np.empty((len(stars.u), 3))
     radius = np.empty(n)
     before = np.full(n, -2, np.int64)
     for step in range(8):
-        turn_stars(R, a, v)
+        turn_stars(R, stars.u, v)
         for k in range(n):
             wide = 0.0
             if step == 0:
@@ -155,21 +194,21 @@ def settle(
                 wide = s_xy * s_xy + s_z * s_z * off2
             elif step == 1:  # the first attitude may rest on a wrong match
                 wide = 2.0 * sigma[k] * sigma[k]
-            radius[k] = gate * math.sqrt(sigma[k] * sigma[k] + wide)
-        match_stars(u, sigma, v, radius, star_of, chi2_of, step > 1)
-        _drop_odd(star_of, instrumental, magnitude, zero_point)
-        same, matches = True, 0
+            radius[k] = rule.gate * math.sqrt(sigma[k] * sigma[k] + wide)
+        match_stars(u, sigma, v, radius, matches.star, matches.chi2, step > 1)
+        _drop_odd(matches.star, centroids.instrumental, stars.magnitude, rule.zero_point)
+        same, count = True, 0
         for k in range(n):
-            same = same and star_of[k] == before[k]
-            before[k] = star_of[k]
-            matches += star_of[k] >= 0
-        if matches < 2:
+            same = same and matches.star[k] == before[k]
+            before[k] = matches.star[k]
+            count += matches.star[k] >= 0
+        if count < 2:
             return 0
         if same and step > 2:
-            return matches
-        if not refine_attitude(R, u, sigma, a, star_of, P):
+            return count
+        if not refine_attitude(R, u, sigma, stars.u, matches.star, P):
             return 0
-    return matches
+    return count
 
 
 @kernel
@@ -186,19 +225,20 @@ def _nudge(R, u, k, a, s):
 
 
 @kernel
-def best_nudge(R0, s_xy, s_z, u, sigma, a, gate, n_tried, R):
+def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
     """Write to R the attitude near R0, moved so that one star falls on one centroid, that
     brings most other stars onto centroids (compiled).
 
     For predictions with an error wider than the stars are apart: their pattern, shifted as
-    a whole, decides. The first n_tried centroids (brightest first) are tried.
+    a whole, decides. The `N_NUDGED` brightest centroids are tried.
     """
+    u, sigma = centroids.u, centroids.sigma
     n, m = len(u), len(a)
     v, w, trial = np.empty((m, 3)), np.empty((m, 3)), np.empty((3, 3))
     turn_stars(R0, a, v)
     best = 0.0
     copy_matrix(R0, R)
-    for i in range(min(n, n_tried)):
+    for i in range(min(n, N_NUDGED)):
         off2 = u[i, 0] * u[i, 0] + u[i, 1] * u[i, 1]
         reach2 = gate * gate * (s_xy * s_xy + s_z * s_z * off2 + sigma[i] * sigma[i])
         for s in range(m):
@@ -224,91 +264,53 @@ def best_nudge(R0, s_xy, s_z, u, sigma, a, gate, n_tried, R):
 
 
 @kernel
-def solve_predicted(
-    R0,
-    P0,
-    lost,
-    u,
-    sigma,
-    instrumental,
-    a,
-    magnitude,
-    box,
-    gate,
-    log_density,
-    zero_point,
-    spread,
-    enough,
-    R,
-    P,
-    star_of,
-    chi2_of,
-):
+def solve_predicted(predicted, lost, centroids, stars, box, rule, solution, matches):
     """Identify a frame whose attitude is nearly known; return its log evidence (compiled).
 
     Parameters
     ----------
-    R0, P0 : (3, 3), (3, 3)
-        Predicted attitude (sensor from ICRS) and its covariance about the sensor axes [rad^2].
+    predicted : Attitude
+        The prediction.
     lost : bool
-        The attitude was searched over the whole sky: then P0 only says where to look, and the
-        evidence is charged with every attitude there is.
-    u, sigma, instrumental : (n, 3), (n,), (n,)
-        Centroids, brightest first.
-    a, magnitude : (m, 3), (m,)
-        Apparent directions (ICRS axes) and magnitudes of the stars around the field.
-    enough : float
-        Log evidence with which to stop trying.
-    R, P, star_of, chi2_of : out
-        Attitude, covariance, matches; of no use where the evidence is -1e9.
+        The attitude was searched over the whole sky: then its covariance only says how far to
+        look, and the evidence is charged with every attitude there is.
+    centroids : Centroids
+        The frame's centroids.
+    stars : StarPlaces
+        The stars around the field: apparent directions, ICRS axes.
+    box : (4,)
+        The image in normalised coordinates: x0, x1, y0, y1.
+    rule : MatchRule
+        How matches are weighed.
+    solution, matches : Attitude, Matches, out
+        Of no use where the evidence is -1e9.
     """
+    R0, P0 = predicted.R, predicted.P
     s_xy, s_z = math.sqrt(0.5 * (P0[0, 0] + P0[1, 1])), math.sqrt(P0[2, 2])
-    v = np.empty((len(a), 3))
-    turn_stars(R0, a, v)
+    n = len(centroids.u)
+    v = np.empty((len(stars.u), 3))
+    turn_stars(R0, stars.u, v)
     in_view = count_in_view(v, box)
     area = (box[1] - box[0]) * (box[3] - box[2])
     best = -1e9
-    Rt, Pt = np.empty((3, 3)), np.empty((3, 3))
-    star_t, chi2_t = np.empty(len(u), np.int64), np.zeros(len(u))
-    for way in range(2):
-        copy_matrix(R0, Rt)
-        if way == 1:
-            best_nudge(R0, s_xy, s_z, u, sigma, a, gate, N_NUDGED, Rt)
-        matches = settle(
-            Rt,
-            Pt,
-            s_xy if way == 0 else 2.0 * sigma[0],
-            s_z,
-            u,
-            sigma,
-            instrumental,
-            a,
-            magnitude,
-            gate,
-            zero_point,
-            star_t,
-            chi2_t,
-        )
-        if matches >= 3:
+    R, P = np.empty((3, 3)), np.empty((3, 3))
+    tried = Matches(np.empty(n, np.int64), np.zeros(n))
+    for attempt in range(2):
+        copy_matrix(R0, R)
+        if attempt == 1:
+            best_nudge(R0, s_xy, s_z, centroids, stars.u, rule.gate, R)
+        start = s_xy if attempt == 0 else 2.0 * centroids.sigma[0]
+        if settle(R, P, start, s_z, centroids, stars, rule, tried) >= 3:
             evidence, _ = match_evidence(
-                star_t,
-                chi2_t,
-                sigma,
-                instrumental,
-                magnitude,
-                log_density,
-                zero_point,
-                spread,
-                in_view,
-                area,
-            )
-            evidence += choice_lost(Pt) if lost else choice_predicted(Pt, P0, Rt, R0)
+                tried.star, tried.chi2, centroids.sigma, centroids.instrumental,
+                stars.magnitude, rule, in_view, area,
+            )  # fmt: skip
+            evidence += choice_lost(P) if lost else choice_predicted(P, P0, R, R0)
             if evidence > best:
                 best = evidence
-                copy_matrix(Rt, R)
-                copy_matrix(Pt, P)
-                for k in range(len(u)):
-                    star_of[k], chi2_of[k] = star_t[k], chi2_t[k]
-        if best > enough or lost:
+                copy_matrix(R, solution.R)
+                copy_matrix(P, solution.P)
+                matches.star[:], matches.chi2[:] = tried.star, tried.chi2
+        if best > rule.enough or lost:
             break
     return best

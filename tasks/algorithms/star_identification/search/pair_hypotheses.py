@@ -1,4 +1,4 @@
-"""A pair of centroids taken for a pair of stars: its attitude, tried and judged by all others."""
+"""A pair of centroids taken for a pair of stars: its attitude, tried on all other centroids."""
 
 import math
 from typing import NamedTuple
@@ -9,12 +9,14 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.geometry.attitude import refine_attitude
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.search.evidence import (
+    MatchRule,
     choice_lost,
     log_ways,
     match_evidence,
 )
-from epipole.tasks.algorithms.star_identification.search.field import aberrated
-from epipole.tasks.algorithms.star_identification.sky.sky_grid import nearest_star
+from epipole.tasks.algorithms.star_identification.search.field import Centroids, aberrated
+from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
+from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid, nearest_star
 
 Array = npt.NDArray[np.float64]
 
@@ -23,54 +25,60 @@ LOG_MISS = math.log(1.0 - STAR_SHARE)
 MAX_BETA = 1.1e-4  # of an observer near the Earth
 
 
-class Centroids(NamedTuple):
-    """A frame's centroids, brightest first; as `frame.Frame`.
-
-    n_checked : how many of them a hypothesis is tried on
-    """
-
-    u: Array
-    sigma: Array
-    instrumental: Array
-    beta: Array
-    n_checked: int
-
-
 class Stars(NamedTuple):
-    """The catalogue with its `SkyGrid`."""
+    """The catalogue: directions, magnitudes, and the grid for look-ups."""
 
     u: Array
     magnitude: Array
-    first: npt.NDArray[np.int32]
-    star: npt.NDArray[np.int32]
-    n_face: int
-    grid_radius: float
+    grid: SkyGrid
 
 
-class Rule(NamedTuple):
-    """How matches are weighed; as in `evidence`.
+class Image(NamedTuple):
+    """A camera's image.
 
-    in_view : stars in an image on average
+    box : (4,) float, x0, x1, y0, y1 in normalised coordinates
+    area : solid angle [sr]
+    in_view : mean number of catalogue stars in an image
     """
 
-    gate: float
-    log_density: Array
-    zero_point: float
-    spread: float
-    in_view: float
-    area: float
     box: Array
+    area: float
+    in_view: float
 
 
-class Scratch(NamedTuple):
+class SearchLimits(NamedTuple):
+    """Bounds of a search.
+
+    min_chord : closest centroids that are paired [rad]
+    n_pattern : how many of the brightest centroids are paired
+    budget : most work, see `WORK_PER_S`
+    """
+
+    min_chord: float
+    n_pattern: int
+    budget: float
+
+
+class Problem(NamedTuple):
+    """A frame whose attitude is searched for over the whole sky, and what is known."""
+
+    centroids: Centroids
+    stars: Stars
+    pairs: PairTable
+    image: Image
+    rule: MatchRule
+    limits: SearchLimits
+
+
+class PairScratch(NamedTuple):
     """Room for one pair of centroids and one hypothesis.
 
     E, F, R, P : (3, 3): frames of the pair in the image and in the sky, attitude, covariance
     t : (n_checked, 3), the centroids in E
-    gain, fall, radius : (n_checked,), what a hit adds, less `fall` times its squared
-        distance, and how far one is looked for
+    gain, fall, radius : (n_checked,); a hit at distance d adds gain - fall d^2, and stars
+        within the radius are hits
     row_of : (n,), the star of each centroid, -1 none
-    none : (0,), an empty order
+    no_order : (0,), an empty order
     """
 
     E: Array
@@ -82,13 +90,13 @@ class Scratch(NamedTuple):
     fall: Array
     radius: Array
     row_of: npt.NDArray[np.int64]
-    none: npt.NDArray[np.int64]
+    no_order: npt.NDArray[np.int64]
 
 
 @kernel
 def make_scratch(n, n_checked):
-    """Return room for frames of n centroids (compiled)."""
-    return Scratch(
+    """Return scratch for n centroids, of which hypotheses are tried on n_checked (compiled)."""
+    return PairScratch(
         np.empty((3, 3)),
         np.empty((3, 3)),
         np.empty((3, 3)),
@@ -122,39 +130,40 @@ def _basis(a, b, c, F):
 
 
 @kernel
-def prepare_pair(seen, stars, rule, i, j, c, room):
-    """Fill the room for centroids i and j, c apart; return in which order the others are to
+def prepare_pair(problem, i, j, c, room):
+    """Fill the scratch for centroids i and j, c apart; return in which order the others are to
     be looked up (compiled)."""
-    u, sigma, t = seen.u, seen.sigma, room.t
+    u, sigma, t = problem.centroids.u, problem.centroids.sigma, room.t
+    image, gate, grid_radius = problem.image, problem.rule.gate, problem.stars.grid.radius_rad
     noise2 = sigma[i] * sigma[i] + sigma[j] * sigma[j]
     E, fall, gain = room.E, room.fall, room.gain
     _basis(u[i], u[j], c, E)
-    for k in range(seen.n_checked):
+    for k in range(len(gain)):
         for m in range(3):
             t[k, m] = E[m, 0] * u[k, 0] + E[m, 1] * u[k, 1] + E[m, 2] * u[k, 2]
-        # The pair's own errors, with the lever of the distance from its middle;
-        # aberration, left out here, is nearly the same for all.
+        # The pair's errors, with the lever of the distance from its middle. Aberration, which
+        # is ignored here, is nearly the same for all.
         d2 = t[k, 1] * t[k, 1] + t[k, 2] * t[k, 2]
         s2 = sigma[k] * sigma[k] + 0.5 * noise2 * (0.5 + 2.0 * d2 / (c * c))
         s2 += MAX_BETA * MAX_BETA * d2
         fall[k] = 0.5 / s2
-        gain[k] = math.log(STAR_SHARE * rule.area * fall[k] / (math.pi * rule.in_view))
-        # Beyond that a hit says less than a miss.
-        near = min(rule.gate * rule.gate, 2.0 * max(gain[k] - LOG_MISS, 0.0))
-        room.radius[k] = min(math.sqrt(near * s2), stars.grid_radius)
-    # The pair itself first, then the nearest, which it places best: not by
-    # brightness, as false ones may be the brightest.
+        gain[k] = math.log(STAR_SHARE * image.area * fall[k] / (math.pi * image.in_view))
+        # Farther away, a hit would be worth less than a miss.
+        near = min(gate * gate, 2.0 * max(gain[k] - LOG_MISS, 0.0))
+        room.radius[k] = min(math.sqrt(near * s2), grid_radius)
+    # The pair itself comes first and is cut off. The nearest follow: the pair predicts their
+    # places best. Not by brightness: false centroids may be the brightest.
     fall[i] = fall[j] = np.inf
     return np.argsort(-fall)[2:].copy()
 
 
 @kernel
 def try_pair(stars, a, b, c, order, floor, room):
-    """Return how much more likely the other centroids are with the attitude that puts star a
-    on the first and b on the second centroid of the pair than by chance (ln), below `floor`
-    as soon as that is seen (compiled).
+    """Return the log odds of the attitude that puts stars a and b on the pair's centroids,
+    by all other centroids (compiled).
 
-    A sequential probability ratio test (Wald 1945). F and row_of of the room are written.
+    A sequential probability ratio test (Wald 1945): it stops as soon as the odds are below
+    `floor`. Writes F and row_of of the scratch.
     """
     F, t = room.F, room.t
     _basis(stars.u[a], stars.u[b], c, F)
@@ -166,9 +175,9 @@ def try_pair(stars, a, b, c, order, floor, room):
             t[k, 0] * F[0, 2] + t[k, 1] * F[1, 2] + t[k, 2] * F[2, 2],
             room.radius[k],
             stars.u,
-            stars.first,
-            stars.star,
-            stars.n_face,
+            stars.grid.first,
+            stars.grid.star,
+            stars.grid.n_face,
         )
         odds += room.gain[k] - room.fall[k] * d2 if room.row_of[k] >= 0 else LOG_MISS
         if odds < floor:
@@ -177,23 +186,26 @@ def try_pair(stars, a, b, c, order, floor, room):
 
 
 @kernel
-def judge_pair(seen, stars, rule, i, a, j, b, beaten, room):
-    """Return the log evidence of the attitude last tried, refined with its matches, or a
-    number below `beaten` where it is no more than that; R of the room gets it (compiled)."""
+def judge_pair(problem, i, a, j, b, beaten, room):
+    """Return the log evidence of the attitude tried last, refined with its matches (compiled).
+
+    Where it is not above `beaten`, the number returned is only known to be not above it
+    either. Writes the attitude to R of the scratch.
+    """
     row_of, E, F, R = room.row_of, room.E, room.F, room.R
     row_of[i], row_of[j] = a, b
-    for k in range(seen.n_checked, len(row_of)):
+    for k in range(len(room.gain), len(row_of)):
         row_of[k] = -1
     for r in range(3):
         for m in range(3):
             R[r, m] = E[0, r] * F[0, m] + E[1, r] * F[1, m] + E[2, r] * F[2, m]
-    return _judge(seen, stars, rule, beaten, R, room.P, row_of)
+    return _judge(problem, beaten, R, room.P, row_of)
 
 
 @kernel
-def _look_up(R, seen, k, radius, stars):
-    """Return the star nearest to centroid k, and the squared chord: aberration taken off it."""
-    u, beta = seen.u, seen.beta
+def _look_up(R, centroids, k, radius, stars):
+    """Return the star nearest to centroid k, without aberration, and the squared chord to it."""
+    u, beta = centroids.u, centroids.beta
     x = R[0, 0] * u[k, 0] + R[1, 0] * u[k, 1] + R[2, 0] * u[k, 2]
     y = R[0, 1] * u[k, 0] + R[1, 1] * u[k, 1] + R[2, 1] * u[k, 2]
     z = R[0, 2] * u[k, 0] + R[1, 2] * u[k, 1] + R[2, 2] * u[k, 2]
@@ -205,9 +217,9 @@ def _look_up(R, seen, k, radius, stars):
         z + p * z - beta[2],
         radius,
         stars.u,
-        stars.first,
-        stars.star,
-        stars.n_face,
+        stars.grid.first,
+        stars.grid.star,
+        stars.grid.n_face,
     )
 
 
@@ -230,10 +242,11 @@ def _stars_in_image(R, beta, star_u, box):
 
 
 @kernel
-def _judge(seen, stars, rule, beaten, R, P, row_of):
-    """Refine an attitude whose first matches are in row_of; return its log evidence, or a
-    number below `beaten` where it is no more than that."""
-    u, sigma = seen.u, seen.sigma
+def _judge(problem, beaten, R, P, row_of):
+    """Refine an attitude whose first matches are in row_of; return its log evidence, as
+    `judge_pair` does."""
+    centroids, stars, rule = problem.centroids, problem.stars, problem.rule
+    u, sigma = centroids.u, centroids.sigma
     n = len(u)
     a, magnitude = np.empty((n, 3)), np.zeros(n)
     slot, chi2_of = np.empty(n, np.int64), np.zeros(n)
@@ -243,8 +256,8 @@ def _judge(seen, stars, rule, beaten, R, P, row_of):
         for k in range(n):
             if step > 0:
                 wide = 1.7 if step == 1 else 1.0
-                radius = min(rule.gate * sigma[k] * wide, stars.grid_radius)
-                row_of[k], d2 = _look_up(R, seen, k, radius, stars)
+                radius = min(rule.gate * sigma[k] * wide, stars.grid.radius_rad)
+                row_of[k], d2 = _look_up(R, centroids, k, radius, stars)
                 chi2_of[k] = d2 / (sigma[k] * sigma[k])
                 for j in range(k):  # one star, one centroid
                     if row_of[k] >= 0 and row_of[j] == row_of[k]:
@@ -258,7 +271,7 @@ def _judge(seen, stars, rule, beaten, R, P, row_of):
             if s >= 0:
                 matches += 1
                 magnitude[k] = stars.magnitude[s]
-                aberrated(stars.u[s, 0], stars.u[s, 1], stars.u[s, 2], seen.beta, a[k])
+                aberrated(stars.u[s, 0], stars.u[s, 1], stars.u[s, 2], centroids.beta, a[k])
         for k in range(n):
             same = same and before[k] == row_of[k]
             before[k] = row_of[k]
@@ -269,11 +282,10 @@ def _judge(seen, stars, rule, beaten, R, P, row_of):
         if not refine_attitude(R, u, sigma, a, slot, P):
             return -1e9
     evidence, matches = match_evidence(
-        slot, chi2_of, sigma, seen.instrumental, magnitude, rule.log_density, rule.zero_point,
-        rule.spread, 0.0, rule.area,
-    )  # fmt: skip
+        slot, chi2_of, sigma, centroids.instrumental, magnitude, rule, 0.0, problem.image.area
+    )
     evidence += choice_lost(P)
-    if evidence <= beaten:  # even if no star was missed
+    if evidence <= beaten:  # even if every star in view was matched
         return evidence
-    in_view = float(_stars_in_image(R, seen.beta, stars.u, rule.box))
+    in_view = float(_stars_in_image(R, centroids.beta, stars.u, problem.image.box))
     return evidence + log_ways(n, matches, float(matches)) - log_ways(n, matches, in_view)

@@ -10,8 +10,8 @@ from epipole.tasks.algorithms.star_identification.search.evidence import log_mag
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable, build_pair_table
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid, build_sky_grid
 
-# Bright stars a field, on average, whose pairs are tabled: enough that sparse fields show several,
-# few enough that a pair has few namesakes.
+# Mean number of bright stars in a field whose pairs are tabled: enough that sparse fields have
+# several, and few enough that not many pairs share a separation.
 PATTERN_STARS = 24.0
 MAX_PAIRS = 1_000_000
 
@@ -21,7 +21,7 @@ class Sky(NamedTuple):
 
     catalogue : the stars
     log_density : (72,) float, see `evidence.log_magnitude_density`
-    rho : stars a steradian, mean of the sky
+    rho : stars per steradian, mean of the sky
     """
 
     catalogue: NavigationCatalogue

@@ -14,7 +14,7 @@ class KVector(NamedTuple):
     """A sorted vector with its index.
 
     s : (n,) float, ascending
-    below : (n + 1,) int32; below[k] = how many s lie at or below the index line at k (below[n] = n)
+    below : (n + 1,) int32, how many s lie at or below the index line at k; below[n] = n
     slope, intercept : of the index line z(k) = intercept + slope k, k = 0 .. n
     """
 
@@ -37,8 +37,9 @@ def build_kvector(s: Array) -> KVector:
 
     References
     ----------
-    Mortari and Neta (2000), K-vector range searching techniques; METHODS' [C] has the same
-    with the line (1, s(1) - d/2) .. (n, s(n) + d/2), d = (s(n) - s(1)) / (n - 1).
+    Mortari and Neta (2000), K-vector range searching techniques. Yuan, Zhang, Shi (2017), A
+    modified star map identification algorithm based on K vector, have the same with the line
+    (1, s(1) - d/2) .. (n, s(n) + d/2), d = (s(n) - s(1)) / (n - 1).
     """
     s = np.ascontiguousarray(s, np.float64)
     n = len(s)
@@ -57,23 +58,21 @@ def build_kvector(s: Array) -> KVector:
 
 
 @kernel
-def range_of(s, below, slope, intercept, low, high):
-    """Return first and last + 1 of the elements with low <= s <= high (compiled).
-
-    Takes the four fields of a `KVector`, then the range.
-    """
+def range_of(index, low, high):
+    """Return first and last + 1 of a `KVector`'s elements with low <= s <= high (compiled)."""
+    s, below = index.s, index.below
     n = len(s)
     if n == 0 or low > high or high < s[0] or low > s[n - 1]:
         return 0, 0
     # Clamped as floats: far ends would overflow the integers.
-    k = int(min(max(np.floor((low - intercept) / slope), 0.0), float(n)))
+    k = int(min(max(np.floor((low - index.intercept) / index.slope), 0.0), float(n)))
     first = below[k]
     # Rounding of the line may be off by an element either way.
     while first > 0 and s[first - 1] >= low:
         first -= 1
     while first < n and s[first] < low:
         first += 1
-    k = int(min(max(np.ceil((high - intercept) / slope), 0.0), float(n)))
+    k = int(min(max(np.ceil((high - index.intercept) / index.slope), 0.0), float(n)))
     last = below[k]
     while last < n and s[last] <= high:
         last += 1

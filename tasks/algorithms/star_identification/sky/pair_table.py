@@ -15,8 +15,8 @@ TURN = 1 << 16
 class PairTable(NamedTuple):
     """Pairs of stars by separation.
 
-    chord : K-vector over 2 sin(separation / 2), ascending. The cosine, which papers sort
-        by, is flat at small separations and loses half of the digits there.
+    chord : K-vector over 2 sin(separation / 2), ascending. Papers sort by the cosine, which is
+        flat at small separations and loses half of the digits there.
     first, second : (n,) int32, rows of the catalogue, first the brighter
     at_first, at_second : (n,) uint16, position angle of the other star as seen from each,
         in parts of `TURN`, from `tangent_axes`
@@ -51,7 +51,7 @@ def tangent_axes(
     u: npt.NDArray[np.float64],
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return two (n, 3) unit vectors that complete each direction to a right-handed frame."""
-    # Any two will do; off the axis that the direction is nearest to, it is never parallel.
+    # Any two will do. The axis crossed with the direction is never parallel to it.
     near_z = np.abs(u[:, 2:]) > 0.9
     along = np.cross(np.where(near_z, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]), u)
     along /= np.linalg.norm(along, axis=1, keepdims=True)

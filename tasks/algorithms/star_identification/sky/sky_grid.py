@@ -1,4 +1,4 @@
-"""A grid over the sky that tells the catalogue stars near a direction in constant time."""
+"""A grid over the sky: finds the catalogue stars near a direction in constant time."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from epipole.tasks.algorithms.kernels import kernel
 
 
 class SkyGrid(NamedTuple):
-    """Cells on the six faces of a cube; a star stands in every cell that its disc touches.
+    """Cells on the six faces of a cube; a star is entered in every cell that its disc touches.
 
     first : (6 n_face^2 + 1,) int32; the stars of cell c are star[first[c]:first[c + 1]]
     star : int32, rows of the catalogue
@@ -25,8 +25,8 @@ class SkyGrid(NamedTuple):
 
 def build_sky_grid(u_icrs: npt.NDArray[np.float64], radius_rad: float) -> SkyGrid:
     """Return the grid of (n, 3) star directions for look-ups within `radius_rad`."""
-    # Cells of two disc radii: a star stands in about four. Fewer than 256 an edge keeps the
-    # grid of a small radius in the processor's cache.
+    # Cells of two disc radii: a star is in about four. At most 256 along an edge keep the grid of a
+    # small radius in the processor's cache.
     n_face = int(np.clip(np.pi / 2 / (2 * radius_rad), 8, 256))
     count = np.zeros(6 * n_face * n_face + 1, np.int32)
     _visit_cells(u_icrs, radius_rad, n_face, count, np.empty(0, np.int32))
@@ -39,7 +39,7 @@ def build_sky_grid(u_icrs: npt.NDArray[np.float64], radius_rad: float) -> SkyGri
 
 @kernel
 def _visit_cells(u, radius, n, slot, star):
-    """Count each star's cells in `slot`, or, with room in `star`, enter it at the slots."""
+    """Count each star's cells in `slot`; or enter the stars at the slots, where `star` has room."""
     for k in range(len(u)):
         for face in range(6):
             axis = face % 3
@@ -79,7 +79,7 @@ def cell_of(x, y, z, n):
 
 @kernel
 def nearest_star(x, y, z, radius, u_icrs, first, star, n_face):
-    """Return the star nearest to a unit vector within `radius` [rad], -1 if none, and the
+    """Return the star nearest to a unit vector within `radius` [rad], -1 if there is none, and the
     squared chord to it (compiled)."""
     cell = cell_of(x, y, z, n_face)
     best, best_d2 = -1, radius * radius

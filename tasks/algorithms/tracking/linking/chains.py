@@ -14,6 +14,38 @@ Indices = npt.NDArray[np.int64]
 NONE = -1
 
 
+class Fragments(NamedTuple):
+    """Broken tracks of one sensor.
+
+    offsets : (g + 1,) int64; fragment k has the detections offsets[k]:offsets[k + 1], in time
+        order, at least one
+    time_s, u_icrs, sigma_rad : (n,), (n, 3), (n,) float, times [s], unit vectors, and their
+        1-sigma errors an axis [rad]
+    """
+
+    offsets: Indices
+    time_s: Array
+    u_icrs: Array
+    sigma_rad: Array
+
+
+class LinkRule(NamedTuple):
+    """What the methods of linking are told; each takes what it needs.
+
+    gap_s : longest gap that is bridged
+    kept : share of true links that the chi-square test lets pass
+    field_sr : solid angle in which fragments begin, for their density
+    interval_s : the sensor's frame interval
+    noise_rad2_s3 : process noise of a method that has one [rad^2/s^3]
+    """
+
+    gap_s: float
+    kept: float
+    field_sr: float
+    interval_s: float
+    noise_rad2_s3: float
+
+
 class Links(NamedTuple):
     """For each fragment the one before it (-1: none), and the link's chi-square (NaN: none)."""
 
@@ -29,21 +61,21 @@ def choose_links(earlier: Indices, later: Indices, gain: Array, chi2: Array, n: 
     earlier, later : (p,) int
         Fragments of each possible link, a pair at most once.
     gain, chi2 : (p,) float
-        What the link is worth against leaving both ends open; a link without gain is not made.
-        And its test quantity, which is passed on.
+        What the link is worth compared with leaving both ends open: links without gain are not
+        made. And its test quantity, which is passed on.
     n
         Number of fragments.
 
     Notes
     -----
-    An assignment on the matrix of gains in which what cannot be linked gains nothing. It has
-    the same optimum as [[D, diag(c / 2)], [diag(c / 2), 0]] with gain = c - D, at a quarter of
-    the size. Links that share no fragment, directly or through others, are assigned apart.
+    An assignment on the matrix of gains, in which impossible links gain nothing. It has the same
+    optimum as [[D, diag(c / 2)], [diag(c / 2), 0]] with gain = c - D, at a quarter of the size.
+    Links that share no fragment, directly or through others, are assigned separately.
     """
-    before, found = np.full(n, NONE), np.full(n, np.nan)
+    before, kept = np.full(n, NONE), np.full(n, np.nan)
     good = np.flatnonzero(gain > 0)
     if not len(good):
-        return Links(before, found)
+        return Links(before, kept)
     i, j = earlier[good], later[good]
     # An end and a start of one fragment are two things: columns come after the rows.
     graph = coo_array((np.ones(len(good)), (i, n + j)), shape=(2 * n, 2 * n))
@@ -57,8 +89,14 @@ def choose_links(earlier: Indices, later: Indices, gain: Array, chi2: Array, n: 
         chosen.append(_assign(order[lo : lo + k], i, j, gain[good]))
     picked = good[np.concatenate(chosen)]
     before[later[picked]] = earlier[picked]
-    found[later[picked]] = chi2[picked]
-    return Links(before, found)
+    kept[later[picked]] = chi2[picked]
+    return Links(before, kept)
+
+
+def leave_unlinked(fragments: Fragments, rule: LinkRule) -> Links:
+    """Return no links: every fragment stays a track."""
+    n = len(fragments.offsets) - 1
+    return Links(np.full(n, NONE), np.full(n, np.nan))
 
 
 def _assign(members: Indices, i: Indices, j: Indices, gain: Array) -> Indices:
@@ -74,14 +112,14 @@ def _assign(members: Indices, i: Indices, j: Indices, gain: Array) -> Indices:
 
 
 def fill_in(links: Links, earlier: Indices, later: Indices, gain: Array, chi2: Array) -> Links:
-    """Return the links with fragments put in that stand alone inside a link and fit both sides.
+    """Return the links, with lone fragments inserted where they fit both sides of a link.
 
-    Two long fragments know of each other more than either does of a short one between them, so
-    that the link past it can outweigh the two links through it; but it contradicts neither.
-    Parameters as in `choose_links`.
+    A link between two long fragments can outweigh the two links through a short fragment between
+    them, as each long one predicts the other more precisely than the short one. The short one
+    contradicts neither. Parameters as in `choose_links`.
     """
     n = len(links.before)
-    before, found = links.before.copy(), links.chi2.copy()
+    before, kept = links.before.copy(), links.chi2.copy()
     good = np.flatnonzero(gain > 0)
     pair = {(int(earlier[p]), int(later[p])): p for p in good}
     while True:
@@ -95,14 +133,14 @@ def fill_in(links: Links, earlier: Indices, later: Indices, gain: Array, chi2: A
             if (m, k) in pair
         ]
         if not inner:
-            return Links(before, found)
+            return Links(before, kept)
         _, p, q = max(inner)
         for link in (p, q):
-            before[later[link]], found[later[link]] = earlier[link], chi2[link]
+            before[later[link]], kept[later[link]] = earlier[link], chi2[link]
 
 
 def chain_heads(before: Indices) -> Indices:
-    """Return, for each fragment, the first of its chain (itself where it stands alone)."""
+    """Return the first fragment of each fragment's chain; its own number where it is alone."""
     head = np.arange(len(before))
     linked = before != NONE
     head[linked] = before[linked]

@@ -1,8 +1,8 @@
 """Links by the likelihood ratio of one motion against two: no window, nothing to tune.
 
-The motion of a fragment is a cubic in time on the plane of the sky, its acceleration and
-jerk held to what the apparent rate allows. Each fragment is reduced once to sums over its
-detections; a pair then costs a few small matrices, however long its fragments are.
+The motion of a fragment is a cubic in time on the plane of the sky, with priors on acceleration
+and jerk that follow from the apparent rate. Each fragment is reduced once to sums over its
+detections. A pair then costs a few small matrices, however long its fragments are.
 """
 
 from typing import NamedTuple
@@ -13,22 +13,28 @@ from scipy.special import chdtri
 
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, cubic_span, jerk
-from epipole.tasks.algorithms.tracking.linking.chains import Links, choose_links, fill_in
+from epipole.tasks.algorithms.tracking.linking.chains import (
+    Fragments,
+    LinkRule,
+    Links,
+    choose_links,
+    fill_in,
+)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-FARTHEST_RAD = 0.5  # arc between fragments over which a plane still serves as the sky
-SEARCH_SIGMA = 6.0  # of the quick test that spares most pairs the full one
+FARTHEST_RAD = 0.5  # longest arc between fragments: a plane stands for the sky
+SEARCH_SIGMA = 6.0  # of the quick test that most pairs fail
 
 
 class _Ends(NamedTuple):
     """Sums over the detections near one end of each fragment, about a middle instant.
 
     S[:, k] = sum w t^k, B[:, k] = sum w t^k (u - u0), C = sum w (u - u0)(u - u0)', with
-    w = 1 / sigma^2 and t from the instant t0; and the end itself: time, place and rate with
-    their variances (infinite: a single detection has no rate), and the square of what its
-    acceleration shows beyond noise and beyond the bound that its rate sets.
+    w = 1 / sigma^2 and t from the instant t0. At the end itself: time `at`, place `u` and rate `w`
+    with their variances (infinite for the rate of a single detection), and `extra`, the square
+    of the acceleration beyond noise and beyond the bound that the rate sets.
     """
 
     t0: Array
@@ -44,8 +50,31 @@ class _Ends(NamedTuple):
     extra: Array
 
 
+class _FitScratch(NamedTuple):
+    """Normal equations of two fragments, A (4, 4) and b (4, 2), and a Cholesky factor (4, 4)."""
+
+    A_1: Array
+    b_1: Array
+    A_2: Array
+    b_2: Array
+    factor: Array
+
+
+class _Plane(NamedTuple):
+    """A tangent plane and a common instant: axes, a straight drift, instant, unit of time [s]."""
+
+    e_1: Array
+    e_2: Array
+    drift: Array
+    centre: float
+    scale: float
+
+
 @kernel
-def _sums(time_s, u, sigma, lo, hi, t0, u0, S, B, C):
+def _sums(fragments, lo, hi, ends, f):
+    """Fill the sums of fragment f over the detections lo:hi."""
+    time_s, u, sigma = fragments.time_s, fragments.u_icrs, fragments.sigma_rad
+    t0, u0, S, B, C = ends.t0[f], ends.u0[f], ends.S[f], ends.B[f], ends.C[f]
     for k in range(lo, hi):
         weight, t = 1.0 / sigma[k] ** 2, time_s[k] - t0
         power = weight
@@ -64,7 +93,7 @@ def _sums(time_s, u, sigma, lo, hi, t0, u0, S, B, C):
 def _unforeseen(S, B, half, bend):
     """Return the square [rad^2/s^4] of a fragment's acceleration beyond noise and bound.
 
-    A near object that comes straight on is slow and yet soon fast: its rate sets no bound.
+    A near object that approaches head-on is slow at first and soon fast: its rate sets no bound.
     """
     # Time in units of the half-length, and a parabola free of value and slope.
     s_0, s_1, s_2 = S[0], S[1] / half, S[2] / half**2
@@ -84,66 +113,77 @@ def _unforeseen(S, B, half, bend):
 
 
 @kernel
-def _reduce(
-    offsets, time_s, u, sigma, last, t0, u0, S, B, C, at, end_u, end_w, var_u, var_w, extra
-):
-    """Fill the sums of every fragment's first (or last) part, as long as a cubic serves it."""
-    for f in range(len(offsets) - 1):
-        lo, hi = offsets[f], offsets[f + 1]
-        length = time_s[hi - 1] - time_s[lo]
-        chord = 0.0
-        for a in range(3):
-            chord += (u[hi - 1, a] - u[lo, a]) ** 2
-        rate = np.sqrt(chord) / length if length > 0 else 0.0
-        # A quarter of the span on each side leaves half of it to the gap.
-        reach = cubic_span(rate, sigma[lo]) / 4
-        if last:
-            while hi - lo > 3 and time_s[hi - 1] - time_s[lo] > reach:
-                lo += 1
-        else:
-            while hi - lo > 3 and time_s[hi - 1] - time_s[lo] > reach:
-                hi -= 1
+def _part(fragments, f, last):
+    """Return the rows lo, hi of a fragment's last (or first) part that a cubic describes, and
+    the fragment's rate."""
+    time_s, u = fragments.time_s, fragments.u_icrs
+    lo, hi = fragments.offsets[f], fragments.offsets[f + 1]
+    length = time_s[hi - 1] - time_s[lo]
+    chord = 0.0
+    for a in range(3):
+        chord += (u[hi - 1, a] - u[lo, a]) ** 2
+    rate = np.sqrt(chord) / length if length > 0 else 0.0
+    # A quarter of the span on each side leaves half of it to the gap.
+    reach = cubic_span(rate, fragments.sigma_rad[lo]) / 4
+    if last:
+        while hi - lo > 3 and time_s[hi - 1] - time_s[lo] > reach:
+            lo += 1
+    else:
+        while hi - lo > 3 and time_s[hi - 1] - time_s[lo] > reach:
+            hi -= 1
+    return lo, hi, rate
+
+
+@kernel
+def _reduce(fragments, last, ends):
+    """Fill the sums of every fragment's last (or first) part."""
+    time_s, u = fragments.time_s, fragments.u_icrs
+    for f in range(len(fragments.offsets) - 1):
+        lo, hi, rate = _part(fragments, f, last)
         middle = (lo + hi) // 2
-        t0[f], at[f] = time_s[middle], time_s[hi - 1] if last else time_s[lo]
-        u0[f] = u[middle]
-        _sums(time_s, u, sigma, lo, hi, t0[f], u0[f], S[f], B[f], C[f])
+        ends.t0[f], ends.at[f] = time_s[middle], time_s[hi - 1] if last else time_s[lo]
+        ends.u0[f] = u[middle]
+        _sums(fragments, lo, hi, ends, f)
         # A straight line for the quick test; its variances are those of the full test's prior.
-        det = S[f, 0] * S[f, 2] - S[f, 1] ** 2
-        dt = at[f] - t0[f]
+        S, B = ends.S[f], ends.B[f]
+        det = S[0] * S[2] - S[1] ** 2
+        dt = ends.at[f] - ends.t0[f]
         half = 0.5 * (time_s[hi - 1] - time_s[lo])
         bend = acceleration(rate)
-        if det > 1e-12 * S[f, 0] * S[f, 2]:
+        if det > 1e-12 * S[0] * S[2]:
             for a in range(3):
-                slope = (S[f, 0] * B[f, 1, a] - S[f, 1] * B[f, 0, a]) / det
-                value = (S[f, 2] * B[f, 0, a] - S[f, 1] * B[f, 1, a]) / det
-                end_w[f, a] = slope
-                end_u[f, a] = u0[f, a] + value + slope * dt
-            var_u[f] = (S[f, 2] - 2 * S[f, 1] * dt + S[f, 0] * dt * dt) / det
-            var_u[f] += (bend * half * half) ** 2
-            var_w[f] = S[f, 0] / det + (bend * half) ** 2
-            extra[f] = _unforeseen(S[f], B[f], half, bend)
+                slope = (S[0] * B[1, a] - S[1] * B[0, a]) / det
+                value = (S[2] * B[0, a] - S[1] * B[1, a]) / det
+                ends.w[f, a] = slope
+                ends.u[f, a] = ends.u0[f, a] + value + slope * dt
+            ends.var_u[f] = (S[2] - 2 * S[1] * dt + S[0] * dt * dt) / det
+            ends.var_u[f] += (bend * half * half) ** 2
+            ends.var_w[f] = S[0] / det + (bend * half) ** 2
+            ends.extra[f] = _unforeseen(S, B, half, bend)
         else:
-            end_u[f] = u0[f]
-            var_u[f], var_w[f] = 1.0 / S[f, 0], np.inf
+            ends.u[f] = ends.u0[f]
+            ends.var_u[f], ends.var_w[f] = 1.0 / S[0], np.inf
 
 
-def _ends(offsets: Indices, time_s: Array, u: Array, sigma: Array, last: bool) -> _Ends:
-    n = len(offsets) - 1
+def _ends(fragments: Fragments, last: bool) -> _Ends:
+    n = len(fragments.offsets) - 1
     ends = _Ends(
         np.zeros(n), np.zeros((n, 3)), np.zeros((n, 7)), np.zeros((n, 4, 3)), np.zeros((n, 3, 3)),
         np.zeros(n), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros(n),
     )  # fmt: skip
-    _reduce(offsets, time_s, u, sigma, last, *ends)
+    _reduce(fragments, last, ends)
     return ends
 
 
 @kernel
-def _shift(S, B, C, e_1, e_2, drift, t0, centre, scale, out_A, out_b):
+def _shift(ends, f, plane, out_A, out_b):
     """Fill A (4, 4) and b (4, 2) of one fragment about a common instant, in a tangent plane.
 
-    A straight drift is taken off first: the prior says nothing of it, and what remains is
-    small, so that no digits are lost. Returns c = sum w |d|^2.
+    A straight drift is subtracted first. It has no prior, and the remainder is small, so that
+    no digits are lost. Returns c = sum w |d|^2.
     """
+    S, B, C = ends.S[f], ends.B[f], ends.C[f]
+    e_1, e_2, drift, scale = plane.e_1, plane.e_2, plane.drift, plane.scale
     moved = np.empty((4, 2))
     for k in range(4):
         x, y = 0.0, 0.0
@@ -157,7 +197,7 @@ def _shift(S, B, C, e_1, e_2, drift, t0, centre, scale, out_A, out_b):
         for b in range(3):
             value = C[a, b] - B[1, a] * drift[b] - drift[a] * B[1, b] + drift[a] * drift[b] * S[2]
             c += value * (e_1[a] * e_1[b] + e_2[a] * e_2[b])
-    delta = t0 - centre
+    delta = ends.t0[f] - plane.centre
     total = np.empty(7)
     power = 1.0
     for k in range(7):
@@ -182,7 +222,7 @@ def _shift(S, B, C, e_1, e_2, drift, t0, centre, scale, out_A, out_b):
 
 
 @kernel
-def _misfit(A, b, prior_2, prior_3, work):
+def _misfit(A, b, prior_2, prior_3, factor):
     """Return b' (A + L)^-1 b summed over both axes, and ln det(A + L), by Cholesky."""
     for i in range(4):
         for j in range(i + 1):
@@ -190,51 +230,48 @@ def _misfit(A, b, prior_2, prior_3, work):
             if i == j:
                 value += prior_2 if i == 2 else (prior_3 if i == 3 else 0.0)
             for k in range(j):
-                value -= work[i, k] * work[j, k]
+                value -= factor[i, k] * factor[j, k]
             if i == j:
-                work[i, i] = np.sqrt(max(value, 1e-300))
+                factor[i, i] = np.sqrt(max(value, 1e-300))
             else:
-                work[i, j] = value / work[j, j]
+                factor[i, j] = value / factor[j, j]
     explained, log_det = 0.0, 0.0
     y = np.empty((4, 2))
     for i in range(4):
         for axis in range(2):
             value = b[i, axis]
             for k in range(i):
-                value -= work[i, k] * y[k, axis]
-            y[i, axis] = value / work[i, i]
+                value -= factor[i, k] * y[k, axis]
+            y[i, axis] = value / factor[i, i]
             explained += y[i, axis] ** 2
-        log_det += 2 * np.log(work[i, i])
+        log_det += 2 * np.log(factor[i, i])
     return explained, log_det
 
 
 @kernel
-def _free_parameters(work, prior_2, prior_3):
+def _free_parameters(factor, prior_2, prior_3):
     """Return how many of the 4 parameters the data decide: 4 - tr((A + L)^-1 L).
 
     Only the last two have a prior: of the inverse, the lower right corner is needed.
     """
-    last = 1.0 / work[3, 3] ** 2
-    corner = (1.0 + work[3, 2] ** 2 * last) / work[2, 2] ** 2
+    last = 1.0 / factor[3, 3] ** 2
+    corner = (1.0 + factor[3, 2] ** 2 * last) / factor[2, 2] ** 2
     return 4.0 - prior_2 * corner - prior_3 * last
 
 
 @kernel
-def _compare(
-    i, j, t0_1, u0_1, S_1, B_1, C_1, t0_2, u0_2, S_2, B_2, C_2, at_1, at_2, first, last, extra_2,
-    A_1, b_1, A_2, b_2, work,
-):  # fmt: skip
-    """Return (D, degrees of freedom, ln likelihood ratio without the prior volume)."""
+def _plane_between(tail, head, i, j, first, last):
+    """Return the plane halfway between two fragments, and the rate [rad/s] between them."""
     drift, middle = np.empty(3), np.empty(3)
     norm, rate = 0.0, 0.0
     for a in range(3):
-        drift[a] = (u0_2[j, a] - u0_1[i, a]) / (t0_2[j] - t0_1[i])
-        middle[a] = u0_2[j, a] + u0_1[i, a]
+        drift[a] = (head.u0[j, a] - tail.u0[i, a]) / (head.t0[j] - tail.t0[i])
+        middle[a] = head.u0[j, a] + tail.u0[i, a]
         norm += middle[a] ** 2
         rate += drift[a] ** 2
     middle /= np.sqrt(norm)
     rate = np.sqrt(rate)
-    # Any two axes across the middle: the sum over both does not depend on which.
+    # Any two axes across the middle: the sum over both does not depend on the choice.
     e_1, e_2 = np.zeros(3), np.empty(3)
     helper = 0
     for a in range(1, 3):
@@ -249,26 +286,36 @@ def _compare(
     e_2[0] = middle[1] * e_1[2] - middle[2] * e_1[1]
     e_2[1] = middle[2] * e_1[0] - middle[0] * e_1[2]
     e_2[2] = middle[0] * e_1[1] - middle[1] * e_1[0]
-    centre = 0.5 * (at_1[i] + at_2[j])
+    centre = 0.5 * (tail.at[i] + head.at[j])
     scale = max(last[j] - centre, centre - first[i])
-    c_1 = _shift(S_1[i], B_1[i], C_1[i], e_1, e_2, drift, t0_1[i], centre, scale, A_1, b_1)
-    c_2 = _shift(S_2[j], B_2[j], C_2[j], e_1, e_2, drift, t0_2[j], centre, scale, A_2, b_2)
+    return _Plane(e_1, e_2, drift, centre, scale), rate
+
+
+@kernel
+def _compare(tail, head, i, j, first, last, room):
+    """Return (D, degrees of freedom, ln likelihood ratio without the prior volume)."""
+    A_1, b_1, A_2, b_2, factor = room.A_1, room.b_1, room.A_2, room.b_2, room.factor
+    plane, rate = _plane_between(tail, head, i, j, first, last)
+    scale, extra_2 = plane.scale, max(tail.extra[i], head.extra[j])
+    c_1 = _shift(tail, i, plane, A_1, b_1)
+    c_2 = _shift(head, j, plane, A_2, b_2)
     bend2 = acceleration(rate) ** 2 + extra_2
-    # What approaches at r' / r bends by twice that times its rate, and that by half as much again.
+    # An object that approaches at r' / r has the acceleration a = 2 r' / r times its rate, and
+    # the jerk 1.5 a^2 over its rate.
     twist = jerk(rate) + 1.5 * extra_2 / max(rate, 1e-9)
     prior_2 = 4.0 / (bend2 * scale**4)
     prior_3 = 36.0 / (twist * scale**3) ** 2
-    got_1, log_1 = _misfit(A_1, b_1, prior_2, prior_3, work)
-    free = _free_parameters(work, prior_2, prior_3)
-    got_2, log_2 = _misfit(A_2, b_2, prior_2, prior_3, work)
-    free += _free_parameters(work, prior_2, prior_3)
+    got_1, log_1 = _misfit(A_1, b_1, prior_2, prior_3, factor)
+    free = _free_parameters(factor, prior_2, prior_3)
+    got_2, log_2 = _misfit(A_2, b_2, prior_2, prior_3, factor)
+    free += _free_parameters(factor, prior_2, prior_3)
     for a in range(4):
         for b in range(4):
             A_1[a, b] += A_2[a, b]
         for axis in range(2):
             b_1[a, axis] += b_2[a, axis]
-    got, log_both = _misfit(A_1, b_1, prior_2, prior_3, work)
-    free -= _free_parameters(work, prior_2, prior_3)
+    got, log_both = _misfit(A_1, b_1, prior_2, prior_3, factor)
+    free -= _free_parameters(factor, prior_2, prior_3)
     D = (c_1 + c_2 - got) - (c_1 - got_1) - (c_2 - got_2)
     log_ratio = log_1 + log_2 - log_both - np.log(prior_2 * prior_3) - 2 * np.log(2 * np.pi)
     # A rate in units of the scale: its share of the prior volume is rad^2, not rad^2 / s^2.
@@ -276,34 +323,32 @@ def _compare(
 
 
 @kernel
-def _near(u_1, w_1, var_u_1, var_w_1, u_2, w_2, var_u_2, var_w_2, extra, gap):
+def _near(tail, head, i, j):
     """Return whether straight lines from both ends come near each other in mid-gap."""
+    gap = head.at[j] - tail.at[i]
     half, miss, arc, rate = 0.5 * gap, 0.0, 0.0, 0.0
     for a in range(3):
-        miss += (u_1[a] + half * w_1[a] - u_2[a] + half * w_2[a]) ** 2
-        arc += (u_2[a] - u_1[a]) ** 2
+        miss += (tail.u[i, a] + half * tail.w[i, a] - head.u[j, a] + half * head.w[j, a]) ** 2
+        arc += (head.u[j, a] - tail.u[i, a]) ** 2
     rate = np.sqrt(arc) / gap
-    bend2 = 0.25 * (acceleration(rate) ** 2 + extra) * half**4
-    allowed = var_u_1 + var_u_2 + half * half * (var_w_1 + var_w_2) + 2 * bend2
+    bend2 = 0.25 * (acceleration(rate) ** 2 + max(tail.extra[i], head.extra[j])) * half**4
+    allowed = tail.var_u[i] + head.var_u[j] + half * half * (tail.var_w[i] + head.var_w[j])
+    allowed += 2 * bend2
     return arc < FARTHEST_RAD**2 and miss < 2 * SEARCH_SIGMA**2 * allowed
 
 
 @kernel
-def _search(by_start, start, end, gap_s, u_1, w_1, vu_1, vw_1, x_1, u_2, w_2, vu_2, vw_2, x_2):
-    """Return the pairs (earlier, later) that the gap and the quick test leave."""
-    n, room, count = len(start), 1024, 0
+def _search(tail, head, by_start, gap_s):
+    """Return the pairs (earlier, later) that pass the longest gap and the quick test."""
+    n, room, count = len(head.at), 1024, 0
     first, second = np.empty(room, np.int64), np.empty(room, np.int64)
-    sorted_start = start[by_start]
+    sorted_start = head.at[by_start]
     for i in range(n):
-        for k in range(np.searchsorted(sorted_start, end[i], side="right"), n):
+        for k in range(np.searchsorted(sorted_start, tail.at[i], side="right"), n):
             j = by_start[k]
-            gap = start[j] - end[i]
-            if gap > gap_s:
+            if head.at[j] - tail.at[i] > gap_s:
                 break
-            if not _near(
-                u_1[i], w_1[i], vu_1[i], vw_1[i], u_2[j], w_2[j], vu_2[j], vw_2[j],
-                max(x_1[i], x_2[j]), gap,
-            ):  # fmt: skip
+            if not _near(tail, head, i, j):
                 continue
             if count == room:
                 room *= 2
@@ -315,75 +360,46 @@ def _search(by_start, start, end, gap_s, u_1, w_1, vu_1, vw_1, x_1, u_2, w_2, vu
 
 
 @kernel
-def _compare_all(
-    earlier, later, t0_1, u0_1, S_1, B_1, C_1, at_1, t0_2, u0_2, S_2, B_2, C_2, at_2, first, last,
-    extra_1, extra_2, out_D, out_free, out_log,
-):  # fmt: skip
-    A_1, b_1, A_2, b_2 = np.empty((4, 4)), np.empty((4, 2)), np.empty((4, 4)), np.empty((4, 2))
-    work = np.zeros((4, 4))
-    for p in range(len(earlier)):
-        out_D[p], out_free[p], out_log[p] = _compare(
-            earlier[p], later[p], t0_1, u0_1, S_1, B_1, C_1, t0_2, u0_2, S_2, B_2, C_2, at_1,
-            at_2, first, last, max(extra_1[earlier[p]], extra_2[later[p]]), A_1, b_1, A_2, b_2,
-            work,
-        )  # fmt: skip
+def _compare_all(tail, head, earlier, later, first, last):
+    """Return what `_compare` does for each pair."""
+    n = len(earlier)
+    D, free, log_ratio = np.empty(n), np.empty(n), np.empty(n)
+    room = _FitScratch(
+        np.empty((4, 4)), np.empty((4, 2)), np.empty((4, 4)), np.empty((4, 2)), np.zeros((4, 4))
+    )
+    for p in range(n):
+        D[p], free[p], log_ratio[p] = _compare(tail, head, earlier[p], later[p], first, last, room)
+    return D, free, log_ratio
 
 
-def link_by_likelihood(
-    offsets: Indices,
-    time_s: Array,
-    u_icrs: Array,
-    sigma_rad: Array,
-    *,
-    gap_s: float,
-    kept: float,
-    field_sr: float,
-) -> Links:
+def link_by_likelihood(fragments: Fragments, rule: LinkRule) -> Links:
     """Return which fragment continues which, by the ratio of joined against separate fits.
-
-    Parameters
-    ----------
-    offsets : (g + 1,) int
-        Fragment k has the detections ``offsets[k]:offsets[k + 1]``, in time order, at least one.
-    time_s, u_icrs, sigma_rad : (n,), (n, 3), (n,) float
-        Times [s], unit vectors, and their 1-sigma errors an axis [rad].
-    gap_s
-        Longest gap bridged.
-    kept
-        Share of true links that the chi-square test lets pass.
-    field_sr
-        Solid angle in which fragments begin: how dense they are decides what is ambiguous.
 
     Notes
     -----
-    D = J(i u j) - J(i) - J(j), J the misfit of a cubic with a prior on acceleration and
-    jerk, is chi-square with 4 degrees of freedom where the prior decides both, with 8 where
-    the data do. What a link gains is the log of the ratio of the two marginal likelihoods,
-    one motion against two: D, and how precisely the one motion foretold the other fragment
-    against how many others could have begun there.
+    D = J(i u j) - J(i) - J(j), J the misfit of a cubic with a prior on acceleration and jerk, is
+    chi-square with 4 degrees of freedom where the prior decides both, with 8 where the data do.
+    The gain of a link is the log of the ratio of two marginal likelihoods, one motion against
+    two. It depends on D, and on how precisely the one motion predicts the other fragment compared
+    with how many others could have begun there.
     """
-    head = _ends(offsets, time_s, u_icrs, sigma_rad, False)
-    tail = _ends(offsets, time_s, u_icrs, sigma_rad, True)
+    head, tail = _ends(fragments, False), _ends(fragments, True)
+    offsets, time_s, gap_s = fragments.offsets, fragments.time_s, float(rule.gap_s)
     by_start = np.argsort(head.at, kind="stable")
-    earlier, later = _search(
-        by_start, head.at, tail.at, float(gap_s), tail.u, tail.w, tail.var_u, tail.var_w,
-        tail.extra, head.u, head.w, head.var_u, head.var_w, head.extra,
-    )  # fmt: skip
-    D, free, log_ratio = (np.empty(len(earlier)) for _ in range(3))
-    _compare_all(
-        earlier, later, *tail[:6], *head[:6], time_s[offsets[:-1]], time_s[offsets[1:] - 1],
-        tail.extra, head.extra, D, free, log_ratio,
-    )  # fmt: skip
+    earlier, later = _search(tail, head, by_start, gap_s)
+    D, free, log_ratio = _compare_all(
+        tail, head, earlier, later, time_s[offsets[:-1]], time_s[offsets[1:] - 1]
+    )
     gain = log_ratio - np.log(_others(head, tail, gap_s)[earlier])
-    gain += np.log(field_sr * _rate_area(head))
-    gain[chdtri(free, 1.0 - kept) < D] = 0.0
+    gain += np.log(rule.field_sr * _rate_area(head))
+    gain[chdtri(free, 1.0 - rule.kept) < D] = 0.0
     D = np.maximum(D, 0.0)
     links = choose_links(earlier, later, gain, D, len(offsets) - 1)
     return fill_in(links, earlier, later, gain, D)
 
 
 def _others(head: _Ends, tail: _Ends, gap_s: float) -> Array:
-    """Return how many fragments begin in the time in which each could continue."""
+    """Return how many fragments begin within the longest gap after each fragment."""
     starts = np.sort(head.at)
     return (
         np.searchsorted(starts, tail.at + gap_s, side="right")
@@ -392,7 +408,7 @@ def _others(head: _Ends, tail: _Ends, gap_s: float) -> Array:
 
 
 def _rate_area(head: _Ends) -> float:
-    """Return over what area [rad^2/s^2] the fragments' rates spread.
+    """Return the area [rad^2/s^2] over which the fragments' rates spread.
 
     The mean density of a normal distribution is one over 4 pi sigma^2.
     """

@@ -1,39 +1,59 @@
-"""Links by prediction forward and backward, weighted by speed: the published method.
+"""Links by prediction forward and backward, weighted by speed [published].
 
 Cheng, Wang, Li et al. (2021), patent: image-plane track fragment association by forward and
 backward prediction with velocity weighting. The old fragment is filtered forward, the new one
-backward, both with constant acceleration; across the gap both are predicted with constant
-velocity; about an instant that their speeds choose they must agree. The printed source lacks
-its formulas; process noise, window and test quantity are reconstructed.
+backward, both with constant acceleration. Across the gap both are predicted with constant
+velocity, and they must agree about an instant that their speeds choose. The printed source lacks
+its formulas: process noise, window and test quantity are reconstructed.
 
 Directions stand in for the image plane: the filters run on the three components of the unit
 vector, which share one covariance, and the comparison is made on the plane of the sky.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.linking.chains import Links, choose_links
+from epipole.tasks.algorithms.tracking.linking.chains import (
+    Fragments,
+    LinkRule,
+    Links,
+    choose_links,
+)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-DEGREES_OF_FREEDOM = 4  # the window's instants are almost fully correlated: they count as one
+DEGREES_OF_FREEDOM = 4  # of one instant: those of the window are almost fully correlated
 HALF_WINDOW = 5  # instants on each side of the middle one
 FASTEST_RAD_S = 0.1  # 1-sigma of a rate not yet measured
 HARDEST_RAD_S2 = 1e-3  # 1-sigma of an acceleration not yet measured
 
 
+class _EndStates(NamedTuple):
+    """Filtered states at one end of each fragment.
+
+    at : (g,) float, times
+    x, P : (g, 3, 3), (g, 3, 3) float, as in `_filter`
+    """
+
+    at: Array
+    x: Array
+    P: Array
+
+
 @kernel
-def _filter(time_s, u, sigma, first, last, step, q, x, P):
+def _filter(fragments, first, last, step, q, x, P):
     """Run the constant-acceleration filter over the detections first, first + step .. last.
 
     x (3, 3) receives place, rate and acceleration of the three components at the last one,
     P (3, 3) the covariance that the components share. Backward, time steps are negative and
     the process noise is -Q(T), which turns the sign of its odd terms only.
     """
+    time_s, u, sigma = fragments.time_s, fragments.u_icrs, fragments.sigma_rad
     x[:] = 0.0
     x[0] = u[first]
     P[:] = 0.0
@@ -65,13 +85,18 @@ def _filter(time_s, u, sigma, first, last, step, q, x, P):
 
 
 @kernel
-def _filter_all(offsets, time_s, u, sigma, backward, q, X, P):
-    for f in range(len(offsets) - 1):
-        lo, hi = offsets[f], offsets[f + 1] - 1
+def _filter_all(fragments, backward, q):
+    """Return the states at the last detection of each fragment, or backward at the first."""
+    offsets = fragments.offsets
+    n = len(offsets) - 1
+    states = _EndStates(np.empty(n), np.zeros((n, 3, 3)), np.zeros((n, 3, 3)))
+    for f in range(n):
+        first, last, step = offsets[f], offsets[f + 1] - 1, 1
         if backward:
-            _filter(time_s, u, sigma, hi, lo, -1, q, X[f], P[f])
-        else:
-            _filter(time_s, u, sigma, lo, hi, 1, q, X[f], P[f])
+            first, last, step = last, first, -1
+        _filter(fragments, first, last, step, q, states.x[f], states.P[f])
+        states.at[f] = fragments.time_s[last]
+    return states
 
 
 @kernel
@@ -126,71 +151,50 @@ def _distance(x_1, P_1, t_1, x_2, P_2, t_2, interval_s, q):
 
 
 @kernel
-def _compare_all(by_start, start, end, gap_s, X_1, P_1, X_2, P_2, interval_s, q, limit):
+def _compare_all(tail, head, by_start, rule, limit):
     """Return the pairs (earlier, later) within the limit and their test quantity."""
-    room, count = 1024, 0
+    room, count, q = 1024, 0, rule.noise_rad2_s3
     first, second = np.empty(room, np.int64), np.empty(room, np.int64)
-    found = np.empty(room)
+    distance = np.empty(room)
+    start, end = head.at, tail.at
     sorted_start = start[by_start]
     for i in range(len(start)):
         for k in range(np.searchsorted(sorted_start, end[i], side="right"), len(start)):
             j = by_start[k]
-            if start[j] - end[i] > gap_s:
+            if start[j] - end[i] > rule.gap_s:
                 break
-            D = _distance(X_1[i], P_1[i], end[i], X_2[j], P_2[j], start[j], interval_s, q)
+            D = _distance(
+                tail.x[i], tail.P[i], end[i], head.x[j], head.P[j], start[j], rule.interval_s, q
+            )
             if not limit > D:
                 continue
             if count == room:
                 room *= 2
                 first = np.concatenate((first, np.empty(count, np.int64)))
                 second = np.concatenate((second, np.empty(count, np.int64)))
-                found = np.concatenate((found, np.empty(count)))
-            first[count], second[count], found[count] = i, j, D
+                distance = np.concatenate((distance, np.empty(count)))
+            first[count], second[count], distance[count] = i, j, D
             count += 1
-    return first[:count], second[:count], found[:count]
+    return first[:count], second[:count], distance[:count]
 
 
-def link_by_prediction(
-    offsets: Indices,
-    time_s: Array,
-    u_icrs: Array,
-    sigma_rad: Array,
-    *,
-    gap_s: float,
-    kept: float,
-    interval_s: float,
-    q_rad2_s3: float,
-) -> Links:
+def link_by_prediction(fragments: Fragments, rule: LinkRule) -> Links:
     """Return which fragment continues which, by predictions that meet in the gap.
 
     Parameters
     ----------
-    offsets : (g + 1,) int
-        Fragment k has the detections ``offsets[k]:offsets[k + 1]``, in time order, at least one.
-    time_s, u_icrs, sigma_rad : (n,), (n, 3), (n,) float
-        Times [s], unit vectors, and their 1-sigma errors an axis [rad].
-    gap_s
-        Longest gap bridged.
-    kept
-        Share of true links that the chi-square test lets pass, were the models exact.
-    interval_s
-        Between the instants compared: the sensor's frame interval.
-    q_rad2_s3
-        Process noise of both models: white acceleration [rad^2/s^3] across the gap, and the
-        same number of white jerk [rad^2/s^5] in the fragments. It decides what is linked.
+    rule
+        ``noise_rad2_s3`` is the process noise of both models: white acceleration [rad^2/s^3]
+        across the gap, and the same number of white jerk [rad^2/s^5] in the fragments. It
+        decides what is linked. The instants compared are ``interval_s`` apart.
 
     References
     ----------
     Cheng, Wang, Li et al. (2021); see the module.
     """
-    n = len(offsets) - 1
-    X_1, P_1, X_2, P_2 = (np.zeros((n, 3, 3)) for _ in range(4))
-    _filter_all(offsets, time_s, u_icrs, sigma_rad, False, float(q_rad2_s3), X_1, P_1)
-    _filter_all(offsets, time_s, u_icrs, sigma_rad, True, float(q_rad2_s3), X_2, P_2)
-    start, end = time_s[offsets[:-1]], time_s[offsets[1:] - 1]
-    limit = float(chdtri(DEGREES_OF_FREEDOM, 1.0 - kept))
-    earlier, later, D = _compare_all(
-        np.argsort(start, kind="stable"), start, end, float(gap_s), X_1, P_1, X_2, P_2,
-        float(interval_s), float(q_rad2_s3), limit,
-    )  # fmt: skip
-    return choose_links(earlier, later, limit - D, D, n)
+    tail = _filter_all(fragments, False, rule.noise_rad2_s3)
+    head = _filter_all(fragments, True, rule.noise_rad2_s3)
+    limit = float(chdtri(DEGREES_OF_FREEDOM, 1.0 - rule.kept))
+    by_start = np.argsort(head.at, kind="stable")
+    earlier, later, D = _compare_all(tail, head, by_start, rule, limit)
+    return choose_links(earlier, later, limit - D, D, len(head.at))

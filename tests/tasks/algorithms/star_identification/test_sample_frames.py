@@ -9,8 +9,8 @@ from scenes.random_stars import angle_between
 from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.star_identification.frames.frame import (
-    Frame,
-    Optics,
+    FieldOfView,
+    FrameCentroids,
     Search,
     identify_lost,
 )
@@ -32,10 +32,10 @@ class Sample:
     def __init__(self, name):
         self.data = data = dict(np.load(FRAMES / f"{name}.npz"))
         width, f = int(data["width"]), float(data["focal_px"])
-        # There the middle of the top-left pixel is (0.5, 0.5).
+        # In the samples, the middle of the top-left pixel is (0.5, 0.5).
         self.camera = Camera(width, width, f, f, width / 2 - 0.5, width / 2 - 0.5)
         half = width / 2 / f
-        self.optics = Optics(
+        self.optics = FieldOfView(
             self.camera.half_diagonal_rad, np.array([-half, half, -half, half]), 1 / f
         )
         stars = navigation_catalogue(
@@ -49,12 +49,12 @@ class Sample:
         d, rows = self.data, slice(self.data["offset"][k], self.data["offset"][k + 1])
         u = unproject(self.camera, d["x"][rows] - 0.5, d["y"][rows] - 0.5)
         sigma = max(float(d["sigma_px"][k]), 0.05) * pixel_angle(self.camera, u)
-        return Frame(u, sigma, d["mag"][rows].astype(float), np.zeros(3), self.optics)
+        return FrameCentroids(u, sigma, d["mag"][rows].astype(float), np.zeros(3), self.optics)
 
 
 def answers(name, how):
-    """Return how many of the sample frames are answered, right and wrong, as METHODS of the
-    field have it: boresight within 0.05 and roll within 0.5 degrees; boresight 0.25 off."""
+    """Return how many of the sample frames get a right answer and how many a wrong one. Right:
+    boresight within 0.05 and roll within 0.5 degrees. Wrong: boresight off by 0.25 degrees."""
     sample, right, wrong, grids = Sample(name), 0, 0, {}
     for k in range(180):
         seen = sample.frame(k)
@@ -78,7 +78,7 @@ def answers(name, how):
     ("name", "how", "least_right"),
     [
         ("a_fov20", CALIBRATED, 1.0),
-        ("b_fov12", CALIBRATED, 0.977),  # 178 have an attitude from their true stars
+        ("b_fov12", CALIBRATED, 0.977),  # 178 are solved with their true stars
         ("c_fov08", CALIBRATED, 1.0),
         ("a_fov20", HOW, 0.998),
         ("b_fov12", HOW, 0.972),

@@ -19,7 +19,7 @@ from scenes.random_stars import (
 from epipole.tasks.algorithms.catalogue.star_catalogue import limit_for_density
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, project, unproject
 from epipole.tasks.algorithms.star_identification import sensor
-from epipole.tasks.algorithms.star_identification.frames.frame import Frame
+from epipole.tasks.algorithms.star_identification.frames.frame import FrameCentroids
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
@@ -39,7 +39,7 @@ class Skies:
     def limit_for(self, stars_per_sr):
         return limit_for_density(CATALOGUE.magnitude, stars_per_sr)
 
-    @cache  # noqa: B019 - as long as the tests
+    @cache  # noqa: B019 - lives as long as the tests
     def sky(self, limit):
         return sky_to_limit(CATALOGUE, limit)
 
@@ -61,15 +61,15 @@ SKIES = Skies()
 
 
 class Shot(NamedTuple):
-    """A frame, its centroids' errors as stated [px], and how large a pixel is."""
+    """A frame, its centroids' stated errors [px], and the angle of a pixel there [rad]."""
 
-    frame: Frame
+    frame: FrameCentroids
     sigma_px: np.ndarray
     pixel_rad: np.ndarray
 
 
 def _shot(k, sigma_px, stated_px=np.nan, **how):
-    """Return a frame with an error that is stated as another, or not at all."""
+    """Return a frame, and its true stars; its errors are stated wrongly, or not at all."""
     seen, true = frame(SEEN, random_attitude(k), k, sigma_px, **how)
     return Shot(seen, np.full(len(seen.u), stated_px), seen.sigma_rad / sigma_px), true
 
@@ -99,7 +99,7 @@ def test_stars_and_attitudes_are_the_true_ones_among_many_false_points():
         np.testing.assert_array_equal(ids, want)
 
 
-def test_a_flux_that_tells_nothing_is_left_aside():
+def test_a_flux_unrelated_to_brightness_is_not_used():
     rng = np.random.default_rng(0)
     spots = [_shot(k, 0.3)[0] for k in range(15)]
     spots = [
@@ -115,7 +115,7 @@ def test_a_limit_that_is_set_is_kept():
     assert found.solutions.solved.all()
 
 
-def test_one_frame_and_frames_without_stars_are_borne():
+def test_one_frame_alone_and_frames_without_stars_get_a_status():
     assert _identify([_shot(0, 0.3)[0]]).status == [None]
     dark = [_shot(k, 0.3, n_false=5, missing=1.0)[0] for k in range(4)]
     assert set(_identify(dark).status) <= {"no_match", "time_limit"}

@@ -1,4 +1,4 @@
-"""What a sensor's own stars tell about it."""
+"""What a sensor's stars tell about it."""
 
 import numpy as np
 import pytest

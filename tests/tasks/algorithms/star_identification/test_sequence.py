@@ -37,7 +37,7 @@ def _pairs():
 
 
 def _turning(n, rate=0.005, seed=0):
-    """Return the attitudes of a sensor that turns evenly, one a second."""
+    """Return the attitudes of a sensor that turns evenly, one per second."""
     first = random_attitude(seed)
     axis = np.array([0.5, -0.7, 0.4])
     return [Rotation.from_rotvec(rate * k * axis).as_matrix() @ first for k in range(n)]
@@ -55,13 +55,13 @@ def _remembering(*fixes):
     """Return the memory of a sensor with these times and attitudes, known to an arc second."""
     memory = new_memory(1)
     for t_s, R in fixes:
-        remember(t_s, R, P_FIX, memory.t_s, memory.R, memory.P, memory.held)
+        remember(memory, t_s, R, P_FIX)
     return memory
 
 
 def _predict(memory, t_s):
     R, P = np.empty((3, 3)), np.empty((3, 3))
-    return predict(t_s, memory.t_s, memory.R, memory.P, memory.held, R, P), R, P
+    return predict(memory, t_s, R, P), R, P
 
 
 def test_a_turning_sensor_is_predicted_to_where_it_turns():
@@ -105,7 +105,7 @@ def test_after_the_first_frames_no_search_is_needed():
 
 
 def test_stars_of_a_sensor_that_turns_far_are_those_of_its_field():
-    # Ten times as far as stars are kept around a field.
+    # Ten times the margin within which stars around a field are listed.
     R = _turning(100, rate=0.006)
     frames, true = zip(*[frame(CATALOGUE, r, k, n_false=3) for k, r in enumerate(R)], strict=True)
     for solution, star in zip(_identify(list(frames))[0], true, strict=True):

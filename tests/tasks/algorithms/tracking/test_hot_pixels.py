@@ -1,4 +1,4 @@
-"""Hot pixels: found wherever light could not do the same; what is followed is left alone."""
+"""Hot pixels: found where light cannot do the same; objects that the sensor follows are not."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def turning(rate_rad_s, time_s, axis=(1.0, 0.0, 0.0)):
 
 
 def image(seed, n_frames, fixed, n_false=5, noise=SIGMA):
-    """Detections of fixed places and strays: frame, x, y, and which are of a fixed place."""
+    """Return detections at fixed places and false alarms: frame, x, y, and which are fixed."""
     rng = np.random.default_rng(seed)
     frame, x, y, is_fixed = [], [], [], []
     for f in range(n_frames):

@@ -1,4 +1,4 @@
-"""Local motion: exact on a great circle, honest with noise, never worse for fast objects."""
+"""Local motion: exact on a great circle, true errors with noise, no worse for fast objects."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Tracking: objects slow and fast are followed through misses, strays do not make tracks."""
+"""Tracking: slow and fast objects are followed through misses; false alarms make no tracks."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,8 @@ SIGMA = 2 * ARCSEC
 
 
 def scene(seed, *, n_objects, n_false, n_frames, rate_arcsec_s, missed=0.05, axis=(0.3, 0.5, 0.8)):
-    """Detections of objects on great circles among strays: frames, directions, who they are."""
+    """Return detections of objects on great circles among false alarms: frame times and offsets,
+    directions, and the object of each."""
     rng = np.random.default_rng(seed)
     centre = np.array(axis) / np.linalg.norm(axis)
     basis = tangent_basis(centre)

@@ -38,7 +38,7 @@ def test_only_the_brightest_centroids_are_searched():
     seen, _ = frame(CATALOGUE, random_attitude(0), 0)
     rng = np.random.default_rng(0)
     more = frame(CATALOGUE, random_attitude(0), 0, n_false=3000)[0]
-    # 3,000 false points, all fainter than the stars, and of which most are not looked at.
+    # 3,000 false centroids, all fainter than the stars: most of them are not used.
     n = len(seen.u)
     crowded = more._replace(
         u=np.concatenate([seen.u, more.u[rng.permutation(len(more.u))[:3000]]]),
@@ -46,4 +46,4 @@ def test_only_the_brightest_centroids_are_searched():
         instrumental_mag=np.concatenate([seen.instrumental_mag, np.full(3000, -13.0)]),
     )
     assert n < N_SEARCHED
-    assert search_lost(crowded, sky, grid, pairs, HOW).found
+    assert search_lost(crowded, sky, grid, pairs, HOW).is_clear

@@ -19,12 +19,14 @@ from epipole.tasks.algorithms.catalogue.star_catalogue import (
     navigation_catalogue,
 )
 from epipole.tasks.algorithms.geometry.camera import pixel_angle
-from epipole.tasks.algorithms.star_identification.frames.frame import Frame, identify_lost
-from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
-    identify_published,
-    matcher,
-    solve_matches,
+from epipole.tasks.algorithms.star_identification.frames.frame import FrameCentroids, identify_lost
+from epipole.tasks.algorithms.star_identification.published import (
+    four_base_stars,
+    match_group,
+    radial_cyclic,
 )
+from epipole.tasks.algorithms.star_identification.published.frame_by_frame import solve_matches
+from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
     pattern_pairs,
     pattern_size,
@@ -32,7 +34,11 @@ from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
     sky_to_limit,
 )
 
-METHODS = ["four_base_stars", "match_group", "radial_cyclic"]
+METHODS = [
+    four_base_stars.identify_by_four_base_stars,
+    match_group.identify_by_match_group,
+    radial_cyclic.identify_by_radial_cyclic,
+]
 NEEDS_MAPS = pytest.mark.skipif(not SEEDS.is_file(), reason="the shared star maps are not here")
 
 
@@ -54,7 +60,7 @@ def skies(maps):
 
 def as_frame(kind, u, sigma_rad, magnitude=None):
     mag = np.full(len(u), np.nan) if magnitude is None else magnitude
-    return Frame(u, sigma_rad, mag, np.zeros(3), optics(kind.camera))
+    return FrameCentroids(u, sigma_rad, mag, np.zeros(3), optics(kind.camera))
 
 
 def solved(maps, skies, method):
@@ -62,7 +68,7 @@ def solved(maps, skies, method):
     right = set()
     for number, (kind, u, sigma_rad, star_id, R) in maps.items():
         sky, seen = skies[number], as_frame(kind, u, sigma_rad)
-        star = matcher(method, sky, seen.optics)(u, sigma_rad)
+        star = method.make_matcher(sky, seen.optics)(u, sigma_rad)
         solution = solve_matches(seen, sky, star, HOW.gate_sigma)
         if solution is None:
             continue
@@ -75,20 +81,20 @@ def solved(maps, skies, method):
 
 @NEEDS_MAPS
 def test_the_match_group_fails_on_the_noisy_maps_3_and_6_as_published(maps, skies):
-    assert solved(maps, skies, "match_group") == {1, 2, 4, 5, 7, 8}
+    assert solved(maps, skies, match_group) == {1, 2, 4, 5, 7, 8}
 
 
 @NEEDS_MAPS
 def test_radial_and_cyclic_features_fail_where_stars_are_missing_as_published(maps, skies):
-    # Published: 4, 5 and 8 fail. Rebuilt, the noisy maps 3 and 6 fail as well: their fields
-    # show too few stars all of whose neighbours are in view.
-    assert solved(maps, skies, "radial_cyclic") == {1, 2, 7}
+    # Published: 4, 5 and 8 fail. Here the noisy maps 3 and 6 fail as well: in their fields, too few
+    # stars have all their neighbours in view.
+    assert solved(maps, skies, radial_cyclic) == {1, 2, 7}
 
 
 @NEEDS_MAPS
 def test_four_base_stars_need_a_fifth_that_agrees(maps, skies):
-    # Map 3 has four stars in their place.
-    assert solved(maps, skies, "four_base_stars") == {1, 2, 4, 5, 6, 7, 8}
+    # Map 3 has only four stars in place.
+    assert solved(maps, skies, four_base_stars) == {1, 2, 4, 5, 6, 7, 8}
 
 
 def by_default(maps, skies, number):
@@ -119,8 +125,8 @@ def test_the_default_solves_all_eight_maps_without_brightness(skies, seed):
 
 @NEEDS_MAPS
 def test_with_ten_times_the_error_only_map_3_may_be_refused(maps, skies):
-    # Four of its seven stars are in their place: without brightness, too few to be sure at
-    # the usual false-alarm probability of one in a million.
+    # Four of its seven stars are in place: without brightness, these are too few at a false-alarm
+    # probability of one in a million.
     for number in maps:
         solution = by_default(maps, skies, number)
         assert solution is not None or number == 3, number
@@ -129,7 +135,7 @@ def test_with_ten_times_the_error_only_map_3_may_be_refused(maps, skies):
 
 
 class OneSky:
-    """Skies that are all one catalogue."""
+    """Skies of one catalogue, whatever the limit."""
 
     def __init__(self, catalogue: NavigationCatalogue):
         self.whole = sky_to_limit(catalogue, 99.0)
@@ -147,6 +153,11 @@ def spots(frames, camera):
     return join_spots(frames, sigma_px, pixel_rad)
 
 
+def identify(method, frames, catalogue):
+    n = len(frames.counts)
+    return method(np.arange(n) * 1.0, frames, no_priors(n), OneSky(catalogue), None, HOW)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_frames_get_their_attitude_and_a_status(method):
     catalogue = random_sky(3000)
@@ -154,9 +165,7 @@ def test_frames_get_their_attitude_and_a_status(method):
     empty = frames[0]._replace(
         u=np.empty((0, 3)), sigma_rad=np.empty(0), instrumental_mag=np.empty(0)
     )
-    found = identify_published(
-        spots([*frames, empty], CAMERA), OneSky(catalogue), None, method, HOW
-    )
+    found = identify(method, spots([*frames, empty], CAMERA), catalogue)
     off = [
         angle_between(s.R_sensor_from_icrs, random_attitude(k))
         for k, s in enumerate(found.solutions.each())
@@ -174,7 +183,7 @@ def test_errors_that_are_not_stated_follow_from_the_residuals(method):
     frames = [frame(catalogue, random_attitude(k), k, sigma_px=0.3)[0] for k in range(12)]
     given = spots(frames, CAMERA)
     unknown = given._replace(sigma_px=np.full(len(given.u), np.nan))
-    found = identify_published(unknown, OneSky(catalogue), None, method, HOW)
+    found = identify(method, unknown, catalogue)
     assert 0.25 < found.sigma_scale < 0.35
 
 
@@ -183,6 +192,6 @@ def test_centroids_all_on_one_spot_are_refused(method):
     catalogue = random_sky(3000)
     seen = frame(catalogue, random_attitude(0), 0)[0]
     spot = spots([seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0))], CAMERA)
-    found = identify_published(spot, OneSky(catalogue), None, method, HOW)
+    found = identify(method, spot, catalogue)
     assert not found.solutions.solved.any()
     assert found.status == ["no_match"]

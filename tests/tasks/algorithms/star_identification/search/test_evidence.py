@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.star_identification.search.evidence import (
+    MatchRule,
     choice_lost,
     choice_predicted,
     log_brightness_ratio,
@@ -19,20 +20,24 @@ AREA = 0.04
 FLAT = log_magnitude_density(np.linspace(-2, 16, 10_000))
 
 
+def _rule(zero_point):
+    return MatchRule(3.7, FLAT, zero_point, 0.4, 11.5, 18.5)
+
+
 def _evidence(star_of, chi2=0.0, n_stars=5, instrumental=None, magnitude=None, zero=math.nan):
     n = len(star_of)
     instrumental = np.full(n, np.nan) if instrumental is None else instrumental
     magnitude = np.full(n_stars, 5.0) if magnitude is None else magnitude
     return match_evidence(
-        np.array(star_of), np.full(n, chi2), np.full(n, SIGMA), instrumental, magnitude, FLAT,
-        zero, 0.4, float(n_stars), AREA,
+        np.array(star_of), np.full(n, chi2), np.full(n, SIGMA), instrumental, magnitude,
+        _rule(zero), float(n_stars), AREA,
     )  # fmt: skip
 
 
 def test_the_evidence_of_three_matches_is_what_the_formula_gives():
     total, matches = _evidence([0, 1, -1, 4], chi2=2.0)
     one = math.log(AREA / (2 * math.pi * SIGMA**2)) - 1.0
-    # n! / (n - k)!, the integral of 4 p^3 p^k (1 - p)^(m - k), and one false rather than four.
+    # n! / (n - k)!, the integral of 4 p^3 p^k (1 - p)^(m - k), and one false centroid, not four.
     ways = math.factorial(4) / (4 * math.factorial(6) * math.factorial(2) / math.factorial(9))
     ways *= (1 + 1) / (4 + 1)
     assert matches == 3
@@ -40,8 +45,8 @@ def test_the_evidence_of_three_matches_is_what_the_formula_gives():
 
 
 def test_averaged_over_chance_the_evidence_is_below_one():
-    # Markov's inequality rests on this: the mean of its exponential over random frames of
-    # up to six centroids, as often as the prior has them, and one star, the best assignment taken.
+    # Markov's inequality rests on this: the mean of the evidence's exponential over random frames
+    # with one star and up to six centroids, weighted by the prior, under the best assignment.
     rng = np.random.default_rng(0)
     side, sigma = math.sqrt(AREA), 0.01
     mean, weight = np.zeros(7), 1.0 / np.arange(1.0, 8.0)
@@ -50,7 +55,7 @@ def test_averaged_over_chance_the_evidence_is_below_one():
         d2 = np.sum((u - side / 2) ** 2, axis=2).min(axis=1) / sigma**2
         lone = match_evidence(
             np.where(np.arange(n) == 0, 0, -1), np.zeros(n), np.full(n, sigma),
-            np.full(n, np.nan), np.array([5.0]), FLAT, math.nan, 0.4, 1.0, AREA,
+            np.full(n, np.nan), np.array([5.0]), _rule(math.nan), 1.0, AREA,
         )[0]  # fmt: skip
         mean[n] = np.mean(np.exp(lone - 0.5 * d2))
     assert 0.5 < np.sum(mean * weight) / np.sum(weight) < 1.0

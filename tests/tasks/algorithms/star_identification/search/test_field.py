@@ -1,4 +1,4 @@
-"""Identification next to a known attitude."""
+"""Identification near a known attitude."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Identification with no prior."""
+"""Identification without a prior."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def test_a_search_ends_when_its_bound_is_reached(grid, pairs):
     seen, _ = frame(CATALOGUE, random_attitude(0), 0, 1.0, 60, 1.0)
     verdict = search_lost(seen, SKY, grid, pairs, HOW._replace(time_limit_s=1e-3))
     assert verdict.exhausted
-    assert not verdict.found
+    assert not verdict.is_clear
 
 
 def test_centroids_all_on_one_spot_are_refused(grid, pairs):
@@ -101,7 +101,7 @@ def test_thousands_of_false_centroids_end_without_an_answer(sigma_px, grid, pair
 
 
 def test_the_work_of_a_search_is_bounded_by_the_time_it_is_given(grid, pairs):
-    # What work costs is measured in the benchmark: a test asserts no time.
+    # The benchmark measures the time of a unit of work: tests assert no time.
     crowd, _ = frame(CATALOGUE, random_attitude(0), 0, 4.0, 4000, 1.0)
     exhausted = [
         search_lost(crowd, SKY, grid, pairs, HOW._replace(time_limit_s=t)).exhausted

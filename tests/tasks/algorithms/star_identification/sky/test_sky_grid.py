@@ -1,4 +1,4 @@
-"""Looking up the catalogue by direction."""
+"""Look-ups in the catalogue by direction."""
 
 import numpy as np
 from hypothesis import given, settings

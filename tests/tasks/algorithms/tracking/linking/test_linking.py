@@ -1,4 +1,4 @@
-"""Track linking: fragments of one object are joined, others stay alone; both methods."""
+"""Track linking, both methods: fragments of one object are joined, others stay alone."""
 
 import numpy as np
 import pytest
@@ -9,24 +9,35 @@ from scipy.stats import chi2 as chi_square
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
-from epipole.tasks.algorithms.tracking.linking.chains import NONE, chain_heads, choose_links
+from epipole.tasks.algorithms.tracking.linking.chains import (
+    NONE,
+    Fragments,
+    LinkRule,
+    chain_heads,
+    choose_links,
+)
 from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
 from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction
 
 SIGMA = 4 * ARCSEC
 
 
-def by_likelihood(offsets, time_s, u, sigma, gap_s=90.0):
-    return link_by_likelihood(
-        offsets, time_s, u, sigma, gap_s=gap_s, kept=0.9999, field_sr=np.radians(8.0) ** 2
+def rule(gap_s):
+    return LinkRule(
+        gap_s=gap_s,
+        kept=0.9999,
+        field_sr=np.radians(8.0) ** 2,
+        interval_s=1.0,
+        noise_rad2_s3=1e-3 * (28 * ARCSEC) ** 2,
     )
 
 
-def by_prediction(offsets, time_s, u, sigma, gap_s=90.0):
-    return link_by_prediction(
-        offsets, time_s, u, sigma, gap_s=gap_s, kept=0.9999, interval_s=1.0,
-        q_rad2_s3=1e-3 * (28 * ARCSEC) ** 2,
-    )  # fmt: skip
+def by_likelihood(*fragments, gap_s=90.0):
+    return link_by_likelihood(Fragments(*fragments), rule(gap_s))
+
+
+def by_prediction(*fragments, gap_s=90.0):
+    return link_by_prediction(Fragments(*fragments), rule(gap_s))
 
 
 METHODS = pytest.mark.parametrize("link", [by_likelihood, by_prediction])
@@ -119,7 +130,7 @@ def test_broken_tracks_of_orbiting_objects_are_joined(link, n_objects, gap_s):
 
 
 def test_the_likelihood_statistic_has_its_degrees_of_freedom_where_two_are_one_object():
-    # Motions drawn from the prior: then its mean is 4, two for each axis.
+    # Motions drawn from the prior: then the mean is 4, two for each axis.
     rate = 40 * ARCSEC
     bend = (rate**2 + 1e-3 * rate + 2.5e-7) / ARCSEC
     rng = np.random.default_rng(6)
@@ -173,7 +184,7 @@ def test_the_likelihood_statistic_is_that_of_least_squares():
         return np.sum((z - A / scale @ fit) ** 2)
 
     expected = misfit(slice(None)) - misfit(slice(0, 12)) - misfit(slice(12, None))
-    # The prior acts on what is left after the straight drift, as here: it leaves lines free.
+    # The prior acts on the motion without its straight drift, as here: lines are free.
     assert by_likelihood(offsets, t, u, sigma).chi2[1] == pytest.approx(max(expected, 0), abs=1e-3)
 
 
