@@ -16,18 +16,16 @@ from epipole.schemas.bridge import table, unstack
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Orbit, Scene, SceneCamera, SceneSensor
 from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_POINTS
+from epipole.tasks.algorithms.simulation.constants import ARCSEC, GM_KM3_S2, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposing, Exposures
 from epipole.tasks.algorithms.simulation.optics import Optics, field_radius
 from epipole.tasks.algorithms.simulation.orbits import (
-    GM_KM3_S2,
     circular_velocity,
     elements_from_state,
     mean_from_true_anomaly,
     state_at,
 )
 from epipole.tasks.algorithms.simulation.sensor import (
-    ARCSEC,
-    SECOND_NS,
     Sensor,
     frame_times,
     random_stream,

@@ -3,10 +3,9 @@
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
 
-GM_KM3_S2 = 398600.4418
-EARTH_RADIUS_KM = 6378.137
+Array = npt.NDArray[np.float64]
 
 
 def eccentric_anomaly(mean: Array, e: Array) -> Array:

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from epipole.tasks.algorithms.simulation.orbits import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM
 
 Array = npt.NDArray[np.float64]
 

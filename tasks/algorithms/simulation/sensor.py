@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from epipole.tasks.algorithms.simulation.constants import SECOND_NS
 from epipole.tasks.algorithms.simulation.optics import Optics
 from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.pointing import look_along, random_attitudes, spinning
@@ -14,9 +15,6 @@ from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
-
-ARCSEC = np.pi / 648000.0
-SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,10 @@
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.simulation.orbits import EARTH_RADIUS_KM, state_at
+from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM, LIGHT_KM_S
+from epipole.tasks.algorithms.simulation.orbits import state_at
 
 Array = npt.NDArray[np.float64]
-
-LIGHT_KM_S = 299792.458
 
 
 def boost(n: Array, v_km_s: Array) -> Array:

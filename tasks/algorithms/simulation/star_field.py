@@ -5,14 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.simulation.ephemeris import AU_KM
-from epipole.tasks.algorithms.simulation.sightlines import LIGHT_KM_S
+from epipole.tasks.algorithms.simulation.constants import (
+    AU_KM,
+    DAY_S,
+    JULIAN_YEAR_DAYS,
+    LIGHT_KM_S,
+    MILLIARCSEC,
+)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MAS = np.pi / 648e6  # rad
-JULIAN_YEAR_S = 365.25 * 86400
+JULIAN_YEAR_S = JULIAN_YEAR_DAYS * DAY_S
 
 
 @dataclass(frozen=True)
@@ -58,9 +62,9 @@ def star_field(
         star_id=star_id[order],
         magnitude=magnitude[order],
         place=np.stack([cos_d * cos_a, cos_d * sin_a, sin_d], axis=1),
-        motion=motion * MAS,
+        motion=motion * MILLIARCSEC,
         # A negative parallax is a measuring error, not a place.
-        parallax=np.maximum(parallax_mas[order], 0.0) * MAS,
+        parallax=np.maximum(parallax_mas[order], 0.0) * MILLIARCSEC,
         epoch=epoch,
         key=key,
         zone_rad=zone_rad,

@@ -14,8 +14,9 @@ from epipole.io.simulation.truth import read_truth
 from epipole.schemas.bridge import array, flatten, stack
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import parse_scene, validate_scene
+from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.simulation.exposures import Exposing
-from epipole.tasks.algorithms.simulation.orbits import EARTH_RADIUS_KM, state_at
+from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.sensor import frame_times
 from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
 from epipole.tasks.algorithms.simulation.star_field import star_field, stars_in_cones

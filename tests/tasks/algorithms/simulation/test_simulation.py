@@ -27,13 +27,14 @@ from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import validate_scene
 from epipole.schemas.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
 from epipole.tasks.algorithms.catalogue.catalogue_join import moved
+from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
 from epipole.tasks.algorithms.simulation.ephemeris import (
     barycentric_julian_date,
     earth_at,
     julian_years_since,
 )
 from epipole.tasks.algorithms.simulation.optics import Optics, image_place
-from epipole.tasks.algorithms.simulation.orbits import GM_KM3_S2, elements_from_state, state_at
+from epipole.tasks.algorithms.simulation.orbits import elements_from_state, state_at
 from epipole.tasks.algorithms.simulation.sightlines import boost, received_from
 from epipole.tasks.algorithms.simulation.star_field import star_directions, star_field
 from epipole.tasks.simulate.simulate_scene import expose_blocks, simulate_scene
