@@ -16,11 +16,10 @@ from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.truth import SUFFIX, TruthWriter
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Scene, validate_scene
-from epipole.tasks.algorithms.simulation.constants import SECOND_NS
+from epipole.tasks.algorithms.simulation.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposures
 from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.sensor import (
-    ARCSEC,
     Attitudes,
     Beliefs,
     Sensor,
