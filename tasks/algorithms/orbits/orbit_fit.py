@@ -51,6 +51,23 @@ class Arcs(NamedTuple):
     sigma_km: Array
 
 
+class ArcViews(NamedTuple):
+    """Views of a single arc, for the compiled loops.
+
+    time_s, sensor, r_km, u
+        As in `Arcs`, the sensors numbered from 0.
+    basis, weight : (n, 2, 3), (n, 2, 2) float
+        Tangent bases of the directions, and inverse covariances of the noise [rad^-2].
+    """
+
+    time_s: Array
+    sensor: Indices
+    r_km: Array
+    u: Array
+    basis: Array
+    weight: Array
+
+
 @kernel
 def _rates(y, out):
     """Write the rates of a state (6) and its transition matrix (36, row by row)."""
@@ -169,8 +186,9 @@ def _accumulate(y, view, shared, N, rhs, at):
 
 
 @kernel
-def _add_views(state, errors, time_s, sensor, r, u, basis, weight, N, rhs):
+def _add_views(state, errors, views, N, rhs):
     """Add all views to the normal equations at a state; return their chi-square."""
+    time_s, sensor, r, u, basis, weight = views
     chi2 = 0.0
     middle = np.searchsorted(time_s, 0.0)
     for later in range(2):
@@ -188,18 +206,7 @@ def _add_views(state, errors, time_s, sensor, r, u, basis, weight, N, rhs):
     return chi2
 
 
-class _Views(NamedTuple):
-    """One arc's views: as in `Arcs`, with the tangent basis and the inverse of the noise."""
-
-    time_s: Array
-    sensor: Indices
-    r_km: Array
-    u: Array
-    basis: Array
-    weight: Array
-
-
-def _fit(state: Array, prior: Array, views: _Views) -> tuple[Array, Array, float]:
+def _fit(state: Array, prior: Array, views: ArcViews) -> tuple[Array, Array, float]:
     """Return state, covariance and chi-square of one arc from a start; NaN where it fails."""
     failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan
     n_sensors = len(prior)
@@ -211,18 +218,7 @@ def _fit(state: Array, prior: Array, views: _Views) -> tuple[Array, Array, float
     for _ in range(ITERATIONS):
         pull = (prior @ errors[:, :, None])[:, :, 0]
         N, rhs = at_prior.copy(), np.concatenate([np.zeros(6), -pull.ravel()])
-        chi2 = float(np.sum(errors * pull)) + _add_views(
-            state,
-            errors,
-            views.time_s,
-            views.sensor,
-            views.r_km,
-            views.u,
-            views.basis,
-            views.weight,
-            N,
-            rhs,
-        )
+        chi2 = float(np.sum(errors * pull)) + _add_views(state, errors, views, N, rhs)
         if not (np.isfinite(chi2) and (np.diag(N) > 0.0).all()):
             return failed
         # Kilometres, km/s and radians: scaled alike before anything is solved.
@@ -281,7 +277,7 @@ def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
         if own.stop - own.start < 3:
             state[k] = np.nan
             continue
-        views = _Views(
+        views = ArcViews(
             arcs.time_s[own], sensor.astype(np.int64), arcs.r_km[own], arcs.u[own], basis[own],
             weight[own],
         )  # fmt: skip

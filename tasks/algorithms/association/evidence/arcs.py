@@ -108,7 +108,7 @@ def _begin(views, x, seen_by, state):
 
 
 @kernel
-def _normal_equations(views, members, n, first, state, at, k, N, rhs):
+def _normal_equations(views, members, first, state, at, k, N, rhs):
     """Write the normal equations of the orbit; return chi-square, NaN behind a sensor.
 
     `at` gets the states at the instants. The partials are those of motion in the gravity
@@ -127,8 +127,7 @@ def _normal_equations(views, members, n, first, state, at, k, N, rhs):
             _fall(y, views.time_s[m] - views.time_s[m - 1], k)
         at[m] = y
         t = views.time_s[m] - views.time_s[first]
-        for q in range(n):
-            i = members[q]
+        for i in members:
             if not views.seen[i, m]:
                 continue
             if residual(views, i, m, y, part) == 0.0:
@@ -181,7 +180,7 @@ def _scatter(views, chance, i, begun, ended, b):
 
 
 @kernel
-def _usual_velocity(views, chance, members, n, first, state, prior, usual):
+def _usual_velocity(views, chance, members, first, state, prior, usual):
     """Write the prior of the velocity, its mean and inverse covariance; return its log norm.
 
     Across the line of sight objects move as the tracklets of the sensor do whose tracklets
@@ -190,8 +189,7 @@ def _usual_velocity(views, chance, members, n, first, state, prior, usual):
     radius = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     along = RADIAL_SHARE * np.sqrt(GM_KM3_S2 / radius)
     across, chosen, cost, b = 0.0, members[0], 0.0, np.empty(3)
-    for q in range(n):
-        i = members[q]
+    for i in members:
         begun, ended = _ends(views, i, first)
         if begun == ended:
             continue
@@ -287,7 +285,7 @@ def _leaves(state, L):
 
 
 @kernel
-def arc_odds(views, chance, members, n, x, seen_by):
+def arc_odds(views, chance, members, points):
     """Return the log-odds that the members' directions are one orbit's rather than their own.
 
     Without what the place is worth (see `score`) and without absences. -inf where there is no
@@ -296,11 +294,11 @@ def arc_odds(views, chance, members, n, x, seen_by):
     state, k = np.empty(6), np.empty((5, 6))
     at = np.empty((len(views.time_s), 6))
     N, rhs, prior, usual = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty(3)
-    first = _begin(views, x, seen_by, state)
-    log_prior = _usual_velocity(views, chance, members, n, first, state, prior, usual)
+    first = _begin(views, points.x_km, points.seen_by, state)
+    log_prior = _usual_velocity(views, chance, members, first, state, prior, usual)
     chi2 = log_det = gain = np.inf
     for _ in range(ITERATIONS):
-        chi2 = _normal_equations(views, members, n, first, state, at, k, N, rhs)
+        chi2 = _normal_equations(views, members, first, state, at, k, N, rhs)
         for a in range(3):
             for b in range(3):
                 N[3 + a, 3 + b] += prior[a, b]
@@ -321,6 +319,6 @@ def arc_odds(views, chance, members, n, x, seen_by):
     if _leaves(state, N):
         return -np.inf
     total = log_prior + 3.0 * LN_2PI - 0.5 * log_det - 0.5 * (chi2 - gain)
-    for q in range(n):
-        total -= _own_odds(views, chance, members[q], first, at)
+    for i in members:
+        total -= _own_odds(views, chance, i, first, at)
     return total
