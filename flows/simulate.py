@@ -22,7 +22,7 @@ from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.sensor import (
     Attitudes,
     Beliefs,
-    Sensor,
+    SimulatedSensor,
     seconds_since,
     state_times,
 )
@@ -237,7 +237,7 @@ class _States:
     """The states of one sensor, sent in order of time up to a moment."""
 
     def __init__(self, simulation: Simulation, k: int) -> None:
-        self.sensor: Sensor = simulation.sensors[k]
+        self.sensor: SimulatedSensor = simulation.sensors[k]
         self._told = simulation.told[k].states
         self._attitudes, self._beliefs = Attitudes(self.sensor), Beliefs(self.sensor)
         self._times, self._sent = state_times(self.sensor), 0

@@ -13,7 +13,7 @@ from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.columns import upper_triangle
 from epipole.schemas.settings import Settings
-from epipole.tasks.algorithms.orbits.object_linking import Seen, chains, link_by_motion
+from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, chains, link_by_motion
 
 Array = npt.NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> d
     if not len(ends):
         return {}
     origin = ends["first"].min()
-    seen = Seen(
+    seen = ObservedMotions(
         *(_seconds(ends, name, origin) for name in ("first", "last", "head_epoch", "tail_epoch")),
         *(ends.select(_named(side, [*PLACE, *VELOCITY])).to_numpy() for side in ("head", "tail")),
         *(_covariance(ends, side) for side in ("head", "tail")),

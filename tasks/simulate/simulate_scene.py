@@ -18,7 +18,7 @@ from epipole.schemas.scene import Orbit, Scene, SceneCamera, SceneSensor
 from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_POINTS
 from epipole.tasks.algorithms.simulation.constants import ARCSEC, GM_KM3_S2, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposing, Exposures
-from epipole.tasks.algorithms.simulation.optics import Optics, field_radius
+from epipole.tasks.algorithms.simulation.optics import TrueOptics, field_radius
 from epipole.tasks.algorithms.simulation.orbits import (
     circular_velocity,
     elements_from_state,
@@ -26,7 +26,7 @@ from epipole.tasks.algorithms.simulation.orbits import (
     state_at,
 )
 from epipole.tasks.algorithms.simulation.sensor import (
-    Sensor,
+    SimulatedSensor,
     frame_times,
     random_stream,
 )
@@ -46,7 +46,7 @@ class Simulation:
 
     scene: Scene
     t0_ns: int
-    sensors: list[Sensor]
+    sensors: list[SimulatedSensor]
     told: list[SceneSensor]  # the scene's words on each of them
     targets: Array  # (n, 6) elements at t0
     target_magnitude: Array
@@ -56,7 +56,7 @@ def simulate_scene(scene: Scene) -> Simulation:
     """Return the sensors and objects of a scene; the same scene gives the same ones."""
     t0_ns = round(scene.start.timestamp() * 1e6) * 1000
     targets, magnitude = _targets(scene)
-    sensors: list[Sensor] = []
+    sensors: list[SimulatedSensor] = []
     told: list[SceneSensor] = []
     for group in scene.sensors:
         for number in range(1, group.count + 1):
@@ -123,7 +123,7 @@ def true_tables(sensor_id: str, seen: Exposures) -> tuple[pa.Table, pa.Table]:
     return frames, points
 
 
-def sent_optics(camera: SceneCamera) -> Optics:
+def sent_optics(camera: SceneCamera) -> TrueOptics:
     """Return the optics that the log tells of."""
     if camera.focal_px is not None:
         focal = camera.focal_px
@@ -132,10 +132,10 @@ def sent_optics(camera: SceneCamera) -> Optics:
     cx = (camera.width - 1) / 2 if camera.cx_px is None else camera.cx_px
     cy = (camera.height - 1) / 2 if camera.cy_px is None else camera.cy_px
     lens = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
-    return Optics(camera.width, camera.height, focal, focal, cx, cy, *lens)
+    return TrueOptics(camera.width, camera.height, focal, focal, cx, cy, *lens)
 
 
-def true_optics(camera: SceneCamera) -> Optics:
+def true_optics(camera: SceneCamera) -> TrueOptics:
     """Return the optics that make the image."""
     sent, off = sent_optics(camera), camera.departure
     return sent._replace(
@@ -218,7 +218,7 @@ def _spread(orbit: Orbit, spread_km: float, rng: np.random.Generator) -> Array:
 
 def _sensor(
     scene: Scene, group: SceneSensor, name: str, index: int, t0_ns: int, targets: Array
-) -> Sensor:
+) -> SimulatedSensor:
     rng = random_stream(scene.seed, index, "sensor")
     pointing, detection, states = group.pointing, group.detection, group.states
     phase = float(rng.random()) if group.phase is None else group.phase
@@ -228,7 +228,7 @@ def _sensor(
         followed = _elements(pointing.orbit, rng) if pointing.orbit else np.zeros(6)
     ra, dec = math.radians(pointing.ra_deg or 0.0), math.radians(pointing.dec_deg or 0.0)
     noise_arcsec = states.prior_noise_arcsec
-    return Sensor(
+    return SimulatedSensor(
         sensor_id=name,
         index=index,
         seed=scene.seed,

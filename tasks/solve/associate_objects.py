@@ -13,7 +13,7 @@ from epipole.schemas.tables import REJECTS
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
 from epipole.tasks.algorithms.association.sampling.samples import Groups, Samples
-from epipole.tasks.algorithms.association.verdicts import Seen, Verdicts
+from epipole.tasks.algorithms.association.verdicts import NightViews, Verdicts
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.orbits.object_identity import ObjectRegistry
 from epipole.tasks.algorithms.sensor_faults.agreement import agreement
@@ -237,10 +237,10 @@ class _Night:
         cuts = np.flatnonzero(np.diff(span)) + 1
         return np.split(np.arange(len(span)), cuts)
 
-    def seen(self, spans: list[Indices]) -> Seen:
+    def seen(self, spans: list[Indices]) -> NightViews:
         """Return what each row is of."""
         span = np.repeat(np.arange(len(spans)), [len(rows) for rows in spans])
-        return Seen(self.epoch_ns, span, self.tracklet, self.sensor)
+        return NightViews(self.epoch_ns, span, self.tracklet, self.sensor)
 
     def samples(self, rows: Indices, instants: Indices) -> tuple[Samples, Indices]:
         """Return the tracklets that are seen at some epochs, and which tracklets they are."""

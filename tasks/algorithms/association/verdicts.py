@@ -20,7 +20,7 @@ Flags = npt.NDArray[np.bool_]
 LONGER = 2.0  # times the time over which a tracklet was judged, to judge it again
 
 
-class Seen(NamedTuple):
+class NightViews(NamedTuple):
     """Views of a night, a row each: epoch [ns], number of the span, tracklet and sensor."""
 
     epoch_ns: Indices
@@ -30,9 +30,9 @@ class Seen(NamedTuple):
 
 
 class Verdicts:
-    """The group of each row of `Seen`, numbered through the night; FREE where it is of none."""
+    """The group of each row of `NightViews`, numbered through the night; FREE where it is of none."""
 
-    def __init__(self, seen: Seen) -> None:
+    def __init__(self, seen: NightViews) -> None:
         n = len(seen.epoch_ns)
         self.seen = seen
         self.group = np.full(n, FREE)

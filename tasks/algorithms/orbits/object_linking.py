@@ -32,7 +32,7 @@ ACCELERATION_KM_S2 = 1e-8
 SHARE_OF_GRAVITY = 1e-5
 
 
-class Seen(NamedTuple):
+class ObservedMotions(NamedTuple):
     """Objects as they were seen: when, and their motion at both ends of that.
 
     first_s, last_s : (n,) float
@@ -55,7 +55,9 @@ class Seen(NamedTuple):
     tail_cov: Array
 
 
-def link_by_motion(seen: Seen, *, gap_s: float, log_odds: float) -> tuple[Indices, Array]:
+def link_by_motion(
+    seen: ObservedMotions, *, gap_s: float, log_odds: float
+) -> tuple[Indices, Array]:
     """Return which object continues which.
 
     Parameters
@@ -104,7 +106,7 @@ def chains(before: Indices) -> Indices:
     return head
 
 
-class _Pairs(NamedTuple):
+class _CandidatePairs(NamedTuple):
     """Objects that ended and ones that began later, and the difference of their motions there.
 
     `apart` is the begun one's state minus that of the ended one, (p, 6); NaN velocity where one
@@ -117,7 +119,7 @@ class _Pairs(NamedTuple):
     cov: Array
 
 
-def _pairs(seen: Seen, gap_s: float) -> _Pairs:
+def _pairs(seen: ObservedMotions, gap_s: float) -> _CandidatePairs:
     """Return the pairs that may be one object, by time and by what an orbit keeps."""
     gap = seen.first_s - seen.last_s[:, None]
     timely = (gap > 0.0) & (gap <= gap_s)
@@ -138,10 +140,10 @@ def _pairs(seen: Seen, gap_s: float) -> _Pairs:
         parts.append((earlier, later, state - seen.tail[earlier], seen.tail_cov[earlier] + cov))
     none = np.zeros(0, np.int64)
     parts.append((none, none, np.zeros((0, 6)), np.zeros((0, 6, 6))))
-    return _Pairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return _CandidatePairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _alike(seen: Seen) -> npt.NDArray[np.bool_]:
+def _alike(seen: ObservedMotions) -> npt.NDArray[np.bool_]:
     """Return which (earlier, later) pairs agree in energy, true where it is not known of both.
 
     A wide gate that costs nothing: what two bodies keep, J2 changes by a thousandth.
@@ -162,7 +164,7 @@ def _energy(state: Array, cov: Array) -> tuple[Array, Array]:
     return energy, np.einsum("ni,nij,nj->n", slope, cov, slope)
 
 
-def _gains(seen: Seen, pairs: _Pairs) -> Array:
+def _gains(seen: ObservedMotions, pairs: _CandidatePairs) -> Array:
     """Return the log odds of each pair; -inf where the difference is too large."""
     gain = np.full(len(pairs.later), -np.inf)
     order = np.argsort(pairs.later, kind="stable")
@@ -201,7 +203,7 @@ def _carried(state: Array, cov: Array, dt_s: Array) -> tuple[Array, Array]:
     return there, transition @ cov @ np.swapaxes(transition, -1, -2) + grown
 
 
-def _present(seen: Seen, later: int) -> Array:
+def _present(seen: ObservedMotions, later: int) -> Array:
     """Return a begun object's state minus those of the objects that were seen when it was."""
     at = seen.head_s[later]
     there = (seen.first_s <= seen.last_s[later]) & (seen.last_s >= seen.first_s[later])

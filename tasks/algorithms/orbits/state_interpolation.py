@@ -39,7 +39,7 @@ VELOCITY_MEMORY_S = 30.0
 MAX_ATTITUDE_GAP_S = 10.0
 
 
-class States(NamedTuple):
+class SensorStates(NamedTuple):
     """States of one sensor, by strictly increasing time."""
 
     time_ns: Nanoseconds  # (n,)
@@ -60,7 +60,7 @@ class Places(NamedTuple):
     attitude_sigma: Array  # (m,)
 
 
-def interpolate_states(states: States, at_ns: Nanoseconds, state_gap_s: float) -> Places:
+def interpolate_states(states: SensorStates, at_ns: Nanoseconds, state_gap_s: float) -> Places:
     """Return where a sensor is and how it is turned at given times.
 
     Parameters
@@ -167,7 +167,7 @@ def _carry_on(r_km: Array, v_km_s: Array, step_s: Array) -> tuple[Array, Array]:
     return r, v
 
 
-def _with_velocities(states: States) -> tuple[Array, Array]:
+def _with_velocities(states: SensorStates) -> tuple[Array, Array]:
     """Return every state's velocity, sent or fitted, and what it costs to carry it on.
 
     The second is (n, 2): after t seconds the variance of the position is that of the state
@@ -181,7 +181,7 @@ def _with_velocities(states: States) -> tuple[Array, Array]:
     return v, growth
 
 
-def _fit_velocities(states: States, which: Nanoseconds) -> tuple[Array, Array]:
+def _fit_velocities(states: SensorStates, which: Nanoseconds) -> tuple[Array, Array]:
     points, used = _fit_points(states.time_ns, which)
     since_s = (states.time_ns[points] - states.time_ns[which][:, None]) / SECOND_NS
     r_km = states.r_gcrf_km[points]
@@ -231,7 +231,7 @@ def _double_integral(tau: Array, values: Array, weight: Array) -> Array:
     return np.einsum("npi,nik->npk", integrals, coefficients)
 
 
-def _attitudes(states: States, at_ns: Nanoseconds) -> tuple[Array, Array]:
+def _attitudes(states: SensorStates, at_ns: Nanoseconds) -> tuple[Array, Array]:
     """Return prior attitudes and their sigmas where a state with one is on either side."""
     q, sigma = np.full((len(at_ns), 4), np.nan), np.full(len(at_ns), np.nan)
     having = np.flatnonzero(np.isfinite(states.q_sensor_from_icrs).all(axis=1))

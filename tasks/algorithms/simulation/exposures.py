@@ -14,7 +14,7 @@ from epipole.tasks.algorithms.simulation.optics import field_radius, image_place
 from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.sensor import (
     Attitudes,
-    Sensor,
+    SimulatedSensor,
     boresight_hidden,
     random_stream,
     seconds_since,
@@ -37,7 +37,7 @@ TARGETS_AT_ONCE = 500_000  # pairs of a frame and a target
 
 
 @dataclass
-class Spots:
+class TrueSpots:
     """Spots of a block of frames, one entry a spot; `frame` is the frame's place in the block."""
 
     frame: Indices
@@ -73,7 +73,7 @@ class Exposing:
     """A sensor at work. Give it its frames in order of time, in blocks of any length."""
 
     def __init__(
-        self, sensor: Sensor, stars: StarField, targets: Array, target_magnitude: Array
+        self, sensor: SimulatedSensor, stars: StarField, targets: Array, target_magnitude: Array
     ) -> None:
         self.sensor, self.stars = sensor, stars
         self.targets, self.target_magnitude = targets, target_magnitude
@@ -111,7 +111,7 @@ class Exposing:
 
     def _star_spots(
         self, time_ns: Indices, r_km: Array, earth_km: Array, v_km_s: Array, R: Array
-    ) -> Spots:
+    ) -> TrueSpots:
         s, field = self.sensor, self.stars
         frame, star = stars_in_cones(field, R[:, 2], self._radius + ABERRATION_ROOM)
         years = julian_years_since(field.epoch, time_ns)
@@ -127,7 +127,7 @@ class Exposing:
 
     def _target_spots(
         self, time_ns: Indices, r_km: Array, v_km_s: Array, earth_km_s: Array, R: Array
-    ) -> Spots:
+    ) -> TrueSpots:
         s, n_targets = self.sensor, len(self.targets)
         t_s = seconds_since(s.t0_ns, time_ns)
         parts = []
@@ -150,10 +150,10 @@ class Exposing:
         )
         kept = self._streams["target drop"].random(len(frame)) >= s.target_drop
         kind = np.full(len(frame), TARGET, np.int8)
-        spots = Spots(frame, x, y, self.target_magnitude[target], kind, target)
+        spots = TrueSpots(frame, x, y, self.target_magnitude[target], kind, target)
         return _selected(spots, np.flatnonzero(kept))
 
-    def _false_spots(self, n_frames: int) -> Spots:
+    def _false_spots(self, n_frames: int) -> TrueSpots:
         s, streams = self.sensor, self._streams
         n = streams["false count"].poisson(s.false_points, n_frames)
         place = streams["false place"].random((int(n.sum()), 2))
@@ -165,7 +165,7 @@ class Exposing:
         place = np.concatenate([place * size - 0.5, np.tile(hot, (n_frames, 1))])
         magnitude = np.concatenate([magnitude, np.tile(hot_magnitude, n_frames)])
         kind = np.full(len(frame), FALSE, np.int8)
-        return Spots(frame, place[:, 0], place[:, 1], magnitude, kind, np.full(len(frame), -1))
+        return TrueSpots(frame, place[:, 0], place[:, 1], magnitude, kind, np.full(len(frame), -1))
 
     def _image(self, u: Array, R: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
         """Return columns, rows, and which directions lie within the camera's cone."""
@@ -184,7 +184,7 @@ class Exposing:
         pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
         return pairs[:, 0], pairs[:, 1]
 
-    def _merged(self, frame: Indices, star: Indices, x: Array, y: Array) -> Spots:
+    def _merged(self, frame: Indices, star: Indices, x: Array, y: Array) -> TrueSpots:
         """Return star spots, stars within MERGE_PX as one with the brightest one's number."""
         n_stars = len(self.stars.star_id)
         key = frame * n_stars + star
@@ -206,7 +206,7 @@ class Exposing:
         # The brightest of each spot comes first in this order.
         order = np.lexsort((-light, spot))
         brightest = order[np.searchsorted(spot[order], np.arange(n_spots))]
-        return Spots(
+        return TrueSpots(
             frame[brightest],
             np.bincount(spot, light * x, n_spots) / total,
             np.bincount(spot, light * y, n_spots) / total,
@@ -223,7 +223,7 @@ class Exposing:
 
     def _measure(
         self,
-        spots: Spots,
+        spots: TrueSpots,
         frame_number: Indices,
         time_ns: Indices,
         r_km: Array,
@@ -268,8 +268,8 @@ def _random_magnitudes(rng: np.random.Generator, n: int, limit: float) -> Array:
     return limit + 2 * np.log10(1 - rng.random(n))
 
 
-def _selected(spots: Spots, at: Indices) -> Spots:
-    return Spots(
+def _selected(spots: TrueSpots, at: Indices) -> TrueSpots:
+    return TrueSpots(
         spots.frame[at],
         spots.x_px[at],
         spots.y_px[at],
@@ -279,9 +279,9 @@ def _selected(spots: Spots, at: Indices) -> Spots:
     )
 
 
-def _joined(parts: list[Spots]) -> Spots:
+def _joined(parts: list[TrueSpots]) -> TrueSpots:
     names = ("frame", "x_px", "y_px", "magnitude", "kind", "source")
-    return Spots(*[np.concatenate([getattr(p, name) for p in parts]) for name in names])
+    return TrueSpots(*[np.concatenate([getattr(p, name) for p in parts]) for name in names])
 
 
 def _nothing(

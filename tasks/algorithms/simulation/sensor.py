@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from epipole.tasks.algorithms.simulation.constants import SECOND_NS
-from epipole.tasks.algorithms.simulation.optics import Optics
+from epipole.tasks.algorithms.simulation.optics import TrueOptics
 from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.pointing import look_along, random_attitudes, spinning
 from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
@@ -18,7 +18,7 @@ Nanoseconds = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Sensor:
+class SimulatedSensor:
     """Everything of a sensor that the simulation needs, in radians, pixels, km and seconds."""
 
     sensor_id: str
@@ -27,7 +27,7 @@ class Sensor:
     t0_ns: int
     duration_s: float
     elements: Array  # (6,) at t0, see `state_at`
-    optics: Optics  # the true ones
+    optics: TrueOptics  # the true ones
     # pointing
     mode: str  # track, fixed, spin, random
     followed: Array  # (6,) track
@@ -78,7 +78,7 @@ def seconds_since(t0_ns: int, time_ns: Nanoseconds) -> Array:
     return (np.asarray(time_ns, np.int64) - t0_ns) / SECOND_NS
 
 
-def frame_times(sensor: Sensor) -> tuple[npt.NDArray[np.int64], Nanoseconds]:
+def frame_times(sensor: SimulatedSensor) -> tuple[npt.NDArray[np.int64], Nanoseconds]:
     """Return frame numbers and mid-exposure times of all frames that the sensor takes."""
     n = max(int(np.ceil(sensor.duration_s * sensor.rate_hz - sensor.phase - 1e-9)), 0)
     number = np.arange(n, dtype=np.int64)
@@ -100,7 +100,7 @@ def frame_times(sensor: Sensor) -> tuple[npt.NDArray[np.int64], Nanoseconds]:
 class Attitudes:
     """The sensor's turning over the whole scene, without the jitter of single frames."""
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SimulatedSensor) -> None:
         self.sensor = sensor
         self._held = Rotation.identity(1)
         if sensor.mode == "random":
@@ -132,7 +132,7 @@ def boresight_hidden(r_km: Array, attitude: Rotation) -> npt.NDArray[np.bool_]:
     return hidden_by_earth(r_km, attitude.as_matrix()[:, 2], np.inf)
 
 
-def state_times(sensor: Sensor) -> Nanoseconds:
+def state_times(sensor: SimulatedSensor) -> Nanoseconds:
     """Return the times of the sensor's states, a margin beyond the scene's ends included."""
     first = -np.floor(sensor.state_margin_s * sensor.state_rate_hz)
     n = (
@@ -146,7 +146,7 @@ def state_times(sensor: Sensor) -> Nanoseconds:
 class Beliefs:
     """What the sensor believes of its place and attitude: the truth, a bias and noise."""
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SimulatedSensor) -> None:
         self.sensor = sensor
         self._bias_km = self._stream("position bias").standard_normal(3) * sensor.position_bias_km
         self._bias = self._stream("attitude bias").standard_normal(3) * sensor.prior_bias

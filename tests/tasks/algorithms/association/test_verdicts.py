@@ -6,7 +6,7 @@ from scenes.associations import associated, wrong_views
 from scenes.tracklet_scenes import Scene
 
 from epipole.tasks.algorithms.association.sampling.samples import Groups
-from epipole.tasks.algorithms.association.verdicts import Seen, Verdicts
+from epipole.tasks.algorithms.association.verdicts import NightViews, Verdicts
 
 EVERY_S = 6.0
 
@@ -19,7 +19,7 @@ def ten_minutes(seed: int) -> Scene:
 def entered(score: float, tracklets=(0, 1)) -> Verdicts:
     """Two tracklets of two sensors, five spans of 30 s: one group in the first span."""
     epoch_s = np.repeat(np.arange(0, 150, 10), 2)
-    seen = Seen(
+    seen = NightViews(
         epoch_s * 1_000_000_000, epoch_s // 30,
         np.tile([0, 1], 15), np.tile([0, 1], 15),
     )  # fmt: skip

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from epipole.tasks.algorithms.orbits.object_linking import NONE, Seen, chains, link_by_motion
+from epipole.tasks.algorithms.orbits.object_linking import (
+    NONE,
+    ObservedMotions,
+    chains,
+    link_by_motion,
+)
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate, trajectory
 
 GEO = np.array([-39359.89, 15125.76, 64.30, -1.1030, -2.8700, 0.01])
@@ -34,7 +39,9 @@ def seen_of(passes, rng, sigma=SIGMA):
             out.append(rng.multivariate_normal(true, cov))
             covs.append(cov)
     first, last = (np.array([p[k] for p in passes], float) for k in (1, 2))
-    return Seen(first, last, first, last, *map(np.array, (heads, tails, head_cov, tail_cov)))
+    return ObservedMotions(
+        first, last, first, last, *map(np.array, (heads, tails, head_cov, tail_cov))
+    )
 
 
 def cluster(rng, n=9, spread_km=300.0):
@@ -174,7 +181,7 @@ def test_several_gaps_make_one_chain():
 def test_no_objects_and_one_object_have_no_links():
     seen = seen_of([(GEO, 0.0, 60.0)], np.random.default_rng(6))
     assert link_by_motion(seen, **RULE)[0].tolist() == [NONE]
-    nothing = Seen(*(values[:0] for values in seen))
+    nothing = ObservedMotions(*(values[:0] for values in seen))
     assert link_by_motion(nothing, **RULE)[0].shape == (0,)
     assert chains(np.zeros(0, np.int64)).shape == (0,)
 
@@ -186,6 +193,6 @@ def test_the_order_of_the_objects_changes_nothing():
     before, _ = link_by_motion(seen, **RULE)
     order = rng.permutation(18)
     place = np.argsort(order)
-    mixed, _ = link_by_motion(Seen(*(values[order] for values in seen)), **RULE)
+    mixed, _ = link_by_motion(ObservedMotions(*(values[order] for values in seen)), **RULE)
     expected = np.where(before[order] == NONE, NONE, place[before[order]])
     np.testing.assert_array_equal(mixed, expected)

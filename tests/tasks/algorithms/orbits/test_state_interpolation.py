@@ -5,7 +5,11 @@ import pytest
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry import rotations
-from epipole.tasks.algorithms.orbits.state_interpolation import States, gravity, interpolate_states
+from epipole.tasks.algorithms.orbits.state_interpolation import (
+    SensorStates,
+    gravity,
+    interpolate_states,
+)
 
 METRE = 1e-3  # km
 METRE_S = 1e-3  # km/s
@@ -46,7 +50,7 @@ def states_at(at_s, path=low_orbit, velocities=True, noise_km=0.0, q=None, seed=
     r, v = path(at_s)
     n = len(at_s)
     r = r + noise_km * np.random.default_rng(seed).standard_normal((n, 3))
-    return States(
+    return SensorStates(
         nanoseconds(at_s),
         r,
         v if velocities else np.full((n, 3), np.nan),

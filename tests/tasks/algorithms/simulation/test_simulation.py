@@ -33,7 +33,7 @@ from epipole.tasks.algorithms.simulation.ephemeris import (
     earth_at,
     julian_years_since,
 )
-from epipole.tasks.algorithms.simulation.optics import Optics, image_place
+from epipole.tasks.algorithms.simulation.optics import TrueOptics, image_place
 from epipole.tasks.algorithms.simulation.orbits import elements_from_state, state_at
 from epipole.tasks.algorithms.simulation.sightlines import boost, received_from
 from epipole.tasks.algorithms.simulation.star_field import star_directions, star_field
@@ -340,6 +340,6 @@ def spots_of(log):
 
 def optics_of(log):
     """Return the one calibration of a log."""
-    cameras = read_log(log).cameras.select(Optics._fields).to_pylist()
+    cameras = read_log(log).cameras.select(TrueOptics._fields).to_pylist()
     assert all(camera == cameras[0] for camera in cameras)
-    return Optics(**cameras[0])
+    return TrueOptics(**cameras[0])
