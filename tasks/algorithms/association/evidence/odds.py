@@ -1,4 +1,4 @@
-"""Odds: how much likelier one object is than unrelated tracklets."""
+"""Odds: how much more likely one object is than unrelated tracklets."""
 
 import numpy as np
 
