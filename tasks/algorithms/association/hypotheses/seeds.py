@@ -21,7 +21,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 SHORTEST_BASELINE_KM = 1.0
-NEAREST_KM = 300.0  # an error of the baseline turns the plane most for a near object
+NEAREST_KM = 300.0  # range at which errors of the baseline turn the plane most
 
 
 class PlaneAngles(NamedTuple):
@@ -133,7 +133,7 @@ def _free_at(space: SearchSpace, s: int, m: int) -> Indices:
 
 
 def _axes(baseline: Array, towards: Array) -> Array:
-    """Return two axes across the baseline, the first towards the field, where the angle is 0."""
+    """Return two axes across the baseline, the first (angle 0) towards the field."""
     unit = baseline / np.linalg.norm(baseline)
     first = towards - (towards @ unit) * unit
     if not np.linalg.norm(first) > 1e-9 * np.linalg.norm(towards):
@@ -145,9 +145,9 @@ def _axes(baseline: Array, towards: Array) -> Array:
 class SensorPairs:
     """Pairs of sensors that may see one object, in the order in which they should seed.
 
-    The longer the baseline across the line of sight, the better two views fix a point and the
-    fewer chance partners they have; but no sensor seeds a second time before the others had
-    their turn. Pairs whose fields do not meet are left out.
+    Pairs with a longer baseline across the line of sight come first: they fix a point better and
+    have fewer chance partners. But every sensor takes part once before any takes part again.
+    Pairs whose fields do not meet are skipped.
     """
 
     def __init__(self, views: Views, farthest_km: float) -> None:
@@ -157,7 +157,7 @@ class SensorPairs:
         a, b = a[known], b[known]
         baseline = place[b] - place[a]
         range_a, range_b, miss = _closest_approach(baseline, look[a], look[b])
-        # Nearly parallel axes meet far out, wherever they do.
+        # Nearly parallel axes meet far out, at an uncertain distance.
         apart = np.arccos(np.clip(np.sum(look[a] * look[b], axis=1), -1, 1))
         meet = (range_a > 0) & (range_b > 0)
         meet &= miss <= range_a * np.tan(half[a]) + range_b * np.tan(half[b])
@@ -174,9 +174,9 @@ class SensorPairs:
         self._covered = np.zeros(len(self._a), np.int64)
 
     def next(self, enough: float = np.inf) -> tuple[int, int] | None:
-        """Return the next pair, none where all are done; round after round.
+        """Return the next pair, None after the last.
 
-        A pair is passed over where `enough` of those that had their turn look at what it sees.
+        A pair is skipped where `enough` of the earlier pairs cover the middle of its field.
         """
         wanted = self._waiting & (self._covered < enough)
         ready = wanted & ~self._busy[self._a] & ~self._busy[self._b]
@@ -199,7 +199,7 @@ class SensorPairs:
 
 
 def _middle(views: Views) -> tuple[Array, Array, Array]:
-    """Return where each sensor's tracklets lie, where it stands, and their widest angle."""
+    """Return each sensor's mean direction, position [km], and radius of its tracklets [rad]."""
     n = len(views.half_field)
     look, place, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
     for s in range(n):
@@ -214,7 +214,7 @@ def _middle(views: Views) -> tuple[Array, Array, Array]:
 
 
 def _closest_approach(baseline: Array, u_a: Array, u_b: Array) -> tuple[Array, Array, Array]:
-    """Return the ranges along two lines of the points nearest to each other, and their gap."""
+    """Return the ranges [km] along two lines of their nearest points, and the gap [km]."""
     cosine = np.sum(u_a * u_b, axis=1)
     sine2 = np.maximum(1 - cosine**2, 1e-12)
     along_a, along_b = np.sum(baseline * u_a, axis=1), np.sum(baseline * u_b, axis=1)
