@@ -124,12 +124,12 @@ def best_of_sensor(space, work, s, members, least):
             continue
         begin = views.grid[s, m, 0]
         place = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
-        own = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
-        reach = gate * np.sqrt(predicted[m, H00] + own)
+        errors = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
+        reach = gate * np.sqrt(predicted[m, H00] + errors)
         here = predicted[m, A0] - cam[s, m, CORNER]
         lo0 = max(int(np.floor((here - reach) * cam[s, m, SCALE])), 0)
         hi0 = min(int(np.floor((here + reach) * cam[s, m, SCALE])), side - 1)
-        reach = gate * np.sqrt(predicted[m, H11] + own)
+        reach = gate * np.sqrt(predicted[m, H11] + errors)
         here = predicted[m, A1] - cam[s, m, CORNER + 1]
         lo1 = max(int(np.floor((here - reach) * cam[s, m, SCALE + 1])), 0)
         hi1 = min(int(np.floor((here + reach) * cam[s, m, SCALE + 1])), side - 1)
