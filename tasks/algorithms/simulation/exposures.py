@@ -1,4 +1,4 @@
-"""Exposures: every spot that a sensor sees in a block of frames, and what each one is."""
+"""Exposures: all centroids of a sensor in a block of frames, and the source of each."""
 
 from dataclasses import dataclass
 
@@ -31,14 +31,14 @@ Indices = npt.NDArray[np.int64]
 
 STAR, TARGET, FALSE = 0, 1, 2
 MERGE_PX = 2.0  # stars closer than this are one spot
-FLUX_AT_ZERO = 1e6  # of magnitude 0, in units of nothing in particular
-ABERRATION_ROOM = 1.5e-3  # rad; aberration is 1.3e-4, proper motion in 30 years 1.5e-3 at most
-TARGETS_AT_ONCE = 500_000  # pairs of a frame and a target
+FLUX_AT_ZERO = 1e6  # of magnitude 0, arbitrary units
+ABERRATION_ROOM = 1.5e-3  # [rad] aberration is 1.3e-4, proper motion in 30 years at most 1.5e-3
+TARGETS_AT_ONCE = 500_000  # pairs of a frame and a target, to bound the memory
 
 
 @dataclass
 class TrueSpots:
-    """Spots of a block of frames, one entry a spot; `frame` is the frame's place in the block."""
+    """True spots of a block of frames, one entry each; `frame` is an index in the block."""
 
     frame: Indices
     x_px: Array
@@ -50,9 +50,9 @@ class TrueSpots:
 
 @dataclass
 class Exposures:
-    """A block of frames: their truth, and their centroids one after the other.
+    """A block of frames: true states, and the centroids of all frames with their sources.
 
-    Frame i has centroids ``offsets[i]:offsets[i + 1]``; attitudes turn ICRS into sensor axes.
+    Frame i has the centroids ``offsets[i]:offsets[i + 1]``. Attitudes are sensor from ICRS.
     """
 
     frame_number: Indices
@@ -70,7 +70,7 @@ class Exposures:
 
 
 class Exposing:
-    """A sensor at work. Give it its frames in order of time, in blocks of any length."""
+    """Makes the exposures of a sensor, from its frames in order of time in blocks of any length."""
 
     def __init__(
         self, sensor: SimulatedSensor, stars: StarField, targets: Array, target_magnitude: Array
@@ -88,16 +88,16 @@ class Exposing:
         self._neighbours = self._close_stars()
 
     def expose(self, frame_number: Indices, time_ns: Indices) -> Exposures:
-        """Return what the frames show; frames that the sensor skips are left out."""
+        """Return the exposures of these frames, without those that the sensor skips."""
         s = self.sensor
         r_km, v_km_s = state_at(s.elements, seconds_since(s.t0_ns, time_ns))
         attitude = self.attitudes.at(time_ns, r_km)
         jitter = self._streams["jitter"].standard_normal((len(time_ns), 3)) * s.jitter
         attitude = Rotation.from_rotvec(jitter) * attitude if len(time_ns) else attitude
         if s.skip_hidden and len(time_ns):
-            seen = ~boresight_hidden(r_km, attitude)
-            frame_number, time_ns = frame_number[seen], time_ns[seen]
-            r_km, v_km_s, attitude = r_km[seen], v_km_s[seen], attitude[seen]
+            free = ~boresight_hidden(r_km, attitude)
+            frame_number, time_ns = frame_number[free], time_ns[free]
+            r_km, v_km_s, attitude = r_km[free], v_km_s[free], attitude[free]
         if not len(time_ns):
             return _nothing(frame_number, time_ns, r_km, v_km_s, attitude)
         R_sensor_from_icrs = attitude.as_matrix()
@@ -132,10 +132,10 @@ class Exposing:
         t_s = seconds_since(s.t0_ns, time_ns)
         parts = []
         step = max(TARGETS_AT_ONCE // max(n_targets, 1), 1)
-        seen = np.flatnonzero(self.target_magnitude <= s.magnitude_limit)
-        for low in range(0, len(time_ns) if len(seen) else 0, step):
+        bright = np.flatnonzero(self.target_magnitude <= s.magnitude_limit)
+        for low in range(0, len(time_ns) if len(bright) else 0, step):
             of_frame = np.arange(low, min(low + step, len(time_ns)))
-            frame, target = (v.ravel() for v in np.meshgrid(of_frame, seen, indexing="ij"))
+            frame, target = (v.ravel() for v in np.meshgrid(of_frame, bright, indexing="ij"))
             d, _ = received_from(self.targets[target], t_s[frame], r_km[frame], earth_km_s[frame])
             distance = np.linalg.norm(d, axis=1)
             u = d / distance[:, None]
@@ -168,7 +168,7 @@ class Exposing:
         return TrueSpots(frame, place[:, 0], place[:, 1], magnitude, kind, np.full(len(frame), -1))
 
     def _image(self, u: Array, R: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        """Return columns, rows, and which directions lie within the camera's cone."""
+        """Return columns and rows [px], and which directions are within the camera's cone."""
         in_sensor = np.einsum("nij,nj->ni", R, u)
         ok = in_sensor[:, 2] > np.cos(self._radius)
         x, y = np.full(len(u), np.nan), np.full(len(u), np.nan)
@@ -176,7 +176,7 @@ class Exposing:
         return x, y, ok
 
     def _close_stars(self) -> tuple[Indices, Indices]:
-        """Return the pairs of stars that may fall within MERGE_PX of each other."""
+        """Return the pairs of stars that may be within MERGE_PX of each other."""
         # A lens stretches by a few per cent at most, proper motion by some arcseconds.
         optics = self.sensor.optics
         radius = 1.2 * MERGE_PX / min(optics.fx_px, optics.fy_px) + 3e-4
@@ -185,7 +185,7 @@ class Exposing:
         return pairs[:, 0], pairs[:, 1]
 
     def _merged(self, frame: Indices, star: Indices, x: Array, y: Array) -> TrueSpots:
-        """Return star spots, stars within MERGE_PX as one with the brightest one's number."""
+        """Return star spots; stars within MERGE_PX are one, with the number of the brightest."""
         n_stars = len(self.stars.star_id)
         key = frame * n_stars + star
         order = np.argsort(key, kind="stable")
@@ -234,7 +234,7 @@ class Exposing:
         s = self.sensor
         brightness = 10 ** (0.4 * (spots.magnitude - s.magnitude_limit))  # 1 at the limit
         sigma = np.hypot(s.sigma_px, s.faint_sigma_px * brightness)
-        # By frame first, so that the noise does not depend on the length of the blocks.
+        # Sorted by frame, so that the noise does not depend on the length of the blocks.
         order = np.lexsort((np.arange(len(spots.frame)), spots.frame))
         noise = self._streams["centroid noise"].standard_normal((len(order), 2))
         light = self._streams["flux noise"].standard_normal(len(order))

@@ -1,4 +1,4 @@
-"""The true camera: where a direction in the sensor frame falls on the image."""
+"""The true camera: image places of directions in the sensor frame."""
 
 from typing import NamedTuple
 
@@ -42,20 +42,20 @@ def image_place(optics: TrueOptics, u: Array) -> tuple[Array, Array]:
 
 
 def on_image(optics: TrueOptics, x_px: Array, y_px: Array) -> npt.NDArray[np.bool_]:
-    """Return which places lie on the image, whose pixels reach half a pixel around their middle."""
+    """Return which places are on the image; a pixel extends half a pixel about its centre."""
     return (np.abs(x_px - (optics.width - 1) / 2) < optics.width / 2) & (
         np.abs(y_px - (optics.height - 1) / 2) < optics.height / 2
     )
 
 
 def field_radius(optics: TrueOptics) -> float:
-    """Return the angle [rad] from the boresight that holds the whole image, with a little room."""
+    """Return the angle [rad] from the boresight to the farthest corner, plus 1 %."""
     columns = np.linspace(-0.5, optics.width - 0.5, 9)
     rows = np.linspace(-0.5, optics.height - 0.5, 9)
     x, y = (v.ravel() for v in np.meshgrid(columns, rows))
     x, y = (x - optics.cx_px) / optics.fx_px, (y - optics.cy_px) / optics.fy_px
     wanted_x, wanted_y = x, y
-    for _ in range(30):  # a plain fixed point: the lens bends little
+    for _ in range(30):  # a fixed-point iteration: the distortion is small
         got_x, got_y = bend(optics, x, y)
         x, y = x + wanted_x - got_x, y + wanted_y - got_y
     return float(np.arctan(np.max(np.hypot(x, y)))) * 1.01 + 1e-4

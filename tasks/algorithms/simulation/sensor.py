@@ -1,4 +1,4 @@
-"""A simulated sensor: when it exposes, where it is, how it is turned and what it believes."""
+"""A simulated sensor: times of exposure, attitudes, and the states that it reports."""
 
 import zlib
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ Nanoseconds = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class SimulatedSensor:
-    """Everything of a sensor that the simulation needs, in radians, pixels, km and seconds."""
+    """All parameters of a sensor, in radians, pixels, km and seconds."""
 
     sensor_id: str
     index: int
@@ -27,7 +27,7 @@ class SimulatedSensor:
     t0_ns: int
     duration_s: float
     elements: Array  # (6,) at t0, see `state_at`
-    optics: TrueOptics  # the true ones
+    optics: TrueOptics
     # pointing
     mode: str  # track, fixed, spin, random
     followed: Array  # (6,) track
@@ -68,7 +68,7 @@ class SimulatedSensor:
 def random_stream(seed: int, index: int, purpose: str) -> np.random.Generator:
     """Return the stream of random numbers of a sensor (or group) for one purpose.
 
-    Each purpose has its own, so that switching one effect on does not move the others.
+    Each purpose has its own stream, so that switching on one effect does not change the others.
     """
     return np.random.default_rng([seed, index, zlib.crc32(purpose.encode())])
 
@@ -79,7 +79,7 @@ def seconds_since(t0_ns: int, time_ns: Nanoseconds) -> Array:
 
 
 def frame_times(sensor: SimulatedSensor) -> tuple[npt.NDArray[np.int64], Nanoseconds]:
-    """Return frame numbers and mid-exposure times of all frames that the sensor takes."""
+    """Return frame numbers and mid-exposure times [ns] of all frames of the sensor."""
     n = max(int(np.ceil(sensor.duration_s * sensor.rate_hz - sensor.phase - 1e-9)), 0)
     number = np.arange(n, dtype=np.int64)
     t = (number + sensor.phase) / sensor.rate_hz
@@ -98,7 +98,7 @@ def frame_times(sensor: SimulatedSensor) -> tuple[npt.NDArray[np.int64], Nanosec
 
 
 class Attitudes:
-    """The sensor's turning over the whole scene, without the jitter of single frames."""
+    """The sensor's attitude over the whole scene, without the jitter of single frames."""
 
     def __init__(self, sensor: SimulatedSensor) -> None:
         self.sensor = sensor
@@ -128,12 +128,12 @@ class Attitudes:
 
 
 def boresight_hidden(r_km: Array, attitude: Rotation) -> npt.NDArray[np.bool_]:
-    """Return where the Earth stands in the boresight's way."""
+    """Return which boresights meet the Earth."""
     return hidden_by_earth(r_km, attitude.as_matrix()[:, 2], np.inf)
 
 
 def state_times(sensor: SimulatedSensor) -> Nanoseconds:
-    """Return the times of the sensor's states, a margin beyond the scene's ends included."""
+    """Return the times [ns] of the sensor's states, with a margin beyond the scene's ends."""
     first = -np.floor(sensor.state_margin_s * sensor.state_rate_hz)
     n = (
         int(np.floor((sensor.duration_s + sensor.state_margin_s) * sensor.state_rate_hz - first))
@@ -144,7 +144,7 @@ def state_times(sensor: SimulatedSensor) -> Nanoseconds:
 
 
 class Beliefs:
-    """What the sensor believes of its place and attitude: the truth, a bias and noise."""
+    """Reported positions and attitudes: the truth plus a bias and noise."""
 
     def __init__(self, sensor: SimulatedSensor) -> None:
         self.sensor = sensor
@@ -157,12 +157,12 @@ class Beliefs:
         return random_stream(self.sensor.seed, self.sensor.index, purpose)
 
     def position(self, r_km: Array) -> Array:
-        """Return the believed positions of true ones; call in order of time."""
+        """Return reported positions for true ones; call in order of time."""
         noise = self._position_noise.standard_normal(r_km.shape)
         return r_km + self._bias_km + noise * self.sensor.position_noise_km
 
     def attitude(self, true: Rotation) -> Rotation | None:
-        """Return the believed attitudes of true ones, or None where none is sent."""
+        """Return reported attitudes for true ones, None for a sensor that reports none."""
         if self.sensor.prior_noise is None:
             return None
         noise = self._attitude_noise.standard_normal((len(true), 3)) * self.sensor.prior_noise
