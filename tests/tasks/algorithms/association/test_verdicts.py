@@ -1,4 +1,4 @@
-"""Verdicts: what half a minute leaves open is judged over ten; what is sure stays as it is."""
+"""Verdicts: what half a minute leaves open is judged over ten; sure groups are unchanged."""
 
 import numpy as np
 import pytest
@@ -58,8 +58,8 @@ def test_a_sure_group_is_not_judged_again_where_it_is_sure():
     assert len(unsure) == 30
 
 
-def test_what_does_not_go_on_for_longer_keeps_its_verdict():
-    assert not len(entered(score=3.0).open_rows(np.arange(12), 30.0))  # 50 s of two times 30 s
+def test_tracklets_that_do_not_continue_keep_their_verdict():
+    assert not len(entered(score=3.0).open_rows(np.arange(12), 30.0))  # 50 s < 2 x 30 s
 
 
 def test_longer_evidence_against_a_group_dissolves_it():
@@ -71,7 +71,7 @@ def test_longer_evidence_against_a_group_dissolves_it():
 
 def test_what_longer_evidence_adds_to_a_sure_group_joins_it():
     verdicts = entered(score=9.0, tracklets=(0, 2))
-    # In the first span tracklet 0 is of a sure group and 1 of none; over 150 s they are one.
+    # In the first span tracklet 0 is in a sure group and 1 in none; over 150 s they are one.
     rows = np.arange(30)
     open_rows = verdicts.open_rows(rows, 30.0)
     first = open_rows[verdicts.seen.span[open_rows] == 0]

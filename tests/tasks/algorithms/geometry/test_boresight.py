@@ -90,7 +90,7 @@ def test_newton_recovers_the_focal_length_of_a_perfect_image(seed):
     x, u, R = stars(seed)
     a = np.hypot(*x.T)
     assume(spread(x) > 2000)
-    # There may be a second root near by, or a double one.
+    # There may be a second root nearby, or a double one.
     lengths = [squared_length(f, u, a) for f in np.linspace(0.9, 1.1, 401) * FOCAL_PX]
     assume(np.sum(np.diff(np.sign(lengths)) != 0) == 1)
     assume(abs(lengths[210] - lengths[190]) > 1e-6)

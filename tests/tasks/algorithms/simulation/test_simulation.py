@@ -59,7 +59,7 @@ def time_ns(t_s):
 
 
 class Orbiting(VectorFunction):
-    """Skyfield's view of a body on an orbit about the Earth, barycentric."""
+    """A body on an orbit about the Earth, for skyfield: barycentric position and velocity."""
 
     def __init__(self, elements, target):
         self.center, self.target, self.elements = 0, target, elements
