@@ -163,7 +163,7 @@ class _Search:
         clear = CLEAR_LOG_ODDS if self.many else np.inf
         out = []
         for h in self.grow(seeds, clear):
-            if clear_of_doubt(self.space.chance, h.looks, len(h.members), h.score, clear):
+            if clear_of_doubt(self.space.chance, h.outcomes, len(h.members), h.score, clear):
                 self._accept(h, h.members)
             else:
                 out.append(h)
@@ -181,7 +181,7 @@ class _Search:
             size=np.zeros(n, np.int64),
             score=np.empty(n),
             x_km=np.empty((n, 3)),
-            looks=np.zeros((n, n_sensors), np.int8),
+            outcomes=np.zeros((n, n_sensors), np.int8),
             members=np.empty((n, room), np.int64),
         )
         grow_all(self.space, seeds, float(clear), grown)
@@ -192,7 +192,7 @@ class _Search:
                 tuple(seeds[q].tolist()),
                 tuple(sorted(grown.members[q, : grown.size[q]].tolist())),
                 grown.x_km[q],
-                grown.looks[q],
+                grown.outcomes[q],
             )
             for q in worth
         ]
@@ -275,8 +275,8 @@ def _with_detection(
     """Return the hypotheses with their odds for other probabilities of detection."""
     if not hypotheses:
         return []
-    looks = np.array([h.looks for h in hypotheses])
-    change = detection_odds(looks, detected) - detection_odds(looks, believed)
+    outcomes = np.array([h.outcomes for h in hypotheses])
+    change = detection_odds(outcomes, detected) - detection_odds(outcomes, believed)
     return [
         replace(h, score=h.score + float(more)) for h, more in zip(hypotheses, change, strict=True)
     ]

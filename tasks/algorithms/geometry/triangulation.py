@@ -40,7 +40,20 @@ class LinesOfSight(NamedTuple):
 
 
 class Triangulated(NamedTuple):
-    """Positions of g groups from n views; see `triangulate`."""
+    """Positions of g groups from n views.
+
+    r_km : (g, 3) float
+        Positions [km] at the epoch minus the mean light time of the views used; NaN where the
+        lines are parallel or meet behind a sensor, or fewer than two views are left.
+    cov_km2 : (g, 3, 3) float
+        Covariances of the positions.
+    chi2 : (g,) float
+        Weighted sums of squares, 2 n - 3 degrees of freedom.
+    used : (n,) bool
+        False for rejected views.
+    mean_range_km : (g,) float
+        Mean distance of the sensors used.
+    """
 
     r_km: Array
     cov_km2: Array
@@ -263,20 +276,6 @@ def triangulate(
         Velocity of each object. It matters only over the differences of light time.
     reject_sigma
         Of three or more views, those with a larger residual are rejected, the worst first.
-
-    Returns
-    -------
-    r_km : (g, 3) float
-        Positions [km] at the epoch minus the mean light time of the views used; NaN where the
-        lines are parallel or meet behind a sensor, or fewer than two views are left.
-    cov_km2 : (g, 3, 3) float
-        Covariances of the positions.
-    chi2 : (g,) float
-        Weighted sums of squares, 2 n - 3 degrees of freedom.
-    used : (n,) bool
-        False for rejected views.
-    mean_range_km : (g,) float
-        Mean distance of the sensors used.
 
     References
     ----------

@@ -93,8 +93,8 @@ def link_by_motion(
     graph = coo_array((np.ones(len(gain)), (earlier, later)), shape=(n, n))
     _, part = connected_components(graph, directed=False)
     for label in np.unique(part[earlier]):
-        own = np.flatnonzero(part[earlier] == label)
-        for k in own[_sure(earlier[own], later[own], gain[own], log_odds)]:
+        linked = np.flatnonzero(part[earlier] == label)
+        for k in linked[_sure(earlier[linked], later[linked], gain[linked], log_odds)]:
             before[later[k]], odds[later[k]] = earlier[k], gain[k]
     return before, odds
 
@@ -130,7 +130,7 @@ def _pairs(motions: ObservedMotions, gap_s: float) -> _CandidatePairs:
     for i in np.flatnonzero(moving):  # forward, from each earlier object
         later = np.flatnonzero(kept[i])
         later = later[np.argsort(motions.head_s[later], kind="stable")]
-        state, cov = _carried(
+        state, cov = _propagated(
             motions.tail[i], motions.tail_cov[i], motions.head_s[later] - motions.tail_s[i]
         )
         earlier = np.full(len(later), i)
@@ -138,7 +138,7 @@ def _pairs(motions: ObservedMotions, gap_s: float) -> _CandidatePairs:
     for j in np.flatnonzero(moves):  # backward, to earlier objects of unknown velocity
         earlier = np.flatnonzero(kept[:, j] & ~moving)
         earlier = earlier[np.argsort(-motions.tail_s[earlier], kind="stable")]
-        state, cov = _carried(
+        state, cov = _propagated(
             motions.head[j], motions.head_cov[j], motions.tail_s[earlier] - motions.head_s[j]
         )
         later = np.full(len(earlier), j)
@@ -194,7 +194,7 @@ def _gains(motions: ObservedMotions, pairs: _CandidatePairs) -> Array:
     return gain
 
 
-def _carried(state: Array, cov: Array, dt_s: Array) -> tuple[Array, Array]:
+def _propagated(state: Array, cov: Array, dt_s: Array) -> tuple[Array, Array]:
     """Return a state propagated by several times, with covariances.
 
     The neglected forces grow in it as a constant acceleration does.

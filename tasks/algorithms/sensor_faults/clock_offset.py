@@ -103,7 +103,7 @@ def clock_offsets(
     """
     n_sensors = len(position_sigma_km)
     guess = np.zeros(n_sensors) if guess_s is None else np.array(guess_s, float)
-    seen = np.bincount(lines.sensor, minlength=n_sensors) > 0
+    has_lines = np.bincount(lines.sensor, minlength=n_sensors) > 0
     spread = np.concatenate(
         [
             np.full((n_sensors, 1), PRIOR_S),
@@ -114,10 +114,10 @@ def clock_offsets(
     ).ravel()
     kept = np.ones(len(lines.sensor), bool)
     for _ in range(ROUNDS):
-        about = _carried(lines, guess)
+        about = _shifted(lines, guess)
         normal, right = _equations(about, kept, spread)
         model = _Model(normal, right, guess / PRIOR_S)
-        wrong, distinct = _wrong_clocks(model, np.flatnonzero(seen))
+        wrong, distinct = _wrong_clocks(model, np.flatnonzero(has_lines))
         unknowns = model.unknowns(wrong)
         step_s = unknowns[::PER_SENSOR][wrong] * PRIOR_S
         good = _chi2(about, kept, spread, unknowns) < OUTLIER
@@ -125,7 +125,7 @@ def clock_offsets(
         if (good == kept).all() and (np.abs(step_s) < 1e-4).all():
             break
         kept = good
-    return _estimates(model, wrong, distinct, seen)
+    return _estimates(model, wrong, distinct, has_lines)
 
 
 class _Model:
@@ -208,10 +208,10 @@ def _beside(names: frozenset[int], sensors: list[int]) -> list[frozenset[int]]:
     return [*more, *less, *(fewer | {s} for fewer in less for s in others)]
 
 
-def _estimates(model: _Model, wrong: Flags, distinct: bool, seen: Flags) -> Offsets:
+def _estimates(model: _Model, wrong: Flags, distinct: bool, has_lines: Flags) -> Offsets:
     """Return each sensor's offset, if it and the wrong clocks may be wrong."""
     offset, sigma = np.full(len(wrong), np.nan), np.full(len(wrong), np.nan)
-    for s in np.flatnonzero(seen):
+    for s in np.flatnonzero(has_lines):
         free = wrong | (np.arange(len(wrong)) == s) if distinct else np.ones(len(wrong), bool)
         step, cov = model.offsets(free)
         offset[s] = (model.guess[s] + step[s]) * PRIOR_S
@@ -219,7 +219,7 @@ def _estimates(model: _Model, wrong: Flags, distinct: bool, seen: Flags) -> Offs
     return Offsets(offset, sigma, wrong)
 
 
-def _carried(lines: Lines, offset_s: Array) -> Lines:
+def _shifted(lines: Lines, offset_s: Array) -> Lines:
     """Return the lines moved to the reported times, for clocks with these offsets.
 
     A line shows the object and the sensor where they were `offset_s` earlier.

@@ -57,7 +57,7 @@ def julian_year(time_ns: Nanoseconds) -> Array:
 def earth_barycentric(time_ns: Nanoseconds) -> tuple[Array, Array]:
     """Return Earth's barycentric position [km] and velocity [km/s], (..., 3), ICRS axes.
 
-    TT stands for TDB: they differ by less than 2 ms, which moves Earth's velocity by 1e-8 km/s.
+    TT is used for TDB: they differ by less than 2 ms, which moves Earth's velocity by 1e-8 km/s.
     """
     _, barycentric = erfa.epv00(*tt_julian_date(time_ns))
     return barycentric["p"] * AU_KM, barycentric["v"] * (AU_KM / DAY_S)

@@ -17,13 +17,13 @@ PRIOR_LOOKS = 10.0  # weight of the prior, as a number of looks
 LEAST, MOST = 0.05, 0.99
 
 
-def detection_odds(looks: Array, detected: Array) -> Array:
+def detection_odds(outcomes: Array, detected: Array) -> Array:
     """Return the log-probability of the detections and misses of objects, (n,).
 
-    `looks` (n, s): 1 for a detection, -1 for a miss, 0 for a sensor without the object in its
+    `outcomes` (n, s): 1 for a detection, -1 for a miss, 0 for a sensor without the object in its
     field.
     """
-    total = (looks > 0) @ np.log(detected) + (looks < 0) @ np.log(1 - detected)
+    total = (outcomes > 0) @ np.log(detected) + (outcomes < 0) @ np.log(1 - detected)
     return np.asarray(total, float)
 
 
@@ -36,10 +36,10 @@ def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float
     which is shrunk towards `prior`.
     """
     n_sensors = len(views.half_field)
-    looks = np.array([h.looks for h in groups], np.int8).reshape(-1, n_sensors)
-    has = looks > 0
+    outcomes = np.array([h.outcomes for h in groups], np.int8).reshape(-1, n_sensors)
+    has = outcomes > 0
     others = has.sum(axis=1)[:, None] - has
-    asked = (looks != 0) & (others >= (OTHERS if len(views.time_s) > 1 else OTHERS_AT_ONCE))
+    asked = (outcomes != 0) & (others >= (OTHERS if len(views.time_s) > 1 else OTHERS_AT_ONCE))
     looked, hits = asked.sum(axis=0), (asked & has).sum(axis=0)
     common = (hits.sum() + PRIOR_LOOKS * prior) / (looked.sum() + PRIOR_LOOKS)
     return np.clip((hits + PRIOR_LOOKS * common) / (looked + PRIOR_LOOKS), LEAST, MOST)

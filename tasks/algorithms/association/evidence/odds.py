@@ -18,7 +18,7 @@ def _det3(M):
 
 
 @kernel
-def score(views, chance, members, points, shells, near, looks, part):
+def score(views, chance, members, points, shells, near, outcomes, part):
     """Return the log-odds of "one object" against "unrelated tracklets".
 
     An unrelated tracklet may lie anywhere in its field (`chance.density`), an object anywhere in
@@ -30,7 +30,7 @@ def score(views, chance, members, points, shells, near, looks, part):
     ----------
     near : (s,) bool
         Sensors whose field may hold the points, see `near_fields`.
-    looks : (s,) int
+    outcomes : (s,) int
         Output, see `_detections`.
     part : (11,) float
         Work space, see `residual`.
@@ -50,24 +50,24 @@ def score(views, chance, members, points, shells, near, looks, part):
     else:
         total = arc_odds(views, chance, members, points)
     total += np.log(chance.objects_km3) + _altitude_weight(points.x_km[m], shells)
-    return total + _detections(views, chance, members, points, near, looks)
+    return total + _detections(views, chance, members, points, near, outcomes)
 
 
 @kernel
-def _detections(views, chance, members, points, near, looks):
+def _detections(views, chance, members, points, near, outcomes):
     """Return the log-probability of which sensors detect the object and which miss it.
 
-    Writes `looks` for each sensor: 1 detection, -1 miss, 0 not in its field.
+    Writes `outcomes` for each sensor: 1 detection, -1 miss, 0 not in its field.
     """
     total = 0.0
-    looks[:] = 0
+    outcomes[:] = 0
     for i in members:
-        looks[views.sensor[i]] = 1
-    for s in range(len(looks)):
-        if looks[s] == 1:
+        outcomes[views.sensor[i]] = 1
+    for s in range(len(outcomes)):
+        if outcomes[s] == 1:
             total += np.log(chance.detected[s])
         elif near[s] and looks_at(views, s, points.x_km, points.seen_by):
-            looks[s] = -1
+            outcomes[s] = -1
             total += np.log(1.0 - chance.detected[s])
     return total
 

@@ -14,14 +14,14 @@ class Hypothesis:
     """Tracklets (`members`) that may be one object, grown from the two of `seed`.
 
     `score` is the log-odds against unrelated tracklets. `x_km` (3,) is the point at the first
-    instant. `looks` (s,) is 1 for sensors that detect it, -1 for misses, 0 out of the field.
+    instant. `outcomes` (s,) is 1 for sensors that detect it, -1 for misses, 0 out of the field.
     """
 
     score: float
     seed: tuple[int, int]
     members: tuple[int, ...]
     x_km: npt.NDArray[np.float64]
-    looks: npt.NDArray[np.int8]
+    outcomes: npt.NDArray[np.int8]
 
 
 class Pool:

@@ -38,7 +38,7 @@ class GrownSeeds(NamedTuple):
         Log-odds.
     x_km : (n, 3) float
         Position at the first instant.
-    looks : (n, s) int
+    outcomes : (n, s) int
         Detections (1) and misses (-1) of the sensors, see `odds`.
     members : (n, m) int
         Tracklets; the first `size` columns count.
@@ -47,7 +47,7 @@ class GrownSeeds(NamedTuple):
     size: npt.NDArray[np.int64]
     score: npt.NDArray[np.float64]
     x_km: npt.NDArray[np.float64]
-    looks: npt.NDArray[np.int8]
+    outcomes: npt.NDArray[np.int8]
     members: npt.NDArray[np.int64]
 
 
@@ -84,28 +84,28 @@ def grow_all(space, seeds, clear, out):
         if n < 2 or not possible(space, members[:n], points):
             continue
         value = score(
-            views, chance, members[:n], points, space.shells, work.near, out.looks[q], work.part
+            views, chance, members[:n], points, space.shells, work.near, out.outcomes[q], work.part
         )
         out.score[q] = value
         out.size[q] = min(n, out.members.shape[1])
         out.x_km[q] = points.x_km[np.argmax(points.seen_by >= 2)]
         out.members[q, : out.size[q]] = members[: out.size[q]]
-        if clear_of_doubt(chance, out.looks[q], n, value, clear):
+        if clear_of_doubt(chance, out.outcomes[q], n, value, clear):
             for i in members[:n]:
                 taken[i] = True
 
 
 @kernel
-def clear_of_doubt(chance, looks, n, value, clear):
+def clear_of_doubt(chance, outcomes, n, value, clear):
     """Return whether a hypothesis may be taken at once.
 
     It has many views, and of the sensors that have it in their field about as many detect it
     as usual. A mixture of two objects' tracklets fits in some of the sensors only.
     """
     has, usual = 0, 0.0
-    for s in range(len(looks)):
-        has += looks[s] > 0
-        usual += chance.detected[s] * (looks[s] != 0)
+    for s in range(len(outcomes)):
+        has += outcomes[s] > 0
+        usual += chance.detected[s] * (outcomes[s] != 0)
     return value > clear and n >= WELL_KNOWN and has >= COMPLETE * usual
 
 
@@ -138,9 +138,9 @@ def _grow(space, work, members):
         if n > before and before < WELL_KNOWN:
             early = min(n, np.int64(WELL_KNOWN))
         if turn < n_sensors:
-            looks = detected or looks_at(views, s, work.points.x_km, work.points.seen_by)
-            looked += looks
-            if looks and not detected:
+            in_field = detected or looks_at(views, s, work.points.x_km, work.points.seen_by)
+            looked += in_field
+            if in_field and not detected:
                 evidence += np.log(1.0 - space.chance.detected[s])
             if looked >= FEW and evidence < GIVEN_UP:
                 return np.int64(0)

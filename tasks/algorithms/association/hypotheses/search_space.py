@@ -1,4 +1,4 @@
-"""Search space: what all hypotheses of one search have in common, and the arrays to work in."""
+"""Search space: the input that all hypotheses of a search share, and their work arrays."""
 
 from typing import NamedTuple
 

@@ -114,7 +114,7 @@ def seeds_between(space: SearchSpace, a: int, b: int) -> Indices:
         planes_a = plane_angles(views, a, m, items_a, baseline, axes)
         planes_b = plane_angles(views, b, m, items_b, baseline, axes)
         order = np.argsort(planes_b.angle, kind="stable")
-        planes_b = PlaneAngles(*(column[order] for column in planes_b))
+        planes_b = PlaneAngles(planes_b.items[order], planes_b.angle[order], planes_b.sigma[order])
         out = np.empty((4 * (len(items_a) + len(items_b)), 2), np.int64)
         while True:
             n = _meeting(space, m, planes_a, planes_b, out)
@@ -203,12 +203,12 @@ def _middle(views: Views) -> tuple[Array, Array, Array]:
     n = len(views.half_field)
     look, place, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
     for s in range(n):
-        seen = views.seen[views.first[s] : views.first[s + 1]]
-        if not seen.any():
+        visible = views.seen[views.first[s] : views.first[s + 1]]
+        if not visible.any():
             continue
-        m = int(np.argmax(seen.sum(axis=0)))
+        m = int(np.argmax(visible.sum(axis=0)))
         look[s], place[s] = views.plane[s, m, 2], views.place_km[s, m]
-        at = views.sight[views.first[s] : views.first[s + 1], m, :XX][seen[:, m]]
+        at = views.sight[views.first[s] : views.first[s + 1], m, :XX][visible[:, m]]
         half[s] = np.arctan(np.sqrt((at**2).sum(axis=1).max())) + 1e-3
     return look, place, half
 

@@ -53,7 +53,7 @@ def test_a_span_of_ten_minutes_by_settings_is_judged_once():
 def test_a_sure_group_is_not_judged_again_where_it_is_sure():
     verdicts = entered(score=9.0)
     rows = verdicts.open_rows(np.arange(30), 30.0)
-    assert set(verdicts.seen.span[rows].tolist()) == {1, 2, 3, 4}
+    assert set(verdicts.views.span[rows].tolist()) == {1, 2, 3, 4}
     unsure = entered(score=3.0).open_rows(np.arange(30), 30.0)
     assert len(unsure) == 30
 
@@ -74,8 +74,8 @@ def test_what_longer_evidence_adds_to_a_sure_group_joins_it():
     # In the first span tracklet 0 is in a sure group and 1 in none; over 150 s they are one.
     rows = np.arange(30)
     open_rows = verdicts.open_rows(rows, 30.0)
-    first = open_rows[verdicts.seen.span[open_rows] == 0]
-    assert set(verdicts.seen.tracklet[first].tolist()) == {1}
+    first = open_rows[verdicts.views.span[open_rows] == 0]
+    assert set(verdicts.views.tracklet[first].tolist()) == {1}
     verdicts.reconsider(rows, open_rows, np.array([0, 1]), group_of(2, 12.0))
-    assert (verdicts.group[verdicts.seen.span == 0] == verdicts.group[0]).all()
-    assert len(np.unique(verdicts.group[verdicts.seen.span > 0])) == 1
+    assert (verdicts.group[verdicts.views.span == 0] == verdicts.group[0]).all()
+    assert len(np.unique(verdicts.group[verdicts.views.span > 0])) == 1
