@@ -53,8 +53,8 @@ class Verdicts:
     def open_rows(self, rows: Indices, judged_s: float) -> Indices:
         """Return the rows of a window that are to be judged again; empty where that is useless.
 
-        They belong to no sure group, and their tracklets continue for clearly longer than the
-        time `judged_s` [s] over which they were judged. So do all tracklets of their group.
+        They belong to no sure group, and their tracklets last at least twice the time
+        `judged_s` [s] over which they were judged. So do all tracklets of their group.
         """
         views = self.views
         _, item = np.unique(views.tracklet[rows], return_inverse=True)
@@ -76,8 +76,8 @@ class Verdicts:
     ) -> None:
         """Enter the groups that longer evidence gives for the open rows of a window.
 
-        A tracklet whose new group holds a sure group of a span joins that sure group in the
-        span, unless its sensor already has a tracklet there.
+        Where a new group shares a tracklet with a sure group of a span, its other tracklets join
+        the sure group in that span. One whose sensor has a tracklet there already is free.
         """
         sure = np.setdiff1d(rows, open_rows)
         sure = sure[self.group[sure] != FREE]

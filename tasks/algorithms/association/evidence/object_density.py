@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.evidence.chance import Chance
+from epipole.tasks.algorithms.association.evidence.detection import CERTAIN_LOG_ODDS
 from epipole.tasks.algorithms.association.evidence.visibility import in_view
 from epipole.tasks.algorithms.association.sampling.views import Views
 from epipole.tasks.algorithms.kernels import kernel
@@ -20,7 +21,6 @@ SIGHTS = 100  # lines of sight that sample all fields together, at least one per
 STEPS = 24  # along a line of sight, in addition to the shells' edges
 MOST = 10.0  # largest rate of a shell over the common rate
 PRIOR_OBJECTS = 1.0  # weight of the prior of a shell, as a number of objects
-CERTAIN_LOG_ODDS = 8.0  # groups that count from the first round
 ROUNDS = 100
 
 
