@@ -16,14 +16,13 @@ from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.truth import SUFFIX, TruthWriter
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Scene, validate_scene
+from epipole.tasks.algorithms.simulation.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposures
 from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.sensor import (
-    ARCSEC,
-    SECOND_NS,
     Attitudes,
     Beliefs,
-    Sensor,
+    SimulatedSensor,
     seconds_since,
     state_times,
 )
@@ -238,7 +237,7 @@ class _States:
     """The states of one sensor, sent block by block in order of time."""
 
     def __init__(self, simulation: Simulation, k: int) -> None:
-        self.sensor: Sensor = simulation.sensors[k]
+        self.sensor: SimulatedSensor = simulation.sensors[k]
         self._settings = simulation.groups[k].states
         self._attitudes, self._beliefs = Attitudes(self.sensor), Beliefs(self.sensor)
         self._times, self._sent = state_times(self.sensor), 0

@@ -1,4 +1,4 @@
-"""How far results are from the truth: attitudes, positions, and which group is which object."""
+"""Evaluation: errors of attitudes and positions against the truth, and of the grouping."""
 
 from typing import NamedTuple
 
@@ -11,12 +11,12 @@ Indices = npt.NDArray[np.int64]
 
 
 def attitude_errors(q_found: Array, q_true: Array) -> tuple[Array, Array]:
-    """Return how far found attitudes are turned from true ones, about the sensor's axes.
+    """Return the errors of attitudes against the true ones, about the sensor's axes.
 
     Parameters
     ----------
     q_found, q_true : (n, 4) float
-        Quaternions, sensor from ICRS, scalar last, of any length but 0.
+        Quaternions, sensor from ICRS, scalar last; any length above 0.
 
     Returns
     -------
@@ -32,9 +32,10 @@ def attitude_errors(q_found: Array, q_true: Array) -> tuple[Array, Array]:
 
 
 def squared_normalised_errors(error: Array, covariance: Array) -> Array:
-    """Return e' C^-1 e of errors (n, 3) and covariances (n, 3, 3): chi-square of 3 if honest.
+    """Return e' C^-1 e of errors (n, 3) and covariances (n, 3, 3).
 
-    Infinite where the covariance is not positive definite: such a claim is as wrong as can be.
+    Chi-square distributed with 3 degrees of freedom if the covariances are right. Infinite where
+    a covariance is not positive definite.
     """
     finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     safe = np.where(finite[:, None, None], covariance, np.eye(3))
@@ -45,21 +46,21 @@ def squared_normalised_errors(error: Array, covariance: Array) -> Array:
 
 
 class Majority(NamedTuple):
-    """Of each group, the value most of its members have, -1 where none has any, and how many."""
+    """The most frequent value of each group (-1 without any), and the number of its members."""
 
     value: Indices
     votes: Indices
 
 
 def majority(group: Indices, value: Indices, n_groups: int) -> Majority:
-    """Return the most frequent value of each group; of equals, the one that comes first.
+    """Return the most frequent value of each group; of a tie, the value that comes first.
 
     Parameters
     ----------
     group : (n,) int
-        0 to n_groups - 1.
+        Group of each member, 0 to n_groups - 1.
     value : (n,) int
-        Members with a negative value are not counted.
+        Value of each member; negative ones are not counted.
     """
     there = np.flatnonzero(value >= 0)
     group, value = group[there], value[there]
@@ -78,7 +79,7 @@ def majority(group: Indices, value: Indices, n_groups: int) -> Majority:
 
 
 def pairs_within(group: Indices, value: Indices, n_groups: int) -> tuple[int, int]:
-    """Return how many pairs groups have, and how many are of equal values that are not negative."""
+    """Return the number of pairs within groups, and of those with equal values (0 or above)."""
     size = np.bincount(group, minlength=n_groups)
     alike = value >= 0
     together = np.unique(np.stack([group[alike], value[alike]]), axis=1, return_counts=True)[1]

@@ -10,7 +10,11 @@ import pyarrow as pa
 from epipole.schemas.bridge import array, nullable, stack, table, unstack
 from epipole.schemas.settings import SensorSettings, Settings
 from epipole.schemas.work_tables import PLACES
-from epipole.tasks.algorithms.orbits.state_interpolation import Places, States, interpolate_states
+from epipole.tasks.algorithms.orbits.state_interpolation import (
+    Places,
+    SensorStates,
+    interpolate_states,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +33,7 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
         own = np.flatnonzero(state_sensor == name)
         columns: list[npt.NDArray[Any]] = [values[own] for values in all_states]
         places = interpolate_states(
-            States(*columns),
+            SensorStates(*columns),
             time_ns[frames],
             settings.sensors.state_gap_s,
         )
@@ -48,11 +52,11 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
     return table(PLACES, {**key, **{name: nullable(value) for name, value in by_name.items()}})
 
 
-def _states(states: pa.Table, settings: SensorSettings) -> States:
+def _states(states: pa.Table, settings: SensorSettings) -> SensorStates:
     """Return the rows' states; a sigma of 0 is unknown and takes the settings' value."""
     position_sigma_km = array(states, "position_sigma_km")
     attitude_sigma = array(states, "attitude_sigma_arcsec")
-    return States(
+    return SensorStates(
         array(states, "time"),
         stack(states, "{}_km"),
         stack(states, "v{}_km_s"),

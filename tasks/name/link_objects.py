@@ -13,7 +13,7 @@ from epipole.schemas.bridge import stack_covariance
 from epipole.schemas.columns import STATE_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.stages import Stage
-from epipole.tasks.algorithms.orbits.object_linking import Seen, chains, link_by_motion
+from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, chains, link_by_motion
 from epipole.tasks.common.stage_tasks import stage_task
 
 Array = npt.NDArray[np.float64]
@@ -33,7 +33,7 @@ def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> d
     if not len(ends):
         return {}
     origin = ends["first"].min()
-    seen = Seen(
+    seen = ObservedMotions(
         *(_seconds(ends, name, origin) for name in ("first", "last", "head_epoch", "tail_epoch")),
         *(ends.select(_named(side, [*PLACE, *VELOCITY])).to_numpy() for side in ("head", "tail")),
         *(stack_covariance(ends, f"{side}_cov_{{}}", STATE_AXES) for side in ("head", "tail")),

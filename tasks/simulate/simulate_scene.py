@@ -17,19 +17,17 @@ from epipole.schemas.bridge import table, unstack
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Orbit, Scene, SceneCamera, SceneSensor
 from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_POINTS
+from epipole.tasks.algorithms.simulation.constants import ARCSEC, GM_KM3_S2, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposing, Exposures
-from epipole.tasks.algorithms.simulation.optics import Optics, field_radius
+from epipole.tasks.algorithms.simulation.optics import TrueOptics, field_radius
 from epipole.tasks.algorithms.simulation.orbits import (
-    GM_KM3_S2,
     circular_velocity,
     elements_from_state,
     mean_from_true_anomaly,
     state_at,
 )
 from epipole.tasks.algorithms.simulation.sensor import (
-    ARCSEC,
-    SECOND_NS,
-    Sensor,
+    SimulatedSensor,
     frame_times,
     random_stream,
 )
@@ -49,7 +47,7 @@ class Simulation:
 
     scene: Scene
     t0_ns: int
-    sensors: list[Sensor]
+    sensors: list[SimulatedSensor]
     groups: list[SceneSensor]  # the group of the scene that each sensor belongs to
     targets: Array  # (n, 6) elements at t0
     target_magnitude: Array
@@ -59,7 +57,7 @@ def simulate_scene(scene: Scene) -> Simulation:
     """Return the sensors and objects of a scene. The same scene always gives the same ones."""
     t0_ns = round(scene.start.timestamp() * 1e6) * 1000
     targets, magnitude = _targets(scene)
-    sensors: list[Sensor] = []
+    sensors: list[SimulatedSensor] = []
     groups: list[SceneSensor] = []
     for group in scene.sensors:
         for number in range(1, group.count + 1):
@@ -126,7 +124,7 @@ def true_tables(sensor_id: str, exposed: Exposures) -> tuple[pa.Table, pa.Table]
     return frames, points
 
 
-def sent_optics(camera: SceneCamera) -> Optics:
+def sent_optics(camera: SceneCamera) -> TrueOptics:
     """Return the optics that the log reports."""
     if camera.focal_px is not None:
         focal = camera.focal_px
@@ -135,10 +133,10 @@ def sent_optics(camera: SceneCamera) -> Optics:
     cx = (camera.width - 1) / 2 if camera.cx_px is None else camera.cx_px
     cy = (camera.height - 1) / 2 if camera.cy_px is None else camera.cy_px
     lens = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
-    return Optics(camera.width, camera.height, focal, focal, cx, cy, *lens)
+    return TrueOptics(camera.width, camera.height, focal, focal, cx, cy, *lens)
 
 
-def true_optics(camera: SceneCamera) -> Optics:
+def true_optics(camera: SceneCamera) -> TrueOptics:
     """Return the true optics, which make the image."""
     sent, off = sent_optics(camera), camera.departure
     return sent._replace(
@@ -221,7 +219,7 @@ def _spread(orbit: Orbit, spread_km: float, rng: np.random.Generator) -> Array:
 
 def _sensor(
     scene: Scene, group: SceneSensor, name: str, index: int, t0_ns: int, targets: Array
-) -> Sensor:
+) -> SimulatedSensor:
     rng = random_stream(scene.seed, index, "sensor")
     pointing, detection, states = group.pointing, group.detection, group.states
     phase = float(rng.random()) if group.phase is None else group.phase
@@ -231,7 +229,7 @@ def _sensor(
         followed = _elements(pointing.orbit, rng) if pointing.orbit else np.zeros(6)
     ra, dec = math.radians(pointing.ra_deg or 0.0), math.radians(pointing.dec_deg or 0.0)
     noise_arcsec = states.prior_noise_arcsec
-    return Sensor(
+    return SimulatedSensor(
         sensor_id=name,
         index=index,
         seed=scene.seed,

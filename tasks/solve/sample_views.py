@@ -7,7 +7,7 @@ import pyarrow as pa
 from epipole.schemas.bridge import array, stack, stack_covariance
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.tasks.algorithms.association.sampling.samples import Samples
-from epipole.tasks.algorithms.association.verdicts import Seen
+from epipole.tasks.algorithms.association.verdicts import ViewKeys
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.common.sightings import camera_of, solved_frames
 
@@ -62,10 +62,10 @@ class SpanViews:
         cuts = np.flatnonzero(np.diff(window)) + 1
         return np.split(np.arange(len(window)), cuts)
 
-    def keys(self, windows: list[Indices]) -> Seen:
+    def keys(self, windows: list[Indices]) -> ViewKeys:
         """Return the epoch, window, tracklet and sensor of each row."""
         window = np.repeat(np.arange(len(windows)), [len(rows) for rows in windows])
-        return Seen(self.epoch_ns, window, self.tracklet, self.sensor)
+        return ViewKeys(self.epoch_ns, window, self.tracklet, self.sensor)
 
     def samples(self, rows: Indices, instants: Indices) -> tuple[Samples, Indices]:
         """Return the samples of the tracklets at some epochs, and the tracklets' numbers."""

@@ -21,7 +21,11 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
 from epipole.schemas.tables import ASSOCIATIONS, PAIRS, POSITIONS, REJECTS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.epipolar import epipolar_angle, epipolar_sigma
+from epipole.tasks.algorithms.geometry.epipolar import (
+    UncertainSight,
+    epipolar_angle,
+    epipolar_sigma,
+)
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import velocities
@@ -190,9 +194,10 @@ def _pair_up(groups: _Groups) -> _Pairs:
     cov = np.swapaxes(basis, -1, -2) @ groups.cov @ basis
     sigma_km = array(groups.views, "position_sigma_km")
     sigma = epipolar_sigma(
-        r[a], u[a], cov[a], r[b], u[b], cov[b], sigma_km[a], sigma_km[b],
+        UncertainSight(r[a], u[a], cov[a], sigma_km[a]),
+        UncertainSight(r[b], u[b], cov[b], sigma_km[b]),
         groups.x_km[groups.group[a]],
-    )  # fmt: skip
+    )
     pixel = array(groups.views, "pixel_rad")
     return _Pairs(a, b, np.abs(angle) / pixel[b], np.abs(angle) / sigma)
 

@@ -1,4 +1,4 @@
-"""Alignment: positions of sensors that never expose together against those that always do.
+"""Alignment: position errors of sensors that never expose together, or always do.
 
 python tests/benchmarks/bench_alignment.py
 """
@@ -40,13 +40,13 @@ def scene_of(rates_hz: list[float], changes: dict[str, float | None]) -> Scene:
 
 
 def errors_of(scene: Scene, seed: int) -> Array:
-    """Return the position errors of a simulated log [km], of at most one epoch a second."""
+    """Return the position errors [km] of a simulated log, at most one epoch per second."""
     settings = Settings()
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "night.mcap"
         simulate(scene, log, seed=seed)
-        seen = see(log, settings)
-        solved = solve(seen, track(seen, settings), settings)
+        night = see(log, settings)
+        solved = solve(night, track(night, settings), settings)
         return position_errors(log, solved.positions)
 
 

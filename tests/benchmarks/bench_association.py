@@ -1,10 +1,10 @@
-"""Association measured: points at one instant, many sensors, tracklets; the published beside it.
+"""Association: points at one instant, many sensors, tracklets, and the published method.
 
 ``python tests/benchmarks/bench_association.py [TABLE ...] [--seeds N]``, tables: points, openptv,
 floor, scale, tracklets.
 
-Points: F1 over the objects that at least three sensors detect; a group is right if it holds at
-least three of its object's points and no other. OpenPTV runs on the same points where `optv` is
+Points: F1 over the objects that at least three sensors detect. A group is right if it holds at
+least three points of its object and no other point. OpenPTV runs on the same points if `optv` is
 installed (the extra ``bench``). Times are CPU times.
 """
 
@@ -19,7 +19,7 @@ from epipole.tasks.algorithms.constants import ARCSEC
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from points import PIXEL_RAD, Points, Score, judge, scene, told
+from points import PIXEL_RAD, Points, Score, judge, oracle_groups, scene
 
 from epipole.schemas.settings import AssociationSettings
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
@@ -48,13 +48,13 @@ def associate(samples: Samples) -> Groups:
 
 
 def by_lines(samples: Samples) -> Groups:
-    """Associate as it was published."""
+    """Associate by the published method."""
     focal_px = np.full(len(samples.half_field), 1 / PIXEL_RAD)
     return associate_by_lines(samples, focal_px, LINES_PX)
 
 
 def judge_once(points: Points, group: np.ndarray) -> Score:
-    """Score as `judge` does, but an object found twice is right once only."""
+    """Score like `judge`, but count an object with two groups only once."""
     score = judge(points, group)
     found = [
         int(own[0])
@@ -67,7 +67,7 @@ def judge_once(points: Points, group: np.ndarray) -> Score:
 def cell(
     method, n_sensors: int, n_objects: int, n_false: int, seeds: int
 ) -> tuple[float, Score, float]:
-    """Return F1 [%], the scores summed, and the median time [ms] of one density."""
+    """Return F1 [%], the sum of the scores, and the median time [ms] of one density."""
     scores, took = [], []
     for seed in range(seeds):
         points = scene(seed, n_sensors, n_objects, n_false)
@@ -103,8 +103,8 @@ def openptv_table(seeds: int) -> None:
 
 def points_table(seeds: int) -> None:
     """Print the table of points at one instant."""
-    associate(scene(0, 4, 20, 10).samples)  # compiled before anything is timed
-    print(f"\nPoints at one instant, 20 objects, {seeds} seeds a cell: F1 % (median ms)")
+    associate(scene(0, 4, 20, 10).samples)  # compiles, before the timing
+    print(f"\nPoints at one instant, 20 objects, {seeds} seeds per cell: F1 % (median ms)")
     print("sensors | false points | default | wanted, groups, right | published, L = 1 px")
     for n_sensors in (4, 8, 20):
         for n_false in FALSE:
@@ -119,7 +119,7 @@ def points_table(seeds: int) -> None:
 
 
 def scale_table(seeds: int) -> None:
-    """Print what 100 sensors with 1,000 objects and 1,000 false points each come to."""
+    """Print the result for 100 sensors with 1,000 objects and 1,000 false points each."""
     print("\n100 sensors, 1,000 objects, 1,000 false points each, one core")
     associate(scene(0, 8, 20, 10).samples)
     for seed in range(seeds):
@@ -137,15 +137,15 @@ def scale_table(seeds: int) -> None:
 
 
 def orbit(state: np.ndarray, ahead_s: np.ndarray) -> np.ndarray:
-    """Return where an object is, ahead_s from its state."""
+    """Return the positions of an object at times `ahead_s` after its state."""
     return np.array([propagate(state, t)[:3] for t in ahead_s])
 
 
 def tracklets(seed: int, n_sensors: int, n_lone: int, times_s: np.ndarray, n_objects: int = 20):
-    """Return tracklets at instants that share no detection, and whose they are.
+    """Return tracklets at independent instants, and the object of each (-1: unrelated).
 
-    Low orbits; GEO objects that all sensors see, and as many as said that one sensor alone sees,
-    whose motion differs by 2"/s.
+    Sensors in low orbits, GEO objects that all sensors see, and `n_lone` unrelated tracklets for
+    each sensor with motions that differ by 2"/s.
     """
     rng = np.random.default_rng(seed)
     geo, v = np.array([-39359.89, 15125.76, 64.30]), np.array([-1.103, -2.870, 0.0])
@@ -184,7 +184,7 @@ def tracklets(seed: int, n_sensors: int, n_lone: int, times_s: np.ndarray, n_obj
     shake = rng.normal(size=(*sight.shape[:2], 2)) * ARCSEC
     sight += np.einsum("nka,nkai->nki", shake, tangent_basis(sight))
     sight /= np.linalg.norm(sight, axis=2, keepdims=True)
-    # What leaves the field has no view there.
+    # An object out of the field has no view.
     inside = np.einsum("nki,nki->nk", sight, look[np.array(sensor)]) > np.cos(np.radians(1.4))
     first = np.array([times_s[np.flatnonzero(row)[0]] if row.any() else 0.0 for row in inside])
     last = np.array([times_s[np.flatnonzero(row)[-1]] if row.any() else 0.0 for row in inside])
@@ -199,28 +199,28 @@ def tracklets(seed: int, n_sensors: int, n_lone: int, times_s: np.ndarray, n_obj
 
 
 def pair_score(who: np.ndarray, group: np.ndarray) -> tuple[int, int, int]:
-    """Return how many pairs of tracklets are one object, are grouped, and both."""
+    """Return how many pairs of tracklets are true, grouped, and both."""
 
     def pairs(label: np.ndarray) -> set[tuple[int, int]]:
         out = set()
         for k in range(label.max(initial=-1) + 1):
-            own = np.flatnonzero(label == k).tolist()
-            out |= {(i, j) for i in own for j in own if i < j}
+            members = np.flatnonzero(label == k).tolist()
+            out |= {(i, j) for i in members for j in members if i < j}
         return out
 
-    true, found = pairs(who), pairs(group)
-    return len(true), len(found), len(true & found)
+    true, grouped = pairs(who), pairs(group)
+    return len(true), len(grouped), len(true & grouped)
 
 
 def floor_table(seeds: int) -> None:
-    """Print what one who is told the true places could do, by how sure he wants to be."""
-    print("\nTold where the objects are: objects with a stray %, F1 %, true views kept %")
+    """Print what is possible with known positions, for several thresholds of the log-odds."""
+    print("\nPositions of the objects known: objects with a false view %, F1 %, true views kept %")
     for n_sensors, n_objects, n_false in ((8, 20, 1000), (20, 20, 1000), (100, 1000, 1000)):
         scenes = [scene(k, n_sensors, n_objects, n_false) for k in range(seeds)]
         for least, lead in ((0.0, 0.0), (5.0, 3.0), (5.0, 5.0), (7.0, 5.0), (8.5, 5.0)):
             total, kept, true = np.zeros(4), 0, 0
             for points in scenes[: 1 if n_sensors == 100 else None]:
-                group = told(points, least, lead)
+                group = oracle_groups(points, least, lead)
                 total += np.array(judge_once(points, group))
                 kept += int(((group == points.who) & (group >= 0)).sum())
                 true += int((points.who >= 0).sum())
@@ -240,7 +240,7 @@ def tracklet_table(seeds: int) -> None:
         (2, 100, np.arange(6.0, 60, 12)),
         (2, 100, np.linspace(25, 575, 12)),
     )
-    print("\nTracklets, 20 objects, lone ones a sensor as said")
+    print("\nTracklets, 20 objects, lone tracklets per sensor")
     for n_sensors, n_lone, times_s in cases:
         total, took = np.zeros(3, int), []
         for seed in range(seeds):
@@ -249,17 +249,18 @@ def tracklet_table(seeds: int) -> None:
             groups = associate(samples)
             took.append(time.thread_time() - begun)
             total += pair_score(who, groups.group)
-        true, found, right = total.tolist()
+        true, grouped, right = total.tolist()
         print(
             f"{n_sensors} sensors, {n_lone} lone, {len(times_s)} instants in "
-            f"{np.ptp(times_s) + 12:.0f} s: precision {100 * right / max(found, 1):.2f} %, recall "
-            f"{100 * right / max(true, 1):.2f} % of {true} pairs, {1e3 * np.median(took):.0f} ms",
+            f"{np.ptp(times_s) + 12:.0f} s: precision {100 * right / max(grouped, 1):.2f} %, "
+            f"recall {100 * right / max(true, 1):.2f} % of {true} pairs, "
+            f"{1e3 * np.median(took):.0f} ms",
             flush=True,
         )
 
 
 def main() -> None:
-    """Run the tables asked for, or all."""
+    """Run the requested tables, or all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
         "tables", nargs="*", default=["points", "openptv", "floor", "scale", "tracklets"]

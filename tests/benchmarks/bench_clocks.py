@@ -1,4 +1,4 @@
-"""Clocks: offsets told from a minute of data, over their sigmas, and what is made of them."""
+"""Clocks: offsets estimated from a minute of data, over their sigmas, and the decisions."""
 
 from typing import Any
 
@@ -11,17 +11,17 @@ OFFSETS_S = (0.0, 0.005, -0.02, 0.05, -0.1, 0.2, -0.3, 0.5, -0.7, 1.0, -1.3, 2.0
 
 
 def main() -> None:
-    """Print a row an offset, then the scatter of all estimates over their sigmas."""
-    told: list[Any] = []
-    read = flow.estimate_clocks
+    """Print a row for each offset, then the scatter of all estimates over their sigmas."""
+    estimates: list[Any] = []
+    estimate_clocks = flow.estimate_clocks
 
-    def noted(*args: Any) -> Any:
-        told.append(read(*args))
-        return told[-1]
+    def recorded(*args: Any) -> Any:
+        estimates.append(estimate_clocks(*args))
+        return estimates[-1]
 
-    flow.estimate_clocks = noted
+    flow.estimate_clocks = recorded
     scores, wrong = [], 0
-    print("| true s | told s | sigma s | called off | others called off | left out |")
+    print("| true s | estimate s | sigma s | wrong clock | others called wrong | left out |")
     with runs() as run:
         for k, offset_s in enumerate(OFFSETS_S):
 
@@ -29,18 +29,18 @@ def main() -> None:
                 scene["seed"] = 300 + k
                 scene["sensors"][k % 4]["clock_offset_s"] = offset_s
 
-            told.clear()
+            estimates.clear()
             summary, *_ = run(late)
             name = f"sat{k % 4 + 1}"
-            for clock in told[0]:
+            for clock in estimates[0]:
                 true = offset_s if clock.sensor_id == name else 0.0
                 scores.append((clock.offset_s - true) / clock.sigma_s)
                 if clock.sensor_id == name:
-                    own = clock
+                    late_clock = clock
                 else:
                     wrong += clock.is_off
-            print(f"| {offset_s} | {own.offset_s:.3f} | {own.sigma_s:.3f} | {own.is_off} | "
-                  f"{wrong} | {summary.rejects} |", flush=True)  # fmt: skip
+            estimate = f"{late_clock.offset_s:.3f} | {late_clock.sigma_s:.3f} | {late_clock.is_off}"
+            print(f"| {offset_s} | {estimate} | {wrong} | {summary.rejects} |", flush=True)
     print(f"rms over sigma {np.sqrt(np.mean(np.square(scores))):.2f} of {len(scores)}")
 
 

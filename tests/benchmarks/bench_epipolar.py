@@ -1,7 +1,8 @@
-"""The published association re-run: what comes out beside what was printed.
+"""The published association, run again: its results beside those of the paper.
 
-Huang, Zhang, Feng, doi 10.19650/j.cnki.cjsi.J1905157: threshold against errors, ambiguity with
-100 random points, positions of GEO1 and GEO5. ``python tests/benchmarks/bench_epipolar.py
+Huang, Zhang, Feng: Space target synchronization association method under distributed star sensor,
+doi 10.19650/j.cnki.cjsi.J1905157. Threshold against errors, ambiguity with 100 random points,
+positions of GEO1 and GEO5. ``python tests/benchmarks/bench_epipolar.py
 [--scenes N] [--out DIR]``; with --out it draws pictures (needs matplotlib: the extra `bench`).
 """
 
@@ -34,7 +35,7 @@ ORBITS = (  # a km, e, i, RAAN, argument of perigee, true anomaly, degrees: tabl
     (6995.72, 0.00, 98.096, 124.52, 189.66, 234.47),
 )
 GEO1, GEO5 = np.array([-39359.89, 15125.76, 64.30]), np.array([-39347.14, 15135.49, 844.10])
-SIZE, FOCAL = 512, 7331.0  # the 2 degrees fit the printed pixels best as half the field
+SIZE, FOCAL = 512, 7331.0  # the pixels of the paper fit best with 2 degrees as half the field
 MIDDLE = 256.0
 THRESHOLDS = (2, 4, 6, 8, 10, 12, 15, 20, 25, 30)
 RANDOM_POINTS = 100
@@ -43,7 +44,7 @@ PLACE_KM = 0.2
 
 
 class Pose(NamedTuple):
-    """Sensors: intrinsic matrices, attitudes, places."""
+    """Sensors: intrinsic matrices, attitudes, positions."""
 
     M: Array
     R: Array
@@ -51,7 +52,7 @@ class Pose(NamedTuple):
 
 
 def places() -> Array:
-    """Return where table 1's sensors are."""
+    """Return the positions of table 1's sensors."""
     rows = []
     for a, e, *angles in ORBITS:
         i, raan, argp, true = np.radians(angles)
@@ -87,7 +88,7 @@ def image(pose: Pose, s: int, x: Array) -> Array:
 
 
 def disturbed(pose: Pose, sigma_rad: float, place_km: float, rng: np.random.Generator) -> Pose:
-    """Return what is believed of the sensors: angles and places off by these, 1-sigma an axis."""
+    """Return the sensors with errors of attitude and position, 1-sigma per axis."""
     n = len(pose.R)
     turn = quaternion_from_rotation_vector(rng.normal(size=(n, 3)) * sigma_rad)
     place = pose.r_km + rng.normal(size=(n, 3)) * place_km
@@ -95,9 +96,9 @@ def disturbed(pose: Pose, sigma_rad: float, place_km: float, rng: np.random.Gene
 
 
 def pair_scores(scenes: int, seed: int = 1) -> list[tuple[int, float, float]]:
-    """Return (L, recall, precision) of the pairs of nine objects and two false points an image, %.
+    """Return (L, recall %, precision %) of pairs, nine objects and two false points per image.
 
-    Angles 1', places 0.2 km, centroids 0.5 px, each 1-sigma.
+    Errors: attitude 1', position 0.2 km, centroid 0.5 px, each 1-sigma.
     """
     true, found = 0, np.zeros(len(THRESHOLDS))
     right = np.zeros(len(THRESHOLDS))
@@ -129,7 +130,7 @@ def pair_scores(scenes: int, seed: int = 1) -> list[tuple[int, float, float]]:
 
 
 def line_distance(scenes: int, sigma_rad: float, place_km: float) -> tuple[float, float]:
-    """Return the least and the greatest mean distance to the line, over the pairs of images."""
+    """Return the least and greatest mean distance to the line [px] of all pairs of images."""
     rng = np.random.default_rng(2)
     total = np.zeros((4, 4))
     for _ in range(scenes):
@@ -151,8 +152,8 @@ def line_distance(scenes: int, sigma_rad: float, place_km: float) -> tuple[float
 def ambiguity(scenes: int, overlap: bool) -> list[float]:
     """Return the share [%] of points with another candidate, at L = 5, 10, 15, 20 px.
 
-    A hundred random points in each image; a point is ambiguous if two or more of the other
-    image's lie within L of its line.
+    A hundred random points per image. A point is ambiguous if two or more points of the other
+    image lie within L of its line.
     """
     rng = np.random.default_rng(3)
     wide = SIZE / 2 / np.tan(np.radians(10.0))
@@ -178,7 +179,7 @@ def ambiguity(scenes: int, overlap: bool) -> list[float]:
 def positions(scenes: int, x: Array, sigma_arcsec: float) -> tuple[Array, float]:
     """Return the mean error on each axis [km], and the share of trials below 3 km on all [%].
 
-    By the published rule. Attitude errors of `sigma_arcsec` about each axis, places of 0.2 km.
+    By the published rule. Attitude errors `sigma_arcsec` per axis, position errors 0.2 km.
     """
     rng = np.random.default_rng(4)
     error = np.empty((scenes, 3))
@@ -221,7 +222,7 @@ def draw(out: Path, scores: list[tuple[int, float, float]], shares: dict[str, li
 
 
 def main() -> None:
-    """Print the tables; draw them where asked."""
+    """Print the tables; draw them with --out."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", type=int, default=300)
     parser.add_argument("--out", type=Path, help="folder for pictures")

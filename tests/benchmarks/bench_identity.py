@@ -1,4 +1,4 @@
-"""Identity: nine objects seen for a minute, by no sensor for a while, and for a minute again."""
+"""Identity: nine objects are observed for a minute, then not for a while, then again."""
 
 from typing import Any
 
@@ -10,8 +10,8 @@ SEEDS = (1, 2, 3)
 
 
 def main() -> None:
-    """Print a row a gap: objects seen on both sides, known again, and mistaken for another."""
-    print("| gap s | seen on both sides | known again | mistaken |")
+    """Print for each gap: objects on both sides, recognised, and mistaken for another."""
+    print("| gap s | on both sides | recognised | mistaken |")
     with runs() as run:
         for gap_s in GAPS_S:
             both = again = mistaken = 0
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def _whose(out: Any, log: Any, gap_s: float) -> dict[int, tuple[set[str], set[str]]]:
-    """Return the ids of each true object before and after the gap, of those seen on both sides."""
+    """Return the ids before and after the gap of each true object observed on both sides."""
     views = pl.read_parquet(f"{out}/night=*/associations/*.parquet").drop_nulls("centroid")
     truth = pl.read_parquet(f"{log}.truth/points.parquet").filter(pl.col("kind") == 1)
     views = views.join(truth, on=["sensor_id", "frame_number", "centroid"])

@@ -1,9 +1,9 @@
-"""Two sensors over ten minutes, end to end: objects that both see, and those that one alone does.
+"""Two sensors over ten minutes, end to end: objects of both sensors, and of one sensor only.
 
 ``python tests/benchmarks/bench_long_evidence.py [--seeds N] [--lone N] [--work DIR]`` simulates
-logs, runs them with and without evidence over more than half a minute, and evaluates. Twenty
-geostationary objects; the lone ones stand half way to these, on orbits of their own, and move in
-the image as these do but for 2"/s.
+logs, runs them with and without evidence over more than half a minute, and evaluates. There are
+twenty geostationary objects. Objects that only one sensor sees are half way to these, and their
+motion in the image differs by 2"/s.
 """
 
 import argparse
@@ -23,13 +23,13 @@ from epipole.tasks.algorithms.simulation.orbits import state_at
 Array = npt.NDArray[np.float64]
 
 DURATION_S = 600.0
-MIDDLE_S = DURATION_S / 2  # when everything is in the middle of the fields
+MIDDLE_S = DURATION_S / 2  # when all objects are near the middle of the fields
 GEO_KM = np.array([-39359.89, 15125.76, 64.30])
 EARTH_RATE_RAD_S = np.array([0.0, 0.0, 7.2921159e-5])
 V_GEO_KM_S = np.cross(EARTH_RATE_RAD_S, GEO_KM)
 OBJECTS, SPREAD_KM = 20, 200.0
-NEARER = (0.5, 0.62)  # the lone ones' ranges over the geostationary objects'
-SHORTEST_BASELINE_KM = 2500.0  # across the line of sight: no lone one is in both fields
+NEARER = (0.5, 0.62)  # ranges of the lone objects over those of the geostationary ones
+SHORTEST_BASELINE_KM = 2500.0  # across the line of sight: no lone object is in both fields
 
 SHOWN = ("pair_precision", "pair_recall", "groups", "ghosts", "positions", "nees_in_99")
 
@@ -59,7 +59,7 @@ magnitude = {magnitude}
 
 
 def low_orbits(rng: np.random.Generator) -> list[Array]:
-    """Return the elements of two orbits that have the objects in view all the time."""
+    """Return the elements of two orbits from which the objects are always in view."""
     toward = GEO_KM / np.linalg.norm(GEO_KM)
     orbits: list[tuple[Array, Array]] = []
     while len(orbits) < 2:
@@ -112,7 +112,7 @@ def scene(seed: int, n_lone: int) -> str:
 
 
 def lone(rng: np.random.Generator, r_km: Array, v_km_s: Array) -> Array:
-    """Return the state of an object that a sensor at r_km sees among the others."""
+    """Return the state of an object in the field of a sensor at r_km."""
     line = GEO_KM - r_km
     basis = tangent_basis(line / np.linalg.norm(line))
     u = line / np.linalg.norm(line) + rng.uniform(-1, 1, 2) * np.radians(0.9) @ basis
@@ -137,8 +137,12 @@ def main() -> None:
     """Print pair precision and recall with and without longer evidence, scene by scene."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=3, help="scenes")
-    parser.add_argument("--lone", type=int, default=100, help="objects that one alone sees, each")
-    parser.add_argument("--work", type=Path, help="where logs and datasets go; none: nowhere")
+    parser.add_argument(
+        "--lone", type=int, default=100, help="objects that only one sensor sees, per sensor"
+    )
+    parser.add_argument(
+        "--work", type=Path, help="folder for logs and datasets; default: temporary"
+    )
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         work = args.work or Path(folder)

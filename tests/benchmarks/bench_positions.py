@@ -1,9 +1,9 @@
-"""Positions measured against the Cramer-Rao bound, and their covariance against their errors.
+"""Positions: errors against the Cramer-Rao bound and against the stated covariance.
 
 ``python tests/benchmarks/bench_positions.py [--positions N] [--runs DIR]``
 
-Views are made with the errors that the pipeline believes in: centroids new in every view,
-attitude and place of a sensor shared by its views. The published rule (mean of the pairwise
+Views have the errors that the pipeline assumes: centroid errors are independent, attitude and
+position errors of a sensor are shared by its views. The published rule (mean of the pairwise
 intersections) gets the same views. With ``--runs`` it averages the reports of ``epipole
 evaluate --json`` in a folder.
 """
@@ -27,7 +27,7 @@ PLACE_KM = 0.05
 
 
 def sensors(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Return places of low sensors on the object's side of the Earth."""
+    """Return positions of low sensors on the object's side of the Earth."""
     out: list[np.ndarray] = []
     while len(out) < n:
         r = rng.normal(size=3)
@@ -49,13 +49,13 @@ def bound(r: np.ndarray, x: np.ndarray, variance: float) -> np.ndarray:
 
 
 def trial(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return sensors' believed places, directions, and where the object truly is."""
+    """Return reported sensor positions, directions, and the object's true position."""
     r = sensors(rng, n)
     x = GEO + rng.normal(size=3) * 300.0
     rho = np.linalg.norm(x - r, axis=1)
-    # Each sensor sees where the object was when the light left; x is the mean of these.
-    seen = x + V_GEO * (rho.mean() - rho)[:, None] / SPEED_OF_LIGHT_KM_S
-    u = (seen - r) / np.linalg.norm(seen - r, axis=1, keepdims=True)
+    # Each sensor sees the object where it was at the emission; x is the mean of these.
+    emitted = x + V_GEO * (rho.mean() - rho)[:, None] / SPEED_OF_LIGHT_KM_S
+    u = (emitted - r) / np.linalg.norm(emitted - r, axis=1, keepdims=True)
     shake = rng.normal(size=(n, 2)) * np.hypot(NOISE, BIAS)
     u += np.einsum("na,nai->ni", shake, tangent_basis(u))
     believed = r + rng.normal(size=(n, 3)) * PLACE_KM
@@ -82,8 +82,8 @@ def synthetic(n_positions: int) -> None:
         off = x - truth
         square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(P), off)
         limit = np.array([bound(t[0], t[2], variance) for t in trials])
-        # Two sensors close to one line with the object know no range: scaled by the bound, such
-        # a trial weighs like any other.
+        # Two sensors nearly in line with the object do not determine the range. Scaled by the
+        # bound, such a trial has the same weight as any other.
         scale = np.trace(limit, axis1=1, axis2=2)
         rms = np.sqrt(np.mean(np.sum(off**2, axis=1) / scale))
         plain = np.array([intersect_sights(t[0], t[1])[0] for t in trials]) - truth
@@ -97,7 +97,7 @@ def synthetic(n_positions: int) -> None:
 
 
 def reports(folder: Path) -> None:
-    """Print the mean of every number in the reports of a folder."""
+    """Print mean, least and largest of every number in the reports of a folder."""
     values: dict[str, list[float]] = {}
     files = sorted(folder.glob("ev*.json"))
     for file in files:
@@ -119,7 +119,7 @@ def _numbers(report: dict, prefix: str = "") -> list[tuple[str, float]]:
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """Run the requested parts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--positions", type=int, default=5000, help="for each number of sensors")
     parser.add_argument("--runs", type=Path, help="folder with ev*.json reports")

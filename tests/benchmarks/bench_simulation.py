@@ -1,4 +1,4 @@
-"""How fast a night is simulated, log and truth written: frames a second and peak memory.
+"""Simulation with log and truth written: frames per second and peak memory.
 
     python tests/benchmarks/bench_simulation.py [--hours 2] [--sensors 6]
 
@@ -16,7 +16,7 @@ from epipole.flows.simulate import simulate
 
 
 def bench_simulate(hours: float, sensors: int) -> dict[str, float]:
-    """Return what one simulated night took."""
+    """Return time and memory of one simulated night."""
     with tempfile.TemporaryDirectory() as folder:
         simulate("night", Path(folder) / "first.mcap", hours=0.01)
         wall, cpu = time.perf_counter(), time.process_time()

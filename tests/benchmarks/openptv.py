@@ -1,8 +1,8 @@
 """OpenPTV's correspondences on the benchmark's points (`optv`, with the extra ``bench``).
 
-Its world has the objects about the origin and the cameras towards +z, which a turn about the middle
-of what is seen gives; its camera looks along -z with y up, and its "glass" is given the refractive
-index of what is on both sides. So its images are ours to 1e-11 px. At most 4 cameras.
+OpenPTV has the objects about the origin and the cameras at +z: a rotation about the middle of the
+scene gives that. Its cameras look along -z with y up. Its "glass" gets the refractive index of
+both sides. With these the images agree to 1e-11 px. It takes at most 4 cameras.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ from epipole.tasks.algorithms.geometry.sky import tangent_basis
 
 PIXELS = 512
 SPAN_KM = 1000.0  # half the width of the volume
-DEPTH_KM = 100.0  # half its depth: the objects' heights are known
+DEPTH_KM = 100.0  # half its depth: the altitudes of the objects are known
 GLASS_KM = 20000.0  # anywhere between objects and cameras
 
 
@@ -63,7 +63,7 @@ def cameras(samples: Samples) -> list[Calibration]:
 
 
 def associate_by_openptv(samples: Samples, eps_px: float) -> np.ndarray:
-    """Return the groups that OpenPTV makes of four sensors' points: in all four, or in three."""
+    """Return OpenPTV's groups of four sensors' points: in all four sensors, or in three."""
     control = _control()
     volume = VolumeParams(
         x_span=np.array([-SPAN_KM, SPAN_KM]),

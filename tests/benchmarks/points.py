@@ -1,7 +1,7 @@
-"""Points at one instant: sensors in low orbits look at objects near GEO among false points.
+"""Points at one instant: sensors in low orbits see objects near GEO, and false points.
 
-The setting of the association benchmark: 2 degree fields of 512 px, 0.16 px centroids,
-attitudes good to 1" (x, y) and 8" (roll), 95 % of the objects detected.
+The scene of the association benchmark: 2 degree fields of 512 px, 0.16 px centroids,
+attitude errors of 1" (x, y) and 8" (roll), 95 % of the objects detected.
 """
 
 from typing import NamedTuple
@@ -32,7 +32,7 @@ DETECTED = 0.95
 
 
 class Points(NamedTuple):
-    """Samples of one instant, who each point is (-1: false), and where the objects are [km]."""
+    """Samples of one instant, the object of each point (-1: false), and the positions [km]."""
 
     samples: Samples
     who: npt.NDArray[np.int64]
@@ -40,7 +40,7 @@ class Points(NamedTuple):
 
 
 def low_orbits(rng: np.random.Generator, n: int) -> npt.NDArray[np.float64]:
-    """Return places of sensors 600 to 1200 km up that see the centre past the Earth."""
+    """Return positions of sensors at 600 to 1200 km that see the centre past the Earth."""
     out: list[npt.NDArray[np.float64]] = []
     while len(out) < n:
         r = rng.normal(size=3)
@@ -55,11 +55,11 @@ def low_orbits(rng: np.random.Generator, n: int) -> npt.NDArray[np.float64]:
 def scene(
     seed: int, n_sensors: int, n_objects: int, n_false: int, spread_km: float = 250.0
 ) -> Points:
-    """Return one instant."""
+    """Return the points of one instant."""
     rng = np.random.default_rng(seed)
     r = low_orbits(rng, n_sensors)
     x = CENTRE_KM + rng.normal(size=(n_objects, 3)) * spread_km
-    # Across the field as they come; in height within the geostationary ring.
+    # Uniform across the field; in altitude within the geostationary ring.
     height = GEO_RADIUS_KM + rng.normal(size=n_objects) * RING_KM
     x *= (height / np.linalg.norm(x, axis=1))[:, None]
     sensor, who, u, cov, look = [], [], [], [], []
@@ -77,7 +77,7 @@ def scene(
         order = rng.permutation(len(label))
         sight = np.column_stack([place[order], np.ones(len(order))])
         sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-        # The sensor's axes are believed where they are not: one small rotation for all points.
+        # The attitude error: one small rotation for all points of the sensor.
         turn = matrix_from_quaternion(
             quaternion_from_rotation_vector(rng.normal(size=3) * ATTITUDE_RAD)
         )
@@ -108,36 +108,36 @@ def scene(
     return Points(samples, np.concatenate(who), x)
 
 
-def told(points: Points, least: float, lead: float) -> npt.NDArray[np.int64]:
-    """Return the groups of one who is told where the objects are: the floor of what errors leave.
+def oracle_groups(points: Points, least: float, lead: float) -> npt.NDArray[np.int64]:
+    """Return the groups from the true positions of the objects: the best that errors allow.
 
-    In each sensor an object has the point that explains it best, if its log-odds against "missed,
-    and a false point here" are `least` or more and lead those of the next point by `lead`.
+    In each sensor an object gets the point that fits best, if its log-odds against "missed, and
+    a false point here" are at least `least` and lead those of the next point by `lead`.
     """
     s = points.samples
     group = np.full(len(points.who), -1)
     for sensor, r in enumerate(s.sensor_km[:, 0]):
-        own = np.flatnonzero(s.sensor == sensor)
+        rows = np.flatnonzero(s.sensor == sensor)
         toward = points.x_km - r
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        e = np.einsum("tai,ni->nta", tangent_basis(s.u[own, 0]), toward)
-        weight = np.linalg.inv(s.cov[own, 0])
-        spot = 2 * np.pi * np.sqrt(np.linalg.det(s.cov[own, 0]))
-        clutter = len(own) / FIELD_RAD**2
+        e = np.einsum("tai,ni->nta", tangent_basis(s.u[rows, 0]), toward)
+        weight = np.linalg.inv(s.cov[rows, 0])
+        spot = 2 * np.pi * np.sqrt(np.linalg.det(s.cov[rows, 0]))
+        clutter = len(rows) / FIELD_RAD**2
         odds = np.log(DETECTED / (1 - DETECTED) / (clutter * spot))
         odds = odds - np.einsum("nta,tab,ntb->nt", e, weight, e) / 2
-        odds[toward @ s.u[own, 0].mean(axis=0) < 0] = -np.inf
+        odds[toward @ s.u[rows, 0].mean(axis=0) < 0] = -np.inf
         order = np.argsort(-odds, axis=1)[:, :2]
         best, second = np.take_along_axis(odds, order, axis=1).T
         sure = np.flatnonzero((best >= least) & (best - second >= lead))
-        # A point that two objects claim is the likelier one's.
+        # A point that two objects claim belongs to the likelier one.
         for k in sure[np.argsort(best[sure])].tolist():
-            group[own[order[k, 0]]] = k
+            group[rows[order[k, 0]]] = k
     return group
 
 
 class Score(NamedTuple):
-    """How many objects three sensors detect, how many groups, how many of these are right."""
+    """Objects that three sensors detect, groups, right groups, groups with a false view."""
 
     wanted: int
     groups: int
@@ -165,7 +165,7 @@ def judge(points: Points, group: npt.NDArray[np.int64], least: int = 3) -> Score
         groups += 1
         true = members[members >= 0]
         best = np.bincount(true).argmax() if len(true) else -1
-        own = int((members == best).sum()) if len(true) else 0
-        right += own >= least and own == len(members)
-        strays += own >= least and own < len(members)
+        n_best = int((members == best).sum()) if len(true) else 0
+        right += n_best >= least and n_best == len(members)
+        strays += n_best >= least and n_best < len(members)
     return Score(int((seen_by >= least).sum()), groups, right, strays)

@@ -1,4 +1,4 @@
-"""Arcs of one geostationary object, seen with errors that are new in each view and shared ones."""
+"""Arcs of a geostationary object, with independent errors and errors that views share."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ GEO = np.array([-39359.89, 15125.76, 64.30, -1.1030, -2.8700, 0.01])
 
 
 def trial(seed, *, n_sensors=4, times=None, noise=2.0, bias=3.0, place_km=0.05, truth=GEO):
-    """Views of one object with errors new in each view, and shared ones of each sensor."""
+    """Return views of one object with independent errors and with errors shared by a sensor."""
     rng = np.random.default_rng(seed)
     times = np.arange(-294.0, 295.0, 49.0) if times is None else times
     out, along = rng.normal(size=(2, n_sensors, 3))

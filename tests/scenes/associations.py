@@ -1,4 +1,4 @@
-"""Scenes of tracklets as the association gets them, and what it makes of them."""
+"""Scenes of tracklets as tables, the input of the association stage, and its results."""
 
 import numpy as np
 import pyarrow as pa
@@ -11,13 +11,11 @@ from epipole.tasks.solve.associate_objects import associate_objects
 from scenes.tracklet_scenes import Scene
 
 START_NS = int(np.datetime64("2019-04-01T04:00:00", "ns").astype(np.int64))
-
-
 WIDTH = 512
 
 
 def filled(schema: pa.Schema, n: int, columns: dict) -> pa.Table:
-    """A table with these columns; the others are null where they may be, else 0 or empty."""
+    """Return a table with these columns; the others are null if nullable, else 0 or empty."""
     arrays = []
     for field in schema:
         if field.name in columns:
@@ -32,7 +30,7 @@ def filled(schema: pa.Schema, n: int, columns: dict) -> pa.Table:
 
 
 def tables(scene: Scene, names=None) -> tuple[pa.Table, pa.Table, pa.Table, pa.Table]:
-    """The scene as the stage gets it: views, tracklets, solutions, cameras."""
+    """Return the input tables of the stage: views, tracklets, solutions, cameras."""
     samples = scene.samples()
     n_sensors, k = samples.sensor_km.shape[:2]
     names = np.array(names or [f"sat{s}" for s in range(n_sensors)])
@@ -92,10 +90,10 @@ def reasons(found) -> dict[str, int]:
 
 
 def wrong_views(scene: Scene, found) -> int:
-    """Views that share an object's number with a view of something else."""
+    """Return how many objects have views of different true objects, or of none."""
     who = np.array([scene.who[int(t[1:])] for t in found.views["tracklet_id"].to_pylist()])
     wrong = 0
     for k in np.unique(found.object_number):
-        own = who[found.object_number == k]
-        wrong += int((own != own[0]).any() or own[0] < 0)
+        true = who[found.object_number == k]
+        wrong += int((true != true[0]).any() or true[0] < 0)
     return wrong

@@ -8,12 +8,11 @@ from epipole.tasks.algorithms.sensor_faults.clock_offset import Lines
 from epipole.tasks.algorithms.simulation.orbits import state_at
 
 SIGMA = 1.0 * ARCSEC
-
-
 POSITION_KM = 0.02
 
 
 def orbit(a, i, raan, anomaly):
+    """Return orbital elements of a [km] and angles [deg]."""
     return np.array([a, 0.001, np.radians(i), np.radians(raan), 0.0, np.radians(anomaly)])
 
 
@@ -24,7 +23,7 @@ SENSORS = [
 
 
 def lines_of(seed, offsets, *, bias_km=POSITION_KM, turn_rad=0.0, n_epochs=60, used=(0, 1, 2, 3)):
-    """Lines of sight of sensors whose stamps are late by `offsets`, to nine far objects."""
+    """Return lines of sight to nine far objects, of sensors whose stamps are late by `offsets`."""
     rng = np.random.default_rng(seed)
     t = np.arange(n_epochs) * 2.0
     bias = rng.normal(size=(4, 3)) * bias_km
@@ -35,10 +34,10 @@ def lines_of(seed, offsets, *, bias_km=POSITION_KM, turn_rad=0.0, n_epochs=60, u
         x, v = state_at(target, t)
         for s in used:
             true_t = t - offsets[s]
-            seen, _ = state_at(target, true_t)
+            shown, _ = state_at(target, true_t)
             here, _ = state_at(SENSORS[s], true_t)
             r, v_sensor = state_at(SENSORS[s], t)
-            u = seen - here
+            u = shown - here
             u /= np.linalg.norm(u, axis=1)[:, None]
             u += np.cross(turn[s], u)
             noise = rng.normal(size=(n_epochs, 2)) * SIGMA
@@ -48,7 +47,7 @@ def lines_of(seed, offsets, *, bias_km=POSITION_KM, turn_rad=0.0, n_epochs=60, u
             parts["sensor"].append(np.full(n_epochs, s))
             parts["u"].append(u)
             parts["cov"].append(np.tile(np.eye(2) * SIGMA**2, (n_epochs, 1, 1)))
-            parts["x_km"].append(x + 0.5)  # a position that is solved is a little wrong
+            parts["x_km"].append(x + 0.5)  # a solved position has an error
             parts["v_km_s"].append(v)
             parts["r_km"].append(r + bias[s])
             parts["v_sensor_km_s"].append(v_sensor)

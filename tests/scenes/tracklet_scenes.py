@@ -1,4 +1,4 @@
-"""Tracklets of many sensors that look at geostationary objects, and how well they are grouped."""
+"""Scenes of tracklets: many sensors that see geostationary objects, and scores of the groups."""
 
 import numpy as np
 
@@ -9,19 +9,13 @@ from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 
 GEO = np.array([-39359.89, 15125.76, 64.30])
-
-
 V_GEO = np.array([-1.103, -2.870, 0.0])
-
-
 FIELD = np.radians(2.0)
-
-
 TIMES = np.array([5.0, 17.0, 29.0])
 
 
 class Scene:
-    """Sensors on circles that look at GEO; objects near it; tracklets of strays."""
+    """Sensors on circular orbits that look at GEO, objects near it, and unrelated tracklets."""
 
     def __init__(self, seed, n_sensors, *, sigma_arcsec=1.0, times=TIMES, same_side=True):
         self.rng = np.random.default_rng(seed)
@@ -40,6 +34,7 @@ class Scene:
         self.sensor, self.who, self.seen, self.u = [], [], [], []
 
     def objects(self, n, spread_km=200.0, seen_by=None):
+        """Add n objects near GEO with a tracklet in each sensor of `seen_by` (default: all)."""
         for k in range(n):
             start = GEO + self.rng.normal(size=3) * spread_km
             v = V_GEO + self.rng.normal(size=3) * 0.02
@@ -50,7 +45,7 @@ class Scene:
         return self
 
     def strays(self, n, sensors=None):
-        """Tracklets of things that only one sensor sees: they move much like the others."""
+        """Add n tracklets per sensor that no other sensor sees; they move much like the others."""
         for s in range(len(self.r)) if sensors is None else sensors:
             for _ in range(n):
                 path = GEO + self.times[:, None] * V_GEO - self.r[s]
@@ -62,6 +57,7 @@ class Scene:
         return self
 
     def add(self, sensor, who, u, seen=None):
+        """Add a tracklet of object `who` (-1: unrelated) with noise; u (k, 3)."""
         noise = self.rng.normal(size=(len(self.times), 2)) * self.sigma
         u = u + np.einsum("ka,kai->ki", noise, tangent_basis(u))
         self.u.append(u / np.linalg.norm(u, axis=1, keepdims=True))
@@ -106,7 +102,7 @@ def solve(samples, **changes):
 
 
 def pairs(label):
-    """Pairs of tracklets that carry one label."""
+    """Return the pairs of tracklets with the same label, 0 or above."""
     return {
         (i, j)
         for i in range(len(label))
@@ -116,6 +112,7 @@ def pairs(label):
 
 
 def judge(scene, groups):
-    """Pair precision and recall."""
-    found, true = pairs(groups.group), pairs(np.array(scene.who))
-    return len(found & true) / max(len(found), 1), len(found & true) / max(len(true), 1)
+    """Return the precision and recall of pairs."""
+    grouped, true = pairs(groups.group), pairs(np.array(scene.who))
+    right = len(grouped & true)
+    return right / max(len(grouped), 1), right / max(len(true), 1)

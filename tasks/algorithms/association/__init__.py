@@ -1,1 +1,1 @@
-"""Association: which spots in different sensors are one object."""
+"""Association: which tracklets of different sensors are one object."""

@@ -1,9 +1,9 @@
-"""Association by epipolar lines in pixels, as it was published: the method to be beaten.
+"""Association by epipolar lines in pixels: the published method, as a baseline.
 
 Huang, Zhang, Feng: Space target synchronization association method under distributed star
-sensor, doi 10.19650/j.cnki.cjsi.J1905157. A point is an object's image if it lies within a
-fixed distance of the epipolar line of a point in another image; images are paired two by two,
-and a table, a column an image, collects what all pairs agree on. No errors are weighed.
+sensor, doi 10.19650/j.cnki.cjsi.J1905157. Points of two images are a pair if one lies within a
+fixed distance of the other's epipolar line. All pairs of images are compared, and a table with a
+column for each image collects the objects on which all pairs agree. Errors are not weighed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,9 +32,9 @@ def fundamental_matrix(
     M_1, M_2 : (3, 3) float
         Intrinsic matrices [px].
     R_1_from_icrs, R_2_from_icrs : (3, 3) float
-        How the sensors are turned.
+        Attitudes of the sensors.
     r_1_km, r_2_km : (3,) float
-        Where they are, GCRF.
+        Positions of the sensors, GCRF.
 
     Returns
     -------
@@ -67,9 +67,9 @@ def line_distances(F_12: Array, p_1_px: Array, p_2_px: Array) -> Array:
 
 
 def pair_points(distance_px: Array, threshold_px: float) -> Indices:
-    """Return (k, 2) pairs of points: within the threshold, the nearest, each point once.
+    """Return (k, 2) pairs of points within the threshold, each point at most once.
 
-    The pair that lies nearest of all is taken first; ties by the order of the points.
+    The pair with the smallest distance is taken first; ties by the order of the points.
     """
     first, second = np.nonzero(distance_px <= threshold_px)
     order = np.lexsort((second, first, distance_px[first, second]))
@@ -96,13 +96,13 @@ def pair_images(
     images_px
         Points of each image, (n, 2) [px].
     M, R_sensor_from_icrs, r_km : (s, 3, 3), (s, 3, 3), (s, 3) float
-        Intrinsic matrices, attitudes and places of the sensors.
+        Intrinsic matrices, attitudes and positions of the sensors.
     threshold_px
-        L, how far from the line a point may lie.
+        Largest distance of a point from the line (L of the paper).
 
     Notes
     -----
-    The cost grows with the square of both the images and their points.
+    The cost grows with the square of the number of images and of points per image.
     """
     out = {}
     for a in range(len(images_px)):
@@ -115,24 +115,24 @@ def pair_images(
 
 
 def view_table(n_points: Sequence[int], pairs: Pairs) -> Indices:
-    """Return a row an object and a column an image: which point of the image it is.
+    """Return the table of objects: a row for each object, a column for each image.
 
-    A point joins the first row with all of whose points it is paired, else it begins a row of
-    its own; rows of a single point are dropped.
+    A point joins the first row whose points are all paired with it. Otherwise it begins a new
+    row. Rows with a single point are dropped.
 
     Parameters
     ----------
     n_points
-        How many points each image has.
+        Number of points of each image.
     pairs
         (k, 2) pairs of points of two images (a, b), a < b.
 
     Returns
     -------
     (rows, images) int
-        -1 where the image does not show the object.
+        Index of the object's point in the image, -1 where the image does not show it.
     """
-    paired = {key: {(i, j) for i, j in found.tolist()} for key, found in pairs.items()}
+    paired = {key: {(i, j) for i, j in listed.tolist()} for key, listed in pairs.items()}
     rows: list[dict[int, int]] = []
     rows_of: dict[tuple[int, int], list[int]] = {}
     for image, count in enumerate(n_points):
@@ -160,21 +160,21 @@ def view_table(n_points: Sequence[int], pairs: Pairs) -> Indices:
 
 
 def intersect_sights(r_km: Array, u: Array) -> tuple[Array, int]:
-    """Return the mean of where each two lines of sight meet, and how many served.
+    """Return the mean of the points where two lines of sight meet, and how many were used.
 
-    Where two miss, it is the middle of their common perpendicular; parallel ones do not meet.
-    A result more than 3 standard deviations from the mean in any coordinate is dropped, which
-    below 11 results cannot happen: of m values none lies further off than (m - 1) / sqrt(m).
+    Two lines meet at the middle of their common perpendicular; parallel lines are skipped. A
+    point more than 3 standard deviations from the mean in any coordinate is dropped. With fewer
+    than 11 points this cannot happen: of m values none is further off than (m - 1) / sqrt(m).
 
     Parameters
     ----------
     r_km, u : (n, 3) float
-        Places of the sensors [km] and unit vectors to the object.
+        Positions of the sensors [km] and unit vectors to the object.
 
     Returns
     -------
     (3,) float, int
-        Position [km], NaN where no two lines meet.
+        Position [km], NaN where no two lines meet, and the number of points used.
     """
     a, b = np.triu_indices(len(u), 1)
     between, normal = r_km[b] - r_km[a], np.cross(u[a], u[b])
@@ -192,33 +192,33 @@ def intersect_sights(r_km: Array, u: Array) -> tuple[Array, int]:
 
 
 def associate_by_lines(samples: Samples, focal_px: Array, threshold_px: float) -> Groups:
-    """Return which tracklets are one object, by the published method instant by instant.
+    """Return which tracklets are one object, by the published method at each instant.
 
     Parameters
     ----------
     samples
         The tracklets at their common instants.
     focal_px : (s,) float
-        Focal lengths [px]; directions become points of ideal images with the middle at 0.
+        Focal lengths [px]. Directions become points of distortion-free images centred on 0.
     threshold_px
-        L, how far from the line a point may lie.
+        Largest distance of a point from the line (L of the paper).
 
     Returns
     -------
     Groups
-        Scores are NaN and nothing is ambiguous: the method weighs nothing. Tracklets are paired
-        that are at more than half of the instants that show both; the table is made of these.
+        Scores are NaN and no tracklet is ambiguous: the method does not weigh errors. Two
+        tracklets are a pair if they are one at more than half of the instants that show both.
     """
     n_sensors = len(focal_px)
-    own = [np.flatnonzero(samples.sensor == s) for s in range(n_sensors)]
+    of_sensor = [np.flatnonzero(samples.sensor == s) for s in range(n_sensors)]
     both: dict[tuple[int, int], Array] = {}
     made: dict[tuple[int, int], Array] = {}
     for m in range(len(samples.time_s)):
-        _vote(samples, focal_px, threshold_px, own, m, made, both)
+        _vote(samples, focal_px, threshold_px, of_sensor, m, made, both)
     pairs = {key: np.argwhere(made[key] * 2 > both[key]) for key in made}
-    table = view_table([len(t) for t in own], pairs)
+    table = view_table([len(t) for t in of_sensor], pairs)
     group = np.full(len(samples.sensor), FREE, np.int64)
-    for s, tracklets in enumerate(own):
+    for s, tracklets in enumerate(of_sensor):
         shown = table[:, s] != FREE
         group[tracklets[table[shown, s]]] = np.flatnonzero(shown)
     nan = np.full(len(samples.half_field), np.nan)
@@ -229,26 +229,26 @@ def _vote(
     samples: Samples,
     focal_px: Array,
     threshold_px: float,
-    own: list[Indices],
+    of_sensor: list[Indices],
     m: int,
     made: dict[tuple[int, int], Array],
     both: dict[tuple[int, int], Array],
 ) -> None:
-    """Add one instant's pairs to `made`, and to `both` which tracklets it shows together."""
+    """Count in `made` the pairs of one instant, and in `both` the tracklets that it shows."""
     R, r = samples.R_sensor_from_icrs[:, m], samples.sensor_km[:, m]
     known = np.flatnonzero(np.isfinite(R).all(axis=(1, 2)) & np.isfinite(r).all(axis=1))
     shown, images = [], []
     for s in known:
-        place = samples.u[own[s], m] @ R[s].T
-        seen = np.flatnonzero(samples.seen[own[s], m] & (place[:, 2] > 0))
-        shown.append(seen)
-        images.append(focal_px[s] * place[seen, :2] / place[seen, 2:])
+        place = samples.u[of_sensor[s], m] @ R[s].T
+        visible = np.flatnonzero(samples.seen[of_sensor[s], m] & (place[:, 2] > 0))
+        shown.append(visible)
+        images.append(focal_px[s] * place[visible, :2] / place[visible, 2:])
     M = np.zeros((len(known), 3, 3))
     M[:, 0, 0] = M[:, 1, 1] = focal_px[known]
     M[:, 2, 2] = 1.0
-    for (a, b), found in pair_images(images, M, R[known], r[known], threshold_px).items():
+    for (a, b), matched in pair_images(images, M, R[known], r[known], threshold_px).items():
         key = int(known[a]), int(known[b])
         for counts in (made, both):
-            counts.setdefault(key, np.zeros((len(own[key[0]]), len(own[key[1]]))))
-        made[key][shown[a][found[:, 0]], shown[b][found[:, 1]]] += 1
+            counts.setdefault(key, np.zeros((len(of_sensor[key[0]]), len(of_sensor[key[1]]))))
+        made[key][shown[a][matched[:, 0]], shown[b][matched[:, 1]]] += 1
         both[key][np.ix_(shown[a], shown[b])] += 1

@@ -1,9 +1,9 @@
-"""Association by likelihood: the hypothesis that explains most, best first.
+"""Association by likelihood: which tracklets are one object, the likeliest hypothesis first.
 
-Two tracklets of two sensors whose lines of sight meet, within their errors, above the Earth,
-begin a hypothesis; other sensors' tracklets that its points explain join it; hypotheses are
-weighed against "all of these are different things" and taken best first. What two hypotheses
-explain about equally well is not decided but called ambiguous.
+Two tracklets of two sensors begin a hypothesis where their lines of sight meet, within their
+errors, above the Earth. Tracklets of other sensors join it where its points explain them. A
+hypothesis is weighed against "all of these are unrelated", and the likeliest are taken first.
+What two hypotheses explain about equally well is not decided: it is ambiguous.
 """
 
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.evidence.chance import Chance, chance_of
+from epipole.tasks.algorithms.association.evidence.chance import chance_of
 from epipole.tasks.algorithms.association.evidence.detection import (
     CERTAIN_LOG_ODDS,
     detection_odds,
@@ -25,7 +25,12 @@ from epipole.tasks.algorithms.association.evidence.object_density import (
 )
 from epipole.tasks.algorithms.association.evidence.pool import Hypothesis, Pool, distinct
 from epipole.tasks.algorithms.association.hypotheses.contests import settle_contests
-from epipole.tasks.algorithms.association.hypotheses.growth import clear_of_doubt, grow_all
+from epipole.tasks.algorithms.association.hypotheses.growth import (
+    GrownSeeds,
+    clear_of_doubt,
+    grow_all,
+)
+from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace
 from epipole.tasks.algorithms.association.hypotheses.seeds import SensorPairs, seeds_between
 from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.sampling.views import views_of
@@ -34,17 +39,17 @@ from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-DETECTED = 0.9  # before the data tell: a sensor that looks at an object has it
-FEW_SENSORS = 6  # up to this many, every pair of sensors seeds; objects of two views are found
-SEED_SIGMA = 2.5  # with more sensors: an object that one pair just misses, the next one has
-UNSEEDED = 0.05  # objects that may be left without a seed, with more sensors than that
-CLEAR_LOG_ODDS = 15.0  # with more sensors, such a group is taken before the next pair seeds
-WORTH_A_LOOK = -3.0  # log-odds at which a group waits for what the number of objects says
-BEYOND_DOUBT = 20.0  # log-odds that no number of objects brings down
+DETECTED = 0.9  # probability of detection before the data are known
+FEW_SENSORS = 6  # up to this many, every pair of sensors seeds, so two views are enough
+SEED_SIGMA = 2.5  # with more sensors: another pair seeds the objects that this gate rejects
+UNSEEDED = 0.05  # with more sensors: expected number of objects without a seed
+CLEAR_LOG_ODDS = 15.0  # with more sensors: such a group is taken before the next pair seeds
+WORTH_A_LOOK = -3.0  # log-odds of a group that is kept until the number of objects is known
+BEYOND_DOUBT = 20.0  # log-odds that no number of objects makes doubtful
 
 
 class Shell(NamedTuple):
-    """Heights [km above the equator's radius] at which a share of all objects is."""
+    """Altitudes [km above the equatorial radius] of a share of all objects."""
 
     lowest_km: float
     highest_km: float
@@ -68,35 +73,40 @@ def associate_tracklets(
     samples
         The tracklets at their common instants.
     gate_sigma
-        Views of one object agree within this (as a chi-square just as rare).
+        Views of one object agree within this (as a chi-square of the same probability).
     min_altitude_km, max_range_km
-        Objects are looked for between this height and this distance from the Earth's centre.
+        Objects are sought between this altitude and this distance from the Earth's centre.
     min_log_odds
-        A group is reported if it is more likely than chance by this (natural log).
+        A group is reported if its log-odds (natural) against chance are at least this.
     ambiguity_log_odds
-        Where another group that contradicts it comes closer than this, neither is.
+        Neither of two contradicting groups is reported if their log-odds differ by less.
     shells
-        A weak prior on altitude; what they leave of the whole is anywhere. None: all heights
-        are alike.
+        A weak prior on altitude. The share that the shells leave is spread evenly. Without
+        shells the prior is uniform.
 
     Notes
     -----
-    Deterministic: no random numbers, ties by the order of sensors and tracklets. The work
-    grows with the number of tracklets times sensors, not with its square: see `seeds`.
+    Deterministic: no random numbers; ties are decided by the order of sensors and tracklets.
+    The cost grows with the number of tracklets times sensors, not with its square: see `seeds`.
     """
     if len(samples.sensor) == 0:
         nothing = np.full(len(samples.half_field), np.nan)
         return Groups(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool), nothing)
-    limits = (EARTH_RADIUS_KM + min_altitude_km, max_range_km)
-    chance = chance_of(samples, max_range_km, DETECTED)
-    search = _Search(
-        samples, chance, gate_sigma, limits, _weights(shells, max_range_km), ambiguity_log_odds
+    views, order = views_of(samples)
+    space = SearchSpace(
+        views=views,
+        chance=chance_of(samples, max_range_km, DETECTED),
+        taken=np.zeros(len(order), np.bool_),
+        shells=_weights(shells, max_range_km).astype(float),
+        lowest_km=float(EARTH_RADIUS_KM + min_altitude_km),
+        farthest_km=float(max_range_km),
+        gate_sigma=float(gate_sigma),
     )
-    return search.run(min_log_odds)
+    return _Search(space, order, ambiguity_log_odds).run(min_log_odds)
 
 
 def _weights(shells: Iterable[Shell], farthest_km: float) -> Array:
-    """Return rows (lowest, highest radius, weight): density over that of objects anywhere."""
+    """Return rows (lowest, highest radius, weight): density over that of a uniform spread."""
     rows, rest = [], 1.0
     for lowest, highest, share in shells:
         inner, outer = EARTH_RADIUS_KM + lowest, EARTH_RADIUS_KM + highest
@@ -106,104 +116,101 @@ def _weights(shells: Iterable[Shell], farthest_km: float) -> Array:
 
 
 class _Search:
-    """Hypotheses over one set of samples."""
+    """The hypotheses over one set of samples, and the groups that are accepted.
 
-    def __init__(
-        self,
-        samples: Samples,
-        chance: Chance,
-        gate_sigma: float,
-        limits: tuple[float, float],
-        shells: Array,
-        margin: float,
-    ) -> None:
-        self.views, self.order = views_of(samples)
-        self.chance, self.gate_sigma, self.limits = chance, float(gate_sigma), np.array(limits)
-        self.shells, self.margin = shells.astype(float), float(margin)
-        self.many = len(self.views.half_field) > FEW_SENSORS
-        n = len(self.order)
-        self.taken = np.zeros(n, np.bool_)
-        self.group, self.ambiguous = np.full(n, FREE), np.zeros(n, np.bool_)
+    `order` gives the sample of each tracklet of the search space; `margin` is the difference in
+    log-odds below which two hypotheses contest each other.
+    """
+
+    def __init__(self, space: SearchSpace, order: Indices, margin: float) -> None:
+        self.space, self.order, self.margin = space, order, float(margin)
+        self.many = len(space.views.half_field) > FEW_SENSORS
+        self.group, self.ambiguous = np.full(len(order), FREE), np.zeros(len(order), np.bool_)
         self.groups: list[Hypothesis] = []
 
     def run(self, min_log_odds: float) -> Groups:
-        """Return the groups: with many sensors the clear ones at once, the others at the end."""
-        pairs = SensorPairs(self.views, float(self.limits[1]))
+        """Return the groups. With many sensors the clear ones are accepted during the search."""
+        pairs = SensorPairs(self.space.views, self.space.farthest_km)
         waiting: list[Hypothesis] = []
         while (pair := pairs.next(self._enough_pairs())) is not None:
             while pair is not None:
                 waiting += self.hypotheses(*pair)
                 pair = pairs.next(self._enough_pairs())
-            # Where sensors miss more than was thought, more pairs are needed.
+            # Where sensors miss more than was assumed, more pairs are needed.
             waiting = self._learn_detection(waiting)
         self.take(waiting, WORTH_A_LOOK)
-        settle_contests(self.views, self.chance, self.group, len(self.groups), self.gate_sigma)
+        nothing_taken = self.space._replace(taken=np.zeros_like(self.space.taken))
+        settle_contests(nothing_taken, self.group, len(self.groups))
         scores = self._withdraw_doubtful(min_log_odds)
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
         group[self.order], ambiguous[self.order] = self.group, self.ambiguous
-        return Groups(group, scores, ambiguous & (group == FREE), self.chance.detected)
+        return Groups(group, scores, ambiguous & (group == FREE), self.space.chance.detected)
 
     def _enough_pairs(self) -> float:
-        """Return how many pairs must look at a place until no object there is likely unseeded.
+        """Return how many pairs must cover a place, so that few objects there have no seed.
 
-        A pair misses an object where either sensor did. With few sensors: all.
+        A pair misses an object where either sensor does. With few sensors: all pairs.
         """
         if not self.many:
             return np.inf
-        missed = 1 - float(np.mean(self.chance.detected)) ** 2
+        missed = 1 - float(np.mean(self.space.chance.detected)) ** 2
         return float(np.ceil(np.log(UNSEEDED / max(len(self.groups), 1)) / np.log(missed)))
 
     def hypotheses(self, a: int, b: int) -> list[Hypothesis]:
-        """Return what the pairs of two sensors' tracklets grow into, beside clear groups."""
-        gate_sigma = min(self.gate_sigma, SEED_SIGMA) if self.many else self.gate_sigma
-        lowest, farthest = self.limits.tolist()
-        seeds = seeds_between(self.views, a, b, self.taken, lowest, farthest, gate_sigma)
+        """Return what the seeds of two sensors grow into; clear groups are accepted at once."""
+        gate_sigma = min(self.space.gate_sigma, SEED_SIGMA) if self.many else self.space.gate_sigma
+        seeds = seeds_between(self.space._replace(gate_sigma=gate_sigma), a, b)
         clear = CLEAR_LOG_ODDS if self.many else np.inf
         out = []
         for h in self.grow(seeds, clear):
-            if clear_of_doubt(self.chance, h.looks, len(h.members), h.score, clear):
+            if clear_of_doubt(self.space.chance, h.outcomes, len(h.members), h.score, clear):
                 self._accept(h, h.members)
             else:
                 out.append(h)
         return distinct(out)
 
     def grow(self, seeds: Indices, clear: float = np.inf) -> list[Hypothesis]:
-        """Return what (n, 2) seeds grow into among the tracklets that are free.
+        """Return what (n, 2) seeds grow into among the free tracklets.
 
-        All tracklets of a clear hypothesis are taken then.
+        The tracklets of clear hypotheses are entered in `space.taken`.
         """
-        n, n_sensors = len(seeds), len(self.views.half_field)
-        sizes, scores, x_km = np.zeros(n, np.int64), np.empty(n), np.empty((n, 3))
-        looks = np.zeros((n, n_sensors), np.int8)
-        # More than two fragments a sensor are not kept; the next span has them again.
-        grown = np.empty((n, min(2 * n_sensors, len(self.taken))), np.int64)
-        grow_all(
-            self.views, self.chance, seeds, self.taken, self.limits, self.gate_sigma, self.shells,
-            float(clear), (sizes, scores, x_km, looks, grown),
-        )  # fmt: skip
-        worth = np.flatnonzero((sizes > 0) & (scores > WORTH_A_LOOK - self.margin))
+        n, n_sensors = len(seeds), len(self.space.views.half_field)
+        # At most two fragments per sensor are kept; the next span finds the others.
+        room = min(2 * n_sensors, len(self.space.taken))
+        grown = GrownSeeds(
+            size=np.zeros(n, np.int64),
+            score=np.empty(n),
+            x_km=np.empty((n, 3)),
+            outcomes=np.zeros((n, n_sensors), np.int8),
+            members=np.empty((n, room), np.int64),
+        )
+        grow_all(self.space, seeds, float(clear), grown)
+        worth = np.flatnonzero((grown.size > 0) & (grown.score > WORTH_A_LOOK - self.margin))
         return [
             Hypothesis(
-                float(scores[q]),
+                float(grown.score[q]),
                 tuple(seeds[q].tolist()),
-                tuple(sorted(grown[q, : sizes[q]].tolist())),
-                x_km[q],
-                looks[q],
+                tuple(sorted(grown.members[q, : grown.size[q]].tolist())),
+                grown.x_km[q],
+                grown.outcomes[q],
             )
             for q in worth
         ]
 
     def _learn_detection(self, waiting: list[Hypothesis]) -> list[Hypothesis]:
-        """Estimate how likely sensors detect, from the surest; return all with their new odds."""
+        """Estimate the probabilities of detection; return the hypotheses with their new odds.
+
+        The estimate is from the groups and the surest hypotheses.
+        """
         used: set[int] = set()
         sure = []
         for h in sorted(waiting, key=lambda h: (-h.score, h.members)):
             if h.score > CERTAIN_LOG_ODDS and used.isdisjoint(h.members):
                 used.update(h.members)
                 sure.append(h)
-        believed = self.chance.detected
-        detected = estimated_detection(self.views, [*self.groups, *sure], DETECTED)
-        self.chance = self.chance._replace(detected=detected)
+        believed = self.space.chance.detected
+        detected = estimated_detection(self.space.views, [*self.groups, *sure], DETECTED)
+        self.space = self.space._replace(chance=self.space.chance._replace(detected=detected))
         self.groups = _with_detection(self.groups, believed, detected)
         return _with_detection(waiting, believed, detected)
 
@@ -212,33 +219,34 @@ class _Search:
         self.groups.append(h)
 
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
-        """Accept hypotheses, best first; what rivals contest is ambiguous."""
-        # Nearly all of what clear groups took from is nothing without it.
-        stale = [h for h in hypotheses if self.taken[list(h.members)].any()]
+        """Accept hypotheses, the likeliest first; members that a rival contests are ambiguous."""
+        taken = self.space.taken
+        # What a clear group took tracklets from is usually nothing without them: grow it again.
+        stale = [h for h in hypotheses if taken[list(h.members)].any()]
         afresh = self.grow(np.array([h.seed for h in stale], np.int64).reshape(-1, 2))
         gone = set(map(id, stale))
         pool = Pool([h for h in hypotheses if id(h) not in gone] + afresh)
         while (best := pool.pop()) is not None and best.score >= min_log_odds:
-            if self.taken[list(best.members)].any():
-                if not self.taken[list(best.seed)].any():
+            if taken[list(best.members)].any():
+                if not taken[list(best.seed)].any():
                     for again in self.grow(np.array([best.seed])):
                         pool.push(again)
                 continue
             rivals = pool.rivals(best, self.margin, self.group != FREE)
             kept = set(best.members).intersection(*(h.members for h in rivals))
-            sensors = {int(self.views.sensor[i]) for i in kept}
-            # What is left of a group that lost most of its views is no object by itself.
+            sensors = {int(self.space.views.sensor[i]) for i in kept}
+            # The rest of a group that lost most of its views is no object by itself.
             if len(sensors) >= 2 and 2 * len(kept) >= len(best.members):
                 self._accept(best, kept)
             else:
                 kept = set()
             self.ambiguous[sorted(set(best.members) - kept)] = True
-            self.taken[list(best.members)] = True
+            taken[list(best.members)] = True
 
     def _withdraw_doubtful(self, min_log_odds: float) -> Array:
-        """Withdraw groups that are not sure enough once the number of objects is known.
+        """Withdraw groups that are too unlikely once the number of objects is known.
 
-        Returns the log-odds of those that are left.
+        Returns the log-odds of the groups that are left.
         """
         scores = self._revised()
         kept = scores >= min_log_odds
@@ -250,24 +258,25 @@ class _Search:
         return np.asarray(scores[kept])
 
     def _revised(self) -> Array:
-        scores = np.array([h.score for h in self.groups])
+        """Return the groups' log-odds with the number of objects that they tell of."""
+        space, scores = self.space, np.array([h.score for h in self.groups])
         if not len(scores) or scores.min() > BEYOND_DOUBT:
             return scores
         anywhere = np.array([[0.0, np.inf, 1.0]])
-        shells = self.shells if len(self.shells) else anywhere
-        volume = visible_volume(self.views, shells, float(self.limits[1]))
+        shells = space.shells if len(space.shells) else anywhere
+        volume = visible_volume(space.views, shells, space.farthest_km)
         radius_km = np.linalg.norm([h.x_km for h in self.groups], axis=1)
-        return revised_odds(scores, radius_km, shells, volume, self.chance)
+        return revised_odds(scores, radius_km, shells, volume, space.chance)
 
 
 def _with_detection(
     hypotheses: list[Hypothesis], believed: Array, detected: Array
 ) -> list[Hypothesis]:
-    """Return the hypotheses with the odds that they have with other detection probabilities."""
+    """Return the hypotheses with their odds for other probabilities of detection."""
     if not hypotheses:
         return []
-    looks = np.array([h.looks for h in hypotheses])
-    change = detection_odds(looks, detected) - detection_odds(looks, believed)
+    outcomes = np.array([h.outcomes for h in hypotheses])
+    change = detection_odds(outcomes, detected) - detection_odds(outcomes, believed)
     return [
         replace(h, score=h.score + float(more)) for h, more in zip(hypotheses, change, strict=True)
     ]

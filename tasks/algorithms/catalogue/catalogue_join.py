@@ -1,4 +1,4 @@
-"""Gaia's stars joined with Hipparcos': brightness in V, motions, and the bright ones left out."""
+"""Gaia joined with Hipparcos: V magnitudes, motions, and the bright stars that Gaia lacks."""
 
 from typing import NamedTuple
 
@@ -13,22 +13,24 @@ from epipole.tasks.algorithms.geometry.sky import radec_from_unit, unit_from_rad
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
-# The same star: 99.9 % of Hipparcos' places moved to 2016 lie within 0.7" of Gaia's.
+# Stars within this are the same: 99.9 % of Hipparcos' places at 2016 are within 0.7" of Gaia's.
 SAME_ARCSEC = 1.0
-# A Hipparcos star is missing where nothing of like light is this near (a double that one of the
-# two resolves is not) and it is well above Gaia's limit.
+# A Hipparcos star is missing from Gaia if no Gaia star of similar brightness is this near (as
+# there is for a double that one of the catalogues resolves) and it is brighter than this.
 NEAR_ARCSEC = 3.0
 LIKE_MAG = 1.5
 SURELY_LISTED_MAG = 9.0
-# Where Hipparcos saw so much more light, its brightness stands: the relation below fails for the
-# reddest variables, and of some doubles Gaia lists the faint star alone.
+# Where Hipparcos is brighter by more, its magnitude is used: the relation below fails for the
+# reddest variables, and of some doubles Gaia lists the faint star only.
 MORE_LIGHT_MAG = 1.0
 COLOURS = (-0.5, 5.0)  # BP-RP to which the relation holds
 
 
 class Joined(NamedTuple):
-    """hipparcos_of : (n,) row of the Hipparcos star that each of Gaia's is, -1 none
-    missing : (k,) rows of Hipparcos stars that Gaia's lack
+    """Gaia's stars matched with those of Hipparcos.
+
+    hipparcos_of : (n,) int, row of the Hipparcos star of each Gaia star, -1 for none
+    missing : (k,) int, rows of Hipparcos stars that Gaia lacks
     """
 
     hipparcos_of: Rows
@@ -36,9 +38,9 @@ class Joined(NamedTuple):
 
 
 def johnson_v_of_gaia(g: Array, bp: Array, rp: Array) -> Array:
-    """Return Johnson V [mag] from Gaia DR3's magnitudes; good to 0.03 mag.
+    """Return Johnson V [mag] from the magnitudes of Gaia DR3, with errors of 0.03 mag.
 
-    Where BP or RP is NaN the others' median colour stands in.
+    Where BP or RP is NaN, the median colour of the other stars is assumed.
 
     References
     ----------
@@ -53,8 +55,10 @@ def johnson_v_of_gaia(g: Array, bp: Array, rp: Array) -> Array:
 def moved(
     ra: Array, dec: Array, pm_ra_mas_yr: Array, pm_dec_mas_yr: Array, years: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return places [rad] and motions [mas/yr] that many Julian years later, as seen from the
-    barycentre; radial velocities left aside."""
+    """Return places [rad] and motions [mas/yr] after some Julian years, for the barycentre.
+
+    Radial velocities are neglected.
+    """
     u, east, north = unit_from_radec(ra, dec), *_axes(ra, dec)
     motion = pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north
     place = u + motion * (MAS * years)
@@ -74,7 +78,7 @@ def _axes(ra: Array, dec: Array) -> tuple[Array, Array]:
 
 
 def join(u_gaia: Array, v_gaia: Array, u_hipparcos: Array, v_hipparcos: Array) -> Joined:
-    """Return which of Gaia's stars are Hipparcos', and which of Hipparcos' Gaia's lack.
+    """Return which Gaia stars are Hipparcos stars, and the Hipparcos stars that Gaia lacks.
 
     Parameters
     ----------
@@ -102,5 +106,5 @@ def join(u_gaia: Array, v_gaia: Array, u_hipparcos: Array, v_hipparcos: Array) -
 
 
 def joined_magnitude(v_gaia: Array, v_hipparcos: Array) -> Array:
-    """Return the V of stars that are in both."""
+    """Return the V magnitude of stars that are in both catalogues."""
     return np.where(v_hipparcos < v_gaia - MORE_LIGHT_MAG, v_hipparcos, v_gaia)

@@ -1,4 +1,4 @@
-"""The navigation catalogue: a star catalogue's places at a date, as a camera sees them."""
+"""The navigation catalogue: directions and magnitudes of the stars at a date, for a camera."""
 
 from typing import NamedTuple
 
@@ -17,8 +17,8 @@ class NavigationCatalogue(NamedTuple):
     """Stars at a date, brightest first, close doubles merged.
 
     star_id : (n,) int64
-    u_icrs : (n, 3) float, directions from the Earth at the date, aberration not applied
-    magnitude : (n,) float, V, of doubles together
+    u_icrs : (n, 3) float, directions from the Earth at the date, without aberration
+    magnitude : (n,) float, V; of merged doubles the total
     """
 
     star_id: npt.NDArray[np.int64]
@@ -42,7 +42,7 @@ def places_at(
     ra, dec : (n,) float
         Barycentric places at the epoch, ICRS [rad].
     parallax_mas, pm_ra_mas_yr, pm_dec_mas_yr : (n,) float
-        Parallax (below zero counts as zero); proper motions, in right ascension times cos(dec).
+        Parallax (negative values count as 0); proper motions, in right ascension times cos(dec).
     years : float
         Julian years since the epoch.
     r_observer_km : (3,) float
@@ -50,8 +50,8 @@ def places_at(
 
     References
     ----------
-    ESA (1997), The Hipparcos Catalogue, vol. 1, section 1.2.8; radial velocities left aside,
-    which move no star by 0.2" in a century.
+    ESA (1997), The Hipparcos Catalogue, vol. 1, section 1.2.8. Radial velocities are neglected:
+    they move no star by 0.2" in a century.
     """
     cos_ra, sin_ra, cos_dec, sin_dec = np.cos(ra), np.sin(ra), np.cos(dec), np.sin(dec)
     u = np.stack([cos_dec * cos_ra, cos_dec * sin_ra, sin_dec], axis=-1)
@@ -65,18 +65,18 @@ def places_at(
 
 
 def place_errors(sigma_mas: Array, pm_sigma_mas_yr: Array, years: float) -> Array:
-    """Return 1-sigma an axis [rad] of places `years` after the catalogue's epoch."""
+    """Return 1-sigma errors, per axis [rad], of places `years` after the catalogue's epoch."""
     return np.hypot(sigma_mas, pm_sigma_mas_yr * years) * MAS
 
 
 def navigation_catalogue(
     star_id: npt.NDArray[np.int64], u_icrs: Array, magnitude: Array, merge_rad: float
 ) -> NavigationCatalogue:
-    """Return the stars brightest first; those closer than `merge_rad` are one.
+    """Return the stars, brightest first, with those closer than `merge_rad` merged.
 
-    A star joins the brightest star within `merge_rad` that joined no other itself. The one
-    has that star's id, the light-weighted place and the light of all. Nothing is lost by
-    calling it before a magnitude limit: light adds, so it must see the faint companions.
+    A star merges with the brightest star within `merge_rad` that is not merged itself. The
+    result has the brightest star's id, the light-weighted place and the total light. Apply a
+    magnitude limit afterwards only: faint companions add light.
     """
     order = np.lexsort((star_id, magnitude))
     star_id, u_icrs, magnitude = star_id[order], u_icrs[order], magnitude[order]
@@ -100,7 +100,7 @@ def navigation_catalogue(
 
 
 def _close_pairs(u: Array, merge_rad: float) -> list[tuple[int, int]]:
-    """Return index pairs closer than the limit, first index the lower, in order."""
+    """Return the sorted index pairs closer than the limit, the lower index first."""
     if merge_rad <= 0 or len(u) < 2:
         return []
     pairs = cKDTree(u).query_pairs(2 * np.sin(merge_rad / 2), output_type="ndarray")
@@ -108,6 +108,6 @@ def _close_pairs(u: Array, merge_rad: float) -> list[tuple[int, int]]:
 
 
 def limit_for_density(magnitude: Array, stars_per_sr: float) -> float:
-    """Return the magnitude to which a catalogue, brightest first, has this mean density."""
+    """Return the magnitude limit at which a catalogue, brightest first, has this mean density."""
     n = int(np.clip(round(stars_per_sr * 4 * np.pi), 1, len(magnitude)))
     return float(magnitude[n - 1])

@@ -1,8 +1,7 @@
-"""Attitude from matched directions: optimal, with covariance.
+"""Attitude from matched directions: the optimum and its covariance.
 
-A reported attitude R errs by a small rotation phi about the sensor axes,
-``R_true = exp([phi x]) R``, and the covariance is that of phi [rad^2]. (Its sign does not
-matter to first order.)
+The error of an attitude R is a small rotation phi about the sensor axes,
+``R_true = exp([phi x]) R``. Covariances are those of phi [rad^2]; its sign does not matter.
 """
 
 import numpy as np
@@ -14,20 +13,20 @@ Array = npt.NDArray[np.float64]
 
 
 def optimal_attitude(u_sensor: Array, u_icrs: Array, sigma_rad: Array) -> tuple[Array, Array]:
-    """Return the attitude that fits weighted directions best, and its covariance.
+    """Return the attitude that fits weighted directions best, with its covariance.
 
     Parameters
     ----------
     u_sensor, u_icrs : (n, 3) float
-        Measured unit vectors and where they are on the sky (aberrated). n >= 2, not all one.
+        Measured unit vectors, and the apparent directions of their stars. n >= 2, not all equal.
     sigma_rad : (n,) float
-        1-sigma an axis of the measured ones.
+        1-sigma errors of the measured vectors, per axis.
 
     Returns
     -------
     R_sensor_from_icrs : (3, 3) float
     cov_rad2 : (3, 3) float
-        Of the small rotation about the sensor axes; NaN where the directions leave a turn free.
+        Of the small rotation about the sensor axes; NaN where the directions do not fix it.
 
     References
     ----------
@@ -57,7 +56,7 @@ def attitude_covariance(u_sensor: Array, sigma_rad: Array) -> Array:
     """Return (sum of (I - u u') / sigma^2)^-1 [rad^2] about the sensor axes; NaN if singular."""
     weight = 1.0 / np.square(sigma_rad)
     information = weight.sum() * np.eye(3) - np.einsum("n,ni,nj->ij", weight, u_sensor, u_sensor)
-    # Directions closer together than a millionth of a radian fix no roll.
+    # Directions within a millionth of a radian do not fix the roll.
     if len(u_sensor) < 2 or np.linalg.cond(information) > 1e12:
         return np.full((3, 3), np.nan)
     return np.linalg.inv(information)
@@ -77,7 +76,10 @@ def attitude_information(u_sensor, sigma_rad, A):
 
 @kernel
 def invert_symmetric(A, out):
-    """Write the inverse of a symmetric 3x3 matrix; return its determinant (compiled)."""
+    """Write the inverse of a symmetric 3x3 matrix (compiled).
+
+    Returns the determinant; 0, without an inverse, unless it is positive.
+    """
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
     c01 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
     c02 = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
@@ -95,7 +97,7 @@ def invert_symmetric(A, out):
 
 @kernel
 def copy_matrix(source, target):
-    """Copy a 3x3 matrix (compiled); a slice assignment compiles to far more."""
+    """Copy a 3x3 matrix (compiled); a slice assignment compiles to much more code."""
     for i in range(3):
         for j in range(3):
             target[i, j] = source[i, j]
@@ -125,7 +127,7 @@ def turn(R, x, y, z):
 
 @kernel
 def orthonormalise(R):
-    """Make the rows of R orthonormal again, in place, the boresight's direction kept (compiled)."""
+    """Make the rows of R orthonormal, in place, and keep the boresight (compiled)."""
     n = np.sqrt(R[2, 0] ** 2 + R[2, 1] ** 2 + R[2, 2] ** 2)
     for j in range(3):
         R[2, j] /= n
@@ -144,20 +146,20 @@ def orthonormalise(R):
 def refine_attitude(R, u, sigma, a, star_of, P):
     """Move R to the weighted least-squares attitude of its matches, in place; write P (compiled).
 
-    Gauss-Newton on the rotation group: quadratic, its fixed point is Wahba's optimum.
+    Gauss-Newton on the rotation group; its fixed point is the optimum of Wahba's problem.
 
     Parameters
     ----------
     R : (3, 3) float, sensor from ICRS, near the optimum (a few degrees)
     u, sigma : (n, 3), (n,) float, measured directions and their errors [rad]
     a : (m, 3) float, apparent directions of stars, ICRS axes
-    star_of : (n,) int, the star of each direction, -1 none
+    star_of : (n,) int, the star of each direction, -1 for none
     P : (3, 3) float, out: covariance about the sensor axes [rad^2]
 
     Returns
     -------
     bool
-        False where the matches leave a turn free; R and P are then of no use.
+        False where the matches do not fix the attitude; R and P are then invalid.
     """
     A = np.zeros((3, 3))
     for _ in range(3):

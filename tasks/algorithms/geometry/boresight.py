@@ -1,8 +1,17 @@
-"""Boresight and focal length from a few identified stars, in closed form or by Newton's method.
+"""Boresight and focal length from a few identified stars, by hand and without an attitude.
 
-A star at distance a from the principal point is arctan(a / f) from the boresight d, so
-``r . d = f / sqrt(f^2 + a^2)``: linear in d. Star identification in celestial navigation,
-16th "Huawei Cup" graduate modelling contest (2019).
+The pipeline does not need this: it finds whole attitudes (`attitude`) and calibrates from
+thousands of stars (`optics_calibration`). This is for a single image with three or more stars
+whose names are known. The page ``docs/methods/boresight.md`` has the equations and an example.
+
+A star at distance a [px] from the principal point is at the angle arctan(a / f) from the
+boresight d, so ``u . d = f / sqrt(f^2 + a^2)``: linear in d. Three stars give d; with
+``|d| = 1`` they give the focal length f too.
+
+References
+----------
+Star identification in celestial navigation, 16th "Huawei Cup" graduate mathematical contest in
+modelling (2019): the equations of this module.
 """
 
 from itertools import combinations
@@ -14,7 +23,7 @@ Array = npt.NDArray[np.float64]
 
 MAX_STEPS = 50
 CONVERGED = 1e-12  # relative change of the focal length
-MOST_CHOSEN_FROM = 60  # stars; their triples are tried one and all
+MOST_CHOSEN_FROM = 60  # stars; all their triples are tried
 
 
 def boresight_of_three(u_icrs: Array, distance_px: Array, focal_px: float) -> Array:
@@ -23,10 +32,11 @@ def boresight_of_three(u_icrs: Array, distance_px: Array, focal_px: float) -> Ar
     Parameters
     ----------
     u_icrs : (3, 3) float
-        Apparent unit vectors to the stars, a row each.
+        Apparent unit vectors to the stars, one row for each star.
     distance_px : (3,) float
-        Their distances from the principal point in the image, distortion removed.
+        Distances of their images from the principal point, distortion removed.
     focal_px : float
+        Focal length.
 
     Returns
     -------
@@ -37,24 +47,93 @@ def boresight_of_three(u_icrs: Array, distance_px: Array, focal_px: float) -> Ar
     ------
     ValueError
         If the shapes differ from these, or the stars lie on one great circle.
+
+    Examples
+    --------
+    A sensor whose axes are those of the ICRS looks along z:
+
+    >>> x_px = np.array([[300.0, 0.0], [0.0, 200.0], [-150.0, -100.0]])
+    >>> u = np.column_stack([x_px, np.full(3, 2000.0)])
+    >>> u /= np.linalg.norm(u, axis=1, keepdims=True)
+    >>> d = boresight_of_three(u, np.hypot(x_px[:, 0], x_px[:, 1]), 2000.0)
+    >>> np.allclose(d, [0.0, 0.0, 1.0])
+    True
     """
     d = _free_boresight(u_icrs, _cosines(distance_px, focal_px))
     return d / np.linalg.norm(d)
 
 
+def boresight_covariance(
+    u_icrs: Array, distance_px: Array, focal_px: float, sigma_px: float
+) -> Array:
+    """Return the covariance of `boresight_of_three` [rad^2], to first order.
+
+    Parameters
+    ----------
+    u_icrs, distance_px, focal_px
+        As in `boresight_of_three`.
+    sigma_px : float
+        1-sigma error of an image place, per axis. The focal length is taken as exact.
+
+    Returns
+    -------
+    (3, 3) float
+        ICRS axes; singular along the boresight. The square root of half its trace is the
+        1-sigma error per axis.
+
+    Examples
+    --------
+    >>> x_px = np.array([[300.0, 0.0], [0.0, 200.0], [-150.0, -100.0]])
+    >>> u = np.column_stack([x_px, np.full(3, 2000.0)])
+    >>> u /= np.linalg.norm(u, axis=1, keepdims=True)
+    >>> cov = boresight_covariance(u, np.hypot(x_px[:, 0], x_px[:, 1]), 2000.0, 0.1)
+    >>> round(float(np.degrees(np.sqrt(np.trace(cov) / 2)) * 3600), 1)  # arcsec
+    9.0
+    """
+    d = _free_boresight(u_icrs, _cosines(distance_px, focal_px))
+    length = np.linalg.norm(d)
+    sigma = sigma_px * focal_px * distance_px / (focal_px**2 + distance_px**2) ** 1.5
+    across = (np.eye(3) - np.outer(d, d) / length**2) / length
+    to_boresight = across @ np.linalg.inv(u_icrs) * sigma
+    return np.asarray(to_boresight @ to_boresight.T, float)
+
+
 def boresight_and_focal_length(
     u_icrs: Array, distance_px: Array, focal_px: float
 ) -> tuple[Array, float]:
-    """Return the boresight and the focal length from three stars: |d| = 1 closes the system.
+    """Return the boresight and the focal length from three stars.
 
-    Newton's method from `focal_px`, such as D / (2 tan(field / 2)); where two focal lengths
-    fit, the one that it reaches. Parameters as `boresight_of_three`.
+    Newton's method on ``|d| = 1`` from a first focal length, such as
+    ``width_px / (2 tan(field / 2))``. Where two focal lengths are possible, it gives the one
+    that it reaches.
+
+    Parameters
+    ----------
+    u_icrs, distance_px
+        As in `boresight_of_three`.
+    focal_px : float
+        First estimate.
 
     Returns
     -------
     u_icrs : (3,) float
+        Boresight; NaN where no focal length makes its length one.
     focal_px : float
-        NaN, as is the boresight, where no focal length makes |d| one.
+        Focal length; NaN likewise.
+
+    Raises
+    ------
+    ValueError
+        As `boresight_of_three`.
+
+    Examples
+    --------
+    >>> x_px = np.array([[300.0, 0.0], [0.0, 200.0], [-150.0, -100.0]])
+    >>> u = np.column_stack([x_px, np.full(3, 2000.0)])
+    >>> u /= np.linalg.norm(u, axis=1, keepdims=True)
+    >>> d, focal_px = boresight_and_focal_length(u, np.hypot(x_px[:, 0], x_px[:, 1]), 1900.0)
+    >>> round(focal_px, 3)
+    2000.0
     """
     d, f = np.full(3, np.nan), float(focal_px)
     for _ in range(MAX_STEPS):
@@ -75,21 +154,34 @@ def boresight_and_focal_length(
 def focal_length_from_separations(x_px: Array, u_icrs: Array, focal_px: float) -> float:
     """Return the focal length with which image and sky have the same separations.
 
-    Least squares over all pairs of stars, by Gauss-Newton from `focal_px`; no attitude is
-    needed.
+    Least squares over all pairs of stars, by Gauss-Newton. No attitude is needed.
 
     Parameters
     ----------
     x_px : (n, 2) float
-        Places in the image from the principal point, distortion removed. n >= 2.
+        Image places relative to the principal point, distortion removed. n >= 2.
     u_icrs : (n, 3) float
         Apparent unit vectors to the stars.
+    focal_px : float
+        First estimate.
 
     Returns
     -------
     float
-        NaN where separations do not fix it (all stars as far from the principal point along
-        their line as the image stretches nothing), or the steps do not settle.
+        NaN where the separations do not depend on the focal length, or without convergence.
+
+    Raises
+    ------
+    ValueError
+        With fewer than two stars, or another number of places than of stars.
+
+    Examples
+    --------
+    >>> x_px = np.array([[300.0, 0.0], [0.0, 200.0], [-150.0, -100.0]])
+    >>> u = np.column_stack([x_px, np.full(3, 2000.0)])
+    >>> u /= np.linalg.norm(u, axis=1, keepdims=True)
+    >>> round(focal_length_from_separations(x_px, u, 1900.0), 3)
+    2000.0
     """
     if len(x_px) != len(u_icrs) or len(x_px) < 2:
         raise ValueError(f"expected two or more stars, got {len(x_px)} places, {len(u_icrs)} stars")
@@ -111,16 +203,24 @@ def focal_length_from_separations(x_px: Array, u_icrs: Array, focal_px: float) -
             return np.nan
         f = max(f + step, 0.5 * f)
         if abs(step) < CONVERGED * f:
-            return f
+            return float(f)
     return np.nan
 
 
 def attitude_error(u: Array, sigma_rad: float) -> float:
-    """Return how far an attitude of (n, 3) directions errs [rad], by the transfer of errors.
+    """Return a measure of how well (n, 3) directions fix an attitude [rad], to compare sets.
 
-    sigma sqrt(tr((R R')^-1) / 2) with the directions as columns of R: for a matrix that is
-    not bound to be a rotation, so it serves to compare sets of stars, not as a sigma to
-    report (`attitude.attitude_covariance` does). Infinite for directions in one plane.
+    It is sigma sqrt(tr((U' U)^-1) / 2) with the directions as rows of U: the error of a matrix
+    that need not be a rotation. So it ranks sets of stars, but it is larger than the 1-sigma
+    error (`boresight_covariance`, or `attitude.attitude_covariance` of a whole attitude).
+    Infinite for directions in one plane.
+
+    Examples
+    --------
+    >>> wide, narrow = np.eye(3), np.eye(3) + 1.0
+    >>> narrow /= np.linalg.norm(narrow, axis=1, keepdims=True)
+    >>> attitude_error(wide, 0.01) < attitude_error(narrow, 0.01)
+    True
     """
     information = u.T @ u
     if len(u) < 3 or np.linalg.cond(information) > 1e14:
@@ -131,13 +231,19 @@ def attitude_error(u: Array, sigma_rad: float) -> float:
 def best_three(u: Array) -> npt.NDArray[np.int64]:
     """Return the rows of the three directions with the least `attitude_error`, ascending.
 
-    For three stars the error falls with the volume of their tetrahedron. All triples of the
+    The error of three stars falls as the volume of their tetrahedron grows. All triples of the
     first 60 directions are tried.
 
     Raises
     ------
     ValueError
         With fewer than three directions.
+
+    Examples
+    --------
+    >>> u = np.array([[1.0, 0.0, 0.0], [0.8, 0.6, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    >>> best_three(u).tolist()
+    [0, 2, 3]
     """
     if len(u) < 3:
         raise ValueError(f"expected three or more directions, got {len(u)}")

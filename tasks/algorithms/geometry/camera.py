@@ -28,12 +28,12 @@ class Camera(NamedTuple):
 
     @property
     def pixel_rad(self) -> float:
-        """Angle a pixel spans at the principal point [rad]."""
+        """Angle of one pixel at the principal point [rad]."""
         return 1.0 / np.sqrt(self.fx_px * self.fy_px)
 
     @property
     def half_diagonal_rad(self) -> float:
-        """Angle from the boresight to the farthest corner, distortion left aside [rad]."""
+        """Angle from the boresight to the farthest corner, without distortion [rad]."""
         x = max(self.cx_px + 0.5, self.width - 0.5 - self.cx_px) / self.fx_px
         y = max(self.cy_px + 0.5, self.height - 0.5 - self.cy_px) / self.fy_px
         return float(np.arctan(np.hypot(x, y)))
@@ -51,8 +51,8 @@ def distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
 def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     """Return the normalised coordinates that `distort` maps to (xd, yd), by Newton's method.
 
-    Far outside the calibrated field, where the distortion folds back, the nearest iterate
-    is returned; a star sensor's field does not reach there.
+    Far outside the calibrated field, where the distortion folds back, the last iterate is
+    returned. The field of a star sensor does not reach there.
     """
     x, y = np.array(xd, float), np.array(yd, float)
     k1, k2, p1, p2, k3 = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
@@ -61,7 +61,7 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     for _ in range(8):
         ex, ey = distort(camera, x, y)
         ex, ey = ex - xd, ey - yd
-        # A step is quadratic: after one from 1e-9 the rest is rounding.
+        # Convergence is quadratic: after a step from below 1e-9 the rest is rounding.
         last = max(np.abs(ex).max(initial=0.0), np.abs(ey).max(initial=0.0)) < 1e-9
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -80,7 +80,7 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
 
 
 def unproject(camera: Camera, x_px: Array, y_px: Array) -> Array:
-    """Return (n, 3) unit vectors in the sensor frame of places in the image."""
+    """Return (n, 3) unit vectors in the sensor frame of image places [px]."""
     x, y = undistort(
         camera, (x_px - camera.cx_px) / camera.fx_px, (y_px - camera.cy_px) / camera.fy_px
     )
@@ -89,24 +89,24 @@ def unproject(camera: Camera, x_px: Array, y_px: Array) -> Array:
 
 
 def project(camera: Camera, u: Array) -> tuple[Array, Array]:
-    """Return the places [px] of (n, 3) sensor-frame directions; NaN behind the camera."""
+    """Return the image places [px] of (n, 3) sensor-frame directions; NaN behind the camera."""
     z = np.where(u[..., 2] > 0, u[..., 2], np.nan)
     x, y = distort(camera, u[..., 0] / z, u[..., 1] / z)
     return camera.cx_px + camera.fx_px * x, camera.cy_px + camera.fy_px * y
 
 
 def inside(camera: Camera, x_px: Array, y_px: Array) -> npt.NDArray[np.bool_]:
-    """Return which places lie on the image (false for NaN)."""
+    """Return which places [px] lie on the image; false for NaN."""
     return (
         (x_px >= -0.5) & (x_px < camera.width - 0.5) & (y_px >= -0.5) & (y_px < camera.height - 0.5)
     )
 
 
 def pixel_angle(camera: Camera, u: Array) -> Array:
-    """Return the angle [rad] a pixel spans at (n, 3) sensor-frame directions.
+    """Return the angle [rad] of one pixel at (n, 3) sensor-frame directions.
 
-    The mean of both image axes (root of the solid angle): off the boresight a pixel spans
-    less, by the cosine of the field angle along and its square across.
+    The geometric mean of both image axes (the root of the solid angle). Off the boresight a
+    pixel covers less: by the cosine of the field angle on one axis, its square on the other.
     """
     x, y = u[..., 0] / u[..., 2], u[..., 1] / u[..., 2]
     step = 1e-6

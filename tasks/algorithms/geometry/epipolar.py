@@ -1,13 +1,34 @@
-"""Epipolar geometry of two sensors that see directions, not pixels.
+"""Epipolar geometry of two sensors, on directions instead of pixels.
 
-A direction seen by one sensor and the baseline span a plane, and the same object's direction
-from the other sensor lies in it. In an image that plane is the epipolar line.
+The baseline and a direction seen by one sensor span a plane: the epipolar plane. The direction
+of the same object from the other sensor lies in it. In an image the plane is the epipolar line.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+
+
+class UncertainSight(NamedTuple):
+    """A line of sight with its errors.
+
+    r_km : (..., 3) float
+        Sensor position [km].
+    u : (..., 3) float
+        Unit vector from the sensor to the object.
+    cov : (..., 3, 3) float
+        Covariance of the direction [rad^2], same axes.
+    sigma_km : (...) float
+        1-sigma error of the position, per axis [km].
+    """
+
+    r_km: Array
+    u: Array
+    cov: Array
+    sigma_km: Array
 
 
 def epipolar_angle(r_1_km: Array, u_1: Array, r_2_km: Array, u_2: Array) -> Array:
@@ -24,12 +45,13 @@ def epipolar_angle(r_1_km: Array, u_1: Array, r_2_km: Array, u_2: Array) -> Arra
     -------
     (...) float
         Signed angle; times the focal length in pixels it is the distance to the epipolar line.
-        0 where the first direction lies along the baseline and no plane is defined.
+        0 where the first direction lies along the baseline: no plane is defined.
 
     References
     ----------
-    Huang, Zhang, Feng, doi 10.19650/j.cnki.cjsi.J1905157, as |p_2' F p_1| over the norm of the
-    line, here on the unit sphere, where it holds for any camera.
+    Huang, Zhang, Feng: Space target synchronization association method under distributed star
+    sensor, doi 10.19650/j.cnki.cjsi.J1905157. There it is |p_2' F p_1| over the norm of the
+    line; on the unit sphere it holds for any camera.
     """
     baseline = r_2_km - r_1_km
     normal = np.cross(baseline, u_1)
@@ -39,33 +61,22 @@ def epipolar_angle(r_1_km: Array, u_1: Array, r_2_km: Array, u_2: Array) -> Arra
     return np.arcsin(np.clip(sine, -1.0, 1.0))
 
 
-def epipolar_sigma(
-    r_1_km: Array,
-    u_1: Array,
-    cov_1: Array,
-    r_2_km: Array,
-    u_2: Array,
-    cov_2: Array,
-    sigma_1_km: Array,
-    sigma_2_km: Array,
-    x_km: Array,
-) -> Array:
+def epipolar_sigma(first: UncertainSight, second: UncertainSight, x_km: Array) -> Array:
     """Return the standard deviation of `epipolar_angle` [rad] for an object at x.
 
     Parameters
     ----------
-    cov_1, cov_2 : (..., 3, 3) float
-        Covariances of the directions [rad^2] in the same axes.
-    sigma_1_km, sigma_2_km : (...) float
-        1-sigma errors of the positions an axis [km].
+    first, second
+        The two lines of sight, in the same axes.
     x_km : (..., 3) float
-        The object: an error of the first direction matters by the ratio of the ranges.
+        The object's position [km]: an error of the first direction counts by the ratio of the
+        ranges.
     """
-    normal = np.cross(u_1, u_2)
+    normal = np.cross(first.u, second.u)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     normal = normal / np.where(length > 0, length, 1.0)
-    range_1 = np.linalg.norm(x_km - r_1_km, axis=-1)
-    range_2 = np.linalg.norm(x_km - r_2_km, axis=-1)
-    across_1 = np.einsum("...i,...ij,...j", normal, cov_1, normal) * range_1**2
-    across_2 = np.einsum("...i,...ij,...j", normal, cov_2, normal) * range_2**2
-    return np.sqrt(across_1 + across_2 + sigma_1_km**2 + sigma_2_km**2) / range_2
+    range_1 = np.linalg.norm(x_km - first.r_km, axis=-1)
+    range_2 = np.linalg.norm(x_km - second.r_km, axis=-1)
+    across_1 = np.einsum("...i,...ij,...j", normal, first.cov, normal) * range_1**2
+    across_2 = np.einsum("...i,...ij,...j", normal, second.cov, normal) * range_2**2
+    return np.sqrt(across_1 + across_2 + first.sigma_km**2 + second.sigma_km**2) / range_2

@@ -1,7 +1,7 @@
-"""A sensor's optics as its identified stars show them.
+"""Optics calibration: a sensor's focal lengths, principal point and distortion from its stars.
 
-All frames share focal lengths, principal point and distortion; each has its own small turn,
-which is eliminated frame by frame (Schur complement), so the cost grows with the stars only.
+All frames share the optics. Each frame has its own small rotation, which is eliminated frame by
+frame (Schur complement), so the cost grows linearly with the number of stars.
 """
 
 from typing import NamedTuple
@@ -15,23 +15,23 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 OPTICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-# How far a camera may be from its calibration, 1-sigma. It only matters for what the stars
-# leave open: in a narrow field a shift of the principal point is a turn of the sensor, and
-# the higher terms of the distortion are hardly there.
+# 1-sigma prior about the given calibration. It only matters for what the stars do not determine:
+# in a narrow field a shift of the principal point equals a rotation of the sensor, and the
+# higher terms of the distortion are negligible.
 FOCAL_SHARE = 0.02
 CORNER_PX = 20.0
 PRINCIPAL_POINT_PX = 5.0
 STEPS = 15
-HUBER = 2.0  # residuals beyond this many sigma count less
+HUBER = 2.0  # [sigma] larger residuals have less weight
 LEAST_FRAMES, LEAST_STARS = 3, 60
 
 
 class OpticsFit(NamedTuple):
     """Optics with their covariance (9, 9), in the order of OPTICS.
 
-    residual_px : robust rms of the image residuals, an axis
-    gain : fall of chi-square against the optics as they came, attitudes free in both, and at
-        most their distance in units of `cov`, squared; about 9 by chance
+    residual_px : robust rms of the image residuals, per axis
+    gain : decrease of chi-square from the given optics, with free attitudes in both; at most
+        the squared distance of the optics in units of `cov`; about 9 by chance
     """
 
     camera: Camera
@@ -43,11 +43,11 @@ class OpticsFit(NamedTuple):
 
 class _Fit(NamedTuple):
     camera: Camera
-    u: Array  # stars in the sensor frame, turned as fitted
-    cov: Array  # of the optics, in units of their scale
+    u: Array  # stars in the sensor frame, after the fitted rotations
+    cov: Array  # of the optics, in units of their prior
     residual: Array
     sigma_px: float
-    score: Array  # (n, 9): how each star image pulls at the optics, in units of their scale
+    score: Array  # (n, 9): weighted gradient of each star image, in units of the prior
 
 
 def calibrate_optics(
@@ -58,22 +58,22 @@ def calibrate_optics(
     frame: npt.NDArray[np.int64],
     star: npt.NDArray[np.int64],
 ) -> OpticsFit | None:
-    """Return the optics that fit identified stars best, None where these are too few.
+    """Return the optics that fit identified stars best, None with too few stars.
 
     Parameters
     ----------
     camera
-        As calibrated; the fit starts there.
+        The given calibration: start and prior of the fit.
     x_px, y_px : (n,) float
-        Where the stars were measured.
+        Measured image places of the stars.
     u_sensor : (n, 3) float
-        Where they are by catalogue and the frames' attitudes, sensor frame. The attitudes
-        may rest on wrong optics: a turn of each frame is fitted as well.
+        Their catalogue directions in the sensor frame. The attitudes may come from wrong
+        optics: a rotation of each frame is fitted too.
     frame : (n,) int
-        Which stars are in one frame: equal numbers, side by side.
+        Number of the frame; the stars of a frame are consecutive.
     star : (n,) int
-        Which star each is. What is off in the catalogue, or in a close pair seen as one, is
-        the same in every frame: the covariance holds that, however many frames there are.
+        Number of the star. Errors of the catalogue, and of close pairs that are one image, are
+        the same in every frame. The covariance includes them, however many frames there are.
 
     References
     ----------
@@ -96,19 +96,19 @@ def calibrate_optics(
 
 
 def _with_shared_errors(fit: _Fit, star: npt.NDArray[np.int64]) -> Array:
-    """Return the covariance, in units of the prior's scale, with what a star's images share."""
+    """Return the covariance, in units of the prior, with the errors that a star's images share."""
     _, of_star = np.unique(star, return_inverse=True)
     n = of_star.max() + 1
     pull = np.zeros((n, 9))
     np.add.at(pull, of_star, fit.score)
-    few = n / max(n - 9, 1)  # the fit took away as much as it has numbers
+    few = n / max(n - 9, 1)  # for the degrees of freedom of the fit
     shared = fit.cov @ (few * pull.T @ pull - fit.score.T @ fit.score) @ fit.cov
     value, vector = np.linalg.eigh(shared)
     return fit.cov + (vector * np.maximum(value, 0.0)) @ vector.T
 
 
 def _fit(camera: Camera, xy: Array, u: Array, starts: Indices, optics: bool) -> _Fit:
-    """Return the best turns of the frames and, if asked for, the best optics."""
+    """Return the best rotations of the frames and, if `optics`, the best optics."""
     scale = _prior_sigma(camera)
     came = _values(camera)
     of_frame = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(xy))))
@@ -119,21 +119,23 @@ def _fit(camera: Camera, xy: Array, u: Array, starts: Indices, optics: bool) -> 
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12)) / sigma**2
         J_optics = J_optics * scale
         A = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_turn), starts)
-        A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # all on a spot
+        A += (
+            1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        )  # all stars at one place
         b = np.add.reduceat(np.einsum("nai,na->ni", J_turn, weight * r), starts)
         step, cov, score = np.zeros(9), np.zeros((9, 9)), np.zeros((len(xy), 9))
         turn = np.linalg.solve(A, b[..., None])[..., 0]
         if optics:
             B = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_optics), starts)
-            lever = np.linalg.solve(A, B)  # turns that make up for a change of the optics
+            lever = np.linalg.solve(A, B)  # rotations that compensate a change of the optics
             C = np.einsum("nai,na,naj->ij", J_optics, weight, J_optics) + np.eye(9)
             C -= np.einsum("fki,fkj->ij", B, lever)
             c = np.einsum("nai,na->i", J_optics, weight * r) - (_values(camera) - came) / scale
             cov = np.linalg.inv(C)
             step = cov @ (c - np.einsum("fki,fk->i", B, turn))
             turn = turn - lever @ step
-            own = J_optics - J_turn @ lever[of_frame]
-            score = np.einsum("nai,na->ni", own, weight * r)
+            reduced = J_optics - J_turn @ lever[of_frame]
+            score = np.einsum("nai,na->ni", reduced, weight * r)
             camera = _moved(camera, step * scale)
         u = u + np.cross(turn[of_frame], u)
         u = u / np.linalg.norm(u, axis=1, keepdims=True)
@@ -153,14 +155,14 @@ def _moved(camera: Camera, step: Array) -> Camera:
 
 
 def _prior_sigma(camera: Camera) -> Array:
-    """Return how far each number may be from what the calibration says."""
+    """Return the 1-sigma prior of each number of OPTICS."""
     f, r = np.sqrt(camera.fx_px * camera.fy_px), np.tan(camera.half_diagonal_rad)
     at_corner = CORNER_PX / f / np.array([r**3, r**5, r**2, r**2, r**7])
     return np.array([FOCAL_SHARE * f] * 2 + [PRINCIPAL_POINT_PX] * 2 + at_corner.tolist())
 
 
 def _robust_sigma(residual: Array, degrees_of_freedom: int) -> float:
-    """Return the residuals' rms by their median, what the fit took away put back."""
+    """Return the residuals' rms from their median, corrected for the degrees of freedom."""
     spread = 1.4826 * float(np.median(np.abs(residual)))
     return max(spread * np.sqrt(residual.size / max(degrees_of_freedom, 1)), 1e-4)
 
@@ -171,7 +173,8 @@ def _huber_cost(z: Array) -> float:
 
 
 def _linearise(camera: Camera, xy: Array, u: Array) -> tuple[Array, Array, Array]:
-    """Return residuals (n, 2) [px] and how turns (n, 2, 3) and optics (n, 2, 9) move the images."""
+    """Return residuals (n, 2) [px], and derivatives of the image places by the rotation (n, 2, 3)
+    and by the optics (n, 2, 9)."""
     x, y = u[:, 0] / u[:, 2], u[:, 1] / u[:, 2]
     r2, xy2 = x * x + y * y, 2 * x * y
     k1, k2, p1, p2, k3 = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
@@ -181,7 +184,7 @@ def _linearise(camera: Camera, xy: Array, u: Array) -> tuple[Array, Array, Array
     stretch[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     stretch[:, 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
     stretch[:, 0, 1] = stretch[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    turned = np.empty((len(x), 2, 3))  # of the undistorted place, by a rotation vector
+    turned = np.empty((len(x), 2, 3))  # derivative of the undistorted place by the rotation vector
     turned[:, 0] = np.stack([-x * y, 1 + x * x, -y], axis=1)
     turned[:, 1] = np.stack([-1 - y * y, x * y, x], axis=1)
     f = np.array([camera.fx_px, camera.fy_px])

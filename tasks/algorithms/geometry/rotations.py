@@ -1,6 +1,6 @@
 """Rotations: unit quaternions (x, y, z, w), scalar last, and matrices.
 
-``q_b_from_a`` turns the components of a vector in frame a into those in frame b.
+``q_b_from_a`` converts the components of a vector in frame a to those in frame b.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ Array = npt.NDArray[np.float64]
 def matrix_from_quaternion(q: Array) -> Array:
     """Return (..., 3, 3) matrices of (..., 4) unit quaternions."""
     x, y, z, w = np.moveaxis(np.asarray(q, float), -1, 0)
-    # Rows of the matrix that turns components in a into components in b.
+    # Rows of the matrix that converts components in a to components in b.
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
@@ -93,7 +93,7 @@ def skew(v: Array) -> Array:
 
 
 def interpolate_quaternions(times: Array, q: Array, at: Array) -> Array:
-    """Return attitudes at times `at`, turned evenly between their neighbours (slerp).
+    """Return attitudes at times `at`, turned at a constant rate between neighbours (slerp).
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def interpolate_quaternions(times: Array, q: Array, at: Array) -> Array:
     q : (n, 4) float
         Attitudes at these times.
     at : (m,) float
-        Wanted times; beyond the ends the nearest two are extended.
+        Requested times; beyond the ends the nearest two attitudes are extrapolated.
     """
     if len(times) == 1:
         return np.repeat(canonical(q), len(at), axis=0)

@@ -1,4 +1,4 @@
-"""Directions on the sky: spherical coordinates, tangent planes, aberration, attitude angles."""
+"""Directions on the sky: spherical coordinates, tangent planes, aberration, boresight angles."""
 
 import numpy as np
 import numpy.typing as npt
@@ -20,32 +20,31 @@ def radec_from_unit(u: Array) -> tuple[Array, Array]:
 
 
 def aberrate(u: Array, v_km_s: Array) -> Array:
-    """Return the directions an observer moving at v sees (exact, special relativity).
+    """Return the apparent directions for an observer moving at v (special relativity, exact).
 
     Parameters
     ----------
     u : (..., 3) float
         Unit vectors towards the sources, for an observer at rest in the frame of v.
     v_km_s : (..., 3) float
-        The observer's velocity [km/s]. With -v the function is its own inverse.
+        The observer's velocity [km/s]. The inverse is the same function with -v.
 
     References
     ----------
     Explanatory Supplement to the Astronomical Almanac (2013), eq. 7.40.
     """
     beta = np.asarray(v_km_s) / SPEED_OF_LIGHT_KM_S
-    # einsum: a sum along a short axis costs NumPy ten times as much.
+    # einsum, because a sum along a short axis is ten times slower in NumPy.
     projection = np.einsum("...i,...i->...", u, beta)[..., None]
     inverse_gamma = np.sqrt(1 - np.einsum("...i,...i->...", beta, beta)[..., None])
-    seen = inverse_gamma * u + beta * (1 + projection / (1 + inverse_gamma))
-    return seen / np.sqrt(np.einsum("...i,...i->...", seen, seen)[..., None])
+    apparent = inverse_gamma * u + beta * (1 + projection / (1 + inverse_gamma))
+    return apparent / np.sqrt(np.einsum("...i,...i->...", apparent, apparent)[..., None])
 
 
 def tangent_basis(u: Array) -> Array:
     """Return (..., 2, 3): two unit vectors that complete u to a right-handed triad.
 
-    Deterministic and smooth except where it switches the helper axis; no special direction
-    of the sky is degenerate.
+    Deterministic, without a degenerate direction, and smooth except at ``abs(u_z) = 0.9``.
     """
     helper = np.where(np.abs(u[..., 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     first = np.cross(helper, u)

@@ -1,8 +1,10 @@
-"""Triangulation: the one point that explains all lines of sight, by weighted least squares.
+"""Triangulation: the point that explains all lines of sight, by weighted least squares.
 
 A view is a sensor's place, a direction and the direction's covariance, all at one epoch. The
 residual is the angle between the direction and the point, on the direction's tangent plane.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,9 +21,50 @@ CONVERGED = 1e-9  # of the range
 LIGHT = SPEED_OF_LIGHT_KM_S
 
 
+class LinesOfSight(NamedTuple):
+    """Views of all groups, one after the other, for the compiled loops.
+
+    r_km, u : (n, 3) float
+        Sensor positions [km] and directions.
+    basis, cov : (n, 2, 3), (n, 2, 2) float
+        Tangent bases of the directions, and their covariances [rad^2] on these.
+    sigma_km : (n,) float
+        1-sigma errors of the positions, per axis [km].
+    """
+
+    r_km: Array
+    u: Array
+    basis: Array
+    cov: Array
+    sigma_km: Array
+
+
+class Triangulated(NamedTuple):
+    """Positions of g groups from n views.
+
+    r_km : (g, 3) float
+        Positions [km] at the epoch minus the mean light time of the views used; NaN where the
+        lines are parallel or meet behind a sensor, or fewer than two views are left.
+    cov_km2 : (g, 3, 3) float
+        Covariances of the positions.
+    chi2 : (g,) float
+        Weighted sums of squares, 2 n - 3 degrees of freedom.
+    used : (n,) bool
+        False for rejected views.
+    mean_range_km : (g,) float
+        Mean distance of the sensors used.
+    """
+
+    r_km: Array
+    cov_km2: Array
+    chi2: Array
+    used: npt.NDArray[np.bool_]
+    mean_range_km: Array
+
+
 @kernel
 def invert3(M, out):
-    """Write the inverse of a symmetric 3x3 matrix; return its determinant (0: not done)."""
+    """Write the inverse of a symmetric 3x3 matrix; return its determinant, 0 where it fails."""
     a, b, c = M[0, 0], M[0, 1], M[0, 2]
     d, e, f = M[1, 1], M[1, 2], M[2, 2]
     m00, m01, m02 = d * f - e * e, c * e - b * f, b * e - c * d
@@ -37,9 +80,9 @@ def invert3(M, out):
 
 @kernel
 def start_point(use, r, u, x):
-    """Write the point nearest to the lines in use (all alike); return false where parallel.
+    """Write the point nearest to the lines in use; return false where they are parallel.
 
-    The plain sum of squared distances in km: the start of the iteration only.
+    The sum of squared distances [km^2] is minimal, without weights: a start for the iteration.
     """
     N, inverse, rhs = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3)
     n = 0
@@ -51,7 +94,7 @@ def start_point(use, r, u, x):
                 N[i, j] += p
                 rhs[i] += p * r[v, j]
     det = invert3(N, inverse)
-    # Two lines at angle t give det = n (n/2) ... sin^2 t; below 1e-6 rad nothing is left of it.
+    # Two lines at angle t give det = n (n/2) ... sin^2 t; below 1e-6 rad it is rounding.
     if det < 1e-12 * n**3:
         return False
     for i in range(3):
@@ -71,7 +114,7 @@ def _residual(r, u, basis, shift, x, out):
 
 @kernel
 def weight_of(cov, sigma_km, rho, out):
-    """Write the inverse of a view's 2x2 covariance, the sensor's place included."""
+    """Write the inverse of a view's 2x2 covariance, with the error of the sensor's place."""
     extra = (sigma_km / rho) ** 2
     a, b, c = cov[0, 0] + extra, cov[0, 1], cov[1, 1] + extra
     det = a * c - b * b
@@ -80,13 +123,15 @@ def weight_of(cov, sigma_km, rho, out):
 
 
 @kernel
-def solve_point(use, r, u, basis, cov, sigma_km, velocity, x, P):
-    """Solve one point over the views in `use`; x has its start and receives the point.
+def solve_point(use, lines, velocity, x, P):
+    """Solve one point over the views in `use`; return chi-square, NaN where it fails.
 
-    `velocity` [km/s] of the object moves it between the emissions that the sensors see: the
-    point is where it was at the mean emission. Returns chi-square, or NaN where it fails
-    (parallel lines, a point behind a sensor).
+    x holds the start and receives the point, P receives the covariance. Light that reaches a
+    more distant sensor left earlier: `velocity` [km/s] moves the object between the emissions,
+    and the point is its place at their mean. It fails where lines are parallel or the point is
+    behind a sensor.
     """
+    r, u, basis, cov, sigma_km = lines
     N, rhs = np.empty((3, 3)), np.empty(3)
     e, W, shift = np.empty(2), np.empty((2, 2)), np.zeros(3)
     chi2 = np.nan
@@ -101,7 +146,7 @@ def solve_point(use, r, u, basis, cov, sigma_km, velocity, x, P):
         chi2 = 0.0
         for v in use:
             rho = np.sqrt((x[0] - r[v, 0]) ** 2 + (x[1] - r[v, 1]) ** 2 + (x[2] - r[v, 2]) ** 2)
-            for a in range(3):  # light of a farther sensor left earlier
+            for a in range(3):  # light to a farther sensor left earlier
                 shift[a] = velocity[a] * (mean_range - rho) / LIGHT
             rho = _residual(r[v], u[v], basis[v], shift, x, e)
             weight_of(cov[v], sigma_km[v], rho, W)
@@ -120,7 +165,7 @@ def solve_point(use, r, u, basis, cov, sigma_km, velocity, x, P):
             x[i] += step
             step2 += step * step
             size2 += x[i] * x[i]
-        if not step2 < 1e14:  # ran off to infinity: as good as parallel
+        if not step2 < 1e14:  # [km^2] diverges: the lines are nearly parallel
             return np.nan
         if step2 < CONVERGED * CONVERGED * size2:
             break
@@ -134,12 +179,13 @@ def solve_point(use, r, u, basis, cov, sigma_km, velocity, x, P):
 
 
 @kernel
-def _worst(use, r, u, basis, cov, sigma_km, velocity, x, P):
+def _worst(use, lines, velocity, x, P):
     """Return the view with the largest normalised residual, and that residual squared.
 
-    Normalised by the residual's own covariance C - J P J', smaller than the error's.
+    It is normalised by the covariance of the residual, C - J P J', which is smaller than C.
     """
-    e, _W, shift = np.empty(2), np.empty((2, 2)), np.zeros(3)
+    r, u, basis, cov, sigma_km = lines
+    e, shift = np.empty(2), np.zeros(3)
     mean_range = 0.0
     for v in use:
         mean_range += np.sqrt(
@@ -159,8 +205,8 @@ def _worst(use, r, u, basis, cov, sigma_km, velocity, x, P):
                 c00 -= basis[v, 0, i] * p * basis[v, 0, j]
                 c01 -= basis[v, 0, i] * p * basis[v, 1, j]
                 c11 -= basis[v, 1, i] * p * basis[v, 1, j]
-        # With few views one direction of the residual carries no information: its variance is
-        # nothing but rounding. The larger eigenvalue's direction is what can be judged.
+        # With few views the residual carries no information along one axis: its variance there
+        # is rounding. The axis of the larger eigenvalue can always be judged.
         half, diff = 0.5 * (c00 + c11), 0.5 * (c00 - c11)
         radius = np.sqrt(diff * diff + c01 * c01)
         big, small = half + radius, half - radius
@@ -177,9 +223,10 @@ def _worst(use, r, u, basis, cov, sigma_km, velocity, x, P):
 
 
 @kernel
-def _solve_groups(
-    offsets, r, u, basis, cov, sigma_km, velocity, reject2, x, P, chi2, used, mean_rho
-):
+def _solve_groups(offsets, lines, velocity, reject2, out):
+    """Triangulate each group; while its worst residual is too large, drop that view."""
+    r, u = lines.r_km, lines.u
+    x, P, chi2, used, mean_range = out
     for g in range(len(offsets) - 1):
         lo, hi = offsets[g], offsets[g + 1]
         use = np.arange(lo, hi)
@@ -187,19 +234,19 @@ def _solve_groups(
         while len(use) >= 2:
             if not start_point(use, r, u, x[g]):
                 break
-            chi2[g] = solve_point(use, r, u, basis, cov, sigma_km, velocity[g], x[g], P[g])
+            chi2[g] = solve_point(use, lines, velocity[g], x[g], P[g])
             if len(use) < 3 or np.isnan(chi2[g]):
                 break
-            v, score = _worst(use, r, u, basis, cov, sigma_km, velocity[g], x[g], P[g])
+            v, score = _worst(use, lines, velocity[g], x[g], P[g])
             if score <= reject2:
                 break
             use = use[use != v]
         for v in range(lo, hi):
             used[v] = False
-        mean_rho[g] = 0.0
+        mean_range[g] = 0.0
         for v in use:
             used[v] = not np.isnan(chi2[g])
-            mean_rho[g] += np.sqrt(
+            mean_range[g] += np.sqrt(
                 (x[g, 0] - r[v, 0]) ** 2 + (x[g, 1] - r[v, 1]) ** 2 + (x[g, 2] - r[v, 2]) ** 2
             ) / len(use)
 
@@ -212,8 +259,8 @@ def triangulate(
     sigma_km: Array,
     velocity_km_s: Array,
     reject_sigma: float,
-) -> tuple[Array, Array, Array, npt.NDArray[np.bool_], Array]:
-    """Return the positions of objects from their lines of sight, and which of them served.
+) -> Triangulated:
+    """Return the positions of objects from their lines of sight, and which views were used.
 
     Parameters
     ----------
@@ -224,50 +271,35 @@ def triangulate(
     cov_rad2 : (n, 2, 2) float
         Covariance of the direction [rad^2] on `tangent_basis(u_icrs)`.
     sigma_km : (n,) float
-        1-sigma error of the sensor's position an axis [km].
+        1-sigma error of the sensor's position, per axis [km].
     velocity_km_s : (g, 3) float
-        Velocity of each object; it matters only over the differences of light time.
+        Velocity of each object. It matters only over the differences of light time.
     reject_sigma
-        A view further off than this, of three or more, is left out, the worst first.
-
-    Returns
-    -------
-    r_km : (g, 3) float
-        Positions [km] at the epoch minus the mean light time of the views used; NaN where the
-        lines are parallel, meet behind a sensor, or fewer than two are left.
-    cov_km2 : (g, 3, 3) float
-        Covariances.
-    chi2 : (g,) float
-        Weighted sums of squares, 2 n - 3 degrees of freedom.
-    used : (n,) bool
-        Views that served.
-    mean_range_km : (g,) float
-        Mean distance of the sensors used.
+        Of three or more views, those with a larger residual are rejected, the worst first.
 
     References
     ----------
-    Gauss-Newton on the angular residuals; Hartley and Sturm (1997), Triangulation, CVIU 68(2),
-    for why angles and not distances are to be made small.
+    Gauss-Newton on the angular residuals. Hartley and Sturm (1997), Triangulation, CVIU 68(2),
+    for minimising errors in the image instead of distances in space.
     """
     n, g = len(r_gcrf_km), len(offsets) - 1
-    x, P = np.full((g, 3), np.nan), np.full((g, 3, 3), np.nan)
-    chi2, used, mean_range = np.full(g, np.nan), np.zeros(n, np.bool_), np.full(g, np.nan)
     # Copies: to numba a read-only array is another type, and all would compile twice.
-    _solve_groups(
-        np.array(offsets, np.int64),
-        np.array(r_gcrf_km, float, order="C"),
-        np.array(u_icrs, float, order="C"),
-        np.array(tangent_basis(u_icrs), order="C"),
-        np.array(cov_rad2, float, order="C"),
-        np.array(sigma_km, float, order="C"),
-        np.array(velocity_km_s, float, order="C"),
-        float(reject_sigma) ** 2,
-        x,
-        P,
-        chi2,
-        used,
-        mean_range,
+    lines = LinesOfSight(
+        r_km=np.array(r_gcrf_km, float, order="C"),
+        u=np.array(u_icrs, float, order="C"),
+        basis=np.array(tangent_basis(u_icrs), order="C"),
+        cov=np.array(cov_rad2, float, order="C"),
+        sigma_km=np.array(sigma_km, float, order="C"),
     )
-    failed = np.isnan(chi2)
-    x[failed], P[failed] = np.nan, np.nan
-    return x, P, chi2, used, mean_range
+    out = Triangulated(
+        r_km=np.full((g, 3), np.nan),
+        cov_km2=np.full((g, 3, 3), np.nan),
+        chi2=np.full(g, np.nan),
+        used=np.zeros(n, np.bool_),
+        mean_range_km=np.full(g, np.nan),
+    )
+    velocity = np.array(velocity_km_s, float, order="C")
+    _solve_groups(np.array(offsets, np.int64), lines, velocity, float(reject_sigma) ** 2, out)
+    failed = np.isnan(out.chi2)
+    out.r_km[failed], out.cov_km2[failed] = np.nan, np.nan
+    return out

@@ -1,4 +1,4 @@
-"""Object identity: an object keeps its number from span to span while a tracklet goes on."""
+"""Object identity: an object keeps its number from span to span while a tracklet continues."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ Indices = npt.NDArray[np.int64]
 class ObjectRegistry:
     """Numbers for groups of tracklets, span after span.
 
-    A group is the object that held most of its tracklets when they were last seen; where two
-    groups claim one object, the one with more of its tracklets has it. Ties go to the lower
-    number, so that the outcome does not depend on anything but the order of the spans.
+    A group gets the object that most of its tracklets belonged to last. Of two groups that
+    claim one object, the one with more of its tracklets gets it. Ties are decided by the lower
+    number, so the result depends on the order of the spans only.
     """
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
-"""Object linking: an object that was lost for a while is known again by its motion.
+"""Object linking: an object that was not seen for a while is recognised by its motion.
 
-The state of an object that ended is carried to the instant of a newly begun one. Whether the two
-are one is a likelihood ratio: the difference under both covariances, against an object that
-was never seen before, of which there are as many about as there are known ones nearby.
+The state of an earlier object is propagated to the instant of a later one. Whether the two are
+the same is a likelihood ratio: the difference of the states under both covariances, against a
+new object. New objects are taken to be as dense as the known ones nearby.
 """
 
 from typing import NamedTuple
@@ -21,26 +21,27 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 NONE = -1
-FAR_SIGMA = 10.0  # energies that differ by more are not looked at
-OBLATE = 2e-3  # share of its energy that the oblate Earth lends an orbit and takes back
-KEPT = 0.9999  # share of true links that the chi-square test lets pass
-# Never fewer than this: objects in low orbit, all sizes that are tracked, are as dense.
+FAR_SIGMA = 10.0  # pairs whose energies differ by more are skipped
+OBLATE = 2e-3  # share of an orbit's two-body energy that varies with the oblate Earth
+KEPT = 0.9999  # share of true links that pass the chi-square test
+# The least density of objects: that of all tracked objects in low orbit.
 FEWEST_KM3 = 1e-8
-VELOCITIES_KM3_S3 = 1.0  # and they fill about this much of velocity space
-# Accelerations left out: Sun and Moon at geostationary height; of what pulls, the harmonics.
+VELOCITIES_KM3_S3 = 1.0  # volume of velocity space that they fill, about
+# Neglected accelerations: Sun and Moon at geostationary height, and as a share of gravity the
+# higher harmonics.
 ACCELERATION_KM_S2 = 1e-8
 SHARE_OF_GRAVITY = 1e-5
 
 
-class Seen(NamedTuple):
-    """Objects as they were seen: when, and their motion at both ends of that.
+class ObservedMotions(NamedTuple):
+    """Objects with their motion at the beginning and at the end of their observation.
 
     first_s, last_s : (n,) float
-        First and last instant at which it was seen [s].
+        First and last instant of observation [s].
     head_s, tail_s : (n,) float
-        Instants of the motion near the first and near the last.
+        Instants of the states near the first and near the last [s].
     head, tail : (n, 6) float
-        Position [km] and velocity [km/s], GCRF; NaN velocity where only a position is known.
+        Position [km] and velocity [km/s], GCRF; the velocity is NaN where unknown.
     head_cov, tail_cov : (n, 6, 6) float
         Covariances.
     """
@@ -55,60 +56,62 @@ class Seen(NamedTuple):
     tail_cov: Array
 
 
-def link_by_motion(seen: Seen, *, gap_s: float, log_odds: float) -> tuple[Indices, Array]:
+def link_by_motion(
+    motions: ObservedMotions, *, gap_s: float, log_odds: float
+) -> tuple[Indices, Array]:
     """Return which object continues which.
 
     Parameters
     ----------
-    seen
-        Objects, in any order; a velocity must be known of one of the two that are linked.
+    motions
+        Objects, in any order. Of two that are linked, at least one velocity must be known.
     gap_s
-        Longest time unseen.
+        Longest time between the observations [s].
     log_odds
-        The links made as a whole must be this much likelier (ln) than the best ones without
-        any one of them. So an object is linked with none where two could be it.
+        Each link must raise the log-odds of all links by this, against the best ones without
+        it. So an object is not linked where two could be its continuation.
 
     Returns
     -------
     before : (n,) int
-        The object that each one continues, -1 where it is new; no two continue the same.
+        The object that each object continues, -1 for a new one. No two continue the same.
     odds : (n,) float
-        Log of the odds of the link to it; NaN where there is none.
+        Log-odds of the link; NaN for a new object.
 
     Notes
     -----
-    Errors that the sensors keep over the gap are in both states and count twice, so the test is
-    on the safe side. Forces: two bodies and J2; a constant acceleration of unknown direction stands
-    for what is left out.
+    Errors that the sensors keep over the gap are in both states and count twice: the test is
+    conservative. Forces: two bodies and J2. A constant acceleration of unknown direction stands
+    for the neglected forces.
     """
-    n = len(seen.first_s)
+    n = len(motions.first_s)
     before, odds = np.full(n, NONE), np.full(n, np.nan)
-    pairs = _pairs(seen, gap_s)
-    gain = _gains(seen, pairs)
+    pairs = _pairs(motions, gap_s)
+    gain = _gains(motions, pairs)
     likely = gain > 0.0
     earlier, later, gain = pairs.earlier[likely], pairs.later[likely], gain[likely]
     graph = coo_array((np.ones(len(gain)), (earlier, later)), shape=(n, n))
     _, part = connected_components(graph, directed=False)
     for label in np.unique(part[earlier]):
-        own = np.flatnonzero(part[earlier] == label)
-        for k in own[_sure(earlier[own], later[own], gain[own], log_odds)]:
+        linked = np.flatnonzero(part[earlier] == label)
+        for k in linked[_sure(earlier[linked], later[linked], gain[linked], log_odds)]:
             before[later[k]], odds[later[k]] = earlier[k], gain[k]
     return before, odds
 
 
 def chains(before: Indices) -> Indices:
-    """Return the first object of each one's chain, from what `link_by_motion` found."""
+    """Return the first object of each object's chain, from `before` of `link_by_motion`."""
     head = np.where(before == NONE, np.arange(len(before)), before)
     while (head[head] != head).any():
         head = head[head]
     return head
 
 
-class _Pairs(NamedTuple):
-    """Objects that ended and ones that began later, and the difference of their motions there.
+class _CandidatePairs(NamedTuple):
+    """Pairs of an earlier and a later object, and the difference of their motions.
 
-    `apart` is the begun one's state minus that of the ended one, (p, 6); NaN velocity where one
-    of them is unknown. `cov` is its covariance.
+    `apart` (p, 6) is the state of the later object minus the propagated one of the earlier; its
+    velocity is NaN where either is unknown. `cov` is its covariance.
     """
 
     earlier: Indices
@@ -117,40 +120,45 @@ class _Pairs(NamedTuple):
     cov: Array
 
 
-def _pairs(seen: Seen, gap_s: float) -> _Pairs:
-    """Return the pairs that may be one object, by time and by what an orbit keeps."""
-    gap = seen.first_s - seen.last_s[:, None]
+def _pairs(motions: ObservedMotions, gap_s: float) -> _CandidatePairs:
+    """Return the pairs that may be one object, by time and energy, with their differences."""
+    gap = motions.first_s - motions.last_s[:, None]
     timely = (gap > 0.0) & (gap <= gap_s)
-    moving, moves = np.isfinite(seen.tail[:, 3]), np.isfinite(seen.head[:, 3])
-    kept = timely & _alike(seen)
+    moving, moves = np.isfinite(motions.tail[:, 3]), np.isfinite(motions.head[:, 3])
+    kept = timely & _alike(motions)
     parts = []
-    for i in np.flatnonzero(moving):  # forward from each that ended
+    for i in np.flatnonzero(moving):  # forward, from each earlier object
         later = np.flatnonzero(kept[i])
-        later = later[np.argsort(seen.head_s[later], kind="stable")]
-        state, cov = _carried(seen.tail[i], seen.tail_cov[i], seen.head_s[later] - seen.tail_s[i])
+        later = later[np.argsort(motions.head_s[later], kind="stable")]
+        state, cov = _propagated(
+            motions.tail[i], motions.tail_cov[i], motions.head_s[later] - motions.tail_s[i]
+        )
         earlier = np.full(len(later), i)
-        parts.append((earlier, later, seen.head[later] - state, seen.head_cov[later] + cov))
-    for j in np.flatnonzero(moves):  # back to those of which no velocity is known
+        parts.append((earlier, later, motions.head[later] - state, motions.head_cov[later] + cov))
+    for j in np.flatnonzero(moves):  # backward, to earlier objects of unknown velocity
         earlier = np.flatnonzero(kept[:, j] & ~moving)
-        earlier = earlier[np.argsort(-seen.tail_s[earlier], kind="stable")]
-        state, cov = _carried(seen.head[j], seen.head_cov[j], seen.tail_s[earlier] - seen.head_s[j])
+        earlier = earlier[np.argsort(-motions.tail_s[earlier], kind="stable")]
+        state, cov = _propagated(
+            motions.head[j], motions.head_cov[j], motions.tail_s[earlier] - motions.head_s[j]
+        )
         later = np.full(len(earlier), j)
-        parts.append((earlier, later, state - seen.tail[earlier], seen.tail_cov[earlier] + cov))
+        parts.append(
+            (earlier, later, state - motions.tail[earlier], motions.tail_cov[earlier] + cov)
+        )
     none = np.zeros(0, np.int64)
     parts.append((none, none, np.zeros((0, 6)), np.zeros((0, 6, 6))))
-    return _Pairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    return _CandidatePairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _alike(seen: Seen) -> npt.NDArray[np.bool_]:
-    """Return which (earlier, later) pairs agree in energy, true where it is not known of both.
+def _alike(motions: ObservedMotions) -> npt.NDArray[np.bool_]:
+    """Return which (earlier, later) pairs agree in energy; true where either is unknown.
 
-    A wide gate that costs nothing: what two bodies keep, J2 changes by a thousandth.
+    A wide gate at no cost: two-body motion keeps the energy, and J2 changes it by a thousandth.
     """
-    (one, one_var), (two, two_var) = (
-        _energy(seen.tail, seen.tail_cov), _energy(seen.head, seen.head_cov)
-    )  # fmt: skip
-    room = FAR_SIGMA * np.sqrt(one_var[:, None] + two_var) + OBLATE * np.abs(two)
-    return ~(np.abs(one[:, None] - two) > room)
+    tail, tail_variance = _energy(motions.tail, motions.tail_cov)
+    head, head_variance = _energy(motions.head, motions.head_cov)
+    room = FAR_SIGMA * np.sqrt(tail_variance[:, None] + head_variance) + OBLATE * np.abs(head)
+    return ~(np.abs(tail[:, None] - head) > room)
 
 
 def _energy(state: Array, cov: Array) -> tuple[Array, Array]:
@@ -162,13 +170,13 @@ def _energy(state: Array, cov: Array) -> tuple[Array, Array]:
     return energy, np.einsum("ni,nij,nj->n", slope, cov, slope)
 
 
-def _gains(seen: Seen, pairs: _Pairs) -> Array:
-    """Return the log odds of each pair; -inf where the difference is too large."""
+def _gains(motions: ObservedMotions, pairs: _CandidatePairs) -> Array:
+    """Return the log-odds of each pair; -inf where the difference is too large."""
     gain = np.full(len(pairs.later), -np.inf)
     order = np.argsort(pairs.later, kind="stable")
     cuts = np.flatnonzero(np.diff(pairs.later[order])) + 1
     for own in np.split(order, cuts) if len(order) else []:
-        present = _present(seen, int(pairs.later[own[0]]))
+        present = _present(motions, int(pairs.later[own[0]]))
         past = pairs.earlier[own]
         for k in own:
             i, size = pairs.earlier[k], 6 if np.isfinite(pairs.apart[k]).all() else 3
@@ -176,9 +184,9 @@ def _gains(seen: Seen, pairs: _Pairs) -> Array:
             d2 = float(d @ np.linalg.solve(S, d))
             if not d2 < 2 * gammaincinv(size / 2, KEPT):  # chi-square
                 continue
-            # Two that were seen at one time are two.
-            distinct = (seen.first_s[past] <= seen.last_s[i]) & (
-                seen.last_s[past] >= seen.first_s[i]
+            # Two objects that were seen at the same time are different ones.
+            distinct = (motions.first_s[past] <= motions.last_s[i]) & (
+                motions.last_s[past] >= motions.first_s[i]
             )
             others = np.concatenate([pairs.apart[own[distinct & (past != i)]], present])
             density = _log_density(others[:, :size], S)
@@ -186,10 +194,10 @@ def _gains(seen: Seen, pairs: _Pairs) -> Array:
     return gain
 
 
-def _carried(state: Array, cov: Array, dt_s: Array) -> tuple[Array, Array]:
-    """Return a state at several times from its own, with covariances.
+def _propagated(state: Array, cov: Array, dt_s: Array) -> tuple[Array, Array]:
+    """Return a state propagated by several times, with covariances.
 
-    What the forces leave out grows as a constant acceleration does.
+    The neglected forces grow in it as a constant acceleration does.
     """
     there, transition = trajectory(state, dt_s)
     gravity = GM_KM3_S2 / float(state[:3] @ state[:3])
@@ -201,28 +209,30 @@ def _carried(state: Array, cov: Array, dt_s: Array) -> tuple[Array, Array]:
     return there, transition @ cov @ np.swapaxes(transition, -1, -2) + grown
 
 
-def _present(seen: Seen, later: int) -> Array:
-    """Return a begun object's state minus those of the objects that were seen when it was."""
-    at = seen.head_s[later]
-    there = (seen.first_s <= seen.last_s[later]) & (seen.last_s >= seen.first_s[later])
+def _present(motions: ObservedMotions, later: int) -> Array:
+    """Return the later object's state minus those of the objects that were seen with it."""
+    at = motions.head_s[later]
+    there = (motions.first_s <= motions.last_s[later]) & (motions.last_s >= motions.first_s[later])
     there[later] = False
     out = np.empty((int(there.sum()), 6))
     for row, k in enumerate(np.flatnonzero(there)):
-        near_head = abs(seen.head_s[k] - at) < abs(seen.tail_s[k] - at)
+        near_head = abs(motions.head_s[k] - at) < abs(motions.tail_s[k] - at)
         state, when = (
-            (seen.head[k], seen.head_s[k]) if near_head else (seen.tail[k], seen.tail_s[k])
+            (motions.head[k], motions.head_s[k])
+            if near_head
+            else (motions.tail[k], motions.tail_s[k])
         )
         if np.isfinite(state[3]):
             state = trajectory(state, np.array([at - when]))[0][0]
-        out[row] = seen.head[later] - state
+        out[row] = motions.head[later] - state
     return out
 
 
 def _log_density(apart: Array, S: Array) -> float:
-    """Return the log of how many objects there are about a state, by its nearest neighbour.
+    """Return the log-density of objects about a state, by its nearest neighbour.
 
-    In the state's own units, km and km/s: one object fills the ellipsoid of the shape of S that
-    reaches to it.
+    Per km^3, or per km^3 (km/s)^3 with velocities: one object in the ellipsoid of the shape of
+    S that reaches to the neighbour.
     """
     size = len(S)
     apart = apart[np.isfinite(apart).all(axis=1)]
@@ -237,11 +247,11 @@ def _log_density(apart: Array, S: Array) -> float:
 
 
 def _sure(earlier: Indices, later: Indices, gain: Array, log_odds: float) -> list[int]:
-    """Return the pairs of the best assignment that no other one comes near without."""
+    """Return the pairs of the best assignment without which any other is clearly worse."""
     rows, row = np.unique(earlier, return_inverse=True)
     columns, column = np.unique(later, return_inverse=True)
     benefit = np.zeros((len(rows), len(columns)))
-    benefit[row, column] = gain  # 0: both stay alone
+    benefit[row, column] = gain  # 0: both stay unlinked
     best, total = _assigned(benefit)
     out = []
     for k in range(len(gain)):
@@ -255,7 +265,7 @@ def _sure(earlier: Indices, later: Indices, gain: Array, log_odds: float) -> lis
 
 
 def _assigned(benefit: Array) -> tuple[npt.NDArray[np.bool_], float]:
-    """Return the one-to-one pairs of the greatest sum, and the sum."""
+    """Return the one-to-one pairs with the largest sum of benefits, and the sum."""
     row, column = linear_sum_assignment(benefit, maximize=True)
     chosen = np.zeros(benefit.shape, bool)
     chosen[row, column] = benefit[row, column] > 0.0

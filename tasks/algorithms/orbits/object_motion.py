@@ -1,4 +1,4 @@
-"""How an object moves, from its positions at neighbouring epochs."""
+"""Object motion: velocities from positions at neighbouring epochs."""
 
 import itertools
 
@@ -16,14 +16,14 @@ def velocities(offsets: npt.NDArray[np.int64], time_s: Array, r_km: Array, half_
     offsets : (g + 1,) int
         Object k has the positions ``offsets[k]:offsets[k + 1]``, in time order.
     time_s, r_km : (n,), (n, 3) float
-        Times [s] and positions [km]; NaN positions take no part.
+        Times [s] and positions [km]; NaN positions are skipped.
     half_s
-        Positions within this of each other count together.
+        Half width of the window about each position [s].
 
     Returns
     -------
     (n, 3) float
-        Velocities [km/s]; 0 where an object has a single position nearby.
+        Velocities [km/s]; 0 where the window holds a single position.
     """
     out = np.zeros_like(r_km)
     for lo, hi in itertools.pairwise(offsets):
@@ -45,6 +45,6 @@ def velocities(offsets: npt.NDArray[np.int64], time_s: Array, r_km: Array, half_
         cross = total(t[:, None] * x) - mean_t[:, None] * total(x)
         with np.errstate(invalid="ignore", divide="ignore"):
             slope = cross / spread[:, None]
-        # Below a millisecond squared it is one epoch, and the difference is rounding.
+        # Below 1e-6 s^2 all positions are of one epoch, and the slope is rounding.
         out[lo:hi] = np.where((spread > 1e-6)[:, None], slope, 0.0)
     return out

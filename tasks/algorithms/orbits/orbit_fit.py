@@ -1,8 +1,8 @@
 """Orbit fit: position and velocity of an object over an arc, from all its lines of sight.
 
-The unknowns are the state at one instant and, for each sensor, what all its views share: an
-error of its directions and one of its place, both with their prior covariance. So a shared error
-does not average out over the arc; only what is new in every view does.
+The unknowns are the state at one instant and, for each sensor, the errors that all its views
+share: one of its directions and one of its position, both with a prior covariance. So a shared
+error does not average out over the arc; only independent errors do.
 """
 
 from typing import NamedTuple
@@ -18,10 +18,10 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 LIGHT = SPEED_OF_LIGHT_KM_S
-STEP_S = 10.0  # the Runge-Kutta error of a low orbit over 10 minutes is then below a metre
+STEP_S = 10.0  # Runge-Kutta then errs by less than 1 m over 10 minutes of a low orbit
 ITERATIONS = 20
 CONVERGED = 1e-6  # sigmas squared
-LEAST_BIAS_RAD = 5e-9  # a millarcsecond: keeps the prior invertible where nothing is shared
+LEAST_BIAS_RAD = 5e-9  # 1 mas: keeps the prior invertible where nothing is shared
 LEAST_PLACE_KM = 1e-6
 
 
@@ -29,16 +29,16 @@ class Arcs(NamedTuple):
     """Views of objects, arc by arc: those of arc k are ``offsets[k]:offsets[k + 1]``.
 
     time_s : (n,) float
-        When the sensor saw it, from the instant to which the arc's state belongs [s]; in order.
+        Time of the exposure since the instant of the arc's state [s], increasing.
     sensor : (n,) int
-        Whose view it is; any numbers from 0.
+        Sensor of the view; any numbers from 0.
     r_km, u : (n, 3) float
-        Where the sensor says it is, GCRF [km]; direction to the object without aberration.
+        Reported position of the sensor, GCRF [km]; direction to the object without aberration.
     cov_noise, cov_bias : (n, 2, 2) float
-        What is new in every view, and what all of a sensor's share, on `tangent_basis(u)`
-        [rad^2].
+        Covariance of the independent error of each view, and of the error that all views of a
+        sensor share, on `tangent_basis(u)` [rad^2].
     sigma_km : (n,) float
-        1-sigma error of the sensor's place an axis, shared by all its views [km].
+        1-sigma error of the sensor's position, per axis, shared by all its views [km].
     """
 
     offsets: Indices
@@ -51,9 +51,26 @@ class Arcs(NamedTuple):
     sigma_km: Array
 
 
+class ArcViews(NamedTuple):
+    """Views of a single arc, for the compiled loops.
+
+    time_s, sensor, r_km, u
+        As in `Arcs`, the sensors numbered from 0.
+    basis, weight : (n, 2, 3), (n, 2, 2) float
+        Tangent bases of the directions, and inverse covariances of the noise [rad^-2].
+    """
+
+    time_s: Array
+    sensor: Indices
+    r_km: Array
+    u: Array
+    basis: Array
+    weight: Array
+
+
 @kernel
 def _rates(y, out):
-    """Write the rates of a state (6) and its transition matrix (36, row by row)."""
+    """Write the time derivatives of a state (6) and its transition matrix (36, row by row)."""
     x, v, z = y[:3], y[3:6], y[2]
     r2 = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
     pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
@@ -62,7 +79,7 @@ def _rates(y, out):
     for a in range(3):
         out[a] = v[a]
         out[3 + a] = -pull * x[a] * (1.0 + oblate * ((3.0 if a == 2 else 1.0) - tilt))
-    # The matrix leaves the oblateness out: a thousandth of what it says.
+    # The matrix neglects the oblateness: a thousandth of its elements.
     for a in range(3):
         for k in range(6):
             out[6 + 6 * a + k] = y[6 + 6 * (3 + a) + k]
@@ -74,7 +91,7 @@ def _rates(y, out):
 
 @kernel
 def _advance(y, dt_s):
-    """Carry a state and its transition matrix over dt_s, in place, by Runge and Kutta."""
+    """Propagate a state and its transition matrix by dt_s, in place (Runge-Kutta)."""
     n = int(np.ceil(abs(dt_s) / STEP_S))
     if n == 0:
         return
@@ -89,34 +106,34 @@ def _advance(y, dt_s):
 
 
 def propagate(state: Array, dt_s: float) -> Array:
-    """Return a (6,) state [km, km/s], GCRF, dt_s later: the Earth a point with oblateness (J2).
+    """Return a (6,) state [km, km/s], GCRF, propagated by dt_s: point mass and J2.
 
-    The axis of the Earth is taken as that of the ICRS, from which it is 0.1 degrees off.
+    The Earth's axis is taken as the z axis of the ICRS, from which it is 0.1 degrees off.
     """
     return trajectory(state, np.array([dt_s]))[0][0]
 
 
 def trajectory(state: Array, dt_s: Array) -> tuple[Array, Array]:
-    """Return a (6,) state at several times from its own, and how errors of it are carried there.
+    """Return a (6,) state propagated by several times, with its transition matrices.
 
     Parameters
     ----------
     state : (6,) float
         Position [km] and velocity [km/s], GCRF; forces as in `propagate`.
     dt_s : (n,) float
-        Times [s] since the state's; cheapest in order.
+        Times [s] since the state; fastest in order.
 
     Returns
     -------
     state : (n, 6) float
     transition : (n, 6, 6) float
-        Derivatives of the states by the one given, of two bodies.
+        Derivatives of these states by the given one, for two bodies.
     """
     out = np.empty((len(dt_s), 42))
     begin = np.concatenate([np.asarray(state, float), np.eye(6).ravel()])
     y, now = begin.copy(), 0.0
     for k, t in enumerate(np.asarray(dt_s, float).tolist()):
-        if (t - now) * t < 0.0 or now * t < 0.0:  # nearer than the last, or on the other side
+        if (t - now) * t < 0.0 or now * t < 0.0:  # nearer than the last time, or on the other side
             y, now = begin.copy(), 0.0
         _advance(y, t - now)
         out[k], now = y, t
@@ -125,15 +142,15 @@ def trajectory(state: Array, dt_s: Array) -> tuple[Array, Array]:
 
 @kernel
 def _accumulate(y, view, shared, N, rhs, at):
-    """Add one view to the normal equations; return its part of chi-square, NaN where behind.
+    """Add one view to the normal equations; return its chi-square, NaN behind the sensor.
 
-    `view` is (r, u, basis, weight); `shared` the sensor's errors of direction and place so far,
-    whose unknowns begin at `at`.
+    `view` is (r, u, basis, weight). `shared` holds the sensor's errors of direction and position
+    so far; their unknowns begin at index `at`.
     """
     r, u, basis, W = view
     delay = 0.0
     d = np.empty(3)
-    for _ in range(2):  # light left earlier; the second time is right to a millimetre
+    for _ in range(2):  # light left earlier; two rounds are right to a millimetre
         rho2 = 0.0
         for a in range(3):
             r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
@@ -169,8 +186,9 @@ def _accumulate(y, view, shared, N, rhs, at):
 
 
 @kernel
-def _add_views(state, errors, time_s, sensor, r, u, basis, weight, N, rhs):
+def _add_views(state, errors, views, N, rhs):
     """Add all views to the normal equations at a state; return their chi-square."""
+    time_s, sensor, r, u, basis, weight = views
     chi2 = 0.0
     middle = np.searchsorted(time_s, 0.0)
     for later in range(2):
@@ -188,19 +206,8 @@ def _add_views(state, errors, time_s, sensor, r, u, basis, weight, N, rhs):
     return chi2
 
 
-class _Views(NamedTuple):
-    """One arc's views: as in `Arcs`, with the tangent basis and the inverse of the noise."""
-
-    time_s: Array
-    sensor: Indices
-    r_km: Array
-    u: Array
-    basis: Array
-    weight: Array
-
-
-def _fit(state: Array, prior: Array, views: _Views) -> tuple[Array, Array, float]:
-    """Return state, covariance and chi-square of one arc from a start; NaN where it fails."""
+def _fit(state: Array, prior: Array, views: ArcViews) -> tuple[Array, Array, float]:
+    """Return state, covariance and chi-square of one arc; NaN where the fit fails."""
     failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan
     n_sensors = len(prior)
     errors = np.zeros((n_sensors, 6))
@@ -211,21 +218,10 @@ def _fit(state: Array, prior: Array, views: _Views) -> tuple[Array, Array, float
     for _ in range(ITERATIONS):
         pull = (prior @ errors[:, :, None])[:, :, 0]
         N, rhs = at_prior.copy(), np.concatenate([np.zeros(6), -pull.ravel()])
-        chi2 = float(np.sum(errors * pull)) + _add_views(
-            state,
-            errors,
-            views.time_s,
-            views.sensor,
-            views.r_km,
-            views.u,
-            views.basis,
-            views.weight,
-            N,
-            rhs,
-        )
+        chi2 = float(np.sum(errors * pull)) + _add_views(state, errors, views, N, rhs)
         if not (np.isfinite(chi2) and (np.diag(N) > 0.0).all()):
             return failed
-        # Kilometres, km/s and radians: scaled alike before anything is solved.
+        # km, km/s and radians: scaled to one size before the inversion.
         scale = 1.0 / np.sqrt(np.diag(N))
         try:
             inverse = np.linalg.inv(N * scale[:, None] * scale)
@@ -247,9 +243,9 @@ def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
     Parameters
     ----------
     arcs
-        The views; no two of a sensor may share a detection, for then their noise is not new.
+        The views. No two of a sensor may share a detection: their noise must be independent.
     start : (g, 6) float
-        States [km, km/s] to begin with: off by a little against the distances of the sensors.
+        First states [km, km/s], with errors small against the distances to the sensors.
 
     Returns
     -------
@@ -259,13 +255,13 @@ def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
     cov : (g, 6, 6) float
         Covariance.
     chi2 : (g,) float
-        Weighted sum of squares, the shared errors' own included; 2 n - 6 degrees of freedom.
+        Weighted sum of squares, with those of the shared errors; 2 n - 6 degrees of freedom.
 
     Notes
     -----
-    Errors that a sensor's views share are taken as fixed in ICRS axes over the arc, as those of a
-    sensor are that keeps its roll. Forces: see `propagate`; over 10 minutes what is left
-    out (Moon, Sun, other harmonics) is below 2 m.
+    Shared errors are taken as constant in ICRS axes over the arc, as they are for a sensor that
+    keeps its roll. Forces: see `propagate`. Over 10 minutes the neglected ones (Moon, Sun, other
+    harmonics) are below 2 m.
 
     References
     ----------
@@ -276,31 +272,31 @@ def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
     chi2 = np.full(g, np.nan)
     basis, weight = tangent_basis(arcs.u), np.asarray(np.linalg.inv(arcs.cov_noise), float)
     for k in range(g):
-        own = slice(arcs.offsets[k], arcs.offsets[k + 1])
-        names, sensor = np.unique(arcs.sensor[own], return_inverse=True)
-        if own.stop - own.start < 3:
+        rows = slice(arcs.offsets[k], arcs.offsets[k + 1])
+        names, sensor = np.unique(arcs.sensor[rows], return_inverse=True)
+        if rows.stop - rows.start < 3:
             state[k] = np.nan
             continue
-        views = _Views(
-            arcs.time_s[own], sensor.astype(np.int64), arcs.r_km[own], arcs.u[own], basis[own],
-            weight[own],
+        views = ArcViews(
+            arcs.time_s[rows], sensor.astype(np.int64), arcs.r_km[rows], arcs.u[rows], basis[rows],
+            weight[rows],
         )  # fmt: skip
-        prior = _prior(arcs, own, basis, sensor, len(names))
+        prior = _prior(arcs, rows, basis, sensor, len(names))
         state[k], cov[k], chi2[k] = _fit(state[k], prior, views)
     return state, cov, chi2
 
 
-def _prior(arcs: Arcs, own: slice, basis: Array, sensor: Indices, n_sensors: int) -> Array:
+def _prior(arcs: Arcs, rows: slice, basis: Array, sensor: Indices, n_sensors: int) -> Array:
     """Return the inverse covariance of each sensor's shared errors: direction, then place."""
     out = np.zeros((n_sensors, 6, 6))
-    across = np.swapaxes(basis[own], -1, -2) @ arcs.cov_bias[own] @ basis[own]
-    # Along the sight an error shows nowhere; it only keeps the matrix invertible.
-    along = np.trace(arcs.cov_bias[own], axis1=-2, axis2=-1) / 2
-    full = across + along[:, None, None] * arcs.u[own][:, :, None] * arcs.u[own][:, None, :]
+    across = np.swapaxes(basis[rows], -1, -2) @ arcs.cov_bias[rows] @ basis[rows]
+    # An error along the line of sight has no effect; it keeps the matrix invertible.
+    along = np.trace(arcs.cov_bias[rows], axis1=-2, axis2=-1) / 2
+    full = across + along[:, None, None] * arcs.u[rows][:, :, None] * arcs.u[rows][:, None, :]
     for s in range(n_sensors):
-        mine = sensor == s
-        direction = full[mine].mean(axis=0) + LEAST_BIAS_RAD**2 * np.eye(3)
+        of_sensor = sensor == s
+        direction = full[of_sensor].mean(axis=0) + LEAST_BIAS_RAD**2 * np.eye(3)
         out[s, :3, :3] = np.linalg.inv(direction)
-        place = max(float(arcs.sigma_km[own][mine].mean()), LEAST_PLACE_KM)
+        place = max(float(arcs.sigma_km[rows][of_sensor].mean()), LEAST_PLACE_KM)
         out[s, 3:, 3:] = np.eye(3) / place**2
     return out

@@ -1,4 +1,4 @@
-"""Planets: where they stand in the sky of a sensor."""
+"""Planets: their apparent directions for a sensor, with error bounds."""
 
 from typing import NamedTuple
 
@@ -16,33 +16,33 @@ Nanoseconds = npt.NDArray[np.int64]
 
 NUMBERS = (1, 2, 4, 5, 6, 7, 8)  # of plan94: Mercury, Venus, Mars ... Neptune
 
-# Greatest error of plan94 from 1800 to 2050 (ERFA, plan94), longitude and latitude together
-# [arcsec], seen from the Sun; and the discs' radii [km], as a crescent's light is off its middle.
+# Largest heliocentric errors of plan94 from 1800 to 2050 (ERFA, plan94), longitude and latitude
+# together [arcsec]; radii of the discs [km], because the light of a crescent is off the centre.
 _ERROR_ARCSEC = np.array([4.1, 5.1, 17.0, 71.2, 82.0, 86.3, 11.2])
 _RADIUS_KM = np.array([2440.0, 6052.0, 3390.0, 69911.0, 58232.0, 25362.0, 24622.0])
 
-_NODE_NS = 600_000_000_000  # planets and Earth over ten minutes are smooth to a milliarcsecond
+_NODE_NS = 600_000_000_000  # a cubic over ten minutes errs by less than a milliarcsecond
 
 
 def planet_directions(
     time_ns: Nanoseconds, r_gcrf_km: Array, v_gcrf_km_s: Array
 ) -> tuple[Array, Array]:
-    """Return the planets' apparent directions, and how far off they may be.
+    """Return the planets' apparent directions, and bounds of their errors.
 
     Parameters
     ----------
     time_ns : (n,) int
         UTC since 1970 [ns].
     r_gcrf_km, v_gcrf_km_s : (n, 3) float
-        The observer's place and velocity.
+        Position and velocity of the observer.
 
     Returns
     -------
     u_icrs : (n, 7, 3) float
         Unit vectors to Mercury, Venus, Mars, Jupiter, Saturn, Uranus and Neptune, with light
-        time and the aberration of the observer's barycentric velocity, as stars are seen.
+        time and the aberration of the observer's barycentric velocity.
     error_rad : (n, 7) float
-        Bound of the ephemeris's error and the planet's angular radius together [rad].
+        Sum of the bound of the ephemeris error and the planet's angular radius [rad].
 
     References
     ----------
@@ -60,7 +60,7 @@ def planet_directions(
     for _ in range(2):
         line = sun[:, None] + from_sun - here[:, None]
         delay_s = np.linalg.norm(line, axis=-1) / SPEED_OF_LIGHT_KM_S
-        # The Sun itself is left where it is: in four hours it moves by 0.01 arcsec at Neptune.
+        # The motion of the Sun is neglected: 0.01 arcsec in the four hours of light from Neptune.
         planets = enumerate(paths.planets_km)
         from_sun = np.stack([planet(t - delay_s[:, k]) for k, planet in planets], axis=1)
     line = sun[:, None] + from_sun - here[:, None]
@@ -72,7 +72,7 @@ def planet_directions(
 
 
 class _Paths(NamedTuple):
-    """Barycentric Earth and Sun, and planets from the Sun, by time [s]."""
+    """Splines over time [s]: barycentric Earth and Sun, heliocentric planets."""
 
     earth_km: CubicSpline
     sun_km: CubicSpline
@@ -80,7 +80,7 @@ class _Paths(NamedTuple):
 
 
 def _paths(first_ns: int, last_ns: int) -> _Paths:
-    """Return the paths from first to last; the planets' begin five hours before, for light."""
+    """Return the paths from first to last time, and five hours earlier for the light time."""
     nodes = np.arange(first_ns - 30 * _NODE_NS, last_ns + 3 * _NODE_NS, _NODE_NS)
     at = (nodes - first_ns) / 1e9
     jd = tt_julian_date(nodes)

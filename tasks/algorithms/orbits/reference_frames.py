@@ -1,7 +1,7 @@
-"""Earth-centred frames to GCRF: EME2000, TEME and ITRF, with velocities.
+"""Reference frames: states from EME2000, TEME and ITRF to GCRF.
 
-Rotations are IAU 2006/2000A by pyerfa. The corrections dX, dY that the IERS publishes for
-them (below 0.001 arcsec, 4 cm for a low orbit) are left aside, as astropy leaves them.
+Rotations are IAU 2006/2000A by pyerfa. The IERS corrections dX, dY (below 0.001 arcsec, 4 cm for
+a low orbit) are neglected, as in astropy.
 
 References
 ----------
@@ -27,17 +27,17 @@ Nanoseconds = npt.NDArray[np.int64]
 
 FRAMES = ("GCRF", "EME2000", "TEME", "ITRF")
 MJD_JD = 2400000.5
-# Nutation's fastest term takes days: over ten minutes a line is good to 1e-6 arcsec.
+# The fastest term of nutation takes days: linear over ten minutes to 1e-6 arcsec.
 NODE_NS = 600_000_000_000
 
 
 class Orientation(NamedTuple):
-    """Earth's orientation at n times, as an Earth-orientation table gives it."""
+    """Earth's orientation at n times, from an Earth-orientation table."""
 
     ut1: tuple[Array, Array]  # two-part Julian date
     xp_rad: Array
     yp_rad: Array
-    sigma_rad: Array  # 1-sigma of Earth's rotation from the table's end on; 0 within it
+    sigma_rad: Array  # 1-sigma of the orientation outside the table; 0 within it
 
 
 def orientation_at(
@@ -45,9 +45,9 @@ def orientation_at(
 ) -> Orientation:
     """Return Earth's orientation at times, from a daily table.
 
-    Beyond the table its last (first) value is held, and `sigma_rad` grows as the IERS says
-    its predictions do (Bulletin A: UT1 0.00025 D^0.75 s, pole 0.00068 D^0.80 arcsec, D days).
-    Before the table UT1 is known to a second, as UTC has it.
+    Outside the table its last (or first) value is used. After it, `sigma_rad` grows like the
+    errors of IERS predictions (Bulletin A: UT1 0.00025 D^0.75 s, pole 0.00068 D^0.80 arcsec,
+    after D days). Before it, the error is one second of UT1: the bound of UT1-UTC.
 
     Parameters
     ----------
@@ -58,10 +58,10 @@ def orientation_at(
     """
     day, share = utc_julian_date(time_ns)
     at = (day - MJD_JD) + share
-    # UT1-TAI, unlike UT1-UTC, has no step where a leap second comes.
+    # UT1-TAI, unlike UT1-UTC, has no step at a leap second.
     ut1_tai_s = ut1_utc_s - tai_minus_utc_s(MJD_JD + mjd)
-    # By the day's start: within a day that ends in a leap second, erfa's fraction of a day
-    # is one of 86,401 seconds, ours is not.
+    # TAI-UTC of the day's start: on a day with a leap second, erfa would divide by 86,401 s and
+    # Unix time by 86,400 s.
     ut1_utc = (np.interp(at, mjd, ut1_tai_s) + tai_minus_utc_s(day)) / 86400.0
     ut1 = (day, share + ut1_utc)
     days = np.maximum(at - mjd[-1], 0.0)
@@ -78,7 +78,7 @@ def orientation_at(
 def gcrf_from_eme2000(r_km: Array, v_km_s: Array) -> tuple[Array, Array]:
     """Return GCRF positions and velocities, (n, 3), of those in EME2000 (mean J2000).
 
-    Only the frame bias lies between them: 0.02 arcsec.
+    They differ by the frame bias only: 0.02 arcsec.
     """
     R_eme2000_from_gcrf = erfa.bp06(2451545.0, 0.0)[0]
     return r_km @ R_eme2000_from_gcrf, v_km_s @ R_eme2000_from_gcrf
@@ -89,9 +89,9 @@ def gcrf_from_teme(
 ) -> tuple[Array, Array]:
     """Return GCRF positions and velocities, (n, 3), of those in SGP4's frame TEME.
 
-    TEME is turned to the Earth-fixed axes by the sidereal time of 1982, for which it is
-    made, and from there back by the Earth rotation angle. Both take the same UT1, so its
-    error cancels. TEME itself turns by precession only, which no velocity notices.
+    TEME is rotated to Earth-fixed axes by the sidereal time of 1982, which is part of its
+    definition, and from there to GCRF by the Earth rotation angle. Both use the same UT1, so its
+    error cancels. The rotation of TEME itself (precession) is negligible for velocities.
     """
     gmst = erfa.gmst82(*orientation.ut1)
     R_gcrf_from_teme = _transpose(_tirs_from_gcrf(time_ns, orientation)) @ _about_z(gmst)
@@ -103,8 +103,8 @@ def gcrf_from_itrf(
 ) -> tuple[Array, Array]:
     """Return GCRF positions and velocities, (n, 3), of Earth-fixed ones (ITRF).
 
-    The velocity of a point that rests on Earth is 0 in ITRF and Earth's rotation in GCRF.
-    The length of day (below 5 ms: 3e-8 of that rotation) is left aside.
+    A point at rest on Earth has velocity 0 in ITRF, and that of Earth's rotation in GCRF. The
+    variation of the length of day (below 5 ms: 6e-8 of the rotation) is neglected.
     """
     tio = erfa.sp00(*tt_julian_date(time_ns))
     R_tirs_from_itrf = _transpose(erfa.pom00(orientation.xp_rad, orientation.yp_rad, tio))
@@ -127,14 +127,14 @@ def to_gcrf(
     time_ns : (n,) int
         UTC since 1970.
     r_km, v_km_s : (n, 3) float
-        In that frame; a velocity may be NaN and then stays NaN.
+        In that frame. NaN velocities remain NaN.
     orientation
-        At the same times.
+        Earth's orientation at the same times.
 
     Raises
     ------
     ValueError
-        On another frame.
+        If the frame is unknown.
     """
     if frame == "GCRF":
         return r_km.copy(), v_km_s.copy()
@@ -144,7 +144,7 @@ def to_gcrf(
         return gcrf_from_teme(time_ns, r_km, v_km_s, orientation)
     if frame == "ITRF":
         return gcrf_from_itrf(time_ns, r_km, v_km_s, orientation)
-    raise ValueError(f"frame {frame!r} is none of {', '.join(FRAMES)}")
+    raise ValueError(f"expected a frame of {', '.join(FRAMES)}, got {frame!r}")
 
 
 def _tirs_from_gcrf(time_ns: Nanoseconds, orientation: Orientation) -> Array:
@@ -153,7 +153,7 @@ def _tirs_from_gcrf(time_ns: Nanoseconds, orientation: Orientation) -> Array:
 
 
 def _cirs_from_gcrf(time_ns: Nanoseconds) -> Array:
-    """Return (n, 3, 3) celestial to intermediate; the long series only at nodes."""
+    """Return (n, 3, 3), CIRS from GCRF. The long series is evaluated at nodes only."""
     index = time_ns // NODE_NS
     nodes = np.unique(np.concatenate([index, index + 1]))
     at_nodes = np.stack(erfa.xys06a(*tt_julian_date(nodes * NODE_NS)), axis=-1)

@@ -1,14 +1,13 @@
-"""A sensor's states at the times of its frames.
+"""State interpolation: a sensor's states at the times of its frames.
 
-Between two states the position is the quintic that has their positions, velocities and
-accelerations; an acceleration is gravity at the state's position, which ten metres of
-error do not change. So a path is followed to centimetres over minutes, and the states'
-independent errors are averaged, never amplified: no position is differenced with another
-one nearby. Where velocities are not sent they come from a fit over 20 s of positions, with
-gravity's part of the motion taken off first.
+Between two states the position is the quintic polynomial with their positions, velocities and
+accelerations. An acceleration is gravity at the state's position, which an error of ten metres
+does not change. So the error of the path is centimetres over minutes. Independent errors of the
+states are averaged and never amplified, because nearby positions are not differenced. Missing
+velocities come from a fit to 20 s of positions, after gravity's part of the motion is removed.
 
-A vehicle below 80 km altitude is on no orbit; its acceleration is taken as zero, which at
-one state a second still follows a point at rest on Earth to a metre.
+Below 80 km altitude a vehicle is not on an orbit and its acceleration is taken as zero. With one
+state per second a point at rest on Earth is still right to a metre.
 """
 
 from typing import NamedTuple
@@ -25,33 +24,33 @@ Mask = npt.NDArray[np.bool_]
 
 LOWEST_ORBIT_KM = EARTH_RADIUS_KM + 80.0
 
-# Widest gap between two states that is bridged: the quintic of a low orbit is then good to
-# 5 cm with velocities. Without, the fitted velocities are good to some m/s.
+# Widest gap between two states that is interpolated. The quintic of a low orbit then errs by 5 cm
+# with reported velocities. Fitted velocities err by some m/s.
 MAX_BRIDGE_S = 240.0
 MAX_BRIDGE_FITTED_S = 120.0
-# Positions within this of a state give its velocity, if it has none; the nearest one on
-# each side always does. At most so many of them: more add nothing but work.
+# A missing velocity is fitted to the positions within this of the state, and at least to the
+# nearest one on each side. At most so many points are used: more do not help.
 FIT_HALF_WIDTH_S = 10.0
 FIT_POINTS = 21
-# Along an extrapolation a sent velocity doubles the variance after this long.
+# An extrapolation with a reported velocity doubles the variance after this time.
 VELOCITY_MEMORY_S = 30.0
-# A prior attitude is turned evenly between two states no further apart than this.
+# Prior attitudes are interpolated between states that are at most this far apart.
 MAX_ATTITUDE_GAP_S = 10.0
 
 
-class States(NamedTuple):
+class SensorStates(NamedTuple):
     """States of one sensor, by strictly increasing time."""
 
     time_ns: Nanoseconds  # (n,)
     r_gcrf_km: Array  # (n, 3)
-    v_gcrf_km_s: Array  # (n, 3), NaN where not sent
-    position_sigma_km: Array  # (n,) 1-sigma an axis
-    q_sensor_from_icrs: Array  # (n, 4), NaN where not sent
-    attitude_sigma: Array  # (n,) 1-sigma an axis, any unit
+    v_gcrf_km_s: Array  # (n, 3), NaN where missing
+    position_sigma_km: Array  # (n,) 1-sigma per axis
+    q_sensor_from_icrs: Array  # (n, 4), NaN where missing
+    attitude_sigma: Array  # (n,) 1-sigma per axis, any unit
 
 
 class Places(NamedTuple):
-    """A sensor at m times; NaN where no state is near enough."""
+    """Position, velocity and attitude of a sensor at m times; NaN where no state is near enough."""
 
     r_gcrf_km: Array  # (m, 3)
     v_gcrf_km_s: Array  # (m, 3)
@@ -60,24 +59,24 @@ class Places(NamedTuple):
     attitude_sigma: Array  # (m,)
 
 
-def interpolate_states(states: States, at_ns: Nanoseconds, state_gap_s: float) -> Places:
-    """Return where a sensor is and how it is turned at given times.
+def interpolate_states(states: SensorStates, at_ns: Nanoseconds, state_gap_s: float) -> Places:
+    """Return position, velocity and attitude of a sensor at given times.
 
     Parameters
     ----------
     states
-        Any number, also one or none.
+        Any number, including none.
     at_ns : (m,) int
         UTC since 1970, in any order.
     state_gap_s
-        A time further than this from every state has no position.
+        Farther than this from every state, the result is NaN.
 
     Returns
     -------
     Places
-        Beyond the first and last state, and next to a gap that is too wide to bridge, the
-        nearest state is carried on under gravity and its sigma grows. An attitude is never
-        carried on: who knows when a sensor turns.
+        Beyond the first and last state, and in a gap that is too wide to interpolate, the
+        nearest state is propagated under gravity and its sigma grows. Attitudes are never
+        extrapolated: a sensor may turn at any time.
     """
     n, m = len(states.time_ns), len(at_ns)
     if n == 0 or m == 0:
@@ -86,7 +85,7 @@ def interpolate_states(states: States, at_ns: Nanoseconds, state_gap_s: float) -
     v_km_s, growth = _with_velocities(states)
     right = np.clip(np.searchsorted(states.time_ns, at_ns), 1, max(n - 1, 1)) % n
     left = np.maximum(right - 1, 0)
-    # In integers first: floating seconds since 1970 are good to a quarter microsecond only.
+    # Integers first: float seconds since 1970 are right to a quarter microsecond only.
     since_left_s = (at_ns - states.time_ns[left]) / SECOND_NS
     since_right_s = (at_ns - states.time_ns[right]) / SECOND_NS
     use_left = np.abs(since_left_s) <= np.abs(since_right_s)
@@ -114,7 +113,7 @@ def interpolate_states(states: States, at_ns: Nanoseconds, state_gap_s: float) -
 def gravity(r_km: Array) -> Array:
     """Return the acceleration [km/s^2] of (..., 3) positions: Earth as a point, and J2.
 
-    J2's axis is the GCRF's z, which is within 0.2 degrees of the pole of this century.
+    J2 is about the z axis of the GCRF, which is within 0.2 degrees of the pole in this century.
 
     References
     ----------
@@ -131,10 +130,10 @@ def gravity(r_km: Array) -> Array:
 def _bridge(
     r_km: Array, v_km_s: Array, a: Nanoseconds, b: Nanoseconds, step_s: Array, share: Array
 ) -> tuple[Array, Array]:
-    """Return positions and velocities at a share of the way from states a to states b.
+    """Return positions and velocities at a share of the time from states a to states b.
 
-    Positions by quintic Hermite; velocities by the cubic of the velocities and gravity, not
-    by the derivative of the positions, which would amplify their errors.
+    Positions by a quintic Hermite polynomial. Velocities by the cubic of velocities and gravity:
+    the derivative of the quintic would amplify the errors of the positions.
     """
     h, s = step_s[:, None], share[:, None]
     ra, rb, va, vb = r_km[a], r_km[b], v_km_s[a], v_km_s[b]
@@ -150,9 +149,9 @@ def _bridge(
 
 
 def _carry_on(r_km: Array, v_km_s: Array, step_s: Array) -> tuple[Array, Array]:
-    """Return states carried on under gravity, (n,) s each, by four steps of Runge-Kutta.
+    """Return states propagated under gravity by (n,) seconds, in four Runge-Kutta steps.
 
-    Good to centimetres over minutes on a low orbit.
+    The error is centimetres over minutes on a low orbit.
     """
     steps = 4
     h = (step_s / steps)[:, None]
@@ -167,11 +166,11 @@ def _carry_on(r_km: Array, v_km_s: Array, step_s: Array) -> tuple[Array, Array]:
     return r, v
 
 
-def _with_velocities(states: States) -> tuple[Array, Array]:
-    """Return every state's velocity, sent or fitted, and what it costs to carry it on.
+def _with_velocities(states: SensorStates) -> tuple[Array, Array]:
+    """Return all velocities, reported or fitted, and the growth (a, b) of their variance, (n, 2).
 
-    The second is (n, 2): after t seconds the variance of the position is that of the state
-    times 1 + a t + b t^2. A lone state without velocity has NaN in both.
+    After t seconds the variance of the position is that of the state times 1 + a t + b t^2. A
+    single state without velocity has NaN in both.
     """
     v = states.v_gcrf_km_s.copy()
     growth = np.tile([0.0, VELOCITY_MEMORY_S**-2], (len(v), 1))
@@ -181,7 +180,8 @@ def _with_velocities(states: States) -> tuple[Array, Array]:
     return v, growth
 
 
-def _fit_velocities(states: States, which: Nanoseconds) -> tuple[Array, Array]:
+def _fit_velocities(states: SensorStates, which: Nanoseconds) -> tuple[Array, Array]:
+    """Return fitted velocities of some states, and the growth of their variance."""
     points, used = _fit_points(states.time_ns, which)
     since_s = (states.time_ns[points] - states.time_ns[which][:, None]) / SECOND_NS
     r_km = states.r_gcrf_km[points]
@@ -190,7 +190,7 @@ def _fit_velocities(states: States, which: Nanoseconds) -> tuple[Array, Array]:
     tau = since_s / width_s[:, None]
     weight = used.astype(float)
     fall = _double_integral(tau, gravity(r_km), weight) * (width_s**2)[:, None, None]
-    # What is left is a straight line; its slope errs together with the state's own position.
+    # The rest is a straight line. The error of its slope correlates with the state's position.
     mean_s = (weight * since_s).sum(axis=1) / weight.sum(axis=1)
     lever_s = np.where(used, since_s - mean_s[:, None], 0.0)
     spread = (lever_s**2).sum(axis=1)
@@ -200,14 +200,14 @@ def _fit_velocities(states: States, which: Nanoseconds) -> tuple[Array, Array]:
 
 
 def _fit_points(time_ns: Nanoseconds, which: Nanoseconds) -> tuple[Nanoseconds, Mask]:
-    """Return (k, FIT_POINTS) indices of the states around each of k, and which count."""
+    """Return (k, FIT_POINTS) indices of the states around each of k, and which are used."""
     n = len(time_ns)
     reach = int(FIT_HALF_WIDTH_S * SECOND_NS)
     first = np.searchsorted(time_ns, time_ns[which] - reach)
     last = np.searchsorted(time_ns, time_ns[which] + reach, side="right") - 1
     first = np.maximum(np.minimum(first, which - 1), 0)
     last = np.minimum(np.maximum(last, which + 1), n - 1)
-    # A run's end has no neighbour on one side: take a second one of the other, for gravity.
+    # At either end there is no neighbour on one side: take a second one from the other side.
     first = np.where(last == which, np.maximum(np.minimum(first, which - 2), 0), first)
     last = np.where(first == which, np.minimum(np.maximum(last, which + 2), n - 1), last)
     share = np.linspace(0.0, 1.0, FIT_POINTS)
@@ -223,7 +223,7 @@ def _double_integral(tau: Array, values: Array, weight: Array) -> Array:
     powers = np.stack([np.ones_like(tau), tau, tau**2], axis=-1)
     weighted = powers * weight[..., None]
     normal = np.einsum("npi,npj->nij", weighted, powers)
-    # Fewer than three points: the smallest coefficients that pass through them.
+    # With fewer than three points: the smallest coefficients that fit them.
     normal += 1e-9 * np.eye(3)
     moments = np.einsum("npi,npk->nik", weighted, values)
     coefficients = np.linalg.solve(normal, moments)
@@ -231,8 +231,8 @@ def _double_integral(tau: Array, values: Array, weight: Array) -> Array:
     return np.einsum("npi,nik->npk", integrals, coefficients)
 
 
-def _attitudes(states: States, at_ns: Nanoseconds) -> tuple[Array, Array]:
-    """Return prior attitudes and their sigmas where a state with one is on either side."""
+def _attitudes(states: SensorStates, at_ns: Nanoseconds) -> tuple[Array, Array]:
+    """Return prior attitudes and their sigmas where states on both sides have one."""
     q, sigma = np.full((len(at_ns), 4), np.nan), np.full(len(at_ns), np.nan)
     having = np.flatnonzero(np.isfinite(states.q_sensor_from_icrs).all(axis=1))
     if len(having) == 0:

@@ -1,8 +1,8 @@
-"""Sensor check: a sensor that looks at what the others see and never agrees is wrong itself.
+"""Agreement: a sensor that has the others' objects in its field but joins none is at fault.
 
 A wrong clock, position or attitude moves all of a sensor's lines of sight. Its tracklets then
-join no object, though the objects that the other sensors found stand in its field and it has
-tracklets enough.
+join no object, although objects of the other sensors are in its field and it has enough
+tracklets.
 """
 
 from typing import NamedTuple
@@ -17,20 +17,20 @@ from epipole.tasks.algorithms.geometry.triangulation import triangulate
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-FEWEST_OBJECTS = 3  # that a sensor must look at before it is judged
-AGREES = 0.3  # share of them that a sound sensor has at least
-STRAYS = 0.5  # tracklets without an object, for each object looked at, of one that sees but errs
+FEWEST_OBJECTS = 3  # objects in its field from which a sensor is judged
+AGREES = 0.3  # least share of them that a sound sensor joins
+STRAYS = 0.5  # tracklets without an object per object in the field, of a sensor at fault
 
 
 class Agreement(NamedTuple):
-    """What a sensor looked at, and what of it the sensor had.
+    """How many objects were in each sensor's field, and how many it joined.
 
     looked : (s,) int
-        Objects, found by two other sensors or more, that stood in the sensor's field.
+        Objects of at least two other sensors that were in the sensor's field.
     joined : (s,) int
-        Those of them that a tracklet of the sensor belongs to.
+        Those of them that have a tracklet of the sensor.
     free : (s,) int
-        The sensor's tracklets that belong to no object.
+        Tracklets of the sensor without an object.
     """
 
     looked: Indices
@@ -38,7 +38,7 @@ class Agreement(NamedTuple):
     free: Indices
 
     def disagreeing(self) -> Indices:
-        """Return the sensors that see but err: they are to be left out."""
+        """Return the sensors that detect but disagree: they should be left out."""
         return np.flatnonzero(
             (self.looked >= FEWEST_OBJECTS)
             & (self.joined < AGREES * self.looked)
@@ -47,7 +47,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(samples: Samples, groups: Groups) -> Agreement:
-    """Return how far each sensor agrees with the objects that the others found."""
+    """Return how far each sensor agrees with the objects of the other sensors."""
     n_sensors, n_groups = len(samples.half_field), len(groups.score)
     looked, joined = np.zeros(n_sensors, np.int64), np.zeros(n_sensors, np.int64)
     member, group, instant = _members_at_best(samples, groups)
@@ -66,7 +66,10 @@ def agreement(samples: Samples, groups: Groups) -> Agreement:
 
 
 def _members_at_best(samples: Samples, groups: Groups) -> tuple[Indices, Indices, Indices]:
-    """Return the members that each group has when it has most, their groups; and when that is."""
+    """Return the members of each group at its best instant, their groups, and these instants.
+
+    The best instant is the first one with most members.
+    """
     n_groups = len(groups.score)
     member = np.flatnonzero(groups.group != FREE)
     member = member[np.argsort(groups.group[member], kind="stable")]
@@ -80,7 +83,7 @@ def _members_at_best(samples: Samples, groups: Groups) -> tuple[Indices, Indices
 def _points(
     samples: Samples, member: Indices, group: Indices, instant: Indices, n_groups: int
 ) -> Array:
-    """Return where the groups' lines of sight meet, (g, 3); NaN where they do not."""
+    """Return the points where the groups' lines of sight meet, (g, 3); NaN where they do not."""
     m = instant[group]
     x, *_ = triangulate(
         np.searchsorted(group, np.arange(n_groups + 1)),

@@ -1,12 +1,12 @@
 """Clock offsets of sensors, constant over a night, from the residuals of positions.
 
-A frame stamped late by d shows what stood there d before: the line of sight lags behind by d
-times its rate. The objects' positions, a bias of each sensor's own position and one of its
-attitude are solved with the offsets, so that none of these is taken for a clock.
+A frame with a time stamp late by d shows the sky of d earlier: its lines of sight lag by d times
+their rate. The objects' positions, a bias of each sensor's position and one of its attitude are
+solved together with the offsets, so that none of them is mistaken for an offset.
 
-Most clocks are right. Of sensors that look one way, several wrong clocks together may look like
-another's; so a clock is taken for wrong only where that explains the lines far better than right
-clocks do, and better than other sensors' wrong ones.
+Most clocks are right. For sensors that look in similar directions, several wrong clocks may have
+the effect of another one. So a clock is declared wrong only if that explains the lines far better
+than right clocks do, and better than wrong clocks of other sensors.
 """
 
 import itertools
@@ -24,13 +24,13 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-PRIOR_S = 10.0  # 1-sigma of the offset of a wrong clock before anything is known
-SOUND_S = 1e-3  # of a right one
-SURE = 12.5  # log of the odds that it takes to believe a clock wrong: five sigma
-DISTINCT = 5.0  # and that it is this one rather than another
-FEW = 8  # sensors: of so many every set of wrong clocks is judged
-OUTLIER = 20.0  # chi-square of a line, of 2 degrees of freedom: it is of another object
-ROUNDS = 4  # of fits about better offsets, without outliers
+PRIOR_S = 10.0  # 1-sigma prior of the offset of a wrong clock
+SOUND_S = 1e-3  # 1-sigma of the offset of a right clock
+SURE = 12.5  # log-odds from which a clock is declared wrong: five sigma
+DISTINCT = 5.0  # log-odds from which it is this clock and not another one
+FEW = 8  # up to so many sensors, every set of wrong clocks is judged
+OUTLIER = 20.0  # chi-square (2 degrees of freedom) of a line that is of another object
+ROUNDS = 4  # fits, each with better offsets and without outliers
 PER_SENSOR = 7  # offset, bias of position (3), bias of attitude (3)
 
 
@@ -38,17 +38,17 @@ class Lines(NamedTuple):
     """Lines of sight to objects at common instants.
 
     group : (n,) int
-        Position that the line belongs to, 0 .. g - 1.
+        Position (object at an epoch) of the line, 0 .. g - 1.
     sensor : (n,) int
         Sensor, 0 .. s - 1.
     u : (n, 3) float
         Measured directions, aberration removed.
     cov : (n, 2, 2) float
-        Their errors that are new each time, on `tangent_basis(u)` [rad^2].
+        Covariance of their independent errors on `tangent_basis(u)` [rad^2].
     x_km, v_km_s : (n, 3) float
-        Position and velocity of the line's object as they were solved, at the line's time.
+        Solved position and velocity of the object, at the line's time.
     r_km, v_sensor_km_s : (n, 3) float
-        The same of its sensor.
+        Position and velocity of the sensor.
     """
 
     group: Indices
@@ -65,11 +65,11 @@ class Offsets(NamedTuple):
     """Clock offsets of sensors: reported minus true time.
 
     offset_s, sigma_s : (s,) float
-        Offset and its 1-sigma error, the clocks that are not `wrong` taken as right (or all as
-        unknown, where it cannot be told whose is wrong); NaN for a sensor without lines. A sigma
-        near `PRIOR_S`: the geometry shows nothing.
+        Offset and its 1-sigma error; NaN for a sensor without lines. Clocks that are not `wrong`
+        are assumed right, or all unknown where the wrong ones cannot be told. A sigma near
+        `PRIOR_S` means that the geometry does not determine the offset.
     wrong : (s,) bool
-        The clock is surely off.
+        The clock is surely wrong.
     """
 
     offset_s: Array
@@ -88,22 +88,22 @@ def clock_offsets(
     Parameters
     ----------
     lines
-        Lines of sight, in any order; groups of one line say nothing.
+        Lines of sight, in any order. Groups of one line are skipped.
     position_sigma_km, attitude_sigma_rad : (s,) float
-        1-sigma an axis of the biases that a sensor keeps over the night: of its position
-        [km], and of its attitude [rad] (0 where stars give it).
+        1-sigma per axis of the biases that a sensor keeps over the night: of its position
+        [km], and of its attitude [rad] (0 for attitudes from stars).
     guess_s : (s,) float
-        Offsets to begin with, where they are seconds; none: 0.
+        First offsets, needed where they are seconds. Default 0.
 
     Notes
     -----
-    Least squares about the solved positions, those eliminated group by group (Schur complement);
-    which clocks are wrong by the evidence of the linear model. What all sensors share shows only
-    by their own motion.
+    Least squares about the solved positions, which are eliminated group by group (Schur
+    complement). The wrong clocks are chosen by the evidence of the linear model. An offset that
+    all sensors share shows only in the sensors' motion.
     """
     n_sensors = len(position_sigma_km)
     guess = np.zeros(n_sensors) if guess_s is None else np.array(guess_s, float)
-    seen = np.bincount(lines.sensor, minlength=n_sensors) > 0
+    has_lines = np.bincount(lines.sensor, minlength=n_sensors) > 0
     spread = np.concatenate(
         [
             np.full((n_sensors, 1), PRIOR_S),
@@ -114,23 +114,24 @@ def clock_offsets(
     ).ravel()
     kept = np.ones(len(lines.sensor), bool)
     for _ in range(ROUNDS):
-        about = _carried(lines, guess)
+        about = _shifted(lines, guess)
         normal, right = _equations(about, kept, spread)
         model = _Model(normal, right, guess / PRIOR_S)
-        wrong, distinct = _wrong_clocks(model, np.flatnonzero(seen))
-        found = model.unknowns(wrong)
-        good = _chi2(about, kept, spread, found) < OUTLIER
-        guess[wrong] += found[::PER_SENSOR][wrong] * PRIOR_S
-        if (good == kept).all() and (np.abs(found[::PER_SENSOR][wrong]) * PRIOR_S < 1e-4).all():
+        wrong, distinct = _wrong_clocks(model, np.flatnonzero(has_lines))
+        unknowns = model.unknowns(wrong)
+        step_s = unknowns[::PER_SENSOR][wrong] * PRIOR_S
+        good = _chi2(about, kept, spread, unknowns) < OUTLIER
+        guess[wrong] += step_s
+        if (good == kept).all() and (np.abs(step_s) < 1e-4).all():
             break
         kept = good
-    return _estimates(model, wrong, distinct, seen)
+    return _estimates(model, wrong, distinct, has_lines)
 
 
 class _Model:
     """The normal equations of all sensors' unknowns, in units of their spread.
 
-    A guess stands for the offsets that the equations are about; the prior is about none.
+    The equations are linear about the offsets `guess`, the prior is about offset 0.
     """
 
     def __init__(self, normal: Array, right: Array, guess: Array) -> None:
@@ -139,24 +140,24 @@ class _Model:
         across = normal[np.ix_(biases, ~biases)]
         self._inner = np.linalg.inv(normal[np.ix_(biases, biases)] + np.eye(biases.sum()))
         self._across, self._bias_right = across, right[biases]
-        # What is left for the offsets once the biases are solved for.
+        # The equations of the offsets, with the biases eliminated.
         self._normal = normal[np.ix_(~biases, ~biases)] - across.T @ self._inner @ across
         self._right = right[~biases] - across.T @ self._inner @ right[biases]
 
     def offsets(self, free: Flags) -> tuple[Array, Array]:
-        """Return the offsets beyond the guess and their covariance where these may be off."""
+        """Return the offsets beyond the guess and their covariance; `free` clocks may be wrong."""
         A, b, _ = self._with_prior(free)
         cov = np.linalg.inv(A)
         return np.asarray(cov @ b), np.asarray(cov)
 
     def unknowns(self, free: Flags) -> Array:
-        """Return the unknowns of all sensors."""
+        """Return the offsets and biases of all sensors; `free` clocks may be wrong."""
         offset, _ = self.offsets(free)
         bias = self._inner @ (self._bias_right - self._across @ offset)
         return np.concatenate([offset[:, None], bias.reshape(len(offset), -1)], axis=1).ravel()
 
     def evidence(self, free: Flags) -> float:
-        """Return the log of the probability of the lines where these clocks may be off."""
+        """Return the log-probability of the lines if the `free` clocks may be wrong."""
         A, b, constant = self._with_prior(free)
         return float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1]) / 2 + constant
 
@@ -168,9 +169,10 @@ class _Model:
 
 
 def _wrong_clocks(model: _Model, sensors: Indices) -> tuple[Flags, bool]:
-    """Return the clocks that are surely wrong, and whether it can be told which are.
+    """Return the clocks that are surely wrong, and whether only one explanation is good.
 
-    Surely wrong are those that are so in every explanation about as good as the best.
+    Surely wrong are the clocks that are wrong in the best explanation and in all others that are
+    about as good.
     """
     n = len(model.guess)
     score: dict[frozenset[int], float] = {}
@@ -184,8 +186,8 @@ def _wrong_clocks(model: _Model, sensors: Indices) -> tuple[Flags, bool]:
     best = frozenset[int]()
     if len(sensors) <= FEW:
         for k in range(len(sensors) + 1):
-            for some in itertools.combinations(sensors.tolist(), k):
-                judge(frozenset(some))
+            for subset in itertools.combinations(sensors.tolist(), k):
+                judge(frozenset(subset))
         best = max(score, key=judge)
     else:
         while True:
@@ -199,28 +201,28 @@ def _wrong_clocks(model: _Model, sensors: Indices) -> tuple[Flags, bool]:
 
 
 def _beside(names: frozenset[int], sensors: list[int]) -> list[frozenset[int]]:
-    """Return the sets with one sensor more, less, or another instead."""
+    """Return the sets with one sensor added, removed, or exchanged."""
     others = [s for s in sensors if s not in names]
     more = [names | {s} for s in others]
     less = [names - {s} for s in sorted(names)]
     return [*more, *less, *(fewer | {s} for fewer in less for s in others)]
 
 
-def _estimates(model: _Model, wrong: Flags, distinct: bool, seen: Flags) -> Offsets:
-    """Return each sensor's offset where it, and those that are wrong, may be off."""
+def _estimates(model: _Model, wrong: Flags, distinct: bool, has_lines: Flags) -> Offsets:
+    """Return each sensor's offset, if it and the wrong clocks may be wrong."""
     offset, sigma = np.full(len(wrong), np.nan), np.full(len(wrong), np.nan)
-    for s in np.flatnonzero(seen):
+    for s in np.flatnonzero(has_lines):
         free = wrong | (np.arange(len(wrong)) == s) if distinct else np.ones(len(wrong), bool)
-        found, cov = model.offsets(free)
-        offset[s] = (model.guess[s] + found[s]) * PRIOR_S
+        step, cov = model.offsets(free)
+        offset[s] = (model.guess[s] + step[s]) * PRIOR_S
         sigma[s] = np.sqrt(cov[s, s]) * PRIOR_S
     return Offsets(offset, sigma, wrong)
 
 
-def _carried(lines: Lines, offset_s: Array) -> Lines:
-    """Return the lines as they stand beside the objects at the reported time.
+def _shifted(lines: Lines, offset_s: Array) -> Lines:
+    """Return the lines moved to the reported times, for clocks with these offsets.
 
-    Seen was the object where it stood `offset_s` before, from where the sensor stood then.
+    A line shows the object and the sensor where they were `offset_s` earlier.
     """
     d = offset_s[lines.sensor][:, None]
     moved = (lines.v_km_s - lines.v_sensor_km_s) * d
@@ -241,11 +243,11 @@ def _equations(lines: Lines, kept: Flags, spread: Array) -> tuple[Array, Array]:
     return normal, right
 
 
-def _chi2(lines: Lines, kept: Flags, spread: Array, found: Array) -> Array:
-    """Return how far each line is off with the unknowns that were found; inf once left out."""
+def _chi2(lines: Lines, kept: Flags, spread: Array, unknowns: Array) -> Array:
+    """Return the chi-square of each line for solved unknowns; inf for lines left out before."""
     out = np.where(kept, 0.0, np.inf)
     for rows, columns, wide, e in _groups(lines, kept, spread):
-        out[rows] = np.sum((e - wide @ found[columns]).reshape(-1, 2) ** 2, axis=1)
+        out[rows] = np.sum((e - wide @ unknowns[columns]).reshape(-1, 2) ** 2, axis=1)
     return out
 
 
@@ -254,7 +256,7 @@ def _groups(
 ) -> Iterator[tuple[Indices, Indices, Array, Array]]:
     """Yield each position's lines: rows, columns of unknowns, derivatives and residuals.
 
-    Without what the position can absorb: that says nothing of the sensors.
+    The part that the position can absorb is removed: it tells nothing about the sensors.
     """
     to_position, to_sensor, misses = _whitened(lines, spread)
     order = np.argsort(lines.group, kind="stable")
@@ -269,23 +271,22 @@ def _groups(
         columns = (PER_SENSOR * lines.sensor[rows][:, None] + np.arange(PER_SENSOR)).ravel()
         wide = np.zeros((len(e), len(columns)))
         for k in range(hi - lo):
-            own = slice(PER_SENSOR * k, PER_SENSOR * (k + 1))
-            wide[2 * k : 2 * k + 2, own] = A[k]
+            wide[2 * k : 2 * k + 2, PER_SENSOR * k : PER_SENSOR * (k + 1)] = A[k]
         yield rows, columns, wide - free @ (free.T @ wide), e - free @ (free.T @ e)
 
 
 def _whitened(lines: Lines, spread: Array) -> tuple[Array, Array, Array]:
-    """Return derivatives by position (n, 2, 3) and by the sensor's unknowns (n, 2, 7) and the
+    """Return derivatives by position (n, 2, 3) and by the sensor's unknowns (n, 2, 7), and
     residuals (n, 2), in units of the noise and of the unknowns' spread."""
     basis = tangent_basis(lines.u)
     away = lines.x_km - lines.r_km
     reach = np.linalg.norm(away, axis=1)
-    foretold = away / reach[:, None]
+    predicted = away / reach[:, None]
     root = np.linalg.inv(np.linalg.cholesky(lines.cov))
     by_place = root @ basis / reach[:, None, None]
     rate = np.einsum("nij,nj->ni", by_place, lines.v_km_s - lines.v_sensor_km_s)
     by_turn = root @ basis @ -skew(lines.u)
-    own = np.concatenate([-rate[:, :, None], by_place, by_turn], axis=2)
+    by_sensor = np.concatenate([-rate[:, :, None], by_place, by_turn], axis=2)
     per_line = spread.reshape(-1, PER_SENSOR)[lines.sensor]
-    misses = np.einsum("nij,nj->ni", root @ basis, lines.u - foretold)
-    return by_place, own * per_line[:, None, :], misses
+    misses = np.einsum("nij,nj->ni", root @ basis, lines.u - predicted)
+    return by_place, by_sensor * per_line[:, None, :], misses

@@ -1,8 +1,8 @@
-"""Clock search: the offset at which a sensor's lines of sight meet the objects that others found.
+"""Clock search: the offset at which a sensor's lines of sight meet the objects of the others.
 
-A sensor whose clock is seconds off agrees with no other, so none of its lines is told to be of an
-object. But each line and each object give the offset at which the two would meet; the wrong
-ones scatter, the right ones are all the same.
+A sensor whose clock is seconds off agrees with no other sensor, so its lines belong to no object.
+But each pair of a line and an object gives the offset at which the two would meet. The offsets of
+wrong pairs scatter, those of right pairs are equal.
 """
 
 from typing import NamedTuple
@@ -16,28 +16,28 @@ from epipole.tasks.algorithms.geometry.sky import tangent_basis
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-LARGEST_S = 5.0  # offset that is looked for
-MEETS_SIGMA = 4.0  # how far a line may pass by its object, any offset allowed
+LARGEST_S = 5.0  # offset that is searched
+MEETS_SIGMA = 4.0  # largest miss of a line and its object at the best offset
 QUARTER_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
-SAME_SIGMA = 3.0  # offsets that differ by less are one
-FAR = 1e9  # sigmas
-FEWEST = 3  # objects
+SAME_SIGMA = 3.0  # offsets that differ by less are the same
+FAR = 1e9  # [sigma] miss of an object behind the sensor
+FEWEST = 3  # objects that must agree on an offset
 FALSE_ALARM = 1e-4  # accepted probability that the offsets agree by chance
 
 
 class Meetings(NamedTuple):
-    """Lines of sight of one sensor beside objects: each line beside every object of its epoch.
+    """Pairs of a line of sight of one sensor and an object of its epoch, all combinations.
 
     tracklet, item : (n,) int
-        Of which tracklet the line is, and which object stands beside it; any numbers.
+        Tracklet of the line, and the object; any numbers.
     u, cov : (n, 3), (n, 2, 2) float
         Direction without aberration and its covariance on `tangent_basis(u)` [rad^2].
     r_km, v_sensor_km_s : (n, 3) float
         The sensor, GCRF.
     sigma_km : (n,) float
-        1-sigma error of its place an axis.
+        1-sigma error of its position, per axis.
     x_km, v_km_s, cov_km2 : (n, 3), (n, 3), (n, 3, 3) float
-        The object as the other sensors found it at the epoch.
+        The object at the epoch, from the other sensors.
     """
 
     tracklet: Indices
@@ -53,20 +53,20 @@ class Meetings(NamedTuple):
 
 
 class Match(NamedTuple):
-    """The offset [s], reported minus true time, and the rows where line and object then meet."""
+    """The offset [s], reported minus true time, and the rows whose line and object then meet."""
 
     offset_s: float
     row: Indices
 
 
 def search_offset(meetings: Meetings) -> Match | None:
-    """Return the clock offset that lets a sensor see the objects; None where none is sure.
+    """Return the clock offset with which a sensor sees the objects, None if no offset is sure.
 
     Notes
     -----
-    An offset is sure where so many objects agree on it, each with a tracklet of its own, as chance
-    would not give. How often a line meets a wrong object is counted where no right one is: on
-    either side of the way that an offset moves it.
+    An offset is sure if more objects agree on it, each with a different tracklet, than chance
+    explains. The rate of chance meetings is counted at right angles to the direction in which
+    an offset moves the line: there all meetings are by chance.
     """
     pairs, which = np.unique(
         np.column_stack([meetings.tracklet, meetings.item]), axis=0, return_inverse=True
@@ -86,9 +86,9 @@ def search_offset(meetings: Meetings) -> Match | None:
 
 
 def _passes(m: Meetings) -> tuple[Array, Array]:
-    """Return how far each line passes by its object, and the rate at which an offset moves it.
+    """Return the miss of each line and object (n, 2), and its rate with the offset (n, 2).
 
-    (n, 2) each, in units of the errors and those a second.
+    In units of the errors, and the same per second.
     """
     away = m.x_km - m.r_km
     reach = np.linalg.norm(away, axis=1)
@@ -98,15 +98,15 @@ def _passes(m: Meetings) -> tuple[Array, Array]:
     across = np.linalg.inv(np.linalg.cholesky(cov)) @ basis
     miss = np.einsum("nij,nj->ni", across, -away)
     ahead = np.einsum("ni,ni->n", m.u, away) > 0.5 * reach
-    # Seen late, an object stands back by its motion.
+    # With a late time stamp an object lags by its motion.
     rate = np.einsum("nij,nj->ni", across, m.v_sensor_km_s - m.v_km_s)
     return np.where(ahead[:, None], miss, FAR), rate
 
 
 def _mean_offset(miss: Array, rate: Array, which: Indices, n: int) -> tuple[Array, Array]:
-    """Return the offset [s] at which each pair of a tracklet and an object is nearest, and sigma.
+    """Return the offset [s] at which each tracklet is nearest to its object, and its sigma.
 
-    The pair's mean over its epochs; large where the object is behind the sensor.
+    The mean over the epochs of the pair; large where the object is behind the sensor.
     """
     weight = np.bincount(which, np.sum(rate * rate, axis=1), n)
     weight = np.maximum(weight, 1e-300)
@@ -114,9 +114,9 @@ def _mean_offset(miss: Array, rate: Array, which: Indices, n: int) -> tuple[Arra
 
 
 def _surest(pairs: Indices, offset: Array, sigma: Array, n_aside: int) -> float | None:
-    """Return the offset on which most objects agree; None where that may be chance.
+    """Return the offset on which most objects agree, None where that may be chance.
 
-    `n_aside` pairs met where none is right.
+    `n_aside` is the number of pairs that certainly met by chance.
     """
     n = len(offset)
     best: tuple[float, float] | None = None
@@ -127,8 +127,10 @@ def _surest(pairs: Indices, offset: Array, sigma: Array, n_aside: int) -> float 
         if agree < FEWEST:
             continue
         chance = (n_aside + 1) * min(float(np.mean(window)) / LARGEST_S, 1.0)
-        with np.errstate(divide="ignore"):  # no chance at all
-            odds = float(np.log(pdtrc(agree - 2, chance)))  # the middle one agrees by itself
+        with np.errstate(divide="ignore"):  # log of 0: no chance at all
+            odds = float(
+                np.log(pdtrc(agree - 2, chance))
+            )  # the pair at the middle agrees by definition
         if best is None or odds < best[0]:
             weight = 1 / sigma[near] ** 2
             best = odds, float(np.sum(weight * offset[near]) / np.sum(weight))
@@ -138,7 +140,7 @@ def _surest(pairs: Indices, offset: Array, sigma: Array, n_aside: int) -> float 
 
 
 def _one_to_one(pairs: Indices, offset: Array, sigma: Array, best: float) -> list[int]:
-    """Return the pairs that agree with an offset, no tracklet and no object twice."""
+    """Return the pairs that agree with an offset, each tracklet and each object at most once."""
     off = np.abs(offset - best) / sigma
     chosen: list[int] = []
     for k in np.argsort(off, kind="stable").tolist():

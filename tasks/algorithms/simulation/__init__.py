@@ -1,5 +1,6 @@
-"""The simulated sky and its sensors: what a log's truth is.
+"""The simulated sky and its sensors: the truth that a simulated log is made of.
 
-It works with barycentric vectors, exact light time and a Lorentz boost, and imports nothing
-of the pipeline's own mathematics: a wrong sign in either shows when they meet.
+Barycentric vectors, iterated light time and a Lorentz boost, with constants and time scales of
+its own. Nothing of the pipeline's mathematics is imported: an error of sign in one of the two
+shows as a disagreement.
 """

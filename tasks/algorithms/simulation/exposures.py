@@ -1,4 +1,4 @@
-"""Exposures: every spot that a sensor sees in a block of frames, and what each one is."""
+"""Exposures: all centroids of a sensor in a block of frames, and the source of each."""
 
 from dataclasses import dataclass
 
@@ -14,7 +14,7 @@ from epipole.tasks.algorithms.simulation.optics import field_radius, image_place
 from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.sensor import (
     Attitudes,
-    Sensor,
+    SimulatedSensor,
     boresight_hidden,
     random_stream,
     seconds_since,
@@ -31,14 +31,14 @@ Indices = npt.NDArray[np.int64]
 
 STAR, TARGET, FALSE = 0, 1, 2
 MERGE_PX = 2.0  # stars closer than this are one spot
-FLUX_AT_ZERO = 1e6  # of magnitude 0, in units of nothing in particular
-ABERRATION_ROOM = 1.5e-3  # rad; aberration is 1.3e-4, proper motion in 30 years 1.5e-3 at most
-TARGETS_AT_ONCE = 500_000  # pairs of a frame and a target
+FLUX_AT_ZERO = 1e6  # of magnitude 0, arbitrary units
+ABERRATION_ROOM = 1.5e-3  # [rad] aberration is 1.3e-4, proper motion in 30 years at most 1.5e-3
+TARGETS_AT_ONCE = 500_000  # pairs of a frame and a target, to bound the memory
 
 
 @dataclass
-class Spots:
-    """Spots of a block of frames, one entry a spot; `frame` is the frame's place in the block."""
+class TrueSpots:
+    """True spots of a block of frames, one entry each; `frame` is an index in the block."""
 
     frame: Indices
     x_px: Array
@@ -50,9 +50,9 @@ class Spots:
 
 @dataclass
 class Exposures:
-    """A block of frames: their truth, and their centroids one after the other.
+    """A block of frames: true states, and the centroids of all frames with their sources.
 
-    Frame i has centroids ``offsets[i]:offsets[i + 1]``; attitudes turn ICRS into sensor axes.
+    Frame i has the centroids ``offsets[i]:offsets[i + 1]``. Attitudes are sensor from ICRS.
     """
 
     frame_number: Indices
@@ -70,10 +70,10 @@ class Exposures:
 
 
 class Exposing:
-    """A sensor at work. Give it its frames in order of time, in blocks of any length."""
+    """Makes the exposures of a sensor, from its frames in order of time in blocks of any length."""
 
     def __init__(
-        self, sensor: Sensor, stars: StarField, targets: Array, target_magnitude: Array
+        self, sensor: SimulatedSensor, stars: StarField, targets: Array, target_magnitude: Array
     ) -> None:
         self.sensor, self.stars = sensor, stars
         self.targets, self.target_magnitude = targets, target_magnitude
@@ -88,16 +88,16 @@ class Exposing:
         self._neighbours = self._close_stars()
 
     def expose(self, frame_number: Indices, time_ns: Indices) -> Exposures:
-        """Return what the frames show; frames that the sensor skips are left out."""
+        """Return the exposures of these frames, without those that the sensor skips."""
         s = self.sensor
         r_km, v_km_s = state_at(s.elements, seconds_since(s.t0_ns, time_ns))
         attitude = self.attitudes.at(time_ns, r_km)
         jitter = self._streams["jitter"].standard_normal((len(time_ns), 3)) * s.jitter
         attitude = Rotation.from_rotvec(jitter) * attitude if len(time_ns) else attitude
         if s.skip_hidden and len(time_ns):
-            seen = ~boresight_hidden(r_km, attitude)
-            frame_number, time_ns = frame_number[seen], time_ns[seen]
-            r_km, v_km_s, attitude = r_km[seen], v_km_s[seen], attitude[seen]
+            free = ~boresight_hidden(r_km, attitude)
+            frame_number, time_ns = frame_number[free], time_ns[free]
+            r_km, v_km_s, attitude = r_km[free], v_km_s[free], attitude[free]
         if not len(time_ns):
             return _nothing(frame_number, time_ns, r_km, v_km_s, attitude)
         R_sensor_from_icrs = attitude.as_matrix()
@@ -111,7 +111,7 @@ class Exposing:
 
     def _star_spots(
         self, time_ns: Indices, r_km: Array, earth_km: Array, v_km_s: Array, R: Array
-    ) -> Spots:
+    ) -> TrueSpots:
         s, field = self.sensor, self.stars
         frame, star = stars_in_cones(field, R[:, 2], self._radius + ABERRATION_ROOM)
         years = julian_years_since(field.epoch, time_ns)
@@ -127,15 +127,15 @@ class Exposing:
 
     def _target_spots(
         self, time_ns: Indices, r_km: Array, v_km_s: Array, earth_km_s: Array, R: Array
-    ) -> Spots:
+    ) -> TrueSpots:
         s, n_targets = self.sensor, len(self.targets)
         t_s = seconds_since(s.t0_ns, time_ns)
         parts = []
         step = max(TARGETS_AT_ONCE // max(n_targets, 1), 1)
-        seen = np.flatnonzero(self.target_magnitude <= s.magnitude_limit)
-        for low in range(0, len(time_ns) if len(seen) else 0, step):
+        bright = np.flatnonzero(self.target_magnitude <= s.magnitude_limit)
+        for low in range(0, len(time_ns) if len(bright) else 0, step):
             of_frame = np.arange(low, min(low + step, len(time_ns)))
-            frame, target = (v.ravel() for v in np.meshgrid(of_frame, seen, indexing="ij"))
+            frame, target = (v.ravel() for v in np.meshgrid(of_frame, bright, indexing="ij"))
             d, _ = received_from(self.targets[target], t_s[frame], r_km[frame], earth_km_s[frame])
             distance = np.linalg.norm(d, axis=1)
             u = d / distance[:, None]
@@ -150,10 +150,10 @@ class Exposing:
         )
         kept = self._streams["target drop"].random(len(frame)) >= s.target_drop
         kind = np.full(len(frame), TARGET, np.int8)
-        spots = Spots(frame, x, y, self.target_magnitude[target], kind, target)
+        spots = TrueSpots(frame, x, y, self.target_magnitude[target], kind, target)
         return _selected(spots, np.flatnonzero(kept))
 
-    def _false_spots(self, n_frames: int) -> Spots:
+    def _false_spots(self, n_frames: int) -> TrueSpots:
         s, streams = self.sensor, self._streams
         n = streams["false count"].poisson(s.false_points, n_frames)
         place = streams["false place"].random((int(n.sum()), 2))
@@ -165,10 +165,10 @@ class Exposing:
         place = np.concatenate([place * size - 0.5, np.tile(hot, (n_frames, 1))])
         magnitude = np.concatenate([magnitude, np.tile(hot_magnitude, n_frames)])
         kind = np.full(len(frame), FALSE, np.int8)
-        return Spots(frame, place[:, 0], place[:, 1], magnitude, kind, np.full(len(frame), -1))
+        return TrueSpots(frame, place[:, 0], place[:, 1], magnitude, kind, np.full(len(frame), -1))
 
     def _image(self, u: Array, R: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-        """Return columns, rows, and which directions lie within the camera's cone."""
+        """Return columns and rows [px], and which directions are within the camera's cone."""
         in_sensor = np.einsum("nij,nj->ni", R, u)
         ok = in_sensor[:, 2] > np.cos(self._radius)
         x, y = np.full(len(u), np.nan), np.full(len(u), np.nan)
@@ -176,7 +176,7 @@ class Exposing:
         return x, y, ok
 
     def _close_stars(self) -> tuple[Indices, Indices]:
-        """Return the pairs of stars that may fall within MERGE_PX of each other."""
+        """Return the pairs of stars that may be within MERGE_PX of each other."""
         # A lens stretches by a few per cent at most, proper motion by some arcseconds.
         optics = self.sensor.optics
         radius = 1.2 * MERGE_PX / min(optics.fx_px, optics.fy_px) + 3e-4
@@ -184,8 +184,8 @@ class Exposing:
         pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
         return pairs[:, 0], pairs[:, 1]
 
-    def _merged(self, frame: Indices, star: Indices, x: Array, y: Array) -> Spots:
-        """Return star spots, stars within MERGE_PX as one with the brightest one's number."""
+    def _merged(self, frame: Indices, star: Indices, x: Array, y: Array) -> TrueSpots:
+        """Return star spots; stars within MERGE_PX are one, with the number of the brightest."""
         n_stars = len(self.stars.star_id)
         key = frame * n_stars + star
         order = np.argsort(key, kind="stable")
@@ -206,7 +206,7 @@ class Exposing:
         # The brightest of each spot comes first in this order.
         order = np.lexsort((-light, spot))
         brightest = order[np.searchsorted(spot[order], np.arange(n_spots))]
-        return Spots(
+        return TrueSpots(
             frame[brightest],
             np.bincount(spot, light * x, n_spots) / total,
             np.bincount(spot, light * y, n_spots) / total,
@@ -223,7 +223,7 @@ class Exposing:
 
     def _measure(
         self,
-        spots: Spots,
+        spots: TrueSpots,
         frame_number: Indices,
         time_ns: Indices,
         r_km: Array,
@@ -234,7 +234,7 @@ class Exposing:
         s = self.sensor
         brightness = 10 ** (0.4 * (spots.magnitude - s.magnitude_limit))  # 1 at the limit
         sigma = np.hypot(s.sigma_px, s.faint_sigma_px * brightness)
-        # By frame first, so that the noise does not depend on the length of the blocks.
+        # Sorted by frame, so that the noise does not depend on the length of the blocks.
         order = np.lexsort((np.arange(len(spots.frame)), spots.frame))
         noise = self._streams["centroid noise"].standard_normal((len(order), 2))
         light = self._streams["flux noise"].standard_normal(len(order))
@@ -268,8 +268,8 @@ def _random_magnitudes(rng: np.random.Generator, n: int, limit: float) -> Array:
     return limit + 2 * np.log10(1 - rng.random(n))
 
 
-def _selected(spots: Spots, at: Indices) -> Spots:
-    return Spots(
+def _selected(spots: TrueSpots, at: Indices) -> TrueSpots:
+    return TrueSpots(
         spots.frame[at],
         spots.x_px[at],
         spots.y_px[at],
@@ -279,9 +279,9 @@ def _selected(spots: Spots, at: Indices) -> Spots:
     )
 
 
-def _joined(parts: list[Spots]) -> Spots:
+def _joined(parts: list[TrueSpots]) -> TrueSpots:
     names = ("frame", "x_px", "y_px", "magnitude", "kind", "source")
-    return Spots(*[np.concatenate([getattr(p, name) for p in parts]) for name in names])
+    return TrueSpots(*[np.concatenate([getattr(p, name) for p in parts]) for name in names])
 
 
 def _nothing(

@@ -3,10 +3,9 @@
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
 
-GM_KM3_S2 = 398600.4418
-EARTH_RADIUS_KM = 6378.137
+Array = npt.NDArray[np.float64]
 
 
 def eccentric_anomaly(mean: Array, e: Array) -> Array:
@@ -65,15 +64,16 @@ def mean_from_true_anomaly(true: float, e: float) -> float:
 
 
 def circular_velocity(r_km: Array) -> Array:
-    """Return the velocity [km/s] of an eastward circular orbit through a place (3,)."""
+    """Return the velocity [km/s] of an eastward circular orbit through a position (3,)."""
     east = np.cross([0.0, 0.0, 1.0], r_km)
     return east / np.linalg.norm(east) * np.sqrt(GM_KM3_S2 / np.linalg.norm(r_km))
 
 
 def elements_from_state(r_km: Array, v_km_s: Array) -> Array:
-    """Return the (6,) elements of `state_at`, mean anomaly at that instant, of one state (3,).
+    """Return the (6,) elements of a state (3,), (3,); its instant is their epoch.
 
-    A circular orbit's perigee is put at its node, an equatorial orbit's node on the x axis.
+    The perigee of a circular orbit is put at its node, the node of an equatorial orbit on the x
+    axis.
     """
     r, speed2 = float(np.linalg.norm(r_km)), float(v_km_s @ v_km_s)
     h = np.cross(r_km, v_km_s)
@@ -82,7 +82,7 @@ def elements_from_state(r_km: Array, v_km_s: Array) -> Array:
     e_vector = np.cross(v_km_s, h) / GM_KM3_S2 - r_km / r
     e = float(np.linalg.norm(e_vector))
     node = np.array([-h[1], h[0], 0.0])
-    # A tilt or eccentricity below 1e-11 is rounding, and its direction means nothing.
+    # An inclination or eccentricity below 1e-11 is rounding: its direction is arbitrary.
     flat = np.linalg.norm(node) < 1e-11 * np.linalg.norm(h)
     node = np.array([1.0, 0.0, 0.0]) if flat else node / np.linalg.norm(node)
     across = np.cross(h_unit, node)

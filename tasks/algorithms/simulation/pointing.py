@@ -1,10 +1,10 @@
-"""How a sensor is turned: attitudes that track, stand, spin or jump."""
+"""Pointing: attitudes that track an object, stay fixed, spin or jump."""
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from epipole.tasks.algorithms.simulation.orbits import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM
 
 Array = npt.NDArray[np.float64]
 
@@ -12,7 +12,7 @@ Array = npt.NDArray[np.float64]
 def look_along(z: Array, up: Array, roll_rad: float = 0.0) -> Rotation:
     """Return the rotations, sensor from ICRS, with the boresight along (n, 3) directions.
 
-    The image's upper edge (-y) is turned towards `up` (3,), then rolled about the boresight.
+    The image's upper edge (-y) is towards `up` (3,), then rolled about the boresight.
     """
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
     y = -(up - np.einsum("ij,j->i", z, up)[:, None] * z)
@@ -22,7 +22,7 @@ def look_along(z: Array, up: Array, roll_rad: float = 0.0) -> Rotation:
 
 
 def spinning(start: Rotation, axis: Array, rate_rad_s: float, t_s: Array) -> Rotation:
-    """Return attitudes, sensor from ICRS, of a body that turns evenly about an inertial axis."""
+    """Return attitudes, sensor from ICRS, of a constant rotation about an inertial axis."""
     turned = np.asarray(t_s)[:, None] * (rate_rad_s * axis / np.linalg.norm(axis))
     return start * Rotation.from_rotvec(turned).inv()
 
@@ -30,13 +30,13 @@ def spinning(start: Rotation, axis: Array, rate_rad_s: float, t_s: Array) -> Rot
 def random_attitudes(
     rng: np.random.Generator, r_sensor_km: Array, clearance_rad: float | None
 ) -> Rotation:
-    """Return one evenly random attitude a sensor position (n, 3), sensor from ICRS.
+    """Return a uniformly random attitude, sensor from ICRS, for each sensor position (n, 3).
 
-    With a clearance, the boresight stays that far above the Earth's limb.
+    With a clearance, the boresight is at least that far from the Earth's limb.
     """
     distance = np.linalg.norm(r_sensor_km, axis=1)
     limb = np.arcsin(np.minimum(EARTH_RADIUS_KM / distance, 1.0))
-    # Four normal numbers, scaled to one, are evenly spread over all rotations.
+    # Four normal numbers, scaled to unit length, are uniform over all rotations.
     q = rng.standard_normal((len(r_sensor_km), 4))
     low = np.arange(len(q)) if clearance_rad is not None else np.arange(0)
     while len(low):

@@ -1,4 +1,4 @@
-"""A simulated sensor: when it exposes, where it is, how it is turned and what it believes."""
+"""A simulated sensor: times of exposure, attitudes, and the states that it reports."""
 
 import zlib
 from dataclasses import dataclass
@@ -7,7 +7,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from epipole.tasks.algorithms.simulation.optics import Optics
+from epipole.tasks.algorithms.simulation.constants import SECOND_NS
+from epipole.tasks.algorithms.simulation.optics import TrueOptics
 from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.pointing import look_along, random_attitudes, spinning
 from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
@@ -15,13 +16,10 @@ from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 
-ARCSEC = np.pi / 648000.0
-SECOND_NS = 1_000_000_000
-
 
 @dataclass(frozen=True)
-class Sensor:
-    """Everything of a sensor that the simulation needs, in radians, pixels, km and seconds."""
+class SimulatedSensor:
+    """All parameters of a sensor, in radians, pixels, km and seconds."""
 
     sensor_id: str
     index: int
@@ -29,7 +27,7 @@ class Sensor:
     t0_ns: int
     duration_s: float
     elements: Array  # (6,) at t0, see `state_at`
-    optics: Optics  # the true ones
+    optics: TrueOptics
     # pointing
     mode: str  # track, fixed, spin, random
     followed: Array  # (6,) track
@@ -70,7 +68,7 @@ class Sensor:
 def random_stream(seed: int, index: int, purpose: str) -> np.random.Generator:
     """Return the stream of random numbers of a sensor (or group) for one purpose.
 
-    Each purpose has its own, so that switching one effect on does not move the others.
+    Each purpose has its own stream, so that switching on one effect does not change the others.
     """
     return np.random.default_rng([seed, index, zlib.crc32(purpose.encode())])
 
@@ -80,8 +78,8 @@ def seconds_since(t0_ns: int, time_ns: Nanoseconds) -> Array:
     return (np.asarray(time_ns, np.int64) - t0_ns) / SECOND_NS
 
 
-def frame_times(sensor: Sensor) -> tuple[npt.NDArray[np.int64], Nanoseconds]:
-    """Return frame numbers and mid-exposure times of all frames that the sensor takes."""
+def frame_times(sensor: SimulatedSensor) -> tuple[npt.NDArray[np.int64], Nanoseconds]:
+    """Return frame numbers and mid-exposure times [ns] of all frames of the sensor."""
     n = max(int(np.ceil(sensor.duration_s * sensor.rate_hz - sensor.phase - 1e-9)), 0)
     number = np.arange(n, dtype=np.int64)
     t = (number + sensor.phase) / sensor.rate_hz
@@ -100,9 +98,9 @@ def frame_times(sensor: Sensor) -> tuple[npt.NDArray[np.int64], Nanoseconds]:
 
 
 class Attitudes:
-    """The sensor's turning over the whole scene, without the jitter of single frames."""
+    """The sensor's attitude over the whole scene, without the jitter of single frames."""
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SimulatedSensor) -> None:
         self.sensor = sensor
         self._held = Rotation.identity(1)
         if sensor.mode == "random":
@@ -130,12 +128,12 @@ class Attitudes:
 
 
 def boresight_hidden(r_km: Array, attitude: Rotation) -> npt.NDArray[np.bool_]:
-    """Return where the Earth stands in the boresight's way."""
+    """Return which boresights meet the Earth."""
     return hidden_by_earth(r_km, attitude.as_matrix()[:, 2], np.inf)
 
 
-def state_times(sensor: Sensor) -> Nanoseconds:
-    """Return the times of the sensor's states, a margin beyond the scene's ends included."""
+def state_times(sensor: SimulatedSensor) -> Nanoseconds:
+    """Return the times [ns] of the sensor's states, with a margin beyond the scene's ends."""
     first = -np.floor(sensor.state_margin_s * sensor.state_rate_hz)
     n = (
         int(np.floor((sensor.duration_s + sensor.state_margin_s) * sensor.state_rate_hz - first))
@@ -146,9 +144,9 @@ def state_times(sensor: Sensor) -> Nanoseconds:
 
 
 class Beliefs:
-    """What the sensor believes of its place and attitude: the truth, a bias and noise."""
+    """Reported positions and attitudes: the truth plus a bias and noise."""
 
-    def __init__(self, sensor: Sensor) -> None:
+    def __init__(self, sensor: SimulatedSensor) -> None:
         self.sensor = sensor
         self._bias_km = self._stream("position bias").standard_normal(3) * sensor.position_bias_km
         self._bias = self._stream("attitude bias").standard_normal(3) * sensor.prior_bias
@@ -159,12 +157,12 @@ class Beliefs:
         return random_stream(self.sensor.seed, self.sensor.index, purpose)
 
     def position(self, r_km: Array) -> Array:
-        """Return the believed positions of true ones; call in order of time."""
+        """Return reported positions for true ones; call in order of time."""
         noise = self._position_noise.standard_normal(r_km.shape)
         return r_km + self._bias_km + noise * self.sensor.position_noise_km
 
     def attitude(self, true: Rotation) -> Rotation | None:
-        """Return the believed attitudes of true ones, or None where none is sent."""
+        """Return reported attitudes for true ones, None for a sensor that reports none."""
         if self.sensor.prior_noise is None:
             return None
         noise = self._attitude_noise.standard_normal((len(true), 3)) * self.sensor.prior_noise

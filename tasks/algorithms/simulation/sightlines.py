@@ -1,19 +1,18 @@
-"""What light does on its way: light time, aberration, the Earth in between."""
+"""Lines of sight: light time, aberration, and the Earth in between."""
 
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.simulation.orbits import EARTH_RADIUS_KM, state_at
+from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM, LIGHT_KM_S
+from epipole.tasks.algorithms.simulation.orbits import state_at
 
 Array = npt.NDArray[np.float64]
 
-LIGHT_KM_S = 299792.458
-
 
 def boost(n: Array, v_km_s: Array) -> Array:
-    """Return the directions towards light sources as an observer moving at v sees them.
+    """Return the apparent directions towards light sources for an observer moving at v.
 
-    A photon's four-momentum (1, -n) is taken to the observer's frame by a Lorentz boost.
+    The photon's four-momentum (1, -n) is transformed to the observer's frame (Lorentz boost).
 
     Parameters
     ----------
@@ -26,18 +25,17 @@ def boost(n: Array, v_km_s: Array) -> Array:
     beta2 = np.einsum("ij,ij->i", beta, beta)
     gamma = 1 / np.sqrt(1 - beta2)
     along = np.einsum("ij,ij->i", n, beta)
-    # (gamma - 1) / beta^2 written so that it does not cancel at small speeds.
-    seen = n + (gamma * gamma / (gamma + 1) * along + gamma)[:, None] * beta
-    return seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    # (gamma - 1) / beta^2, without cancellation at small speeds.
+    apparent = n + (gamma * gamma / (gamma + 1) * along + gamma)[:, None] * beta
+    return apparent / np.linalg.norm(apparent, axis=1, keepdims=True)
 
 
 def received_from(
     elements: Array, t_s: Array, r_sensor_km: Array, v_earth_km_s: Array
 ) -> tuple[Array, Array]:
-    """Return barycentric vectors from sensors to objects whose light they receive.
+    """Return barycentric vectors from sensors to objects at the emission of the received light.
 
-    The object counts where it was when the light left, in the solar system's frame at rest:
-    the Earth has moved on since.
+    In the barycentric frame the Earth moves on while the light is under way.
 
     Parameters
     ----------
@@ -62,8 +60,7 @@ def received_from(
     sent = tau
     r, v = state_at(elements, t_s - sent)
     for _ in range(3):
-        # Over the 1e-5 s still missing, and over 0.3 s of the Earth's way, a straight line is
-        # exact to 1e-6 km.
+        # Motion is linear to 1e-6 km over the remaining 1e-5 s, and the Earth's over 0.3 s.
         r_sent = r - v * (tau - sent)[:, None]
         d = r_sent - r_sensor_km - v_earth_km_s * tau[:, None]
         tau = np.linalg.norm(d, axis=1) / LIGHT_KM_S
@@ -80,7 +77,7 @@ def hidden_by_earth(
     r_sensor_km, u : (n, 3) float
         Geocentric positions of the sensors, and unit vectors of the geometric directions.
     distance_km : (n,) float or float
-        Where the lines end; infinity for stars.
+        Lengths of the lines; infinity for stars.
     """
     along = -np.einsum("ij,ij->i", r_sensor_km, u)
     miss2 = np.einsum("ij,ij->i", r_sensor_km, r_sensor_km) - along * along

@@ -1,18 +1,22 @@
-"""The stars a camera may see: a catalogue in zones of declination, and where its stars stand."""
+"""Star field: a catalogue sorted into zones of declination, and directions of its stars."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.simulation.ephemeris import AU_KM
-from epipole.tasks.algorithms.simulation.sightlines import LIGHT_KM_S
+from epipole.tasks.algorithms.simulation.constants import (
+    AU_KM,
+    DAY_S,
+    JULIAN_YEAR_DAYS,
+    LIGHT_KM_S,
+    MILLIARCSEC,
+)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MAS = np.pi / 648e6  # rad
-JULIAN_YEAR_S = 365.25 * 86400
+JULIAN_YEAR_S = JULIAN_YEAR_DAYS * DAY_S
 
 
 @dataclass(frozen=True)
@@ -22,7 +26,7 @@ class StarField:
     star_id: Indices
     magnitude: Array
     place: Array  # (n, 3) unit vectors at the epoch
-    motion: Array  # (n, 3) rad a Julian year
+    motion: Array  # (n, 3) rad per Julian year
     parallax: Array  # rad
     epoch: float  # Julian year
     key: Array  # zone times 2 pi plus right ascension, increasing
@@ -41,7 +45,7 @@ def star_field(
     epoch: float,
     radius_rad: float,
 ) -> StarField:
-    """Return the stars prepared for look-ups in cones of a radius; angles in rad.
+    """Return the stars prepared for searches in cones of a given radius; angles in rad.
 
     `pm_ra_mas_yr` includes cos(dec), as in the Hipparcos catalogue.
     """
@@ -58,9 +62,9 @@ def star_field(
         star_id=star_id[order],
         magnitude=magnitude[order],
         place=np.stack([cos_d * cos_a, cos_d * sin_a, sin_d], axis=1),
-        motion=motion * MAS,
-        # A negative parallax is a measuring error, not a place.
-        parallax=np.maximum(parallax_mas[order], 0.0) * MAS,
+        motion=motion * MILLIARCSEC,
+        # A negative parallax is an error of measurement.
+        parallax=np.maximum(parallax_mas[order], 0.0) * MILLIARCSEC,
         epoch=epoch,
         key=key,
         zone_rad=zone_rad,
@@ -70,8 +74,8 @@ def star_field(
 def stars_in_cones(field: StarField, u: Array, radius_rad: float) -> tuple[Indices, Indices]:
     """Return the pairs (cone, star) of all stars in cones about (n, 3) directions.
 
-    The catalogue's own places count, which proper motion, parallax and aberration move by less
-    than 0.02 degrees for all but a few stars: let the radius have room for that.
+    Places are those of the catalogue. Proper motion, parallax and aberration move all but a few
+    stars by less than 0.02 degrees: add a margin to the radius.
     """
     dec = np.arcsin(np.clip(u[:, 2], -1, 1))
     ra = np.remainder(np.arctan2(u[:, 1], u[:, 0]), 2 * np.pi)
@@ -83,7 +87,7 @@ def stars_in_cones(field: StarField, u: Array, radius_rad: float) -> tuple[Indic
     half = np.where(over_pole, np.pi, np.arcsin(np.minimum(ratio, 1.0)))
     low, high = (ra - half)[:, None], (ra + half)[:, None]
     turn = 2 * np.pi
-    # The part of the interval within [0, 2 pi), and the part that went round.
+    # The part of the interval within [0, 2 pi), and the part that wraps around.
     around_low = np.where(low < 0, low + turn, 0.0)
     around_high = np.where(low < 0, turn, high - turn)
     lows = np.stack([np.maximum(low, 0) + 0 * zone, around_low + 0 * zone], axis=2)
@@ -101,7 +105,7 @@ def stars_in_cones(field: StarField, u: Array, radius_rad: float) -> tuple[Indic
 def star_directions(
     field: StarField, star: Indices, years: Array, r_barycentric_km: Array
 ) -> Array:
-    """Return (n, 3) unit vectors to stars from barycentric places, before aberration.
+    """Return (n, 3) unit vectors to stars from barycentric positions, before aberration.
 
     Parameters
     ----------
@@ -110,15 +114,15 @@ def star_directions(
     years : (n,) float
         TDB Julian years since the catalogue's epoch.
     r_barycentric_km : (n, 3) float
-        Where the sensor is.
+        Positions of the sensor.
 
     References
     ----------
-    ESA SP-1200 (1997), The Hipparcos and Tycho Catalogues, volume 1, section 1.2.8, without
-    radial velocities.
+    ESA SP-1200 (1997), The Hipparcos and Tycho Catalogues, volume 1, section 1.2.8. Radial
+    velocities are neglected.
     """
     u0 = field.place[star]
-    # A star's motion is counted at the barycentre; the sensor gets the light earlier or later.
+    # Catalogue epochs are of light at the barycentre; the sensor gets it earlier or later.
     ahead_s = np.einsum("ij,ij->i", u0, r_barycentric_km) / LIGHT_KM_S
     u = u0 + field.motion[star] * (years + ahead_s / JULIAN_YEAR_S)[:, None]
     u -= (field.parallax[star] / AU_KM)[:, None] * r_barycentric_km

@@ -17,18 +17,19 @@ def frame_interval_ns(time_ns: Nanoseconds) -> int:
 
 
 def epoch_interval_ns(time_ns_by_sensor: list[Nanoseconds]) -> int:
-    """Return the slowest sensor's frame interval, to the millisecond, at least one.
+    """Return the slowest sensor's frame interval [ns], rounded to 1 ms, at least 1 ms.
 
-    Rounded, so that jitter of the exposures does not move the grid from night to night.
+    Rounding keeps the grid fixed from night to night, whatever the jitter of the exposures.
+    Without any interval it is one second.
     """
     slowest = max((frame_interval_ns(t) for t in time_ns_by_sensor), default=0)
     return max(round(slowest / MILLISECOND_NS), 1) * MILLISECOND_NS if slowest else 1_000_000_000
 
 
 def instants_of(time_ns: Nanoseconds, apart_ns: int) -> Nanoseconds:
-    """Return the mean times of frames that lie together, no two of them `apart_ns` from the next.
+    """Return the mean times [ns] of groups of frames, split at gaps of `apart_ns` or more.
 
-    The epochs of a night in which no sensor has a frame interval: there is no grid to keep.
+    These are the epochs of a night in which no sensor has a frame interval, hence no grid.
     """
     time_ns = np.unique(time_ns)
     group = np.concatenate([[0], np.cumsum(np.diff(time_ns) >= apart_ns)]).astype(np.int64)
@@ -40,9 +41,9 @@ def instants_of(time_ns: Nanoseconds, apart_ns: int) -> Nanoseconds:
 
 
 def epoch_grid(first_ns: int, last_ns: int, interval_ns: int) -> Nanoseconds:
-    """Return all multiples of the interval since midnight UTC that lie in [first, last].
+    """Return all multiples of the interval since midnight UTC within [first, last], in ns.
 
-    Counted from midnight, the grid of a night does not depend on which logs it has.
+    Counting from midnight makes the grid of a night independent of its logs.
     """
     out = []
     for day in range(first_ns // DAY_NS, last_ns // DAY_NS + 1):
@@ -54,12 +55,12 @@ def epoch_grid(first_ns: int, last_ns: int, interval_ns: int) -> Nanoseconds:
 
 
 def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> npt.NDArray[np.int64]:
-    """Return the index of the frame nearest to each epoch; the earlier one of two as near.
+    """Return the index of the frame nearest to each epoch; the earlier one of a tie.
 
     Parameters
     ----------
     epoch_ns : (e,) int
-        Wanted instants [ns].
+        Epochs [ns].
     time_ns : (f,) int
         Frame times [ns], increasing, f >= 1.
     """

@@ -1,4 +1,4 @@
-"""The order of frames, and which of them are there twice."""
+"""The order of frames and states, and which are duplicates."""
 
 import numpy as np
 import numpy.typing as npt
@@ -16,18 +16,17 @@ def order_frames(
     Parameters
     ----------
     sensor, time_ns, frame_number : (n,) int
-        Sensor as an index. Of frames that are alike, the first given is kept.
+        The sensor as an index. Of equal frames the first is kept.
 
     Returns
     -------
     order : (n,) int
         Indices that sort the frames.
     verdict : (n,) int8
-        In that order. DUPLICATE_FRAME: the same sensor, number and time as a frame that is
-        kept. DUPLICATE_NUMBER: the number of an earlier frame at another time, from a counter
-        that restarted or from two sensors with one id; the first in time is kept.
-        DUPLICATE_TIME: another number at the time of a frame that is kept (the lowest number
-        is): a sensor exposes once at a time.
+        In that order. KEEP: the frame is kept. DUPLICATE_FRAME: same sensor, number and time as
+        a kept frame. DUPLICATE_NUMBER: same number as an earlier kept frame, at another time (a
+        counter that restarted, or two sensors with one id). DUPLICATE_TIME: same time as a kept
+        frame with a lower number: a sensor makes one exposure at a time.
     """
     order = np.lexsort((np.arange(len(sensor)), frame_number, time_ns, sensor))
     s, t, f = sensor[order], time_ns[order], frame_number[order]
@@ -38,12 +37,12 @@ def order_frames(
     same_frame = same_time & (f[1:] == f[:-1])
     verdict[1:][same_time] = DUPLICATE_TIME
     verdict[1:][same_frame] = DUPLICATE_FRAME
-    # By number, the candidates in order of time: all but the first repeat it.
+    # By number, in order of time: all but the first repeat the number.
     rest = np.flatnonzero(verdict == KEEP)
     by_number = rest[np.lexsort((rest, f[rest], s[rest]))]
     a, b = by_number[:-1], by_number[1:]
     verdict[b[(s[a] == s[b]) & (f[a] == f[b])]] = DUPLICATE_NUMBER
-    # A copy shares the fate of the frame it is a copy of, if that is not kept.
+    # A copy of a frame that is not kept has the verdict of that frame.
     copied = np.maximum.accumulate(np.where(verdict == DUPLICATE_FRAME, 0, np.arange(len(s))))
     copies = verdict == DUPLICATE_FRAME
     verdict[copies] = np.where(verdict[copied] == KEEP, DUPLICATE_FRAME, verdict[copied])[copies]
@@ -51,9 +50,9 @@ def order_frames(
 
 
 def order_states(sensor: Integers, time_ns: Integers) -> tuple[Integers, npt.NDArray[np.bool_]]:
-    """Return the order of states by sensor and time, and, in it, which repeat the one before.
+    """Return the order of states by sensor and time, and which of them repeat their predecessor.
 
-    Of states of one sensor at one time the first given is kept.
+    A state repeats if sensor and time are the same; the first given is kept.
     """
     order = np.lexsort((np.arange(len(sensor)), time_ns, sensor))
     s, t = sensor[order], time_ns[order]

@@ -32,7 +32,7 @@ def test_honest_errors_have_chi_square_of_three():
 
 
 @pytest.mark.parametrize("bad", [np.full((3, 3), np.nan), np.zeros((3, 3)), -np.eye(3)])
-def test_a_covariance_that_is_none_is_infinitely_wrong_and_spoils_no_other(bad):
+def test_an_invalid_covariance_gives_infinity_and_does_not_change_others(bad):
     nees = squared_normalised_errors(np.ones((2, 3)), np.stack([bad, np.eye(3)]))
     assert nees.tolist() == [np.inf, 3.0]
 

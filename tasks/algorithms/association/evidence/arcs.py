@@ -1,9 +1,9 @@
-"""Arcs: what several instants say about a hypothesis, tied together by one orbit.
+"""Arcs: the odds of a hypothesis from several instants, tied together by one orbit.
 
-An orbit has six numbers, however many instants it is seen at. A tracklet that is no part of it
-has four of its own, a place and a drift beside the orbit; its further directions follow from
-these and are no evidence. So a chance meeting of two tracklets needs two coincidences (the miss
-and its drift), not one an instant, and is weighed so.
+An orbit has six parameters, however many instants there are. An unrelated tracklet has four of
+its own, a position and a drift relative to the orbit; its other directions follow from these and
+are no evidence. So a chance meeting of two tracklets takes two coincidences (the miss and its
+drift), not one for each instant.
 """
 
 import numpy as np
@@ -12,8 +12,8 @@ from epipole.tasks.algorithms.association.sampling.views import PLANE, X, Y, dir
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
 from epipole.tasks.algorithms.kernels import kernel
 
-J2_RE2_KM2 = J2 * EARTH_RADIUS_KM**2  # GCRF's pole is near enough
-STEP_S = 60.0  # Runge-Kutta is good to 0.1 m over it in a low orbit
+J2_RE2_KM2 = J2 * EARTH_RADIUS_KM**2  # about GCRF's pole: near enough
+STEP_S = 60.0  # one Runge-Kutta step of a low orbit errs by 0.1 m
 ITERATIONS = 6
 CONVERGED = 1e-4  # sigmas squared
 RADIAL_SHARE = 0.6  # an orbiting object's 1-sigma radial velocity over that of a circular orbit
@@ -23,7 +23,7 @@ SLACK_SIGMA = 3.0
 
 @kernel
 def factor(N, b):
-    """Solve N x = b in place (Cholesky); return ln det N, NaN where N is not positive."""
+    """Solve N x = b in place (Cholesky); return ln det N, NaN if N is not positive definite."""
     n, log_det = len(b), 0.0
     for k in range(n):
         for j in range(k):
@@ -47,8 +47,8 @@ def factor(N, b):
 
 
 @kernel
-def _pull(y, dy):
-    """Write the rates of a state (6) about an oblate Earth."""
+def _derivative(y, dy):
+    """Write the time derivative of a state (6) about an oblate Earth."""
     r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
     pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
     flat = 1.5 * J2_RE2_KM2 / r2
@@ -59,26 +59,26 @@ def _pull(y, dy):
 
 
 @kernel
-def _fall(y, dt_s, k):
-    """Carry a state over dt_s in place (Runge and Kutta); `k` is (5, 6) to work in."""
+def _propagate(y, dt_s, k):
+    """Propagate a state by dt_s in place (Runge-Kutta); `k` (5, 6) is work space."""
     n = int(np.ceil(dt_s / STEP_S))
     for _ in range(n):
         h = dt_s / n
-        _pull(y, k[0])
+        _derivative(y, k[0])
         k[4] = y + h / 2 * k[0]
-        _pull(k[4], k[1])
+        _derivative(k[4], k[1])
         k[4] = y + h / 2 * k[1]
-        _pull(k[4], k[2])
+        _derivative(k[4], k[2])
         k[4] = y + h * k[2]
-        _pull(k[4], k[3])
+        _derivative(k[4], k[3])
         y += h / 6 * (k[0] + 2 * k[1] + 2 * k[2] + k[3])
 
 
 @kernel
 def _begin(views, x, seen_by, state):
-    """Write the state at the first solved instant from the points; return that instant.
+    """Write a first state at the first solved instant; return that instant.
 
-    The line through the points, bent by gravity.
+    It is the straight line through the points, corrected for gravity.
     """
     first, n, mean_t = -1, 0, 0.0
     for m in range(len(views.time_s)):
@@ -108,12 +108,12 @@ def _begin(views, x, seen_by, state):
 
 
 @kernel
-def _normal_equations(views, members, n, first, state, at, k, N, rhs):
+def _normal_equations(views, members, first, state, at, k, N, rhs):
     """Write the normal equations of the orbit; return chi-square, NaN behind a sensor.
 
-    `at` gets the states at the instants. The partials are those of motion in the gravity
-    gradient at the first place, to the third order in time: good to 1 % over ten minutes of a
-    low orbit.
+    `at` receives the states at the instants, `k` (5, 6) is work space. The partials are those
+    of motion in the gravity gradient at the first position, to the third order in time: good to
+    1 % over ten minutes of a low orbit.
     """
     N[:] = 0.0
     rhs[:] = 0.0
@@ -124,11 +124,10 @@ def _normal_equations(views, members, n, first, state, at, k, N, rhs):
     pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
     for m in range(first, len(views.time_s)):
         if m > first:
-            _fall(y, views.time_s[m] - views.time_s[m - 1], k)
+            _propagate(y, views.time_s[m] - views.time_s[m - 1], k)
         at[m] = y
         t = views.time_s[m] - views.time_s[first]
-        for q in range(n):
-            i = members[q]
+        for i in members:
             if not views.seen[i, m]:
                 continue
             if residual(views, i, m, y, part) == 0.0:
@@ -155,7 +154,7 @@ def _normal_equations(views, members, n, first, state, at, k, N, rhs):
 
 @kernel
 def _ends(views, i, first):
-    """Return the first and the last instant at which a tracklet is seen, from `first` on."""
+    """Return the first and last instant, from `first` on, at which a tracklet is seen."""
     begun, ended = -1, -1
     for m in range(first, len(views.time_s)):
         if views.seen[i, m]:
@@ -166,9 +165,10 @@ def _ends(views, i, first):
 
 @kernel
 def _scatter(views, chance, i, begun, ended, b):
-    """Write how tracklet i drifts beside its sensor's others; return that drift's variance.
+    """Write the drift of tracklet i relative to its sensor's others; return its variance.
 
-    A rate far from all others is as rare as its square is large, not as a Gaussian's tail.
+    The variance is at least half the square of the drift: a far outlier is rare by a power law,
+    not by a Gaussian's tail.
     """
     s, dt = views.sensor[i], views.time_s[ended] - views.time_s[begun]
     square, u = 0.0, np.empty(3)
@@ -181,17 +181,17 @@ def _scatter(views, chance, i, begun, ended, b):
 
 
 @kernel
-def _usual_velocity(views, chance, members, n, first, state, prior, usual):
-    """Write the prior of the velocity, its mean and inverse covariance; return its log norm.
+def _usual_velocity(views, chance, members, first, state, prior, usual):
+    """Write mean and inverse covariance of the velocity's prior; return its log norm.
 
-    Across the line of sight objects move as the tracklets of the sensor do whose tracklets
-    differ most (and the start is as likely a mean as that makes it); along it as orbits allow.
+    Across the line of sight objects move like the tracklets of the sensor whose tracklets
+    differ most; the norm includes how usual the first state is among these. Along the line of
+    sight they move as orbits allow.
     """
     radius = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     along = RADIAL_SHARE * np.sqrt(GM_KM3_S2 / radius)
     across, chosen, cost, b = 0.0, members[0], 0.0, np.empty(3)
-    for q in range(n):
-        i = members[q]
+    for i in members:
         begun, ended = _ends(views, i, first)
         if begun == ended:
             continue
@@ -216,6 +216,7 @@ def _usual_velocity(views, chance, members, n, first, state, prior, usual):
 
 @kernel
 def _range(views, i, m, x):
+    """Return the distance [km] of x from the sensor of tracklet i at instant m."""
     total = 0.0
     for a in range(3):
         total += (x[a] - views.camera[views.sensor[i], m, a]) ** 2
@@ -223,11 +224,12 @@ def _range(views, i, m, x):
 
 
 @kernel
-def _own_odds(views, chance, i, first, at):
-    """Return the log-likelihood of a tracklet's directions as something else's.
+def _unrelated_odds(views, chance, i, first, at):
+    """Return the log-likelihood of a tracklet's directions as those of an unrelated object.
 
-    They lie anywhere in the field and drift as the sensor's tracklets do, beside the orbit
-    whose states are `at`: so they need not be said to curve as a distant object's do.
+    It lies anywhere in the field and drifts like the sensor's other tracklets. Its position and
+    drift are relative to the orbit with the states `at`, so the curvature of the path is common
+    to both hypotheses.
     """
     s = views.sensor[i]
     J, h, part = np.zeros((4, 4)), np.zeros(4), np.empty(11)
@@ -236,7 +238,7 @@ def _own_odds(views, chance, i, first, at):
     if begun < ended:
         variance = _scatter(views, chance, i, begun, ended, b)
     for c in range(2):
-        # The residual drifts as the tracklet itself does beside what is usual.
+        # The residual drifts like the tracklet relative to the usual drift.
         mean = 0.0
         for a in range(3):
             mean += views.camera[s, begun, PLANE + 3 * c + a] * b[a]
@@ -259,11 +261,11 @@ def _own_odds(views, chance, i, first, at):
                 J[p, o + 1] += tp * to * part[9]
                 J[p + 1, o] += tp * to * part[9]
                 J[p + 1, o + 1] += tp * to * part[10]
-    own = h.copy()
-    log_det = factor(J, own)
+    solved = h.copy()
+    log_det = factor(J, solved)
     for p in range(4):
-        chi2 -= own[p] * h[p]
-    # The density is one on the sky, the place one in the plane.
+        chi2 -= solved[p] * h[p]
+    # The density is per area of the sky, the position one on the plane.
     flat = 1.0 + views.sight[i, begun, X] ** 2 + views.sight[i, begun, Y] ** 2
     prior = np.log(chance.density[s] / variance) - 1.5 * np.log(flat)
     return prior + LN_2PI - 0.5 * log_det - 0.5 * chi2
@@ -271,7 +273,7 @@ def _own_odds(views, chance, i, first, at):
 
 @kernel
 def _leaves(state, L):
-    """Return whether the orbit leaves the Earth, by 3 sigma; L is the factored information."""
+    """Return whether the orbit is hyperbolic by 3 sigma; L is the factored information."""
     r = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     v2 = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
     slope, variance = np.empty(6), 0.0
@@ -287,20 +289,20 @@ def _leaves(state, L):
 
 
 @kernel
-def arc_odds(views, chance, members, n, x, seen_by):
-    """Return the log-odds that the members' directions are one orbit's rather than their own.
+def arc_odds(views, chance, members, points):
+    """Return the log-odds of one orbit against unrelated tracklets, by the directions alone.
 
-    Without what the place is worth (see `score`) and without absences. -inf where there is no
-    orbit, or only one that leaves the Earth.
+    Without the prior of the position and without misses (see `odds.score`). -inf where no orbit
+    fits, or only a hyperbolic one.
     """
     state, k = np.empty(6), np.empty((5, 6))
     at = np.empty((len(views.time_s), 6))
     N, rhs, prior, usual = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty(3)
-    first = _begin(views, x, seen_by, state)
-    log_prior = _usual_velocity(views, chance, members, n, first, state, prior, usual)
+    first = _begin(views, points.x_km, points.seen_by, state)
+    log_prior = _usual_velocity(views, chance, members, first, state, prior, usual)
     chi2 = log_det = gain = np.inf
     for _ in range(ITERATIONS):
-        chi2 = _normal_equations(views, members, n, first, state, at, k, N, rhs)
+        chi2 = _normal_equations(views, members, first, state, at, k, N, rhs)
         for a in range(3):
             for b in range(3):
                 N[3 + a, 3 + b] += prior[a, b]
@@ -321,6 +323,6 @@ def arc_odds(views, chance, members, n, x, seen_by):
     if _leaves(state, N):
         return -np.inf
     total = log_prior + 3.0 * LN_2PI - 0.5 * log_det - 0.5 * (chi2 - gain)
-    for q in range(n):
-        total -= _own_odds(views, chance, members[q], first, at)
+    for i in members:
+        total -= _unrelated_odds(views, chance, i, first, at)
     return total

@@ -1,34 +1,34 @@
-"""Object density: how many objects there are, shell by shell, as the groups found tell.
+"""Object density: how many objects there are in each altitude shell, from the sure groups.
 
-The search takes every tracklet for a possible object and the altitude prior at its word. The
-sure groups tell how many objects the space in view really holds and at what heights; by as much
-the odds of all groups change. Empirical Bayes: the rate of each shell is Poisson with a gamma
-prior about the common one.
+The search assumes that every tracklet may be an object, and the altitude prior as given. The
+sure groups tell how many objects the space in view really holds and at which altitudes, and the
+odds of all groups change accordingly. Empirical Bayes: the count of each shell is Poisson, its
+rate has a gamma prior about the common rate.
 """
 
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.evidence.chance import Chance
+from epipole.tasks.algorithms.association.evidence.detection import CERTAIN_LOG_ODDS
 from epipole.tasks.algorithms.association.evidence.visibility import in_view
 from epipole.tasks.algorithms.association.sampling.views import Views
 from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 
-SIGHTS = 100  # lines of sight in all that sample the fields, at least one a sensor
-STEPS = 24  # along a line of sight, beside the shells' edges
-MOST = 10.0  # times the common rate: no shell is taken to be fuller
-PRIOR_OBJECTS = 1.0  # as good as so many objects does a shell's own share count
-CERTAIN_LOG_ODDS = 8.0  # groups that count from the start
+SIGHTS = 100  # lines of sight that sample all fields together, at least one per sensor
+STEPS = 24  # along a line of sight, in addition to the shells' edges
+MOST = 10.0  # largest rate of a shell over the common rate
+PRIOR_OBJECTS = 1.0  # weight of the prior of a shell, as a number of objects
 ROUNDS = 100
 
 
 def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
-    """Return the volume [km^3] that two sensors see, weighed by each of the shells, (j,).
+    """Return the volume [km^3] that two sensors see in each shell, times its weight, (j,).
 
-    `shells` are rows of (lowest, highest radius [km], weight). At the instant at which most
-    sensors' attitudes are known, by some lines of sight of each. Zero where fewer than two are.
+    `shells` are rows of (lowest, highest radius [km], weight). The volume is integrated along
+    sample lines of sight, at the instant of most known attitudes; zero for fewer than two.
     """
     ready = np.isfinite(views.place_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
     m = int(np.argmax(ready.sum(axis=0)))
@@ -68,7 +68,7 @@ def _in_view_of(camera, x):
 
 
 def _steps(r_km: Array, u: Array, shells: Array, farthest_km: float) -> tuple[Array, Array]:
-    """Return middles and edges of the steps along lines of sight, split at the shells' edges."""
+    """Return middles and edges [km] of steps along lines of sight, split at the shells' edges."""
     along, r2 = u @ r_km, r_km @ r_km
     edges = [np.tile(np.linspace(0, farthest_km, STEPS), (len(u), 1))]
     for radius in np.unique(shells[:, :2]):
@@ -88,21 +88,21 @@ def revised_odds(
     Parameters
     ----------
     scores, radius_km : (g,) float
-        Log-odds as searched with, and the groups' distances from the Earth's centre.
+        Log-odds of the search, and the groups' distances from the Earth's centre.
     shells : (j, 3) float
         Lowest, highest radius, weight.
     volume_km3 : (j,) float
-        What is in view of each, see `visible_volume`.
+        Volumes in view, see `visible_volume`.
     chance
-        With the density that the search believed in.
+        With the object density that the search assumed.
 
     Notes
     -----
-    Upwards from the certain groups, to the smallest numbers that explain themselves.
+    An iteration upwards from the certain groups, to the smallest consistent numbers.
     """
     inside = (radius_km[:, None] >= shells[:, 0]) & (radius_km[:, None] < shells[:, 1])
     believed = inside * shells[:, 2] + 1e-9
-    if not volume_km3.any():  # unknown: as if all that sensors look at were seen by two
+    if not volume_km3.any():  # unknown: as if two sensors saw all of it
         volume_km3 = np.full(len(shells), chance.objects_in_view / chance.objects_km3)
     expected = chance.objects_km3 * volume_km3 + 1e-9
     sure = (scores > CERTAIN_LOG_ODDS).astype(float)
@@ -117,12 +117,12 @@ def revised_odds(
 
 
 def _rates(sure: Array, believed: Array, expected: Array) -> Array:
-    """Return the rate of objects in each shell, over the believed one."""
+    """Return the rate of objects in each shell over the assumed rate."""
     common = max(sure.sum(), 0.5) / expected.sum()
     factor = np.full(len(expected), common)
-    for _ in range(10):  # where shells overlap, an object may be of either
+    for _ in range(10):  # an object may belong to either of two shells that overlap
         belongs = believed * factor
         count = (sure[:, None] * belongs / belongs.sum(axis=1, keepdims=True)).sum(axis=0)
-        own = (count + PRIOR_OBJECTS) / (common * expected + PRIOR_OBJECTS)
-        factor = common * np.minimum(own, MOST)
+        ratio = (count + PRIOR_OBJECTS) / (common * expected + PRIOR_OBJECTS)
+        factor = common * np.minimum(ratio, MOST)
     return factor

@@ -1,4 +1,4 @@
-"""Odds: how much likelier one object is than unrelated tracklets."""
+"""Odds: how much more likely one object is than unrelated tracklets."""
 
 import numpy as np
 
@@ -18,59 +18,66 @@ def _det3(M):
 
 
 @kernel
-def score(views, chance, members, n, points, part, shells, near, looks):
-    """Return the log of the odds "one object" against "unrelated tracklets".
+def score(views, chance, members, points, shells, near, outcomes, part):
+    """Return the log-odds of "one object" against "unrelated tracklets".
 
-    A stray lies anywhere in its field (`chance.density`) and an object anywhere in view
-    (`chance.objects_km3`, weighed by altitude where `shells` say so). Several instants are tied
-    together by one orbit, see `arcs`. A sensor that looks at the point and has nothing there
-    counts against it; `near` tells which may, `looks` in the end which did (see `_detections`).
+    An unrelated tracklet may lie anywhere in its field (`chance.density`), an object anywhere in
+    view (`chance.objects_km3`, weighted by altitude with `shells`). Several instants are tied
+    together by one orbit, see `arcs`. A sensor that has the point in its field but no tracklet
+    of it counts against the object.
+
+    Parameters
+    ----------
+    near : (s,) bool
+        Sensors whose field may hold the points, see `near_fields`.
+    outcomes : (s,) int
+        Output, see `_detections`.
+    part : (11,) float
+        Work space, see `residual`.
     """
-    X, _, P, seen_by = points
     m, instants = -1, 0
     for k in range(len(views.time_s)):
-        if seen_by[k] >= 2:
+        if points.seen_by[k] >= 2:
             m = k if m < 0 else m
             instants += 1
     if instants == 1:
-        total = 1.5 * LN_2PI + 0.5 * np.log(_det3(P[m]))
-        for q in range(n):
-            i = members[q]
+        total = 1.5 * LN_2PI + 0.5 * np.log(_det3(points.cov_km2[m]))
+        for i in members:
             if views.seen[i, m]:
                 total -= np.log(chance.density[views.sensor[i]] * views.sight[i, m, SPOT_SR])
-                residual(views, i, m, X[m], part)
+                residual(views, i, m, points.x_km[m], part)
                 total -= 0.5 * misfit(part)
     else:
-        total = arc_odds(views, chance, members, n, X, seen_by)
-    total += np.log(chance.objects_km3) + _altitude_weight(X[m], shells)
-    return total + _detections(views, chance, members, n, X, seen_by, near, looks)
+        total = arc_odds(views, chance, members, points)
+    total += np.log(chance.objects_km3) + _altitude_weight(points.x_km[m], shells)
+    return total + _detections(views, chance, members, points, near, outcomes)
 
 
 @kernel
-def _detections(views, chance, members, n, X, seen_by, near, looks):
-    """Return the log-probability that these sensors have it and the others that look do not.
+def _detections(views, chance, members, points, near, outcomes):
+    """Return the log-probability of which sensors detect the object and which miss it.
 
-    Writes who they are: `looks` is 1, or -1 where a sensor looks in vain.
+    Writes `outcomes` for each sensor: 1 detection, -1 miss, 0 not in its field.
     """
     total = 0.0
-    looks[:] = 0
-    for q in range(n):
-        looks[views.sensor[members[q]]] = 1
-    for s in range(len(looks)):
-        if looks[s] == 1:
+    outcomes[:] = 0
+    for i in members:
+        outcomes[views.sensor[i]] = 1
+    for s in range(len(outcomes)):
+        if outcomes[s] == 1:
             total += np.log(chance.detected[s])
-        elif near[s] and looks_at(views, s, X, seen_by):
-            looks[s] = -1
+        elif near[s] and looks_at(views, s, points.x_km, points.seen_by):
+            outcomes[s] = -1
             total += np.log(1.0 - chance.detected[s])
     return total
 
 
 @kernel
 def _altitude_weight(x, shells):
-    """Return the log of how much likelier objects are at this height than on average.
+    """Return the log of the object density at this radius over the mean density.
 
-    `shells` are rows of (lowest, highest radius [km], weight), which add up; none: all heights
-    are alike.
+    `shells` are rows of (lowest, highest radius [km], weight). Weights of overlapping shells
+    add up. Without shells the density is uniform.
     """
     if len(shells) == 0:
         return 0.0

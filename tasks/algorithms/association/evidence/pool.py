@@ -1,4 +1,4 @@
-"""A pool of hypotheses, best first, that knows which others share a tracklet with one."""
+"""Pool: hypotheses, the likeliest first, and those that share tracklets with a given one."""
 
 import heapq
 from collections import defaultdict
@@ -11,21 +11,21 @@ import numpy.typing as npt
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Hypothesis:
-    """Tracklets that may be one object; `seed` are the two it grew from.
+    """Tracklets (`members`) that may be one object, grown from the two of `seed`.
 
-    `x_km` (3,) is where they meet at the first instant; `looks` (s,) is 1 for each sensor that
-    has it, -1 for one that looks in vain, else 0.
+    `score` is the log-odds against unrelated tracklets. `x_km` (3,) is the point at the first
+    instant. `outcomes` (s,) is 1 for sensors that detect it, -1 for misses, 0 out of the field.
     """
 
     score: float
     seed: tuple[int, int]
     members: tuple[int, ...]
     x_km: npt.NDArray[np.float64]
-    looks: npt.NDArray[np.int8]
+    outcomes: npt.NDArray[np.int8]
 
 
 class Pool:
-    """Hypotheses, best first; of equal ones that with the lowest tracklets."""
+    """Hypotheses, the likeliest first; ties by the lowest tracklets."""
 
     def __init__(self, hypotheses: Iterable[Hypothesis]) -> None:
         self._heap: list[tuple[float, tuple[int, ...], int, Hypothesis]] = []
@@ -42,7 +42,7 @@ class Pool:
             self._holding[i].append(h)
 
     def pop(self) -> Hypothesis | None:
-        """Take out the best hypothesis; none where the pool is empty. It stays a rival."""
+        """Remove the likeliest hypothesis, None if empty. It stays a rival of the others."""
         return heapq.heappop(self._heap)[3] if self._heap else None
 
     def rivals(
@@ -51,7 +51,7 @@ class Pool:
         """Return hypotheses about as likely as `best` that contradict it.
 
         They share a tracklet with it, neither contains the other, and none of their tracklets
-        is known to be another object's. One that itself was ambiguous contests still.
+        belongs to a group already. A hypothesis that was found ambiguous is still a rival.
         """
         contest = (h for i in best.members for h in self._holding[i])
         return [
@@ -63,7 +63,7 @@ class Pool:
 
 
 def distinct(hypotheses: Iterable[Hypothesis]) -> list[Hypothesis]:
-    """Return one hypothesis, the likeliest, for each set of members."""
+    """Return the likeliest hypothesis for each set of members."""
     best: dict[tuple[int, ...], Hypothesis] = {}
     for h in hypotheses:
         if h.members not in best or h.score > best[h.members].score:

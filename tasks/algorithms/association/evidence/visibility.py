@@ -1,4 +1,4 @@
-"""Visibility: whether a sensor could see a point at all."""
+"""Visibility: whether a sensor has a point in its field, the Earth not in between."""
 
 import numpy as np
 
@@ -6,12 +6,12 @@ from epipole.tasks.algorithms.association.sampling.views import HALF, PLANE, REA
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import kernel
 
-INSIDE = 0.98  # of the half field: nearer to the edge a sensor may well miss an object
+INSIDE = 0.98  # of half the field: nearer to its edge misses are frequent
 
 
 @kernel
 def blocked(r, x, radius):
-    """Return whether the Earth stands between r and x."""
+    """Return whether the Earth, of this radius, is between r and x."""
     dot, length2, r2 = 0.0, 0.0, 0.0
     for a in range(3):
         d = x[a] - r[a]
@@ -23,9 +23,9 @@ def blocked(r, x, radius):
 
 @kernel
 def sees(r, R, half_field, x):
-    """Return whether a sensor at r has x in its field, not at the edge, the Earth not between.
+    """Return whether a sensor at r, with attitude R, has x in its field and in view.
 
-    False where the sensor's place or attitude is unknown (NaN).
+    False at the edge of the field, behind the Earth, and where r or R is unknown (NaN).
     """
     d0, d1, d2 = x[0] - r[0], x[1] - r[1], x[2] - r[2]
     depth = R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2
@@ -40,7 +40,7 @@ def sees(r, R, half_field, x):
 
 @kernel
 def in_view(cam, x):
-    """Return what `sees` does, by a row of `Views.camera`."""
+    """Return the same as `sees`, for a row of `Views.camera`."""
     d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
     depth = cam[TURN + 6] * d0 + cam[TURN + 7] * d1 + cam[TURN + 8] * d2
     if not depth > 0.0:
@@ -54,7 +54,7 @@ def in_view(cam, x):
 
 @kernel
 def looks_at(views, s, X, seen_by):
-    """Return whether sensor s has the point in its field at every solved instant."""
+    """Return whether sensor s has the points in its field at all solved instants."""
     looked = False
     for m in range(len(views.time_s)):
         if seen_by[m] < 2:
@@ -67,9 +67,9 @@ def looks_at(views, s, X, seen_by):
 
 @kernel
 def near_fields(views, X, P, seen_by, near):
-    """Write which sensors have a point, by far, near what they see at any solved instant.
+    """Write which sensors may have a point in their field at any solved instant.
 
-    A quick look: within the cone about all of a sensor's tracklets and its field, and 6 sigma.
+    A fast first test: within 6 sigma of the cone that holds the sensor's tracklets and field.
     """
     near[:] = False
     cam = views.camera

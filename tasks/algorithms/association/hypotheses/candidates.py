@@ -1,4 +1,4 @@
-"""Candidates: which tracklet of a sensor a hypothesis' points explain best."""
+"""Candidates: the tracklet of a sensor that the points of a hypothesis explain best."""
 
 import numpy as np
 
@@ -17,12 +17,12 @@ from epipole.tasks.algorithms.association.sampling.views import (
 )
 from epipole.tasks.algorithms.kernels import kernel
 
-A0, A1, H00, H01, H11, DEPTH, STRETCH = range(7)  # columns of what is predicted
+A0, A1, H00, H01, H11, DEPTH, STRETCH = range(7)  # columns of `WorkSpace.predicted`
 
 
 @kernel
 def _predict(views, s, points, predicted):
-    """Write where sensor s should see the points, and how well that is known; false: behind."""
+    """Write where sensor s should see the points, with covariance; DEPTH 0 or less: behind it."""
     x, _, P, seen_by = points
     cam = views.camera  # element by element, see `views.residual`
     for m in range(len(views.time_s)):
@@ -55,10 +55,11 @@ def _predict(views, s, points, predicted):
 
 @kernel
 def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
-    """Return what tracklet c adds to the odds; -inf where it does not fit at the shared instants.
+    """Return what tracklet c adds to the log-odds; -inf where it does not fit the points.
 
-    The log of how much likelier the points make its directions than chance does. At later
-    instants than the first, chance is known to within how differently tracklets move.
+    The log-likelihood of its directions as views of the points, minus that as an unrelated
+    tracklet. After the first shared instant, an unrelated tracklet is uncertain only by how
+    differently the tracklets of the sensor move.
     """
     gain, total, n, begun_at, see = 0.0, 0.0, 0, 0.0, views.sight
     largest = quantile(2 * len(views.time_s), gate_sigma)
@@ -92,17 +93,30 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
 
 
 @kernel
-def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_sigma, least):
-    """Return the free tracklet of sensor s that adds most to the odds, how much, and the next.
+def best_of_sensor(space, work, s, members, least):
+    """Return the free tracklet of sensor s that adds most to the log-odds.
 
-    -1 where there is none; the last is what the second best adds, `least` without one.
+    Only grid cells within the gate are searched. A tracklet is weighed once, at the first
+    instant that it shares with the points.
 
-    One that adds less than `least` is not taken. At each instant only the grid cells
-    that the gate touches are looked at; a tracklet is weighed once, at the first instant that
-    it shares with the points.
+    Parameters
+    ----------
+    members : (n,) int
+        Tracklets of the hypothesis so far.
+    least : float
+        A tracklet that adds less is not chosen.
+
+    Returns
+    -------
+    int
+        The tracklet, -1 for none.
+    float, float
+        What it adds, and what the second best adds; `least` without one.
     """
-    best, best_gain, second, seen_by, cam = -1, least, least, points[3], views.camera
-    _predict(views, s, points, predicted)
+    views, chance, taken, gate_sigma = space.views, space.chance, space.taken, space.gate_sigma
+    predicted, seen_by, cam = work.predicted, work.points.seen_by, views.camera
+    best, best_gain, second = -1, least, least
+    _predict(views, s, work.points, predicted)
     gate = np.sqrt(quantile(2, gate_sigma))
     for m in range(len(views.time_s)):
         side = views.grid[s, m, 1]
@@ -110,12 +124,12 @@ def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_
             continue
         begin = views.grid[s, m, 0]
         place = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
-        own = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
-        reach = gate * np.sqrt(predicted[m, H00] + own)
+        errors = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
+        reach = gate * np.sqrt(predicted[m, H00] + errors)
         here = predicted[m, A0] - cam[s, m, CORNER]
         lo0 = max(int(np.floor((here - reach) * cam[s, m, SCALE])), 0)
         hi0 = min(int(np.floor((here + reach) * cam[s, m, SCALE])), side - 1)
-        reach = gate * np.sqrt(predicted[m, H11] + own)
+        reach = gate * np.sqrt(predicted[m, H11] + errors)
         here = predicted[m, A1] - cam[s, m, CORNER + 1]
         lo1 = max(int(np.floor((here - reach) * cam[s, m, SCALE + 1])), 0)
         hi1 = min(int(np.floor((here + reach) * cam[s, m, SCALE + 1])), side - 1)
@@ -128,7 +142,7 @@ def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_
                 if taken[c] or _shared_before(views, c, m, seen_by):
                     continue
                 gain = _fit(views, chance, s, c, seen_by, predicted, gate_sigma)
-                if gain > second and not _clashes(views, c, members, n):
+                if gain > second and not _clashes(views, c, members):
                     if gain > best_gain:
                         best, best_gain, second = c, gain, best_gain
                     else:
@@ -137,14 +151,16 @@ def best_of_sensor(views, chance, s, members, n, taken, points, predicted, gate_
 
 
 @kernel
-def odds_of_view(views, chance, s, c, points, predicted):
-    """Return what tracklet c of sensor s adds to the odds of an object with these points."""
-    _predict(views, s, points, predicted)
-    return _fit(views, chance, s, c, points[3], predicted, np.inf)
+def odds_of_view(space, work, s, c):
+    """Return what tracklet c of sensor s adds to the log-odds of these points; no gate."""
+    _predict(space.views, s, work.points, work.predicted)
+    seen_by = work.points.seen_by
+    return _fit(space.views, space.chance, s, c, seen_by, work.predicted, np.inf)
 
 
 @kernel
 def _shared_before(views, c, m, seen_by):
+    """Return whether tracklet c shares an instant before m with the points."""
     shared = False
     for earlier in range(m):
         shared |= seen_by[earlier] >= 2 and views.seen[c, earlier]
@@ -152,10 +168,9 @@ def _shared_before(views, c, m, seen_by):
 
 
 @kernel
-def _clashes(views, c, members, n):
-    """Return whether a member is c, or of the same sensor at the same time."""
-    for q in range(n):
-        o = members[q]
+def _clashes(views, c, members):
+    """Return whether c is a member, or overlaps in time with a member of its sensor."""
+    for o in members:
         if o == c:
             return True
         if views.sensor[o] == views.sensor[c] and (

@@ -1,97 +1,127 @@
-"""Growth: two tracklets become a hypothesis as other sensors' tracklets join them."""
+"""Growth: two tracklets become a hypothesis as tracklets of other sensors join them."""
+
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.evidence.odds import score
+from epipole.tasks.algorithms.association.evidence.points import InstantPoints
 from epipole.tasks.algorithms.association.evidence.visibility import looks_at, near_fields
 from epipole.tasks.algorithms.association.hypotheses.candidates import best_of_sensor
 from epipole.tasks.algorithms.association.hypotheses.instant_points import join, possible, solve
+from epipole.tasks.algorithms.association.hypotheses.search_space import (
+    PREDICTED_COLUMNS,
+    RESIDUAL_PARTS,
+    WorkSpace,
+)
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
 from epipole.tasks.algorithms.kernels import kernel
 
 FEW = 3  # sensors that must have looked before a hypothesis is given up
-GIVEN_UP = -4.0  # log-odds of the sensors beside the seed's at which it is
+GIVEN_UP = -4.0  # log-odds of the sensors beside the seed's at which it is given up
 SPEAKS = 2.0  # log-odds at which a view of a well-known point is clearly of the object
 CONTESTED = 5.0  # log-odds by which the best view of a sensor must lead the next one
 ENOUGH = 4  # views that fix a point well enough to choose them all again
 WELL_KNOWN = 8  # views after which a sensor's choice needs no review
-COMPLETE = 0.85  # of the views that are usual, those of a clear hypothesis
-REVIEWS = 2  # the first may still rest on a stray
+COMPLETE = 0.85  # of the expected detections, those of a clear hypothesis
+REVIEWS = 2  # the first may still rest on a false member
+
+
+class GrownSeeds(NamedTuple):
+    """What n seeds have grown into.
+
+    size : (n,) int
+        Number of members; 0 where the hypothesis failed.
+    score : (n,) float
+        Log-odds.
+    x_km : (n, 3) float
+        Position at the first instant.
+    outcomes : (n, s) int
+        Detections (1) and misses (-1) of the sensors, see `odds`.
+    members : (n, m) int
+        Tracklets; the first `size` columns count.
+    """
+
+    size: npt.NDArray[np.int64]
+    score: npt.NDArray[np.float64]
+    x_km: npt.NDArray[np.float64]
+    outcomes: npt.NDArray[np.int8]
+    members: npt.NDArray[np.int64]
 
 
 @kernel
-def grow_all(views, chance, seeds, taken, limits, gate_sigma, shells, clear, found):
-    """Grow every seed and write what comes of it.
+def grow_all(space, seeds, clear, out):
+    """Grow every seed and write the result to `out` (`GrownSeeds`).
 
     Parameters
     ----------
     seeds : (n, 2) int
-        Pairs of tracklets; one that was taken meanwhile is passed over.
-    taken : (t,) bool
-        Tracklets of known objects; those of clear hypotheses are added.
-    limits : (2,) float
-        Lowest and farthest distance from the Earth's centre [km].
-    clear
-        Log-odds at which a hypothesis is taken at once, see `clear_of_doubt`.
-    found
-        To write to: sizes (0: fails), scores, places at the first instant [km], who looks (see
-        `odds`), members.
+        Pairs of tracklets. A pair of which one was taken since is skipped.
+    clear : float
+        Log-odds at which a hypothesis is taken at once, see `clear_of_doubt`. Its tracklets are
+        entered in `space.taken`.
     """
-    sizes, scores, x_km, looks, grown = found
-    k = len(views.time_s)
-    points = np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3)), np.zeros(k, np.int64)
-    part = np.empty(11)
-    predicted, near = np.empty((k, 7)), np.empty(views.camera.shape[0], np.bool_)
+    views, chance, taken = space.views, space.chance, space.taken
+    k, n_sensors = len(views.time_s), views.camera.shape[0]
+    work = WorkSpace(
+        InstantPoints(
+            np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3)), np.zeros(k, np.int64)
+        ),
+        np.empty(RESIDUAL_PARTS),
+        np.empty((k, PREDICTED_COLUMNS)),
+        np.empty(n_sensors, np.bool_),
+    )
+    points = work.points
     members = np.empty(len(views.sensor) + 2, np.int64)
     for q in range(len(seeds)):
-        sizes[q] = 0
+        out.size[q] = 0
         if taken[seeds[q, 0]] or taken[seeds[q, 1]]:
             continue
         members[0], members[1] = seeds[q, 0], seeds[q, 1]
-        n = _grow(views, chance, members, taken, limits, gate_sigma, points, part, predicted, near)
-        if n < 2 or not possible(views, members, n, points, limits[0], limits[1]):
+        n = _grow(space, work, members)
+        if n < 2 or not possible(space, members[:n], points):
             continue
-        scores[q] = score(views, chance, members, n, points, part, shells, near, looks[q])
-        sizes[q] = min(n, grown.shape[1])
-        x_km[q] = points[0][np.argmax(points[3] >= 2)]
-        grown[q, : sizes[q]] = members[: sizes[q]]
-        if clear_of_doubt(chance, looks[q], n, scores[q], clear):
+        value = score(
+            views, chance, members[:n], points, space.shells, work.near, out.outcomes[q], work.part
+        )
+        out.score[q] = value
+        out.size[q] = min(n, out.members.shape[1])
+        out.x_km[q] = points.x_km[np.argmax(points.seen_by >= 2)]
+        out.members[q, : out.size[q]] = members[: out.size[q]]
+        if clear_of_doubt(chance, out.outcomes[q], n, value, clear):
             for i in members[:n]:
                 taken[i] = True
 
 
 @kernel
-def clear_of_doubt(chance, looks, n, value, clear):
+def clear_of_doubt(chance, outcomes, n, value, clear):
     """Return whether a hypothesis may be taken at once.
 
-    It has many views, and nearly as many of the sensors that look have it as usually do: two
-    objects' tracklets, mixed, fit in a part of the sensors only.
+    It has many views, and of the sensors that have it in their field about as many detect it
+    as usual. A mixture of two objects' tracklets fits in some of the sensors only.
     """
     has, usual = 0, 0.0
-    for s in range(len(looks)):
-        has += looks[s] > 0
-        usual += chance.detected[s] * (looks[s] != 0)
+    for s in range(len(outcomes)):
+        has += outcomes[s] > 0
+        usual += chance.detected[s] * (outcomes[s] != 0)
     return value > clear and n >= WELL_KNOWN and has >= COMPLETE * usual
 
 
 @kernel
-def _grow(views, chance, members, taken, limits, gate_sigma, points, part, predicted, near):
-    """Grow the first two members; return the size, 0 where it fails.
+def _grow(space, work, members):
+    """Grow the first two members; return the size, 0 where the hypothesis fails.
 
-    Sensor after sensor, the tracklet that adds most to the odds joins. A sensor that looks and
-    has none counts against the hypothesis, which is given up as soon as its other sensors speak
-    clearly against it (Wald's sequential test).
+    Sensor after sensor, the tracklet that adds most to the odds joins. A miss counts against
+    the hypothesis. It is given up as soon as the other sensors speak clearly against it (Wald's
+    sequential test).
     """
-    n_sensors = views.camera.shape[0]
-    points[3][:] = 0
+    views = space.views
     n = np.int64(2)  # a plain 2 is a type of its own to numba: all would compile twice
-    chi2, dof = solve(views, members, n, points, part)
-    if not chi2 <= quantile(max(dof, 1), gate_sigma):
-        return 0
-    if not possible(views, members, n, points, limits[0], limits[1]):
-        return 0
-    near_fields(views, points[0], points[2], points[3], near)
+    if not _begin(space, work, members[:n]):
+        return np.int64(0)
+    n_sensors = views.camera.shape[0]
     a, b = views.sensor[members[0]], views.sensor[members[1]]
     evidence, looked, early = 0.0, 0, np.int64(0)
     for turn in range(n_sensors + 2):
@@ -99,68 +129,92 @@ def _grow(views, chance, members, taken, limits, gate_sigma, points, part, predi
         s = (a + turn) % n_sensors
         if turn >= n_sensors:
             s = a if turn == n_sensors else b
-        elif s in (a, b) or not near[s]:
+        elif s in (a, b) or not work.near[s]:
             continue
-        absent = np.log(1.0 - chance.detected[s])
-        found = False
-        while n < len(members):
-            known = n >= WELL_KNOWN
-            least = SPEAKS if known else absent
-            c, gain, second = best_of_sensor(
-                views, chance, s, members, n, taken, points, predicted, gate_sigma, least
-            )
-            if c < 0 or (known and second > SPEAKS and gain - second < CONTESTED):
-                found |= c >= 0
-                break
-            found = True
-            evidence += gain
-            members[n] = c
-            n += 1
-            early = n if n <= WELL_KNOWN else early
-            if not join(views, c, points, part):
-                return 0
-            # A sensor has one tracklet of an object at a time.
-            if len(views.time_s) == 1:
-                break
+        before = n
+        n, evidence, detected = _join_sensor(space, work, s, members, n, evidence)
+        if n < 0:
+            return np.int64(0)
+        if n > before and before < WELL_KNOWN:
+            early = min(n, np.int64(WELL_KNOWN))
         if turn < n_sensors:
-            looks = found or looks_at(views, s, points[0], points[3])
-            looked += looks
-            if looks and not found:
-                evidence += absent
+            in_field = detected or looks_at(views, s, work.points.x_km, work.points.seen_by)
+            looked += in_field
+            if in_field and not detected:
+                evidence += np.log(1.0 - space.chance.detected[s])
             if looked >= FEW and evidence < GIVEN_UP:
-                return 0
+                return np.int64(0)
     if n < 2 * WELL_KNOWN:
-        n = _settle(views, members, n, points, part, gate_sigma)
+        n = _settle(space, work, members, n)
     for _ in range(REVIEWS if n < 2 * WELL_KNOWN else 1):
         if n >= ENOUGH:
-            n = _review(
-                views, chance, members, n, early, taken, points, part, predicted, gate_sigma
-            )
+            n = _review(space, work, members, n, early)
     return n
 
 
 @kernel
-def _review(views, chance, members, n, early, taken, points, part, predicted, gate_sigma):
+def _begin(space, work, members):
+    """Solve the points of a seed; return whether an object can be there."""
+    points = work.points
+    points.seen_by[:] = 0
+    chi2, dof = solve(space.views, members, points, work.part)
+    if not chi2 <= quantile(max(dof, 1), space.gate_sigma):
+        return False
+    if not possible(space, members, points):
+        return False
+    near_fields(space.views, points.x_km, points.cov_km2, points.seen_by, work.near)
+    return True
+
+
+@kernel
+def _join_sensor(space, work, s, members, n, evidence):
+    """Add the tracklets of sensor s that fit to the members.
+
+    Returns the new size (-1 where a point cannot be solved any more), the log-odds `evidence`
+    with what they add, and whether the sensor detects the object: it does also where two
+    tracklets are about equal and none joins.
+    """
+    detected = False
+    while n < len(members):
+        known = n >= WELL_KNOWN
+        least = SPEAKS if known else np.log(1.0 - space.chance.detected[s])
+        c, gain, second = best_of_sensor(space, work, s, members[:n], least)
+        if c < 0 or (known and second > SPEAKS and gain - second < CONTESTED):
+            detected |= c >= 0
+            break
+        detected = True
+        evidence += gain
+        members[n] = c
+        n += 1
+        if not join(space.views, c, work.points, work.part):
+            return np.int64(-1), evidence, detected
+        # A sensor has one tracklet of an object at a time.
+        if len(space.views.time_s) == 1:
+            break
+    return n, evidence, detected
+
+
+@kernel
+def _review(space, work, members, n, early):
     """Choose the early members again, now that the points are well known; return the size.
 
-    They were chosen by points that a few views gave. A stray does more harm than an absence:
-    what does not speak for the object by itself stays out, and so does a sensor in which two
-    tracklets do about equally.
+    They were chosen by points from a few views only. A false member does more harm than a miss:
+    a tracklet joins only where it clearly speaks for the object, and a sensor with two such
+    tracklets that are about equal contributes none.
     """
+    views = space.views
     before = members[:n].copy()
     again = np.zeros(views.camera.shape[0], np.bool_)
     for q in range(min(early, n)):
         again[views.sensor[members[q]]] = True
     kept = np.int64(0)
-    for q in range(n):
-        if not again[views.sensor[before[q]]] and _speaks(views, chance, before[q], points, part):
-            members[kept] = before[q]
+    for i in before:
+        if not again[views.sensor[i]] and _speaks(space, work, i):
+            members[kept] = i
             kept += 1
     for s in range(len(again)):
         while again[s] and kept < len(members):
-            c, gain, second = best_of_sensor(
-                views, chance, s, members, kept, taken, points, predicted, gate_sigma, SPEAKS
-            )
+            c, gain, second = best_of_sensor(space, work, s, members[:kept], SPEAKS)
             if c < 0 or (second > SPEAKS and gain - second < CONTESTED):
                 break
             members[kept] = c
@@ -170,16 +224,17 @@ def _review(views, chance, members, n, early, taken, points, part, predicted, ga
     if kept < ENOUGH - 1:
         kept = n
         members[:n] = before
-    return _settle(views, members, kept, points, part, gate_sigma)
+    return _settle(space, work, members, kept)
 
 
 @kernel
-def _speaks(views, chance, i, points, part):
-    """Return whether a member still speaks for the object, by the first instant it shares."""
+def _speaks(space, work, i):
+    """Return whether a member still speaks for the object, by the first instant they share."""
+    views, chance, points, part = space.views, space.chance, work.points, work.part
     for m in range(len(views.time_s)):
-        if points[3][m] >= 2 and views.seen[i, m]:
+        if points.seen_by[m] >= 2 and views.seen[i, m]:
             s, spot = views.sensor[i], views.sight[i, m, SPOT_SR]
-            if residual(views, i, m, points[0][m], part) == 0.0:
+            if residual(views, i, m, points.x_km[m], part) == 0.0:
                 return False
             odds = np.log(chance.detected[s] / (chance.density[s] * spot))
             return odds - 0.5 * misfit(part) >= SPEAKS
@@ -187,30 +242,31 @@ def _speaks(views, chance, i, points, part):
 
 
 @kernel
-def _settle(views, members, n, points, part, gate_sigma):
-    """Solve, and let go the member that fits worst until all fit; return the size.
+def _settle(space, work, members, n):
+    """Solve, and drop the member that fits worst until all fit; return the size.
 
-    The seed is not spared. 0 where fewer than two of them fit.
+    The seed's tracklets may be dropped too. 0 where fewer than two are left.
     """
-    X, _, _, seen_by = points
+    views, part = space.views, work.part
+    X, _, _, seen_by = work.points
     while n >= 2:
-        chi2, dof = solve(views, members, n, points, part)
-        if dof > 0 and chi2 <= quantile(dof, gate_sigma):
+        chi2, dof = solve(views, members[:n], work.points, part)
+        if dof > 0 and chi2 <= quantile(dof, space.gate_sigma):
             return n
         if n == 2:
             break
         worst, largest = 0, -1.0
         for q in range(n):
-            own, shared = 0.0, 1e-9
+            total, shared = 0.0, 1e-9
             for m in range(len(views.time_s)):
                 if seen_by[m] < 2 or not views.seen[members[q], m]:
                     continue
                 if residual(views, members[q], m, X[m], part) == 0.0:
-                    own = np.inf
-                own += misfit(part)
+                    total = np.inf
+                total += misfit(part)
                 shared += 1
-            if own / shared > largest:
-                worst, largest = q, own / shared
+            if total / shared > largest:
+                worst, largest = q, total / shared
         for q in range(worst, n - 1):
             members[q] = members[q + 1]
         n -= 1

@@ -1,4 +1,4 @@
-"""Points of a hypothesis: at every instant at which two tracklets are seen, one point."""
+"""Instant points: one point of a hypothesis at each instant that two of its tracklets share."""
 
 import numpy as np
 
@@ -14,12 +14,11 @@ CONVERGED = 1e-4  # sigmas squared
 
 
 @kernel
-def _start(views, members, n, m, x):
-    """Write the point nearest to the members' lines; false where they are parallel."""
+def _start(views, members, m, x):
+    """Write the point nearest to the members' lines; return false where they are parallel."""
     N, inverse, rhs, u = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
     count = 0
-    for q in range(n):
-        i = members[q]
+    for i in members:
         if not views.seen[i, m]:
             continue
         count += 1
@@ -38,7 +37,10 @@ def _start(views, members, n, m, x):
 
 @kernel
 def add_view(views, i, m, x, N, rhs, part):
-    """Add a view to the normal equations (upper half); return its chi-square, NaN behind."""
+    """Add a view to the normal equations (upper half); return its chi-square.
+
+    NaN where the point is behind the sensor.
+    """
     if residual(views, i, m, x, part) == 0.0:
         return np.nan
     g0 = part[8] * part[0] + part[9] * part[1]
@@ -54,7 +56,7 @@ def add_view(views, i, m, x, N, rhs, part):
 
 @kernel
 def step(x, N, rhs, P):
-    """Invert N into P and move x; return how much chi-square falls, NaN where it runs off."""
+    """Invert N into P and move x; return the decrease of chi-square, NaN where it diverges."""
     if invert3(N, P) == 0.0:
         return np.nan
     gain = 0.0
@@ -62,36 +64,36 @@ def step(x, N, rhs, P):
         move = P[a, 0] * rhs[0] + P[a, 1] * rhs[1] + P[a, 2] * rhs[2]
         x[a] += move
         gain += move * rhs[a]
-    return gain if gain < 1e12 else np.nan  # as good as parallel
+    return gain if gain < 1e12 else np.nan  # nearly parallel
 
 
 @kernel
-def solve(views, members, n, points, part):
-    """Solve every instant at which two members are seen; return chi-square and freedom.
+def solve(views, members, points, part):
+    """Solve every instant that two members share; return chi-square and degrees of freedom.
 
-    `points` are (x, N, P, seen_by) of each instant. Where `seen_by` tells that an instant was
-    solved before, its point is the start. NaN where an instant has no solution.
+    An instant that was solved before (by `points.seen_by`) starts from its point. NaN where an
+    instant has no solution.
     """
     X, N, P, seen_by = points
     total, dof, rhs = 0.0, 0, np.empty(3)
     for m in range(len(views.time_s)):
         count = 0
-        for q in range(n):
-            count += views.seen[members[q], m]
+        for i in members:
+            count += views.seen[i, m]
         solved = seen_by[m] >= 2
         seen_by[m] = count
         if count < 2:
             continue
-        if not solved and not _start(views, members, n, m, X[m]):
+        if not solved and not _start(views, members, m, X[m]):
             return np.nan, 0
         chi2 = np.nan
         for _ in range(ITERATIONS):
             N[m] = 0.0
             rhs[:] = 0.0
             chi2 = 0.0
-            for q in range(n):
-                if views.seen[members[q], m]:
-                    chi2 += add_view(views, members[q], m, X[m], N[m], rhs, part)
+            for i in members:
+                if views.seen[i, m]:
+                    chi2 += add_view(views, i, m, X[m], N[m], rhs, part)
             gain = step(X[m], N[m], rhs, P[m])
             chi2 -= gain
             if not gain >= CONVERGED:
@@ -105,7 +107,7 @@ def solve(views, members, n, points, part):
 
 @kernel
 def join(views, c, points, part):
-    """Add tracklet c to the points that are solved (Kalman's update); false where it fails."""
+    """Update the solved points with tracklet c (Kalman); return false where it fails."""
     X, N, P, seen_by = points
     rhs = np.empty(3)
     for m in range(len(views.time_s)):
@@ -121,19 +123,19 @@ def join(views, c, points, part):
 
 
 @kernel
-def possible(views, members, n, points, lowest, farthest):
+def possible(space, members, points):
     """Return whether the points lie, within 3 sigma, where their sensors can see an object."""
+    views, lowest, farthest = space.views, space.lowest_km, space.farthest_km
     X, _, P, seen_by = points
     for m in range(len(views.time_s)):
         if seen_by[m] < 2:
             continue
         radius = np.sqrt(X[m, 0] ** 2 + X[m, 1] ** 2 + X[m, 2] ** 2)
         slack = SLACK_SIGMA * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
-        # However badly a range is known: far outside, no object is looked for.
+        # An uncertain range is no excuse for a point far beyond the limit.
         if radius + slack < lowest or radius - min(slack, BEYOND * farthest) > farthest:
             return False
-        for q in range(n):
-            i = members[q]
+        for i in members:
             if views.seen[i, m] and blocked(
                 views.camera[views.sensor[i], m], X[m], EARTH_RADIUS_KM - slack
             ):

@@ -1,13 +1,17 @@
 """Seeds: pairs of tracklets whose lines of sight meet, found by sorting one angle.
 
-The baseline of two sensors and a direction span a plane. The angle of that plane about the
-baseline is one number a direction, the same for both sensors' views of one object: sorted, a
-view's partners are a binary search away, and no pair that cannot meet is ever looked at.
+The baseline of two sensors and a direction span a plane. The angle of this plane about the
+baseline is one number for each direction, and equal for both sensors' views of one object. With
+the angles sorted, a binary search gives the partners of a view, and pairs that cannot meet
+cost nothing.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import pair_miss, quantile
 from epipole.tasks.algorithms.association.sampling.views import SIGMA_KM, XX, YY, Views
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
@@ -17,19 +21,38 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 SHORTEST_BASELINE_KM = 1.0
-NEAREST_KM = 300.0  # an error of the baseline turns the plane most for a near object
+NEAREST_KM = 300.0  # range at which errors of the baseline turn the plane most
+
+
+class PlaneAngles(NamedTuple):
+    """Tracklets of one sensor at one instant, by the angle of their planes about the baseline.
+
+    items : (n,) int
+        The tracklets.
+    angle, sigma : (n,) float
+        Angles and their 1-sigma errors [rad].
+    """
+
+    items: Indices
+    angle: Array
+    sigma: Array
 
 
 def plane_angles(
     views: Views, s: int, m: int, items: Indices, baseline_km: Array, axes: Array
-) -> tuple[Array, Array]:
-    """Return the angle of each tracklet's plane about the baseline, and its 1-sigma [rad]."""
+) -> PlaneAngles:
+    """Return the angles of tracklets of sensor s at instant m about a baseline.
+
+    `axes` (2, 3) are across the baseline; the angle counts from the first to the second.
+    """
     unit = baseline_km / np.linalg.norm(baseline_km)
     u = _directions(views, s, m, items)
     across = np.maximum(np.sqrt(np.maximum(1 - (u @ unit) ** 2, 0)), 1e-9)
-    variance = views.sight[items, m, XX] + views.sight[items, m, YY]  # no less than any axis has
+    # The trace is at least the variance along any axis.
+    variance = views.sight[items, m, XX] + views.sight[items, m, YY]
     place = 2 * (views.sight[items, m, SIGMA_KM] / NEAREST_KM) ** 2
-    return np.arctan2(u @ axes[1], u @ axes[0]), np.sqrt(variance + place) / across
+    angle = np.arctan2(u @ axes[1], u @ axes[0])
+    return PlaneAngles(items, angle, np.sqrt(variance + place) / across)
 
 
 def _directions(views: Views, s: int, m: int, items: Indices) -> Array:
@@ -38,23 +61,25 @@ def _directions(views: Views, s: int, m: int, items: Indices) -> Array:
 
 
 @kernel
-def _meeting(
-    views, m, items_a, angle_a, sigma_a, items_b, angle_b, sigma_b, taken, lowest, farthest,
-    gate_sigma, out,
-):  # fmt: skip
-    """Write the pairs that meet at all instants they share, and how well; return how many."""
+def _meeting(space, m, a, b, out):
+    """Write the pairs that meet at all instants they share; return how many there are.
+
+    `a`, `b` are the sensors' `PlaneAngles` at instant m, those of `b` by increasing angle.
+    `out` (n, 2) receives as many pairs as it has room for.
+    """
+    views, taken, gate_sigma = space.views, space.taken, space.gate_sigma
     widest, n = 0.0, 0
     ui, uj = np.empty(3), np.empty(3)
-    for k in range(len(sigma_b)):
-        widest = max(widest, sigma_b[k])
-    for q in range(len(items_a)):
-        i = items_a[q]
+    for k in range(len(b.sigma)):
+        widest = max(widest, b.sigma[k])
+    for q in range(len(a.items)):
+        i = a.items[q]
         if taken[i]:
             continue
-        reach = gate_sigma * np.sqrt(sigma_a[q] ** 2 + widest**2)
-        k = np.searchsorted(angle_b, angle_a[q] - reach)
-        while k < len(items_b) and angle_b[k] <= angle_a[q] + reach:
-            j = items_b[k]
+        reach = gate_sigma * np.sqrt(a.sigma[q] ** 2 + widest**2)
+        k = np.searchsorted(b.angle, a.angle[q] - reach)
+        while k < len(b.items) and b.angle[k] <= a.angle[q] + reach:
+            j = b.items[k]
             k += 1
             if taken[j]:
                 continue
@@ -64,7 +89,7 @@ def _meeting(
                     if h < m:
                         before = True  # was weighed at the first instant they share
                         break
-                    total += pair_miss(views, i, j, h, lowest, farthest, ui, uj)
+                    total += pair_miss(views, i, j, h, space.lowest_km, space.farthest_km, ui, uj)
                     shared += 1
             if before or not total <= quantile(shared, gate_sigma):  # false for NaN
                 continue
@@ -74,49 +99,41 @@ def _meeting(
     return n
 
 
-def seeds_between(
-    views: Views,
-    a: int,
-    b: int,
-    taken: npt.NDArray[np.bool_],
-    lowest_km: float,
-    farthest_km: float,
-    gate_sigma: float,
-) -> Indices:
+def seeds_between(space: SearchSpace, a: int, b: int) -> Indices:
     """Return (n, 2): free tracklets of sensors a and b whose lines of sight meet."""
-    found = []
+    views = space.views
+    pairs = []
     for m in range(len(views.time_s)):
         baseline = views.place_km[b, m] - views.place_km[a, m]
         if not np.linalg.norm(baseline) > SHORTEST_BASELINE_KM:  # false for NaN
             continue
-        sides = [
-            views.first[s] + np.flatnonzero(
-                views.seen[views.first[s] : views.first[s + 1], m]
-                & ~taken[views.first[s] : views.first[s + 1]]
-            )
-            for s in (a, b)
-        ]  # fmt: skip
-        if not len(sides[0]) or not len(sides[1]):
+        items_a, items_b = _free_at(space, a, m), _free_at(space, b, m)
+        if not len(items_a) or not len(items_b):
             continue
         axes = _axes(baseline, views.plane[a, m, 2])
-        angle_a, sigma_a = plane_angles(views, a, m, sides[0], baseline, axes)
-        angle_b, sigma_b = plane_angles(views, b, m, sides[1], baseline, axes)
-        order = np.argsort(angle_b, kind="stable")
-        out = np.empty((4 * (len(angle_a) + len(angle_b)), 2), np.int64)
+        planes_a = plane_angles(views, a, m, items_a, baseline, axes)
+        planes_b = plane_angles(views, b, m, items_b, baseline, axes)
+        order = np.argsort(planes_b.angle, kind="stable")
+        planes_b = PlaneAngles(planes_b.items[order], planes_b.angle[order], planes_b.sigma[order])
+        out = np.empty((4 * (len(items_a) + len(items_b)), 2), np.int64)
         while True:
-            n = _meeting(
-                views, m, sides[0], angle_a, sigma_a, sides[1][order], angle_b[order],
-                sigma_b[order], taken, lowest_km, farthest_km, gate_sigma, out,
-            )  # fmt: skip
+            n = _meeting(space, m, planes_a, planes_b, out)
             if n <= len(out):
                 break
             out = np.empty((n, 2), np.int64)
-        found.append(out[:n])
-    return np.concatenate([*found, np.zeros((0, 2), np.int64)])
+        pairs.append(out[:n])
+    return np.concatenate([*pairs, np.zeros((0, 2), np.int64)])
+
+
+def _free_at(space: SearchSpace, s: int, m: int) -> Indices:
+    """Return the free tracklets of sensor s that have a direction at instant m."""
+    of_sensor = slice(space.views.first[s], space.views.first[s + 1])
+    free = space.views.seen[of_sensor, m] & ~space.taken[of_sensor]
+    return np.asarray(space.views.first[s] + np.flatnonzero(free))
 
 
 def _axes(baseline: Array, towards: Array) -> Array:
-    """Return two axes across the baseline, the first towards the field, where the angle is 0."""
+    """Return two axes across the baseline, the first (angle 0) towards the field."""
     unit = baseline / np.linalg.norm(baseline)
     first = towards - (towards @ unit) * unit
     if not np.linalg.norm(first) > 1e-9 * np.linalg.norm(towards):
@@ -128,9 +145,9 @@ def _axes(baseline: Array, towards: Array) -> Array:
 class SensorPairs:
     """Pairs of sensors that may see one object, in the order in which they should seed.
 
-    The longer the baseline across the line of sight, the better two views fix a point and the
-    fewer chance partners they have; but no sensor seeds a second time before the others had
-    their turn. Pairs whose fields do not meet are left out.
+    Pairs with a longer baseline across the line of sight come first: they fix a point better and
+    have fewer chance partners. But every sensor takes part once before any takes part again.
+    Pairs whose fields do not meet are skipped.
     """
 
     def __init__(self, views: Views, farthest_km: float) -> None:
@@ -140,7 +157,7 @@ class SensorPairs:
         a, b = a[known], b[known]
         baseline = place[b] - place[a]
         range_a, range_b, miss = _closest_approach(baseline, look[a], look[b])
-        # Nearly parallel axes meet far out, wherever they do.
+        # Nearly parallel axes meet far out, at an uncertain distance.
         apart = np.arccos(np.clip(np.sum(look[a] * look[b], axis=1), -1, 1))
         meet = (range_a > 0) & (range_b > 0)
         meet &= miss <= range_a * np.tan(half[a]) + range_b * np.tan(half[b])
@@ -157,9 +174,9 @@ class SensorPairs:
         self._covered = np.zeros(len(self._a), np.int64)
 
     def next(self, enough: float = np.inf) -> tuple[int, int] | None:
-        """Return the next pair, none where all are done; round after round.
+        """Return the next pair, None after the last.
 
-        A pair is passed over where `enough` of those that had their turn look at what it sees.
+        A pair is skipped where `enough` of the earlier pairs cover the middle of its field.
         """
         wanted = self._waiting & (self._covered < enough)
         ready = wanted & ~self._busy[self._a] & ~self._busy[self._b]
@@ -182,22 +199,22 @@ class SensorPairs:
 
 
 def _middle(views: Views) -> tuple[Array, Array, Array]:
-    """Return where each sensor's tracklets lie, where it stands, and their widest angle."""
+    """Return each sensor's mean direction, position [km], and radius of its tracklets [rad]."""
     n = len(views.half_field)
     look, place, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
     for s in range(n):
-        seen = views.seen[views.first[s] : views.first[s + 1]]
-        if not seen.any():
+        visible = views.seen[views.first[s] : views.first[s + 1]]
+        if not visible.any():
             continue
-        m = int(np.argmax(seen.sum(axis=0)))
+        m = int(np.argmax(visible.sum(axis=0)))
         look[s], place[s] = views.plane[s, m, 2], views.place_km[s, m]
-        at = views.sight[views.first[s] : views.first[s + 1], m, :XX][seen[:, m]]
+        at = views.sight[views.first[s] : views.first[s + 1], m, :XX][visible[:, m]]
         half[s] = np.arctan(np.sqrt((at**2).sum(axis=1).max())) + 1e-3
     return look, place, half
 
 
 def _closest_approach(baseline: Array, u_a: Array, u_b: Array) -> tuple[Array, Array, Array]:
-    """Return the ranges along two lines of the points nearest to each other, and their gap."""
+    """Return the ranges [km] along two lines of their nearest points, and the gap [km]."""
     cosine = np.sum(u_a * u_b, axis=1)
     sine2 = np.maximum(1 - cosine**2, 1e-12)
     along_a, along_b = np.sum(baseline * u_a, axis=1), np.sum(baseline * u_b, axis=1)

@@ -1,4 +1,4 @@
-"""Lines of sight, two at a time: whether they meet, and where an object can be."""
+"""Pairs of lines of sight: whether they meet where an object can be."""
 
 import numpy as np
 
@@ -14,13 +14,13 @@ from epipole.tasks.algorithms.association.sampling.views import (
 )
 from epipole.tasks.algorithms.kernels import kernel
 
-BEYOND = 0.2  # share of the farthest distance
-SLACK_SIGMA = 3.0  # a point may lie this far outside where objects can be
+BEYOND = 0.2  # share of the farthest distance by which a point may lie beyond it
+SLACK_SIGMA = 3.0  # a point may lie this far outside the limits
 
 
 @kernel
 def quantile(dof, sigma):
-    """Return the chi-square with `dof` degrees of freedom that is as rare as `sigma`.
+    """Return the chi-square with `dof` degrees of freedom that is as improbable as `sigma`.
 
     Wilson and Hilferty (1931): its cube root is close to normal.
     """
@@ -30,10 +30,10 @@ def quantile(dof, sigma):
 
 @kernel
 def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
-    """Return the squared miss of two lines of sight over its variance; NaN where impossible.
+    """Return the squared gap of two lines of sight over its variance; NaN where impossible.
 
-    Impossible: parallel, meeting behind a sensor, or not, by 3 sigma of the range, between the
-    lowest and the farthest place of an object. `ui`, `uj` are (3,) to work in.
+    Impossible are parallel lines, and a meeting point behind a sensor or, by 3 sigma, outside
+    the limits [km from the Earth's centre]. `ui`, `uj` (3,) are work space.
     """
     direction(views, i, m, ui)
     direction(views, j, m, uj)
@@ -71,7 +71,7 @@ def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
 
 @kernel
 def _spread(views, i, m):
-    """Return the trace of a direction's covariance in its plane."""
+    """Return the trace of a direction's covariance on its plane."""
     return views.sight[i, m, XX] + views.sight[i, m, YY]
 
 

@@ -1,1 +1,1 @@
-"""What the association works on: tracklets of all sensors at common instants."""
+"""Sampling: tracklets of all sensors at common instants, the input of the association."""

@@ -1,4 +1,4 @@
-"""What the association works on: tracklets, or lone points, of all sensors at common instants."""
+"""Samples: tracklets, or single detections, of all sensors at common instants, and their groups."""
 
 from typing import NamedTuple
 
@@ -13,12 +13,12 @@ FREE = -1
 
 
 class Samples(NamedTuple):
-    """Tracklets of all sensors at a few common instants: t tracklets, k instants, s sensors.
+    """Tracklets of s sensors at k common instants: t tracklets.
 
     sensor : (t,) int
-        Whose tracklet it is, 0 .. s - 1.
+        Sensor of the tracklet, 0 .. s - 1.
     start_s, end_s : (t,) float
-        First and last detection [s]; tracklets of one sensor that overlap are two objects.
+        First and last detection [s]. Tracklets of one sensor that overlap are different objects.
     seen : (t, k) bool
         The tracklet has a direction at the instant.
     u : (t, k, 3) float
@@ -26,13 +26,14 @@ class Samples(NamedTuple):
     cov : (t, k, 2, 2) float
         Their covariances [rad^2] on `tangent_basis(u)`.
     sigma_km : (t, k) float
-        1-sigma errors of the sensor positions an axis.
+        1-sigma errors of the sensor positions, per axis [km].
     time_s : (k,) float
-        The instants.
+        The instants [s].
     sensor_km : (s, k, 3) float
-        Where the sensors are, GCRF; NaN where unknown, which no tracklet seen then may have.
+        Positions of the sensors, GCRF; NaN where unknown. A sensor must have one where a
+        tracklet of it is seen.
     R_sensor_from_icrs : (s, k, 3, 3) float
-        How the sensors are turned; NaN where unknown.
+        Attitudes of the sensors; NaN where unknown.
     half_field : (s, 2) float
         Tangents of half the field's width and height.
     """
@@ -62,12 +63,13 @@ class Groups(NamedTuple):
     group : (t,) int
         Group of each tracklet; -1 where it belongs to none.
     score : (g,) float
-        Log of the odds of each group against its members being unrelated.
+        Log-odds of each group against its members being unrelated.
     ambiguous : (t,) bool
-        Tracklets left out because two groups claim them about equally well, or because one
-        does without being sure enough.
+        Tracklets in no group because two groups explain them about equally well, or because
+        the group that explains them is not sure enough.
     detected : (s,) float
-        Estimated probability that a sensor which looks at an object has it; NaN: not estimated.
+        Estimated probability that a sensor detects an object in its field; NaN if not
+        estimated.
     """
 
     group: Indices

@@ -1,8 +1,8 @@
-"""Views: the samples by sensor, flattened for the compiled search.
+"""Views: the samples sorted by sensor and projected onto planes, for the compiled search.
 
-Each sensor has, at each instant, a plane that touches the sky in the middle of its directions.
-A tracklet is then two coordinates and their covariance, a point is projected by nine
-multiplications, and a grid of cells tells which tracklets are near.
+Each sensor has, at each instant, a plane tangent to the sky in the middle of its directions. On
+it a tracklet is two coordinates and their covariance, a point is projected by nine
+multiplications, and a grid of cells holds the tracklets that are near.
 """
 
 from typing import NamedTuple
@@ -19,8 +19,8 @@ Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 
-# Columns of `Views.sight` and `Views.camera`. One row of each is all that the search reads of a
-# tracklet or a sensor at an instant; few arrays are also quick to compile.
+# Columns of `Views.sight` and `Views.camera`. For a tracklet or a sensor at an instant the search
+# reads a single row. Few arrays also compile fast.
 X, Y, XX, XY, YY, SIGMA_KM, SPOT_SR = range(7)
 R_KM, PLANE, TURN, HALF, CORNER, SCALE, WIDEST, REACH = 0, 3, 12, 21, 23, 25, 27, 28
 N_CAMERA = 29
@@ -35,15 +35,15 @@ class Views(NamedTuple):
         As in `Samples`.
     sight : (t, k, 7) float
         Gnomonic coordinates in the sensor's plane (X, Y), their variances and covariance (XX, XY,
-        YY), the 1-sigma error of the sensor's place [km], and 2 pi times the root of the
-        direction's covariance determinant [sr].
+        YY), the 1-sigma error of the sensor's position [km], and 2 pi times the square root of
+        the determinant of the direction's covariance [sr].
     camera : (s, k, 29) float
-        Where the sensor is [km], the plane's two axes and its normal, the sensor's axes (NaN where
-        unknown), tangents of half its field; the grid's lowest coordinates and cells a unit; the
-        largest variance of a tracklet in the plane; the tangent of the cone about the normal that
-        holds field and tracklets (0: no tracklet there).
+        The sensor's position [km]; the plane's two axes and its normal; the sensor's axes (NaN
+        where unknown); tangents of half its field; the grid's lowest coordinates and its cells
+        per unit; the largest variance of a tracklet on the plane; the tangent of the cone about
+        the normal that holds field and tracklets (0 without tracklets).
     grid : (s, k, 2) int
-        Where the cells of a sensor and instant begin in `cell_start`, and how many a side.
+        First cell of a sensor and instant in `cell_start`, and the number of cells per side.
     cell_start, cell_item : (c,), (v,) int
         Tracklets of a cell are ``cell_item[cell_start[q]:cell_start[q + 1]]``.
     """
@@ -62,7 +62,7 @@ class Views(NamedTuple):
 
     @property
     def place_km(self) -> Array:
-        """Where the sensors are, (s, k, 3)."""
+        """Positions of the sensors [km], (s, k, 3)."""
         return self.camera[..., R_KM:PLANE]
 
     @property
@@ -72,7 +72,7 @@ class Views(NamedTuple):
 
     @property
     def attitude(self) -> Array:
-        """How the sensors are turned, (s, k, 3, 3); NaN where unknown."""
+        """Attitudes of the sensors, sensor from ICRS, (s, k, 3, 3); NaN where unknown."""
         return self.camera[..., TURN:HALF].reshape(*self.camera.shape[:2], 3, 3)
 
     @property
@@ -82,7 +82,7 @@ class Views(NamedTuple):
 
 
 def views_of(samples: Samples) -> tuple[Views, Indices]:
-    """Return the samples sorted by sensor, ready to be searched, and the order that did it."""
+    """Return the samples sorted by sensor, ready for the search, and the sorting order."""
     n_sensors, n_instants = samples.sensor_km.shape[:2]
     order = np.argsort(samples.sensor, kind="stable")
     sensor = np.ascontiguousarray(samples.sensor[order], np.int64)
@@ -121,11 +121,11 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
 
 
 def _planes(first: Indices, seen: Flags, u: Array) -> Array:
-    """Return each sensor's planes; their axes turn with the normal from instant to instant."""
+    """Return each sensor's planes. Their axes follow the normal from instant to instant."""
     plane = np.zeros((len(first) - 1, seen.shape[1], 3, 3))
     for s in range(len(plane)):
-        own = slice(first[s], first[s + 1])
-        total = np.einsum("tk,tki->ki", seen[own].astype(float), u[own])
+        of_sensor = slice(first[s], first[s + 1])
+        total = np.einsum("tk,tki->ki", seen[of_sensor].astype(float), u[of_sensor])
         length = np.linalg.norm(total, axis=1)
         axis = None
         for m in np.flatnonzero(length > 0).tolist():
@@ -137,7 +137,7 @@ def _planes(first: Indices, seen: Flags, u: Array) -> Array:
 
 
 def _reach(camera: Array, grid: Indices) -> Array:
-    """Return tangents of the cones about the planes' normals that hold all that is in view."""
+    """Return tangents of the cones about the planes' normals that hold field and tracklets."""
     side = grid[..., 1:]
     low = camera[..., CORNER:SCALE]
     high = low + side / np.maximum(camera[..., SCALE:WIDEST], 1e-300)
@@ -150,7 +150,7 @@ def _reach(camera: Array, grid: Indices) -> Array:
 
 @kernel
 def _flatten(sensor, seen, u, cov, camera, sight):
-    """Project directions and covariances, which are on `sky.tangent_basis`, onto the planes."""
+    """Project directions, and their covariances on `sky.tangent_basis`, onto the planes."""
     M, t, p = np.empty((2, 2)), np.empty((2, 3)), np.empty((3, 3))
     for i in range(seen.shape[0]):
         for m in range(seen.shape[1]):
@@ -186,7 +186,7 @@ def _flatten(sensor, seen, u, cov, camera, sight):
 
 @kernel
 def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
-    """Sort each sensor's tracklets into square cells, about one a cell."""
+    """Sort each sensor's tracklets into square cells, about one tracklet per cell."""
     begin, filled = 0, 0
     cell = np.empty(seen.shape[0], np.int64)
     for s in range(grid.shape[0]):
@@ -235,7 +235,7 @@ def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
 
 @kernel
 def direction(views, i, m, u):
-    """Write the direction of a tracklet."""
+    """Write the direction u (3,) of tracklet i at instant m."""
     s, x, y = views.sensor[i], views.sight[i, m, X], views.sight[i, m, Y]
     length = np.sqrt(1.0 + x * x + y * y)
     for a in range(PLANE, PLANE + 3):
@@ -245,12 +245,12 @@ def direction(views, i, m, u):
 
 @kernel
 def residual(views, i, m, x, part):
-    """Write a view's residual, predicted minus seen, its partials and weight; return the depth.
+    """Write a view's residual, predicted minus measured, with partials and weight.
 
-    `part` (11,), in the sensor's plane: the residual (2), its partials (2 by 3) [1/km], and the
-    inverse covariance (xx, xy, yy). Depth 0: the point is behind.
+    `part` (11,), on the sensor's plane: the residual (2), its partials (2 by 3) [1/km], and the
+    inverse covariance (xx, xy, yy). Returns the depth of the point [km], 0 behind the sensor.
     """
-    # Element by element: numba counts references to every row that is taken out.
+    # Element by element: numba counts references to every row that is sliced.
     cam, see, s = views.camera, views.sight, views.sensor[i]
     d0, d1, d2 = x[0] - cam[s, m, 0], x[1] - cam[s, m, 1], x[2] - cam[s, m, 2]
     n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
@@ -265,7 +265,7 @@ def residual(views, i, m, x, part):
         part[2 + 3 * a] = (p0 - here * n0) / depth
         part[3 + 3 * a] = (p1 - here * n1) / depth
         part[4 + 3 * a] = (p2 - here * n2) / depth
-    # An error of the sensor's place, across the line of sight.
+    # The error of the sensor's position, across the line of sight.
     extra, x0, x1 = (see[i, m, SIGMA_KM] / depth) ** 2, see[i, m, X], see[i, m, Y]
     c00 = see[i, m, XX] + extra * (1.0 + x0 * x0)
     c01 = see[i, m, XY] + extra * x0 * x1

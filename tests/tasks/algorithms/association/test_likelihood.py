@@ -1,4 +1,4 @@
-"""Association: what belongs together is found, what does not is left alone or called ambiguous."""
+"""Association: tracklets of one object are grouped, others are free or ambiguous."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ def test_two_sensors_suffice_where_strays_are_few():
     assert recall >= 0.8
 
 
-def test_two_sensors_at_one_instant_in_dense_clutter_report_next_to_nothing_wrong():
+def test_two_sensors_at_one_instant_in_dense_clutter_report_few_wrong_groups():
     scene = Scene(2, 2, times=np.array([0.0])).objects(5).strays(200)
     groups = solve(scene.samples())
     wrong = pairs(groups.group) - pairs(np.array(scene.who))
@@ -45,7 +45,7 @@ def test_two_objects_that_two_sensors_cannot_tell_apart_are_ambiguous():
     assert (groups.group == -1).all()
 
 
-def test_strays_alone_make_no_object():
+def test_unrelated_tracklets_make_no_object():
     scene = Scene(4, 4).strays(20)
     groups = solve(scene.samples())
     assert (groups.group >= 0).sum() <= 4
@@ -82,7 +82,7 @@ def _where(scene):
     return np.array(out)
 
 
-def test_an_object_below_the_ground_or_behind_the_earth_is_none():
+def test_points_below_the_ground_or_behind_the_earth_are_no_objects():
     scene = Scene(7, 3)
     inside = np.array([6000.0, 0.0, 0.0])
     for s in range(3):
@@ -90,7 +90,7 @@ def test_an_object_below_the_ground_or_behind_the_earth_is_none():
         scene.add(s, 0, path / np.linalg.norm(path, axis=1, keepdims=True))
     assert (solve(scene.samples()).group == -1).all()
     scene = Scene(7, 3)
-    scene.r[:] = -scene.r  # the Earth now stands between
+    scene.r[:] = -scene.r  # the Earth is now in between
     scene.objects(3)
     assert (solve(scene.samples()).group == -1).all()
 

@@ -1,4 +1,4 @@
-"""Verdicts: what half a minute leaves open is judged over ten; what is sure stays as it is."""
+"""Verdicts: what half a minute leaves open is judged over ten; sure groups are unchanged."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from scenes.associations import associated, wrong_views
 from scenes.tracklet_scenes import Scene
 
 from epipole.tasks.algorithms.association.sampling.samples import Groups
-from epipole.tasks.algorithms.association.verdicts import Seen, Verdicts
+from epipole.tasks.algorithms.association.verdicts import Verdicts, ViewKeys
 
 EVERY_S = 6.0
 
@@ -19,7 +19,7 @@ def ten_minutes(seed: int) -> Scene:
 def entered(score: float, tracklets=(0, 1)) -> Verdicts:
     """Two tracklets of two sensors, five spans of 30 s: one group in the first span."""
     epoch_s = np.repeat(np.arange(0, 150, 10), 2)
-    seen = Seen(
+    seen = ViewKeys(
         epoch_s * 1_000_000_000, epoch_s // 30,
         np.tile([0, 1], 15), np.tile([0, 1], 15),
     )  # fmt: skip
@@ -53,13 +53,13 @@ def test_a_span_of_ten_minutes_by_settings_is_judged_once():
 def test_a_sure_group_is_not_judged_again_where_it_is_sure():
     verdicts = entered(score=9.0)
     rows = verdicts.open_rows(np.arange(30), 30.0)
-    assert set(verdicts.seen.span[rows].tolist()) == {1, 2, 3, 4}
+    assert set(verdicts.views.span[rows].tolist()) == {1, 2, 3, 4}
     unsure = entered(score=3.0).open_rows(np.arange(30), 30.0)
     assert len(unsure) == 30
 
 
-def test_what_does_not_go_on_for_longer_keeps_its_verdict():
-    assert not len(entered(score=3.0).open_rows(np.arange(12), 30.0))  # 50 s of two times 30 s
+def test_tracklets_that_do_not_continue_keep_their_verdict():
+    assert not len(entered(score=3.0).open_rows(np.arange(12), 30.0))  # 50 s < 2 x 30 s
 
 
 def test_longer_evidence_against_a_group_dissolves_it():
@@ -71,11 +71,11 @@ def test_longer_evidence_against_a_group_dissolves_it():
 
 def test_what_longer_evidence_adds_to_a_sure_group_joins_it():
     verdicts = entered(score=9.0, tracklets=(0, 2))
-    # In the first span tracklet 0 is of a sure group and 1 of none; over 150 s they are one.
+    # In the first span tracklet 0 is in a sure group and 1 in none; over 150 s they are one.
     rows = np.arange(30)
     open_rows = verdicts.open_rows(rows, 30.0)
-    first = open_rows[verdicts.seen.span[open_rows] == 0]
-    assert set(verdicts.seen.tracklet[first].tolist()) == {1}
+    first = open_rows[verdicts.views.span[open_rows] == 0]
+    assert set(verdicts.views.tracklet[first].tolist()) == {1}
     verdicts.reconsider(rows, open_rows, np.array([0, 1]), group_of(2, 12.0))
-    assert (verdicts.group[verdicts.seen.span == 0] == verdicts.group[0]).all()
-    assert len(np.unique(verdicts.group[verdicts.seen.span > 0])) == 1
+    assert (verdicts.group[verdicts.views.span == 0] == verdicts.group[0]).all()
+    assert len(np.unique(verdicts.group[verdicts.views.span > 0])) == 1

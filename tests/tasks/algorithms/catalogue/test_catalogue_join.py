@@ -33,7 +33,7 @@ def test_places_and_motions_move_as_astropy_moves_them():
     new_ra, new_dec, new_pm_ra, new_pm_dec = moved(ra, dec, pm_ra, pm_dec, 24.75)
     want = unit_from_radec(stars.ra.rad, stars.dec.rad)
     assert np.max(np.linalg.norm(unit_from_radec(new_ra, new_dec) - want, axis=1)) < MAS
-    # The transverse speed seen changes with perspective by parts in a million a century.
+    # The apparent transverse speed changes with perspective by parts in a million a century.
     np.testing.assert_allclose(new_pm_ra, stars.pm_ra_cosdec.to_value("mas/yr"), atol=0.05)
     np.testing.assert_allclose(new_pm_dec, stars.pm_dec.to_value("mas/yr"), atol=0.05)
 
@@ -48,7 +48,7 @@ def test_v_follows_from_g_and_colour():
     v = johnson_v_of_gaia(np.array([8.0, 8.0, 8.0]), np.array([8.5, np.nan, 8.5]), np.full(3, 7.5))
     np.testing.assert_allclose(v, 8.0 + 0.21414)
     red = johnson_v_of_gaia(np.array([8.0, 8.0]), np.array([12.0, 20.0]), np.array([7.0, 7.0]))
-    assert red[0] == red[1]  # beyond the relation's end its end holds
+    assert red[0] == red[1]  # beyond its range the relation is constant
 
 
 def at(*offsets_arcsec):
@@ -91,5 +91,5 @@ def test_no_stars_join_with_nothing():
 
 
 @pytest.mark.parametrize(("gaia", "hipparcos", "v"), [(7.0, 6.5, 7.0), (11.0, 8.0, 8.0), (6, 8, 6)])
-def test_where_hipparcos_saw_far_more_light_its_brightness_stands(gaia, hipparcos, v):
+def test_where_hipparcos_is_much_brighter_its_magnitude_is_used(gaia, hipparcos, v):
     assert joined_magnitude(np.array([gaia]), np.array([hipparcos])).tolist() == [v]

@@ -26,7 +26,7 @@ def _field(rng, n, half_angle):
 
 
 def _noisy(rng, u, sigma):
-    """Return directions moved by sigma an axis, across the line of sight."""
+    """Return directions with errors of sigma per axis, across the line of sight."""
     moved = u + np.cross(rng.normal(size=u.shape) * np.reshape(sigma, (-1, 1)), u)
     return moved / np.linalg.norm(moved, axis=1, keepdims=True)
 

@@ -1,6 +1,8 @@
 """Boresight and focal length from a few stars, against SciPy."""
 
+import doctest
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,16 +11,19 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, least_squares, lsq_linear
 from scipy.spatial.transform import Rotation
 
+from epipole.tasks.algorithms.geometry import boresight
 from epipole.tasks.algorithms.geometry.boresight import (
     attitude_error,
     best_three,
     boresight_and_focal_length,
+    boresight_covariance,
     boresight_of_three,
     focal_length_from_separations,
 )
 
 FOCAL_PX = 2435.7  # 12 degrees on 512 px
 ARCSEC = np.pi / 648000
+PAGE = Path(__file__).parents[4] / "docs" / "methods" / "boresight.md"
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -85,7 +90,7 @@ def test_newton_recovers_the_focal_length_of_a_perfect_image(seed):
     x, u, R = stars(seed)
     a = np.hypot(*x.T)
     assume(spread(x) > 2000)
-    # There may be a second root near by, or a double one.
+    # There may be a second root nearby, or a double one.
     lengths = [squared_length(f, u, a) for f in np.linspace(0.9, 1.1, 401) * FOCAL_PX]
     assume(np.sum(np.diff(np.sign(lengths)) != 0) == 1)
     assume(abs(lengths[210] - lengths[190]) > 1e-6)
@@ -162,3 +167,27 @@ def test_too_few_stars_are_refused():
 
 def test_one_spot_twice_fixes_no_focal_length():
     assert np.isnan(focal_length_from_separations(np.zeros((2, 2)), np.eye(3)[:2], FOCAL_PX))
+
+
+def test_the_covariance_is_honest_over_many_trials():
+    rng = np.random.default_rng(2)
+    for seed in range(3):
+        x, u, R = stars(seed)
+        cov = boresight_covariance(u, np.hypot(*x.T), FOCAL_PX, 0.1)
+        shaken = x + rng.normal(0, 0.1, (3000, 3, 2))
+        d = np.array([boresight_of_three(u, np.hypot(*p.T), FOCAL_PX) for p in shaken])
+        across = (d - R[2]) @ R[:2].T
+        whitened = across @ np.linalg.inv(np.linalg.cholesky(R[:2] @ cov @ R[:2].T)).T
+        np.testing.assert_allclose(np.cov(whitened.T), np.eye(2), atol=0.1)  # 3000 trials: 0.03
+
+
+def test_the_examples_of_the_docstrings_run():
+    result = doctest.testmod(boresight)
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+def test_the_example_of_the_page_runs():
+    result = doctest.testfile(str(PAGE), module_relative=False)
+    assert result.attempted > 0
+    assert result.failed == 0

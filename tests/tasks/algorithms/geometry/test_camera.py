@@ -57,7 +57,7 @@ def test_projection_undoes_unprojection(x, y):
     np.testing.assert_allclose(np.ravel(got), [x, y], atol=1e-7)
 
 
-def test_what_is_behind_the_camera_is_in_no_place():
+def test_directions_behind_the_camera_have_no_place():
     x, y = project(CAMERA, np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
     assert np.isnan(x).all()
     assert not inside(CAMERA, x, y).any()

@@ -5,7 +5,11 @@ from scenes.two_sensors import GEO, R_1, R_2, attitude, look
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance
-from epipole.tasks.algorithms.geometry.epipolar import epipolar_angle, epipolar_sigma
+from epipole.tasks.algorithms.geometry.epipolar import (
+    UncertainSight,
+    epipolar_angle,
+    epipolar_sigma,
+)
 from epipole.tasks.algorithms.geometry.rotations import skew
 
 
@@ -38,9 +42,9 @@ def test_its_sigma_is_honest_over_many_trials():
     noisy_1 = u_1 + np.einsum("nij,nj->ni", cov[0] / sigma, rng.normal(size=(n, 3)))
     noisy_2 = u_2 + np.einsum("nij,nj->ni", cov[1] / sigma, rng.normal(size=(n, 3)))
     angle = epipolar_angle(r_1, look(0, noisy_1), r_2, look(0, noisy_2))
-    claimed = epipolar_sigma(
-        R_1, u_1, cov[0], R_2, u_2, cov[1], np.array(place), np.array(place), GEO
-    )
+    first = UncertainSight(R_1, u_1, cov[0], np.array(place))
+    second = UncertainSight(R_2, u_2, cov[1], np.array(place))
+    claimed = epipolar_sigma(first, second, GEO)
     assert abs(np.std(angle / claimed) - 1) < 0.05
 
 

@@ -12,7 +12,7 @@ TRUE = SENT._replace(fx_px=3671.0, fy_px=3670.0, cx_px=513.0, cy_px=509.0, k1=-0
 
 
 def stars(camera, seed=0, n_frames=60, n_stars=25, sigma_px=0.15, wrong=0.0):
-    """Return measured places, directions by slightly turned attitudes, frames and star ids."""
+    """Return measured places, directions with small errors of attitude, frames and star ids."""
     rng = np.random.default_rng(seed)
     u, frame, x, y = [], [], [], []
     for k in range(n_frames):
@@ -30,7 +30,7 @@ def stars(camera, seed=0, n_frames=60, n_stars=25, sigma_px=0.15, wrong=0.0):
 
 
 def same_stars_drifting(camera, seed, off_px, n_frames=200, n_stars=40):
-    """Return what `stars` does of stars seen again and again, each off its catalogue place."""
+    """Return the same as `stars`, for the same stars in all frames, with errors of catalogue."""
     rng = np.random.default_rng(seed)
     at = np.column_stack([rng.uniform(-0.2, 0.15, n_stars), rng.uniform(-0.15, 0.15, n_stars)])
     shift = rng.normal(0, off_px / camera.fx_px, (n_stars, 2))
@@ -71,7 +71,7 @@ def test_errors_over_sigmas_are_standard_normal():
             ]
         )
     z = np.array(z)
-    # What only the prior holds is nearer to it than chance would have it.
+    # What only the prior determines is nearer to it than by chance.
     assert np.all(np.sqrt(np.mean(z**2, axis=0)) < 1.35)
     assert np.sqrt(np.mean(z[:, :2] ** 2)) == pytest.approx(1.0, abs=0.25)
 
@@ -83,19 +83,19 @@ def test_a_few_wrong_stars_change_little():
     assert fit.residual_px == pytest.approx(0.15, rel=0.1)
 
 
-def test_the_gain_tells_a_departure_from_none():
+def test_the_gain_shows_a_departure():
     assert calibrate_optics(TRUE, *stars(TRUE)).gain < 40
     assert calibrate_optics(SENT, *stars(TRUE)).gain > 1000
 
 
-def test_what_is_off_with_a_star_in_every_frame_is_no_departure():
+def test_catalogue_errors_are_no_departure():
     z, gains = [], []
     for seed in range(20):
         fit = calibrate_optics(TRUE, *same_stars_drifting(TRUE, seed, off_px=0.1))
         off = np.array([getattr(fit.camera, n) - getattr(TRUE, n) for n in OPTICS[:2]])
         z.append(off / np.sqrt(np.diagonal(fit.cov)[:2]))
         gains.append(fit.gain)
-    assert np.sqrt(np.mean(np.square(z))) < 1.7  # 40 stars tell of their own scatter so well
+    assert np.sqrt(np.mean(np.square(z))) < 1.7  # 40 stars show their scatter so well
     assert max(gains) < 60
 
 
@@ -105,7 +105,7 @@ def test_too_few_stars_give_none():
     assert calibrate_optics(SENT, none, none, np.empty((0, 3)), nothing, nothing) is None
 
 
-def test_stars_all_on_one_spot_do_no_harm():
+def test_stars_all_at_one_place_do_no_harm():
     u = np.tile([0.01, 0.02, 1.0], (100, 1))
     x, y = project(SENT, u)
     fit = calibrate_optics(

@@ -101,7 +101,7 @@ def test_a_wrong_view_is_left_out_and_named():
 def test_light_time_puts_the_point_at_the_mean_emission():
     velocity = np.array([-1.1, -2.85, 0.01])
     r = np.array([[7000.0, 0, 0], [-7000.0, 0, 0], [0, 0, 7000.0]])
-    # What each sensor sees at time 0 left the object when it was that far back on its way.
+    # The light that a sensor gets at time 0 left the object earlier on its path.
     u = np.empty((3, 3))
     for i in range(3):
         x = GEO

@@ -1,4 +1,4 @@
-"""Object identity: numbers hold while a tracklet goes on, and are never shared."""
+"""Object identity: a number holds while a tracklet continues, and is never shared."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ def name(registry, *groups):
     return registry.name_groups([np.array(g) for g in groups])
 
 
-def test_a_number_holds_while_one_tracklet_goes_on():
+def test_a_number_holds_while_one_tracklet_continues():
     registry = ObjectRegistry()
     assert name(registry, [1, 2], [3, 4]) == [0, 1]
     assert name(registry, [4, 5], [2, 6]) == [1, 0]

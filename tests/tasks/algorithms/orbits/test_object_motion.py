@@ -14,7 +14,7 @@ def test_straight_motion_gives_its_velocity_whatever_is_missing():
     np.testing.assert_allclose(got, np.tile(v, (100, 1)), atol=1e-9)
 
 
-def test_objects_do_not_mix_and_a_lone_position_stands_still():
+def test_objects_do_not_mix_and_a_single_position_has_velocity_zero():
     t = np.array([0.0, 1.0, 0.0])
     x = np.array([[0.0, 0, 0], [1.0, 0, 0], [9.0, 9, 9]])
     got = velocities(np.array([0, 2, 3]), t, x, 5.0)

@@ -65,7 +65,7 @@ def test_a_shared_error_does_not_average_out():
     assert 0.3 < ratio < 0.9  # without it: 0.1
 
 
-def test_arcs_are_fitted_each_for_itself_and_bad_ones_are_nan():
+def test_arcs_are_fitted_separately_and_bad_ones_are_nan():
     one = trial(3)
     n = len(one.time_s)
     both = Arcs(np.array([0, n, n + 2]), *(np.concatenate([a, a[:2]]) for a in one[1:]))

@@ -1,4 +1,4 @@
-"""Planets stand where Astropy has them, as stars are seen; bounds as ERFA documents."""
+"""Planets: apparent directions against Astropy, error bounds as documented by ERFA."""
 
 import astropy.units as units
 import numpy as np
@@ -18,7 +18,7 @@ TIMES = NOON + np.arange(5) * 11 * 3_600_000_000_000
 
 
 @pytest.mark.parametrize("planet", range(7))
-def test_planets_stand_where_astropy_has_them(planet):
+def test_directions_agree_with_astropy(planet):
     zero = np.zeros((5, 3))
     u, _ = planet_directions(TIMES, zero, zero)
     with iers.conf.set_temp("auto_download", False), solar_system_ephemeris.set("builtin"):

@@ -93,7 +93,7 @@ def test_a_point_at_rest_on_earth_moves_with_it():
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_a_missing_velocity_stays_missing_and_leaves_the_position_alone(states, frame):
+def test_a_missing_velocity_remains_missing_and_does_not_change_the_position(states, frame):
     time_ns, r_km, v_km_s = states
     orientation = orientation_at(time_ns, *read_earth_orientation())
     r, v = to_gcrf(frame, time_ns, r_km, np.full_like(v_km_s, np.nan), orientation)
@@ -102,9 +102,9 @@ def test_a_missing_velocity_stays_missing_and_leaves_the_position_alone(states, 
     np.testing.assert_array_equal(r, expected)
 
 
-def test_beyond_the_table_the_sigma_grows_and_within_it_there_is_none():
+def test_the_sigma_is_zero_within_the_table_and_grows_after_it():
     table = read_earth_orientation()
-    table = EarthOrientation(*(column[:15000] for column in table))  # as if it ended in 2014
+    table = EarthOrientation(*(column[:15000] for column in table))  # ends in 2014
     end_ns = int((table.mjd[-1] - 40587) * DAY_NS)
     days = np.array([-1000, 0, 100, 1000])
     time_ns = np.append(end_ns + days * DAY_NS, DAY_NS)

@@ -1,11 +1,15 @@
-"""States at frame times, against an orbit model that this project did not write (SGP4)."""
+"""State interpolation, against an independent orbit model (SGP4)."""
 
 import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry import rotations
-from epipole.tasks.algorithms.orbits.state_interpolation import States, gravity, interpolate_states
+from epipole.tasks.algorithms.orbits.state_interpolation import (
+    SensorStates,
+    gravity,
+    interpolate_states,
+)
 
 METRE = 1e-3  # km
 METRE_S = 1e-3  # km/s
@@ -46,7 +50,7 @@ def states_at(at_s, path=low_orbit, velocities=True, noise_km=0.0, q=None, seed=
     r, v = path(at_s)
     n = len(at_s)
     r = r + noise_km * np.random.default_rng(seed).standard_normal((n, 3))
-    return States(
+    return SensorStates(
         nanoseconds(at_s),
         r,
         v if velocities else np.full((n, 3), np.nan),
@@ -75,7 +79,7 @@ def between(at_s, n=400):
 @pytest.mark.parametrize(
     ("step_s", "limit_km"), [(1, 0.01 * METRE), (10, 0.1 * METRE), (60, METRE)]
 )
-def test_a_low_orbit_is_followed_between_states(velocities, step_s, limit_km):
+def test_a_low_orbit_is_interpolated_between_states(velocities, step_s, limit_km):
     at_s = np.arange(0.0, 20 * step_s + 1, step_s)
     distance, speed, _ = errors(states_at(at_s, low_orbit, velocities), between(at_s))
     assert distance.max() < limit_km
@@ -83,7 +87,7 @@ def test_a_low_orbit_is_followed_between_states(velocities, step_s, limit_km):
 
 
 @pytest.mark.parametrize("velocities", [True, False])
-def test_a_point_at_rest_on_earth_is_followed_too(velocities):
+def test_a_point_at_rest_on_earth_is_interpolated_too(velocities):
     at_s = np.arange(0.0, 61.0)
     states = states_at(at_s, fixed_to_earth, velocities)
     distance, _, _ = errors(states, between(at_s), fixed_to_earth)
@@ -91,7 +95,7 @@ def test_a_point_at_rest_on_earth_is_followed_too(velocities):
 
 
 @pytest.mark.parametrize("step_s", [120, 240])
-def test_long_gaps_are_bridged_where_velocities_are_sent(step_s):
+def test_long_gaps_are_interpolated_with_reported_velocities(step_s):
     at_s = np.arange(0.0, 5 * step_s + 1, step_s)
     distance, _, _ = errors(states_at(at_s), between(at_s))
     assert distance.max() < METRE
@@ -111,7 +115,7 @@ def test_independent_errors_of_positions_are_not_amplified(velocities, step_s):
 
 @pytest.mark.parametrize("velocities", [True, False])
 @pytest.mark.parametrize("ahead_s", [-30.0, -1.0, 0.5, 5.0, 30.0])
-def test_a_state_is_carried_on_and_its_sigma_covers_what_that_costs(velocities, ahead_s):
+def test_a_state_is_extrapolated_with_an_honest_sigma(velocities, ahead_s):
     at_s = np.arange(0.0, 61.0)
     wanted_s = np.array([ahead_s if ahead_s < 0 else 60.0 + ahead_s])
     normalised = []
@@ -125,14 +129,14 @@ def test_a_state_is_carried_on_and_its_sigma_covers_what_that_costs(velocities, 
         assert np.mean(normalised) > 0.5
 
 
-def test_a_frame_further_from_any_state_than_allowed_has_no_place():
+def test_a_frame_too_far_from_any_state_has_no_position():
     states = states_at(np.array([0.0, 1.0, 2.0, 100.0, 101.0]))
     at_ns = nanoseconds([-31.0, -29.0, 31.0, 33.0, 50.0, 71.0, 130.0, 132.0])
     found = np.isfinite(interpolate_states(states, at_ns, 30.0).r_gcrf_km[:, 0])
     assert found.tolist() == [False, True, True, False, False, True, True, False]
 
 
-def test_a_gap_too_wide_to_bridge_is_entered_from_its_nearer_end():
+def test_in_a_wide_gap_the_nearest_state_is_extrapolated():
     at_s = np.array([0.0, 1.0, 501.0, 502.0])
     wanted_s = np.array([31.0, 471.0])
     distance, _, sigma = errors(states_at(at_s), wanted_s)
@@ -149,13 +153,13 @@ def test_one_state_is_enough_if_it_has_a_velocity():
     assert np.isnan(places.r_gcrf_km).all()
 
 
-def test_two_states_without_velocity_are_joined():
+def test_two_states_without_velocity_are_interpolated():
     states = states_at(np.array([0.0, 10.0]), velocities=False)
     distance, _, _ = errors(states, np.array([0.0, 2.5, 10.0]))
     assert distance.max() < METRE
 
 
-def test_a_state_that_lacks_its_velocity_takes_it_from_the_others():
+def test_a_missing_velocity_is_fitted_to_the_other_states():
     at_s = np.arange(0.0, 31.0)
     states = states_at(at_s)
     states.v_gcrf_km_s[10:15] = np.nan
@@ -171,7 +175,7 @@ def test_no_states_or_no_frames_give_no_places(n, m):
     assert np.isnan(places.r_gcrf_km).all()
 
 
-def test_inputs_stay_as_they_are():
+def test_inputs_are_unchanged():
     states = states_at(np.arange(5.0), velocities=False)
     before = [column.copy() for column in states]
     interpolate_states(states, nanoseconds(np.array([0.5, 7.0])), GAP_S)
@@ -204,7 +208,7 @@ def attitudes_at(states, at_s):
     return places.q_sensor_from_icrs, places.attitude_sigma
 
 
-def test_attitudes_turn_evenly_between_states():
+def test_attitudes_turn_at_a_constant_rate_between_states():
     at_s, wanted_s = np.arange(0.0, 6.0), np.array([0.0, 0.25, 3.5, 5.0])
     q, sigma = attitudes_at(states_at(at_s, q=turning(at_s)), wanted_s)
     off = rotations.multiply(q, rotations.conjugate(turning(wanted_s)))
@@ -213,14 +217,14 @@ def test_attitudes_turn_evenly_between_states():
     np.testing.assert_array_equal(sigma, 60.0)
 
 
-def test_attitudes_are_never_carried_beyond_states_or_over_long_gaps():
+def test_attitudes_are_missing_beyond_states_and_in_long_gaps():
     at_s = np.array([0.0, 1.0, 31.0, 32.0])
     q, sigma = attitudes_at(states_at(at_s, q=turning(at_s)), [-0.1, 0.5, 2.0, 31.0, 31.5, 32.1])
     known = [False, True, False, True, True, False]
     assert np.isfinite(q[:, 3]).tolist() == np.isfinite(sigma).tolist() == known
 
 
-def test_states_without_attitude_lie_between_those_with_one():
+def test_states_without_attitude_between_others_are_skipped():
     at_s = np.arange(0.0, 5.0)
     q = turning(at_s)
     q[[1, 3]] = np.nan

@@ -1,4 +1,4 @@
-"""Sensor check: a sensor that sees but errs is found; a sound or a blind one is not."""
+"""Agreement: a sensor at fault is found; a sound sensor and a blind sensor are not."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from epipole.tasks.algorithms.sensor_faults.agreement import agreement
 
 
 def turned(scene, sensor, angle_rad):
-    """The scene, all directions of one sensor turned a little."""
+    """Return the scene with all directions of one sensor rotated a little."""
     axis = np.cross(GEO, [0.0, 0.0, 1.0])
     axis /= np.linalg.norm(axis)
     for i, s in enumerate(scene.sensor):
@@ -32,7 +32,7 @@ def test_sound_sensors_are_left_alone():
     assert (found.joined >= 0.9 * found.looked).all()
 
 
-def test_a_sensor_that_sees_nothing_is_no_wrong_one():
+def test_a_sensor_without_detections_is_not_at_fault():
     scene = Scene(3, 4).objects(8, spread_km=100.0, seen_by=[0, 1, 2])
     samples = scene.samples()
     found = agreement(samples, solve(samples))
@@ -41,7 +41,7 @@ def test_a_sensor_that_sees_nothing_is_no_wrong_one():
     assert found.disagreeing().tolist() == []
 
 
-def test_no_group_judges_nobody():
+def test_without_groups_no_sensor_is_judged():
     samples = Scene(4, 3).strays(3).samples()
     found = agreement(samples, solve(samples))
     assert found.disagreeing().tolist() == []

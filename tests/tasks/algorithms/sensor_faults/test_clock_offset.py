@@ -1,4 +1,4 @@
-"""Clock offsets: found from lines of sight, with honest sigmas; nothing is taken for a clock."""
+"""Clock offsets: estimated with honest sigmas, and not mistaken for other errors."""
 
 import numpy as np
 import pytest
@@ -27,11 +27,11 @@ def test_errors_over_sigmas_are_standard_normal(turn_rad):
         offset, sigma, _ = solve(lines_of(seed, true, turn_rad=turn_rad, n_epochs=20), turn_rad)
         scores.append((offset - true) / sigma)
     scores = np.array(scores)
-    # Four offsets a seed share their position biases: some 80 independent draws.
+    # Four offsets per seed share their position biases: some 80 independent draws.
     assert 0.8 < np.sqrt(np.mean(scores**2)) < 1.2
 
 
-def test_the_clocks_that_are_wrong_are_told_from_right_ones():
+def test_wrong_clocks_are_distinguished_from_right_ones():
     scores = []
     for seed in range(20):
         true = np.array([0.0, -0.5, 2.0, 0.0])
@@ -57,7 +57,7 @@ def test_lines_of_another_object_do_not_count():
     assert abs(found.offset_s[2] - 0.1) < 4 * found.sigma_s[2]
 
 
-def test_one_sensor_alone_shows_nothing():
+def test_one_sensor_alone_determines_nothing():
     lines = lines_of(2, np.zeros(4), used=(1,))
     offset, sigma, _ = solve(lines)
     assert np.isnan(offset[[0, 2, 3]]).all()

@@ -1,4 +1,4 @@
-"""Clock search: the offset at which a sensor sees the others' objects; none where chance might."""
+"""Clock search: the offset at which a sensor sees the others' objects; None where it is chance."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ POSITION_KM = 0.7
 
 
 def meetings(seed, offset, *, n=9, strays=0, epochs=5, missing=()):
-    """Every view of one sensor, late by an offset, beside every object of its epoch."""
+    """Return all views of a sensor, late by an offset, paired with all objects of their epochs."""
     rng = np.random.default_rng(seed)
     t = np.arange(epochs) * 12.0
     bias, shared = rng.normal(size=(2, 3)) * PLACE_KM
@@ -52,7 +52,7 @@ def test_an_offset_of_seconds_is_found_and_each_line_meets_its_own_object(offset
     for seed in range(5):
         given = meetings(seed, offset)
         match = search_offset(given)
-        assert abs(match.offset_s - offset) < 0.1  # 0.8 km: as the positions are
+        assert abs(match.offset_s - offset) < 0.1  # 0.8 km: the error of the positions
         assert (given.tracklet[match.row] == given.item[match.row]).all()
         assert len(match.row) > 0.9 * 9 * 5
 
@@ -64,7 +64,7 @@ def test_strays_and_objects_that_were_missed_do_not_hide_it():
     assert set(given.item[match.row]) == {0, 1, 3, 4, 6, 7, 8}
 
 
-def test_what_agrees_by_chance_is_no_offset():
+def test_agreement_by_chance_is_no_offset():
     found = [search_offset(meetings(s, 0.0, strays=12, missing=range(9))) for s in range(30)]
     assert found == [None] * 30
 
@@ -73,7 +73,7 @@ def test_two_objects_are_too_few():
     assert search_offset(meetings(2, 1.0, n=2)) is None
 
 
-def test_an_offset_beyond_what_is_looked_for_is_not_made_up():
+def test_an_offset_beyond_the_search_is_not_found():
     assert search_offset(meetings(3, 8.0)) is None
 
 

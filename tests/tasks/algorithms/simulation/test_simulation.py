@@ -27,13 +27,14 @@ from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import validate_scene
 from epipole.schemas.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
 from epipole.tasks.algorithms.catalogue.catalogue_join import moved
+from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
 from epipole.tasks.algorithms.simulation.ephemeris import (
     barycentric_julian_date,
     earth_at,
     julian_years_since,
 )
-from epipole.tasks.algorithms.simulation.optics import Optics, image_place
-from epipole.tasks.algorithms.simulation.orbits import GM_KM3_S2, elements_from_state, state_at
+from epipole.tasks.algorithms.simulation.optics import TrueOptics, image_place
+from epipole.tasks.algorithms.simulation.orbits import elements_from_state, state_at
 from epipole.tasks.algorithms.simulation.sightlines import boost, received_from
 from epipole.tasks.algorithms.simulation.star_field import star_directions, star_field
 from epipole.tasks.simulate.simulate_scene import expose_blocks, simulate_scene
@@ -58,7 +59,7 @@ def time_ns(t_s):
 
 
 class Orbiting(VectorFunction):
-    """Skyfield's view of a body on an orbit about the Earth, barycentric."""
+    """A body on an orbit about the Earth, for skyfield: barycentric position and velocity."""
 
     def __init__(self, elements, target):
         self.center, self.target, self.elements = 0, target, elements
@@ -339,6 +340,6 @@ def spots_of(log):
 
 def optics_of(log):
     """Return the one calibration of a log."""
-    cameras = read_log(log).cameras.select(Optics._fields).to_pylist()
+    cameras = read_log(log).cameras.select(TrueOptics._fields).to_pylist()
     assert all(camera == cameras[0] for camera in cameras)
-    return Optics(**cameras[0])
+    return TrueOptics(**cameras[0])

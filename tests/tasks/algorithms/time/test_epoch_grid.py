@@ -1,4 +1,4 @@
-"""Epochs: a grid from midnight, and the frame that serves."""
+"""Epochs: a grid from midnight, and the frame nearest to each."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def test_the_slowest_sensor_sets_the_interval_and_jitter_does_not_move_it():
     assert epoch_interval_ns([fast]) == SECOND // 5
 
 
-def test_a_lone_frame_still_has_an_interval():
+def test_a_single_frame_still_has_an_interval():
     assert frame_interval_ns(np.array([NIGHT])) == 0
     assert epoch_interval_ns([np.array([NIGHT])]) > 0
     assert epoch_interval_ns([]) > 0

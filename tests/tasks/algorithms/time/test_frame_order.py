@@ -1,4 +1,4 @@
-"""The order of frames and which are there twice."""
+"""The order of frames, and which are duplicates."""
 
 import numpy as np
 from hypothesis import given

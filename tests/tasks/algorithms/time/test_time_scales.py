@@ -62,7 +62,7 @@ def test_a_date_far_ahead_brings_no_warning():
         earth_barycentric(far_ns)
 
 
-def test_before_the_first_leap_second_its_value_holds():
+def test_before_the_first_leap_second_the_first_value_is_used():
     assert tai_minus_utc_s(np.array([2440587.5, 2441317.5, 2441499.5])).tolist() == [10, 10, 11]
 
 

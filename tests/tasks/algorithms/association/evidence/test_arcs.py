@@ -9,7 +9,7 @@ from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 
 
 def falling(scene, k, start, v):
-    """Adds object k as its orbit has it, to all sensors."""
+    """Add object k to all sensors, on its orbit."""
     x = np.array([propagate(np.concatenate([start, v]), t)[:3] for t in scene.times])
     for s in range(len(scene.r)):
         scene.add(s, k, (x - scene.r[s]) / np.linalg.norm(x - scene.r[s], axis=1)[:, None])
@@ -28,7 +28,7 @@ def test_the_factored_solution_and_determinant_are_those_of_linalg():
 
 
 def test_chance_pairs_among_a_thousand_lone_tracklets_are_no_objects():
-    # Three hundred in each of three sensors meet by the dozen, at all instants.
+    # Of three hundred in each of three sensors, dozens of pairs meet at all instants.
     for seed in range(3):
         scene = Scene(40 + seed, 3).strays(300)
         assert (solve(scene.samples()).group >= 0).sum() <= 2
@@ -51,15 +51,15 @@ def test_two_sensors_find_objects_among_a_hundred_lone_tracklets_over_ten_minute
     assert true >= 28
 
 
-def test_what_leaves_the_earth_is_not_followed():
-    speed = 2.0 * np.linalg.norm(V_GEO)  # 1.4 times what escapes
+def test_hyperbolic_orbits_are_no_objects():
+    speed = 2.0 * np.linalg.norm(V_GEO)  # 1.4 times the escape velocity
     scene = falling(Scene(80, 4), 0, GEO, speed * GEO / np.linalg.norm(GEO))
     assert (solve(scene.samples()).group == -1).all()
     scene = falling(Scene(80, 4), 0, GEO, V_GEO)
     assert (solve(scene.samples()).group == 0).all()
 
 
-def test_a_low_orbit_is_followed_over_its_curve():
+def test_a_low_orbit_is_found_over_its_curve():
     state = np.array([7100.0, 0.0, 0.0, 0.0, 5.3, 5.3])
     scene = Scene(90, 3, times=np.linspace(0.0, 60.0, 6))
     for s in range(3):

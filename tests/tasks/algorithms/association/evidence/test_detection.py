@@ -1,4 +1,4 @@
-"""Detection: how likely sensors are to have what they look at is told by the groups themselves."""
+"""Detection: the probability of detection is estimated from the groups themselves."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from scenes.tracklet_scenes import Scene, judge, solve
 
 
 def partly_seen(seed, n_sensors, detected, n_objects=30):
-    """Objects, each seen by each sensor with its probability; a few strays."""
+    """Return a scene of objects that each sensor detects with its probability, and a few strays."""
     scene = Scene(seed, n_sensors)
     rng = np.random.default_rng([seed, 1])
     for k in range(n_objects):
@@ -21,11 +21,11 @@ def partly_seen(seed, n_sensors, detected, n_objects=30):
 @pytest.mark.parametrize("detected", [0.6, 0.75, 0.9, 0.98])
 def test_the_probability_of_detection_is_estimated(detected):
     found = [solve(partly_seen(seed, 6, detected).samples()).detected for seed in range(3)]
-    # 3 runs of 6 sensors and 30 objects: 540 looks, and a prior of ten a sensor.
+    # 3 runs of 6 sensors and 30 objects: 540 looks, and a prior of ten per sensor.
     assert np.mean(found) == pytest.approx(detected, abs=0.05)
 
 
-def test_a_sensor_that_misses_more_than_the_others_is_told():
+def test_a_sensor_that_misses_more_than_the_others_is_recognised():
     detected = np.array([0.95, 0.95, 0.95, 0.95, 0.95, 0.4])
     found = np.mean(
         [solve(partly_seen(s, 6, detected).samples()).detected for s in range(3)], axis=0
@@ -42,7 +42,7 @@ def test_objects_are_found_whatever_the_probability_of_detection(detected):
     assert recall > 0.97
 
 
-def test_nothing_found_leaves_the_prior():
+def test_without_groups_the_prior_is_unchanged():
     groups = solve(Scene(1, 4).strays(3).samples())
     assert groups.detected == pytest.approx(0.9)
 
