@@ -70,7 +70,7 @@ class Report:
     att_wrong: int | None = _measure(
         "attitude",
         "wrong (error above 6', roll 30')",
-        definition="Attitudes from stars with a boresight error above 6' or a roll error above 30'.",
+        definition="Attitudes from stars with an error above 6' (boresight) or 30' (roll).",
     )
 
     epochs: int | None = _measure(
@@ -116,16 +116,22 @@ class Report:
         "sensor in which at least two sensors see the object.",
     )
     pos_err_km_median: float | None = _measure(
-        "positions", "error, median", "km", definition="Median distance to the true position."
+        "positions",
+        "error, median",
+        "km",
+        definition="Median distance of the positions to the true ones.",
     )
     pos_err_km_p95: float | None = _measure(
         "positions",
         "error, 95 %",
         "km",
-        definition="95 % of the positions are nearer to the true position.",
+        definition="95 % of the positions are nearer to the true ones.",
     )
     pos_err_km_max: float | None = _measure(
-        "positions", "error, largest", "km", definition="Largest distance to the true position."
+        "positions",
+        "error, largest",
+        "km",
+        definition="Largest distance of a position to the true one.",
     )
     axis_rms_km: tuple[float, float, float] | None = _measure(
         "positions", "rms x, y, z", "km", definition="Root mean square error along each axis."
@@ -194,7 +200,10 @@ class Report:
         "states", "of ghosts", definition="States of ids without a position of a true object."
     )
     states_err_km_median: float | None = _measure(
-        "states", "error, median", "km", definition="Median distance to the true position."
+        "states",
+        "error, median",
+        "km",
+        definition="Median distance of the states to the true positions.",
     )
     states_nees_mean: float | None = _measure(
         "states",

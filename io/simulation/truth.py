@@ -131,6 +131,10 @@ def _read(path: Path, schema: pa.Schema) -> pa.Table:
 
 
 def elements_of(truth: Truth) -> np.ndarray:
-    """Return the (n, 6) orbital elements of the true objects at `t0_ns` [km and rad]."""
-    elements = [target["elements"] for target in truth.scenario["targets"]]
+    """Return the (n, 6) orbital elements of the true objects at `t0_ns` [km and rad].
+
+    NaN where the scenario has no elements of an object.
+    """
+    missing = [np.nan] * 6
+    elements = [target.get("elements", missing) for target in truth.scenario["targets"]]
     return np.array(elements, float).reshape(-1, 6)
