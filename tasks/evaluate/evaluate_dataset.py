@@ -5,6 +5,7 @@ A plain function, not a Prefect task, because an evaluation is not scheduled.
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import polars as pl
 import pyarrow as pa
@@ -71,6 +72,6 @@ def _measure_objects(
     return measures | measure_tracks(detections, points)
 
 
-def _finite(value: object) -> object:
+def _finite(value: Any) -> Any:
     """Return the value, or None where it is not finite: JSON has no infinity."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
