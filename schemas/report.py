@@ -150,7 +150,7 @@ class Report:
     )
     nees_mean: float | None = _measure(
         "positions",
-        "NEES / 3, mean of objects (expected: 1)",
+        "NEES / 3, mean (expected: 1)",
         "number",
         definition="Mean over the true objects of the mean NEES / 3 of their positions; 1 where "
         "the covariances are right.",

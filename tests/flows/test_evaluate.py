@@ -21,7 +21,6 @@ from epipole.schemas.errors import DatasetError
 
 SHARED = Path(__file__).parents[3] / "shared"
 LOGS = [
-    "logs/lost_in_space_20deg.mcap",  # no objects
     "logs/six_sensors_8deg_no_prior.mcap",  # orbits by elements
     "logs_real_orbits/geo_cluster_every_30s.mcap",  # sampled orbits, and the next one
     "logs_real_orbits/low_8deg_5hz.mcap",
