@@ -13,7 +13,7 @@ from epipole.schemas.errors import DatasetError
 from epipole.schemas.report import Report
 from epipole.tasks.evaluate.evaluate_dataset import evaluate_dataset
 
-TABLES = ("frames", "stars", "detections", "epochs", "associations", "positions")
+TABLES = ("frames", "stars", "detections", "epochs", "associations", "positions", "states")
 
 
 def evaluate(dataset: str | os.PathLike[str], truth: str | os.PathLike[str]) -> Report:

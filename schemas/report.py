@@ -5,65 +5,258 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 
-def _measure(group: str, label: str, style: str = "count") -> Any:
-    return field(default=None, metadata={"group": group, "label": label, "style": style})
+def _measure(group: str, label: str, style: str = "count", *, definition: str) -> Any:
+    metadata = {"group": group, "label": label, "style": style, "definition": definition}
+    return field(default=None, metadata=metadata)
 
 
 @dataclass(frozen=True)
 class Report:
-    """The measures of an evaluation. None: there was nothing to measure.
+    """The measures of an evaluation, each with its definition in the metadata of its field.
 
-    Shares are 0 to 1: of the rows in the dataset (precision, purity) or of the rows in the truth
-    (recall, completeness). Attitude errors are in arcseconds about the sensor axes. Position
-    errors are in kilometres, against the object's true position at the position's `time`.
+    A measure is None where there was nothing to measure, or where it is infinite because a
+    covariance is invalid. Shares are 0 to 1. Attitude errors are in arcseconds about the sensor
+    axes. Position errors are in kilometres, GCRF, against the true position at the time of the
+    estimate.
+
+    A view is one sensor's part in a claim. A claim is an object that the dataset reports at an
+    epoch; its true object is the one that most of its views show, at least two. A claim without a
+    true object is a ghost. A possible claim is a true object at an epoch in which at least two
+    frames show it. NEES is the squared error, normalised by the covariance.
     """
 
-    frames: int | None = _measure("frames", "in the dataset")
-    frames_duplicated: int | None = _measure("frames", "more than once")
-    frames_solved: float | None = _measure("frames", "attitude from stars", "share")
-
-    stars_claimed: int | None = _measure("stars", "claimed")
-    star_precision: float | None = _measure("stars", "precision", "share")
-    star_recall: float | None = _measure("stars", "recall", "share")
-
-    att_cross_arcsec_median: float | None = _measure("attitude", "boresight, median", "arcsec")
-    att_cross_arcsec_p99: float | None = _measure("attitude", "boresight, 99 %", "arcsec")
-    att_roll_arcsec_median: float | None = _measure("attitude", "roll, median", "arcsec")
-    att_wrong: int | None = _measure("attitude", "wrong (error above 6', roll 30')")
-
-    epochs: int | None = _measure("associations", "epochs")
-    groups: int | None = _measure("associations", "objects reported at epochs")
-    pair_precision: float | None = _measure("associations", "pair precision", "share")
-    pair_recall: float | None = _measure("associations", "pair recall", "share")
-    object_recall: float | None = _measure("associations", "object recall", "share")
-    ghosts: int | None = _measure("associations", "ghosts")
-
-    positions: int | None = _measure("positions", "of true objects")
-    positions_of_ghosts: int | None = _measure("positions", "of ghosts")
-    positions_per_truth: float | None = _measure(
-        "positions", "per interval with two sensors", "share"
+    frames: int | None = _measure(
+        "frames", "in the dataset", definition="Rows of the table frames."
     )
-    pos_err_km_median: float | None = _measure("positions", "error, median", "km")
-    pos_err_km_p95: float | None = _measure("positions", "error, 95 %", "km")
-    pos_err_km_max: float | None = _measure("positions", "error, largest", "km")
-    axis_rms_km: tuple[float, float, float] | None = _measure("positions", "rms x, y, z", "km")
-    nees_median: float | None = _measure("positions", "NEES, median (expected: 2.37)", "number")
-    nees_in_99: float | None = _measure("positions", "in the 99 % ellipsoid", "share")
-    ids_per_target: float | None = _measure("positions", "ids per object", "number")
-    longest_id_share: float | None = _measure("positions", "share of the main id", "share")
+    frames_duplicated: int | None = _measure(
+        "frames", "more than once", definition="Rows of frames that repeat an earlier row's frame."
+    )
+    frames_solved: float | None = _measure(
+        "frames",
+        "attitude from stars",
+        "share",
+        definition="Frames with an attitude from stars, as a share of the true frames.",
+    )
 
-    tracks: int | None = _measure("tracks", "tracks")
-    track_purity: float | None = _measure("tracks", "purity", "share")
-    track_completeness: float | None = _measure("tracks", "completeness", "share")
-    tracks_per_target: float | None = _measure("tracks", "tracks per object and sensor", "number")
+    stars_claimed: int | None = _measure("stars", "claimed", definition="Rows of the table stars.")
+    star_precision: float | None = _measure(
+        "stars", "precision", "share", definition="Identified stars whose number is the true one."
+    )
+    star_recall: float | None = _measure(
+        "stars",
+        "recall",
+        "share",
+        definition="Rightly identified stars, as a share of the centroids that are stars.",
+    )
+
+    att_cross_arcsec_median: float | None = _measure(
+        "attitude",
+        "boresight, median",
+        "arcsec",
+        definition="Median error of the boresight of attitudes from stars.",
+    )
+    att_cross_arcsec_p99: float | None = _measure(
+        "attitude",
+        "boresight, 99 %",
+        "arcsec",
+        definition="99 % of the attitudes from stars have a smaller error of the boresight.",
+    )
+    att_roll_arcsec_median: float | None = _measure(
+        "attitude",
+        "roll, median",
+        "arcsec",
+        definition="Median size of the error about the boresight of attitudes from stars.",
+    )
+    att_wrong: int | None = _measure(
+        "attitude",
+        "wrong (error above 6', roll 30')",
+        definition="Attitudes from stars with an error above 6' (boresight) or 30' (roll).",
+    )
+
+    epochs: int | None = _measure(
+        "associations", "epochs", definition="Different epochs of the table epochs."
+    )
+    groups: int | None = _measure(
+        "associations", "objects reported at epochs", definition="Claims."
+    )
+    pair_precision: float | None = _measure(
+        "associations",
+        "pair precision",
+        "share",
+        definition="Pairs of views in one claim that show one true object; views without a "
+        "centroid are skipped.",
+    )
+    pair_recall: float | None = _measure(
+        "associations",
+        "pair recall",
+        "share",
+        definition="Right pairs, as a share of all pairs of centroids of one object at an epoch.",
+    )
+    object_recall: float | None = _measure(
+        "associations",
+        "object recall",
+        "share",
+        definition="Possible claims that the dataset has, as a share of all possible ones.",
+    )
+    ghosts: int | None = _measure(
+        "associations", "ghosts", definition="Claims without a true object."
+    )
+
+    positions: int | None = _measure(
+        "positions", "of true objects", definition="Positions of claims that have a true object."
+    )
+    positions_of_ghosts: int | None = _measure(
+        "positions", "of ghosts", definition="Positions of claims without a true object."
+    )
+    positions_per_truth: float | None = _measure(
+        "positions",
+        "per interval with two sensors",
+        "share",
+        definition="Positions of true objects, per object and frame interval of the slowest "
+        "sensor in which at least two sensors see the object.",
+    )
+    pos_err_km_median: float | None = _measure(
+        "positions",
+        "error, median",
+        "km",
+        definition="Median distance of the positions to the true ones.",
+    )
+    pos_err_km_p95: float | None = _measure(
+        "positions",
+        "error, 95 %",
+        "km",
+        definition="95 % of the positions are nearer to the true ones.",
+    )
+    pos_err_km_max: float | None = _measure(
+        "positions",
+        "error, largest",
+        "km",
+        definition="Largest distance of a position to the true one.",
+    )
+    axis_rms_km: tuple[float, float, float] | None = _measure(
+        "positions", "rms x, y, z", "km", definition="Root mean square error along each axis."
+    )
+    nees_median: float | None = _measure(
+        "positions",
+        "NEES, median (expected: 2.37)",
+        "number",
+        definition="Median NEES of the positions; 2.37 where the covariances are right.",
+    )
+    nees_in_99: float | None = _measure(
+        "positions",
+        "in the 99 % ellipsoid",
+        "share",
+        definition="Positions with a NEES below 11.345; 99 % where the covariances are right.",
+    )
+    nees_mean: float | None = _measure(
+        "positions",
+        "NEES / 3, mean (expected: 1)",
+        "number",
+        definition="Mean over the true objects of the mean NEES / 3 of their positions; 1 where "
+        "the covariances are right.",
+    )
+    nees_mean_sigma: float | None = _measure(
+        "positions",
+        "its standard error",
+        "number",
+        definition="Standard error of nees_mean: standard deviation over the objects, divided by "
+        "the root of their number.",
+    )
+
+    objects_seen_by_two: int | None = _measure(
+        "objects",
+        "possible at ten epochs or more",
+        definition="True objects with ten possible claims or more.",
+    )
+    objects_lost: int | None = _measure(
+        "objects",
+        "of these lost",
+        definition="Those of which the dataset has less than half of the possible claims.",
+    )
+    ids_per_target: float | None = _measure(
+        "objects", "ids per object", "number", definition="Mean number of ids of a true object."
+    )
+    longest_id_share: float | None = _measure(
+        "objects",
+        "share of the main id",
+        "share",
+        definition="Share of a true object's positions that have its most frequent id; mean over "
+        "the true objects.",
+    )
+    id_swaps: int | None = _measure(
+        "objects",
+        "ids that pass to another object",
+        definition="How often two successive positions of one id are of different true objects; "
+        "ghosts are skipped.",
+    )
+
+    states: int | None = _measure(
+        "states",
+        "of true objects",
+        definition="States of ids with a position of a true object; the state is compared with "
+        "the true object that most of these positions are of.",
+    )
+    states_of_nothing: int | None = _measure(
+        "states", "of ghosts", definition="States of ids without a position of a true object."
+    )
+    states_err_km_median: float | None = _measure(
+        "states",
+        "error, median",
+        "km",
+        definition="Median distance of the states to the true positions.",
+    )
+    states_nees_mean: float | None = _measure(
+        "states",
+        "NEES / 6, mean (expected: 1)",
+        "number",
+        definition="Mean NEES / 6 of the states (position and velocity); 1 where the covariances "
+        "are right.",
+    )
+    states_nees_median: float | None = _measure(
+        "states",
+        "NEES, median (expected: 5.35)",
+        "number",
+        definition="Median NEES of the states; 5.35 where the covariances are right.",
+    )
+    states_nees_max: float | None = _measure(
+        "states", "NEES, largest", "number", definition="Largest NEES of a state."
+    )
+    states_in_99: float | None = _measure(
+        "states",
+        "in the 99 % ellipsoid",
+        "share",
+        definition="States with a NEES below 16.81; 99 % where the covariances are right.",
+    )
+
+    tracks: int | None = _measure(
+        "tracks", "tracks", definition="Different tracks of detections that are called objects."
+    )
+    track_purity: float | None = _measure(
+        "tracks",
+        "purity",
+        "share",
+        definition="Detections with a track that show the object most of their track shows.",
+    )
+    track_completeness: float | None = _measure(
+        "tracks",
+        "completeness",
+        "share",
+        definition="The same detections, as a share of all centroids that are objects.",
+    )
+    tracks_per_target: float | None = _measure(
+        "tracks",
+        "tracks per object and sensor",
+        "number",
+        definition="Mean number of tracks of an object in a sensor.",
+    )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the measures by name, as JSON takes them."""
+        """Return the measures by name, ready for JSON."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in values.items()}
 
     def rows(self) -> list[tuple[str, str, str]]:
-        """Return group, measure and value of all that there is, as people read them."""
+        """Return group, label and formatted value of each measure that is not None."""
         return [
             (f.metadata["group"], f.metadata["label"], _text(value, f.metadata["style"]))
             for f in fields(self)

@@ -208,6 +208,17 @@ TRUE_POINTS = schema(
     ],
 )
 
+TRUE_ORBITS = schema(
+    "true_orbits",
+    "Simulation truth, one row per object and sampling time; cubic Hermite in between.",
+    [
+        column("object", I64, doc="Object index, as in `source` of `true_points`."),
+        column("t_ns", I64, unit="ns", doc="UTC since 1970."),
+        *[column(a, F64, unit="km", frame="GCRF", doc="Object position.") for a in "xyz"],
+        *[column(f"v{a}", F64, unit="km/s", frame="GCRF", doc="Object velocity.") for a in "xyz"],
+    ],
+)
+
 TRACKLET_OUTCOMES = schema(
     "tracklet_outcomes",
     "One row a tracklet that a span compared with other sensors: what became of it there.",

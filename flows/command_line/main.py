@@ -263,8 +263,8 @@ def evaluate(
 ) -> None:
     """Compare a dataset with the truth of the simulated log it was made from.
 
-    Shows the precision and recall of stars, pairs and objects, the errors, and whether the
-    sigmas agree with the errors.
+    Shows the precision and recall of stars, pairs and objects, the errors of attitudes, positions
+    and states, whether covariances agree with these errors, and objects that were lost.
     """
     from epipole.flows.evaluate import evaluate, show
 

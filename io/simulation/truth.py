@@ -8,24 +8,30 @@ from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
+import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from epipole.schemas.bridge import conform
+from epipole.schemas.bridge import conform, to_polars
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_POINTS
+from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_ORBITS, TRUE_POINTS
 
 SUFFIX = ".truth"
+OBJECT = 1  # value of `kind` in TRUE_POINTS
 _FILES = {"frames": TRUE_FRAMES, "points": TRUE_POINTS}
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The truth of a simulated log: its frames, its centroids, and the scene."""
+    """The truth of a simulated log: its frames, its centroids, the scene, and sampled orbits.
 
-    frames: pa.Table
-    points: pa.Table
+    Without `orbits`, objects move by the `elements` of the targets of `scenario`.
+    """
+
+    frames: pa.Table  # TRUE_FRAMES
+    points: pa.Table  # TRUE_POINTS
     scenario: dict[str, Any]
+    orbits: pa.Table | None = None  # TRUE_ORBITS
 
 
 class TruthWriter:
@@ -63,19 +69,28 @@ class TruthWriter:
 def read_truth(path: str | os.PathLike[str]) -> Truth:
     """Return the truth in a folder. The log beside the folder may be named instead.
 
+    `orbits.parquet` is optional: objects that do not move by two-body orbits have it.
+
     Raises
     ------
     DatasetError
-        Where the folder or a file of it is missing or cannot be read.
+        Where the folder or a file of it is missing or cannot be read, or an object of the points
+        has no orbit.
     """
     folder = Path(path)
     if not folder.is_dir() and Path(os.fspath(path) + SUFFIX).is_dir():
         folder = Path(os.fspath(path) + SUFFIX)
     if not folder.is_dir():
         raise DatasetError(f"{path}: no truth folder; `epipole simulate` writes it as LOG{SUFFIX}")
-    tables = {}
-    for name, schema in _FILES.items():
-        tables[name] = _read(folder / f"{name}.parquet", schema)
+    tables = {name: _read(folder / f"{name}.parquet", schema) for name, schema in _FILES.items()}
+    where = folder / "orbits.parquet"
+    orbits = _read(where, TRUE_ORBITS) if where.exists() else None
+    truth = Truth(tables["frames"], tables["points"], _read_scenario(folder), orbits)
+    _require_orbits(folder, truth)
+    return truth
+
+
+def _read_scenario(folder: Path) -> dict[str, Any]:
     where = folder / "scenario.json"
     try:
         scenario = json.loads(where.read_text(encoding="utf-8"))
@@ -84,7 +99,27 @@ def read_truth(path: str | os.PathLike[str]) -> Truth:
     missing = [key for key in ("t0_ns", "sensors", "targets") if key not in scenario]
     if missing:
         raise DatasetError(f"{where}: {', '.join(missing)} missing")
-    return Truth(tables["frames"], tables["points"], scenario)
+    return scenario
+
+
+def _require_orbits(folder: Path, truth: Truth) -> None:
+    """Raise where an object of the points has neither a sampled orbit nor elements."""
+    if truth.orbits is None:
+        targets = truth.scenario["targets"]
+        known = [i for i, target in enumerate(targets) if "elements" in target]
+        where = folder / "scenario.json"
+    else:
+        rows = to_polars(truth.orbits).group_by("object")
+        times = rows.agg(n=pl.len(), n_times=pl.col("t_ns").n_unique())
+        is_path = (pl.col("n") >= 2) & (pl.col("n") == pl.col("n_times"))
+        known = times.filter(is_path)["object"].to_list()
+        where = folder / "orbits.parquet"
+    shown = to_polars(truth.points).filter(pl.col("kind") == OBJECT)["source"].unique()
+    if missing := sorted(set(shown.to_list()) - set(known)):
+        raise DatasetError(
+            f"{where}: no orbit of object {missing[0]}; expected its elements in scenario.json, "
+            "or two rows or more at different times in orbits.parquet"
+        )
 
 
 def _read(path: Path, schema: pa.Schema) -> pa.Table:
@@ -96,6 +131,10 @@ def _read(path: Path, schema: pa.Schema) -> pa.Table:
 
 
 def elements_of(truth: Truth) -> np.ndarray:
-    """Return the (n, 6) orbital elements of the true objects at `t0_ns` [km and rad]."""
-    elements = [target["elements"] for target in truth.scenario["targets"]]
+    """Return the (n, 6) orbital elements of the true objects at `t0_ns` [km and rad].
+
+    NaN where the scenario has no elements of an object.
+    """
+    missing = [np.nan] * 6
+    elements = [target.get("elements", missing) for target in truth.scenario["targets"]]
     return np.array(elements, float).reshape(-1, 6)

@@ -1,9 +1,11 @@
-"""Evaluation: errors of attitudes and positions against the truth, and of the grouping."""
+"""How far results are from the truth: attitudes, positions, states, and identities."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 Array = npt.NDArray[np.float64]
@@ -32,28 +34,44 @@ def attitude_errors(q_found: Array, q_true: Array) -> tuple[Array, Array]:
 
 
 def squared_normalised_errors(error: Array, covariance: Array) -> Array:
-    """Return e' C^-1 e of errors (n, 3) and covariances (n, 3, 3).
+    """Return e' C^-1 e of errors, the normalised estimation error squared (NEES).
 
-    Chi-square distributed with 3 degrees of freedom if the covariances are right. Infinite where
-    a covariance is not positive definite.
+    Its distribution is chi-square of k where the covariances agree with the errors.
+
+    Parameters
+    ----------
+    error : (n, k) float
+        Estimate minus truth.
+    covariance : (n, k, k) float
+        Symmetric, in the squared units of the errors.
+
+    Returns
+    -------
+    nees : (n,) float
+        Infinite where the covariance is not finite or not positive definite.
+
+    References
+    ----------
+    Bar-Shalom, Li and Kirubarajan (2001), Estimation with Applications to Tracking and
+    Navigation, section 5.4.2.
     """
     finite = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
-    safe = np.where(finite[:, None, None], covariance, np.eye(3))
+    safe = np.where(finite[:, None, None], covariance, np.eye(error.shape[1]))
     good = finite & (np.linalg.eigvalsh(safe)[:, 0] > 0)
-    safe = np.where(good[:, None, None], safe, np.eye(3))
+    safe = np.where(good[:, None, None], safe, np.eye(error.shape[1]))
     weighted = np.linalg.solve(safe, error[:, :, None])[:, :, 0]
     return np.where(good, np.einsum("ij,ij->i", error, weighted), np.inf)
 
 
 class Majority(NamedTuple):
-    """The most frequent value of each group (-1 without any), and the number of its members."""
+    """The most frequent value of each group (-1: no member is counted), and how often it occurs."""
 
     value: Indices
     votes: Indices
 
 
 def majority(group: Indices, value: Indices, n_groups: int) -> Majority:
-    """Return the most frequent value of each group; of a tie, the value that comes first.
+    """Return the most frequent value of each group; the earliest of equally frequent values.
 
     Parameters
     ----------
@@ -79,8 +97,87 @@ def majority(group: Indices, value: Indices, n_groups: int) -> Majority:
 
 
 def pairs_within(group: Indices, value: Indices, n_groups: int) -> tuple[int, int]:
-    """Return the number of pairs within groups, and of those with equal values (0 or above)."""
+    """Return the number of pairs within groups, and of those with equal, non-negative values.
+
+    Parameters
+    ----------
+    group : (n,) int
+        0 to n_groups - 1.
+    value : (n,) int
+        A pair with a negative value is never right.
+    """
     size = np.bincount(group, minlength=n_groups)
     alike = value >= 0
     together = np.unique(np.stack([group[alike], value[alike]]), axis=1, return_counts=True)[1]
     return int(np.sum(size * (size - 1) // 2)), int(np.sum(together * (together - 1) // 2))
+
+
+def count_changes(group: Indices, value: Indices) -> int:
+    """Return how often the value changes from one member of a group to the next.
+
+    Parameters
+    ----------
+    group, value : (n,) int
+        The members of a group are consecutive, in the order in which they are compared.
+    """
+    same_group = group[1:] == group[:-1]
+    return int(np.sum(same_group & (value[1:] != value[:-1])))
+
+
+def mean_of_group_means(group: Indices, value: Array) -> tuple[float, float]:
+    """Return the mean of the means of groups, and its standard error from their scatter.
+
+    Members of a group may share an error, so the groups, not the members, are independent. Both
+    are not finite where a value is infinite.
+
+    Parameters
+    ----------
+    group : (n,) int
+        Any numbers; n > 0.
+    value : (n,) float
+    """
+    _, number, size = np.unique(group, return_inverse=True, return_counts=True)
+    means = np.bincount(number, weights=value) / size
+    if not np.isfinite(means).all():
+        return float(np.mean(means)), math.inf
+    return float(np.mean(means)), float(np.std(means) / math.sqrt(len(means)))
+
+
+class SampledOrbits(NamedTuple):
+    """Positions and velocities of objects, ordered by object and time.
+
+    Each object has two rows or more, and no time twice.
+    """
+
+    object: Indices  # (n,)
+    t_s: Array  # (n,) s since a common epoch
+    r_km: Array  # (n, 3) any one inertial frame
+    v_km_s: Array  # (n, 3) same frame
+
+
+def interpolate_orbits(orbits: SampledOrbits, objects: Indices, t_s: Array) -> tuple[Array, Array]:
+    """Return positions and velocities of objects by cubic Hermite interpolation.
+
+    Parameters
+    ----------
+    orbits
+        Has rows of all `objects`.
+    objects : (n,) int
+        An object per row.
+    t_s : (n,) float
+        A time per row [s], since the epoch of the orbits. Before the first and after the last
+        sample of an object its first and last cubic go on.
+
+    Returns
+    -------
+    r_km, v_km_s : (n, 3) float
+        Frame of the orbits; the velocity is the derivative of the cubic.
+    """
+    r_km, v_km_s = np.empty((len(objects), 3)), np.empty((len(objects), 3))
+    order = np.argsort(objects, kind="stable")
+    numbers, start = np.unique(objects[order], return_index=True)
+    for number, rows in zip(numbers, np.split(order, start[1:]), strict=False):
+        own = slice(*np.searchsorted(orbits.object, [number, number + 1]))
+        path = CubicHermiteSpline(orbits.t_s[own], orbits.r_km[own], orbits.v_km_s[own])
+        r_km[rows], v_km_s[rows] = path(t_s[rows]), path(t_s[rows], nu=1)
+    return r_km, v_km_s
