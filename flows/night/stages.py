@@ -165,10 +165,10 @@ def _epoch_grid(work: Work, settings: Settings) -> EpochGrid:
 
 
 class Checked(NamedTuple):
-    """What the check of the sensors says.
+    """The result of the check of the sensors.
 
-    `again`: clocks were corrected, and the night goes back to `track`. `left_out` are the
-    sensors without which it is solved again: their clocks are wrong and stay so.
+    With `again`, clocks were corrected and the night goes back to `track`. `left_out` are sensors
+    whose clocks are wrong and stay wrong: the night is solved again without them.
     """
 
     work: Work
@@ -180,14 +180,27 @@ def check(work: Work, solved: Parts, settings: Settings) -> Checked:
     """Estimate each sensor's clock from all spans together, and correct it if the settings say."""
     step(Stage.CHECK, 0, 1)
     clocks: list[Clock] = estimate_clocks(solved, work.all_spans())
-    for clock in clocks:
-        LOGGER.log(logging.WARNING if clock.is_off else logging.INFO, "%s", clock)
     wrong = [clock for clock in clocks if clock.is_off]
+    _tell_clocks(clocks)
     work = work._replace(clocks=tuple(total_offsets(work.clocks, clocks)))
     correctable = settings.alignment.correct_clocks and work.round < MOST_CORRECTIONS
     if wrong and correctable:
         return Checked(_correct_clocks(work, wrong, settings), again=True, left_out=[])
     return Checked(work, again=False, left_out=_taking_part(work, solved, wrong))
+
+
+def _tell_clocks(clocks: Sequence[Clock]) -> None:
+    """Log one line for all clocks that are right, and a warning for each that is wrong."""
+    right = [clock for clock in clocks if not clock.is_off]
+    if right:
+        within_s = max(max(abs(clock.offset_s), clock.sigma_s) for clock in right)
+        verb = "is" if len(right) == 1 else "are"
+        LOGGER.info(
+            "clocks of %s %s right within %.2g s", many(len(right), "sensor"), verb, within_s
+        )
+    for clock in clocks:
+        if clock.is_off:
+            LOGGER.warning("%s", clock)
 
 
 def _taking_part(work: Work, solved: Parts, clocks: Sequence[Clock]) -> list[str]:
