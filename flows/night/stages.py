@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 from epipole.flows.night.progress import results, step
 from epipole.flows.night.summary import Summary, many, summarise
 from epipole.flows.night.work import Spans, Work
+from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import ReadFolder, WorkFolder
 from epipole.schemas.bridge import array, concat
@@ -246,8 +247,8 @@ def _enter_spans(parts: Parts, spans: Sequence[Span]) -> list[Span]:
     starts = np.unique(np.concatenate(times) // SPAN_NS * SPAN_NS).tolist()
     entered = [span for t in starts if (span := Span(t, t + SPAN_NS)) not in spans]
     for span in entered:
-        names = ("solutions", "stars", "detections", "rejects")
-        write_part(parts.of(span), {name: parts.read(spans[0], name).slice(0, 0) for name in names})
+        tables = {name: parts.read(spans[0], name).slice(0, 0) for name in IDENTIFIED}
+        write_part(parts.of(span), IDENTIFIED, tables)
     return entered
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pyarrow as pa
 
+from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import array, from_polars, to_polars
@@ -48,7 +49,8 @@ def correct_clock(
     states = states_about(frames, sensor, span, settings)
     places = place_sensors(tables["solutions"], states, settings)
     tables["solutions"] = at_places(tables["solutions"], places)
-    write_part(parts.of(span), {**tables, "rejects": identified.read(span, "rejects")})
+    tables["rejects"] = identified.read(span, "rejects")
+    write_part(parts.of(span), IDENTIFIED, tables)
 
 
 def at_true_times(rows: pa.Table, clock: Clock) -> pa.Table:

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
+from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import concat
@@ -58,7 +59,7 @@ def identify_span(
         catalogue = read_star_catalogue(settings.identification.catalogue)
         identified = identify_stars(exposures, places, cameras, catalogue, settings)
         rejects = concat(REJECTS, [identified.rejects, _unplaced(places)])
-        write_part(parts.of(span), {**identified._asdict(), "rejects": rejects})
+        write_part(parts.of(span), IDENTIFIED, {**identified._asdict(), "rejects": rejects})
     source = parts.read(span, "solutions", ["attitude_source"])["attitude_source"]
     by_stars = pc.sum(pc.equal(source, "stars")).as_py() or 0
     return Counts(len(source), by_stars, parts.read(span, "stars").num_rows)

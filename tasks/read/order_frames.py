@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
+from epipole.io.work.part_tables import READ_SENSOR
 from epipole.io.work.parts import read_part, write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import array, concat, conform, nullable, stack, table, unstack
@@ -79,7 +80,7 @@ def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) 
         index = conform(FRAME_INDEX, keys.take(kept[sensor[kept] == number]))
         states, repeats = _sorted_states(folder, logs, sensors[number], settings)
         rejects.append(repeats)
-        write_part(folder.sensor(number), {"index": index, "states": states})
+        write_part(folder.sensor(number), READ_SENSOR, {"index": index, "states": states})
         time_ns.append(array(index, "time"))
     cameras = _sorted_cameras(_piece_tables(pieces, "cameras", CAMERAS))
     left_out = concat(REJECTS, rejects)

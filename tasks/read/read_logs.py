@@ -4,6 +4,7 @@ import logging
 from typing import NamedTuple
 
 from epipole.io.logs.reader import read_log_parts
+from epipole.io.work.part_tables import LOG_PIECE
 from epipole.io.work.parts import write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.log_tables import LogSource
@@ -36,6 +37,7 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
     for piece in read_log_parts(path):
         write_part(
             folder.piece(number, n_pieces),
+            LOG_PIECE,
             {
                 "exposures": piece.exposures,
                 "states": piece.states,

@@ -11,6 +11,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.io.work.part_tables import SOLVED
 from epipole.io.work.parts import Parts, read_part, write_part
 from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import array, concat, table
@@ -62,7 +63,8 @@ def solve_span(
         How many positions there are.
     """
     if not parts.holds(span):
-        write_part(parts.of(span), _solve(sensors, span, grid, cameras, left_out, settings))
+        tables = _solve(sensors, span, grid, cameras, left_out, settings)
+        write_part(parts.of(span), SOLVED, tables)
     return parts.read(span, "positions").num_rows
 
 

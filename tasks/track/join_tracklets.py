@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from epipole.io.work.part_tables import NIGHT_TRACKLETS, SPAN_NAMES
 from epipole.io.work.parts import Parts, is_written, read_part, write_part
 from epipole.schemas.bridge import from_polars, to_polars
 from epipole.schemas.spans import Sensor, Span
@@ -172,12 +173,12 @@ def _write(
     names = named.join(night.select("number", "tracklet_id", "track_id"), on="number")
     for k, span in enumerate(spans):
         of_span = names.filter(span=k).sort("span_name")
-        write_part(parts.of(span), {"names": from_polars(TRACKLET_NAMES, of_span)})
+        write_part(parts.of(span), SPAN_NAMES, {"names": from_polars(TRACKLET_NAMES, of_span)})
     night = night.rename({"start_ns": "start_time", "end_ns": "end_time"}).with_columns(
         sensor_id=pl.lit(sensor_id)
     )
     night = night.sort("start_time", "tracklet_id")
-    write_part(parts.of_night(), {"tracklets": from_polars(TRACKLET_RUNS, night)})
+    write_part(parts.of_night(), NIGHT_TRACKLETS, {"tracklets": from_polars(TRACKLET_RUNS, night)})
 
 
 def _before(night: pl.DataFrame) -> tuple[np.ndarray, list[float | None]]:

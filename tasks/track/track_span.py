@@ -2,6 +2,7 @@
 
 import pyarrow as pa
 
+from epipole.io.work.part_tables import TRACKED
 from epipole.io.work.parts import Parts, write_part
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span
@@ -52,5 +53,5 @@ def track_span(
             cameras,
             settings,
         )
-        write_part(parts.of(span), tracked._asdict())
+        write_part(parts.of(span), TRACKED, tracked._asdict())
     return parts.read(span, "tracklets").num_rows
