@@ -84,9 +84,9 @@ def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None
 
 def _of_night(name: str, parts: NightParts) -> pa.Table:
     if name == "tracklets":
-        rows = _tracklets(parts)
+        rows = tracklets_of_run(parts)
     elif name == "rejects":
-        rows = _counted([parts.whole[name], *_rejects(parts)])
+        rows = counted([parts.whole[name], *_rejects(parts)])
     else:
         rows = parts.whole[name]
     return in_order(rows_of_night(name, rows, parts.night))
@@ -129,7 +129,7 @@ def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:
     return rows.set_column(at, rows.schema.field(at), new.take(pc.index_in(rows["object_id"], old)))
 
 
-def _tracklets(parts: NightParts) -> pa.Table:
+def tracklets_of_run(parts: NightParts) -> pa.Table:
     """Return the tracklets of the run, each with what became of it in all spans."""
     runs = [read_part(sensor.names.of_night(), "tracklets") for sensor in parts.sensors]
     tracklets = concat(TRACKLET_RUNS, runs)
@@ -147,7 +147,7 @@ def _rejects(parts: NightParts) -> Iterator[pa.Table]:
                 yield of_stage.read(span, "rejects")
 
 
-def _counted(rejects: Iterable[pa.Table]) -> pa.Table:
+def counted(rejects: Iterable[pa.Table]) -> pa.Table:
     """Return the rejects of a night; those that spans counted separately as one row each."""
     rows = concat(REJECTS, rejects)
     counted = pc.is_in(rows["reason"], pa.array([reason.value for reason in COUNTED]))
