@@ -17,6 +17,7 @@ from epipole.io.caches.arrays import cache_folder
 from epipole.io.catalogues import hipparcos
 from epipole.io.datasets.dataset import dataset_folder
 from epipole.io.datasets.local_nights import STAGING
+from epipole.schemas.log_tables import LogSource
 from epipole.schemas.settings import Settings
 
 # Another version may change the last bits of a result.
@@ -54,18 +55,19 @@ def work_root(dataset: str) -> Path:
     return root / "work" / hashlib.sha256(dataset.encode()).hexdigest()[:12]
 
 
-def work_key(logs: Sequence[str], settings: Settings, nights: Sequence[str]) -> str:
+def work_key(logs: Sequence[LogSource], settings: Settings, nights: Sequence[str]) -> str:
     """Return a digest of everything that results depend on.
 
     Parameters
     ----------
     logs
-        The SHA-256 and name of each log. Where frames contradict each other, the names of their
-        logs decide which frame is used.
+        Their content and names count. Where frames contradict each other, the names of their logs
+        decide which frame is used.
     """
     digest = hashlib.sha256()
+    logs_read = sorted(f"{log.sha256} {log.name}" for log in logs)
     catalogue = _catalogue_key(settings.identification.catalogue)
-    for part in (*sorted(logs), settings.key(), *nights, catalogue, code_key()):
+    for part in (*logs_read, settings.key(), *nights, catalogue, code_key()):
         digest.update(part.encode() + b"\0")
     return digest.hexdigest()[:16]
 
