@@ -1,4 +1,4 @@
-"""Identify a span: one sensor's stars and attitudes over a span of time, from file to file."""
+"""Identify a span: one sensor's stars and attitudes, from part to part."""
 
 import logging
 from typing import NamedTuple
@@ -23,11 +23,11 @@ from epipole.tasks.read.order_frames import frames_between, states_between
 
 LOGGER = logging.getLogger(__name__)
 
-BRIDGED_NS = 300_000_000_000  # states this far beyond a span help to place its frames
+BRIDGED_NS = 300_000_000_000  # states this far outside a span help to place its frames
 
 
 class Counts(NamedTuple):
-    """What a part holds: frames, those with an attitude from stars, identified stars."""
+    """Counts of a part: frames, frames with an attitude from stars, identified stars."""
 
     frames: int
     by_stars: int
@@ -43,14 +43,14 @@ def identify_span(
     settings: Settings,
     parts: Parts,
 ) -> Counts:
-    """Place one sensor's frames of a span and identify them, unless that has been done.
+    """Place one sensor's frames of a span and identify them, unless the part exists.
 
     Parameters
     ----------
     frames
-        Where `order_logs` left the frames.
+        Where `order_logs` put the frames.
     parts
-        Where the part goes: `solutions`, `stars`, `detections` and `rejects`.
+        Where the part goes: `IDENTIFIED`.
     """
     if not parts.holds(span):
         exposures = frames_between(frames, sensor.number, *span)
@@ -66,18 +66,18 @@ def identify_span(
 
 
 def states_about(frames: ReadFolder, sensor: Sensor, span: Span, settings: Settings) -> pa.Table:
-    """Return the states of a sensor that place its frames of a span."""
+    """Return the states of a sensor that are needed to place its frames of a span."""
     reach_ns = BRIDGED_NS + round(settings.sensors.state_gap_s * 1e9)
     return states_between(frames, sensor.number, *span.widened(reach_ns))
 
 
 def _unplaced(places: pa.Table) -> pa.Table:
-    """Return a row of `rejects` for the frames with no state near: they give no position."""
-    lost = places.filter(pc.is_null(places["x_km"]))
-    first = lost.slice(0, 1)
+    """Return a row of `rejects` for the frames that have no state near in time."""
+    unplaced = places.filter(pc.is_null(places["x_km"]))
+    first = unplaced.slice(0, 1)
     return reject_rows(
         Reason.NO_STATE,
         sensor_id=first["sensor_id"],
         time=first["time"],
-        count=[lost.num_rows] * first.num_rows,
+        count=[unplaced.num_rows] * first.num_rows,
     )

@@ -1,4 +1,4 @@
-"""Read logs: what each holds goes into the work folder, piece by piece."""
+"""Read logs: the content of each goes into the work folder, piece by piece."""
 
 import logging
 from typing import NamedTuple
@@ -15,7 +15,7 @@ LOGGER = logging.getLogger(__name__)
 
 
 class ReadLog(NamedTuple):
-    """A log that was read: its number among those of the run, and how many pieces it has."""
+    """A log that was read: its number in the run, and how many pieces it has."""
 
     number: int
     n_pieces: int
@@ -31,7 +31,7 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
     Raises
     ------
     LogError
-        Where it is no log; see `read_log_parts`.
+        If it is not a log; see `read_log_parts`.
     """
     n_pieces, n_frames, source = 0, 0, None
     for piece in read_log_parts(path):
