@@ -30,11 +30,11 @@ from epipole.tasks.common.lone_detections import only_id, published_ids
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-VELOCITY_WINDOW_S = 30.0  # positions this near give an object's velocity
+VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
 
 
 class Solved(NamedTuple):
-    """Associations, the pairs of detections they imply, positions, and what was left out."""
+    """Tables ASSOCIATIONS, PAIRS, POSITIONS and REJECTS."""
 
     associations: pa.Table
     pairs: pa.Table
@@ -43,7 +43,7 @@ class Solved(NamedTuple):
 
 
 class _Groups(NamedTuple):
-    """Views in groups of one epoch and object, the objects' names, and the solution."""
+    """Views grouped by epoch and object, and the solution of each group."""
 
     views: pa.Table
     offsets: Indices
@@ -67,10 +67,10 @@ class _Groups(NamedTuple):
 def solve_positions(
     views: pa.Table, object_number: Indices, settings: Settings, span: Span | None = None
 ) -> Solved:
-    """Return positions with covariance of objects seen by two sensors or more.
+    """Return the positions, with covariances, of objects that two or more sensors detect.
 
-    Solved twice: the first positions give the velocities that the difference in light time
-    between near and far sensors needs. With a span, what is returned is of its epochs only.
+    They are solved twice. The first solution gives the velocities, which are needed because the
+    light time to near and far sensors differs. With `span`, only its epochs are returned.
     """
     groups = _solve(views, object_number, settings)
     if span is not None:
@@ -137,14 +137,14 @@ def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
 
     Rows are in order of time.
     """
-    out = np.empty(len(number), dtype=object)
+    names = np.empty(len(number), dtype=object)
     first: dict[int, str] = {}
     for i, (t, n) in enumerate(zip(epoch_ns.tolist(), number.tolist(), strict=True)):
         if n not in first:
             date = np.datetime64(t, "ns").astype("datetime64[D]")
             first[n] = f"{str(date).replace('-', '')}-{n + 1:05d}"
-        out[i] = first[n]
-    return out
+        names[i] = first[n]
+    return names
 
 
 def _direction_covariance(views: pa.Table) -> Array:
@@ -166,8 +166,8 @@ def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> Array:
     return out
 
 
-class _Pairs(NamedTuple):
-    """All pairs of views of one group: their rows, epipolar distance [px] and its sigmas."""
+class _ViewPairs(NamedTuple):
+    """Pairs of views of one group: their rows, and the epipolar distance in px and in sigmas."""
 
     first: Indices
     second: Indices
@@ -175,7 +175,7 @@ class _Pairs(NamedTuple):
     mahalanobis: Array
 
 
-def _pair_up(groups: _Groups) -> _Pairs:
+def _pair_up(groups: _Groups) -> _ViewPairs:
     """Return every ordered pair of views of one object at one epoch."""
     first, second = [], []
     for lo, hi in zip(groups.offsets[:-1], groups.offsets[1:], strict=True):
@@ -194,10 +194,10 @@ def _pair_up(groups: _Groups) -> _Pairs:
         groups.x_km[groups.group[a]],
     )  # fmt: skip
     pixel = array(groups.views, "pixel_rad")
-    return _Pairs(a, b, np.abs(angle) / pixel[b], np.abs(angle) / sigma)
+    return _ViewPairs(a, b, np.abs(angle) / pixel[b], np.abs(angle) / sigma)
 
 
-def _association_table(groups: _Groups, pairs: _Pairs) -> pa.Table:
+def _association_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
     n = groups.views.num_rows
     square = np.bincount(pairs.second, pairs.epipolar_px**2, minlength=n)
     count = np.maximum(np.bincount(pairs.second, minlength=n), 1)
@@ -215,8 +215,8 @@ def _association_table(groups: _Groups, pairs: _Pairs) -> pa.Table:
     )
 
 
-def _pair_table(groups: _Groups, pairs: _Pairs) -> pa.Table:
-    """Return the pairs of used views that have a centroid each, the first sensor before."""
+def _pair_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
+    """Return PAIRS: used views that both have a centroid, sorted by sensor."""
     seen = groups.views["centroid"].is_valid().to_numpy() & groups.used
     kept = seen[pairs.first] & seen[pairs.second] & (pairs.first < pairs.second)
     columns = {
@@ -260,7 +260,7 @@ def _residual_px(groups: _Groups) -> Array:
 
 
 def _reject_table(groups: _Groups) -> pa.Table:
-    """Return a row per sensor and reason: views rejected, and epochs without a solution."""
+    """Return a row of `rejects` per sensor and reason, with the number of views."""
     unsolved = ~np.isfinite(groups.chi2)[groups.group]
     which = {
         Reason.VIEW_REJECTED: ~groups.used & ~unsolved,
