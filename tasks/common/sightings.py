@@ -23,7 +23,7 @@ Indices = npt.NDArray[np.int64]
 class Frames(NamedTuple):
     """Frames of one sensor, in time order.
 
-    For frames without an attitude it is the identity: their directions are in sensor axes.
+    The attitude of frames without one is the identity, so their directions are in sensor axes.
     """
 
     table: pa.Table
