@@ -1,4 +1,4 @@
-"""Several logs together: each frame once, in order, whatever order the paths have."""
+"""Order frames: those of several logs together, each once, whatever the order of the logs."""
 
 import logging
 from pathlib import Path
@@ -64,7 +64,7 @@ def test_frames_of_all_logs_are_sorted_by_sensor_and_time(tmp_path):
     assert log.sources[1].first_time_ns == START_NS + SECOND_NS
 
 
-def test_frames_of_a_time_come_from_all_logs_in_order(tmp_path):
+def test_frames_between_two_instants_come_from_all_logs_in_order(tmp_path):
     a = write(tmp_path / "a.mcap", "s", [(i, i) for i in range(6)], states=range(6))
     b = write(tmp_path / "b.mcap", "s", [(i, i) for i in range(4, 9)])
     between = START_NS + 3 * SECOND_NS, START_NS + 7 * SECOND_NS
@@ -74,7 +74,7 @@ def test_frames_of_a_time_come_from_all_logs_in_order(tmp_path):
     assert log.states.num_rows == 3
 
 
-def test_lists_of_frames_go_with_their_frames(tmp_path):
+def test_lists_of_centroids_stay_with_their_frames(tmp_path):
     order = np.random.default_rng(0).permutation(300)
     for name, part in (("a", order[:100]), ("b", order[100:])):
         with LogWriter(tmp_path / f"{name}.mcap", chunk_size=2000) as log:
@@ -116,7 +116,7 @@ def test_overlapping_logs_give_each_frame_and_state_once_in_any_order(tmp_path):
     assert log.sources == other.sources
 
 
-def test_a_counter_that_restarts_is_a_row_for_what_repeats(tmp_path):
+def test_repeated_numbers_of_a_restarted_counter_are_one_reject(tmp_path):
     a = write(tmp_path / "a.mcap", "s", [(0, 0), (1, 1), (2, 2), (10, 0), (11, 1), (12, 7)])
     log = read(a)
     assert array(log.exposures, "frame_number").tolist() == [0, 1, 2, 7]
@@ -139,13 +139,13 @@ def test_a_sensor_without_calibration_keeps_its_frames(tmp_path):
     assert log.cameras.num_rows == 0
 
 
-def test_calibrations_are_sorted_and_a_repeated_one_is_one(tmp_path):
+def test_calibrations_are_sorted_and_a_repeated_one_counts_once(tmp_path):
     times = [START_NS + 5, START_NS, START_NS]
     log = read(write(tmp_path / "a.mcap", "s", [(0, 0)], camera_ns=times))
     assert array(log.cameras, "time").tolist() == [START_NS, START_NS + 5]
 
 
-def test_states_come_in_gcrf(tmp_path):
+def test_states_are_converted_to_gcrf(tmp_path):
     log = read(write(tmp_path / "a.mcap", "s", [(0, 0)], states=[0], frame="ITRF", sigma_km=0.2))
     r_km = stack(log.states, "{}_km")
     assert np.linalg.norm(r_km) == pytest.approx(7000.0, abs=1e-9)
@@ -154,7 +154,7 @@ def test_states_come_in_gcrf(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:.*dubious year")  # ERFA on leap seconds not yet announced
-def test_beyond_the_earth_orientation_table_there_is_a_warning_and_a_larger_sigma(tmp_path, caplog):
+def test_outside_the_earth_orientation_table_sigmas_are_larger_with_a_warning(tmp_path, caplog):
     far_s = 30 * 365 * 86400  # 2049
     path = write(tmp_path / "a.mcap", "s", [(far_s, 0)], states=[far_s], frame="ITRF")
     with caplog.at_level(logging.WARNING):
