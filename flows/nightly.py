@@ -63,12 +63,12 @@ def nightly(
     night = night_asked(night)
     check_folder(out)
     check_star_catalogue(settings.identification.catalogue)
-    found = find_logs(logs, night)
+    given = find_logs(logs, night)
     with claim_nights(out, [night] if night else []) as run:
-        frames = read(found.paths, ReadFolder(run), settings)
+        frames = read(given.paths, ReadFolder(run), settings)
 
         nights = nights_of(np.concatenate(frames.time_ns))
-        chosen = choose_nights(found.paths, nights, night)
+        chosen = choose_nights(given.paths, nights, night)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
         spans, uncalibrated = plan_spans(frames, chosen)
@@ -88,7 +88,7 @@ def nightly(
             if left_out:
                 solved = solve(work, settings, left_out)
             names = name(work, solved, settings)
-            rejects = concat(REJECTS, [found.rejects, frames.rejects, uncalibrated])
+            rejects = concat(REJECTS, [given.rejects, frames.rejects, uncalibrated])
             whole = {
                 "calibrations": calibrations,
                 "sources": sources,

@@ -118,8 +118,8 @@ def _identify_again(
     spans = {sensor: of_sensor for sensor, of_sensor in work.spans.items()
              if sensor.sensor_id in departed}  # fmt: skip
     where = {sensor: work.folder.identified_again(sensor, number) for sensor in spans}
-    again = work._replace(cameras=cameras, spans=spans, identified=where)
-    _identify(Stage.CALIBRATE, again, settings)
+    departed_work = work._replace(cameras=cameras, spans=spans, identified=where)
+    _identify(Stage.CALIBRATE, departed_work, settings)
     return work._replace(cameras=cameras, identified={**work.identified, **where})
 
 

@@ -220,10 +220,10 @@ def _with_two_sensors(arrays: SpanViews, number: Indices) -> Indices:
         )
     ]
     key = np.column_stack([arrays.epoch_ns[order], number[order], arrays.sensor[order]])
-    again = np.zeros(len(order), bool)
-    again[1:] = (key[1:] == key[:-1]).all(axis=1)
-    kept[order[again]] = -1
-    order, key = order[~again], key[~again]
+    repeated = np.zeros(len(order), bool)
+    repeated[1:] = (key[1:] == key[:-1]).all(axis=1)
+    kept[order[repeated]] = -1
+    order, key = order[~repeated], key[~repeated]
     _, inverse, count = np.unique(key[:, :2], axis=0, return_inverse=True, return_counts=True)
     kept[order[count[inverse.ravel()] < 2]] = -1
     return kept

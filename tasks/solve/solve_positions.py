@@ -159,11 +159,11 @@ def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> Array:
     order = np.lexsort((epoch_ns, number))
     cuts = np.flatnonzero(np.diff(number[order])) + 1
     offsets = np.concatenate([[0], cuts, [len(number)]]).astype(np.int64)
-    out = np.empty_like(x_km)
+    v_km_s = np.empty_like(x_km)
     origin = epoch_ns[0] if len(epoch_ns) else 0
     time_s = (epoch_ns[order] - origin) / 1e9
-    out[order] = velocities(offsets, time_s, x_km[order], VELOCITY_WINDOW_S)
-    return out
+    v_km_s[order] = velocities(offsets, time_s, x_km[order], VELOCITY_WINDOW_S)
+    return v_km_s
 
 
 class _ViewPairs(NamedTuple):
@@ -217,8 +217,8 @@ def _association_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
 
 def _pair_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
     """Return PAIRS: used views that both have a centroid, sorted by sensor."""
-    seen = groups.views["centroid"].is_valid().to_numpy() & groups.used
-    kept = seen[pairs.first] & seen[pairs.second] & (pairs.first < pairs.second)
+    has_centroid = groups.views["centroid"].is_valid().to_numpy() & groups.used
+    kept = has_centroid[pairs.first] & has_centroid[pairs.second] & (pairs.first < pairs.second)
     columns = {
         "epoch": groups.epoch_ns[groups.group[pairs.first[kept]]],
         "epipolar_px": pairs.epipolar_px[kept],

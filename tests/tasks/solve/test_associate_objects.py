@@ -54,7 +54,7 @@ def test_an_object_inside_the_earth_gives_no_object():
 
 
 @pytest.mark.parametrize("error", ["attitude", "state", "clock"])
-def test_a_wrong_sensor_is_named_and_left_out_and_the_others_are_unchanged(error, caplog):
+def test_a_wrong_sensor_is_named_and_left_out_and_no_view_is_wrong(error, caplog):
     scene = Scene(17, 4).objects(8, spread_km=100.0)
     if error == "attitude":  # by a degree, and it is believed to be turned so
         axis = np.array([0.0, 0.0, 1.0])
