@@ -21,7 +21,8 @@ class Reason(StrEnum):
     stage: Stage
     sentence: str
 
-    def __new__(cls, reason: str, stage: Stage, sentence: str) -> "Reason":
+    # The defaults are for type checkers: `Reason("nan")` looks a member up by its value.
+    def __new__(cls, reason: str, stage: Stage = Stage.READ, sentence: str = "") -> "Reason":
         """Return a member whose value is the reason alone."""
         member = str.__new__(cls, reason)
         member._value_ = reason
