@@ -183,7 +183,7 @@ def check(work: Work, solved: Parts, settings: Settings) -> Checked:
     step(Stage.CHECK, 0, 1)
     clocks: list[Clock] = estimate_clocks(solved, work.all_spans())
     wrong = [clock for clock in clocks if clock.is_off]
-    _tell_clocks(clocks)
+    tell_clocks(clocks)
     work = work._replace(clocks=tuple(total_offsets(work.clocks, clocks)))
     correctable = settings.alignment.correct_clocks and work.round < MOST_CORRECTIONS
     if wrong and correctable:
@@ -191,7 +191,7 @@ def check(work: Work, solved: Parts, settings: Settings) -> Checked:
     return Checked(work, again=False, left_out=_taking_part(work, solved, wrong))
 
 
-def _tell_clocks(clocks: Sequence[Clock]) -> None:
+def tell_clocks(clocks: Sequence[Clock]) -> None:
     """Log one line for all clocks that are right, and a warning for each that is wrong."""
     right = [clock for clock in clocks if not clock.is_off]
     if right:
