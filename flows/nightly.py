@@ -50,30 +50,29 @@ def nightly(
     Prefect's form for a run shows the text under Args.
 
     Args:
-        logs: MCAP files, folders, globs or URLs of them; those of the night are chosen.
-        out: The dataset, a folder; it is made where it is missing.
+        logs: MCAP files, folders, globs or URLs of them; the logs of the night are chosen.
+        out: The dataset, a folder or URL; it is created if missing.
         settings: Groups of settings, as in a settings file; missing ones keep their defaults.
-        night: Publish this UTC date only: YYYY-MM-DD, or yesterday, seen from when the run was
-            due. None: every night that the logs have frames of.
-        replace: Publish a night even though it was made of a log that is not among these.
+        night: Publish only this UTC date: YYYY-MM-DD, or yesterday (the day before the run was
+            scheduled). None: every night that the logs have frames of.
+        replace: Replace a night even if one of its earlier logs is not given.
 
     Raises:
-        EpipoleError: Where the work cannot be done; the dataset is then unchanged.
+        EpipoleError: If the work cannot be done; the dataset is then unchanged.
     """
     night = night_asked(night)
     check_folder(out)
     check_star_catalogue(settings.identification.catalogue)
-    found = find_logs(logs, night)
+    given = find_logs(logs, night)
     with claim_nights(out, [night] if night else []) as run:
-        frames = read(found.paths, ReadFolder(run), settings)
+        frames = read(given.paths, ReadFolder(run), settings)
 
         nights = nights_of(np.concatenate(frames.time_ns))
-        chosen = choose_nights(found.paths, nights, night)
+        chosen = choose_nights(given.paths, nights, night)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
         spans, uncalibrated = plan_spans(frames, chosen)
-        logs_read = [f"{log.sha256} {log.name}" for log in frames.sources]
-        key = work_key(logs_read, settings, chosen)
+        key = work_key(frames.sources, settings, chosen)
         with (
             claim_nights(out, [] if night else chosen) as staging,
             work_folder(work_root(out), chosen, key) as folder,
@@ -89,7 +88,7 @@ def nightly(
             if left_out:
                 solved = solve(work, settings, left_out)
             names = name(work, solved, settings)
-            rejects = concat(REJECTS, [found.rejects, frames.rejects, uncalibrated])
+            rejects = concat(REJECTS, [given.rejects, frames.rejects, uncalibrated])
             whole = {
                 "calibrations": calibrations,
                 "sources": sources,

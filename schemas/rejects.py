@@ -1,6 +1,6 @@
 """Why something was left out: reasons of `rejects`, outcomes of tracklets, statuses of frames.
 
-Each has a sentence, which the documentation repeats. `reject_rows` makes the rows of `rejects`.
+Each has a sentence, which the documentation shows. `reject_rows` makes the rows of `rejects`.
 """
 
 from collections.abc import Sequence
@@ -16,12 +16,13 @@ from epipole.schemas.tables import REJECTS
 
 
 class Reason(StrEnum):
-    """Why a row stands in `rejects`: its stage and a sentence."""
+    """Why something was left out: the stage that did, and a sentence."""
 
     stage: Stage
     sentence: str
 
-    def __new__(cls, reason: str, stage: Stage, sentence: str) -> "Reason":
+    # The defaults are for type checkers: `Reason("nan")` looks a member up by its value.
+    def __new__(cls, reason: str, stage: Stage = Stage.READ, sentence: str = "") -> "Reason":
         """Return a member whose value is the reason alone."""
         member = str.__new__(cls, reason)
         member._value_ = reason
@@ -29,12 +30,16 @@ class Reason(StrEnum):
         return member
 
     # Of a file.
-    NO_MCAP = "no_mcap", Stage.READ, "A file that was found in a folder or by a glob is no MCAP."
+    NO_MCAP = (
+        "no_mcap",
+        Stage.READ,
+        "A file that was found in a folder or by a glob is not an MCAP file.",
+    )
     TRUNCATED = "truncated", Stage.READ, "The log ends too early: cut short, or never closed."
     LOG_BEHIND_LOG = (
         "log_behind_log",
         Stage.READ,
-        "A second log begins behind the end of the first; both are read.",
+        "A second log begins after the end of the first; both are read.",
     )
     DAMAGED_RECORD = "damaged_record", Stage.READ, "A record of the log is damaged."
     MISSING_MESSAGES = (
@@ -73,11 +78,15 @@ class Reason(StrEnum):
     BAD_SENSOR_ID = "bad_sensor_id", Stage.READ, "The sensor id is empty or no valid text."
     NO_TIMESTAMP = "no_timestamp", Stage.READ, "The message has no time, or an impossible one."
     # Of a frame.
-    NAN = "nan", Stage.READ, "The frame has a centroid whose place is not a finite number."
+    NAN = "nan", Stage.READ, "The frame has a centroid whose position is not a finite number."
     UNEQUAL_ARRAYS = "unequal_arrays", Stage.READ, "The frame's arrays differ in length."
-    BAD_SIGMA = "bad_sigma", Stage.READ, "The frame has a centroid error that is no valid number."
+    BAD_SIGMA = "bad_sigma", Stage.READ, "The frame has an invalid centroid error."
     BAD_FRAME_NUMBER = "bad_frame_number", Stage.READ, "The frame number is out of range."
-    DUPLICATE_FRAME = "duplicate_frame", Stage.READ, "The frame came before; it counts once."
+    DUPLICATE_FRAME = (
+        "duplicate_frame",
+        Stage.READ,
+        "The same frame was already read; it counts once.",
+    )
     DUPLICATE_NUMBER = (
         "duplicate_number",
         Stage.READ,
@@ -121,7 +130,7 @@ class Reason(StrEnum):
         "The calibration's distortion model is not plumb_bob.",
     )
     # Of a sensor's frames.
-    NO_CALIBRATION = "no_calibration", Stage.IDENTIFY, "No calibration holds for the frames."
+    NO_CALIBRATION = "no_calibration", Stage.IDENTIFY, "No calibration is valid for the frames."
     NO_STATE = (
         "no_state",
         Stage.IDENTIFY,
@@ -136,12 +145,12 @@ class Reason(StrEnum):
     AMBIGUOUS = (
         "ambiguous",
         Stage.SOLVE,
-        "The tracklet could be of more than one object, and the evidence does not decide.",
+        "The tracklet could belong to more than one object, and the evidence does not decide.",
     )
     VIEW_REJECTED = (
         "view_rejected",
         Stage.SOLVE,
-        "The view is too far from the object's position, which was solved without it.",
+        "The view is too far from the object's position, which was solved without the view.",
     )
     NO_POSITION = "no_position", Stage.SOLVE, "The views of the object have no common point."
     CLOCK_OFF = (
@@ -152,7 +161,7 @@ class Reason(StrEnum):
 
 
 class Outcome(StrEnum):
-    """What became of a tracklet; of two that hold at different times, the earlier one here."""
+    """What became of a tracklet. If several are true at different times, the first one counts."""
 
     sentence: str
 
@@ -163,20 +172,23 @@ class Outcome(StrEnum):
         member.sentence = sentence
         return member
 
-    OBJECT = "object", "It is part of an object and served one of its positions."
+    OBJECT = "object", "It belongs to an object, and a position of the object was solved with it."
     DISAGREES = (
         "disagrees",
         "It was associated with an object, but each position was solved without it.",
     )
-    AMBIGUOUS = "ambiguous", "It could be of more than one object; the evidence does not decide."
+    AMBIGUOUS = (
+        "ambiguous",
+        "It could belong to more than one object; the evidence does not decide.",
+    )
     SENSOR_LEFT_OUT = (
         "sensor_left_out",
-        "Its sensor was left out: a wrong clock, or lines of sight that agree with no other's.",
+        "Its sensor was left out: its clock is wrong, or its lines of sight agree with no other's.",
     )
-    SEEN_BY_ONE = "seen_by_one", "No second sensor has a tracklet that fits it."
+    SEEN_BY_ONE = "seen_by_one", "No other sensor has a tracklet of the same object."
     NOT_COMPARED = (
         "not_compared",
-        "It was not compared with other sensors: no attitude, no sensor position, or no epoch.",
+        "It was not compared with other sensors: it has no attitude, sensor position or epoch.",
     )
 
 
@@ -195,11 +207,11 @@ class FrameStatus(StrEnum):
     NO_CENTROIDS = "no_centroids", "The frame has no centroids."
     TOO_FEW_STARS = (
         "too_few_stars",
-        "Too few centroids, or too few stars in the field, to identify.",
+        "The frame has too few centroids, or its field too few stars.",
     )
-    NO_MATCH = "no_match", "No attitude explains the centroids surely enough."
+    NO_MATCH = "no_match", "No attitude explains the centroids with enough certainty."
     TIME_LIMIT = "time_limit", "The search was stopped by its time limit."
-    NO_CALIBRATION = "no_calibration", "No calibration holds for the frame."
+    NO_CALIBRATION = "no_calibration", "No calibration is valid for the frame."
 
 
 def reason_of(name: str) -> Reason:
@@ -222,7 +234,7 @@ def reject_rows(
     Parameters
     ----------
     reason
-        Of all rows, or one per row; the stage follows from it.
+        Of all rows, or one per row. It also gives the stage.
     time, count
         One per row: NumPy array, Arrow array or list. Times are int64 nanoseconds.
     sensor_id, source, offset, tracklet_id
@@ -242,8 +254,8 @@ def reject_rows(
         values
         | {
             "time": np.asarray(time, np.int64) if isinstance(time, list) else time,
-            "stage": [one.stage.value for one in reasons],
-            "reason": [one.value for one in reasons],
+            "stage": [reason.stage.value for reason in reasons],
+            "reason": [reason.value for reason in reasons],
             "count": count,
         },
     )

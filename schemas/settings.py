@@ -29,7 +29,7 @@ class Group(BaseModel):
 
 
 class SensorSettings(Group):
-    """Values for what a log does not say about its sensors."""
+    """Values that are used where a log has none."""
 
     attitude_sigma_arcsec: float = Field(
         60.0, gt=0, description="1-sigma of a prior attitude that has no sigma in the log."
@@ -40,7 +40,7 @@ class SensorSettings(Group):
     centroid_sigma_px: float | None = Field(
         None,
         gt=0,
-        description="1-sigma of centroids that have no sigma in the log. "
+        description="1-sigma of a centroid that has no sigma in the log. "
         "Default: estimated from the stars.",
     )
     state_gap_s: float = Field(
@@ -54,8 +54,7 @@ class IdentificationSettings(Group):
     method: StarMethod = Field(
         "likelihood",
         description="How stars are identified. The methods other than likelihood are published "
-        "ones, "
-        "for comparison.",
+        "ones, for comparison.",
     )
     catalogue: str = Field(
         "hipparcos",
@@ -72,7 +71,9 @@ class IdentificationSettings(Group):
         description="Stars closer than this make one spot. It gets the id of the brighter star.",
     )
     gate_sigma: float = Field(
-        3.7, gt=0, description="Farthest centroid from the predicted place of its star."
+        3.7,
+        gt=0,
+        description="Largest distance of a centroid from the predicted place of its star.",
     )
     false_alarm: float = Field(
         1e-5,
@@ -83,9 +84,9 @@ class IdentificationSettings(Group):
     time_limit_s: float = Field(0.5, gt=0, description="Longest search for one frame.")
     calibrate: Literal["use", "report", "off"] = Field(
         "use",
-        description="The optics are also measured from the stars of the night. 'use' takes them "
-        "where "
-        "they differ from the log's calibration, 'report' only publishes them, 'off' does neither.",
+        description="The optics are also fitted to the stars of the night. 'use' takes the fitted "
+        "optics where they differ from the log's calibration, 'report' only publishes them, "
+        "'off' does neither.",
     )
 
 
@@ -93,10 +94,12 @@ class TrackletSettings(Group):
     """How detections of one sensor are joined to tracklets."""
 
     gate_sigma: float = Field(
-        4.0, gt=0, description="Farthest detection from the prediction of its track."
+        4.0, gt=0, description="Largest distance of a detection from the prediction of its track."
     )
     max_rate_deg_s: float = Field(2.0, gt=0, description="Fastest apparent motion to search for.")
-    max_missed: int = Field(3, ge=0, description="Most misses in a row within a tracklet.")
+    max_missed: int = Field(
+        3, ge=0, description="Most frames in a row in which a tracklet may have no detection."
+    )
     min_detections: int = Field(3, ge=2, description="Fewest detections of a tracklet.")
     false_alarm: float = Field(
         1e-4, gt=0, lt=1, description="Accepted number of false tracklets per frame."
@@ -138,9 +141,8 @@ class AlignmentSettings(Group):
     )
     correct_clocks: bool = Field(
         False,
-        description="What to do with a sensor whose clock is certainly off: true corrects the "
-        "times "
-        "of its frames, false leaves the sensor out.",
+        description="What to do with a sensor whose clock is certainly wrong: true corrects the "
+        "times of its frames, false leaves the sensor out.",
     )
 
 
@@ -170,8 +172,8 @@ class AssociationSettings(Group):
     threshold_px: float = Field(
         8.0,
         gt=0,
-        description="Farthest view from the epipolar line, of the method 'epipolar'. Published "
-        "values are 8 to 12 px.",
+        description="Method 'epipolar': largest distance of a view from the epipolar line. "
+        "Published values are 8 to 12 px.",
     )
     gate_sigma: float = Field(
         4.5, gt=0, description="Largest disagreement between views of one object."
@@ -189,8 +191,7 @@ class AssociationSettings(Group):
         600.0,
         ge=0,
         description="Undecided tracklets are judged again over spans of 2 and then 10 minutes, "
-        "up to "
-        "this length. 0: never.",
+        "up to this length. 0: never.",
     )
     shells: tuple[AltitudeShell, ...] = Field(
         (LOW_ORBITS, NAVIGATION_ORBITS, GEOSTATIONARY_REGION, GEOSTATIONARY_RING),
@@ -204,8 +205,7 @@ class AssociationSettings(Group):
         2.0,
         ge=0,
         description="Least difference in log-odds (ln) between two rival hypotheses. Below it, "
-        "neither is "
-        "reported.",
+        "neither is reported.",
     )
 
 
@@ -236,8 +236,7 @@ class StateSettings(Group):
         4.6,
         gt=0,
         description="Least log-odds (ln) that it is the same object. At the default, 1 in 100 "
-        "links "
-        "is wrong.",
+        "links is wrong.",
     )
 
 

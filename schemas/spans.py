@@ -1,7 +1,7 @@
-"""Spans of a night and its sensors: what a task works on.
+"""Spans of a night, and sensors: what a task works on.
 
-Spans are counted from 1970, not from the first frame, and divide a day. So another log of a
-night does not shift them, and no span holds a midnight.
+Spans are counted from 1970, not from the first frame, and a day is a whole number of them. So
+another log of a night does not shift them, and no span contains a midnight.
 """
 
 from typing import NamedTuple
@@ -13,11 +13,11 @@ import pyarrow as pa
 from epipole.schemas.bridge import array
 
 DAY_NS = 86_400_000_000_000
-SPAN_NS = 1_800_000_000_000  # half an hour: tasks enough for many workers, few per night
+SPAN_NS = 1_800_000_000_000  # half an hour: enough tasks for many workers, but few per night
 
 
 class Span(NamedTuple):
-    """From one instant until just before another; UTC nanoseconds since 1970."""
+    """A time from `start_ns` to before `end_ns`; UTC nanoseconds since 1970."""
 
     start_ns: int
     end_ns: int
@@ -27,33 +27,33 @@ class Span(NamedTuple):
         return Span(self.start_ns - margin_ns, self.end_ns + margin_ns)
 
     def holds(self, time_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """Return which instants lie in it."""
+        """Return which instants lie in the span."""
         return (time_ns >= self.start_ns) & (time_ns < self.end_ns)
 
     def of(self, rows: pa.Table, column: str) -> pa.Table:
-        """Return the rows whose time lies in it, in their order."""
+        """Return the rows whose time lies in the span, in their order."""
         inside = self.holds(array(rows, column))
         return rows if inside.all() else rows.filter(pa.array(inside))
 
     @property
     def folder(self) -> str:
-        """The name of its parts among those of other spans."""
+        """Name of the span's parts in the folder of a stage: its start [s since 1970]."""
         return f"{self.start_ns // 1_000_000_000}"
 
     def __str__(self) -> str:
-        """Return it as people read it: ``04:00-04:30``."""
+        """Return the times of day, such as ``04:00-04:30``."""
         start, end = (np.datetime64(t, "ns").astype("datetime64[m]") for t in self)
         return f"{str(start)[11:]}-{str(end)[11:]}"
 
 
 class Sensor(NamedTuple):
-    """A sensor: its number among those of a run, which names its parts, and its id."""
+    """A sensor: its number in the run, which names its parts, and its id."""
 
     number: int
     sensor_id: str
 
     def __str__(self) -> str:
-        """Return its id."""
+        """Return the sensor's id."""
         return self.sensor_id
 
 

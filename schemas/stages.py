@@ -1,7 +1,7 @@
 """The stages of a night, in their order, each with one name and a sentence.
 
-The name is that of the stage's package in `tasks/`, of its Prefect tasks, of its progress line,
-of its folder in the work folder, and of `rejects.stage`.
+The name is the same everywhere: package in `tasks/`, Prefect tasks, progress line, folder in the
+work folder, and the column `stage` of `rejects`.
 """
 
 from enum import StrEnum
@@ -25,7 +25,7 @@ class Stage(StrEnum):
     )
     IDENTIFY = (
         "identify",
-        "Finds where each sensor was, which centroids are stars, and each frame's attitude.",
+        "Finds where each sensor was, which centroids are stars, and the attitude of each frame.",
     )
     CALIBRATE = (
         "calibrate",
@@ -33,17 +33,17 @@ class Stage(StrEnum):
     )
     TRACK = (
         "track",
-        "Follows what is no star from frame to frame, and joins the fragments of a track.",
+        "Follows detections that are no stars from frame to frame, and joins fragments of tracks.",
     )
     SOLVE = (
         "solve",
-        "Finds which tracklets of different sensors are one object, and solves its positions and "
+        "Finds which tracklets of different sensors show one object, and solves its positions and "
         "states.",
     )
     CHECK = (
         "check",
-        "Estimates each sensor's clock; a wrong one is corrected, and the night is tracked again, "
-        "or its sensor is left out.",
+        "Estimates each sensor's clock; a wrong clock is corrected and the night tracked again, or "
+        "its sensor is left out.",
     )
     NAME = (
         "name",

@@ -35,16 +35,20 @@ PIXEL = axes(
     names="xy",
 )
 EPOCH = time_column("epoch", doc="Common instant at which the sensors are compared, UTC.")
-OBJECT_ID = id_column("object_id", doc="Space object, the same as long as it is followed.")
+OBJECT_ID = id_column("object_id", doc="Space object; it keeps its id as long as it is followed.")
 
 FRAMES = schema(
     "frames",
-    "One row a frame: its attitude and where the sensor was.",
+    "One row per frame: its attitude and where the sensor was.",
     [
         *FRAME_KEY,
         column("n_centroids", I32, doc="Centroids in the message."),
         column("n_stars", I32, doc="Centroids identified as stars and used for the attitude."),
-        column("attitude_source", pa.string(), doc="stars, prior or none."),
+        column(
+            "attitude_source",
+            pa.string(),
+            doc="Where the attitude comes from: stars, prior or none.",
+        ),
         column(
             "status",
             pa.string(),
@@ -89,7 +93,7 @@ FRAMES = schema(
 
 STARS = schema(
     "stars",
-    "One row an identified star.",
+    "One row per identified star.",
     [
         *FRAME_KEY,
         CENTROID,
@@ -102,7 +106,7 @@ STARS = schema(
 
 DETECTIONS = schema(
     "detections",
-    "One row a centroid that is no star.",
+    "One row per centroid that is no star.",
     [
         *FRAME_KEY,
         CENTROID,
@@ -128,43 +132,52 @@ DETECTIONS = schema(
             "sigma_arcsec",
             F64,
             unit="arcsec",
-            doc="1-sigma an axis, of the centroid alone; the attitude's is in frames.",
+            doc="1-sigma per axis, of the centroid alone; `frames` has the attitude's error.",
         ),
         column(
-            "kind", pa.string(), doc="Taken for: object, star_unlisted, planet, hot_pixel, unknown."
+            "kind",
+            pa.string(),
+            doc="What it is: object, star_unlisted, planet, hot_pixel or unknown.",
         ),
-        id_column("tracklet_id", null=True, doc="Null: belongs to none."),
-        id_column("track_id", null=True, doc="Null: belongs to none; only an object has one."),
+        id_column("tracklet_id", null=True, doc="Null where it belongs to no tracklet."),
+        id_column(
+            "track_id", null=True, doc="Null where it belongs to no track; only objects have one."
+        ),
     ],
 )
 
 TRACKLETS = schema(
     "tracklets",
-    "One row an unbroken run of detections of one object in one sensor.",
+    "One row per tracklet: an unbroken run of detections of one object by one sensor.",
     [
-        id_column("tracklet_id", doc="Unbroken run of detections."),
-        id_column("track_id", doc="Fragments of one object share it."),
+        id_column("tracklet_id", doc="Its id in the night."),
+        id_column(
+            "track_id", doc="Track that the tracklet belongs to; fragments of one object share it."
+        ),
         SENSOR_ID,
         time_column("start_time", doc="First detection, UTC."),
         time_column("end_time", doc="Last detection, UTC."),
-        column("n_detections", I32, doc="Detections in the run."),
+        column("n_detections", I32, doc="Detections of the tracklet."),
         column("rate_arcsec_s", F64, unit="arcsec/s", doc="Mean apparent rate on the sky."),
         column(
-            "residual_px", F64, unit="px", doc="Rms of the detections about the run's local motion."
+            "residual_px",
+            F64,
+            unit="px",
+            doc="Rms distance of the detections from the local motion.",
         ),
         column(
             "link_chi2",
             F64,
             null=True,
-            doc="Chi-square of the link to the fragment before; null where it is the first.",
+            doc="Chi-square of the link to the fragment before; null for the first fragment.",
         ),
-        column("outcome", pa.string(), doc="What became of it: one of the declared outcomes."),
+        column("outcome", pa.string(), doc="What became of it: an `Outcome`."),
     ],
 )
 
 EPOCHS = schema(
     "epochs",
-    "One row a sensor and epoch: the frame that serves.",
+    "One row per sensor and epoch: the frame that is used for it.",
     [
         EPOCH,
         SENSOR_ID,
@@ -175,7 +188,7 @@ EPOCHS = schema(
 
 ASSOCIATIONS = schema(
     "associations",
-    "One row a sensor's view of an object at an epoch.",
+    "One row per view: an object at an epoch, seen by one sensor.",
     [
         EPOCH,
         OBJECT_ID,
@@ -185,32 +198,34 @@ ASSOCIATIONS = schema(
             "centroid",
             I32,
             null=True,
-            doc="Centroid in the nearest frame; null where the object was missed in it and its "
-            "place comes from the tracklet.",
+            doc="Centroid in the nearest frame; null where the object was missed in it. Its place "
+            "then comes from the tracklet.",
         ),
-        id_column("tracklet_id", null=True, doc="Null: a detection that belongs to no tracklet."),
+        id_column(
+            "tracklet_id", null=True, doc="Null for a detection that belongs to no tracklet."
+        ),
         *axes("{}_px", unit="px", frame="image", doc="Place at the epoch", names="xy"),
         column(
             "epipolar_px",
             F64,
             unit="px",
-            doc="Distance to the epipolar line, rms over the other views.",
+            doc="Distance from the epipolar lines of the other views, rms.",
         ),
         column(
             "used",
             pa.bool_(),
-            doc="False: rejected by the position solution, no longer claimed as this object.",
+            doc="False: the position was solved without it; it may be another object.",
         ),
     ],
 )
 
 POSITIONS = schema(
     "positions",
-    "One row an object at an epoch.",
+    "One row per object and epoch.",
     [
         EPOCH,
         time_column(
-            doc="When the object was there, UTC: epoch minus mean light time of the used views."
+            doc="When the object was there, UTC: epoch minus the mean light time of the used views."
         ),
         OBJECT_ID,
         *axes("{}_km", unit="km", frame="GCRF", doc="Object position"),
@@ -231,7 +246,7 @@ def _state_unit(a: str, b: str) -> str:
 
 STATES = schema(
     "states",
-    "One row an object's position and velocity over an arc.",
+    "One row per object and arc: position and velocity at the arc's middle epoch.",
     [
         EPOCH,
         OBJECT_ID,
@@ -262,7 +277,7 @@ _OPTICS = [
 
 CALIBRATIONS = schema(
     "calibrations",
-    "One row a sensor: its optics as its stars of the night show them.",
+    "One row per sensor: its optics, fitted to its stars of the night.",
     [
         SENSOR_ID,
         *[column(name, F64, unit=unit, doc=doc) for name, unit, doc in _OPTICS],
@@ -270,14 +285,14 @@ CALIBRATIONS = schema(
             column(f"sigma_{name}", F64, unit=unit, doc=f"1-sigma of {name}.")
             for name, unit, _ in _OPTICS
         ],
-        column("n_stars", I32, doc="Star images that took part."),
+        column("n_stars", I32, doc="Star images used in the fit."),
         column("residual_px", F64, unit="px", doc="Rms of their image residuals."),
     ],
 )
 
 PAIRS = schema(
     "pairs",
-    "One row two detections judged a pair.",
+    "One row per pair of detections of one object by two sensors.",
     [
         EPOCH,
         id_column("sensor_id_1", doc="First sensor."),
@@ -298,7 +313,7 @@ PAIRS = schema(
 
 SOURCES = schema(
     "sources",
-    "One row a log that the night is made of.",
+    "One row per log that the night was made from.",
     [
         column("name", pa.string(), doc="File name of the log."),
         column("size", I64, unit="byte", doc="Size of the log."),
@@ -312,17 +327,22 @@ SOURCES = schema(
 
 REJECTS = schema(
     "rejects",
-    "One row something that was left out.",
+    "One row per thing that was left out, or per group of equal ones.",
     [
-        column("source", pa.string(), null=True, doc="Log file; null where it is no single one."),
+        column(
+            "source",
+            pa.string(),
+            null=True,
+            doc="Log file; null where it is about none, or more than one.",
+        ),
         column("offset", I64, unit="byte", null=True, doc="Place in the log."),
         id_column("sensor_id", null=True, doc="Null where unknown, or more than one."),
         id_column("tracklet_id", null=True, doc="Null where it is not about one tracklet."),
         time_column(
-            "time", doc="Time of what was left out, UTC; the night's start where it has none."
+            "time", doc="Time of what was left out, UTC; the start of the night if it has no time."
         ),
         column("stage", pa.string(), doc="Stage that left it out."),
-        column("reason", pa.string(), doc="Why: one of the declared reasons."),
+        column("reason", pa.string(), doc="Why: a `Reason`."),
         column("count", I64, doc="How many."),
     ],
 )

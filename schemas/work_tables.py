@@ -221,10 +221,10 @@ TRUE_ORBITS = schema(
 
 TRACKLET_OUTCOMES = schema(
     "tracklet_outcomes",
-    "One row a tracklet that a span compared with other sensors: what became of it there.",
+    "One row per tracklet that was compared with other sensors in a span, and its outcome there.",
     [
-        id_column("tracklet_id", doc="In the night."),
-        column("outcome", pa.string(), doc="One of the declared outcomes."),
+        id_column("tracklet_id", doc="Its id in the night."),
+        column("outcome", pa.string(), doc="What became of it: an `Outcome`."),
     ],
 )
 
@@ -236,7 +236,8 @@ TRACKLET_RUNS = schema(
 
 CLOCK_VIEWS = schema(
     "clock_views",
-    "One row a view and an object: those of each object, and views of none beside all objects.",
+    "One row per view and object: each object with its views, and views of no object with every "
+    "object.",
     [
         *[
             VIEWS.field(name)

@@ -1,1 +1,1 @@
-"""What the nightly flow calls."""
+"""The steps of the nightly flow: choice of logs, stages, progress, summary."""

@@ -1,4 +1,4 @@
-"""Which logs are of a night, of all that lie in a folder."""
+"""The choice of logs: those of a night, out of all in a folder."""
 
 import datetime
 import logging
@@ -24,31 +24,33 @@ MARGIN_NS = SPAN_NS + LOGGED_WITHIN_NS
 
 
 class FoundLogs(NamedTuple):
-    """The logs of a night, and a row of `rejects` for each file that is no log."""
+    """The logs of a night, and a row of `rejects` for each file that is not a log."""
 
     paths: list[str]
     rejects: pa.Table
 
 
 def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
-    """Return the logs that may have frames of a night, with a margin beyond both its ends.
+    """Return the logs that may have frames of a night or of a margin before and after it.
 
     Parameters
     ----------
     where
-        A file, folder, glob or URL, or several; see `list_logs`. What comes twice counts once.
+        A file, folder, glob or URL, or several; see `list_logs`. A log listed twice counts once.
     night
-        UTC date, ``YYYY-MM-DD``; none: all logs.
-
-    A log that is named itself is taken. Those found in a folder or by a glob are chosen by when
-    their messages were logged; one that was never closed does not say so and is taken too:
-    reading it tells. A found file that is no MCAP is left out with a warning, so that one broken
-    recording does not stop every night.
+        UTC date, ``YYYY-MM-DD``; None: all logs.
 
     Raises
     ------
     LogError
-        No logs there, none of the night, or one that was named is no MCAP.
+        If there are no logs, none of the night, or a log that was named is not MCAP.
+
+    Notes
+    -----
+    A log that is named itself is always taken. Logs found in a folder or by a glob are chosen by
+    the times at which their messages were logged. A log that was never closed does not have these
+    times and is taken too. A found file that is not MCAP is left out with a warning, so that one
+    broken recording does not stop every night.
     """
     named = [where] if isinstance(where, str) else list(where)
     if not named:
@@ -60,7 +62,7 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
         try:
             logged_ns = read_log_times(path)
         except LogError as error:
-            if is_named or error.__cause__ is not None:  # it may be a log, but cannot be read
+            if is_named or error.__cause__ is not None:  # it may be a log that cannot be read
                 raise
             LOGGER.warning("left out: %s", error)
             broken.append(path)
@@ -76,7 +78,7 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
 
 
 def _listed(named: Sequence[str]) -> dict[str, bool]:
-    """Return each log once, and whether it was named itself."""
+    """Return each log once, and whether it was named itself or found."""
     listed: dict[str, bool] = {}
     for where in named:
         paths, is_named = list_logs(where)

@@ -1,4 +1,4 @@
-"""The night that a run is asked for; Prefect checks it before a run is made."""
+"""The night that a run is asked for; Prefect checks it before it creates a run."""
 
 import datetime
 from typing import Annotated, Any
@@ -14,14 +14,14 @@ Night = Annotated[str | None, Field(pattern=rf"^(\d{{4}}-\d\d-\d\d|{YESTERDAY})$
 
 
 def night_asked(night: str | None) -> str | None:
-    """Return the UTC date that is asked for; none: every night.
+    """Return the UTC date that is asked for; None: every night.
 
-    Yesterday is seen from when the run was due, so one that starts late does its own night.
+    Yesterday is the day before the run was scheduled, even if the run starts late.
 
     Raises
     ------
     EpipoleError
-        Where there is no such date.
+        If there is no such date.
     """
     if night is None:
         return None
@@ -35,10 +35,10 @@ def night_asked(night: str | None) -> str | None:
 
 
 def run_name() -> str:
-    """Return what a run is called on Prefect's page, such as ``night 2019-04-01``."""
+    """Return the name of a run on Prefect's page, such as ``night 2019-04-01``."""
     asked: dict[str, Any] = flow_run.parameters
     try:
         night = night_asked(asked.get("night"))
-    except EpipoleError:  # the run itself says so
+    except EpipoleError:  # the run itself reports it
         night = asked["night"]
     return f"night {night}" if night else "every night"

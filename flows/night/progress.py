@@ -1,7 +1,7 @@
-"""How far a run is: log lines everywhere, a moving bar on a terminal and on Prefect's page.
+"""Progress of a run: log lines, and a progress bar on a terminal and on Prefect's page.
 
-Stages say what they did as log records. Their progress goes as records to a separate logger,
-`STEPS`, which moves the bars and prints nothing. So a flow knows nothing of terminals and pages.
+Stages log what they did. Their progress goes to a separate logger, `STEPS`, which moves the bars
+and prints nothing. So the stages do not depend on terminals or pages.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ STEPS = logging.getLogger("epipole.steps")
 STEPS.propagate = False
 STEPS.setLevel(logging.INFO)
 
-# The share of each stage in the time of a night (%), as measured on half an hour of four sensors
+# The share of each stage in the run time of a night (%), measured on half an hour of four sensors
 # at 5 Hz.
 _SHARES = {
     Stage.READ: 4,
@@ -38,13 +38,13 @@ _BEFORE = dict(zip(Stage, itertools.accumulate((_SHARES[s] for s in Stage), init
 
 
 def step(stage: Stage, done: int, total: int) -> None:
-    """Say how many of a stage's tasks are done."""
+    """Report how many of a stage's tasks are done."""
     share = _SHARES[stage] * done / total if total else 0.0
     _send(stage.value, done, total, min(100.0, _BEFORE[stage] + share))
 
 
 def prepare(what: str) -> None:
-    """Say what is done before the first stage."""
+    """Report what is done before the first stage, such as compiling."""
     _send(what, 0, 1, 0.0)
 
 
@@ -54,9 +54,9 @@ def _send(what: str, done: int, total: int, percent: float) -> None:
 
 
 def results(stage: Stage, futures: Sequence[PrefectFuture[Any]]) -> list[Any]:
-    """Return what the tasks of a stage return, in the order they were submitted.
+    """Return the results of a stage's tasks, in the order in which the tasks were submitted.
 
-    The order does not depend on which task ends first, so neither does what is made of it.
+    So the rows of a night do not depend on which task ends first.
     """
     returned = []
     step(stage, 0, len(futures))
@@ -68,9 +68,9 @@ def results(stage: Stage, futures: Sequence[PrefectFuture[Any]]) -> list[Any]:
 
 @contextlib.contextmanager
 def shown(quiet: bool, verbose: bool) -> Iterator[None]:
-    """Show how a run goes on standard error: a bar on a terminal, plain lines elsewhere."""
+    """Show the progress of a run on standard error: a bar on a terminal, plain lines elsewhere."""
     if quiet:
-        ROOT.addHandler(logging.NullHandler())  # or Python prints warnings by itself
+        ROOT.addHandler(logging.NullHandler())  # without any handler Python prints warnings
         ROOT.propagate = False
         yield
         return
@@ -84,6 +84,8 @@ def shown(quiet: bool, verbose: bool) -> Iterator[None]:
             handler = logging.StreamHandler()
             handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
         ROOT.setLevel(logging.INFO)
+        propagates, ROOT.propagate = ROOT.propagate, False  # or Prefect's console shows them again
+        stack.callback(setattr, ROOT, "propagate", propagates)
         if not verbose:
             handler.addFilter(_is_of_the_flow)
         ROOT.addHandler(handler)
@@ -93,7 +95,7 @@ def shown(quiet: bool, verbose: bool) -> Iterator[None]:
 
 
 def _is_of_the_flow(record: logging.LogRecord) -> bool:
-    """Tell a stage's line from those of its tasks, of which a night has thousands."""
+    """Return whether to show a line: warnings, and lines of stages but not of their many tasks."""
     return record.levelno >= logging.WARNING or record.name.startswith("epipole.flows.")
 
 

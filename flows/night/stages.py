@@ -1,8 +1,8 @@
-"""The stages of a night, each shared out over tasks of a sensor and a span of time.
+"""The stages of a night, each as tasks for one sensor and span.
 
-Tasks take paths and small tables and leave their own tables in the work folder, whole or not at
-all. A part that exists is not made again: the folder's name tells what it was made of. The rows
-do not depend on which worker made which part, or when.
+Tasks take paths and small tables, and write their results as parts of the work folder. A part that
+exists is not made again: the name of the folder depends on everything that parts depend on. The
+rows of a night do not depend on which worker made which part, or when.
 """
 
 import logging
@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 from epipole.flows.night.progress import results, step
 from epipole.flows.night.summary import Summary, many, summarise
 from epipole.flows.night.work import Spans, Work
+from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import ReadFolder, WorkFolder
 from epipole.schemas.bridge import array, concat
@@ -44,12 +45,12 @@ LOGGER = logging.getLogger(__name__)
 
 Names = Mapping[str, Mapping[str, str]]
 
-# The first correction lets a sensor see objects that it saw none of; the second is then exact.
+# After the first correction the views of a sensor fit objects; from these the second is exact.
 MOST_CORRECTIONS = 2
 
 
 def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> OrderedFrames:
-    """Read the logs, a task per log, and order what they hold."""
+    """Read the logs, a task per log, and order their frames and states."""
     futures = [read_log_into.submit(folder, k, log) for k, log in enumerate(logs)]
     frames = order_logs(folder, results(Stage.READ, futures), settings)
     count = sum(len(time_ns) for time_ns in frames.time_ns)
@@ -65,7 +66,7 @@ def identify(frames: OrderedFrames, spans: Spans, folder: WorkFolder, settings: 
 
 
 def _identify(stage: Stage, work: Work, settings: Settings) -> Work:
-    """Identify the frames of a work's spans; the parts go where `work.identified` says."""
+    """Identify the frames of all spans of `work`; the parts go to `work.identified`."""
     futures = [
         identify_span.submit(
             work.frames, sensor, span, work.cameras, settings, work.identified[sensor]
@@ -79,7 +80,7 @@ def _identify(stage: Stage, work: Work, settings: Settings) -> Work:
 
 
 def calibrate(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
-    """Fit each sensor's optics to its stars; identify again those whose calibration is off."""
+    """Fit each sensor's optics to its stars; identify again the sensors whose optics differ."""
     mode = settings.identification.calibrate
     calibrations = CALIBRATIONS.empty_table()
     for number in range(1, 3 if mode == "use" else 2):  # with better optics more stars take part
@@ -94,7 +95,7 @@ def calibrate(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
         departed = {name for fit in fits for name in fit.departed}
         if mode == "report" or not departed:
             break
-        LOGGER.info("optics of %s depart from the calibration", ", ".join(sorted(departed)))
+        LOGGER.info("optics of %s differ from the calibration", ", ".join(sorted(departed)))
         work = _identify_again(work, [fit.cameras for fit in fits if fit.departed], departed,
                                number, settings)  # fmt: skip
     return work, calibrations
@@ -107,17 +108,18 @@ def _identify_again(
     number: int,
     settings: Settings,
 ) -> Work:
-    """Identify the sensors whose optics departed with those that were fitted."""
+    """Identify the sensors whose optics differ again, with the fitted optics."""
     unchanged = work.cameras.filter(
         pc.invert(pc.is_in(work.cameras["sensor_id"], pa.array(sorted(departed))))
     )
     cameras = concat(CAMERAS, [unchanged, *fitted]).sort_by(
         [("sensor_id", "ascending"), ("time", "ascending")]
     )
-    spans = {sensor: own for sensor, own in work.spans.items() if sensor.sensor_id in departed}
+    spans = {sensor: of_sensor for sensor, of_sensor in work.spans.items()
+             if sensor.sensor_id in departed}  # fmt: skip
     where = {sensor: work.folder.identified_again(sensor, number) for sensor in spans}
-    again = work._replace(cameras=cameras, spans=spans, identified=where)
-    _identify(Stage.CALIBRATE, again, settings)
+    departed_work = work._replace(cameras=cameras, spans=spans, identified=where)
+    _identify(Stage.CALIBRATE, departed_work, settings)
     return work._replace(cameras=cameras, identified={**work.identified, **where})
 
 
@@ -140,7 +142,7 @@ def track(work: Work, settings: Settings) -> None:
 
 
 def solve(work: Work, settings: Settings, left_out: Sequence[str] = ()) -> Parts:
-    """Find and solve objects, a task per span, of all sensors but those left out."""
+    """Find and solve objects, a task per span, from all sensors but those left out."""
     grid = _epoch_grid(work, settings)
     sensors = list(work.sensor_parts().values())
     solved = work.folder.solved(work.round, all_sensors=not left_out)
@@ -165,10 +167,10 @@ def _epoch_grid(work: Work, settings: Settings) -> EpochGrid:
 
 
 class Checked(NamedTuple):
-    """What the check of the sensors says.
+    """The result of the check of the sensors.
 
-    `again`: clocks were corrected, and the night goes back to `track`. `left_out` are the
-    sensors without which it is solved again: their clocks are wrong and stay so.
+    With `again`, clocks were corrected and the night goes back to `track`. `left_out` are sensors
+    whose clocks are wrong and stay wrong: the night is solved again without them.
     """
 
     work: Work
@@ -177,12 +179,11 @@ class Checked(NamedTuple):
 
 
 def check(work: Work, solved: Parts, settings: Settings) -> Checked:
-    """Estimate each sensor's clock from all spans together, and correct it if the settings say."""
+    """Estimate each sensor's clock from all spans; correct wrong ones if the settings say so."""
     step(Stage.CHECK, 0, 1)
     clocks: list[Clock] = estimate_clocks(solved, work.all_spans())
-    for clock in clocks:
-        LOGGER.log(logging.WARNING if clock.is_off else logging.INFO, "%s", clock)
     wrong = [clock for clock in clocks if clock.is_off]
+    tell_clocks(clocks)
     work = work._replace(clocks=tuple(total_offsets(work.clocks, clocks)))
     correctable = settings.alignment.correct_clocks and work.round < MOST_CORRECTIONS
     if wrong and correctable:
@@ -190,8 +191,22 @@ def check(work: Work, solved: Parts, settings: Settings) -> Checked:
     return Checked(work, again=False, left_out=_taking_part(work, solved, wrong))
 
 
+def tell_clocks(clocks: Sequence[Clock]) -> None:
+    """Log one line for all clocks that are right, and a warning for each that is wrong."""
+    right = [clock for clock in clocks if not clock.is_off]
+    if right:
+        within_s = max(max(abs(clock.offset_s), clock.sigma_s) for clock in right)
+        verb = "is" if len(right) == 1 else "are"
+        LOGGER.info(
+            "clocks of %s %s right within %.2g s", many(len(right), "sensor"), verb, within_s
+        )
+    for clock in clocks:
+        if clock.is_off:
+            LOGGER.warning("%s", clock)
+
+
 def _taking_part(work: Work, solved: Parts, clocks: Sequence[Clock]) -> list[str]:
-    """Return the sensors of these clocks that take part in an association, and so distort it."""
+    """Return the sensors of wrong clocks that take part in an association, and so distort it."""
     sensors = {clock.sensor_id for clock in clocks}
     associated: set[str] = set()
     for span in work.all_spans() if sensors else []:
@@ -201,7 +216,7 @@ def _taking_part(work: Work, solved: Parts, clocks: Sequence[Clock]) -> list[str
 
 
 def _correct_clocks(work: Work, wrong: Sequence[Clock], settings: Settings) -> Work:
-    """Put the frames of wrong clocks at their true times; the next round begins."""
+    """Correct the times of frames of wrong clocks, and return the work of the next round."""
     clocks = {clock.sensor_id: clock for clock in wrong}
     next_round = work.round + 1
     where = {
@@ -219,27 +234,30 @@ def _correct_clocks(work: Work, wrong: Sequence[Clock], settings: Settings) -> W
     ]  # fmt: skip
     results(Stage.CHECK, futures)
     entered = {sensor: _enter_spans(where[sensor], work.spans[sensor]) for sensor in where}
-    spans = {sensor: sorted([*own, *entered.get(sensor, [])]) for sensor, own in work.spans.items()}
+    spans = {
+        sensor: sorted([*of_sensor, *entered.get(sensor, [])])
+        for sensor, of_sensor in work.spans.items()
+    }
     identified = {**work.identified, **where}
     return work._replace(spans=spans, identified=identified, round=next_round)
 
 
 def _enter_spans(parts: Parts, spans: Sequence[Span]) -> list[Span]:
-    """Return the spans that frames at their true times have entered; each gets an empty part.
+    """Return new spans that have frames at their true times; each gets an empty part.
 
-    The frames stay in the parts they were in.
+    The frames themselves stay in the parts in which they were.
     """
     times = [array(parts.read(span, "solutions", ["time"]), "time") for span in spans]
     starts = np.unique(np.concatenate(times) // SPAN_NS * SPAN_NS).tolist()
     entered = [span for t in starts if (span := Span(t, t + SPAN_NS)) not in spans]
     for span in entered:
-        names = ("solutions", "stars", "detections", "rejects")
-        write_part(parts.of(span), {name: parts.read(spans[0], name).slice(0, 0) for name in names})
+        tables = {name: parts.read(spans[0], name).slice(0, 0) for name in IDENTIFIED}
+        write_part(parts.of(span), IDENTIFIED, tables)
     return entered
 
 
 def name(work: Work, solved: Parts, settings: Settings) -> Names:
-    """Return, for each span, what its objects are called in the night."""
+    """Return, for each span, the names of its objects in the night."""
     step(Stage.NAME, 0, 1)
     spans = [span for span in work.all_spans() if solved.holds(span)]
     names = name_objects(solved, spans)
@@ -250,18 +268,18 @@ def name(work: Work, solved: Parts, settings: Settings) -> Names:
     new_id: dict[str, str] = link_objects(
         concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
     )
-    objects = {new_id.get(known, known) for of_span in names.values() for known in of_span.values()}
+    objects = {new_id.get(old, old) for of_span in names.values() for old in of_span.values()}
     LOGGER.info("named %s", many(len(objects), "object"))
     if new_id:
         LOGGER.info("recognised %s after a gap", many(len(new_id), "object"))
     return {
-        span: {old: new_id.get(known, known) for old, known in of_span.items()}
+        span: {name: new_id.get(old, old) for name, old in of_span.items()}
         for span, of_span in names.items()
     }
 
 
 class Destination(NamedTuple):
-    """Where a run's nights go: staged in a folder each, then put in place in the dataset."""
+    """Where nights go: first each to a staging folder, then all at once into the dataset."""
 
     dataset: str
     staged: Mapping[str, Path]
@@ -280,7 +298,7 @@ def publish(
     Parameters
     ----------
     whole
-        Tables of the whole run: `calibrations`, `sources`, and the `rejects` of no span.
+        Tables of the whole run: `calibrations`, `sources`, and `rejects` that belong to no span.
     """
     sensors = list(work.sensor_parts().values())
     all_spans = work.all_spans()

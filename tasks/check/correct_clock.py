@@ -1,8 +1,9 @@
-"""Correct a clock: one sensor's identified frames of a span at their true times."""
+"""Correct a clock: set one sensor's identified frames of a span to their true times."""
 
 import numpy as np
 import pyarrow as pa
 
+from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import array, from_polars, to_polars
@@ -32,14 +33,14 @@ def correct_clock(
     settings: Settings,
     parts: Parts,
 ) -> None:
-    """Set a part's frames to their true times, and their sensor to where it was then.
+    """Set a part's frames to their true times, and their sensor to its positions then.
 
     Parameters
     ----------
     identified
-        The sensor's parts with the times of its clock.
+        The sensor's parts, with the times of its clock.
     parts
-        Where the corrected part goes, with the same tables.
+        Where the corrected part goes: `IDENTIFIED`.
     """
     if parts.holds(span):
         return
@@ -48,11 +49,12 @@ def correct_clock(
     states = states_about(frames, sensor, span, settings)
     places = place_sensors(tables["solutions"], states, settings)
     tables["solutions"] = at_places(tables["solutions"], places)
-    write_part(parts.of(span), {**tables, "rejects": identified.read(span, "rejects")})
+    tables["rejects"] = identified.read(span, "rejects")
+    write_part(parts.of(span), IDENTIFIED, tables)
 
 
 def at_true_times(rows: pa.Table, clock: Clock) -> pa.Table:
-    """Return rows of frames at their true times."""
+    """Return the rows with true times instead of the clock's."""
     at = rows.schema.get_field_index("time")
     field = rows.schema.field(at)
     time_ns = array(rows, "time") - np.int64(round(clock.offset_s * 1e9))
@@ -60,7 +62,7 @@ def at_true_times(rows: pa.Table, clock: Clock) -> pa.Table:
 
 
 def at_places(solutions: pa.Table, places: pa.Table) -> pa.Table:
-    """Return the solutions with the positions of their sensors from `places`, a row per frame."""
+    """Return the solutions with the sensor positions and velocities of `places`, by frame."""
     key = ["sensor_id", "frame_number"]
     moved = to_polars(solutions).drop(PLACED).join(
         to_polars(places).select([*key, *PLACED]), on=key, how="left", maintain_order="left"

@@ -18,14 +18,14 @@ from epipole.tasks.common.stage_tasks import stage_task
 
 Array = npt.NDArray[np.float64]
 
-MOST_EPOCHS = 300  # more tell nothing new of a constant
+MOST_EPOCHS = 300  # more do not help: the offset is one constant
 KNOWN_S = 1.0  # with a larger sigma a clock counts as unknown
 
 
 class Clock(NamedTuple):
-    """A sensor's clock: reported minus true time of its frames, and its 1-sigma error.
+    """A sensor's clock: reported minus true time of its frames, and the 1-sigma error of that.
 
-    `is_off`: the offset is real.
+    `is_off` says whether the clock is certainly wrong.
     """
 
     sensor_id: str
@@ -34,7 +34,7 @@ class Clock(NamedTuple):
     is_off: bool
 
     def __str__(self) -> str:
-        """Return it as people read it."""
+        """Return the offset as a sentence."""
         side = "late" if self.offset_s > 0 else "early"
         return (
             f"the clock of {self.sensor_id} is {abs(self.offset_s):.3f} s {side} "
@@ -44,17 +44,17 @@ class Clock(NamedTuple):
 
 @stage_task(Stage.CHECK, "clocks")
 def estimate_clocks(solved: Parts, spans: Sequence[Span]) -> list[Clock]:
-    """Return the clocks that the night's lines of sight determine, by sensor.
+    """Return the clocks that the lines of sight of the night determine, by sensor.
 
     Parameters
     ----------
     solved
-        Parts by `solve_span`, of these spans.
+        The parts of `solve_span` of these spans.
     """
     parts = []
     for span in spans:
         rows = to_polars(solved.read(span, "clock_views"))
-        # Objects are numbered in each span anew.
+        # The ids of objects are those of the span.
         object_id = pl.format("{}/{}", pl.lit(span.folder), "object_id")
         parts.append(rows.with_columns(object_id=object_id))
     if not parts:
@@ -72,9 +72,9 @@ def clocks_of(rows: pl.DataFrame) -> list[Clock]:
     for (sensor_id,), of_sensor in rows.group_by("sensor_id", maintain_order=True):
         match = _search(of_sensor.filter(~pl.col("claimed")))
         if match is not None:
-            first_guess[str(sensor_id)], met = match
+            first_guess[str(sensor_id)], matched = match
             key = ["epoch", "object_id", "sensor_id"]
-            of_objects.append(met.join(claimed, on=key, how="anti"))
+            of_objects.append(matched.join(claimed, on=key, how="anti"))
     rows = pl.concat(of_objects).sort("epoch", "object_id", "sensor_id")
     if not len(rows):
         return []
@@ -96,7 +96,7 @@ def clocks_of(rows: pl.DataFrame) -> list[Clock]:
 
 
 def _search(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:
-    """Return the offset that lets a sensor see the objects, and its views of them then."""
+    """Return the offset at which a sensor's views fit objects, and these views."""
     if not len(free):
         return None
     match = search_offset(
@@ -117,7 +117,7 @@ def _search(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:
 
 
 def _lines(rows: pl.DataFrame, sensors: pl.Series) -> Lines:
-    """Return views of objects as lines of sight, the sensors numbered in order."""
+    """Return views of objects as lines of sight; sensors are numbered in the given order."""
     return Lines(
         group=rows.select(pl.struct("epoch", "object_id").rle_id()).to_series().to_numpy(),
         sensor=np.asarray(sensors.search_sorted(rows["sensor_id"]), np.int64),
@@ -135,7 +135,7 @@ def _direction_cov(rows: pl.DataFrame, which: str) -> Array:
 
 
 def total_offsets(before: Sequence[Clock], now: Sequence[Clock]) -> list[Clock]:
-    """Return the clocks as the logs have them: what was corrected before, and what remains."""
+    """Return the clocks with their offsets in the logs: corrections so far, and what remains."""
     corrected = {clock.sensor_id: clock for clock in before if clock.is_off}
     total = [
         clock._replace(

@@ -1,1 +1,1 @@
-"""What several stages share: spans, sightings, retries."""
+"""Code that several stages share: sightings, lone detections, retries, the task decorator."""

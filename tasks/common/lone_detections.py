@@ -1,7 +1,7 @@
-"""Lone detections: those of frames too few and too far apart for any tracklet.
+"""Lone detections: those in frames that are too few, or too far apart, for a tracklet.
 
-They take part in the association as tracklets of one detection, under ids that are published
-nowhere: a dataset's tracklet_id is null for them.
+They take part in the association as tracklets of one detection. Their ids are not published:
+`tracklet_id` is null for them in a dataset.
 """
 
 import numpy as np
@@ -15,13 +15,13 @@ from epipole.schemas.settings import TrackletSettings
 from epipole.schemas.work_tables import TRACKLET_RUNS
 from epipole.tasks.algorithms.time.epoch_grid import frame_interval_ns
 
-MARK = "lone:"  # no sensor id begins like this: it holds a colon
+MARK = "lone:"  # sensor ids have no colon, so no other id begins like this
 
 
 def in_lone_frames(
     frame_time_ns: npt.NDArray[np.int64], settings: TrackletSettings
 ) -> npt.NDArray[np.bool_]:
-    """Return which frames of one sensor, in time order, lie among too few for a tracklet."""
+    """Return which frames of one sensor, in time order, have too few others near for a tracklet."""
     if not len(frame_time_ns):
         return np.zeros(0, bool)
     coast_ns = (settings.max_missed + 1.5) * frame_interval_ns(frame_time_ns)
@@ -30,7 +30,7 @@ def in_lone_frames(
 
 
 def with_lone_detections(detections: pa.Table, lone: npt.NDArray[np.bool_]) -> pa.Table:
-    """Return the detections with an id of its own as tracklet_id for each lone one."""
+    """Return the detections; each lone one gets an unpublished tracklet_id."""
     names = array(detections, "tracklet_id").copy()
     rows = np.flatnonzero(lone)
     sensor, frame = array(detections, "sensor_id"), array(detections, "frame_number")
@@ -42,7 +42,7 @@ def with_lone_detections(detections: pa.Table, lone: npt.NDArray[np.bool_]) -> p
 
 
 def with_lone_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
-    """Return the tracklets that have views, with a row for each lone detection among these."""
+    """Return the tracklets that have views, and a row for each lone detection that has views."""
     tracklets = tracklets.filter(pc.is_in(tracklets["tracklet_id"], views["tracklet_id"]))
     lone = views.filter(is_lone(views["tracklet_id"]))
     if not lone.num_rows:
@@ -67,36 +67,36 @@ def with_lone_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
     return concat(TRACKLET_RUNS, [tracklets, rows])
 
 
-def with_objects_found(detections: pa.Table, associations: pa.Table) -> pa.Table:
-    """Return the detections; what served a position without a tracklet is an object's too.
+def with_lone_objects(detections: pa.Table, associations: pa.Table) -> pa.Table:
+    """Return the detections; lone ones that a position used are of kind ``object``.
 
-    One detection alone can be anything; what several sensors agree on is an object.
+    One detection alone may be anything. A detection that several sensors agree on is an object.
     """
-    served = pc.and_(associations["used"], pc.is_null(associations["tracklet_id"]))
+    is_lone_view = pc.and_(associations["used"], pc.is_null(associations["tracklet_id"]))
     key = ["sensor_id", "frame_number", "centroid"]
-    lone = pl.DataFrame(associations.filter(served).select(key)).drop_nulls().unique()
+    lone = pl.DataFrame(associations.filter(is_lone_view).select(key)).drop_nulls().unique()
     if not len(lone):
         return detections
-    known = pl.DataFrame(detections.select(key)).join(
-        lone.with_columns(found=True), on=key, how="left", maintain_order="left"
+    marked = pl.DataFrame(detections.select(key)).join(
+        lone.with_columns(is_object=True), on=key, how="left", maintain_order="left"
     )  # fmt: skip
     at = detections.schema.get_field_index("kind")
-    kind = pc.if_else(known["found"].fill_null(False).to_arrow(), "object", detections["kind"])
+    kind = pc.if_else(marked["is_object"].fill_null(False).to_arrow(), "object", detections["kind"])
     return detections.set_column(at, detections.schema.field(at), kind)
 
 
 def is_lone(tracklet_id: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return which ids are those of lone detections."""
+    """Return which ids are of lone detections."""
     return pc.starts_with(tracklet_id, MARK)
 
 
 def published_ids(tracklet_id: pa.ChunkedArray) -> pa.ChunkedArray:
-    """Return the ids, null where they are those of lone detections."""
+    """Return the ids; null for those of lone detections."""
     return pc.if_else(is_lone(tracklet_id), pa.scalar(None, pa.string()), tracklet_id)
 
 
 def only_id(tracklet_id: npt.NDArray[np.object_]) -> str | None:
-    """Return the id that all of these are, None where they are several or a lone detection's."""
+    """Return the one id in an array; None where there are several, or it is of a lone detection."""
     ids = set(tracklet_id.tolist())
     if len(ids) != 1:
         return None

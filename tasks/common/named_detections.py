@@ -1,4 +1,4 @@
-"""One sensor's detections with the names that their tracklets have in the night."""
+"""One sensor's detections, with the names of their tracklets in the night."""
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -10,7 +10,7 @@ from epipole.schemas.tables import DETECTIONS
 
 
 def detections_within(sensor: SensorParts, span: Span) -> pa.Table:
-    """Return a sensor's detections in a span, each as the part of its own span has it."""
+    """Return a sensor's detections in a time, each from the part of the span it lies in."""
     rows = []
     for other in spans_between(*span):
         if not sensor.tracked.holds(other):

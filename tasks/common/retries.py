@@ -1,4 +1,4 @@
-"""Which failures of a task are worth another try: those of storage that may pass by themselves."""
+"""Which failures of a task are tried again: those of storage that may be temporary."""
 
 import errno
 import sys
@@ -11,7 +11,7 @@ from prefect.client.schemas.objects import State, TaskRun
 RETRIES = 3
 DELAYS_S = [2.0, 10.0, 30.0]
 
-# What a second try finds just as it was.
+# Errors that a second try would meet again.
 _LASTING = (
     FileNotFoundError,
     FileExistsError,
@@ -26,18 +26,18 @@ _LASTING_CODES = {
 
 
 def storage_failed(_task: Task[..., Any], _run: TaskRun, state: State[Any]) -> bool:
-    """Tell whether a task failed because its storage did; what is wrong with a log stays wrong."""
+    """Return whether a task failed because of its storage, and not of a bad log or a bug."""
     error = state.data if isinstance(state.data, BaseException) else _error_of(state)
     return any(_may_pass(cause) for cause in _causes(error))
 
 
 def _error_of(state: State[Any]) -> BaseException | None:
-    found = state.result(raise_on_failure=False)
-    return found if isinstance(found, BaseException) else None
+    result = state.result(raise_on_failure=False)
+    return result if isinstance(result, BaseException) else None
 
 
 def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """Yield an error and what it was raised from."""
+    """Yield an error, then the errors that caused it."""
     while error is not None:
         yield error
         error = error.__cause__

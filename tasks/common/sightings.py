@@ -1,4 +1,4 @@
-"""Detections with the attitude and place of the frame they come from."""
+"""Sightings: detections with the attitude of their frame and the position of its sensor."""
 
 from typing import NamedTuple
 
@@ -23,7 +23,7 @@ Indices = npt.NDArray[np.int64]
 class Frames(NamedTuple):
     """Frames of one sensor, in time order.
 
-    Those without an attitude have their own axes in its place: identity.
+    The attitude of frames without one is the identity, so their directions are in sensor axes.
     """
 
     table: pa.Table
@@ -45,8 +45,8 @@ def solved_frames(solutions: pa.Table) -> Frames:
 
 def unsolved_frames(solutions: pa.Table) -> Frames:
     """Return the frames of a `solutions` table with a camera but no attitude, in time order."""
-    lost = (pa.compute.field("attitude_source") == "none") & (pa.compute.field("camera") >= 0)
-    frames = _frames(solutions.filter(lost))
+    unsolved = (pa.compute.field("attitude_source") == "none") & (pa.compute.field("camera") >= 0)
+    frames = _frames(solutions.filter(unsolved))
     n = len(frames.number)
     return frames._replace(
         q_sensor_from_icrs=np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), cov_att_rad2=np.zeros((n, 3, 3))
@@ -70,10 +70,12 @@ def _frames(solutions: pa.Table) -> Frames:
 
 
 class Sightings(NamedTuple):
-    """Detections of one sensor in the order of its frames, and the frame each comes from.
+    """Detections of one sensor, in the order of its frames.
 
-    `cov_noise` is what is new in every frame, `cov_bias` what all frames share [rad^2, ICRS]:
-    the error of an attitude from stars is new each time, that of a prior is one bias.
+    `row` is the row of the detection, `frame` the index of its frame. Frame k has the sightings
+    ``offsets[k]:offsets[k + 1]``. `cov_noise` is the error that is independent in each frame,
+    `cov_bias` the error that is common to all [rad^2, ICRS]: the error of an attitude from stars
+    is independent, that of a prior is common.
     """
 
     row: npt.NDArray[np.int64]
@@ -85,7 +87,7 @@ class Sightings(NamedTuple):
 
 
 def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
-    """Return the detections of one sensor that lie in its solved frames, by frame."""
+    """Return the sightings in solved frames, sorted by frame."""
     row, frame = _in_frames(frames, detections)
     u = unit_from_radec(
         np.radians(array(detections, "ra_deg")[row]), np.radians(array(detections, "dec_deg")[row])
@@ -106,7 +108,7 @@ def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
 
 
 def image_sightings_of(frames: Frames, detections: pa.Table, camera: Camera) -> Sightings:
-    """Return the detections that lie in unsolved frames, by frame; directions in sensor axes."""
+    """Return the sightings in unsolved frames, sorted by frame; directions in sensor axes."""
     row, frame = _in_frames(frames, detections)
     u = unproject(camera, array(detections, "x_px")[row], array(detections, "y_px")[row])
     noise = centroid_covariance(u, array(detections, "sigma_arcsec")[row] * ARCSEC)
@@ -115,7 +117,7 @@ def image_sightings_of(frames: Frames, detections: pa.Table, camera: Camera) -> 
 
 
 def _in_frames(frames: Frames, detections: pa.Table) -> tuple[Indices, Indices]:
-    """Return the rows of detections in these frames, by frame and centroid, and their frames."""
+    """Return the rows of detections in these frames, sorted by frame and centroid; their frames."""
     by_number = np.argsort(frames.number, kind="stable")
     number = array(detections, "frame_number")
     at = np.searchsorted(frames.number[by_number], number)
@@ -127,20 +129,20 @@ def _in_frames(frames: Frames, detections: pa.Table) -> tuple[Indices, Indices]:
     return row[order], frame[order]
 
 
-def part_of(seen: Sightings, kept: npt.NDArray[np.bool_]) -> Sightings:
-    """Return the sightings that are kept, still in the order of the frames."""
+def part_of(sightings: Sightings, kept: npt.NDArray[np.bool_]) -> Sightings:
+    """Return some of the sightings, in the same order."""
     before = np.concatenate([[0], np.cumsum(kept)])
     return Sightings(
-        seen.row[kept],
-        seen.frame[kept],
-        before[seen.offsets],
-        seen.u_icrs[kept],
-        seen.cov_noise[kept],
-        seen.cov_bias[kept],
+        sightings.row[kept],
+        sightings.frame[kept],
+        before[sightings.offsets],
+        sightings.u_icrs[kept],
+        sightings.cov_noise[kept],
+        sightings.cov_bias[kept],
     )
 
 
 def camera_of(cameras: pa.Table, row: int) -> Camera:
     """Return the camera in a row of `cameras`."""
-    # Without its time: a nanosecond is more than a Python datetime can hold.
+    # Not the time: a Python datetime has no nanoseconds.
     return Camera(**cameras.select(list(Camera._fields)).slice(row, 1).to_pylist()[0])

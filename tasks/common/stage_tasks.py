@@ -1,4 +1,4 @@
-"""Tasks of a stage: named by it, and each run by its stage and what it works on."""
+"""Tasks of a stage: their name is the stage, the name of a run is the stage and its work."""
 
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -18,14 +18,14 @@ def stage_task(stage: Stage, works_on: str, *, retried: bool = False) -> Callabl
     Parameters
     ----------
     works_on
-        What a run works on, by the task's parameters: ``{sensor} {span}``.
+        What a run works on, by the task's parameters, such as ``{sensor} {span}``.
     retried
-        Tried again where storage failed.
+        Whether the task is tried again after a failure of storage.
 
     Notes
     -----
-    Prefect caches no result: hashing the inputs costs more than most tasks, and what was
-    finished lies in the work folder.
+    Prefect caches no result: to hash the inputs would cost more than most tasks, and finished
+    parts lie in the work folder.
     """
     options: dict[str, Any] = {"cache_policy": NO_CACHE}
     if retried:

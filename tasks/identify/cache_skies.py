@@ -1,4 +1,4 @@
-"""Skies made from a catalogue table, kept in the process and on disk: sensors share them."""
+"""Cache skies: those made from a catalogue are kept in memory and on disk, shared by sensors."""
 
 import hashlib
 import inspect
@@ -40,15 +40,15 @@ from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 from epipole.tasks.algorithms.time import time_scales
 from epipole.tasks.algorithms.time.time_scales import earth_barycentric, julian_year
 
-# A star whose place at the date is less sure than this is none to navigate by [pixels, 1-sigma].
+# Stars whose place at the date is less certain than this are not used [pixels, 1-sigma].
 SURE_PX = 0.5
 
-# What the arrays on disk are made by: other code, other arrays.
+# The code that makes the arrays on disk: if it changes, they are made again.
 _MADE_BY: tuple[ModuleType, ...] = (star_catalogue, time_scales, pair_table, kvector, skies)
 
 
 class Catalogue:
-    """A labelled catalogue as a key of caches: two with the same content are the same."""
+    """A labelled catalogue that can be a key of a cache; equal content makes it equal."""
 
     def __init__(self, stars: pa.Table) -> None:
         self.stars = stars
@@ -66,14 +66,14 @@ class Catalogue:
 
 
 class CachedSkies:
-    """Skies of one day for one size of pixel; stars within `merge_px` pixels are one."""
+    """Skies of one day for one pixel size; stars closer than `merge_px` are merged."""
 
     def __init__(self, catalogue: Catalogue, day: int, pixel_rad: float, merge_px: float) -> None:
         self.key = (catalogue, day, round(pixel_rad, 9), merge_px)
 
     def limit_for(self, stars_per_sr: float) -> float:
         limit = limit_for_density(_navigation(*self.key).magnitude, stars_per_sr)
-        return float(np.ceil(limit * 4) / 4)  # in steps, so that like sensors share a sky
+        return float(np.ceil(limit * 4) / 4)  # in steps, so that similar sensors share a sky
 
     def sky(self, limit: float) -> Sky:
         return _sky(*self.key, limit)
@@ -159,6 +159,6 @@ def _disk_key(what: str, catalogue: Catalogue, *inputs: float) -> str:
 
 @cache
 def _code() -> str:
-    """Return a digest of the code that makes the arrays, and of the libraries it stands on."""
+    """Return a digest of the code that makes the arrays, and of its libraries."""
     text = "".join(inspect.getsource(module) for module in (*_MADE_BY, sys.modules[__name__]))
     return hashlib.blake2b(f"{np.__version__} {scipy.__version__} {text}".encode()).hexdigest()

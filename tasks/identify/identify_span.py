@@ -1,4 +1,4 @@
-"""Identify a span: one sensor's stars and attitudes over a span of time, from file to file."""
+"""Identify a span: one sensor's stars and attitudes, from part to part."""
 
 import logging
 from typing import NamedTuple
@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
+from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import concat
@@ -22,11 +23,11 @@ from epipole.tasks.read.order_frames import frames_between, states_between
 
 LOGGER = logging.getLogger(__name__)
 
-BRIDGED_NS = 300_000_000_000  # states this far beyond a span help to place its frames
+BRIDGED_NS = 300_000_000_000  # states this far outside a span help to place its frames
 
 
 class Counts(NamedTuple):
-    """What a part holds: frames, those with an attitude from stars, identified stars."""
+    """Counts of a part: frames, frames with an attitude from stars, identified stars."""
 
     frames: int
     by_stars: int
@@ -42,14 +43,14 @@ def identify_span(
     settings: Settings,
     parts: Parts,
 ) -> Counts:
-    """Place one sensor's frames of a span and identify them, unless that has been done.
+    """Place one sensor's frames of a span and identify them, unless the part exists.
 
     Parameters
     ----------
     frames
-        Where `order_logs` left the frames.
+        Where `order_logs` put the frames.
     parts
-        Where the part goes: `solutions`, `stars`, `detections` and `rejects`.
+        Where the part goes: `IDENTIFIED`.
     """
     if not parts.holds(span):
         exposures = frames_between(frames, sensor.number, *span)
@@ -58,25 +59,25 @@ def identify_span(
         catalogue = read_star_catalogue(settings.identification.catalogue)
         identified = identify_stars(exposures, places, cameras, catalogue, settings)
         rejects = concat(REJECTS, [identified.rejects, _unplaced(places)])
-        write_part(parts.of(span), {**identified._asdict(), "rejects": rejects})
+        write_part(parts.of(span), IDENTIFIED, {**identified._asdict(), "rejects": rejects})
     source = parts.read(span, "solutions", ["attitude_source"])["attitude_source"]
     by_stars = pc.sum(pc.equal(source, "stars")).as_py() or 0
     return Counts(len(source), by_stars, parts.read(span, "stars").num_rows)
 
 
 def states_about(frames: ReadFolder, sensor: Sensor, span: Span, settings: Settings) -> pa.Table:
-    """Return the states of a sensor that place its frames of a span."""
+    """Return the states of a sensor that are needed to place its frames of a span."""
     reach_ns = BRIDGED_NS + round(settings.sensors.state_gap_s * 1e9)
     return states_between(frames, sensor.number, *span.widened(reach_ns))
 
 
 def _unplaced(places: pa.Table) -> pa.Table:
-    """Return a row of `rejects` for the frames with no state near: they give no position."""
-    lost = places.filter(pc.is_null(places["x_km"]))
-    first = lost.slice(0, 1)
+    """Return a row of `rejects` for the frames that have no state near in time."""
+    unplaced = places.filter(pc.is_null(places["x_km"]))
+    first = unplaced.slice(0, 1)
     return reject_rows(
         Reason.NO_STATE,
         sensor_id=first["sensor_id"],
         time=first["time"],
-        count=[lost.num_rows] * first.num_rows,
+        count=[unplaced.num_rows] * first.num_rows,
     )

@@ -1,4 +1,4 @@
-"""Where each sensor was, and how it was said to be turned, at each of its frames."""
+"""Place sensors: position and prior attitude of each sensor at the times of its frames."""
 
 import logging
 from typing import Any
@@ -16,13 +16,13 @@ from epipole.tasks.algorithms.orbits.state_interpolation import (
     interpolate_states,
 )
 
-logger = logging.getLogger(__name__)
+LOGGER = logging.getLogger(__name__)
 
 
 def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> pa.Table:
-    """PLACES, row by row with the exposures; see `interpolate_states`.
+    """Return PLACES, one row per row of `exposures`; see `interpolate_states`.
 
-    `states` are sorted by sensor and time, each time once, as `read_logs` gives them.
+    `states` are sorted by sensor and time, each time once, as `order_logs` returns them.
     """
     sensor, time_ns = array(exposures, "sensor_id"), array(exposures, "time")
     state_sensor, all_states = array(states, "sensor_id"), _states(states, settings.sensors)
@@ -30,8 +30,8 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
     placed = Places(*(np.full((n, *width), np.nan) for width in ((3,), (3,), (), (4,), ())))
     for name in sorted(set(sensor)):
         frames = np.flatnonzero(sensor == name)
-        own = np.flatnonzero(state_sensor == name)
-        columns: list[npt.NDArray[Any]] = [values[own] for values in all_states]
+        rows = np.flatnonzero(state_sensor == name)
+        columns: list[npt.NDArray[Any]] = [values[rows] for values in all_states]
         places = interpolate_states(
             SensorStates(*columns),
             time_ns[frames],
@@ -40,7 +40,7 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
         for column, values in zip(placed, places, strict=True):
             column[frames] = values
     without = np.count_nonzero(np.isnan(placed.r_gcrf_km[:, 0]))
-    logger.info("placed %d frames, %d have no state near", n - without, without)
+    LOGGER.info("placed %d frames, %d have no state near in time", n - without, without)
     by_name = {
         **unstack("{}_km", placed.r_gcrf_km),
         **unstack("v{}_km_s", placed.v_gcrf_km_s),
@@ -53,7 +53,7 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
 
 
 def _states(states: pa.Table, settings: SensorSettings) -> SensorStates:
-    """Return the rows' states; a sigma of 0 is unknown and takes the settings' value."""
+    """Return the states as arrays; an unknown sigma (0) takes the value of the settings."""
     position_sigma_km = array(states, "position_sigma_km")
     attitude_sigma = array(states, "attitude_sigma_arcsec")
     return SensorStates(

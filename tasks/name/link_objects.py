@@ -1,4 +1,4 @@
-"""Link objects: an object that is seen again after a gap keeps its object_id."""
+"""Link objects: an object that is detected again after a gap gets its earlier id."""
 
 from collections.abc import Mapping
 from typing import Literal
@@ -24,10 +24,10 @@ VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 
 @stage_task(Stage.NAME, "objects")
 def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> dict[str, str]:
-    """Return the ids that change: an object that is the same as an earlier one gets its id.
+    """Return the new ids of objects that are the same as an earlier object: the earlier one's id.
 
-    Only each object's first and last position count (see `outermost`), and its first and last
-    state. Both tables are of a whole night, in any order.
+    Only the first and last position of each object are used (see `outermost`), and its first and
+    last state. Both tables are of a whole night, in any order.
     """
     ends = _ends(pl.DataFrame(positions), pl.DataFrame(states))
     if not len(ends):
@@ -46,14 +46,14 @@ def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> d
 
 
 def outermost(rows: pa.Table) -> pa.Table:
-    """Return each object's first and last row: all that linking needs of `positions`."""
+    """Return each object's first and last row."""
     frame = pl.DataFrame(rows).with_row_index("row").sort("epoch", "row")
     ends = frame.group_by("object_id").agg(first=pl.col("row").first(), last=pl.col("row").last())
     return rows.take(np.unique(ends.select("first", "last").to_numpy().ravel()))
 
 
 def renamed(rows: pa.Table, new_id: Mapping[str, str]) -> pa.Table:
-    """Return the rows with the new ids of objects that have one."""
+    """Return the rows with new ids, where objects have one."""
     if not new_id:
         return rows
     at = rows.schema.get_field_index("object_id")
@@ -63,9 +63,9 @@ def renamed(rows: pa.Table, new_id: Mapping[str, str]) -> pa.Table:
 
 
 def _ends(positions: pl.DataFrame, states: pl.DataFrame) -> pl.DataFrame:
-    """Return a row per object, sorted by id: its time span, and its motion at both ends.
+    """Return a row per object, sorted by id: first and last epoch, and the motion at both.
 
-    The motion is that of its first or last state. Without a state it is the position alone.
+    The motion is that of the first or last state. Without a state it is only the position.
     """
     keys = ["object_id", "epoch"]
     position = positions.sort(keys).select(*keys, *PLACE, pl.col("^cov_.*$"))

@@ -14,5 +14,5 @@ from epipole.tasks.common.stage_tasks import stage_task
 def publish_nights(
     dataset: str, staged: Mapping[str, Path], sources: pa.Table, replace: bool
 ) -> None:
-    """Put staged nights in place; see `publish_folders`."""
+    """Put the staged nights in place in the dataset; see `publish_folders`."""
     publish_folders(dataset, staged, sources, replace)

@@ -1,4 +1,4 @@
-"""Write tables: the parts of a night's spans put together as the tables of a dataset."""
+"""Write tables: the parts of a night's spans, joined to the tables of a dataset."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
@@ -21,19 +21,19 @@ from epipole.schemas.spans import DAY_NS, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES, TRACKLETS
 from epipole.schemas.work_tables import SOLUTIONS, TRACKLET_RUNS
-from epipole.tasks.common.lone_detections import with_objects_found
+from epipole.tasks.common.lone_detections import with_lone_objects
 from epipole.tasks.common.named_detections import detections_within
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.judge_tracklets import best_outcomes
 
-# Of these a night has too many rows to be held at once; they come span by span.
+# These tables may not fit in memory as a whole: they are written span by span.
 BY_SENSOR = ("frames", "stars", "detections")
 BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
 WHOLE = ("tracklets", "calibrations", "sources", "rejects")
-# What one task writes: about a third of the work each.
+# The tables of one task; each task has about a third of the work.
 SHARES = (("stars",), ("detections",), ("frames", *BY_SPAN, *WHOLE))
-SERVED_NS = 60_000_000_000
-# Counted over the night: a row per span would say no more.
+SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
+# These are counted over the night: a row per span would tell nothing more.
 COUNTED = (
     Reason.NO_CALIBRATION,
     Reason.NO_STATE,
@@ -44,11 +44,11 @@ COUNTED = (
 
 
 class NightParts(NamedTuple):
-    """What the tables of a night are made of.
+    """The parts and tables from which the tables of a night are made.
 
-    `spans` are the night's, in order, and `all_spans` those of the run. `names` has, for each
-    span's folder, what its objects are called in the night. `whole` are tables of the whole run:
-    `calibrations`, `sources`, and the `rejects` of no span.
+    `spans` are the night's, in order, and `all_spans` the run's. `names` has, for the folder of
+    each span, the names of its objects in the night. `whole` has tables of the whole run:
+    `calibrations`, `sources`, and the `rejects` that belong to no span.
     """
 
     night: str
@@ -84,16 +84,16 @@ def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None
 
 def _of_night(name: str, parts: NightParts) -> pa.Table:
     if name == "tracklets":
-        rows = _tracklets(parts)
+        rows = tracklets_of_run(parts)
     elif name == "rejects":
-        rows = _counted([parts.whole[name], *_rejects(parts)])
+        rows = counted([parts.whole[name], *_rejects(parts)])
     else:
         rows = parts.whole[name]
     return in_order(rows_of_night(name, rows, parts.night))
 
 
 def _of_sensors(name: str, parts: NightParts, span: Span) -> pa.Table:
-    """Return a span's rows of all sensors by time, then sensor, then in the sensor's order."""
+    """Return a span's rows of all sensors, sorted by time and then sensor."""
     schema = TABLES[name]
     if name == "detections":
         rows = [detections_within(sensor, span) for sensor in parts.sensors]
@@ -105,11 +105,11 @@ def _of_sensors(name: str, parts: NightParts, span: Span) -> pa.Table:
     else:
         rows = [sensor.identified.rows_within(span, schema, name) for sensor in parts.sensors]
     together = concat(schema, rows)
-    if name == "detections":  # an epoch may be served by a frame of the neighbouring span
+    if name == "detections":  # an epoch of a neighbouring span may use a frame of this one
         near = parts.solved.rows_within(
             span.widened(SERVED_NS), ASSOCIATIONS, "associations", time="epoch"
         )
-        together = with_objects_found(together, near)
+        together = with_lone_objects(together, near)
     return together.take(np.argsort(array(together, "time"), kind="stable"))
 
 
@@ -129,8 +129,8 @@ def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:
     return rows.set_column(at, rows.schema.field(at), new.take(pc.index_in(rows["object_id"], old)))
 
 
-def _tracklets(parts: NightParts) -> pa.Table:
-    """Return the tracklets of the run, each with what became of it in all spans."""
+def tracklets_of_run(parts: NightParts) -> pa.Table:
+    """Return TRACKLETS of the run, each with its outcome over all spans."""
     runs = [read_part(sensor.names.of_night(), "tracklets") for sensor in parts.sensors]
     tracklets = concat(TRACKLET_RUNS, runs)
     solved = [span for span in parts.all_spans if parts.solved.holds(span)]
@@ -147,8 +147,8 @@ def _rejects(parts: NightParts) -> Iterator[pa.Table]:
                 yield of_stage.read(span, "rejects")
 
 
-def _counted(rejects: Iterable[pa.Table]) -> pa.Table:
-    """Return the rejects of a night; those that spans counted separately as one row each."""
+def counted(rejects: Iterable[pa.Table]) -> pa.Table:
+    """Return the rejects of a night; those that each span counted are summed to one row."""
     rows = concat(REJECTS, rejects)
     counted = pc.is_in(rows["reason"], pa.array([reason.value for reason in COUNTED]))
     key = ["source", "sensor_id", "reason"]
@@ -177,7 +177,7 @@ def _counted(rejects: Iterable[pa.Table]) -> pa.Table:
 
 
 def source_table(sources: Sequence[LogSource], settings: Settings) -> pa.Table:
-    """Return the rows of `sources`: the logs, and by which code and settings they were run."""
+    """Return SOURCES: the logs, and the code and settings that the night was made with."""
     columns = {name: [getattr(s, name) for s in sources] for name in ("name", "size", "sha256")}
     return table(
         SOURCES,
@@ -192,7 +192,7 @@ def source_table(sources: Sequence[LogSource], settings: Settings) -> pa.Table:
 
 
 def into_nights(rejects: pa.Table, nights: Sequence[str]) -> pa.Table:
-    """Return the rejects, each in one of these nights; others move to the nearest night's start."""
+    """Return the rejects; those outside these nights move to the start of the nearest one."""
     time_ns = array(rejects, "time")
     starts = np.array([_start_ns(night) for night in nights])
     day = time_ns // DAY_NS * DAY_NS

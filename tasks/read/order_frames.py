@@ -1,7 +1,7 @@
-"""Order frames: those of all logs by sensor and time, each once, and states in GCRF.
+"""Order frames: those of all logs by sensor and time, each once; states are converted to GCRF.
 
-Frames stay where reading put them. An index per sensor says where. So a night is never in
-memory, whatever the order of its frames and the number of its logs.
+Frames stay in the parts of their logs; an index per sensor says where. So a night is never in
+memory as a whole, whatever the order of its frames and the number of its logs.
 """
 
 import logging
@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
+from epipole.io.work.part_tables import READ_SENSOR
 from epipole.io.work.parts import read_part, write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import array, concat, conform, nullable, stack, table, unstack
@@ -46,7 +47,7 @@ _DUPLICATES = {
 
 
 class OrderedFrames(NamedTuple):
-    """The frames of a run: where they lie and, in memory, what is small."""
+    """The frames of a run: where they lie, and in memory only their times and small tables."""
 
     folder: ReadFolder
     sensors: list[str]  # sorted; a sensor's number is its place here
@@ -57,10 +58,10 @@ class OrderedFrames(NamedTuple):
 
 
 def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) -> OrderedFrames:
-    """Put what was read in order; the order of the logs does not matter.
+    """Order the content of logs; the order of the logs does not matter.
 
-    A frame that comes twice counts once; see `order_frames` for what is a repeat. A log that
-    is given twice is used once.
+    A frame that occurs twice counts once; `order_frames` says what a repeat is. Of two logs with
+    the same content one is used.
     """
     logs = _distinct(logs)
     pieces = {(log.number, k): folder.piece(log.number, k) for log in logs
@@ -79,7 +80,7 @@ def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) 
         index = conform(FRAME_INDEX, keys.take(kept[sensor[kept] == number]))
         states, repeats = _sorted_states(folder, logs, sensors[number], settings)
         rejects.append(repeats)
-        write_part(folder.sensor(number), {"index": index, "states": states})
+        write_part(folder.sensor(number), READ_SENSOR, {"index": index, "states": states})
         time_ns.append(array(index, "time"))
     cameras = _sorted_cameras(_piece_tables(pieces, "cameras", CAMERAS))
     left_out = concat(REJECTS, rejects)
@@ -87,7 +88,7 @@ def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) 
 
 
 def frames_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) -> pa.Table:
-    """Return EXPOSURES of a sensor's frames from one instant to before another, by time."""
+    """Return EXPOSURES of a sensor from one instant to before another, sorted by time."""
     index = read_part(folder.sensor(sensor), "index")
     first, last = np.searchsorted(array(index, "time"), [start_ns, end_ns])
     index = index.slice(first, last - first)
@@ -105,24 +106,26 @@ def frames_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) 
 
 
 def states_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) -> pa.Table:
-    """Return SENSOR_STATES of a sensor from one instant to before another, by time."""
+    """Return SENSOR_STATES of a sensor from one instant to before another, sorted by time."""
     states = read_part(folder.sensor(sensor), "states")
     first, last = np.searchsorted(array(states, "time"), [start_ns, end_ns])
     return states.slice(first, last - first)
 
 
 def _distinct(logs: Sequence[ReadLog]) -> list[ReadLog]:
-    """Return the logs by name and content, each content once."""
+    """Return the logs sorted by name, each content once."""
     by_content: dict[str, ReadLog] = {}
     for log in sorted(logs, key=lambda log: (log.source.name, log.source.sha256)):
         first = by_content.setdefault(log.source.sha256, log)
         if first is not log:
-            LOGGER.info("%s holds the same as %s: used once", log.source.name, first.source.name)
+            LOGGER.info(
+                "%s has the same content as %s: used once", log.source.name, first.source.name
+            )
     return list(by_content.values())
 
 
 def _keys(pieces: Mapping[tuple[int, int], Path]) -> pa.Table:
-    """Return a row per frame of all pieces: its key, its log and where it lies."""
+    """Return a row per frame of all pieces: its key, its log, its piece and its row."""
     names = ["sensor_id", "frame_number", "time", "source"]
     places = ("log", "piece", "row")
     schema = pa.schema(
@@ -142,14 +145,14 @@ def _keys(pieces: Mapping[tuple[int, int], Path]) -> pa.Table:
 
 
 def _names(pieces: Mapping[tuple[int, int], Path], name: str) -> set[str]:
-    """Return the sensors that a table of the pieces names."""
+    """Return the ids of the sensors in one table of all pieces."""
     tables = (read_part(part, name, ["sensor_id"]) for part in pieces.values())
     return {sensor for rows in tables for sensor in pc.unique(rows["sensor_id"]).to_pylist()}
 
 
 def _numbers(sensor_id: pa.ChunkedArray, sensors: list[str]) -> Indices:
-    found = pc.index_in(sensor_id, pa.array(sensors, pa.string()))
-    return np.asarray(found.to_numpy(), np.int64)
+    numbers = pc.index_in(sensor_id, pa.array(sensors, pa.string()))
+    return np.asarray(numbers.to_numpy(), np.int64)
 
 
 def _piece_tables(pieces: Mapping[tuple[int, int], Path], name: str, schema: pa.Schema) -> pa.Table:
@@ -157,7 +160,7 @@ def _piece_tables(pieces: Mapping[tuple[int, int], Path], name: str, schema: pa.
 
 
 def _repeats(frames: pa.Table, reason: Reason) -> pa.Table:
-    """Return a row of `rejects` per sensor and log: when the first repeat was, how many."""
+    """Return a row of `rejects` per sensor and log: the first repeat's time, and how many."""
     grouped = frames.group_by(["sensor_id", "source"], use_threads=False).aggregate(
         [("time", "min"), ("time", "count")]
     )
@@ -173,7 +176,7 @@ def _repeats(frames: pa.Table, reason: Reason) -> pa.Table:
 def _sorted_states(
     folder: ReadFolder, logs: Sequence[ReadLog], sensor_id: str, settings: Settings
 ) -> tuple[pa.Table, pa.Table]:
-    """Return one sensor's states in GCRF, sorted and each once, and the rejects for the rest."""
+    """Return one sensor's states in GCRF, sorted, each time once; and the rejects of repeats."""
     states, names = [], []
     for log in logs:
         for k in range(log.n_pieces):
@@ -188,10 +191,10 @@ def _sorted_states(
 
 
 def _turned_to_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
-    """Return SENSOR_STATES of LOG_STATES, row by row.
+    """Return SENSOR_STATES for the rows of LOG_STATES.
 
-    Outside the Earth-orientation table an Earth-fixed position is less certain than its sigma
-    says. The sigma that is returned is larger there.
+    For times outside the Earth-orientation table, sigmas of Earth-fixed positions are increased by
+    the uncertainty of the Earth's rotation.
     """
     time_ns, frame = array(states, "time"), array(states, "frame")
     r_km, v_km_s = stack(states, "{}_km"), stack(states, "v{}_km_s")
@@ -223,6 +226,6 @@ def _warn_of_orientation(turn_km: npt.NDArray[np.float64]) -> None:
 
 
 def _sorted_cameras(cameras: pa.Table) -> pa.Table:
-    """Return the calibrations by sensor and time; equal ones of one time count once."""
+    """Return the calibrations sorted by sensor and time; equal rows count once."""
     unique = cameras.group_by(CAMERAS.names, use_threads=False).aggregate([])
     return conform(CAMERAS, unique.sort_by([(name, "ascending") for name in CAMERAS.names]))

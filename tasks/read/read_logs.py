@@ -1,9 +1,10 @@
-"""Read logs: what each holds goes into the work folder, piece by piece."""
+"""Read logs: the content of each goes into the work folder, piece by piece."""
 
 import logging
 from typing import NamedTuple
 
 from epipole.io.logs.reader import read_log_pieces
+from epipole.io.work.part_tables import LOG_PIECE
 from epipole.io.work.parts import write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.log_tables import LogSource
@@ -14,7 +15,7 @@ LOGGER = logging.getLogger(__name__)
 
 
 class ReadLog(NamedTuple):
-    """A log that was read: its number among those of the run, and how many pieces it has."""
+    """A log that was read: its number in the run, and how many pieces it has."""
 
     number: int
     n_pieces: int
@@ -30,12 +31,13 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
     Raises
     ------
     LogError
-        Where it is no log; see `read_log_pieces`.
+        If it is not a log; see `read_log_pieces`.
     """
     n_pieces, n_frames, source = 0, 0, None
     for piece in read_log_pieces(path):
         write_part(
             folder.piece(number, n_pieces),
+            LOG_PIECE,
             {
                 "exposures": piece.exposures,
                 "states": piece.states,

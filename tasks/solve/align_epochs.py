@@ -1,4 +1,4 @@
-"""Align epochs: common instants of all sensors, and the frame of each that serves."""
+"""Align epochs: common instants of all sensors, and the frame that each sensor has for them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -20,10 +20,10 @@ from epipole.tasks.algorithms.time.epoch_grid import (
 
 
 class EpochGrid(NamedTuple):
-    """The epochs of a night, whichever part of it is looked at."""
+    """The epochs of a whole night, the same for each of its spans."""
 
     interval_ns: int
-    regular: bool  # or else at the frames themselves
+    regular: bool  # False: the epochs are the times of frames
 
 
 def grid_of(time_ns: Sequence[npt.NDArray[np.int64]], settings: Settings) -> EpochGrid:
@@ -32,7 +32,7 @@ def grid_of(time_ns: Sequence[npt.NDArray[np.int64]], settings: Settings) -> Epo
     Parameters
     ----------
     time_ns
-        For each sensor the times of its frames that serve; see `frames_that_serve`.
+        For each sensor, the times of the frames that can be used; see `frames_that_serve`.
     """
     wanted_s = settings.alignment.interval_s
     if wanted_s is not None:
@@ -50,10 +50,9 @@ def frames_that_serve(solutions: pa.Table) -> pa.Table:
 def align_epochs(
     solutions: pa.Table, settings: Settings, grid: EpochGrid | None = None
 ) -> pa.Table:
-    """Return the epochs of a time: which frame of which sensor serves each, and how far off.
+    """Return EPOCHS: for each epoch and sensor the nearest frame, and its distance in time.
 
-    An epoch is kept if any sensor has a frame for it. Without a grid, it is that of these
-    frames.
+    An epoch is kept if any sensor has a frame for it. Without `grid`, these frames give it.
     """
     served = frames_that_serve(solutions).sort_by("time")
     sensors = sorted(set(served["sensor_id"].to_pylist()))
@@ -85,7 +84,7 @@ def _serving(
     interval_ns: int,
     settings: AlignmentSettings,
 ) -> pa.Table:
-    """Return one sensor's rows of the epochs table."""
+    """Return EPOCHS of one sensor."""
     frame = nearest_frame(epochs, time_ns)
     dt_ns = time_ns[frame] - epochs
     if settings.max_gap_s is not None:

@@ -1,4 +1,4 @@
-"""Associate objects: which sensors' tracklets are one object, window by window of a span."""
+"""Associate objects: which tracklets of different sensors are one object, window by window."""
 
 import logging
 from typing import NamedTuple
@@ -28,9 +28,9 @@ LONGER_S = (120.0, 600.0)  # each divides a span
 
 
 class Associated(NamedTuple):
-    """Views that belong to an object, each with its object's number; and what was left out.
+    """Views of objects, each with the number of its object; and rows of `rejects`.
 
-    `undecided` has a row (epoch, tracklet_id, outcome) per view whose tracklet is ambiguous or
+    `undecided` has a row (epoch, tracklet_id, outcome) for each view whose tracklet is ambiguous or
     whose sensor was left out at that time.
     """
 
@@ -47,10 +47,11 @@ def associate_objects(
     cameras: pa.Table,
     settings: Settings,
 ) -> Associated:
-    """Return the views of objects that two sensors or more see, and the object of each.
+    """Return the views of objects that two or more sensors detect, and the object of each.
 
-    Object numbers count from 0 in the order of first appearance. They hold from window to window
-    as long as a track of the object goes on. A sensor that disagrees with all others is left out.
+    Object numbers count from 0 in the order of first appearance. An object keeps its number from
+    window to window as long as one of its tracks continues. A sensor that disagrees with all
+    others is left out.
     """
     views = views.sort_by([("epoch", "ascending"), ("sensor_id", "ascending"),
                            ("tracklet_id", "ascending")])  # fmt: skip
@@ -86,7 +87,7 @@ def associate_objects(
 def _judge(arrays: SpanViews, rows: Indices, verdicts: Verdicts, settings: Settings) -> Indices:
     """Enter the verdict on a window's views; return the sensors that disagree with all others.
 
-    Where some do, the others are judged again without them.
+    If there are any, the other sensors are judged again without them.
     """
     groups, samples, tracklet = _grouped(arrays, rows, settings)
     disagreeing = agreement(samples, groups).disagreeing()
@@ -129,7 +130,7 @@ def _undecided(
 def _judge_again(
     arrays: SpanViews, verdicts: Verdicts, believed: npt.NDArray[np.bool_], settings: Settings
 ) -> None:
-    """Judge what is undecided over longer and longer windows in which its tracklets go on."""
+    """Judge undecided tracklets again, over longer windows."""
     judged_s = settings.association.span_s
     for window_s in LONGER_S:
         if not judged_s < window_s <= settings.association.longest_span_s:
@@ -171,12 +172,12 @@ def _solve(arrays: SpanViews, samples: Samples, settings: Settings) -> Groups:
 def _reject_table(
     arrays: SpanViews, reason: Reason, window: Indices, left_out: Indices
 ) -> pa.Table:
-    """Return a row of `rejects` per sensor: how many of its tracklets are left out of a window.
+    """Return a row of `rejects` per sensor: how many of its tracklets are left out in a window.
 
     Parameters
     ----------
     window, left_out
-        Rows of the views: those of the window, and those of them that are left out.
+        Rows of the views of the window, and of the views that are left out.
     """
     tracklet = np.unique(arrays.tracklet[left_out])
     sensor = arrays.sensor_of_tracklet[tracklet]
@@ -191,12 +192,12 @@ def _reject_table(
 
 
 def _with_two_sensors(arrays: SpanViews, number: Indices) -> Indices:
-    """Return the object numbers, -1 where no second sensor sees the object at that epoch.
+    """Return the object numbers; -1 where no second sensor has a view of the object at the epoch.
 
-    Two fragments of one object in one sensor may both have a view at an epoch. The one with a
-    centroid in the frame, or else the first, counts: no sensor sees an object twice.
+    Two fragments of a track in one sensor may both have a view of an object at an epoch. Only one
+    counts: the one with a centroid in the frame, or else the first.
     """
-    out = number.copy()
+    kept = number.copy()
     grouped = np.flatnonzero(number >= 0)
     order = grouped[
         np.lexsort(
@@ -209,10 +210,10 @@ def _with_two_sensors(arrays: SpanViews, number: Indices) -> Indices:
         )
     ]
     key = np.column_stack([arrays.epoch_ns[order], number[order], arrays.sensor[order]])
-    again = np.zeros(len(order), bool)
-    again[1:] = (key[1:] == key[:-1]).all(axis=1)
-    out[order[again]] = -1
-    order, key = order[~again], key[~again]
+    repeated = np.zeros(len(order), bool)
+    repeated[1:] = (key[1:] == key[:-1]).all(axis=1)
+    kept[order[repeated]] = -1
+    order, key = order[~repeated], key[~repeated]
     _, inverse, count = np.unique(key[:, :2], axis=0, return_inverse=True, return_counts=True)
-    out[order[count[inverse.ravel()] < 2]] = -1
-    return out
+    kept[order[count[inverse.ravel()] < 2]] = -1
+    return kept

@@ -1,7 +1,4 @@
-"""Collect clock views: what the check of clocks needs of a span.
-
-Views beside objects, with the velocities of both.
-"""
+"""Collect clock views: the views and objects of a span that the check of clocks needs."""
 
 import numpy as np
 import polars as pl
@@ -12,9 +9,9 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CLOCK_VIEWS
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 
-VELOCITY_WINDOW_S = 30.0  # positions this near give an object's velocity
-MOST_EPOCHS = 300  # more tell nothing new of a constant
-MOST_PAIRS = 200_000  # of a view and an object: bounds the memory
+VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
+MOST_EPOCHS = 300  # more do not help: the offset is one constant
+MOST_PAIRS = 200_000  # pairs of a view and an object: limits the memory
 POSITION_COV = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
 PLACE = ["x_km", "y_km", "z_km"]
 VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
@@ -27,13 +24,13 @@ def collect_clock_views(
     solutions: pa.Table,
     settings: Settings,
 ) -> pa.Table:
-    """Return CLOCK_VIEWS: the views of each object, and all other views beside all objects.
+    """Return CLOCK_VIEWS: each object with its views, and all other views with every object.
 
-    `views` are all views, not only those of objects. A sensor whose clock is seconds off sees no
-    object where it is, so its views are held against the objects that the other sensors found.
+    `views` are all views, not only those of objects. If a sensor's clock is seconds off, none of
+    its views fits an object, so they are compared with the objects of the other sensors.
 
-    Epochs that share detections would count twice. So one in each width of the local motion is
-    used, `MOST_EPOCHS` at most.
+    Epochs nearer than twice the window of the local motion share detections. So only some epochs
+    are used, `MOST_EPOCHS` at most.
     """
     key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
     claims = pl.DataFrame(associations).select([*key, "object_id"])
@@ -60,7 +57,7 @@ def collect_clock_views(
 
 
 def _thinned(free: pl.DataFrame, objects: pl.DataFrame) -> pl.DataFrame:
-    """Return the views of fewer epochs, so that there are at most `MOST_PAIRS` with objects."""
+    """Return the views of fewer epochs, so that they make at most `MOST_PAIRS` with objects."""
     n_objects = objects.group_by("epoch").agg(n=pl.len())
     pairs = free.select("epoch").join(n_objects, on="epoch")["n"].sum()
     epochs = free["epoch"].unique().sort()[:: max(-(-pairs // MOST_PAIRS), 1)]
@@ -68,7 +65,7 @@ def _thinned(free: pl.DataFrame, objects: pl.DataFrame) -> pl.DataFrame:
 
 
 def _apart(epochs: pl.Series, apart_s: float) -> pl.Series:
-    """Return epochs at least so far apart, thinned evenly to `MOST_EPOCHS`."""
+    """Return epochs that are at least so far apart, `MOST_EPOCHS` at most, evenly spread."""
     kept: list[int] = []
     time_ns = epochs.cast(pl.Int64).to_numpy()
     for k, t in enumerate(time_ns):
@@ -78,7 +75,7 @@ def _apart(epochs: pl.Series, apart_s: float) -> pl.Series:
 
 
 def _with_velocities(positions: pl.DataFrame) -> pl.DataFrame:
-    """Return the positions with the velocities that the neighbouring ones show."""
+    """Return the positions, with velocities from the positions near them in time."""
     positions = positions.sort("object_id", "epoch")
     size = positions.group_by("object_id", maintain_order=True).len()["len"].to_numpy()
     offsets = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)

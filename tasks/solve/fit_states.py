@@ -1,4 +1,4 @@
-"""Fit states: position and velocity of each object over the arcs that it has."""
+"""Fit states: position and velocity of each object, arc by arc."""
 
 import itertools
 
@@ -24,7 +24,7 @@ from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, fit_orbits
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-SLOPE_S = 60.0  # positions this near the middle of an arc give the velocity to begin with
+SLOPE_S = 60.0  # positions within this time of an arc's middle give the initial velocity
 
 
 def fit_states(
@@ -32,8 +32,8 @@ def fit_states(
 ) -> pa.Table:
     """Return a state for each object and arc, at the arc's middle epoch.
 
-    Epochs nearer to each other than twice the half-window share detections, so only some serve,
-    none nearer than that. What a sensor's views share is estimated along with the state.
+    Epochs nearer to each other than twice the half-window share detections, so only epochs that
+    are farther apart are used. Each sensor's common error is estimated together with the state.
     """
     rows = _used_views(views, associations, positions, settings)
     if not len(rows):
@@ -43,8 +43,8 @@ def fit_states(
     offsets = np.append(begins, len(arc)).astype(np.int64)
     epoch_ns = rows["epoch"].cast(pl.Int64).to_numpy()
     epochs = [np.unique(epoch_ns[lo:hi]) for lo, hi in itertools.pairwise(offsets)]
-    n_epochs = np.array([len(own) for own in epochs])
-    middle = np.array([own[len(own) // 2] for own in epochs])
+    n_epochs = np.array([len(of_arc) for of_arc in epochs])
+    middle = np.array([of_arc[len(of_arc) // 2] for of_arc in epochs])
     object_id = rows["object_id"].to_numpy()[begins]
     arcs = Arcs(
         offsets=offsets,
@@ -63,7 +63,7 @@ def fit_states(
 def _used_views(
     views: pa.Table, associations: pa.Table, positions: pa.Table, settings: Settings
 ) -> pl.DataFrame:
-    """Return the views that served positions at epochs apart, with the number of their arc."""
+    """Return the views used for positions, at epochs far enough apart, with their arc numbers."""
     key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
     claimed = to_polars(associations).filter("used").select([*key, "object_id"])
     solved = to_polars(positions).select("epoch", "object_id").sort("object_id", "epoch")
@@ -84,14 +84,14 @@ def _used_views(
 def _arcs(
     name: npt.NDArray[np.object_], epoch_ns: Indices, arc_s: float, apart_s: float
 ) -> tuple[Indices, npt.NDArray[np.bool_]]:
-    """Return the arc of each epoch of sorted objects, and which epochs serve."""
+    """Return the arc of each epoch of sorted objects, and which epochs are used."""
     arc, kept = np.zeros(len(name), np.int64), np.zeros(len(name), bool)
     number, begun, last = -1, 0, 0
     for k, t in enumerate(epoch_ns.tolist()):
         if k == 0 or name[k] != name[k - 1] or t - begun > arc_s * 1e9:
             number, begun = number + 1, t
-            # The last epoch of the arc before shares nothing with this one that matters: each
-            # arc's covariance stands for itself.
+            # An epoch may be near the last one of the arc before: their errors are correlated, but
+            # each arc has a covariance of its own.
             last = t - round(apart_s * 1e9)
         arc[k], kept[k] = number, t - last >= apart_s * 1e9
         last = t if kept[k] else last
@@ -104,7 +104,7 @@ def _long_enough(arc: Indices, kept: npt.NDArray[np.bool_], least: int) -> npt.N
 
 
 def _starts(positions: pa.Table, object_id: npt.NDArray[np.object_], middle_ns: Indices) -> Array:
-    """Return states to begin with: the position at each arc's middle, and the slope there."""
+    """Return initial states: the position at each arc's middle, and the slope there."""
     rows = to_polars(positions).sort("object_id", "epoch")
     name, epoch_ns = rows["object_id"].to_numpy(), rows["epoch"].cast(pl.Int64).to_numpy()
     begins = np.flatnonzero(np.append(True, name[1:] != name[:-1]))
@@ -124,9 +124,9 @@ def _state_table(
     chi2: Array,
     n_epochs: Indices,
 ) -> pa.Table:
-    """Return the states that were found, in order of time."""
-    found = np.flatnonzero(np.isfinite(chi2))
-    found = found[np.lexsort((object_id[found].astype(str), epoch_ns[found]))]
+    """Return STATES of the arcs whose fit converged, in order of time."""
+    fitted = np.flatnonzero(np.isfinite(chi2))
+    fitted = fitted[np.lexsort((object_id[fitted].astype(str), epoch_ns[fitted]))]
     columns = {
         "epoch": epoch_ns,
         "object_id": object_id,
@@ -136,4 +136,4 @@ def _state_table(
         "n_epochs": n_epochs.astype(np.int32),
         "chi2": chi2,
     }
-    return table(STATES, {name: values[found] for name, values in columns.items()})
+    return table(STATES, {name: values[fitted] for name, values in columns.items()})

@@ -1,4 +1,4 @@
-"""Judge tracklets: what became of each that a span compared with other sensors."""
+"""Judge tracklets: the outcome of each that was compared with other sensors in a span."""
 
 from collections.abc import Iterable
 
@@ -17,18 +17,18 @@ _RANK = {outcome.value: rank for rank, outcome in enumerate(Outcome)}
 def judge_tracklets(
     views: pa.Table, left_out: pa.Table, undecided: pa.Table, associations: pa.Table
 ) -> pa.Table:
-    """Return TRACKLET_OUTCOMES of a span; lone detections, which are not published, have none.
+    """Return TRACKLET_OUTCOMES of a span. Lone detections, which are not published, have none.
 
     Parameters
     ----------
     views
         VIEWS that were compared.
     left_out
-        VIEWS of sensors that were left out as a whole.
+        VIEWS of sensors that were left out because of their clocks.
     undecided
-        Rows of (tracklet_id, outcome) that the association did not decide.
+        Rows of (tracklet_id, outcome), as `associate_objects` returns them.
     associations
-        ASSOCIATIONS that came of it.
+        ASSOCIATIONS of the span.
     """
     used = associations["used"]
     ids = associations["tracklet_id"]
@@ -45,7 +45,7 @@ def judge_tracklets(
 
 
 def best_outcomes(tables: Iterable[pa.Table]) -> pa.Table:
-    """Return TRACKLET_OUTCOMES of all tables together: of each tracklet the first of `Outcome`."""
+    """Return TRACKLET_OUTCOMES of several tables: of each tracklet the first in `Outcome`."""
     rows = pl.concat(
         to_polars(rows).select("tracklet_id", "outcome")
         for rows in (empty(TRACKLET_OUTCOMES), *tables)

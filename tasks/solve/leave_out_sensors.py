@@ -1,4 +1,4 @@
-"""Leave out sensors: those whose clocks are wrong and were not corrected."""
+"""Leave out sensors whose clocks are wrong and were not corrected."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from epipole.schemas.rejects import Reason, reject_rows
 
 
 class Remaining(NamedTuple):
-    """The views that remain, those that were left out, and the rows of `rejects` for these."""
+    """The views that remain, the views left out, and rows of `rejects` for the latter."""
 
     views: pa.Table
     left_out: pa.Table
@@ -19,7 +19,7 @@ class Remaining(NamedTuple):
 
 
 def leave_out_sensors(views: pa.Table, sensors: Sequence[str]) -> Remaining:
-    """Return the views without those of these sensors."""
+    """Return the views, without those of some sensors."""
     wrong = pc.is_in(views["sensor_id"], pa.array(list(sensors), pa.string()))
     left_out = views.filter(wrong)
     by_sensor = pl.DataFrame(left_out).group_by("sensor_id").agg(

@@ -1,4 +1,4 @@
-"""Sample views: the views of a span as arrays, and samples of them for the association."""
+"""Sample views: the views of a span at a few instants, as arrays for the association."""
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MOST_SAMPLES = 12  # instants in a window
-NEAR_NS = 2_000_000_000  # a frame this near gives the sensor's pose
+NEAR_NS = 2_000_000_000  # a frame within this time gives the sensor's pose
 
 
 class SpanViews:
@@ -26,7 +26,7 @@ class SpanViews:
     ) -> None:
         tracklets = tracklets.sort_by("tracklet_id")
         self.tracklet_id = array(tracklets, "tracklet_id").astype(str)
-        # Fragments that the linking joined are one track: an object keeps its number by it.
+        # Joined fragments are one track, by which an object keeps its number.
         _, self.track = np.unique(array(tracklets, "track_id").astype(str), return_inverse=True)
         self.sensors, self.sensor_of_tracklet = np.unique(
             array(tracklets, "sensor_id").astype(str), return_inverse=True
@@ -43,7 +43,7 @@ class SpanViews:
         self._read_poses(solutions, cameras)
 
     def _read_poses(self, solutions: pa.Table, cameras: pa.Table) -> None:
-        """Keep each sensor's position and attitude, frame by frame, and its half field."""
+        """Read each sensor's positions and attitudes, and its field of view."""
         self.frames, half_field, focal_px = [], [], []
         for sensor in self.sensors:
             frames = solved_frames(solutions.filter(pa.compute.field("sensor_id") == sensor))
@@ -55,7 +55,7 @@ class SpanViews:
         self.focal_px = np.array(focal_px)
 
     def windows(self, window_s: float) -> list[Indices]:
-        """Return the rows of each window of time, counted from midnight, in order."""
+        """Return the rows of each window of time, in order; windows are counted from 1970."""
         if not len(self.epoch_ns):
             return []
         window = self.epoch_ns // max(round(window_s * 1e9), 1)
@@ -77,8 +77,8 @@ class SpanViews:
         cov, sigma_km = np.tile(np.eye(2), (t, k, 1, 1)), np.ones((t, k))
         seen[item, at] = True
         u[item, at] = self.u[rows]
-        # An error that all frames share is drawn once. In k samples it gets k times its
-        # variance, so that together they count as one draw.
+        # The common error is one for all k samples. With k times its variance in each of them,
+        # they count together as one.
         n_samples = seen.sum(axis=1)[item].astype(float)
         cov[item, at] = self.noise[rows] + n_samples[:, None, None] * self.bias[rows]
         sigma_km[item, at] = np.sqrt(n_samples) * self.sigma_km[rows]
@@ -112,9 +112,9 @@ class SpanViews:
         return np.unique([epochs[np.argmin(np.abs(epochs - m))] for m in middle])
 
     def instants(self, rows: Indices, window_s: float) -> Indices:
-        """Return a few epochs of a window, so that no tracklet is left out.
+        """Return a few epochs of a window at which every tracklet has a view, if possible.
 
-        A tracklet that has no view at the evenly spaced epochs adds the middle one of its own.
+        They are evenly spaced, and the middle epoch of each tracklet without a view at those.
         """
         chosen = set(self.even_instants(rows, window_s).tolist())
         for tracklet in np.unique(self.tracklet[rows]):

@@ -34,11 +34,11 @@ from epipole.tasks.common.lone_detections import only_id, published_ids
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-VELOCITY_WINDOW_S = 30.0  # positions this near give an object's velocity
+VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
 
 
 class Solved(NamedTuple):
-    """Associations, the pairs of detections they imply, positions, and what was left out."""
+    """Tables ASSOCIATIONS, PAIRS, POSITIONS and REJECTS."""
 
     associations: pa.Table
     pairs: pa.Table
@@ -47,7 +47,7 @@ class Solved(NamedTuple):
 
 
 class _Groups(NamedTuple):
-    """Views in groups of one epoch and object, the objects' names, and the solution."""
+    """Views grouped by epoch and object, and the solution of each group."""
 
     views: pa.Table
     offsets: Indices
@@ -71,10 +71,10 @@ class _Groups(NamedTuple):
 def solve_positions(
     views: pa.Table, object_number: Indices, settings: Settings, span: Span | None = None
 ) -> Solved:
-    """Return positions with covariance of objects seen by two sensors or more.
+    """Return the positions, with covariances, of objects that two or more sensors detect.
 
-    Solved twice: the first positions give the velocities that the difference in light time
-    between near and far sensors needs. With a span, what is returned is of its epochs only.
+    They are solved twice. The first solution gives the velocities, which are needed because the
+    light time to near and far sensors differs. With `span`, only its epochs are returned.
     """
     groups = _solve(views, object_number, settings)
     if span is not None:
@@ -141,14 +141,14 @@ def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
 
     Rows are in order of time.
     """
-    out = np.empty(len(number), dtype=object)
+    names = np.empty(len(number), dtype=object)
     first: dict[int, str] = {}
     for i, (t, n) in enumerate(zip(epoch_ns.tolist(), number.tolist(), strict=True)):
         if n not in first:
             date = np.datetime64(t, "ns").astype("datetime64[D]")
             first[n] = f"{str(date).replace('-', '')}-{n + 1:05d}"
-        out[i] = first[n]
-    return out
+        names[i] = first[n]
+    return names
 
 
 def _direction_covariance(views: pa.Table) -> Array:
@@ -163,15 +163,15 @@ def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> Array:
     order = np.lexsort((epoch_ns, number))
     cuts = np.flatnonzero(np.diff(number[order])) + 1
     offsets = np.concatenate([[0], cuts, [len(number)]]).astype(np.int64)
-    out = np.empty_like(x_km)
+    v_km_s = np.empty_like(x_km)
     origin = epoch_ns[0] if len(epoch_ns) else 0
     time_s = (epoch_ns[order] - origin) / 1e9
-    out[order] = velocities(offsets, time_s, x_km[order], VELOCITY_WINDOW_S)
-    return out
+    v_km_s[order] = velocities(offsets, time_s, x_km[order], VELOCITY_WINDOW_S)
+    return v_km_s
 
 
-class _Pairs(NamedTuple):
-    """All pairs of views of one group: their rows, epipolar distance [px] and its sigmas."""
+class _ViewPairs(NamedTuple):
+    """Pairs of views of one group: their rows, and the epipolar distance in px and in sigmas."""
 
     first: Indices
     second: Indices
@@ -179,7 +179,7 @@ class _Pairs(NamedTuple):
     mahalanobis: Array
 
 
-def _pair_up(groups: _Groups) -> _Pairs:
+def _pair_up(groups: _Groups) -> _ViewPairs:
     """Return every ordered pair of views of one object at one epoch."""
     first, second = [], []
     for lo, hi in zip(groups.offsets[:-1], groups.offsets[1:], strict=True):
@@ -199,10 +199,10 @@ def _pair_up(groups: _Groups) -> _Pairs:
         groups.x_km[groups.group[a]],
     )
     pixel = array(groups.views, "pixel_rad")
-    return _Pairs(a, b, np.abs(angle) / pixel[b], np.abs(angle) / sigma)
+    return _ViewPairs(a, b, np.abs(angle) / pixel[b], np.abs(angle) / sigma)
 
 
-def _association_table(groups: _Groups, pairs: _Pairs) -> pa.Table:
+def _association_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
     n = groups.views.num_rows
     square = np.bincount(pairs.second, pairs.epipolar_px**2, minlength=n)
     count = np.maximum(np.bincount(pairs.second, minlength=n), 1)
@@ -220,10 +220,10 @@ def _association_table(groups: _Groups, pairs: _Pairs) -> pa.Table:
     )
 
 
-def _pair_table(groups: _Groups, pairs: _Pairs) -> pa.Table:
-    """Return the pairs of used views that have a centroid each, the first sensor before."""
-    seen = groups.views["centroid"].is_valid().to_numpy() & groups.used
-    kept = seen[pairs.first] & seen[pairs.second] & (pairs.first < pairs.second)
+def _pair_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
+    """Return PAIRS: used views that both have a centroid, sorted by sensor."""
+    has_centroid = groups.views["centroid"].is_valid().to_numpy() & groups.used
+    kept = has_centroid[pairs.first] & has_centroid[pairs.second] & (pairs.first < pairs.second)
     columns = {
         "epoch": groups.epoch_ns[groups.group[pairs.first[kept]]],
         "epipolar_px": pairs.epipolar_px[kept],
@@ -265,7 +265,7 @@ def _residual_px(groups: _Groups) -> Array:
 
 
 def _reject_table(groups: _Groups) -> pa.Table:
-    """Return a row per sensor and reason: views rejected, and epochs without a solution."""
+    """Return a row of `rejects` per sensor and reason, with the number of views."""
     unsolved = ~np.isfinite(groups.chi2)[groups.group]
     which = {
         Reason.VIEW_REJECTED: ~groups.used & ~unsolved,

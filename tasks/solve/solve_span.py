@@ -1,8 +1,7 @@
-"""Solve a span: from all sensors' tracklets to objects, positions and states, file to file.
+"""Solve a span: from all sensors' tracklets to objects, positions and states, part to part.
 
-Epochs, views, association, positions and states of a span of time. A margin at both ends is
-worked on too, so that the span's first and last epochs are solved like all others. The rows of
-the margin are the neighbours'.
+Margins before and after the span are solved too, so that its first and last epochs have the same
+evidence as all others. Rows of the margins are not kept: they belong to the neighbouring spans.
 """
 
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.io.work.part_tables import SOLVED
 from epipole.io.work.parts import Parts, read_part, write_part
 from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import array, concat, table
@@ -31,7 +31,7 @@ from epipole.tasks.solve.leave_out_sensors import leave_out_sensors
 from epipole.tasks.solve.solve_positions import Solved, object_names, solve_positions
 from epipole.tasks.solve.view_objects import view_objects
 
-FEWEST_EPOCHS = 6  # of margin, at any rate
+FEWEST_EPOCHS = 6  # of a margin
 
 
 @stage_task(Stage.SOLVE, "{span}")
@@ -44,25 +44,25 @@ def solve_span(
     settings: Settings,
     parts: Parts,
 ) -> int:
-    """Find the objects of a span and solve them, unless that has been done.
+    """Find the objects of a span and solve them, unless the part exists.
 
     Parameters
     ----------
     sensors
         In the order of their ids.
     left_out
-        Ids of sensors whose clocks are wrong: they see nothing where they say.
+        Ids of sensors whose clocks are wrong; their views are not used.
     parts
-        Where the part goes: the tables that are published, with objects as they are called in
-        the span, `object_tracks`, `tracklet_outcomes`, `clock_views` and `rejects`.
+        Where the part goes: `SOLVED`, with the objects' names in the span.
 
     Returns
     -------
     int
-        How many positions there are.
+        Number of positions.
     """
     if not parts.holds(span):
-        write_part(parts.of(span), _solve(sensors, span, grid, cameras, left_out, settings))
+        tables = _solve(sensors, span, grid, cameras, left_out, settings)
+        write_part(parts.of(span), SOLVED, tables)
     return parts.read(span, "positions").num_rows
 
 
@@ -76,7 +76,7 @@ def _solve(
 ) -> dict[str, pa.Table]:
     margin_ns = _margin_ns(grid, settings)
     about = span.widened(margin_ns)
-    # Motion at an epoch is fitted to the detections around it.
+    # The motion at an epoch is fitted to the detections before and after it.
     wide = about.widened(round(2e9 * settings.alignment.window_s) + margin_ns)
     solutions = [sensor.identified.rows_within(wide, SOLUTIONS, "solutions") for sensor in sensors]
     frames = concat(SOLUTIONS, solutions)
@@ -110,7 +110,7 @@ def _solve(
 
 
 def _margin_ns(grid: EpochGrid, settings: Settings) -> int:
-    """Return a margin that holds whole windows of evidence and what velocities are taken from."""
+    """Return a margin long enough for windows of evidence and for velocities."""
     evidence_ns = round(2e9 * settings.association.span_s)
     return max(evidence_ns, FEWEST_EPOCHS * grid.interval_ns)
 
@@ -144,7 +144,7 @@ def _tracklets(sensors: Sequence[SensorParts]) -> pa.Table:
 
 
 def _object_tracks(associated: Associated, tracklets: pa.Table, solved: Solved) -> pa.Table:
-    """Return the tracks of each object of the span, in the order they were last seen."""
+    """Return OBJECT_TRACKS: the tracks of each object, in the order of their last views."""
     tracks = dict(
         zip(tracklets["tracklet_id"].to_pylist(), tracklets["track_id"].to_pylist(), strict=True)
     )

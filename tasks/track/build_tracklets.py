@@ -1,6 +1,5 @@
-"""Build tracklets: detections of one sensor, frame after frame, become runs of one object."""
+"""Build tracklets: runs of detections of one object in the frames of one sensor."""
 
-import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -22,7 +21,6 @@ from epipole.tasks.algorithms.tracking.linking.chains import (
     Links,
     chain_heads,
 )
-from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.algorithms.tracking.runs import NONE, follow_detections
 from epipole.tasks.common.sightings import (
     Frames,
@@ -41,19 +39,13 @@ from epipole.tasks.track.classify_detections import (
     is_planet,
     sighting_sigma,
 )
+from epipole.tasks.track.measure_runs import TrackRun, measure_runs
 
 Array = npt.NDArray[np.float64]
 
-STAR_RATE_SIGMA = 4.0  # a tracklet that moves by less than this many sigmas stands still
-# rad/s: and one slower than this, however well that is known. What drifts so slowly is a star in
-# a field whose optics err by a tenth of a pixel: an object in orbit seen from another moves by
-# arcseconds a second.
-STAR_DRIFT = 0.05 * ARCSEC
-STAR_RATE_KNOWN = 1.0 * ARCSEC  # rad/s: a rate not known this well does not make it a star
-
 
 class Tracked(NamedTuple):
-    """Detections with their tracklets, and the tracklets."""
+    """DETECTIONS with their tracklets, and TRACKLET_RUNS."""
 
     detections: pa.Table
     tracklets: pa.Table
@@ -64,8 +56,8 @@ def build_tracklets(
 ) -> Tracked:
     """Return one sensor's detections with tracklet_id, track_id and kind, and its tracklets.
 
-    Frames with an attitude are tracked on the sky. Those without are tracked in the image, a
-    run of them for itself: there stars move with the objects and cannot be told from them.
+    Frames with an attitude are tracked on the sky. Frames without are tracked apart from them, in
+    the image. There stars move like objects and cannot be told from them.
     """
     if not detections.num_rows:
         return Tracked(detections, empty(TRACKLET_RUNS))
@@ -86,47 +78,51 @@ def build_tracklets(
 
 
 class _Labels(NamedTuple):
-    """What is said of each detection; written as it is found."""
+    """Kind and ids of each detection, filled step by step."""
 
     kind: npt.NDArray[np.object_]
     tracklet_id: npt.NDArray[np.object_]
     track_id: npt.NDArray[np.object_]
 
 
-class _Part(NamedTuple):
-    """Frames that are tracked together, and what they show."""
+class _TrackedFrames(NamedTuple):
+    """Frames that are tracked together, and their sightings."""
 
     frames: Frames
-    seen: Sightings
+    sightings: Sightings
     camera: Camera
     interval_s: float
     on_sky: bool
 
 
-def _parts(solutions: pa.Table, detections: pa.Table, cameras: pa.Table) -> Iterator[_Part]:
-    """Yield the frames with an attitude, and those without."""
+def _parts(
+    solutions: pa.Table, detections: pa.Table, cameras: pa.Table
+) -> Iterator[_TrackedFrames]:
+    """Yield the frames with an attitude, then the frames without."""
     frames = solved_frames(solutions)
     if len(frames.number):
         camera = camera_of(cameras, int(frames.camera[0]))
         interval_s = frame_interval_ns(frames.time_ns) / 1e9
-        yield _Part(frames, sightings_of(frames, detections), camera, interval_s, True)
-    lost = unsolved_frames(solutions)
-    if len(lost.number):
-        camera = camera_of(cameras, int(lost.camera[0]))
-        # Of all frames: those that were lost may be far between.
+        yield _TrackedFrames(frames, sightings_of(frames, detections), camera, interval_s, True)
+    unsolved = unsolved_frames(solutions)
+    if len(unsolved.number):
+        camera = camera_of(cameras, int(unsolved.camera[0]))
+        # The interval of all frames: frames without an attitude may be far apart.
         interval_s = frame_interval_ns(np.sort(array(solutions, "time"))) / 1e9
-        seen = image_sightings_of(lost, detections, camera)
-        yield _Part(lost, seen, camera, interval_s, False)
+        sightings = image_sightings_of(unsolved, detections, camera)
+        yield _TrackedFrames(unsolved, sightings, camera, interval_s, False)
 
 
-def _follow(part: _Part, seen: Sightings, settings: TrackletSettings) -> npt.NDArray[np.int64]:
-    """Return the track number of every sighting."""
+def _follow(
+    part: _TrackedFrames, sightings: Sightings, settings: TrackletSettings
+) -> npt.NDArray[np.int64]:
+    """Return the track number of each sighting; NONE where it belongs to no track."""
     frames, camera, interval_s = part.frames, part.camera, part.interval_s
     return follow_detections(
         (frames.time_ns - frames.time_ns[0]) / 1e9,
-        seen.offsets,
-        seen.u_icrs,
-        sighting_sigma(seen),
+        sightings.offsets,
+        sightings.u_icrs,
+        sighting_sigma(sightings),
         max_rate_rad_s=np.radians(settings.max_rate_deg_s),
         # Half a frame of slack, for jitter.
         max_coast_s=(settings.max_missed + 1.5) * interval_s,
@@ -138,77 +134,74 @@ def _follow(part: _Part, seen: Sightings, settings: TrackletSettings) -> npt.NDA
     )
 
 
-class _Run(NamedTuple):
-    """One track's sightings and what they show."""
-
-    members: npt.NDArray[np.int64]
-    rate_rad_s: float
-    stands_still: bool
-    residual_px: float
-
-
-def _label(part: _Part, labels: _Labels, detections: pa.Table, settings: Settings) -> pa.Table:
-    """Say what the detections of some frames are; return their tracklets."""
-    frames, seen, camera = part.frames, part.seen, part.camera
+def _label(
+    part: _TrackedFrames, labels: _Labels, detections: pa.Table, settings: Settings
+) -> pa.Table:
+    """Label the detections of some frames, and return their tracklets."""
+    frames, sightings, camera = part.frames, part.sightings, part.camera
     known = labels.kind == "hot_pixel"
-    hot = is_hot_pixel(frames, seen, detections, camera)
-    hot |= at_hot_pixel(seen, detections, known, camera)
-    labels.kind[seen.row[hot]] = "hot_pixel"
+    hot = is_hot_pixel(frames, sightings, detections, camera)
+    hot |= at_hot_pixel(sightings, detections, known, camera)
+    labels.kind[sightings.row[hot]] = "hot_pixel"
     planet = np.zeros_like(hot)
     if part.on_sky:
-        planet = is_planet(frames, seen, camera) & ~hot
-        labels.kind[seen.row[planet]] = "planet"
-    seen = part_of(seen, ~hot & ~planet)
-    track = _follow(part, seen, settings.tracklets)
-    runs = _runs(frames, seen, track, camera, settings.alignment.window_s)
+        planet = is_planet(frames, sightings, camera) & ~hot
+        labels.kind[sightings.row[planet]] = "planet"
+    sightings = part_of(sightings, ~hot & ~planet)
+    track = _follow(part, sightings, settings.tracklets)
+    runs = measure_runs(frames, sightings, track, camera, settings.alignment.window_s)
     if part.on_sky:
         stars = [run for run in runs if run.stands_still]
         runs = [run for run in runs if not run.stands_still]
-        _label_stars(labels, seen, stars, np.flatnonzero(track == NONE))
+        _label_stars(labels, sightings, stars, np.flatnonzero(track == NONE))
     sensor_id = str(detections["sensor_id"][0])
     objects = sorted(runs, key=lambda run: int(run.members[0]))
-    names = [_name(sensor_id, frames, seen, detections, run) for run in objects]
-    links = _link(part, seen, objects, settings)
+    names = [_name(sensor_id, frames, sightings, detections, run) for run in objects]
+    links = _link(part, sightings, objects, settings)
     heads = [names[head] for head in chain_heads(links.before)]
     for run, name, head in zip(objects, names, heads, strict=True):
-        labels.kind[seen.row[run.members]] = "object"
-        labels.tracklet_id[seen.row[run.members]] = name
-        labels.track_id[seen.row[run.members]] = head
-    return _tracklet_table(frames, seen, objects, names, heads, links.chi2, sensor_id)
+        labels.kind[sightings.row[run.members]] = "object"
+        labels.tracklet_id[sightings.row[run.members]] = name
+        labels.track_id[sightings.row[run.members]] = head
+    return _tracklet_table(frames, sightings, objects, names, heads, links.chi2, sensor_id)
 
 
 def _label_stars(
-    labels: _Labels, seen: Sightings, stars: list[_Run], single: npt.NDArray[np.int64]
+    labels: _Labels, sightings: Sightings, stars: list[TrackRun], single: npt.NDArray[np.int64]
 ) -> None:
     """Label runs that stand still, and single sightings at their places, as unlisted stars."""
     for run in stars:
-        labels.kind[seen.row[run.members]] = "star_unlisted"
-    places = np.array([seen.u_icrs[run.members].mean(axis=0) for run in stars])
-    labels.kind[seen.row[single[at_star(seen, single, places)]]] = "star_unlisted"
+        labels.kind[sightings.row[run.members]] = "star_unlisted"
+    places = np.array([sightings.u_icrs[run.members].mean(axis=0) for run in stars])
+    labels.kind[sightings.row[single[at_star(sightings, single, places)]]] = "star_unlisted"
 
 
-def _name(sensor_id: str, frames: Frames, seen: Sightings, detections: pa.Table, run: _Run) -> str:
-    """Return a tracklet's id: the frame and centroid in which it begins name it.
+def _name(
+    sensor_id: str, frames: Frames, sightings: Sightings, detections: pa.Table, run: TrackRun
+) -> str:
+    """Return a tracklet's id: its sensor, and the frame and centroid of its first detection.
 
-    So it is the same, whatever else the night holds.
+    So the id does not depend on the rest of the night.
     """
     first = run.members[0]
-    centroid = detections["centroid"][int(seen.row[first])].as_py()
-    return f"{sensor_id}-{frames.number[seen.frame[first]]}-{centroid}"
+    centroid = detections["centroid"][int(sightings.row[first])].as_py()
+    return f"{sensor_id}-{frames.number[sightings.frame[first]]}-{centroid}"
 
 
-def _link(part: _Part, seen: Sightings, runs: list[_Run], settings: Settings) -> Links:
-    """Return which run continues which, by the method that the settings name."""
+def _link(
+    part: _TrackedFrames, sightings: Sightings, runs: list[TrackRun], settings: Settings
+) -> Links:
+    """Return which run continues which, by the method of the settings."""
     chosen, frames, camera = settings.tracklets, part.frames, part.camera
     if not runs:
-        return Links(np.full(len(runs), NONE), np.full(len(runs), np.nan))
+        return Links(np.full(0, NONE), np.full(0, np.nan))
     members = np.concatenate([run.members for run in runs])
     offsets = np.cumsum([0, *(len(run.members) for run in runs)])
     fragments = Fragments(
         offsets.astype(np.int64),
-        (frames.time_ns[seen.frame[members]] - frames.time_ns[0]) / 1e9,
-        seen.u_icrs[members],
-        sighting_sigma(seen)[members],
+        (frames.time_ns[sightings.frame[members]] - frames.time_ns[0]) / 1e9,
+        sightings.u_icrs[members],
+        sighting_sigma(sightings)[members],
     )
     rule = LinkRule(
         gap_s=chosen.link_gap_s,
@@ -221,54 +214,16 @@ def _link(part: _Part, seen: Sightings, runs: list[_Run], settings: Settings) ->
     return links
 
 
-def _runs(
-    frames: Frames,
-    seen: Sightings,
-    track: npt.NDArray[np.int64],
-    camera: Camera,
-    window_s: float,
-) -> list[_Run]:
-    """Return what each track shows, in the order in which they were confirmed."""
-    order = np.lexsort((seen.frame, track))
-    order = order[track[order] != NONE]
-    bounds = np.flatnonzero(np.diff(track[order], prepend=NONE, append=NONE))
-    time_s = (frames.time_ns[seen.frame] - frames.time_ns[0]) / 1e9
-    first = np.repeat(bounds[:-1], np.diff(bounds))
-    last = np.repeat(bounds[1:], np.diff(bounds))
-    smooth, *_ = directions_at(
-        first, last, time_s[order], 0.0, time_s[order], seen.u_icrs[order],
-        seen.cov_noise[order], seen.cov_bias[order], window_s,
-    )  # fmt: skip
-    miss = np.linalg.norm(seen.u_icrs[order] - smooth, axis=1)
-    out = []
-    for lo, hi in itertools.pairwise(bounds):
-        members = order[lo:hi]
-        rate, sigma = _mean_rate(time_s[members], seen.u_icrs[members], seen.cov_noise[members])
-        still = rate < max(STAR_RATE_SIGMA * sigma, STAR_DRIFT) and sigma < STAR_RATE_KNOWN
-        residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / camera.pixel_rad
-        out.append(_Run(members, rate, still, residual))
-    return out
-
-
-def _mean_rate(time_s: Array, u: Array, cov_noise: Array) -> tuple[float, float]:
-    """Return the mean rate of a run and its 1-sigma error [rad/s]."""
-    t = time_s - time_s.mean()
-    lever = float(np.sum(t * t))
-    slope = t @ (u - u[0]) / lever
-    sigma = np.sqrt(np.mean(np.trace(cov_noise, axis1=1, axis2=2)) / lever)
-    return float(np.linalg.norm(slope)), float(sigma)
-
-
 def _tracklet_table(
     frames: Frames,
-    seen: Sightings,
-    runs: list[_Run],
+    sightings: Sightings,
+    runs: list[TrackRun],
     names: list[str],
     heads: list[str],
     link_chi2: Array,
     sensor_id: str,
 ) -> pa.Table:
-    time_ns = frames.time_ns[seen.frame]
+    time_ns = frames.time_ns[sightings.frame]
     return table(
         TRACKLET_RUNS,
         {

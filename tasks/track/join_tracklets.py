@@ -1,7 +1,7 @@
-"""Join tracklets: what one sensor's spans found becomes the tracklets and tracks of its night.
+"""Join tracklets: those of one sensor's spans become the tracklets and tracks of its night.
 
-Two neighbouring spans both follow the detections near the instant between them. Tracklets of
-the two that share detections there are one.
+Detections near the border of two spans are followed in both. Tracklets of the two spans that share
+detections there are one tracklet.
 """
 
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from epipole.io.work.part_tables import NIGHT_TRACKLETS, SPAN_NAMES
 from epipole.io.work.parts import Parts, is_written, read_part, write_part
 from epipole.schemas.bridge import from_polars, to_polars
 from epipole.schemas.spans import Sensor, Span
@@ -23,27 +24,27 @@ KEY = ["frame_number", "centroid"]
 
 @stage_task(Stage.TRACK, "{sensor} all spans")
 def join_tracklets(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts: Parts) -> int:
-    """Name one sensor's tracklets for the night, unless that has been done.
+    """Name one sensor's tracklets for the night, unless the parts exist.
 
     Parameters
     ----------
     tracked
-        The sensor's tracked parts.
+        The sensor's parts of `track_span`.
     spans
-        Those it has parts of, in order.
+        The spans of these parts, in order.
     parts
-        Where the parts go: `names` of each span, and `tracklets` of the night.
+        Where the parts go: `SPAN_NAMES` of each span, and `NIGHT_TRACKLETS`.
 
     Returns
     -------
     int
-        How many tracklets there are.
+        Number of tracklets.
 
     Notes
     -----
-    A detection belongs to the tracklet that it has in its own span. A tracklet keeps the number
-    that it has in the span before, if the two share more detections than either shares with
-    another. What it continues is taken from the span in which it begins.
+    A detection belongs to the tracklet that it has in the span it lies in. A tracklet keeps its
+    number of the span before, if the two share more detections than either shares with another.
+    Which tracklet it continues is taken from the span in which it begins.
     """
     if not is_written(parts.of_night()):
         _join(sensor, tracked, spans, parts)
@@ -52,23 +53,25 @@ def join_tracklets(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts:
 
 def _join(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts: Parts) -> None:
     count = 0
-    before: pl.DataFrame | None = None  # tracklet numbers of the span before
-    owned, named = [], []
+    before: pl.DataFrame | None = None  # the span before: its detections' tracklet numbers
+    summed, linked = [], []
     for k, span in enumerate(spans):
         part = tracked.of(span)
-        seen = _tracked(part).with_columns(owned=pl.col("time_ns").is_between(*span, closed="left"))
-        known = _shared(before, seen)  # a margin may reach over spans that have no frames
-        numbers = _numbered(seen, known, count)
+        rows = _tracked(part).with_columns(
+            inside=pl.col("time_ns").is_between(*span, closed="left")
+        )
+        known = _shared(before, rows)  # the span before may not be the neighbour
+        numbers = _numbered(rows, known, count)
         count = max([count, *(numbers["number"] + 1).to_list()])
-        seen = seen.join(numbers, on="span_name")
-        named.append(_links(part, numbers).with_columns(span=pl.lit(k, pl.Int64)))
-        owned.append(_summed(seen.filter("owned"), part).with_columns(span=pl.lit(k, pl.Int64)))
-        before = seen.select(*KEY, "number")
-    _write(spans, parts, pl.concat(named), pl.concat(owned), sensor.sensor_id)
+        rows = rows.join(numbers, on="span_name")
+        linked.append(_links(part, numbers).with_columns(span=pl.lit(k, pl.Int64)))
+        summed.append(_summed(rows.filter("inside"), part).with_columns(span=pl.lit(k, pl.Int64)))
+        before = rows.select(*KEY, "number")
+    _write(spans, parts, pl.concat(linked), pl.concat(summed), sensor.sensor_id)
 
 
 def _tracked(part: Path) -> pl.DataFrame:
-    """Return a row a detection of a tracklet, in order of time."""
+    """Return a row per detection of a tracklet, in order of time."""
     rows = read_part(part, "detections", [*KEY, "time", "tracklet_id"])
     rows = rows.filter(rows["tracklet_id"].is_valid())
     return (
@@ -80,12 +83,12 @@ def _tracked(part: Path) -> pl.DataFrame:
     )
 
 
-def _shared(before: pl.DataFrame | None, seen: pl.DataFrame) -> pl.DataFrame:
-    """Return which tracklet of a span is which of the one before: most detections shared."""
+def _shared(before: pl.DataFrame | None, rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the numbers of tracklets that share most detections with one of the span before."""
     if before is None:
         return pl.DataFrame(schema={"span_name": pl.String, "number": pl.Int64})
     both = (
-        seen.join(before, on=KEY)
+        rows.join(before, on=KEY)
         .group_by("span_name", "number")
         .len()
         .sort(["len", "number", "span_name"], descending=[True, False, False])
@@ -102,9 +105,9 @@ def _shared(before: pl.DataFrame | None, seen: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _numbered(seen: pl.DataFrame, known: pl.DataFrame, count: int) -> pl.DataFrame:
-    """Return the night's number of each tracklet of a span; new ones count on from `count`."""
-    names = seen.select(pl.col("span_name").unique(maintain_order=True))
+def _numbered(rows: pl.DataFrame, known: pl.DataFrame, count: int) -> pl.DataFrame:
+    """Return each tracklet's number in the night; new tracklets get numbers from `count` on."""
+    names = rows.select(pl.col("span_name").unique(maintain_order=True))
     numbers = names.join(known, on="span_name", how="left", maintain_order="left")
     new = numbers["number"].is_null()
     fresh = pl.Series(np.cumsum(new.to_numpy()) - 1 + count, dtype=pl.Int64)
@@ -112,7 +115,7 @@ def _numbered(seen: pl.DataFrame, known: pl.DataFrame, count: int) -> pl.DataFra
 
 
 def _links(part: Path, numbers: pl.DataFrame) -> pl.DataFrame:
-    """Return, for each tracklet of a span, what it continues there, and how well."""
+    """Return which tracklet each tracklet of a span continues, and the chi-square of the link."""
     rows = to_polars(
         read_part(part, "tracklets", ["tracklet_id", "track_id", "start_time", "link_chi2"])
     ).rename({"tracklet_id": "span_name"})
@@ -125,11 +128,13 @@ def _links(part: Path, numbers: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def _summed(owned: pl.DataFrame, part: Path) -> pl.DataFrame:
-    """Return a row a tracklet and span: its share of the detections, its motion and residual."""
-    found = to_polars(read_part(part, "tracklets", ["tracklet_id", "rate_arcsec_s", "residual_px"]))
+def _summed(rows: pl.DataFrame, part: Path) -> pl.DataFrame:
+    """Return a row per tracklet of a span: its detections inside the span, rate and residual."""
+    motions = to_polars(
+        read_part(part, "tracklets", ["tracklet_id", "rate_arcsec_s", "residual_px"])
+    )
     return (
-        owned.group_by("number", "span_name")
+        rows.group_by("number", "span_name")
         .agg(
             start_ns=pl.col("time_ns").first(),
             end_ns=pl.col("time_ns").last(),
@@ -137,16 +142,16 @@ def _summed(owned: pl.DataFrame, part: Path) -> pl.DataFrame:
             frame_number=pl.col("frame_number").first(),
             centroid=pl.col("centroid").first(),
         )
-        .join(found.rename({"tracklet_id": "span_name"}), on="span_name")
+        .join(motions.rename({"tracklet_id": "span_name"}), on="span_name")
         .sort("number")
     )
 
 
 def _write(
-    spans: Sequence[Span], parts: Parts, named: pl.DataFrame, owned: pl.DataFrame, sensor_id: str
+    spans: Sequence[Span], parts: Parts, linked: pl.DataFrame, summed: pl.DataFrame, sensor_id: str
 ) -> None:
     night = (
-        owned.sort("number", "span")
+        summed.sort("number", "span")
         .group_by("number", maintain_order=True)
         .agg(
             pl.col("frame_number", "centroid", "span", "start_ns").first(),
@@ -157,7 +162,7 @@ def _write(
                 (pl.col("residual_px") ** 2 * pl.col("n")).sum() / pl.col("n").sum()
             ).sqrt(),
         )
-        .join(named.drop("span_name"), on=["number", "span"], how="left")
+        .join(linked.drop("span_name"), on=["number", "span"], how="left")
         .sort("start_ns", "frame_number", "centroid")
         .with_columns(
             tracklet_id=pl.format("{}-{}-{}", pl.lit(sensor_id), "frame_number", "centroid")
@@ -169,21 +174,22 @@ def _write(
     night = night.with_columns(
         track_id=pl.Series(heads, dtype=pl.String), link_chi2=pl.Series(chi2, dtype=pl.Float64)
     )
-    names = named.join(night.select("number", "tracklet_id", "track_id"), on="number")
+    names = linked.join(night.select("number", "tracklet_id", "track_id"), on="number")
     for k, span in enumerate(spans):
         of_span = names.filter(span=k).sort("span_name")
-        write_part(parts.of(span), {"names": from_polars(TRACKLET_NAMES, of_span)})
+        write_part(parts.of(span), SPAN_NAMES, {"names": from_polars(TRACKLET_NAMES, of_span)})
     night = night.rename({"start_ns": "start_time", "end_ns": "end_time"}).with_columns(
         sensor_id=pl.lit(sensor_id)
     )
     night = night.sort("start_time", "tracklet_id")
-    write_part(parts.of_night(), {"tracklets": from_polars(TRACKLET_RUNS, night)})
+    write_part(parts.of_night(), NIGHT_TRACKLETS, {"tracklets": from_polars(TRACKLET_RUNS, night)})
 
 
 def _before(night: pl.DataFrame) -> tuple[np.ndarray, list[float | None]]:
-    """Return the row that each tracklet continues (-1: none) and the link's chi-square.
+    """Return the row that each tracklet continues (-1: none), and the chi-square of the link.
 
-    Two spans may each have one tracklet continue the same third: the likelier one does.
+    In two spans, different tracklets may continue the same one. The link with the smaller
+    chi-square is kept.
     """
     row_of = {number: row for row, number in enumerate(night["number"])}
     before = np.full(len(night), -1)

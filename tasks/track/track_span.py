@@ -1,7 +1,8 @@
-"""Track a span: one sensor's tracklets over a span of time and a margin, from file to file."""
+"""Track a span: one sensor's tracklets over a span and its margins, from part to part."""
 
 import pyarrow as pa
 
+from epipole.io.work.part_tables import TRACKED
 from epipole.io.work.parts import Parts, write_part
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span
@@ -11,13 +12,13 @@ from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.track.build_tracklets import build_tracklets
 
-# A tracklet that begins before the span is followed for so long that both spans find the same
-# one, and a broken one is joined across the span's end.
+# Tracklets are followed this long before and after a span, so that neighbouring spans find the same
+# ones, and broken tracks are joined across the border.
 MARGIN_S = 90.0
 
 
 def track_margin_ns(settings: Settings) -> int:
-    """Return how far beyond a span its tracklets are followed, and those of its neighbours."""
+    """Return how far before and after a span its detections are followed."""
     return round((MARGIN_S + settings.tracklets.link_gap_s) * 1e9)
 
 
@@ -30,19 +31,19 @@ def track_span(
     settings: Settings,
     parts: Parts,
 ) -> int:
-    """Follow one sensor's detections through a span and its margins, unless that was done.
+    """Follow one sensor's detections through a span and its margins, unless the part exists.
 
     Parameters
     ----------
     identified
-        The sensor's identified parts.
+        The sensor's parts of `identify_span`.
     parts
-        Where the part goes: `detections` and `tracklets`, named within the span.
+        Where the part goes: `TRACKED`, with the tracklets' names in the span.
 
     Returns
     -------
     int
-        How many tracklets there are.
+        Number of tracklets.
     """
     if not parts.holds(span):
         wide = span.widened(track_margin_ns(settings))
@@ -52,5 +53,5 @@ def track_span(
             cameras,
             settings,
         )
-        write_part(parts.of(span), tracked._asdict())
+        write_part(parts.of(span), TRACKED, tracked._asdict())
     return parts.read(span, "tracklets").num_rows

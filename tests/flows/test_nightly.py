@@ -1,4 +1,4 @@
-"""The flow end to end: a simulated night, held against its truth."""
+"""The nightly flow: a simulated night compared with its truth, and nights with missing data."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def write_log(path: Path, sensors: dict[str, dict], start_ns: int = START_NS) -> Path:
-    """Write a log of ten frames a sensor, each with three spots; options leave things out."""
+    """Write a log: ten frames per sensor with three centroids each; options leave things out."""
     with LogWriter(path) as log:
         for sensor_id, leave in sensors.items():
             if leave.get("camera", True):
@@ -174,7 +174,7 @@ def test_a_sensor_without_states_keeps_its_frames_and_gives_no_positions(tmp_pat
     assert "lost" not in set(scan(tmp_path / "out", "epochs")["sensor_id"])
 
 
-def test_a_bad_frame_is_a_reject_and_the_rest_goes_on(tmp_path):
+def test_a_bad_frame_is_a_reject_and_the_others_are_used(tmp_path):
     log = write_log(tmp_path / "n.mcap", {"a": {"nan_frame": 4}})
     nightly([str(log)], str(tmp_path / "out"))
     assert scan(tmp_path / "out", "frames")["frame_number"].to_list() == [0, 1, 2, 3, *range(5, 10)]

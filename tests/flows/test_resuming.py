@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from epipole.io.work.folder import work_key, work_root
+from epipole.schemas.log_tables import LogSource
 from epipole.schemas.settings import Settings, validate_settings
 
 NIGHT = "2019-04-01"
@@ -64,7 +65,7 @@ def test_a_run_reuses_the_parts_of_a_killed_one_and_gives_the_same_rows(
     out = tmp_path / "out"
     kill_when(run(out), lambda: parts(out, stage))
     assert not list(out.glob("night=*"))
-    done = {part: part.stat().st_ino for part in parts(out, "identified")}
+    done = {part: part.stat().st_ino for part in parts(out, "identify/*")}
     assert done
 
     again = run(out)
@@ -72,8 +73,8 @@ def test_a_run_reuses_the_parts_of_a_killed_one_and_gives_the_same_rows(
     while again.poll() is None:
         kept += [part for part, inode in done.items() if part.exists() and _is(part, inode)]
         time.sleep(0.01)
-    said = again.communicate()[0]
-    assert again.returncode == 0, said
+    output = again.communicate()[0]
+    assert again.returncode == 0, output
     assert set(kept) == set(done)  # reused, not written again
     assert contents(out) == contents(night_dataset)
 
@@ -99,18 +100,20 @@ def test_a_run_killed_while_it_replaces_a_night_leaves_the_night_whole(
 def test_two_runs_of_one_night_at_once_end_with_one_night(run, tmp_path, night_dataset):
     out = tmp_path / "out"
     both = [run(out), run(out)]
-    said = [process.communicate(timeout=WAIT_S)[0] for process in both]
+    outputs = [process.communicate(timeout=WAIT_S)[0] for process in both]
     codes = [process.returncode for process in both]
-    assert 0 in codes, said
-    for code, words in zip(codes, said, strict=True):
-        assert code == 0 or "has worked on it since" in words
+    assert 0 in codes, outputs
+    for code, output in zip(codes, outputs, strict=True):
+        assert code == 0 or "has worked on it since" in output
     assert contents(out) == contents(night_dataset)
 
 
 def test_finished_parts_are_reused_only_for_the_same_logs_settings_and_nights():
-    key = work_key(["a", "b"], Settings(), [NIGHT])
-    assert key == work_key(["b", "a"], Settings(), [NIGHT])
+    a, b = (LogSource(f"{name}.mcap", 1, name, 0, 1) for name in "ab")
+    key = work_key([a, b], Settings(), [NIGHT])
+    assert key == work_key([b, a], Settings(), [NIGHT])
     other = validate_settings({"tracklets": {"gate_sigma": 5.0}}, "test")
-    assert key != work_key(["a", "b"], other, [NIGHT])
-    assert key != work_key(["a"], Settings(), [NIGHT])
-    assert key != work_key(["a", "b"], Settings(), ["2019-04-02"])
+    assert key != work_key([a, b], other, [NIGHT])
+    assert key != work_key([a], Settings(), [NIGHT])
+    assert key != work_key([a, b._replace(name="c.mcap")], Settings(), [NIGHT])
+    assert key != work_key([a, b], Settings(), ["2019-04-02"])

@@ -1,4 +1,4 @@
-"""Half-hour spans leave no trace in a night: what passes a border stays whole."""
+"""Spans: tracks and frames at their borders are complete."""
 
 import datetime
 import tomllib
@@ -47,7 +47,7 @@ def rows(out: Path, table: str) -> pl.DataFrame:
 
 
 def test_a_broken_track_is_joined_over_a_span_without_frames(tmp_path):
-    # From 04:28 to 05:03 nobody looks: there is no span from 04:30 to 05:00.
+    # No frames from 04:28 to 05:03, so there is no span from 04:30 to 05:00.
     simulate(validate_scene(tomllib.loads(SLOW), "slow"), tmp_path / "slow.mcap")
     settings = {"tracklets": {"link_gap_s": 3600.0}}
     nightly([str(tmp_path / "slow.mcap")], str(tmp_path / "out"), settings)
@@ -58,7 +58,7 @@ def test_a_broken_track_is_joined_over_a_span_without_frames(tmp_path):
 
 
 @pytest.mark.parametrize(("start", "offset_s"), [("04:29:20", -1.5), ("04:29:59", 1.5)])
-def test_frames_whose_true_times_are_in_another_span_keep_all(tmp_path, start, offset_s):
+def test_frames_whose_true_times_lie_in_another_span_keep_all_centroids(tmp_path, start, offset_s):
     # As told, all frames of sat3 are on one side of 04:30.
     scene = tomllib.loads(FOUR_SENSORS.read_text()) | {"duration_s": 41.0, "seed": 3}
     scene["start"] = datetime.datetime.fromisoformat(f"{NIGHT}T{start}Z")

@@ -1,4 +1,4 @@
-"""The logs of a night, out of a folder: by their times, whatever else lies there."""
+"""The choice of logs: those of a night, whatever else lies in the folder."""
 
 from pathlib import Path
 
@@ -60,7 +60,7 @@ def test_a_folder_a_glob_and_a_url_give_the_same_logs(where, folder):
         memory.rm("/logs", recursive=True)
 
 
-def test_folders_in_the_folder_are_left_to_a_glob_that_asks_for_them(folder):
+def test_logs_in_subfolders_are_found_only_by_a_glob_that_has_them(folder):
     deep = write_log(folder / "sat9" / "x.mcap", *[instant("2019-04-02T12:00:00")] * 2)
     assert str(deep) not in find_logs(str(folder), "2019-04-02").paths
     assert str(deep) in find_logs(f"{folder}/**/*.mcap", "2019-04-02").paths
@@ -146,7 +146,7 @@ def test_a_place_without_logs_is_an_error_that_names_it(where, says, folder):
         find_logs(where.format(folder), None)
 
 
-def test_only_files_that_are_no_logs_is_an_error(tmp_path):
+def test_a_folder_without_any_log_is_an_error(tmp_path):
     (tmp_path / "a.mcap").write_text("PNG")
     with pytest.raises(LogError, match="none of 1 files is an MCAP log"):
         find_logs(str(tmp_path), None)

@@ -43,7 +43,7 @@ def test_the_form_on_the_page_says_what_each_parameter_is():
     assert all("description" in properties[name] for name in ("logs", "out", "night", "replace"))
 
 
-def test_yesterday_is_seen_from_when_the_run_was_due():
+def test_yesterday_is_the_day_before_the_run_was_scheduled():
     due = datetime.datetime(2019, 4, 2, 6, tzinfo=datetime.UTC)
     with patch.object(parameters, "flow_run", DueAt(due, {"night": "yesterday"})):
         assert night_asked("yesterday") == "2019-04-01"

@@ -1,4 +1,4 @@
-"""Which spans a night takes: its own and one beyond each end; sensors without calibration out."""
+"""The spans of a night: its own and one before and after; none without a calibration."""
 
 from pathlib import Path
 
@@ -38,7 +38,7 @@ def frames(calibrated: list[str], **hours: list[float]) -> OrderedFrames:
     )
 
 
-def test_a_night_takes_one_span_beyond_each_end():
+def test_a_night_has_one_more_span_before_and_after():
     found = frames(["a"], a=[-1.0, -0.4, 0.1, 0.2, 12.0, 24.2, 24.6])
     spans, rejects = plan_spans(found, [NIGHT])
     ((sensor, own),) = spans.items()

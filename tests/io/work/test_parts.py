@@ -10,6 +10,7 @@ from epipole.schemas.errors import DatasetError
 from epipole.schemas.spans import SPAN_NS, Span
 
 SCHEMA = pa.schema([pa.field("time", TIME), pa.field("value", pa.int64())])
+ONE = {"a": SCHEMA}
 SPANS = [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in range(3)]
 
 
@@ -21,7 +22,7 @@ def rows(*time_ns: int) -> pa.Table:
 def test_what_is_written_is_read_again(tmp_path):
     part = tmp_path / "stage" / "1"
     assert not is_written(part)
-    write_part(part, {"a": rows(1, 2), "b": rows()})
+    write_part(part, {"a": SCHEMA, "b": SCHEMA}, {"a": rows(1, 2), "b": rows()})
     assert is_written(part)
     assert read_part(part, "a").equals(rows(1, 2))
     assert read_part(part, "b").num_rows == 0
@@ -30,13 +31,13 @@ def test_what_is_written_is_read_again(tmp_path):
 
 
 def test_a_part_that_exists_is_unchanged(tmp_path):
-    write_part(tmp_path / "1", {"a": rows(1)})
-    write_part(tmp_path / "1", {"a": rows(1, 2, 3)})
+    write_part(tmp_path / "1", ONE, {"a": rows(1)})
+    write_part(tmp_path / "1", ONE, {"a": rows(1, 2, 3)})
     assert read_part(tmp_path / "1", "a").num_rows == 1
 
 
 def test_a_missing_or_damaged_table_is_an_error_for_people(tmp_path):
-    write_part(tmp_path / "1", {"a": rows(1)})
+    write_part(tmp_path / "1", ONE, {"a": rows(1)})
     with pytest.raises(DatasetError, match=r"cannot be read.*run again"):
         read_part(tmp_path / "1", "b")
     (tmp_path / "1" / "a.arrow").write_bytes(b"no arrow")
@@ -47,15 +48,15 @@ def test_a_missing_or_damaged_table_is_an_error_for_people(tmp_path):
 def test_a_folder_that_cannot_be_made_is_an_error_for_people(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DatasetError, match="cannot be written"):
-        write_part(tmp_path / "file" / "1", {"a": rows(1)})
+        write_part(tmp_path / "file" / "1", ONE, {"a": rows(1)})
 
 
 def test_rows_within_a_span_come_from_all_parts_that_it_touches(tmp_path):
     parts = Parts(tmp_path)
     border = SPANS[1].start_ns
     # The second part holds a frame whose corrected time lies in the first span.
-    write_part(parts.of(SPANS[0]), {"a": rows(5, border - 1)})
-    write_part(parts.of(SPANS[1]), {"a": rows(border - 2, border, border + 9)})
+    write_part(parts.of(SPANS[0]), ONE, {"a": rows(5, border - 1)})
+    write_part(parts.of(SPANS[1]), ONE, {"a": rows(border - 2, border, border + 9)})
     found = parts.rows_within(SPANS[0], SCHEMA, "a")
     assert found["time"].cast(pa.int64()).to_pylist() == [5, border - 1, border - 2]
     found = parts.rows_within(SPANS[1], SCHEMA, "a")

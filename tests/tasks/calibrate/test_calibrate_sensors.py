@@ -1,4 +1,4 @@
-"""The stage that fits a sensor's optics to its stars: tables in, tables out."""
+"""Calibrate sensors: optics that differ are found, others are unchanged."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ TRUE = SENT._replace(fx_px=3671.0, fy_px=3671.0, k1=-0.08)
 
 
 def stars_of(sensor_id, camera, seed=0, n_frames=40):
-    """Return STARS of a sensor that is taken for SENT, its attitudes a little off."""
+    """Return STARS of a sensor, identified with the camera SENT and attitudes with small errors."""
     rng = np.random.default_rng(seed)
     parts = []
     for k in range(n_frames):
@@ -45,7 +45,7 @@ def cameras(*sensor_ids, **changes):
     )
 
 
-def test_only_the_sensor_that_departs_gets_new_optics():
+def test_only_a_sensor_whose_optics_differ_gets_new_ones():
     stars = concat(STARS, [stars_of("a", TRUE), stars_of("b", SENT)])
     found = calibrate_sensors(stars, cameras("a", "b"))
     assert found.departed == ["a"]
@@ -57,13 +57,13 @@ def test_only_the_sensor_that_departs_gets_new_optics():
     assert np.all(np.abs(off) < 4 * array(found.calibrations, "sigma_fx_px"))
 
 
-def test_few_stars_give_no_row_and_leave_the_camera():
+def test_few_stars_give_no_row_and_an_unchanged_camera():
     found = calibrate_sensors(stars_of("a", TRUE, n_frames=2), cameras("a", "b"))
     assert found.calibrations.num_rows == 0
     assert found.cameras.equals(cameras("a", "b"))
 
 
-def test_a_sensor_with_two_calibrations_is_left_alone():
+def test_a_sensor_with_two_calibrations_is_unchanged():
     both = concat(CAMERAS, [cameras("a"), cameras("a", fx_px=3700.0)])
     found = calibrate_sensors(stars_of("a", TRUE), both)
     assert found.calibrations.num_rows == 0

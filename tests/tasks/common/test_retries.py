@@ -1,4 +1,4 @@
-"""Another try is for storage that may come back, not for what is wrong with a log."""
+"""Retries: after failures of storage that may be temporary, never because of a bad log."""
 
 import errno
 
@@ -17,7 +17,7 @@ from epipole.tasks.read.read_logs import read_log_into
 
 
 def wrapped(cause: Exception | None, kind: type[Exception] = LogError) -> Exception:
-    """Return the error for people that our code raises from another."""
+    """Return an error as our code raises it from another one."""
     error = kind("night.mcap: cannot be read")
     error.__cause__ = cause
     return error
@@ -41,7 +41,7 @@ def answer(status: int) -> Exception:
         wrapped(answer(429)),
     ],
 )
-def test_storage_that_may_come_back_is_tried_again(error):
+def test_temporary_failures_of_storage_are_tried_again(error):
     assert storage_failed(None, None, Failed(data=error))
 
 
@@ -59,7 +59,7 @@ def test_storage_that_may_come_back_is_tried_again(error):
         ZeroDivisionError(),
     ],
 )
-def test_what_stays_as_it_is_is_not_tried_again(error):
+def test_lasting_errors_are_not_tried_again(error):
     assert not storage_failed(None, None, Failed(data=error))
 
 

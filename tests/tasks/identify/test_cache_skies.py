@@ -1,4 +1,4 @@
-"""Skies kept in the process."""
+"""Cache skies: in memory and on disk, shared where catalogue, day and pixel size are equal."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -79,7 +79,7 @@ def _forget():
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Return a disk cache of its own, with nothing kept in the process."""
+    """Return the folder of an empty disk cache, with nothing kept in memory."""
     monkeypatch.setenv("EPIPOLE_CACHE", str(tmp_path))
     _forget()
     yield tmp_path
@@ -99,7 +99,7 @@ def test_what_another_process_left_on_disk_gives_the_same_numbers(folder, monkey
         assert type(a) is type(b)
 
 
-def test_a_damaged_file_is_not_trusted(folder):
+def test_a_damaged_file_is_made_again(folder):
     pairs = _skies().pairs(5.0, optics())
     for path in folder.iterdir():
         content = bytearray(path.read_bytes())
@@ -139,7 +139,7 @@ def test_places_are_of_the_day(folder):
     assert np.median(moved) == pytest.approx(np.sqrt(2), rel=0.02)
 
 
-def test_a_star_whose_place_is_too_unsure_is_none_to_navigate_by(folder):
+def test_a_star_with_an_uncertain_place_is_not_used(folder):
     # 18 years after the epoch: 5" for those of the unsure motion, with pixels of 10".
     unsure = np.where(np.arange(6000) < 100, 300.0, 200.0)
     left_out = _skies(day=17_600, pm_sigma_mas_yr=unsure).sky(9.0).catalogue.star_id

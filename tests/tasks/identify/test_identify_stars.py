@@ -1,4 +1,4 @@
-"""The stage: tables in, tables out."""
+"""Identify stars: frames of a simulated sensor, compared with its truth."""
 
 import numpy as np
 import pyarrow as pa
@@ -46,7 +46,7 @@ def sky(catalogue):
 
 
 class Log:
-    """Frames of a slowly turning sensor, as tables, and what is true of them."""
+    """Frames of a slowly turning sensor as tables, and their truth."""
 
     def __init__(self, sky, n, seed=0, sigma_px=0.2, stated=None, n_false=8, flux=True):
         rng = np.random.default_rng(seed)
@@ -127,7 +127,7 @@ def found(log, catalogue):
     return log.run(catalogue)
 
 
-def test_every_frame_is_solved_and_no_star_is_another(log, found):
+def test_every_frame_is_solved_and_no_star_is_wrong(log, found):
     assert found.solutions["attitude_source"].to_pylist() == ["stars"] * 40
     assert found.solutions["status"].null_count == 40
     frame, centroid = array(found.stars, "frame_number"), array(found.stars, "centroid")
@@ -147,14 +147,14 @@ def test_attitude_errors_are_honest(log, found):
     np.testing.assert_allclose(sigma**2, np.diagonal(cov, axis1=1, axis2=2), rtol=1e-12)
 
 
-def test_the_centroid_error_is_learned_where_it_is_not_stated(found):
+def test_an_unknown_centroid_error_is_estimated(found):
     at_centre = array(found.detections, "sigma_arcsec").max() * ARCSEC / DISTORTED.pixel_rad
     assert at_centre == pytest.approx(0.2, rel=0.05)
     assert np.mean(array(found.solutions, "residual_px")) == pytest.approx(0.2, rel=0.1)
 
 
 @pytest.mark.parametrize("stated", [0.06, 0.2, 0.6])
-def test_a_stated_centroid_error_is_put_right_where_residuals_contradict_it(stated, sky, catalogue):
+def test_a_wrong_centroid_error_is_corrected_by_the_residuals(stated, sky, catalogue):
     log = Log(sky, 20, seed=1, stated=stated)
     found = log.run(catalogue)
     at_centre = array(found.detections, "sigma_arcsec").max() * ARCSEC / DISTORTED.pixel_rad
@@ -204,7 +204,7 @@ def test_without_velocity_only_the_earths_aberration_is_left(log, catalogue, fou
     np.testing.assert_allclose(np.hypot(moved[:, 0], moved[:, 1]), across, atol=0.05)
 
 
-def test_where_stars_fail_the_prior_is_used_as_it_is(sky, log, catalogue):
+def test_without_stars_the_prior_is_used_unchanged(sky, log, catalogue):
     rng = np.random.default_rng(3)
     x = [rng.uniform(0, 1023, 6) for _ in range(40)]
     exposures = log.make_exposures(x, x[::-1])
@@ -232,14 +232,14 @@ def test_frames_without_attitude_are_data_and_their_centroids_have_no_direction(
     assert found.rejects.num_rows == 0
 
 
-def test_a_sensor_without_calibration_keeps_its_frames_and_says_so(log, catalogue):
+def test_a_sensor_without_calibration_keeps_its_frames_with_a_status(log, catalogue):
     found = log.run(catalogue, cameras=log.cameras.slice(0, 0))
     assert set(found.solutions["status"].to_pylist()) == {"no_calibration"}
     assert set(found.solutions["camera"].to_pylist()) == {-1}
     assert found.rejects["reason"].to_pylist() == ["no_calibration"]
 
 
-def test_the_newest_calibration_holds_and_before_the_first_the_first(log, catalogue):
+def test_the_newest_calibration_is_used_or_the_first_for_earlier_frames(log, catalogue):
     late = [T0_NS + 5 * 10**9, T0_NS + 25 * 10**9, T0_NS]
     cameras = pa.concat_tables([log.cameras] * 3)
     names = pa.array(["s", "s", "other"])

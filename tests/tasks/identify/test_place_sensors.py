@@ -1,4 +1,4 @@
-"""Sensors at their frames, row by row, and against the truth of the sample logs."""
+"""Place sensors: at the times of their frames, and as the truth of the sample logs has them."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def test_places_go_row_by_row_with_the_exposures(tmp_path):
     np.testing.assert_allclose(array(places, "x_km"), [7500.0] * 5 + [7000.0] * 5, atol=1e-9)
 
 
-def test_sigmas_that_are_not_sent_are_those_of_the_settings(tmp_path):
+def test_unknown_sigmas_are_those_of_the_settings(tmp_path):
     sent = {"velocity_km_s": [0.0, 7.5, 0.0], "attitude_xyzw": [0.0, 0.0, 0.0, 1.0]}
     settings = Settings.model_validate(
         {"sensors": {"position_sigma_km": 0.7, "attitude_sigma_arcsec": 9.0}}

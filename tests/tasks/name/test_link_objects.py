@@ -1,4 +1,4 @@
-"""Link objects: ids hold through gaps of all sensors, and tables follow the ids."""
+"""Link objects: objects keep their ids across gaps of all sensors."""
 
 import tomllib
 from pathlib import Path
@@ -66,13 +66,13 @@ def test_ids_change_to_the_first_one_of_their_object():
     assert renamed(positions, {}) is positions
 
 
-def test_an_object_without_a_state_is_known_by_its_position():
+def test_an_object_without_a_state_is_recognised_by_its_position():
     states = states_of(PASSES[:2])
     assert link_objects.fn(positions_of(PASSES), states, SETTINGS) == {"3": "2", "4": "1"}
     assert link_objects.fn(positions_of(PASSES), states.slice(0, 0), SETTINGS) == {}
 
 
-def test_the_first_and_last_positions_tell_all():
+def test_only_first_and_last_positions_are_needed():
     positions, states = positions_of(PASSES), states_of(PASSES)
     few = outermost(positions)
     assert few.num_rows == 2 * len(PASSES)
@@ -108,7 +108,7 @@ def gap_dataset(prefect, tmp_path_factory):
     return folder
 
 
-def test_objects_keep_their_ids_through_a_gap_of_all_sensors(gap_dataset):
+def test_objects_keep_their_ids_across_a_gap_of_all_sensors(gap_dataset):
     def scan(name):
         return pl.read_parquet(gap_dataset / f"out/night=*/{name}/*.parquet")
 

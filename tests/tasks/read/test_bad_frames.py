@@ -1,4 +1,4 @@
-"""Logs as they should not be, through reading, identification and tracking: right or rejected."""
+"""Frames out of order, repeated, missing or full of strays: read, identified and tracked."""
 
 import numpy as np
 import pyarrow.compute as pc
@@ -19,12 +19,12 @@ OPTICS = {
 }  # fmt: skip
 SETTINGS = Settings()
 PLACES = np.array([[200.0, 300.0], [500.0, 600.0], [800.0, 350.0]])
-SPEEDS = np.array([[1.5, 0.7], [-1.1, 0.9], [0.6, -1.3]])  # px a frame
+SPEEDS = np.array([[1.5, 0.7], [-1.1, 0.9], [0.6, -1.3]])  # px per frame
 SIGMA = 0.15
 
 
 def frame(number, at_s=None, strays=0):
-    """A frame of three objects that move evenly: number, time [s] and places."""
+    """A frame of three objects in uniform motion: number, time [s] and places."""
     at_s = float(number) if at_s is None else at_s
     rng = np.random.default_rng(number)
     place = PLACES + SPEEDS * (at_s % 600) + rng.normal(size=(3, 2)) * SIGMA
@@ -32,7 +32,7 @@ def frame(number, at_s=None, strays=0):
 
 
 def track(tmp_path, frames):
-    """Write a log of one sensor with a prior attitude; return its tables and what was rejected."""
+    """Write and track a log of one sensor with a prior attitude; return its tables, and the log."""
     path = tmp_path / "bad.mcap"
     last = max((at for _, at, _ in frames), default=0.0)
     with LogWriter(path) as log:
@@ -74,7 +74,7 @@ def test_a_frame_that_comes_twice_counts_once(good, tmp_path):
     assert built.detections.equals(good.detections)
 
 
-def test_two_frames_at_one_time_are_no_motion(tmp_path):
+def test_two_frames_at_one_time_give_no_infinite_rate(tmp_path):
     frames = [frame(k, float(k - (k > 20))) for k in range(41)]  # 20 and 21 at 20 s
     built, read = track(tmp_path, frames)
     assert built.tracklets.num_rows == 3
@@ -84,7 +84,7 @@ def test_two_frames_at_one_time_are_no_motion(tmp_path):
     assert max(built.tracklets["residual_px"].to_pylist()) < 0.3
 
 
-def test_all_frames_at_one_time_are_no_tracks(tmp_path):
+def test_frames_that_all_have_one_time_give_no_tracklets(tmp_path):
     built, _ = track(tmp_path, [frame(k, 5.0) for k in range(40)])
     assert built.tracklets.num_rows == 0
 
@@ -96,7 +96,7 @@ def test_a_gap_of_an_hour_ends_the_tracks(tmp_path):
     assert len(set(built.tracklets["track_id"].to_pylist())) == 6
 
 
-def test_ten_thousand_strays_in_a_frame_break_no_track(tmp_path):
+def test_ten_thousand_strays_in_one_frame_break_no_track(tmp_path):
     built, _ = track(tmp_path, [frame(k, strays=10_000 * (k == 17)) for k in range(40)])
     assert built.tracklets.num_rows == 3
     assert min(built.tracklets["n_detections"].to_pylist()) >= 39
@@ -105,13 +105,13 @@ def test_ten_thousand_strays_in_a_frame_break_no_track(tmp_path):
 
 
 @pytest.mark.parametrize("frames", [[frame(0)], [frame(0), frame(1)]])
-def test_a_sensor_of_a_frame_or_two_has_detections_and_no_tracks(tmp_path, frames):
+def test_one_or_two_frames_give_detections_and_no_tracklets(tmp_path, frames):
     built, _ = track(tmp_path, frames)
     assert built.detections["kind"].to_pylist() == ["unknown"] * 3 * len(frames)
     assert built.tracklets.num_rows == 0
 
 
-def test_empty_frames_are_no_trouble(tmp_path):
+def test_empty_frames_give_empty_tables(tmp_path):
     nothing = [(k, float(k), np.zeros((0, 2))) for k in range(10)]
     built, _ = track(tmp_path, nothing)
     assert built.detections.num_rows == built.tracklets.num_rows == 0

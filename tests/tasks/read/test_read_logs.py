@@ -1,179 +1,39 @@
-"""Several logs together: each frame once, in order, whatever order the paths have."""
+"""Read logs: the content of each log goes into parts with the declared tables."""
 
 import logging
-from pathlib import Path
 
-import numpy as np
 import pytest
-from scenes.whole_logs import read_whole
 
 from epipole.io.logs.writer import LogWriter
-from epipole.schemas.bridge import array, stack
-from epipole.schemas.settings import Settings
+from epipole.io.work.part_tables import LOG_PIECE
+from epipole.io.work.parts import read_part
+from epipole.io.work.places import ReadFolder
+from epipole.schemas.errors import LogError
+from epipole.tasks.read.read_logs import read_log_into
 
 START_NS = 1_554_091_200_000_000_000
-SECOND_NS = 1_000_000_000
-LOGS = Path(__file__).resolve().parents[4] / "shared" / "data" / "logs"
-CAMERA = dict.fromkeys(("cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3"), 0.0)
-CAMERA |= {"width": 100, "height": 100, "fx_px": 500.0, "fy_px": 500.0}
 
 
-def write(path, sensor_id, frames, *, states=(), frame="GCRF", sigma_km=0.0, camera_ns=()):
-    """Write a log: frames as (second, number), states as seconds."""
-    with LogWriter(path) as log:
-        for time_ns in camera_ns:
-            log.camera(sensor_id, time_ns, CAMERA)
-        for second in states:
-            log.state(
-                sensor_id,
-                START_NS + second * SECOND_NS,
-                frame=frame,
-                position_km=[7000.0, second % 1000, 0.0],
-                position_sigma_km=sigma_km,
-            )
-        for second, number in frames:
+def test_a_log_becomes_pieces_with_the_declared_tables(tmp_path, caplog):
+    with LogWriter(tmp_path / "a.mcap") as log:
+        log.state("s", START_NS, position_km=[7000.0, 0.0, 0.0])
+        for k in range(5):
             log.frame(
-                sensor_id,
-                START_NS + second * SECOND_NS,
-                frame_number=number,
-                exposure_s=0.1,
-                x_px=[number],
-                y_px=[second],
-            )
-    return path
+                "s", START_NS + k, frame_number=k, exposure_s=0.1, x_px=[1.0], y_px=[2.0]
+            )  # fmt: skip
+    folder = ReadFolder(tmp_path / "work")
+    with caplog.at_level(logging.INFO):
+        read = read_log_into.fn(folder, 3, str(tmp_path / "a.mcap"))
+    assert (read.number, read.source.name) == (3, "a.mcap")
+    pieces = [folder.piece(3, k) for k in range(read.n_pieces)]
+    rows = {name: sum(read_part(p, name).num_rows for p in pieces) for name in LOG_PIECE}
+    assert rows == {"exposures": 5, "states": 1, "cameras": 0, "rejects": 0}
+    assert not folder.piece(3, read.n_pieces).exists()
+    assert "a.mcap: read 5 frames" in caplog.text
 
 
-def read(*paths):
-    return read_whole(list(paths), Settings())
-
-
-def rows(log):
-    return [
-        (row["reason"], row["sensor_id"], row["source"], row["count"])
-        for row in log.rejects.drop_columns("time").to_pylist()
-    ]
-
-
-def test_frames_of_all_logs_are_sorted_by_sensor_and_time(tmp_path):
-    b = write(tmp_path / "b.mcap", "sat2", [(3, 1), (1, 0)])
-    a = write(tmp_path / "a.mcap", "sat1", [(2, 5)])
-    log = read(b, a)
-    assert log.exposures["sensor_id"].to_pylist() == ["sat1", "sat2", "sat2"]
-    assert array(log.exposures, "frame_number").tolist() == [5, 0, 1]
-    assert [source.name for source in log.sources] == ["a.mcap", "b.mcap"]
-    assert log.sources[1].first_time_ns == START_NS + SECOND_NS
-
-
-def test_frames_of_a_time_come_from_all_logs_in_order(tmp_path):
-    a = write(tmp_path / "a.mcap", "s", [(i, i) for i in range(6)], states=range(6))
-    b = write(tmp_path / "b.mcap", "s", [(i, i) for i in range(4, 9)])
-    between = START_NS + 3 * SECOND_NS, START_NS + 7 * SECOND_NS
-    log = read_whole([b, a], Settings(), between)
-    assert array(log.exposures, "frame_number").tolist() == [3, 4, 5, 6]
-    assert [(reason, n) for reason, _, _, n in rows(log)] == [("duplicate_frame", 2)]
-    assert log.states.num_rows == 3
-
-
-def test_lists_of_frames_go_with_their_frames(tmp_path):
-    order = np.random.default_rng(0).permutation(300)
-    for name, part in (("a", order[:100]), ("b", order[100:])):
-        with LogWriter(tmp_path / f"{name}.mcap", chunk_size=2000) as log:
-            for number in part.tolist():
-                x = np.full(number % 4, number, np.float32)
-                flux = None if number % 3 else x + 1
-                time_ns = START_NS + number * SECOND_NS
-                log.frame(
-                    f"s{number % 2}",
-                    time_ns,
-                    frame_number=number,
-                    exposure_s=1.0,
-                    x_px=x,
-                    y_px=x,
-                    flux=flux,
-                )
-    log = read(tmp_path / "b.mcap", tmp_path / "a.mcap")
-    numbers = array(log.exposures, "frame_number").tolist()
-    assert numbers == [*range(0, 300, 2), *range(1, 300, 2)]
-    assert log.exposures["x_px"].to_pylist() == [[float(n)] * (n % 4) for n in numbers]
-    expected = [None if n % 3 or not n % 4 else [n + 1.0] * (n % 4) for n in numbers]
-    assert log.exposures["flux"].to_pylist() == expected
-    assert log.exposures["sigma_px"].null_count == 300
-
-
-def test_overlapping_logs_give_each_frame_and_state_once_in_any_order(tmp_path):
-    a = write(tmp_path / "a.mcap", "s", [(i, i) for i in range(6)], states=range(6))
-    b = write(tmp_path / "b.mcap", "s", [(i, i) for i in range(4, 9)], states=range(4, 9))
-    log = read(a, b)
-    assert array(log.exposures, "frame_number").tolist() == list(range(9))
-    assert stack(log.states, "{}_km")[:, 1].tolist() == list(range(9))
-    assert rows(log) == [
-        ("duplicate_frame", "s", "b.mcap", 2),
-        ("duplicate_state", "s", "b.mcap", 2),
-    ]
-    other = read(b, a)
-    assert all(mine.equals(yours) for mine, yours in zip(log[:3], other[:3], strict=True))
-    assert log.rejects.equals(other.rejects)
-    assert log.sources == other.sources
-
-
-def test_a_counter_that_restarts_is_a_row_for_what_repeats(tmp_path):
-    a = write(tmp_path / "a.mcap", "s", [(0, 0), (1, 1), (2, 2), (10, 0), (11, 1), (12, 7)])
-    log = read(a)
-    assert array(log.exposures, "frame_number").tolist() == [0, 1, 2, 7]
-    assert rows(log) == [("duplicate_number", "s", "a.mcap", 2)]
-    assert array(log.rejects, "time").tolist() == [START_NS + 10 * SECOND_NS]
-
-
-def test_the_same_log_under_two_names_is_read_once(tmp_path):
-    a = write(tmp_path / "a.mcap", "s", [(0, 0)])
-    b = write(tmp_path / "b.mcap", "s", [(0, 0)])
-    log = read(b, a)
-    assert [source.name for source in log.sources] == ["a.mcap"]
-    assert log.exposures.num_rows == 1
-    assert log.rejects.num_rows == 0
-
-
-def test_a_sensor_without_calibration_keeps_its_frames(tmp_path):
-    log = read(write(tmp_path / "a.mcap", "s", [(0, 0)]))
-    assert log.exposures.num_rows == 1
-    assert log.cameras.num_rows == 0
-
-
-def test_calibrations_are_sorted_and_a_repeated_one_is_one(tmp_path):
-    times = [START_NS + 5, START_NS, START_NS]
-    log = read(write(tmp_path / "a.mcap", "s", [(0, 0)], camera_ns=times))
-    assert array(log.cameras, "time").tolist() == [START_NS, START_NS + 5]
-
-
-def test_states_come_in_gcrf(tmp_path):
-    log = read(write(tmp_path / "a.mcap", "s", [(0, 0)], states=[0], frame="ITRF", sigma_km=0.2))
-    r_km = stack(log.states, "{}_km")
-    assert np.linalg.norm(r_km) == pytest.approx(7000.0, abs=1e-9)
-    assert abs(r_km[0, 0] - 7000.0) > 1000  # Earth has turned
-    assert array(log.states, "position_sigma_km").tolist() == [0.2]
-
-
-@pytest.mark.filterwarnings("ignore:.*dubious year")  # ERFA on leap seconds not yet announced
-def test_beyond_the_earth_orientation_table_there_is_a_warning_and_a_larger_sigma(tmp_path, caplog):
-    far_s = 30 * 365 * 86400  # 2049
-    path = write(tmp_path / "a.mcap", "s", [(far_s, 0)], states=[far_s], frame="ITRF")
-    with caplog.at_level(logging.WARNING):
-        log = read(path)
-    sigma_km = array(log.states, "position_sigma_km")[0]
-    assert sigma_km > Settings().sensors.position_sigma_km
-    assert "outside the Earth-orientation table" in caplog.text
-
-
-@pytest.mark.skipif(not LOGS.exists(), reason="the sample logs are not at hand")
-@pytest.mark.parametrize(
-    ("name", "n_frames", "n_states"),
-    [
-        ("four_sensors_2deg", 240, 260),
-        ("six_sensors_8deg_no_prior", 180, 210),
-        ("lost_in_space_20deg", 100, 105),
-    ],
-)
-def test_the_sample_logs_are_whole(name, n_frames, n_states):
-    log = read(LOGS / f"{name}.mcap")
-    assert (log.exposures.num_rows, log.states.num_rows) == (n_frames, n_states)
-    assert log.rejects.num_rows == 0
+def test_a_file_that_is_no_log_is_an_error_and_leaves_no_part(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"PNG")
+    with pytest.raises(LogError, match=r"a\.mcap"):
+        read_log_into.fn(ReadFolder(tmp_path / "work"), 0, str(tmp_path / "a.mcap"))
+    assert not (tmp_path / "work").exists()

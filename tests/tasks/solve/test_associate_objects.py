@@ -1,4 +1,4 @@
-"""The stage that associates: good views become objects, bad ones a reason and no position."""
+"""Associate objects: good views become objects, wrong ones rejects."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def test_objects_come_out_with_all_their_views(method):
     assert found.views.num_rows >= 0.9 * 4 * 4 * len(scene.times)
 
 
-def test_it_is_the_same_bit_for_bit():
+def test_a_repetition_gives_the_same_bits():
     one, other = (associated(Scene(12, 5).objects(10).strays(30)) for _ in range(2))
     assert one.views.equals(other.views)
     assert one.rejects.equals(other.rejects)
@@ -54,7 +54,7 @@ def test_an_object_inside_the_earth_gives_no_object():
 
 
 @pytest.mark.parametrize("error", ["attitude", "state", "clock"])
-def test_a_wrong_sensor_is_left_out_named_and_spoils_nothing(error, caplog):
+def test_a_wrong_sensor_is_named_and_left_out_and_no_view_is_wrong(error, caplog):
     scene = Scene(17, 4).objects(8, spread_km=100.0)
     if error == "attitude":  # by a degree, and it is believed to be turned so
         axis = np.array([0.0, 0.0, 1.0])
@@ -87,7 +87,7 @@ def test_two_sensors_with_one_id_give_no_wrong_object():
     assert wrong_views(scene, found) == 0
 
 
-def test_what_cannot_be_decided_is_called_ambiguous():
+def test_undecided_tracklets_are_ambiguous():
     scene = Scene(3, 2, times=np.array([0.0]))
     baseline = scene.r[1, 0] - scene.r[0, 0]
     towards = np.array([-39359.89, 15125.76, 64.30]) - scene.r[0, 0]

@@ -1,4 +1,4 @@
-"""States of arcs: from views, what they claim, and which epochs serve."""
+"""Fit states: honest covariances, arcs, and which epochs are used."""
 
 import numpy as np
 import pytest
@@ -63,7 +63,7 @@ def errors(states):
     return found - truth, cov
 
 
-def test_a_state_is_as_far_off_as_it_claims():
+def test_errors_of_states_agree_with_their_covariances():
     square = []
     for seed in range(60):
         off, cov = errors(fit_states(*night(seed, np.arange(-60.0, 61, 20)), SETTINGS))
@@ -71,7 +71,7 @@ def test_a_state_is_as_far_off_as_it_claims():
     assert abs(np.mean(square) / 6 - 1) < 0.22  # three sigma of a mean of 60
 
 
-def test_epochs_that_share_detections_do_not_serve():
+def test_epochs_that_share_detections_are_not_used():
     states = fit_states(*night(1, np.arange(0.0, 61)), SETTINGS)
     assert states["n_epochs"].to_pylist() == [6]  # of 61, every twelfth second: 0 to 60
 
@@ -86,7 +86,7 @@ def test_an_arc_of_two_epochs_gives_no_state():
     assert fit_states(*night(3, np.array([0.0, 20.0])), SETTINGS).num_rows == 0
 
 
-def test_views_that_a_position_rejected_do_not_serve():
+def test_views_that_a_position_rejected_are_not_used():
     views, claimed, positions = night(4, np.arange(-60.0, 61, 20))
     wrong = array(views, "sensor_id") == "s0"
     u = stack(views, "u{}")
@@ -101,7 +101,7 @@ def test_views_that_a_position_rejected_do_not_serve():
 
 
 @pytest.mark.parametrize("which", ["views", "positions"])
-def test_nothing_gives_no_state(which):
+def test_empty_tables_give_no_state(which):
     tables = [empty(VIEWS), empty(ASSOCIATIONS), empty(POSITIONS)]
     if which == "views":
         tables[2] = night(5, np.arange(3.0))[2]

@@ -1,4 +1,4 @@
-"""What became of a tracklet: one outcome each, the most telling one of all spans."""
+"""Judge tracklets: one outcome each, the first in `Outcome` of all spans."""
 
 import polars as pl
 import pyarrow as pa
@@ -35,7 +35,7 @@ def as_dict(rows: pa.Table) -> dict[str, str]:
     return dict(zip(rows["tracklet_id"].to_pylist(), rows["outcome"].to_pylist(), strict=True))
 
 
-def test_each_tracklet_has_the_outcome_that_tells_most():
+def test_each_tracklet_has_its_first_outcome():
     judged = judge_tracklets(
         ids("a", "b", "c", "d", "e", "a"),
         ids("f"),

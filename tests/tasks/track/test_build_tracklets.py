@@ -1,4 +1,4 @@
-"""Build tracklets: detections are taken for what they are, broken tracks are one track."""
+"""Build tracklets: kinds of detections, joined fragments, frames without attitude."""
 
 import numpy as np
 import polars as pl
@@ -83,7 +83,7 @@ def test_only_objects_have_tracklets_and_tracks(seen):
 
 
 @pytest.mark.parametrize("method", ["likelihood_ratio", "prediction"])
-def test_a_break_leaves_one_track_an_object(seen, method):
+def test_after_a_break_each_object_has_one_track(seen, method):
     detections, tracklets = build(seen, broken=True, link_method=method)
     assert tracklets.num_rows == 10
     assert tracklets["link_chi2"].null_count == 5
@@ -99,7 +99,7 @@ def test_joining_can_be_switched_off(seen):
 
 
 def without_attitude(found, lost):
-    """What was found, as if these frames (from the first) had no attitude."""
+    """The identified tables, but these frames (counted from the first) have no attitude."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -127,7 +127,7 @@ def test_frames_without_attitude_are_tracked_in_the_image(seen):
     assert (kind == "object").sum() > 0.9 * 5 * 60
 
 
-def test_lost_frames_far_between_make_no_track(seen):
+def test_frames_without_attitude_that_are_far_apart_give_no_track(seen):
     found, cameras, _ = seen
     solutions, detections = without_attitude(found, range(0, 60, 8))
     built = build_tracklets(solutions, detections, cameras, validate_settings({}, "test"))
@@ -141,7 +141,7 @@ def test_no_detections_give_no_tracklets(seen):
     assert built.tracklets.num_rows == 0
 
 
-def test_a_frame_of_ten_thousand_strays_is_no_trouble(seen):
+def test_a_frame_of_ten_thousand_strays_breaks_no_track(seen):
     import pyarrow as pa
 
     found, cameras, _ = seen

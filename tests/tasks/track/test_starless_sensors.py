@@ -1,4 +1,4 @@
-"""Sensors without stars: a prior places what they see; without one it is tracked in the image."""
+"""Sensors without stars: with a prior they take part, else they are tracked in the image."""
 
 import numpy as np
 import polars as pl

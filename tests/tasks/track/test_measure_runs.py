@@ -1,4 +1,4 @@
-"""What drifts slower than any orbit's apparent motion is a star, however well that is known."""
+"""Measure runs: a drift slower than any orbit's apparent motion is a star's."""
 
 import numpy as np
 import pyarrow as pa
@@ -18,7 +18,7 @@ CAMERA |= {"cy_px": 511.5, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k3": 0.0
 
 
 def filled(schema, n, **given):
-    """Return a table of `n` rows; what is not given is null, or else nothing."""
+    """Return a table of `n` rows; other columns are null, or else 0 or empty."""
     for field in schema:
         if field.name not in given:
             empty = "" if field.type == pa.string() else 0
@@ -29,7 +29,7 @@ def filled(schema, n, **given):
 
 
 def kinds(rate_arcsec_s):
-    """Return what a point is taken for that moves so fast through ten minutes of frames."""
+    """Return the kinds of the detections of a point that moves at this rate for ten minutes."""
     rng = np.random.default_rng(1)
     key = {"sensor_id": ["a"] * N, "frame_number": np.arange(N), "time": TIME_NS}
     solutions = filled(

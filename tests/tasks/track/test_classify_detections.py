@@ -1,4 +1,4 @@
-"""Planets in a log: written where JPL's ephemeris has them, they come out as planets."""
+"""Classify detections: planets, put into a log at the places of JPL's ephemeris."""
 
 import numpy as np
 import polars as pl
@@ -45,7 +45,7 @@ def apparent(sky, body, time_ns, r_km, v_km_s):
 
 
 def scene(sky):
-    """High sensors, each of which stares at a planet, with an object nowhere near."""
+    """High sensors that each point at a planet, without an object near it."""
     sensors = []
     at = np.array([START_NS])
     for k, planet in enumerate(PLANETS):
@@ -72,7 +72,7 @@ def scene(sky):
 
 
 def with_planets(sky, log, out):
-    """Write a log again with a planet more in each frame, the last centroid."""
+    """Write a copy of a log with a planet as the last centroid of each frame."""
     from scenes.whole_logs import read_whole
 
     from epipole.io.logs.writer import LogWriter

@@ -1,0 +1,181 @@
+"""Tabulate identified frames: stars, attitudes and other centroids as tables."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, nullable, stack, table, unstack, unstack_covariance
+from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.tables import DETECTIONS, STARS
+from epipole.schemas.work_tables import SOLUTIONS
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.camera import project
+from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
+from epipole.tasks.algorithms.geometry.sky import aberrate, boresight_angles, radec_from_unit
+from epipole.tasks.algorithms.time.time_scales import earth_velocity
+from epipole.tasks.identify.flatten_centroids import Centroids
+
+Array = npt.NDArray[np.float64]
+
+
+class StarAttitudes(NamedTuple):
+    """The attitude of each frame; NaN where there is none."""
+
+    source: npt.NDArray[np.object_]
+    status: list[str | None]
+    R: Array  # sensor from ICRS
+    cov_arcsec2: Array
+
+
+class MatchedStars(NamedTuple):
+    """Identified stars: the index of each one's centroid, and the star.
+
+    `scale` is the factor on the centroid errors that the stars' residuals show.
+    """
+
+    at: npt.NDArray[np.int64]
+    star_id: npt.NDArray[np.int64]
+    magnitude: Array
+    u_icrs: Array
+    scale: float
+
+
+def barycentric_velocity(time_ns: npt.NDArray[np.int64], places: pa.Table) -> Array:
+    """Return the sensor's barycentric velocity [km/s].
+
+    Where the sensor's geocentric velocity is unknown, it is the Earth's.
+    """
+    return earth_velocity(time_ns) + np.nan_to_num(stack(places, "v{}_km_s"))
+
+
+def _frame_key(exposures: pa.Table, frame: npt.NDArray[np.int64]) -> dict[str, pa.ChunkedArray]:
+    return {name: exposures[name].take(frame) for name in ("sensor_id", "frame_number", "time")}
+
+
+def stars_table(
+    exposures: pa.Table,
+    places: pa.Table,
+    c: Centroids,
+    attitudes: StarAttitudes,
+    m: MatchedStars,
+) -> pa.Table:
+    """Return STARS: a row per identified star."""
+    frame = c.frame[m.at]
+    v_km_s = barycentric_velocity(array(exposures, "time"), places)
+    u = np.einsum("nij,nj->ni", attitudes.R[frame], aberrate(m.u_icrs, v_km_s[frame]))
+    dx, dy = np.full((2, len(frame)), np.nan)
+    for row, camera in c.cameras.items():
+        at = c.camera_of_frame[frame] == row
+        x, y = project(camera, u[at])
+        dx[at], dy[at] = c.x_px[m.at[at]] - x, c.y_px[m.at[at]] - y
+    return table(
+        STARS,
+        _frame_key(exposures, frame)
+        | {
+            "centroid": m.at - c.first[frame],
+            "star_id": m.star_id,
+            "magnitude": m.magnitude,
+            "x_px": c.x_px[m.at],
+            "y_px": c.y_px[m.at],
+            "dx_px": dx,
+            "dy_px": dy,
+        },
+    )
+
+
+def solutions_table(
+    exposures: pa.Table,
+    places: pa.Table,
+    c: Centroids,
+    a: StarAttitudes,
+    m: MatchedStars,
+    stars: pa.Table,
+) -> pa.Table:
+    """Return SOLUTIONS: a row per frame."""
+    n = exposures.num_rows
+    frame = c.frame[m.at]
+    n_stars = np.bincount(frame, minlength=n)
+    squares = np.bincount(frame, array(stars, "dx_px") ** 2 + array(stars, "dy_px") ** 2, n)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        residual = np.where(n_stars > 0, np.sqrt(squares / (2 * n_stars)), np.nan)
+    known = a.source != "none"
+    q = np.full((n, 4), np.nan)
+    q[known] = quaternion_from_matrix(a.R[known])
+    ra, dec, roll = boresight_angles(a.R)
+    sigma = np.sqrt(np.diagonal(a.cov_arcsec2, axis1=1, axis2=2))
+    values = {
+        **unstack("q{}", q, "xyzw"),
+        **unstack("sigma_{}_arcsec", sigma),
+        **unstack_covariance("cov_att_{}_arcsec2", a.cov_arcsec2),
+        "ra_deg": np.degrees(ra),
+        "dec_deg": np.degrees(dec),
+        "roll_deg": np.degrees(roll),
+        "residual_px": residual,
+    }
+    kept = ("x_km", "y_km", "z_km", "vx_km_s", "vy_km_s", "vz_km_s", "position_sigma_km")
+    return table(
+        SOLUTIONS,
+        _frame_key(exposures, np.arange(n))
+        | {name: nullable(v) for name, v in values.items()}
+        | {name: places[name] for name in kept}
+        | {
+            "n_centroids": np.diff(c.first),
+            "n_stars": n_stars,
+            "attitude_source": a.source,
+            "status": a.status,
+            "camera": c.camera_of_frame,
+        },
+    )
+
+
+def detections_table(
+    exposures: pa.Table, c: Centroids, a: StarAttitudes, m: MatchedStars
+) -> pa.Table:
+    """Return DETECTIONS: each centroid that is no star, in frames with a camera.
+
+    It has no direction where the frame has no attitude.
+    """
+    left = (c.camera_of_frame >= 0)[c.frame]
+    left[m.at] = False
+    at = np.flatnonzero(left)
+    frame = c.frame[at]
+    u_icrs = np.einsum("nji,nj->ni", a.R[frame], c.u[at])
+    ra, dec = radec_from_unit(u_icrs)
+    sigma_px = np.where(np.isnan(c.sigma_px[at]), 1.0, c.sigma_px[at]) * m.scale
+    return table(
+        DETECTIONS,
+        _frame_key(exposures, frame)
+        | {
+            "centroid": at - c.first[frame],
+            "x_px": c.x_px[at],
+            "y_px": c.y_px[at],
+            "flux": nullable(c.flux[at]),
+            "ra_deg": nullable(np.degrees(ra)),
+            "dec_deg": nullable(np.degrees(dec)),
+            "sigma_arcsec": sigma_px * c.pixel_rad[at] / ARCSEC,
+            "kind": np.full(len(at), "unknown", object),
+            "tracklet_id": pa.nulls(len(at), pa.string()),
+            "track_id": pa.nulls(len(at), pa.string()),
+        },
+    )
+
+
+def rejects_table(exposures: pa.Table, c: Centroids) -> pa.Table:
+    """Return a row of `rejects` per log: how many centroids lie in frames without a camera."""
+    counts, frames = np.diff(c.first), c.camera_of_frame < 0
+    sources, times = array(exposures, "source"), array(exposures, "time")
+    rows = []
+    for source in sorted(set(sources[frames])):
+        at = np.flatnonzero(frames & (sources == source) & (counts > 0))
+        if len(at):
+            rows.append((source, int(times[at[0]]), int(counts[at].sum())))
+    source, time, count = zip(*rows, strict=True) if rows else ((), (), ())
+    return reject_rows(
+        Reason.NO_CALIBRATION,
+        source=list(source),
+        sensor_id=exposures["sensor_id"][0].as_py(),
+        time=list(time),
+        count=list(count),
+    )

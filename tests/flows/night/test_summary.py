@@ -1,0 +1,88 @@
+"""The summary of a run: what people read, what was left out and why, counts of staged nights."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from scenes.associations import filled
+
+from epipole.flows.night.summary import Summary, many, summarise
+from epipole.io.datasets.night_files import write_table
+from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.tables import TABLES
+from epipole.tasks.check.estimate_clocks import Clock
+
+FOUND = Summary(
+    dataset="/data/out", nights=["2019-04-01"], logs=1, sensors=2, frames=1234, identified=1200,
+    stars=9000, detections=8, tracklets=1, epochs=6, objects=5, positions=4, rejects={},
+    clocks=[], by_sensor=[],
+)  # fmt: skip
+
+
+def test_a_night_with_nothing_left_out_says_nothing_of_it():
+    lines = FOUND.lines()
+    assert lines[1] == "frames      1,234 of 2 sensors in 1 log"
+    assert lines[3] == "objects     5 in 8 detections, 1 tracklet"
+    assert not any("left out" in line or line.startswith("clock") for line in lines)
+
+
+def test_each_reason_is_shown_with_its_sentence():
+    from dataclasses import replace
+
+    lines = replace(FOUND, rejects={"no_state": 1034, "ambiguous": 2}).lines()
+    at = lines.index("left out    1,036:")
+    assert lines[at + 1] == f"  1,034 no_state: {Reason.NO_STATE.sentence}"
+    assert lines[at + 2] == f"      2 ambiguous: {Reason.AMBIGUOUS.sentence}"
+
+
+def test_counts_have_their_noun():
+    assert [many(n, "log") for n in (0, 1, 2000)] == ["0 logs", "1 log", "2,000 logs"]
+
+
+def staged(folder: Path, **columns) -> Path:
+    """A night with these columns; tables without any are empty."""
+    for name, schema in TABLES.items():
+        values = columns.get(name, {})
+        n = len(next(iter(values.values()), [])) if isinstance(values, dict) else 0
+        rows = filled(schema, n, values) if isinstance(values, dict) else values
+        write_table(folder, name, iter([rows]))
+    return folder
+
+
+def test_staged_nights_are_counted_together(tmp_path):
+    first = staged(
+        tmp_path / "1",
+        frames={
+            "sensor_id": ["a", "a", "b"], "attitude_source": ["stars", "prior", "none"],
+            "residual_px": pa.array([0.25, None, None]),
+        },
+        tracklets={"sensor_id": ["a", "a", "b"], "track_id": ["t", "t", "u"]},
+        epochs={"epoch": [1, 1, 2]},
+        positions={"object_id": ["o", "p", "o"]},
+        sources={"sha256": ["s"]},
+        stars={"centroid": np.arange(4)},
+    )  # fmt: skip
+    reasons = [Reason.NAN, Reason.NO_STATE, Reason.BAD_SIGMA, Reason.NO_STATE]
+    second = staged(
+        tmp_path / "2",
+        rejects=reject_rows(reasons, time=[1, 2, 3, 4], count=[3, 8, 3, 1]),
+        frames={
+            "sensor_id": ["a"], "attitude_source": ["stars"], "residual_px": pa.array([0.75]),
+        },
+        positions={"object_id": ["o"]},
+        sources={"sha256": ["s"]},
+    )  # fmt: skip
+    clocks = [Clock("a", 0.5, 0.01, True), Clock("b", 0.0, 0.01, False)]
+    summary = summarise("/data", {"2019-04-01": first, "2019-04-02": second}, clocks)
+    assert (summary.logs, summary.sensors, summary.frames) == (1, 2, 4)
+    assert (summary.identified, summary.stars, summary.tracklets) == (2, 4, 3)
+    assert (summary.epochs, summary.objects, summary.positions) == (2, 2, 4)
+    # The most frequent first, then by name.
+    assert list(summary.rejects.items()) == [("no_state", 9), ("bad_sigma", 3), ("nan", 3)]
+    assert summary.clocks == ["the clock of a is 0.500 s late (sigma 0.010 s)"]
+    rows = [sensor.as_row() for sensor in summary.by_sensor]
+    assert rows == [
+        {"sensor": "a", "frames": 3, "identified": 2, "residual px": "0.500", "tracks": 1},
+        {"sensor": "b", "frames": 1, "identified": 0, "residual px": "", "tracks": 1},
+    ]
+    assert summary.as_dict()["by_sensor"][1]["residual_px"] is None
