@@ -10,7 +10,7 @@ from rich.table import Table
 from epipole.io.datasets.dataset import nights_in, nights_of, read_table
 from epipole.io.simulation.truth import Truth, read_truth
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.report import Report
+from epipole.schemas.simulation.report import Report
 from epipole.tasks.evaluate.evaluate_dataset import evaluate_dataset
 
 TABLES = ("frames", "stars", "detections", "epochs", "associations", "positions", "states")

@@ -15,7 +15,7 @@ from epipole.io.logs.writer import LogWriter
 from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.truth import SUFFIX, TruthWriter
 from epipole.schemas.errors import SceneError
-from epipole.schemas.scene import Scene, validate_scene
+from epipole.schemas.simulation.scene import Scene, validate_scene
 from epipole.tasks.algorithms.simulation.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposures
 from epipole.tasks.algorithms.simulation.orbits import state_at

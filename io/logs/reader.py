@@ -26,8 +26,8 @@ from epipole.io.logs.messages.batches import batches_of
 from epipole.io.logs.messages.encodings.registry import kinds_of_schemas, message_encodings
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
-from epipole.schemas.log_tables import LogContents, LogPiece, LogSource
-from epipole.schemas.messages import CALIBRATION, FRAME, KINDS, STATE
+from epipole.schemas.logs.log_tables import LogContents, LogPiece, LogSource
+from epipole.schemas.logs.messages import CALIBRATION, FRAME, KINDS, STATE
 from epipole.schemas.tables import REJECTS
 
 THREADS = 2  # that decompress and check chunks, in addition to the one that decodes

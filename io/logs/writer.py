@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 
 from epipole.io.logs.messages.encodings.encoding import Values
 from epipole.io.logs.messages.encodings.registry import encoding_named
-from epipole.schemas.messages import CALIBRATION, FRAME, STATE
+from epipole.schemas.logs.messages import CALIBRATION, FRAME, STATE
 
 COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,

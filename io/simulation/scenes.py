@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 from epipole.schemas.errors import SceneError
-from epipole.schemas.scene import Scene, parse_scene
+from epipole.schemas.simulation.scene import Scene, parse_scene
 
 _BUILT_IN = Path(__file__).parent / "built_in"
 

@@ -17,7 +17,7 @@ from epipole.io.caches.arrays import cache_folder
 from epipole.io.catalogues import hipparcos
 from epipole.io.datasets.dataset import dataset_folder
 from epipole.io.datasets.local_nights import STAGING
-from epipole.schemas.log_tables import LogSource
+from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.settings import Settings
 
 # Another version may change the last bits of a result.

@@ -8,7 +8,7 @@ from typing import Final
 
 import pyarrow as pa
 
-from epipole.schemas.log_tables import LOG_STATES
+from epipole.schemas.logs.log_tables import LOG_STATES
 from epipole.schemas.tables import (
     ASSOCIATIONS,
     DETECTIONS,

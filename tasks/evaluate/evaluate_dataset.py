@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from epipole.io.simulation.truth import Truth
 from epipole.schemas.bridge import to_polars
-from epipole.schemas.report import Report
+from epipole.schemas.simulation.report import Report
 from epipole.tasks.evaluate.match_claims import (
     match_claims,
     match_positions,

@@ -13,7 +13,7 @@ from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproj
 Array = npt.NDArray[np.float64]
 
 
-class Centroids(NamedTuple):
+class FlatCentroids(NamedTuple):
     """All centroids of one sensor's frames, one after another.
 
     Frame k has the centroids ``first[k]:first[k + 1]``. Cameras are named by their row in
@@ -32,7 +32,7 @@ class Centroids(NamedTuple):
     cameras: dict[int, Camera]
 
 
-def flatten_centroids(exposures: pa.Table, cameras: pa.Table, settings: Settings) -> Centroids:
+def flatten_centroids(exposures: pa.Table, cameras: pa.Table, settings: Settings) -> FlatCentroids:
     """Return the centroids of one sensor's frames, with the valid cameras."""
     x_px, first = flatten(exposures, "x_px")
     y_px, _ = flatten(exposures, "y_px")
@@ -47,7 +47,9 @@ def flatten_centroids(exposures: pa.Table, cameras: pa.Table, settings: Settings
         u[at] = unproject(camera, x_px[at], y_px[at])
         pixel_rad[at] = pixel_angle(camera, u[at])
     flux = _optional(exposures, "flux", len(x_px))
-    return Centroids(first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, camera_of_frame, used)
+    return FlatCentroids(
+        first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, camera_of_frame, used
+    )
 
 
 def _optional(exposures: pa.Table, name: str, n: int) -> Array:

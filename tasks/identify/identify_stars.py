@@ -24,7 +24,7 @@ from epipole.tasks.algorithms.star_identification.frames.spots import (
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
-from epipole.tasks.identify.flatten_centroids import Centroids, flatten_centroids
+from epipole.tasks.identify.flatten_centroids import FlatCentroids, flatten_centroids
 from epipole.tasks.identify.tabulate_identified import (
     MatchedStars,
     StarAttitudes,
@@ -97,7 +97,7 @@ def _optics(camera: Camera) -> FieldOfView:
 
 
 def _identify(
-    exposures: pa.Table, places: pa.Table, c: Centroids, catalogue: pa.Table, settings: Settings
+    exposures: pa.Table, places: pa.Table, c: FlatCentroids, catalogue: pa.Table, settings: Settings
 ) -> tuple[IdentifiedSensor | None, npt.NDArray[np.int64]]:
     """Return the identified stars, and the order of centroids: brightest first in each frame."""
     time_ns = array(exposures, "time")

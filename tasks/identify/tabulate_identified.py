@@ -15,7 +15,7 @@ from epipole.tasks.algorithms.geometry.camera import project
 from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
 from epipole.tasks.algorithms.geometry.sky import aberrate, boresight_angles, radec_from_unit
 from epipole.tasks.algorithms.time.time_scales import earth_velocity
-from epipole.tasks.identify.flatten_centroids import Centroids
+from epipole.tasks.identify.flatten_centroids import FlatCentroids
 
 Array = npt.NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def _frame_key(exposures: pa.Table, frame: npt.NDArray[np.int64]) -> dict[str, p
 def stars_table(
     exposures: pa.Table,
     places: pa.Table,
-    c: Centroids,
+    c: FlatCentroids,
     attitudes: StarAttitudes,
     m: MatchedStars,
 ) -> pa.Table:
@@ -88,7 +88,7 @@ def stars_table(
 def solutions_table(
     exposures: pa.Table,
     places: pa.Table,
-    c: Centroids,
+    c: FlatCentroids,
     a: StarAttitudes,
     m: MatchedStars,
     stars: pa.Table,
@@ -131,7 +131,7 @@ def solutions_table(
 
 
 def detections_table(
-    exposures: pa.Table, c: Centroids, a: StarAttitudes, m: MatchedStars
+    exposures: pa.Table, c: FlatCentroids, a: StarAttitudes, m: MatchedStars
 ) -> pa.Table:
     """Return DETECTIONS: each centroid that is no star, in frames with a camera.
 
@@ -162,7 +162,7 @@ def detections_table(
     )
 
 
-def rejects_table(exposures: pa.Table, c: Centroids) -> pa.Table:
+def rejects_table(exposures: pa.Table, c: FlatCentroids) -> pa.Table:
     """Return a row of `rejects` per log: how many centroids lie in frames without a camera."""
     counts, frames = np.diff(c.first), c.camera_of_frame < 0
     sources, times = array(exposures, "source"), array(exposures, "time")

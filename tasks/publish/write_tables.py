@@ -14,7 +14,7 @@ from epipole.io.datasets.night_files import write_table
 from epipole.io.work.parts import Parts, read_part
 from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import array, concat, conform, table
-from epipole.schemas.log_tables import LogSource
+from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.rejects import Outcome, Reason, reason_of, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, Span

@@ -19,7 +19,7 @@ from epipole.io.work.part_tables import READ_SENSOR
 from epipole.io.work.parts import read_part, write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import array, concat, conform, nullable, stack, table, unstack
-from epipole.schemas.log_tables import ITRF, LOG_STATES, LogSource
+from epipole.schemas.logs.log_tables import ITRF, LOG_STATES, LogSource
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS

@@ -7,7 +7,7 @@ from epipole.io.logs.reader import read_log_pieces
 from epipole.io.work.part_tables import LOG_PIECE
 from epipole.io.work.parts import write_part
 from epipole.io.work.places import ReadFolder
-from epipole.schemas.log_tables import LogSource
+from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.stages import Stage
 from epipole.tasks.common.stage_tasks import stage_task
 

@@ -15,7 +15,7 @@ import pyarrow as pa
 from epipole.io.simulation.sky import SkyStars, read_stars
 from epipole.schemas.bridge import table, unstack
 from epipole.schemas.errors import SceneError
-from epipole.schemas.scene import Orbit, Scene, SceneCamera, SceneSensor
+from epipole.schemas.simulation.scene import Orbit, Scene, SceneCamera, SceneSensor
 from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_POINTS
 from epipole.tasks.algorithms.simulation.constants import ARCSEC, GM_KM3_S2, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposing, Exposures

@@ -69,7 +69,7 @@ class _TrackletSightings(NamedTuple):
     name: npt.NDArray[np.object_]
 
 
-class _Queries(NamedTuple):
+class _EpochQueries(NamedTuple):
     """What is asked for: each tracklet at each epoch that it covers."""
 
     tracklet: Indices
@@ -117,7 +117,7 @@ def _bounds(names: npt.NDArray[np.object_]) -> Indices:
     return np.concatenate([[0], change, [len(names)]]).astype(np.int64)
 
 
-def _queries(tracklets: _TrackletSightings, epochs: pa.Table, frames: Frames) -> _Queries:
+def _queries(tracklets: _TrackletSightings, epochs: pa.Table, frames: Frames) -> _EpochQueries:
     """Return each epoch that a tracklet covers, by tracklet."""
     epoch_ns, bounds = array(epochs, "epoch"), tracklets.bounds
     time_ns = frames.time_ns[tracklets.frame]
@@ -128,13 +128,13 @@ def _queries(tracklets: _TrackletSightings, epochs: pa.Table, frames: Frames) ->
     tracklet = np.repeat(np.arange(len(count)), count)
     start = np.cumsum(count) - count
     row = np.arange(count.sum()) - np.repeat(start - first, count)
-    return _Queries(tracklet, row, frames_of(epochs, frames)[row])
+    return _EpochQueries(tracklet, row, frames_of(epochs, frames)[row])
 
 
 def _view_table(
     frames: Frames,
     tracklets: _TrackletSightings,
-    query: _Queries,
+    query: _EpochQueries,
     epochs: pa.Table,
     camera: Camera,
     settings: Settings,
@@ -183,7 +183,7 @@ def _view_table(
 
 
 def _centroids(
-    tracklets: _TrackletSightings, query: _Queries
+    tracklets: _TrackletSightings, query: _EpochQueries
 ) -> tuple[Indices, npt.NDArray[np.bool_]]:
     """Return each query's centroid in the frame that serves, and which queries have none."""
     n_frames = max(int(tracklets.frame.max()), int(query.frame.max(initial=0))) + 1

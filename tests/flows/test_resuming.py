@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from epipole.io.work.folder import work_key, work_root
-from epipole.schemas.log_tables import LogSource
+from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.settings import Settings, validate_settings
 
 NIGHT = "2019-04-01"

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import concat
-from epipole.schemas.log_tables import LogSource
+from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import EXPOSURES, SENSOR_STATES
 from epipole.tasks.read.order_frames import frames_between, order_logs, states_between

@@ -14,7 +14,7 @@ from epipole.io.logs.messages.batches import MessageBatch, Received, fault, know
 from epipole.io.logs.messages.decoded import StateMessage
 from epipole.io.logs.messages.scan import StateRows, scan_states
 from epipole.schemas.bridge import nullable, table, unstack
-from epipole.schemas.log_tables import LOG_STATES, STATE_FRAMES
+from epipole.schemas.logs.log_tables import LOG_STATES, STATE_FRAMES
 from epipole.schemas.rejects import Reason
 
 Array = npt.NDArray[np.floating]

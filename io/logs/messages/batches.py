@@ -15,7 +15,7 @@ from epipole.io.logs.messages.encodings.encoding import MessageEncoding, Undecod
 from epipole.io.logs.messages.encodings.registry import message_encodings
 from epipole.io.logs.messages.fields import FIELD_TYPES, no_fields
 from epipole.io.logs.messages.scan import Messages
-from epipole.schemas.messages import CALIBRATION, FRAME, STATE
+from epipole.schemas.logs.messages import CALIBRATION, FRAME, STATE
 from epipole.schemas.rejects import Reason
 
 SENSOR_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}")

@@ -12,7 +12,7 @@ row of integers per message:
 import numpy as np
 import numpy.typing as npt
 
-from epipole.schemas.messages import DECLARED, FRAME, STATE, MessageType
+from epipole.schemas.logs.messages import DECLARED, FRAME, STATE, MessageType
 
 Integers = npt.NDArray[np.int64]
 

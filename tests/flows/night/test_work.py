@@ -10,7 +10,7 @@ from epipole.flows.night.work import Work, plan_spans
 from epipole.io.work.places import ReadFolder, WorkFolder
 from epipole.schemas.bridge import empty
 from epipole.schemas.errors import LogError
-from epipole.schemas.log_tables import LogSource
+from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.spans import DAY_NS, SPAN_NS
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import CAMERAS

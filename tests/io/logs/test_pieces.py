@@ -13,7 +13,7 @@ from epipole.io.logs.messages.encodings import protobuf
 from epipole.io.logs.reader import read_log, read_log_pieces
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.errors import LogError
-from epipole.schemas.messages import CENTROID_FRAME, FRAME, SENSOR_STATE, STATE
+from epipole.schemas.logs.messages import CENTROID_FRAME, FRAME, SENSOR_STATE, STATE
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000

@@ -16,7 +16,7 @@ from epipole.io.logs.reader import read_log, read_log_times
 from epipole.io.logs.writer import LogWriter, calibration_values
 from epipole.schemas.bridge import array, flatten, stack
 from epipole.schemas.errors import LogError
-from epipole.schemas.messages import (
+from epipole.schemas.logs.messages import (
     CALIBRATION,
     CALIBRATION_NAME,
     CENTROID_FRAME,

@@ -6,7 +6,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from epipole.schemas.scene import validate_scene
+from epipole.schemas.simulation.scene import validate_scene
 
 FOUR_SENSORS = Path(__file__).parents[3] / "io/simulation/built_in/four_sensor_geo.toml"
 

@@ -7,8 +7,8 @@ import pytest
 from epipole.flows.simulate import simulate
 from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.schemas.bridge import array, stack
-from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import Settings
+from epipole.schemas.simulation.scene import validate_scene
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 
 SENSOR = {

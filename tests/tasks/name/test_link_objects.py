@@ -8,8 +8,8 @@ import polars as pl
 import pytest
 
 from epipole.schemas.bridge import empty, table
-from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import Settings
+from epipole.schemas.simulation.scene import validate_scene
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS, STATES
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 from epipole.tasks.name.link_objects import link_objects, outermost, renamed

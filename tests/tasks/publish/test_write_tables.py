@@ -9,7 +9,7 @@ from epipole.io.work.part_tables import NIGHT_TRACKLETS, SOLVED
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import SensorParts, WorkFolder
 from epipole.schemas.bridge import array, concat, empty
-from epipole.schemas.log_tables import LogSource
+from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.rejects import Outcome, Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span

@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from epipole.schemas.scene import validate_scene
+from epipole.schemas.simulation.scene import validate_scene
 
 MIDDLE = [-39367.69, 15079.54, 454.20]
 # Two sensors see stars, the third has a prior attitude alone, the fourth nothing at all.

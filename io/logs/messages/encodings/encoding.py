@@ -8,7 +8,7 @@ from typing import Any
 from epipole.io.logs.messages.decoded import DecodedMessage
 
 # Fields by name. A calibration has timestamp, frame_id, width, height, distortion_model, D, K,
-# R and P; the other kinds have the fields that `epipole.schemas.messages` declares.
+# R and P; the other kinds have the fields that `epipole.schemas.logs.messages` declares.
 Values = Mapping[str, Any]
 
 # What decoders raise where bytes are not a message. Whatever else they raise is a bug.

@@ -20,7 +20,7 @@ from epipole.io.logs.messages.decoded import (
 )
 from epipole.io.logs.messages.encodings.encoding import MessageEncoding, Values
 from epipole.io.logs.messages.encodings.protobuf import json_name
-from epipole.schemas.messages import (
+from epipole.schemas.logs.messages import (
     CALIBRATION,
     CALIBRATION_NAME,
     CENTROID_FRAME,

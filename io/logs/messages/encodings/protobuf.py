@@ -35,7 +35,7 @@ from epipole.io.logs.messages.fields import (
     TIME,
     UNKNOWN,
 )
-from epipole.schemas.messages import (
+from epipole.schemas.logs.messages import (
     CALIBRATION,
     CALIBRATION_NAME,
     CENTROID_FRAME,

@@ -19,7 +19,7 @@ from epipole.io.logs.messages.decoded import (
 )
 from epipole.io.logs.messages.encodings.encoding import MessageEncoding, Values
 from epipole.io.logs.messages.fields import DOUBLE, DOUBLES, FLOATS, INTEGER, TEXT, TIME
-from epipole.schemas.messages import (
+from epipole.schemas.logs.messages import (
     CALIBRATION,
     CENTROID_FRAME,
     DECLARED,

@@ -18,7 +18,7 @@ from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import array, flatten
 from epipole.schemas.errors import LogError
-from epipole.schemas.messages import FRAME, STATE
+from epipole.schemas.logs.messages import FRAME, STATE
 
 START_NS = 1_554_091_200_000_000_000
 GOOD_FRAME = {

@@ -7,7 +7,7 @@ import pytest
 
 from epipole.io.logs.messages.encodings.encoding import UndecodableError
 from epipole.io.logs.messages.encodings.json_text import ENCODING, json_schema
-from epipole.schemas.messages import DECLARED, FRAME, STATE
+from epipole.schemas.logs.messages import DECLARED, FRAME, STATE
 
 VALUES = {
     "timestamp": {"sec": 1_554_091_200, "nsec": 123_456_789},

@@ -14,7 +14,7 @@ from epipole.io.logs.messages.encodings.protobuf import (
     protobuf_schema,
     varint,
 )
-from epipole.schemas.messages import (
+from epipole.schemas.logs.messages import (
     CALIBRATION,
     CALIBRATION_NAME,
     CENTROID_FRAME,

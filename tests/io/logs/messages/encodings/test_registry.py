@@ -12,7 +12,7 @@ from epipole.io.logs.messages.encodings.registry import ENCODINGS, encoding_name
 from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import LogWriter, calibration_values
 from epipole.schemas.bridge import array, flatten
-from epipole.schemas.messages import CALIBRATION, FRAME, KINDS, STATE
+from epipole.schemas.logs.messages import CALIBRATION, FRAME, KINDS, STATE
 
 START_NS = 1_554_091_200_000_000_000
 EXACT_KM = float(np.nextafter(7000.0, 8000.0))

@@ -9,7 +9,7 @@ from epipole.io.logs.messages.encodings.ros2_cdr import (
     message_definition,
     ros2_schema,
 )
-from epipole.schemas.messages import DECLARED, FRAME, STATE
+from epipole.schemas.logs.messages import DECLARED, FRAME, STATE
 
 # The .msg files of epipole_msgs, which recorders compile.
 DEFINITIONS = {

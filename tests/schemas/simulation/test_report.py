@@ -3,7 +3,7 @@
 import itertools
 from dataclasses import fields
 
-from epipole.schemas.report import Report
+from epipole.schemas.simulation.report import Report
 
 
 def test_a_share_is_printed_as_all_only_where_it_is_all():

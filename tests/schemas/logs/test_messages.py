@@ -2,7 +2,7 @@
 
 import pytest
 
-from epipole.schemas.messages import CENTROID_FRAME, SENSOR_STATE
+from epipole.schemas.logs.messages import CENTROID_FRAME, SENSOR_STATE
 
 # As in epipole.proto, which recorders compile.
 FIELDS = {

@@ -6,7 +6,7 @@ import pytest
 from scenes.simulated import scene_of
 
 from epipole.schemas.errors import SceneError
-from epipole.schemas.scene import parse_scene
+from epipole.schemas.simulation.scene import parse_scene
 
 BAD_SCENES = {
     "sensors.0.camera: a camera takes one of": {"camera": {"fov_deg": 2.0, "focal_px": 100.0}},

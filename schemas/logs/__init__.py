@@ -1,0 +1,1 @@
+"""The messages of a log, and the tables that one log gives."""

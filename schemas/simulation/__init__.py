@@ -1,0 +1,1 @@
+"""The simulator: scenes, and the report of an evaluation."""
