@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from epipole.tasks.algorithms.simulation.orbits import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
 
 
