@@ -64,7 +64,7 @@ def test_a_killed_dask_worker_is_replaced_and_the_night_is_the_same(
     ) as cluster:
 
         def kill_one() -> None:
-            while not list(work_root(str(out)).glob("work-*/identified/*/*")):
+            while not list(work_root(str(out)).glob("work-*/identify/*/*")):
                 time.sleep(0.01)
             killed.append(next(iter(cluster.workers.values())).pid)
             os.kill(killed[0], signal.SIGKILL)
