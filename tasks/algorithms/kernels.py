@@ -9,9 +9,14 @@ numba otherwise counts up and down, at each call, every array of every named tup
 in the innermost loops that took longer than the computation. So a borrowing kernel makes no arrays
 (numba refuses to compile it), returns none, and calls no kernel that returns one: that array would
 never be freed. Slices and rows of the caller's arrays are allowed.
+
+An `inlined_kernel` is a borrowing kernel that becomes part of its caller. It is for kernels that
+take many arrays, are called for each frame and from one place only: a call copies each array's
+address, shape and strides.
 """
 
 from numba import njit
 
 kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=True)
 borrowing_kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+inlined_kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, forceinline=True)

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude, turn
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     choice_lost,
     choice_predicted,
@@ -61,7 +61,7 @@ class Matches(NamedTuple):
     chi2: Array
 
 
-@kernel
+@borrowing_kernel
 def aberrated(x, y, z, beta, out):
     """Write the direction that an observer at beta (v / c) sees of a unit vector (compiled).
 
@@ -75,7 +75,7 @@ def aberrated(x, y, z, beta, out):
     out[0], out[1], out[2] = ax / norm, ay / norm, az / norm
 
 
-@kernel
+@borrowing_kernel
 def stars_in_cone(u_icrs, n_stars, R, radius, row):
     """Write the rows of those of the first n_stars that are within `radius` [rad] of the boresight;
     return how many (compiled)."""
@@ -87,7 +87,7 @@ def stars_in_cone(u_icrs, n_stars, R, radius, row):
     return n
 
 
-@kernel
+@borrowing_kernel
 def turn_stars(R, a, v):
     """Write the stars' directions in the sensor frame (compiled)."""
     for s in range(len(a)):
@@ -95,7 +95,7 @@ def turn_stars(R, a, v):
             v[s, i] = R[i, 0] * a[s, 0] + R[i, 1] * a[s, 1] + R[i, 2] * a[s, 2]
 
 
-@kernel
+@borrowing_kernel
 def count_in_view(v, box):
     """Return how many of the stars, given in the sensor frame, are in the image (compiled).
 
@@ -163,7 +163,7 @@ def match_stars(u, sigma, v, radius, star_of, chi2_of, strict):
                 star_of[k] = -1
 
 
-@kernel
+@borrowing_kernel
 def _drop_odd(star_of, instrumental, magnitude, zero_point):
     if math.isnan(zero_point):
         return
@@ -211,7 +211,7 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
     return count
 
 
-@kernel
+@borrowing_kernel
 def _nudge(R, u, k, a, s):
     """Turn R by the smallest rotation that puts star s on centroid k."""
     x = R[0, 0] * a[s, 0] + R[0, 1] * a[s, 1] + R[0, 2] * a[s, 2]
@@ -310,7 +310,8 @@ def solve_predicted(predicted, lost, centroids, stars, box, rule, solution, matc
                 best = evidence
                 copy_matrix(R, solution.R)
                 copy_matrix(P, solution.P)
-                matches.star[:], matches.chi2[:] = tried.star, tried.chi2
+                for k in range(n):
+                    matches.star[k], matches.chi2[k] = tried.star[k], tried.chi2[k]
         if best > rule.enough or lost:
             break
     return best
