@@ -161,7 +161,12 @@ def refine_attitude(R, u, sigma, a, star_of, P):
     bool
         False where the matches do not fix the attitude; R and P are then invalid.
     """
-    A = np.zeros((3, 3))
+    return refine_attitude_in(R, u, sigma, a, star_of, P, np.empty((3, 3)))
+
+
+@borrowing_kernel
+def refine_attitude_in(R, u, sigma, a, star_of, P, A):
+    """Do what `refine_attitude` does; A (3, 3) is work space (compiled)."""
     for _ in range(3):
         A[:] = 0.0
         b0, b1, b2, total = 0.0, 0.0, 0.0, 0.0

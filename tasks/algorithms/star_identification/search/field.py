@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude, turn
+from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude_in, turn
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     choice_lost,
@@ -61,6 +61,23 @@ class Matches(NamedTuple):
     chi2: Array
 
 
+class _SettleScratch(NamedTuple):
+    """Work space of `settle` for n centroids and m stars.
+
+    v, radius, before : (m, 3), (n,), (n,) int64: directions of the stars in the sensor frame,
+        search radii, matches of the step before
+    owner, contested : (m,) int64, (m,) bool, see `match_stars`
+    A : (3, 3), see `refine_attitude_in`
+    """
+
+    v: Array
+    radius: Array
+    before: npt.NDArray[np.int64]
+    owner: npt.NDArray[np.int64]
+    contested: npt.NDArray[np.bool_]
+    A: Array
+
+
 @borrowing_kernel
 def aberrated(x, y, z, beta, out):
     """Write the direction that an observer at beta (v / c) sees of a unit vector (compiled).
@@ -110,8 +127,8 @@ def count_in_view(v, box):
     return n
 
 
-@kernel
-def match_stars(u, sigma, v, radius, star_of, chi2_of, strict):
+@borrowing_kernel
+def match_stars(u, sigma, v, radius, matches, strict, owner, contested):
     """Match each centroid with the star nearest to it within its radius, one to one (compiled).
 
     Parameters
@@ -120,14 +137,17 @@ def match_stars(u, sigma, v, radius, star_of, chi2_of, strict):
         Centroids' directions, sigma and search radius [rad], sensor frame.
     v : (m, 3)
         Stars' directions, sensor frame.
-    star_of, chi2_of : (n,), out
-        The star, -1 where there is none; squared distance over sigma squared.
+    matches : Matches, out
+        The matches.
     strict : bool
         Where two are possible, match neither.
+    owner, contested : (m,) int64, (m,) bool
+        Work space.
     """
+    star_of, chi2_of = matches.star, matches.chi2
     n, m = len(u), len(v)
-    owner = np.full(m, -1, np.int64)
-    contested = np.zeros(m, np.bool_)
+    for s in range(m):
+        owner[s], contested[s] = -1, False
     for k in range(n):
         star_of[k] = -1
         r, limit = radius[k], radius[k] * radius[k]
@@ -180,11 +200,24 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
     Starts at R with an error of s_xy across and s_z about the boresight [rad]. R is refined in
     place; its covariance P and the matches are written. Returns 0 where there is no attitude.
     """
+    n, m = len(centroids.u), len(stars.u)
+    room = _SettleScratch(
+        np.empty((m, 3)),
+        np.empty(n),
+        np.full(n, -2, np.int64),
+        np.empty(m, np.int64),
+        np.empty(m, np.bool_),
+        np.empty((3, 3)),
+    )
+    return _settle_in(room, R, P, s_xy, s_z, centroids, stars, rule, matches)
+
+
+@borrowing_kernel
+def _settle_in(room, R, P, s_xy, s_z, centroids, stars, rule, matches):
+    """Do what `settle` does, in the given work space."""
     u, sigma = centroids.u, centroids.sigma
+    v, radius, before, owner, contested, A = room
     n = len(u)
-    v = np.empty((len(stars.u), 3))
-    radius = np.empty(n)
-    before = np.full(n, -2, np.int64)
     for step in range(8):
         turn_stars(R, stars.u, v)
         for k in range(n):
@@ -195,7 +228,7 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
             elif step == 1:  # the first attitude may rest on a wrong match
                 wide = 2.0 * sigma[k] * sigma[k]
             radius[k] = rule.gate * math.sqrt(sigma[k] * sigma[k] + wide)
-        match_stars(u, sigma, v, radius, matches.star, matches.chi2, step > 1)
+        match_stars(u, sigma, v, radius, matches, step > 1, owner, contested)
         _drop_odd(matches.star, centroids.instrumental, stars.magnitude, rule.zero_point)
         same, count = True, 0
         for k in range(n):
@@ -206,7 +239,7 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
             return 0
         if same and step > 2:
             return count
-        if not refine_attitude(R, u, sigma, stars.u, matches.star, P):
+        if not refine_attitude_in(R, u, sigma, stars.u, matches.star, P, A):
             return 0
     return count
 
