@@ -5,4 +5,4 @@ The same as `epipole.tasks.algorithms.kernels`, which io may not import. A test 
 
 from numba import njit
 
-kernel = njit(cache=True, nogil=True, error_model="numpy")
+kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=True)

@@ -1,10 +1,22 @@
-"""How kernels are compiled: the one decorator of all compiled loops of the mathematics.
+"""How kernels are compiled: the decorators of all compiled loops of the mathematics.
 
 `nogil`: tasks run on threads, and a kernel lets the others go on. `cache`: compiled code is kept
 between runs. `error_model`: a division by zero gives inf or NaN as in NumPy, and no exception is
 prepared for it in the innermost loop.
+
+A `borrowing_kernel` uses only arrays that its caller holds, and counts no references to them.
+numba otherwise counts up and down, at each call, every array of every named tuple that is passed:
+in the innermost loops that took longer than the computation. So a borrowing kernel makes no arrays
+(numba refuses to compile it), returns none, and calls no kernel that returns one: that array would
+never be freed. Slices and rows of the caller's arrays are allowed.
+
+An `inlined_kernel` is a borrowing kernel that becomes part of its caller. It is for kernels that
+take many arrays, are called for each frame and from one place only: a call copies each array's
+address, shape and strides.
 """
 
 from numba import njit
 
-kernel = njit(cache=True, nogil=True, error_model="numpy")
+kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=True)
+borrowing_kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+inlined_kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, forceinline=True)

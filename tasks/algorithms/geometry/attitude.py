@@ -7,7 +7,7 @@ The error of an attitude R is a small rotation phi about the sensor axes,
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 Array = npt.NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def attitude_covariance(u_sensor: Array, sigma_rad: Array) -> Array:
     return np.linalg.inv(information)
 
 
-@kernel
+@borrowing_kernel
 def attitude_information(u_sensor, sigma_rad, A):
     """Write the sum of (I - u u') / sigma^2 [rad^-2] about the sensor axes (compiled)."""
     A[:] = 0.0
@@ -74,7 +74,7 @@ def attitude_information(u_sensor, sigma_rad, A):
                 A[i, j] -= w * u_sensor[k, i] * u_sensor[k, j]
 
 
-@kernel
+@borrowing_kernel
 def invert_symmetric(A, out):
     """Write the inverse of a symmetric 3x3 matrix (compiled).
 
@@ -95,7 +95,7 @@ def invert_symmetric(A, out):
     return determinant
 
 
-@kernel
+@borrowing_kernel
 def copy_matrix(source, target):
     """Copy a 3x3 matrix (compiled); a slice assignment compiles to much more code."""
     for i in range(3):
@@ -103,7 +103,7 @@ def copy_matrix(source, target):
             target[i, j] = source[i, j]
 
 
-@kernel
+@borrowing_kernel
 def turn(R, x, y, z):
     """Turn R by the rotation vector (x, y, z) about its sensor axes, in place (compiled)."""
     angle = np.sqrt(x * x + y * y + z * z)
@@ -125,7 +125,7 @@ def turn(R, x, y, z):
         R[2, j] = c + 2.0 * (qx * ty - qy * tx)
 
 
-@kernel
+@borrowing_kernel
 def orthonormalise(R):
     """Make the rows of R orthonormal, in place, and keep the boresight (compiled)."""
     n = np.sqrt(R[2, 0] ** 2 + R[2, 1] ** 2 + R[2, 2] ** 2)
@@ -161,7 +161,12 @@ def refine_attitude(R, u, sigma, a, star_of, P):
     bool
         False where the matches do not fix the attitude; R and P are then invalid.
     """
-    A = np.zeros((3, 3))
+    return refine_attitude_in(R, u, sigma, a, star_of, P, np.empty((3, 3)))
+
+
+@borrowing_kernel
+def refine_attitude_in(R, u, sigma, a, star_of, P, A):
+    """Do what `refine_attitude` does; A (3, 3) is work space (compiled)."""
     for _ in range(3):
         A[:] = 0.0
         b0, b1, b2, total = 0.0, 0.0, 0.0, 0.0

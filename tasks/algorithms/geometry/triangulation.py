@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -62,7 +62,7 @@ class Triangulated(NamedTuple):
     mean_range_km: Array
 
 
-@kernel
+@borrowing_kernel
 def invert3(M, out):
     """Write the inverse of a symmetric 3x3 matrix; return its determinant, 0 where it fails."""
     a, b, c = M[0, 0], M[0, 1], M[0, 2]

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, turn
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
 from epipole.tasks.algorithms.star_identification.frames.spots import Rows
 from epipole.tasks.algorithms.star_identification.search.field import (
     Attitude,
@@ -108,7 +108,7 @@ class _FieldScratch(NamedTuple):
     row: Rows
 
 
-@kernel
+@borrowing_kernel
 def remember(memory, t_s, R, P):
     """Enter an identified attitude (compiled)."""
     memory.t_s[0], memory.t_s[1] = memory.t_s[1], t_s
@@ -119,7 +119,7 @@ def remember(memory, t_s, R, P):
     memory.held[0] = min(memory.held[0] + 1, 2)
 
 
-@kernel
+@borrowing_kernel
 def predict(memory, t_s, R, P):
     """Write attitude and covariance at t_s, extrapolated from the last one or two; return
     whether the prediction is precise enough to be used (compiled)."""
@@ -167,7 +167,7 @@ def _rotation_between(A, B):
     return f * v[0], f * v[1], f * v[2]
 
 
-@kernel
+@borrowing_kernel
 def _field_stars(R, reach, beta, stars, memory, room):
     """Write the apparent directions, magnitudes and rows of the stars within `reach` of the
     boresight; return how many."""
@@ -189,7 +189,7 @@ def _field_stars(R, reach, beta, stars, memory, room):
     return n
 
 
-@kernel
+@inlined_kernel
 def _solve_near(k, frames, stars, rule, memory, room, solutions):
     """Identify frame k near the attitude in `room`; return whether its stars confirm it."""
     camera = frames.camera[k]
@@ -222,7 +222,7 @@ def _solve_near(k, frames, stars, rule, memory, room, solutions):
     return True
 
 
-@kernel
+@inlined_kernel
 def _identify_next(k, frames, priors, stars, rule, memory, room, solutions):
     """Identify frame k from the frames before it, or from its prior; return whether it was."""
     for attempt in range(2):
@@ -244,7 +244,7 @@ def _identify_next(k, frames, priors, stars, rule, memory, room, solutions):
     return False
 
 
-@kernel
+@borrowing_kernel
 def _clear(k, first, solutions):
     """Erase what attempts left in the solution of frame k."""
     solutions.R_sensor_from_icrs[k], solutions.cov_rad2[k] = np.nan, np.nan

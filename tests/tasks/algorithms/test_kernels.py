@@ -3,8 +3,12 @@
 import re
 from pathlib import Path
 
+import numpy as np
+import pytest
+from numba.core.errors import NumbaError
+
 from epipole.io.logs.kernels import kernel as of_logs
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 ROOT = Path(__file__).parents[3]
 
@@ -19,6 +23,33 @@ def test_kernels_of_the_log_reader_are_compiled_like_all_others():
         return x
 
     assert one.targetoptions == other.targetoptions
+
+
+def test_a_borrowing_kernel_makes_and_returns_no_array():
+    @borrowing_kernel
+    def makes():
+        return np.empty(3)[0]
+
+    @borrowing_kernel
+    def returns(x):
+        return x[1:]
+
+    with pytest.raises(NumbaError):
+        makes()
+    with pytest.raises(NumbaError):
+        returns(np.zeros(3))
+
+
+def test_a_borrowing_kernel_may_call_a_kernel_that_makes_arrays():
+    @kernel
+    def total(x):
+        return np.ones(len(x)).sum() + x.sum()
+
+    @borrowing_kernel
+    def of_rest(x):
+        return total(x[1:])
+
+    assert of_rest(np.ones(3)) == 4.0
 
 
 def test_no_module_compiles_kernels_its_own_way():

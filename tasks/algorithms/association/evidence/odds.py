@@ -5,10 +5,10 @@ import numpy as np
 from epipole.tasks.algorithms.association.evidence.arcs import LN_2PI, arc_odds
 from epipole.tasks.algorithms.association.evidence.visibility import looks_at
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 
-@kernel
+@borrowing_kernel
 def _det3(M):
     return (
         M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
@@ -17,7 +17,7 @@ def _det3(M):
     )
 
 
-@kernel
+@borrowing_kernel
 def score(views, chance, members, points, shells, near, outcomes, part):
     """Return the log-odds of "one object" against "unrelated tracklets".
 
@@ -53,7 +53,7 @@ def score(views, chance, members, points, shells, near, outcomes, part):
     return total + _detections(views, chance, members, points, near, outcomes)
 
 
-@kernel
+@borrowing_kernel
 def _detections(views, chance, members, points, near, outcomes):
     """Return the log-probability of which sensors detect the object and which miss it.
 
@@ -72,7 +72,7 @@ def _detections(views, chance, members, points, near, outcomes):
     return total
 
 
-@kernel
+@borrowing_kernel
 def _altitude_weight(x, shells):
     """Return the log of the object density at this radius over the mean density.
 

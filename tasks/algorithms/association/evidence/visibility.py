@@ -4,12 +4,12 @@ import numpy as np
 
 from epipole.tasks.algorithms.association.sampling.views import HALF, PLANE, REACH, TURN
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 INSIDE = 0.98  # of half the field: nearer to its edge misses are frequent
 
 
-@kernel
+@borrowing_kernel
 def blocked(r, x, radius):
     """Return whether the Earth, of this radius, is between r and x."""
     dot, length2, r2 = 0.0, 0.0, 0.0
@@ -21,7 +21,7 @@ def blocked(r, x, radius):
     return dot < 0.0 and -dot < length2 and r2 - dot * dot / length2 < radius * radius
 
 
-@kernel
+@borrowing_kernel
 def sees(r, R, half_field, x):
     """Return whether a sensor at r, with attitude R, has x in its field and in view.
 
@@ -38,7 +38,7 @@ def sees(r, R, half_field, x):
     return not blocked(r, x, EARTH_RADIUS_KM)
 
 
-@kernel
+@borrowing_kernel
 def in_view(cam, x):
     """Return the same as `sees`, for a row of `Views.camera`."""
     d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
@@ -52,7 +52,7 @@ def in_view(cam, x):
     return not blocked(cam, x, EARTH_RADIUS_KM)
 
 
-@kernel
+@borrowing_kernel
 def looks_at(views, s, X, seen_by):
     """Return whether sensor s has the points in its field at all solved instants."""
     looked = False
@@ -65,7 +65,7 @@ def looks_at(views, s, X, seen_by):
     return looked
 
 
-@kernel
+@borrowing_kernel
 def near_fields(views, X, P, seen_by, near):
     """Write which sensors may have a point in their field at any solved instant.
 

@@ -15,12 +15,12 @@ from epipole.tasks.algorithms.association.sampling.views import (
     X,
     Y,
 )
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 A0, A1, H00, H01, H11, DEPTH, STRETCH = range(7)  # columns of `WorkSpace.predicted`
 
 
-@kernel
+@borrowing_kernel
 def _predict(views, s, points, predicted):
     """Write where sensor s should see the points, with covariance; DEPTH 0 or less: behind it."""
     x, _, P, seen_by = points
@@ -53,7 +53,7 @@ def _predict(views, s, points, predicted):
         predicted[m, STRETCH] = 1.0 + a0 * a0 + a1 * a1
 
 
-@kernel
+@borrowing_kernel
 def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
     """Return what tracklet c adds to the log-odds; -inf where it does not fit the points.
 
@@ -92,7 +92,7 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
     return gain if n > 0 and total <= quantile(2 * n, gate_sigma) else -np.inf
 
 
-@kernel
+@borrowing_kernel
 def best_of_sensor(space, work, s, members, least):
     """Return the free tracklet of sensor s that adds most to the log-odds.
 
@@ -150,7 +150,7 @@ def best_of_sensor(space, work, s, members, least):
     return best, best_gain, second
 
 
-@kernel
+@borrowing_kernel
 def odds_of_view(space, work, s, c):
     """Return what tracklet c of sensor s adds to the log-odds of these points; no gate."""
     _predict(space.views, s, work.points, work.predicted)
@@ -158,7 +158,7 @@ def odds_of_view(space, work, s, c):
     return _fit(space.views, space.chance, s, c, seen_by, work.predicted, np.inf)
 
 
-@kernel
+@borrowing_kernel
 def _shared_before(views, c, m, seen_by):
     """Return whether tracklet c shares an instant before m with the points."""
     shared = False
@@ -167,7 +167,7 @@ def _shared_before(views, c, m, seen_by):
     return shared
 
 
-@kernel
+@borrowing_kernel
 def _clashes(views, c, members):
     """Return whether c is a member, or overlaps in time with a member of its sensor."""
     for o in members:

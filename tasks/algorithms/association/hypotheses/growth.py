@@ -17,7 +17,7 @@ from epipole.tasks.algorithms.association.hypotheses.search_space import (
 )
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 FEW = 3  # sensors that must have looked before a hypothesis is given up
 GIVEN_UP = -4.0  # log-odds of the sensors beside the seed's at which it is given up
@@ -95,7 +95,7 @@ def grow_all(space, seeds, clear, out):
                 taken[i] = True
 
 
-@kernel
+@borrowing_kernel
 def clear_of_doubt(chance, outcomes, n, value, clear):
     """Return whether a hypothesis may be taken at once.
 
@@ -109,7 +109,7 @@ def clear_of_doubt(chance, outcomes, n, value, clear):
     return value > clear and n >= WELL_KNOWN and has >= COMPLETE * usual
 
 
-@kernel
+@borrowing_kernel
 def _grow(space, work, members):
     """Grow the first two members; return the size, 0 where the hypothesis fails.
 
@@ -152,7 +152,7 @@ def _grow(space, work, members):
     return n
 
 
-@kernel
+@borrowing_kernel
 def _begin(space, work, members):
     """Solve the points of a seed; return whether an object can be there."""
     points = work.points
@@ -166,7 +166,7 @@ def _begin(space, work, members):
     return True
 
 
-@kernel
+@borrowing_kernel
 def _join_sensor(space, work, s, members, n, evidence):
     """Add the tracklets of sensor s that fit to the members.
 
@@ -227,7 +227,7 @@ def _review(space, work, members, n, early):
     return _settle(space, work, members, kept)
 
 
-@kernel
+@borrowing_kernel
 def _speaks(space, work, i):
     """Return whether a member still speaks for the object, by the first instant they share."""
     views, chance, points, part = space.views, space.chance, work.points, work.part
@@ -241,7 +241,7 @@ def _speaks(space, work, i):
     return True
 
 
-@kernel
+@borrowing_kernel
 def _settle(space, work, members, n):
     """Solve, and drop the member that fits worst until all fit; return the size.
 

@@ -7,7 +7,7 @@ from epipole.tasks.algorithms.association.hypotheses.sight_lines import BEYOND, 
 from epipole.tasks.algorithms.association.sampling.views import direction, residual
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.geometry.triangulation import invert3
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 ITERATIONS = 6
 CONVERGED = 1e-4  # sigmas squared
@@ -35,7 +35,7 @@ def _start(views, members, m, x):
     return True
 
 
-@kernel
+@borrowing_kernel
 def add_view(views, i, m, x, N, rhs, part):
     """Add a view to the normal equations (upper half); return its chi-square.
 
@@ -54,7 +54,7 @@ def add_view(views, i, m, x, N, rhs, part):
     return part[0] * g0 + part[1] * g1
 
 
-@kernel
+@borrowing_kernel
 def step(x, N, rhs, P):
     """Invert N into P and move x; return the decrease of chi-square, NaN where it diverges."""
     if invert3(N, P) == 0.0:
@@ -122,7 +122,7 @@ def join(views, c, points, part):
     return True
 
 
-@kernel
+@borrowing_kernel
 def possible(space, members, points):
     """Return whether the points lie, within 3 sigma, where their sensors can see an object."""
     views, lowest, farthest = space.views, space.lowest_km, space.farthest_km

@@ -12,13 +12,13 @@ from epipole.tasks.algorithms.association.sampling.views import (
     Y,
     direction,
 )
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 BEYOND = 0.2  # share of the farthest distance by which a point may lie beyond it
 SLACK_SIGMA = 3.0  # a point may lie this far outside the limits
 
 
-@kernel
+@borrowing_kernel
 def quantile(dof, sigma):
     """Return the chi-square with `dof` degrees of freedom that is as improbable as `sigma`.
 
@@ -28,7 +28,7 @@ def quantile(dof, sigma):
     return dof * (1.0 - a + sigma * np.sqrt(a)) ** 3
 
 
-@kernel
+@borrowing_kernel
 def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
     """Return the squared gap of two lines of sight over its variance; NaN where impossible.
 
@@ -69,13 +69,13 @@ def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
     return miss * miss / variance
 
 
-@kernel
+@borrowing_kernel
 def _spread(views, i, m):
     """Return the trace of a direction's covariance on its plane."""
     return views.sight[i, m, XX] + views.sight[i, m, YY]
 
 
-@kernel
+@borrowing_kernel
 def _across(views, i, m, n0, n1, n2):
     """Return the variance of a direction along a unit vector across it [rad^2]."""
     cam, see = views.camera[views.sensor[i], m], views.sight[i, m]

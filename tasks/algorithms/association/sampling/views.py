@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.sampling.samples import Samples
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -233,7 +233,7 @@ def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
             begin += side * side + 1
 
 
-@kernel
+@borrowing_kernel
 def direction(views, i, m, u):
     """Write the direction u (3,) of tracklet i at instant m."""
     s, x, y = views.sensor[i], views.sight[i, m, X], views.sight[i, m, Y]
@@ -243,7 +243,7 @@ def direction(views, i, m, u):
         u[a - PLANE] = (along + views.camera[s, m, a + 6]) / length
 
 
-@kernel
+@borrowing_kernel
 def residual(views, i, m, x, part):
     """Write a view's residual, predicted minus measured, with partials and weight.
 
@@ -275,7 +275,7 @@ def residual(views, i, m, x, part):
     return depth
 
 
-@kernel
+@borrowing_kernel
 def misfit(part):
     """Return the chi-square of what `residual` wrote."""
     e0, e1 = part[0], part[1]

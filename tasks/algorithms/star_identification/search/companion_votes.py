@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import MAX_BETA
 from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
 from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
@@ -67,7 +67,7 @@ def turn_bits(n_votes, n_stars, tolerance):
     return int(min(max(min(fine, sparse), LEAST_BINS_LOG2), MOST_BINS_LOG2))
 
 
-@kernel
+@borrowing_kernel
 def companion(centroids, i, j, min_chord):
     """Return separation (0: too close), its tolerance, position angle of j about i and its
     tolerance, both in parts of `TURN` (compiled)."""
@@ -86,7 +86,7 @@ def companion(centroids, i, j, min_chord):
     return c, noise + MAX_BETA * c, angle, int(wide) + 2
 
 
-@kernel
+@borrowing_kernel
 def shown_magnitudes(problem, i, j):
     """Return the magnitudes that two centroids show, NaN where the zero point is not known, and
     their difference, NaN where a flux is not known (compiled)."""
@@ -95,7 +95,7 @@ def shown_magnitudes(problem, i, j):
     return m_i, m_j, instrumental[i] - instrumental[j]
 
 
-@kernel
+@borrowing_kernel
 def is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
     """Tell whether the brightness of two centroids contradicts two stars (compiled).
 
@@ -108,7 +108,7 @@ def is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
     return abs(m_a - m_i) > mag_gate or abs(m_b - m_j) > mag_gate
 
 
-@kernel
+@borrowing_kernel
 def count_votes(problem, i, order, n_least, n_votes, votes):
     """Count the votes of pivot i's companions; return companions, votes cast and log2 of the
     bins of turn (compiled).
@@ -138,7 +138,7 @@ def count_votes(problem, i, order, n_least, n_votes, votes):
     return n, cast, log2
 
 
-@kernel
+@borrowing_kernel
 def _vote(problem, i, m, log2, votes):
     """Count the votes of the pivot's m-th companion."""
     pairs, magnitude = problem.pairs, problem.stars.magnitude

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import invert_symmetric
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 Array = npt.NDArray[np.float64]
 
@@ -61,7 +61,7 @@ def log_magnitude_density(magnitude: Array) -> Array:
     return np.log(count / count.sum() / BIN_MAG)
 
 
-@kernel
+@borrowing_kernel
 def log_brightness_ratio(difference, magnitude, log_density, spread):
     """Return ln(g / h) of a match with this difference of magnitudes; spread 1-sigma (compiled)."""
     z = difference / spread
@@ -106,7 +106,7 @@ def log_ways(n, matches, in_view):
     return centroids - detected
 
 
-@kernel
+@borrowing_kernel
 def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, rule, in_view, area):
     """Return the matches' part of the log evidence, and their number (compiled).
 
@@ -140,7 +140,7 @@ def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, rule, in_vi
     return total - log_ways(len(star_of), matches, in_view), matches
 
 
-@kernel
+@borrowing_kernel
 def _brightness(star_of, instrumental, magnitude, log_density, zero, spread):
     """Return ln of how much better stars explain the matches' brightness than chance does."""
     total = 0.0
@@ -152,7 +152,7 @@ def _brightness(star_of, instrumental, magnitude, log_density, zero, spread):
     return total
 
 
-@kernel
+@borrowing_kernel
 def _log_determinant(P):
     return math.log(
         max(
@@ -164,7 +164,7 @@ def _log_determinant(P):
     )
 
 
-@kernel
+@borrowing_kernel
 def choice_lost(P):
     """Return the attitude's part of the log evidence, all attitudes equally likely (compiled)."""
     return 0.5 * _log_determinant(P) + 1.5 * math.log(2.0 * math.pi) - math.log(8.0 * math.pi**2)

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude, turn
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude_in, turn
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     choice_lost,
     choice_predicted,
@@ -61,7 +61,24 @@ class Matches(NamedTuple):
     chi2: Array
 
 
-@kernel
+class _SettleScratch(NamedTuple):
+    """Work space of `settle` for n centroids and m stars.
+
+    v, radius, before : (m, 3), (n,), (n,) int64: directions of the stars in the sensor frame,
+        search radii, matches of the step before
+    owner, contested : (m,) int64, (m,) bool, see `match_stars`
+    A : (3, 3), see `refine_attitude_in`
+    """
+
+    v: Array
+    radius: Array
+    before: npt.NDArray[np.int64]
+    owner: npt.NDArray[np.int64]
+    contested: npt.NDArray[np.bool_]
+    A: Array
+
+
+@borrowing_kernel
 def aberrated(x, y, z, beta, out):
     """Write the direction that an observer at beta (v / c) sees of a unit vector (compiled).
 
@@ -75,7 +92,7 @@ def aberrated(x, y, z, beta, out):
     out[0], out[1], out[2] = ax / norm, ay / norm, az / norm
 
 
-@kernel
+@borrowing_kernel
 def stars_in_cone(u_icrs, n_stars, R, radius, row):
     """Write the rows of those of the first n_stars that are within `radius` [rad] of the boresight;
     return how many (compiled)."""
@@ -87,7 +104,7 @@ def stars_in_cone(u_icrs, n_stars, R, radius, row):
     return n
 
 
-@kernel
+@borrowing_kernel
 def turn_stars(R, a, v):
     """Write the stars' directions in the sensor frame (compiled)."""
     for s in range(len(a)):
@@ -95,7 +112,7 @@ def turn_stars(R, a, v):
             v[s, i] = R[i, 0] * a[s, 0] + R[i, 1] * a[s, 1] + R[i, 2] * a[s, 2]
 
 
-@kernel
+@borrowing_kernel
 def count_in_view(v, box):
     """Return how many of the stars, given in the sensor frame, are in the image (compiled).
 
@@ -110,8 +127,8 @@ def count_in_view(v, box):
     return n
 
 
-@kernel
-def match_stars(u, sigma, v, radius, star_of, chi2_of, strict):
+@borrowing_kernel
+def match_stars(u, sigma, v, radius, matches, strict, owner, contested):
     """Match each centroid with the star nearest to it within its radius, one to one (compiled).
 
     Parameters
@@ -120,14 +137,17 @@ def match_stars(u, sigma, v, radius, star_of, chi2_of, strict):
         Centroids' directions, sigma and search radius [rad], sensor frame.
     v : (m, 3)
         Stars' directions, sensor frame.
-    star_of, chi2_of : (n,), out
-        The star, -1 where there is none; squared distance over sigma squared.
+    matches : Matches, out
+        The matches.
     strict : bool
         Where two are possible, match neither.
+    owner, contested : (m,) int64, (m,) bool
+        Work space.
     """
+    star_of, chi2_of = matches.star, matches.chi2
     n, m = len(u), len(v)
-    owner = np.full(m, -1, np.int64)
-    contested = np.zeros(m, np.bool_)
+    for s in range(m):
+        owner[s], contested[s] = -1, False
     for k in range(n):
         star_of[k] = -1
         r, limit = radius[k], radius[k] * radius[k]
@@ -163,7 +183,7 @@ def match_stars(u, sigma, v, radius, star_of, chi2_of, strict):
                 star_of[k] = -1
 
 
-@kernel
+@borrowing_kernel
 def _drop_odd(star_of, instrumental, magnitude, zero_point):
     if math.isnan(zero_point):
         return
@@ -180,11 +200,24 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
     Starts at R with an error of s_xy across and s_z about the boresight [rad]. R is refined in
     place; its covariance P and the matches are written. Returns 0 where there is no attitude.
     """
+    n, m = len(centroids.u), len(stars.u)
+    room = _SettleScratch(
+        np.empty((m, 3)),
+        np.empty(n),
+        np.full(n, -2, np.int64),
+        np.empty(m, np.int64),
+        np.empty(m, np.bool_),
+        np.empty((3, 3)),
+    )
+    return _settle_in(room, R, P, s_xy, s_z, centroids, stars, rule, matches)
+
+
+@borrowing_kernel
+def _settle_in(room, R, P, s_xy, s_z, centroids, stars, rule, matches):
+    """Do what `settle` does, in the given work space."""
     u, sigma = centroids.u, centroids.sigma
+    v, radius, before, owner, contested, A = room
     n = len(u)
-    v = np.empty((len(stars.u), 3))
-    radius = np.empty(n)
-    before = np.full(n, -2, np.int64)
     for step in range(8):
         turn_stars(R, stars.u, v)
         for k in range(n):
@@ -195,7 +228,7 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
             elif step == 1:  # the first attitude may rest on a wrong match
                 wide = 2.0 * sigma[k] * sigma[k]
             radius[k] = rule.gate * math.sqrt(sigma[k] * sigma[k] + wide)
-        match_stars(u, sigma, v, radius, matches.star, matches.chi2, step > 1)
+        match_stars(u, sigma, v, radius, matches, step > 1, owner, contested)
         _drop_odd(matches.star, centroids.instrumental, stars.magnitude, rule.zero_point)
         same, count = True, 0
         for k in range(n):
@@ -206,12 +239,12 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
             return 0
         if same and step > 2:
             return count
-        if not refine_attitude(R, u, sigma, stars.u, matches.star, P):
+        if not refine_attitude_in(R, u, sigma, stars.u, matches.star, P, A):
             return 0
     return count
 
 
-@kernel
+@borrowing_kernel
 def _nudge(R, u, k, a, s):
     """Turn R by the smallest rotation that puts star s on centroid k."""
     x = R[0, 0] * a[s, 0] + R[0, 1] * a[s, 1] + R[0, 2] * a[s, 2]
@@ -310,7 +343,8 @@ def solve_predicted(predicted, lost, centroids, stars, box, rule, solution, matc
                 best = evidence
                 copy_matrix(R, solution.R)
                 copy_matrix(P, solution.P)
-                matches.star[:], matches.chi2[:] = tried.star, tried.chi2
+                for k in range(n):
+                    matches.star[k], matches.chi2[k] = tried.star[k], tried.chi2[k]
         if best > rule.enough or lost:
             break
     return best

@@ -19,7 +19,7 @@ from epipole.tasks.algorithms.geometry.attitude import (
     copy_matrix,
     invert_symmetric,
 )
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.companion_votes import (
     MAG_GATE,
     count_votes,
@@ -68,7 +68,7 @@ class Best(NamedTuple):
     R: npt.NDArray[np.float64]
 
 
-@kernel
+@borrowing_kernel
 def _keep(evidence, R, best):
     """Enter an attitude where it is the best, or the best other one."""
     top = best.evidence
@@ -118,7 +118,7 @@ def _matches_needed(problem):
     return n + 1
 
 
-@kernel
+@borrowing_kernel
 def _is_clear(best, rule):
     """Tell whether the best attitude is beyond doubt."""
     top = best.evidence

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import refine_attitude
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     MatchRule,
     choice_lost,
@@ -110,14 +110,14 @@ def make_scratch(n, n_checked):
     )
 
 
-@kernel
+@borrowing_kernel
 def separation(u, i, j):
     """Return the chord between two of the directions (compiled)."""
     dx, dy, dz = u[j, 0] - u[i, 0], u[j, 1] - u[i, 1], u[j, 2] - u[i, 2]
     return math.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@kernel
+@borrowing_kernel
 def _basis(a, b, c, F):
     """Write rows: along the sum of two unit vectors c apart, along the difference, and their
     cross product."""
@@ -157,7 +157,7 @@ def prepare_pair(problem, i, j, c, room):
     return np.argsort(-fall)[2:].copy()
 
 
-@kernel
+@borrowing_kernel
 def try_pair(stars, a, b, c, order, floor, room):
     """Return the log odds of the attitude that puts stars a and b on the pair's centroids,
     by all other centroids (compiled).
@@ -185,7 +185,7 @@ def try_pair(stars, a, b, c, order, floor, room):
     return odds
 
 
-@kernel
+@borrowing_kernel
 def judge_pair(problem, i, a, j, b, beaten, room):
     """Return the log evidence of the attitude tried last, refined with its matches (compiled).
 
@@ -202,7 +202,7 @@ def judge_pair(problem, i, a, j, b, beaten, room):
     return _judge(problem, beaten, R, room.P, row_of)
 
 
-@kernel
+@borrowing_kernel
 def _look_up(R, centroids, k, radius, stars):
     """Return the star nearest to centroid k, without aberration, and the squared chord to it."""
     u, beta = centroids.u, centroids.beta
@@ -223,7 +223,7 @@ def _look_up(R, centroids, k, radius, stars):
     )
 
 
-@kernel
+@borrowing_kernel
 def _stars_in_image(R, beta, star_u, box):
     """Return how many catalogue stars are in the image."""
     n = 0

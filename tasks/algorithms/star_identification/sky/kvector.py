@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 Array = npt.NDArray[np.float64]
 
@@ -57,7 +57,7 @@ def build_kvector(s: Array) -> KVector:
     return KVector(s, below, slope, intercept)
 
 
-@kernel
+@borrowing_kernel
 def range_of(index, low, high):
     """Return first and last + 1 of a `KVector`'s elements with low <= s <= high (compiled)."""
     s, below = index.s, index.below

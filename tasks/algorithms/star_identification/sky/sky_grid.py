@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 
 class SkyGrid(NamedTuple):
@@ -77,7 +77,7 @@ def cell_of(x, y, z, n):
     return (face * n + i) * n + j
 
 
-@kernel
+@borrowing_kernel
 def nearest_star(x, y, z, radius, u_icrs, first, star, n_face):
     """Return the star nearest to a unit vector within `radius` [rad], -1 if there is none, and the
     squared chord to it (compiled)."""

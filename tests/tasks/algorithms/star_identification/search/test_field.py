@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.star_identification.frames.frame import identify_predicted
 from epipole.tasks.algorithms.star_identification.search.field import (
+    Matches,
     aberrated,
     count_in_view,
     match_stars,
@@ -22,9 +23,10 @@ SKY = sky_to_limit(CATALOGUE, 99.0)
 
 def _match(u, v, radius=0.1, sigma=0.01, strict=True):
     u, v = np.array(u, float), np.array(v, float)
-    star, chi2 = np.empty(len(u), np.int64), np.zeros(len(u))
-    match_stars(u, np.full(len(u), sigma), v, np.full(len(u), radius), star, chi2, strict)
-    return star.tolist()
+    matches = Matches(np.empty(len(u), np.int64), np.zeros(len(u)))
+    work = np.empty(len(v), np.int64), np.empty(len(v), np.bool_)
+    match_stars(u, np.full(len(u), sigma), v, np.full(len(u), radius), matches, strict, *work)
+    return matches.star.tolist()
 
 
 def test_each_centroid_gets_the_nearest_star_within_reach():
