@@ -153,10 +153,31 @@ class Reason(StrEnum):
         "The view is too far from the object's position, which was solved without the view.",
     )
     NO_POSITION = "no_position", Stage.SOLVE, "The views of the object have no common point."
+    STATE_MISFIT = (
+        "state_misfit",
+        Stage.SOLVE,
+        "The chi-square of an object's state does not fit its degrees of freedom.",
+    )
     CLOCK_OFF = (
         "clock_off",
         Stage.CHECK,
         "The sensor's clock is wrong and was not corrected; its views are left out.",
+    )
+    EPHEMERIS_OFF = (
+        "ephemeris_off",
+        Stage.CHECK,
+        "The sensor's ephemeris is wrong; its views are left out.",
+    )
+    ATTITUDE_OFF = (
+        "attitude_off",
+        Stage.CHECK,
+        "The sensor's prior attitudes are wrong; its views are left out.",
+    )
+    DISAGREES = (
+        "disagrees",
+        Stage.CHECK,
+        "The sensor is at fault, and it is not clear whether by its clock, ephemeris or attitude; "
+        "its views are left out.",
     )
 
 

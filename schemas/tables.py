@@ -258,7 +258,9 @@ STATES = schema(
             )
             for a, b in upper_triangle(_STATE)
         ],
-        column("n_epochs", I32, doc="Epochs of the arc."),
+        column("n_epochs", I32, doc="Epochs of the arc that share no detection."),
+        column("n_views", I32, doc="Views that were fitted."),
+        column("dof", I32, doc="Degrees of freedom of chi2: 2 n_views - 6."),
         column("chi2", F64, doc="Weighted sum of squares of the fit."),
     ],
 )

@@ -21,14 +21,20 @@ from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import ReadFolder, WorkFolder
 from epipole.schemas.bridge import array, concat
+from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS, POSITIONS, STATES
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensor
+from epipole.tasks.check.check_sensors import (
+    REASONS,
+    SensorVerdict,
+    as_in_the_logs,
+    check_sensors,
+)
 from epipole.tasks.check.correct_clock import correct_clock
-from epipole.tasks.check.estimate_clocks import Clock, estimate_clocks, total_offsets
 from epipole.tasks.identify.identify_span import identify_span
 from epipole.tasks.name.link_objects import link_objects, outermost, renamed
 from epipole.tasks.name.name_objects import name_objects
@@ -141,13 +147,13 @@ def track(work: Work, settings: Settings) -> None:
     LOGGER.info("followed %s", many(count, "tracklet"))
 
 
-def solve(work: Work, settings: Settings, left_out: Sequence[str] = ()) -> Parts:
+def solve(work: Work, settings: Settings, left_out: Mapping[str, Reason] | None = None) -> Parts:
     """Find and solve objects, a task per span, from all sensors but those left out."""
     grid = _epoch_grid(work, settings)
     sensors = list(work.sensor_parts().values())
     solved = work.folder.solved(work.round, all_sensors=not left_out)
     futures = [
-        solve_span.submit(sensors, span, grid, work.cameras, left_out, settings, solved)
+        solve_span.submit(sensors, span, grid, work.cameras, left_out or {}, settings, solved)
         for span in work.all_spans()
     ]
     count = sum(results(Stage.SOLVE, futures))
@@ -170,52 +176,53 @@ class Checked(NamedTuple):
     """The result of the check of the sensors.
 
     With `again`, clocks were corrected and the night goes back to `track`. `left_out` are sensors
-    whose clocks are wrong and stay wrong: the night is solved again without them.
+    that stay at fault, each with its reason: the night is solved again without them.
     """
 
     work: Work
     again: bool
-    left_out: list[str]
+    left_out: dict[str, Reason]
 
 
 def check(work: Work, solved: Parts, settings: Settings) -> Checked:
-    """Estimate each sensor's clock from all spans; correct wrong ones if the settings say so."""
+    """Judge the sensors by all spans; correct wrong clocks if the settings say so."""
     step(Stage.CHECK, 0, 1)
-    clocks: list[Clock] = estimate_clocks(solved, work.all_spans())
-    wrong = [clock for clock in clocks if clock.is_off]
-    tell_clocks(clocks)
-    work = work._replace(clocks=tuple(total_offsets(work.clocks, clocks)))
+    verdicts: list[SensorVerdict] = check_sensors(solved, work.all_spans())
+    tell_verdicts(verdicts)
+    faulty = [verdict for verdict in verdicts if verdict.is_faulty]
+    late = [verdict for verdict in faulty if verdict.is_late]
+    work = work._replace(verdicts=tuple(as_in_the_logs(work.verdicts, verdicts)))
     correctable = settings.alignment.correct_clocks and work.round < MOST_CORRECTIONS
-    if wrong and correctable:
-        return Checked(_correct_clocks(work, wrong, settings), again=True, left_out=[])
-    return Checked(work, again=False, left_out=_taking_part(work, solved, wrong))
+    if late and correctable:
+        return Checked(_correct_clocks(work, late, settings), again=True, left_out={})
+    return Checked(work, again=False, left_out=_taking_part(work, solved, faulty))
 
 
-def tell_clocks(clocks: Sequence[Clock]) -> None:
-    """Log one line for all clocks that are right, and a warning for each that is wrong."""
-    right = [clock for clock in clocks if not clock.is_off]
-    if right:
-        within_s = max(max(abs(clock.offset_s), clock.sigma_s) for clock in right)
-        verb = "is" if len(right) == 1 else "are"
+def tell_verdicts(verdicts: Sequence[SensorVerdict]) -> None:
+    """Log one line for all sound sensors, and a warning for each that is at fault."""
+    sound = [verdict for verdict in verdicts if not verdict.is_faulty]
+    if sound:
+        within_s = max(max(abs(verdict.offset_s), verdict.sigma_s) for verdict in sound)
+        verb = "is" if len(sound) == 1 else "are"
         LOGGER.info(
-            "clocks of %s %s right within %.2g s", many(len(right), "sensor"), verb, within_s
+            "clocks of %s %s right within %.2g s", many(len(sound), "sensor"), verb, within_s
         )
-    for clock in clocks:
-        if clock.is_off:
-            LOGGER.warning("%s", clock)
+    for verdict in verdicts:
+        if verdict.is_faulty:
+            LOGGER.warning("%s", verdict)
 
 
-def _taking_part(work: Work, solved: Parts, clocks: Sequence[Clock]) -> list[str]:
-    """Return the sensors of wrong clocks that take part in an association, and so distort it."""
-    sensors = {clock.sensor_id for clock in clocks}
+def _taking_part(work: Work, solved: Parts, faulty: Sequence[SensorVerdict]) -> dict[str, Reason]:
+    """Return the faulty sensors that take part in an association, and so distort it."""
+    reasons = {verdict.sensor_id: REASONS[verdict.cause] for verdict in faulty}
     associated: set[str] = set()
-    for span in work.all_spans() if sensors else []:
+    for span in work.all_spans() if reasons else []:
         rows = solved.read(span, "associations", ["sensor_id"])
-        associated |= sensors.intersection(rows["sensor_id"].unique().to_pylist())
-    return sorted(associated)
+        associated |= reasons.keys() & set(rows["sensor_id"].unique().to_pylist())
+    return {sensor: reasons[sensor] for sensor in sorted(associated)}
 
 
-def _correct_clocks(work: Work, wrong: Sequence[Clock], settings: Settings) -> Work:
+def _correct_clocks(work: Work, wrong: Sequence[SensorVerdict], settings: Settings) -> Work:
     """Correct the times of frames of wrong clocks, and return the work of the next round."""
     clocks = {clock.sensor_id: clock for clock in wrong}
     next_round = work.round + 1
@@ -309,6 +316,6 @@ def publish(
         parts = NightParts(night, spans, all_spans, sensors, solved, names, whole)
         futures += [write_tables.submit(tables, folder, parts) for tables in SHARES]
     results(Stage.PUBLISH, futures)
-    summary = summarise(destination.dataset, destination.staged, work.clocks)
+    summary = summarise(destination.dataset, destination.staged, work.verdicts)
     publish_nights(destination.dataset, destination.staged, whole["sources"], destination.replace)
     return summary

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 
 from epipole.io.datasets.night_files import read_columns
 from epipole.schemas.rejects import Reason
-from epipole.tasks.check.estimate_clocks import Clock
+from epipole.tasks.check.check_sensors import SensorVerdict
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class SensorSummary:
 
 @dataclass(frozen=True)
 class Summary:
-    """Counts of what was published; `rejects` by reason, `clocks` only those that are wrong."""
+    """Counts of what was published; `rejects` by reason, `faults` of sensors, a sentence each."""
 
     dataset: str
     nights: list[str]
@@ -53,7 +53,7 @@ class Summary:
     objects: int
     positions: int
     rejects: dict[str, int]
-    clocks: list[str]
+    faults: list[str]
     by_sensor: list[SensorSummary]
 
     def as_dict(self) -> dict[str, Any]:
@@ -70,7 +70,7 @@ class Summary:
             f"objects     {self.objects:,} in {self.detections:,} detections, "
             f"{many(self.tracklets, 'tracklet')}",
             f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
-            *[f"clock       {clock}" for clock in self.clocks],
+            *[f"fault       {fault}" for fault in self.faults],
             *self._left_out(),
             f"dataset     {self.dataset}",
         ]
@@ -100,8 +100,10 @@ _COLUMNS = {
 }
 
 
-def summarise(dataset: str, staged: Mapping[str, Path], clocks: Sequence[Clock] = ()) -> Summary:
-    """Return the summary of staged nights, and of the clocks that are wrong."""
+def summarise(
+    dataset: str, staged: Mapping[str, Path], verdicts: Sequence[SensorVerdict] = ()
+) -> Summary:
+    """Return the summary of staged nights, and of the sensors that are at fault."""
     tables = {
         name: pa.concat_tables([read_columns(folder, name, columns) for folder in staged.values()])
         for name, columns in _COLUMNS.items()
@@ -121,7 +123,7 @@ def summarise(dataset: str, staged: Mapping[str, Path], clocks: Sequence[Clock] 
         objects=pc.count_distinct(tables["positions"]["object_id"]).as_py(),
         positions=tables["positions"].num_rows,
         rejects=_by_reason(tables["rejects"]),
-        clocks=[str(clock) for clock in clocks if clock.is_off],
+        faults=[str(verdict) for verdict in verdicts if verdict.is_faulty],
         by_sensor=[
             _of_sensor(frames.filter(pc.field("sensor_id") == name), tables["tracklets"], name)
             for name in sorted(pc.unique(frames["sensor_id"]).to_pylist())

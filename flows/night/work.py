@@ -14,7 +14,7 @@ from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span
 from epipole.schemas.tables import REJECTS
-from epipole.tasks.check.estimate_clocks import Clock
+from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.read.order_frames import OrderedFrames
 
 Spans = dict[Sensor, list[Span]]
@@ -32,7 +32,7 @@ class Work(NamedTuple):
     cameras: pa.Table
     identified: dict[Sensor, Parts]  # the newest of each sensor
     round: int = 0
-    clocks: tuple[Clock, ...] = ()  # offsets in the logs, before any correction
+    verdicts: tuple[SensorVerdict, ...] = ()  # of the logs, before any correction
 
     def all_spans(self) -> list[Span]:
         """Return the spans in which any sensor has frames, in order."""

@@ -98,8 +98,8 @@ def as_markdown(summary: Summary) -> str:
         "positions": summary.positions,
     }
     lines = [f"# Night {', '.join(summary.nights)}", "", *_table("what", counts)]
-    if summary.clocks:
-        lines += ["", "Clocks that are off:", "", *(f"- {clock}" for clock in summary.clocks)]
+    if summary.faults:
+        lines += ["", "Sensors at fault:", "", *(f"- {fault}" for fault in summary.faults)]
     if summary.rejects:
         lines += ["", f"Left out: {many(sum(summary.rejects.values()), 'thing')}", ""]
         lines += _table("reason", summary.rejects)

@@ -1,1 +1,1 @@
-"""Stage `check`: whether the sensors' clocks are right, and frames at their true times."""
+"""Stage `check`: whether the sensors are sound, and frames at their true times."""

@@ -11,7 +11,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import SOLUTIONS
-from epipole.tasks.check.estimate_clocks import Clock
+from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.identify_span import states_about
 from epipole.tasks.identify.place_sensors import place_sensors
@@ -29,7 +29,7 @@ def correct_clock(
     sensor: Sensor,
     identified: Parts,
     span: Span,
-    clock: Clock,
+    clock: SensorVerdict,
     settings: Settings,
     parts: Parts,
 ) -> None:
@@ -53,7 +53,7 @@ def correct_clock(
     write_part(parts.of(span), IDENTIFIED, tables)
 
 
-def at_true_times(rows: pa.Table, clock: Clock) -> pa.Table:
+def at_true_times(rows: pa.Table, clock: SensorVerdict) -> pa.Table:
     """Return the rows with true times instead of the clock's."""
     at = rows.schema.get_field_index("time")
     field = rows.schema.field(at)

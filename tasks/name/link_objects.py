@@ -18,6 +18,7 @@ from epipole.tasks.common.stage_tasks import stage_task
 
 Array = npt.NDArray[np.float64]
 
+COUNTS = ("n_epochs", "n_views", "dof", "chi2")  # of a state, not of its motion
 PLACE = ["x_km", "y_km", "z_km"]
 VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 
@@ -71,7 +72,9 @@ def _ends(positions: pl.DataFrame, states: pl.DataFrame) -> pl.DataFrame:
     position = positions.sort(keys).select(*keys, *PLACE, pl.col("^cov_.*$"))
     missing = [name for name in states.columns if name not in position.columns]
     position = position.with_columns(
-        pl.lit(None, pl.Float64).alias(name) for name in missing if name not in ("n_epochs", "chi2")
+        pl.lit(None, pl.Float64).alias(name)
+        for name in missing
+        if name not in ("n_epochs", "n_views", "dof", "chi2")
     )
     state = states.sort(keys).select(position.columns)
     ends = position.group_by("object_id", maintain_order=True).agg(

@@ -4,9 +4,10 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from epipole.schemas.bridge import table
+from epipole.schemas.bridge import stack, table
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CLOCK_VIEWS
+from epipole.tasks.algorithms.geometry.light_time import apparent_places
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 
 VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
@@ -50,10 +51,21 @@ def collect_clock_views(
     claimed = with_sensors.filter(pl.col("claimed")).join(objects, on=["epoch", "object_id"])
     free = with_sensors.filter(~pl.col("claimed")).drop("object_id")
     free = _thinned(free, objects).join(objects, on="epoch")
-    rows = pl.concat([claimed, free.select(claimed.columns)]).sort(
+    rows = _with_light_time(pl.concat([claimed, free.select(claimed.columns)])).sort(
         "sensor_id", "epoch", "tracklet_id", "object_id"
     )
     return table(CLOCK_VIEWS, {name: rows[name].to_arrow() for name in CLOCK_VIEWS.names})
+
+
+def _with_light_time(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows with each object where its light left for the sensor of the row."""
+    x_km = apparent_places(
+        stack(rows, "{}_km"),
+        stack(rows, "v{}_km_s"),
+        rows["light_s"].to_numpy(),
+        stack(rows, "sensor_{}_km"),
+    )
+    return rows.with_columns(pl.Series(name, x_km[:, k]) for k, name in enumerate(PLACE))
 
 
 def _thinned(free: pl.DataFrame, objects: pl.DataFrame) -> pl.DataFrame:
@@ -75,7 +87,10 @@ def _apart(epochs: pl.Series, apart_s: float) -> pl.Series:
 
 
 def _with_velocities(positions: pl.DataFrame) -> pl.DataFrame:
-    """Return the positions, with velocities from the positions near them in time."""
+    """Return the positions, with velocities from the positions near them in time.
+
+    `light_s` is the light time from a position to its epoch.
+    """
     positions = positions.sort("object_id", "epoch")
     size = positions.group_by("object_id", maintain_order=True).len()["len"].to_numpy()
     offsets = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
@@ -83,4 +98,7 @@ def _with_velocities(positions: pl.DataFrame) -> pl.DataFrame:
     time_s = (time_ns - (time_ns.min() if len(time_ns) else 0)) / 1e9
     v = velocities(offsets, time_s, positions.select(PLACE).to_numpy(), VELOCITY_WINDOW_S)
     columns = [pl.Series(name, v[:, k]) for k, name in enumerate(VELOCITY)]
-    return positions.select(["epoch", "object_id", *PLACE, *POSITION_COV]).with_columns(columns)
+    light_ns = pl.col("epoch").cast(pl.Int64) - pl.col("time").cast(pl.Int64)
+    return positions.select(
+        "epoch", "object_id", *PLACE, *POSITION_COV, light_s=light_ns / 1e9
+    ).with_columns(columns)

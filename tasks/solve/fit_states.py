@@ -1,13 +1,17 @@
 """Fit states: position and velocity of each object, arc by arc."""
 
 import itertools
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
+from scipy.special import chdtrc
 
 from epipole.schemas.bridge import (
+    array,
     stack,
     stack_covariance,
     table,
@@ -16,6 +20,7 @@ from epipole.schemas.bridge import (
     unstack_covariance,
 )
 from epipole.schemas.columns import STATE_AXES, TANGENT_AXES
+from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import STATES
 from epipole.tasks.algorithms.orbits.object_motion import velocities
@@ -24,6 +29,7 @@ from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, fit_orbits
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+LEAST_PROBABLE = 1e-6  # a chi-square less probable than this does not fit
 SLOPE_S = 60.0  # positions within this time of an arc's middle give the initial velocity
 
 
@@ -57,7 +63,28 @@ def fit_states(
         sigma_km=rows["position_sigma_km"].to_numpy(),
     )
     state, cov, chi2 = fit_orbits(arcs, _starts(positions, object_id, middle))
-    return _state_table(object_id, middle, state, cov, chi2, n_epochs)
+    counts = {"n_epochs": n_epochs, "n_views": np.diff(offsets)}
+    return _state_table(object_id, middle, state, cov, chi2, counts)
+
+
+class FittingStates(NamedTuple):
+    """STATES whose chi-square fits, and rows of `rejects` for the others."""
+
+    states: pa.Table
+    rejects: pa.Table
+
+
+def refuse_misfits(states: pa.Table) -> FittingStates:
+    """Return the states whose chi-square fits their degrees of freedom.
+
+    Any other state mixes two objects, or the errors of its views are larger than stated. Its
+    covariance is not valid.
+    """
+    fits = chdtrc(array(states, "dof"), array(states, "chi2")) > LEAST_PROBABLE
+    misfits = states.filter(pa.array(~fits)).sort_by("epoch")
+    count = np.ones(misfits.num_rows, np.int64)
+    rejects = reject_rows(Reason.STATE_MISFIT, time=misfits["epoch"], count=count)
+    return FittingStates(states.filter(pa.array(fits)), rejects)
 
 
 def _used_views(
@@ -122,7 +149,7 @@ def _state_table(
     state: Array,
     cov: Array,
     chi2: Array,
-    n_epochs: Indices,
+    counts: Mapping[str, Indices],
 ) -> pa.Table:
     """Return STATES of the arcs whose fit converged, in order of time."""
     fitted = np.flatnonzero(np.isfinite(chi2))
@@ -133,7 +160,8 @@ def _state_table(
         **unstack("{}_km", state[:, :3]),
         **unstack("v{}_km_s", state[:, 3:]),
         **unstack_covariance("cov_{}", cov, STATE_AXES),
-        "n_epochs": n_epochs.astype(np.int32),
+        **{name: count.astype(np.int32) for name, count in counts.items()},
+        "dof": (2 * counts["n_views"] - 6).astype(np.int32),
         "chi2": chi2,
     }
     return table(STATES, {name: values[fitted] for name, values in columns.items()})

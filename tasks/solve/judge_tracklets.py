@@ -24,7 +24,7 @@ def judge_tracklets(
     views
         VIEWS that were compared.
     left_out
-        VIEWS of sensors that were left out because of their clocks.
+        VIEWS of sensors that were left out because they are at fault.
     undecided
         Rows of (tracklet_id, outcome), as `associate_objects` returns them.
     associations

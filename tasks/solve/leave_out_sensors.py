@@ -1,6 +1,6 @@
-"""Leave out sensors whose clocks are wrong and were not corrected."""
+"""Leave out sensors that the check found at fault."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import polars as pl
@@ -18,15 +18,15 @@ class Remaining(NamedTuple):
     rejects: pa.Table
 
 
-def leave_out_sensors(views: pa.Table, sensors: Sequence[str]) -> Remaining:
-    """Return the views, without those of some sensors."""
+def leave_out_sensors(views: pa.Table, sensors: Mapping[str, Reason]) -> Remaining:
+    """Return the views, without those of some sensors, each left out for a reason."""
     wrong = pc.is_in(views["sensor_id"], pa.array(list(sensors), pa.string()))
     left_out = views.filter(wrong)
     by_sensor = pl.DataFrame(left_out).group_by("sensor_id").agg(
         time=pl.col("epoch").min(), count=pl.len().cast(pl.Int64)
     ).sort("sensor_id")  # fmt: skip
     rejects = reject_rows(
-        Reason.CLOCK_OFF,
+        [sensors[name] for name in by_sensor["sensor_id"]],
         sensor_id=by_sensor["sensor_id"].to_arrow(),
         time=by_sensor["time"].to_arrow(),
         count=by_sensor["count"].to_arrow(),

@@ -26,6 +26,7 @@ from epipole.tasks.algorithms.geometry.epipolar import (
     epipolar_angle,
     epipolar_sigma,
 )
+from epipole.tasks.algorithms.geometry.light_time import apparent_places
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import velocities
@@ -61,6 +62,16 @@ class _Groups(NamedTuple):
     chi2: Array
     used: npt.NDArray[np.bool_]
     mean_range_km: Array
+    velocity_km_s: Array
+
+    @property
+    def apparent_km(self) -> Array:
+        """Where each view's sensor sees the object: its light left at a time of its own."""
+        group = self.group
+        light_s = self.mean_range_km / SPEED_OF_LIGHT_KM_S
+        return apparent_places(
+            self.x_km[group], self.velocity_km_s[group], light_s[group], self.r_km
+        )
 
     @property
     def group(self) -> Indices:
@@ -109,7 +120,7 @@ def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> _Grou
         velocity = _velocities(epoch_ns[start], number[start], x_km)
     return _Groups(
         views, offsets, object_names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
-        x_km, cov_km2, chi2, used, mean_range,
+        x_km, cov_km2, chi2, used, mean_range, velocity,
     )  # fmt: skip
 
 
@@ -133,6 +144,7 @@ def _within(groups: _Groups, span: Span) -> _Groups:
         chi2=groups.chi2[kept],
         used=groups.used[rows],
         mean_range_km=groups.mean_range_km[kept],
+        velocity_km_s=groups.velocity_km_s[kept],
     )
 
 
@@ -188,7 +200,10 @@ def _pair_up(groups: _Groups) -> _ViewPairs:
         second.append(lo + j)
     a = np.concatenate([*first, np.zeros(0, np.int64)])
     b = np.concatenate([*second, np.zeros(0, np.int64)])
-    r, u = groups.r_km, groups.u
+    # Each sensor is moved as if all sensors saw the object at one place: the light to a farther one
+    # left earlier.
+    r = groups.r_km + np.nan_to_num(groups.x_km[groups.group] - groups.apparent_km)
+    u = groups.u
     angle = epipolar_angle(r[a], u[a], r[b], u[b])
     basis = tangent_basis(u)
     cov = np.swapaxes(basis, -1, -2) @ groups.cov @ basis
@@ -255,7 +270,7 @@ def _position_table(groups: _Groups) -> pa.Table:
 
 def _residual_px(groups: _Groups) -> Array:
     """Return the rms image distance of each group's used views from its position."""
-    sight = groups.x_km[groups.group] - groups.r_km
+    sight = groups.apparent_km - groups.r_km
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
     pixel = array(groups.views, "pixel_rad")
     square = np.where(groups.used, np.sum((sight - groups.u) ** 2, axis=1) / pixel**2, 0.0)

@@ -4,7 +4,7 @@ Margins before and after the span are solved too, so that its first and last epo
 evidence as all others. Rows of the margins are not kept: they belong to the neighbouring spans.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import polars as pl
 import pyarrow as pa
@@ -14,6 +14,7 @@ from epipole.io.work.part_tables import SOLVED
 from epipole.io.work.parts import Parts, read_part, write_part
 from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import array, concat, table
+from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
@@ -25,7 +26,7 @@ from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
 from epipole.tasks.solve.associate_objects import Associated, associate_objects
 from epipole.tasks.solve.collect_clock_views import collect_clock_views
-from epipole.tasks.solve.fit_states import fit_states
+from epipole.tasks.solve.fit_states import fit_states, refuse_misfits
 from epipole.tasks.solve.judge_tracklets import judge_tracklets
 from epipole.tasks.solve.leave_out_sensors import leave_out_sensors
 from epipole.tasks.solve.solve_positions import Solved, object_names, solve_positions
@@ -40,7 +41,7 @@ def solve_span(
     span: Span,
     grid: EpochGrid,
     cameras: pa.Table,
-    left_out: Sequence[str],
+    left_out: Mapping[str, Reason],
     settings: Settings,
     parts: Parts,
 ) -> int:
@@ -51,7 +52,7 @@ def solve_span(
     sensors
         In the order of their ids.
     left_out
-        Ids of sensors whose clocks are wrong; their views are not used.
+        Sensors at fault, each with its reason; their views are not used.
     parts
         Where the part goes: `SOLVED`, with the objects' names in the span.
 
@@ -71,7 +72,7 @@ def _solve(
     span: Span,
     grid: EpochGrid,
     cameras: pa.Table,
-    left_out: Sequence[str],
+    left_out: Mapping[str, Reason],
     settings: Settings,
 ) -> dict[str, pa.Table]:
     margin_ns = _margin_ns(grid, settings)
@@ -81,20 +82,24 @@ def _solve(
     solutions = [sensor.identified.rows_within(wide, SOLUTIONS, "solutions") for sensor in sensors]
     frames = concat(SOLUTIONS, solutions)
     epochs = about.of(align_epochs(frames, settings, grid), "epoch")
-    views, left_out_views, of_clocks = leave_out_sensors(
+    views, left_out_views, of_sensors = leave_out_sensors(
         _views(sensors, solutions, epochs, wide, cameras, settings), left_out
     )
     tracklets = with_lone_tracklets(_tracklets(sensors), views)
     associated = associate_objects(views, tracklets, frames, cameras, settings)
     solved = solve_positions(associated.views, associated.object_number, settings, span)
-    rejects = [span.of(of_clocks, "time"), span.of(associated.rejects, "time"), solved.rejects]
+    states, misfits = refuse_misfits(
+        fit_states(associated.views, solved.associations, solved.positions, settings)
+    )
+    of_associations = span.of(associated.rejects, "time")
+    rejects = [span.of(of_sensors, "time"), of_associations, solved.rejects, misfits]
     views_within = span.of(views, "epoch")
     return {
         "epochs": span.of(epochs, "epoch"),
         "associations": solved.associations,
         "positions": solved.positions,
         "pairs": solved.pairs,
-        "states": fit_states(associated.views, solved.associations, solved.positions, settings),
+        "states": states,
         "rejects": concat(REJECTS, rejects),
         "object_tracks": _object_tracks(associated, tracklets, solved),
         "tracklet_outcomes": judge_tracklets(

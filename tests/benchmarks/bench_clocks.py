@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from four_sensors import runs
 
-from epipole.flows.night import clocks as flow
+from epipole.flows.night import stages
 
 OFFSETS_S = (0.0, 0.005, -0.02, 0.05, -0.1, 0.2, -0.3, 0.5, -0.7, 1.0, -1.3, 2.0)
 
@@ -13,13 +13,13 @@ OFFSETS_S = (0.0, 0.005, -0.02, 0.05, -0.1, 0.2, -0.3, 0.5, -0.7, 1.0, -1.3, 2.0
 def main() -> None:
     """Print a row for each offset, then the scatter of all estimates over their sigmas."""
     estimates: list[Any] = []
-    estimate_clocks = flow.estimate_clocks
+    check_sensors = stages.check_sensors
 
     def recorded(*args: Any) -> Any:
-        estimates.append(estimate_clocks(*args))
+        estimates.append(check_sensors(*args))
         return estimates[-1]
 
-    flow.estimate_clocks = recorded
+    stages.check_sensors = recorded
     scores, wrong = [], 0
     print("| true s | estimate s | sigma s | wrong clock | others called wrong | left out |")
     with runs() as run:
@@ -38,8 +38,10 @@ def main() -> None:
                 if clock.sensor_id == name:
                     late_clock = clock
                 else:
-                    wrong += clock.is_off
-            estimate = f"{late_clock.offset_s:.3f} | {late_clock.sigma_s:.3f} | {late_clock.is_off}"
+                    wrong += clock.is_faulty
+            estimate = (
+                f"{late_clock.offset_s:.3f} | {late_clock.sigma_s:.3f} | {late_clock.is_late}"
+            )
             print(f"| {offset_s} | {estimate} | {wrong} | {summary.rejects} |", flush=True)
     print(f"rms over sigma {np.sqrt(np.mean(np.square(scores))):.2f} of {len(scores)}")
 

@@ -66,7 +66,7 @@ def test_frames_whose_true_times_lie_in_another_span_keep_all_centroids(tmp_path
     simulate(validate_scene(scene, "off"), tmp_path / "off.mcap")
     settings = {"alignment": {"correct_clocks": True}}
     summary = nightly([str(tmp_path / "off.mcap")], str(tmp_path / "out"), settings)
-    assert summary.clocks[0].startswith("the clock of sat3 is 1.")
+    assert summary.faults[0].startswith("the clock of sat3 is 1.")
     key = ["sensor_id", "frame_number"]
     frames = rows(tmp_path / "out", "frames").filter(sensor_id="sat3")
     border = datetime.datetime.fromisoformat(f"{NIGHT}T04:30:00Z")

@@ -2,16 +2,16 @@
 
 import logging
 
-from epipole.flows.night.stages import tell_clocks
-from epipole.tasks.check.estimate_clocks import Clock
+from epipole.flows.night.stages import tell_verdicts
+from epipole.tasks.check.check_sensors import SensorVerdict
 
-RIGHT = [Clock("a", -0.017, 0.029, False), Clock("b", 0.004, 0.007, False)]
-WRONG = Clock("c", 0.25, 0.01, True)
+RIGHT = [SensorVerdict("a", -0.017, 0.029), SensorVerdict("b", 0.004, 0.007)]
+WRONG = SensorVerdict("c", 0.25, 0.01, "clock")
 
 
 def lines(clocks, caplog):
     with caplog.at_level(logging.INFO):
-        tell_clocks(clocks)
+        tell_verdicts(clocks)
     return [(record.levelname, record.getMessage()) for record in caplog.records]
 
 

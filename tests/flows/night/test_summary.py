@@ -10,12 +10,12 @@ from epipole.flows.night.summary import Summary, many, summarise
 from epipole.io.datasets.night_files import write_table
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.tables import TABLES
-from epipole.tasks.check.estimate_clocks import Clock
+from epipole.tasks.check.check_sensors import SensorVerdict
 
 FOUND = Summary(
     dataset="/data/out", nights=["2019-04-01"], logs=1, sensors=2, frames=1234, identified=1200,
     stars=9000, detections=8, tracklets=1, epochs=6, objects=5, positions=4, rejects={},
-    clocks=[], by_sensor=[],
+    faults=[], by_sensor=[],
 )  # fmt: skip
 
 
@@ -72,14 +72,14 @@ def test_staged_nights_are_counted_together(tmp_path):
         positions={"object_id": ["o"]},
         sources={"sha256": ["s"]},
     )  # fmt: skip
-    clocks = [Clock("a", 0.5, 0.01, True), Clock("b", 0.0, 0.01, False)]
+    clocks = [SensorVerdict("a", 0.5, 0.01, "clock"), SensorVerdict("b", 0.0, 0.01)]
     summary = summarise("/data", {"2019-04-01": first, "2019-04-02": second}, clocks)
     assert (summary.logs, summary.sensors, summary.frames) == (1, 2, 4)
     assert (summary.identified, summary.stars, summary.tracklets) == (2, 4, 3)
     assert (summary.epochs, summary.objects, summary.positions) == (2, 2, 4)
     # The most frequent first, then by name.
     assert list(summary.rejects.items()) == [("no_state", 9), ("bad_sigma", 3), ("nan", 3)]
-    assert summary.clocks == ["the clock of a is 0.500 s late (sigma 0.010 s)"]
+    assert summary.faults == ["the clock of a is 0.500 s late (sigma 0.010 s)"]
     rows = [sensor.as_row() for sensor in summary.by_sensor]
     assert rows == [
         {"sensor": "a", "frames": 3, "identified": 2, "residual px": "0.500", "tracks": 1},

@@ -5,10 +5,10 @@ import pyarrow as pa
 
 from epipole.schemas.bridge import array, table
 from epipole.schemas.work_tables import PLACES, SOLUTIONS
+from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.check.correct_clock import at_places, at_true_times
-from epipole.tasks.check.estimate_clocks import Clock
 
-LATE, EARLY = Clock("a", 0.25, 0.01, True), Clock("b", -0.5, 0.01, True)
+LATE, EARLY = SensorVerdict("a", 0.25, 0.01, "clock"), SensorVerdict("b", -0.5, 0.01, "clock")
 
 
 def frames(schema, **columns):

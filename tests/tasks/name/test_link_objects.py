@@ -45,7 +45,8 @@ def states_of(passes):
         rows.append((T0 + int(t * 1e9), name, *propagate(truth, t)))
     epoch, name, *state = (list(column) for column in zip(*rows, strict=True))
     columns = {n: np.zeros(len(name)) for n in STATES.names} | {"epoch": np.array(epoch)}
-    columns |= {"object_id": name, "n_epochs": np.full(len(name), 5, np.int32)}
+    columns |= {"object_id": name}
+    columns |= {n: np.full(len(name), 5, np.int32) for n in ("n_epochs", "n_views", "dof")}
     names = [*(f"{a}_km" for a in "xyz"), *(f"v{a}_km_s" for a in "xyz")]
     columns |= dict(zip(names, state, strict=True))
     columns |= {f"cov_{a}{a}": np.full(len(name), 0.25) for a in "xyz"}

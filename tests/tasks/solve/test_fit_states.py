@@ -1,6 +1,7 @@
 """Fit states: honest covariances, arcs, and which epochs are used."""
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from scenes.arcs import GEO, trial
 
@@ -9,7 +10,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS, STATES
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
-from epipole.tasks.solve.fit_states import fit_states
+from epipole.tasks.solve.fit_states import fit_states, refuse_misfits
 
 T0 = 1_554_091_200_000_000_000
 SETTINGS = Settings()
@@ -108,3 +109,20 @@ def test_empty_tables_give_no_state(which):
     states = fit_states(*tables, SETTINGS)
     assert states.schema == STATES
     assert states.num_rows == 0
+
+
+def test_a_state_that_does_not_fit_is_refused_and_has_a_reject():
+    views, claimed, positions = night(1, np.arange(-60.0, 61, 20))
+    states = fit_states(views, claimed, positions, SETTINGS)
+    assert states["dof"].to_pylist() == [2 * states["n_views"][0].as_py() - 6]
+    kept, rejects = refuse_misfits(states)
+    assert kept.equals(states)
+    assert rejects.num_rows == 0
+    half = views.num_rows // 2
+    x = array(views, "ux").copy()
+    x[half:] += 1e-3  # another object from here on
+    at = views.schema.get_field_index("ux")
+    mixed = views.set_column(at, views.schema.field(at), pa.array(x))
+    kept, rejects = refuse_misfits(fit_states(mixed, claimed, positions, SETTINGS))
+    assert kept.num_rows == 0
+    assert rejects["reason"].to_pylist() == ["state_misfit"]

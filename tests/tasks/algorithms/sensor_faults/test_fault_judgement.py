@@ -5,15 +5,22 @@ import pytest
 from scenes.late_sensors import POSITION_KM, lines_of
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.sensor_faults.clock_offset import PRIOR_S, Lines, clock_offsets
+from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
+    CLOCK,
+    EPHEMERIS,
+    PRIOR_S,
+    SOUND,
+    Lines,
+    judge_sensors,
+)
 
 
 def solve(lines, turn_rad=0.0):
-    return clock_offsets(lines, np.full(4, POSITION_KM), np.full(4, turn_rad))
+    return judge_sensors(lines, np.full(4, POSITION_KM), np.full(4, turn_rad))
 
 
 def test_the_offset_of_one_sensor_is_found():
-    offset, sigma, _ = solve(lines_of(1, (0.0, 0.0, 0.2, 0.0)))
+    offset, sigma, *_ = solve(lines_of(1, (0.0, 0.0, 0.2, 0.0)))
     assert (sigma < 0.03).all()
     assert abs(offset[2] - 0.2) < 4 * sigma[2]
     assert (abs(offset[[0, 1, 3]]) < 4 * sigma[[0, 1, 3]]).all()
@@ -24,7 +31,7 @@ def test_errors_over_sigmas_are_standard_normal(turn_rad):
     true = np.array([0.02, -0.05, 0.1, 0.0])
     scores = []
     for seed in range(40):
-        offset, sigma, _ = solve(lines_of(seed, true, turn_rad=turn_rad, n_epochs=20), turn_rad)
+        offset, sigma, *_ = solve(lines_of(seed, true, turn_rad=turn_rad, n_epochs=20), turn_rad)
         scores.append((offset - true) / sigma)
     scores = np.array(scores)
     # Four offsets per seed share their position biases: some 80 independent draws.
@@ -59,7 +66,7 @@ def test_lines_of_another_object_do_not_count():
 
 def test_one_sensor_alone_determines_nothing():
     lines = lines_of(2, np.zeros(4), used=(1,))
-    offset, sigma, _ = solve(lines)
+    offset, sigma, *_ = solve(lines)
     assert np.isnan(offset[[0, 2, 3]]).all()
     assert sigma[1] == pytest.approx(PRIOR_S)
     assert offset[1] == pytest.approx(0.0)
@@ -70,6 +77,22 @@ def test_no_lines_give_no_offsets():
         *[np.zeros((0, *shape)) for shape in ((), (), (3,), (2, 2), (3,), (3,), (3,), (3,))]
     )
     empty = empty._replace(group=np.zeros(0, np.int64), sensor=np.zeros(0, np.int64))
-    offset, sigma, _ = solve(empty)
+    offset, sigma, *_ = solve(empty)
     assert np.isnan(offset).all()
     assert np.isnan(sigma).all()
+
+
+def test_a_wrong_ephemeris_is_named_and_no_clock_is():
+    for seed in range(5):
+        bias_km = np.array([[POSITION_KM], [POSITION_KM], [0.8], [POSITION_KM]])
+        judged = solve(lines_of(seed, np.zeros(4), bias_km=bias_km, n_epochs=150))
+        assert judged.cause == [SOUND, SOUND, EPHEMERIS, SOUND]
+        assert not judged.wrong.any()
+        # Along the lines of sight an error of the ephemeris hardly shows.
+        assert judged.size[2] > 2 * judged.size_sigma[2]
+
+
+def test_a_wrong_clock_is_not_mistaken_for_an_ephemeris():
+    for seed in range(5):
+        judged = solve(lines_of(seed, (0.0, 0.0, 0.3, 0.0), n_epochs=150))
+        assert judged.cause == [SOUND, SOUND, CLOCK, SOUND]

@@ -1,4 +1,4 @@
-"""Estimate clocks: each sensor's clock offset over the night."""
+"""Check sensors: each sensor's clock, ephemeris and attitude over the night."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,10 +10,20 @@ import polars as pl
 from epipole.io.work.parts import Parts
 from epipole.schemas.bridge import stack, stack_covariance, to_polars
 from epipole.schemas.columns import TANGENT_AXES
+from epipole.schemas.rejects import Reason
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
-from epipole.tasks.algorithms.sensor_faults.clock_offset import Lines, clock_offsets
+from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.sensor_faults.clock_search import Meetings, search_offset
+from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
+    ATTITUDE,
+    CLOCK,
+    DISAGREES,
+    EPHEMERIS,
+    SOUND,
+    Lines,
+    judge_sensors,
+)
 from epipole.tasks.common.stage_tasks import stage_task
 
 Array = npt.NDArray[np.float64]
@@ -22,19 +32,54 @@ MOST_EPOCHS = 300  # more do not help: the offset is one constant
 KNOWN_S = 1.0  # with a larger sigma a clock counts as unknown
 
 
-class Clock(NamedTuple):
-    """A sensor's clock: reported minus true time of its frames, and the 1-sigma error of that.
+# The reasons for which a sensor is left out, by its fault.
+REASONS = {
+    CLOCK: Reason.CLOCK_OFF,
+    EPHEMERIS: Reason.EPHEMERIS_OFF,
+    ATTITUDE: Reason.ATTITUDE_OFF,
+    DISAGREES: Reason.DISAGREES,
+}
 
-    `is_off` says whether the clock is certainly wrong.
+
+class SensorVerdict(NamedTuple):
+    """What the check says of a sensor.
+
+    `offset_s` is the clock offset, reported minus true time, with its 1-sigma error `sigma_s`.
+    `cause` is the fault that is sure, '' for a sound sensor; `size` and `size_sigma` are those of
+    a wrong ephemeris [km] or attitude [rad].
     """
 
     sensor_id: str
     offset_s: float
     sigma_s: float
-    is_off: bool
+    cause: str = SOUND
+    size: float = 0.0
+    size_sigma: float = 0.0
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the clock is surely wrong, late or early."""
+        return self.cause == CLOCK
+
+    @property
+    def is_faulty(self) -> bool:
+        """Whether any fault is sure."""
+        return self.cause != SOUND
 
     def __str__(self) -> str:
-        """Return the offset as a sentence."""
+        """Return the verdict as a sentence."""
+        if self.cause == EPHEMERIS:
+            return (
+                f"the ephemeris of {self.sensor_id} is {self.size:.3f} km off "
+                f"(sigma {self.size_sigma:.3f} km)"
+            )
+        if self.cause == ATTITUDE:
+            return (
+                f"the attitude of {self.sensor_id} is {self.size / ARCSEC:.1f} arcsec off "
+                f"(sigma {self.size_sigma / ARCSEC:.1f} arcsec)"
+            )
+        if self.cause == DISAGREES:
+            return f"{self.sensor_id} disagrees with the other sensors; its fault is not clear"
         side = "late" if self.offset_s > 0 else "early"
         return (
             f"the clock of {self.sensor_id} is {abs(self.offset_s):.3f} s {side} "
@@ -42,9 +87,9 @@ class Clock(NamedTuple):
         )
 
 
-@stage_task(Stage.CHECK, "clocks")
-def estimate_clocks(solved: Parts, spans: Sequence[Span]) -> list[Clock]:
-    """Return the clocks that the lines of sight of the night determine, by sensor.
+@stage_task(Stage.CHECK, "sensors")
+def check_sensors(solved: Parts, spans: Sequence[Span]) -> list[SensorVerdict]:
+    """Return the verdicts on the sensors that the lines of sight of the night determine.
 
     Parameters
     ----------
@@ -62,11 +107,11 @@ def estimate_clocks(solved: Parts, spans: Sequence[Span]) -> list[Clock]:
     rows = pl.concat(parts)
     epochs = rows["epoch"].unique().sort()
     kept = epochs[:: max(-(-len(epochs) // MOST_EPOCHS), 1)]
-    return clocks_of(rows.filter(pl.col("epoch").is_in(kept.implode())))
+    return verdicts_of(rows.filter(pl.col("epoch").is_in(kept.implode())))
 
 
-def clocks_of(rows: pl.DataFrame) -> list[Clock]:
-    """Return the clocks that CLOCK_VIEWS determine, by sensor."""
+def verdicts_of(rows: pl.DataFrame) -> list[SensorVerdict]:
+    """Return the verdicts that CLOCK_VIEWS determine, by sensor."""
     claimed = rows.filter(pl.col("claimed"))
     first_guess, of_objects = {}, [claimed]
     for (sensor_id,), of_sensor in rows.group_by("sensor_id", maintain_order=True):
@@ -82,17 +127,19 @@ def clocks_of(rows: pl.DataFrame) -> list[Clock]:
     bias = rows.group_by("sensor_id").agg(
         pl.col("position_sigma_km").max(), attitude_sigma_rad=spread.max().sqrt()
     ).sort("sensor_id")  # fmt: skip
-    offsets = clock_offsets(
+    judged = judge_sensors(
         _lines(rows, bias["sensor_id"]),
         bias["position_sigma_km"].to_numpy(),
         bias["attitude_sigma_rad"].to_numpy(),
         np.array([first_guess.get(name, 0.0) for name in bias["sensor_id"]]),
     )
-    return [
-        Clock(name, float(offset), float(sigma), bool(off))
-        for name, offset, sigma, off in zip(bias["sensor_id"], *offsets, strict=True)
-        if sigma < KNOWN_S
+    verdicts = [
+        SensorVerdict(name, float(offset), float(sigma), cause, float(size), float(size_sigma))
+        for name, offset, sigma, cause, size, size_sigma in zip(
+            bias["sensor_id"], *judged, strict=True
+        )
     ]
+    return [one for one in verdicts if one.sigma_s < KNOWN_S or one.is_faulty]
 
 
 def _search(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:
@@ -134,15 +181,20 @@ def _direction_cov(rows: pl.DataFrame, which: str) -> Array:
     return stack_covariance(rows, f"cov_{which}_{{}}_rad2", TANGENT_AXES)
 
 
-def total_offsets(before: Sequence[Clock], now: Sequence[Clock]) -> list[Clock]:
-    """Return the clocks with their offsets in the logs: corrections so far, and what remains."""
-    corrected = {clock.sensor_id: clock for clock in before if clock.is_off}
+def as_in_the_logs(
+    before: Sequence[SensorVerdict], now: Sequence[SensorVerdict]
+) -> list[SensorVerdict]:
+    """Return the verdicts with the clock offsets of the logs: corrections so far and the rest."""
+    corrected = {verdict.sensor_id: verdict for verdict in before if verdict.is_late}
     total = [
-        clock._replace(
-            offset_s=clock.offset_s + corrected[clock.sensor_id].offset_s, is_off=True
-        ) if clock.sensor_id in corrected else clock
-        for clock in now
-    ]  # fmt: skip
-    remaining = {clock.sensor_id for clock in now}
-    total += [clock for name, clock in corrected.items() if name not in remaining]
+        verdict._replace(
+            offset_s=verdict.offset_s + corrected[verdict.sensor_id].offset_s,
+            cause=verdict.cause or CLOCK,
+        )
+        if verdict.sensor_id in corrected
+        else verdict
+        for verdict in now
+    ]
+    judged = {verdict.sensor_id for verdict in now}
+    total += [verdict for name, verdict in corrected.items() if name not in judged]
     return sorted(total)

@@ -1,0 +1,354 @@
+"""Faults of sensors, constant over a night, from the residuals of positions.
+
+A frame with a time stamp late by d shows the sky of d earlier: its lines of sight lag by d times
+their rate. A wrong ephemeris moves the lines by its error over the range, a wrong attitude turns
+them all alike. The objects' positions, and for each sensor a clock offset, a bias of its position
+and one of its attitude, are solved together.
+
+Most sensors are sound. For sensors that look in similar directions, several wrong clocks may have
+the effect of another one, and a wrong ephemeris or attitude that of a wrong clock. So all sensors
+are judged together: the fewest faults that explain the lines far better than sound sensors do, and
+better than other faults. Where the sensor is clear and its fault is not, it only disagrees.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2
+from epipole.tasks.algorithms.geometry.rotations import skew
+from epipole.tasks.algorithms.geometry.sky import tangent_basis
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+PRIOR_S = 10.0  # 1-sigma prior of the offset of a wrong clock
+SOUND_S = 1e-3  # 1-sigma of the offset of a right clock
+FAULT_KM = 10.0  # 1-sigma per axis of a wrong ephemeris
+FAULT_RAD = 600 * ARCSEC  # 1-sigma per axis of a wrong attitude
+SURE = 12.5  # log-odds from which a fault is declared: five sigma
+RARER = 5.0  # prior log-odds of a wrong clock against another fault
+DISTINCT = 5.0  # log-odds from which it is this fault and not another one
+MOST_SETS = 1100  # sets of faults that are all judged; where there are more, from small to large
+OUTLIER = 20.0  # chi-square (2 degrees of freedom) of a line that is of another object
+ROUNDS = 4  # fits, each with better offsets and without outliers
+PER_SENSOR = 7  # offset, bias of position (3), bias of attitude (3)
+SOUND, CLOCK, EPHEMERIS, ATTITUDE, DISAGREES = "", "clock", "ephemeris", "attitude", "disagrees"
+COLUMNS = {CLOCK: slice(0, 1), EPHEMERIS: slice(1, 4), ATTITUDE: slice(4, 7)}
+
+Faults = frozenset[tuple[int, str]]  # a sensor and its fault
+
+
+class Lines(NamedTuple):
+    """Lines of sight to objects at common instants.
+
+    group : (n,) int
+        Position (object at an epoch) of the line, 0 .. g - 1.
+    sensor : (n,) int
+        Sensor, 0 .. s - 1.
+    u : (n, 3) float
+        Measured directions, aberration removed.
+    cov : (n, 2, 2) float
+        Covariance of their independent errors on `tangent_basis(u)` [rad^2].
+    x_km, v_km_s : (n, 3) float
+        Solved position and velocity of the object, at the line's time.
+    r_km, v_sensor_km_s : (n, 3) float
+        Position and velocity of the sensor.
+    """
+
+    group: Indices
+    sensor: Indices
+    u: Array
+    cov: Array
+    x_km: Array
+    v_km_s: Array
+    r_km: Array
+    v_sensor_km_s: Array
+
+
+class JudgedSensors(NamedTuple):
+    """Clock offsets of sensors (reported minus true time), and their faults.
+
+    offset_s, sigma_s : (s,) float
+        Offset and its 1-sigma error; NaN for a sensor without lines. Clocks that are not wrong
+        are assumed right, or all unknown where the faults cannot be told. A sigma near `PRIOR_S`
+        means that the geometry does not determine the offset.
+    cause : (s,) of str
+        The fault that is sure: `CLOCK`, `EPHEMERIS`, `ATTITUDE`; `DISAGREES` where a fault is
+        sure and its kind is not; `SOUND` for none.
+    size, size_sigma : (s,) float
+        Size of a wrong ephemeris [km] or attitude [rad], and its 1-sigma error; else 0.
+    """
+
+    offset_s: Array
+    sigma_s: Array
+    cause: list[str]
+    size: Array
+    size_sigma: Array
+
+    @property
+    def wrong(self) -> Flags:
+        """(s,) bool: the clock is surely wrong."""
+        return np.array([cause == CLOCK for cause in self.cause], bool)
+
+
+def judge_sensors(
+    lines: Lines,
+    position_sigma_km: Array,
+    attitude_sigma_rad: Array,
+    guess_s: Array | None = None,
+) -> JudgedSensors:
+    """Return each sensor's clock offset and fault.
+
+    Parameters
+    ----------
+    lines
+        Lines of sight, in any order. Groups of one line are skipped.
+    position_sigma_km, attitude_sigma_rad : (s,) float
+        1-sigma per axis of the biases that a sensor keeps over the night: of its position
+        [km], and of its attitude [rad] (0 for attitudes from stars, which are never at fault).
+    guess_s : (s,) float
+        First offsets, needed where they are seconds. Default 0.
+
+    Notes
+    -----
+    Least squares about the solved positions, which are eliminated group by group (Schur
+    complement). The faults are chosen by the evidence of the linear model. An offset that all
+    sensors share shows only in the sensors' motion.
+    """
+    n_sensors = len(position_sigma_km)
+    guess = np.zeros(n_sensors) if guess_s is None else np.array(guess_s, float)
+    has_lines = np.bincount(lines.sensor, minlength=n_sensors) > 0
+    spread = _spread(position_sigma_km, attitude_sigma_rad)
+    kept = np.ones(len(lines.sensor), bool)
+    for _ in range(ROUNDS):
+        about = _shifted(lines, guess)
+        normal, right = _equations(about, kept, spread)
+        model = _Model(normal, right, guess / PRIOR_S, spread)
+        explained = _explain(model, np.flatnonzero(has_lines), attitude_sigma_rad > 0)
+        wrong = np.array([(s, CLOCK) in explained.faults for s in range(n_sensors)])
+        unknowns = model.estimate(explained.faults)[0]
+        step_s = unknowns[::PER_SENSOR][wrong] * PRIOR_S
+        good = _chi2(about, kept, spread, unknowns) < OUTLIER
+        guess[wrong] += step_s
+        if (good == kept).all() and (np.abs(step_s) < 1e-4).all():
+            break
+        kept = good
+    return _estimates(model, explained, has_lines)
+
+
+def _spread(position_sigma_km: Array, attitude_sigma_rad: Array) -> Array:
+    """Return the prior 1-sigma of all unknowns, sensor by sensor."""
+    return np.concatenate(
+        [
+            np.full((len(position_sigma_km), 1), PRIOR_S),
+            np.repeat(np.maximum(position_sigma_km, 1e-6)[:, None], 3, axis=1),
+            np.repeat(np.maximum(attitude_sigma_rad, 1e-9)[:, None], 3, axis=1),
+        ],
+        axis=1,
+    ).ravel()
+
+
+class _Model:
+    """The normal equations of all sensors' unknowns, in units of their spread.
+
+    The equations are linear about the offsets `guess`, the prior is about offset 0.
+    """
+
+    def __init__(self, normal: Array, right: Array, guess: Array, spread: Array) -> None:
+        self.normal, self.right, self.spread = normal, right, spread.reshape(-1, PER_SENSOR)
+        self.guess = np.zeros_like(self.spread)
+        self.guess[:, 0] = guess
+
+    def estimate(self, faults: Faults) -> tuple[Array, Array]:
+        """Return the unknowns beyond the guess and their covariance, if these faults may be."""
+        A, b, _ = self._with_prior(faults)
+        cov = np.linalg.inv(A)
+        return np.asarray(cov @ b), np.asarray(cov)
+
+    def evidence(self, faults: Faults) -> float:
+        """Return the log-probability of the lines, if these faults may be."""
+        A, b, constant = self._with_prior(faults)
+        return float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1]) / 2 + constant
+
+    def size(self, sensor: int, cause: str, faults: Faults) -> tuple[float, float]:
+        """Return the size of a wrong ephemeris [km] or attitude [rad], and its sigma."""
+        x, cov = self.estimate(faults)
+        columns = np.arange(PER_SENSOR)[COLUMNS[cause]] + PER_SENSOR * sensor
+        unit = self.spread.ravel()[columns]
+        off = x[columns] * unit
+        length = float(np.linalg.norm(off))
+        along = off / max(length, 1e-300) * unit
+        return length, float(np.sqrt(along @ cov[np.ix_(columns, columns)] @ along))
+
+    def _with_prior(self, faults: Faults) -> tuple[Array, Array, float]:
+        weight = np.ones_like(self.spread)
+        weight[:, 0] = (PRIOR_S / SOUND_S) ** 2
+        for s, cause in faults:
+            usual = {CLOCK: PRIOR_S, EPHEMERIS: FAULT_KM, ATTITUDE: FAULT_RAD}[cause]
+            weight[s, COLUMNS[cause]] = (self.spread[s, COLUMNS[cause]] / usual) ** 2
+        pull = weight * self.guess
+        constant = np.log(weight).sum() - np.sum(pull * self.guess)
+        right = self.right - pull.ravel()
+        return self.normal + np.diag(weight.ravel()), right, float(constant) / 2
+
+
+class _Explanation(NamedTuple):
+    """Faults that are sure, sensors with a fault of unknown kind, and whether no other
+    explanation is about as good."""
+
+    faults: Faults
+    disagreeing: list[int]
+    distinct: bool
+
+
+def _explain(model: _Model, sensors: Indices, has_prior_attitude: Flags) -> _Explanation:
+    """Return the explanation of the lines by the fewest faults.
+
+    Sure are the faults that are in the best explanation and in all others that are about as
+    good. An attitude can be wrong only where `has_prior_attitude`.
+    """
+    score: dict[Faults, float] = {}
+    kinds = [
+        [(s, kind) for kind in COLUMNS if kind != ATTITUDE or has_prior_attitude[s]]
+        for s in sensors.tolist()
+    ]
+
+    def judge(faults: Faults) -> float:
+        if faults not in score:
+            rarer = sum(kind != CLOCK for _, kind in faults)
+            score[faults] = model.evidence(faults) - SURE * len(faults) - RARER * rarer
+        return score[faults]
+
+    best: Faults = frozenset()
+    judge(best)
+    if math.prod(1 + len(of_sensor) for of_sensor in kinds) <= MOST_SETS:
+        for chosen in itertools.product(*([None, *of_sensor] for of_sensor in kinds)):
+            judge(frozenset(fault for fault in chosen if fault is not None))
+        best = max(score, key=judge)
+    else:
+        while True:
+            better = max([best, *_beside(best, kinds)], key=judge)
+            if better == best:
+                break
+            best = better
+    good = [faults for faults, value in score.items() if value > score[best] - DISTINCT]
+    sure = best.intersection(*good)
+    at_fault = {s for s, _ in best}.intersection(*({s for s, _ in faults} for faults in good))
+    return _Explanation(sure, sorted(at_fault - {s for s, _ in sure}), len(good) == 1)
+
+
+def _beside(faults: Faults, kinds: list[list[tuple[int, str]]]) -> list[Faults]:
+    """Return the sets with one fault added, removed, or exchanged; one fault per sensor."""
+    sensors = {s for s, _ in faults}
+    possible = [fault for of_sensor in kinds for fault in of_sensor]
+    more = [faults | {fault} for fault in possible if fault[0] not in sensors]
+    less = [faults - {fault} for fault in sorted(faults)]
+    exchanged = [
+        fewer | {fault}
+        for fewer in less
+        for fault in possible
+        if fault not in faults and fault[0] not in {s for s, _ in fewer}
+    ]
+    return [*more, *less, *exchanged]
+
+
+def _estimates(model: _Model, explained: _Explanation, has_lines: Flags) -> JudgedSensors:
+    """Return each sensor's offset, if it and what is at fault may be wrong; and the faults."""
+    n = len(has_lines)
+    faults = explained.faults
+    offset, sigma = np.full(n, np.nan), np.full(n, np.nan)
+    size, size_sigma = np.zeros(n), np.zeros(n)
+    cause = [SOUND] * n
+    all_clocks = frozenset((s, CLOCK) for s in range(n))
+    for s in np.flatnonzero(has_lines).tolist():
+        may_be = faults | {(s, CLOCK)} if explained.distinct else faults | all_clocks
+        step, cov = model.estimate(may_be)
+        at = PER_SENSOR * s
+        offset[s] = (model.guess[s, 0] + step[at]) * PRIOR_S
+        sigma[s] = np.sqrt(cov[at, at]) * PRIOR_S
+    for s, kind in faults:
+        cause[s] = kind
+        if kind != CLOCK:
+            size[s], size_sigma[s] = model.size(s, kind, faults)
+    for s in explained.disagreeing:
+        cause[s] = DISAGREES
+    return JudgedSensors(offset, sigma, cause, size, size_sigma)
+
+
+def _shifted(lines: Lines, offset_s: Array) -> Lines:
+    """Return the lines moved to the reported times, for clocks with these offsets.
+
+    A line shows the object and the sensor where they were `offset_s` earlier.
+    """
+    d = offset_s[lines.sensor][:, None]
+    moved = (lines.v_km_s - lines.v_sensor_km_s) * d
+    bent = (_gravity(lines.r_km) - _gravity(lines.x_km)) * d * d / 2
+    return lines._replace(r_km=lines.r_km + moved + bent)
+
+
+def _gravity(r_km: Array) -> Array:
+    return -GM_KM3_S2 * r_km / np.linalg.norm(r_km, axis=1, keepdims=True) ** 3
+
+
+def _equations(lines: Lines, kept: Flags, spread: Array) -> tuple[Array, Array]:
+    """Return the normal equations of the sensors' unknowns, in units of their spread."""
+    normal, right = np.zeros((len(spread), len(spread))), np.zeros(len(spread))
+    for _, columns, wide, e in _groups(lines, kept, spread):
+        np.add.at(normal, np.ix_(columns, columns), wide.T @ wide)
+        np.add.at(right, columns, wide.T @ e)
+    return normal, right
+
+
+def _chi2(lines: Lines, kept: Flags, spread: Array, unknowns: Array) -> Array:
+    """Return the chi-square of each line for solved unknowns; inf for lines left out before."""
+    out = np.where(kept, 0.0, np.inf)
+    for rows, columns, wide, e in _groups(lines, kept, spread):
+        out[rows] = np.sum((e - wide @ unknowns[columns]).reshape(-1, 2) ** 2, axis=1)
+    return out
+
+
+def _groups(
+    lines: Lines, kept: Flags, spread: Array
+) -> Iterator[tuple[Indices, Indices, Array, Array]]:
+    """Yield each position's lines: rows, columns of unknowns, derivatives and residuals.
+
+    The part that the position can absorb is removed: it tells nothing about the sensors.
+    """
+    to_position, to_sensor, misses = _whitened(lines, spread)
+    order = np.argsort(lines.group, kind="stable")
+    order = order[kept[order]]
+    bounds = np.flatnonzero(np.diff(lines.group[order], prepend=-1, append=-1))
+    for lo, hi in itertools.pairwise(bounds):
+        rows = order[lo:hi]
+        if hi - lo < 2:
+            continue
+        H, A, e = to_position[rows].reshape(-1, 3), to_sensor[rows], misses[rows].ravel()
+        free, _ = np.linalg.qr(H)
+        columns = (PER_SENSOR * lines.sensor[rows][:, None] + np.arange(PER_SENSOR)).ravel()
+        wide = np.zeros((len(e), len(columns)))
+        for k in range(hi - lo):
+            wide[2 * k : 2 * k + 2, PER_SENSOR * k : PER_SENSOR * (k + 1)] = A[k]
+        yield rows, columns, wide - free @ (free.T @ wide), e - free @ (free.T @ e)
+
+
+def _whitened(lines: Lines, spread: Array) -> tuple[Array, Array, Array]:
+    """Return derivatives by position (n, 2, 3) and by the sensor's unknowns (n, 2, 7), and
+    residuals (n, 2), in units of the noise and of the unknowns' spread."""
+    basis = tangent_basis(lines.u)
+    away = lines.x_km - lines.r_km
+    reach = np.linalg.norm(away, axis=1)
+    predicted = away / reach[:, None]
+    root = np.linalg.inv(np.linalg.cholesky(lines.cov))
+    by_place = root @ basis / reach[:, None, None]
+    rate = np.einsum("nij,nj->ni", by_place, lines.v_km_s - lines.v_sensor_km_s)
+    by_turn = root @ basis @ -skew(lines.u)
+    by_sensor = np.concatenate([-rate[:, :, None], by_place, by_turn], axis=2)
+    per_line = spread.reshape(-1, PER_SENSOR)[lines.sensor]
+    misses = np.einsum("nij,nj->ni", root @ basis, lines.u - predicted)
+    return by_place, by_sensor * per_line[:, None, :], misses
