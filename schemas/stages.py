@@ -42,8 +42,8 @@ class Stage(StrEnum):
     )
     CHECK = (
         "check",
-        "Estimates each sensor's clock; a wrong clock is corrected and the night tracked again, or "
-        "its sensor is left out.",
+        "Judges each sensor's clock, ephemeris and attitude; a wrong clock is corrected and the "
+        "night tracked again, or the sensor is left out.",
     )
     NAME = (
         "name",
