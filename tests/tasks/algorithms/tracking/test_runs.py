@@ -123,3 +123,22 @@ def test_few_frames_give_no_track(n_frames):
 def test_the_same_input_gives_the_same_tracks():
     times, offsets, u, _ = scene(5, n_objects=20, n_false=50, n_frames=30, rate_arcsec_s=40)
     assert (follow(times, offsets, u) == follow(times, offsets, u)).all()
+
+
+@pytest.mark.parametrize("miss_km", [300.0, 500.0, 1000.0])
+def test_an_object_that_comes_near_is_one_track(miss_km):
+    """Two low orbits meet at 14 km/s: the range changes, and the rate with it, by far more than
+    the rate itself would let one expect."""
+    rng = np.random.default_rng(1)
+    times = np.arange(-100, 100, 0.2)
+    path = np.column_stack([14.0 * times, np.full(len(times), miss_km), 0.05 * miss_km + times])
+    u = path / np.linalg.norm(path, axis=1, keepdims=True)
+    u += rng.normal(size=u.shape) * SIGMA
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    kept = rng.random(len(times)) > 0.05
+    rate = 14.0 * miss_km / np.sum(path**2, axis=1)
+    kept &= rate < np.radians(1.5)
+    track = follow(times[kept], np.arange(kept.sum() + 1), u[kept], max_coast_s=0.9)
+    names, count = np.unique(track[track >= 0], return_counts=True)
+    assert len(names) == (2 if rate.max() > np.radians(1.5) else 1)
+    assert count.sum() > 0.99 * kept.sum()

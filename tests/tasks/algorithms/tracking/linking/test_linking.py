@@ -9,6 +9,7 @@ from scipy.stats import chi2 as chi_square
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, jerk
 from epipole.tasks.algorithms.tracking.linking.chains import (
     NONE,
     Fragments,
@@ -132,7 +133,7 @@ def test_broken_tracks_of_orbiting_objects_are_joined(link, n_objects, gap_s):
 def test_the_likelihood_statistic_has_its_degrees_of_freedom_where_two_are_one_object():
     # Motions drawn from the prior: then the mean is 4, two for each axis.
     rate = 40 * ARCSEC
-    bend = (rate**2 + 1e-3 * rate + 2.5e-7) / ARCSEC
+    bend = acceleration(rate) / ARCSEC
     rng = np.random.default_rng(6)
     t = np.concatenate([np.arange(10), np.arange(25, 35)]) - 17.0
     found = []
@@ -172,8 +173,7 @@ def test_the_likelihood_statistic_is_that_of_least_squares():
     centre = (t[11] + t[12]) / 2
     h = np.vander(t - centre, 4, increasing=True)
     rate = np.linalg.norm((u[19] - u[6]) / (t[19] - t[6]))
-    bend = rate**2 + 1e-3 * rate + 2.5e-7
-    bound = np.diag([0, 0, bend / 2, (2 * rate**3 + 1e-3 * bend) / 6])
+    bound = np.diag([0, 0, acceleration(rate) / 2, jerk(rate) / 6])
     prior = np.diag([0, 0, 1 / bound[2, 2], 1 / bound[3, 3]])[2:]
 
     def misfit(rows):
