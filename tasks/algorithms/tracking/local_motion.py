@@ -16,6 +16,9 @@ from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, jerk
 Array = npt.NDArray[np.float64]
 
 BIAS_SHARE = 0.25  # most that the neglected third derivative may add, in sigmas of a detection
+# 1-sigma acceleration per axis, as a share of the bound that the rate allows: real orbits have
+# 0.3 to 0.5.
+BEND = 0.5
 
 
 class _Queries(NamedTuple):
@@ -151,7 +154,7 @@ def _fit(detections, lo, hi, at, rate, half, unknown_rate):
         unmodelled = (unknown_rate * tau[0]) ** 2
     else:
         scale = max(np.max(np.abs(tau)), 1e-9)
-        prior = 1.0 / (acceleration(rate) * scale * scale) ** 2
+        prior = 1.0 / (BEND * acceleration(rate) * scale * scale) ** 2
         unmodelled = _coefficients(tau, weight, scale, prior, value, slope)
         if scale > half:
             unmodelled += (jerk(rate) * scale**3 / 6) ** 2
