@@ -133,6 +133,7 @@ VIEWS = schema(
         column("centroid", pa.int32(), null=True, doc="Centroid in that frame; null: a miss."),
         *axes("{}_px", unit="px", frame="image", doc="Place at the epoch", names="xy"),
         *axes("u{}", unit="", frame="ICRS", doc="Direction, aberration removed"),
+        *axes("w{}_rad_s", unit="rad/s", frame="ICRS", doc="Rate of the direction; 0: unknown"),
         *covariance(
             "cov_noise_{}_rad2",
             unit="rad^2",

@@ -37,6 +37,7 @@ class SpanViews:
         self.sensor = np.searchsorted(self.sensors, array(views, "sensor_id").astype(str))
         self.tracklet = np.searchsorted(self.tracklet_id, array(views, "tracklet_id").astype(str))
         self.u, self.r_km = stack(views, "u{}"), stack(views, "{}_km")
+        self.w_rad_s = stack(views, "w{}_rad_s")
         self.noise = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
         self.bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES)
         self.sigma_km = array(views, "position_sigma_km")
@@ -75,14 +76,15 @@ class SpanViews:
         t, k = len(tracklet), len(instants)
         seen, u = np.zeros((t, k), bool), np.tile([0.0, 0.0, 1.0], (t, k, 1))
         cov, sigma_km = np.tile(np.eye(2), (t, k, 1, 1)), np.ones((t, k))
+        rate = np.zeros((t, k, 3))
         seen[item, at] = True
-        u[item, at] = self.u[rows]
+        u[item, at], rate[item, at] = self.u[rows], self.w_rad_s[rows]
         # The common error is one for all k samples. With k times its variance in each of them,
         # they count together as one.
         n_samples = seen.sum(axis=1)[item].astype(float)
         cov[item, at] = self.noise[rows] + n_samples[:, None, None] * self.bias[rows]
         sigma_km[item, at] = np.sqrt(n_samples) * self.sigma_km[rows]
-        attitude, sensor_km = self._poses_at(instants)
+        attitude, sensor_km, sensor_km_s = self._poses_at(instants)
         sensor_km[self.sensor[rows], at] = self.r_km[rows]
         origin = self.epoch_ns[0]
         return Samples(
@@ -97,6 +99,8 @@ class SpanViews:
             sensor_km=sensor_km,
             R_sensor_from_icrs=attitude,
             half_field=self.half_field,
+            rate=rate,
+            sensor_km_s=sensor_km_s,
         ), tracklet
 
     def even_instants(self, rows: Indices, window_s: float) -> Indices:
@@ -123,13 +127,15 @@ class SpanViews:
                 chosen.add(int(epochs[len(epochs) // 2]))
         return np.array(sorted(chosen), np.int64)
 
-    def _poses_at(self, instants: Indices) -> tuple[Array, Array]:
-        """Return the sensors' attitudes and positions; NaN where no frame is near."""
+    def _poses_at(self, instants: Indices) -> tuple[Array, Array, Array]:
+        """Return the sensors' attitudes, positions, velocities; NaN where no frame is near."""
         attitude = np.full((len(self.sensors), len(instants), 3, 3), np.nan)
         sensor_km = np.full((len(self.sensors), len(instants), 3), np.nan)
+        sensor_km_s = np.full_like(sensor_km, np.nan)
         for s, (frames, turned) in enumerate(self.frames):
             near = np.clip(np.searchsorted(frames.time_ns, instants), 0, len(turned) - 1)
             there = np.abs(frames.time_ns[near] - instants) < NEAR_NS
             attitude[s, there] = turned[near[there]]
             sensor_km[s, there] = frames.r_gcrf_km[near[there]]
-        return attitude, sensor_km
+            sensor_km_s[s, there] = frames.v_gcrf_km_s[near[there]]
+        return attitude, sensor_km, sensor_km_s

@@ -145,7 +145,7 @@ def _view_table(
     v = np.nan_to_num(frames.v_gcrf_km_s)
     u_still = aberrate(tracklets.u_icrs, -v[tracklets.frame])
     at_s = (array(epochs, "epoch")[row] - origin) / 1e9
-    u, _, noise, bias, _ = directions_at(
+    u, w, noise, bias, _ = directions_at(
         bounds[tracklet],
         bounds[tracklet + 1],
         at_s,
@@ -171,6 +171,7 @@ def _view_table(
         "x_px": x_px,
         "y_px": y_px,
         **unstack("u{}", u),
+        **unstack("w{}_rad_s", w),
         **unstack_covariance("cov_noise_{}_rad2", cov_noise, TANGENT_AXES),
         **unstack_covariance("cov_bias_{}_rad2", cov_bias, TANGENT_AXES),
         **unstack("{}_km", r_km),

@@ -43,6 +43,7 @@ def tables(scene: Scene, names=None) -> tuple[pa.Table, pa.Table, pa.Table, pa.T
         "epoch": epoch[at], "sensor_id": names[s], "frame_number": at,
         "tracklet_id": [f"t{i:04d}" for i in item], "centroid": item.astype(np.int32),
         "ux": u[:, 0], "uy": u[:, 1], "uz": u[:, 2],
+        **{f"w{a}_rad_s": np.zeros(n) for a in "xyz"},
         "cov_noise_11_rad2": cov[:, 0, 0], "cov_noise_12_rad2": cov[:, 0, 1],
         "cov_noise_22_rad2": cov[:, 1, 1], "cov_bias_11_rad2": np.zeros(n),
         "cov_bias_12_rad2": np.zeros(n), "cov_bias_22_rad2": np.zeros(n),

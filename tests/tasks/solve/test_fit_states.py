@@ -31,6 +31,7 @@ def night(seed, times):
         "y_px": np.zeros(n),
     }
     views = shared | {f"u{a}": arcs.u[:, i] for i, a in enumerate("xyz")}
+    views |= {f"w{a}_rad_s": np.zeros(n) for a in "xyz"}
     views |= {f"{a}_km": arcs.r_km[:, i] for i, a in enumerate("xyz")}
     for which, cov in (("noise", arcs.cov_noise), ("bias", arcs.cov_bias)):
         for ab, i, j in (("11", 0, 0), ("12", 0, 1), ("22", 1, 1)):

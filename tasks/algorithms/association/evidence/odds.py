@@ -3,7 +3,7 @@
 import numpy as np
 
 from epipole.tasks.algorithms.association.evidence.arcs import LN_2PI, arc_odds
-from epipole.tasks.algorithms.association.evidence.visibility import looks_at
+from epipole.tasks.algorithms.association.evidence.visibility import should_detect
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 
@@ -57,7 +57,7 @@ def score(views, chance, members, points, shells, near, outcomes, part):
 def _detections(views, chance, members, points, near, outcomes):
     """Return the log-probability of which sensors detect the object and which miss it.
 
-    Writes `outcomes` for each sensor: 1 detection, -1 miss, 0 not in its field.
+    Writes `outcomes` for each sensor: 1 detection, -1 miss, 0 where none is expected.
     """
     total = 0.0
     outcomes[:] = 0
@@ -66,7 +66,7 @@ def _detections(views, chance, members, points, near, outcomes):
     for s in range(len(outcomes)):
         if outcomes[s] == 1:
             total += np.log(chance.detected[s])
-        elif near[s] and looks_at(views, s, points.x_km, points.seen_by):
+        elif near[s] and should_detect(views, members, s, points):
             outcomes[s] = -1
             total += np.log(1.0 - chance.detected[s])
     return total

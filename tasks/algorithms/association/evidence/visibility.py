@@ -6,6 +6,7 @@ from epipole.tasks.algorithms.association.sampling.views import HALF, PLANE, REA
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 
+FAINTER = 1.5  # times the range: the object is 0.9 mag fainter and may not be detected
 INSIDE = 0.98  # of half the field: nearer to its edge misses are frequent
 
 
@@ -63,6 +64,41 @@ def looks_at(views, s, X, seen_by):
             return False
         looked = True
     return looked
+
+
+@borrowing_kernel
+def should_detect(views, members, s, points):
+    """Return whether a sensor without a tracklet of the object counts as a miss.
+
+    It does where the points are in its field, and not much fainter than for the members' sensors.
+    """
+    return looks_at(views, s, points.x_km, points.seen_by) and not _too_faint(
+        views, members, s, points
+    )
+
+
+@borrowing_kernel
+def _too_faint(views, members, s, points):
+    """Return whether sensor s is so far from the object that it may not detect it.
+
+    The range is compared with the longest among the members' sensors, at the first solved instant.
+    """
+    for m in range(len(views.time_s)):
+        if points.seen_by[m] < 2:
+            continue
+        farthest2, x = 0.0, points.x_km[m]
+        for i in members:
+            if views.seen[i, m]:
+                farthest2 = max(farthest2, _range2(views.camera, views.sensor[i], m, x))
+        return _range2(views.camera, s, m, x) > FAINTER * FAINTER * farthest2
+    return False
+
+
+@borrowing_kernel
+def _range2(cam, s, m, x):
+    """Return the squared range [km^2] from sensor s at instant m to the point x."""
+    d0, d1, d2 = x[0] - cam[s, m, 0], x[1] - cam[s, m, 1], x[2] - cam[s, m, 2]
+    return d0 * d0 + d1 * d1 + d2 * d2
 
 
 @borrowing_kernel

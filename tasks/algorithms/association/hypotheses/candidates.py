@@ -5,19 +5,28 @@ import numpy as np
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
 from epipole.tasks.algorithms.association.sampling.views import (
     CORNER,
+    DX,
+    DY,
+    FASTEST,
+    MOVES,
     PLANE,
     SCALE,
     SIGMA_KM,
+    V_KM_S,
     WIDEST,
     XX,
     XY,
     YY,
     X,
     Y,
+    later_s,
 )
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 
-A0, A1, H00, H01, H11, DEPTH, STRETCH = range(7)  # columns of `WorkSpace.predicted`
+# Columns of `WorkSpace.predicted`: coordinates and covariance on the sensor's plane, depth [km],
+# stretch of the plane, the delay of `later_s` [s], and how far the sensor's own motion moves the
+# coordinates in that time.
+A0, A1, H00, H01, H11, DEPTH, STRETCH, LATER, OWN0, OWN1 = range(10)
 
 
 @borrowing_kernel
@@ -51,6 +60,11 @@ def _predict(views, s, points, predicted):
         t2 = P[m, 2, 0] * q0 + P[m, 2, 1] * q1 + P[m, 2, 2] * q2
         predicted[m, H11] = q0 * t0 + q1 * t1 + q2 * t2
         predicted[m, STRETCH] = 1.0 + a0 * a0 + a1 * a1
+        later = later_s(d0, d1, d2, x[m])
+        v0, v1, v2 = cam[s, m, V_KM_S], cam[s, m, V_KM_S + 1], cam[s, m, V_KM_S + 2]
+        predicted[m, LATER] = later
+        predicted[m, OWN0] = later * (p0 * v0 + p1 * v1 + p2 * v2)
+        predicted[m, OWN1] = later * (q0 * v0 + q1 * v1 + q2 * v2)
 
 
 @borrowing_kernel
@@ -70,7 +84,9 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
         if not depth > 0.0:
             return -np.inf
         x0, x1 = see[c, m, X], see[c, m, Y]
-        e0, e1 = predicted[m, A0] - x0, predicted[m, A1] - x1
+        later, moves = predicted[m, LATER], see[c, m, MOVES]
+        e0 = predicted[m, A0] - x0 - moves * predicted[m, OWN0] - later * see[c, m, DX]
+        e1 = predicted[m, A1] - x1 - moves * predicted[m, OWN1] - later * see[c, m, DY]
         extra = (see[c, m, SIGMA_KM] / depth) ** 2
         c00 = see[c, m, XX] + extra * (1.0 + x0 * x0) + predicted[m, H00]
         c01 = see[c, m, XY] + extra * x0 * x1 + predicted[m, H01]
@@ -125,11 +141,12 @@ def best_of_sensor(space, work, s, members, least):
         begin = views.grid[s, m, 0]
         place = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
         errors = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
-        reach = gate * np.sqrt(predicted[m, H00] + errors)
+        drift = abs(predicted[m, LATER]) * cam[s, m, FASTEST]
+        reach = gate * np.sqrt(predicted[m, H00] + errors) + abs(predicted[m, OWN0]) + drift
         here = predicted[m, A0] - cam[s, m, CORNER]
         lo0 = max(int(np.floor((here - reach) * cam[s, m, SCALE])), 0)
         hi0 = min(int(np.floor((here + reach) * cam[s, m, SCALE])), side - 1)
-        reach = gate * np.sqrt(predicted[m, H11] + errors)
+        reach = gate * np.sqrt(predicted[m, H11] + errors) + abs(predicted[m, OWN1]) + drift
         here = predicted[m, A1] - cam[s, m, CORNER + 1]
         lo1 = max(int(np.floor((here - reach) * cam[s, m, SCALE + 1])), 0)
         hi1 = min(int(np.floor((here + reach) * cam[s, m, SCALE + 1])), side - 1)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.evidence.odds import score
 from epipole.tasks.algorithms.association.evidence.points import InstantPoints
-from epipole.tasks.algorithms.association.evidence.visibility import looks_at, near_fields
+from epipole.tasks.algorithms.association.evidence.visibility import near_fields, should_detect
 from epipole.tasks.algorithms.association.hypotheses.candidates import best_of_sensor
 from epipole.tasks.algorithms.association.hypotheses.instant_points import join, possible, solve
 from epipole.tasks.algorithms.association.hypotheses.search_space import (
@@ -138,9 +138,9 @@ def _grow(space, work, members):
         if n > before and before < WELL_KNOWN:
             early = min(n, np.int64(WELL_KNOWN))
         if turn < n_sensors:
-            in_field = detected or looks_at(views, s, work.points.x_km, work.points.seen_by)
-            looked += in_field
-            if in_field and not detected:
+            expected = detected or should_detect(views, members[:n], s, work.points)
+            looked += expected
+            if expected and not detected:
                 evidence += np.log(1.0 - space.chance.detected[s])
             if looked >= FEW and evidence < GIVEN_UP:
                 return np.int64(0)

@@ -13,7 +13,7 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 RESIDUAL_PARTS = 11  # of `views.residual`
-PREDICTED_COLUMNS = 7  # of `candidates`
+PREDICTED_COLUMNS = 10  # of `candidates`
 
 
 class SearchSpace(NamedTuple):
@@ -47,7 +47,7 @@ class WorkSpace(NamedTuple):
         Its points.
     part : (11,) float
         Residual of one view, see `views.residual`.
-    predicted : (k, 7) float
+    predicted : (k, 10) float
         Predictions for one sensor, see `candidates`.
     near : (s,) bool
         Sensors whose field may hold the points, see `visibility.near_fields`.

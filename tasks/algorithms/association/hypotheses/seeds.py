@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import pair_miss, quantile
-from epipole.tasks.algorithms.association.sampling.views import SIGMA_KM, XX, YY, Views
+from epipole.tasks.algorithms.association.sampling.views import MOVES, SIGMA_KM, XX, YY, Views
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.kernels import kernel
 
@@ -22,6 +23,9 @@ Indices = npt.NDArray[np.int64]
 
 SHORTEST_BASELINE_KM = 1.0
 NEAREST_KM = 300.0  # range at which errors of the baseline turn the plane most
+FASTEST_KM_S = 11.0  # of an object near the Earth, for the light time between two sensors
+LARGEST_SIGMA = 3.0  # the longest such way counts as an error of this many sigmas
+N_EDGES = 8  # outermost tracklets of a sensor, one for each way on its plane
 
 
 class PlaneAngles(NamedTuple):
@@ -51,6 +55,9 @@ def plane_angles(
     # The trace is at least the variance along any axis.
     variance = views.sight[items, m, XX] + views.sight[items, m, YY]
     place = 2 * (views.sight[items, m, SIGMA_KM] / NEAREST_KM) ** 2
+    # Light time: the ranges of two sensors differ by at most the baseline.
+    moved_km = FASTEST_KM_S * np.linalg.norm(baseline_km) / SPEED_OF_LIGHT_KM_S / LARGEST_SIGMA
+    place += views.sight[items, m, MOVES] * (moved_km / NEAREST_KM) ** 2
     angle = np.arctan2(u @ axes[1], u @ axes[0])
     return PlaneAngles(items, angle, np.sqrt(variance + place) / across)
 
@@ -167,18 +174,22 @@ class SensorPairs:
         order = np.argsort(-across[meet], kind="stable")
         self._a, self._b = a[meet][order], b[meet][order]
         reach = np.where(range_a > 0, np.minimum(range_a, farthest_km), farthest_km)
-        self._middle = (place[a] + reach[:, None] * look[a])[meet][order]
+        middle = (place[a] + reach[:, None] * look[a])[meet][order]
+        edges = _shared_points(views, (look, place, half), self._a, self._b, farthest_km)
+        self._points = np.concatenate([middle[:, None], edges], axis=1)
         self._look, self._place, self._half = look, place, half
         self._waiting = np.ones(len(self._a), bool)
         self._busy = np.zeros(len(look), bool)
-        self._covered = np.zeros(len(self._a), np.int64)
+        # Earlier pairs that cover each point of a pair. A point that is not shared (NaN) counts as
+        # covered.
+        self._covered = np.where(np.isfinite(self._points[..., 0]), 0, np.iinfo(np.int64).max)
 
     def next(self, enough: float = np.inf) -> tuple[int, int] | None:
         """Return the next pair, None after the last.
 
-        A pair is skipped where `enough` of the earlier pairs cover the middle of its field.
+        A pair is skipped where `enough` of the earlier pairs cover each point that it shares.
         """
-        wanted = self._waiting & (self._covered < enough)
+        wanted = self._waiting & (self._covered.min(axis=1) < enough)
         ready = wanted & ~self._busy[self._a] & ~self._busy[self._b]
         if not ready.any():
             self._busy[:] = False
@@ -189,13 +200,62 @@ class SensorPairs:
         a, b = int(self._a[k]), int(self._b[k])
         self._waiting[k] = False
         self._busy[[a, b]] = True
-        both = np.ones(len(self._a), bool)
+        rows = np.flatnonzero(wanted)
+        both = np.isfinite(self._points[rows, :, 0])
         for s in (a, b):
-            toward = self._middle - self._place[s]
-            cosine = (toward @ self._look[s]) / np.linalg.norm(toward, axis=1)
-            both &= cosine > np.cos(self._half[s] / 2)
-        self._covered += both
+            toward = self._points[rows] - self._place[s]
+            along = toward @ self._look[s]
+            both &= along > np.cos(self._half[s]) * np.linalg.norm(toward, axis=2)
+        self._covered[rows] += both
         return a, b
+
+
+def _edges(views: Views) -> Array:
+    """Return directions of each sensor's outermost tracklets, (s, 8, 3); NaN without tracklets."""
+    turn = np.arange(N_EDGES) * 2 * np.pi / N_EDGES
+    ways = np.column_stack([np.cos(turn), np.sin(turn)])
+    edges = np.full((len(views.half_field), N_EDGES, 3), np.nan)
+    for s in range(len(edges)):
+        visible = views.seen[views.first[s] : views.first[s + 1]]
+        if not visible.any():
+            continue
+        m = int(np.argmax(visible.sum(axis=0)))
+        items = views.first[s] + np.flatnonzero(visible[:, m])
+        outermost = np.argmax(views.sight[items, m, :XX] @ ways.T, axis=0)
+        edges[s] = _directions(views, s, m, items[outermost])
+    return edges
+
+
+def _shared_points(
+    views: Views, middle: tuple[Array, Array, Array], a: Indices, b: Indices, farthest_km: float
+) -> Array:
+    """Return (n, 8, 3): points [km] at the edges of fields a, where both fields of a pair see them.
+
+    A point lies on the line of an outermost tracklet of sensor a. It is the one that is nearest to
+    the axis of sensor b, or to an outermost tracklet of it, whichever passes most closely. NaN
+    where this is outside the field of b. `middle` is that of `_middle`.
+    """
+    look, place, half = middle
+    edges = _edges(views)
+    best = np.full((len(a), N_EDGES), np.inf)
+    points = np.full((len(a), N_EDGES, 3), np.nan)
+    baseline = np.repeat(place[b] - place[a], N_EDGES, axis=0)
+    u = edges[a].reshape(-1, 3)
+    for towards in (*np.moveaxis(edges, 1, 0), look):
+        u_b = np.repeat(towards[b], N_EDGES, axis=0)
+        reach, beyond, miss = _closest_approach(baseline, u, u_b)
+        reach = np.minimum(reach, farthest_km)
+        with np.errstate(invalid="ignore"):
+            miss = np.where((reach > 0) & (beyond > 0), miss / reach, np.inf)
+        miss = miss.reshape(-1, N_EDGES)
+        nearer = miss < best
+        best[nearer] = miss[nearer]
+        at = place[a][:, None] + (reach[:, None] * u).reshape(-1, N_EDGES, 3)
+        points[nearer] = at[nearer]
+    toward = points - place[b][:, None]
+    along = np.einsum("npi,ni->np", toward, look[b])
+    inside = along > np.cos(half[b])[:, None] * np.linalg.norm(toward, axis=2)
+    return np.where(inside[..., None], points, np.nan)
 
 
 def _middle(views: Views) -> tuple[Array, Array, Array]:

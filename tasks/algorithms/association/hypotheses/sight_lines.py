@@ -3,8 +3,12 @@
 import numpy as np
 
 from epipole.tasks.algorithms.association.sampling.views import (
+    DX,
+    DY,
+    MOVES,
     PLANE,
     SIGMA_KM,
+    V_KM_S,
     XX,
     XY,
     YY,
@@ -12,6 +16,7 @@ from epipole.tasks.algorithms.association.sampling.views import (
     Y,
     direction,
 )
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 BEYOND = 0.2  # share of the farthest distance by which a point may lie beyond it
@@ -66,7 +71,29 @@ def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
     variance += range_i**2 * _across(views, i, m, n0 / sine, n1 / sine, n2 / sine)
     variance += range_j**2 * _across(views, j, m, n0 / sine, n1 / sine, n2 / sine)
     miss = (b0 * n0 + b1 * n1 + b2 * n2) / sine
+    # Light takes longer to the farther sensor, which sees the object where it was earlier.
+    if views.sight[j, m, MOVES] > 0.0:
+        speed = _speed(views, j, m, range_j, n0 / sine, n1 / sine, n2 / sine)
+    else:
+        speed = _speed(views, i, m, range_i, n0 / sine, n1 / sine, n2 / sine)
+    miss += speed * (range_j - range_i) / SPEED_OF_LIGHT_KM_S
     return miss * miss / variance
+
+
+@borrowing_kernel
+def _speed(views, i, m, range_km, n0, n1, n2):
+    """Return the object's velocity [km/s] along a unit vector, from the rate of tracklet i.
+
+    The vector is perpendicular to the line of sight. 0 where the rate is unknown.
+    """
+    cam, see = views.camera[views.sensor[i], m], views.sight[i, m]
+    if see[MOVES] == 0.0:
+        return 0.0
+    a = cam[PLANE] * n0 + cam[PLANE + 1] * n1 + cam[PLANE + 2] * n2
+    b = cam[PLANE + 3] * n0 + cam[PLANE + 4] * n1 + cam[PLANE + 5] * n2
+    turning = (see[DX] * a + see[DY] * b) / np.sqrt(1.0 + see[X] ** 2 + see[Y] ** 2)
+    own = cam[V_KM_S] * n0 + cam[V_KM_S + 1] * n1 + cam[V_KM_S + 2] * n2
+    return own + range_km * turning
 
 
 @borrowing_kernel

@@ -36,6 +36,11 @@ class Samples(NamedTuple):
         Attitudes of the sensors; NaN where unknown.
     half_field : (s, 2) float
         Tangents of half the field's width and height.
+    rate : (t, k, 3) float or None
+        Rates of the directions [rad/s], ICRS; 0 where unknown.
+    sensor_km_s : (s, k, 3) float or None
+        Velocities of the sensors, GCRF; NaN where unknown. Without them, or without the rates,
+        light time is ignored. This is right for sensors at similar ranges.
     """
 
     sensor: Indices
@@ -49,6 +54,8 @@ class Samples(NamedTuple):
     sensor_km: Array
     R_sensor_from_icrs: Array
     half_field: Array
+    rate: Array | None = None
+    sensor_km_s: Array | None = None
 
     @property
     def field_sr(self) -> Array:

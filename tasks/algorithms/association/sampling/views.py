@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
@@ -21,9 +22,10 @@ Flags = npt.NDArray[np.bool_]
 
 # Columns of `Views.sight` and `Views.camera`. For a tracklet or a sensor at an instant the search
 # reads a single row. Few arrays also compile fast.
-X, Y, XX, XY, YY, SIGMA_KM, SPOT_SR = range(7)
+X, Y, XX, XY, YY, SIGMA_KM, SPOT_SR, DX, DY, MOVES = range(10)
 R_KM, PLANE, TURN, HALF, CORNER, SCALE, WIDEST, REACH = 0, 3, 12, 21, 23, 25, 27, 28
-N_CAMERA = 29
+V_KM_S, FASTEST = 29, 32
+N_SIGHT, N_CAMERA = 10, 33
 
 
 class Views(NamedTuple):
@@ -33,15 +35,17 @@ class Views(NamedTuple):
         Tracklets of sensor s are ``first[s]:first[s + 1]``.
     sensor, start_s, end_s, seen, time_s
         As in `Samples`.
-    sight : (t, k, 7) float
+    sight : (t, k, 10) float
         Gnomonic coordinates in the sensor's plane (X, Y), their variances and covariance (XX, XY,
-        YY), the 1-sigma error of the sensor's position [km], and 2 pi times the square root of
-        the determinant of the direction's covariance [sr].
-    camera : (s, k, 29) float
+        YY), the 1-sigma error of the sensor's position [km], 2 pi times the square root of the
+        determinant of the direction's covariance [sr], the rates of the coordinates [1/s] (DX,
+        DY), and 1 where these are known, else 0 (MOVES).
+    camera : (s, k, 33) float
         The sensor's position [km]; the plane's two axes and its normal; the sensor's axes (NaN
         where unknown); tangents of half its field; the grid's lowest coordinates and its cells
         per unit; the largest variance of a tracklet on the plane; the tangent of the cone about
-        the normal that holds field and tracklets (0 without tracklets).
+        the normal that holds field and tracklets (0 without tracklets); the sensor's velocity
+        [km/s]; the highest rate of a coordinate among its tracklets [1/s].
     grid : (s, k, 2) int
         First cell of a sensor and instant in `cell_start`, and the number of cells per side.
     cell_start, cell_item : (c,), (v,) int
@@ -88,16 +92,20 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
     sensor = np.ascontiguousarray(samples.sensor[order], np.int64)
     seen = np.ascontiguousarray(samples.seen[order])
     first = np.searchsorted(sensor, np.arange(n_sensors + 1)).astype(np.int64)
-    sight = np.zeros((len(order), n_instants, 7))
+    sight = np.zeros((len(order), n_instants, N_SIGHT))
     sight[..., SIGMA_KM] = samples.sigma_km[order]
     camera = np.zeros((n_sensors, n_instants, N_CAMERA))
     camera[..., R_KM:PLANE] = samples.sensor_km
     camera[..., TURN:HALF] = samples.R_sensor_from_icrs.reshape(n_sensors, n_instants, 9)
     camera[..., HALF:CORNER] = samples.half_field[:, None]
+    rate = np.zeros_like(samples.u)
+    if samples.rate is not None and samples.sensor_km_s is not None:
+        rate, camera[..., V_KM_S:FASTEST] = samples.rate, np.nan_to_num(samples.sensor_km_s)
+    rate = np.ascontiguousarray(rate[order], float)
     u = np.ascontiguousarray(samples.u[order], float)
     camera[..., PLANE:TURN] = _planes(first, seen, u).reshape(n_sensors, n_instants, 9)
     cov = np.ascontiguousarray(samples.cov[order], float)
-    _flatten(sensor, seen, u, cov, camera, sight)
+    _flatten(sensor, seen, u, cov, rate, camera, sight)
     n_seen = int(np.count_nonzero(seen))
     grid = np.zeros((n_sensors, n_instants, 2), np.int64)
     cell_start = np.zeros(n_seen + n_sensors * n_instants + 1, np.int64)
@@ -149,8 +157,8 @@ def _reach(camera: Array, grid: Indices) -> Array:
 
 
 @kernel
-def _flatten(sensor, seen, u, cov, camera, sight):
-    """Project directions, and their covariances on `sky.tangent_basis`, onto the planes."""
+def _flatten(sensor, seen, u, cov, rate, camera, sight):
+    """Project directions, rates, and covariances on `sky.tangent_basis` onto the planes."""
     M, t, p = np.empty((2, 2)), np.empty((2, 3)), np.empty((3, 3))
     for i in range(seen.shape[0]):
         for m in range(seen.shape[1]):
@@ -172,6 +180,14 @@ def _flatten(sensor, seen, u, cov, camera, sight):
             for a in range(2):
                 here = (p[a, 0] * x + p[a, 1] * y + p[a, 2] * z) / depth
                 sight[i, m, X + a] = here
+                moved = 0.0
+                for b in range(3):
+                    moved += (p[a, b] - here * p[2, b]) * rate[i, m, b] / depth
+                    if rate[i, m, b] != 0.0:
+                        sight[i, m, MOVES] = 1.0
+                sight[i, m, DX + a] = moved
+                fastest = camera[sensor[i], m, FASTEST]
+                camera[sensor[i], m, FASTEST] = max(fastest, abs(moved))
                 for b in range(2):
                     M[a, b] = 0.0
                     for c in range(3):
@@ -244,8 +260,21 @@ def direction(views, i, m, u):
 
 
 @borrowing_kernel
+def later_s(d0, d1, d2, x):
+    """Return by how much the sensor's light time is longer than the geocentric one of x [s].
+
+    `d0`, `d1`, `d2` is the vector from the sensor to the point x [km].
+    """
+    range_km = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+    return (range_km - np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])) / SPEED_OF_LIGHT_KM_S
+
+
+@borrowing_kernel
 def residual(views, i, m, x, part):
     """Write a view's residual, predicted minus measured, with partials and weight.
+
+    The object is at x one geocentric light time before the instant. A sensor at another range
+    sees it there `later_s` after the instant. Sensor and direction are carried to that time.
 
     `part` (11,), on the sensor's plane: the residual (2), its partials (2 by 3) [1/km], and the
     inverse covariance (xx, xy, yy). Returns the depth of the point [km], 0 behind the sensor.
@@ -257,14 +286,16 @@ def residual(views, i, m, x, part):
     depth = n0 * d0 + n1 * d1 + n2 * d2
     if not depth > 0.0:
         return 0.0
+    later, moves = later_s(d0, d1, d2, x), see[i, m, MOVES]
+    v0, v1, v2 = cam[s, m, V_KM_S], cam[s, m, V_KM_S + 1], cam[s, m, V_KM_S + 2]
     for a in range(2):
         q = PLANE + 3 * a
         p0, p1, p2 = cam[s, m, q], cam[s, m, q + 1], cam[s, m, q + 2]
         here = (p0 * d0 + p1 * d1 + p2 * d2) / depth
-        part[a] = here - see[i, m, X + a]
-        part[2 + 3 * a] = (p0 - here * n0) / depth
-        part[3 + 3 * a] = (p1 - here * n1) / depth
-        part[4 + 3 * a] = (p2 - here * n2) / depth
+        p0, p1, p2 = (p0 - here * n0) / depth, (p1 - here * n1) / depth, (p2 - here * n2) / depth
+        own = moves * (p0 * v0 + p1 * v1 + p2 * v2) + see[i, m, DX + a]
+        part[a] = here - see[i, m, X + a] - later * own
+        part[2 + 3 * a], part[3 + 3 * a], part[4 + 3 * a] = p0, p1, p2
     # The error of the sensor's position, across the line of sight.
     extra, x0, x1 = (see[i, m, SIGMA_KM] / depth) ** 2, see[i, m, X], see[i, m, Y]
     c00 = see[i, m, XX] + extra * (1.0 + x0 * x0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scenes.light_time import light_time_samples
 from scenes.tracklet_scenes import GEO, V_GEO, Scene, judge, pairs, solve
 
 from epipole.tasks.algorithms.association.sampling.samples import Samples
@@ -114,3 +115,9 @@ def test_no_tracklet_gives_no_group():
     ))  # fmt: skip
     groups = solve(nothing)
     assert len(groups.group) == len(groups.score) == 0
+
+
+def test_sensors_at_very_different_ranges_agree_on_a_low_object():
+    assert solve(light_time_samples()).group.tolist() == [0, 0, 0]
+    without_rates = light_time_samples()._replace(rate=None)
+    assert solve(without_rates).group.tolist() != [0, 0, 0]  # light time matters here
