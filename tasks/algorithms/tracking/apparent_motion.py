@@ -41,6 +41,17 @@ def jerk(rate: float) -> float:
 
 
 @kernel
+def jerk_of(rate: float, bend: float) -> float:
+    """Return how fast [rad/s^3] an acceleration `bend` [rad/s^2] at a rate [rad/s] may change.
+
+    An object that approaches accelerates by twice its relative range rate times its rate. This
+    acceleration changes by three times the relative range rate times itself.
+    """
+    geometry = (2 + 6 * APPROACH**2) * rate**3 + LOW_ORBIT_S * acceleration(rate)
+    return geometry + 1.5 * bend * bend / max(rate, 1e-6)
+
+
+@kernel
 def cubic_span(rate: float, sigma: float) -> float:
     """Return over how long [s] a cubic describes the motion to a standard deviation [rad].
 

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.frame_grid import window
 from epipole.tasks.algorithms.tracking.sky_filter import (
+    SIZE,
     advance,
     begin,
     begin_covariance,
@@ -124,10 +125,14 @@ class _Chains(NamedTuple):
 
 
 class _ChainScratch(NamedTuple):
-    """Room for one chain: direction, rate, covariance, a predicted direction, detections."""
+    """Room for one chain: the filter's state, a predicted direction, detections.
+
+    u, w, bend, P : see `sky_filter`
+    """
 
     u: Array
     w: Array
+    bend: Array
     P: Array
     ahead: Array
     members: Indices
@@ -167,7 +172,7 @@ def _best_evidence(f, g, times, density, variance, class_rates):
     """
     n_back = len(density) - (f - g) - 1
     out = np.zeros((N_RATES, n_back + 1))
-    P = np.empty(3)
+    P = np.empty(SIZE)
     for c in range(N_RATES):
         rate = class_rates[c]
         begin_covariance(rate, times[g] - times[f], variance, variance, P)
@@ -177,7 +182,7 @@ def _best_evidence(f, g, times, density, variance, class_rates):
             dt = times[h] - at
             if dt == 0.0:
                 continue
-            grow(P, rate, dt)
+            grow(P, rate, 0.0, dt)
             at = times[h]
             spot = 2 * np.pi * (P[0] + variance)
             out[c, k] = max(np.log(P_DETECTION / (density[f - h] * spot)), 0.0)
@@ -234,8 +239,10 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, room):
     """
     f, j, g, i = pair.f, pair.j, pair.g, pair.i
     times, directions, variances = detections.times, detections.directions, detections.variances
-    u, w, P, n_slots = room.u, room.w, room.P, len(recent.largest)
-    begin(directions[j], times[f], variances[j], directions[i], times[g], variances[i], u, w, P)
+    u, w, bend, P = room.u, room.w, room.bend, room.P
+    begin(
+        directions[j], times[f], variances[j], directions[i], times[g], variances[i], u, w, bend, P
+    )
     room.members[0], room.members[1] = j, i
     n, evidence, at = 2, (f - g - 1) * MISSED, times[g]
     waiting = 0.0  # misses before the oldest detection so far: the object may have entered there
@@ -246,10 +253,11 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, room):
         dt = times[h] - at
         if dt == 0.0:
             continue
-        grow(P, rate_of(w), dt)
-        advance(u, w, dt)
+        grow(P, rate_of(w), rate_of(bend), dt)
+        advance(u, w, bend, dt)
         at = times[h]
-        m, chi2 = _nearest_free(u, P[0], detections, recent, h % n_slots, rule.gate2)
+        slot = h % len(recent.largest)
+        m, chi2 = _nearest_free(u, P[0], detections, recent, slot, rule.gate2)
         if m == NONE:
             waiting += MISSED
             continue
@@ -259,7 +267,7 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, room):
             waiting += MISSED
             continue
         evidence, waiting = evidence + gain, 0.0
-        correct(u, w, P, directions[m], variances[m])
+        correct(u, w, bend, P, directions[m], variances[m])
         room.members[n] = m
         n += 1
     return n, evidence
@@ -293,7 +301,7 @@ def _may_chain(pair, detections, recent, rule, room):
     directions, variances, P = detections.directions, detections.variances, room.P
     dt_back = detections.times[g] - detections.times[g - 1]
     begin_covariance(np.sqrt(chord2) / dt, -dt, variances[j], variances[i], P)
-    grow(P, np.sqrt(chord2) / dt, -dt_back)
+    grow(P, np.sqrt(chord2) / dt, 0.0, -dt_back)
     _foretell(directions[j], directions[i], chord2, dt_back / dt, room.ahead)
     slot = (g - 1) % len(recent.largest)
     m, _ = _nearest_free(room.ahead, P[0], detections, recent, slot, 1.02 * rule.gate2)
@@ -330,6 +338,7 @@ def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
         np.empty(3),
         np.empty(3),
         np.empty(3),
+        np.empty(SIZE),
         np.empty(3),
         np.empty(chains.members.shape[1], np.int64),
     )

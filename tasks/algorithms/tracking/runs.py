@@ -1,8 +1,9 @@
 """Tracking: detections of one sensor, frame after frame, become runs of one object.
 
 Everything happens on the sky, after attitude, so that the sensor's own turning is gone. In each
-frame, live tracks claim the detections that they fit, the nearest in sigmas first. The other
-detections may begin new tracks.
+frame, live tracks claim the detections that they fit, the nearest in sigmas first. Two tracks
+exchange their detections where both together then fit better. The other detections may begin new
+tracks.
 """
 
 from typing import NamedTuple
@@ -20,6 +21,7 @@ from epipole.tasks.algorithms.tracking.initiation import (
     new_tracks,
 )
 from epipole.tasks.algorithms.tracking.sky_filter import (
+    SIZE,
     advance,
     begin,
     correct,
@@ -37,19 +39,20 @@ DEEPEST = 9  # the same where false alarms are so dense that it takes more detec
 class _Tracks(NamedTuple):
     """States of tracks.
 
-    u, w, P : (t, 3), (t, 3), (t, 3) float, direction, rate and covariance, see `sky_filter`
+    u, w, bend, P : (t, 3), (t, 3), (t, 3), (t, SIZE) float, see `sky_filter`
     at, missed : (t,) float and int64, time of the state, and misses in a row
     """
 
     u: Array
     w: Array
+    bend: Array
     P: Array
     at: Array
     missed: npt.NDArray[np.int64]
 
 
 @kernel
-def _state_of(members, detections, u, w, P):
+def _state_of(members, detections, u, w, bend, P):
     """Filter a new track's detections, newest first in `members`, into its state at the newest."""
     times, frame_of = detections.times, detections.frame_of
     directions, variances = detections.directions, detections.variances
@@ -57,13 +60,13 @@ def _state_of(members, detections, u, w, P):
     first, second = members[last], members[last - 1]
     begin(
         directions[first], times[frame_of[first]], variances[first],
-        directions[second], times[frame_of[second]], variances[second], u, w, P,
+        directions[second], times[frame_of[second]], variances[second], u, w, bend, P,
     )  # fmt: skip
     for m in range(last - 2, -1, -1):
         dt = times[frame_of[members[m]]] - times[frame_of[members[m + 1]]]
-        grow(P, rate_of(w), dt)
-        advance(u, w, dt)
-        correct(u, w, P, directions[members[m]], variances[members[m]])
+        grow(P, rate_of(w), rate_of(bend), dt)
+        advance(u, w, bend, dt)
+        correct(u, w, bend, P, directions[members[m]], variances[members[m]])
 
 
 @kernel
@@ -98,23 +101,58 @@ def _candidates(live, tracks, detections, recent, slot, gate2):
 
 @kernel
 def _claim(f, live, tracks, detections, recent, gate2):
-    """Move the live tracks to frame f and give each detection to the track it fits best."""
-    u, w, P = tracks.u, tracks.w, tracks.P
+    """Move the live tracks to frame f, give them its detections and correct them."""
+    u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
     time, slot = detections.times[f], f % len(recent.largest)
     for m in live:
         dt = time - tracks.at[m]
-        grow(P[m], rate_of(w[m]), dt)
-        advance(u[m], w[m], dt)
+        grow(P[m], rate_of(w[m]), rate_of(bend[m]), dt)
+        advance(u[m], w[m], bend[m], dt)
         tracks.at[m] = time
         tracks.missed[m] += 1
     track, detection, chi2 = _candidates(live, tracks, detections, recent, slot, gate2)
+    row = np.searchsorted(live, track)
+    claimed = np.full(len(live), NONE)
     for p in np.argsort(chi2, kind="mergesort"):
-        m, j = track[p], detection[p]
-        if tracks.missed[m] == 0 or detections.track[j] != NONE:
+        q, j = row[p], detection[p]
+        if claimed[q] == NONE and detections.track[j] == NONE:
+            claimed[q] = j
+            detections.track[j] = track[p]
+    _exchange(live, tracks, detections, (row, detection, chi2), claimed, gate2)
+    for q in range(len(live)):
+        m, j = live[q], claimed[q]
+        if j == NONE:
             continue
         tracks.missed[m] = 0
-        detections.track[j] = m
-        correct(u[m], w[m], P[m], detections.directions[j], detections.variances[j])
+        correct(u[m], w[m], bend[m], P[m], detections.directions[j], detections.variances[j])
+
+
+@kernel
+def _exchange(live, tracks, detections, candidates, claimed, gate2):
+    """Exchange the detections of two tracks where both together then fit better.
+
+    Predictions of neighbours may all be off to one side. Then the nearest detection is often the
+    neighbour's. `candidates` are row in `live`, detection and chi-square; `claimed` (len(live),)
+    the detection of each live track. Changes `claimed` and `detections.track`.
+    """
+    row, detection, chi2 = candidates
+    for p in range(len(row)):
+        q, k = row[p], detection[p]
+        j, other = claimed[q], detections.track[k]
+        if j in (NONE, k) or other == NONE:
+            continue
+        now = _chi2(tracks, live[q], detections, j) + _chi2(tracks, other, detections, k)
+        back = _chi2(tracks, other, detections, j)
+        if back < gate2 and chi2[p] + back < now:
+            claimed[q], claimed[np.searchsorted(live, other)] = k, j
+            detections.track[k], detections.track[j] = live[q], other
+
+
+@kernel
+def _chi2(tracks, m, detections, j):
+    """Return the squared distance, in sigmas, of detection j from the prediction of track m."""
+    variance = tracks.P[m, 0] + detections.variances[j]
+    return distance2(detections.directions[j], tracks.u[m]) / variance
 
 
 @kernel
@@ -134,6 +172,7 @@ def _follow(detections, most, rule):
         np.empty((room, 3)),
         np.empty((room, 3)),
         np.empty((room, 3)),
+        np.empty((room, SIZE)),
         np.empty(room),
         np.zeros(room, np.int64),
     )
@@ -152,9 +191,8 @@ def _follow(detections, most, rule):
         begun, held, chains = new_tracks(f, rule.need + SLACK, n_tracks, detections, recent, rule)
         for row in begun:
             members = chains[row, : held[row]]
-            _state_of(
-                members, detections, tracks.u[n_tracks], tracks.w[n_tracks], tracks.P[n_tracks]
-            )
+            u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
+            _state_of(members, detections, u[n_tracks], w[n_tracks], bend[n_tracks], P[n_tracks])
             tracks.at[n_tracks], tracks.missed[n_tracks] = times[f], 0
             n_tracks += 1
         live = np.concatenate((live, np.arange(n_tracks - len(begun), n_tracks)))

@@ -142,3 +142,24 @@ def test_an_object_that_comes_near_is_one_track(miss_km):
     names, count = np.unique(track[track >= 0], return_counts=True)
     assert len(names) == (2 if rate.max() > np.radians(1.5) else 1)
     assert count.sum() > 0.99 * kept.sum()
+
+
+@pytest.mark.parametrize("apart_arcsec", [60.0, 80.0])
+def test_neighbours_seen_every_half_minute_are_not_exchanged(apart_arcsec):
+    """In half a minute, the orbit of a low sensor moves objects by more than their distance."""
+    rng = np.random.default_rng(4)
+    times = np.arange(0.0, 1200.0, 30.0)
+    n = len(times)
+    angle = 1.1e-3 * times
+    common = np.column_stack([45 * ARCSEC * times, np.zeros(n)])
+    common += 0.2 * np.column_stack([np.cos(angle), np.sin(angle)])  # a low orbit, 36,000 km off
+    apart = np.array([[0.0, 0.0], [0.8, 0.6]]) * apart_arcsec * ARCSEC
+    centre = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
+    place = (common[:, None] + apart).reshape(-1, 2) + rng.normal(size=(2 * n, 2)) * SIGMA
+    u = centre + place @ tangent_basis(centre)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    track = follow(times, 2 * np.arange(n + 1), u, max_coast_s=135.0)
+    for first in range(2):
+        later = track[first::2][6:]  # the first three frames may join the two objects crosswise
+        assert later[0] >= 0
+        assert len(set(later.tolist())) == 1
