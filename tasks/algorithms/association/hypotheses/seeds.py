@@ -23,9 +23,10 @@ Indices = npt.NDArray[np.int64]
 
 SHORTEST_BASELINE_KM = 1.0
 NEAREST_KM = 300.0  # range at which errors of the baseline turn the plane most
-FASTEST_KM_S = 11.0  # of an object near the Earth, for the light time between two sensors
-LARGEST_SIGMA = 3.0  # the longest such way counts as an error of this many sigmas
-N_EDGES = 8  # outermost tracklets of a sensor, one for each way on its plane
+FASTEST_KM_S = 11.0  # of an object near the Earth, which moves while light travels
+LARGEST_SIGMA = 3.0  # the most that it can move counts as an error of this many sigmas
+MOST_WITH_EDGES = 32  # sensors: with more, looking at the edges of the fields costs too much
+N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its plane
 
 
 class PlaneAngles(NamedTuple):
@@ -174,10 +175,13 @@ class SensorPairs:
         order = np.argsort(-across[meet], kind="stable")
         self._a, self._b = a[meet][order], b[meet][order]
         reach = np.where(range_a > 0, np.minimum(range_a, farthest_km), farthest_km)
-        middle = (place[a] + reach[:, None] * look[a])[meet][order]
-        edges = _shared_points(views, (look, place, half), self._a, self._b, farthest_km)
-        self._points = np.concatenate([middle[:, None], edges], axis=1)
-        self._look, self._place, self._half = look, place, half
+        self._points = (place[a] + reach[:, None] * look[a])[meet][order][:, None]
+        self._cone = half / 2
+        if len(look) <= MOST_WITH_EDGES:
+            edges = _shared_points(views, (look, place, half), self._a, self._b, farthest_km)
+            self._points = np.concatenate([self._points, edges], axis=1)
+            self._cone = half
+        self._look, self._place = look, place
         self._waiting = np.ones(len(self._a), bool)
         self._busy = np.zeros(len(look), bool)
         # Earlier pairs that cover each point of a pair. A point that is not shared (NaN) counts as
@@ -188,6 +192,7 @@ class SensorPairs:
         """Return the next pair, None after the last.
 
         A pair is skipped where `enough` of the earlier pairs cover each point that it shares.
+        These are the middle of the field and, with up to MOST_WITH_EDGES sensors, its edges.
         """
         wanted = self._waiting & (self._covered.min(axis=1) < enough)
         ready = wanted & ~self._busy[self._a] & ~self._busy[self._b]
@@ -205,7 +210,7 @@ class SensorPairs:
         for s in (a, b):
             toward = self._points[rows] - self._place[s]
             along = toward @ self._look[s]
-            both &= along > np.cos(self._half[s]) * np.linalg.norm(toward, axis=2)
+            both &= along > np.cos(self._cone[s]) * np.linalg.norm(toward, axis=2)
         self._covered[rows] += both
         return a, b
 
