@@ -166,8 +166,8 @@ class Reason(StrEnum):
     EPHEMERIS_OFF = (
         "ephemeris_off",
         Stage.CHECK,
-        "The sensor's ephemeris is wrong and its attitude right, by stars or by the lines of sight; "
-        "its views are left out.",
+        "The sensor's ephemeris is wrong; its attitude is right, by stars or by the other lines of "
+        "sight; its views are left out.",
     )
     ATTITUDE_OFF = (
         "attitude_off",

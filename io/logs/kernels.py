@@ -3,6 +3,10 @@
 The same as `epipole.tasks.algorithms.kernels`, which io may not import. A test compares the two.
 """
 
+from typing import Any
+
 from numba import njit
 
-kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=True)
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": True}
+
+kernel = njit(**_OPTIONS)

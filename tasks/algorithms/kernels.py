@@ -15,8 +15,13 @@ take many arrays, are called for each frame and from one place only: a call copi
 address, shape and strides.
 """
 
+from typing import Any
+
 from numba import njit
 
-kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=True)
-borrowing_kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
-inlined_kernel = njit(cache=True, nogil=True, error_model="numpy", _nrt=False, forceinline=True)
+_COUNTING: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": True}
+_BORROWING: dict[str, Any] = {**_COUNTING, "_nrt": False}
+
+kernel = njit(**_COUNTING)
+borrowing_kernel = njit(**_BORROWING)
+inlined_kernel = njit(**{**_BORROWING, "forceinline": True})
