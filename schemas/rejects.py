@@ -236,11 +236,6 @@ class FrameStatus(StrEnum):
     NO_CALIBRATION = "no_calibration", "No calibration is valid for the frame."
 
 
-def reason_of(name: str) -> Reason:
-    """Return the reason of this name."""
-    return Reason.__members__[name.upper()]
-
-
 def reject_rows(
     reason: Reason | Sequence[Reason],
     *,

@@ -15,7 +15,7 @@ from epipole.io.work.parts import Parts, read_part
 from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import array, concat, conform, table
 from epipole.schemas.logs.log_tables import LogSource
-from epipole.schemas.rejects import Outcome, Reason, reason_of, reject_rows
+from epipole.schemas.rejects import Outcome, Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, Span
 from epipole.schemas.stages import Stage
@@ -166,7 +166,7 @@ def counted(rejects: Iterable[pa.Table]) -> pa.Table:
     )
     one_tracklet = pc.equal(sums["tracklet_id_count_distinct"], 1)
     summed = reject_rows(
-        [reason_of(name) for name in sums["reason"].to_pylist()],
+        [Reason(name) for name in sums["reason"].to_pylist()],
         source=sums["source"],
         sensor_id=sums["sensor_id"],
         tracklet_id=pc.if_else(one_tracklet, sums["tracklet_id_min"], pa.scalar(None, pa.string())),
