@@ -84,7 +84,7 @@ def nightly(
                 solved = solve(work, settings)
                 work, again, left_out = check(work, solved, settings)
                 if not again:
-                    break  # otherwise clocks were corrected: back to `track`
+                    break  # else: back to `track`, with corrected times
             if left_out:
                 solved = solve(work, settings, left_out)
             names = name(work, solved, settings)

@@ -197,7 +197,8 @@ class Outcome(StrEnum):
     OBJECT = "object", "It belongs to an object, and a position of the object was solved with it."
     DISAGREES = (
         "disagrees",
-        "It was associated with an object, but each position was solved without it.",
+        "It was associated with an object, but each position was solved without it (the reason "
+        "`disagrees` is about a sensor).",
     )
     AMBIGUOUS = (
         "ambiguous",
@@ -205,7 +206,8 @@ class Outcome(StrEnum):
     )
     SENSOR_LEFT_OUT = (
         "sensor_left_out",
-        "Its sensor was left out: its clock is wrong, or its lines of sight agree with no other's.",
+        "Its sensor was left out: its clock, ephemeris or attitude is wrong, or its lines of sight "
+        "agree with no other's.",
     )
     SEEN_BY_ONE = "seen_by_one", "No other sensor has a tracklet of the same object."
     NOT_COMPARED = (

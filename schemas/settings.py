@@ -81,7 +81,12 @@ class IdentificationSettings(Group):
         lt=1,
         description="Accepted probability that a reported attitude is a chance match.",
     )
-    time_limit_s: float = Field(0.5, gt=0, description="Longest search for one frame.")
+    time_limit_s: float = Field(
+        0.5,
+        gt=0,
+        description="Longest search for one frame, in seconds of a reference machine: work is "
+        "counted.",
+    )
     calibrate: Literal["use", "report", "off"] = Field(
         "use",
         description="The optics are also fitted to the stars of the night. 'use' takes the fitted "

@@ -31,6 +31,7 @@ from star_frames import (
 )
 from star_peers import Solver, cedar_solve, tetra3rs
 
+from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.rotations import (
@@ -67,7 +68,7 @@ Array = npt.NDArray[np.float64]
 SHARED = Path(__file__).parents[3] / "shared" / "data" / "starid"
 RIGHT_DEG, RIGHT_ROLL_DEG, WRONG_DEG = 0.05, 0.5, 0.25
 WRONG_ROLL_DEG = 5.0  # three right stars at 2 px may leave a degree or two
-FALSE_ALARM = 1e-5
+FALSE_ALARM = Settings().identification.false_alarm
 LEAST_SIGMA_PX = 0.05  # stated where there is none
 PUBLISHED = {
     "four_base_stars": four_base_stars.make_matcher,
