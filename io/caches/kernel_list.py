@@ -35,5 +35,6 @@ def signature(arguments: Iterable[str]) -> Signature:
     return tuple(eval(text, {"__builtins__": {}}, known) for text in arguments)
 
 
-def _named(name: str, *fields: types.Type) -> types.NamedTuple:
-    return types.NamedTuple(fields, kernel(name))
+def _named(name: str, *fields: types.Type) -> types.BaseTuple:
+    """Return the type of a named tuple; numba has one for fields of equal types, one for others."""
+    return types.BaseTuple.from_types(fields, kernel(name))

@@ -209,7 +209,7 @@ def test_a_scene_names_a_catalogue_that_cannot_be_read(content, tmp_path):
     path = tmp_path / "stars.parquet"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(SceneError, match=r"stars\.parquet: no star catalogue"):
+    with pytest.raises(SceneError, match=r"stars\.parquet: not a star catalogue"):
         read_stars(str(path), 9.0)
 
 
