@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.schemas.bridge import table
-from epipole.schemas.stages import Stage
+from epipole.schemas.stages import Declared, Stage
 from epipole.schemas.tables import REJECTS
 
 
@@ -182,17 +182,8 @@ class Reason(StrEnum):
     )
 
 
-class Outcome(StrEnum):
+class Outcome(Declared):
     """What became of a tracklet. If several are true at different times, the first one counts."""
-
-    sentence: str
-
-    def __new__(cls, outcome: str, sentence: str) -> "Outcome":
-        """Return a member whose value is the outcome alone."""
-        member = str.__new__(cls, outcome)
-        member._value_ = outcome
-        member.sentence = sentence
-        return member
 
     OBJECT = "object", "It belongs to an object, and a position of the object was solved with it."
     DISAGREES = (
@@ -216,17 +207,8 @@ class Outcome(StrEnum):
     )
 
 
-class FrameStatus(StrEnum):
+class FrameStatus(Declared):
     """Why a frame has no attitude from stars."""
-
-    sentence: str
-
-    def __new__(cls, status: str, sentence: str) -> "FrameStatus":
-        """Return a member whose value is the status alone."""
-        member = str.__new__(cls, status)
-        member._value_ = status
-        member.sentence = sentence
-        return member
 
     NO_CENTROIDS = "no_centroids", "The frame has no centroids."
     TOO_FEW_STARS = (

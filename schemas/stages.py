@@ -5,19 +5,24 @@ work folder, and the column `stage` of `rejects`.
 """
 
 from enum import StrEnum
+from typing import Self
 
 
-class Stage(StrEnum):
-    """A stage of the nightly flow; `sentence` says what it does."""
+class Declared(StrEnum):
+    """Names that are declared once, each with a `sentence` that says what it means."""
 
     sentence: str
 
-    def __new__(cls, name: str, sentence: str) -> "Stage":
+    def __new__(cls, name: str, sentence: str) -> Self:
         """Return a member whose value is the name alone."""
         member = str.__new__(cls, name)
         member._value_ = name
         member.sentence = sentence
         return member
+
+
+class Stage(Declared):
+    """A stage of the nightly flow; `sentence` says what it does."""
 
     READ = (
         "read",

@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from epipole.schemas.bridge import stack, table
+from epipole.schemas.bridge import from_polars, stack, to_polars
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CLOCK_VIEWS
 from epipole.tasks.algorithms.geometry.light_time import apparent_places
@@ -34,12 +34,12 @@ def collect_clock_views(
     are used, `MOST_EPOCHS` at most.
     """
     key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
-    claims = pl.DataFrame(associations).select([*key, "object_id"])
-    objects = _with_velocities(pl.DataFrame(positions))
+    claims = to_polars(associations).select([*key, "object_id"])
+    objects = _with_velocities(to_polars(positions))
     epochs = _apart(objects["epoch"].unique().sort(), 2 * settings.alignment.window_s)
-    frames = pl.DataFrame(solutions).select(["sensor_id", "frame_number", *VELOCITY])
+    frames = to_polars(solutions).select(["sensor_id", "frame_number", *VELOCITY])
     with_sensors = (
-        pl.DataFrame(views)
+        to_polars(views)
         .rename({name: f"sensor_{name}" for name in PLACE})
         .filter(pl.col("epoch").is_in(epochs.implode()))
         .join(claims, on=key, how="left")
@@ -54,7 +54,7 @@ def collect_clock_views(
     rows = _with_light_time(pl.concat([claimed, free.select(claimed.columns)])).sort(
         "sensor_id", "epoch", "tracklet_id", "object_id"
     )
-    return table(CLOCK_VIEWS, {name: rows[name].to_arrow() for name in CLOCK_VIEWS.names})
+    return from_polars(CLOCK_VIEWS, rows)
 
 
 def _with_light_time(rows: pl.DataFrame) -> pl.DataFrame:

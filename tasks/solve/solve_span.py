@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from epipole.io.work.part_tables import SOLVED
 from epipole.io.work.parts import Parts, read_part, write_part
 from epipole.io.work.places import SensorParts
-from epipole.schemas.bridge import array, concat, table
+from epipole.schemas.bridge import array, concat, from_polars
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
@@ -169,4 +169,4 @@ def _object_tracks(associated: Associated, tracklets: pa.Table, solved: Solved) 
         .agg(pl.col("epoch").max())
         .sort("epoch", "span_name", "track_id")
     )
-    return table(OBJECT_TRACKS, {n: rows[n].to_arrow() for n in OBJECT_TRACKS.names})
+    return from_polars(OBJECT_TRACKS, rows)
