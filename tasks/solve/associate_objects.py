@@ -105,7 +105,7 @@ def _grouped(
 ) -> tuple[Groups, Samples, Indices]:
     """Return the groups of a window's tracklets, their samples and the tracklets' numbers."""
     instants = arrays.instants(rows, settings.alignment.window_s)
-    samples, tracklet = arrays.samples(rows, instants)
+    samples, tracklet = arrays.samples(rows, instants, settings.alignment.window_s)
     return _solve(arrays, samples, settings), samples, tracklet
 
 
@@ -140,7 +140,7 @@ def _judge_again(
             open_rows = verdicts.open_rows(rows, judged_s)
             if len(open_rows):
                 instants = arrays.even_instants(rows, settings.alignment.window_s)
-                samples, tracklet = arrays.samples(rows, instants)
+                samples, tracklet = arrays.samples(rows, instants, settings.alignment.window_s)
                 groups = _solve(arrays, samples, settings)
                 verdicts.reconsider(rows, open_rows, tracklet, groups)
         judged_s = window_s

@@ -15,6 +15,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MOST_SAMPLES = 12  # instants in a window
+BLENDED = 4.0  # times the noise: what blends may add makes a view useless to tell objects apart
 NEAR_NS = 2_000_000_000  # a frame within this time gives the sensor's pose
 
 
@@ -41,6 +42,7 @@ class SpanViews:
         self.noise = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
         self.bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES)
         self.sigma_km = array(views, "position_sigma_km")
+        self.clear = self._clear()
         self._read_poses(solutions, cameras)
 
     def _read_poses(self, solutions: pa.Table, cameras: pa.Table) -> None:
@@ -55,6 +57,18 @@ class SpanViews:
         self.half_field = np.array(half_field).reshape(-1, 2)
         self.focal_px = np.array(focal_px)
 
+    def _clear(self) -> npt.NDArray[np.bool_]:
+        """Return which views are no worse than others of their tracklet, but for their noise.
+
+        The others may be blends: their direction may be of one object or of its neighbour. A group
+        that is found without them has them as well.
+        """
+        shared = np.trace(self.bias, axis1=1, axis2=2)
+        least = np.full(len(self.tracklet_id), np.inf)
+        np.minimum.at(least, self.tracklet, shared)
+        noise = np.trace(self.noise, axis1=1, axis2=2)
+        return np.asarray(shared - least[self.tracklet] <= BLENDED * noise)
+
     def windows(self, window_s: float) -> list[Indices]:
         """Return the rows of each window of time, in order; windows are counted from 1970."""
         if not len(self.epoch_ns):
@@ -68,9 +82,13 @@ class SpanViews:
         window = np.repeat(np.arange(len(windows)), [len(rows) for rows in windows])
         return ViewKeys(self.epoch_ns, window, self.tracklet, self.sensor)
 
-    def samples(self, rows: Indices, instants: Indices) -> tuple[Samples, Indices]:
-        """Return the samples of the tracklets at some epochs, and the tracklets' numbers."""
-        rows = rows[np.isin(self.epoch_ns[rows], instants)]
+    def samples(self, rows: Indices, instants: Indices, window_s: float) -> tuple[Samples, Indices]:
+        """Return the samples of the tracklets at some epochs, and the tracklets' numbers.
+
+        A view rests on the detections within `window_s` of its epoch, at most. Only clear views
+        are sampled.
+        """
+        rows = rows[np.isin(self.epoch_ns[rows], instants) & self.clear[rows]]
         tracklet, item = np.unique(self.tracklet[rows], return_inverse=True)
         at = np.searchsorted(instants, self.epoch_ns[rows])
         t, k = len(tracklet), len(instants)
@@ -82,7 +100,10 @@ class SpanViews:
         # The common error is one for all k samples. With k times its variance in each of them,
         # they count together as one.
         n_samples = seen.sum(axis=1)[item].astype(float)
-        cov[item, at] = self.noise[rows] + n_samples[:, None, None] * self.bias[rows]
+        repeated = _repeated(seen, instants / 1e9, window_s)[item, at]
+        cov[item, at] = (
+            repeated[:, None, None] * self.noise[rows] + n_samples[:, None, None] * self.bias[rows]
+        )
         sigma_km[item, at] = np.sqrt(n_samples) * self.sigma_km[rows]
         attitude, sensor_km, sensor_km_s = self._poses_at(instants)
         sensor_km[self.sensor[rows], at] = self.r_km[rows]
@@ -121,6 +142,7 @@ class SpanViews:
         They are evenly spaced, and the middle epoch of each tracklet without a view at those.
         """
         chosen = set(self.even_instants(rows, window_s).tolist())
+        rows = rows[self.clear[rows]]
         for tracklet in np.unique(self.tracklet[rows]):
             epochs = self.epoch_ns[rows[self.tracklet[rows] == tracklet]]
             if len(chosen) < MOST_SAMPLES and not chosen.intersection(epochs.tolist()):
@@ -139,3 +161,22 @@ class SpanViews:
             sensor_km[s, there] = frames.r_gcrf_km[near[there]]
             sensor_km_s[s, there] = frames.v_gcrf_km_s[near[there]]
         return attitude, sensor_km, sensor_km_s
+
+
+def _repeated(seen: npt.NDArray[np.bool_], time_s: Array, window_s: float) -> Array:
+    """Return how many samples of its tracklet each sample repeats, itself included, (t, k).
+
+    Samples nearer than twice the half-window share detections, and with them their errors. With
+    the noise so many times larger, they count together as what is independent.
+
+    Parameters
+    ----------
+    seen : (t, k) bool
+        Whether tracklet t has a sample at instant k.
+    time_s : (k,) float
+        The instants [s].
+    """
+    apart = np.abs(time_s[:, None] - time_s[None, :])
+    shared = np.maximum(1 - apart / max(2 * window_s, 1e-9), 0.0)
+    np.fill_diagonal(shared, 1.0)
+    return seen.astype(float) @ shared

@@ -18,6 +18,7 @@ from epipole.tasks.algorithms.geometry.rotations import (
     matrix_from_quaternion,
 )
 from epipole.tasks.algorithms.geometry.sky import aberrate
+from epipole.tasks.algorithms.tracking.blends import Tracked, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.lone_detections import in_lone_frames, with_lone_detections
 from epipole.tasks.common.sightings import Frames, camera_of, sightings_of, solved_frames
@@ -48,9 +49,9 @@ def view_objects(
     tracked = detections.filter(placed)
     if not tracked.num_rows or not epochs.num_rows:
         return empty(VIEWS)
-    tracklets = _by_tracklet(frames, tracked)
-    query = _queries(tracklets, epochs, frames)
     camera = camera_of(cameras, int(frames.camera[0]))
+    tracklets = _with_blends(_by_tracklet(frames, tracked), frames, camera)
+    query = _queries(tracklets, epochs, frames)
     return _view_table(frames, tracklets, query, epochs, camera, settings)
 
 
@@ -65,6 +66,7 @@ class _TrackletSightings(NamedTuple):
     u_icrs: Array
     cov_noise: Array
     cov_bias: Array
+    flux: Array
     bounds: Indices
     name: npt.NDArray[np.object_]
 
@@ -88,8 +90,41 @@ def _by_tracklet(frames: Frames, tracked: pa.Table) -> _TrackletSightings:
         sightings.u_icrs[order],
         sightings.cov_noise[order],
         sightings.cov_bias[order],
+        array(tracked, "flux").astype(float)[sightings.row[order]],
         bounds,
         name[order[bounds[:-1]]],
+    )
+
+
+def _with_blends(
+    tracklets: _TrackletSightings, frames: Frames, camera: Camera
+) -> _TrackletSightings:
+    """Return the sightings with the errors that the light of neighbours may add.
+
+    Those of a neighbour alone are left out.
+    """
+    time_s = (frames.time_ns - frames.time_ns[0]) / 1e9
+    tracked = Tracked(
+        tracklets.bounds,
+        time_s[tracklets.frame],
+        tracklets.u_icrs,
+        tracklets.cov_noise,
+        tracklets.flux,
+    )
+    variance = blend_variance(tracked, time_s, camera.pixel_rad)
+    across = np.eye(3) - tracklets.u_icrs[:, :, None] * tracklets.u_icrs[:, None, :]
+    cov_bias = tracklets.cov_bias + variance[:, None, None] * across
+    own = ~of_neighbour(tracked, variance)
+    left = np.concatenate([[0], np.cumsum(own)])
+    return _TrackletSightings(
+        tracklets.frame[own],
+        tracklets.centroid[own],
+        tracklets.u_icrs[own],
+        tracklets.cov_noise[own],
+        cov_bias[own],
+        tracklets.flux[own],
+        left[tracklets.bounds],
+        tracklets.name,
     )
 
 

@@ -32,6 +32,7 @@ from epipole.tasks.algorithms.association.hypotheses.growth import (
 )
 from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace
 from epipole.tasks.algorithms.association.hypotheses.seeds import SensorPairs, seeds_between
+from epipole.tasks.algorithms.association.hypotheses.unions import best_union
 from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.sampling.views import views_of
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
@@ -231,6 +232,10 @@ class _Search:
                 if not taken[list(best.seed)].any():
                     for again in self.grow(np.array([best.seed])):
                         pool.push(again)
+                continue
+            if (union := best_union(self.space, best, pool.sharing(best))) is not None:
+                pool.push(best)
+                pool.push(union)
                 continue
             rivals = pool.rivals(best, self.margin, self.group != FREE)
             kept = set(best.members).intersection(*(h.members for h in rivals))

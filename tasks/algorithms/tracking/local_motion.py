@@ -146,8 +146,13 @@ def _fit(detections, lo, hi, at, rate, half, unknown_rate):
     noise nor bias explains."""
     n = hi - lo
     tau, weight = detections.t[lo:hi] - at, np.empty(n)
+    least = np.inf
+    for k in range(lo, hi):
+        least = min(least, np.trace(detections.bias[k]))
     for k in range(n):
-        weight[k] = 2.0 / np.trace(detections.noise[lo + k])
+        # What all share has no part in the weights; what some have more of has.
+        more = np.trace(detections.bias[lo + k]) - least
+        weight[k] = 2.0 / (np.trace(detections.noise[lo + k]) + more)
     value, slope = np.empty(n), np.empty(n)
     if n == 1:
         value[0], slope[0] = 1.0, 0.0

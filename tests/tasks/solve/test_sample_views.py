@@ -58,7 +58,7 @@ def test_a_tracklet_between_the_even_instants_adds_one_of_its_epochs():
 
 def test_samples_have_the_views_at_the_instants(scene, views):
     instants = START_NS + (np.array([10.0, 40.0, 80.0]) * SECOND_NS).astype(np.int64)
-    samples, tracklet = views.samples(np.arange(len(views.epoch_ns)), instants)
+    samples, tracklet = views.samples(np.arange(len(views.epoch_ns)), instants, 6.0)
     assert tracklet.tolist() == list(range(6))
     assert samples.seen.all()
     at = np.searchsorted(TIMES, [10.0, 40.0, 80.0])
@@ -75,11 +75,38 @@ def test_an_error_that_all_frames_share_counts_once_in_any_number_of_samples(sce
     views = SpanViews(rows.sort_by("epoch"), *others)
     everything = np.arange(len(views.epoch_ns))
     for n in (1, 4):
-        samples, _ = views.samples(everything, START_NS + np.arange(n) * 20 * SECOND_NS)
+        samples, _ = views.samples(everything, START_NS + np.arange(n) * 20 * SECOND_NS, 6.0)
         noise = views.noise[0, 0, 0]
         np.testing.assert_allclose(samples.cov[:, :, 0, 0], (1 + n) * noise)
         sigma_km = views.sigma_km[0]
         np.testing.assert_allclose(samples.sigma_km, np.sqrt(n) * sigma_km)
+
+
+def test_samples_that_share_detections_count_together_as_what_is_independent(views):
+    everything, noise, window_s = np.arange(len(views.epoch_ns)), views.noise[0, 0, 0], 6.0
+    apart = START_NS + np.arange(6) * 12 * SECOND_NS
+    near = START_NS + np.arange(6) * 2 * SECOND_NS  # in less time than one window
+    weight = [
+        np.sum(1 / views.samples(everything, instants, window_s)[0].cov[:, :, 0, 0], axis=1)
+        for instants in (apart, near)
+    ]
+    np.testing.assert_allclose(weight[0], 6 / noise)
+    assert (weight[1] > 1 / noise).all()
+    assert (weight[1] < 2 / noise).all()
+
+
+def test_views_that_may_be_blends_are_not_sampled(scene):
+    rows, *others = tables(scene)
+    rows = rows.sort_by([("tracklet_id", "ascending"), ("epoch", "ascending")])
+    doubtful = np.arange(rows.num_rows) < len(TIMES) // 2  # of the first tracklet
+    for name in ("cov_bias_11_rad2", "cov_bias_22_rad2"):
+        at = rows.schema.get_field_index(name)
+        bias = np.where(doubtful, 100 * rows["cov_noise_11_rad2"].to_numpy(), 0.0)
+        rows = rows.set_column(at, rows.schema.field(at), [bias])
+    views = SpanViews(rows.sort_by("epoch"), *others)
+    instants = START_NS + np.array([10, 100]) * SECOND_NS
+    samples, _ = views.samples(np.arange(len(views.epoch_ns)), instants, 6.0)
+    assert samples.seen.tolist() == [[False, True]] + [[True, True]] * 5
 
 
 def test_a_sensor_without_a_frame_near_an_instant_has_no_pose_there(scene):
@@ -87,6 +114,6 @@ def test_a_sensor_without_a_frame_near_an_instant_has_no_pose_there(scene):
     near = solutions["frame_number"].to_numpy() < 30  # until 58 s
     views = SpanViews(rows.sort_by("epoch"), tracklets, solutions.filter(near), cameras)
     instants = START_NS + np.array([10, 100]) * SECOND_NS
-    samples, _ = views.samples(np.arange(len(views.epoch_ns)), instants)
+    samples, _ = views.samples(np.arange(len(views.epoch_ns)), instants, 6.0)
     known = np.isfinite(samples.R_sensor_from_icrs).all(axis=(2, 3))
     assert known.tolist() == [[True, False]] * 3

@@ -45,6 +45,11 @@ class Pool:
         """Remove the likeliest hypothesis, None if empty. It stays a rival of the others."""
         return heapq.heappop(self._heap)[3] if self._heap else None
 
+    def sharing(self, h: Hypothesis) -> list[Hypothesis]:
+        """Return the other hypotheses that share a tracklet with h, also those popped before."""
+        found = dict.fromkeys(other for i in h.members for other in self._holding[i])
+        return [other for other in found if other is not h]
+
     def rivals(
         self, best: Hypothesis, closer_than: float, grouped: npt.NDArray[np.bool_]
     ) -> list[Hypothesis]:
@@ -53,11 +58,11 @@ class Pool:
         They share a tracklet with it, neither contains the other, and none of their tracklets
         belongs to a group already. A hypothesis that was found ambiguous is still a rival.
         """
-        contest = (h for i in best.members for h in self._holding[i])
         return [
             h
-            for h in dict.fromkeys(h for h in contest if h.score > best.score - closer_than)
-            if not (set(h.members) <= set(best.members) or set(best.members) <= set(h.members))
+            for h in self.sharing(best)
+            if h.score > best.score - closer_than
+            and not (set(h.members) <= set(best.members) or set(best.members) <= set(h.members))
             and not grouped[list(h.members)].any()
         ]
 

@@ -6,15 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.evidence.odds import score
-from epipole.tasks.algorithms.association.evidence.points import InstantPoints
 from epipole.tasks.algorithms.association.evidence.visibility import near_fields, should_detect
 from epipole.tasks.algorithms.association.hypotheses.candidates import best_of_sensor
 from epipole.tasks.algorithms.association.hypotheses.instant_points import join, possible, solve
-from epipole.tasks.algorithms.association.hypotheses.search_space import (
-    PREDICTED_COLUMNS,
-    RESIDUAL_PARTS,
-    WorkSpace,
-)
+from epipole.tasks.algorithms.association.hypotheses.search_space import work_space
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
@@ -64,15 +59,7 @@ def grow_all(space, seeds, clear, out):
         entered in `space.taken`.
     """
     views, chance, taken = space.views, space.chance, space.taken
-    k, n_sensors = len(views.time_s), views.camera.shape[0]
-    work = WorkSpace(
-        InstantPoints(
-            np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3)), np.zeros(k, np.int64)
-        ),
-        np.empty(RESIDUAL_PARTS),
-        np.empty((k, PREDICTED_COLUMNS)),
-        np.empty(n_sensors, np.bool_),
-    )
+    work = work_space(len(views.time_s), views.camera.shape[0])
     points = work.points
     members = np.empty(len(views.sensor) + 2, np.int64)
     for q in range(len(seeds)):

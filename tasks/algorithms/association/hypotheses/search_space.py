@@ -8,6 +8,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.association.evidence.chance import Chance
 from epipole.tasks.algorithms.association.evidence.points import InstantPoints
 from epipole.tasks.algorithms.association.sampling.views import Views
+from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -57,3 +58,17 @@ class WorkSpace(NamedTuple):
     part: Array
     predicted: Array
     near: Flags
+
+
+@kernel
+def work_space(k, n_sensors):
+    """Return a `WorkSpace` for k instants, without points."""
+    points = InstantPoints(
+        np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3)), np.zeros(k, np.int64)
+    )
+    return WorkSpace(
+        points,
+        np.empty(RESIDUAL_PARTS),
+        np.empty((k, PREDICTED_COLUMNS)),
+        np.empty(n_sensors, np.bool_),
+    )

@@ -26,6 +26,8 @@ NEAREST_KM = 300.0  # range at which errors of the baseline turn the plane most
 FASTEST_KM_S = 11.0  # of an object near the Earth, which moves while light travels
 LARGEST_SIGMA = 3.0  # the most that it can move counts as an error of this many sigmas
 MOST_WITH_EDGES = 32  # sensors: with more, looking at the edges of the fields costs too much
+NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a field, to see whether it meets another one
+TESTED_INSTANTS = 3
 N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its plane
 
 
@@ -164,13 +166,9 @@ class SensorPairs:
         known = np.isfinite(look[a, 0]) & np.isfinite(look[b, 0])
         a, b = a[known], b[known]
         baseline = place[b] - place[a]
-        range_a, range_b, miss = _closest_approach(baseline, look[a], look[b])
-        # Nearly parallel axes meet far out, at an uncertain distance.
-        apart = np.arccos(np.clip(np.sum(look[a] * look[b], axis=1), -1, 1))
-        meet = (range_a > 0) & (range_b > 0)
-        meet &= miss <= range_a * np.tan(half[a]) + range_b * np.tan(half[b])
-        meet |= apart < half[a] + half[b]
-        meet &= np.linalg.norm(baseline, axis=1) > SHORTEST_BASELINE_KM
+        range_a, _, _ = _closest_approach(baseline, look[a], look[b])
+        meet = np.linalg.norm(baseline, axis=1) > SHORTEST_BASELINE_KM
+        meet[meet] = fields_meet(views, half, a[meet], b[meet], farthest_km)
         across = np.linalg.norm(np.cross(baseline, look[a] + look[b]), axis=1) / 2
         order = np.argsort(-across[meet], kind="stable")
         self._a, self._b = a[meet][order], b[meet][order]
@@ -213,6 +211,39 @@ class SensorPairs:
             both &= along > np.cos(self._cone[s]) * np.linalg.norm(toward, axis=2)
         self._covered[rows] += both
         return a, b
+
+
+def fields_meet(
+    views: Views, half: Array, a: Indices, b: Indices, farthest_km: float
+) -> npt.NDArray[np.bool_]:
+    """Return whether the cones of tracklets of two sensors share any place, (n,).
+
+    At some instants, the axis of sensor a's cone is stepped through. A ball about each step holds
+    the cone up to the next one. The test is whether the ball touches the cone of b. It may say
+    yes too often, never no where the fields meet.
+
+    Parameters
+    ----------
+    half : (s,) float
+        Half-angles of the sensors' cones [rad].
+    a, b : (n,) int
+        Pairs of sensors.
+    """
+    reach = np.geomspace(NEAREST_STEP_KM, farthest_km, N_STEPS)
+    between = (reach[1] / reach[0] - 1) / 2
+    meet = np.zeros(len(a), np.bool_)
+    for m in np.unique(np.linspace(0, len(views.time_s) - 1, TESTED_INSTANTS).astype(int)):
+        look, place = views.plane[:, m, 2], views.place_km[:, m]
+        toward = (place[a] - place[b])[:, None] + reach[:, None] * look[a][:, None]
+        ball = reach * (np.tan(half[a])[:, None] + between)
+        distance = np.linalg.norm(toward, axis=2)
+        along = np.einsum("npi,ni->np", toward, look[b])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            off_axis = np.arccos(np.clip(along / distance, -1, 1))
+            radius = np.arcsin(np.clip(ball / distance, 0, 1))
+        inside = (distance <= ball) | (off_axis <= half[b][:, None] + radius)
+        meet |= inside.any(axis=1)
+    return meet
 
 
 def _edges(views: Views) -> Array:

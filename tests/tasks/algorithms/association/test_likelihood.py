@@ -71,6 +71,26 @@ def test_two_fragments_of_one_sensor_join_one_object():
     assert groups.group.tolist() == [0, 0, 0, 0]
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_sensors_that_follow_each_other_see_one_object(seed):
+    """The first sensor sees it throughout; no instant is common to the two others."""
+    times = np.arange(5.0, 120.0, 12.0)
+    scene = Scene(seed, 3, times=times).objects(1)
+    scene.seen[1], scene.seen[2] = times < 60, times > 60
+    assert solve(scene.samples()).group.tolist() == [0, 0, 0]
+
+
+def test_two_objects_on_one_line_of_sight_in_turn_are_not_one():
+    times = np.arange(5.0, 120.0, 12.0)
+    scene = Scene(2, 3, times=times).objects(1)
+    scene.seen[1], scene.seen[2] = times < 60, times > 60
+    # On the same lines of the first sensor, but 300 km nearer to it, is no orbit's way on.
+    first = scene.r[0] + scene.u[0] * np.linalg.norm(GEO - scene.r[0], axis=1, keepdims=True)
+    nearer = first - 300.0 * scene.u[0] - scene.r[2]
+    scene.u[2] = nearer / np.linalg.norm(nearer, axis=1, keepdims=True)
+    assert solve(scene.samples()).group.tolist() != [0, 0, 0]
+
+
 def _where(scene):
     """The point nearest to the first two tracklets' lines, instant by instant."""
     out = []

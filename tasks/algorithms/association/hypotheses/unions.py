@@ -1,0 +1,60 @@
+"""Unions: hypotheses that share a tracklet and follow each other in time may be one object.
+
+A hypothesis grows by tracklets that are seen at its solved instants. A sensor that sees the object
+only before or after these begins a second hypothesis, with a tracklet of the first. The two do not
+contradict each other. Whether they are one object is a matter of one orbit through both.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from epipole.tasks.algorithms.association.evidence.odds import score
+from epipole.tasks.algorithms.association.evidence.pool import Hypothesis
+from epipole.tasks.algorithms.association.evidence.visibility import near_fields
+from epipole.tasks.algorithms.association.hypotheses.instant_points import possible, solve
+from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace, work_space
+from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
+from epipole.tasks.algorithms.kernels import kernel
+
+
+@kernel
+def _weigh(space, members, outcomes, x_km):
+    """Return the log-odds of a set of tracklets as one object; -inf where they do not fit.
+
+    Writes `outcomes` (s,), see `odds.score`, and the point `x_km` (3,) at the first solved instant.
+    """
+    views = space.views
+    work = work_space(len(views.time_s), views.camera.shape[0])
+    points = work.points
+    chi2, dof = solve(views, members, points, work.part)
+    if not chi2 <= quantile(max(dof, 1), space.gate_sigma) or not possible(space, members, points):
+        return -np.inf
+    near_fields(views, points.x_km, points.cov_km2, points.seen_by, work.near)
+    x_km[:] = points.x_km[np.argmax(points.seen_by >= 2)]
+    return score(views, space.chance, members, points, space.shells, work.near, outcomes, work.part)
+
+
+def best_union(
+    space: SearchSpace, h: Hypothesis, others: Iterable[Hypothesis]
+) -> Hypothesis | None:
+    """Return the likeliest union of a hypothesis with another one, if it is likelier than both.
+
+    Only others whose own tracklets are not seen where `h` is solved are tried: those that are
+    seen there did not fit when it grew.
+    """
+    seen = space.views.seen
+    solved = seen[list(h.members)].sum(axis=0) >= 2
+    best = None
+    tried = {h.members}
+    for other in others:
+        more = [i for i in other.members if i not in h.members]
+        members = tuple(sorted({*h.members, *more}))
+        if not more or members in tried or space.taken[more].any() or seen[more][:, solved].any():
+            continue
+        tried.add(members)
+        x_km, outcomes = np.empty(3), np.zeros(len(space.views.half_field), np.int8)
+        value = float(_weigh(space, np.array(members, np.int64), outcomes, x_km))
+        if value > max(h.score, other.score, best.score if best else -np.inf):
+            best = Hypothesis(value, h.seed, members, x_km, outcomes)
+    return best

@@ -1,0 +1,240 @@
+"""Blends: detections that may hold the light of a second object of the same sensor.
+
+Two spots closer than about a spot's diameter give one centroid. It lies between the two, and it
+stays there while they pass: for a slow object up to half a minute. So the error is common to
+all these detections, and no average removes it. The other object's tracklet has a gap there, or
+it has ended or not yet begun. Carried over that time, it tells which detections are concerned, and
+how far off they may be.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.tracking.apparent_motion import acceleration
+from epipole.tasks.algorithms.tracking.local_motion import BEND, directions_at
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+SPOT_PX = 2.5  # spots closer than this may be one centroid, where the data do not tell
+BIN_PX = 0.25
+RESOLVED = 0.25  # share of the pairs expected at a separation below which spots are not resolved
+ENOUGH = 100  # pairs of detections to tell this from
+CARRIED_S = 60.0  # longest time over which a tracklet is carried beyond its ends
+OWN_LIGHT = 0.5  # of its usual flux: a fainter spot among blends is the neighbour's alone
+BESIDE = 3  # detections that each of two tracklets has while the other lives: two objects
+
+
+class Tracked(NamedTuple):
+    """The detections of one sensor's t tracklets, n in all, by tracklet and then by time.
+
+    bounds : (t + 1,) int
+        Tracklet k has the detections ``bounds[k]:bounds[k + 1]``.
+    time_s : (n,) float
+        Times of their frames [s].
+    u_icrs : (n, 3) float
+        Unit vectors.
+    cov_noise : (n, 3, 3) float
+        Independent errors [rad^2].
+    flux : (n,) float
+        In any unit, the same for all; NaN where unknown.
+    """
+
+    bounds: Indices
+    time_s: Array
+    u_icrs: Array
+    cov_noise: Array
+    flux: Array
+
+
+class _Ends(NamedTuple):
+    """Each tracklet's first (0) and last (1) detection: time, direction, rate, variance.
+
+    The arrays are (t, 2), (t, 2, 3), (t, 2, 3), (t, 2); `reach` (t,) is how long [s] the
+    detections are that gave the rate, `flux` (t,) the median flux.
+    """
+
+    time: Array
+    u: Array
+    w: Array
+    variance: Array
+    reach: Array
+    flux: Array
+
+
+def blend_variance(tracked: Tracked, frame_s: Array, pixel_rad: float) -> Array:
+    """Return the variance per axis [rad^2] that blends may add to each detection, (n,).
+
+    Parameters
+    ----------
+    frame_s : (f,) float
+        Times of the sensor's frames [s], increasing; those of the detections are among them.
+    pixel_rad
+        Angle of a pixel [rad].
+
+    Notes
+    -----
+    With fluxes f and g, the centroid of a blend is off by the share g / (f + g) of the separation.
+    Half of it is taken where a flux is unknown. This is the size of the error, taken as 1-sigma.
+    """
+    u = np.ascontiguousarray(tracked.u_icrs, float)
+    by_frame = np.argsort(tracked.time_s, kind="stable")
+    starts = np.searchsorted(tracked.time_s[by_frame], np.append(frame_s, np.inf))
+    tracklet = np.repeat(np.arange(len(tracked.bounds) - 1), np.diff(tracked.bounds))
+    n_bins = 2 * round(SPOT_PX / BIN_PX)
+    pairs = _separations(u, by_frame, starts, BIN_PX * pixel_rad, n_bins)
+    spot, frame_s = resolved_px(pairs) * pixel_rad, np.ascontiguousarray(frame_s, float)
+    ends, out = _ends_of(tracked), np.zeros(len(tracked.time_s))
+    for _ in range(2):
+        # Blends are brighter. Once they are known, so are the fluxes of the objects.
+        ends = ends._replace(flux=_own_flux(tracked, out > 0))
+        out[:] = 0.0
+        _enter_blends(
+            tracked.time_s, u, tracklet, by_frame, starts, tracked.bounds, frame_s, ends, spot, out
+        )
+    return out
+
+
+def of_neighbour(tracked: Tracked, variance: Array) -> npt.NDArray[np.bool_]:
+    """Return which detections are too faint to hold their tracklet's object, (n,).
+
+    A blend is brighter than either object. Where detections may be blends by their `variance`
+    (n,), but are much fainter than the others of their tracklet, the tracklet has gone over to the
+    neighbour.
+    """
+    blended = variance > 0
+    usual = np.repeat(_own_flux(tracked, blended), np.diff(tracked.bounds))
+    return np.asarray(blended & (tracked.flux < OWN_LIGHT * usual))
+
+
+def resolved_px(pairs: Indices) -> float:
+    """Return the separation [px] below which spots may be one centroid.
+
+    Parameters
+    ----------
+    pairs : (b,) int
+        Pairs of detections of a frame by their separation, in bins of `BIN_PX`.
+
+    Notes
+    -----
+    Without blends the pairs below a separation are a third as many as those between it and twice
+    as much: they lie anywhere.
+    """
+    below = np.concatenate([[0], np.cumsum(pairs)])
+    for bins in range(len(pairs) // 2, 0, -1):
+        expected = (below[2 * bins] - below[bins]) / 3
+        if expected >= ENOUGH / 3 and below[bins] < RESOLVED * expected:
+            return (bins + 1) * BIN_PX
+    return SPOT_PX if below[-1] < ENOUGH else BIN_PX
+
+
+def _ends_of(tracked: Tracked) -> _Ends:
+    first, last = tracked.bounds[:-1], tracked.bounds[1:]
+    t = tracked.time_s
+    time = np.column_stack([t[first], t[last - 1]])
+    u, w, noise, _, _ = directions_at(
+        np.repeat(first, 2), np.repeat(last, 2), time.ravel(), 1.0,
+        t, tracked.u_icrs, tracked.cov_noise, np.zeros_like(tracked.cov_noise), CARRIED_S / 2,
+    )  # fmt: skip
+    reach = np.clip(time[:, 1] - time[:, 0], 1e-3, CARRIED_S / 2)
+    variance = np.trace(noise, axis1=1, axis2=2).reshape(-1, 2) / 2
+    flux = np.full(len(first), np.nan)
+    return _Ends(time, u.reshape(-1, 2, 3), w.reshape(-1, 2, 3), variance, reach, flux)
+
+
+def _own_flux(tracked: Tracked, blended: npt.NDArray[np.bool_]) -> Array:
+    """Return the median flux of each tracklet's detections that are no blends; NaN if none."""
+    out = np.full(len(tracked.bounds) - 1, np.nan)
+    known = ~blended & np.isfinite(tracked.flux)
+    for k, (first, last) in enumerate(pairwise(tracked.bounds)):
+        if known[first:last].any():
+            out[k] = np.median(tracked.flux[first:last][known[first:last]])
+    return out
+
+
+@kernel
+def _separations(u, by_frame, starts, width, n_bins):
+    """Return the number of pairs of detections of a frame by their separation, (n_bins,)."""
+    out = np.zeros(n_bins, np.int64)
+    for f in range(len(starts) - 1):
+        for q in range(starts[f], starts[f + 1]):
+            i = by_frame[q]
+            for r in range(q + 1, starts[f + 1]):
+                j, away2 = by_frame[r], 0.0
+                for c in range(3):
+                    away2 += (u[i, c] - u[j, c]) ** 2
+                if away2 < (n_bins * width) ** 2:
+                    out[int(np.sqrt(away2) / width)] += 1
+    return out
+
+
+@kernel
+def _enter_blends(time, u, tracklet, by_frame, starts, bounds, frame_s, ends, spot, out):
+    """Write the variance of each detection's possible blends to `out` (n,)."""
+    p = np.empty(3)
+    for b in range(len(bounds) - 1):
+        k = bounds[b]
+        lo = np.searchsorted(frame_s, ends.time[b, 0] - CARRIED_S)
+        hi = np.searchsorted(frame_s, ends.time[b, 1] + CARRIED_S, side="right")
+        for f in range(lo, hi):
+            while k < bounds[b + 1] and time[k] < frame_s[f]:
+                k += 1
+            if k < bounds[b + 1] and time[k] == frame_s[f]:
+                continue  # a spot of its own
+            variance = _carry(time, u, bounds, ends, b, k, frame_s[f], p)
+            if not variance < spot * spot:
+                continue
+            for q in range(starts[f], starts[f + 1]):
+                i = by_frame[q]
+                away2 = 0.0
+                for c in range(3):
+                    away2 += (u[i, c] - p[c]) ** 2
+                if away2 > (spot + np.sqrt(variance)) ** 2:
+                    continue
+                a = tracklet[i]
+                if not _coexist(time, bounds, ends, a, b):
+                    continue
+                share = ends.flux[b] / (ends.flux[a] + ends.flux[b])
+                share = share if 0.0 <= share <= 1.0 else 0.5  # 0.5 for NaN
+                # The centroid lies nearer to the neighbour than the object by the share.
+                apart2 = min((away2 + variance) / max(1.0 - share, 1e-3) ** 2, spot * spot)
+                size = share * share * apart2
+                out[i] = max(out[i], size)
+
+
+@kernel
+def _carry(time, u, bounds, ends, b, k, at, p):
+    """Write where tracklet b is at a time without a detection; return the variance per axis.
+
+    `k` is its next detection. Between two detections the direction is interpolated.
+    """
+    if bounds[b] < k < bounds[b + 1]:
+        x = (at - time[k - 1]) / (time[k] - time[k - 1])
+        for c in range(3):
+            p[c] = u[k - 1, c] + x * (u[k, c] - u[k - 1, c])
+        return max(ends.variance[b, 0], ends.variance[b, 1])
+    e = 0 if k == bounds[b] else 1
+    gap, rate = at - ends.time[b, e], 0.0
+    for c in range(3):
+        p[c] = ends.u[b, e, c] + gap * ends.w[b, e, c]
+        rate += ends.w[b, e, c] ** 2
+    bent = BEND * acceleration(np.sqrt(rate)) * gap * gap / 2
+    return ends.variance[b, e] * (1 + 2 * abs(gap) / ends.reach[b]) ** 2 + bent * bent
+
+
+@kernel
+def _coexist(time, bounds, ends, a, b):
+    """Return whether two tracklets are two objects: both have detections at the same times."""
+    if a == b:
+        return False
+    begun, ended = max(ends.time[a, 0], ends.time[b, 0]), min(ends.time[a, 1], ends.time[b, 1])
+    for t in (a, b):
+        lo = np.searchsorted(time[bounds[t] : bounds[t + 1]], begun)
+        hi = np.searchsorted(time[bounds[t] : bounds[t + 1]], ended, side="right")
+        if hi - lo < BESIDE:
+            return False
+    return True
