@@ -148,7 +148,7 @@ def _judge_again(
 
 def _numbered(arrays: SpanViews, group: Indices, windows: list[Indices]) -> Indices:
     """Return each view's object number: groups that share a track are one object."""
-    registry = ObjectRegistry()
+    registry = ObjectRegistry(np.bincount(arrays.track[arrays.tracklet]).astype(float))
     number = np.full(len(group), -1)
     for rows in windows:
         grouped = rows[group[rows] >= 0]

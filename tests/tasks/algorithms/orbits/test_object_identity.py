@@ -31,3 +31,9 @@ def test_two_groups_never_share_a_number_and_the_larger_claim_wins():
 
 def test_no_group_is_no_trouble():
     assert name(ObjectRegistry()) == []
+
+
+def test_long_tracklets_count_more_than_short_ones():
+    registry = ObjectRegistry(np.array([60.0, 57.0, 2.0, 3.0, 2.0]))
+    name(registry, [0, 1, 2, 3, 4])
+    assert name(registry, [2, 3, 4], [0, 1]) == [1, 0]
