@@ -10,10 +10,13 @@ from epipole.io.logs.reader import read_log
 from epipole.io.simulation.truth import read_truth
 from epipole.schemas.errors import SceneError
 from epipole.tasks.algorithms.simulation.exposures import Exposing
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.objects import SimulatedObjects
+from epipole.tasks.algorithms.simulation.paths import two_body_paths
 from epipole.tasks.algorithms.simulation.sensor import frame_times
 from epipole.tasks.algorithms.simulation.star_field import star_field
 from epipole.tasks.simulate import simulate_scene as stage
+
+NO_OBJECTS = SimulatedObjects(two_body_paths(np.empty((0, 6))), np.empty(0), np.empty(0, bool))
 
 
 def exposures(scene):
@@ -101,7 +104,7 @@ def test_close_stars_are_one_spot_of_the_brighter_one_at_the_middle_of_the_light
         ("first", little_sky([(0, 0)], [5.0])),
         ("second", little_sky([(0, apart_px)], [5.0])),
     ):
-        seen = Exposing(sensor, sky, np.empty((0, 6)), np.empty(0)).expose(number, time_ns)
+        seen = Exposing(sensor, sky, NO_OBJECTS).expose(number, time_ns)
         places[name] = np.stack([seen.x_px, seen.y_px], axis=1), seen.source, seen.flux
     both, ids, flux = places["both"]
     first, second = places["first"][0][0], places["second"][0][0]
@@ -176,7 +179,7 @@ def test_pointing_follows_stands_spins_and_jumps():
         axes[mode] = seen.attitude.as_matrix()[:, 2]
         t_s = np.arange(20.0)
         if mode == "track":
-            d_km = state_at(simulation.targets[0], t_s)[0] - seen.r_km
+            d_km = simulation.objects.paths.at(t_s)[0] - seen.r_km
             along = d_km / np.linalg.norm(d_km, axis=1)[:, None]
             np.testing.assert_allclose(axes[mode], along, atol=1e-12)
     ra = np.degrees(np.unwrap(np.arctan2(axes["spin"][:, 1], axes["spin"][:, 0])))
