@@ -12,7 +12,7 @@ from epipole.schemas.errors import SceneError
 from epipole.schemas.simulation.element_set import ElementSet
 from epipole.schemas.simulation.scene import Scene, SceneSensor
 from epipole.tasks.algorithms.simulation.constants import ARCSEC
-from epipole.tasks.algorithms.simulation.paths import Paths, sampled_paths, two_body_paths
+from epipole.tasks.algorithms.simulation.paths import Paths, resting_path, two_body_paths
 from epipole.tasks.algorithms.simulation.sensor import SimulatedSensor, random_stream
 from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
 from epipole.tasks.simulate.draw_objects import DrawnObjects
@@ -105,8 +105,7 @@ def _followed(
     if pointing.mode != "track":
         return None
     if pointing.place_km is not None:
-        r_km = np.tile(np.array(pointing.place_km), (1, 2, 1))
-        return sampled_paths(0.0, r_km, np.zeros_like(r_km))
+        return resting_path(np.array(pointing.place_km))
     if isinstance(pointing.target, str):
         return objects.objects.paths.of(objects.number_of(pointing.target, scene))
     if pointing.target is not None:

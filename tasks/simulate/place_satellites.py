@@ -44,14 +44,14 @@ def place_satellites(scene: Scene, orbit: Orbit, t0_ns: int) -> Satellites:
     t_s = scene_nodes(scene)
     time_ns = t0_ns + np.rint(t_s * SECOND_NS).astype(np.int64)
     elements = np.array([element_set.elements for element_set in sets])
-    r_km, v_km_s, failures = propagate(elements, time_ns)
+    r_km, failures = propagate(elements, time_ns)
     if failures:
         first = failures[0]
         raise SceneError(
             f"{orbit.elements}: {sets[first.satellite].label}: SGP4 fails at "
             f"{_text(first.time_ns)}: {first.reason}; leave this satellite out"
         )
-    return Satellites(sets, sampled_paths(float(t_s[0]), r_km, v_km_s))
+    return Satellites(sets, sampled_paths(t_s, r_km))
 
 
 def draw_satellites(
@@ -64,9 +64,7 @@ def draw_satellites(
     if count > n:
         raise SceneError(f"{count} satellites are wanted of {n} in the file")
     taken = np.sort(rng.permutation(n)[:count])
-    nodes = satellites.paths.nodes
-    paths = sampled_paths(nodes.first_s, nodes.r_km[taken], nodes.v_km_s[taken])
-    return Satellites([satellites.sets[i] for i in taken], paths)
+    return Satellites([satellites.sets[i] for i in taken], satellites.paths.of(*taken))
 
 
 def scene_nodes(scene: Scene) -> np.ndarray:

@@ -20,6 +20,7 @@ from epipole.tasks.algorithms.simulation.constants import SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposing, Exposures
 from epipole.tasks.algorithms.simulation.objects import SimulatedObjects
 from epipole.tasks.algorithms.simulation.optics import field_radius
+from epipole.tasks.algorithms.simulation.paths import END_NODES
 from epipole.tasks.algorithms.simulation.sensor import SimulatedSensor, frame_times
 from epipole.tasks.algorithms.simulation.star_field import StarField, star_field
 from epipole.tasks.simulate.draw_objects import draw_objects
@@ -120,7 +121,7 @@ def true_orbits(simulation: Simulation) -> pa.Table | None:
     paths = simulation.objects.paths
     if not paths.is_sampled.any():
         return None
-    t_s = scene_nodes(simulation.scene)
+    t_s = scene_nodes(simulation.scene)[END_NODES:-END_NODES]
     t_ns = simulation.t0_ns + np.rint(t_s * SECOND_NS).astype(np.int64)
     number = np.repeat(np.arange(len(paths)), len(t_s))
     r_km, v_km_s = paths.at(np.tile(t_s, len(paths)), number)

@@ -13,6 +13,7 @@ Indices = npt.NDArray[np.int64]
 # [s] A cubic between nodes errs by step^4 / 384 of the fourth derivative, and a low orbit's is
 # 1e-8 km/s^4: less than a millimetre.
 NODE_STEP_S = 10
+END_NODES = 2  # at each end, which only give the derivatives of the others
 
 
 @dataclass(frozen=True)
@@ -57,10 +58,16 @@ class Paths:
             r_km[part], v_km_s[part] = self.at(t_s[part], body[part])
         return r_km, v_km_s
 
-    def of(self, body: int) -> "Paths":
-        """Return the path of one body."""
-        part = slice(body, body + 1)
-        return Paths(self.elements[part], self.row[part], self.nodes)
+    def of(self, *bodies: int) -> "Paths":
+        """Return the paths of some bodies."""
+        part = np.array(bodies, int)
+        row = self.row[part]
+        sampled = row >= 0
+        nodes = Nodes(
+            self.nodes.first_s, self.nodes.r_km[row[sampled]], self.nodes.v_km_s[row[sampled]]
+        )
+        row = np.where(sampled, np.cumsum(sampled) - 1, -1)
+        return Paths(self.elements[part], row, nodes)
 
     @property
     def is_sampled(self) -> npt.NDArray[np.bool_]:
@@ -77,10 +84,30 @@ def two_body_paths(elements: Array) -> Paths:
     return Paths(elements, np.full(len(elements), -1), NO_NODES)
 
 
-def sampled_paths(first_s: float, r_km: Array, v_km_s: Array) -> Paths:
-    """Return the paths through states (n, m, 3) at times `NODE_STEP_S` apart; m is 2 or more."""
+def sampled_paths(t_s: Array, r_km: Array) -> Paths:
+    """Return the paths through places at even times, see `node_times`.
+
+    The velocities at the nodes are central differences of fourth order: within 1e-8 km/s of the
+    derivative for a low orbit.
+
+    Parameters
+    ----------
+    t_s : (m,) float
+        Times `NODE_STEP_S` apart, 6 or more. The paths begin at the third.
+    r_km : (n, m, 3) float
+        GCRF.
+    """
     n = len(r_km)
-    return Paths(np.full((n, 6), np.nan), np.arange(n), Nodes(first_s, r_km, v_km_s))
+    before, after = r_km[:, 1:-3] - r_km[:, 3:-1], r_km[:, :-4] - r_km[:, 4:]
+    v_km_s = (after - 8 * before) / (12 * NODE_STEP_S)
+    nodes = Nodes(float(t_s[END_NODES]), r_km[:, END_NODES:-END_NODES], v_km_s)
+    return Paths(np.full((n, 6), np.nan), np.arange(n), nodes)
+
+
+def resting_path(r_km: Array) -> Paths:
+    """Return the path of a body that stays at a GCRF place (3,)."""
+    r_km = np.tile(r_km, (1, 2, 1))
+    return Paths(np.full((1, 6), np.nan), np.zeros(1, int), Nodes(0.0, r_km, np.zeros_like(r_km)))
 
 
 def joined_paths(parts: list[Paths]) -> Paths:
@@ -101,9 +128,10 @@ def joined_paths(parts: list[Paths]) -> Paths:
 
 
 def node_times(start_s: float, end_s: float) -> Array:
-    """Return the even times that cover a part of the scene, at least two [s]."""
-    first, last = np.floor(start_s / NODE_STEP_S), np.ceil(end_s / NODE_STEP_S)
-    return np.arange(first, max(last, first + 1) + 1) * NODE_STEP_S
+    """Return even times that cover a part of the scene, with `END_NODES` more at each end [s]."""
+    first = np.floor(start_s / NODE_STEP_S) - END_NODES
+    last = np.ceil(end_s / NODE_STEP_S) + END_NODES
+    return np.arange(first, max(last, first + 2 * END_NODES + 1) + 1) * NODE_STEP_S
 
 
 def interpolated(nodes: Nodes, row: Indices | int, t_s: Array) -> tuple[Array, Array]:

@@ -27,8 +27,11 @@ class Failure(NamedTuple):
     reason: str
 
 
-def propagate(mean_elements: Array, time_ns: Nanoseconds) -> tuple[Array, Array, list[Failure]]:
+def propagate(mean_elements: Array, time_ns: Nanoseconds) -> tuple[Array, list[Failure]]:
     """Return where satellites are by SGP4, and for which of them it fails.
+
+    SGP4's velocities are not returned: they lack the rates of several of its terms, and are up to
+    0.1 m/s from the derivative of its positions at geostationary height, more in a low orbit.
 
     Parameters
     ----------
@@ -39,9 +42,8 @@ def propagate(mean_elements: Array, time_ns: Nanoseconds) -> tuple[Array, Array,
 
     Returns
     -------
-    r_km, v_km_s : (n, m, 3) float
-        GCRF; NaN where SGP4 fails. The turn of TEME itself, below 1e-6 km/s at geostationary
-        height, is not in the velocity.
+    r_km : (n, m, 3) float
+        GCRF; NaN where SGP4 fails.
     failures : list
         One for each satellite that SGP4 fails for, such as one that has decayed.
 
@@ -51,16 +53,12 @@ def propagate(mean_elements: Array, time_ns: Nanoseconds) -> tuple[Array, Array,
     """
     shape = len(mean_elements), len(time_ns), 3
     if not shape[0] or not shape[1]:
-        return np.empty(shape), np.empty(shape), []
+        return np.empty(shape), []
     satellites = SatrecArray([_satellite(row) for row in mean_elements])
-    code, r_teme_km, v_teme_km_s = satellites.sgp4(*utc_julian_date(time_ns))
+    code, r_teme_km, _ = satellites.sgp4(*utc_julian_date(time_ns))
     bad = (code != 0) | ~np.isfinite(r_teme_km).all(axis=2)
-    R_teme_from_gcrf = teme_from_gcrf(time_ns)
-    r_km, v_km_s = (
-        np.where(bad[:, :, None], np.nan, np.einsum("mji,nmj->nmi", R_teme_from_gcrf, teme))
-        for teme in (r_teme_km, v_teme_km_s)
-    )
-    return r_km, v_km_s, _failures(bad, code, time_ns)
+    r_km = np.einsum("mji,nmj->nmi", teme_from_gcrf(time_ns), r_teme_km)
+    return np.where(bad[:, :, None], np.nan, r_km), _failures(bad, code, time_ns)
 
 
 def _satellite(elements: Sequence[float] | Array) -> Any:
