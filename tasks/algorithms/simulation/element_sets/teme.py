@@ -23,8 +23,8 @@ def teme_from_gcrf(time_ns: Nanoseconds) -> Array:
     GCRF to the true equator and equinox of date is IAU 2000B: frame bias, the precession of IAU
     1976 with its corrected rates, and nutation. SGP4 counts sidereal time by GMST of 1982, so the
     x axis of TEME lies behind the true equinox by apparent minus that mean sidereal time. The
-    difference of the two hardly depends on UT1, for which UTC is taken. Together right to 0.1 m
-    at geostationary height.
+    difference of the two hardly depends on UT1, for which UTC is taken. Together right to 1 mas:
+    3 cm for a low orbit, 0.2 m at geostationary height.
 
     References
     ----------
