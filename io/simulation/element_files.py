@@ -1,6 +1,6 @@
 """Files of published element sets: two-line elements, and CCSDS OMM in JSON, CSV or XML."""
 
-import io
+import csv
 import json
 import os
 import xml.etree.ElementTree as ET
@@ -46,20 +46,20 @@ def read_element_sets(path: str | os.PathLike[str]) -> list[ElementSet]:
         text = where.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{name}: cannot be read as element sets: {error}") from error
-    found = list(_parsed(text, name))
+    found = list(_parsed(text, where, name))
     if not found:
         raise SceneError(f"{name}: has no element sets; give two-line elements or OMM")
     return found
 
 
-def _parsed(text: str, name: str) -> Iterator[ElementSet]:
+def _parsed(text: str, where: Path, name: str) -> Iterator[ElementSet]:
     start = text.lstrip()[:1]
     if start in ("[", "{"):
         return _messages(_json_messages(text, name), name)
     if start == "<":
-        return _messages(_xml_messages(text, name), name)
+        return _messages(_xml_messages(where, name), name)
     if "MEAN_MOTION" in text.lstrip().partition("\n")[0]:
-        return _messages(omm.parse_csv(io.StringIO(text.lstrip())), name)
+        return _messages(csv.DictReader(text.lstrip().splitlines()), name)
     return _two_line_sets(text, name)
 
 
@@ -113,9 +113,10 @@ def _json_messages(text: str, name: str) -> list[Mapping[str, Any]]:
     return found if isinstance(found, list) else [found]
 
 
-def _xml_messages(text: str, name: str) -> list[Mapping[str, Any]]:
+def _xml_messages(where: Path, name: str) -> list[Mapping[str, Any]]:
     try:
-        return list(omm.parse_xml(io.StringIO(text)))
+        with where.open("rb") as file:
+            return list(omm.parse_xml(file))
     except (ET.ParseError, AttributeError, TypeError) as error:
         raise SceneError(f"{name}: not an OMM in XML: {error}") from error
 
