@@ -48,6 +48,9 @@ class Orbit(Group):
             raise ValueError("an orbit takes one of a_km, position_km, random and elements")
         if self.satellites and self.elements is None:
             raise ValueError("satellites goes with elements")
+        if self.elements is not None:
+            for name in sorted(self.model_fields_set - {"elements", "satellites"}):
+                raise ValueError(f"{name} does not go with elements")
         if self.mean_anomaly_deg is not None and self.true_anomaly_deg is not None:
             raise ValueError("an orbit takes mean_anomaly_deg or true_anomaly_deg, not both")
         if self.position_km is not None and not any(self.position_km[:2]):

@@ -116,6 +116,15 @@ def test_the_truth_of_real_satellites_is_sampled_and_agrees_with_the_frames(tmp_
     seen = Rotation.from_quat(spots.select("qx", "qy", "qz", "qw").to_numpy()).apply(d)
     assert spots.height > 200
     assert (np.abs(seen[:, :2] / seen[:, 2:]) < np.tan(np.radians(10.1))).all()
+    # Objects on two-body orbits are among them where there are both kinds.
+    kepler = {"orbit": {"a_km": 42164.0, "mean_anomaly_deg": 30.0}, "magnitude": 5.0}
+    real = {"orbit": {"elements": "real_leo.tle"}, "count": 2, "magnitude": 5.0}
+    scene = scene_of({"pointing": {"target": 2}}, targets=[real, kepler, real],
+                     start="2026-05-30T12:00:00Z", duration_s=5.0)  # fmt: skip
+    both = read_truth(simulate(scene, tmp_path / "n.mcap").truth)
+    assert set(array(both.orbits, "object").tolist()) == {0, 1, 2, 3, 4}
+    r_km, _ = locate_objects(both, np.array([2]), np.array([both.scenario["t0_ns"]]))
+    np.testing.assert_allclose(r_km[0, :2], [42164 * 0.75**0.5, 21082.0], atol=1e-3)
     # A log made again without such satellites leaves no sampled orbits behind.
     simulate("four_sensor_geo", tmp_path / "n.mcap", hours=0.001)
     assert read_truth(made.truth).orbits is None

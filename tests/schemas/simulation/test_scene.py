@@ -17,6 +17,9 @@ BAD_SCENES = {
     "sensors.0.id = '../x': ": {"id": "../x"},
     'sensors.0.pointing: pointing "fixed" takes ra_deg': {"pointing": {"mode": "fixed"}},
     "sensors.0.orbit: satellites goes with elements": {"orbit": {"a_km": 7e3, "satellites": ["A"]}},
+    "sensors.0.orbit: i_deg does not go with elements": {
+        "orbit": {"elements": "a.tle", "i_deg": 3.0}
+    },
     'sensors.0.pointing: pointing "track" takes one of': {
         "pointing": {"target": 0, "place_km": (1.0, 2.0, 3.0)}
     },
