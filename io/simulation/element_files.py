@@ -102,7 +102,7 @@ def _two_line_set(title: str, first: str, second: str, where: str) -> ElementSet
         raise SceneError(f"{where}: not an element set: {error}") from error
     if first[2:7] != second[2:7]:
         raise SceneError(f"{where}: of satellite {second[2:7]}, line 1 is of {first[2:7]}")
-    return _element_set(title, satellite)
+    return _element_set(title, int(satellite.satnum), satellite)
 
 
 def _json_messages(text: str, name: str) -> list[Mapping[str, Any]]:
@@ -126,11 +126,12 @@ def _messages(messages: Iterable[Mapping[str, Any]], name: str) -> Iterator[Elem
         satellite = Satrec()
         try:
             text = {key: str(value).strip() for key, value in fields.items() if value is not None}
+            number = int(text["NORAD_CAT_ID"])
             omm.initialize(satellite, _with_defaults(text))
         except (KeyError, ValueError, AttributeError) as error:
             what = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
             raise SceneError(f"{name}, message {number}: not an OMM: {what}") from error
-        yield _element_set(text.get("OBJECT_NAME", ""), satellite)
+        yield _element_set(text.get("OBJECT_NAME", ""), number, satellite)
 
 
 def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
@@ -142,12 +143,14 @@ def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
     if not fields.get("MEAN_ELEMENT_THEORY", "SGP4").startswith("SGP"):
         raise ValueError(f"MEAN_ELEMENT_THEORY is {fields['MEAN_ELEMENT_THEORY']}, expected SGP4")
     epoch = fields["EPOCH"].removesuffix("Z")
-    return unused | fields | {"EPOCH": epoch if "." in epoch else f"{epoch}.0"}
+    # sgp4 refuses the numbers above 339999, which two-line elements cannot hold.
+    changed = {"EPOCH": epoch if "." in epoch else f"{epoch}.0", "NORAD_CAT_ID": "0"}
+    return unused | fields | changed
 
 
-def _element_set(title: str, satellite: Any) -> ElementSet:
+def _element_set(title: str, number: int, satellite: Any) -> ElementSet:
     day, part = satellite.jdsatepoch, satellite.jdsatepochF
     epoch_ns = round((day - _UNIX_EPOCH_JD) * _DAY_NS) + round(part * _DAY_NS)
     names = ("bstar", "ndot", "nddot", "ecco", "argpo", "inclo", "mo", "no_kozai", "nodeo")
     elements = (day - _SGP4_EPOCH_JD + part, *(float(getattr(satellite, n)) for n in names))
-    return ElementSet(title, int(satellite.satnum), epoch_ns, elements)
+    return ElementSet(title, number, epoch_ns, elements)

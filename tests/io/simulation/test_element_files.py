@@ -82,6 +82,13 @@ def test_what_an_orbit_does_not_need_may_be_missing_in_an_omm(tmp_path):
     assert found.elements == pytest.approx(ISS.elements, rel=1e-12)
 
 
+def test_an_omm_has_numbers_that_two_lines_cannot_hold(tmp_path):
+    text = json.dumps([omm_fields() | {"NORAD_CAT_ID": 270000001}])
+    (found,) = read_element_sets(write(tmp_path / "a.json", text))
+    assert found.number == 270000001
+    assert found.elements == pytest.approx(ISS.elements, rel=1e-12)
+
+
 def changed(line, at, to):
     return line[:at] + to + line[at + 1 :]
 
