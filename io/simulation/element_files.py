@@ -126,12 +126,12 @@ def _messages(messages: Iterable[Mapping[str, Any]], name: str) -> Iterator[Elem
         satellite = Satrec()
         try:
             text = {key: str(value).strip() for key, value in fields.items() if value is not None}
-            number = int(text["NORAD_CAT_ID"])
+            satellite_number = int(text["NORAD_CAT_ID"])
             omm.initialize(satellite, _with_defaults(text))
         except (KeyError, ValueError, AttributeError) as error:
             what = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
             raise SceneError(f"{name}, message {number}: not an OMM: {what}") from error
-        yield _element_set(text.get("OBJECT_NAME", ""), number, satellite)
+        yield _element_set(text.get("OBJECT_NAME", ""), satellite_number, satellite)
 
 
 def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
