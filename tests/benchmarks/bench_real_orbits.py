@@ -244,14 +244,14 @@ def pooled(results: list[dict[str, Any]]) -> dict[str, Any]:
     for name, weight in (("nees_in_99", "positions"), ("states_in_99", "states"),
                          ("object_recall", "positions")):  # fmt: skip
         pairs = [(r[name], r[weight]) for r in results if r.get(name) is not None and r.get(weight)]
-        out[name] = _round(np.average(*np.array(pairs).T)) if pairs else None
+        share, count = np.array(pairs).T if pairs else (np.ones(0), np.ones(0))
+        out[name] = _round(np.average(share, weights=count)) if pairs else None
     for name in ("nees_mean", "states_nees_mean"):
         values = np.array([r[name] for r in results if r.get(name) is not None])
         if len(values):
             out[name] = _round(values.mean())
-            out[f"{name}_error"] = (
-                _round(values.std(ddof=1) / len(values) ** 0.5) if len(values) > 1 else None
-            )
+            error = values.std(ddof=1) / len(values) ** 0.5 if len(values) > 1 else math.inf
+            out[f"{name}_error"] = _round(error)
             out[f"{name}_median"] = _round(np.median(values))
     return out
 
