@@ -22,6 +22,18 @@ from pydantic.fields import FieldInfo
 
 from epipole.schemas.rejects import FrameStatus, Outcome, Reason
 from epipole.schemas.settings import Settings
+from epipole.schemas.simulation.orbit import Orbit
+from epipole.schemas.simulation.scene import (
+    LensDeparture,
+    Pointing,
+    Scene,
+    SceneCamera,
+    SceneDetection,
+    SceneFaults,
+    SceneSensor,
+    SceneStates,
+    SceneTargets,
+)
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import TABLES
 
@@ -36,6 +48,11 @@ MADE_BY = {
     Stage.SOLVE: ("epochs", "associations", "pairs", "positions", "states"),
     Stage.PUBLISH: ("sources", "rejects"),
 }
+
+SCENE_PARTS = (
+    "scene", "sensors", "targets", "orbit", "pointing", "camera", "camera.departure", "detection",
+    "states", "faults",
+)  # fmt: skip
 
 
 def stages() -> str:
@@ -112,6 +129,25 @@ def settings() -> str:
     return "\n".join(sections)
 
 
+def scene() -> str:
+    """Return a section for each part of a scene: names, defaults, meanings."""
+    parts = (Scene, SceneSensor, SceneTargets, Orbit, Pointing, SceneCamera, LensDeparture,
+             SceneDetection, SceneStates, SceneFaults)  # fmt: skip
+    names = dict(zip(parts, SCENE_PARTS, strict=True))
+    sections = []
+    for group, heading in names.items():
+        rows = []
+        for key, option in group.model_fields.items():
+            inner = type(option.default)
+            default = f"see {names[inner]}" if inner in names else _default(option.default)
+            default = "required" if option.is_required() else default
+            rows.append((f"`{key}`", default, (option.description or "") + _choices(option)))
+        table = _markdown(("field", "default", "meaning"), rows)
+        doc = " ".join((group.__doc__ or "").split())
+        sections.append(f"### {heading}\n\n{doc}\n\n{table}")
+    return "\n".join(sections)
+
+
 def _choices(option: FieldInfo) -> str:
     if get_origin(option.annotation) is not Literal:
         return ""
@@ -171,6 +207,7 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "statuses": statuses,
     },
     "docs/settings.md": {"settings": settings},
+    "docs/scenes.md": {"scene": scene},
     "CONTRIBUTING.md": {"packages": rooms},
 }
 

@@ -15,10 +15,11 @@ from epipole.io.logs.writer import LogWriter
 from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.truth import SUFFIX, TruthWriter
 from epipole.schemas.errors import SceneError
+from epipole.schemas.simulation.element_set import ElementSet
 from epipole.schemas.simulation.scene import Scene, validate_scene
 from epipole.tasks.algorithms.simulation.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposures
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.paths import Paths
 from epipole.tasks.algorithms.simulation.sensor import (
     Attitudes,
     Beliefs,
@@ -26,11 +27,12 @@ from epipole.tasks.algorithms.simulation.sensor import (
     seconds_since,
     state_times,
 )
+from epipole.tasks.simulate.scene_optics import sent_optics
 from epipole.tasks.simulate.simulate_scene import (
     Simulation,
     expose_blocks,
-    sent_optics,
     simulate_scene,
+    true_orbits,
     true_tables,
 )
 
@@ -102,11 +104,13 @@ def simulate(
                 for name in names
             ]
             true = stack.enter_context(TruthWriter(truth, scenario(simulation)))
+            if (orbits := true_orbits(simulation)) is not None:
+                true.write_orbits(orbits)
             frames, centroids = _write(simulation, writers, true)
     except OSError as error:
         raise SceneError(f"{out}: cannot be written: {error}") from error
     return Simulated(
-        names, truth, len(simulation.sensors), len(simulation.targets), frames, centroids
+        names, truth, len(simulation.sensors), len(simulation.objects), frames, centroids
     )
 
 
@@ -116,25 +120,54 @@ def scenario(simulation: Simulation) -> dict[str, Any]:
         "t0_ns": simulation.t0_ns,
         "duration_s": simulation.scene.duration_s,
         "seed": simulation.scene.seed,
-        "sensors": [
-            {
-                "id": s.sensor_id,
-                "elements": s.elements.tolist(),
-                "rate_hz": s.rate_hz,
-                "phase": s.phase,
-                "mag_limit": s.magnitude_limit,
-                "sigma_px": s.sigma_px,
-                "camera": dict(s.optics._asdict()),
-            }
-            for s in simulation.sensors
-        ],
-        "targets": [
-            {"elements": elements.tolist(), "mag": float(magnitude)}
-            for elements, magnitude in zip(
-                simulation.targets, simulation.target_magnitude, strict=True
-            )
-        ],
+        "sensors": [_told_sensor(simulation, k) for k in range(len(simulation.sensors))],
+        "targets": [_told_object(simulation, k) for k in range(len(simulation.objects))],
         "scene": simulation.scene.model_dump(mode="json"),
+    }
+
+
+def _told_sensor(simulation: Simulation, k: int) -> dict[str, Any]:
+    s, faults = simulation.sensors[k], simulation.groups[k].faults
+    told = {
+        "id": s.sensor_id,
+        **_told_path(s.path, simulation.sensor_sets[k]),
+        "rate_hz": s.rate_hz,
+        "phase": s.phase,
+        "mag_limit": s.magnitude_limit,
+        "sigma_px": s.sigma_px,
+        "camera": dict(s.optics._asdict()),
+    }
+    if simulation.groups[k].clock_offset_s:
+        told["clock_s"] = simulation.groups[k].clock_offset_s
+    if s.position_offset_km.any():
+        told |= {
+            "pos_off_km": s.position_offset_km.tolist(),
+            "pos_off_told": faults.position_told,
+        }
+    if s.prior_offset.any():
+        told |= {
+            "prior_bias_vec_arcsec": (s.prior_offset / ARCSEC).tolist(),
+            "prior_bias_told": faults.prior_told,
+        }
+    return told
+
+
+def _told_object(simulation: Simulation, k: int) -> dict[str, Any]:
+    objects = simulation.objects
+    key = "standard_mag" if objects.is_standard[k] else "mag"
+    path = _told_path(objects.paths.of(k), simulation.object_sets[k])
+    return path | {key: float(objects.magnitude[k])}
+
+
+def _told_path(path: Paths, element_set: ElementSet | None) -> dict[str, Any]:
+    """Return the elements of a path, or the satellite whose element set it follows."""
+    if element_set is None:
+        return {"elements": path.elements[0].tolist()}
+    epoch = np.datetime64(element_set.epoch_ns, "ns")
+    return {
+        "name": element_set.name,
+        "norad_id": element_set.number,
+        "element_epoch": f"{np.datetime_as_string(epoch, unit='ms')}Z",
     }
 
 
@@ -248,12 +281,12 @@ class _States:
         times, self._sent = self._times[self._sent : end], max(end, self._sent)
         if not len(times):
             return
-        r_km, v_km_s = state_at(s.elements, seconds_since(s.t0_ns, times))
-        believed = self._beliefs.attitude(self._attitudes.at(times, r_km))
+        r_km, v_km_s = s.path.at(seconds_since(s.t0_ns, times))
+        believed = self._beliefs.attitude(self._attitudes.at(times, r_km, v_km_s))
         q = None if believed is None else believed.as_quat()
         place = self._beliefs.position(r_km)
-        sigma_km = float(np.hypot(s.position_noise_km, s.position_bias_km))
-        sigma_q = 0.0 if q is None else float(np.hypot(s.prior_noise or 0.0, s.prior_bias) / ARCSEC)
+        sigma_km = self._beliefs.position_sigma_km
+        sigma_q = self._beliefs.attitude_sigma / ARCSEC
         for i, at in enumerate(times.tolist()):
             values: dict[str, Any] = {
                 "position_km": place[i],

@@ -222,6 +222,13 @@ def simulate(
     lost_in_space: a new attitude in every frame
 
     night: any number of sensors, objects and hours
+
+    real_geo: real satellites, low ones that look at geostationary ones, some co-located
+
+    real_leo: real satellites, low ones in wide fields above the pole
+
+    A scene's orbits may come from files of element sets (two-line elements, or OMM in
+    JSON, CSV or XML): docs/scenes.md.
     """
     from epipole.flows.night.summary import many
     from epipole.flows.simulate import simulate

@@ -2,9 +2,10 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.scene import Scene, parse_scene
+from epipole.schemas.simulation.scene import Scene, scene_values, validate_scene
 
 _BUILT_IN = Path(__file__).parent / "built_in"
 
@@ -23,7 +24,8 @@ def read_scene(scene: str | os.PathLike[str]) -> Scene:
         Where there is neither, or the file is invalid.
     """
     name = os.fspath(scene)
-    path = _BUILT_IN / f"{name}.toml" if name in built_in_scenes() else Path(name)
+    is_built_in = name in built_in_scenes()
+    path = _BUILT_IN / f"{name}.toml" if is_built_in else Path(name)
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -31,4 +33,18 @@ def read_scene(scene: str | os.PathLike[str]) -> Scene:
         raise SceneError(f"{name}: no such scene file; the built-in scenes are {known}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SceneError(f"{name}: cannot be read as a scene: {error}") from error
-    return parse_scene(text, name)
+    values = scene_values(text, name)
+    return validate_scene(values if is_built_in else _beside(values, path.parent), name)
+
+
+def _beside(values: Any, folder: Path) -> Any:
+    """Return the values of a scene with the full path of each element file in its folder."""
+    if isinstance(values, list):
+        return [_beside(value, folder) for value in values]
+    if not isinstance(values, dict):
+        return values
+    values = {key: _beside(value, folder) for key, value in values.items()}
+    file = values.get("elements")
+    if isinstance(file, str) and (folder / file).is_file():
+        values["elements"] = str((folder / file).resolve())
+    return values

@@ -18,6 +18,7 @@ from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_ORBITS, TRUE_POINTS
 
 SUFFIX = ".truth"
 OBJECT = 1  # value of `kind` in TRUE_POINTS
+_ORBITS = "orbits.parquet"
 _FILES = {"frames": TRUE_FRAMES, "points": TRUE_POINTS}
 
 
@@ -40,6 +41,7 @@ class TruthWriter:
     def __init__(self, folder: str | os.PathLike[str], scenario: dict[str, Any]) -> None:
         self._folder = Path(folder)
         self._folder.mkdir(parents=True, exist_ok=True)
+        (self._folder / _ORBITS).unlink(missing_ok=True)  # of an earlier log of this name
         text = json.dumps(scenario, indent=1, allow_nan=False) + "\n"
         (self._folder / "scenario.json").write_text(text, encoding="utf-8")
         self._writers = {
@@ -65,6 +67,11 @@ class TruthWriter:
             if rows.num_rows:
                 self._writers[name].write_table(conform(_FILES[name], rows))
 
+    def write_orbits(self, orbits: pa.Table) -> None:
+        """Write rows of TRUE_ORBITS: all objects, where some do not move by two-body orbits."""
+        rows = conform(TRUE_ORBITS, orbits)
+        pq.write_table(rows, self._folder / _ORBITS, compression="zstd")
+
 
 def read_truth(path: str | os.PathLike[str]) -> Truth:
     """Return the truth in a folder. The log beside the folder may be named instead.
@@ -83,7 +90,7 @@ def read_truth(path: str | os.PathLike[str]) -> Truth:
     if not folder.is_dir():
         raise DatasetError(f"{path}: no truth folder; `epipole simulate` writes it as LOG{SUFFIX}")
     tables = {name: _read(folder / f"{name}.parquet", schema) for name, schema in _FILES.items()}
-    where = folder / "orbits.parquet"
+    where = folder / _ORBITS
     orbits = _read(where, TRUE_ORBITS) if where.exists() else None
     truth = Truth(tables["frames"], tables["points"], _read_scenario(folder), orbits)
     _require_orbits(folder, truth)
@@ -113,7 +120,7 @@ def _require_orbits(folder: Path, truth: Truth) -> None:
         times = rows.agg(n=pl.len(), n_times=pl.col("t_ns").n_unique())
         is_path = (pl.col("n") >= 2) & (pl.col("n") == pl.col("n_times"))
         known = times.filter(is_path)["object"].to_list()
-        where = folder / "orbits.parquet"
+        where = folder / _ORBITS
     shown = to_polars(truth.points).filter(pl.col("kind") == OBJECT)["source"].unique()
     if missing := sorted(set(shown.to_list()) - set(known)):
         raise DatasetError(

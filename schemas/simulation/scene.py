@@ -6,49 +6,15 @@ then drawn with the scene's seed.
 
 import tomllib
 from datetime import UTC, datetime
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AwareDatetime, Field, ValidationError, model_validator
 
 from epipole.schemas.errors import SceneError
 from epipole.schemas.settings import Group
+from epipole.schemas.simulation.orbit import Orbit, Vector
 
-Vector = tuple[float, float, float]
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,62}$"
-
-
-class Orbit(Group):
-    """An orbit about the Earth at the start of the scene: by elements, by a position, or random."""
-
-    a_km: float | None = Field(None, gt=6378.0, description="Semi-major axis.")
-    e: float = Field(0.0, ge=0, lt=1, description="Eccentricity.")
-    i_deg: float = Field(0.0, ge=0, le=180, description="Inclination.")
-    raan_deg: float = Field(0.0, description="Right ascension of the ascending node.")
-    argp_deg: float = Field(0.0, description="Argument of perigee.")
-    mean_anomaly_deg: float | None = Field(None, description="Mean anomaly at the start.")
-    true_anomaly_deg: float | None = Field(None, description="The true anomaly instead.")
-    position_km: Vector | None = Field(None, description="GCRF position at the start.")
-    velocity_km_s: Vector | None = Field(
-        None, description="GCRF velocity there. Default: a circular orbit eastward."
-    )
-    random: Literal["leo", "meo", "geo"] | None = Field(
-        None, description="A random orbit of this kind."
-    )
-
-    @model_validator(mode="after")
-    def _one_way(self) -> Self:
-        ways = [self.a_km is not None, self.position_km is not None, self.random is not None]
-        if sum(ways) != 1:
-            raise ValueError("an orbit takes one of a_km, position_km and random")
-        if self.mean_anomaly_deg is not None and self.true_anomaly_deg is not None:
-            raise ValueError("an orbit takes mean_anomaly_deg or true_anomaly_deg, not both")
-        if self.position_km is not None and not any(self.position_km[:2]):
-            raise ValueError("position_km lies on the Earth's axis")
-        if self.velocity_km_s is not None and self.position_km is None:
-            raise ValueError("velocity_km_s goes with position_km")
-        if self.a_km is not None and self.a_km * (1 - self.e) < 6378.0:
-            raise ValueError("the orbit's perigee lies below the ground")
-        return self
 
 
 class LensDeparture(Group):
@@ -92,17 +58,29 @@ class SceneCamera(Group):
 class Pointing(Group):
     """The pointing of a sensor."""
 
-    mode: Literal["track", "fixed", "spin", "random"] = "track"
+    mode: Literal["track", "fixed", "spin", "body", "random"] = "track"
     orbit: Orbit | None = Field(None, description="track: the orbit to follow.")
-    target: int | None = Field(
-        None, ge=0, description="track: the object of the scene to follow instead."
+    target: Annotated[int, Field(ge=0)] | str | None = Field(
+        None,
+        description="track: the object of the scene to follow instead, by its number or name.",
+    )
+    place_km: Vector | None = Field(
+        None, description="track: the GCRF place to follow instead; it does not move."
     )
     up: Vector = Field(
         (0.0, 0.0, 1.0),
         description="track, fixed, spin: inertial direction that is up in the image.",
     )
     roll_deg: float = Field(
-        0.0, description="track, fixed, spin: rotation about the boresight after that."
+        0.0, description="All but random: rotation about the boresight after that."
+    )
+    azimuth_deg: float = Field(
+        0.0,
+        description="body: boresight in the sensor's own orbital frame, from along the motion "
+        "towards across (the orbit's normal). Away from the Earth is up in the image.",
+    )
+    elevation_deg: float = Field(
+        0.0, ge=-90, le=90, description="body: from the horizontal away from the Earth."
     )
     ra_deg: float | None = Field(None, description="fixed, spin: boresight at the start.")
     dec_deg: float | None = Field(None, ge=-90, le=90)
@@ -126,8 +104,9 @@ class Pointing(Group):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        if self.mode == "track" and (self.orbit is None) == (self.target is None):
-            raise ValueError('pointing "track" takes one of orbit and target')
+        followed = (self.orbit, self.target, self.place_km)
+        if self.mode == "track" and sum(way is not None for way in followed) != 1:
+            raise ValueError('pointing "track" takes one of orbit, target and place_km')
         if self.mode in ("fixed", "spin") and (self.ra_deg is None or self.dec_deg is None):
             raise ValueError(f'pointing "{self.mode}" takes ra_deg and dec_deg')
         if not any(self.up) or not any(self.axis):
@@ -151,6 +130,12 @@ class SceneDetection(Group):
     hot_pixels: int = Field(0, ge=0, description="Pixels that show a point in every frame.")
     star_drop: float = Field(0.0, ge=0, le=1, description="Share of stars missed.")
     target_drop: float = Field(0.0, ge=0, le=1, description="Share of objects missed.")
+    fade: float = Field(
+        0.0,
+        ge=0,
+        description="1-sigma width of the magnitude limit of objects, drawn anew in each frame. "
+        "Default: a sharp limit.",
+    )
 
 
 class SceneStates(Group):
@@ -177,21 +162,54 @@ class SceneStates(Group):
     )
 
 
+class SceneFaults(Group):
+    """Errors of a sensor that are constant, and whether its log tells of them.
+
+    An offset that is told is part of the sigma in the states. One that is not told is beyond what
+    the sigma says. See `clock_offset_s` for the clock, for which a log has no sigma.
+    """
+
+    position_offset_km: float | Vector = Field(
+        0.0,
+        description="Reported minus true position, GCRF. One number is the size of an offset in a "
+        "random direction.",
+    )
+    position_told: bool = False
+    prior_offset_arcsec: float | Vector = Field(
+        0.0,
+        description="Rotation of the reported attitudes about the sensor's axes. One number is "
+        "its size, about a random axis.",
+    )
+    prior_told: bool = False
+
+
 class SceneSensor(Group):
-    """One sensor, or several that differ only in their random values."""
+    """One sensor, or several that differ in their random values or in their satellites."""
 
     id: str = Field(pattern=_NAME, description="With a count above 1, a number is appended.")
-    count: int = Field(1, ge=1, le=10000)
+    count: int | None = Field(
+        None,
+        ge=1,
+        le=10000,
+        description="Default: 1, or one for each satellite of `orbit.elements`. A smaller number "
+        "takes these satellites at random.",
+    )
     orbit: Orbit
     in_view: bool = Field(
-        False, description="Draw the random orbit again until the tracked object is always visible."
+        False,
+        description="Take only random orbits or satellites from which the tracked object or place "
+        "is always visible.",
     )
     camera: SceneCamera
     pointing: Pointing
     detection: SceneDetection = SceneDetection()
     states: SceneStates = SceneStates()
+    faults: SceneFaults = SceneFaults()
     magnitude_limit: float = Field(
         7.5, description="V magnitude of the faintest star that is detected."
+    )
+    object_limit: float | None = Field(
+        None, description="V magnitude of the faintest object. Default: that of stars."
     )
     rate_hz: float = Field(1.0, gt=0, le=1000)
     phase: float | None = Field(
@@ -215,16 +233,35 @@ class SceneSensor(Group):
 
 
 class SceneTargets(Group):
-    """One object, or several near the same orbit."""
+    """One object, several near the same orbit, or real satellites."""
 
-    count: int = Field(1, ge=0, le=1000000)
+    count: int | None = Field(
+        None,
+        ge=0,
+        le=1000000,
+        description="Default: 1, or one for each satellite of `orbit.elements`. A smaller number "
+        "takes these satellites at random.",
+    )
     orbit: Orbit
     spread_km: float = Field(
         0.0, ge=0, description="1-sigma per axis about the position of the orbit at the start."
     )
     magnitude: float | tuple[float, float] = Field(
-        8.0, description="A value, or the limits of a random one."
+        8.0, description="A value, or the limits of a random one. The same at any distance."
     )
+    standard_magnitude: float | tuple[float, float] | None = Field(
+        None,
+        description="Magnitude at 1000 km instead, a value or limits: 5 log10 of the distance "
+        "is added.",
+    )
+
+    @model_validator(mode="after")
+    def _one_magnitude(self) -> Self:
+        if self.standard_magnitude is not None and "magnitude" in self.model_fields_set:
+            raise ValueError("an object takes magnitude or standard_magnitude, not both")
+        if self.spread_km and self.orbit.elements is not None:
+            raise ValueError("spread_km does not go with an orbit of element sets")
+        return self
 
 
 class Scene(Group):
@@ -241,18 +278,34 @@ class Scene(Group):
         min_length=1,
         description='Stars: "hipparcos", or the path of a file of `epipole catalog build`.',
     )
+    element_age_days: float = Field(
+        14.0,
+        gt=0,
+        description="Element sets farther than this from the scene are refused: after two weeks "
+        "SGP4 is tens of kilometres off for a low orbit.",
+    )
+    earth_shadow: bool = Field(
+        False, description="Objects in the Earth's shadow (a cylinder) are not seen."
+    )
+    phase_law: bool = Field(
+        False,
+        description="Objects are diffuse spheres lit by the Sun: magnitudes hold where they are "
+        "fully lit.",
+    )
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
         names = [s.id for s in self.sensors]
         if len(set(names)) < len(names):
             raise ValueError("two sensors have the same id")
-        n = sum(t.count for t in self.targets)
+        counts = [
+            1 if g.count is None and g.orbit.elements is None else g.count for g in self.targets
+        ]
+        n = None if None in counts else sum(c for c in counts if c is not None)
         for sensor in self.sensors:
-            if sensor.pointing.target is not None and sensor.pointing.target >= n:
-                raise ValueError(
-                    f"sensor {sensor.id} tracks target {sensor.pointing.target} of {n}"
-                )
+            target = sensor.pointing.target
+            if isinstance(target, int) and n is not None and target >= n:
+                raise ValueError(f"sensor {sensor.id} tracks target {target} of {n}")
         return self
 
 
@@ -266,8 +319,13 @@ def parse_scene(text: str, where: str) -> Scene:
     SceneError
         Names the field, the value given and the value expected.
     """
+    return validate_scene(scene_values(text, where), where)
+
+
+def scene_values(text: str, where: str) -> dict[str, Any]:
+    """Return the nested mappings of a TOML text, not validated."""
     try:
-        return validate_scene(tomllib.loads(text), where)
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"{where}: not TOML: {error}") from error
 

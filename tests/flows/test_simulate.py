@@ -1,6 +1,7 @@
 """Simulated logs and their truth: the same again from the same seed, with what the scene says."""
 
 import numpy as np
+import polars as pl
 import pytest
 from scenes.simulated import scene_of
 from scipy.spatial.transform import Rotation
@@ -9,8 +10,9 @@ from epipole.flows.simulate import simulate
 from epipole.io.logs.reader import read_log
 from epipole.io.simulation.scenes import built_in_scenes
 from epipole.io.simulation.truth import read_truth
-from epipole.schemas.bridge import array, flatten, stack
+from epipole.schemas.bridge import array, flatten, stack, to_polars
 from epipole.schemas.errors import SceneError
+from epipole.tasks.evaluate.locate_objects import locate_objects
 
 ARCSEC = np.pi / 648000
 
@@ -72,6 +74,60 @@ def test_states_are_off_by_a_bias_of_each_sensor_and_noise_of_each_state(tmp_pat
         assert off.mean(axis=1).std() == pytest.approx(bias, rel=0.3)  # of 90 numbers
     sent = array(states, "attitude_sigma_arcsec")
     np.testing.assert_allclose(sent, np.hypot(20.0, 300.0))
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_a_fault_is_in_the_states_and_in_the_sigma_only_where_it_is_told(told, tmp_path):
+    faults = {"position_offset_km": 3.0, "position_told": told,
+              "prior_offset_arcsec": (0.0, 0.0, 600.0), "prior_told": told}  # fmt: skip
+    quiet = {"position_noise_km": 0.001, "position_bias_km": 0.0, "prior_noise_arcsec": 1.0}
+    made = simulate(scene_of({"states": quiet, "faults": faults}), tmp_path / "n.mcap")
+    states, frames = read_log(made.logs[0]).states, read_truth(made.truth).frames
+    i, j = same_instants(states, frames)
+    off_km = stack(states, "{}_km")[i] - stack(frames, "{}")[j]
+    assert np.linalg.norm(off_km, axis=1) == pytest.approx(3.0, abs=0.01)
+    assert np.ptp(off_km, axis=0).max() < 0.01
+    q_told, q_true = stack(states, "q{}", "xyzw")[i], stack(frames, "q{}", "xyzw")[j]
+    turned = (Rotation.from_quat(q_told) * Rotation.from_quat(q_true).inv()).as_rotvec() / ARCSEC
+    np.testing.assert_allclose(turned, [[0.0, 0.0, 600.0]] * len(i), atol=5.0)
+    sigmas = array(states, "position_sigma_km"), array(states, "attitude_sigma_arcsec")
+    expected = (3.0 / 3**0.5, 600.0 / 3**0.5) if told else (0.001, 1.0)
+    for sigma, value in zip(sigmas, expected, strict=True):
+        assert sigma == pytest.approx(value, rel=1e-4)
+    sensor = read_truth(made.truth).scenario["sensors"][0]
+    np.testing.assert_allclose(sensor["pos_off_km"], off_km.mean(axis=0), atol=0.001)
+    assert sensor["prior_bias_vec_arcsec"] == pytest.approx([0.0, 0.0, 600.0])
+
+
+def test_the_truth_of_real_satellites_is_sampled_and_agrees_with_the_frames(tmp_path):
+    made = simulate("real_leo", tmp_path / "n.mcap", hours=0.003)
+    truth = read_truth(made.truth)
+    assert truth.orbits.num_rows == 30 * len(set(array(truth.orbits, "t_ns").tolist()))
+    names = [target["name"] for target in truth.scenario["targets"]]
+    assert names[0] == "ONEWEB-0023"
+    assert truth.scenario["sensors"][1]["norad_id"] == 42969
+    # Each spot lies in its frame where the sampled orbit puts the object: a pinhole, no lens.
+    shown = to_polars(truth.points).filter(pl.col("kind") == 1)
+    spots = shown.join(to_polars(truth.frames), on=["sensor_id", "frame_number"])
+    t_ns, source = spots["t_ns"].to_numpy(), spots["source"].to_numpy()
+    r_km, _ = locate_objects(truth, source, t_ns)
+    d = r_km - spots.select("x", "y", "z").to_numpy()
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    seen = Rotation.from_quat(spots.select("qx", "qy", "qz", "qw").to_numpy()).apply(d)
+    assert spots.height > 200
+    assert (np.abs(seen[:, :2] / seen[:, 2:]) < np.tan(np.radians(10.1))).all()
+    # Objects on two-body orbits are among them where there are both kinds.
+    kepler = {"orbit": {"a_km": 42164.0, "mean_anomaly_deg": 30.0}, "magnitude": 5.0}
+    real = {"orbit": {"elements": "real_leo.tle"}, "count": 2, "magnitude": 5.0}
+    scene = scene_of({"pointing": {"target": 2}}, targets=[real, kepler, real],
+                     start="2026-05-30T12:00:00Z", duration_s=5.0)  # fmt: skip
+    both = read_truth(simulate(scene, tmp_path / "n.mcap").truth)
+    assert set(array(both.orbits, "object").tolist()) == {0, 1, 2, 3, 4}
+    r_km, _ = locate_objects(both, np.array([2]), np.array([both.scenario["t0_ns"]]))
+    np.testing.assert_allclose(r_km[0, :2], [42164 * 0.75**0.5, 21082.0], atol=1e-3)
+    # A log made again without such satellites leaves no sampled orbits behind.
+    simulate("four_sensor_geo", tmp_path / "n.mcap", hours=0.001)
+    assert read_truth(made.truth).orbits is None
 
 
 def same_instants(states, frames):

@@ -1,6 +1,7 @@
 """Exposures: all centroids of a sensor in a block of frames, and the source of each."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -9,9 +10,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from epipole.tasks.algorithms.simulation.ephemeris import earth_at, julian_years_since
+from epipole.tasks.algorithms.simulation.brightness import detection_probability
+from epipole.tasks.algorithms.simulation.ephemeris import (
+    directions_to_sun,
+    earth_at,
+    julian_years_since,
+)
+from epipole.tasks.algorithms.simulation.objects import SimulatedObjects
 from epipole.tasks.algorithms.simulation.optics import field_radius, image_place, on_image
-from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.algorithms.simulation.sensor import (
     Attitudes,
     SimulatedSensor,
@@ -33,6 +39,7 @@ STAR, TARGET, FALSE = 0, 1, 2
 MERGE_PX = 2.0  # stars closer than this are one spot
 FLUX_AT_ZERO = 1e6  # of magnitude 0, arbitrary units
 ABERRATION_ROOM = 1.5e-3  # [rad] aberration is 1.3e-4, proper motion in 30 years at most 1.5e-3
+OWN_BODY_KM = 0.1  # nearer is the satellite that carries the sensor, or is docked to it
 TARGETS_AT_ONCE = 500_000  # pairs of a frame and a target, to bound the memory
 
 
@@ -73,14 +80,13 @@ class Exposing:
     """Makes the exposures of a sensor, from its frames in order of time in blocks of any length."""
 
     def __init__(
-        self, sensor: SimulatedSensor, stars: StarField, targets: Array, target_magnitude: Array
+        self, sensor: SimulatedSensor, stars: StarField, objects: SimulatedObjects
     ) -> None:
-        self.sensor, self.stars = sensor, stars
-        self.targets, self.target_magnitude = targets, target_magnitude
+        self.sensor, self.stars, self.objects = sensor, stars, objects
         self.attitudes = Attitudes(sensor)
         self._radius = field_radius(sensor.optics)
         purposes = (
-            "jitter", "star drop", "target drop", "false count", "false place",
+            "jitter", "star drop", "target drop", "target fade", "false count", "false place",
             "false light", "centroid noise", "flux noise", "shuffle",
         )  # fmt: skip
         self._streams = {p: random_stream(sensor.seed, sensor.index, p) for p in purposes}
@@ -90,8 +96,8 @@ class Exposing:
     def expose(self, frame_number: Indices, time_ns: Indices) -> Exposures:
         """Return the exposures of these frames, without those that the sensor skips."""
         s = self.sensor
-        r_km, v_km_s = state_at(s.elements, seconds_since(s.t0_ns, time_ns))
-        attitude = self.attitudes.at(time_ns, r_km)
+        r_km, v_km_s = s.path.at(seconds_since(s.t0_ns, time_ns))
+        attitude = self.attitudes.at(time_ns, r_km, v_km_s)
         jitter = self._streams["jitter"].standard_normal((len(time_ns), 3)) * s.jitter
         attitude = Rotation.from_rotvec(jitter) * attitude if len(time_ns) else attitude
         if s.skip_hidden and len(time_ns):
@@ -128,29 +134,51 @@ class Exposing:
     def _target_spots(
         self, time_ns: Indices, r_km: Array, v_km_s: Array, earth_km_s: Array, R: Array
     ) -> TrueSpots:
-        s, n_targets = self.sensor, len(self.targets)
+        s, objects = self.sensor, self.objects
         t_s = seconds_since(s.t0_ns, time_ns)
+        u_to_sun = directions_to_sun(time_ns) if objects.need_sun else np.empty((len(t_s), 3))
         parts = []
-        step = max(TARGETS_AT_ONCE // max(n_targets, 1), 1)
-        bright = np.flatnonzero(self.target_magnitude <= s.magnitude_limit)
-        for low in range(0, len(time_ns) if len(bright) else 0, step):
-            of_frame = np.arange(low, min(low + step, len(time_ns)))
-            frame, target = (v.ravel() for v in np.meshgrid(of_frame, bright, indexing="ij"))
-            d, _ = received_from(self.targets[target], t_s[frame], r_km[frame], earth_km_s[frame])
+        step = max(TARGETS_AT_ONCE // max(len(objects), 1), 1)
+        for low in range(0, len(time_ns) if len(objects) else 0, step):
+            frame, target = self._in_cone(t_s, r_km, R, low, min(low + step, len(t_s)))
+            states_at = partial(objects.paths.at, body=target)
+            d, r_sent = received_from(states_at, t_s[frame], r_km[frame], earth_km_s[frame])
             distance = np.linalg.norm(d, axis=1)
             u = d / distance[:, None]
-            clear = ~hidden_by_earth(r_km[frame], u, distance)
-            frame, target, u = frame[clear], target[clear], u[clear]
-            x, y, ok = self._image(boost(u, (earth_km_s + v_km_s)[frame]), R[frame])
-            ok &= on_image(s.optics, x, y)
-            parts.append((frame[ok], target[ok], x[ok], y[ok]))
-        frame, target, x, y = (
+            ok = ~hidden_by_earth(r_km[frame], u, distance)
+            x, y, inside = self._image(boost(u, (earth_km_s + v_km_s)[frame]), R[frame])
+            ok &= inside & on_image(s.optics, x, y)
+            magnitude = objects.magnitudes(target, d, r_sent, u_to_sun[frame])
+            parts.append((frame[ok], target[ok], x[ok], y[ok], magnitude[ok]))
+        frame, target, x, y, magnitude = (
             np.concatenate([np.empty(0, k), *[p[i] for p in parts]])
-            for i, k in enumerate((np.int64, np.int64, float, float))
+            for i, k in enumerate((np.int64, np.int64, float, float, float))
         )
-        kept = self._streams["target drop"].random(len(frame)) >= s.target_drop
         kind = np.full(len(frame), TARGET, np.int8)
-        spots = TrueSpots(frame, x, y, self.target_magnitude[target], kind, target)
+        return self._detected(TrueSpots(frame, x, y, magnitude, kind, target))
+
+    def _in_cone(
+        self, t_s: Array, r_km: Array, R: Array, low: int, high: int
+    ) -> tuple[Indices, Indices]:
+        """Return the pairs of a frame (from low to high) and an object about its field."""
+        of_frame, of_target = np.arange(low, high), np.arange(len(self.objects))
+        frame, target = (v.ravel() for v in np.meshgrid(of_frame, of_target, indexing="ij"))
+        d = self.objects.paths.at(t_s[frame], target)[0] - r_km[frame]
+        along = np.einsum("ij,ij->i", d, R[frame, 2])
+        distance_km = np.linalg.norm(d, axis=1)
+        # In the light time d changes by less than 2e-4 of itself.
+        near = along >= distance_km * np.cos(self._radius + ABERRATION_ROOM)
+        near &= distance_km > OWN_BODY_KM
+        return frame[near], target[near]
+
+    def _detected(self, spots: TrueSpots) -> TrueSpots:
+        """Return the spots of objects that are bright enough and not missed."""
+        s = self.sensor
+        chance = detection_probability(spots.magnitude, s.object_limit, s.fade)
+        draw = self._streams["target fade"].random(len(chance))
+        bright = draw < chance  # a sharp limit has chances of 0 and 1
+        spots = _selected(spots, np.flatnonzero(bright))
+        kept = self._streams["target drop"].random(len(spots.frame)) >= s.target_drop
         return _selected(spots, np.flatnonzero(kept))
 
     def _false_spots(self, n_frames: int) -> TrueSpots:
@@ -232,7 +260,8 @@ class Exposing:
     ) -> Exposures:
         """Return the exposures with noise on their centroids, in random order in each frame."""
         s = self.sensor
-        brightness = 10 ** (0.4 * (spots.magnitude - s.magnitude_limit))  # 1 at the limit
+        limit = np.where(spots.kind == TARGET, s.object_limit, s.magnitude_limit)
+        brightness = 10 ** (0.4 * (spots.magnitude - limit))  # 1 at the limit
         sigma = np.hypot(s.sigma_px, s.faint_sigma_px * brightness)
         # Sorted by frame, so that the noise does not depend on the length of the blocks.
         order = np.lexsort((np.arange(len(spots.frame)), spots.frame))

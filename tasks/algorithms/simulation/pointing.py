@@ -12,13 +12,39 @@ Array = npt.NDArray[np.float64]
 def look_along(z: Array, up: Array, roll_rad: float = 0.0) -> Rotation:
     """Return the rotations, sensor from ICRS, with the boresight along (n, 3) directions.
 
-    The image's upper edge (-y) is towards `up` (3,), then rolled about the boresight.
+    The image's upper edge (-y) is towards `up`, (3,) or (n, 3), then rolled about the boresight.
     """
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
-    y = -(up - np.einsum("ij,j->i", z, up)[:, None] * z)
+    y = -(up - np.einsum("ij,ij->i", z, np.broadcast_to(up, z.shape))[:, None] * z)
     y /= np.linalg.norm(y, axis=1, keepdims=True)
     R_sensor_from_icrs = np.stack([np.cross(y, z), y, z], axis=1)
     return Rotation.from_rotvec([0.0, 0.0, roll_rad]) * Rotation.from_matrix(R_sensor_from_icrs)
+
+
+def body_fixed(
+    r_km: Array, v_km_s: Array, azimuth_rad: float, elevation_rad: float, roll_rad: float
+) -> Rotation:
+    """Return attitudes, sensor from ICRS, that are fixed to the sensor's own orbital frame.
+
+    The frame is radial (away from the Earth), across (the orbit's normal) and along, which
+    completes it. Up in the image is radial; where the boresight is within a thousandth of a
+    radian of that, it is along.
+
+    Parameters
+    ----------
+    r_km, v_km_s : (n, 3) float
+        Positions and velocities of the sensor, GCRF.
+    azimuth_rad, elevation_rad : float
+        Boresight, from along towards across, and from there towards radial.
+    """
+    radial = r_km / np.linalg.norm(r_km, axis=1, keepdims=True)
+    across = np.cross(r_km, v_km_s)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along = np.cross(across, radial)
+    level = np.cos(azimuth_rad) * along + np.sin(azimuth_rad) * across
+    z = np.cos(elevation_rad) * level + np.sin(elevation_rad) * radial
+    up = radial if abs(np.cos(elevation_rad)) > 1e-3 else along
+    return look_along(z, up, roll_rad)
 
 
 def spinning(start: Rotation, axis: Array, rate_rad_s: float, t_s: Array) -> Rotation:

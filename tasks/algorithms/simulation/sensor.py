@@ -9,8 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from epipole.tasks.algorithms.simulation.constants import SECOND_NS
 from epipole.tasks.algorithms.simulation.optics import TrueOptics
-from epipole.tasks.algorithms.simulation.orbits import state_at
-from epipole.tasks.algorithms.simulation.pointing import look_along, random_attitudes, spinning
+from epipole.tasks.algorithms.simulation.paths import Paths
+from epipole.tasks.algorithms.simulation.pointing import (
+    body_fixed,
+    look_along,
+    random_attitudes,
+    spinning,
+)
 from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
 
 Array = npt.NDArray[np.float64]
@@ -26,16 +31,18 @@ class SimulatedSensor:
     seed: int
     t0_ns: int
     duration_s: float
-    elements: Array  # (6,) at t0, see `state_at`
+    path: Paths  # of one body
     optics: TrueOptics
     # pointing
-    mode: str  # track, fixed, spin, random
-    followed: Array  # (6,) track
+    mode: str  # track, fixed, spin, body, random
+    followed: Paths | None  # track: of one body
     up: Array  # (3,)
     roll: float
     boresight: Array  # (3,) fixed, spin
     axis: Array  # (3,) spin
     spin_rate: float
+    azimuth: float  # body
+    elevation: float
     hold_s: float
     clearance: float | None
     skip_hidden: bool
@@ -49,6 +56,8 @@ class SimulatedSensor:
     outages_s: tuple[tuple[float, float], ...]
     # detection
     magnitude_limit: float
+    object_limit: float
+    fade: float  # mag
     sigma_px: float
     faint_sigma_px: float
     flux_error: float
@@ -63,6 +72,11 @@ class SimulatedSensor:
     position_bias_km: float
     prior_noise: float | None
     prior_bias: float
+    # faults
+    position_offset_km: Array  # (3,) GCRF
+    position_told: bool
+    prior_offset: Array  # (3,) about the sensor's axes
+    prior_told: bool
 
 
 def random_stream(seed: int, index: int, purpose: str) -> np.random.Generator:
@@ -107,20 +121,22 @@ class Attitudes:
             n = int(np.ceil(sensor.duration_s / sensor.hold_s)) + 2
             # One more hold on either side, for the states beyond the ends.
             middle: Array = (np.arange(n, dtype=float) - 0.5) * sensor.hold_s
-            r_km, _ = state_at(sensor.elements, middle)
+            r_km, _ = sensor.path.at(middle)
             rng = random_stream(sensor.seed, sensor.index, "attitudes")
             self._held = random_attitudes(rng, r_km, sensor.clearance)
 
-    def at(self, time_ns: Nanoseconds, r_km: Array) -> Rotation:
-        """Return attitudes, sensor from ICRS, at times with sensor positions (n, 3) GCRF."""
+    def at(self, time_ns: Nanoseconds, r_km: Array, v_km_s: Array) -> Rotation:
+        """Return attitudes, sensor from ICRS, at times with sensor states (n, 3) GCRF."""
         s = self.sensor
         t_s = seconds_since(s.t0_ns, time_ns)
         if s.mode == "random":
             hold = np.floor((t_s * s.rate_hz - s.phase + 0.5) / (s.hold_s * s.rate_hz)).astype(int)
             return self._held[np.clip(hold + 1, 0, len(self._held) - 1)]
-        if s.mode == "track":
-            followed_km, _ = state_at(s.followed, t_s)
+        if s.followed is not None:
+            followed_km, _ = s.followed.at(t_s)
             return look_along(followed_km - r_km, s.up, s.roll)
+        if s.mode == "body":
+            return body_fixed(r_km, v_km_s, s.azimuth, s.elevation, s.roll)
         start = look_along(s.boresight[None, :], s.up, s.roll)
         if s.mode == "fixed":
             return start[np.zeros(len(t_s), int)]
@@ -144,17 +160,35 @@ def state_times(sensor: SimulatedSensor) -> Nanoseconds:
 
 
 class Beliefs:
-    """Reported positions and attitudes: the truth plus a bias and noise."""
+    """Reported positions and attitudes: the truth plus a bias, a fault and noise."""
 
     def __init__(self, sensor: SimulatedSensor) -> None:
         self.sensor = sensor
         self._bias_km = self._stream("position bias").standard_normal(3) * sensor.position_bias_km
+        self._bias_km += sensor.position_offset_km
         self._bias = self._stream("attitude bias").standard_normal(3) * sensor.prior_bias
+        self._bias += sensor.prior_offset
         self._position_noise = self._stream("position noise")
         self._attitude_noise = self._stream("attitude noise")
 
     def _stream(self, purpose: str) -> np.random.Generator:
         return random_stream(self.sensor.seed, self.sensor.index, purpose)
+
+    @property
+    def position_sigma_km(self) -> float:
+        """Return the reported sigma per axis of positions. An offset counts where it is told."""
+        s = self.sensor
+        told = _per_axis(s.position_offset_km) if s.position_told else 0.0
+        return float(np.hypot(np.hypot(s.position_noise_km, s.position_bias_km), told))
+
+    @property
+    def attitude_sigma(self) -> float:
+        """Return the reported sigma per axis of attitudes [rad], 0 where none are reported."""
+        s = self.sensor
+        if s.prior_noise is None:
+            return 0.0
+        told = _per_axis(s.prior_offset) if s.prior_told else 0.0
+        return float(np.hypot(np.hypot(s.prior_noise, s.prior_bias), told))
 
     def position(self, r_km: Array) -> Array:
         """Return reported positions for true ones; call in order of time."""
@@ -167,3 +201,8 @@ class Beliefs:
             return None
         noise = self._attitude_noise.standard_normal((len(true), 3)) * self.sensor.prior_noise
         return Rotation.from_rotvec(self._bias + noise) * true
+
+
+def _per_axis(offset: Array) -> float:
+    """Return the root mean square of the components of an offset (3,)."""
+    return float(np.linalg.norm(offset) / np.sqrt(3.0))

@@ -1,10 +1,11 @@
 """Lines of sight: light time, aberration, and the Earth in between."""
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM, LIGHT_KM_S
-from epipole.tasks.algorithms.simulation.orbits import state_at
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +32,10 @@ def boost(n: Array, v_km_s: Array) -> Array:
 
 
 def received_from(
-    elements: Array, t_s: Array, r_sensor_km: Array, v_earth_km_s: Array
+    states_at: Callable[[Array], tuple[Array, Array]],
+    t_s: Array,
+    r_sensor_km: Array,
+    v_earth_km_s: Array,
 ) -> tuple[Array, Array]:
     """Return barycentric vectors from sensors to objects at the emission of the received light.
 
@@ -39,10 +43,10 @@ def received_from(
 
     Parameters
     ----------
-    elements : (n, 6) float
-        Orbits of the objects, see `state_at`.
+    states_at : callable
+        Geocentric positions [km] and velocities [km/s] of the n objects, (n, 3), at (n,) times.
     t_s : (n,) float
-        Reception, seconds since the elements' epoch.
+        Reception, on the same time scale as `states_at`.
     r_sensor_km : (n, 3) float
         Geocentric position of the sensor at reception, GCRF.
     v_earth_km_s : (n, 3) float
@@ -55,10 +59,10 @@ def received_from(
     r_km : (n, 3) float
         Geocentric position of the object at emission.
     """
-    r, v = state_at(elements, t_s)
+    r, v = states_at(t_s)
     tau = np.linalg.norm(r - r_sensor_km, axis=1) / LIGHT_KM_S
     sent = tau
-    r, v = state_at(elements, t_s - sent)
+    r, v = states_at(t_s - sent)
     for _ in range(3):
         # Motion is linear to 1e-6 km over the remaining 1e-5 s, and the Earth's over 0.3 s.
         r_sent = r - v * (tau - sent)[:, None]

@@ -16,6 +16,13 @@ BAD_SCENES = {
     "unknown field sensors.0.colour": {"colour": "red"},
     "sensors.0.id = '../x': ": {"id": "../x"},
     'sensors.0.pointing: pointing "fixed" takes ra_deg': {"pointing": {"mode": "fixed"}},
+    "sensors.0.orbit: satellites goes with elements": {"orbit": {"a_km": 7e3, "satellites": ["A"]}},
+    "sensors.0.orbit: i_deg does not go with elements": {
+        "orbit": {"elements": "a.tle", "i_deg": 3.0}
+    },
+    'sensors.0.pointing: pointing "track" takes one of': {
+        "pointing": {"target": 0, "place_km": (1.0, 2.0, 3.0)}
+    },
     "sensor a tracks target 3 of 0": {"pointing": {"target": 3}},
     "sensors.0.detection.star_drop = 2.0: input": {"detection": {"star_drop": 2.0}},
 }
@@ -26,6 +33,18 @@ def test_a_bad_scene_is_one_line_that_names_the_field(says):
     with pytest.raises(SceneError, match="^test: .*" + re.escape(says)) as error:
         scene_of(BAD_SCENES[says])
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("says", "target"),
+    [
+        ("magnitude or standard_magnitude", {"magnitude": 8.0, "standard_magnitude": 3.0}),
+        ("spread_km does not go", {"spread_km": 3.0, "orbit": {"elements": "a.tle"}}),
+    ],
+)
+def test_objects_that_contradict_themselves_are_refused(says, target):
+    with pytest.raises(SceneError, match=rf"^test: targets.0: .*{says}"):
+        scene_of(targets=[{"orbit": {"a_km": 7000.0}} | target])
 
 
 def test_a_scene_that_is_not_toml_or_lacks_a_field_is_refused():

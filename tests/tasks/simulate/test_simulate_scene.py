@@ -10,10 +10,13 @@ from epipole.io.logs.reader import read_log
 from epipole.io.simulation.truth import read_truth
 from epipole.schemas.errors import SceneError
 from epipole.tasks.algorithms.simulation.exposures import Exposing
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.objects import SimulatedObjects
+from epipole.tasks.algorithms.simulation.paths import two_body_paths
 from epipole.tasks.algorithms.simulation.sensor import frame_times
 from epipole.tasks.algorithms.simulation.star_field import star_field
 from epipole.tasks.simulate import simulate_scene as stage
+
+NO_OBJECTS = SimulatedObjects(two_body_paths(np.empty((0, 6))), np.empty(0), np.empty(0, bool))
 
 
 def exposures(scene):
@@ -101,7 +104,7 @@ def test_close_stars_are_one_spot_of_the_brighter_one_at_the_middle_of_the_light
         ("first", little_sky([(0, 0)], [5.0])),
         ("second", little_sky([(0, apart_px)], [5.0])),
     ):
-        seen = Exposing(sensor, sky, np.empty((0, 6)), np.empty(0)).expose(number, time_ns)
+        seen = Exposing(sensor, sky, NO_OBJECTS).expose(number, time_ns)
         places[name] = np.stack([seen.x_px, seen.y_px], axis=1), seen.source, seen.flux
     both, ids, flux = places["both"]
     first, second = places["first"][0][0], places["second"][0][0]
@@ -176,7 +179,7 @@ def test_pointing_follows_stands_spins_and_jumps():
         axes[mode] = seen.attitude.as_matrix()[:, 2]
         t_s = np.arange(20.0)
         if mode == "track":
-            d_km = state_at(simulation.targets[0], t_s)[0] - seen.r_km
+            d_km = simulation.objects.paths.at(t_s)[0] - seen.r_km
             along = d_km / np.linalg.norm(d_km, axis=1)[:, None]
             np.testing.assert_allclose(axes[mode], along, atol=1e-12)
     ra = np.degrees(np.unwrap(np.arctan2(axes["spin"][:, 1], axes["spin"][:, 0])))
@@ -184,3 +187,72 @@ def test_pointing_follows_stands_spins_and_jumps():
     np.testing.assert_allclose(axes["fixed"], axes["spin"][:1].repeat(20, axis=0), atol=1e-12)
     jumps = np.einsum("ij,ij->i", axes["random"][1:], axes["random"][:-1])
     assert len(np.unique(np.round(jumps, 6))) == 19
+
+
+def test_body_fixed_and_place_pointing_hold_their_angles():
+    body = {"mode": "body", "azimuth_deg": 90.0, "elevation_deg": 30.0}
+    (seen,) = exposures(scene_of({"pointing": body}, duration_s=2000.0))
+    r, v = (a / np.linalg.norm(a, axis=1)[:, None] for a in (seen.r_km, seen.v_km_s))
+    across = np.cross(r, v)
+    axes = seen.attitude.as_matrix()
+    np.testing.assert_allclose(np.einsum("ij,ij->i", axes[:, 2], r), 0.5, atol=1e-12)
+    np.testing.assert_allclose(np.einsum("ij,ij->i", axes[:, 2], across), 0.75**0.5, atol=1e-12)
+    # Up in the image, -y, is away from the Earth: no part of it is along the motion.
+    np.testing.assert_allclose(np.einsum("ij,ij->i", axes[:, 1], v), 0.0, atol=1e-12)
+    assert (np.einsum("ij,ij->i", axes[:, 1], r) < 0).all()
+    (up,) = exposures(scene_of({"pointing": body | {"elevation_deg": 90.0}}))
+    assert np.isfinite(up.attitude.as_matrix()).all()
+    np.testing.assert_allclose(up.attitude.as_matrix()[:, 2], up.r_km / 7000.0, atol=1e-9)
+    place = np.array([9000.0, 9000.0, 100.0])
+    (seen,) = exposures(scene_of({"pointing": {"place_km": tuple(place)}}))
+    along = (place - seen.r_km) / np.linalg.norm(place - seen.r_km, axis=1)[:, None]
+    np.testing.assert_allclose(seen.attitude.as_matrix()[:, 2], along, atol=1e-12)
+
+
+def test_an_object_is_seen_where_it_is_near_enough_and_fainter_with_distance():
+    # The sensor goes by below the object: 3,090 km are the limit.
+    target = {"orbit": {"a_km": 9000.0, "mean_anomaly_deg": 20.0}, "standard_magnitude": 3.55}
+    detection = {"flux_error": 0.0, "target_drop": 0.0, "sigma_px": 0.1}
+    sensor = {
+        "orbit": {"a_km": 8000.0},
+        "pointing": {"target": 0},
+        "detection": detection,
+        "rate_hz": 0.1,
+        "magnitude_limit": 6.0,
+    }
+    (seen,) = exposures(scene_of(sensor, targets=[target], duration_s=5000.0))
+    simulation = stage.simulate_scene(scene_of(sensor, targets=[target]))
+    r_km, _ = simulation.objects.paths.at((seen.time_ns - simulation.t0_ns) / 1e9)
+    distance = np.linalg.norm(r_km - seen.r_km, axis=1)
+    frame = np.repeat(np.arange(len(distance)), np.diff(seen.offsets))
+    shown = frame[seen.kind == 1]
+    magnitude = 6.0 - 2.5 * np.log10(seen.flux[seen.kind == 1] / 1e6 * 10 ** (0.4 * 6.0))
+    np.testing.assert_allclose(magnitude, 3.55 + 5 * np.log10(distance[shown] / 1e3), atol=1e-3)
+    limit_km = 1e3 * 10 ** ((6.0 - 3.55) / 5)
+    assert set(shown) == set(np.flatnonzero(distance < limit_km))
+    assert 10 < len(shown) < len(distance) - 10
+    # With a limit of its own, half of the objects at the limit are detected.
+    shown = {}
+    for fade in (0.0, 0.5):
+        soft = sensor | {"object_limit": 5.0, "detection": detection | {"fade": fade}}
+        steady = {"orbit": target["orbit"], "magnitude": 5.0}
+        (seen,) = exposures(scene_of(soft, targets=[steady], duration_s=2000.0))
+        shown[fade] = np.sum(seen.kind == 1)
+    assert shown[0.0] == 200
+    assert abs(shown[0.5] - 100) < 4 * np.sqrt(50)
+
+
+def test_shadow_and_phase_take_light_from_objects():
+    sensor = {"orbit": {"a_km": 7000.0}, "pointing": {"target": 0}, "rate_hz": 0.05}
+    target = {"orbit": {"a_km": 7000.0, "mean_anomaly_deg": 5.0}, "magnitude": 6.0}
+    counts, flux = {}, {}
+    for name in ("plain", "earth_shadow", "phase_law"):
+        switch = {} if name == "plain" else {name: True}
+        scene = scene_of(sensor, targets=[target], duration_s=5800.0, **switch)
+        (seen,) = exposures(scene)
+        counts[name], flux[name] = np.sum(seen.kind == 1), seen.flux[seen.kind == 1]
+    # A low orbit in the plane of the Sun at the equinox is dark for some 35 of 97 minutes.
+    assert counts["plain"] == 290
+    assert 0.60 < counts["earth_shadow"] / counts["plain"] < 0.68
+    assert counts["phase_law"] < counts["plain"]
+    assert flux["phase_law"].min() < 0.5 * flux["plain"].min()

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from functools import partial
 from pathlib import Path
 
 import erfa
@@ -152,7 +153,7 @@ def test_objects_are_seen_where_skyfield_sees_them():
         expected = apparent(observer, Orbiting(high, -9002))
         r_km, v_km_s = state_at(low, np.array([t_s]))
         _, earth_km_s = earth_at(time_ns(t_s))
-        d_km, _ = received_from(high[None, :], np.array([t_s]), r_km, earth_km_s)
+        d_km, _ = received_from(partial(state_at, high[None, :]), np.array([t_s]), r_km, earth_km_s)
         u = boost(d_km / np.linalg.norm(d_km), earth_km_s + v_km_s)
         assert angle(u, expected)[0] < 0.1 * MAS
 
@@ -253,11 +254,15 @@ def test_a_whole_image_is_what_skyfield_and_a_pinhole_make_of_it():
         for i in range(len(seen.time_ns)):
             part = slice(seen.offsets[i], seen.offsets[i + 1])
             kind, source = seen.kind[part], seen.source[part].tolist()
-            observer = Orbiting(sensor.elements, -9001).at(moment((seen.time_ns[i] - T0_NS) / 1e9))
+            observer = Orbiting(sensor.path.elements[0], -9001).at(
+                moment((seen.time_ns[i] - T0_NS) / 1e9)
+            )
             at = [k for k in range(len(kind)) if kind[k] == 0 and source[k] not in blended]
             u = [apparent(observer, star_of(stars, np.array([row[source[k]] for k in at])))]
             targets = [k for k in range(len(kind)) if kind[k] == 1]
-            orbits = [Orbiting(simulation.targets[source[k]], -9002) for k in targets]
+            orbits = [
+                Orbiting(simulation.objects.paths.elements[source[k]], -9002) for k in targets
+            ]
             u = np.concatenate(u + [apparent(observer, orbit) for orbit in orbits])
             q = seen.attitude[i].as_quat()
             x, y, z = Rotation.from_quat(q).apply(u).T
@@ -299,7 +304,9 @@ def test_it_reproduces_the_logs_of_another_simulator_to_their_noise(name):
         orbits = np.array([target["elements"] for target in scenario["targets"]])
         t_s = (t_ns - scenario["t0_ns"]) / 1e9
         of = orbits[source[~is_star]]
-        d[~is_star], _ = received_from(of, t_s[~is_star], r_km[~is_star], earth_km_s[~is_star])
+        d[~is_star], _ = received_from(
+            partial(state_at, of), t_s[~is_star], r_km[~is_star], earth_km_s[~is_star]
+        )
     u = boost(d / np.linalg.norm(d, axis=1, keepdims=True), earth_km_s + v_km_s)
     x, y = image_place(optics, q.apply(u))
     off = np.stack([spots["column"].to_numpy() - x, spots["row"].to_numpy() - y], axis=1) / sigma_px

@@ -1,0 +1,20 @@
+"""A published element set: the mean elements of a satellite for SGP4."""
+
+from typing import NamedTuple
+
+
+class ElementSet(NamedTuple):
+    """The mean elements of one satellite at their epoch, of WGS 72."""
+
+    name: str  # empty where the file has none
+    number: int  # of the satellite catalogue
+    epoch_ns: int  # UTC since 1970
+    # The arguments of `sgp4init`, in its order: days since 1949 December 31 0h UTC, 1 / Earth
+    # radii, rad/min^2 (half the first derivative), rad/min^3 (a sixth of the second), and angles
+    # in rad; the mean motion in rad/min.
+    elements: tuple[float, ...]
+
+    @property
+    def label(self) -> str:
+        """Return its name and number, for messages."""
+        return f"{self.name} ({self.number})" if self.name else str(self.number)
