@@ -81,6 +81,14 @@ CAMERAS = schema(
     ],
 )
 
+USED_SIGMA = column(
+    "used_position_sigma_km",
+    F64,
+    unit="km",
+    null=True,
+    doc="1-sigma per axis; that of the settings where the log tells none.",
+)
+
 PLACES = schema(
     "places",
     "One row per frame, in the order of exposures: the state interpolated to the frame's time.",
@@ -90,7 +98,8 @@ PLACES = schema(
             "{}_km", unit="km", frame="GCRF", null=True, doc="Position; null where no state is near"
         ),
         *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity"),
-        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma per axis."),
+        column("position_sigma_km", F64, unit="km", null=True, doc="Told 1-sigma per axis."),
+        USED_SIGMA,
         *[
             column(
                 f"q{a}",
@@ -117,7 +126,7 @@ SOLUTIONS = schema(
             null=True,
             doc="Covariance of the small rotation from the true to the reported sensor axes.",
         ),
-        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma per axis."),
+        USED_SIGMA,
         column("camera", I64, doc="Row of `cameras` that is valid for the frame."),
     ],
 )
@@ -148,6 +157,8 @@ VIEWS = schema(
             doc="Error that is common to all frames of the sensor.",
             names=TANGENT_AXES,
         ),
+        time_column("first_fitted", doc="First detection that the direction was fitted to, UTC."),
+        time_column("last_fitted", doc="Last detection that the direction was fitted to, UTC."),
         *axes("{}_km", unit="km", frame="GCRF", doc="Sensor position at the epoch"),
         column("position_sigma_km", F64, unit="km", doc="1-sigma per axis."),
         column("pixel_rad", F64, unit="rad", doc="Angle a pixel spans."),

@@ -38,8 +38,8 @@ def fit_states(
 ) -> pa.Table:
     """Return a state for each object and arc, at the arc's middle epoch.
 
-    Epochs nearer to each other than twice the half-window share detections, so only epochs that
-    are farther apart are used. Each sensor's common error is estimated together with the state.
+    Only the epochs of `independent` positions are used: these share no detection. Each
+    sensor's common error is estimated together with the state.
     """
     rows = _used_views(views, associations, positions, settings)
     if not len(rows):
@@ -90,13 +90,13 @@ def refuse_misfits(states: pa.Table) -> FittingStates:
 def _used_views(
     views: pa.Table, associations: pa.Table, positions: pa.Table, settings: Settings
 ) -> pl.DataFrame:
-    """Return the views used for positions, at epochs far enough apart, with their arc numbers."""
+    """Return the views used for independent positions, with their arc numbers."""
     key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
     claimed = to_polars(associations).filter("used").select([*key, "object_id"])
-    solved = to_polars(positions).select("epoch", "object_id").sort("object_id", "epoch")
-    name = solved["object_id"].to_numpy()
-    epoch_ns = solved["epoch"].cast(pl.Int64).to_numpy()
-    arc, kept = _arcs(name, epoch_ns, settings.states.arc_s, 2 * settings.alignment.window_s)
+    solved = to_polars(positions).select("epoch", "object_id", "independent")
+    solved = solved.sort("object_id", "epoch")
+    name, kept = solved["object_id"].to_numpy(), solved["independent"].to_numpy()
+    arc = _arcs(name, solved["epoch"].cast(pl.Int64).to_numpy(), settings.states.arc_s)
     arc = np.where(_long_enough(arc, kept, settings.states.min_epochs), arc, -1)
     solved = solved.with_columns(arc=arc).filter(pl.Series(kept & (arc >= 0)))
     return (
@@ -108,21 +108,15 @@ def _used_views(
     )
 
 
-def _arcs(
-    name: npt.NDArray[np.object_], epoch_ns: Indices, arc_s: float, apart_s: float
-) -> tuple[Indices, npt.NDArray[np.bool_]]:
-    """Return the arc of each epoch of sorted objects, and which epochs are used."""
-    arc, kept = np.zeros(len(name), np.int64), np.zeros(len(name), bool)
-    number, begun, last = -1, 0, 0
+def _arcs(name: npt.NDArray[np.object_], epoch_ns: Indices, arc_s: float) -> Indices:
+    """Return the arc of each epoch of sorted objects."""
+    arc = np.zeros(len(name), np.int64)
+    number, begun = -1, 0
     for k, t in enumerate(epoch_ns.tolist()):
         if k == 0 or name[k] != name[k - 1] or t - begun > arc_s * 1e9:
             number, begun = number + 1, t
-            # An epoch may be near the last one of the arc before: their errors are correlated, but
-            # each arc has a covariance of its own.
-            last = t - round(apart_s * 1e9)
-        arc[k], kept[k] = number, t - last >= apart_s * 1e9
-        last = t if kept[k] else last
-    return arc, kept
+        arc[k] = number
+    return arc
 
 
 def _long_enough(arc: Indices, kept: npt.NDArray[np.bool_], least: int) -> npt.NDArray[np.bool_]:

@@ -63,6 +63,7 @@ class _Groups(NamedTuple):
     used: npt.NDArray[np.bool_]
     mean_range_km: Array
     velocity_km_s: Array
+    independent: npt.NDArray[np.bool_]
 
     @property
     def apparent_km(self) -> Array:
@@ -90,6 +91,7 @@ def solve_positions(
     groups = _solve(views, object_number, settings)
     if span is not None:
         groups = _within(groups, span)
+    groups = groups._replace(independent=_independent(groups, span))
     pairs = _pair_up(groups)
     return Solved(
         _association_table(groups, pairs),
@@ -120,7 +122,7 @@ def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> _Grou
         velocity = _velocities(epoch_ns[start], number[start], x_km)
     return _Groups(
         views, offsets, object_names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
-        x_km, cov_km2, chi2, used, mean_range, velocity,
+        x_km, cov_km2, chi2, used, mean_range, velocity, np.zeros(len(start), bool),
     )  # fmt: skip
 
 
@@ -145,7 +147,30 @@ def _within(groups: _Groups, span: Span) -> _Groups:
         used=groups.used[rows],
         mean_range_km=groups.mean_range_km[kept],
         velocity_km_s=groups.velocity_km_s[kept],
+        independent=groups.independent[kept],
     )
+
+
+def _independent(groups: _Groups, span: Span | None) -> npt.NDArray[np.bool_]:
+    """Return the groups to use where no two may share a detection: in order of time, each that
+    shares none with those before.
+
+    Where a detection lies outside the span, the neighbouring span may use it: not such a group.
+    """
+    first_ns, last_ns = array(groups.views, "first_fitted"), array(groups.views, "last_fitted")
+    apart = np.isfinite(groups.chi2)
+    if span is not None:
+        outside = ~(span.holds(first_ns) & span.holds(last_ns))
+        apart[groups.group[outside & groups.used]] = False
+    track = array(groups.views, "tracklet_id").tolist()
+    bounds = groups.offsets.tolist()
+    used_until = dict.fromkeys(track, -1)
+    for g in np.flatnonzero(apart).tolist():
+        views = [v for v in range(bounds[g], bounds[g + 1]) if groups.used[v]]
+        apart[g] = all(first_ns[v] > used_until[track[v]] for v in views)
+        if apart[g]:
+            used_until.update({track[v]: last_ns[v] for v in views})
+    return apart
 
 
 def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
@@ -264,6 +289,7 @@ def _position_table(groups: _Groups) -> pa.Table:
         "n_rejected": np.diff(groups.offsets).astype(np.int32) - n_used,
         "residual_px": _residual_px(groups),
         "chi2": groups.chi2,
+        "independent": groups.independent,
     }
     return table(POSITIONS, {name: values[solved] for name, values in columns.items()})
 

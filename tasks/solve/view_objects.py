@@ -145,7 +145,7 @@ def _view_table(
     v = np.nan_to_num(frames.v_gcrf_km_s)
     u_still = aberrate(tracklets.u_icrs, -v[tracklets.frame])
     at_s = (array(epochs, "epoch")[row] - origin) / 1e9
-    u, w, noise, bias, _ = directions_at(
+    u, w, noise, bias, fitted = directions_at(
         bounds[tracklet],
         bounds[tracklet + 1],
         at_s,
@@ -174,6 +174,8 @@ def _view_table(
         **unstack("w{}_rad_s", w),
         **unstack_covariance("cov_noise_{}_rad2", cov_noise, TANGENT_AXES),
         **unstack_covariance("cov_bias_{}_rad2", cov_bias, TANGENT_AXES),
+        "first_fitted": frames.time_ns[tracklets.frame[fitted[:, 0]]],
+        "last_fitted": frames.time_ns[tracklets.frame[fitted[:, 1] - 1]],
         **unstack("{}_km", r_km),
         "position_sigma_km": frames.position_sigma_km[served],
         "pixel_rad": np.full(len(row), camera.pixel_rad),

@@ -47,7 +47,7 @@ class _MotionPlaces(NamedTuple):
     w: Array
     noise: Array
     bias: Array
-    n: npt.NDArray[np.int64]
+    fitted: npt.NDArray[np.int64]
 
 
 @kernel
@@ -193,7 +193,7 @@ def _evaluate(queries, detections, places):
         nearest = _nearest(t, first, last, at)
         sigma = np.sqrt(np.trace(noise[nearest]) / 2)
         lo, hi, rate, half = _window(t, u, first, last, at, sigma, queries.widest)
-        places.n[q] = hi - lo
+        places.fitted[q, 0], places.fitted[q, 1] = lo, hi
         value, slope, unmodelled = _fit(detections, lo, hi, at, rate, half, queries.unknown_rate)
         for a in range(3):
             mean, moving = 0.0, 0.0
@@ -243,8 +243,8 @@ def directions_at(
         Rates of change [rad/s].
     cov_noise, cov_bias : (q, 3, 3) float
         Propagated errors [rad^2].
-    n : (q,) int
-        Number of detections fitted.
+    fitted : (q, 2) int
+        The detections that were fitted: ``fitted[k, 0]:fitted[k, 1]``.
 
     Notes
     -----
@@ -266,8 +266,8 @@ def directions_at(
     )
     places = _MotionPlaces(
         np.empty((q, 3)), np.empty((q, 3)), np.empty((q, 3, 3)), np.empty((q, 3, 3)),
-        np.empty(q, np.int64),
+        np.empty((q, 2), np.int64),
     )  # fmt: skip
     _evaluate(queries, detections, places)
     u = places.u / np.linalg.norm(places.u, axis=1, keepdims=True)
-    return u, places.w, places.noise, places.bias, places.n
+    return u, places.w, places.noise, places.bias, places.fitted

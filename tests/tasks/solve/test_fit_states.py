@@ -16,7 +16,7 @@ T0 = 1_554_091_200_000_000_000
 SETTINGS = Settings()
 
 
-def night(seed, times):
+def night(seed, times, independent=None):
     """Views of one object, claimed, and its positions with an error of some kilometres."""
     arcs = trial(seed, times=times)
     n = len(arcs.time_s)
@@ -37,6 +37,7 @@ def night(seed, times):
         for ab, i, j in (("11", 0, 0), ("12", 0, 1), ("22", 1, 1)):
             views[f"cov_{which}_{ab}_rad2"] = cov[:, i, j]
     views |= {"position_sigma_km": arcs.sigma_km, "pixel_rad": np.full(n, 7e-5)}
+    views |= {"first_fitted": epoch, "last_fitted": epoch}
     claimed = shared | {"object_id": ["a"] * n, "epipolar_px": np.zeros(n),
                         "used": np.ones(n, bool)}  # fmt: skip
     at = np.unique(arcs.time_s)
@@ -45,6 +46,7 @@ def night(seed, times):
     positions = {"epoch": T0 + np.round(at * 1e9).astype(np.int64), "object_id": ["a"] * len(at)}
     positions["time"] = positions["epoch"]
     positions |= {f"{a}_km": where[:, i] for i, a in enumerate("xyz")}
+    positions["independent"] = np.ones(len(at), bool) if independent is None else independent
     for name in POSITIONS.names:
         if name not in positions:
             integer = name in ("n_sensors", "n_rejected")
@@ -74,8 +76,8 @@ def test_errors_of_states_agree_with_their_covariances():
 
 
 def test_epochs_that_share_detections_are_not_used():
-    states = fit_states(*night(1, np.arange(0.0, 61)), SETTINGS)
-    assert states["n_epochs"].to_pylist() == [6]  # of 61, every twelfth second: 0 to 60
+    states = fit_states(*night(1, np.arange(0.0, 61), np.arange(61) % 12 == 0), SETTINGS)
+    assert states["n_epochs"].to_pylist() == [6]
 
 
 def test_a_long_pass_is_cut_into_arcs():
