@@ -131,7 +131,7 @@ def _starts(positions: pa.Table, object_id: npt.NDArray[np.object_], middle_ns: 
     begins = np.flatnonzero(np.append(True, name[1:] != name[:-1]))
     offsets = np.append(begins, len(name)).astype(np.int64)
     x_km = stack(rows, "{}_km")
-    v_km_s = velocities(offsets, (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)
+    v_km_s, _ = velocities(offsets, (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)
     at = dict(zip(zip(name, epoch_ns.tolist(), strict=True), range(len(name)), strict=True))
     chosen = [at[key] for key in zip(object_id, middle_ns.tolist(), strict=True)]
     return np.hstack([x_km[chosen], v_km_s[chosen]])

@@ -89,7 +89,7 @@ def _solve(
     associated = associate_objects(views, tracklets, frames, cameras, settings)
     solved = solve_positions(associated.views, associated.object_number, settings, span)
     states, misfits = refuse_misfits(
-        fit_states(associated.views, solved.associations, solved.positions, settings)
+        fit_states(solved.views, solved.associations, solved.positions, settings)
     )
     of_associations = span.of(associated.rejects, "time")
     rejects = [span.of(of_sensors, "time"), of_associations, solved.rejects, misfits]
@@ -109,7 +109,7 @@ def _solve(
             solved.associations,
         ),
         "clock_views": collect_clock_views(
-            views_within, solved.associations, solved.positions, frames, settings
+            views_within, solved.views, solved.associations, solved.positions, settings
         ),
     }
 

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, empty, table, unstack, unstack_covariance
+from epipole.schemas.bridge import array, empty, nullable, table, unstack, unstack_covariance
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import VIEWS
@@ -145,7 +145,7 @@ def _view_table(
     v = np.nan_to_num(frames.v_gcrf_km_s)
     u_still = aberrate(tracklets.u_icrs, -v[tracklets.frame])
     at_s = (array(epochs, "epoch")[row] - origin) / 1e9
-    u, w, noise, bias, fitted = directions_at(
+    motion = directions_at(
         bounds[tracklet],
         bounds[tracklet + 1],
         at_s,
@@ -158,10 +158,11 @@ def _view_table(
     )
     centroid, missed = _centroids(tracklets, query)
     q = interpolate_quaternions((frames.time_ns - origin) / 1e9, frames.q_sensor_from_icrs, at_s)
+    u, fitted = motion.u, motion.fitted
     u_sensor = np.einsum("nij,nj->ni", matrix_from_quaternion(q), aberrate(u, v[served]))
     x_px, y_px = project(camera, u_sensor)
-    r_km = _carried(frames, served, array(epochs, "dt_s")[row])
-    cov_noise, cov_bias = on_tangent_plane(u, noise), on_tangent_plane(u, bias)
+    r_km, v_km_s = _carried(frames, served, array(epochs, "dt_s")[row])
+    cov_noise, cov_bias = (on_tangent_plane(u, cov) for cov in motion[2:4])
     kept = np.isfinite(x_px) & np.isfinite(r_km[:, 0])
     columns = {
         "epoch": array(epochs, "epoch")[row],
@@ -171,16 +172,20 @@ def _view_table(
         "x_px": x_px,
         "y_px": y_px,
         **unstack("u{}", u),
-        **unstack("w{}_rad_s", w),
+        **unstack("w{}_rad_s", motion.w),
         **unstack_covariance("cov_noise_{}_rad2", cov_noise, TANGENT_AXES),
         **unstack_covariance("cov_bias_{}_rad2", cov_bias, TANGENT_AXES),
         "first_fitted": frames.time_ns[tracklets.frame[fitted[:, 0]]],
         "last_fitted": frames.time_ns[tracklets.frame[fitted[:, 1] - 1]],
+        **unstack("moment_{}", motion.moments, "123"),
+        "unmodelled_rad2": motion.unmodelled,
         **unstack("{}_km", r_km),
         "position_sigma_km": frames.position_sigma_km[served],
         "pixel_rad": np.full(len(row), camera.pixel_rad),
     }
     columns = {key: values[kept] for key, values in columns.items()}
+    velocity = unstack("sensor_v{}_km_s", v_km_s[kept])
+    columns |= {name: nullable(values) for name, values in velocity.items()}
     columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
     return table(VIEWS, columns).sort_by([("epoch", "ascending"), ("tracklet_id", "ascending")])
 
@@ -197,12 +202,12 @@ def _centroids(
     return tracklets.centroid[at], key[at] != wanted
 
 
-def _carried(frames: Frames, served: Indices, dt_s: Array) -> Array:
-    """Return the sensor's positions at the epochs, from those at the frames that serve them.
+def _carried(frames: Frames, served: Indices, dt_s: Array) -> tuple[Array, Array]:
+    """Return the sensor's positions and velocities at the epochs, from those at their frames.
 
     Gravity is included: in one second it bends an orbit by 4 m.
     """
     r, v = frames.r_gcrf_km[served], frames.v_gcrf_km_s[served]
     back = -dt_s[:, None]  # dt is frame minus epoch
     gravity = -GM_KM3_S2 * r / np.linalg.norm(r, axis=1, keepdims=True) ** 3
-    return r + np.nan_to_num(v) * back + gravity * back**2 / 2
+    return r + np.nan_to_num(v) * back + gravity * back**2 / 2, v + gravity * back

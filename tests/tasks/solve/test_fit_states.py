@@ -37,7 +37,9 @@ def night(seed, times, independent=None):
         for ab, i, j in (("11", 0, 0), ("12", 0, 1), ("22", 1, 1)):
             views[f"cov_{which}_{ab}_rad2"] = cov[:, i, j]
     views |= {"position_sigma_km": arcs.sigma_km, "pixel_rad": np.full(n, 7e-5)}
-    views |= {"first_fitted": epoch, "last_fitted": epoch}
+    views |= {"first_fitted": epoch, "last_fitted": epoch, "unmodelled_rad2": np.zeros(n)}
+    views |= {f"moment_{k}": np.zeros(n) for k in "123"}
+    views |= {f"sensor_v{a}_km_s": np.zeros(n) for a in "xyz"}
     claimed = shared | {"object_id": ["a"] * n, "epipolar_px": np.zeros(n),
                         "used": np.ones(n, bool)}  # fmt: skip
     at = np.unique(arcs.time_s)
