@@ -12,7 +12,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.geometry.camera import Camera, project
-from epipole.tasks.algorithms.geometry.direction_errors import on_tangent_plane
+from epipole.tasks.algorithms.geometry.direction_errors import on_tangent_plane, scatter_beyond
 from epipole.tasks.algorithms.geometry.rotations import (
     interpolate_quaternions,
     matrix_from_quaternion,
@@ -48,7 +48,7 @@ def view_objects(
     tracked = detections.filter(placed)
     if not tracked.num_rows or not epochs.num_rows:
         return empty(VIEWS)
-    tracklets = _by_tracklet(frames, tracked)
+    tracklets = _with_split_prior(_by_tracklet(frames, tracked), frames, settings)
     query = _queries(tracklets, epochs, frames)
     camera = camera_of(cameras, int(frames.camera[0]))
     return _view_table(frames, tracklets, query, epochs, camera, settings)
@@ -91,6 +91,46 @@ def _by_tracklet(frames: Frames, tracked: pa.Table) -> _TrackletSightings:
         bounds,
         name[order[bounds[:-1]]],
     )
+
+
+def _with_split_prior(
+    tracklets: _TrackletSightings, frames: Frames, settings: Settings
+) -> _TrackletSightings:
+    """Return the sightings with each prior attitude's error divided as the detections show it.
+
+    What changes from frame to frame scatters about the smooth motion of objects: it is noise. The
+    rest of the stated variance is the bias that all frames share. It is not less than the error of
+    the division.
+    """
+    prior = np.flatnonzero(~frames.from_stars[tracklets.frame])
+    if not len(prior):
+        return tracklets
+    v = np.nan_to_num(frames.v_gcrf_km_s)
+    u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
+    own = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[prior] / 2
+    fit = directions_at(
+        np.repeat(tracklets.bounds[:-1], np.diff(tracklets.bounds))[prior],
+        np.repeat(tracklets.bounds[1:], np.diff(tracklets.bounds))[prior],
+        (frames.time_ns[tracklets.frame[prior]] - frames.time_ns[0]) / 1e9,
+        0.0,
+        (frames.time_ns[tracklets.frame] - frames.time_ns[0]) / 1e9,
+        u,
+        tracklets.cov_noise,
+        tracklets.cov_bias,
+        settings.alignment.window_s,
+    )
+    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / own
+    tracklet = np.repeat(np.arange(len(tracklets.name)), np.diff(tracklets.bounds))[prior]
+    follows = np.append(False, (np.diff(tracklet) == 0) & (np.diff(prior) == 1))
+    scatter = scatter_beyond(u[prior] - fit.u, np.sqrt(own), leverage, follows)
+    stated = np.trace(tracklets.cov_bias, axis1=1, axis2=2)[prior] / 2
+    share = scatter / np.maximum(stated, 1e-30)
+    n_frames = len(np.unique(tracklets.frame[prior]))
+    stays = np.maximum(1.0 - share, share / np.sqrt(n_frames))
+    noise, bias = tracklets.cov_noise.copy(), tracklets.cov_bias.copy()
+    noise[prior] += share[:, None, None] * bias[prior]
+    bias[prior] *= stays[:, None, None]
+    return tracklets._replace(cov_noise=noise, cov_bias=bias)
 
 
 def _with_lone(frames: Frames, detections: pa.Table, settings: Settings) -> pa.Table:
