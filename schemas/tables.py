@@ -88,6 +88,14 @@ FRAMES = schema(
         column("residual_px", F64, unit="px", null=True, doc="Rms of the stars' image residuals."),
         *axes("{}_km", unit="km", frame="GCRF", null=True, doc="Sensor position"),
         *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Sensor velocity"),
+        column(
+            "position_sigma_km",
+            F64,
+            unit="km",
+            null=True,
+            doc="1-sigma error of the sensor position, per axis, as the log tells it; null where "
+            "it tells none. Such errors are mostly common to many frames of the sensor.",
+        ),
     ],
 )
 
@@ -234,6 +242,16 @@ POSITIONS = schema(
         column("n_rejected", I32, doc="Sensors whose view was rejected."),
         column("residual_px", F64, unit="px", doc="Rms of the used views' image residuals."),
         column("chi2", F64, doc="Weighted sum of squares; 2 n_sensors - 3 degrees of freedom."),
+        column(
+            "independent",
+            pa.bool_(),
+            doc="A position is fitted to the detections of some seconds before and after the "
+            "epoch (`alignment.window_s`, 6 s unless set), so neighbouring rows of an object share "
+            "detections: their errors correlate by 0.95 after 1 s, by half after 5 s, and not at "
+            "all after 12 s. Rows with true share no detection with each other: fit an orbit to "
+            "these only. What a sensor's frames have in common (its position, a prior attitude) "
+            "is shared by all rows.",
+        ),
     ],
 )
 

@@ -81,6 +81,14 @@ CAMERAS = schema(
     ],
 )
 
+USED_SIGMA = column(
+    "used_position_sigma_km",
+    F64,
+    unit="km",
+    null=True,
+    doc="1-sigma per axis; that of the settings where the log tells none.",
+)
+
 PLACES = schema(
     "places",
     "One row per frame, in the order of exposures: the state interpolated to the frame's time.",
@@ -90,7 +98,8 @@ PLACES = schema(
             "{}_km", unit="km", frame="GCRF", null=True, doc="Position; null where no state is near"
         ),
         *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity"),
-        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma per axis."),
+        column("position_sigma_km", F64, unit="km", null=True, doc="Told 1-sigma per axis."),
+        USED_SIGMA,
         *[
             column(
                 f"q{a}",
@@ -117,7 +126,7 @@ SOLUTIONS = schema(
             null=True,
             doc="Covariance of the small rotation from the true to the reported sensor axes.",
         ),
-        column("position_sigma_km", F64, unit="km", null=True, doc="1-sigma per axis."),
+        USED_SIGMA,
         column("camera", I64, doc="Row of `cameras` that is valid for the frame."),
     ],
 )
@@ -148,7 +157,19 @@ VIEWS = schema(
             doc="Error that is common to all frames of the sensor.",
             names=TANGENT_AXES,
         ),
+        time_column("first_fitted", doc="First detection that the direction was fitted to, UTC."),
+        time_column("last_fitted", doc="Last detection that the direction was fitted to, UTC."),
+        column("moment_1", F64, unit="s", doc="Weighted mean of their times minus the epoch."),
+        column("moment_2", F64, unit="s^2", doc="The same of the square of these times."),
+        column("moment_3", F64, unit="s^3", doc="The same of the cube of these times."),
+        column(
+            "unmodelled_rad2",
+            F64,
+            unit="rad^2",
+            doc="Part of the noise: what the fit neglects of the motion at these times, per axis.",
+        ),
         *axes("{}_km", unit="km", frame="GCRF", doc="Sensor position at the epoch"),
+        *axes("sensor_v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity at the epoch"),
         column("position_sigma_km", F64, unit="km", doc="1-sigma per axis."),
         column("pixel_rad", F64, unit="rad", doc="Angle a pixel spans."),
     ],
@@ -246,7 +267,7 @@ CLOCK_VIEWS = schema(
         ],
         *[field for field in VIEWS if field.name.startswith("cov_")],
         *axes("sensor_{}_km", unit="km", frame="GCRF", doc="Sensor position at the epoch"),
-        *axes("sensor_v{}_km_s", unit="km/s", frame="GCRF", doc="Sensor velocity"),
+        *axes("sensor_v{}_km_s", unit="km/s", frame="GCRF", doc="Sensor velocity at the epoch"),
         VIEWS.field("position_sigma_km"),
         OBJECT_ID,
         column("claimed", pa.bool_(), doc="Whether the view is one of the object's."),

@@ -19,7 +19,7 @@ from epipole.tasks.identify.place_sensors import place_sensors
 PLACED = [
     *("x_km", "y_km", "z_km"),
     *("vx_km_s", "vy_km_s", "vz_km_s"),
-    "position_sigma_km",
+    *("position_sigma_km", "used_position_sigma_km"),
 ]
 
 

@@ -64,7 +64,7 @@ def _frames(solutions: pa.Table) -> Frames:
         array(solved, "attitude_source") == "stars",
         stack(solved, "{}_km"),
         stack(solved, "v{}_km_s"),
-        array(solved, "position_sigma_km").astype(float),
+        array(solved, "used_position_sigma_km").astype(float),
         array(solved, "camera"),
     )
 

@@ -28,10 +28,12 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
     state_sensor, all_states = array(states, "sensor_id"), _states(states, settings.sensors)
     n = len(time_ns)
     placed = Places(*(np.full((n, *width), np.nan) for width in ((3,), (3,), (), (4,), ())))
+    told = np.zeros(n, bool)
     for name in sorted(set(sensor)):
         frames = np.flatnonzero(sensor == name)
         rows = np.flatnonzero(state_sensor == name)
         columns: list[npt.NDArray[Any]] = [values[rows] for values in all_states]
+        told[frames] = _told(states.take(rows), time_ns[frames])
         places = interpolate_states(
             SensorStates(*columns),
             time_ns[frames],
@@ -44,12 +46,22 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
     by_name = {
         **unstack("{}_km", placed.r_gcrf_km),
         **unstack("v{}_km_s", placed.v_gcrf_km_s),
-        "position_sigma_km": placed.position_sigma_km,
+        "position_sigma_km": np.where(told, placed.position_sigma_km, np.nan),
+        "used_position_sigma_km": placed.position_sigma_km,
         **unstack("q{}", placed.q_sensor_from_icrs, "xyzw"),
         "attitude_sigma_arcsec": placed.attitude_sigma,
     }
     key = {name: exposures[name] for name in ("sensor_id", "frame_number", "time")}
     return table(PLACES, {**key, **{name: nullable(value) for name, value in by_name.items()}})
+
+
+def _told(states: pa.Table, at_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Return whether the states of one sensor on both sides of each time tell their sigma."""
+    if not states.num_rows:
+        return np.zeros(len(at_ns), bool)
+    known = array(states, "position_sigma_km") > 0
+    right = np.minimum(np.searchsorted(array(states, "time"), at_ns), states.num_rows - 1)
+    return np.asarray(known[np.maximum(right - 1, 0)] & known[right])
 
 
 def _states(states: pa.Table, settings: SensorSettings) -> SensorStates:

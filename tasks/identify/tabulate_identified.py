@@ -114,7 +114,10 @@ def solutions_table(
         "roll_deg": np.degrees(roll),
         "residual_px": residual,
     }
-    kept = ("x_km", "y_km", "z_km", "vx_km_s", "vy_km_s", "vz_km_s", "position_sigma_km")
+    kept = [
+        *("x_km", "y_km", "z_km", "vx_km_s", "vy_km_s", "vz_km_s"),
+        *("position_sigma_km", "used_position_sigma_km"),
+    ]
     return table(
         SOLUTIONS,
         _frame_key(exposures, np.arange(n))

@@ -20,15 +20,16 @@ VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 
 def collect_clock_views(
     views: pa.Table,
+    of_objects: pa.Table,
     associations: pa.Table,
     positions: pa.Table,
-    solutions: pa.Table,
     settings: Settings,
 ) -> pa.Table:
     """Return CLOCK_VIEWS: each object with its views, and all other views with every object.
 
-    `views` are all views, not only those of objects. If a sensor's clock is seconds off, none of
-    its views fits an object, so they are compared with the objects of the other sensors.
+    `views` are all views, not only those of objects, and `of_objects` the corrected ones that
+    positions were solved from. If a sensor's clock is seconds off, none of its views fits an
+    object, so they are compared with the objects of the other sensors.
 
     Epochs nearer than twice the window of the local motion share detections. So only some epochs
     are used, `MOST_EPOCHS` at most.
@@ -37,14 +38,12 @@ def collect_clock_views(
     claims = to_polars(associations).select([*key, "object_id"])
     objects = _with_velocities(to_polars(positions))
     epochs = _apart(objects["epoch"].unique().sort(), 2 * settings.alignment.window_s)
-    frames = to_polars(solutions).select(["sensor_id", "frame_number", *VELOCITY])
+    corrected = to_polars(of_objects)
+    seen = pl.concat([to_polars(views).join(corrected, on=key, how="anti"), corrected])
     with_sensors = (
-        to_polars(views)
-        .rename({name: f"sensor_{name}" for name in PLACE})
+        seen.rename({name: f"sensor_{name}" for name in PLACE})
         .filter(pl.col("epoch").is_in(epochs.implode()))
         .join(claims, on=key, how="left")
-        .join(frames.rename({name: f"sensor_{name}" for name in VELOCITY}),
-              on=["sensor_id", "frame_number"])
         .drop_nulls([f"sensor_{name}" for name in VELOCITY])
         .with_columns(claimed=pl.col("object_id").is_not_null())
     )  # fmt: skip
@@ -96,7 +95,7 @@ def _with_velocities(positions: pl.DataFrame) -> pl.DataFrame:
     offsets = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
     time_ns = positions["epoch"].cast(pl.Int64).to_numpy()
     time_s = (time_ns - (time_ns.min() if len(time_ns) else 0)) / 1e9
-    v = velocities(offsets, time_s, positions.select(PLACE).to_numpy(), VELOCITY_WINDOW_S)
+    v, _ = velocities(offsets, time_s, positions.select(PLACE).to_numpy(), VELOCITY_WINDOW_S)
     columns = [pl.Series(name, v[:, k]) for k, name in enumerate(VELOCITY)]
     light_ns = pl.col("epoch").cast(pl.Int64) - pl.col("time").cast(pl.Int64)
     return positions.select(

@@ -23,13 +23,16 @@ from epipole.schemas.columns import STATE_AXES, TANGENT_AXES
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import STATES
+from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.orbits.object_motion import velocities
-from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, fit_orbits
+from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, FittedOrbits, fit_orbits, prior_of
+from epipole.tasks.algorithms.orbits.shared_errors import SensorEquations, scale_shared_errors
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 LEAST_PROBABLE = 1e-6  # a chi-square less probable than this does not fit
+MIXED = 3.0  # chi-square per degree of freedom above which an arc mixes objects
 SLOPE_S = 60.0  # positions within this time of an arc's middle give the initial velocity
 
 
@@ -38,12 +41,75 @@ def fit_states(
 ) -> pa.Table:
     """Return a state for each object and arc, at the arc's middle epoch.
 
-    Epochs nearer to each other than twice the half-window share detections, so only epochs that
-    are farther apart are used. Each sensor's common error is estimated together with the state.
+    Only the epochs of `independent` positions are used: these share no detection. Each
+    sensor's common error is estimated together with the state.
     """
     rows = _used_views(views, associations, positions, settings)
     if not len(rows):
         return table(STATES, {name: [] for name in STATES.names})
+    named = _arcs_of(rows)
+    fitted = fit_orbits(named.arcs, _starts(positions, named.object_id, named.middle_ns))
+    counts = {"n_epochs": named.n_epochs, "n_views": np.diff(named.arcs.offsets)}
+    return _state_table(named.object_id, named.middle_ns, fitted, counts)
+
+
+def with_honest_biases(
+    views: pa.Table, associations: pa.Table, positions: pa.Table, settings: Settings
+) -> pa.Table:
+    """Return VIEWS of objects with larger shared errors for sensors whose errors are larger.
+
+    All objects of the span show together whether the errors that a sensor's views share are of
+    the stated size; see `scale_shared_errors`. If all are, the same table is returned.
+    """
+    rows = _used_views(views, associations, positions, settings)
+    if not len(rows):
+        return views
+    named = _arcs_of(rows)
+    arcs = named.arcs
+    fitted = fit_orbits(arcs, _starts(positions, named.object_id, named.middle_ns))
+    sensors = rows.group_by("sensor").agg(pl.col("sensor_id").first()).sort("sensor")["sensor_id"]
+    equations = _sum_of(fitted, np.diff(arcs.offsets), len(sensors))
+    prior = prior_of(arcs, slice(None), arcs.sensor, len(sensors))
+    has_bias = np.bincount(arcs.sensor, np.trace(arcs.cov_bias, axis1=1, axis2=2)) > 0.0
+    free = np.column_stack([has_bias, np.ones(len(sensors), bool)])
+    factor = scale_shared_errors(equations, prior, free)
+    if not (factor > 1.0).any():
+        return views
+    at = np.clip(np.searchsorted(sensors, array(views, "sensor_id")), 0, len(sensors) - 1)
+    of_view = np.where(
+        (sensors.to_numpy()[at] == array(views, "sensor_id"))[:, None], factor[at], 1.0
+    )
+    bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES) * of_view[:, 0, None, None]
+    sigma_km = array(views, "position_sigma_km") * np.sqrt(of_view[:, 1])
+    columns = {name: views[name] for name in VIEWS.names} | {
+        **unstack_covariance("cov_bias_{}_rad2", bias, TANGENT_AXES),
+        "position_sigma_km": sigma_km,
+    }
+    return table(VIEWS, columns)
+
+
+def _sum_of(fitted: FittedOrbits, n_views: Indices, n_sensors: int) -> SensorEquations:
+    """Return the equations of all arcs together, but of those that mix objects."""
+    normal, right = np.zeros((6 * n_sensors,) * 2), np.zeros(6 * n_sensors)
+    for k in np.flatnonzero(fitted.chi2 < MIXED * (2 * n_views - 6)):
+        sensors, of_arc = fitted.of_sensors[k]
+        at = (6 * sensors[:, None] + np.arange(6)).ravel()
+        normal[np.ix_(at, at)] += of_arc.normal
+        right[at] += of_arc.right
+    return SensorEquations(normal, right)
+
+
+class _NamedArcs(NamedTuple):
+    """Arcs, each with its object, middle epoch and number of epochs."""
+
+    arcs: Arcs
+    object_id: npt.NDArray[np.object_]
+    middle_ns: Indices
+    n_epochs: Indices
+
+
+def _arcs_of(rows: pl.DataFrame) -> _NamedArcs:
+    """Return the arcs of views that are sorted by arc and epoch."""
     arc = rows["arc"].to_numpy()
     begins = np.flatnonzero(np.append(True, arc[1:] != arc[:-1]))
     offsets = np.append(begins, len(arc)).astype(np.int64)
@@ -62,9 +128,7 @@ def fit_states(
         cov_bias=stack_covariance(rows, "cov_bias_{}_rad2", TANGENT_AXES),
         sigma_km=rows["position_sigma_km"].to_numpy(),
     )
-    state, cov, chi2 = fit_orbits(arcs, _starts(positions, object_id, middle))
-    counts = {"n_epochs": n_epochs, "n_views": np.diff(offsets)}
-    return _state_table(object_id, middle, state, cov, chi2, counts)
+    return _NamedArcs(arcs, object_id, middle, n_epochs)
 
 
 class FittingStates(NamedTuple):
@@ -90,13 +154,13 @@ def refuse_misfits(states: pa.Table) -> FittingStates:
 def _used_views(
     views: pa.Table, associations: pa.Table, positions: pa.Table, settings: Settings
 ) -> pl.DataFrame:
-    """Return the views used for positions, at epochs far enough apart, with their arc numbers."""
+    """Return the views used for independent positions, with their arc numbers."""
     key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
     claimed = to_polars(associations).filter("used").select([*key, "object_id"])
-    solved = to_polars(positions).select("epoch", "object_id").sort("object_id", "epoch")
-    name = solved["object_id"].to_numpy()
-    epoch_ns = solved["epoch"].cast(pl.Int64).to_numpy()
-    arc, kept = _arcs(name, epoch_ns, settings.states.arc_s, 2 * settings.alignment.window_s)
+    solved = to_polars(positions).select("epoch", "object_id", "independent")
+    solved = solved.sort("object_id", "epoch")
+    name, kept = solved["object_id"].to_numpy(), solved["independent"].to_numpy()
+    arc = _arcs(name, solved["epoch"].cast(pl.Int64).to_numpy(), settings.states.arc_s)
     arc = np.where(_long_enough(arc, kept, settings.states.min_epochs), arc, -1)
     solved = solved.with_columns(arc=arc).filter(pl.Series(kept & (arc >= 0)))
     return (
@@ -108,21 +172,15 @@ def _used_views(
     )
 
 
-def _arcs(
-    name: npt.NDArray[np.object_], epoch_ns: Indices, arc_s: float, apart_s: float
-) -> tuple[Indices, npt.NDArray[np.bool_]]:
-    """Return the arc of each epoch of sorted objects, and which epochs are used."""
-    arc, kept = np.zeros(len(name), np.int64), np.zeros(len(name), bool)
-    number, begun, last = -1, 0, 0
+def _arcs(name: npt.NDArray[np.object_], epoch_ns: Indices, arc_s: float) -> Indices:
+    """Return the arc of each epoch of sorted objects."""
+    arc = np.zeros(len(name), np.int64)
+    number, begun = -1, 0
     for k, t in enumerate(epoch_ns.tolist()):
         if k == 0 or name[k] != name[k - 1] or t - begun > arc_s * 1e9:
             number, begun = number + 1, t
-            # An epoch may be near the last one of the arc before: their errors are correlated, but
-            # each arc has a covariance of its own.
-            last = t - round(apart_s * 1e9)
-        arc[k], kept[k] = number, t - last >= apart_s * 1e9
-        last = t if kept[k] else last
-    return arc, kept
+        arc[k] = number
+    return arc
 
 
 def _long_enough(arc: Indices, kept: npt.NDArray[np.bool_], least: int) -> npt.NDArray[np.bool_]:
@@ -137,7 +195,7 @@ def _starts(positions: pa.Table, object_id: npt.NDArray[np.object_], middle_ns: 
     begins = np.flatnonzero(np.append(True, name[1:] != name[:-1]))
     offsets = np.append(begins, len(name)).astype(np.int64)
     x_km = stack(rows, "{}_km")
-    v_km_s = velocities(offsets, (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)
+    v_km_s, _ = velocities(offsets, (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)
     at = dict(zip(zip(name, epoch_ns.tolist(), strict=True), range(len(name)), strict=True))
     chosen = [at[key] for key in zip(object_id, middle_ns.tolist(), strict=True)]
     return np.hstack([x_km[chosen], v_km_s[chosen]])
@@ -146,12 +204,11 @@ def _starts(positions: pa.Table, object_id: npt.NDArray[np.object_], middle_ns: 
 def _state_table(
     object_id: npt.NDArray[np.object_],
     epoch_ns: Indices,
-    state: Array,
-    cov: Array,
-    chi2: Array,
+    orbits: FittedOrbits,
     counts: Mapping[str, Indices],
 ) -> pa.Table:
     """Return STATES of the arcs whose fit converged, in order of time."""
+    state, cov, chi2 = orbits.state, orbits.cov, orbits.chi2
     fitted = np.flatnonzero(np.isfinite(chi2))
     fitted = fitted[np.lexsort((object_id[fitted].astype(str), epoch_ns[fitted]))]
     columns = {

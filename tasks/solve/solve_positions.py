@@ -20,6 +20,7 @@ from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
 from epipole.schemas.tables import ASSOCIATIONS, PAIRS, POSITIONS, REJECTS
+from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.epipolar import (
     UncertainSight,
@@ -29,7 +30,7 @@ from epipole.tasks.algorithms.geometry.epipolar import (
 from epipole.tasks.algorithms.geometry.light_time import apparent_places
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
-from epipole.tasks.algorithms.orbits.object_motion import velocities
+from epipole.tasks.algorithms.orbits.object_motion import neglected_motion, velocities
 from epipole.tasks.common.lone_detections import only_id, published_ids
 
 Array = npt.NDArray[np.float64]
@@ -39,12 +40,17 @@ VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
 
 
 class Solved(NamedTuple):
-    """Tables ASSOCIATIONS, PAIRS, POSITIONS and REJECTS."""
+    """Tables ASSOCIATIONS, PAIRS, POSITIONS and REJECTS.
+
+    `views` are VIEWS of the objects. Where an object's motion is known, their directions are
+    corrected for the motion that their fits neglected.
+    """
 
     associations: pa.Table
     pairs: pa.Table
     positions: pa.Table
     rejects: pa.Table
+    views: pa.Table
 
 
 class _Groups(NamedTuple):
@@ -63,6 +69,7 @@ class _Groups(NamedTuple):
     used: npt.NDArray[np.bool_]
     mean_range_km: Array
     velocity_km_s: Array
+    independent: npt.NDArray[np.bool_]
 
     @property
     def apparent_km(self) -> Array:
@@ -85,17 +92,20 @@ def solve_positions(
     """Return the positions, with covariances, of objects that two or more sensors detect.
 
     They are solved twice. The first solution gives the velocities, which are needed because the
-    light time to near and far sensors differs. With `span`, only its epochs are returned.
+    light time to near and far sensors differs, and for the motion that the fits of the directions
+    neglected. With `span`, only its epochs are returned.
     """
     groups = _solve(views, object_number, settings)
     if span is not None:
         groups = _within(groups, span)
+    groups = groups._replace(independent=_independent(groups, span))
     pairs = _pair_up(groups)
     return Solved(
         _association_table(groups, pairs),
         _pair_table(groups, pairs),
         _position_table(groups),
         _reject_table(groups),
+        groups.views,
     )
 
 
@@ -108,20 +118,70 @@ def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> _Grou
     begins = np.ones(len(number), bool)
     begins[1:] = (epoch_ns[1:] != epoch_ns[:-1]) | (number[1:] != number[:-1])
     offsets = np.append(np.flatnonzero(begins), len(number)).astype(np.int64)
-    u, r_km = stack(views, "u{}"), stack(views, "{}_km")
-    cov = _direction_covariance(views)
-    sigma_km = array(views, "position_sigma_km")
+    r_km, sigma_km = stack(views, "{}_km"), array(views, "position_sigma_km")
     start = offsets[:-1]
     velocity = np.zeros((len(start), 3))
-    for _ in range(2):
+    for last in (False, True):
+        u, cov = stack(views, "u{}"), _direction_covariance(views)
         x_km, cov_km2, chi2, used, mean_range = triangulate(
             offsets, r_km, u, cov, sigma_km, velocity, settings.positions.reject_sigma
         )
-        velocity = _velocities(epoch_ns[start], number[start], x_km)
+        velocity, spread_s = _velocities(epoch_ns[start], number[start], x_km)
+        if not last:
+            group = np.repeat(np.arange(len(start)), np.diff(offsets))
+            sigma = np.sqrt(np.trace(cov_km2, axis1=1, axis2=2) / 3)
+            views = with_neglected_motion(
+                views,
+                np.hstack([x_km, velocity])[group],
+                sigma[group],
+                spread_s[group],
+            )
     return _Groups(
         views, offsets, object_names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
-        x_km, cov_km2, chi2, used, mean_range, velocity,
+        x_km, cov_km2, chi2, used, mean_range, velocity, np.zeros(len(start), bool),
     )  # fmt: skip
+
+
+def with_neglected_motion(
+    views: pa.Table, state: Array, sigma_km: Array, spread_s: Array
+) -> pa.Table:
+    """Return VIEWS with directions corrected for the motion that their fits neglected.
+
+    Parameters
+    ----------
+    state : (n, 6) float
+        Position and velocity of each view's object; NaN where unknown.
+    sigma_km, spread_s : (n,) float
+        1-sigma error of the position, and the `spread_s` of the velocity.
+
+    Notes
+    -----
+    The error of the correction takes the place of the variance of the neglected motion. A view
+    for which it is not smaller stays as it is.
+    """
+    sensor = np.hstack([stack(views, "{}_km"), stack(views, "sensor_v{}_km_s")])
+    moments, neglected = stack(views, "moment_{}", "123"), array(views, "unmodelled_rad2")
+    off = neglected_motion(state, sensor, moments)
+    reach = np.linalg.norm(state[:, :3] - sensor[:, :3], axis=1)
+    speed = np.linalg.norm(state[:, 3:] - sensor[:, 3:], axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = sigma_km / (spread_s * reach) * (
+            np.abs(moments[:, 0]) + np.abs(moments[:, 1]) * speed / reach
+        )  # fmt: skip
+        error = np.hypot(error, np.linalg.norm(off, axis=1) * sigma_km / reach)
+    known = error**2 < neglected
+    off[~known] = 0.0
+    u = stack(views, "u{}") - off
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    less = np.where(known, neglected - error**2, 0.0)
+    cov = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
+    cov = cov - less[:, None, None] * np.eye(2)
+    columns = {
+        **unstack("u{}", u),
+        **unstack_covariance("cov_noise_{}_rad2", cov, TANGENT_AXES),
+        "unmodelled_rad2": neglected - less,
+    }
+    return table(VIEWS, {**{name: views[name] for name in VIEWS.names}, **columns})
 
 
 def _within(groups: _Groups, span: Span) -> _Groups:
@@ -145,7 +205,30 @@ def _within(groups: _Groups, span: Span) -> _Groups:
         used=groups.used[rows],
         mean_range_km=groups.mean_range_km[kept],
         velocity_km_s=groups.velocity_km_s[kept],
+        independent=groups.independent[kept],
     )
+
+
+def _independent(groups: _Groups, span: Span | None) -> npt.NDArray[np.bool_]:
+    """Return the groups to use where no two may share a detection: in order of time, each that
+    shares none with those before.
+
+    Where a detection lies outside the span, the neighbouring span may use it: not such a group.
+    """
+    first_ns, last_ns = array(groups.views, "first_fitted"), array(groups.views, "last_fitted")
+    apart = np.isfinite(groups.chi2)
+    if span is not None:
+        outside = ~(span.holds(first_ns) & span.holds(last_ns))
+        apart[groups.group[outside & groups.used]] = False
+    track = array(groups.views, "tracklet_id").tolist()
+    bounds = groups.offsets.tolist()
+    used_until = dict.fromkeys(track, -1)
+    for g in np.flatnonzero(apart).tolist():
+        views = [v for v in range(bounds[g], bounds[g + 1]) if groups.used[v]]
+        apart[g] = all(first_ns[v] > used_until[track[v]] for v in views)
+        if apart[g]:
+            used_until.update({track[v]: last_ns[v] for v in views})
+    return apart
 
 
 def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
@@ -171,15 +254,15 @@ def _direction_covariance(views: pa.Table) -> Array:
     return noise + bias
 
 
-def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> Array:
+def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> tuple[Array, Array]:
     order = np.lexsort((epoch_ns, number))
     cuts = np.flatnonzero(np.diff(number[order])) + 1
     offsets = np.concatenate([[0], cuts, [len(number)]]).astype(np.int64)
-    v_km_s = np.empty_like(x_km)
+    v_km_s, spread_s = np.empty_like(x_km), np.empty(len(x_km))
     origin = epoch_ns[0] if len(epoch_ns) else 0
     time_s = (epoch_ns[order] - origin) / 1e9
-    v_km_s[order] = velocities(offsets, time_s, x_km[order], VELOCITY_WINDOW_S)
-    return v_km_s
+    v_km_s[order], spread_s[order] = velocities(offsets, time_s, x_km[order], VELOCITY_WINDOW_S)
+    return v_km_s, spread_s
 
 
 class _ViewPairs(NamedTuple):
@@ -264,6 +347,7 @@ def _position_table(groups: _Groups) -> pa.Table:
         "n_rejected": np.diff(groups.offsets).astype(np.int32) - n_used,
         "residual_px": _residual_px(groups),
         "chi2": groups.chi2,
+        "independent": groups.independent,
     }
     return table(POSITIONS, {name: values[solved] for name, values in columns.items()})
 

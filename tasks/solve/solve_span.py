@@ -26,7 +26,7 @@ from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
 from epipole.tasks.solve.associate_objects import Associated, associate_objects
 from epipole.tasks.solve.collect_clock_views import collect_clock_views
-from epipole.tasks.solve.fit_states import fit_states, refuse_misfits
+from epipole.tasks.solve.fit_states import fit_states, refuse_misfits, with_honest_biases
 from epipole.tasks.solve.judge_tracklets import judge_tracklets
 from epipole.tasks.solve.leave_out_sensors import leave_out_sensors
 from epipole.tasks.solve.solve_positions import Solved, object_names, solve_positions
@@ -88,8 +88,12 @@ def _solve(
     tracklets = with_lone_tracklets(_tracklets(sensors), views)
     associated = associate_objects(views, tracklets, frames, cameras, settings)
     solved = solve_positions(associated.views, associated.object_number, settings, span)
+    stated_views = solved.views  # the check of the sensors holds them against what they tell
+    honest = with_honest_biases(associated.views, solved.associations, solved.positions, settings)
+    if honest is not associated.views:
+        solved = solve_positions(honest, associated.object_number, settings, span)
     states, misfits = refuse_misfits(
-        fit_states(associated.views, solved.associations, solved.positions, settings)
+        fit_states(solved.views, solved.associations, solved.positions, settings)
     )
     of_associations = span.of(associated.rejects, "time")
     rejects = [span.of(of_sensors, "time"), of_associations, solved.rejects, misfits]
@@ -109,7 +113,7 @@ def _solve(
             solved.associations,
         ),
         "clock_views": collect_clock_views(
-            views_within, solved.associations, solved.positions, frames, settings
+            views_within, stated_views, solved.associations, solved.positions, settings
         ),
     }
 

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, empty, table, unstack, unstack_covariance
+from epipole.schemas.bridge import array, empty, nullable, table, unstack, unstack_covariance
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import VIEWS
@@ -18,10 +18,10 @@ from epipole.tasks.algorithms.geometry.rotations import (
     matrix_from_quaternion,
 )
 from epipole.tasks.algorithms.geometry.sky import aberrate
-from epipole.tasks.algorithms.tracking.blends import Tracked, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.lone_detections import in_lone_frames, with_lone_detections
-from epipole.tasks.common.sightings import Frames, camera_of, sightings_of, solved_frames
+from epipole.tasks.common.sightings import Frames, camera_of, solved_frames
+from epipole.tasks.solve.tracklet_sightings import TrackletSightings, tracklet_sightings
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -50,25 +50,9 @@ def view_objects(
     if not tracked.num_rows or not epochs.num_rows:
         return empty(VIEWS)
     camera = camera_of(cameras, int(frames.camera[0]))
-    tracklets = _with_blends(_by_tracklet(frames, tracked), frames, camera)
+    tracklets = tracklet_sightings(frames, tracked, camera, settings)
     query = _queries(tracklets, epochs, frames)
     return _view_table(frames, tracklets, query, epochs, camera, settings)
-
-
-class _TrackletSightings(NamedTuple):
-    """Sightings sorted by tracklet, then frame.
-
-    Tracklet k has the rows ``bounds[k]:bounds[k + 1]``, and the id ``name[k]``.
-    """
-
-    frame: Indices
-    centroid: Indices
-    u_icrs: Array
-    cov_noise: Array
-    cov_bias: Array
-    flux: Array
-    bounds: Indices
-    name: npt.NDArray[np.object_]
 
 
 class _EpochQueries(NamedTuple):
@@ -77,55 +61,6 @@ class _EpochQueries(NamedTuple):
     tracklet: Indices
     row: Indices  # of `epochs`
     frame: Indices  # that serves the epoch
-
-
-def _by_tracklet(frames: Frames, tracked: pa.Table) -> _TrackletSightings:
-    sightings = sightings_of(frames, tracked)
-    name = array(tracked, "tracklet_id")[sightings.row]
-    order = np.lexsort((sightings.frame, name.astype(str)))
-    bounds = _bounds(name[order])
-    return _TrackletSightings(
-        sightings.frame[order],
-        array(tracked, "centroid")[sightings.row[order]],
-        sightings.u_icrs[order],
-        sightings.cov_noise[order],
-        sightings.cov_bias[order],
-        array(tracked, "flux").astype(float)[sightings.row[order]],
-        bounds,
-        name[order[bounds[:-1]]],
-    )
-
-
-def _with_blends(
-    tracklets: _TrackletSightings, frames: Frames, camera: Camera
-) -> _TrackletSightings:
-    """Return the sightings with the errors that the light of neighbours may add.
-
-    Those of a neighbour alone are left out.
-    """
-    time_s = (frames.time_ns - frames.time_ns[0]) / 1e9
-    tracked = Tracked(
-        tracklets.bounds,
-        time_s[tracklets.frame],
-        tracklets.u_icrs,
-        tracklets.cov_noise,
-        tracklets.flux,
-    )
-    variance = blend_variance(tracked, time_s, camera.pixel_rad)
-    across = np.eye(3) - tracklets.u_icrs[:, :, None] * tracklets.u_icrs[:, None, :]
-    cov_bias = tracklets.cov_bias + variance[:, None, None] * across
-    own = ~of_neighbour(tracked, variance)
-    left = np.concatenate([[0], np.cumsum(own)])
-    return _TrackletSightings(
-        tracklets.frame[own],
-        tracklets.centroid[own],
-        tracklets.u_icrs[own],
-        tracklets.cov_noise[own],
-        cov_bias[own],
-        tracklets.flux[own],
-        left[tracklets.bounds],
-        tracklets.name,
-    )
 
 
 def _with_lone(frames: Frames, detections: pa.Table, settings: Settings) -> pa.Table:
@@ -146,13 +81,7 @@ def frames_of(epochs: pa.Table, frames: Frames) -> Indices:
     ].astype(np.int64)
 
 
-def _bounds(names: npt.NDArray[np.object_]) -> Indices:
-    """Return where each run of equal names begins, and where the last one ends."""
-    change = np.flatnonzero(names[1:] != names[:-1]) + 1
-    return np.concatenate([[0], change, [len(names)]]).astype(np.int64)
-
-
-def _queries(tracklets: _TrackletSightings, epochs: pa.Table, frames: Frames) -> _EpochQueries:
+def _queries(tracklets: TrackletSightings, epochs: pa.Table, frames: Frames) -> _EpochQueries:
     """Return each epoch that a tracklet covers, by tracklet."""
     epoch_ns, bounds = array(epochs, "epoch"), tracklets.bounds
     time_ns = frames.time_ns[tracklets.frame]
@@ -168,7 +97,7 @@ def _queries(tracklets: _TrackletSightings, epochs: pa.Table, frames: Frames) ->
 
 def _view_table(
     frames: Frames,
-    tracklets: _TrackletSightings,
+    tracklets: TrackletSightings,
     query: _EpochQueries,
     epochs: pa.Table,
     camera: Camera,
@@ -180,7 +109,7 @@ def _view_table(
     v = np.nan_to_num(frames.v_gcrf_km_s)
     u_still = aberrate(tracklets.u_icrs, -v[tracklets.frame])
     at_s = (array(epochs, "epoch")[row] - origin) / 1e9
-    u, w, noise, bias, _ = directions_at(
+    motion = directions_at(
         bounds[tracklet],
         bounds[tracklet + 1],
         at_s,
@@ -193,10 +122,11 @@ def _view_table(
     )
     centroid, missed = _centroids(tracklets, query)
     q = interpolate_quaternions((frames.time_ns - origin) / 1e9, frames.q_sensor_from_icrs, at_s)
+    u, fitted = motion.u, motion.fitted
     u_sensor = np.einsum("nij,nj->ni", matrix_from_quaternion(q), aberrate(u, v[served]))
     x_px, y_px = project(camera, u_sensor)
-    r_km = _carried(frames, served, array(epochs, "dt_s")[row])
-    cov_noise, cov_bias = on_tangent_plane(u, noise), on_tangent_plane(u, bias)
+    r_km, v_km_s = _carried(frames, served, array(epochs, "dt_s")[row])
+    cov_noise, cov_bias = (on_tangent_plane(u, cov) for cov in motion[2:4])
     kept = np.isfinite(x_px) & np.isfinite(r_km[:, 0])
     columns = {
         "epoch": array(epochs, "epoch")[row],
@@ -206,20 +136,26 @@ def _view_table(
         "x_px": x_px,
         "y_px": y_px,
         **unstack("u{}", u),
-        **unstack("w{}_rad_s", w),
+        **unstack("w{}_rad_s", motion.w),
         **unstack_covariance("cov_noise_{}_rad2", cov_noise, TANGENT_AXES),
         **unstack_covariance("cov_bias_{}_rad2", cov_bias, TANGENT_AXES),
+        "first_fitted": frames.time_ns[tracklets.frame[fitted[:, 0]]],
+        "last_fitted": frames.time_ns[tracklets.frame[fitted[:, 1] - 1]],
+        **unstack("moment_{}", motion.moments, "123"),
+        "unmodelled_rad2": motion.unmodelled,
         **unstack("{}_km", r_km),
         "position_sigma_km": frames.position_sigma_km[served],
         "pixel_rad": np.full(len(row), camera.pixel_rad),
     }
     columns = {key: values[kept] for key, values in columns.items()}
+    velocity = unstack("sensor_v{}_km_s", v_km_s[kept])
+    columns |= {name: nullable(values) for name, values in velocity.items()}
     columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
     return table(VIEWS, columns).sort_by([("epoch", "ascending"), ("tracklet_id", "ascending")])
 
 
 def _centroids(
-    tracklets: _TrackletSightings, query: _EpochQueries
+    tracklets: TrackletSightings, query: _EpochQueries
 ) -> tuple[Indices, npt.NDArray[np.bool_]]:
     """Return each query's centroid in the frame that serves, and which queries have none."""
     n_frames = max(int(tracklets.frame.max()), int(query.frame.max(initial=0))) + 1
@@ -230,12 +166,12 @@ def _centroids(
     return tracklets.centroid[at], key[at] != wanted
 
 
-def _carried(frames: Frames, served: Indices, dt_s: Array) -> Array:
-    """Return the sensor's positions at the epochs, from those at the frames that serve them.
+def _carried(frames: Frames, served: Indices, dt_s: Array) -> tuple[Array, Array]:
+    """Return the sensor's positions and velocities at the epochs, from those at their frames.
 
     Gravity is included: in one second it bends an orbit by 4 m.
     """
     r, v = frames.r_gcrf_km[served], frames.v_gcrf_km_s[served]
     back = -dt_s[:, None]  # dt is frame minus epoch
     gravity = -GM_KM3_S2 * r / np.linalg.norm(r, axis=1, keepdims=True) ** 3
-    return r + np.nan_to_num(v) * back + gravity * back**2 / 2
+    return r + np.nan_to_num(v) * back + gravity * back**2 / 2, v + gravity * back

@@ -9,8 +9,15 @@ from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, propagate
 GEO = np.array([-39359.89, 15125.76, 64.30, -1.1030, -2.8700, 0.01])
 
 
-def trial(seed, *, n_sensors=4, times=None, noise=2.0, bias=3.0, place_km=0.05, truth=GEO):
-    """Return views of one object with independent errors and with errors shared by a sensor."""
+def trial(
+    seed, *, n_sensors=4, times=None, noise=2.0, bias=3.0, place_km=0.05, truth=GEO, number=0,
+    worse=1.0,
+):  # fmt: skip
+    """Return views of one object with independent errors and with errors shared by a sensor.
+
+    Objects with different numbers have other independent errors, but sensors and shared errors
+    are those of the seed. The first sensor's error of place is worse than stated by a factor.
+    """
     rng = np.random.default_rng(seed)
     times = np.arange(-294.0, 295.0, 49.0) if times is None else times
     out, along = rng.normal(size=(2, n_sensors, 3))
@@ -19,6 +26,8 @@ def trial(seed, *, n_sensors=4, times=None, noise=2.0, bias=3.0, place_km=0.05, 
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     shift = rng.normal(size=(n_sensors, 3)) * bias * ARCSEC
     place = rng.normal(size=(n_sensors, 3)) * place_km
+    place[0] *= worse
+    rng = np.random.default_rng((seed, number))
     rows = []
     for t in times:
         for s in range(n_sensors):

@@ -69,7 +69,7 @@ def tables(scene: Scene, names=None) -> tuple[pa.Table, pa.Table, pa.Table, pa.T
         **{f"v{a}_km_s": np.zeros(m) for a in "xyz"},
         **{f"cov_att_{ab}_arcsec2": np.full(m, 1.0 if ab[0] == ab[1] else 0.0)
            for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
-        "position_sigma_km": np.full(m, 0.02),
+        "used_position_sigma_km": np.full(m, 0.02),
     })  # fmt: skip
     cameras = filled(CAMERAS, 1, {
         "sensor_id": [names[0]], "time": [START_NS], "width": [WIDTH], "height": [WIDTH],

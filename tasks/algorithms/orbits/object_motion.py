@@ -1,14 +1,18 @@
-"""Object motion: velocities from positions at neighbouring epochs."""
+"""Object motion: velocities from positions, and what a fit of apparent motion neglects."""
 
 import itertools
 
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.orbits.state_interpolation import gravity
+
 Array = npt.NDArray[np.float64]
 
 
-def velocities(offsets: npt.NDArray[np.int64], time_s: Array, r_km: Array, half_s: float) -> Array:
+def velocities(
+    offsets: npt.NDArray[np.int64], time_s: Array, r_km: Array, half_s: float
+) -> tuple[Array, Array]:
     """Return each position's velocity: the slope of its object's positions around it.
 
     Parameters
@@ -16,16 +20,25 @@ def velocities(offsets: npt.NDArray[np.int64], time_s: Array, r_km: Array, half_
     offsets : (g + 1,) int
         Object k has the positions ``offsets[k]:offsets[k + 1]``, in time order.
     time_s, r_km : (n,), (n, 3) float
-        Times [s] and positions [km]; NaN positions are skipped.
+        Times [s] and positions [km], GCRF; NaN positions are skipped.
     half_s
         Half width of the window about each position [s].
 
     Returns
     -------
-    (n, 3) float
+    v_km_s : (n, 3) float
         Velocities [km/s]; 0 where the window holds a single position.
+    spread_s : (n,) float
+        Rms distance of the window's times from their mean [s]: an error that the window's
+        positions share in part makes an error of the velocity of at most itself over this. 0
+        where the window holds a single position.
+
+    Notes
+    -----
+    Gravity's part, taken at the window's mean position, is removed: it would turn the slope where
+    the window is longer on one side.
     """
-    out = np.zeros_like(r_km)
+    v_km_s, spread_s = np.zeros_like(r_km), np.zeros(len(r_km))
     for lo, hi in itertools.pairwise(offsets):
         known = lo + np.flatnonzero(np.isfinite(r_km[lo:hi, 0]))
         if len(known) < 2:
@@ -40,11 +53,62 @@ def velocities(offsets: npt.NDArray[np.int64], time_s: Array, r_km: Array, half_
             return running[last] - running[first]
 
         n = np.maximum(last - first, 1)
-        mean_t = total(t) / n
-        spread = total(t * t) - n * mean_t**2
+        mean_t, square = total(t) / n, total(t * t)
+        spread = square - n * mean_t**2
         cross = total(t[:, None] * x) - mean_t[:, None] * total(x)
+        # The slope of half the square of the time since `at`.
+        bent = (total(t**3) - mean_t * square) / 2 - at * spread
+        fall = gravity(r_km[known[0]] + total(x) / n[:, None])
         with np.errstate(invalid="ignore", divide="ignore"):
-            slope = cross / spread[:, None]
+            slope = (cross - bent[:, None] * fall) / spread[:, None]
         # Below 1e-6 s^2 all positions are of one epoch, and the slope is rounding.
-        out[lo:hi] = np.where((spread > 1e-6)[:, None], slope, 0.0)
-    return out
+        several = spread > 1e-6
+        v_km_s[lo:hi] = np.where(several[:, None], slope, 0.0)
+        spread_s[lo:hi] = np.where(several, np.sqrt(np.maximum(spread, 0.0) / n), 0.0)
+    return v_km_s, spread_s
+
+
+def neglected_motion(object_state: Array, sensor_state: Array, moments: Array) -> Array:
+    """Return how far fitted directions lie from the true ones, because motion was neglected.
+
+    A direction fitted to detections around an instant is their weighted mean. It differs from
+    the direction at the instant by the moments of their times, times the derivatives of the
+    direction. For a low sensor, a geostationary object and 6 s on both sides these are 0.3 arcsec,
+    towards the same side in each fit: as if the sensor were 50 m nearer to the Earth.
+
+    Parameters
+    ----------
+    object_state, sensor_state : (n, 6) float
+        Position [km] and velocity [km/s] of the object and of the sensor, GCRF.
+    moments : (n, 3) float
+        Weighted means of (time minus instant)^1, ^2, ^3 [s, s^2, s^3]; see `LocalMotion`.
+
+    Returns
+    -------
+    (n, 3) float
+        Fitted minus true direction, at right angles to the true one [rad].
+    """
+    at = [
+        a - b for a, b in zip(_derivatives(object_state), _derivatives(sensor_state), strict=True)
+    ]
+    reach = np.linalg.norm(at[0], axis=1, keepdims=True)
+    away, rate, bend, jerk = (derivative / reach for derivative in at)
+
+    def along(a: Array, b: Array) -> Array:
+        return np.sum(a * b, axis=1, keepdims=True)
+
+    # Derivatives of u = d / rho, from those of d = rho u; all over rho.
+    rate_rho = along(away, rate)
+    u1 = rate - rate_rho * away
+    bend_rho = along(away, bend) + along(u1, u1)
+    u2 = bend - bend_rho * away - 2 * rate_rho * u1
+    jerk_rho = along(away, jerk) + 3 * rate_rho * along(u1, u1) + 3 * along(u1, u2)
+    u3 = jerk - jerk_rho * away - 3 * bend_rho * u1 - 3 * rate_rho * u2
+    off = moments[:, :1] * u1 + moments[:, 1:2] * u2 / 2 + moments[:, 2:] * u3 / 6
+    return np.asarray(off - along(away, off) * away)
+
+
+def _derivatives(state: Array) -> tuple[Array, Array, Array, Array]:
+    """Return position, velocity, acceleration by gravity, and its rate."""
+    r, v = state[:, :3], state[:, 3:]
+    return r, v, gravity(r), (gravity(r + v / 2) - gravity(r - v / 2))  # over one second

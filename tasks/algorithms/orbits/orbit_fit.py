@@ -13,6 +13,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.orbits.shared_errors import SensorEquations
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -206,9 +207,13 @@ def _add_views(state, errors, views, N, rhs):
     return chi2
 
 
-def _fit(state: Array, prior: Array, views: ArcViews) -> tuple[Array, Array, float]:
-    """Return state, covariance and chi-square of one arc; NaN where the fit fails."""
-    failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan
+def _fit(
+    state: Array, prior: Array, views: ArcViews
+) -> tuple[Array, Array, float, SensorEquations]:
+    """Return state, covariance and chi-square of one arc, NaN where the fit fails; and what it
+    tells of its sensors' errors."""
+    nothing = SensorEquations(np.zeros((6 * len(prior),) * 2), np.zeros(6 * len(prior)))
+    failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan, nothing
     n_sensors = len(prior)
     errors = np.zeros((n_sensors, 6))
     size = 6 + 6 * n_sensors
@@ -233,11 +238,46 @@ def _fit(state: Array, prior: Array, views: ArcViews) -> tuple[Array, Array, flo
             return failed
         state, errors = state + step[:6], errors + step[6:].reshape(n_sensors, 6)
         if gain < CONVERGED:
-            return state, inverse[:6, :6] * scale[:6, None] * scale[:6], chi2 - gain
+            cov = inverse[:6, :6] * scale[:6, None] * scale[:6]
+            # Without the prior; the last step is below a thousandth of a sigma.
+            of_sensors = _without_state(N - at_prior, at_prior[6:, 6:] @ errors.ravel(), errors)
+            return state, cov, chi2 - gain, of_sensors
     return failed
 
 
-def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
+def _without_state(normal: Array, right: Array, errors: Array) -> SensorEquations:
+    """Return the equations of the sensors' errors, with the state eliminated.
+
+    `right` is about these errors, at the best state; the returned one is about none.
+    """
+    scale = 1.0 / np.sqrt(np.diag(normal)[:6])
+    to_state = normal[6:, :6] * scale
+    inverse = np.linalg.pinv(normal[:6, :6] * scale[:, None] * scale, hermitian=True)
+    reduced = normal[6:, 6:] - to_state @ inverse @ to_state.T
+    return SensorEquations(reduced, right + reduced @ errors.ravel())
+
+
+class FittedOrbits(NamedTuple):
+    """States of g arcs.
+
+    state : (g, 6) float
+        Position [km] and velocity [km/s], GCRF, at the instant from which the times count;
+        NaN where the fit fails (too few views, an object behind a sensor, no convergence).
+    cov : (g, 6, 6) float
+        Covariance.
+    chi2 : (g,) float
+        Weighted sum of squares, with those of the shared errors; 2 n - 6 degrees of freedom.
+    of_sensors : g of (array of sensors, SensorEquations)
+        What each arc tells of its sensors' errors.
+    """
+
+    state: Array
+    cov: Array
+    chi2: Array
+    of_sensors: list[tuple[Indices, SensorEquations]]
+
+
+def fit_orbits(arcs: Arcs, start: Array) -> FittedOrbits:
     """Return the states that fit arcs best, with covariance.
 
     Parameters
@@ -246,16 +286,6 @@ def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
         The views. No two of a sensor may share a detection: their noise must be independent.
     start : (g, 6) float
         First states [km, km/s], with errors small against the distances to the sensors.
-
-    Returns
-    -------
-    state : (g, 6) float
-        Position [km] and velocity [km/s], GCRF, at the instant from which the times count;
-        NaN where the fit fails (too few views, an object behind a sensor, no convergence).
-    cov : (g, 6, 6) float
-        Covariance.
-    chi2 : (g,) float
-        Weighted sum of squares, with those of the shared errors; 2 n - 6 degrees of freedom.
 
     Notes
     -----
@@ -269,31 +299,37 @@ def fit_orbits(arcs: Arcs, start: Array) -> tuple[Array, Array, Array]:
     """
     g = len(arcs.offsets) - 1
     state, cov = np.array(start, float).reshape(g, 6), np.full((g, 6, 6), np.nan)
-    chi2 = np.full(g, np.nan)
+    chi2, of_sensors = np.full(g, np.nan), []
     basis, weight = tangent_basis(arcs.u), np.asarray(np.linalg.inv(arcs.cov_noise), float)
     for k in range(g):
         rows = slice(arcs.offsets[k], arcs.offsets[k + 1])
         names, sensor = np.unique(arcs.sensor[rows], return_inverse=True)
         if rows.stop - rows.start < 3:
             state[k] = np.nan
+            of_sensors.append((names[:0], SensorEquations(np.zeros((0, 0)), np.zeros(0))))
             continue
         views = ArcViews(
             arcs.time_s[rows], sensor.astype(np.int64), arcs.r_km[rows], arcs.u[rows], basis[rows],
             weight[rows],
         )  # fmt: skip
-        prior = _prior(arcs, rows, basis, sensor, len(names))
-        state[k], cov[k], chi2[k] = _fit(state[k], prior, views)
-    return state, cov, chi2
+        prior = prior_of(arcs, rows, sensor, len(names))
+        state[k], cov[k], chi2[k], equations = _fit(state[k], prior, views)
+        of_sensors.append((names, equations))
+    return FittedOrbits(state, cov, chi2, of_sensors)
 
 
-def _prior(arcs: Arcs, rows: slice, basis: Array, sensor: Indices, n_sensors: int) -> Array:
-    """Return the inverse covariance of each sensor's shared errors: direction, then place."""
+def prior_of(arcs: Arcs, rows: slice, sensor: Indices, n_sensors: int) -> Array:
+    """Return (s, 6, 6) inverse covariances of each sensor's shared errors: direction, then place.
+
+    `sensor` has the sensor of each of the rows; a sensor without rows has zeros.
+    """
     out = np.zeros((n_sensors, 6, 6))
-    across = np.swapaxes(basis[rows], -1, -2) @ arcs.cov_bias[rows] @ basis[rows]
+    basis = tangent_basis(arcs.u[rows])
+    across = np.swapaxes(basis, -1, -2) @ arcs.cov_bias[rows] @ basis
     # An error along the line of sight has no effect; it keeps the matrix invertible.
     along = np.trace(arcs.cov_bias[rows], axis1=-2, axis2=-1) / 2
     full = across + along[:, None, None] * arcs.u[rows][:, :, None] * arcs.u[rows][:, None, :]
-    for s in range(n_sensors):
+    for s in np.unique(sensor).tolist():
         of_sensor = sensor == s
         direction = full[of_sensor].mean(axis=0) + LEAST_BIAS_RAD**2 * np.eye(3)
         out[s, :3, :3] = np.linalg.inv(direction)

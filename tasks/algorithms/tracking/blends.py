@@ -136,14 +136,14 @@ def _ends_of(tracked: Tracked) -> _Ends:
     first, last = tracked.bounds[:-1], tracked.bounds[1:]
     t = tracked.time_s
     time = np.column_stack([t[first], t[last - 1]])
-    u, w, noise, _, _ = directions_at(
+    fit = directions_at(
         np.repeat(first, 2), np.repeat(last, 2), time.ravel(), 1.0,
         t, tracked.u_icrs, tracked.cov_noise, np.zeros_like(tracked.cov_noise), CARRIED_S / 2,
     )  # fmt: skip
     reach = np.clip(time[:, 1] - time[:, 0], 1e-3, CARRIED_S / 2)
-    variance = np.trace(noise, axis1=1, axis2=2).reshape(-1, 2) / 2
+    variance = np.trace(fit.cov_noise, axis1=1, axis2=2).reshape(-1, 2) / 2
     flux = np.full(len(first), np.nan)
-    return _Ends(time, u.reshape(-1, 2, 3), w.reshape(-1, 2, 3), variance, reach, flux)
+    return _Ends(time, fit.u.reshape(-1, 2, 3), fit.w.reshape(-1, 2, 3), variance, reach, flux)
 
 
 def _own_flux(tracked: Tracked, blended: npt.NDArray[np.bool_]) -> Array:

@@ -47,7 +47,36 @@ class _MotionPlaces(NamedTuple):
     w: Array
     noise: Array
     bias: Array
-    n: npt.NDArray[np.int64]
+    fitted: npt.NDArray[np.int64]
+    moments: Array
+    unmodelled: Array
+
+
+class LocalMotion(NamedTuple):
+    """Directions at wanted instants.
+
+    u : (q, 3) float
+        Unit vectors.
+    w : (q, 3) float
+        Rates of change [rad/s].
+    cov_noise, cov_bias : (q, 3, 3) float
+        Propagated errors [rad^2]; `cov_noise` includes `unmodelled`.
+    fitted : (q, 2) int
+        The detections that were fitted: ``fitted[k, 0]:fitted[k, 1]``.
+    moments : (q, 3) float
+        Weighted means of (time minus instant)^1, ^2, ^3 [s, s^2, s^3] of the detections: u differs
+        from the true direction by these times its derivatives, over 1, 2 and 6.
+    unmodelled : (q,) float
+        Variance per axis of what the fit neglects of these differences [rad^2].
+    """
+
+    u: Array
+    w: Array
+    cov_noise: Array
+    cov_bias: Array
+    fitted: npt.NDArray[np.int64]
+    moments: Array
+    unmodelled: Array
 
 
 @kernel
@@ -198,7 +227,7 @@ def _evaluate(queries, detections, places):
         nearest = _nearest(t, first, last, at)
         sigma = np.sqrt(np.trace(noise[nearest]) / 2)
         lo, hi, rate, half = _window(t, u, first, last, at, sigma, queries.widest)
-        places.n[q] = hi - lo
+        places.fitted[q, 0], places.fitted[q, 1] = lo, hi
         value, slope, unmodelled = _fit(detections, lo, hi, at, rate, half, queries.unknown_rate)
         for a in range(3):
             mean, moving = 0.0, 0.0
@@ -208,6 +237,12 @@ def _evaluate(queries, detections, places):
                 moving += slope[k] * (u[lo + k, a] - u[nearest, a])
             places.u[q, a] = u[nearest, a] + mean
             places.w[q, a] = moving
+        for k in range(hi - lo):
+            tau = t[lo + k] - at
+            places.moments[q, 0] += value[k] * tau
+            places.moments[q, 1] += value[k] * tau * tau
+            places.moments[q, 2] += value[k] * tau * tau * tau
+        places.unmodelled[q] = max(unmodelled, 0.0)
         _enter_errors(q, value, unmodelled, noise[lo:hi], bias[lo:hi], places)
 
 
@@ -221,7 +256,7 @@ def directions_at(
     cov_noise: Array,
     cov_bias: Array,
     widest_s: float,
-) -> tuple[Array, Array, Array, Array, npt.NDArray[np.int64]]:
+) -> LocalMotion:
     """Return directions at wanted instants, their rates and covariances.
 
     Parameters
@@ -239,17 +274,6 @@ def directions_at(
         by all frames.
     widest_s
         Half-width of the widest window.
-
-    Returns
-    -------
-    u : (q, 3) float
-        Unit vectors.
-    w : (q, 3) float
-        Rates of change [rad/s].
-    cov_noise, cov_bias : (q, 3, 3) float
-        Propagated errors [rad^2].
-    n : (q,) int
-        Number of detections fitted.
 
     Notes
     -----
@@ -271,8 +295,10 @@ def directions_at(
     )
     places = _MotionPlaces(
         np.empty((q, 3)), np.empty((q, 3)), np.empty((q, 3, 3)), np.empty((q, 3, 3)),
-        np.empty(q, np.int64),
+        np.empty((q, 2), np.int64), np.zeros((q, 3)), np.empty(q),
     )  # fmt: skip
     _evaluate(queries, detections, places)
     u = places.u / np.linalg.norm(places.u, axis=1, keepdims=True)
-    return u, places.w, places.noise, places.bias, places.n
+    return LocalMotion(
+        u, places.w, places.noise, places.bias, places.fitted, places.moments, places.unmodelled
+    )

@@ -3,7 +3,7 @@
 from epipole.schemas.bridge import empty, to_polars
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS
-from epipole.schemas.work_tables import SOLUTIONS, VIEWS
+from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.check.check_sensors import SensorVerdict, as_in_the_logs, verdicts_of
 from epipole.tasks.solve.collect_clock_views import collect_clock_views
 
@@ -21,5 +21,5 @@ def test_an_offset_is_the_correction_and_what_remains_of_it():
 
 
 def test_without_views_no_clock_is_known():
-    tables = (empty(s) for s in (VIEWS, ASSOCIATIONS, POSITIONS, SOLUTIONS))
+    tables = (empty(s) for s in (VIEWS, VIEWS, ASSOCIATIONS, POSITIONS))
     assert verdicts_of(to_polars(collect_clock_views(*tables, Settings()))) == []

@@ -104,7 +104,8 @@ class Log:
             | {f"{a}_km": [7000.0] * n for a in "xyz"}
             | {f"v{a}_km_s": [V_KM_S[i]] * n for i, a in enumerate("xyz")}
             | {f"q{a}": prior or q[:, i] for i, a in enumerate("xyzw")}
-            | {"position_sigma_km": [0.05] * n, "attitude_sigma_arcsec": [sigma_arcsec] * n},
+            | {name: [0.05] * n for name in ("position_sigma_km", "used_position_sigma_km")}
+            | {"attitude_sigma_arcsec": [sigma_arcsec] * n},
         )
 
     def errors(self, solutions):

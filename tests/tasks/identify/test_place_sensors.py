@@ -48,11 +48,13 @@ def test_unknown_sigmas_are_those_of_the_settings(tmp_path):
         {"sensors": {"position_sigma_km": 0.7, "attitude_sigma_arcsec": 9.0}}
     )
     _, places = place(write(tmp_path / "a.mcap", ["a"], **sent), settings)
-    assert array(places, "position_sigma_km").tolist() == [0.7] * 5
+    assert array(places, "used_position_sigma_km").tolist() == [0.7] * 5
+    assert places["position_sigma_km"].null_count == 5  # only what the log tells
     assert array(places, "attitude_sigma_arcsec").tolist() == [9.0] * 5
     sent |= {"position_sigma_km": 0.1, "attitude_sigma_arcsec": 3.0}
     _, places = place(write(tmp_path / "b.mcap", ["a"], **sent), settings)
     np.testing.assert_allclose(array(places, "position_sigma_km"), 0.1)
+    np.testing.assert_allclose(array(places, "used_position_sigma_km"), 0.1)
     assert array(places, "attitude_sigma_arcsec").tolist() == [3.0] * 5
 
 
@@ -74,7 +76,7 @@ def test_places_of_the_sample_logs_are_those_of_their_truth(name):
     truth = truth.sort_by(key)
     assert truth["t_ns"].to_pylist() == array(places, "time").tolist()
     off_km = stack(places, "{}_km") - stack(truth, "{}")
-    sigma_km = array(places, "position_sigma_km")
+    sigma_km = array(places, "used_position_sigma_km")
     # Errors are a bias of each sensor and noise of each state; where neither was added, metres.
     assert np.sqrt(np.mean((off_km / sigma_km[:, None]) ** 2)) < 1.6
     assert np.abs(stack(places, "v{}_km_s") - stack(truth, "v{}")).max() < 1e-5

@@ -34,7 +34,7 @@ def positions_of(passes):
     columns |= {f"cov_{a}{a}": zeros + 1.0 for a in "xyz"}
     columns |= {f"cov_{ab}": zeros for ab in ("xy", "xz", "yz")} | {"chi2": zeros}
     columns |= {n: zeros.astype(np.int32) for n in ("n_sensors", "n_rejected")}
-    return table(POSITIONS, columns | {"residual_px": zeros})
+    return table(POSITIONS, columns | {"residual_px": zeros, "independent": zeros > 0})
 
 
 def states_of(passes):

@@ -10,15 +10,15 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS, STATES
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
-from epipole.tasks.solve.fit_states import fit_states, refuse_misfits
+from epipole.tasks.solve.fit_states import fit_states, refuse_misfits, with_honest_biases
 
 T0 = 1_554_091_200_000_000_000
 SETTINGS = Settings()
 
 
-def night(seed, times):
+def night(seed, times, independent=None, name="a", **scene):
     """Views of one object, claimed, and its positions with an error of some kilometres."""
-    arcs = trial(seed, times=times)
+    arcs = trial(seed, times=times, **scene)
     n = len(arcs.time_s)
     epoch = T0 + np.round(arcs.time_s * 1e9).astype(np.int64)
     shared = {
@@ -27,7 +27,7 @@ def night(seed, times):
         "frame_number": np.arange(n),
         "centroid": np.zeros(n, np.int32),
         "tracklet_id": [f"s{s}-1" for s in arcs.sensor],
-        "x_px": np.arange(n, dtype=float),
+        "x_px": np.arange(n) + 1000.0 * scene.get("number", 0),
         "y_px": np.zeros(n),
     }
     views = shared | {f"u{a}": arcs.u[:, i] for i, a in enumerate("xyz")}
@@ -37,14 +37,18 @@ def night(seed, times):
         for ab, i, j in (("11", 0, 0), ("12", 0, 1), ("22", 1, 1)):
             views[f"cov_{which}_{ab}_rad2"] = cov[:, i, j]
     views |= {"position_sigma_km": arcs.sigma_km, "pixel_rad": np.full(n, 7e-5)}
-    claimed = shared | {"object_id": ["a"] * n, "epipolar_px": np.zeros(n),
+    views |= {"first_fitted": epoch, "last_fitted": epoch, "unmodelled_rad2": np.zeros(n)}
+    views |= {f"moment_{k}": np.zeros(n) for k in "123"}
+    views |= {f"sensor_v{a}_km_s": np.zeros(n) for a in "xyz"}
+    claimed = shared | {"object_id": [name] * n, "epipolar_px": np.zeros(n),
                         "used": np.ones(n, bool)}  # fmt: skip
     at = np.unique(arcs.time_s)
     where = np.array([propagate(GEO, t)[:3] for t in at])
     where += np.random.default_rng(seed).normal(size=where.shape) * 2
-    positions = {"epoch": T0 + np.round(at * 1e9).astype(np.int64), "object_id": ["a"] * len(at)}
+    positions = {"epoch": T0 + np.round(at * 1e9).astype(np.int64), "object_id": [name] * len(at)}
     positions["time"] = positions["epoch"]
     positions |= {f"{a}_km": where[:, i] for i, a in enumerate("xyz")}
+    positions["independent"] = np.ones(len(at), bool) if independent is None else independent
     for name in POSITIONS.names:
         if name not in positions:
             integer = name in ("n_sensors", "n_rejected")
@@ -74,8 +78,8 @@ def test_errors_of_states_agree_with_their_covariances():
 
 
 def test_epochs_that_share_detections_are_not_used():
-    states = fit_states(*night(1, np.arange(0.0, 61)), SETTINGS)
-    assert states["n_epochs"].to_pylist() == [6]  # of 61, every twelfth second: 0 to 60
+    states = fit_states(*night(1, np.arange(0.0, 61), np.arange(61) % 12 == 0), SETTINGS)
+    assert states["n_epochs"].to_pylist() == [6]
 
 
 def test_a_long_pass_is_cut_into_arcs():
@@ -127,3 +131,37 @@ def test_a_state_that_does_not_fit_is_refused_and_has_a_reject():
     kept, rejects = refuse_misfits(fit_states(mixed, claimed, positions, SETTINGS))
     assert kept.num_rows == 0
     assert rejects["reason"].to_pylist() == ["state_misfit"]
+
+
+def objects(worse):
+    """A night of six objects; the place of the first of five sensors is worse than stated."""
+    nights = [
+        night(7, np.arange(-143.0, 144.0, 26.0), name=f"o{k}", number=k, worse=worse,
+              n_sensors=5, noise=1.5, bias=0.0, place_km=0.02)
+        for k in range(6)
+    ]  # fmt: skip
+    return [pa.concat_tables(tables) for tables in zip(*nights, strict=True)]
+
+
+def test_views_of_a_sensor_with_a_worse_ephemeris_have_a_larger_sigma():
+    views, claimed, positions = objects(worse=30.0)
+    honest = with_honest_biases(views, claimed, positions, SETTINGS)
+    wider = array(honest, "position_sigma_km") / array(views, "position_sigma_km")
+    first = array(views, "sensor_id") == "s0"
+    # Of the 30, the part that this seed drew and that the Student distribution allows.
+    assert (wider[first] > 3).all()
+    assert (wider[~first] < 1.5).all()
+    same = [name for name in views.column_names if name != "position_sigma_km"]
+    assert honest.select(same).equals(views.select(same))
+
+
+def test_views_of_sound_sensors_keep_their_sigmas():
+    views, claimed, positions = objects(worse=1.0)
+    honest = with_honest_biases(views, claimed, positions, SETTINGS)
+    wider = array(honest, "position_sigma_km") / array(views, "position_sigma_km")
+    assert (wider < 1.3).all()
+
+
+def test_no_views_stay_no_views():
+    views = empty(VIEWS)
+    assert with_honest_biases(views, empty(ASSOCIATIONS), empty(POSITIONS), SETTINGS) is views

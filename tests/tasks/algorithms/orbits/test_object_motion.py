@@ -1,25 +1,69 @@
-"""Velocities from positions at neighbouring epochs."""
+"""Velocities from positions at neighbouring epochs, and the motion that fits neglect."""
 
 import numpy as np
+import pytest
 
-from epipole.tasks.algorithms.orbits.object_motion import velocities
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance
+from epipole.tasks.algorithms.orbits.object_motion import neglected_motion, velocities
+from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
+from epipole.tasks.algorithms.tracking.local_motion import directions_at
+
+METRE_S = 1e-3
+LOW = np.array([7000.0, 0.0, 0.0, 0.0, 5.3, 5.3])
+GEO = np.array([12000.0, 40400.0, 0.0, -2.95, 0.88, 0.0])
+CROSSING = np.array([7300.0, -200.0, 300.0, 0.5, -6.0, 4.2])  # passes the low one at 470 km
 
 
-def test_straight_motion_gives_its_velocity_whatever_is_missing():
+def test_falling_motion_gives_its_velocity_whatever_is_missing():
     t = np.arange(100.0)
-    v = np.array([1.0, -2.0, 3.0])
-    x = np.array([4e4, 0.0, 0.0]) + t[:, None] * v
+    states, _ = trajectory(LOW, t)
+    x = states[:, :3].copy()
     x[::7] = np.nan
-    got = velocities(np.array([0, 100]), t, x, 5.0)
-    np.testing.assert_allclose(got, np.tile(v, (100, 1)), atol=1e-9)
+    got, spread_s = velocities(np.array([0, 100]), t, x, 5.0)
+    # At the ends the window is on one side, and gravity bends the path there by 20 m/s.
+    np.testing.assert_allclose(got, states[:, 3:], atol=METRE_S)
+    np.testing.assert_allclose(spread_s[20:80], np.sqrt(10.0), atol=0.5)  # of -5 to 5 s
 
 
 def test_objects_do_not_mix_and_a_single_position_has_velocity_zero():
     t = np.array([0.0, 1.0, 0.0])
-    x = np.array([[0.0, 0, 0], [1.0, 0, 0], [9.0, 9, 9]])
-    got = velocities(np.array([0, 2, 3]), t, x, 5.0)
+    x = np.array([[1.0, 0, 0], [2.0, 0, 0], [9.0, 9, 9]])
+    got, spread_s = velocities(np.array([0, 2, 3]), t, x, 5.0)
     np.testing.assert_allclose(got, [[1, 0, 0], [1, 0, 0], [0, 0, 0]])
+    np.testing.assert_allclose(spread_s, [0.5, 0.5, 0.0])
 
 
 def test_nothing_in_gives_nothing_out():
-    assert velocities(np.array([0]), np.zeros(0), np.zeros((0, 3)), 5.0).shape == (0, 3)
+    got, spread_s = velocities(np.array([0]), np.zeros(0), np.zeros((0, 3)), 5.0)
+    assert got.shape == (0, 3)
+    assert spread_s.shape == (0,)
+
+
+@pytest.mark.parametrize(
+    ("target", "noise_arcsec", "at"),
+    [(GEO, 4.0, 0.0), (GEO, 4.0, -8.0), (CROSSING, 10.0, 0.0), (CROSSING, 10.0, 1.3)],
+)
+def test_a_corrected_direction_is_the_true_one(target, noise_arcsec, at):
+    t = np.arange(-6.0, 6.1, 1.0)
+    sensor, seen = trajectory(LOW, t)[0], trajectory(target, t)[0]
+    u = seen[:, :3] - sensor[:, :3]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    noise = centroid_covariance(u, np.full(len(u), noise_arcsec * ARCSEC))
+    fit = directions_at(
+        np.zeros(1, int), np.full(1, len(t)), np.array([at]), 0.01, t, u, noise, 0 * noise, 6.0
+    )
+    here, there = trajectory(LOW, np.array([at]))[0], trajectory(target, np.array([at]))[0]
+    true = there[:, :3] - here[:, :3]
+    true /= np.linalg.norm(true)
+    off = neglected_motion(there, here, fit.moments)
+    left = np.linalg.norm(fit.u - off - true)
+    missed = np.linalg.norm(fit.u - true)
+    assert missed > 0.2 * ARCSEC  # what is neglected
+    assert left < 0.02 * missed
+    assert missed < 4 * np.sqrt(fit.unmodelled[0])
+
+
+def test_nothing_is_neglected_at_the_instant_itself():
+    off = neglected_motion(GEO[None], LOW[None], np.zeros((1, 3)))
+    np.testing.assert_array_equal(off, np.zeros((1, 3)))

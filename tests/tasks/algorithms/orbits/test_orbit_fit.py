@@ -38,7 +38,7 @@ def start(rng):
 
 def test_without_errors_the_fit_is_the_truth():
     arcs = trial(1, noise=1e-3, bias=1e-3, place_km=1e-6)
-    state, _, chi2 = fit_orbits(arcs, start(np.random.default_rng(0)))
+    state, _, chi2, _ = fit_orbits(arcs, start(np.random.default_rng(0)))
     assert np.linalg.norm(state[0, :3] - GEO[:3]) < METRE
     assert np.linalg.norm(state[0, 3:] - GEO[3:]) < 10 * MM_S
     assert np.isfinite(chi2[0])
@@ -48,7 +48,7 @@ def test_errors_over_many_trials_are_as_claimed_though_biases_are_shared():
     n, square, total, dof = 300, 0.0, 0.0, 0
     for seed in range(n):
         arcs = trial(seed)
-        state, cov, chi2 = fit_orbits(arcs, start(np.random.default_rng(seed)))
+        state, cov, chi2, _ = fit_orbits(arcs, start(np.random.default_rng(seed)))
         off = state[0] - GEO
         square += off @ np.linalg.solve(cov[0], off)
         total, dof = total + chi2[0], dof + 2 * len(arcs.time_s) - 6
@@ -69,7 +69,7 @@ def test_arcs_are_fitted_separately_and_bad_ones_are_nan():
     one = trial(3)
     n = len(one.time_s)
     both = Arcs(np.array([0, n, n + 2]), *(np.concatenate([a, a[:2]]) for a in one[1:]))
-    state, cov, chi2 = fit_orbits(both, np.array([GEO, GEO]))
+    state, cov, chi2, _ = fit_orbits(both, np.array([GEO, GEO]))
     np.testing.assert_allclose(state[0], fit_orbits(one, GEO[None])[0][0])
     assert np.isnan(state[1]).all()
     assert np.isnan(cov[1]).all()
@@ -80,7 +80,7 @@ def test_arcs_are_fitted_separately_and_bad_ones_are_nan():
 
 def test_no_arc_gives_no_state():
     empty = Arcs(np.array([0]), *(a[:0] for a in trial(4, times=np.zeros(1))[1:]))
-    state, cov, chi2 = fit_orbits(empty, np.zeros((0, 6)))
+    state, cov, chi2, _ = fit_orbits(empty, np.zeros((0, 6)))
     assert state.shape == (0, 6)
     assert cov.shape == (0, 6, 6)
     assert chi2.shape == (0,)

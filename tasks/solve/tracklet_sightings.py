@@ -1,0 +1,140 @@
+"""Tracklet sightings: one sensor's detections by tracklet, with honest errors.
+
+Two errors are told by the detections together: which part of a prior attitude's error changes from
+frame to frame, and what the light of a neighbour may add to a centroid.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array
+from epipole.schemas.settings import Settings
+from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.geometry.direction_errors import scatter_beyond
+from epipole.tasks.algorithms.geometry.sky import aberrate
+from epipole.tasks.algorithms.tracking.blends import Tracked, blend_variance, of_neighbour
+from epipole.tasks.algorithms.tracking.local_motion import directions_at
+from epipole.tasks.common.sightings import Frames, sightings_of
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class TrackletSightings(NamedTuple):
+    """Sightings sorted by tracklet, then frame.
+
+    Tracklet k has the rows ``bounds[k]:bounds[k + 1]``, and the id ``name[k]``.
+    """
+
+    frame: Indices
+    centroid: Indices
+    u_icrs: Array
+    cov_noise: Array
+    cov_bias: Array
+    flux: Array
+    bounds: Indices
+    name: npt.NDArray[np.object_]
+
+
+def tracklet_sightings(
+    frames: Frames, tracked: pa.Table, camera: Camera, settings: Settings
+) -> TrackletSightings:
+    """Return the sightings of one sensor's detections that have a tracklet and a direction."""
+    sightings = _with_split_prior(_by_tracklet(frames, tracked), frames, settings)
+    return _with_blends(sightings, frames, camera)
+
+
+def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
+    sightings = sightings_of(frames, tracked)
+    name = array(tracked, "tracklet_id")[sightings.row]
+    order = np.lexsort((sightings.frame, name.astype(str)))
+    bounds = _bounds(name[order])
+    return TrackletSightings(
+        sightings.frame[order],
+        array(tracked, "centroid")[sightings.row[order]],
+        sightings.u_icrs[order],
+        sightings.cov_noise[order],
+        sightings.cov_bias[order],
+        array(tracked, "flux").astype(float)[sightings.row[order]],
+        bounds,
+        name[order[bounds[:-1]]],
+    )
+
+
+def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -> TrackletSightings:
+    """Return the sightings with the errors that the light of neighbours may add.
+
+    Those of a neighbour alone are left out.
+    """
+    time_s = (frames.time_ns - frames.time_ns[0]) / 1e9
+    tracked = Tracked(
+        tracklets.bounds,
+        time_s[tracklets.frame],
+        tracklets.u_icrs,
+        tracklets.cov_noise,
+        tracklets.flux,
+    )
+    variance = blend_variance(tracked, time_s, camera.pixel_rad)
+    across = np.eye(3) - tracklets.u_icrs[:, :, None] * tracklets.u_icrs[:, None, :]
+    cov_bias = tracklets.cov_bias + variance[:, None, None] * across
+    own = ~of_neighbour(tracked, variance)
+    left = np.concatenate([[0], np.cumsum(own)])
+    return TrackletSightings(
+        tracklets.frame[own],
+        tracklets.centroid[own],
+        tracklets.u_icrs[own],
+        tracklets.cov_noise[own],
+        cov_bias[own],
+        tracklets.flux[own],
+        left[tracklets.bounds],
+        tracklets.name,
+    )
+
+
+def _with_split_prior(
+    tracklets: TrackletSightings, frames: Frames, settings: Settings
+) -> TrackletSightings:
+    """Return the sightings with each prior attitude's error divided as the detections show it.
+
+    What changes from frame to frame scatters about the smooth motion of objects: it is noise. The
+    rest of the stated variance is the bias that all frames share. It is not less than the error of
+    the division.
+    """
+    prior = np.flatnonzero(~frames.from_stars[tracklets.frame])
+    if not len(prior):
+        return tracklets
+    v = np.nan_to_num(frames.v_gcrf_km_s)
+    u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
+    own = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[prior] / 2
+    fit = directions_at(
+        np.repeat(tracklets.bounds[:-1], np.diff(tracklets.bounds))[prior],
+        np.repeat(tracklets.bounds[1:], np.diff(tracklets.bounds))[prior],
+        (frames.time_ns[tracklets.frame[prior]] - frames.time_ns[0]) / 1e9,
+        0.0,
+        (frames.time_ns[tracklets.frame] - frames.time_ns[0]) / 1e9,
+        u,
+        tracklets.cov_noise,
+        tracklets.cov_bias,
+        settings.alignment.window_s,
+    )
+    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / own
+    tracklet = np.repeat(np.arange(len(tracklets.name)), np.diff(tracklets.bounds))[prior]
+    follows = np.append(False, (np.diff(tracklet) == 0) & (np.diff(prior) == 1))
+    scatter = scatter_beyond(u[prior] - fit.u, np.sqrt(own), leverage, follows)
+    stated = np.trace(tracklets.cov_bias, axis1=1, axis2=2)[prior] / 2
+    share = scatter / np.maximum(stated, 1e-30)
+    n_frames = len(np.unique(tracklets.frame[prior]))
+    stays = np.maximum(1.0 - share, share / np.sqrt(n_frames))
+    noise, bias = tracklets.cov_noise.copy(), tracklets.cov_bias.copy()
+    noise[prior] += share[:, None, None] * bias[prior]
+    bias[prior] *= stays[:, None, None]
+    return tracklets._replace(cov_noise=noise, cov_bias=bias)
+
+
+def _bounds(names: npt.NDArray[np.object_]) -> Indices:
+    """Return where each run of equal names begins, and where the last one ends."""
+    change = np.flatnonzero(names[1:] != names[:-1]) + 1
+    return np.concatenate([[0], change, [len(names)]]).astype(np.int64)
