@@ -109,6 +109,13 @@ class TrackletSettings(Group):
     false_alarm: float = Field(
         1e-4, gt=0, lt=1, description="Accepted number of false tracklets per frame."
     )
+    false_alarm_sequence: float = Field(
+        1.0,
+        gt=0,
+        description="Accepted number of false tracklets in a short sequence: what no tracklet "
+        "claimed is followed again with it, where it allows ten times `false_alarm` per frame. It "
+        "counts every pair of detections as a test; 1 to 5 % of it are measured.",
+    )
     link_method: LinkMethod = Field(
         "likelihood_ratio", description="How tracklets of one object are joined after a gap."
     )

@@ -134,6 +134,7 @@ def _follow(
         gate_sigma=settings.gate_sigma,
         field_sr=camera.width * camera.height * camera.pixel_rad**2,
         false_alarm=settings.false_alarm,
+        false_alarm_sequence=settings.false_alarm_sequence,
     )
 
 
