@@ -119,8 +119,11 @@ class TrackletSettings(Group):
     link_method: LinkMethod = Field(
         "likelihood_ratio", description="How tracklets of one object are joined after a gap."
     )
-    link_gap_s: float = Field(
-        90.0, gt=0, description="Longest gap across which tracklets are joined."
+    link_gap_s: float | None = Field(
+        None,
+        gt=0,
+        description="Longest gap across which tracklets are joined. Default: as far as their "
+        "motion can be foretold; three minutes where the gap lies over the end of a span.",
     )
     link_kept: float = Field(
         0.9999, gt=0, lt=1, description="Share of true links that the chi-square test accepts."

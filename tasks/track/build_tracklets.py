@@ -234,7 +234,7 @@ def _link(
         sighting_sigma(sightings)[members],
     )
     rule = LinkRule(
-        gap_s=chosen.link_gap_s,
+        gap_s=np.inf if chosen.link_gap_s is None else chosen.link_gap_s,
         kept=chosen.link_kept,
         field_sr=camera.width * camera.height * camera.pixel_rad**2,
         interval_s=part.interval_s,
