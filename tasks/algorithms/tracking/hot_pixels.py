@@ -76,7 +76,8 @@ def fixed_places(
         return FixedPlaces(place, np.zeros(0))
     reach = max(4 * float(np.median(sigma_px)), 0.25)
     R = matrix_from_quaternion(q_sensor_from_icrs)
-    certain, ratio = [], []
+    certain: list[bool] = []
+    evidence: list[Place] = []
     for members in _fixed_places(x_px, y_px, reach, (camera.width, camera.height), n_frames):
         shown = np.unique(frame[members])
         if len(shown) < max(SHARE * n_frames, FEWEST):
@@ -89,8 +90,8 @@ def fixed_places(
             _stays_through_repointing(shown, _pointings(time_s, path, camera.pixel_rad))
             or _turns_fast(time_s, path)
         )
-        ratio.append(Place(time_s[frame[members]], x, y, sigma_px[members], reach))
-    return FixedPlaces(place, _log_odds(np.array(certain, bool), ratio, camera))
+        evidence.append(Place(time_s[frame[members]], x, y, sigma_px[members], reach))
+    return FixedPlaces(place, _log_odds(np.array(certain, bool), evidence, camera))
 
 
 def _log_odds(certain: Flags, places: list[Place], camera: Camera) -> Array:

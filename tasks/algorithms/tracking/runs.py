@@ -263,7 +263,7 @@ def follow_detections(
         -float(np.log(false_alarm)),
     )
     track = _followed(time_s, offsets, u_icrs, sigma_rad, rule)
-    per_frame = false_alarm_sequence / max(np.count_nonzero(np.diff(offsets)), 1)
+    per_frame = false_alarm_sequence / max(int(np.count_nonzero(np.diff(offsets))), 1)
     free = np.flatnonzero(track == NONE)
     if per_frame < SHORTER * false_alarm or not len(free):
         return track
