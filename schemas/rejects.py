@@ -137,6 +137,12 @@ class Reason(StrEnum):
         "No state of the sensor is near enough in time: the frames give no position.",
     )
     # Of tracklets and views.
+    HOT_PIXEL = (
+        "hot_pixel",
+        Stage.TRACK,
+        "Detections of hot pixels; with a tracklet_id: it stands on a pixel as a hot pixel does, "
+        "and no other sensor sees an object there.",
+    )
     SENSOR_DISAGREES = (
         "sensor_disagrees",
         Stage.SOLVE,

@@ -109,11 +109,21 @@ class TrackletSettings(Group):
     false_alarm: float = Field(
         1e-4, gt=0, lt=1, description="Accepted number of false tracklets per frame."
     )
+    false_alarm_sequence: float = Field(
+        1.0,
+        gt=0,
+        description="Accepted number of false tracklets in a short sequence: what no tracklet "
+        "claimed is followed again with it, where it allows ten times `false_alarm` per frame. It "
+        "counts every pair of detections as a test; 1 to 5 % of it are measured.",
+    )
     link_method: LinkMethod = Field(
         "likelihood_ratio", description="How tracklets of one object are joined after a gap."
     )
-    link_gap_s: float = Field(
-        90.0, gt=0, description="Longest gap across which tracklets are joined."
+    link_gap_s: float | None = Field(
+        None,
+        gt=0,
+        description="Longest gap across which tracklets are joined. Default: as far as their "
+        "motion can be foretold; three minutes where the gap lies over the end of a span.",
     )
     link_kept: float = Field(
         0.9999, gt=0, lt=1, description="Share of true links that the chi-square test accepts."

@@ -256,6 +256,13 @@ TRACKLET_RUNS = schema(
     [field for field in TRACKLETS if field.name != "outcome"],
 )
 
+HOT_SUSPECTS = schema(
+    "hot_suspects",
+    "One row per tracklet of one sensor that is a hot pixel, unless another sensor sees an object "
+    "there.",
+    [id_column("tracklet_id", doc="Id in the span, or in the night.")],
+)
+
 CLOCK_VIEWS = schema(
     "clock_views",
     "One row per view and object: each object with its views, and views of no object with every "

@@ -38,8 +38,9 @@ from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.identify.identify_span import identify_span
 from epipole.tasks.name.link_objects import link_objects, outermost, renamed
 from epipole.tasks.name.name_objects import name_objects
+from epipole.tasks.publish.night_parts import NightParts
 from epipole.tasks.publish.publish_nights import publish_nights
-from epipole.tasks.publish.write_tables import SHARES, NightParts, write_tables
+from epipole.tasks.publish.write_tables import SHARES, write_tables
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs
 from epipole.tasks.read.read_logs import read_log_into
 from epipole.tasks.solve.align_epochs import EpochGrid, frames_that_serve, grid_of

@@ -24,6 +24,7 @@ from epipole.schemas.work_tables import (
     CLOCK_VIEWS,
     EXPOSURES,
     FRAME_INDEX,
+    HOT_SUSPECTS,
     OBJECT_TRACKS,
     SENSOR_STATES,
     SOLUTIONS,
@@ -47,9 +48,13 @@ IDENTIFIED: Final[PartTables] = {
     "detections": DETECTIONS,
     "rejects": REJECTS,
 }
-TRACKED: Final[PartTables] = {"detections": DETECTIONS, "tracklets": TRACKLET_RUNS}
+TRACKED: Final[PartTables] = {
+    "detections": DETECTIONS,
+    "tracklets": TRACKLET_RUNS,
+    "suspects": HOT_SUSPECTS,
+}
 SPAN_NAMES: Final[PartTables] = {"names": TRACKLET_NAMES}
-NIGHT_TRACKLETS: Final[PartTables] = {"tracklets": TRACKLET_RUNS}
+NIGHT_TRACKLETS: Final[PartTables] = {"tracklets": TRACKLET_RUNS, "suspects": HOT_SUSPECTS}
 SOLVED: Final[PartTables] = {
     "epochs": EPOCHS,
     "associations": ASSOCIATIONS,

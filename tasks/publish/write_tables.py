@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -11,20 +10,24 @@ import pyarrow.compute as pc
 
 from epipole.io.datasets.dataset import in_order, rows_of_night
 from epipole.io.datasets.night_files import write_table
-from epipole.io.work.parts import Parts, read_part
-from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import array, concat, conform, table
 from epipole.schemas.logs.log_tables import LogSource
-from epipole.schemas.rejects import Outcome, Reason, reject_rows
+from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, Span
 from epipole.schemas.stages import Stage
-from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES, TRACKLETS
-from epipole.schemas.work_tables import SOLUTIONS, TRACKLET_RUNS
+from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES
+from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.common.lone_detections import with_lone_objects
 from epipole.tasks.common.named_detections import detections_within
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.solve.judge_tracklets import best_outcomes
+from epipole.tasks.publish.hot_tracklets import (
+    confirmed_tracklets,
+    hot_pixel_rejects,
+    hot_tracklets,
+    with_hot_pixels,
+)
+from epipole.tasks.publish.night_parts import NightParts
 
 # These tables may not fit in memory as a whole: they are written span by span.
 BY_SENSOR = ("frames", "stars", "detections")
@@ -43,23 +46,6 @@ COUNTED = (
 )
 
 
-class NightParts(NamedTuple):
-    """The parts and tables from which the tables of a night are made.
-
-    `spans` are the night's, in order, and `all_spans` the run's. `names` has, for the folder of
-    each span, the names of its objects in the night. `whole` has tables of the whole run:
-    `calibrations`, `sources`, and the `rejects` that belong to no span.
-    """
-
-    night: str
-    spans: list[Span]
-    all_spans: list[Span]
-    sensors: list[SensorParts]
-    solved: Parts
-    names: Mapping[str, Mapping[str, str]]
-    whole: Mapping[str, pa.Table]
-
-
 @stage_task(Stage.PUBLISH, "{tables[0]} of {parts.night}")
 def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None:
     """Write tables of a night, each sorted by time, from the parts of its spans.
@@ -74,7 +60,8 @@ def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None
     for name in tables:
         rows: Iterator[pa.Table]
         if name in BY_SENSOR:
-            rows = (_of_sensors(name, parts, span) for span in parts.spans)
+            hot = hot_tracklets(parts)["tracklet_id"] if name == "detections" else None
+            rows = (_of_sensors(name, parts, span, hot) for span in parts.spans)
         elif name in BY_SPAN:
             rows = _of_spans(name, parts)
         else:
@@ -84,16 +71,19 @@ def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None
 
 def _of_night(name: str, parts: NightParts) -> pa.Table:
     if name == "tracklets":
-        rows = tracklets_of_run(parts)
+        rows = confirmed_tracklets(parts)
     elif name == "rejects":
-        rows = counted([parts.whole[name], *_rejects(parts)])
+        rows = counted([parts.whole[name], *_rejects(parts), hot_pixel_rejects(parts)])
     else:
         rows = parts.whole[name]
     return in_order(rows_of_night(name, rows, parts.night))
 
 
-def _of_sensors(name: str, parts: NightParts, span: Span) -> pa.Table:
-    """Return a span's rows of all sensors, sorted by time and then sensor."""
+def _of_sensors(name: str, parts: NightParts, span: Span, hot: pa.ChunkedArray | None) -> pa.Table:
+    """Return a span's rows of all sensors, sorted by time and then sensor.
+
+    `hot`, for `detections` only, are the ids of tracklets that are hot pixels.
+    """
     schema = TABLES[name]
     if name == "detections":
         rows = [detections_within(sensor, span) for sensor in parts.sensors]
@@ -109,7 +99,7 @@ def _of_sensors(name: str, parts: NightParts, span: Span) -> pa.Table:
         near = parts.solved.rows_within(
             span.widened(SERVED_NS), ASSOCIATIONS, "associations", time="epoch"
         )
-        together = with_lone_objects(together, near)
+        together = with_hot_pixels(with_lone_objects(together, near), hot)
     return together.take(np.argsort(array(together, "time"), kind="stable"))
 
 
@@ -127,17 +117,6 @@ def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:
     old = pa.array(list(names), pa.string())
     new = pa.array(list(names.values()), pa.string())
     return rows.set_column(at, rows.schema.field(at), new.take(pc.index_in(rows["object_id"], old)))
-
-
-def tracklets_of_run(parts: NightParts) -> pa.Table:
-    """Return TRACKLETS of the run, each with its outcome over all spans."""
-    runs = [read_part(sensor.names.of_night(), "tracklets") for sensor in parts.sensors]
-    tracklets = concat(TRACKLET_RUNS, runs)
-    solved = [span for span in parts.all_spans if parts.solved.holds(span)]
-    outcomes = best_outcomes(parts.solved.read(span, "tracklet_outcomes") for span in solved)
-    row = pc.index_in(tracklets["tracklet_id"], outcomes["tracklet_id"].combine_chunks())
-    outcome = pc.coalesce(outcomes["outcome"].take(row), Outcome.NOT_COMPARED.value)
-    return conform(TRACKLETS, tracklets.append_column("outcome", outcome))
 
 
 def _rejects(parts: NightParts) -> Iterator[pa.Table]:

@@ -11,10 +11,11 @@ from epipole.schemas.bridge import array, concat, empty, nullable, table
 from epipole.schemas.methods import TRACK_LINKING, load_method
 from epipole.schemas.settings import Settings, TrackletSettings
 from epipole.schemas.tables import DETECTIONS
-from epipole.schemas.work_tables import TRACKLET_RUNS
+from epipole.schemas.work_tables import HOT_SUSPECTS, TRACKLET_RUNS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.time.epoch_grid import frame_interval_ns
+from epipole.tasks.algorithms.tracking.hot_pixels import CERTAIN, LIKELY, NOWHERE
 from epipole.tasks.algorithms.tracking.linking.chains import (
     Fragments,
     LinkRule,
@@ -35,8 +36,8 @@ from epipole.tasks.common.sightings import (
 from epipole.tasks.track.classify_detections import (
     at_hot_pixel,
     at_star,
-    is_hot_pixel,
     is_planet,
+    places_in_image,
     sighting_sigma,
 )
 from epipole.tasks.track.measure_runs import TrackRun, measure_runs
@@ -45,10 +46,11 @@ Array = npt.NDArray[np.float64]
 
 
 class Tracked(NamedTuple):
-    """DETECTIONS with their tracklets, and TRACKLET_RUNS."""
+    """DETECTIONS with their tracklets, TRACKLET_RUNS, and HOT_SUSPECTS among them."""
 
     detections: pa.Table
     tracklets: pa.Table
+    suspects: pa.Table
 
 
 def build_tracklets(
@@ -60,20 +62,21 @@ def build_tracklets(
     the image. There stars move like objects and cannot be told from them.
     """
     if not detections.num_rows:
-        return Tracked(detections, empty(TRACKLET_RUNS))
+        return Tracked(detections, empty(TRACKLET_RUNS), empty(HOT_SUSPECTS))
     labels = _Labels(
         np.full(detections.num_rows, "unknown", dtype=object),
         *(np.full(detections.num_rows, None, dtype=object) for _ in range(2)),
     )
-    tracklets = [
+    parts = [
         _label(part, labels, detections, settings)
         for part in _parts(solutions, detections, cameras)
     ]
     columns = {name: detections[name] for name in DETECTIONS.names} | labels._asdict()
-    built = concat(TRACKLET_RUNS, tracklets)
+    built = concat(TRACKLET_RUNS, [tracklets for tracklets, _ in parts])
     return Tracked(
         table(DETECTIONS, columns),
         built.sort_by([("start_time", "ascending"), ("tracklet_id", "ascending")]),
+        concat(HOT_SUSPECTS, [suspects for _, suspects in parts]),
     )
 
 
@@ -131,39 +134,66 @@ def _follow(
         gate_sigma=settings.gate_sigma,
         field_sr=camera.width * camera.height * camera.pixel_rad**2,
         false_alarm=settings.false_alarm,
+        false_alarm_sequence=settings.false_alarm_sequence,
     )
 
 
 def _label(
     part: _TrackedFrames, labels: _Labels, detections: pa.Table, settings: Settings
-) -> pa.Table:
-    """Label the detections of some frames, and return their tracklets."""
+) -> tuple[pa.Table, pa.Table]:
+    """Label the detections of some frames; return their tracklets, and those that may be hot."""
     frames, sightings, camera = part.frames, part.sightings, part.camera
     known = labels.kind == "hot_pixel"
-    hot = is_hot_pixel(frames, sightings, detections, camera)
-    hot |= at_hot_pixel(sightings, detections, known, camera)
+    places = places_in_image(frames, sightings, detections, camera)
+    hot = places.with_odds(CERTAIN) | at_hot_pixel(sightings, detections, known, camera)
     labels.kind[sightings.row[hot]] = "hot_pixel"
     planet = np.zeros_like(hot)
     if part.on_sky:
         planet = is_planet(frames, sightings, camera) & ~hot
         labels.kind[sightings.row[planet]] = "planet"
-    sightings = part_of(sightings, ~hot & ~planet)
+    kept = ~hot & ~planet
+    sightings, suspected = part_of(sightings, kept), places.with_odds(LIKELY)[kept]
     track = _follow(part, sightings, settings.tracklets)
     runs = measure_runs(frames, sightings, track, camera, settings.alignment.window_s)
     if part.on_sky:
         stars = [run for run in runs if run.stands_still]
         runs = [run for run in runs if not run.stands_still]
         _label_stars(labels, sightings, stars, np.flatnonzero(track == NONE))
-    sensor_id = str(detections["sensor_id"][0])
+    # What no run holds, no other sensor can confirm.
+    held = _held(places.place[kept], runs)
+    labels.kind[sightings.row[suspected & ~held]] = "hot_pixel"
     objects = sorted(runs, key=lambda run: int(run.members[0]))
-    names = [_name(sensor_id, frames, sightings, detections, run) for run in objects]
+    return _label_objects(part, sightings, objects, labels, detections, settings, suspected)
+
+
+def _held(place: npt.NDArray[np.int64], runs: list[TrackRun]) -> npt.NDArray[np.bool_]:
+    """Return which sightings are at a place of the image that a run has a sighting at."""
+    members = np.concatenate([np.zeros(0, np.int64), *(run.members for run in runs)])
+    return np.isin(place, np.setdiff1d(place[members], [NOWHERE]))
+
+
+def _label_objects(
+    part: _TrackedFrames,
+    sightings: Sightings,
+    objects: list[TrackRun],
+    labels: _Labels,
+    detections: pa.Table,
+    settings: Settings,
+    suspected: npt.NDArray[np.bool_],
+) -> tuple[pa.Table, pa.Table]:
+    """Label the sightings of objects; return their TRACKLET_RUNS and HOT_SUSPECTS."""
+    sensor_id = str(detections["sensor_id"][0])
+    names = [_name(sensor_id, part.frames, sightings, detections, run) for run in objects]
     links = _link(part, sightings, objects, settings)
     heads = [names[head] for head in chain_heads(links.before)]
     for run, name, head in zip(objects, names, heads, strict=True):
         labels.kind[sightings.row[run.members]] = "object"
         labels.tracklet_id[sightings.row[run.members]] = name
         labels.track_id[sightings.row[run.members]] = head
-    return _tracklet_table(frames, sightings, objects, names, heads, links.chi2, sensor_id)
+    at_suspect = [suspected[run.members].mean() > 0.5 for run in objects]
+    suspects = [name for name, at in zip(names, at_suspect, strict=True) if at]
+    rows = _tracklet_table(part.frames, sightings, objects, names, heads, links.chi2, sensor_id)
+    return rows, table(HOT_SUSPECTS, {"tracklet_id": suspects})
 
 
 def _label_stars(
@@ -204,7 +234,7 @@ def _link(
         sighting_sigma(sightings)[members],
     )
     rule = LinkRule(
-        gap_s=chosen.link_gap_s,
+        gap_s=np.inf if chosen.link_gap_s is None else chosen.link_gap_s,
         kept=chosen.link_kept,
         field_sr=camera.width * camera.height * camera.pixel_rad**2,
         interval_s=part.interval_s,

@@ -10,7 +10,7 @@ from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.orbits.planets import planet_directions
-from epipole.tasks.algorithms.tracking.hot_pixels import hot_pixels
+from epipole.tasks.algorithms.tracking.hot_pixels import FixedPlaces, fixed_places
 from epipole.tasks.common.sightings import Frames, Sightings
 
 Array = npt.NDArray[np.float64]
@@ -19,12 +19,12 @@ Flags = npt.NDArray[np.bool_]
 GATE_SIGMA = 4.0  # largest distance of a detection from a known hot pixel, planet or star
 
 
-def is_hot_pixel(
+def places_in_image(
     frames: Frames, sightings: Sightings, detections: pa.Table, camera: Camera
-) -> Flags:
-    """Return which sightings are hot pixels."""
+) -> FixedPlaces:
+    """Return the places of the image that sightings stay at, and how likely each is a hot pixel."""
     sigma_px = array(detections, "sigma_arcsec")[sightings.row] * ARCSEC / camera.pixel_rad
-    return hot_pixels(
+    return fixed_places(
         sightings.frame,
         array(detections, "x_px")[sightings.row],
         array(detections, "y_px")[sightings.row],

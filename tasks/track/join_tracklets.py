@@ -15,7 +15,7 @@ from epipole.io.work.parts import Parts, is_written, read_part, write_part
 from epipole.schemas.bridge import from_polars, to_polars
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
-from epipole.schemas.work_tables import TRACKLET_NAMES, TRACKLET_RUNS
+from epipole.schemas.work_tables import HOT_SUSPECTS, TRACKLET_NAMES, TRACKLET_RUNS
 from epipole.tasks.algorithms.tracking.linking.chains import chain_heads
 from epipole.tasks.common.stage_tasks import stage_task
 
@@ -129,10 +129,12 @@ def _links(part: Path, numbers: pl.DataFrame) -> pl.DataFrame:
 
 
 def _summed(rows: pl.DataFrame, part: Path) -> pl.DataFrame:
-    """Return a row per tracklet of a span: its detections inside the span, rate and residual."""
+    """Return a row per tracklet of a span: its detections inside the span, rate and residual, and
+    whether it may be a hot pixel."""
     motions = to_polars(
         read_part(part, "tracklets", ["tracklet_id", "rate_arcsec_s", "residual_px"])
     )
+    suspects = to_polars(read_part(part, "suspects"))["tracklet_id"]
     return (
         rows.group_by("number", "span_name")
         .agg(
@@ -143,6 +145,7 @@ def _summed(rows: pl.DataFrame, part: Path) -> pl.DataFrame:
             centroid=pl.col("centroid").first(),
         )
         .join(motions.rename({"tracklet_id": "span_name"}), on="span_name")
+        .with_columns(suspect=pl.col("span_name").is_in(suspects.to_list()))
         .sort("number")
     )
 
@@ -161,6 +164,7 @@ def _write(
             residual_px=(
                 (pl.col("residual_px") ** 2 * pl.col("n")).sum() / pl.col("n").sum()
             ).sqrt(),
+            suspect=(pl.col("suspect") * pl.col("n")).sum() / pl.col("n").sum() > 0.5,
         )
         .join(linked.drop("span_name"), on=["number", "span"], how="left")
         .sort("start_ns", "frame_number", "centroid")
@@ -182,7 +186,11 @@ def _write(
         sensor_id=pl.lit(sensor_id)
     )
     night = night.sort("start_time", "tracklet_id")
-    write_part(parts.of_night(), NIGHT_TRACKLETS, {"tracklets": from_polars(TRACKLET_RUNS, night)})
+    tables = {
+        "tracklets": from_polars(TRACKLET_RUNS, night),
+        "suspects": from_polars(HOT_SUSPECTS, night.filter("suspect")),
+    }
+    write_part(parts.of_night(), NIGHT_TRACKLETS, tables)
 
 
 def _before(night: pl.DataFrame) -> tuple[np.ndarray, list[float | None]]:

@@ -13,13 +13,14 @@ from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.track.build_tracklets import build_tracklets
 
 # Tracklets are followed this long before and after a span, so that neighbouring spans find the same
-# ones, and broken tracks are joined across the border.
+# ones; and this long in addition, so that broken tracks are joined across the border.
 MARGIN_S = 90.0
+LINK_MARGIN_S = 90.0
 
 
 def track_margin_ns(settings: Settings) -> int:
     """Return how far before and after a span its detections are followed."""
-    return round((MARGIN_S + settings.tracklets.link_gap_s) * 1e9)
+    return round((MARGIN_S + (settings.tracklets.link_gap_s or LINK_MARGIN_S)) * 1e9)
 
 
 @stage_task(Stage.TRACK, "{sensor} {span}")

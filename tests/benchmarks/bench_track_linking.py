@@ -32,10 +32,18 @@ from scenes.fragment_scenes import (
 from scenes.identity_score import identity_f1
 
 Labels = npt.NDArray[np.int64]
-CASES = [(60, (10, 20)), (60, (30, 60)), (250, (10, 20)), (250, (30, 60))]
-LONGEST_S = 90.0
+# Objects, range of their gaps [s], duration [s].
+CASES = [
+    (60, (10, 20), 240.0),
+    (60, (30, 60), 240.0),
+    (250, (10, 20), 240.0),
+    (250, (30, 60), 240.0),
+    (250, (60, 120), 480.0),
+    (250, (120, 300), 900.0),
+]
+LONGEST_S = 300.0  # told to the rivals: no gap of a case is longer by design
 RULE = LinkRule(
-    gap_s=LONGEST_S,
+    gap_s=np.inf,
     kept=0.9999,
     field_sr=FIELD_RAD**2,
     interval_s=1.0,
@@ -49,7 +57,7 @@ def likelihood_ratio(scene: BrokenTracks) -> Labels:
 
 
 def prediction(scene: BrokenTracks) -> Labels:
-    links = link_by_prediction(Fragments(*scene[:4]), RULE)
+    links = link_by_prediction(Fragments(*scene[:4]), RULE._replace(gap_s=LONGEST_S))
     return np.repeat(chain_heads(links.before), np.diff(scene.offsets))
 
 
@@ -165,11 +173,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rivals", action="store_true", help="Stone Soup and laptrack as well")
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--mixed", action="store_true", help="orbits of any height")
     chosen = parser.parse_args()
     warnings.filterwarnings("ignore")
     print(f"{'objects':>7} {'gap s':>7} {'method':<18} {'IDF1 %':>7} {'lowest':>7} {'CPU ms':>12}")
-    for n, gap in CASES:
-        scenes = [broken_tracks(seed, n, gap) for seed in range(chosen.seeds)]
+    for n, gap, duration_s in CASES:
+        seeds = range(chosen.first, chosen.first + chosen.seeds)
+        scenes = [
+            broken_tracks(seed, n, gap, belt=not chosen.mixed, duration_s=duration_s)
+            for seed in seeds
+        ]
         rows = [
             ("likelihood ratio", likelihood_ratio, scenes, 5),
             ("prediction [D]", prediction, scenes, 5),

@@ -1,6 +1,7 @@
 """Frame to frame: IDF1 and CPU time per detection, against the number of false detections.
 
 python tests/benchmarks/bench_tracking.py
+python tests/benchmarks/bench_tracking.py --few    five frames, one in 40 s: shares found
 """
 
 import argparse
@@ -15,6 +16,8 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.tracking.runs import follow_detections
 
 sys.path.append(str(Path(__file__).parents[1]))  # what tests share
+from scenes.few_frames import FIELD_RAD as SMALL_FIELD_RAD
+from scenes.few_frames import INTERVAL_S, few_frames, found_and_false
 from scenes.identity_score import identity_f1
 
 Array = npt.NDArray[np.float64]
@@ -100,13 +103,49 @@ def follow(scene: Night, **changes: float) -> Labels:
     )
 
 
+def few(n_false: float, seeds: int, missed: float, **changes: float) -> tuple[float, float, float]:
+    """Return the shares of objects found that are in all five frames, and in three or more; and
+    the number of false tracks per sequence."""
+    options = {
+        "max_rate_rad_s": np.radians(2.0),
+        "max_coast_s": 4.5 * INTERVAL_S,
+        "max_missed": 3,
+        "min_detections": 3,
+        "gate_sigma": 4.0,
+        "field_sr": SMALL_FIELD_RAD.prod(),
+        "false_alarm": 1e-4,
+    }
+    whole, some = np.zeros(3), np.zeros(3)
+    for seed in range(seeds):
+        scene = few_frames(seed, 2, n_false, sigma_px=0.8, missed=missed)
+        track = follow_detections(*scene[:4], **(options | changes))
+        whole += found_and_false(scene, track, 5)
+        some += found_and_false(scene, track, 3)
+    return whole[0] / whole[1], some[0] / some[1], whole[2] / seeds
+
+
+def tell_few(seeds: int) -> None:
+    print(f"{'strays':>6} {'accepted':>9} {'found in 5 %':>13} {'in 3 to 5 %':>12} {'false':>7}")
+    for n_false in (0, 1, 5, 20):
+        for accepted in (5e-4, 1.0):  # the first is the rate per frame, as for long sequences
+            whole, some, false = few(n_false, seeds, MISSED, false_alarm_sequence=accepted)
+            print(
+                f"{n_false:>6} {accepted:>9} {100 * whole:>13.1f} {100 * some:>12.1f} {false:>7.3f}"
+            )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=600)
     parser.add_argument("--objects", type=int, default=250)
     parser.add_argument("--false", type=int, nargs="*", default=[2, 10, 30, 100, 300, 1000])
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--few", action="store_true", help="five frames instead")
+    parser.add_argument("--seeds", type=int, default=500, help="of --few")
     chosen = parser.parse_args()
+    if chosen.few:
+        tell_few(chosen.seeds)
+        return
     follow(night(0, 5, 5, 20))
     print(f"{'objects':>7} {'false':>6} {'IDF1 %':>7} {'us a detection':>15}")
     for n_false in chosen.false:

@@ -1,11 +1,14 @@
 """Hot pixels: detections that stay at a place of the image while the sky moves through it."""
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.tracking.apparent_motion import acceleration
+from epipole.tasks.algorithms.tracking.hot_pixel_odds import Place, log_ratio, with_population
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -13,17 +16,34 @@ Flags = npt.NDArray[np.bool_]
 
 SHARE = 0.5  # least share of the frames, and of the pointings, that show a hot pixel
 FEWEST = 5  # frames
-FEWEST_STILL = 10  # frames, where only its steadiness is evidence
-STEADY = 0.1  # most of the centroids' variance: light has all of it, a hot pixel none
-NEAR_CHI2 = 11.8, 19.3  # of 2 degrees of freedom: 99.7 %; 99.994 % where there are many frames
-CHANCE_OF_MIDDLE = 0.02  # accepted chance that light falls on the middle of a pixel
+FEWEST_STILL = 10  # frames, where only its centroids are evidence
+NOWHERE = -1
+CERTAIN = np.log(1e4)  # from these odds on it is a hot pixel, whatever other sensors see
+LIKELY = np.log(10.0)  # from these odds on it is one, unless another sensor sees an object there
 REPOINTED_PX = 20.0  # least motion of the sky through the image at a repointing
 BOUND = 10.0  # times the bound on apparent motion: no object follows a repointing
 FAST_TURN_RAD_S = 3e-3  # three times a low orbit's: no object is seen to keep it up
 HALF_TURN_RAD = np.pi
 
 
-def hot_pixels(
+class FixedPlaces(NamedTuple):
+    """Places of the image that half of the frames show.
+
+    place : (n,) int, of each detection the index of its place; NOWHERE where it has none
+    log_odds : (p,) float, of each place ln of the odds that it is a hot pixel, not light;
+        infinite where light cannot stay there, minus infinite where nothing speaks for it
+    """
+
+    place: Indices
+    log_odds: Array
+
+    def with_odds(self, least: float) -> Flags:
+        """Return which detections are at a place with at least these odds."""
+        odds = np.append(self.log_odds, -np.inf)  # NOWHERE takes the last one
+        return np.asarray(odds[self.place] >= least)
+
+
+def fixed_places(
     frame: Indices,
     x_px: Array,
     y_px: Array,
@@ -31,8 +51,8 @@ def hot_pixels(
     time_s: Array,
     q_sensor_from_icrs: Array,
     camera: Camera,
-) -> Flags:
-    """Return which detections of one sensor are hot pixels.
+) -> FixedPlaces:
+    """Return the places that half of the frames show, and how likely each is a hot pixel.
 
     Parameters
     ----------
@@ -46,35 +66,46 @@ def hot_pixels(
     Notes
     -----
     A sensor that follows an object keeps it in place as well, and a sensor with a fixed attitude
-    keeps the stars. So a place that is detected in half of all frames, within the centroids'
-    error, is a hot pixel only where light cannot do the same. It stays through repointings that
-    no object follows, or through a fast turn of more than half a circle; or it scatters less
-    than light can; or it stays on the very middle of a pixel.
+    keeps the stars. A place is a hot pixel for certain where it stays through repointings that
+    no object follows, or through a fast turn of more than half a circle. Otherwise its centroids
+    are evidence: see `hot_pixel_odds`.
     """
-    out = np.zeros(len(frame), bool)
     n_frames = len(time_s)
+    place = np.full(len(frame), NOWHERE)
     if n_frames < FEWEST or not len(frame):
-        return out
+        return FixedPlaces(place, np.zeros(0))
     reach = max(4 * float(np.median(sigma_px)), 0.25)
     R = matrix_from_quaternion(q_sensor_from_icrs)
+    certain: list[bool] = []
+    evidence: list[Place] = []
     for members in _fixed_places(x_px, y_px, reach, (camera.width, camera.height), n_frames):
         shown = np.unique(frame[members])
         if len(shown) < max(SHARE * n_frames, FEWEST):
             continue
-        place = unproject(
-            camera, x_px[members].mean(keepdims=True), y_px[members].mean(keepdims=True)
-        )
-        path = place[0] @ R  # the row form of R' u: where the place pointed, frame by frame
-        if (
+        place[members] = len(certain)
+        x, y = x_px[members], y_px[members]
+        where = unproject(camera, x.mean(keepdims=True), y.mean(keepdims=True))
+        path = where[0] @ R  # the row form of R' u: where the place pointed, frame by frame
+        certain.append(
             _stays_through_repointing(shown, _pointings(time_s, path, camera.pixel_rad))
             or _turns_fast(time_s, path)
-            or _too_steady(x_px[members], y_px[members], sigma_px[members])
-            or _is_one_pixel(
-                time_s[frame[members]], x_px[members], y_px[members], sigma_px[members]
-            )
-        ):
-            out[members] = True
-    return out
+        )
+        evidence.append(Place(time_s[frame[members]], x, y, sigma_px[members], reach))
+    return FixedPlaces(place, _log_odds(np.array(certain, bool), evidence, camera))
+
+
+def _log_odds(certain: Flags, places: list[Place], camera: Camera) -> Array:
+    """Return ln of the odds of each place that it is a hot pixel."""
+    odds = np.where(certain, np.inf, -np.inf)
+    asked = [k for k, place in enumerate(places) if len(place.x_px) >= FEWEST_STILL]
+    asked = [k for k in asked if not certain[k]]
+    for k in asked:
+        odds[k] = log_ratio(places[k], camera, 1)
+    # Hot pixels that hardly scatter tell nothing about others that scatter as light does.
+    open_ = [k for k in asked if odds[k] < CERTAIN]
+    ratios = np.array([log_ratio(places[k], camera, len(open_)) for k in open_])
+    odds[open_] = with_population(ratios)
+    return odds
 
 
 def _stays_through_repointing(shown: Indices, pointing: Indices) -> bool:
@@ -82,33 +113,6 @@ def _stays_through_repointing(shown: Indices, pointing: Indices) -> bool:
     frames_in = np.bincount(pointing)
     shows = np.bincount(pointing[shown], minlength=len(frames_in)) >= SHARE * frames_in
     return bool(shows.sum() > 1 and shows.mean() >= SHARE)
-
-
-def _too_steady(x_px: Array, y_px: Array, sigma_px: Array) -> bool:
-    if len(x_px) < FEWEST_STILL:
-        return False
-    return bool(x_px.var() + y_px.var() < STEADY * 2 * np.mean(sigma_px**2))
-
-
-def _is_one_pixel(time_s: Array, x_px: Array, y_px: Array, sigma_px: Array) -> bool:
-    """Return whether a place is the middle of a pixel and has no drift, to a small error.
-
-    Light falls anywhere on a pixel. It is so near the middle by chance in one of fifty cases at
-    most. An object that the sensor follows drifts, if only a little.
-    """
-    n, sigma = len(x_px), float(np.sqrt(np.mean(sigma_px**2)))
-    if n < FEWEST_STILL:
-        return False
-    least, most = NEAR_CHI2
-    near = min(CHANCE_OF_MIDDLE * n / (np.pi * sigma**2), most)
-    if near < least:
-        return False
-    off_x, off_y = x_px - np.round(x_px.mean()), y_px - np.round(y_px.mean())
-    lever = time_s - time_s.mean()
-    spread = max(float(lever @ lever), 1e-300)
-    middle = n * (off_x.mean() ** 2 + off_y.mean() ** 2) / sigma**2
-    drift = ((lever @ off_x) ** 2 + (lever @ off_y) ** 2) / (spread * sigma**2)
-    return bool(middle < near and drift < 2 * near)
 
 
 def _rates(time_s: Array, path: Array) -> tuple[Array, Array]:

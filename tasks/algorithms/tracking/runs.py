@@ -33,6 +33,10 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
 Array = npt.NDArray[np.float64]
 
 SLACK = 4  # a track begins within so many frames more than the fewest detections
+# Accepted number of false tracks in a sequence. It counts every pair of detections as a test. Most
+# pairs are too fast to reach the evidence, so that 1 to 5 % of this number are measured.
+FALSE_ALARM_SEQUENCE = 1.0
+SHORTER = 10.0  # a sequence is short where it allows so many times the rate per frame
 DEEPEST = 9  # the same where false alarms are so dense that it takes more detections
 
 
@@ -211,6 +215,7 @@ def follow_detections(
     gate_sigma: float,
     field_sr: float,
     false_alarm: float,
+    false_alarm_sequence: float = FALSE_ALARM_SEQUENCE,
 ) -> npt.NDArray[np.int64]:
     """Return the track number of every detection, -1 where it belongs to none.
 
@@ -237,21 +242,17 @@ def follow_detections(
     false_alarm
         Accepted number of tracks per frame that consist of false alarms. Where false alarms are
         dense, or an object is fast, it takes more detections to begin a track.
+    false_alarm_sequence
+        Accepted number of such tracks in the whole sequence. Few frames cannot give the evidence
+        that many can. So in a short sequence, detections that no track has claimed are followed
+        again, with what this number allows per frame.
 
     Returns
     -------
     (n,) int
-        Tracks count from 0 by the frame in which they were confirmed.
+        Tracks count from 0 by the frame in which they were confirmed; those of the second time
+        come last.
     """
-    n_in = np.diff(offsets)
-    detections = Detections(
-        np.ascontiguousarray(time_s, float),
-        np.ascontiguousarray(offsets, np.int64),
-        np.repeat(np.arange(len(n_in)), n_in),
-        np.ascontiguousarray(u_icrs, float),
-        np.ascontiguousarray(sigma_rad, float) ** 2,
-        np.full(len(u_icrs), NONE),
-    )
     rule = TrackRule(
         float(max_rate_rad_s),
         float(max_coast_s),
@@ -260,6 +261,40 @@ def follow_detections(
         float(gate_sigma) ** 2,
         float(field_sr),
         -float(np.log(false_alarm)),
+    )
+    track = _followed(time_s, offsets, u_icrs, sigma_rad, rule)
+    per_frame = false_alarm_sequence / max(int(np.count_nonzero(np.diff(offsets))), 1)
+    free = np.flatnonzero(track == NONE)
+    if per_frame < SHORTER * false_alarm or not len(free):
+        return track
+    before = np.searchsorted(free, offsets)
+    again = _followed(
+        time_s,
+        before,
+        u_icrs[free],
+        sigma_rad[free],
+        rule._replace(enough=-float(np.log(per_frame))),
+    )
+    track[free] = np.where(again == NONE, NONE, again + track.max() + 1)
+    return track
+
+
+def _followed(
+    time_s: Array,
+    offsets: npt.NDArray[np.int64],
+    u_icrs: Array,
+    sigma_rad: Array,
+    rule: TrackRule,
+) -> npt.NDArray[np.int64]:
+    """Return the track number of every detection, by one rule."""
+    n_in = np.diff(offsets)
+    detections = Detections(
+        np.ascontiguousarray(time_s, float),
+        np.ascontiguousarray(offsets, np.int64),
+        np.repeat(np.arange(len(n_in)), n_in),
+        np.ascontiguousarray(u_icrs, float),
+        np.ascontiguousarray(sigma_rad, float) ** 2,
+        np.full(len(u_icrs), NONE),
     )
     _follow(detections, int(n_in.max(initial=0)), rule)
     return detections.track

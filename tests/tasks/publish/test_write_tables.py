@@ -1,35 +1,27 @@
-"""Tables of a night: rejects counted once per night, each in a night, tracklets with outcomes."""
+"""Tables of a night: rejects counted once per night, each in a night."""
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from scenes.associations import filled
 
-from epipole.io.work.part_tables import NIGHT_TRACKLETS, SOLVED
-from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import SensorParts, WorkFolder
 from epipole.schemas.bridge import array, concat, empty
 from epipole.schemas.logs.log_tables import LogSource
-from epipole.schemas.rejects import Outcome, Reason, reject_rows
+from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
-from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span
-from epipole.schemas.tables import REJECTS, SOURCES, TABLES, TRACKLETS
-from epipole.schemas.work_tables import TRACKLET_OUTCOMES, TRACKLET_RUNS
+from epipole.schemas.spans import DAY_NS
+from epipole.schemas.tables import REJECTS, SOURCES, TABLES
 from epipole.tasks.publish.write_tables import (
     BY_SENSOR,
     BY_SPAN,
     SHARES,
     WHOLE,
-    NightParts,
     counted,
     into_nights,
     source_table,
-    tracklets_of_run,
 )
 
 NIGHT = "2019-04-01"
 MIDNIGHT_NS = int(np.datetime64(NIGHT, "ns").astype(np.int64))
-SPANS = [Span(MIDNIGHT_NS + k * SPAN_NS, MIDNIGHT_NS + (k + 1) * SPAN_NS) for k in (20, 21, 22)]
 
 
 def view_rejected(time_ns: int, count: int, sensor_id="a", tracklet_id=None) -> pa.Table:
@@ -83,36 +75,6 @@ def test_a_reject_is_in_one_of_the_nights():
     assert array(moved, "time").tolist() == [MIDNIGHT_NS, MIDNIGHT_NS, within, MIDNIGHT_NS, last]
     assert moved.schema.equals(rows.schema)
     assert moved.drop_columns("time").equals(rows.drop_columns("time"))
-
-
-def runs(sensor_id: str, *names: str) -> pa.Table:
-    columns = {"tracklet_id": names, "track_id": names, "sensor_id": [sensor_id] * len(names)}
-    return filled(TRACKLET_RUNS, len(names), columns)
-
-
-def solved_part(parts: Parts, span: Span, **outcomes: str) -> None:
-    rows = {"tracklet_id": list(outcomes), "outcome": list(outcomes.values())}
-    tables = {name: empty(schema) for name, schema in SOLVED.items()}
-    tables["tracklet_outcomes"] = filled(TRACKLET_OUTCOMES, len(outcomes), rows)
-    write_part(parts.of(span), SOLVED, tables)
-
-
-def test_each_tracklet_has_its_first_outcome_of_all_spans(tmp_path):
-    folder, sensors = WorkFolder(tmp_path), []
-    for sensor, names in ((Sensor(0, "a"), ("a1", "a2", "a3")), (Sensor(1, "b"), ("b1",))):
-        names_of = folder.tracklet_names(sensor, 0)
-        tracklets = {"tracklets": runs(sensor.sensor_id, *names)}
-        write_part(names_of.of_night(), NIGHT_TRACKLETS, tracklets)
-        sensors.append(SensorParts(folder.identified(sensor), folder.tracked(sensor, 0), names_of))
-    solved = folder.solved(0)
-    solved_part(solved, SPANS[0], a1=Outcome.SEEN_BY_ONE, a2=Outcome.AMBIGUOUS)
-    solved_part(solved, SPANS[2], a1=Outcome.OBJECT, a2=Outcome.SEEN_BY_ONE, b1=Outcome.OBJECT)
-    # The middle span has no part. The night has only the first span, but the outcome is the run's.
-    parts = NightParts(NIGHT, SPANS[:1], SPANS, sensors, solved, {}, {})
-    rows = tracklets_of_run(parts)
-    assert rows["tracklet_id"].to_pylist() == ["a1", "a2", "a3", "b1"]
-    assert rows["outcome"].to_pylist() == ["object", "ambiguous", "not_compared", "object"]
-    assert rows.schema.equals(TRACKLETS)
 
 
 def test_sources_have_the_code_and_settings_that_made_the_night():

@@ -47,10 +47,28 @@ def seen(tmp_path_factory):
     places = place_sensors(log.exposures, log.states, settings)
     found = identify_stars(log.exposures, places, log.cameras, read_hipparcos(), settings)
     truth = pl.read_parquet(folder / "k.mcap.truth" / "points.parquet")
-    return found, log.cameras, truth
+    return found._replace(detections=steadied(found.detections, truth)), log.cameras, truth
 
 
-def build(seen, broken=False, **tracklets):
+def steadied(detections, truth):
+    """The detections, but hot pixels scatter by a tenth of what the simulator gives them."""
+    rows = pl.from_arrow(detections.select(["frame_number", "centroid", "x_px", "y_px"]))
+    kind = rows.join(
+        truth.select("frame_number", "centroid", "kind"), on=["frame_number", "centroid"],
+        how="left", maintain_order="left",
+    )["kind"].to_numpy()  # fmt: skip
+    place = rows.select("x_px", "y_px").to_numpy()
+    middle = np.round(place)
+    _, pixel, count = np.unique(middle, axis=0, return_inverse=True, return_counts=True)
+    hot = (kind == 2) & (count[pixel.ravel()] > 20)
+    place = np.where(hot[:, None], middle + 0.1 * (place - middle), place)
+    for k, name in enumerate(("x_px", "y_px")):
+        at = detections.schema.get_field_index(name)
+        detections = detections.set_column(at, detections.schema.field(at), [place[:, k]])
+    return detections
+
+
+def build(seen, broken=False, suspects=False, **tracklets):
     found, cameras, truth = seen
     detections = of_sensor(found.detections, "a")
     if broken:
@@ -62,7 +80,8 @@ def build(seen, broken=False, **tracklets):
     key = ["sensor_id", "frame_number", "centroid"]
     cast = [pl.col("frame_number").cast(pl.Int64), pl.col("centroid").cast(pl.Int64)]
     known = pl.from_arrow(built.detections).rename({"kind": "taken_for"}).with_columns(cast)
-    return known.join(truth.with_columns(cast), on=key, how="left"), built.tracklets
+    rows = built.suspects if suspects else built.tracklets
+    return known.join(truth.with_columns(cast), on=key, how="left"), rows
 
 
 def test_a_sensor_that_follows_objects_tells_them_from_hot_pixels(seen):
@@ -73,6 +92,54 @@ def test_a_sensor_that_follows_objects_tells_them_from_hot_pixels(seen):
     assert (strays["taken_for"] == "hot_pixel").sum() > 0.95 * 6 * 60
     assert (strays["taken_for"] == "object").sum() == 0
     assert tracklets.num_rows == 5
+
+
+def moved_to_one_pixel(seen, target):
+    """What `seen` has, but the sensor holds an object on the middle of a pixel."""
+    found, cameras, truth = seen
+    rows = pl.from_arrow(found.detections.select(["frame_number", "centroid"]))
+    source = rows.join(
+        truth.filter(pl.col("kind") == 1), on=["frame_number", "centroid"], how="left",
+        maintain_order="left",
+    )["source"].fill_null(-1).to_numpy()  # fmt: skip
+    rng, detections, chosen = np.random.default_rng(1), found.detections, source == target
+    for name, middle in (("x_px", 300.0), ("y_px", 400.0)):
+        at = detections.schema.get_field_index(name)
+        value = detections[name].to_numpy().copy()
+        value[chosen] = middle + 0.15 * rng.normal(size=chosen.sum())
+        detections = detections.set_column(at, detections.schema.field(at), [value])
+    return found._replace(detections=detections), cameras, truth
+
+
+@pytest.mark.parametrize("target", range(3))
+def test_an_object_held_on_the_middle_of_a_pixel_has_its_tracklet(seen, target):
+    detections, suspects = build(moved_to_one_pixel(seen, target), suspects=True)
+    held = detections.filter((pl.col("kind") == 1) & (pl.col("source") == target))
+    assert len(held) > 50
+    assert (held["taken_for"] == "object").mean() > 0.95
+    assert set(suspects["tracklet_id"].to_pylist()) <= set(held["tracklet_id"].to_list())
+    strays = detections.filter(pl.col("kind") == 2)
+    assert (strays["taken_for"] == "hot_pixel").sum() > 0.95 * 6 * 60
+
+
+def test_hot_pixels_that_scatter_as_light_are_suspects_until_other_sensors_are_asked(seen):
+    found, cameras, truth = seen
+    detections = found.detections
+    for name in ("x_px", "y_px"):
+        at = detections.schema.get_field_index(name)
+        value = detections[name].to_numpy()
+        off = value - np.round(value)
+        hot = np.abs(off) < 0.08
+        value = np.where(hot, np.round(value) + 10 * off, value)
+        detections = detections.set_column(at, detections.schema.field(at), [value])
+    detections, suspects = build(
+        (found._replace(detections=detections), cameras, truth), suspects=True
+    )
+    named = set(suspects["tracklet_id"].to_pylist())
+    strays = detections.filter(pl.col("kind") == 2)
+    judged = (strays["taken_for"] == "hot_pixel") | strays["tracklet_id"].is_in(list(named))
+    assert judged.sum() > 0.9 * 6 * 60
+    assert not detections.filter(pl.col("kind") == 1)["tracklet_id"].is_in(list(named)).any()
 
 
 def test_only_objects_have_tracklets_and_tracks(seen):

@@ -32,7 +32,7 @@ class Fragments(NamedTuple):
 class LinkRule(NamedTuple):
     """What the methods of linking are told; each takes what it needs.
 
-    gap_s : longest gap that is bridged
+    gap_s : longest gap that is bridged; infinite: as far as the method itself goes
     kept : share of true links that the chi-square test lets pass
     field_sr : solid angle in which fragments begin, for their density
     interval_s : the sensor's frame interval

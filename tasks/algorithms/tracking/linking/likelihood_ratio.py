@@ -26,6 +26,7 @@ Indices = npt.NDArray[np.int64]
 
 FARTHEST_RAD = 0.5  # longest arc between fragments: a plane stands for the sky
 SEARCH_SIGMA = 6.0  # of the quick test that most pairs fail
+MOST_PAIRS = 10_000_000  # compared: where more are possible, the longest gaps are not bridged
 
 
 class _Ends(NamedTuple):
@@ -381,16 +382,19 @@ def link_by_likelihood(fragments: Fragments, rule: LinkRule) -> Links:
     chi-square with 4 degrees of freedom where the prior decides both, with 8 where the data do.
     The gain of a link is the log of the ratio of two marginal likelihoods, one motion against
     two. It depends on D, and on how precisely the one motion predicts the other fragment compared
-    with how many others could have begun there.
+    with how many others could have begun there. So no gap is too long where the prediction is
+    good enough. Gaps are bridged as far as any motion can be foretold.
     """
     head, tail = _ends(fragments, False), _ends(fragments, True)
-    offsets, time_s, gap_s = fragments.offsets, fragments.time_s, float(rule.gap_s)
+    offsets, time_s = fragments.offsets, fragments.time_s
+    starts = np.sort(head.at)
+    gap_s = _longest_gap(starts, tail.at, rule)
     by_start = np.argsort(head.at, kind="stable")
     earlier, later = _search(tail, head, by_start, gap_s)
     D, free, log_ratio = _compare_all(
         tail, head, earlier, later, time_s[offsets[:-1]], time_s[offsets[1:] - 1]
     )
-    gain = log_ratio - np.log(_others(head, tail, gap_s)[earlier])
+    gain = log_ratio - np.log(_others(starts, tail.at[earlier], head.at[later], gap_s))
     gain += np.log(rule.field_sr * _rate_area(head))
     gain[chdtri(free, 1.0 - rule.kept) < D] = 0.0
     D = np.maximum(D, 0.0)
@@ -398,13 +402,35 @@ def link_by_likelihood(fragments: Fragments, rule: LinkRule) -> Links:
     return fill_in(links, earlier, later, gain, D)
 
 
-def _others(head: _Ends, tail: _Ends, gap_s: float) -> Array:
-    """Return how many fragments begin within the longest gap after each fragment."""
-    starts = np.sort(head.at)
-    return (
-        np.searchsorted(starts, tail.at + gap_s, side="right")
-        - np.searchsorted(starts, tail.at, side="right")
-    ).astype(float)
+def _longest_gap(starts: Array, ends: Array, rule: LinkRule) -> float:
+    """Return the longest gap [s] that is worth a comparison, or that the rule asks for.
+
+    Over a longer one, the jerk that even the slowest object may have makes its place unsure by
+    the whole field. Shorter ones count where there are too many fragments to compare them all.
+    """
+    longest = float(np.cbrt(6 * np.sqrt(rule.field_sr) / jerk(0.0)))
+    if np.isfinite(rule.gap_s):
+        longest = float(rule.gap_s)
+    while _begun(starts, ends, ends + longest).sum() > MOST_PAIRS:
+        longest *= 0.8
+    return longest
+
+
+def _begun(starts: Array, after: Array, until: Array) -> Indices:
+    """Return how many of the sorted starts are after one time and up to another."""
+    return np.searchsorted(starts, until, side="right") - np.searchsorted(
+        starts, after, side="right"
+    )
+
+
+def _others(starts: Array, end: Array, start: Array, gap_s: float) -> Array:
+    """Return among how many fragments each continuation was found.
+
+    All that begin up to then could have been it. Gaps of any length are as likely, in the log of
+    that number: the harmonic sum of all that begin within the longest gap makes it a prior.
+    """
+    up_to, all_of = _begun(starts, end, start), _begun(starts, end, end + gap_s)
+    return np.asarray(np.maximum(up_to, 1) * (np.log(np.maximum(all_of, 1)) + np.euler_gamma + 0.5))
 
 
 def _rate_area(head: _Ends) -> float:

@@ -27,6 +27,7 @@ from epipole.tasks.algorithms.tracking.linking.chains import (
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+LONGEST_S = 90.0  # gap that is bridged, where none is given: its process noise suits no longer one
 DEGREES_OF_FREEDOM = 4  # of one instant: those of the window are almost fully correlated
 HALF_WINDOW = 5  # instants on each side of the middle one
 FASTEST_RAD_S = 0.1  # 1-sigma of a rate not yet measured
@@ -192,6 +193,7 @@ def link_by_prediction(fragments: Fragments, rule: LinkRule) -> Links:
     ----------
     Cheng, Wang, Li et al. (2021); see the module.
     """
+    rule = rule._replace(gap_s=rule.gap_s if np.isfinite(rule.gap_s) else LONGEST_S)
     tail = _filter_all(fragments, False, rule.noise_rad2_s3)
     head = _filter_all(fragments, True, rule.noise_rad2_s3)
     limit = float(chdtri(DEGREES_OF_FREEDOM, 1.0 - rule.kept))

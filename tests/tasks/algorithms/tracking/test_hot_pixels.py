@@ -5,7 +5,7 @@ import pytest
 
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.rotations import multiply, quaternion_from_rotation_vector
-from epipole.tasks.algorithms.tracking.hot_pixels import hot_pixels
+from epipole.tasks.algorithms.tracking.hot_pixels import CERTAIN, LIKELY, fixed_places
 
 CAMERA = Camera(512, 512, 14667.0, 14667.0, 255.5, 255.5)
 SIGMA = 0.15
@@ -34,8 +34,9 @@ def image(seed, n_frames, fixed, n_false=5, noise=SIGMA):
     return np.array(frame), np.array(x), np.array(y), np.array(is_fixed)
 
 
-def find(frame, x, y, time_s, q):
-    return hot_pixels(frame, x, y, np.full(len(x), SIGMA), time_s, q, CAMERA)
+def find(frame, x, y, time_s, q, least=CERTAIN):
+    places = fixed_places(frame, x, y, np.full(len(x), SIGMA), time_s, q, CAMERA)
+    return places.with_odds(least)
 
 
 OFF_MIDDLE = [(100.3, 200.4), (401.6, 55.7)]
@@ -62,17 +63,51 @@ def test_what_stays_more_exactly_than_light_is_a_hot_pixel():
 
 
 @pytest.mark.parametrize("rate", [0.0, 2e-4, 1e-3])
-def test_what_stays_on_the_middle_of_a_pixel_is_a_hot_pixel(rate):
+@pytest.mark.parametrize("seed", range(4))
+def test_several_that_scatter_as_light_on_the_middle_of_pixels_are_likely_hot_pixels(rate, seed):
     t = np.arange(60.0)
-    frame, x, y, fixed = image(4, len(t), MIDDLE)
-    assert (find(frame, x, y, t, turning(rate, t)) == fixed).all()
+    frame, x, y, fixed = image(seed, len(t), MIDDLE)
+    assert (find(frame, x, y, t, turning(rate, t), LIKELY) == fixed).all()
+    assert not find(frame, x, y, t, turning(rate, t), CERTAIN).any()  # other sensors may object
+
+
+@pytest.mark.parametrize("off_px", [0.0, 0.05, 0.1, 0.2])
+@pytest.mark.parametrize("place", [(255.0, 256.0), (100.0, 200.0)])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_followed_object_on_the_middle_of_a_pixel_is_no_hot_pixel(off_px, place, seed):
+    """It scatters as light does; one place alone may be on a middle by chance."""
+    t = np.arange(60.0)
+    frame, x, y, _ = image(seed, len(t), [(place[0] + off_px, place[1])])
+    assert not find(frame, x, y, t, turning(2e-4, t), LIKELY).any()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.005, 0.02])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_followed_object_is_told_from_hot_pixels_beside_it(noise, seed):
+    t = np.arange(60.0)
+    frame, x, y, fixed = image(seed, len(t), MIDDLE, noise=noise)
+    rng = np.random.default_rng(seed + 50)
+    frame, fixed = np.append(frame, np.arange(60)), np.append(fixed, np.zeros(60, bool))
+    x = np.append(x, 256.0 + rng.normal(size=60) * SIGMA)
+    y = np.append(y, 250.0 + rng.normal(size=60) * SIGMA)
+    order = np.argsort(frame, kind="stable")
+    found = find(frame[order], x[order], y[order], t, turning(2e-4, t))
+    assert (found == fixed[order]).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_drifts_is_no_hot_pixel_however_steady(seed):
+    t = np.arange(60.0)
+    frame, x, y, fixed = image(seed, len(t), MIDDLE, noise=0.05)
+    x[fixed] += 0.25 * (frame[fixed] / 30.0 - 1)
+    assert not find(frame, x, y, t, turning(2e-4, t), LIKELY).any()
 
 
 @pytest.mark.parametrize("rate", [0.0, 2e-4, 1e-3])
 def test_what_the_sensor_follows_is_no_hot_pixel(rate):
     t = np.arange(60.0)
     frame, x, y, _ = image(5, len(t), OFF_MIDDLE)
-    assert not find(frame, x, y, t, turning(rate, t)).any()
+    assert not find(frame, x, y, t, turning(rate, t), LIKELY).any()
 
 
 def test_what_is_seen_in_one_of_two_pointings_is_no_hot_pixel():

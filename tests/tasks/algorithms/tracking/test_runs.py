@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scenes.few_frames import FIELD_RAD, INTERVAL_S, few_frames, found_and_false
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
@@ -163,3 +164,30 @@ def test_neighbours_seen_every_half_minute_are_not_exchanged(apart_arcsec):
         later = track[first::2][6:]  # the first three frames may join the two objects crosswise
         assert later[0] >= 0
         assert len(set(later.tolist())) == 1
+
+
+@pytest.mark.parametrize("n_false", [0, 1, 5, 20])
+def test_objects_in_five_frames_are_found_among_strays(n_false):
+    """Five frames give less evidence than a rate of false tracks per frame would ask for."""
+    found = asked = false = 0
+    for seed in range(60):
+        scene = few_frames(seed, 2, n_false, sigma_px=0.8)
+        track = follow(*scene[:3], scene.sigma_rad[0], max_coast_s=4.5 * INTERVAL_S,
+                       field_sr=FIELD_RAD.prod())  # fmt: skip
+        counts = found_and_false(scene, track, 5)
+        found, asked, false = found + counts[0], asked + counts[1], false + counts[2]
+    assert asked == 120
+    assert found >= 0.94 * asked
+    assert false <= 0.1 * 60
+
+
+@pytest.mark.parametrize("n_frames", [5, 20])
+@pytest.mark.parametrize("n_false", [3, 10, 30])
+def test_strays_of_few_frames_make_no_more_tracks_than_accepted(n_frames, n_false):
+    false = 0
+    for seed in range(60):
+        scene = few_frames(seed, 0, n_false, n_frames=n_frames)
+        track = follow(*scene[:3], scene.sigma_rad[0], max_coast_s=4.5 * INTERVAL_S,
+                       field_sr=FIELD_RAD.prod())  # fmt: skip
+        false += int(track.max(initial=-1)) + 1
+    assert false <= 0.1 * 60  # accepted: one per sequence, of which a twentieth is measured

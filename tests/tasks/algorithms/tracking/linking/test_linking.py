@@ -130,6 +130,34 @@ def test_broken_tracks_of_orbiting_objects_are_joined(link, n_objects, gap_s):
     assert score >= 0.995
 
 
+@pytest.mark.parametrize("seed", range(100, 103))
+@pytest.mark.parametrize("belt", [True, False])
+def test_gaps_of_minutes_are_bridged_as_the_evidence_allows(seed, belt):
+    scene = broken_tracks(seed, 120, (100, 250), belt=belt, duration_s=700.0)
+    links = by_likelihood(*scene[:4], gap_s=np.inf)
+    size = np.diff(scene.offsets)
+    score = identity_f1(np.repeat(scene.truth, size), np.repeat(chain_heads(links.before), size))
+    assert score >= 0.99
+    joined = np.flatnonzero(links.before != NONE)
+    first, last = scene.offsets[:-1], scene.offsets[1:] - 1
+    gap_s = scene.time_s[first[joined]] - scene.time_s[last[links.before[joined]]]
+    assert len(joined) > 10
+    assert gap_s.min() > 90.0
+    assert (scene.truth[joined] == scene.truth[links.before[joined]]).all()
+
+
+def test_without_a_longest_gap_the_method_of_prediction_keeps_its_own():
+    parts = [((0, 0), (40, 0), np.arange(10)), ((0, 0), (40, 0), np.arange(110, 120))]
+    assert by_prediction(*fragments(parts), gap_s=np.inf).before.tolist() == [NONE, NONE]
+    assert by_prediction(*fragments(parts), gap_s=110.0).before.tolist() == [NONE, 0]
+
+
+def test_a_fragment_that_could_be_anywhere_is_not_joined():
+    # Single detections, ten minutes apart: no motion is known, nothing is foretold.
+    parts = [((100 * k, 0), (0, 0), np.arange(600 * k, 600 * k + 1)) for k in range(4)]
+    assert (by_likelihood(*fragments(parts), gap_s=np.inf).before == NONE).all()
+
+
 def test_the_likelihood_statistic_has_its_degrees_of_freedom_where_two_are_one_object():
     # Motions drawn from the prior: then the mean is 4, two for each axis.
     rate = 40 * ARCSEC
