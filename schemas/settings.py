@@ -112,8 +112,8 @@ class TrackletSettings(Group):
     false_alarm_sequence: float = Field(
         1.0,
         gt=0,
-        description="Accepted number of false tracklets in a short sequence: what no tracklet "
-        "claimed is followed again with it, where it allows ten times `false_alarm` per frame. It "
+        description="Accepted number of false tracklets in a sequence of at most 24 frames (with "
+        "the default `min_detections`): what no tracklet claimed is followed again with it. It "
         "counts every pair of detections as a test; 1 to 5 % of it are measured.",
     )
     link_method: LinkMethod = Field(

@@ -28,7 +28,7 @@ CENTRE = 0.1  # 1-sigma of their distance from it, in widths of the field
 UNKNOWN = 0.5  # places of each kind that are added to those counted: Jeffreys' prior
 
 
-class Place(NamedTuple):
+class FixedPlace(NamedTuple):
     """Detections at one place of the image.
 
     time_s, x_px, y_px, sigma_px : (n,) float
@@ -57,7 +57,7 @@ class _Line(NamedTuple):
     freedom: int
 
 
-def log_ratio(place: Place, camera: Camera, n_places: int) -> float:
+def log_ratio(place: FixedPlace, camera: Camera, n_places: int) -> float:
     """Return ln of the likelihood of a hot pixel over that of light.
 
     Parameters
@@ -98,7 +98,7 @@ def with_population(ratios: Array) -> Array:
     return np.asarray(ratios + odds)
 
 
-def _line(place: Place) -> _Line:
+def _line(place: FixedPlace) -> _Line:
     weight = place.sigma_px**-2.0
     off = np.stack([place.x_px - np.round(place.x_px.mean()),
                     place.y_px - np.round(place.y_px.mean())], axis=1)  # fmt: skip
@@ -117,7 +117,7 @@ def _normal(distance_2: float, variance: Array) -> Array:
     return np.asarray(-0.5 * distance_2 / variance - np.log(2 * np.pi * variance))
 
 
-def _nearness(place: Place, camera: Camera) -> float:
+def _nearness(place: FixedPlace, camera: Camera) -> float:
     """Return ln of how much likelier an object is followed here than anywhere in the field."""
     area, variance = camera.width * camera.height, (CENTRE * camera.width) ** 2
     distance_2 = (place.x_px.mean() - camera.cx_px) ** 2 + (place.y_px.mean() - camera.cy_px) ** 2

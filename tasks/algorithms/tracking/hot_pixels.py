@@ -8,7 +8,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.tracking.apparent_motion import acceleration
-from epipole.tasks.algorithms.tracking.hot_pixel_odds import Place, log_ratio, with_population
+from epipole.tasks.algorithms.tracking.hot_pixel_odds import FixedPlace, log_ratio, with_population
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -77,7 +77,7 @@ def fixed_places(
     reach = max(4 * float(np.median(sigma_px)), 0.25)
     R = matrix_from_quaternion(q_sensor_from_icrs)
     certain: list[bool] = []
-    evidence: list[Place] = []
+    evidence: list[FixedPlace] = []
     for members in _fixed_places(x_px, y_px, reach, (camera.width, camera.height), n_frames):
         shown = np.unique(frame[members])
         if len(shown) < max(SHARE * n_frames, FEWEST):
@@ -90,11 +90,11 @@ def fixed_places(
             _stays_through_repointing(shown, _pointings(time_s, path, camera.pixel_rad))
             or _turns_fast(time_s, path)
         )
-        evidence.append(Place(time_s[frame[members]], x, y, sigma_px[members], reach))
+        evidence.append(FixedPlace(time_s[frame[members]], x, y, sigma_px[members], reach))
     return FixedPlaces(place, _log_odds(np.array(certain, bool), evidence, camera))
 
 
-def _log_odds(certain: Flags, places: list[Place], camera: Camera) -> Array:
+def _log_odds(certain: Flags, places: list[FixedPlace], camera: Camera) -> Array:
     """Return ln of the odds of each place that it is a hot pixel."""
     odds = np.where(certain, np.inf, -np.inf)
     asked = [k for k, place in enumerate(places) if len(place.x_px) >= FEWEST_STILL]

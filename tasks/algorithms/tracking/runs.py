@@ -36,7 +36,7 @@ SLACK = 4  # a track begins within so many frames more than the fewest detection
 # Accepted number of false tracks in a sequence. It counts every pair of detections as a test. Most
 # pairs are too fast to reach the evidence, so that 1 to 5 % of this number are measured.
 FALSE_ALARM_SEQUENCE = 1.0
-SHORTER = 10.0  # a sequence is short where it allows so many times the rate per frame
+SHORT = 2  # a sequence is short up to so many times the frames in which a track begins
 DEEPEST = 9  # the same where false alarms are so dense that it takes more detections
 
 
@@ -263,10 +263,11 @@ def follow_detections(
         -float(np.log(false_alarm)),
     )
     track = _followed(time_s, offsets, u_icrs, sigma_rad, rule)
-    per_frame = false_alarm_sequence / max(int(np.count_nonzero(np.diff(offsets))), 1)
+    n_frames = int(np.count_nonzero(np.diff(offsets)))
     free = np.flatnonzero(track == NONE)
-    if per_frame < SHORTER * false_alarm or not len(free):
+    if n_frames > SHORT * (rule.need + DEEPEST) or not len(free):
         return track
+    per_frame = max(false_alarm, false_alarm_sequence / n_frames)
     before = np.searchsorted(free, offsets)
     again = _followed(
         time_s,

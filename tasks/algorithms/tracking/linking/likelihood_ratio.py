@@ -12,7 +12,13 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, cubic_span, jerk
+from epipole.tasks.algorithms.tracking.apparent_motion import (
+    FAR_RAD_S2,
+    LOW_ORBIT_S,
+    acceleration,
+    cubic_span,
+    jerk,
+)
 from epipole.tasks.algorithms.tracking.linking.chains import (
     Fragments,
     LinkRule,
@@ -26,6 +32,7 @@ Indices = npt.NDArray[np.int64]
 
 FARTHEST_RAD = 0.5  # longest arc between fragments: a plane stands for the sky
 SEARCH_SIGMA = 6.0  # of the quick test that most pairs fail
+SLOWEST_JERK = LOW_ORBIT_S * FAR_RAD_S2  # [rad/s^3] `jerk` of an object that stands still
 MOST_PAIRS = 10_000_000  # compared: where more are possible, the longest gaps are not bridged
 
 
@@ -408,7 +415,7 @@ def _longest_gap(starts: Array, ends: Array, rule: LinkRule) -> float:
     Over a longer one, the jerk that even the slowest object may have makes its place unsure by
     the whole field. Shorter ones count where there are too many fragments to compare them all.
     """
-    longest = float(np.cbrt(6 * np.sqrt(rule.field_sr) / jerk(0.0)))
+    longest = float(np.cbrt(6 * np.sqrt(rule.field_sr) / SLOWEST_JERK))
     if np.isfinite(rule.gap_s):
         longest = float(rule.gap_s)
     while _begun(starts, ends, ends + longest).sum() > MOST_PAIRS:

@@ -181,7 +181,7 @@ def test_objects_in_five_frames_are_found_among_strays(n_false):
     assert false <= 0.1 * 60
 
 
-@pytest.mark.parametrize("n_frames", [5, 20])
+@pytest.mark.parametrize("n_frames", [5, 15])
 @pytest.mark.parametrize("n_false", [3, 10, 30])
 def test_strays_of_few_frames_make_no_more_tracks_than_accepted(n_frames, n_false):
     false = 0
@@ -191,3 +191,15 @@ def test_strays_of_few_frames_make_no_more_tracks_than_accepted(n_frames, n_fals
                        field_sr=FIELD_RAD.prod())  # fmt: skip
         false += int(track.max(initial=-1)) + 1
     assert false <= 0.1 * 60  # accepted: one per sequence, of which a twentieth is measured
+
+
+def test_more_frames_are_held_to_the_rate_per_frame():
+    """Then a track has had frames enough to give the evidence."""
+    scene = few_frames(1, 2, 20, n_frames=30)
+    options = {"max_coast_s": 4.5 * INTERVAL_S, "field_sr": FIELD_RAD.prod()}
+    tracks = [
+        follow(*scene[:3], scene.sigma_rad[0], **options, false_alarm_sequence=accepted)
+        for accepted in (1e-9, 1.0)
+    ]
+    assert (tracks[0] == tracks[1]).all()
+    assert tracks[0].max() == 1
