@@ -67,7 +67,9 @@ class SpanViews:
         least = np.full(len(self.tracklet_id), np.inf)
         np.minimum.at(least, self.tracklet, shared)
         noise = np.trace(self.noise, axis1=1, axis2=2)
-        return np.asarray(shared - least[self.tracklet] <= BLENDED * noise)
+        # A tracklet that is a blend throughout is judged by its best views.
+        allowed = BLENDED * np.maximum(noise, least[self.tracklet])
+        return np.asarray(shared - least[self.tracklet] <= allowed)
 
     def windows(self, window_s: float) -> list[Indices]:
         """Return the rows of each window of time, in order; windows are counted from 1970."""

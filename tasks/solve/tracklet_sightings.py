@@ -15,7 +15,7 @@ from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.direction_errors import scatter_beyond
 from epipole.tasks.algorithms.geometry.sky import aberrate
-from epipole.tasks.algorithms.tracking.blends import Tracked, blend_variance, of_neighbour
+from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.sightings import Frames, sightings_of
 
@@ -70,7 +70,7 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
     Those of a neighbour alone are left out.
     """
     time_s = (frames.time_ns - frames.time_ns[0]) / 1e9
-    tracked = Tracked(
+    tracked = TrackedSpots(
         tracklets.bounds,
         time_s[tracklets.frame],
         tracklets.u_icrs,

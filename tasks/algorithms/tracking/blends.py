@@ -29,7 +29,7 @@ OWN_LIGHT = 0.5  # of its usual flux: a fainter spot among blends is the neighbo
 BESIDE = 3  # detections that each of two tracklets has while the other lives: two objects
 
 
-class Tracked(NamedTuple):
+class TrackedSpots(NamedTuple):
     """The detections of one sensor's t tracklets, n in all, by tracklet and then by time.
 
     bounds : (t + 1,) int
@@ -51,7 +51,7 @@ class Tracked(NamedTuple):
     flux: Array
 
 
-class _Ends(NamedTuple):
+class _SpotEnds(NamedTuple):
     """Each tracklet's first (0) and last (1) detection: time, direction, rate, variance.
 
     The arrays are (t, 2), (t, 2, 3), (t, 2, 3), (t, 2); `reach` (t,) is how long [s] the
@@ -66,7 +66,7 @@ class _Ends(NamedTuple):
     flux: Array
 
 
-def blend_variance(tracked: Tracked, frame_s: Array, pixel_rad: float) -> Array:
+def blend_variance(tracked: TrackedSpots, frame_s: Array, pixel_rad: float) -> Array:
     """Return the variance per axis [rad^2] that blends may add to each detection, (n,).
 
     Parameters
@@ -99,7 +99,7 @@ def blend_variance(tracked: Tracked, frame_s: Array, pixel_rad: float) -> Array:
     return out
 
 
-def of_neighbour(tracked: Tracked, variance: Array) -> npt.NDArray[np.bool_]:
+def of_neighbour(tracked: TrackedSpots, variance: Array) -> npt.NDArray[np.bool_]:
     """Return which detections are too faint to hold their tracklet's object, (n,).
 
     A blend is brighter than either object. Where detections may be blends by their `variance`
@@ -132,7 +132,7 @@ def resolved_px(pairs: Indices) -> float:
     return SPOT_PX if below[-1] < ENOUGH else BIN_PX
 
 
-def _ends_of(tracked: Tracked) -> _Ends:
+def _ends_of(tracked: TrackedSpots) -> _SpotEnds:
     first, last = tracked.bounds[:-1], tracked.bounds[1:]
     t = tracked.time_s
     time = np.column_stack([t[first], t[last - 1]])
@@ -143,10 +143,10 @@ def _ends_of(tracked: Tracked) -> _Ends:
     reach = np.clip(time[:, 1] - time[:, 0], 1e-3, CARRIED_S / 2)
     variance = np.trace(fit.cov_noise, axis1=1, axis2=2).reshape(-1, 2) / 2
     flux = np.full(len(first), np.nan)
-    return _Ends(time, fit.u.reshape(-1, 2, 3), fit.w.reshape(-1, 2, 3), variance, reach, flux)
+    return _SpotEnds(time, fit.u.reshape(-1, 2, 3), fit.w.reshape(-1, 2, 3), variance, reach, flux)
 
 
-def _own_flux(tracked: Tracked, blended: npt.NDArray[np.bool_]) -> Array:
+def _own_flux(tracked: TrackedSpots, blended: npt.NDArray[np.bool_]) -> Array:
     """Return the median flux of each tracklet's detections that are no blends; NaN if none."""
     out = np.full(len(tracked.bounds) - 1, np.nan)
     known = ~blended & np.isfinite(tracked.flux)
@@ -188,22 +188,28 @@ def _enter_blends(time, u, tracklet, by_frame, starts, bounds, frame_s, ends, sp
             variance = _carry(time, u, bounds, ends, b, k, frame_s[f], p)
             if not variance < spot * spot:
                 continue
+            # Its light is in the nearest spot, which may be a tracklet of its own that follows.
+            nearest = np.inf
+            for q in range(starts[f], starts[f + 1]):
+                nearest = min(nearest, _distance(u[by_frame[q]], p))
+            farthest = min(spot + np.sqrt(variance), nearest + 2 * np.sqrt(variance))
             for q in range(starts[f], starts[f + 1]):
                 i = by_frame[q]
-                away2 = 0.0
-                for c in range(3):
-                    away2 += (u[i, c] - p[c]) ** 2
-                if away2 > (spot + np.sqrt(variance)) ** 2:
-                    continue
-                a = tracklet[i]
-                if not _coexist(time, bounds, ends, a, b):
+                away, a = _distance(u[i], p), tracklet[i]
+                if away > farthest or not _coexist(time, bounds, ends, a, b):
                     continue
                 share = ends.flux[b] / (ends.flux[a] + ends.flux[b])
                 share = share if 0.0 <= share <= 1.0 else 0.5  # 0.5 for NaN
                 # The centroid lies nearer to the neighbour than the object by the share.
-                apart2 = min((away2 + variance) / max(1.0 - share, 1e-3) ** 2, spot * spot)
+                apart2 = min((away * away + variance) / max(1.0 - share, 1e-3) ** 2, spot * spot)
                 size = share * share * apart2
                 out[i] = max(out[i], size)
+
+
+@kernel
+def _distance(u, p):
+    """Return the chord between two directions."""
+    return np.sqrt((u[0] - p[0]) ** 2 + (u[1] - p[1]) ** 2 + (u[2] - p[2]) ** 2)
 
 
 @kernel

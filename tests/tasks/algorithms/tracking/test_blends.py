@@ -8,7 +8,7 @@ from epipole.tasks.algorithms.geometry.direction_errors import centroid_covarian
 from epipole.tasks.algorithms.tracking.blends import (
     BIN_PX,
     SPOT_PX,
-    Tracked,
+    TrackedSpots,
     blend_variance,
     of_neighbour,
     resolved_px,
@@ -49,7 +49,7 @@ def _tracked(rng, times, places, flux):
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     bounds = np.cumsum([0, *map(len, times)])
     noise = centroid_covariance(u, np.full(len(u), SIGMA))
-    return Tracked(bounds, np.concatenate(times), u, noise, np.concatenate(flux))
+    return TrackedSpots(bounds, np.concatenate(times), u, noise, np.concatenate(flux))
 
 
 @pytest.mark.parametrize("seed", range(5))
