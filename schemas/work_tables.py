@@ -157,6 +157,12 @@ VIEWS = schema(
             doc="Error that is common to all frames of the sensor.",
             names=TANGENT_AXES,
         ),
+        column(
+            "blend_rad2",
+            F64,
+            unit="rad^2",
+            doc="Part of the noise: what the light of a neighbour may add, per axis.",
+        ),
         time_column("first_fitted", doc="First detection that the direction was fitted to, UTC."),
         time_column("last_fitted", doc="Last detection that the direction was fitted to, UTC."),
         column("moment_1", F64, unit="s", doc="Weighted mean of their times minus the epoch."),

@@ -123,9 +123,10 @@ def verdicts_of(rows: pl.DataFrame) -> list[SensorVerdict]:
     rows = pl.concat(of_objects).sort("epoch", "object_id", "sensor_id")
     if not len(rows):
         return []
+    # A few tracklets may be blends throughout: no error of the attitude.
     spread = (pl.col("cov_bias_11_rad2") + pl.col("cov_bias_22_rad2")) / 2
     bias = rows.group_by("sensor_id").agg(
-        pl.col("position_sigma_km").max(), attitude_sigma_rad=spread.max().sqrt()
+        pl.col("position_sigma_km").max(), attitude_sigma_rad=spread.quantile(0.9).sqrt()
     ).sort("sensor_id")  # fmt: skip
     judged = judge_sensors(
         _lines(rows, bias["sensor_id"]),

@@ -32,7 +32,8 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 LEAST_PROBABLE = 1e-6  # a chi-square less probable than this does not fit
-MIXED = 3.0  # chi-square per degree of freedom above which an arc mixes objects
+# Chi-square per degree of freedom, over that of most arcs, above which an arc mixes objects.
+MIXED = 3.0
 SLOPE_S = 60.0  # positions within this time of an arc's middle give the initial velocity
 
 
@@ -91,7 +92,10 @@ def with_honest_biases(
 def _sum_of(fitted: FittedOrbits, n_views: Indices, n_sensors: int) -> SensorEquations:
     """Return the equations of all arcs together, but of those that mix objects."""
     normal, right = np.zeros((6 * n_sensors,) * 2), np.zeros(6 * n_sensors)
-    for k in np.flatnonzero(fitted.chi2 < MIXED * (2 * n_views - 6)):
+    reduced = fitted.chi2 / np.maximum(2 * n_views - 6, 1)
+    # A sensor with a large error makes all arcs fit badly, a mixture one.
+    usual = max(1.0, float(np.nanmedian(reduced))) if np.isfinite(reduced).any() else 1.0
+    for k in np.flatnonzero(reduced < MIXED * usual):
         sensors, of_arc = fitted.of_sensors[k]
         at = (6 * sensors[:, None] + np.arange(6)).ravel()
         normal[np.ix_(at, at)] += of_arc.normal

@@ -42,7 +42,7 @@ class SpanViews:
         self.noise = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
         self.bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES)
         self.sigma_km = array(views, "position_sigma_km")
-        self.clear = self._clear()
+        self.clear = self._clear(2 * array(views, "blend_rad2"))
         self._read_poses(solutions, cameras)
 
     def _read_poses(self, solutions: pa.Table, cameras: pa.Table) -> None:
@@ -57,19 +57,16 @@ class SpanViews:
         self.half_field = np.array(half_field).reshape(-1, 2)
         self.focal_px = np.array(focal_px)
 
-    def _clear(self) -> npt.NDArray[np.bool_]:
-        """Return which views are no worse than others of their tracklet, but for their noise.
+    def _clear(self, blend: Array) -> npt.NDArray[np.bool_]:
+        """Return which views tell objects apart: `blend` adds little to their variance.
 
-        The others may be blends: their direction may be of one object or of its neighbour. A group
-        that is found without them has them as well.
+        The direction of the others may be of one object or of its neighbour. A group that is found
+        without them has them as well. A tracklet that is a blend throughout is judged by its best
+        views.
         """
+        noise = np.trace(self.noise, axis1=1, axis2=2) - blend
         shared = np.trace(self.bias, axis1=1, axis2=2)
-        least = np.full(len(self.tracklet_id), np.inf)
-        np.minimum.at(least, self.tracklet, shared)
-        noise = np.trace(self.noise, axis1=1, axis2=2)
-        # A tracklet that is a blend throughout is judged by its best views.
-        allowed = BLENDED * np.maximum(noise, least[self.tracklet])
-        return np.asarray(shared - least[self.tracklet] <= allowed)
+        return np.asarray(blend <= BLENDED * np.maximum(noise, shared))
 
     def windows(self, window_s: float) -> list[Indices]:
         """Return the rows of each window of time, in order; windows are counted from 1970."""

@@ -127,6 +127,7 @@ def _view_table(
     x_px, y_px = project(camera, u_sensor)
     r_km, v_km_s = _carried(frames, served, array(epochs, "dt_s")[row])
     cov_noise, cov_bias = (on_tangent_plane(u, cov) for cov in motion[2:4])
+    cov_noise, cov_bias, blend_rad2 = _without_blends(tracklet, cov_noise, cov_bias)
     kept = np.isfinite(x_px) & np.isfinite(r_km[:, 0])
     columns = {
         "epoch": array(epochs, "epoch")[row],
@@ -139,6 +140,7 @@ def _view_table(
         **unstack("w{}_rad_s", motion.w),
         **unstack_covariance("cov_noise_{}_rad2", cov_noise, TANGENT_AXES),
         **unstack_covariance("cov_bias_{}_rad2", cov_bias, TANGENT_AXES),
+        "blend_rad2": blend_rad2,
         "first_fitted": frames.time_ns[tracklets.frame[fitted[:, 0]]],
         "last_fitted": frames.time_ns[tracklets.frame[fitted[:, 1] - 1]],
         **unstack("moment_{}", motion.moments, "123"),
@@ -152,6 +154,22 @@ def _view_table(
     columns |= {name: nullable(values) for name, values in velocity.items()}
     columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
     return table(VIEWS, columns).sort_by([("epoch", "ascending"), ("tracklet_id", "ascending")])
+
+
+def _without_blends(
+    tracklet: Indices, cov_noise: Array, cov_bias: Array
+) -> tuple[Array, Array, Array]:
+    """Return the covariances of noise and bias, and what some views have more bias than others.
+
+    What all views of a tracklet have is common to them. What blends add to some of them is not: it
+    becomes a part of their noise, with this variance per axis.
+    """
+    shared = np.trace(cov_bias, axis1=1, axis2=2)
+    least = np.full(int(tracklet.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(least, tracklet, shared)
+    stays = (least[tracklet] / np.where(shared > 0.0, shared, np.inf))[:, None, None]
+    more = (1 - stays) * cov_bias
+    return cov_noise + more, stays * cov_bias, np.trace(more, axis1=1, axis2=2) / 2
 
 
 def _centroids(

@@ -38,6 +38,7 @@ def night(seed, times, independent=None, name="a", **scene):
             views[f"cov_{which}_{ab}_rad2"] = cov[:, i, j]
     views |= {"position_sigma_km": arcs.sigma_km, "pixel_rad": np.full(n, 7e-5)}
     views |= {"first_fitted": epoch, "last_fitted": epoch, "unmodelled_rad2": np.zeros(n)}
+    views["blend_rad2"] = np.zeros(n)
     views |= {f"moment_{k}": np.zeros(n) for k in "123"}
     views |= {f"sensor_v{a}_km_s": np.zeros(n) for a in "xyz"}
     claimed = shared | {"object_id": [name] * n, "epipolar_px": np.zeros(n),
@@ -143,12 +144,14 @@ def objects(worse):
     return [pa.concat_tables(tables) for tables in zip(*nights, strict=True)]
 
 
-def test_views_of_a_sensor_with_a_worse_ephemeris_have_a_larger_sigma():
-    views, claimed, positions = objects(worse=30.0)
+@pytest.mark.parametrize("worse", [30.0, 150.0])
+def test_views_of_a_sensor_with_a_worse_ephemeris_have_a_larger_sigma(worse):
+    """Also where it is so much worse that no state of any object fits."""
+    views, claimed, positions = objects(worse=worse)
     honest = with_honest_biases(views, claimed, positions, SETTINGS)
     wider = array(honest, "position_sigma_km") / array(views, "position_sigma_km")
     first = array(views, "sensor_id") == "s0"
-    # Of the 30, the part that this seed drew and that the Student distribution allows.
+    # Of this, the part that this seed drew and that the Student distribution allows.
     assert (wider[first] > 3).all()
     assert (wider[~first] < 1.5).all()
     same = [name for name in views.column_names if name != "position_sigma_km"]

@@ -99,10 +99,12 @@ def test_views_that_may_be_blends_are_not_sampled(scene):
     rows, *others = tables(scene)
     rows = rows.sort_by([("tracklet_id", "ascending"), ("epoch", "ascending")])
     doubtful = np.arange(rows.num_rows) < len(TIMES) // 2  # of the first tracklet
-    for name in ("cov_bias_11_rad2", "cov_bias_22_rad2"):
+    noise = rows["cov_noise_11_rad2"].to_numpy()
+    blend = np.where(doubtful, 100 * noise, 0.0)
+    columns = {f"cov_noise_{axis}_rad2": noise + blend for axis in ("11", "22")}
+    for name, values in (columns | {"blend_rad2": blend}).items():
         at = rows.schema.get_field_index(name)
-        bias = np.where(doubtful, 100 * rows["cov_noise_11_rad2"].to_numpy(), 0.0)
-        rows = rows.set_column(at, rows.schema.field(at), [bias])
+        rows = rows.set_column(at, rows.schema.field(at), [values])
     views = SpanViews(rows.sort_by("epoch"), *others)
     instants = START_NS + np.array([10, 100]) * SECOND_NS
     samples, _ = views.samples(np.arange(len(views.epoch_ns)), instants, 6.0)

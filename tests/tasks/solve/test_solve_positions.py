@@ -121,6 +121,7 @@ def turning(seed, spread_arcsec):
         tables.append(filled(VIEWS, len(at), {
             "epoch": epoch, "sensor_id": [f"s{k}"] * len(at), "tracklet_id": [f"s{k}"] * len(at),
             "first_fitted": epoch, "last_fitted": epoch, "unmodelled_rad2": fit.unmodelled,
+            "blend_rad2": np.zeros(len(epoch)),
             **unstack("u{}", fit.u), **unstack("moment_{}", fit.moments, "123"),
             **unstack_covariance("cov_noise_{}_rad2", cov, TANGENT_AXES),
             **unstack("{}_km", here[:, :3]), **unstack("sensor_v{}_km_s", here[:, 3:]),
