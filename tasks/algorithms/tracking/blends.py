@@ -186,8 +186,8 @@ def _enter_blends(time, u, tracklet, by_frame, starts, bounds, frame_s, ends, sp
             if k < bounds[b + 1] and time[k] == frame_s[f]:
                 continue  # a spot of its own
             variance = _carry(time, u, bounds, ends, b, k, frame_s[f], p)
-            if not variance < spot * spot:
-                continue
+            if not variance < spot * spot / 4:
+                continue  # it may be anywhere
             # Its light is in the nearest spot, which may be a tracklet of its own that follows.
             nearest = np.inf
             for q in range(starts[f], starts[f + 1]):

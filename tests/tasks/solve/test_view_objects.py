@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scenes.associations import filled
 
-from epipole.schemas.bridge import stack, stack_covariance, unstack
+from epipole.schemas.bridge import array, stack, stack_covariance, unstack
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import DETECTIONS, EPOCHS
@@ -17,6 +17,7 @@ from epipole.tasks.solve.view_objects import view_objects
 T0 = 1_554_091_200_000_000_000
 N_FRAMES, N_OBJECTS = 61, 4
 CENTROID, STATED = 4.0, 35.0  # [arcsec]
+PIXEL = 1 / 7300  # [rad]
 RATE = 40 * ARCSEC  # [rad/s]
 APART_S = 13  # epochs so far apart share no detection
 
@@ -33,15 +34,27 @@ def views_of_priors(seed, white, constant):
     true = start[item] + np.outer(frame * RATE, east)
     turn = rng.normal(size=(N_FRAMES, 2)) * white + rng.normal(size=2) * constant
     off = (turn[frame] + rng.normal(size=(len(frame), 2)) * CENTROID) * ARCSEC
-    ra, dec = radec_from_unit(true + off @ np.array([east, north]))
+    seen = {"frame": frame, "item": item, "u": true + off @ np.array([east, north])}
+    views = views_of(seen, "prior", np.full(len(frame), np.nan))
+    order = np.lexsort((frame, item))
+    return views, stack(views, "u{}") - true[order] / np.linalg.norm(true[order], axis=1)[:, None]
+
+
+def views_of(seen, source, flux):
+    """Views of objects by a sensor that looks along x of the ICRS.
+
+    `seen` has the frame, the number of the object and the direction of each detection.
+    """
+    frame, item = seen["frame"], seen["item"]
+    ra, dec = radec_from_unit(seen["u"])
+    stated = STATED if source == "prior" else 1.0
     time = T0 + np.arange(N_FRAMES) * 1_000_000_000
-    name = np.array([f"t{k}" for k in range(N_OBJECTS)])
+    name = np.array([f"t{k}" for k in range(item.max() + 1)])
     key = {"sensor_id": ["s"] * N_FRAMES, "frame_number": np.arange(N_FRAMES)}
-    # The sensor looks along x of the ICRS.
     q = quaternion_from_matrix(np.tile(np.roll(np.eye(3), 1, axis=1), (N_FRAMES, 1, 1)))
     solutions = filled(SOLUTIONS, N_FRAMES, key | unstack("q{}", q, "xyzw") | {
-        "time": time, "attitude_source": ["prior"] * N_FRAMES,
-        **{f"cov_att_{ab}_arcsec2": np.full(N_FRAMES, STATED**2 * (ab[0] == ab[1]))
+        "time": time, "attitude_source": [source] * N_FRAMES,
+        **{f"cov_att_{ab}_arcsec2": np.full(N_FRAMES, stated**2 * (ab[0] == ab[1]))
            for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
         "x_km": np.full(N_FRAMES, 7000.0), **{f"{a}_km": np.zeros(N_FRAMES) for a in "yz"},
         **{f"v{a}_km_s": np.zeros(N_FRAMES) for a in "xyz"},
@@ -51,17 +64,15 @@ def views_of_priors(seed, white, constant):
         "sensor_id": ["s"] * len(frame), "frame_number": frame, "time": time[frame],
         "centroid": item, "ra_deg": np.degrees(ra), "dec_deg": np.degrees(dec),
         "sigma_arcsec": np.full(len(frame), CENTROID), "kind": ["object"] * len(frame),
-        "tracklet_id": name[item], "track_id": name[item],
+        "tracklet_id": name[item], "track_id": name[item], "flux": flux,
     })  # fmt: skip
     epochs = filled(EPOCHS, N_FRAMES, key | {"epoch": time, "dt_s": np.zeros(N_FRAMES)})
     camera = filled(CAMERAS, 1, {
-        "sensor_id": ["s"], "width": [1024], "height": [1024], "fx_px": [7300.0], "fy_px": [7300.0],
-        "cx_px": [511.5], "cy_px": [511.5],
+        "sensor_id": ["s"], "width": [1024], "height": [1024], "fx_px": [1 / PIXEL],
+        "fy_px": [1 / PIXEL], "cx_px": [511.5], "cy_px": [511.5],
     })  # fmt: skip
     views = view_objects(epochs, solutions, detections, camera, Settings())
-    views = views.sort_by([("tracklet_id", "ascending"), ("epoch", "ascending")])
-    order = np.lexsort((frame, item))
-    return views, stack(views, "u{}") - true[order] / np.linalg.norm(true[order], axis=1)[:, None]
+    return views.sort_by([("tracklet_id", "ascending"), ("epoch", "ascending")])
 
 
 @pytest.mark.parametrize(("white", "constant"), [(35.0, 0.0), (20.0, 28.7), (0.0, 35.0)])
@@ -93,3 +104,45 @@ def test_attitudes_that_do_not_scatter_are_not_divided():
     views, _ = views_of_priors(1, 0.0, 35.0)
     bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES)
     np.testing.assert_allclose(np.sqrt(bias[:, 0, 0]) / ARCSEC, STATED, rtol=0.05)
+
+
+def views_of_a_blend(seed):
+    """Views of an object that a neighbour passes at 0.4 px, and the errors of their directions.
+
+    Nearer than 1.5 px, their light is one centroid, which the object's tracklet has.
+    """
+    rng, t = np.random.default_rng(seed), np.arange(N_FRAMES)
+    east, north = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    path = np.array([1.0, 0.0, 0.0]) + np.outer(t * RATE, east)
+    apart = np.outer((t - 30) * 0.12, east) + 0.4 * north  # [px]
+    one = np.linalg.norm(apart, axis=1) < 1.5
+    first = path + np.where(one[:, None], 0.6 * apart, 0.0) * PIXEL
+    second = path + apart * PIXEL
+    before, after = np.flatnonzero(~one & (t < 30)), np.flatnonzero(~one & (t > 30))
+    frame = np.concatenate([t, before, after])
+    item = np.repeat([0, 1, 2], [len(t), len(before), len(after)])
+    u = np.concatenate([first, second[before], second[after]])
+    u += rng.normal(size=(len(u), 2)) * CENTROID * ARCSEC @ np.array([east, north])
+    flux = np.where(item > 0, 60.0, np.where(one[frame], 100.0, 40.0))
+    order = np.lexsort((item, frame))
+    seen = {"frame": frame[order], "item": item[order], "u": u[order]}
+    views = views_of(seen, "stars", flux[order])
+    off = stack(views, "u{}")[:N_FRAMES] - path / np.linalg.norm(path, axis=1)[:, None]
+    return views.slice(0, N_FRAMES), off, one
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_neighbour_s_light_widens_the_error_of_the_views_it_touches(seed):
+    views, off, one = views_of_a_blend(seed)
+    basis = tangent_basis(stack(views, "u{}"))
+    e = np.einsum("nij,nj->ni", basis, off)
+    cov = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
+    far = np.abs(np.arange(N_FRAMES) - 30) > 25
+    blend = array(views, "blend_rad2")
+    assert (blend[far] == 0).all()
+    assert (blend[one] > 0).all()
+    square = np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e)
+    assert square.max() < 14  # 0.1 % of honest ones
+    # Without what the blend adds, some would be far outside their covariance.
+    own = np.trace(cov, axis1=1, axis2=2) / 2 - blend
+    assert (np.sum(e**2, axis=1) / own).max() > 30
