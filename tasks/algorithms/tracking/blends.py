@@ -186,7 +186,7 @@ def _enter_blends(time, u, tracklet, by_frame, starts, bounds, frame_s, ends, sp
             if k < bounds[b + 1] and time[k] == frame_s[f]:
                 continue  # a spot of its own
             variance = _carry(time, u, bounds, ends, b, k, frame_s[f], p)
-            if not variance < spot * spot / 4:
+            if not variance < spot * spot:
                 continue  # it may be anywhere
             # Its light is in the nearest spot, which may be a tracklet of its own that follows.
             nearest = np.inf

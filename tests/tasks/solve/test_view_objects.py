@@ -17,7 +17,7 @@ from epipole.tasks.solve.view_objects import view_objects
 T0 = 1_554_091_200_000_000_000
 N_FRAMES, N_OBJECTS = 61, 4
 CENTROID, STATED = 4.0, 35.0  # [arcsec]
-PIXEL = 1 / 7300  # [rad]
+PIXEL = 1 / 3000  # [rad]
 RATE = 40 * ARCSEC  # [rad/s]
 APART_S = 13  # epochs so far apart share no detection
 
