@@ -228,6 +228,11 @@ class PositionSettings(Group):
     """Positions of objects at epochs, by least squares."""
 
     reject_sigma: float = Field(4.0, gt=0, description="Largest residual of a view that is used.")
+    all_pairs: bool = Field(
+        False,
+        description="Whether `pairs` has every two views of an object at an epoch, or each view "
+        "with its reference view only. Their number grows with the square of the sensors.",
+    )
 
 
 class StateSettings(Group):

@@ -312,10 +312,11 @@ CALIBRATIONS = schema(
 
 PAIRS = schema(
     "pairs",
-    "One row per pair of detections of one object by two sensors.",
+    "One row per pair of detections of one object by two sensors: each with the reference, which "
+    "has the least position error. All pairs: `positions.all_pairs`.",
     [
         EPOCH,
-        id_column("sensor_id_1", doc="First sensor."),
+        id_column("sensor_id_1", doc="First sensor, that of the reference."),
         column("frame_number_1", I64, doc="Frame of the first sensor."),
         column("centroid_1", I32, doc="Centroid in that frame."),
         id_column("sensor_id_2", doc="Second sensor."),

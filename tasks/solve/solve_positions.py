@@ -102,7 +102,7 @@ def solve_positions(
     pairs = _pair_up(groups)
     return Solved(
         _association_table(groups, pairs),
-        _pair_table(groups, pairs),
+        _pair_table(groups, pairs, settings),
         _position_table(groups),
         _reject_table(groups),
         groups.views,
@@ -318,10 +318,14 @@ def _association_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
     )
 
 
-def _pair_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
-    """Return PAIRS: used views that both have a centroid, sorted by sensor."""
+def _pair_table(groups: _Groups, pairs: _ViewPairs, settings: Settings) -> pa.Table:
+    """Return PAIRS: used views that both have a centroid, the reference view first."""
     has_centroid = groups.views["centroid"].is_valid().to_numpy() & groups.used
-    kept = has_centroid[pairs.first] & has_centroid[pairs.second] & (pairs.first < pairs.second)
+    kept = has_centroid[pairs.first] & has_centroid[pairs.second]
+    if settings.positions.all_pairs:
+        kept &= pairs.first < pairs.second
+    else:
+        kept &= pairs.first == _references(groups, has_centroid)[groups.group[pairs.first]]
     columns = {
         "epoch": groups.epoch_ns[groups.group[pairs.first[kept]]],
         "epipolar_px": pairs.epipolar_px[kept],
@@ -331,6 +335,15 @@ def _pair_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
         for name in ("sensor_id", "frame_number", "centroid"):
             columns[f"{name}_{side}"] = groups.views[name].take(rows)
     return table(PAIRS, columns)
+
+
+def _references(groups: _Groups, candidates: npt.NDArray[np.bool_]) -> Indices:
+    """Return the row of each group's reference view: the candidate of the least position error."""
+    across = np.trace(groups.cov, axis1=1, axis2=2) / 2
+    away_km = np.linalg.norm(groups.x_km[groups.group] - groups.r_km, axis=1)
+    error = across * away_km**2 + array(groups.views, "position_sigma_km") ** 2
+    order = np.lexsort((np.where(candidates, error, np.inf), groups.group))
+    return np.asarray(order[groups.offsets[:-1]])
 
 
 def _position_table(groups: _Groups) -> pa.Table:

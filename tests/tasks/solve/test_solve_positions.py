@@ -14,7 +14,7 @@ from epipole.schemas.bridge import (
     unstack_covariance,
 )
 from epipole.schemas.columns import TANGENT_AXES
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import PositionSettings, Settings
 from epipole.schemas.spans import Span
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
@@ -143,3 +143,36 @@ def test_what_the_fits_of_directions_neglect_does_not_add_up():
         mean_off.append(mean @ np.linalg.solve(cov.mean(axis=0) / len(off), mean) / 3)
     assert abs(np.mean(square) - 1) < 0.13
     assert abs(np.mean(mean_off) - 1) < 0.39  # three sigma of 40 trials with three axes
+
+
+def views_of_five(miss=None):
+    """Views of one object at one epoch by five sensors; the fourth has the smallest error."""
+    angle = np.linspace(-1.2, 1.2, 5)
+    r = 7000.0 * np.column_stack([np.cos(angle), np.sin(angle), 0.3 * angle])
+    u = PLACE_KM - r
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    variance = np.array([4.0, 4.0, 4.0, 1.0, 2.0]) * 1e-10
+    return filled(VIEWS, 5, {
+        "epoch": np.full(5, T0), "sensor_id": list("abcde"), "frame_number": np.arange(5),
+        "tracklet_id": [f"{s}-1" for s in "abcde"],
+        "centroid": [None if s == miss else 7 for s in "abcde"],
+        "first_fitted": np.full(5, T0), "last_fitted": np.full(5, T0),
+        **unstack("u{}", u), **unstack("{}_km", r),
+        **{f"cov_noise_{ab}_rad2": variance for ab in ("11", "22")},
+        "position_sigma_km": np.full(5, 0.02), "pixel_rad": np.full(5, 1e-4),
+    }), np.zeros(5, np.int64)  # fmt: skip
+
+
+def test_pairs_are_each_view_with_the_one_of_the_least_error():
+    pairs = solve_positions(*views_of_five(), Settings()).pairs
+    assert pairs["sensor_id_1"].to_pylist() == ["d"] * 4
+    assert sorted(pairs["sensor_id_2"].to_pylist()) == ["a", "b", "c", "e"]
+    missed = solve_positions(*views_of_five(miss="d"), Settings()).pairs
+    assert missed["sensor_id_1"].to_pylist() == ["e"] * 3
+
+
+def test_all_pairs_are_a_setting():
+    settings = Settings(positions=PositionSettings(all_pairs=True))
+    pairs = solve_positions(*views_of_five(), settings).pairs
+    rows = zip(pairs["sensor_id_1"].to_pylist(), pairs["sensor_id_2"].to_pylist(), strict=True)
+    assert sorted(rows) == list(itertools.combinations("abcde", 2))
