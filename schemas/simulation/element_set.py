@@ -18,3 +18,7 @@ class ElementSet(NamedTuple):
     def label(self) -> str:
         """Return its name and number, for messages."""
         return f"{self.name} ({self.number})" if self.name else str(self.number)
+
+    def is_called(self, name: str) -> bool:
+        """Return whether this is its name, in any case, or its catalogue number."""
+        return name.strip().upper() in (self.name.upper(), str(self.number))

@@ -25,8 +25,7 @@ class DrawnObjects(NamedTuple):
     def number_of(self, name: str, scene: Scene) -> int:
         """Return the number of the object of this name or catalogue number."""
         for number, element_set in enumerate(self.sets):
-            key = name.strip().upper()
-            if element_set and key in (element_set.name.upper(), str(element_set.number)):
+            if element_set and element_set.is_called(name):
                 return number
         raise SceneError(f"{scene.name}: no object is called {name}")
 

@@ -82,10 +82,10 @@ def _chosen(sets: list[ElementSet], orbit: Orbit) -> list[ElementSet]:
         return sets
     chosen: list[ElementSet] = []
     for wanted in orbit.satellites:
-        key = str(wanted).strip().upper()
-        found = [s for s in sets if key in (s.name.upper(), str(s.number))]
+        found = [s for s in sets if s.is_called(str(wanted))]
         if not found:
             names = [s.name for s in sets]
+            key = str(wanted).strip().upper()
             close = difflib.get_close_matches(key, names, n=3, cutoff=0.5)
             hint = f"; it has {', '.join(close)}" if close else ""
             raise SceneError(f"{orbit.elements}: has no satellite {wanted}{hint}")

@@ -13,7 +13,7 @@ import pyarrow as pa
 from epipole.schemas.bridge import array
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera
-from epipole.tasks.algorithms.geometry.direction_errors import scatter_beyond
+from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance, scatter_beyond
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
@@ -37,6 +37,11 @@ class TrackletSightings(NamedTuple):
     flux: Array
     bounds: Indices
     name: npt.NDArray[np.object_]
+
+    @property
+    def tracklet(self) -> Indices:
+        """Tracklet of each row."""
+        return np.repeat(np.arange(len(self.name)), np.diff(self.bounds))
 
 
 def tracklet_sightings(
@@ -78,8 +83,7 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
         tracklets.flux,
     )
     variance = blend_variance(tracked, time_s, camera.pixel_rad)
-    across = np.eye(3) - tracklets.u_icrs[:, :, None] * tracklets.u_icrs[:, None, :]
-    cov_bias = tracklets.cov_bias + variance[:, None, None] * across
+    cov_bias = tracklets.cov_bias + centroid_covariance(tracklets.u_icrs, np.sqrt(variance))
     own = ~of_neighbour(tracked, variance)
     left = np.concatenate([[0], np.cumsum(own)])
     return TrackletSightings(
@@ -109,19 +113,20 @@ def _with_split_prior(
     v = np.nan_to_num(frames.v_gcrf_km_s)
     u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
     own = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[prior] / 2
+    tracklet = tracklets.tracklet[prior]
+    time_s = (frames.time_ns[tracklets.frame] - frames.time_ns[0]) / 1e9
     fit = directions_at(
-        np.repeat(tracklets.bounds[:-1], np.diff(tracklets.bounds))[prior],
-        np.repeat(tracklets.bounds[1:], np.diff(tracklets.bounds))[prior],
-        (frames.time_ns[tracklets.frame[prior]] - frames.time_ns[0]) / 1e9,
+        tracklets.bounds[tracklet],
+        tracklets.bounds[tracklet + 1],
+        time_s[prior],
         0.0,
-        (frames.time_ns[tracklets.frame] - frames.time_ns[0]) / 1e9,
+        time_s,
         u,
         tracklets.cov_noise,
         tracklets.cov_bias,
         settings.alignment.window_s,
     )
     leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / own
-    tracklet = np.repeat(np.arange(len(tracklets.name)), np.diff(tracklets.bounds))[prior]
     follows = np.append(False, (np.diff(tracklet) == 0) & (np.diff(prior) == 1))
     scatter = scatter_beyond(u[prior] - fit.u, np.sqrt(own), leverage, follows)
     stated = np.trace(tracklets.cov_bias, axis1=1, axis2=2)[prior] / 2

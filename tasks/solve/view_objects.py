@@ -177,8 +177,7 @@ def _centroids(
 ) -> tuple[Indices, npt.NDArray[np.bool_]]:
     """Return each query's centroid in the frame that serves, and which queries have none."""
     n_frames = max(int(tracklets.frame.max()), int(query.frame.max(initial=0))) + 1
-    tracklet = np.repeat(np.arange(len(tracklets.name)), np.diff(tracklets.bounds))
-    key = tracklet * n_frames + tracklets.frame  # increasing
+    key = tracklets.tracklet * n_frames + tracklets.frame  # increasing
     wanted = query.tracklet * n_frames + query.frame
     at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
     return tracklets.centroid[at], key[at] != wanted

@@ -45,6 +45,8 @@ def best_union(
     """
     seen = space.views.seen
     solved = seen[list(h.members)].sum(axis=0) >= 2
+    if solved.all():
+        return None
     best = None
     tried = {h.members}
     for other in others:
