@@ -10,7 +10,7 @@ from typing import Any
 
 _STARS = "epipole.tasks.algorithms.star_identification"
 _LINKING = "epipole.tasks.algorithms.tracking.linking"
-_ASSOCIATION = "epipole.tasks.solve.association_methods"
+_ASSOCIATION = "epipole.tasks.solve.association.association_methods"
 
 # (t_s, frames, priors, skies, magnitude_limit, how) -> IdentifiedSensor, as `identify_sensor`.
 STAR_IDENTIFICATION = {

@@ -22,6 +22,9 @@ else:  # the names that the registries list
     AssociationMethod = Literal[tuple(ASSOCIATION)]
 
 
+BYTES_PER_VIEW = 2000  # of memory, where positions are solved
+
+
 class Group(BaseModel):
     """A frozen group of settings. An unknown name is an error."""
 
@@ -260,6 +263,22 @@ class StateSettings(Group):
     )
 
 
+class WorkSettings(Group):
+    """How the work of a night is divided."""
+
+    memory_mib: int = Field(
+        512,
+        ge=64,
+        description="Memory that a task of `solve` takes at most, about [MiB]. Nights of many "
+        "sensors are divided into more tasks; the objects stay the same.",
+    )
+
+    @property
+    def most_views(self) -> int:
+        """The views of objects that a task may hold at the same time."""
+        return self.memory_mib * 2**20 // BYTES_PER_VIEW
+
+
 class Settings(Group):
     """All settings of a run."""
 
@@ -270,6 +289,7 @@ class Settings(Group):
     association: AssociationSettings = AssociationSettings()
     positions: PositionSettings = PositionSettings()
     states: StateSettings = StateSettings()
+    work: WorkSettings = WorkSettings()
 
     def key(self) -> str:
         """Return a digest of the settings."""

@@ -15,6 +15,8 @@ from epipole.schemas.bridge import array
 DAY_NS = 86_400_000_000_000
 SPAN_NS = 1_800_000_000_000  # half an hour: enough tasks for many workers, but few per night
 
+BLOCK_NS = 600_000_000_000  # divides a span: the longest evidence that tracklets are one object
+
 
 class Span(NamedTuple):
     """A time from `start_ns` to before `end_ns`; UTC nanoseconds since 1970."""
@@ -34,6 +36,12 @@ class Span(NamedTuple):
         """Return the rows whose time lies in the span, in their order."""
         inside = self.holds(array(rows, column))
         return rows if inside.all() else rows.filter(pa.array(inside))
+
+    @property
+    def span(self) -> "Span":
+        """The half hour that a block of time lies in."""
+        start_ns = self.start_ns // SPAN_NS * SPAN_NS
+        return Span(start_ns, start_ns + SPAN_NS)
 
     @property
     def folder(self) -> str:

@@ -13,6 +13,7 @@ from epipole.schemas.columns import (
 )
 from epipole.schemas.tables import (
     EPOCH,
+    EPOCHS,
     F64,
     FRAME_KEY,
     FRAMES,
@@ -202,12 +203,51 @@ TRACKLET_NAMES = schema(
     ],
 )
 
-OBJECT_TRACKS = schema(
-    "object_tracks",
-    "One row per object of a span and track of it, in the order of the last detection.",
+SENSOR_EPOCHS = schema(
+    "sensor_epochs",
+    "One row per epoch of one sensor: the columns of `epochs`, and the state of the frame.",
     [
-        id_column("span_name", doc="Id of the object in the span."),
-        id_column("track_id", doc="A track of one sensor."),
+        *EPOCHS,
+        *[column(f"q{a}", F64, frame="sensor from ICRS", doc="Attitude.") for a in "xyzw"],
+        *axes("{}_km", unit="km", frame="GCRF", doc="Position"),
+        *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity"),
+        column("camera", I64, doc="Row of `cameras` that is valid for the frame."),
+    ],
+)
+
+VIEWED_TRACKLETS = schema(
+    "viewed_tracklets",
+    "One row per tracklet of one sensor with views in a span: a row of `tracklet_runs`, and where "
+    "its views are.",
+    [
+        *[field for field in TRACKLETS if field.name != "outcome"],
+        column("first_view", I64, doc="Its first row in the sensor's views, sorted by tracklet."),
+        column("n_views", I64, doc="Number of its views."),
+    ],
+)
+
+OBJECT_MEMBERS = schema(
+    "object_members",
+    "One row per object, tracklet, and time in which the tracklet shows the object.",
+    [
+        column("object", I64, doc="Number of the object, in the block or in the night."),
+        column("sensor", I64, doc="Number of the sensor in the run."),
+        id_column("tracklet_id", doc="Its id in the night."),
+        id_column("track_id", doc="Its track in the night."),
+        time_column("first_epoch", doc="First epoch, UTC."),
+        time_column("last_epoch", doc="Last epoch, UTC."),
+        column("n_views", I64, doc="Number of views."),
+        column("piece", I64, doc="Piece of the span in which the object is solved."),
+    ],
+)
+
+SHARED_ERRORS = schema(
+    "shared_errors",
+    "One row per sensor whose shared errors are larger than stated: factors of their variances.",
+    [
+        SENSOR_ID,
+        column("direction", F64, doc="Of the error of its directions."),
+        column("place", F64, doc="Of the error of its position."),
     ],
 )
 
@@ -269,10 +309,9 @@ HOT_SUSPECTS = schema(
     [id_column("tracklet_id", doc="Id in the span, or in the night.")],
 )
 
-CLOCK_VIEWS = schema(
-    "clock_views",
-    "One row per view and object: each object with its views, and views of no object with every "
-    "object.",
+CLOCK_LINES = schema(
+    "clock_lines",
+    "One row per view of an object, at some epochs: what the check of the sensors needs.",
     [
         *[
             VIEWS.field(name)
@@ -283,9 +322,21 @@ CLOCK_VIEWS = schema(
         *axes("sensor_v{}_km_s", unit="km/s", frame="GCRF", doc="Sensor velocity at the epoch"),
         VIEWS.field("position_sigma_km"),
         OBJECT_ID,
-        column("claimed", pa.bool_(), doc="Whether the view is one of the object's."),
-        *axes("{}_km", unit="km", frame="GCRF", doc="Object position at the epoch"),
+        *axes("{}_km", unit="km", frame="GCRF", doc="Object position when its light left"),
         *axes("v{}_km_s", unit="km/s", frame="GCRF", doc="Object velocity"),
         *covariance("cov_{}", unit="km^2", frame="GCRF", doc="Covariance of the position."),
+    ],
+)
+
+MOVING_OBJECTS = schema(
+    "moving_objects",
+    "One row per object, at the epochs of `clock_lines`: where it is and how it moves.",
+    [
+        EPOCH,
+        OBJECT_ID,
+        *axes("{}_km", unit="km", frame="GCRF", doc="Object position"),
+        *axes("v{}_km_s", unit="km/s", frame="GCRF", doc="Object velocity"),
+        *covariance("cov_{}", unit="km^2", frame="GCRF", doc="Covariance of the position."),
+        column("light_s", F64, unit="s", doc="Light time from the object to the epoch."),
     ],
 )

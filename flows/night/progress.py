@@ -37,9 +37,9 @@ _SHARES = {
 _BEFORE = dict(zip(Stage, itertools.accumulate((_SHARES[s] for s in Stage), initial=0)))  # noqa: B905
 
 
-def step(stage: Stage, done: int, total: int) -> None:
-    """Report how many of a stage's tasks are done."""
-    share = _SHARES[stage] * done / total if total else 0.0
+def step(stage: Stage, done: int, total: int, part: tuple[int, int] = (0, 1)) -> None:
+    """Report how many tasks are done: of a stage, or of one of its parts, such as (1, 4)."""
+    share = _SHARES[stage] * (part[0] + (done / total if total else 0.0)) / part[1]
     _send(stage.value, done, total, min(100.0, _BEFORE[stage] + share))
 
 
@@ -53,16 +53,18 @@ def _send(what: str, done: int, total: int, percent: float) -> None:
     STEPS.info("%s: %d of %d", what, done, total, extra=counts)
 
 
-def results(stage: Stage, futures: Sequence[PrefectFuture[Any]]) -> list[Any]:
-    """Return the results of a stage's tasks, in the order in which the tasks were submitted.
+def results(
+    stage: Stage, futures: Sequence[PrefectFuture[Any]], part: tuple[int, int] = (0, 1)
+) -> list[Any]:
+    """Return the results of a stage's tasks, or of a part's, in the order of submission.
 
     So the rows of a night do not depend on which task ends first.
     """
     returned = []
-    step(stage, 0, len(futures))
+    step(stage, 0, len(futures), part)
     for future in futures:
         returned.append(future.result())
-        step(stage, len(returned), len(futures))
+        step(stage, len(returned), len(futures), part)
     return returned
 
 

@@ -15,11 +15,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.flows.night.progress import results, step
+from epipole.flows.night.solving import solve_objects
 from epipole.flows.night.summary import Summary, many, summarise
 from epipole.flows.night.work import Spans, Work
 from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import ReadFolder, WorkFolder
+from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import array, concat
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
@@ -43,8 +44,6 @@ from epipole.tasks.publish.publish_nights import publish_nights
 from epipole.tasks.publish.write_tables import SHARES, write_tables
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs
 from epipole.tasks.read.read_logs import read_log_into
-from epipole.tasks.solve.align_epochs import EpochGrid, frames_that_serve, grid_of
-from epipole.tasks.solve.solve_span import solve_span
 from epipole.tasks.track.join_tracklets import join_tracklets
 from epipole.tasks.track.track_span import track_span
 
@@ -148,29 +147,13 @@ def track(work: Work, settings: Settings) -> None:
     LOGGER.info("followed %s", many(count, "tracklet"))
 
 
-def solve(work: Work, settings: Settings, left_out: Mapping[str, Reason] | None = None) -> Parts:
-    """Find and solve objects, a task per span, from all sensors but those left out."""
-    grid = _epoch_grid(work, settings)
-    sensors = list(work.sensor_parts().values())
-    solved = work.folder.solved(work.round, all_sensors=not left_out)
-    futures = [
-        solve_span.submit(sensors, span, grid, work.cameras, left_out or {}, settings, solved)
-        for span in work.all_spans()
-    ]
-    count = sum(results(Stage.SOLVE, futures))
+def solve(
+    work: Work, settings: Settings, left_out: Mapping[str, Reason] | None = None
+) -> SolvedParts:
+    """Find and solve objects, from all sensors but those left out; see `solve_objects`."""
+    solved, count = solve_objects(work, settings, left_out or {})
     LOGGER.info("solved %s", many(count, "position"))
     return solved
-
-
-def _epoch_grid(work: Work, settings: Settings) -> EpochGrid:
-    """Return the grid of epochs of the night."""
-    columns = ["time", "attitude_source", "x_km"]
-    times = []
-    for sensor, spans in work.spans.items():
-        rows = [work.identified[sensor].read(span, "solutions", columns) for span in spans]
-        serving = [array(frames_that_serve(part), "time") for part in rows]
-        times.append(np.concatenate([np.zeros(0, np.int64), *serving]))
-    return grid_of(times, settings)
 
 
 class Checked(NamedTuple):
@@ -185,10 +168,12 @@ class Checked(NamedTuple):
     left_out: dict[str, Reason]
 
 
-def check(work: Work, solved: Parts, settings: Settings) -> Checked:
+def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     """Judge the sensors by all spans; correct wrong clocks if the settings say so."""
     step(Stage.CHECK, 0, 1)
-    verdicts: list[SensorVerdict] = check_sensors(solved, work.all_spans())
+    sensors = {of.sensor_id: work.folder.viewed(of, work.round) for of in sorted(
+        work.spans, key=lambda sensor: sensor.sensor_id)}  # fmt: skip
+    verdicts: list[SensorVerdict] = check_sensors(solved, sensors, work.all_spans())
     tell_verdicts(verdicts)
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
     late = [verdict for verdict in faulty if verdict.is_late]
@@ -213,13 +198,16 @@ def tell_verdicts(verdicts: Sequence[SensorVerdict]) -> None:
             LOGGER.warning("%s", verdict)
 
 
-def _taking_part(work: Work, solved: Parts, faulty: Sequence[SensorVerdict]) -> dict[str, Reason]:
+def _taking_part(
+    work: Work, solved: SolvedParts, faulty: Sequence[SensorVerdict]
+) -> dict[str, Reason]:
     """Return the faulty sensors that take part in an association, and so distort it."""
     reasons = {verdict.sensor_id: REASONS[verdict.cause] for verdict in faulty}
+    names = {sensor.number: sensor.sensor_id for sensor in work.spans}
     associated: set[str] = set()
     for span in work.all_spans() if reasons else []:
-        rows = solved.read(span, "associations", ["sensor_id"])
-        associated |= reasons.keys() & set(rows["sensor_id"].unique().to_pylist())
+        members = solved.objects.read(span, "members", ["sensor"])
+        associated |= reasons.keys() & {names[k] for k in members["sensor"].unique().to_pylist()}
     return {sensor: reasons[sensor] for sensor in sorted(associated)}
 
 
@@ -264,7 +252,7 @@ def _enter_spans(parts: Parts, spans: Sequence[Span]) -> list[Span]:
     return entered
 
 
-def name(work: Work, solved: Parts, settings: Settings) -> Names:
+def name(work: Work, solved: SolvedParts, settings: Settings) -> Names:
     """Return, for each span, the names of its objects in the night."""
     step(Stage.NAME, 0, 1)
     spans = [span for span in work.all_spans() if solved.holds(span)]
@@ -272,7 +260,8 @@ def name(work: Work, solved: Parts, settings: Settings) -> Names:
     ends: dict[str, list[pa.Table]] = {"positions": [], "states": []}
     for span in spans:
         for table, rows in ends.items():
-            rows.append(renamed(outermost(solved.read(span, table)), names[span.folder]))
+            for piece in solved.read(span, table):
+                rows.append(renamed(outermost(piece), names[span.folder]))
     new_id: dict[str, str] = link_objects(
         concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
     )
@@ -296,7 +285,7 @@ class Destination(NamedTuple):
 
 def publish(
     work: Work,
-    solved: Parts,
+    solved: SolvedParts,
     names: Names,
     whole: Mapping[str, pa.Table],
     destination: Destination,

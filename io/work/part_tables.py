@@ -12,7 +12,6 @@ from epipole.schemas.logs.log_tables import LOG_STATES
 from epipole.schemas.tables import (
     ASSOCIATIONS,
     DETECTIONS,
-    EPOCHS,
     PAIRS,
     POSITIONS,
     REJECTS,
@@ -21,16 +20,21 @@ from epipole.schemas.tables import (
 )
 from epipole.schemas.work_tables import (
     CAMERAS,
-    CLOCK_VIEWS,
+    CLOCK_LINES,
     EXPOSURES,
     FRAME_INDEX,
     HOT_SUSPECTS,
-    OBJECT_TRACKS,
+    MOVING_OBJECTS,
+    OBJECT_MEMBERS,
+    SENSOR_EPOCHS,
     SENSOR_STATES,
+    SHARED_ERRORS,
     SOLUTIONS,
     TRACKLET_NAMES,
     TRACKLET_OUTCOMES,
     TRACKLET_RUNS,
+    VIEWED_TRACKLETS,
+    VIEWS,
 )
 
 PartTables = Mapping[str, pa.Schema]
@@ -55,16 +59,27 @@ TRACKED: Final[PartTables] = {
 }
 SPAN_NAMES: Final[PartTables] = {"names": TRACKLET_NAMES}
 NIGHT_TRACKLETS: Final[PartTables] = {"tracklets": TRACKLET_RUNS, "suspects": HOT_SUSPECTS}
+VIEWED: Final[PartTables] = {
+    "epochs": SENSOR_EPOCHS,
+    "views": VIEWS,
+    "tracklets": VIEWED_TRACKLETS,
+}
+ASSOCIATED: Final[PartTables] = {
+    "members": OBJECT_MEMBERS,
+    "rejects": REJECTS,
+    "outcomes": TRACKLET_OUTCOMES,
+}
+NUMBERED: Final[PartTables] = {"members": OBJECT_MEMBERS}
+JUDGED: Final[PartTables] = {"errors": SHARED_ERRORS}
 SOLVED: Final[PartTables] = {
-    "epochs": EPOCHS,
     "associations": ASSOCIATIONS,
     "positions": POSITIONS,
     "pairs": PAIRS,
     "states": STATES,
     "rejects": REJECTS,
-    "object_tracks": OBJECT_TRACKS,
-    "tracklet_outcomes": TRACKLET_OUTCOMES,
-    "clock_views": CLOCK_VIEWS,
+    "outcomes": TRACKLET_OUTCOMES,
+    "lines": CLOCK_LINES,
+    "objects": MOVING_OBJECTS,
 }
 
 

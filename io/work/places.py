@@ -11,15 +11,22 @@ Parts of reading belong to a run; all others to the nights and a key (see `folde
     track/0/0/1554091200          tracklets of the span, before any check
     track/0/0-names/1554091200    the names of these tracklets in the night
     track/0/0-names/night         all tracklets of the sensor's night
-    solve/0/all/1554091200        objects of the span, before any check
-    solve/0/some/1554091200       the same without the sensors that the check left out
+    solve/0/views/0/1554091200    views of sensor 0, before any check
+    solve/0/all/...               of all sensors; solve/0/some/... without those left out:
+        blocks/1554091200         objects of the block of time that begins at this second
+        objects/1554091200        the objects of the span, each with its views and its piece
+        errors/1554091200         sensors whose shared errors are larger than stated
+        pieces/1554091200/0       positions and states of some of the objects
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from epipole.io.work.parts import Parts
-from epipole.schemas.spans import Sensor
+import pyarrow as pa
+
+from epipole.io.work.parts import Parts, read_part
+from epipole.schemas.spans import BLOCK_NS, Sensor, Span
 from epipole.schemas.stages import Stage
 
 
@@ -65,14 +72,65 @@ class WorkFolder(NamedTuple):
         """Return the parts with names in the night: `SPAN_NAMES`, and `NIGHT_TRACKLETS`."""
         return Parts(self.root / Stage.TRACK / str(round_) / f"{sensor.number}-names")
 
-    def solved(self, round_: int, all_sensors: bool = True) -> Parts:
-        """Return the parts of `solve`, `SOLVED`: of all sensors, or without those left out."""
-        return Parts(self.root / Stage.SOLVE / str(round_) / ("all" if all_sensors else "some"))
+    def viewed(self, sensor: Sensor, round_: int) -> Parts:
+        """Return a sensor's views: `VIEWED`."""
+        return Parts(self.root / Stage.SOLVE / str(round_) / "views" / str(sensor.number))
+
+    def solved(self, round_: int, all_sensors: bool = True) -> "SolvedParts":
+        """Return the parts of `solve`: of all sensors, or without those left out."""
+        which = "all" if all_sensors else "some"
+        return SolvedParts(self.root / Stage.SOLVE / str(round_) / which)
+
+
+class SolvedParts(NamedTuple):
+    """Where `solve` puts what it finds of the objects of all sensors."""
+
+    root: Path
+
+    @property
+    def blocks(self) -> Parts:
+        """The objects of each block of time: `ASSOCIATED`."""
+        return Parts(self.root / "blocks")
+
+    @property
+    def objects(self) -> Parts:
+        """The objects of each span, numbered through the night: `NUMBERED`."""
+        return Parts(self.root / "objects")
+
+    @property
+    def errors(self) -> Parts:
+        """The sensors of each span whose shared errors are larger than stated: `JUDGED`."""
+        return Parts(self.root / "errors")
+
+    def piece(self, span: Span, piece: int) -> Path:
+        """Return the part of some objects of a span: `SOLVED`."""
+        return self.root / "pieces" / span.folder / str(piece)
+
+    def holds(self, span: Span) -> bool:
+        """Return whether the objects of the span are known, be it none."""
+        return self.objects.holds(span)
+
+    def pieces(self, span: Span) -> list[Path]:
+        """Return the parts of a span's pieces, in order."""
+        folder = self.root / "pieces" / span.folder
+        numbers = sorted(int(part.name) for part in folder.glob("[0-9]*"))
+        return [folder / str(number) for number in numbers]
+
+    def of_blocks(self, span: Span, name: str) -> list[pa.Table]:
+        """Return a table of each block of a span."""
+        blocks = [Span(t, t + BLOCK_NS) for t in range(span.start_ns, span.end_ns, BLOCK_NS)]
+        return [self.blocks.read(block, name) for block in blocks if self.blocks.holds(block)]
+
+    def read(self, span: Span, name: str, columns: Sequence[str] | None = None) -> list[pa.Table]:
+        """Return a table of each piece of a span."""
+        return [read_part(part, name, columns) for part in self.pieces(span)]
 
 
 class SensorParts(NamedTuple):
     """The parts of one sensor that the later stages read."""
 
+    number: int
     identified: Parts
     tracked: Parts
     names: Parts
+    viewed: Parts

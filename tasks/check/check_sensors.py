@@ -1,6 +1,7 @@
 """Check sensors: each sensor's clock, ephemeris and attitude over the night."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,11 +9,13 @@ import numpy.typing as npt
 import polars as pl
 
 from epipole.io.work.parts import Parts
-from epipole.schemas.bridge import stack, stack_covariance, to_polars
+from epipole.io.work.places import SolvedParts
+from epipole.schemas.bridge import array, concat, stack, stack_covariance, to_polars
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.rejects import Reason
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
+from epipole.schemas.work_tables import CLOCK_LINES, MOVING_OBJECTS, VIEWS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.sensor_faults.clock_search import Meetings, search_offset
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
@@ -25,10 +28,14 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     judge_sensors,
 )
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.solve.positions.keep_lines import meetings
 
 Array = npt.NDArray[np.float64]
 
 MOST_EPOCHS = 300  # more do not help: the offset is one constant
+MOST_LINES = 200_000  # of sight to objects, of all sensors together
+MOST_PAIRS = 100_000  # of a view and an object, of one sensor
+KEY = ["epoch", "object_id", "sensor_id"]
 KNOWN_S = 1.0  # with a larger sigma a clock counts as unknown
 
 
@@ -88,39 +95,91 @@ class SensorVerdict(NamedTuple):
 
 
 @stage_task(Stage.CHECK, "sensors")
-def check_sensors(solved: Parts, spans: Sequence[Span]) -> list[SensorVerdict]:
+def check_sensors(
+    solved: SolvedParts, sensors: Mapping[str, Parts], spans: Sequence[Span]
+) -> list[SensorVerdict]:
     """Return the verdicts on the sensors that the lines of sight of the night determine.
 
     Parameters
     ----------
     solved
-        The parts of `solve_span` of these spans.
+        The parts of `solve` of these spans.
+    sensors
+        The parts of the views of each sensor.
     """
-    parts = []
-    for span in spans:
-        rows = to_polars(solved.read(span, "clock_views"))
-        # The ids of objects are those of the span.
-        object_id = pl.format("{}/{}", pl.lit(span.folder), "object_id")
-        parts.append(rows.with_columns(object_id=object_id))
-    if not parts:
+    lines, objects = _of_objects(solved, spans)
+    if not len(objects):
         return []
-    rows = pl.concat(parts)
-    epochs = rows["epoch"].unique().sort()
-    kept = epochs[:: max(-(-len(epochs) // MOST_EPOCHS), 1)]
-    return verdicts_of(rows.filter(pl.col("epoch").is_in(kept.implode())))
-
-
-def verdicts_of(rows: pl.DataFrame) -> list[SensorVerdict]:
-    """Return the verdicts that CLOCK_VIEWS determine, by sensor."""
-    claimed = rows.filter(pl.col("claimed"))
-    first_guess, of_objects = {}, [claimed]
-    for (sensor_id,), of_sensor in rows.group_by("sensor_id", maintain_order=True):
-        match = _search(of_sensor.filter(~pl.col("claimed")))
+    first_guess, of_objects = {}, [lines]
+    for sensor_id, viewed in sensors.items():
+        own = lines.filter(pl.col("sensor_id") == sensor_id)
+        match = _search(_others(viewed, spans, own, objects))
         if match is not None:
-            first_guess[str(sensor_id)], matched = match
-            key = ["epoch", "object_id", "sensor_id"]
-            of_objects.append(matched.join(claimed, on=key, how="anti"))
-    rows = pl.concat(of_objects).sort("epoch", "object_id", "sensor_id")
+            first_guess[sensor_id], matched = match
+            of_objects.append(matched.join(lines, on=KEY, how="anti"))
+    return verdicts_of(pl.concat(of_objects), first_guess)
+
+
+def _of_objects(solved: SolvedParts, spans: Sequence[Span]) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Return lines of sight to objects, and the objects: at some of the epochs, evenly spread."""
+    epochs = [
+        to_polars(rows)
+        for span in spans
+        for rows in solved.read(span, "lines", ["epoch"])
+        if rows.num_rows
+    ]
+    if not epochs:
+        return pl.DataFrame(CLOCK_LINES.empty_table()), pl.DataFrame(MOVING_OBJECTS.empty_table())
+    per_epoch = pl.concat(epochs).group_by("epoch").len().sort("epoch")
+    fewer = max(len(per_epoch) / MOST_EPOCHS, per_epoch["len"].sum() / MOST_LINES)
+    kept = per_epoch["epoch"][:: max(math.ceil(fewer), 1)]
+    both = []
+    for name in ("lines", "objects"):
+        rows = [
+            # The ids of objects are those of the span.
+            to_polars(rows)
+            .filter(pl.col("epoch").is_in(kept.implode()))
+            .with_columns(object_id=pl.format("{}/{}", pl.lit(span.folder), "object_id"))
+            for span in spans
+            for rows in solved.read(span, name)
+        ]
+        both.append(pl.concat(rows))
+    return both[0], both[1]
+
+
+def _others(
+    viewed: Parts, spans: Sequence[Span], own: pl.DataFrame, objects: pl.DataFrame
+) -> pl.DataFrame:
+    """Return the views of a sensor that are of no object, each with every object of its epoch.
+
+    If a sensor's clock is seconds off, none of its views fits an object. A sensor with most of its
+    views on objects has none that are to be searched.
+    """
+    epochs = objects["epoch"].unique().sort()
+    tables = [viewed.read(span, "views") for span in spans if viewed.holds(span)]
+    wanted = epochs.cast(pl.Int64).to_numpy()
+    tables = [rows.take(np.flatnonzero(np.isin(array(rows, "epoch"), wanted))) for rows in tables]
+    views = to_polars(concat(VIEWS, tables))
+    free = views.join(own, on=["epoch", "tracklet_id"], how="anti")
+    if 2 * len(own) >= len(views):
+        free = free.clear()
+    n_objects = objects.group_by("epoch").agg(n=pl.len())
+    pairs = free.select("epoch").join(n_objects, on="epoch")["n"].sum()
+    fewer = epochs[:: max(-(-pairs // MOST_PAIRS), 1)]
+    return to_polars(
+        meetings(free.filter(pl.col("epoch").is_in(fewer.implode())), objects, on=["epoch"])
+    )
+
+
+def verdicts_of(
+    rows: pl.DataFrame, first_guess: Mapping[str, float] | None = None
+) -> list[SensorVerdict]:
+    """Return the verdicts that CLOCK_LINES determine, by sensor.
+
+    `first_guess` are clock offsets that were found, by sensor [s].
+    """
+    guess = first_guess or {}
+    rows = rows.sort("epoch", "object_id", "sensor_id")
     if not len(rows):
         return []
     # A few tracklets may be blends throughout: no error of the attitude.
@@ -132,7 +191,7 @@ def verdicts_of(rows: pl.DataFrame) -> list[SensorVerdict]:
         _lines(rows, bias["sensor_id"]),
         bias["position_sigma_km"].to_numpy(),
         bias["attitude_sigma_rad"].to_numpy(),
-        np.array([first_guess.get(name, 0.0) for name in bias["sensor_id"]]),
+        np.array([guess.get(name, 0.0) for name in bias["sensor_id"]]),
     )
     verdicts = [
         SensorVerdict(name, float(offset), float(sigma), cause, float(size), float(size_sigma))

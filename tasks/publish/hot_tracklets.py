@@ -24,8 +24,13 @@ def tracklets_of_run(parts: NightParts) -> pa.Table:
     """Return TRACKLETS of the run, each with its outcome over all spans."""
     runs = [read_part(sensor.names.of_night(), "tracklets") for sensor in parts.sensors]
     tracklets = concat(TRACKLET_RUNS, runs)
-    solved = [span for span in parts.all_spans if parts.solved.holds(span)]
-    outcomes = best_outcomes(parts.solved.read(span, "tracklet_outcomes") for span in solved)
+    outcomes = best_outcomes(
+        rows
+        for span in parts.all_spans
+        for rows in (
+            *parts.solved.of_blocks(span, "outcomes"), *parts.solved.read(span, "outcomes"),
+        )
+    )  # fmt: skip
     row = pc.index_in(tracklets["tracklet_id"], outcomes["tracklet_id"].combine_chunks())
     outcome = pc.coalesce(outcomes["outcome"].take(row), Outcome.NOT_COMPARED.value)
     return conform(TRACKLETS, tracklets.append_column("outcome", outcome))

@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
-from epipole.io.work.parts import Parts
-from epipole.io.work.places import SensorParts
+from epipole.io.work.places import SensorParts, SolvedParts
 from epipole.schemas.spans import Span
 
 
@@ -22,6 +21,6 @@ class NightParts(NamedTuple):
     spans: list[Span]
     all_spans: list[Span]
     sensors: list[SensorParts]
-    solved: Parts
+    solved: SolvedParts
     names: Mapping[str, Mapping[str, str]]
     whole: Mapping[str, pa.Table]

@@ -14,7 +14,7 @@ from epipole.schemas.bridge import array, concat, conform, table
 from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
-from epipole.schemas.spans import DAY_NS, Span
+from epipole.schemas.spans import DAY_NS, Span, spans_between
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES
 from epipole.schemas.work_tables import SOLUTIONS
@@ -28,8 +28,9 @@ from epipole.tasks.publish.hot_tracklets import (
     with_hot_pixels,
 )
 from epipole.tasks.publish.night_parts import NightParts
+from epipole.tasks.publish.time_slices import rows_between, slices_of
 
-# These tables may not fit in memory as a whole: they are written span by span.
+# These tables may not fit in memory as a whole: they are written in slices of time.
 BY_SENSOR = ("frames", "stars", "detections")
 BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
 WHOLE = ("tracklets", "calibrations", "sources", "rejects")
@@ -60,8 +61,7 @@ def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None
     for name in tables:
         rows: Iterator[pa.Table]
         if name in BY_SENSOR:
-            hot = hot_tracklets(parts)["tracklet_id"] if name == "detections" else None
-            rows = (_of_sensors(name, parts, span, hot) for span in parts.spans)
+            rows = _of_sensors(name, parts)
         elif name in BY_SPAN:
             rows = _of_spans(name, parts)
         else:
@@ -79,35 +79,61 @@ def _of_night(name: str, parts: NightParts) -> pa.Table:
     return in_order(rows_of_night(name, rows, parts.night))
 
 
-def _of_sensors(name: str, parts: NightParts, span: Span, hot: pa.ChunkedArray | None) -> pa.Table:
-    """Return a span's rows of all sensors, sorted by time and then sensor.
+def _of_sensors(name: str, parts: NightParts) -> Iterator[pa.Table]:
+    """Yield the rows of all sensors, sorted by time and then sensor, some time of a span each."""
+    hot = hot_tracklets(parts)["tracklet_id"] if name == "detections" else None
+    for span in parts.spans:
+        held = [of.tracked if name == "detections" else of.identified for of in parts.sensors]
+        table_name = "solutions" if name == "frames" else name
+        count = sum(of.read(span, table_name).num_rows for of in held if of.holds(span))
+        lone = lone_views(parts, span) if name == "detections" else None
+        for time in slices_of(span, count):
+            rows = _of_time(name, parts, time)
+            if lone is not None:
+                rows = with_hot_pixels(with_lone_objects(rows, lone), hot)
+            yield rows.take(np.argsort(array(rows, "time"), kind="stable"))
 
-    `hot`, for `detections` only, are the ids of tracklets that are hot pixels.
-    """
+
+def _of_time(name: str, parts: NightParts, time: Span) -> pa.Table:
     schema = TABLES[name]
     if name == "detections":
-        rows = [detections_within(sensor, span) for sensor in parts.sensors]
+        rows = [detections_within(sensor, time) for sensor in parts.sensors]
     elif name == "frames":
         rows = [
-            conform(schema, sensor.identified.rows_within(span, SOLUTIONS, "solutions"))
+            conform(schema, sensor.identified.rows_within(time, SOLUTIONS, "solutions"))
             for sensor in parts.sensors
         ]
     else:
-        rows = [sensor.identified.rows_within(span, schema, name) for sensor in parts.sensors]
-    together = concat(schema, rows)
-    if name == "detections":  # an epoch of a neighbouring span may use a frame of this one
-        near = parts.solved.rows_within(
-            span.widened(SERVED_NS), ASSOCIATIONS, "associations", time="epoch"
-        )
-        together = with_hot_pixels(with_lone_objects(together, near), hot)
-    return together.take(np.argsort(array(together, "time"), kind="stable"))
+        rows = [sensor.identified.rows_within(time, schema, name) for sensor in parts.sensors]
+    return concat(schema, rows)
+
+
+def lone_views(parts: NightParts, span: Span) -> pa.Table:
+    """Return the ASSOCIATIONS of lone detections that positions of a span, or near it, used.
+
+    An epoch of a neighbouring span may use a frame of this one.
+    """
+    time = span.widened(SERVED_NS)
+    of_lone = pc.field("used") & pc.field("tracklet_id").is_null()
+    rows = [
+        rows.filter(of_lone)
+        for other in spans_between(*time)
+        if parts.solved.holds(other)
+        for rows in parts.solved.read(other, "associations")
+    ]
+    return concat(ASSOCIATIONS, rows)
 
 
 def _of_spans(name: str, parts: NightParts) -> Iterator[pa.Table]:
     for span in parts.spans:
-        if parts.solved.holds(span):
-            rows = parts.solved.read(span, name)
-            yield in_order(_renamed(rows, parts.names.get(span.folder, {})))
+        if name == "epochs":
+            tables = [of.viewed.read(span, name) for of in parts.sensors if of.viewed.holds(span)]
+        else:
+            tables = parts.solved.read(span, name)
+        names = parts.names.get(span.folder, {})
+        for time in slices_of(span, sum(rows.num_rows for rows in tables)):
+            rows = [conform(TABLES[name], of) for of in rows_between(tables, time, "epoch")]
+            yield in_order(_renamed(concat(TABLES[name], rows), names))
 
 
 def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:
@@ -121,9 +147,11 @@ def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:
 
 def _rejects(parts: NightParts) -> Iterator[pa.Table]:
     for span in parts.spans:
-        for of_stage in [*(sensor.identified for sensor in parts.sensors), parts.solved]:
+        for of_stage in (sensor.identified for sensor in parts.sensors):
             if of_stage.holds(span):
                 yield of_stage.read(span, "rejects")
+        yield from parts.solved.of_blocks(span, "rejects")
+        yield from parts.solved.read(span, "rejects")
 
 
 def counted(rejects: Iterable[pa.Table]) -> pa.Table:

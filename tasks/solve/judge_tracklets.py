@@ -6,7 +6,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.schemas.bridge import empty, from_polars, to_polars
+from epipole.schemas.bridge import empty, from_polars, table, to_polars
 from epipole.schemas.rejects import Outcome
 from epipole.schemas.work_tables import TRACKLET_OUTCOMES
 from epipole.tasks.common.lone_detections import published_ids
@@ -14,34 +14,18 @@ from epipole.tasks.common.lone_detections import published_ids
 _RANK = {outcome.value: rank for rank, outcome in enumerate(Outcome)}
 
 
-def judge_tracklets(
-    views: pa.Table, left_out: pa.Table, undecided: pa.Table, associations: pa.Table
-) -> pa.Table:
-    """Return TRACKLET_OUTCOMES of a span. Lone detections, which are not published, have none.
+def judge_views(associations: pa.Table) -> pa.Table:
+    """Return TRACKLET_OUTCOMES of the views of objects: used by a position, or rejected.
 
-    Parameters
-    ----------
-    views
-        VIEWS that were compared.
-    left_out
-        VIEWS of sensors that were left out because they are at fault.
-    undecided
-        Rows of (tracklet_id, outcome), as `associate_objects` returns them.
-    associations
-        ASSOCIATIONS of the span.
+    Lone detections, which are not published, have none.
     """
-    used = associations["used"]
-    ids = associations["tracklet_id"]
+    used, ids = associations["used"], associations["tracklet_id"]
     return best_outcomes(
         [
-            _outcomes(published_ids(views["tracklet_id"]), Outcome.SEEN_BY_ONE),
-            _outcomes(published_ids(left_out["tracklet_id"]), Outcome.SENSOR_LEFT_OUT),
-            pa.table({"tracklet_id": published_ids(undecided["tracklet_id"]),
-                      "outcome": undecided["outcome"]}),
-            _outcomes(ids.filter(used), Outcome.OBJECT),
-            _outcomes(ids.filter(pc.invert(used)), Outcome.DISAGREES),
+            outcomes(ids.filter(used), Outcome.OBJECT),
+            outcomes(ids.filter(pc.invert(used)), Outcome.DISAGREES),
         ]
-    )  # fmt: skip
+    )
 
 
 def best_outcomes(tables: Iterable[pa.Table]) -> pa.Table:
@@ -59,6 +43,8 @@ def best_outcomes(tables: Iterable[pa.Table]) -> pa.Table:
     return from_polars(TRACKLET_OUTCOMES, best)
 
 
-def _outcomes(tracklet_id: pa.ChunkedArray, outcome: Outcome) -> pa.Table:
-    values = pa.array([outcome.value] * len(tracklet_id), pa.string())
-    return pa.table({"tracklet_id": tracklet_id, "outcome": values})
+def outcomes(tracklet_id: pa.ChunkedArray, outcome: Outcome) -> pa.Table:
+    """Return TRACKLET_OUTCOMES: one outcome for all these tracklets, lone detections excepted."""
+    ids = pc.unique(published_ids(tracklet_id)).drop_null()
+    values = pa.array([outcome.value] * len(ids), pa.string())
+    return table(TRACKLET_OUTCOMES, {"tracklet_id": ids, "outcome": values})

@@ -20,10 +20,10 @@ from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.common.lone_detections import with_lone_tracklets
 from epipole.tasks.identify.identify_stars import identify_stars
 from epipole.tasks.identify.place_sensors import place_sensors
-from epipole.tasks.solve.align_epochs import align_epochs
-from epipole.tasks.solve.associate_objects import associate_objects
-from epipole.tasks.solve.solve_positions import Solved, solve_positions
-from epipole.tasks.solve.view_objects import view_objects
+from epipole.tasks.solve.association.associate_objects import associate_objects
+from epipole.tasks.solve.positions.solve_positions import Solved, solve_positions
+from epipole.tasks.solve.views.align_epochs import align_epochs
+from epipole.tasks.solve.views.view_objects import view_objects
 from epipole.tasks.track.build_tracklets import Tracked, build_tracklets
 
 Array = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ from epipole.schemas.settings import AssociationSettings, Settings
 from epipole.schemas.tables import TRACKLETS
 from epipole.schemas.work_tables import CAMERAS, SOLUTIONS, VIEWS
 from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
-from epipole.tasks.solve.associate_objects import associate_objects
+from epipole.tasks.solve.association.associate_objects import associate_objects
 from scenes.tracklet_scenes import Scene
 
 START_NS = int(np.datetime64("2019-04-01T04:00:00", "ns").astype(np.int64))

@@ -1,8 +1,8 @@
-"""Verdicts: the group of each view, span by span, and how longer evidence changes it.
+"""Verdicts: the group of each tracklet, window by window, and how longer evidence changes it.
 
 Two lines of sight to different things may meet by chance for half a minute, but rarely for ten.
-So the groups of a span that are not sure are judged again over longer and longer windows, as
-long as their tracklets continue. Sure groups keep their short spans, because tracklets come and
+So the groups of a window that are not sure are judged again over longer and longer windows, as
+long as their tracklets continue. Sure groups keep their short windows, because tracklets come and
 go.
 """
 
@@ -21,98 +21,96 @@ Flags = npt.NDArray[np.bool_]
 LONGER = 2.0  # a tracklet is judged again once it is longer than before by this factor
 
 
-class ViewKeys(NamedTuple):
-    """The views of a span, one row each: epoch [ns], number of the window, tracklet, sensor."""
+class Items(NamedTuple):
+    """Each tracklet in each window, in the order of windows and tracklets.
 
-    epoch_ns: Indices
-    span: Indices
+    window, tracklet, sensor : (n,) int
+        Windows of time, tracklets and sensors, each numbered from 0.
+    first_ns, last_ns, n_views : (n,) int
+        First and last epoch [ns] of the tracklet's views in the window, and their number.
+    """
+
+    window: Indices
     tracklet: Indices
     sensor: Indices
+    first_ns: Indices
+    last_ns: Indices
+    n_views: Indices
 
 
 class Verdicts:
-    """The group of each row of `ViewKeys`, numbered through the span; FREE for no group."""
+    """The group of each item, numbered through the windows; FREE for no group."""
 
-    def __init__(self, views: ViewKeys) -> None:
-        n = len(views.epoch_ns)
-        self.views = views
+    def __init__(self, items: Items) -> None:
+        n = len(items.window)
+        self.items = items
         self.group = np.full(n, FREE)
         self.ambiguous = np.zeros(n, bool)
         self._score = np.zeros(0)
 
     def enter(self, rows: Indices, tracklet: Indices, groups: Groups) -> None:
-        """Enter the groups of some tracklets for those of the rows that are theirs."""
-        at = np.searchsorted(tracklet, self.views.tracklet[rows])
+        """Enter the groups of some tracklets for those of the items that are theirs."""
+        if not len(tracklet):
+            return
+        at = np.searchsorted(tracklet, self.items.tracklet[rows])
         at = np.minimum(at, len(tracklet) - 1)
-        known = tracklet[at] == self.views.tracklet[rows]
+        known = tracklet[at] == self.items.tracklet[rows]
         rows, at = rows[known], at[known]
         new = np.where(groups.group == FREE, FREE, groups.group + len(self._score))
         self.group[rows], self.ambiguous[rows] = new[at], groups.ambiguous[at]
         self._score = np.concatenate([self._score, groups.score])
 
-    def open_rows(self, rows: Indices, judged_s: float) -> Indices:
-        """Return the rows of a window that are to be judged again; empty where that is useless.
+    def open_items(self, rows: Indices, judged_s: float) -> Indices:
+        """Return the items of a longer window that are to be judged again; empty where that is
+        useless.
 
         They belong to no sure group, and their tracklets last at least twice the time
         `judged_s` [s] over which they were judged. So do all tracklets of their group.
         """
-        views = self.views
-        _, item = np.unique(views.tracklet[rows], return_inverse=True)
-        first = np.full(item.max(initial=-1) + 1, np.iinfo(np.int64).max)
+        items = self.items
+        _, which = np.unique(items.tracklet[rows], return_inverse=True)
+        first = np.full(which.max(initial=-1) + 1, np.iinfo(np.int64).max)
         last = np.zeros_like(first)
-        np.minimum.at(first, item, views.epoch_ns[rows])
-        np.maximum.at(last, item, views.epoch_ns[rows])
-        continues = (last - first >= LONGER * judged_s * 1e9)[item]
+        np.minimum.at(first, which, items.first_ns[rows])
+        np.maximum.at(last, which, items.last_ns[rows])
+        continues = (last - first >= LONGER * judged_s * 1e9)[which]
         group = self.group[rows]
         unfit = np.zeros(len(self._score) + 1, bool)
         unfit[:-1] = self._score >= CERTAIN_LOG_ODDS
         unfit[group[~continues & (group != FREE)]] = True
         chosen = rows[continues & ~unfit[group]]  # FREE is -1: the last entry, never unfit
-        alone = len(np.unique(views.sensor[chosen])) < 2
+        alone = len(np.unique(items.sensor[chosen])) < 2
         return chosen[:0] if alone else chosen
 
     def reconsider(
-        self, rows: Indices, open_rows: Indices, tracklet: Indices, groups: Groups
+        self, rows: Indices, open_items: Indices, tracklet: Indices, groups: Groups
     ) -> None:
-        """Enter the groups that longer evidence gives for the open rows of a window.
+        """Enter the groups that longer evidence gives for the open items of a longer window.
 
-        Where a new group shares a tracklet with a sure group of a span, its other tracklets join
-        the sure group in that span. One whose sensor has a tracklet there already is free.
+        Where a new group shares a tracklet with a sure group of a window, its other tracklets join
+        the sure group in that window. One whose sensor has a tracklet there already is free.
         """
-        sure = np.setdiff1d(rows, open_rows)
+        items = self.items
+        sure = np.setdiff1d(rows, open_items)
         sure = sure[self.group[sure] != FREE]
-        self.enter(open_rows, tracklet, groups)
+        self.enter(open_items, tracklet, groups)
         theirs = dict(zip(tracklet.tolist(), groups.group.tolist(), strict=True))
         base = len(self._score) - len(groups.score)
         joined: dict[tuple[int, int], int] = {}
         taken: set[tuple[int, int, int]] = set()
-        for row in self._one_per_tracklet(sure):
-            span, group = int(self.views.span[row]), int(self.group[row])
-            taken.add((span, group, int(self.views.sensor[row])))
-            longer = theirs.get(int(self.views.tracklet[row]), FREE)
+        for row in sure.tolist():
+            window, group = int(items.window[row]), int(self.group[row])
+            taken.add((window, group, int(items.sensor[row])))
+            longer = theirs.get(int(items.tracklet[row]), FREE)
             if longer != FREE:
-                joined.setdefault((span, base + longer), group)
+                joined.setdefault((window, base + longer), group)
         if not joined:
             return
-        first = self._one_per_tracklet(open_rows)
-        now = self.group[first].copy()
-        for k, row in enumerate(first.tolist()):
-            span = int(self.views.span[row])
-            group = joined.get((span, int(now[k])), FREE)
+        now = self.group[open_items].copy()
+        for k, row in enumerate(open_items.tolist()):
+            window = int(items.window[row])
+            group = joined.get((window, int(now[k])), FREE)
             if group != FREE:
-                clash = (span, group, int(self.views.sensor[row])) in taken
+                clash = (window, group, int(items.sensor[row])) in taken
                 now[k] = FREE if clash else group
-        self.group[open_rows] = now[self._inverse(open_rows)]
-
-    def _key(self, rows: Indices) -> Indices:
-        return (
-            self.views.span[rows] * (self.views.tracklet.max(initial=0) + 1)
-            + (self.views.tracklet[rows])
-        )
-
-    def _one_per_tracklet(self, rows: Indices) -> Indices:
-        """Return one row for each tracklet and span; its other rows have the same group."""
-        return rows[np.unique(self._key(rows), return_index=True)[1]]
-
-    def _inverse(self, rows: Indices) -> Indices:
-        return np.unique(self._key(rows), return_inverse=True)[1]
+        self.group[open_items] = now

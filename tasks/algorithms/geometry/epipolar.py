@@ -9,7 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.kernels import kernel
+
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 
 class UncertainSight(NamedTuple):
@@ -80,3 +83,51 @@ def epipolar_sigma(first: UncertainSight, second: UncertainSight, x_km: Array) -
     across_1 = np.einsum("...i,...ij,...j", normal, first.cov, normal) * range_1**2
     across_2 = np.einsum("...i,...ij,...j", normal, second.cov, normal) * range_2**2
     return np.sqrt(across_1 + across_2 + first.sigma_km**2 + second.sigma_km**2) / range_2
+
+
+@kernel
+def _mean_squares(offsets, ranked, most, r, u, out):
+    """Write each view's mean square of the angles to the planes of the first ranked others."""
+    for g in range(len(offsets) - 1):
+        lo, hi = offsets[g], offsets[g + 1]
+        for b in range(lo, hi):
+            total, count = 0.0, 0
+            for k in range(lo, hi):
+                a = ranked[k]
+                if a == b:
+                    continue
+                if count == most:
+                    break
+                count += 1
+                x, y, z = r[b, 0] - r[a, 0], r[b, 1] - r[a, 1], r[b, 2] - r[a, 2]
+                n0 = y * u[a, 2] - z * u[a, 1]
+                n1 = z * u[a, 0] - x * u[a, 2]
+                n2 = x * u[a, 1] - y * u[a, 0]
+                length = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+                if length > 1e-12 * np.sqrt(x * x + y * y + z * z):
+                    sine = (n0 * u[b, 0] + n1 * u[b, 1] + n2 * u[b, 2]) / length
+                    total += np.arcsin(min(max(sine, -1.0), 1.0)) ** 2
+            out[b] = total / max(count, 1)
+
+
+def epipolar_rms(offsets: Indices, ranked: Indices, most: int, r_km: Array, u: Array) -> Array:
+    """Return each view's rms distance to the epipolar planes of others of its group [rad].
+
+    Parameters
+    ----------
+    offsets : (g + 1,) int
+        Group k has the views ``offsets[k]:offsets[k + 1]``.
+    ranked : (n,) int
+        The views of each group, the best first.
+    most
+        So many of the others count, the best ones: the cost does not grow with the square of the
+        sensors.
+    r_km, u : (n, 3) float
+        Sensor positions [km] and directions; see `epipolar_angle`.
+    """
+    out = np.empty(len(u))
+    _mean_squares(
+        np.array(offsets, np.int64), np.array(ranked, np.int64), int(most),
+        np.array(r_km, float, order="C"), np.array(u, float, order="C"), out,
+    )  # fmt: skip
+    return np.sqrt(out)

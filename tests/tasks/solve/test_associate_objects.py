@@ -6,7 +6,7 @@ from scenes.associations import associated, reasons, tables, wrong_views
 from scenes.tracklet_scenes import Scene
 
 from epipole.schemas.settings import Settings
-from epipole.tasks.solve.associate_objects import associate_objects
+from epipole.tasks.solve.association.associate_objects import associate_objects
 
 
 @pytest.mark.parametrize("method", ["likelihood", "epipolar"])

@@ -10,7 +10,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS, STATES
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
-from epipole.tasks.solve.fit_states import fit_states, refuse_misfits, with_honest_biases
+from epipole.tasks.solve.positions.fit_states import fit_states, refuse_misfits, with_honest_biases
 
 T0 = 1_554_091_200_000_000_000
 SETTINGS = Settings()

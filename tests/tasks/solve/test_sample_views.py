@@ -5,7 +5,7 @@ import pytest
 from scenes.associations import START_NS, tables
 from scenes.tracklet_scenes import Scene
 
-from epipole.tasks.solve.sample_views import MOST_SAMPLES, SpanViews
+from epipole.tasks.solve.association.sample_views import MOST_SAMPLES, SpanViews
 
 SECOND_NS = 1_000_000_000
 TIMES = np.arange(0.0, 120.0, 2.0)

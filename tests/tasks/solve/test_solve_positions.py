@@ -25,7 +25,7 @@ from epipole.tasks.algorithms.geometry.direction_errors import (
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
-from epipole.tasks.solve.solve_positions import solve_positions
+from epipole.tasks.solve.positions.solve_positions import solve_positions
 
 T0 = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000

@@ -12,7 +12,7 @@ from epipole.schemas.work_tables import CAMERAS, SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
 from epipole.tasks.algorithms.geometry.sky import radec_from_unit, tangent_basis, unit_from_radec
-from epipole.tasks.solve.view_objects import view_objects
+from epipole.tasks.solve.views.view_objects import view_objects
 
 T0 = 1_554_091_200_000_000_000
 N_FRAMES, N_OBJECTS = 61, 4

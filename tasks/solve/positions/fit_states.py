@@ -8,10 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
+import pyarrow.compute as pc
 from scipy.special import chdtrc
 
 from epipole.schemas.bridge import (
     array,
+    empty,
     stack,
     stack_covariance,
     table,
@@ -23,7 +25,7 @@ from epipole.schemas.columns import STATE_AXES, TANGENT_AXES
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import STATES
-from epipole.schemas.work_tables import VIEWS
+from epipole.schemas.work_tables import SHARED_ERRORS, VIEWS
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, FittedOrbits, fit_orbits, prior_of
 from epipole.tasks.algorithms.orbits.shared_errors import SensorEquations, scale_shared_errors
@@ -54,17 +56,17 @@ def fit_states(
     return _state_table(named.object_id, named.middle_ns, fitted, counts)
 
 
-def with_honest_biases(
+def judge_errors(
     views: pa.Table, associations: pa.Table, positions: pa.Table, settings: Settings
 ) -> pa.Table:
-    """Return VIEWS of objects with larger shared errors for sensors whose errors are larger.
+    """Return SHARED_ERRORS: the sensors whose shared errors are larger than stated.
 
-    All objects of the span show together whether the errors that a sensor's views share are of
-    the stated size; see `scale_shared_errors`. If all are, the same table is returned.
+    All objects together show whether the errors that a sensor's views share are of the stated
+    size; see `scale_shared_errors`.
     """
     rows = _used_views(views, associations, positions, settings)
     if not len(rows):
-        return views
+        return empty(SHARED_ERRORS)
     named = _arcs_of(rows)
     arcs = named.arcs
     fitted = fit_orbits(arcs, _starts(positions, named.object_id, named.middle_ns))
@@ -74,17 +76,29 @@ def with_honest_biases(
     has_bias = np.bincount(arcs.sensor, np.trace(arcs.cov_bias, axis1=1, axis2=2)) > 0.0
     free = np.column_stack([has_bias, np.ones(len(sensors), bool)])
     factor = scale_shared_errors(equations, prior, free)
-    if not (factor > 1.0).any():
-        return views
-    at = np.clip(np.searchsorted(sensors, array(views, "sensor_id")), 0, len(sensors) - 1)
-    of_view = np.where(
-        (sensors.to_numpy()[at] == array(views, "sensor_id"))[:, None], factor[at], 1.0
+    larger = np.flatnonzero((factor > 1.0).any(axis=1))
+    return table(
+        SHARED_ERRORS,
+        {
+            "sensor_id": sensors.to_numpy()[larger],
+            "direction": factor[larger, 0],
+            "place": factor[larger, 1],
+        },
     )
-    bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES) * of_view[:, 0, None, None]
-    sigma_km = array(views, "position_sigma_km") * np.sqrt(of_view[:, 1])
+
+
+def with_larger_errors(views: pa.Table, errors: pa.Table) -> pa.Table:
+    """Return VIEWS with the shared errors of some sensors as large as SHARED_ERRORS say."""
+    if not errors.num_rows:
+        return views
+    row = pc.index_in(views["sensor_id"], errors["sensor_id"].combine_chunks())
+    direction, place = (
+        pc.fill_null(errors[name].take(row), 1.0).to_numpy() for name in ("direction", "place")
+    )
+    bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES) * direction[:, None, None]
     columns = {name: views[name] for name in VIEWS.names} | {
         **unstack_covariance("cov_bias_{}_rad2", bias, TANGENT_AXES),
-        "position_sigma_km": sigma_km,
+        "position_sigma_km": array(views, "position_sigma_km") * np.sqrt(place),
     }
     return table(VIEWS, columns)
 

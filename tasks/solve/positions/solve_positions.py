@@ -19,19 +19,14 @@ from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
-from epipole.schemas.tables import ASSOCIATIONS, PAIRS, POSITIONS, REJECTS
+from epipole.schemas.tables import POSITIONS, REJECTS
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.epipolar import (
-    UncertainSight,
-    epipolar_angle,
-    epipolar_sigma,
-)
-from epipole.tasks.algorithms.geometry.light_time import apparent_places
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import neglected_motion, velocities
-from epipole.tasks.common.lone_detections import only_id, published_ids
+from epipole.tasks.common.lone_detections import only_id
+from epipole.tasks.solve.positions.pair_views import association_table, pair_table
+from epipole.tasks.solve.positions.view_groups import Groups
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -53,39 +48,6 @@ class Solved(NamedTuple):
     views: pa.Table
 
 
-class _Groups(NamedTuple):
-    """Views grouped by epoch and object, and the solution of each group."""
-
-    views: pa.Table
-    offsets: Indices
-    object_id: npt.NDArray[np.object_]
-    epoch_ns: Indices
-    u: Array
-    r_km: Array
-    cov: Array
-    x_km: Array
-    cov_km2: Array
-    chi2: Array
-    used: npt.NDArray[np.bool_]
-    mean_range_km: Array
-    velocity_km_s: Array
-    independent: npt.NDArray[np.bool_]
-
-    @property
-    def apparent_km(self) -> Array:
-        """Where each view's sensor sees the object: its light left at a time of its own."""
-        group = self.group
-        light_s = self.mean_range_km / SPEED_OF_LIGHT_KM_S
-        return apparent_places(
-            self.x_km[group], self.velocity_km_s[group], light_s[group], self.r_km
-        )
-
-    @property
-    def group(self) -> Indices:
-        """Group of each view."""
-        return np.repeat(np.arange(len(self.epoch_ns)), np.diff(self.offsets))
-
-
 def solve_positions(
     views: pa.Table, object_number: Indices, settings: Settings, span: Span | None = None
 ) -> Solved:
@@ -99,17 +61,16 @@ def solve_positions(
     if span is not None:
         groups = _within(groups, span)
     groups = groups._replace(independent=_independent(groups, span))
-    pairs = _pair_up(groups)
     return Solved(
-        _association_table(groups, pairs),
-        _pair_table(groups, pairs, settings),
+        association_table(groups),
+        pair_table(groups, settings),
         _position_table(groups),
         _reject_table(groups),
         groups.views,
     )
 
 
-def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> _Groups:
+def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> Groups:
     order = np.lexsort(
         (array(views, "sensor_id").astype(str), object_number, array(views, "epoch"))
     )
@@ -136,7 +97,7 @@ def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> _Grou
                 sigma[group],
                 spread_s[group],
             )
-    return _Groups(
+    return Groups(
         views, offsets, object_names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
         x_km, cov_km2, chi2, used, mean_range, velocity, np.zeros(len(start), bool),
     )  # fmt: skip
@@ -184,14 +145,14 @@ def with_neglected_motion(
     return table(VIEWS, {**{name: views[name] for name in VIEWS.names}, **columns})
 
 
-def _within(groups: _Groups, span: Span) -> _Groups:
+def _within(groups: Groups, span: Span) -> Groups:
     """Return the groups whose epoch lies in a span."""
     kept = span.holds(groups.epoch_ns)
     if kept.all():
         return groups
     rows = np.flatnonzero(kept[groups.group])
     size = np.diff(groups.offsets)[kept]
-    return _Groups(
+    return Groups(
         views=groups.views.take(rows),
         offsets=np.concatenate([[0], np.cumsum(size)]).astype(np.int64),
         object_id=groups.object_id[kept],
@@ -209,7 +170,7 @@ def _within(groups: _Groups, span: Span) -> _Groups:
     )
 
 
-def _independent(groups: _Groups, span: Span | None) -> npt.NDArray[np.bool_]:
+def _independent(groups: Groups, span: Span | None) -> npt.NDArray[np.bool_]:
     """Return the groups to use where no two may share a detection: in order of time, each that
     shares none with those before.
 
@@ -265,88 +226,7 @@ def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> tuple[Array,
     return v_km_s, spread_s
 
 
-class _ViewPairs(NamedTuple):
-    """Pairs of views of one group: their rows, and the epipolar distance in px and in sigmas."""
-
-    first: Indices
-    second: Indices
-    epipolar_px: Array
-    mahalanobis: Array
-
-
-def _pair_up(groups: _Groups) -> _ViewPairs:
-    """Return every ordered pair of views of one object at one epoch."""
-    first, second = [], []
-    for lo, hi in zip(groups.offsets[:-1], groups.offsets[1:], strict=True):
-        i, j = np.nonzero(~np.eye(hi - lo, dtype=bool))
-        first.append(lo + i)
-        second.append(lo + j)
-    a = np.concatenate([*first, np.zeros(0, np.int64)])
-    b = np.concatenate([*second, np.zeros(0, np.int64)])
-    # Each sensor is moved as if all sensors saw the object at one place: the light to a farther one
-    # left earlier.
-    r = groups.r_km + np.nan_to_num(groups.x_km[groups.group] - groups.apparent_km)
-    u = groups.u
-    angle = epipolar_angle(r[a], u[a], r[b], u[b])
-    basis = tangent_basis(u)
-    cov = np.swapaxes(basis, -1, -2) @ groups.cov @ basis
-    sigma_km = array(groups.views, "position_sigma_km")
-    sigma = epipolar_sigma(
-        UncertainSight(r[a], u[a], cov[a], sigma_km[a]),
-        UncertainSight(r[b], u[b], cov[b], sigma_km[b]),
-        groups.x_km[groups.group[a]],
-    )
-    pixel = array(groups.views, "pixel_rad")
-    return _ViewPairs(a, b, np.abs(angle) / pixel[b], np.abs(angle) / sigma)
-
-
-def _association_table(groups: _Groups, pairs: _ViewPairs) -> pa.Table:
-    n = groups.views.num_rows
-    square = np.bincount(pairs.second, pairs.epipolar_px**2, minlength=n)
-    count = np.maximum(np.bincount(pairs.second, minlength=n), 1)
-    views = groups.views
-    shared = ("epoch", "sensor_id", "frame_number", "centroid", "x_px", "y_px")
-    return table(
-        ASSOCIATIONS,
-        {name: views[name] for name in shared}
-        | {
-            "tracklet_id": published_ids(views["tracklet_id"]),
-            "object_id": groups.object_id[groups.group],
-            "epipolar_px": np.sqrt(square / count),
-            "used": groups.used,
-        },
-    )
-
-
-def _pair_table(groups: _Groups, pairs: _ViewPairs, settings: Settings) -> pa.Table:
-    """Return PAIRS: used views that both have a centroid, the reference view first."""
-    has_centroid = groups.views["centroid"].is_valid().to_numpy() & groups.used
-    kept = has_centroid[pairs.first] & has_centroid[pairs.second]
-    if settings.positions.all_pairs:
-        kept &= pairs.first < pairs.second
-    else:
-        kept &= pairs.first == _references(groups, has_centroid)[groups.group[pairs.first]]
-    columns = {
-        "epoch": groups.epoch_ns[groups.group[pairs.first[kept]]],
-        "epipolar_px": pairs.epipolar_px[kept],
-        "mahalanobis": pairs.mahalanobis[kept],
-    }
-    for side, rows in (("1", pairs.first[kept]), ("2", pairs.second[kept])):
-        for name in ("sensor_id", "frame_number", "centroid"):
-            columns[f"{name}_{side}"] = groups.views[name].take(rows)
-    return table(PAIRS, columns)
-
-
-def _references(groups: _Groups, candidates: npt.NDArray[np.bool_]) -> Indices:
-    """Return the row of each group's reference view: the candidate of the least position error."""
-    across = np.trace(groups.cov, axis1=1, axis2=2) / 2
-    away_km = np.linalg.norm(groups.x_km[groups.group] - groups.r_km, axis=1)
-    error = across * away_km**2 + array(groups.views, "position_sigma_km") ** 2
-    order = np.lexsort((np.where(candidates, error, np.inf), groups.group))
-    return np.asarray(order[groups.offsets[:-1]])
-
-
-def _position_table(groups: _Groups) -> pa.Table:
+def _position_table(groups: Groups) -> pa.Table:
     solved = np.isfinite(groups.chi2)
     n_used = np.bincount(groups.group, groups.used, minlength=len(solved)).astype(np.int32)
     light_ns = np.nan_to_num(groups.mean_range_km / SPEED_OF_LIGHT_KM_S * 1e9)
@@ -365,7 +245,7 @@ def _position_table(groups: _Groups) -> pa.Table:
     return table(POSITIONS, {name: values[solved] for name, values in columns.items()})
 
 
-def _residual_px(groups: _Groups) -> Array:
+def _residual_px(groups: Groups) -> Array:
     """Return the rms image distance of each group's used views from its position."""
     sight = groups.apparent_km - groups.r_km
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
@@ -376,7 +256,7 @@ def _residual_px(groups: _Groups) -> Array:
     return np.sqrt(np.bincount(groups.group, square, minlength=size) / count)
 
 
-def _reject_table(groups: _Groups) -> pa.Table:
+def _reject_table(groups: Groups) -> pa.Table:
     """Return a row of `rejects` per sensor and reason, with the number of views."""
     unsolved = ~np.isfinite(groups.chi2)[groups.group]
     which = {

@@ -23,7 +23,7 @@ class EpochGrid(NamedTuple):
     """The epochs of a whole night, the same for each of its spans."""
 
     interval_ns: int
-    regular: bool  # False: the epochs are the times of frames
+    instants_ns: tuple[int, ...] | None  # the epochs, where no sensor has a frame interval
 
 
 def grid_of(time_ns: Sequence[npt.NDArray[np.int64]], settings: Settings) -> EpochGrid:
@@ -36,8 +36,11 @@ def grid_of(time_ns: Sequence[npt.NDArray[np.int64]], settings: Settings) -> Epo
     """
     wanted_s = settings.alignment.interval_s
     if wanted_s is not None:
-        return EpochGrid(max(round(wanted_s * 1e9), 1), True)
-    return EpochGrid(epoch_interval_ns(list(time_ns)), any(len(t) > 1 for t in time_ns))
+        return EpochGrid(max(round(wanted_s * 1e9), 1), None)
+    interval_ns = epoch_interval_ns(list(time_ns))
+    if any(len(t) > 1 for t in time_ns) or not len(time_ns):
+        return EpochGrid(interval_ns, None)
+    return EpochGrid(interval_ns, tuple(instants_of(np.concatenate(time_ns), interval_ns).tolist()))
 
 
 def frames_that_serve(solutions: pa.Table) -> pa.Table:
@@ -60,15 +63,15 @@ def align_epochs(
     times = [array(part, "time") for part in parts]
     if not parts:
         return concat(EPOCHS, [])
-    interval_ns, regular = grid or grid_of(times, settings)
-    if regular:
+    interval_ns, instants_ns = grid or grid_of(times, settings)
+    if instants_ns is None:
         epochs = epoch_grid(
             min(int(t[0]) for t in times) - interval_ns // 2,
             max(int(t[-1]) for t in times) + interval_ns // 2,
             interval_ns,
         )
     else:
-        epochs = instants_of(np.concatenate(times), interval_ns)
+        epochs = np.array(instants_ns, np.int64)
     rows = [
         _serving(epochs, sensor, array(part, "frame_number"), t, interval_ns, settings.alignment)
         for sensor, part, t in zip(sensors, parts, times, strict=True)

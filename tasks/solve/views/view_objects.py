@@ -21,7 +21,7 @@ from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.lone_detections import in_lone_frames, with_lone_detections
 from epipole.tasks.common.sightings import Frames, camera_of, solved_frames
-from epipole.tasks.solve.tracklet_sightings import TrackletSightings, tracklet_sightings
+from epipole.tasks.solve.views.tracklet_sightings import TrackletSightings, tracklet_sightings
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -34,7 +34,7 @@ def view_objects(
     cameras: pa.Table,
     settings: Settings,
 ) -> pa.Table:
-    """Return VIEWS of one sensor: each tracklet at each epoch that it covers.
+    """Return VIEWS of one sensor: each tracklet at each epoch that it covers, in this order.
 
     A detection in a lone frame is a tracklet of one detection, at an unknown rate.
 
@@ -153,7 +153,7 @@ def _view_table(
     velocity = unstack("sensor_v{}_km_s", v_km_s[kept])
     columns |= {name: nullable(values) for name, values in velocity.items()}
     columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
-    return table(VIEWS, columns).sort_by([("epoch", "ascending"), ("tracklet_id", "ascending")])
+    return table(VIEWS, columns)
 
 
 def _without_blends(

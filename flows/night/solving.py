@@ -1,0 +1,176 @@
+"""Solve the objects of a night, step by step, each step as tasks that one worker can hold.
+
+The views of each sensor; the objects of each block of time; their numbers in the night; sensors
+whose errors are larger than stated; the positions and states of the objects, piece by piece. What
+a task works on depends on the data and the settings, never on the workers.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from epipole.flows.night.progress import results
+from epipole.flows.night.work import Work
+from epipole.io.work.parts import Parts
+from epipole.io.work.places import SensorParts, SolvedParts
+from epipole.schemas.bridge import array
+from epipole.schemas.rejects import Reason
+from epipole.schemas.settings import Settings
+from epipole.schemas.spans import Span
+from epipole.schemas.stages import Stage
+from epipole.tasks.solve.association.associate_block import associate_blocks, blocks_of
+from epipole.tasks.solve.association.number_objects import number_objects
+from epipole.tasks.solve.positions.judge_span import judge_span
+from epipole.tasks.solve.positions.solve_piece import Piece, solve_piece
+from epipole.tasks.solve.views.align_epochs import EpochGrid, frames_that_serve, grid_of
+from epipole.tasks.solve.views.view_sensors import view_sensors
+
+STEPS = 4  # of the progress
+MARGIN_NS = 30_000_000_000  # beyond a span: the positions there show an object's motion
+FEWEST_EPOCHS = 6  # of a margin
+VIEWS_AT_ONCE = 4  # tasks that share what one task may hold: small tasks are spread evenly
+MOST_LINES = 100_000  # of sight, of a span, that are kept for the check of the sensors
+
+
+class _Night(NamedTuple):
+    """What all steps work on: sensors with their parts, in the order of the ids."""
+
+    sensors: list[tuple[str, SensorParts]]
+    spans: list[Span]
+    grid: EpochGrid
+    work: Work
+    settings: Settings
+    solved: SolvedParts
+
+    @property
+    def viewed(self) -> dict[int, Parts]:
+        """The views of each sensor, by its number."""
+        return {of.number: of.viewed for _, of in self.sensors}
+
+    @property
+    def margin_ns(self) -> int:
+        """Time beyond a span whose positions show the motion at its ends."""
+        return max(MARGIN_NS, FEWEST_EPOCHS * self.grid.interval_ns)
+
+
+def solve_objects(
+    work: Work, settings: Settings, left_out: Mapping[str, Reason]
+) -> tuple[SolvedParts, int]:
+    """Find and solve the objects of all sensors but those left out.
+
+    Returns
+    -------
+    solved
+        Where the results are.
+    count
+        Number of positions.
+    """
+    solved = work.folder.solved(work.round, all_sensors=not left_out)
+    sensors = [(sensor.sensor_id, parts) for sensor, parts in sorted(
+        work.sensor_parts().items(), key=lambda pair: pair[0].sensor_id)]  # fmt: skip
+    grid = epoch_grid(work, settings)
+    night = _Night(sensors, work.all_spans(), grid, work, settings, solved)
+    n_views = _view(night)
+    _associate(night, n_views, left_out)
+    return solved, _solve(night, n_views)
+
+
+def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
+    """Return the grid of epochs of the night."""
+    columns = ["time", "attitude_source", "x_km"]
+    times = []
+    for sensor, spans in work.spans.items():
+        rows = [work.identified[sensor].read(span, "solutions", columns) for span in spans]
+        serving = [array(frames_that_serve(part), "time") for part in rows]
+        times.append(np.concatenate([np.zeros(0, np.int64), *serving]))
+    return grid_of(times, settings)
+
+
+def _view(night: _Night) -> dict[Span, int]:
+    """View the tracklets of all sensors, some sensors of a span a task; return each span's views."""
+    work, settings = night.work, night.settings
+    groups = [
+        (span, group)
+        for span in night.spans
+        for group in _sensor_groups(work, span, settings.work.most_views // VIEWS_AT_ONCE)
+    ]
+    futures = [
+        view_sensors.submit(group, span, night.grid, work.cameras, settings)
+        for span, group in groups
+    ]
+    counts = results(Stage.SOLVE, futures, (0, STEPS))
+    total = dict.fromkeys(night.spans, 0)
+    for (span, _), count in zip(groups, counts, strict=True):
+        total[span] += count
+    return total
+
+
+def _sensor_groups(work: Work, span: Span, most: int) -> list[list[SensorParts]]:
+    """Return the sensors with frames in a span, or near it, in groups of so many detections."""
+    near = {span, *(Span(t, t + span.end_ns - span.start_ns) for t in (
+        2 * span.start_ns - span.end_ns, span.end_ns))}  # fmt: skip
+    groups: list[list[SensorParts]] = []
+    held = most
+    for sensor, parts in work.sensor_parts().items():
+        if near.isdisjoint(work.spans[sensor]):
+            continue
+        if held >= most:
+            groups.append([])
+            held = 0
+        groups[-1].append(parts)
+        if parts.tracked.holds(span):
+            held += parts.tracked.read(span, "detections", ["time"]).num_rows
+    return groups
+
+
+def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str, Reason]) -> None:
+    """Find the objects, a task per block, or per span where a task may hold all its views."""
+    futures = []
+    for span in night.spans:
+        blocks = blocks_of(span, night.settings)
+        together = n_views[span] <= night.settings.work.most_views
+        for of_task in [blocks] if together else [[block] for block in blocks]:
+            futures.append(
+                associate_blocks.submit(
+                    night.sensors, of_task, night.work.cameras, left_out, night.settings,
+                    night.solved.blocks,
+                )
+            )  # fmt: skip
+    results(Stage.SOLVE, futures, (1, STEPS))
+
+
+def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
+    """Solve the objects, a task per piece; return the number of positions."""
+    spans, settings, solved = night.spans, night.settings, night.solved
+    numbered = number_objects.submit(spans, night.margin_ns, settings, solved)
+    (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
+    viewed, margin_ns = night.viewed, night.margin_ns
+    judged = {
+        span: judge_span.submit(viewed, span, margin_ns, settings, solved)
+        for span, count in zip(spans, counts, strict=True)
+        if count
+    }
+    futures = [
+        solve_piece.submit(
+            viewed, Piece(span, number, count), margin_ns, _between_lines_ns(night, n_views[span]),
+            settings, solved, wait_for=[judged[span]],
+        )
+        for span, count in zip(spans, counts, strict=True)
+        for number in range(count)
+    ]  # fmt: skip
+    return sum(results(Stage.SOLVE, futures, (3, STEPS)))
+
+
+def _between_lines_ns(night: _Night, n_views: int) -> int:
+    """Return the time between the epochs whose lines of sight are kept.
+
+    Epochs nearer than twice the window of the local motion share detections.
+    """
+    if night.grid.instants_ns is not None:
+        return 1
+    interval_ns = night.grid.interval_ns
+    epochs = math.ceil(2e9 * night.settings.alignment.window_s / interval_ns)
+    fewer = max(math.ceil(n_views / max(epochs, 1) / MOST_LINES), 1)
+    return max(epochs, 1) * fewer * interval_ns

@@ -1,0 +1,1 @@
+"""Which tracklets of different sensors are one object."""

@@ -1,0 +1,170 @@
+"""Associate a block: the objects of a block of time, from the views of all sensors, part to part."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pyarrow as pa
+
+from epipole.io.work.part_tables import ASSOCIATED
+from epipole.io.work.parts import Parts, write_part
+from epipole.io.work.places import SensorParts
+from epipole.schemas.bridge import array, concat, empty, table
+from epipole.schemas.rejects import Outcome, Reason, reject_rows
+from epipole.schemas.settings import Settings
+from epipole.schemas.spans import BLOCK_NS, Span
+from epipole.schemas.stages import Stage
+from epipole.schemas.tables import REJECTS
+from epipole.schemas.work_tables import OBJECT_MEMBERS, TRACKLET_OUTCOMES
+from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.solve.association.associate_objects import Associated, associate_objects
+from epipole.tasks.solve.association.block_views import BlockViews, SensorViews
+from epipole.tasks.solve.judge_tracklets import best_outcomes, outcomes
+
+
+@stage_task(Stage.SOLVE, "objects {blocks[0]}")
+def associate_blocks(
+    sensors: Sequence[tuple[str, SensorParts]],
+    blocks: Sequence[Span],
+    cameras: pa.Table,
+    left_out: Mapping[str, Reason],
+    settings: Settings,
+    parts: Parts,
+) -> None:
+    """Find the objects of some blocks of one span, unless the parts exist.
+
+    Parameters
+    ----------
+    sensors
+        Ids and parts, in the order of the ids.
+    left_out
+        Sensors at fault, each with its reason; their views are not used.
+    parts
+        Where the parts go: `ASSOCIATED` of each block.
+    """
+    for block in blocks:
+        if not parts.holds(block):
+            tables = _associate(sensors, block, cameras, left_out, settings)
+            write_part(parts.of(block), ASSOCIATED, tables)
+
+
+def blocks_of(span: Span, settings: Settings) -> list[Span]:
+    """Return the blocks of a span: as long as the longest evidence, or else the span."""
+    if settings.association.span_s * 1e9 > BLOCK_NS:
+        return [span]
+    return [Span(t, t + BLOCK_NS) for t in range(span.start_ns, span.end_ns, BLOCK_NS)]
+
+
+def sensor_views(sensor_id: str, sensor: SensorParts, span: Span) -> SensorViews:
+    """Return the views of a sensor in a span, mapped into memory."""
+    viewed = sensor.viewed
+    return SensorViews(
+        sensor.number,
+        sensor_id,
+        viewed.read(span, "views"),
+        viewed.read(span, "epochs"),
+        viewed.read(span, "tracklets"),
+    )
+
+
+def _associate(
+    sensors: Sequence[tuple[str, SensorParts]],
+    block: Span,
+    cameras: pa.Table,
+    left_out: Mapping[str, Reason],
+    settings: Settings,
+) -> dict[str, pa.Table]:
+    span = block.span
+    held = [(name, of) for name, of in sensors if of.viewed.holds(span)]
+    views = [sensor_views(name, of, span) for name, of in held if name not in left_out]
+    faulty = [sensor_views(name, of, span) for name, of in held if name in left_out]
+    rejects = _left_out(faulty, block, left_out)
+    views = [of for of in views if of.epochs.num_rows]
+    if not any(of.views.num_rows for of in views):
+        return {
+            "members": empty(OBJECT_MEMBERS),
+            "rejects": rejects,
+            "outcomes": _outcomes(faulty, Outcome.SENSOR_LEFT_OUT),
+        }
+    of_block = BlockViews(
+        views, cameras, block, settings.association.span_s, settings.alignment.window_s
+    )
+    associated = associate_objects(of_block, settings)
+    return {
+        "members": object_members(of_block, associated),
+        "rejects": concat(REJECTS, [rejects, associated.rejects]),
+        "outcomes": best_outcomes(
+            [_outcomes(faulty, Outcome.SENSOR_LEFT_OUT), *_of_items(of_block, associated)]
+        ),
+    }
+
+
+def object_members(block: BlockViews, associated: Associated) -> pa.Table:
+    """Return OBJECT_MEMBERS of a block: windows that follow one another are one row."""
+    items, number = block.items, associated.object_number
+    order = np.lexsort((items.window, items.tracklet))
+    tracklet, object_ = items.tracklet[order], number[order]
+    begins = np.ones(len(order), bool)
+    begins[1:] = (tracklet[1:] != tracklet[:-1]) | (object_[1:] != object_[:-1])
+    first = np.flatnonzero(begins)
+    last = np.append(first[1:], len(order)) - 1
+    n_views = np.add.reduceat(items.n_views[order], first) if len(first) else first
+    rows = np.flatnonzero(object_[first] >= 0)
+    rows = rows[np.lexsort((tracklet[first[rows]], object_[first[rows]]))]
+    first, last, n_views = first[rows], last[rows], n_views[rows]
+    numbers = np.array([of.number for of in block.sensors])
+    of_tracklet = block.tracklets.take(tracklet[first])
+    return table(
+        OBJECT_MEMBERS,
+        {
+            "object": object_[first],
+            "sensor": numbers[items.sensor[order][first]],
+            "tracklet_id": of_tracklet["tracklet_id"],
+            "track_id": of_tracklet["track_id"],
+            "first_epoch": items.first_ns[order][first],
+            "last_epoch": items.last_ns[order][last],
+            "n_views": n_views,
+            "piece": np.zeros(len(first), np.int64),
+        },
+    )
+
+
+def _of_items(block: BlockViews, associated: Associated) -> list[pa.Table]:
+    """Return the outcomes of the tracklets of a block, objects excepted."""
+    tracklet = block.items.tracklet
+    undecided = associated.ambiguous & associated.believed
+
+    def of(rows: np.ndarray, outcome: Outcome) -> pa.Table:
+        ids = block.tracklets["tracklet_id"].take(np.unique(tracklet[rows]))
+        return outcomes(ids, outcome)
+
+    return [
+        of(np.ones(len(tracklet), bool), Outcome.SEEN_BY_ONE),
+        of(undecided, Outcome.AMBIGUOUS),
+        of(~associated.believed, Outcome.SENSOR_LEFT_OUT),
+    ]
+
+
+def _outcomes(sensors: Sequence[SensorViews], outcome: Outcome) -> pa.Table:
+    """Return one outcome for all tracklets of sensors."""
+    ids = [outcomes(of.tracklets["tracklet_id"], outcome) for of in sensors]
+    return concat(TRACKLET_OUTCOMES, ids)
+
+
+def _left_out(
+    sensors: Sequence[SensorViews], block: Span, left_out: Mapping[str, Reason]
+) -> pa.Table:
+    """Return a row of `rejects` per sensor that is left out: its views in the block."""
+    tables = [empty(REJECTS)]
+    for of in sensors:
+        epoch_ns = array(of.views, "epoch")
+        epoch_ns = epoch_ns[block.holds(epoch_ns)]
+        if len(epoch_ns):
+            tables.append(
+                reject_rows(
+                    left_out[of.sensor_id],
+                    sensor_id=of.sensor_id,
+                    time=[int(epoch_ns.min())],
+                    count=[len(epoch_ns)],
+                )
+            )
+    return concat(REJECTS, tables)

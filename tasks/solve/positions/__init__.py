@@ -1,0 +1,1 @@
+"""Where the objects are: positions, states, and the lines of sight that judge the sensors."""

@@ -1,0 +1,72 @@
+"""Keep lines: the lines of sight to objects, and the objects, that the check of sensors needs."""
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, from_polars, stack, to_polars
+from epipole.schemas.spans import DAY_NS
+from epipole.schemas.work_tables import CLOCK_LINES, MOVING_OBJECTS
+from epipole.tasks.algorithms.geometry.light_time import apparent_places
+from epipole.tasks.algorithms.orbits.object_motion import velocities
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
+PLACE = ["x_km", "y_km", "z_km"]
+VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
+
+
+def moving_objects(positions: pa.Table, every_ns: int) -> pa.Table:
+    """Return MOVING_OBJECTS: the positions at epochs that are multiples of a time since
+    midnight, with velocities from the positions near them."""
+    rows = to_polars(positions).sort("object_id", "epoch")
+    size = rows.group_by("object_id", maintain_order=True).len()["len"].to_numpy()
+    offsets = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
+    time_ns = rows["epoch"].cast(pl.Int64).to_numpy()
+    time_s = (time_ns - (time_ns.min() if len(time_ns) else 0)) / 1e9
+    v, _ = velocities(offsets, time_s, rows.select(PLACE).to_numpy(), VELOCITY_WINDOW_S)
+    light_ns = pl.col("epoch").cast(pl.Int64) - pl.col("time").cast(pl.Int64)
+    rows = rows.with_columns(
+        *[pl.Series(name, v[:, k]) for k, name in enumerate(VELOCITY)], light_s=light_ns / 1e9
+    )
+    kept = rows.filter(pl.Series(time_ns % DAY_NS % every_ns == 0, dtype=pl.Boolean))
+    return from_polars(MOVING_OBJECTS, kept.select(MOVING_OBJECTS.names))
+
+
+def keep_lines(views: pa.Table, associations: pa.Table, objects: pa.Table) -> pa.Table:
+    """Return CLOCK_LINES: the views of objects at the epochs of MOVING_OBJECTS.
+
+    Parameters
+    ----------
+    views, associations
+        VIEWS of objects, and ASSOCIATIONS, row by row the same.
+    """
+    epochs = np.unique(array(objects, "epoch"))
+    rows = np.flatnonzero(np.isin(array(associations, "epoch"), epochs))
+    seen = to_polars(views.take(rows)).with_columns(
+        object_id=pl.Series(associations["object_id"].take(rows).to_pylist(), dtype=pl.String)
+    )
+    return meetings(seen, to_polars(objects), on=["epoch", "object_id"])
+
+
+def meetings(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Table:
+    """Return CLOCK_LINES: each view with the objects that are equal in the columns `on`.
+
+    Each object is put where its light left for the sensor of the row.
+    """
+    rows = (
+        views.rename({name: f"sensor_{name}" for name in PLACE})
+        .drop_nulls([f"sensor_{name}" for name in VELOCITY])
+        .join(objects, on=on, maintain_order="left")
+    )
+    x_km = apparent_places(
+        stack(rows, "{}_km"),
+        stack(rows, "v{}_km_s"),
+        rows["light_s"].to_numpy(),
+        stack(rows, "sensor_{}_km"),
+    )
+    rows = rows.with_columns(pl.Series(name, x_km[:, k]) for k, name in enumerate(PLACE))
+    return from_polars(CLOCK_LINES, rows.select(CLOCK_LINES.names))
