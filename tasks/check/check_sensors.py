@@ -25,15 +25,15 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     EPHEMERIS,
     SOUND,
     Lines,
-    judge_sensors,
 )
+from epipole.tasks.algorithms.sensor_faults.suspects import judge_many_sensors
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.positions.keep_lines import meetings
 
 Array = npt.NDArray[np.float64]
 
 MOST_EPOCHS = 300  # more do not help: the offset is one constant
-MOST_LINES = 200_000  # of sight to objects, of all sensors together
+MOST_LINES = 50_000  # of sight to objects, of all sensors together
 MOST_PAIRS = 100_000  # of a view and an object, of one sensor
 KEY = ["epoch", "object_id", "sensor_id"]
 KNOWN_S = 1.0  # with a larger sigma a clock counts as unknown
@@ -187,7 +187,7 @@ def verdicts_of(
     bias = rows.group_by("sensor_id").agg(
         pl.col("position_sigma_km").max(), attitude_sigma_rad=spread.quantile(0.9).sqrt()
     ).sort("sensor_id")  # fmt: skip
-    judged = judge_sensors(
+    judged = judge_many_sensors(
         _lines(rows, bias["sensor_id"]),
         bias["position_sigma_km"].to_numpy(),
         bias["attitude_sigma_rad"].to_numpy(),

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.orbits.shared_errors import SensorEquations
+from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, no_equations
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -142,11 +142,11 @@ def trajectory(state: Array, dt_s: Array) -> tuple[Array, Array]:
 
 
 @kernel
-def _accumulate(y, view, shared, N, rhs, at):
-    """Add one view to the normal equations; return its chi-square, NaN behind the sensor.
+def _accumulate(y, view, shared, sums, s):
+    """Add one view of sensor s to the normal equations; return its chi-square, NaN behind it.
 
     `view` is (r, u, basis, weight). `shared` holds the sensor's errors of direction and position
-    so far; their unknowns begin at index `at`.
+    so far.
     """
     r, u, basis, W = view
     delay = 0.0
@@ -172,22 +172,23 @@ def _accumulate(y, view, shared, N, rhs, at):
             for k in range(6):
                 moved = y[6 + 6 * a + k] - delay * y[6 + 6 * (3 + a) + k]
                 J[i, k] += basis[i, a] / rho * moved
+    state, coupling, own, of_state, of_sensors = sums
     chi2 = 0.0
-    where = np.empty(12, np.int64)
-    for k in range(12):
-        where[k] = k if k < 6 else at + k - 6
     for i in range(2):
         for j in range(2):
             chi2 += e[i] * W[i, j] * e[j]
-            for k in range(12):
-                rhs[where[k]] -= J[i, k] * W[i, j] * e[j]
-                for m in range(12):
-                    N[where[k], where[m]] += J[i, k] * W[i, j] * J[j, m]
+            for k in range(6):
+                of_state[k] -= J[i, k] * W[i, j] * e[j]
+                of_sensors[s, k] -= J[i, 6 + k] * W[i, j] * e[j]
+                for m in range(6):
+                    state[k, m] += J[i, k] * W[i, j] * J[j, m]
+                    coupling[s, k, m] += J[i, 6 + k] * W[i, j] * J[j, m]
+                    own[s, k, m] += J[i, 6 + k] * W[i, j] * J[j, 6 + m]
     return chi2
 
 
 @kernel
-def _add_views(state, errors, views, N, rhs):
+def _add_views(state, errors, views, sums):
     """Add all views to the normal equations at a state; return their chi-square."""
     time_s, sensor, r, u, basis, weight = views
     chi2 = 0.0
@@ -203,58 +204,69 @@ def _add_views(state, errors, views, N, rhs):
             _advance(y, time_s[i] - now)
             now = time_s[i]
             view = (r[i], u[i], basis[i], weight[i])
-            chi2 += _accumulate(y, view, errors[sensor[i]], N, rhs, 6 + 6 * sensor[i])
+            chi2 += _accumulate(y, view, errors[sensor[i]], sums, sensor[i])
     return chi2
 
 
-def _fit(
-    state: Array, prior: Array, views: ArcViews
-) -> tuple[Array, Array, float, SensorEquations]:
-    """Return state, covariance and chi-square of one arc, NaN where the fit fails; and what it
-    tells of its sensors' errors."""
-    nothing = SensorEquations(np.zeros((6 * len(prior),) * 2), np.zeros(6 * len(prior)))
-    failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan, nothing
-    n_sensors = len(prior)
-    errors = np.zeros((n_sensors, 6))
-    size = 6 + 6 * n_sensors
-    at_prior = np.zeros((size, size))
-    for s in range(n_sensors):
-        at_prior[6 + 6 * s : 12 + 6 * s, 6 + 6 * s : 12 + 6 * s] = prior[s]
+def _fit(state: Array, prior: Array, views: ArcViews) -> tuple[Array, Array, float, ArcEquations]:
+    """Return state, covariance and chi-square of one arc, NaN where the fit fails; and its
+    equations, without the prior.
+
+    The errors of each sensor are eliminated before the state is solved: the cost grows with the
+    number of sensors, not with its cube.
+    """
+    errors = np.zeros((len(prior), 6))
+    failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan, no_equations(len(prior))
     for _ in range(ITERATIONS):
         pull = (prior @ errors[:, :, None])[:, :, 0]
-        N, rhs = at_prior.copy(), np.concatenate([np.zeros(6), -pull.ravel()])
-        chi2 = float(np.sum(errors * pull)) + _add_views(state, errors, views, N, rhs)
-        if not (np.isfinite(chi2) and (np.diag(N) > 0.0).all()):
+        sums = no_equations(len(prior))
+        chi2 = float(np.sum(errors * pull)) + _add_views(state, errors, views, sums)
+        own = sums.own + prior
+        if not (np.isfinite(chi2) and (np.diag(sums.state) > 0.0).all()):
             return failed
-        # km, km/s and radians: scaled to one size before the inversion.
-        scale = 1.0 / np.sqrt(np.diag(N))
         try:
-            inverse = np.linalg.inv(N * scale[:, None] * scale)
+            absorbed = _solve(own, np.concatenate(
+                [sums.coupling, (sums.of_sensors - pull)[:, :, None]], axis=2))  # fmt: skip
+            back = np.einsum("ski,skj->ij", sums.coupling, absorbed)
+            cov = _inverse(sums.state - back[:, :6])
         except np.linalg.LinAlgError:
             return failed
-        step = scale * (inverse @ (scale * rhs))
-        gain = float(step @ rhs)
+        step = cov @ (sums.of_state - back[:, 6])
+        turned = absorbed[:, :, 6] - absorbed[:, :, :6] @ step
+        gain = float(step @ sums.of_state + np.sum(turned * (sums.of_sensors - pull)))
         if not abs(gain) < 1e14:
             return failed
-        state, errors = state + step[:6], errors + step[6:].reshape(n_sensors, 6)
+        state, errors = state + step, errors + turned
         if gain < CONVERGED:
-            cov = inverse[:6, :6] * scale[:6, None] * scale[:6]
-            # Without the prior; the last step is below a thousandth of a sigma.
-            of_sensors = _without_state(N - at_prior, at_prior[6:, 6:] @ errors.ravel(), errors)
-            return state, cov, chi2 - gain, of_sensors
+            # The last step is below a thousandth of a sigma.
+            return state, cov, chi2 - gain, _about_no_errors(sums, prior, errors)
     return failed
 
 
-def _without_state(normal: Array, right: Array, errors: Array) -> SensorEquations:
-    """Return the equations of the sensors' errors, with the state eliminated.
+def _solve(matrices: Array, right: Array) -> Array:
+    """Solve (s, 6, 6) symmetric systems; km and radians are scaled to one size."""
+    scale = 1.0 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
+    scaled = matrices * scale[:, :, None] * scale[:, None, :]
+    return np.asarray(scale[:, :, None] * np.linalg.solve(scaled, scale[:, :, None] * right))
 
-    `right` is about these errors, at the best state; the returned one is about none.
+
+def _inverse(matrix: Array) -> Array:
+    """Return the inverse of a (6, 6) matrix; km and km/s are scaled to one size."""
+    diagonal = np.diag(matrix)
+    if not (diagonal > 0.0).all():
+        raise np.linalg.LinAlgError
+    scale = 1.0 / np.sqrt(diagonal)
+    return np.asarray(np.linalg.inv(matrix * scale[:, None] * scale) * scale[:, None] * scale)
+
+
+def _about_no_errors(sums: ArcEquations, prior: Array, errors: Array) -> ArcEquations:
+    """Return the equations at the best state and errors as if about no errors.
+
+    At the best, the lines of sight pull as much as the prior.
     """
-    scale = 1.0 / np.sqrt(np.diag(normal)[:6])
-    to_state = normal[6:, :6] * scale
-    inverse = np.linalg.pinv(normal[:6, :6] * scale[:, None] * scale, hermitian=True)
-    reduced = normal[6:, 6:] - to_state @ inverse @ to_state.T
-    return SensorEquations(reduced, right + reduced @ errors.ravel())
+    of_sensors = np.einsum("sij,sj->si", prior, errors) + np.einsum("sij,sj->si", sums.own, errors)
+    of_state = np.einsum("ski,sk->i", sums.coupling, errors)
+    return sums._replace(of_state=of_state, of_sensors=of_sensors)
 
 
 class FittedOrbits(NamedTuple):
@@ -267,14 +279,14 @@ class FittedOrbits(NamedTuple):
         Covariance.
     chi2 : (g,) float
         Weighted sum of squares, with those of the shared errors; 2 n - 6 degrees of freedom.
-    of_sensors : g of (array of sensors, SensorEquations)
-        What each arc tells of its sensors' errors.
+    equations : g of (array of sensors, ArcEquations)
+        What each arc tells of its sensors' errors, without their prior.
     """
 
     state: Array
     cov: Array
     chi2: Array
-    of_sensors: list[tuple[Indices, SensorEquations]]
+    equations: list[tuple[Indices, ArcEquations]]
 
 
 def fit_orbits(arcs: Arcs, start: Array) -> FittedOrbits:
@@ -299,23 +311,23 @@ def fit_orbits(arcs: Arcs, start: Array) -> FittedOrbits:
     """
     g = len(arcs.offsets) - 1
     state, cov = np.array(start, float).reshape(g, 6), np.full((g, 6, 6), np.nan)
-    chi2, of_sensors = np.full(g, np.nan), []
+    chi2, equations = np.full(g, np.nan), []
     basis, weight = tangent_basis(arcs.u), np.asarray(np.linalg.inv(arcs.cov_noise), float)
     for k in range(g):
         rows = slice(arcs.offsets[k], arcs.offsets[k + 1])
         names, sensor = np.unique(arcs.sensor[rows], return_inverse=True)
         if rows.stop - rows.start < 3:
             state[k] = np.nan
-            of_sensors.append((names[:0], SensorEquations(np.zeros((0, 0)), np.zeros(0))))
+            equations.append((names[:0], no_equations(0)))
             continue
         views = ArcViews(
             arcs.time_s[rows], sensor.astype(np.int64), arcs.r_km[rows], arcs.u[rows], basis[rows],
             weight[rows],
         )  # fmt: skip
         prior = prior_of(arcs, rows, sensor, len(names))
-        state[k], cov[k], chi2[k], equations = _fit(state[k], prior, views)
-        of_sensors.append((names, equations))
-    return FittedOrbits(state, cov, chi2, of_sensors)
+        state[k], cov[k], chi2[k], of_arc = _fit(state[k], prior, views)
+        equations.append((names, of_arc))
+    return FittedOrbits(state, cov, chi2, equations)
 
 
 def prior_of(arcs: Arcs, rows: slice, sensor: Indices, n_sensors: int) -> Array:

@@ -6,42 +6,65 @@ deviation is taken as the scale of a Student distribution: most errors are of th
 are much larger. Then the likeliest scale follows from the lines of sight.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 FREEDOM = 4.0  # degrees of freedom of the Student distribution: 1 error in 90 beyond five sigma
 AXES = 3
 ITERATIONS = 200
 CONVERGED = 1e-3  # relative change of the factors
+MOST_TOGETHER = 32  # sensors that are scaled at a time
+SWEEPS = 2  # over all groups of sensors, the second with the factors of the first
 
 
-class SensorEquations(NamedTuple):
-    """Normal equations of all sensors' shared errors, without a prior.
+class ArcEquations(NamedTuple):
+    """Normal equations of one arc: its object's state, and the shared errors of its s sensors.
 
     Each sensor has six unknowns: an error of its directions [rad] and one of its place [km],
-    three axes each. The states of the objects are eliminated.
+    three axes each. Without a prior, about no errors.
 
-    normal : (6 s, 6 s) float
-    right : (6 s,) float
+    state : (6, 6) float
+    coupling : (s, 6, 6) float
+        Rows are the unknowns of the sensor, columns those of the state.
+    own : (s, 6, 6) float
+        Two sensors are coupled by the state only.
+    of_state, of_sensors : (6,), (s, 6) float
+        Right sides.
     """
 
-    normal: Array
-    right: Array
+    state: Array
+    coupling: Array
+    own: Array
+    of_state: Array
+    of_sensors: Array
+
+
+def no_equations(n_sensors: int) -> ArcEquations:
+    """Return the equations of no views."""
+    return ArcEquations(
+        np.zeros((6, 6)),
+        np.zeros((n_sensors, 6, 6)),
+        np.zeros((n_sensors, 6, 6)),
+        np.zeros(6),
+        np.zeros((n_sensors, 6)),
+    )
 
 
 def scale_shared_errors(
-    equations: SensorEquations, prior: Array, free: npt.NDArray[np.bool_]
+    arcs: Sequence[tuple[Indices, ArcEquations]], prior: Array, free: npt.NDArray[np.bool_]
 ) -> Array:
     """Return by which factors the variances of sensors' shared errors are larger than stated.
 
     Parameters
     ----------
-    equations
-        From all objects of the sensors.
+    arcs
+        The sensors of each arc of all objects, and its equations.
     prior : (s, 6, 6) float
         Inverse of the stated covariance of each sensor's errors, direction and place not
         correlated.
@@ -60,15 +83,78 @@ def scale_shared_errors(
     is 1. Expectation maximisation: e' C^-1 e is the expected one, so a sensor whose errors do not
     show keeps a factor of 1.
 
+    At most `MOST_TOGETHER` sensors are scaled at a time. The errors of the others count as
+    independent from arc to arc: with so many sensors each has little weight.
+
     References
     ----------
     Lange, Little, Taylor (1989), Robust statistical modeling using the t distribution, JASA 84.
     """
     n_sensors = len(prior)
     factor = np.ones((n_sensors, 2))
+    groups = np.array_split(np.arange(n_sensors), max(-(-n_sensors // MOST_TOGETHER), 1))
+    for _ in range(1 if len(groups) == 1 else SWEEPS):
+        absorbed = [_absorbed(sensors, of_arc, prior, factor) for sensors, of_arc in arcs]
+        for group in groups:
+            equations = _of_group(group, arcs, absorbed, n_sensors)
+            factor[group] = _scaled(*equations, prior[group], free[group])
+    return factor
+
+
+def _absorbed(
+    sensors: Indices, arc: ArcEquations, prior: Array, factor: Array
+) -> tuple[Array, Array]:
+    """Return by how much each sensor's unknown errors lessen what is known of the state:
+    (s, 6, 6), and the right sides (s, 6)."""
+    weight = 1.0 / np.repeat(np.sqrt(factor[sensors]), AXES, axis=1)
+    own = arc.own + prior[sensors] * weight[:, :, None] * weight[:, None, :]
+    unit = 1.0 / np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    both = np.concatenate([arc.coupling, arc.of_sensors[:, :, None]], axis=2)
+    scaled = own * unit[:, :, None] * unit[:, None, :]
+    solved = unit[:, :, None] * np.linalg.solve(scaled, unit[:, :, None] * both)
+    lessened = np.swapaxes(arc.coupling, 1, 2) @ solved
+    return lessened[:, :, :6], lessened[:, :, 6]
+
+
+def _of_group(
+    group: Indices,
+    arcs: Sequence[tuple[Indices, ArcEquations]],
+    absorbed: Sequence[tuple[Array, Array]],
+    n_sensors: int,
+) -> tuple[Array, Array]:
+    """Return the equations of some sensors' errors, (6 g, 6 g) and (6 g,), from all arcs.
+
+    The states, and with them the errors of all other sensors, are eliminated.
+    """
+    place = np.full(n_sensors, -1)
+    place[group] = np.arange(len(group))
+    normal, right = np.zeros((6 * len(group),) * 2), np.zeros(6 * len(group))
+    for (sensors, arc), (less, less_right) in zip(arcs, absorbed, strict=True):
+        inside = place[sensors] >= 0
+        if not inside.any():
+            continue
+        state = arc.state - less[~inside].sum(axis=0)
+        of_state = arc.of_state - less_right[~inside].sum(axis=0)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(state), 1e-300))
+        inverse = np.linalg.pinv(state * scale[:, None] * scale, hermitian=True)
+        inverse *= scale[:, None] * scale
+        to_state = arc.coupling[inside].reshape(-1, 6)
+        reduced = -to_state @ inverse @ to_state.T
+        for k, own in enumerate(arc.own[inside]):
+            reduced[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += own
+        at = (6 * place[sensors[inside]][:, None] + np.arange(6)).ravel()
+        normal[np.ix_(at, at)] += reduced
+        right[at] += arc.of_sensors[inside].ravel() - to_state @ (inverse @ of_state)
+    return normal, right
+
+
+def _scaled(normal: Array, right: Array, prior: Array, free: npt.NDArray[np.bool_]) -> Array:
+    """Return the factors of sensors whose equations are given."""
+    n_sensors = len(prior)
+    factor = np.ones((n_sensors, 2))
     unit = _units(prior)
-    normal = equations.normal * unit[:, None] * unit
-    right = equations.right * unit
+    normal = normal * unit[:, None] * unit
+    right = right * unit
     block = np.arange(2 * n_sensors).repeat(AXES)
     stated = np.zeros_like(normal)
     for s in range(n_sensors):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.evidence.visibility import sees
+from epipole.tasks.algorithms.association.evidence.visibility import seeing
 from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 
@@ -54,13 +54,17 @@ def agreement(samples: Samples, groups: Groups) -> Agreement:
     has = np.zeros((n_groups, n_sensors), np.int64)
     np.add.at(has, (group, samples.sensor[member]), 1)
     points = _points(samples, member, group, instant, n_groups)
+    half_field = np.array(samples.half_field, float)
+    in_field = np.zeros(n_sensors, bool)
     for g in np.flatnonzero(np.isfinite(points[:, 0])).tolist():
-        m = instant[g]
-        for s in np.flatnonzero(has[g].sum() - has[g] >= 2).tolist():
-            place, attitude = samples.sensor_km[s, m], samples.R_sensor_from_icrs[s, m]
-            if has[g, s] or sees(place, attitude, samples.half_field[s], points[g]):
-                looked[s] += 1
-                joined[s] += has[g, s] > 0
+        place, attitude = (
+            np.ascontiguousarray(values[:, instant[g]])
+            for values in (samples.sensor_km, samples.R_sensor_from_icrs)
+        )
+        seeing(place, attitude, half_field, points[g], in_field)
+        others = has[g].sum() - has[g] >= 2
+        looked += others & (in_field | (has[g] > 0))
+        joined += others & (has[g] > 0)
     free = np.bincount(samples.sensor[groups.group == FREE], minlength=n_sensors)
     return Agreement(looked, joined, free)
 

@@ -50,7 +50,8 @@ class Lines(NamedTuple):
     group : (n,) int
         Position (object at an epoch) of the line, 0 .. g - 1.
     sensor : (n,) int
-        Sensor, 0 .. s - 1.
+        Sensor, 0 .. s - 1; -1 for a line of a sensor that is sound for sure, whose biases are a
+        part of `cov`.
     u : (n, 3) float
         Measured directions, aberration removed.
     cov : (n, 2, 2) float
@@ -123,13 +124,13 @@ def judge_sensors(
     """
     n_sensors = len(position_sigma_km)
     guess = np.zeros(n_sensors) if guess_s is None else np.array(guess_s, float)
-    has_lines = np.bincount(lines.sensor, minlength=n_sensors) > 0
-    spread = _spread(position_sigma_km, attitude_sigma_rad)
+    has_lines = np.bincount(lines.sensor[lines.sensor >= 0], minlength=n_sensors) > 0
+    spread = spread_of(position_sigma_km, attitude_sigma_rad)
     kept = np.ones(len(lines.sensor), bool)
     for _ in range(ROUNDS):
-        about = _shifted(lines, guess)
+        about = shifted(lines, guess)
         normal, right = _equations(about, kept, spread)
-        model = _Model(normal, right, guess / PRIOR_S, spread)
+        model = Model(normal, right, guess / PRIOR_S, spread)
         explained = _explain(model, np.flatnonzero(has_lines), attitude_sigma_rad > 0)
         wrong = np.array([(s, CLOCK) in explained.faults for s in range(n_sensors)])
         unknowns = model.estimate(explained.faults)[0]
@@ -142,7 +143,7 @@ def judge_sensors(
     return _estimates(model, explained, has_lines)
 
 
-def _spread(position_sigma_km: Array, attitude_sigma_rad: Array) -> Array:
+def spread_of(position_sigma_km: Array, attitude_sigma_rad: Array) -> Array:
     """Return the prior 1-sigma of all unknowns, sensor by sensor."""
     return np.concatenate(
         [
@@ -154,7 +155,7 @@ def _spread(position_sigma_km: Array, attitude_sigma_rad: Array) -> Array:
     ).ravel()
 
 
-class _Model:
+class Model:
     """The normal equations of all sensors' unknowns, in units of their spread.
 
     The equations are linear about the offsets `guess`, the prior is about offset 0.
@@ -207,7 +208,7 @@ class _Explanation(NamedTuple):
     distinct: bool
 
 
-def _explain(model: _Model, sensors: Indices, has_prior_attitude: Flags) -> _Explanation:
+def _explain(model: Model, sensors: Indices, has_prior_attitude: Flags) -> _Explanation:
     """Return the explanation of the lines by the fewest faults.
 
     Sure are the faults that are in the best explanation and in all others that are about as
@@ -258,7 +259,7 @@ def _beside(faults: Faults, kinds: list[list[tuple[int, str]]]) -> list[Faults]:
     return [*more, *less, *exchanged]
 
 
-def _estimates(model: _Model, explained: _Explanation, has_lines: Flags) -> JudgedSensors:
+def _estimates(model: Model, explained: _Explanation, has_lines: Flags) -> JudgedSensors:
     """Return each sensor's offset, if it and what is at fault may be wrong; and the faults."""
     n = len(has_lines)
     faults = explained.faults
@@ -281,12 +282,12 @@ def _estimates(model: _Model, explained: _Explanation, has_lines: Flags) -> Judg
     return JudgedSensors(offset, sigma, cause, size, size_sigma)
 
 
-def _shifted(lines: Lines, offset_s: Array) -> Lines:
+def shifted(lines: Lines, offset_s: Array) -> Lines:
     """Return the lines moved to the reported times, for clocks with these offsets.
 
     A line shows the object and the sensor where they were `offset_s` earlier.
     """
-    d = offset_s[lines.sensor][:, None]
+    d = np.append(offset_s, 0.0)[lines.sensor][:, None]
     moved = (lines.v_km_s - lines.v_sensor_km_s) * d
     bent = (_gravity(lines.r_km) - _gravity(lines.x_km)) * d * d / 2
     return lines._replace(r_km=lines.r_km + moved + bent)
@@ -300,8 +301,13 @@ def _equations(lines: Lines, kept: Flags, spread: Array) -> tuple[Array, Array]:
     """Return the normal equations of the sensors' unknowns, in units of their spread."""
     normal, right = np.zeros((len(spread), len(spread))), np.zeros(len(spread))
     for _, columns, wide, e in _groups(lines, kept, spread):
-        np.add.at(normal, np.ix_(columns, columns), wide.T @ wide)
-        np.add.at(right, columns, wide.T @ e)
+        # A sensor has one line in a group, as a rule: its columns come once.
+        if len(np.unique(columns)) == len(columns):
+            normal[np.ix_(columns, columns)] += wide.T @ wide
+            right[columns] += wide.T @ e
+        else:
+            np.add.at(normal, np.ix_(columns, columns), wide.T @ wide)
+            np.add.at(right, columns, wide.T @ e)
     return normal, right
 
 
@@ -320,7 +326,7 @@ def _groups(
 
     The part that the position can absorb is removed: it tells nothing about the sensors.
     """
-    to_position, to_sensor, misses = _whitened(lines, spread)
+    to_position, to_sensor, misses = whitened(lines, spread)
     order = np.argsort(lines.group, kind="stable")
     order = order[kept[order]]
     bounds = np.flatnonzero(np.diff(lines.group[order], prepend=-1, append=-1))
@@ -328,16 +334,20 @@ def _groups(
         rows = order[lo:hi]
         if hi - lo < 2:
             continue
+        judged = np.flatnonzero(lines.sensor[rows] >= 0)
+        if not len(judged):
+            continue
         H, A, e = to_position[rows].reshape(-1, 3), to_sensor[rows], misses[rows].ravel()
         free, _ = np.linalg.qr(H)
-        columns = (PER_SENSOR * lines.sensor[rows][:, None] + np.arange(PER_SENSOR)).ravel()
+        sensor = lines.sensor[rows[judged]]
+        columns = (PER_SENSOR * sensor[:, None] + np.arange(PER_SENSOR)).ravel()
         wide = np.zeros((len(e), len(columns)))
-        for k in range(hi - lo):
-            wide[2 * k : 2 * k + 2, PER_SENSOR * k : PER_SENSOR * (k + 1)] = A[k]
+        for k, row in enumerate(judged.tolist()):
+            wide[2 * row : 2 * row + 2, PER_SENSOR * k : PER_SENSOR * (k + 1)] = A[row]
         yield rows, columns, wide - free @ (free.T @ wide), e - free @ (free.T @ e)
 
 
-def _whitened(lines: Lines, spread: Array) -> tuple[Array, Array, Array]:
+def whitened(lines: Lines, spread: Array) -> tuple[Array, Array, Array]:
     """Return derivatives by position (n, 2, 3) and by the sensor's unknowns (n, 2, 7), and
     residuals (n, 2), in units of the noise and of the unknowns' spread."""
     basis = tangent_basis(lines.u)
@@ -349,6 +359,6 @@ def _whitened(lines: Lines, spread: Array) -> tuple[Array, Array, Array]:
     rate = np.einsum("nij,nj->ni", by_place, lines.v_km_s - lines.v_sensor_km_s)
     by_turn = root @ basis @ -skew(lines.u)
     by_sensor = np.concatenate([-rate[:, :, None], by_place, by_turn], axis=2)
-    per_line = spread.reshape(-1, PER_SENSOR)[lines.sensor]
+    per_line = np.vstack([spread.reshape(-1, PER_SENSOR), np.ones(PER_SENSOR)])[lines.sensor]
     misses = np.einsum("nij,nj->ni", root @ basis, lines.u - predicted)
     return by_place, by_sensor * per_line[:, None, :], misses

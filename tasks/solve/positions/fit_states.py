@@ -28,7 +28,7 @@ from epipole.schemas.tables import STATES
 from epipole.schemas.work_tables import SHARED_ERRORS, VIEWS
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, FittedOrbits, fit_orbits, prior_of
-from epipole.tasks.algorithms.orbits.shared_errors import SensorEquations, scale_shared_errors
+from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, scale_shared_errors
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -71,11 +71,11 @@ def judge_errors(
     arcs = named.arcs
     fitted = fit_orbits(arcs, _starts(positions, named.object_id, named.middle_ns))
     sensors = rows.group_by("sensor").agg(pl.col("sensor_id").first()).sort("sensor")["sensor_id"]
-    equations = _sum_of(fitted, np.diff(arcs.offsets), len(sensors))
     prior = prior_of(arcs, slice(None), arcs.sensor, len(sensors))
     has_bias = np.bincount(arcs.sensor, np.trace(arcs.cov_bias, axis1=1, axis2=2)) > 0.0
     free = np.column_stack([has_bias, np.ones(len(sensors), bool)])
-    factor = scale_shared_errors(equations, prior, free)
+    telling = _of_one_object(fitted, np.diff(arcs.offsets))
+    factor = scale_shared_errors(telling, prior, free)
     larger = np.flatnonzero((factor > 1.0).any(axis=1))
     return table(
         SHARED_ERRORS,
@@ -103,18 +103,12 @@ def with_larger_errors(views: pa.Table, errors: pa.Table) -> pa.Table:
     return table(VIEWS, columns)
 
 
-def _sum_of(fitted: FittedOrbits, n_views: Indices, n_sensors: int) -> SensorEquations:
-    """Return the equations of all arcs together, but of those that mix objects."""
-    normal, right = np.zeros((6 * n_sensors,) * 2), np.zeros(6 * n_sensors)
+def _of_one_object(fitted: FittedOrbits, n_views: Indices) -> list[tuple[Indices, ArcEquations]]:
+    """Return the equations of the arcs that do not mix objects."""
     reduced = fitted.chi2 / np.maximum(2 * n_views - 6, 1)
     # A sensor with a large error makes all arcs fit badly, a mixture one.
     usual = max(1.0, float(np.nanmedian(reduced))) if np.isfinite(reduced).any() else 1.0
-    for k in np.flatnonzero(reduced < MIXED * usual):
-        sensors, of_arc = fitted.of_sensors[k]
-        at = (6 * sensors[:, None] + np.arange(6)).ravel()
-        normal[np.ix_(at, at)] += of_arc.normal
-        right[at] += of_arc.right
-    return SensorEquations(normal, right)
+    return [fitted.equations[k] for k in np.flatnonzero(reduced < MIXED * usual)]
 
 
 class _NamedArcs(NamedTuple):

@@ -4,7 +4,7 @@ import numpy as np
 
 from epipole.tasks.algorithms.association.sampling.views import HALF, PLANE, REACH, TURN
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
-from epipole.tasks.algorithms.kernels import borrowing_kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 FAINTER = 1.5  # times the range: the object is 0.9 mag fainter and may not be detected
 INSIDE = 0.98  # of half the field: nearer to its edge misses are frequent
@@ -37,6 +37,13 @@ def sees(r, R, half_field, x):
         if abs(side) > INSIDE * half_field[a]:
             return False
     return not blocked(r, x, EARTH_RADIUS_KM)
+
+
+@kernel
+def seeing(r, R, half_field, x, out):
+    """Write for each sensor whether it has x in its field and in view, as in `sees`."""
+    for s in range(len(out)):
+        out[s] = sees(r[s], R[s], half_field[s], x)
 
 
 @borrowing_kernel

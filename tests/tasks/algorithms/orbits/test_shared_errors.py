@@ -3,8 +3,9 @@
 import numpy as np
 from scenes.arcs import GEO, trial
 
+from epipole.tasks.algorithms.orbits import shared_errors
 from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, fit_orbits, prior_of
-from epipole.tasks.algorithms.orbits.shared_errors import SensorEquations, scale_shared_errors
+from epipole.tasks.algorithms.orbits.shared_errors import no_equations, scale_shared_errors
 
 PLACE_KM = 0.02
 N_SENSORS = 5
@@ -27,13 +28,9 @@ def objects(seed, worse=1.0):
 
 
 def factors(arcs, fitted):
-    normal, right = np.zeros((6 * N_SENSORS,) * 2), np.zeros(6 * N_SENSORS)
-    for sensors, of_arc in fitted.of_sensors:
-        assert sensors.tolist() == list(range(N_SENSORS))
-        normal, right = normal + of_arc.normal, right + of_arc.right
     prior = prior_of(arcs, slice(None), arcs.sensor, N_SENSORS)
     free = np.tile([False, True], (N_SENSORS, 1))
-    return scale_shared_errors(SensorEquations(normal, right), prior, free)
+    return scale_shared_errors(fitted.equations, prior, free)
 
 
 def squares(fitted, truth):
@@ -73,6 +70,16 @@ def test_a_worse_ephemeris_widens_the_covariances_of_all_states_and_no_other_sen
 
 def test_sensors_without_lines_of_sight_keep_their_factors():
     prior = np.tile(np.diag([1e12] * 3 + [2500.0] * 3), (2, 1, 1))
-    nothing = SensorEquations(np.zeros((12, 12)), np.zeros(12))
+    nothing = [(np.arange(2), no_equations(2))]
     factor = scale_shared_errors(nothing, prior, np.ones((2, 2), bool))
     np.testing.assert_allclose(factor, 1.0)
+
+
+def test_sensors_scaled_in_groups_get_about_the_factors_of_all_together(monkeypatch):
+    arcs, truth = objects(3, worse=15.0)
+    fitted = fit_orbits(arcs, truth)
+    together = factors(arcs, fitted)
+    monkeypatch.setattr(shared_errors, "MOST_TOGETHER", 2)
+    apart = factors(arcs, fitted)
+    assert together[0, 1] > 15.0
+    np.testing.assert_allclose(apart, together, rtol=0.3)

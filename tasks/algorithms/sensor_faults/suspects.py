@@ -1,0 +1,172 @@
+"""Suspects: of many sensors, those that may be at fault are judged together, the others alone.
+
+All sensors together cost the cube of their number. But one wrong sensor hardly moves the positions
+that many others determine. So each sensor is first judged as if all others were sound, from sums
+over its lines of sight. The most suspicious are then judged together, with all their faults.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
+    ATTITUDE,
+    CLOCK,
+    COLUMNS,
+    PER_SENSOR,
+    PRIOR_S,
+    SOUND,
+    JudgedSensors,
+    Lines,
+    Model,
+    judge_sensors,
+    shifted,
+    spread_of,
+    whitened,
+)
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+MOST_TOGETHER = 24  # sensors that are judged together
+MOST_ROUNDS = 4  # each judges the next suspects, without those found at fault
+
+
+def judge_many_sensors(
+    lines: Lines, position_sigma_km: Array, attitude_sigma_rad: Array, guess_s: Array
+) -> JudgedSensors:
+    """Return each sensor's clock offset and fault, for any number of sensors.
+
+    Parameters are those of `judge_sensors`, which does all the work for few sensors.
+    """
+    n_sensors = len(position_sigma_km)
+    if n_sensors <= MOST_TOGETHER:
+        return judge_sensors(lines, position_sigma_km, attitude_sigma_rad, guess_s)
+    spread = spread_of(position_sigma_km, attitude_sigma_rad)
+    found = _nothing_known(n_sensors)
+    faulty = np.zeros(n_sensors, bool)
+    for _ in range(MOST_ROUNDS):
+        left = _without(lines, faulty)
+        sums = _sums_alone(_anonymous(left, spread), left.sensor, guess_s, spread)
+        if not faulty.any():
+            _enter_alone(found, sums, guess_s, spread)
+        suspicion = np.where(faulty, -np.inf, _suspicion(sums, guess_s, spread, attitude_sigma_rad))
+        together = np.sort(np.argsort(-suspicion, kind="stable")[:MOST_TOGETHER])
+        judged = judge_sensors(
+            _about(left, together, spread),
+            position_sigma_km[together],
+            attitude_sigma_rad[together],
+            guess_s[together],
+        )
+        newly = _enter_judged(found, judged, together)
+        if not newly:
+            break
+        faulty[newly] = True
+    return found
+
+
+class _Sums(NamedTuple):
+    """Normal equations (s, 7, 7) and right sides (s, 7) of each sensor alone."""
+
+    normal: Array
+    right: Array
+
+
+def _nothing_known(n: int) -> JudgedSensors:
+    return JudgedSensors(
+        np.full(n, np.nan), np.full(n, np.nan), [SOUND] * n, np.zeros(n), np.zeros(n)
+    )
+
+
+def _without(lines: Lines, faulty: npt.NDArray[np.bool_]) -> Lines:
+    """Return the lines of the other sensors."""
+    kept = ~faulty[lines.sensor]
+    return Lines(*(values[kept] for values in lines))
+
+
+def _anonymous(lines: Lines, spread: Array) -> Lines:
+    """Return the lines with the biases of their sensors as a part of their errors."""
+    of_sensor = spread.reshape(-1, PER_SENSOR)[lines.sensor]
+    reach = np.linalg.norm(lines.x_km - lines.r_km, axis=1)
+    variance = (of_sensor[:, 1] / reach) ** 2 + of_sensor[:, 4] ** 2
+    cov = lines.cov + variance[:, None, None] * np.eye(2)
+    return lines._replace(cov=cov, sensor=np.full(len(lines.sensor), -1))
+
+
+def _about(lines: Lines, together: Indices, spread: Array) -> Lines:
+    """Return the lines; those of other sensors than these are of sound sensors for sure."""
+    number = np.full(lines.sensor.max(initial=-1) + 1, -1)
+    inside = together[together < len(number)]
+    number[inside] = np.arange(len(together))[together < len(number)]
+    sensor = number[lines.sensor]
+    cov = np.where((sensor >= 0)[:, None, None], lines.cov, _anonymous(lines, spread).cov)
+    return lines._replace(sensor=sensor, cov=cov)
+
+
+def _sums_alone(anonymous: Lines, sensor: Indices, guess_s: Array, spread: Array) -> _Sums:
+    """Return the equations of each sensor, with all others sound.
+
+    The part that the position of the object can absorb is removed, from sums over its lines.
+    """
+    lines = shifted(anonymous._replace(sensor=sensor), guess_s)
+    to_position, to_sensor, misses = whitened(lines, spread)
+    _, group = np.unique(lines.group, return_inverse=True)
+    n_groups = group.max(initial=-1) + 1
+    normal, pull = np.zeros((n_groups, 3, 3)), np.zeros((n_groups, 3))
+    np.add.at(normal, group, np.einsum("nik,nil->nkl", to_position, to_position))
+    np.add.at(pull, group, np.einsum("nik,ni->nk", to_position, misses))
+    several = np.bincount(group, minlength=n_groups) > 1
+    inverse = np.zeros_like(normal)
+    inverse[several] = np.linalg.pinv(normal[several], hermitian=True)
+    rows = several[group]
+    by_place = np.einsum("nik,nkl->nil", to_position, inverse[group])
+    left = misses - np.einsum("nil,nl->ni", by_place, pull[group])
+    own = np.eye(2) - np.einsum("nil,njl->nij", by_place, to_position)
+    n_sensors = len(guess_s)
+    out = _Sums(np.zeros((n_sensors, PER_SENSOR, PER_SENSOR)), np.zeros((n_sensors, PER_SENSOR)))
+    weighted = np.einsum("nij,njk->nik", own, to_sensor)
+    np.add.at(out.normal, sensor[rows], np.einsum("nik,nil->nkl", to_sensor, weighted)[rows])
+    np.add.at(out.right, sensor[rows], np.einsum("nik,ni->nk", to_sensor, left)[rows])
+    return out
+
+
+def _models(sums: _Sums, guess_s: Array, spread: Array) -> list[Model]:
+    """Return the model of each sensor alone."""
+    per_sensor = spread.reshape(-1, PER_SENSOR)
+    return [
+        Model(sums.normal[s], sums.right[s], guess_s[s : s + 1] / PRIOR_S, per_sensor[s])
+        for s in range(len(guess_s))
+    ]
+
+
+def _suspicion(sums: _Sums, guess_s: Array, spread: Array, attitude_sigma_rad: Array) -> Array:
+    """Return the log-odds of each sensor's best fault against none."""
+    out = np.full(len(guess_s), -np.inf)
+    for s, model in enumerate(_models(sums, guess_s, spread)):
+        kinds = [kind for kind in COLUMNS if kind != ATTITUDE or attitude_sigma_rad[s] > 0]
+        sound = model.evidence(frozenset())
+        out[s] = max(model.evidence(frozenset({(0, kind)})) for kind in kinds) - sound
+    return out
+
+
+def _enter_alone(found: JudgedSensors, sums: _Sums, guess_s: Array, spread: Array) -> None:
+    """Enter the clock offset of each sensor that has lines."""
+    clock = frozenset({(0, CLOCK)})
+    for s, model in enumerate(_models(sums, guess_s, spread)):
+        if sums.normal[s, 0, 0] > 0.0:
+            step, cov = model.estimate(clock)
+            found.offset_s[s] = guess_s[s] + step[0] * PRIOR_S
+            found.sigma_s[s] = np.sqrt(cov[0, 0]) * PRIOR_S
+
+
+def _enter_judged(found: JudgedSensors, judged: JudgedSensors, together: Indices) -> list[int]:
+    """Enter what is known of sensors that were judged together; return those at fault."""
+    for name in ("offset_s", "sigma_s", "size", "size_sigma"):
+        getattr(found, name)[together] = getattr(judged, name)
+    newly = []
+    for s, cause in zip(together.tolist(), judged.cause, strict=True):
+        found.cause[s] = cause
+        if cause != SOUND:
+            newly.append(s)
+    return newly
