@@ -89,7 +89,7 @@ def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
 
 
 def _view(night: _Night) -> dict[Span, int]:
-    """View the tracklets of all sensors, some sensors of a span a task; return each span's views."""
+    """View the tracklets of all sensors, some of them a task; return the views of each span."""
     work, settings = night.work, night.settings
     groups = [
         (span, group)

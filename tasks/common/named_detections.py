@@ -1,12 +1,39 @@
 """One sensor's detections, with the names of their tracklets in the night."""
 
+from typing import NamedTuple
+
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from epipole.io.work.parts import CLOCK_NS
 from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import concat
 from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.tables import DETECTIONS
+
+
+class UnnamedDetections(NamedTuple):
+    """A sensor's detections in a time, of one part, with the names of its tracklets aside."""
+
+    detections: pa.Table
+    names: pa.Table
+
+    def named(self, detections: pa.Table) -> pa.Table:
+        """Return some of the detections with the names of their tracklets in the night."""
+        return _named(detections, self.names)
+
+
+def unnamed_detections(sensor: SensorParts, span: Span) -> list[UnnamedDetections]:
+    """Return a sensor's detections in a time, part by part, as they lie in the work folder."""
+    parts = []
+    for other in spans_between(*span.widened(CLOCK_NS)):
+        if not sensor.tracked.holds(other):
+            continue
+        detections = span.of(sensor.tracked.read(other, "detections"), "time")
+        if detections.num_rows:
+            own = other.of(detections, "time")
+            parts.append(UnnamedDetections(own, sensor.names.read(other, "names")))
+    return parts
 
 
 def detections_within(sensor: SensorParts, span: Span) -> pa.Table:

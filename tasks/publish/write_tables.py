@@ -19,7 +19,7 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.common.lone_detections import with_lone_objects
-from epipole.tasks.common.named_detections import detections_within
+from epipole.tasks.common.named_detections import unnamed_detections
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.hot_tracklets import (
     confirmed_tracklets,
@@ -28,7 +28,7 @@ from epipole.tasks.publish.hot_tracklets import (
     with_hot_pixels,
 )
 from epipole.tasks.publish.night_parts import NightParts
-from epipole.tasks.publish.time_slices import rows_between, slices_of
+from epipole.tasks.publish.time_slices import in_slices
 
 # These tables may not fit in memory as a whole: they are written in slices of time.
 BY_SENSOR = ("frames", "stars", "detections")
@@ -81,31 +81,33 @@ def _of_night(name: str, parts: NightParts) -> pa.Table:
 
 def _of_sensors(name: str, parts: NightParts) -> Iterator[pa.Table]:
     """Yield the rows of all sensors, sorted by time and then sensor, some time of a span each."""
-    hot = hot_tracklets(parts)["tracklet_id"] if name == "detections" else None
-    for span in parts.spans:
-        held = [of.tracked if name == "detections" else of.identified for of in parts.sensors]
-        table_name = "solutions" if name == "frames" else name
-        count = sum(of.read(span, table_name).num_rows for of in held if of.holds(span))
-        lone = lone_views(parts, span) if name == "detections" else None
-        for time in slices_of(span, count):
-            rows = _of_time(name, parts, time)
-            if lone is not None:
-                rows = with_hot_pixels(with_lone_objects(rows, lone), hot)
-            yield rows.take(np.argsort(array(rows, "time"), kind="stable"))
-
-
-def _of_time(name: str, parts: NightParts, time: Span) -> pa.Table:
     schema = TABLES[name]
+    for span in parts.spans:
+        for rows in _of_span(name, parts, span):
+            together = concat(schema, rows)
+            yield together.take(np.argsort(array(together, "time"), kind="stable"))
+
+
+def _of_span(name: str, parts: NightParts, span: Span) -> Iterator[list[pa.Table]]:
+    """Yield the rows of each sensor, in the order of the sensors, some time of the span each."""
     if name == "detections":
-        rows = [detections_within(sensor, time) for sensor in parts.sensors]
-    elif name == "frames":
-        rows = [
-            conform(schema, sensor.identified.rows_within(time, SOLUTIONS, "solutions"))
-            for sensor in parts.sensors
-        ]
-    else:
-        rows = [sensor.identified.rows_within(time, schema, name) for sensor in parts.sensors]
-    return concat(schema, rows)
+        yield from _detections(parts, span)
+        return
+    column = "solutions" if name == "frames" else name
+    schema = SOLUTIONS if name == "frames" else TABLES[name]
+    tables = [of.identified.rows_within(span, schema, column) for of in parts.sensors]
+    for rows in in_slices(tables, span, "time"):
+        yield [conform(TABLES[name], of_sensor) for of_sensor in rows]
+
+
+def _detections(parts: NightParts, span: Span) -> Iterator[list[pa.Table]]:
+    hot = hot_tracklets(parts)["tracklet_id"]
+    lone = lone_views(parts, span)
+    found = [part for of in parts.sensors for part in unnamed_detections(of, span)]
+    for rows in in_slices([part.detections for part in found], span, "time"):
+        named = [part.named(of_part) for part, of_part in zip(found, rows, strict=True)]
+        together = with_lone_objects(concat(TABLES["detections"], named), lone)
+        yield [with_hot_pixels(together, hot)]
 
 
 def lone_views(parts: NightParts, span: Span) -> pa.Table:
@@ -131,9 +133,9 @@ def _of_spans(name: str, parts: NightParts) -> Iterator[pa.Table]:
         else:
             tables = parts.solved.read(span, name)
         names = parts.names.get(span.folder, {})
-        for time in slices_of(span, sum(rows.num_rows for rows in tables)):
-            rows = [conform(TABLES[name], of) for of in rows_between(tables, time, "epoch")]
-            yield in_order(_renamed(concat(TABLES[name], rows), names))
+        for rows in in_slices(tables, span, "epoch"):
+            together = concat(TABLES[name], [conform(TABLES[name], of) for of in rows])
+            yield in_order(_renamed(together, names))
 
 
 def _renamed(rows: pa.Table, names: Mapping[str, str]) -> pa.Table:

@@ -1,4 +1,4 @@
-"""Associate a block: the objects of a block of time, from the views of all sensors, part to part."""
+"""Associate blocks: the objects of each block of time, from the views of all sensors."""
 
 from collections.abc import Mapping, Sequence
 

@@ -37,7 +37,8 @@ SAMPLED = [
 class SensorViews(NamedTuple):
     """The views of one sensor in a span: VIEWS sorted by tracklet, and tables that go with them.
 
-    `number` and `sensor_id` are the sensor's in the run, `epochs` are SENSOR_EPOCHS, `tracklets` VIEWED_TRACKLETS.
+    `number` and `sensor_id` are the sensor's in the run, `epochs` are SENSOR_EPOCHS, `tracklets`
+    are VIEWED_TRACKLETS.
     """
 
     number: int

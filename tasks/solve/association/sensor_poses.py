@@ -51,9 +51,11 @@ class SensorPoses:
         q, place = np.full((n, k, 4), np.nan), np.full((n, k, 3), np.nan)
         velocity = np.full((n, k, 3), np.nan)
         for s, frames in enumerate(self._frames):
+            if not len(frames.epoch_ns):
+                continue
             at = np.searchsorted(frames.epoch_ns, instants)
             at = np.minimum(at, len(frames.epoch_ns) - 1)
-            there = np.flatnonzero(frames.epoch_ns[at] == instants) if len(frames.epoch_ns) else []
+            there = np.flatnonzero(frames.epoch_ns[at] == instants)
             q[s, there], place[s, there] = frames.q[at[there]], frames.r_km[at[there]]
             velocity[s, there] = frames.v_km_s[at[there]]
         return Poses(matrix_from_quaternion(q), place, velocity)

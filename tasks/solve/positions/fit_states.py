@@ -89,11 +89,21 @@ def judge_errors(
 
 def with_larger_errors(views: pa.Table, errors: pa.Table) -> pa.Table:
     """Return VIEWS with the shared errors of some sensors as large as SHARED_ERRORS say."""
+    return _scaled(views, errors, 1.0)
+
+
+def with_stated_errors(views: pa.Table, errors: pa.Table) -> pa.Table:
+    """Return VIEWS with the shared errors as the sensors state them: undo `with_larger_errors`."""
+    return _scaled(views, errors, -1.0)
+
+
+def _scaled(views: pa.Table, errors: pa.Table, power: float) -> pa.Table:
     if not errors.num_rows:
         return views
     row = pc.index_in(views["sensor_id"], errors["sensor_id"].combine_chunks())
     direction, place = (
-        pc.fill_null(errors[name].take(row), 1.0).to_numpy() for name in ("direction", "place")
+        pc.fill_null(errors[name].take(row), 1.0).to_numpy() ** power
+        for name in ("direction", "place")
     )
     bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES) * direction[:, None, None]
     columns = {name: views[name] for name in VIEWS.names} | {

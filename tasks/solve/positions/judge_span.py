@@ -19,6 +19,8 @@ from epipole.tasks.solve.positions.gather_views import gather_views
 from epipole.tasks.solve.positions.solve_positions import solve_positions
 
 ENOUGH = 8  # objects that show the errors of a sensor
+# Views of these objects. Not a setting: positions do not depend on the memory of a task.
+MOST_VIEWS = 100_000
 
 
 @stage_task(Stage.SOLVE, "errors {span}")
@@ -40,7 +42,7 @@ def judge_span(
     """
     if solved.errors.holds(span):
         return
-    members = telling_objects(solved.objects.read(span, "members"), settings.work.most_views)
+    members = telling_objects(solved.objects.read(span, "members"), MOST_VIEWS)
     views, number = gather_views(viewed, members, span.widened(margin_ns))
     found = solve_positions(views, number, settings, span)
     errors = judge_errors(views, found.associations, found.positions, settings)
@@ -48,9 +50,9 @@ def judge_span(
 
 
 def telling_objects(members: pa.Table, most_views: int) -> pa.Table:
-    """Return the OBJECT_MEMBERS of as many objects as may be held at the same time.
+    """Return the OBJECT_MEMBERS of objects with so many views together, at most.
 
-    Where not all may, each sensor gets some: those with few objects first, each its longest.
+    Where these are not all, each sensor gets some: those with few objects first, each its longest.
     """
     rows = to_polars(members)
     if rows["n_views"].sum() <= most_views:

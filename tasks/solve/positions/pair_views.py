@@ -15,7 +15,7 @@ from epipole.tasks.algorithms.geometry.epipolar import (
 )
 from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.common.lone_detections import published_ids
-from epipole.tasks.solve.positions.view_groups import Groups
+from epipole.tasks.solve.positions.view_groups import ViewGroups
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -23,7 +23,7 @@ Indices = npt.NDArray[np.int64]
 MOST_OTHERS = 8  # views to which a view's epipolar distance is taken, those of the least error
 
 
-def association_table(groups: Groups) -> pa.Table:
+def association_table(groups: ViewGroups) -> pa.Table:
     """Return ASSOCIATIONS: a row per view."""
     views = groups.views
     ranked = np.lexsort((_position_error(groups), groups.group))
@@ -41,7 +41,7 @@ def association_table(groups: Groups) -> pa.Table:
     )
 
 
-def pair_table(groups: Groups, settings: Settings) -> pa.Table:
+def pair_table(groups: ViewGroups, settings: Settings) -> pa.Table:
     """Return PAIRS: used views that both have a centroid, the reference view first.
 
     The reference view is the one of the least position error.
@@ -63,20 +63,20 @@ def pair_table(groups: Groups, settings: Settings) -> pa.Table:
     return table(PAIRS, columns)
 
 
-def _seen_together(groups: Groups) -> Array:
+def _seen_together(groups: ViewGroups) -> Array:
     """Return the places of the sensors, each moved as if all saw the object at one place: the
     light to a farther one left earlier."""
     return groups.r_km + np.nan_to_num(groups.x_km[groups.group] - groups.apparent_km)
 
 
-def _position_error(groups: Groups) -> Array:
+def _position_error(groups: ViewGroups) -> Array:
     """Return the square of the error that each view alone leaves at the object [km^2]."""
     across = np.trace(groups.cov, axis1=1, axis2=2) / 2
     away_km = np.linalg.norm(groups.x_km[groups.group] - groups.r_km, axis=1)
     return across * away_km**2 + array(groups.views, "position_sigma_km") ** 2
 
 
-def _with_reference(groups: Groups, candidates: npt.NDArray[np.bool_]) -> tuple[Indices, Indices]:
+def _with_reference(groups: ViewGroups, candidates: npt.NDArray[np.bool_]) -> tuple[Indices, Indices]:
     """Return each candidate's reference view, and the candidate."""
     error = np.where(candidates, _position_error(groups), np.inf)
     order = np.lexsort((error, groups.group))
@@ -88,21 +88,20 @@ def _with_reference(groups: Groups, candidates: npt.NDArray[np.bool_]) -> tuple[
 def _every_two(group: Indices, candidates: npt.NDArray[np.bool_]) -> tuple[Indices, Indices]:
     """Return every two candidates of a group; their number grows with the square of the views."""
     rows = np.flatnonzero(candidates)
-    first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    pairs = [np.zeros((0, 2), np.int64)]
     apart = 1
     while apart < len(rows):
         same = np.flatnonzero(group[rows[apart:]] == group[rows[:-apart]])
         if not len(same):
             break
-        first.append(rows[same])
-        second.append(rows[same + apart])
+        pairs.append(np.column_stack([rows[same], rows[same + apart]]))
         apart += 1
-    first, second = np.concatenate(first), np.concatenate(second)
+    first, second = np.concatenate(pairs).T
     order = np.lexsort((second, first))
     return first[order], second[order]
 
 
-def _distances(groups: Groups, first: Indices, second: Indices) -> tuple[Array, Array]:
+def _distances(groups: ViewGroups, first: Indices, second: Indices) -> tuple[Array, Array]:
     """Return how far each second view lies from the first one's epipolar line: in px, in sigmas."""
     r, u = _seen_together(groups), groups.u
     angle = np.abs(epipolar_angle(r[first], u[first], r[second], u[second]))

@@ -24,6 +24,7 @@ from epipole.tasks.solve.positions.fit_states import (
     fit_states,
     refuse_misfits,
     with_larger_errors,
+    with_stated_errors,
 )
 from epipole.tasks.solve.positions.gather_views import gather_views
 from epipole.tasks.solve.positions.keep_lines import keep_lines, moving_objects
@@ -35,11 +36,11 @@ class Piece(NamedTuple):
 
     span: Span
     number: int
-    count: int
+    of: int
 
     def __str__(self) -> str:
         """Return the times of day, and which piece of how many."""
-        return f"{self.span}" + (f" {self.number + 1}/{self.count}" if self.count > 1 else "")
+        return f"{self.span}" + (f" {self.number + 1}/{self.of}" if self.of > 1 else "")
 
 
 @stage_task(Stage.SOLVE, "{piece}")
@@ -84,8 +85,8 @@ def _solve(
     span = piece.span
     members = solved.objects.read(span, "members").filter(pa.compute.field("piece") == piece.number)
     views, number = gather_views(viewed, members, span.widened(margin_ns))
-    views = with_larger_errors(views, solved.errors.read(span, "errors"))
-    found = solve_positions(views, number, settings, span)
+    errors = solved.errors.read(span, "errors")
+    found = solve_positions(with_larger_errors(views, errors), number, settings, span)
     states, misfits = refuse_misfits(
         fit_states(found.views, found.associations, found.positions, settings)
     )
@@ -97,6 +98,7 @@ def _solve(
         "states": states,
         "rejects": concat(REJECTS, [found.rejects, misfits]),
         "outcomes": judge_views(found.associations),
-        "lines": keep_lines(found.views, found.associations, objects),
+        # The check of the sensors holds the lines against the errors that the sensors state.
+        "lines": keep_lines(with_stated_errors(found.views, errors), found.associations, objects),
         "objects": objects,
     }

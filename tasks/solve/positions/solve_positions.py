@@ -26,7 +26,7 @@ from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import neglected_motion, velocities
 from epipole.tasks.common.lone_detections import only_id
 from epipole.tasks.solve.positions.pair_views import association_table, pair_table
-from epipole.tasks.solve.positions.view_groups import Groups
+from epipole.tasks.solve.positions.view_groups import ViewGroups
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -70,7 +70,7 @@ def solve_positions(
     )
 
 
-def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> Groups:
+def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> ViewGroups:
     order = np.lexsort(
         (array(views, "sensor_id").astype(str), object_number, array(views, "epoch"))
     )
@@ -97,7 +97,7 @@ def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> Group
                 sigma[group],
                 spread_s[group],
             )
-    return Groups(
+    return ViewGroups(
         views, offsets, object_names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
         x_km, cov_km2, chi2, used, mean_range, velocity, np.zeros(len(start), bool),
     )  # fmt: skip
@@ -145,14 +145,14 @@ def with_neglected_motion(
     return table(VIEWS, {**{name: views[name] for name in VIEWS.names}, **columns})
 
 
-def _within(groups: Groups, span: Span) -> Groups:
+def _within(groups: ViewGroups, span: Span) -> ViewGroups:
     """Return the groups whose epoch lies in a span."""
     kept = span.holds(groups.epoch_ns)
     if kept.all():
         return groups
     rows = np.flatnonzero(kept[groups.group])
     size = np.diff(groups.offsets)[kept]
-    return Groups(
+    return ViewGroups(
         views=groups.views.take(rows),
         offsets=np.concatenate([[0], np.cumsum(size)]).astype(np.int64),
         object_id=groups.object_id[kept],
@@ -170,7 +170,7 @@ def _within(groups: Groups, span: Span) -> Groups:
     )
 
 
-def _independent(groups: Groups, span: Span | None) -> npt.NDArray[np.bool_]:
+def _independent(groups: ViewGroups, span: Span | None) -> npt.NDArray[np.bool_]:
     """Return the groups to use where no two may share a detection: in order of time, each that
     shares none with those before.
 
@@ -226,7 +226,7 @@ def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> tuple[Array,
     return v_km_s, spread_s
 
 
-def _position_table(groups: Groups) -> pa.Table:
+def _position_table(groups: ViewGroups) -> pa.Table:
     solved = np.isfinite(groups.chi2)
     n_used = np.bincount(groups.group, groups.used, minlength=len(solved)).astype(np.int32)
     light_ns = np.nan_to_num(groups.mean_range_km / SPEED_OF_LIGHT_KM_S * 1e9)
@@ -245,7 +245,7 @@ def _position_table(groups: Groups) -> pa.Table:
     return table(POSITIONS, {name: values[solved] for name, values in columns.items()})
 
 
-def _residual_px(groups: Groups) -> Array:
+def _residual_px(groups: ViewGroups) -> Array:
     """Return the rms image distance of each group's used views from its position."""
     sight = groups.apparent_km - groups.r_km
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
@@ -256,7 +256,7 @@ def _residual_px(groups: Groups) -> Array:
     return np.sqrt(np.bincount(groups.group, square, minlength=size) / count)
 
 
-def _reject_table(groups: Groups) -> pa.Table:
+def _reject_table(groups: ViewGroups) -> pa.Table:
     """Return a row of `rejects` per sensor and reason, with the number of views."""
     unsolved = ~np.isfinite(groups.chi2)[groups.group]
     which = {

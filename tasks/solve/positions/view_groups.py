@@ -1,4 +1,4 @@
-"""Groups of views: those of one object at one epoch, and the solution of each."""
+"""ViewGroups of views: those of one object at one epoch, and the solution of each."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 
-class Groups(NamedTuple):
+class ViewGroups(NamedTuple):
     """Views grouped by epoch and object, and the solution of each group."""
 
     views: pa.Table
