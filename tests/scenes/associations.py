@@ -112,7 +112,7 @@ def tables(scene: Scene, names=None) -> SceneTables:
 
 def sensor_views(of: SceneTables, settings: Settings | None = None) -> list[SensorViews]:
     """Return the views of each sensor, in the order of the ids, as the part of a span has them."""
-    instants = np.unique(array(of.solutions, "time"))
+    instants = np.union1d(array(of.solutions, "time"), array(of.views, "epoch"))
     step_ns = int(np.diff(instants).min()) if len(instants) > 1 else 1_000_000_000
     grid = EpochGrid(step_ns, tuple(instants.tolist()))
     out = []
