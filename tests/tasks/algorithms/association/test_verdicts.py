@@ -23,9 +23,7 @@ def entered(score: float, tracklets=(0, 1)) -> Verdicts:
     """
     window, tracklet = np.repeat(np.arange(5), 2), np.tile([0, 1], 5)
     first_ns = window * 30_000_000_000
-    items = Items(
-        window, tracklet, tracklet, first_ns, first_ns + 20_000_000_000, np.full(10, 3)
-    )
+    items = Items(window, tracklet, tracklet, first_ns, first_ns + 20_000_000_000, np.full(10, 3))
     verdicts = Verdicts(items)
     verdicts.enter(np.flatnonzero(items.window == 0), np.array(tracklets), group_of(2, score))
     return verdicts

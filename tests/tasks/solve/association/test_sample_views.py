@@ -80,7 +80,8 @@ def test_samples_that_share_detections_count_together_as_what_is_independent(sce
     noise = of.views["cov_noise_11_rad2"][0].as_py()
     apart, near = at(*(np.arange(6) * 12.0)), at(*(np.arange(6) * 2.0))  # less than one window
     weight = [
-        np.sum(1 / samples_of(of, instants)[0].cov[:, :, 0, 0], axis=1) for instants in (apart, near)
+        np.sum(1 / samples_of(of, instants)[0].cov[:, :, 0, 0], axis=1)
+        for instants in (apart, near)
     ]
     np.testing.assert_allclose(weight[0], 6 / noise)
     assert (weight[1] > 1 / noise).all()
