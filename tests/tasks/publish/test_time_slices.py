@@ -4,11 +4,11 @@ import itertools
 
 import numpy as np
 import pytest
+from scenes.associations import filled
 
 from epipole.schemas.spans import SPAN_NS, Span
 from epipole.schemas.tables import EPOCHS
 from epipole.tasks.publish.time_slices import MOST_ROWS, rows_between, slices_of
-from scenes.associations import filled
 
 SPAN = Span(7 * SPAN_NS, 8 * SPAN_NS)
 

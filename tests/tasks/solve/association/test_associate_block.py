@@ -100,9 +100,8 @@ def test_without_views_nothing_is_left_out(tmp_path, of):
     nothing = of._replace(views=of.views.slice(0, 0))
     parts = found_by(tmp_path, nothing, {"sat1": Reason.CLOCK_OFF})
     for block in BLOCKS:
-        assert [parts.read(block, name).num_rows for name in ("members", "rejects", "outcomes")] == [
-            0, 0, 0,
-        ]  # fmt: skip
+        for name in ("members", "rejects", "outcomes"):
+            assert parts.read(block, name).num_rows == 0
 
 
 def test_all_sensors_at_fault_leave_no_object_but_their_outcomes(tmp_path, of):
