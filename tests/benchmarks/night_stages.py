@@ -2,6 +2,7 @@
 
 import json
 import sys
+import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,18 +13,24 @@ import pyarrow.compute as pc
 
 from epipole.flows.command_line.log_info import of_sensor, sensor_ids
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
-from epipole.schemas.bridge import concat, stack
+from epipole.io.work.part_tables import VIEWED
+from epipole.io.work.parts import Parts, write_part
+from epipole.io.work.places import SensorParts, SolvedParts
+from epipole.schemas.bridge import array, concat, stack
 from epipole.schemas.settings import Settings
-from epipole.schemas.tables import DETECTIONS, TRACKLETS
-from epipole.schemas.work_tables import SOLUTIONS, VIEWS
+from epipole.schemas.spans import Span, spans_between
+from epipole.schemas.tables import DETECTIONS
+from epipole.schemas.work_tables import HOT_SUSPECTS, OBJECT_MEMBERS, SOLUTIONS, TRACKLET_RUNS
 from epipole.tasks.algorithms.simulation.orbits import state_at
-from epipole.tasks.common.lone_detections import with_lone_tracklets
 from epipole.tasks.identify.identify_stars import identify_stars
 from epipole.tasks.identify.place_sensors import place_sensors
-from epipole.tasks.solve.association.associate_objects import associate_objects
+from epipole.tasks.solve.association.associate_block import associate_blocks, blocks_of
+from epipole.tasks.solve.association.number_objects import number_objects
+from epipole.tasks.solve.positions.gather_views import gather_views
 from epipole.tasks.solve.positions.solve_positions import Solved, solve_positions
 from epipole.tasks.solve.views.align_epochs import align_epochs
 from epipole.tasks.solve.views.view_objects import view_objects
+from epipole.tasks.solve.views.view_sensors import sensor_epochs, viewed_tracklets
 from epipole.tasks.track.build_tracklets import Tracked, build_tracklets
 
 Array = npt.NDArray[np.float64]
@@ -75,30 +82,57 @@ def track(seen: IdentifiedLog, settings: Settings) -> Tracked:
     ]
     return Tracked(
         concat(DETECTIONS, [part.detections for part in parts]),
-        concat(TRACKLETS, [part.tracklets for part in parts]),
+        concat(TRACKLET_RUNS, [part.tracklets for part in parts]),
+        concat(HOT_SUSPECTS, [part.suspects for part in parts]),
     )
 
 
 def solve(seen: IdentifiedLog, tracked: Tracked, settings: Settings) -> Solved:
-    """Align, associate and triangulate."""
-    epochs = align_epochs(seen.solutions, settings)
-    views = concat(
-        VIEWS,
-        [
-            view_objects(
-                of_sensor(epochs, name),
-                of_sensor(seen.solutions, name),
-                of_sensor(tracked.detections, name),
-                seen.cameras,
-                settings,
+    """Align, associate and triangulate: as the flow does, but all positions at once."""
+    with tempfile.TemporaryDirectory() as folder:
+        sensors = _view(Path(folder), seen, tracked, settings)
+        spans = spans_between(*_ends(align_epochs(seen.solutions, settings)))
+        solved = SolvedParts(Path(folder))
+        for span in spans:
+            associate_blocks.fn(
+                sensors, blocks_of(span, settings), seen.cameras, {}, settings, solved.blocks
             )
-            for name in sensor_ids(epochs)
-        ],
-    )
-    associated = associate_objects(
-        views, with_lone_tracklets(tracked.tracklets, views), seen.solutions, seen.cameras, settings
-    )
-    return solve_positions(associated.views, associated.object_number, settings)
+        number_objects.fn(spans, 0, settings, solved)
+        members = [solved.objects.read(span, "members") for span in spans]
+        viewed = {of.number: of.viewed for _, of in sensors}
+        time = Span(spans[0].start_ns, spans[-1].end_ns)
+        views, number = gather_views(viewed, concat(OBJECT_MEMBERS, members), time)
+    return solve_positions(views, number, settings)
+
+
+def _view(
+    folder: Path, seen: IdentifiedLog, tracked: Tracked, settings: Settings
+) -> list[tuple[str, SensorParts]]:
+    """Write the views of all sensors, a part per sensor and span."""
+    epochs = align_epochs(seen.solutions, settings)
+    sensors = []
+    for number, name in enumerate(sorted(sensor_ids(epochs))):
+        solutions = of_sensor(seen.solutions, name)
+        own = of_sensor(epochs, name)
+        detections = of_sensor(tracked.detections, name)
+        views = view_objects(own, solutions, detections, seen.cameras, settings)
+        tracklets = of_sensor(tracked.tracklets, name)
+        parts = SensorParts(number, *(Parts(folder / f"{part}-{number}") for part in "itnv"))
+        for span in spans_between(*_ends(own)):
+            of_span = span.of(views, "epoch")
+            tables = {
+                "views": of_span,
+                "epochs": sensor_epochs(span.of(own, "epoch"), solutions),
+                "tracklets": viewed_tracklets(tracklets, of_span),
+            }
+            write_part(parts.viewed.of(span), VIEWED, tables)
+        sensors.append((name, parts))
+    return sensors
+
+
+def _ends(epochs: pa.Table) -> tuple[int, int]:
+    epoch_ns = array(epochs, "epoch")
+    return int(epoch_ns.min()), int(epoch_ns.max()) + 1
 
 
 def position_errors(log: Path, positions: pa.Table) -> Array:

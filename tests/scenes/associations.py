@@ -1,17 +1,49 @@
 """Scenes of tracklets as tables, the input of the association stage, and its results."""
 
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
+from epipole.io.work.part_tables import VIEWED
+from epipole.io.work.parts import Parts, write_part
+from epipole.schemas.bridge import array
 from epipole.schemas.settings import AssociationSettings, Settings
-from epipole.schemas.tables import TRACKLETS
-from epipole.schemas.work_tables import CAMERAS, SOLUTIONS, VIEWS
+from epipole.schemas.spans import SPAN_NS, Span
+from epipole.schemas.work_tables import CAMERAS, SOLUTIONS, TRACKLET_RUNS, VIEWS
 from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
+from epipole.tasks.solve.association.associate_block import blocks_of, object_members
 from epipole.tasks.solve.association.associate_objects import associate_objects
+from epipole.tasks.solve.association.block_views import BlockViews, SensorViews
+from epipole.tasks.solve.positions.gather_views import gather_views
+from epipole.tasks.solve.views.align_epochs import EpochGrid, align_epochs
+from epipole.tasks.solve.views.view_sensors import sensor_epochs, viewed_tracklets
 from scenes.tracklet_scenes import Scene
 
 START_NS = int(np.datetime64("2019-04-01T04:00:00", "ns").astype(np.int64))
+SPAN = Span(START_NS, START_NS + SPAN_NS)
 WIDTH = 512
+
+
+class SceneTables(NamedTuple):
+    """What the association is made from: VIEWS, TRACKLET_RUNS, SOLUTIONS, CAMERAS."""
+
+    views: pa.Table
+    tracklets: pa.Table
+    solutions: pa.Table
+    cameras: pa.Table
+
+
+class Found(NamedTuple):
+    """The views of objects, the number of the object of each, and rows of `rejects`."""
+
+    views: pa.Table
+    object_number: np.ndarray
+    rejects: pa.Table
 
 
 def filled(schema: pa.Schema, n: int, columns: dict) -> pa.Table:
@@ -29,8 +61,8 @@ def filled(schema: pa.Schema, n: int, columns: dict) -> pa.Table:
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def tables(scene: Scene, names=None) -> tuple[pa.Table, pa.Table, pa.Table, pa.Table]:
-    """Return the input tables of the stage: views, tracklets, solutions, cameras."""
+def tables(scene: Scene, names=None) -> SceneTables:
+    """Return the tables of a scene; sensors may have names."""
     samples = scene.samples()
     n_sensors, k = samples.sensor_km.shape[:2]
     names = np.array(names or [f"sat{s}" for s in range(n_sensors)])
@@ -53,7 +85,7 @@ def tables(scene: Scene, names=None) -> tuple[pa.Table, pa.Table, pa.Table, pa.T
     })  # fmt: skip
     t = len(samples.sensor)
     ids = [f"t{i:04d}" for i in range(t)]
-    tracklets = filled(TRACKLETS, t, {
+    tracklets = filled(TRACKLET_RUNS, t, {
         "tracklet_id": ids, "track_id": ids, "sensor_id": names[samples.sensor],
         "start_time": START_NS + np.round(samples.start_s * 1e9).astype(np.int64),
         "end_time": START_NS + np.round(samples.end_s * 1e9).astype(np.int64),
@@ -75,12 +107,55 @@ def tables(scene: Scene, names=None) -> tuple[pa.Table, pa.Table, pa.Table, pa.T
         "sensor_id": [names[0]], "time": [START_NS], "width": [WIDTH], "height": [WIDTH],
         "fx_px": [focal], "fy_px": [focal], "cx_px": [255.5], "cy_px": [255.5],
     })  # fmt: skip
-    return views, tracklets, solutions, cameras
+    return SceneTables(views, tracklets, solutions, cameras)
 
 
-def associated(scene: Scene, **changes):
+def sensor_views(of: SceneTables, settings: Settings | None = None) -> list[SensorViews]:
+    """Return the views of each sensor, in the order of the ids, as the part of a span has them."""
+    instants = np.union1d(array(of.solutions, "time"), array(of.views, "epoch"))
+    step_ns = int(np.diff(instants).min()) if len(instants) > 1 else 1_000_000_000
+    grid = EpochGrid(step_ns, tuple(instants.tolist()))
+    out = []
+    for number, name in enumerate(sorted(set(of.solutions["sensor_id"].to_pylist()))):
+        of_sensor = pc.field("sensor_id") == name
+        solutions = of.solutions.filter(of_sensor)
+        views = of.views.filter(of_sensor).sort_by(
+            [("tracklet_id", "ascending"), ("epoch", "ascending")]
+        )
+        epochs = align_epochs(solutions, settings or Settings(), grid)
+        tracklets = viewed_tracklets(of.tracklets.filter(of_sensor), views)
+        out.append(SensorViews(number, name, views, sensor_epochs(epochs, solutions), tracklets))
+    return out
+
+
+def block_of(of: SceneTables, settings: Settings | None = None) -> BlockViews:
+    """Return the views of a scene, which lies in one block."""
+    settings = settings or Settings()
+    block = blocks_of(SPAN, settings)[0]
+    assert block.holds(array(of.views, "epoch")).all()
+    window_s, half_width_s = settings.association.span_s, settings.alignment.window_s
+    return BlockViews(sensor_views(of, settings), of.cameras, block, window_s, half_width_s)
+
+
+def write_views(folder: Path, sensors: Sequence[SensorViews], span: Span) -> Mapping[int, Parts]:
+    """Write the parts of the views of sensors in a span, and return them by sensor number."""
+    viewed = {of.number: Parts(folder / str(of.number)) for of in sensors}
+    for of in sensors:
+        tables = {"views": of.views, "epochs": of.epochs, "tracklets": of.tracklets}
+        write_part(viewed[of.number].of(span), VIEWED, tables)
+    return viewed
+
+
+def associated(scene: Scene, names=None, **changes) -> Found:
+    """Return the objects of a scene, with the views that positions are solved from."""
     settings = Settings(association=AssociationSettings(**changes))
-    return associate_objects(*tables(scene), settings)
+    block = block_of(tables(scene, names), settings)
+    found = associate_objects(block, settings)
+    members = object_members(block, found)
+    with tempfile.TemporaryDirectory() as folder:
+        viewed = write_views(Path(folder), block.sensors, SPAN)
+        views, number = gather_views(viewed, members, SPAN)
+    return Found(views, number, found.rejects)
 
 
 def reasons(found) -> dict[str, int]:

@@ -63,7 +63,7 @@ def _rows(
             continue
         begin, end = first[name], first[name] + count[name]
         lo = begin + int(np.searchsorted(epoch_ns[begin:end], start_ns))
-        hi = begin + int(np.searchsorted(epoch_ns[begin:end], end_ns, side="right"))
+        hi = max(begin + int(np.searchsorted(epoch_ns[begin:end], end_ns, side="right")), lo)
         rows.append(np.arange(lo, hi))
         numbers.append(np.full(hi - lo, number))
     return np.concatenate(rows), np.concatenate(numbers)

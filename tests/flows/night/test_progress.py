@@ -58,6 +58,18 @@ def test_stages_one_after_another_make_a_whole(steps):
     assert (percents[0], percents[-1]) == (0.0, 100.0)
 
 
+def test_the_parts_of_a_stage_make_the_stage(steps):
+    step(Stage.TRACK, 1, 1)
+    for k in range(4):
+        results(Stage.SOLVE, [Future(1), Future(2)], (k, 4))
+    step(Stage.CHECK, 0, 1)
+    percents = [percent for *_, percent in steps]
+    assert percents == sorted(percents)
+    assert (percents[0], percents[-2]) == (percents[1], percents[-1])
+    assert len(set(percents)) == 9  # two tasks of four parts, and the start
+    assert [done for _, done, _, _ in steps][1:-1] == [0, 1, 2] * 4
+
+
 def test_a_stage_without_tasks_is_a_step(steps):
     step(Stage.SOLVE, 0, 0)
     ((stage, done, total, percent),) = steps

@@ -1,11 +1,19 @@
 """Check of sensors: what was corrected and what remains; nothing from nothing."""
 
+from epipole.io.work.part_tables import SOLVED
+from epipole.io.work.parts import Parts, write_part
+from epipole.io.work.places import SolvedParts
 from epipole.schemas.bridge import empty, to_polars
-from epipole.schemas.settings import Settings
+from epipole.schemas.spans import SPAN_NS, Span
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS
-from epipole.schemas.work_tables import VIEWS
-from epipole.tasks.check.check_sensors import SensorVerdict, as_in_the_logs, verdicts_of
-from epipole.tasks.solve.collect_clock_views import collect_clock_views
+from epipole.schemas.work_tables import CLOCK_LINES, VIEWS
+from epipole.tasks.check.check_sensors import (
+    SensorVerdict,
+    as_in_the_logs,
+    check_sensors,
+    verdicts_of,
+)
+from epipole.tasks.solve.positions.keep_lines import keep_lines, moving_objects
 
 LATE = SensorVerdict("a", 0.25, 0.01, "clock")
 EARLY = SensorVerdict("b", -0.5, 0.01, "clock")
@@ -21,5 +29,17 @@ def test_an_offset_is_the_correction_and_what_remains_of_it():
 
 
 def test_without_views_no_clock_is_known():
-    tables = (empty(s) for s in (VIEWS, VIEWS, ASSOCIATIONS, POSITIONS))
-    assert verdicts_of(to_polars(collect_clock_views(*tables, Settings()))) == []
+    objects = moving_objects(empty(POSITIONS), 13_000_000_000)
+    lines = keep_lines(empty(VIEWS), empty(ASSOCIATIONS), objects)
+    assert lines.equals(empty(CLOCK_LINES))
+    assert verdicts_of(to_polars(lines)) == []
+    assert verdicts_of(to_polars(lines), {"a": 0.5}) == []
+
+
+def test_without_objects_no_clock_is_known(tmp_path):
+    solved, spans = SolvedParts(tmp_path), [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in (7, 8)]
+    sensors = {"a": Parts(tmp_path / "views")}
+    assert check_sensors.fn(solved, sensors, spans) == []
+    tables = {name: empty(schema) for name, schema in SOLVED.items()}
+    write_part(solved.piece(spans[1], 0), SOLVED, tables)
+    assert check_sensors.fn(solved, sensors, spans) == []

@@ -2,15 +2,16 @@
 
 import numpy as np
 import polars as pl
+import pyarrow as pa
 import pytest
 from scenes.associations import filled
 
-from epipole.io.work.part_tables import NIGHT_TRACKLETS, SOLVED, TRACKED
-from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import SensorParts, WorkFolder
+from epipole.io.work.part_tables import ASSOCIATED, NIGHT_TRACKLETS, SOLVED, TRACKED
+from epipole.io.work.parts import write_part
+from epipole.io.work.places import SensorParts, SolvedParts, WorkFolder
 from epipole.schemas.bridge import empty, table
 from epipole.schemas.rejects import Outcome
-from epipole.schemas.spans import SPAN_NS, Sensor, Span
+from epipole.schemas.spans import BLOCK_NS, SPAN_NS, Sensor, Span
 from epipole.schemas.tables import DETECTIONS, TRACKLETS
 from epipole.schemas.work_tables import HOT_SUSPECTS, TRACKLET_OUTCOMES, TRACKLET_RUNS
 from epipole.tasks.publish.hot_tracklets import (
@@ -28,11 +29,23 @@ SPANS = [Span(MIDNIGHT_NS + k * SPAN_NS, MIDNIGHT_NS + (k + 1) * SPAN_NS) for k 
 A, B = Sensor(0, "a"), Sensor(1, "b")
 
 
-def solved_part(parts: Parts, span: Span, **outcomes: str) -> None:
-    rows = {"tracklet_id": list(outcomes), "outcome": list(outcomes.values())}
+def solved_part(parts: SolvedParts, span: Span, *, piece: int = 0, **outcomes: str) -> None:
+    """Write the part of some objects, with the outcomes of their tracklets."""
     tables = {name: empty(schema) for name, schema in SOLVED.items()}
-    tables["tracklet_outcomes"] = filled(TRACKLET_OUTCOMES, len(outcomes), rows)
-    write_part(parts.of(span), SOLVED, tables)
+    write_part(parts.piece(span, piece), SOLVED, tables | outcomes_of(outcomes))
+
+
+def associated_part(parts: SolvedParts, span: Span, *, block: int = 0, **outcomes: str) -> None:
+    """Write the part of a block of a span, with the outcomes of the tracklets."""
+    tables = {name: empty(schema) for name, schema in ASSOCIATED.items()}
+    start_ns = span.start_ns + block * BLOCK_NS
+    of_block = parts.blocks.of(Span(start_ns, start_ns + BLOCK_NS))
+    write_part(of_block, ASSOCIATED, tables | outcomes_of(outcomes))
+
+
+def outcomes_of(outcomes: dict[str, str]) -> dict[str, pa.Table]:
+    rows = {"tracklet_id": list(outcomes), "outcome": list(outcomes.values())}
+    return {"outcomes": filled(TRACKLET_OUTCOMES, len(outcomes), rows)}
 
 
 def night(tmp_path, tracks: dict[Sensor, dict[str, str]], suspects=()) -> NightParts:
@@ -51,7 +64,12 @@ def night(tmp_path, tracks: dict[Sensor, dict[str, str]], suspects=()) -> NightP
             ),
         }
         write_part(names_of.of_night(), NIGHT_TRACKLETS, tables)
-        sensors.append(SensorParts(folder.identified(sensor), folder.tracked(sensor, 0), names_of))
+        sensors.append(
+            SensorParts(
+                sensor.number, folder.identified(sensor), folder.tracked(sensor, 0), names_of,
+                folder.viewed(sensor, 0),
+            )
+        )  # fmt: skip
     return NightParts(NIGHT, SPANS[:1], SPANS, sensors, folder.solved(0), {}, {})
 
 
@@ -70,6 +88,20 @@ def test_each_tracklet_has_its_first_outcome_of_all_spans(tmp_path):
     assert rows["tracklet_id"].to_pylist() == ["a1", "a2", "a3", "b1"]
     assert rows["outcome"].to_pylist() == ["object", "ambiguous", "not_compared", "object"]
     assert rows.schema.equals(TRACKLETS)
+
+
+def test_the_outcomes_of_all_blocks_and_pieces_count(tmp_path):
+    parts = night(tmp_path, {A: alone("a1", "a2", "a3", "a4"), B: alone("b1")})
+    associated_part(parts.solved, SPANS[0], a1=Outcome.SEEN_BY_ONE, a2=Outcome.SEEN_BY_ONE)
+    associated_part(parts.solved, SPANS[0], block=2, a2=Outcome.AMBIGUOUS, b1=Outcome.SEEN_BY_ONE)
+    associated_part(parts.solved, SPANS[2], block=1, a3=Outcome.SENSOR_LEFT_OUT)
+    solved_part(parts.solved, SPANS[0], a1=Outcome.DISAGREES)
+    solved_part(parts.solved, SPANS[0], piece=11, b1=Outcome.OBJECT)
+    rows = tracklets_of_run(parts)
+    assert dict(zip(rows["tracklet_id"].to_pylist(), rows["outcome"].to_pylist(), strict=True)) == {
+        "a1": "disagrees", "a2": "ambiguous", "a3": "sensor_left_out", "a4": "not_compared",
+        "b1": "object",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("outcome", list(Outcome))

@@ -6,11 +6,11 @@ import pytest
 
 from epipole.schemas.rejects import Outcome
 from epipole.tasks.common.lone_detections import MARK
-from epipole.tasks.solve.judge_tracklets import best_outcomes, judge_tracklets
+from epipole.tasks.solve.judge_tracklets import best_outcomes, judge_views, outcomes
 
 
-def ids(*names: str) -> pa.Table:
-    return pa.table({"tracklet_id": pa.array(names, pa.string())})
+def ids(*names: str) -> pa.ChunkedArray:
+    return pa.chunked_array([pa.array(names, pa.string())])
 
 
 def undecided(**outcomes: str) -> pa.Table:
@@ -36,11 +36,13 @@ def as_dict(rows: pa.Table) -> dict[str, str]:
 
 
 def test_each_tracklet_has_its_first_outcome():
-    judged = judge_tracklets(
-        ids("a", "b", "c", "d", "e", "a"),
-        ids("f"),
-        undecided(c="ambiguous", d="sensor_left_out", a="ambiguous"),
-        associations(a=True, b=False),
+    judged = best_outcomes(
+        [
+            outcomes(ids("a", "b", "c", "d", "e", "a"), Outcome.SEEN_BY_ONE),
+            outcomes(ids("f"), Outcome.SENSOR_LEFT_OUT),
+            undecided(c="ambiguous", d="sensor_left_out", a="ambiguous"),
+            judge_views(associations(a=True, b=False)),
+        ]
     )
     assert as_dict(judged) == {
         "a": Outcome.OBJECT,
@@ -53,8 +55,18 @@ def test_each_tracklet_has_its_first_outcome():
 
 
 def test_lone_detections_have_no_outcome():
-    judged = judge_tracklets(ids(f"{MARK}x", "a"), ids(), undecided(), associations())
+    judged = outcomes(ids(f"{MARK}x", "a"), Outcome.SEEN_BY_ONE)
     assert as_dict(judged) == {"a": Outcome.SEEN_BY_ONE}
+
+
+def test_views_without_a_published_tracklet_have_no_outcome():
+    views = pa.table({"tracklet_id": pa.array([None, "a"]), "used": pa.array([True, True])})
+    assert as_dict(judge_views(views)) == {"a": Outcome.OBJECT}
+
+
+def test_a_tracklet_that_one_position_used_is_of_an_object():
+    views = pa.table({"tracklet_id": ["a", "a", "b", "b"], "used": [False, True, False, False]})
+    assert as_dict(judge_views(views)) == {"a": Outcome.OBJECT, "b": Outcome.DISAGREES}
 
 
 @pytest.mark.parametrize("later", ["ambiguous", "seen_by_one", "disagrees"])
@@ -65,7 +77,8 @@ def test_an_object_in_one_span_is_one_in_the_night(later):
 
 
 def test_no_tracklets_have_no_outcomes():
-    assert judge_tracklets(ids(), ids(), undecided(), associations()).num_rows == 0
+    assert outcomes(ids(), Outcome.SEEN_BY_ONE).num_rows == 0
+    assert judge_views(associations()).num_rows == 0
     assert best_outcomes([]).num_rows == 0
 
 

@@ -6,7 +6,7 @@ from scenes.associations import associated, wrong_views
 from scenes.tracklet_scenes import Scene
 
 from epipole.tasks.algorithms.association.sampling.samples import Groups
-from epipole.tasks.algorithms.association.verdicts import Verdicts, ViewKeys
+from epipole.tasks.algorithms.association.verdicts import Items, Verdicts
 
 EVERY_S = 6.0
 
@@ -17,14 +17,15 @@ def ten_minutes(seed: int) -> Scene:
 
 
 def entered(score: float, tracklets=(0, 1)) -> Verdicts:
-    """Two tracklets of two sensors, five spans of 30 s: one group in the first span."""
-    epoch_s = np.repeat(np.arange(0, 150, 10), 2)
-    seen = ViewKeys(
-        epoch_s * 1_000_000_000, epoch_s // 30,
-        np.tile([0, 1], 15), np.tile([0, 1], 15),
-    )  # fmt: skip
-    verdicts = Verdicts(seen)
-    verdicts.enter(np.flatnonzero(seen.span == 0), np.array(tracklets), group_of(2, score))
+    """Two tracklets of two sensors, five windows of 30 s: one group in the first window.
+
+    Their views are 10 s apart.
+    """
+    window, tracklet = np.repeat(np.arange(5), 2), np.tile([0, 1], 5)
+    first_ns = window * 30_000_000_000
+    items = Items(window, tracklet, tracklet, first_ns, first_ns + 20_000_000_000, np.full(10, 3))
+    verdicts = Verdicts(items)
+    verdicts.enter(np.flatnonzero(items.window == 0), np.array(tracklets), group_of(2, score))
     return verdicts
 
 
@@ -52,30 +53,38 @@ def test_a_span_of_ten_minutes_by_settings_is_judged_once():
 
 def test_a_sure_group_is_not_judged_again_where_it_is_sure():
     verdicts = entered(score=9.0)
-    rows = verdicts.open_rows(np.arange(30), 30.0)
-    assert set(verdicts.views.span[rows].tolist()) == {1, 2, 3, 4}
-    unsure = entered(score=3.0).open_rows(np.arange(30), 30.0)
-    assert len(unsure) == 30
+    rows = verdicts.open_items(np.arange(10), 30.0)
+    assert verdicts.items.window[rows].tolist() == [1, 1, 2, 2, 3, 3, 4, 4]
+    unsure = entered(score=3.0).open_items(np.arange(10), 30.0)
+    assert len(unsure) == 10
 
 
 def test_tracklets_that_do_not_continue_keep_their_verdict():
-    assert not len(entered(score=3.0).open_rows(np.arange(12), 30.0))  # 50 s < 2 x 30 s
+    assert not len(entered(score=3.0).open_items(np.arange(4), 30.0))  # 50 s < 2 x 30 s
 
 
 def test_longer_evidence_against_a_group_dissolves_it():
     verdicts = entered(score=3.0)
-    rows = np.arange(30)
-    verdicts.reconsider(rows, verdicts.open_rows(rows, 30.0), np.array([0, 1]), group_of(2))
+    rows = np.arange(10)
+    assert (verdicts.group[:2] == 0).all()
+    verdicts.reconsider(rows, verdicts.open_items(rows, 30.0), np.array([0, 1]), group_of(2))
     assert (verdicts.group == -1).all()
 
 
 def test_what_longer_evidence_adds_to_a_sure_group_joins_it():
     verdicts = entered(score=9.0, tracklets=(0, 2))
-    # In the first span tracklet 0 is in a sure group and 1 in none; over 150 s they are one.
-    rows = np.arange(30)
-    open_rows = verdicts.open_rows(rows, 30.0)
-    first = open_rows[verdicts.views.span[open_rows] == 0]
-    assert set(verdicts.views.tracklet[first].tolist()) == {1}
-    verdicts.reconsider(rows, open_rows, np.array([0, 1]), group_of(2, 12.0))
-    assert (verdicts.group[verdicts.views.span == 0] == verdicts.group[0]).all()
-    assert len(np.unique(verdicts.group[verdicts.views.span > 0])) == 1
+    # In the first window tracklet 0 is in a sure group and 1 in none; over 150 s they are one.
+    rows = np.arange(10)
+    open_items = verdicts.open_items(rows, 30.0)
+    first = open_items[verdicts.items.window[open_items] == 0]
+    assert verdicts.items.tracklet[first].tolist() == [1]
+    verdicts.reconsider(rows, open_items, np.array([0, 1]), group_of(2, 12.0))
+    assert (verdicts.group[verdicts.items.window == 0] == verdicts.group[0]).all()
+    assert len(np.unique(verdicts.group[verdicts.items.window > 0])) == 1
+
+
+def test_groups_of_no_tracklets_change_nothing():
+    verdicts = entered(score=9.0)
+    before = verdicts.group.copy()
+    verdicts.enter(np.arange(10), np.zeros(0, np.int64), group_of(0))
+    assert (verdicts.group == before).all()

@@ -2,11 +2,8 @@
 
 import numpy as np
 import pytest
-from scenes.associations import associated, reasons, tables, wrong_views
+from scenes.associations import associated, reasons, wrong_views
 from scenes.tracklet_scenes import Scene
-
-from epipole.schemas.settings import Settings
-from epipole.tasks.solve.association.associate_objects import associate_objects
 
 
 @pytest.mark.parametrize("method", ["likelihood", "epipolar"])
@@ -82,8 +79,7 @@ def test_a_clock_a_second_off_gives_no_wrong_object():
 
 def test_two_sensors_with_one_id_give_no_wrong_object():
     scene = Scene(19, 4).objects(6, spread_km=100.0)
-    settings = Settings()
-    found = associate_objects(*tables(scene, ["sat0", "sat1", "sat2", "sat2"]), settings)
+    found = associated(scene, ["sat0", "sat1", "sat2", "sat2"])
     assert wrong_views(scene, found) == 0
 
 

@@ -8,9 +8,14 @@ from scenes.arcs import GEO, trial
 from epipole.schemas.bridge import array, empty, stack, table
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS, STATES
-from epipole.schemas.work_tables import VIEWS
+from epipole.schemas.work_tables import SHARED_ERRORS, VIEWS
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
-from epipole.tasks.solve.positions.fit_states import fit_states, refuse_misfits, with_honest_biases
+from epipole.tasks.solve.positions.fit_states import (
+    fit_states,
+    judge_errors,
+    refuse_misfits,
+    with_larger_errors,
+)
 
 T0 = 1_554_091_200_000_000_000
 SETTINGS = Settings()
@@ -144,11 +149,16 @@ def objects(worse):
     return [pa.concat_tables(tables) for tables in zip(*nights, strict=True)]
 
 
+def honest_views(views, claimed, positions):
+    """Views with the shared errors that all objects together show."""
+    return with_larger_errors(views, judge_errors(views, claimed, positions, SETTINGS))
+
+
 @pytest.mark.parametrize("worse", [30.0, 150.0])
 def test_views_of_a_sensor_with_a_worse_ephemeris_have_a_larger_sigma(worse):
     """Also where it is so much worse that no state of any object fits."""
     views, claimed, positions = objects(worse=worse)
-    honest = with_honest_biases(views, claimed, positions, SETTINGS)
+    honest = honest_views(views, claimed, positions)
     wider = array(honest, "position_sigma_km") / array(views, "position_sigma_km")
     first = array(views, "sensor_id") == "s0"
     # Of this, the part that this seed drew and that the Student distribution allows.
@@ -160,11 +170,49 @@ def test_views_of_a_sensor_with_a_worse_ephemeris_have_a_larger_sigma(worse):
 
 def test_views_of_sound_sensors_keep_their_sigmas():
     views, claimed, positions = objects(worse=1.0)
-    honest = with_honest_biases(views, claimed, positions, SETTINGS)
+    honest = honest_views(views, claimed, positions)
     wider = array(honest, "position_sigma_km") / array(views, "position_sigma_km")
     assert (wider < 1.3).all()
 
 
 def test_no_views_stay_no_views():
     views = empty(VIEWS)
-    assert with_honest_biases(views, empty(ASSOCIATIONS), empty(POSITIONS), SETTINGS) is views
+    errors = judge_errors(views, empty(ASSOCIATIONS), empty(POSITIONS), SETTINGS)
+    assert errors.equals(empty(SHARED_ERRORS))
+    assert with_larger_errors(views, errors) is views
+
+
+def test_only_sensors_whose_errors_are_larger_have_a_row():
+    views, claimed, positions = objects(worse=150.0)
+    errors = judge_errors(views, claimed, positions, SETTINGS)
+    rows = {row["sensor_id"]: row for row in errors.to_pylist()}
+    assert all(max(row["direction"], row["place"]) > 1.0 for row in rows.values())
+    assert all(min(row["direction"], row["place"]) >= 1.0 for row in rows.values())
+    assert rows["s0"]["place"] > 9.0  # of the variance: three sigma
+
+
+def test_views_have_the_larger_errors_of_their_sensors():
+    views, _, _ = objects(worse=1.0)
+    views = with_biases(views)
+    errors = table(
+        SHARED_ERRORS, {"sensor_id": ["s3", "absent"], "direction": [4.0, 2.0], "place": [9.0, 2.0]}
+    )
+    wider = with_larger_errors(views, errors)
+    own = array(views, "sensor_id") == "s3"
+    for name, factor in {
+        "position_sigma_km": 3.0, "cov_bias_11_rad2": 4.0, "cov_bias_12_rad2": 4.0,
+        "cov_bias_22_rad2": 4.0,
+    }.items():  # fmt: skip
+        expected = array(views, name) * np.where(own, factor, 1.0)
+        np.testing.assert_allclose(array(wider, name), expected, rtol=1e-12)
+    same = [name for name in views.column_names if "bias" not in name and "sigma" not in name]
+    assert wider.select(same).equals(views.select(same))
+
+
+def with_biases(views):
+    for k, axes in enumerate(("11", "12", "22")):
+        name = f"cov_bias_{axes}_rad2"
+        at = views.schema.get_field_index(name)
+        values = np.full(views.num_rows, (3.0, 1.0, 2.0)[k] * 1e-10)
+        views = views.set_column(at, views.schema.field(at), [values])
+    return views
