@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.datasets.night_files import read_columns
+from epipole.io.datasets.night_files import count_rows, read_columns
 from epipole.schemas.rejects import Reason
 from epipole.tasks.check.check_sensors import SensorVerdict
 
@@ -90,8 +90,6 @@ class Summary:
 # The columns that are counted: all columns of a whole night would not fit in memory.
 _COLUMNS = {
     "frames": ["sensor_id", "attitude_source", "residual_px"],
-    "stars": ["centroid"],
-    "detections": ["centroid"],
     "tracklets": ["sensor_id", "track_id"],
     "epochs": ["epoch"],
     "positions": ["object_id"],
@@ -116,8 +114,8 @@ def summarise(
         sensors=pc.count_distinct(frames["sensor_id"]).as_py(),
         frames=frames.num_rows,
         identified=pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
-        stars=tables["stars"].num_rows,
-        detections=tables["detections"].num_rows,
+        stars=sum(count_rows(folder, "stars") for folder in staged.values()),
+        detections=sum(count_rows(folder, "detections") for folder in staged.values()),
         tracklets=tables["tracklets"].num_rows,
         epochs=pc.count_distinct(tables["epochs"]["epoch"]).as_py(),
         objects=pc.count_distinct(tables["positions"]["object_id"]).as_py(),

@@ -68,3 +68,9 @@ def _writer(folder: Path, schema: pa.Schema) -> pq.ParquetWriter:
 def read_columns(night: Path, name: str, columns: Sequence[str]) -> pa.Table:
     """Return some columns of a table that `write_table` wrote."""
     return pq.read_table(night / name / PART, columns=list(columns), partitioning=None)
+
+
+def count_rows(night: Path, name: str) -> int:
+    """Return the number of rows of a table that `write_table` wrote."""
+    rows: int = pq.read_metadata(night / name / PART).num_rows
+    return rows

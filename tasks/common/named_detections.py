@@ -5,7 +5,6 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.work.parts import CLOCK_NS
 from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import concat
 from epipole.schemas.spans import Span, spans_between
@@ -13,7 +12,7 @@ from epipole.schemas.tables import DETECTIONS
 
 
 class UnnamedDetections(NamedTuple):
-    """A sensor's detections in a time, of one part, with the names of its tracklets aside."""
+    """A sensor's detections in a span, with the names of its tracklets aside."""
 
     detections: pa.Table
     names: pa.Table
@@ -23,17 +22,10 @@ class UnnamedDetections(NamedTuple):
         return _named(detections, self.names)
 
 
-def unnamed_detections(sensor: SensorParts, span: Span) -> list[UnnamedDetections]:
-    """Return a sensor's detections in a time, part by part, as they lie in the work folder."""
-    parts = []
-    for other in spans_between(*span.widened(CLOCK_NS)):
-        if not sensor.tracked.holds(other):
-            continue
-        detections = span.of(sensor.tracked.read(other, "detections"), "time")
-        if detections.num_rows:
-            own = other.of(detections, "time")
-            parts.append(UnnamedDetections(own, sensor.names.read(other, "names")))
-    return parts
+def unnamed_detections(sensor: SensorParts, span: Span) -> UnnamedDetections:
+    """Return a sensor's detections in a span, which has a part, as they lie in the work folder."""
+    detections = span.of(sensor.tracked.read(span, "detections"), "time")
+    return UnnamedDetections(detections, sensor.names.read(span, "names"))
 
 
 def detections_within(sensor: SensorParts, span: Span) -> pa.Table:

@@ -12,9 +12,7 @@ from epipole.schemas.spans import Span
 MOST_ROWS = 200_000  # in a slice, about
 
 
-def in_slices(
-    tables: Sequence[pa.Table], span: Span, column: str
-) -> Iterator[list[pa.Table]]:
+def in_slices(tables: Sequence[pa.Table], span: Span, column: str) -> Iterator[list[pa.Table]]:
     """Yield the rows of each table in one time after the other; together they are the span.
 
     Parameters
@@ -34,8 +32,7 @@ def in_slices(
     cuts = [np.searchsorted(array(rows, column), edges).tolist() for rows in tables]
     for k, _ in enumerate(itertools.pairwise(edges)):
         yield [
-            rows.slice(cut[k], cut[k + 1] - cut[k])
-            for rows, cut in zip(tables, cuts, strict=True)
+            rows.slice(cut[k], cut[k + 1] - cut[k]) for rows, cut in zip(tables, cuts, strict=True)
         ]
 
 

@@ -103,7 +103,7 @@ def _of_span(name: str, parts: NightParts, span: Span) -> Iterator[list[pa.Table
 def _detections(parts: NightParts, span: Span) -> Iterator[list[pa.Table]]:
     hot = hot_tracklets(parts)["tracklet_id"]
     lone = lone_views(parts, span)
-    found = [part for of in parts.sensors for part in unnamed_detections(of, span)]
+    found = [unnamed_detections(of, span) for of in parts.sensors if of.tracked.holds(span)]
     for rows in in_slices([part.detections for part in found], span, "time"):
         named = [part.named(of_part) for part, of_part in zip(found, rows, strict=True)]
         together = with_lone_objects(concat(TABLES["detections"], named), lone)

@@ -82,7 +82,7 @@ def _nothing_known(n: int) -> JudgedSensors:
 def _without(lines: Lines, faulty: npt.NDArray[np.bool_]) -> Lines:
     """Return the lines of the other sensors."""
     kept = ~faulty[lines.sensor]
-    return Lines(*(values[kept] for values in lines))
+    return lines._replace(**{name: getattr(lines, name)[kept] for name in Lines._fields})
 
 
 def _anonymous(lines: Lines, spread: Array) -> Lines:

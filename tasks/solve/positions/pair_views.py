@@ -76,7 +76,9 @@ def _position_error(groups: ViewGroups) -> Array:
     return across * away_km**2 + array(groups.views, "position_sigma_km") ** 2
 
 
-def _with_reference(groups: ViewGroups, candidates: npt.NDArray[np.bool_]) -> tuple[Indices, Indices]:
+def _with_reference(
+    groups: ViewGroups, candidates: npt.NDArray[np.bool_]
+) -> tuple[Indices, Indices]:
     """Return each candidate's reference view, and the candidate."""
     error = np.where(candidates, _position_error(groups), np.inf)
     order = np.lexsort((error, groups.group))

@@ -1,6 +1,4 @@
-"""Time slices: they cover a span, hold every row once, and depend on the rows only."""
-
-import itertools
+"""Time slices: together they hold every row of a span once, in order, whatever their number."""
 
 import numpy as np
 import pytest
@@ -8,41 +6,39 @@ from scenes.associations import filled
 
 from epipole.schemas.spans import SPAN_NS, Span
 from epipole.schemas.tables import EPOCHS
-from epipole.tasks.publish.time_slices import MOST_ROWS, rows_between, slices_of
+from epipole.tasks.publish import time_slices
+from epipole.tasks.publish.time_slices import in_slices
 
 SPAN = Span(7 * SPAN_NS, 8 * SPAN_NS)
-
-
-@pytest.mark.parametrize(
-    ("n_rows", "count"),
-    [(0, 1), (1, 1), (MOST_ROWS, 1), (MOST_ROWS + 1, 2), (7 * MOST_ROWS - 1, 7)],
-)
-def test_slices_cover_the_span_without_gaps(n_rows, count):
-    slices = slices_of(SPAN, n_rows)
-    assert len(slices) == count
-    assert (slices[0].start_ns, slices[-1].end_ns) == SPAN
-    assert all(a.end_ns == b.start_ns for a, b in itertools.pairwise(slices))
-    lengths = [time.end_ns - time.start_ns for time in slices]
-    assert max(lengths) - min(lengths) <= 1
 
 
 def epochs(*times_ns: int):
     return filled(EPOCHS, len(times_ns), {"epoch": list(times_ns), "frame_number": times_ns})
 
 
-def test_a_slice_has_its_start_and_not_its_end():
+def test_rows_outside_the_span_are_left_out():
     rows = epochs(9, 10, 10, 19, 20, 21)
-    (found,) = rows_between([rows], Span(10, 20), "epoch")
-    assert found["frame_number"].to_pylist() == [10, 10, 19]
+    (found,) = in_slices([rows], Span(10, 20), "epoch")
+    assert found[0]["frame_number"].to_pylist() == [10, 10, 19]
 
 
-def test_slices_together_have_every_row_once_in_order():
+@pytest.mark.parametrize(("most", "count"), [(501, 1), (500, 2), (100, 6)])
+def test_slices_together_have_every_row_once_in_order(monkeypatch, most, count):
+    monkeypatch.setattr(time_slices, "MOST_ROWS", most)
     rng = np.random.default_rng(0)
-    tables = [
-        epochs(*np.sort(rng.integers(SPAN.start_ns, SPAN.end_ns, n)).tolist()) for n in (0, 1, 500)
-    ]
-    cut = [rows_between(tables, time, "epoch") for time in slices_of(SPAN, 5 * MOST_ROWS)]
-    assert all(len(of_slice) == len(tables) for of_slice in cut)
-    for k, rows in enumerate(tables):
-        times = [t for of_slice in cut for t in of_slice[k]["frame_number"].to_pylist()]
-        assert times == rows["frame_number"].to_pylist()
+    times = [np.sort(rng.integers(SPAN.start_ns, SPAN.end_ns, n)) for n in (0, 1, 500)]
+    cut = list(in_slices([epochs(*of_table.tolist()) for of_table in times], SPAN, "epoch"))
+    assert len(cut) == count
+    for k, of_table in enumerate(times):
+        found = [t for of_slice in cut for t in of_slice[k]["frame_number"].to_pylist()]
+        assert found == of_table.tolist()
+
+
+def test_a_table_in_another_order_is_sorted():
+    (found,) = in_slices([epochs(15, 11, 13)], Span(10, 20), "epoch")
+    assert found[0]["frame_number"].to_pylist() == [11, 13, 15]
+
+
+def test_no_rows_are_one_empty_slice():
+    assert [rows[0].num_rows for rows in in_slices([epochs()], SPAN, "epoch")] == [0]
+    assert list(in_slices([], SPAN, "epoch")) == [[]]
