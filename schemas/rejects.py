@@ -222,6 +222,10 @@ class FrameStatus(Declared):
         "The frame has too few centroids, or its field too few stars.",
     )
     NO_MATCH = "no_match", "No attitude explains the centroids with enough certainty."
+    NOT_SEARCHED = (
+        "not_searched",
+        "The searches of frames near it found nothing, so this one was only followed from others.",
+    )
     TIME_LIMIT = "time_limit", "The search was stopped by its time limit."
     NO_CALIBRATION = "no_calibration", "No calibration is valid for the frame."
 

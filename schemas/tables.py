@@ -54,7 +54,7 @@ FRAMES = schema(
             pa.string(),
             null=True,
             doc="Why there is no attitude from stars: no_centroids, too_few_stars, no_match, "
-            "no_calibration, time_limit; null where there is one.",
+            "not_searched, no_calibration, time_limit; null where there is one.",
         ),
         *[
             column(

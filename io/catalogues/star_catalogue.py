@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ def read_star_catalogue(which: str) -> pa.Table:
         Where the file is missing, or is not a catalogue.
     """
     if which == hipparcos.NAME:
-        return hipparcos.read_hipparcos()
+        return _hipparcos()
     label = _label(which)
     try:
         stars = conform(STAR_CATALOGUE, pq.read_table(which, partitioning=None))
@@ -43,6 +44,12 @@ def read_star_catalogue(which: str) -> pa.Table:
                 f"{which}: row {invalid[0] + 1}, {name} is not a number; {BUILD} again"
             )
     return labelled(stars, label)
+
+
+@cache
+def _hipparcos() -> pa.Table:
+    """Return the catalogue of the package, which never changes; every task asks for it."""
+    return hipparcos.read_hipparcos()
 
 
 def check_star_catalogue(which: str) -> None:

@@ -149,7 +149,7 @@ def _pairs(
     kept: dict[str, npt.NDArray[Any]] = dict(cached(key, make))
     slope, intercept = kept.pop("line").tolist()
     chord = KVector(kept.pop("s"), kept.pop("below"), slope, intercept)
-    return PairTable(chord, **kept)
+    return PairTable(chord, **kept, n_stars=n)
 
 
 def _disk_key(what: str, catalogue: Catalogue, *inputs: float) -> str:

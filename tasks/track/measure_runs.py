@@ -52,27 +52,29 @@ def measure_runs(
     time_s = (frames.time_ns[sightings.frame] - frames.time_ns[0]) / 1e9
     first = np.repeat(bounds[:-1], np.diff(bounds))
     last = np.repeat(bounds[1:], np.diff(bounds))
-    smooth, *_ = directions_at(
-        first, last, time_s[order], 0.0, time_s[order], sightings.u_icrs[order],
-        sightings.cov_noise[order], sightings.cov_bias[order], window_s,
-    )  # fmt: skip
-    miss = np.linalg.norm(sightings.u_icrs[order] - smooth, axis=1)
+    u, t = np.take(sightings.u_icrs, order, axis=0), time_s[order]
+    noise = np.take(sightings.cov_noise, order, axis=0)
+    bias = np.take(sightings.cov_bias, order, axis=0)
+    smooth, *_ = directions_at(first, last, t, 0.0, t, u, noise, bias, window_s)
+    miss = np.linalg.norm(u - smooth, axis=1)
+    variance = np.trace(noise, axis1=1, axis2=2)
     runs = []
     for lo, hi in itertools.pairwise(bounds):
         members = order[lo:hi]
-        rate, sigma = _mean_rate(
-            time_s[members], sightings.u_icrs[members], sightings.cov_noise[members]
-        )
+        rate, sigma = _mean_rate(t[lo:hi], u[lo:hi], variance[lo:hi])
         still = rate < max(STAR_RATE_SIGMA * sigma, STAR_DRIFT) and sigma < STAR_RATE_KNOWN
         residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / camera.pixel_rad
         runs.append(TrackRun(members, rate, still, residual))
     return runs
 
 
-def _mean_rate(time_s: Array, u: Array, cov_noise: Array) -> tuple[float, float]:
-    """Return the mean rate of a run and its 1-sigma error [rad/s]."""
+def _mean_rate(time_s: Array, u: Array, variance: Array) -> tuple[float, float]:
+    """Return the mean rate of a run and its 1-sigma error [rad/s].
+
+    `variance` is the trace of each direction's independent error [rad^2].
+    """
     t = time_s - time_s.mean()
     lever = float(np.sum(t * t))
     slope = t @ (u - u[0]) / lever
-    sigma = np.sqrt(np.mean(np.trace(cov_noise, axis1=1, axis2=2)) / lever)
+    sigma = np.sqrt(np.mean(variance) / lever)
     return float(np.linalg.norm(slope)), float(sigma)

@@ -30,7 +30,7 @@ WIDEST_PREDICTION = 0.02  # rad; wider ones are no better than being lost
 MOST_TURNED = 0.5  # rad, between two frames of a tracked sensor
 # Stars this far around a field are listed once and serve while the sensor turns [rad].
 MARGIN = 0.03
-TOO_FEW, NO_MATCH = 1, 2  # status codes
+TOO_FEW, NO_MATCH, NOT_SEARCHED, TIME_LIMIT = 1, 2, 3, 4  # status codes
 
 
 class Memory(NamedTuple):
@@ -272,7 +272,8 @@ def follow(walk, frames, priors, stars, rule, memory, solutions, status):
     solutions : Solutions, out
         Frames that are solved already are not changed.
     status : (F,) int8, out
-        TOO_FEW centroids, NO_MATCH; 0 where solved.
+        TOO_FEW centroids, NO_MATCH, NOT_SEARCHED; 0 where solved. Frames with NO_MATCH or
+        TIME_LIMIT are not searched again.
     """
     n = len(stars.u)
     room = _FieldScratch(
@@ -291,11 +292,12 @@ def follow(walk, frames, priors, stars, rule, memory, solutions, status):
             _clear(k, frames.first, solutions)
             # Where priors were confirmed, a frame that fails has too few stars, not a wrong prior.
             has_prior = not math.isnan(priors.sigma_rad[k])
-            if walk.searches and not (has_prior and memory.held[1] == 1):
-                if memory.held[2] == 0:
-                    return k
-                memory.held[2] -= 1
-            if status[k] == 0:
+            if has_prior and memory.held[1] == 1:
                 status[k] = NO_MATCH
+            elif status[k] != NO_MATCH and status[k] != TIME_LIMIT:
+                if walk.searches and memory.held[2] == 0:
+                    return k
+                memory.held[2] = max(memory.held[2] - 1, 0)
+                status[k] = NOT_SEARCHED
         k += walk.step
     return k

@@ -1,6 +1,7 @@
 """All frames of one sensor over a span: its errors and its faintest star are learned from a sample,
 then every frame is identified."""
 
+from collections.abc import Iterator
 from functools import partial
 from typing import NamedTuple, Protocol
 
@@ -23,18 +24,26 @@ from epipole.tasks.algorithms.star_identification.sensor_limits import (
     scale_of,
     zero_point,
 )
-from epipole.tasks.algorithms.star_identification.sequence import Priors, identify_sequence
+from epipole.tasks.algorithms.star_identification.sequence import (
+    Priors,
+    identify_again,
+    identify_sequence,
+)
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-SAMPLED = (4, 6)  # number of runs of frames, and their length, from which a sensor is learned
-PROBED = (3, 2)  # the same, of this sample, to try scales of the errors until one works
+PROBED = 3  # frames, spread over all, which are searched until any is identified
+SAMPLED = 24  # frames around these from which a sensor is learned
+# Centroids may be mostly objects or clutter: skies that are brighter by this are tried as well.
+BRIGHTER_MAG = (1.0, 2.0)
+LEAST_IN_VIEW = 5.0  # stars in a field, on average, of a sky that is worth a try
 KNOWN_SCALES = (1.0, 3.0, 0.4)  # factors to try on errors that the log or the settings state
 UNKNOWN_SCALES_PX = (0.5, 1.5, 0.15)  # errors to try where none are stated
 LEAST_SPREAD_MAG = 0.15  # of brightness: a sample may scatter less than all
+WRONG_GATE = 0.02  # a sample that misses the errors of all frames by more is corrected
 DEEPER_MAG = 2.0  # how far beyond the first guess the faintest star is searched for
 
 
@@ -89,18 +98,34 @@ def identify_sensor(
         limit = skies.limit_for(density / spots.optics[0].solid_angle_sr)
     known = _Known(1.0, limit, magnitude_limit is None, how, True, not stated)
     whole = _Sample(t_s, spots, priors)
-    sample = whole.take(usable[_runs(len(usable), SAMPLED)])
-    known, sampled = _first_scale(
-        sample, skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
+    rows = usable[_spread(len(usable), PROBED)]
+    known, probed = _first_scale(
+        whole.take(rows), skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
     )
-    known = _learn(sample.spots, sampled, skies, known)
-    solutions, status = _identify(whole, skies, known)
-    if not any(sampled) and solutions.solved.any():  # the sample was poor: learn from the others
+    hopeless = not any(probed)
+    if not hopeless:
+        known, whole = _learn_around(rows, probed, usable, whole, skies, known)
+    solutions, status = _identify(whole, skies, known, hopeless)
+    if hopeless and solutions.solved.any():  # the probe was poor: learn from the others
         solved = np.flatnonzero(solutions.solved)
-        rows = solved[_runs(len(solved), SAMPLED)]
-        known = _learn(whole.take(rows).spots, [solutions.frame(i) for i in rows], skies, known)
-        solutions, status = _identify(whole, skies, known)
+        rows = solved[_spread(len(solved), SAMPLED)]
+        sampled = [solutions.frame(i) for i in rows]
+        known = _learn(whole.take(rows).spots, sampled, skies, known)
+        solutions, status = _identify(whole.anchored(rows, sampled), skies, known)
     residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
+    if known.adjusted and abs(residuals.scale - 1) > WRONG_GATE:
+        known = known._replace(scale=known.scale * residuals.scale)
+        sky, frames = skies.sky(known.limit), spots.frames(known.scale, known.use_flux)
+        again = identify_again(t_s, frames, solutions, sky, known.how)
+        if again.solved[solutions.solved].all():
+            solutions = again
+            status = [None if solved else s for s, solved in zip(status, again.solved, strict=True)]
+            residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
+        else:
+            solutions, residuals = (
+                solutions.rescaled(residuals.scale),
+                residuals._replace(scale=1.0),
+            )
     if residuals.dof > 0 and (known.adjusted or is_significant(residuals)):
         known = known._replace(scale=known.scale * residuals.scale)
         solutions = solutions.rescaled(residuals.scale)
@@ -119,22 +144,38 @@ class _Known(NamedTuple):
 
 
 class _Sample(NamedTuple):
+    """Frames, with their priors; `anchors` are frames whose prior is an earlier solution."""
+
     t_s: Array
     spots: UnscaledCentroids
     priors: Priors
+    anchors: bool = False
 
     def take(self, rows: npt.NDArray[np.int64]) -> "_Sample":
         priors = Priors(self.priors.R_sensor_from_icrs[rows], self.priors.sigma_rad[rows])
-        return _Sample(self.t_s[rows], self.spots.take(rows), priors)
+        return _Sample(self.t_s[rows], self.spots.take(rows), priors, self.anchors)
+
+    def anchored(self, rows: npt.NDArray[np.int64], solutions: list[Solution | None]) -> "_Sample":
+        """Return the frames with these solutions as priors, where they have none of their own."""
+        R, sigma = self.priors.R_sensor_from_icrs.copy(), self.priors.sigma_rad.copy()
+        for row, solution in zip(rows, solutions, strict=True):
+            if solution is not None and np.isnan(self.priors.sigma_rad[row]):
+                R[row] = solution.R_sensor_from_icrs
+                # Errors and sky were other ones: it may be off by more than it says.
+                sigma[row] = 3.0 * np.sqrt(np.trace(solution.cov_rad2) / 3.0)
+        return self._replace(priors=Priors(R, sigma), anchors=True)
 
 
-def _runs(n: int, wanted: tuple[int, int]) -> npt.NDArray[np.int64]:
-    """Return rows of n in runs (number, length), spread evenly: the first frame of a run has to be
-    searched, the others can be followed."""
-    count, length = wanted
-    starts = np.linspace(0, max(n - length, 0), count).astype(np.int64)
-    rows = np.unique(starts[:, None] + np.arange(length))
-    return rows[rows < n]
+def _spread(n: int, wanted: int) -> npt.NDArray[np.int64]:
+    """Return so many rows of n, spread evenly."""
+    return np.unique(np.linspace(0, max(n - 1, 0), wanted).astype(np.int64))[:n]
+
+
+def _around(n: int, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return `SAMPLED` rows of n in runs around these: followed, they need no search."""
+    length = min(-(-SAMPLED // len(rows)), n)
+    start = np.clip(rows - length // 2, 0, n - length)
+    return np.unique(start[:, None] + np.arange(length))
 
 
 def _fill_sigmas(spots: UnscaledCentroids) -> tuple[UnscaledCentroids, bool]:
@@ -186,36 +227,84 @@ def _faintest(
 
 
 def _first_scale(
-    sample: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...]
+    probe: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...]
 ) -> tuple[_Known, list[Solution | None]]:
     """Return what is known, with a scale of errors that identifies frames, and the solutions."""
-    probe = sample.take(_runs(len(sample.t_s), PROBED))
     quick = known.how._replace(time_limit_s=known.how.time_limit_s / 4)
-    flux = bool(np.isfinite(probe.spots.instrumental_mag).any())
-    best, best_count = known._replace(scale=scales[0]), 0
-    # Flux may be unrelated to brightness; then it misleads.
-    for use_flux, scale in [(f, s) for f in ([True, False] if flux else [True]) for s in scales]:
-        if not use_flux and best_count:
-            break
-        tried = known._replace(scale=scale, how=quick, use_flux=use_flux)
-        count = int(_identify(probe, skies, tried)[0].solved.sum())
-        if count > best_count:
-            best, best_count = known._replace(scale=scale, use_flux=use_flux), count
-        if 3 * count >= 2 * len(probe.t_s):
-            break
-    if best_count == 0:
-        return best, [None] * len(sample.t_s)
-    return best, _identify(sample, skies, best)[0].each()
+    for tried in _attempts(probe.spots, skies, known, scales):
+        found = _identify(probe, skies, tried._replace(how=quick))[0].each()
+        if any(found):
+            return _likeliest_scale(probe.spots, found, skies, tried, scales)
+    return known._replace(scale=scales[0]), [None] * len(probe.t_s)
 
 
-def _identify(sample: _Sample, skies: Skies, known: _Known) -> tuple[Solutions, list[str | None]]:
-    """Return the frames' solutions and status."""
+def _attempts(
+    probe: UnscaledCentroids, skies: Skies, known: _Known, scales: tuple[float, ...]
+) -> Iterator[_Known]:
+    """Yield what may be assumed of a sensor, the likeliest first."""
+    flux = bool(np.isfinite(probe.instrumental_mag).any())
+    area = probe.optics[0].solid_angle_sr
+    for use_flux in [True, False] if flux else [True]:  # it may be unrelated to brightness
+        tried = known._replace(scale=scales[0], use_flux=use_flux)
+        yield tried
+        for brighter in BRIGHTER_MAG if known.limit_is_open and use_flux else ():
+            if skies.sky(known.limit - brighter).rho * area > LEAST_IN_VIEW:
+                yield tried._replace(limit=known.limit - brighter)
+        for scale in scales[1:]:
+            yield tried._replace(scale=scale)
+
+
+def _likeliest_scale(
+    spots: UnscaledCentroids,
+    solutions: list[Solution | None],
+    skies: Skies,
+    known: _Known,
+    scales: tuple[float, ...],
+) -> tuple[_Known, list[Solution | None]]:
+    """Return what is known, with the scale of errors that explains solved frames best, and the
+    solutions with it."""
+    best, most, chosen = known, -np.inf, solutions
+    for scale in (known.scale, *scales):
+        frames = spots.frames(scale, known.use_flux).each()
+        again = rematch(frames, solutions, skies.sky(known.limit), known.how)
+        evidence = sum(s.evidence for s in again if s is not None)
+        if any(again) and evidence > most:
+            best, most, chosen = known._replace(scale=scale), evidence, again
+    return best, chosen
+
+
+def _learn_around(
+    rows: npt.NDArray[np.int64],
+    solutions: list[Solution | None],
+    usable: npt.NDArray[np.int64],
+    whole: _Sample,
+    skies: Skies,
+    known: _Known,
+) -> tuple[_Known, _Sample]:
+    """Return what is known, learned from the frames around solved ones, and all frames with
+    these as anchors."""
+    # With the errors, zero point and faintest star of the solved ones, more can be followed.
+    known = _learn(whole.take(rows).spots, solutions, skies, known)
+    solved = np.array([s is not None for s in solutions])
+    near = usable[_around(len(usable), np.searchsorted(usable, rows[solved]))]
+    anchored = whole.anchored(rows, solutions)
+    sampled = _identify(anchored.take(near), skies, known)[0].each()
+    known = _learn(whole.take(near).spots, sampled, skies, known)
+    return known, whole.anchored(near, sampled) if any(sampled) else anchored
+
+
+def _identify(
+    sample: _Sample, skies: Skies, known: _Known, hopeless: bool = False
+) -> tuple[Solutions, list[str | None]]:
+    """Return the frames' solutions and status; `hopeless` ones have failed so far."""
     if not len(sample.t_s):
         return unsolved(sample.spots.first), []
     frames = sample.spots.frames(known.scale, known.use_flux)
     sky, grid = skies.sky(known.limit), skies.grid(known.limit, _grid_radius(frames, known.how))
     pairs = partial(skies.pairs, known.limit, frames.optics[0])
-    return identify_sequence(sample.t_s, frames, sample.priors, sky, grid, pairs, known.how)
+    return identify_sequence(
+        sample.t_s, frames, sample.priors, sky, grid, pairs, known.how, sample.anchors, hopeless
+    )
 
 
 def _grid_radius(frames: SensorCentroids, how: Search) -> float:

@@ -9,6 +9,8 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.star_identification.following import (
     NO_MATCH,
+    NOT_SEARCHED,
+    TIME_LIMIT,
     TOO_FEW,
     FrameArrays,
     Walk,
@@ -18,6 +20,7 @@ from epipole.tasks.algorithms.star_identification.following import (
 )
 from epipole.tasks.algorithms.star_identification.frames.frame import (
     Search,
+    Solution,
     identify_lost,
     rule_of,
 )
@@ -26,6 +29,7 @@ from epipole.tasks.algorithms.star_identification.frames.spots import (
     Solutions,
     unsolved,
 )
+from epipole.tasks.algorithms.star_identification.search.evidence import MatchRule
 from epipole.tasks.algorithms.star_identification.search.field import StarPlaces
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
@@ -33,11 +37,15 @@ from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-MAX_SKIPPED = 32  # frames between two searches, where they keep failing; the way back tries them
-TIME_LIMIT, NO_CENTROIDS = 3, 4
+# Where searches keep failing: after this many, frames are skipped, ever more of them, up to so many
+# or to this share of the frames since the last success. The way back tries them.
+PATIENCE = 6
+MAX_SKIPPED, SKIPPED_SHARE = 32, 1 / 32
+NO_CENTROIDS = 5
 STATUS = {
     TOO_FEW: "too_few_stars",
     NO_MATCH: "no_match",
+    NOT_SEARCHED: "not_searched",
     TIME_LIMIT: "time_limit",
     NO_CENTROIDS: "no_centroids",
 }
@@ -67,47 +75,129 @@ def identify_sequence(
     grid: SkyGrid,
     pairs: Callable[[], PairTable],
     how: Search,
+    anchored: bool = False,
+    hopeless: bool = False,
 ) -> tuple[Solutions, list[str | None]]:
     """Identify frames in order of time; frames that fail are tried again backward in time.
 
     `pairs` is called when the whole sky has to be searched. A sensor with good priors does not
     need them.
 
+    Parameters
+    ----------
+    anchored
+        Some priors are solutions: the others are followed from these, both ways, before any search.
+    hopeless
+        Searches have failed before: frames are skipped from the first failure on.
+
     Returns
     -------
     solutions
         Attitudes and stars.
     status : one per frame
-        None where solved, else no_centroids, too_few_stars, no_match or time_limit.
+        None where solved, else no_centroids, too_few_stars, no_match, not_searched or time_limit.
     """
-    n, n_stars = len(frames.beta), len(sky.catalogue.star_id)
+    n = len(frames.beta)
     solutions, status = unsolved(frames.first), np.zeros(n, np.int8)
     arrays, rule = _arrays(t_s, frames), rule_of(how, sky)
     stars = StarPlaces(sky.catalogue.u_icrs, sky.catalogue.magnitude)
-    memory, failures, k = new_memory(n_stars), 0, 0
-    while True:
-        walk = Walk(k, n, 1, True)
-        k = int(follow(walk, arrays, priors, stars, rule, memory, solutions, status))
-        if k == n:
-            break
-        solution, cut_short = identify_lost(frames.frame(k), sky, grid, pairs(), how)
-        if solution is None:
-            # Searches that keep failing (clouds, a night without stars) become rarer and rarer, so
-            # that a dark log takes bounded time.
-            failures += 1
-            memory.held[2] = min(2 ** min(max(failures - 6, 0), 10) - 1, MAX_SKIPPED)
-            status[k] = TIME_LIMIT if cut_short else NO_MATCH
-        else:
-            failures = 0
-            solutions.enter(k, solution)
-            remember(memory, t_s[k], solution.R_sensor_from_icrs, solution.cov_rad2)
-        k += 1
+    sequence = _Sequence(frames, arrays, stars, rule, solutions, status)
+    forth, back, none = Walk(0, n, 1, False), Walk(n - 1, -1, -1, False), no_priors(n)
+
+    def search(k: int) -> tuple[Solution | None, bool]:
+        return identify_lost(frames.frame(k), sky, grid, pairs(), how)
+
+    if anchored:
+        sequence.follow(forth, priors)
+        sequence.follow(back, none)
+    if not solutions.solved.all():
+        hopeless &= n > MAX_SKIPPED
+        sequence.go(forth, priors, search, PATIENCE + 5 if hopeless else 0)
     if solutions.solved.any() and not solutions.solved.all():
-        # Backward, without priors: those were tried on the way forward.
-        walk, memory = Walk(n - 1, -1, -1, False), new_memory(n_stars)
-        follow(walk, arrays, no_priors(n), stars, rule, memory, solutions, status)
+        # Backward, without priors: those were tried on the way forward. What lies behind a slew
+        # and was skipped is searched.
+        before = solutions.solved.sum()
+        sequence.go(back, none, search, 0)
+        if solutions.solved.sum() > before:
+            sequence.follow(forth, none)
     status[np.diff(frames.first) == 0] = NO_CENTROIDS
     return solutions, [STATUS.get(code) for code in status.tolist()]
+
+
+def identify_again(
+    t_s: Array, frames: SensorCentroids, solutions: Solutions, sky: Sky, how: Search
+) -> Solutions:
+    """Return the frames identified again near their solutions, as with other errors.
+
+    No sky is searched. Frames that are not solved are tried from the others.
+    """
+    n = len(frames.beta)
+    again, status = unsolved(frames.first), np.zeros(n, np.int8)
+    stars = StarPlaces(sky.catalogue.u_icrs, sky.catalogue.magnitude)
+    sequence = _Sequence(frames, _arrays(t_s, frames), stars, rule_of(how, sky), again, status)
+    # Errors were other ones: an attitude may be off by more than its covariance says.
+    sigma = 3.0 * np.sqrt(np.trace(solutions.cov_rad2, axis1=1, axis2=2) / 3.0)
+    sequence.follow(Walk(0, n, 1, False), Priors(solutions.R_sensor_from_icrs, sigma))
+    return again
+
+
+class _Sequence(NamedTuple):
+    """Frames on the way through them; solutions and status are changed."""
+
+    frames: SensorCentroids
+    arrays: FrameArrays
+    stars: StarPlaces
+    rule: MatchRule
+    solutions: Solutions
+    status: npt.NDArray[np.int8]
+
+    def follow(self, walk: Walk, priors: Priors) -> None:
+        """Identify frames from those before them, on one walk, without a search."""
+        memory = new_memory(len(self.stars.u))
+        follow(walk, self.arrays, priors, self.stars, self.rule, memory, self.solutions,
+               self.status)  # fmt: skip
+
+    def go(
+        self,
+        walk: Walk,
+        priors: Priors,
+        search: Callable[[int], tuple[Solution | None, bool]],
+        failures: int,
+    ) -> None:
+        """The same, but frames that fail are searched; so many searches have failed before."""
+        memory, k = new_memory(len(self.stars.u)), walk.start
+        while True:
+            k = int(follow(walk._replace(start=k, searches=True), self.arrays, priors, self.stars,
+                           self.rule, memory, self.solutions, self.status))  # fmt: skip
+            if k == walk.stop:
+                return
+            solution, cut_short = search(k)
+            if solution is None:
+                failures += 1
+                memory.held[2] = _skipped(failures, self._refused(k, walk.step))
+                self.status[k] = TIME_LIMIT if cut_short else NO_MATCH
+            else:
+                failures = 0
+                self.status[k] = 0
+                self.solutions.enter(k, solution)
+                remember(memory, self.arrays.t_s[k], solution.R_sensor_from_icrs, solution.cov_rad2)
+            k += walk.step
+
+    def _refused(self, k: int, step: int) -> int:
+        """Return how many frames before k, on this walk, are not solved."""
+        before = self.solutions.solved[:k][::-1] if step > 0 else self.solutions.solved[k + 1 :]
+        solved = np.flatnonzero(before)
+        return int(solved[0]) if len(solved) else len(before)
+
+
+def _skipped(failures: int, frames: int) -> int:
+    """Return how many frames are not searched after so many failures over so many frames.
+
+    A sensor without stars takes bounded time. One that can be identified again is, however
+    long it could not: from some frame on, or for a while that is longer than this.
+    """
+    most = max(MAX_SKIPPED, int(SKIPPED_SHARE * frames))
+    return min(2 ** min(max(failures - PATIENCE, 0), 20) - 1, most)
 
 
 def _arrays(t_s: Array, frames: SensorCentroids) -> FrameArrays:

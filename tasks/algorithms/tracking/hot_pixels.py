@@ -156,14 +156,27 @@ def _fixed_places(
         column = np.clip(x_px / cell + shift_x, 0, width - 1).astype(np.int64)
         row = np.clip(y_px / cell + shift_y, 0, height - 1).astype(np.int64)
         index = row * width + column
-        count = np.bincount(index[~taken], minlength=width * height)
-        for busy in np.flatnonzero(count >= max(SHARE * n_frames, FEWEST)):
-            inside = np.flatnonzero((index == busy) & ~taken)
+        order = np.argsort(index, kind="stable")
+        ordered = index[order]
+        cells, count = np.unique(index[~taken], return_counts=True)
+        for busy in cells[count >= max(SHARE * n_frames, FEWEST)].tolist():
+            inside = _in_cells(order, ordered, busy, busy)
+            inside = inside[~taken[inside]]
             if not len(inside):  # they belong to a place in a neighbouring cell
                 continue
             middle_x, middle_y = np.median(x_px[inside]), np.median(y_px[inside])
-            near = np.hypot(x_px - middle_x, y_px - middle_y) < reach_px
-            members = np.flatnonzero(near & ~taken)
+            # A place is at most half a cell wide on each side of its middle.
+            around = [busy + step * width for step in (-1, 0, 1)]
+            near = np.concatenate([_in_cells(order, ordered, c - 1, c + 1) for c in around])
+            near = np.sort(near)
+            off = np.hypot(x_px[near] - middle_x, y_px[near] - middle_y)
+            members = near[(off < reach_px) & ~taken[near]]
             taken[members] = True
             out.append(members)
     return out
+
+
+def _in_cells(order: Indices, ordered: Indices, first: int, last: int) -> Indices:
+    """Return the detections in the cells from `first` to `last`, of sorted cells."""
+    lo, hi = np.searchsorted(ordered, [first, last + 1])
+    return order[lo:hi]

@@ -34,6 +34,7 @@ MISSED = np.log(1.0 - P_DETECTION)
 N_RATES = 24  # classes of the rate, for which the best evidence is tabulated
 SLOWEST_RAD_S = 1e-6  # upper end of the first class
 MOST_PAIRS = 500_000  # per frame: where more are possible, the fastest objects are not searched for
+FEW_TO_ASK = 1_000  # up to so many pairs, only the classes of rate that they have are tabulated
 FEW_PAIRS = 50_000  # up to so many, pairs that are two frames apart are tried as well
 
 
@@ -163,8 +164,10 @@ def _class_rates(max_rate):
 
 
 @kernel
-def _best_evidence(f, g, times, density, variance, class_rates):
+def _best_evidence(f, g, times, density, variance, class_rates, asked):
     """Return the most evidence that frames before g can still add, (N_RATES, frames + 1).
+
+    Only for the classes of rate that are asked for; none in the others.
 
     Row c is for a class of rate, column k for the frames g - 1 - k and before. Predictions are best
     for a chain without a miss, and for the slowest of a class, which bends least. So no chain of
@@ -174,6 +177,8 @@ def _best_evidence(f, g, times, density, variance, class_rates):
     out = np.zeros((N_RATES, n_back + 1))
     P = np.empty(SIZE)
     for c in range(N_RATES):
+        if not asked[c]:
+            continue
         rate = class_rates[c]
         begin_covariance(rate, times[g] - times[f], variance, variance, P)
         at = times[g]
@@ -295,6 +300,27 @@ def _class_of(rate, max_rate):
 
 
 @kernel
+def _asked_rates(f, g, detections, density, rule):
+    """Return which classes of rate the pairs of two frames may have: all where they are many."""
+    offsets, track = detections.offsets, detections.track
+    out = np.zeros(N_RATES, np.bool_)
+    if density[0] * density[f - g] * rule.field_sr**2 > FEW_TO_ASK:
+        out[:] = True
+        return out
+    dt = detections.times[f] - detections.times[g]
+    for j in range(offsets[f], offsets[f + 1]):
+        if track[j] != NONE:
+            continue
+        for i in range(offsets[g], offsets[g + 1]):
+            if track[i] == NONE:
+                chord2 = distance2(detections.directions[i], detections.directions[j])
+                rate = np.sqrt(chord2) / dt
+                if rate <= rule.max_rate:
+                    out[_class_of(rate, rule.max_rate)] = True
+    return out
+
+
+@kernel
 def _may_chain(pair, detections, recent, rule, room):
     """Return whether the frame before a pair has a detection where the pair leads; quickly."""
     j, g, i, chord2, dt = pair.j, pair.g, pair.i, pair.chord2, pair.dt
@@ -385,7 +411,11 @@ def _strongest_chains(f, depth, detections, recent, rule):
             continue
         pairs_sr = density[0] * density[f - g] * field_sr
         wanted = np.log(pairs_sr * field_sr) + rule.enough
-        best = _best_evidence(f, g, times, density, variance, class_rates)
+        asked = _asked_rates(f, g, detections, density, rule)
+        if not asked.any():
+            continue
+        asked[0] = True  # tells how far back a chain is followed
+        best = _best_evidence(f, g, times, density, variance, class_rates, asked)
         n_back = max(_useful_depth(best, wanted), min(depth - (f - g) - 1, best.shape[1] - 1))
         for c in range(N_RATES):
             best[c] -= best[c, n_back]

@@ -29,7 +29,7 @@ class Votes(NamedTuple):
     """Votes of one pivot's companions.
 
     cast : (stars << MOST_BINS_LOG2,) uint8, votes for a star and a turn
-    reached : (256,) how many of these cells have at least so many votes
+    reached : (256,) how many of these cells have at least so many votes; from two on
     companion, low, high : (n,) the companions and their ranges of pairs
     angle, wide : (n,) their position angles about the pivot and the tolerances of these, in
         parts of `TURN`
@@ -109,6 +109,13 @@ def is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
 
 
 @borrowing_kernel
+def possible_ways(m_ij, mag_gate):
+    """Return whether the pivot may be the first, brighter star of a pair, and the second, by the
+    difference of magnitudes that `shown_magnitudes` returns (compiled)."""
+    return not m_ij > 1.414 * mag_gate, not m_ij < -1.414 * mag_gate
+
+
+@borrowing_kernel
 def count_votes(problem, i, order, n_least, n_votes, votes):
     """Count the votes of pivot i's companions; return companions, votes cast and log2 of the
     bins of turn (compiled).
@@ -130,8 +137,8 @@ def count_votes(problem, i, order, n_least, n_votes, votes):
         n, cast, widest = n + 1, cast + 2 * (hi - lo), widest + wide
         if n >= n_least and cast > n_votes:
             break
-    log2 = turn_bits(cast, len(problem.stars.u), widest / max(n, 1))
-    votes.cast[: len(problem.stars.u) << log2] = 0
+    log2 = turn_bits(cast, pairs.n_stars, widest / max(n, 1))
+    votes.cast[: pairs.n_stars << log2] = 0
     votes.reached[:] = 0
     for m in range(n):
         _vote(problem, i, m, log2, votes)
@@ -144,19 +151,23 @@ def _vote(problem, i, m, log2, votes):
     pairs, magnitude = problem.pairs, problem.stars.magnitude
     m_i, m_j, m_ij = shown_magnitudes(problem, i, votes.companion[m])
     mag_gate = MAG_GATE * problem.rule.spread
-    shift, wide = 16 - log2, votes.wide[m]
-    mask = (1 << log2) - 1
+    angle, wide = votes.angle[m], votes.wide[m]
+    as_first, as_second = possible_ways(m_ij, mag_gate)
     for p in range(votes.low[m], votes.high[m]):
-        for way in range(2):
-            if way == 0:
-                a, b, angle = pairs.first[p], pairs.second[p], int(pairs.at_first[p])
-            else:
-                a, b, angle = pairs.second[p], pairs.first[p], int(pairs.at_second[p])
-            if is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
-                continue
-            low = angle - votes.angle[m] - wide
-            for turn in range(low >> shift, ((low + 2 * wide) >> shift) + 1):
-                cell = (a << log2) + (turn & mask)
-                count = votes.cast[cell] + np.uint8(1)
-                votes.cast[cell] = count
-                votes.reached[count] += 1
+        a, b = pairs.first[p], pairs.second[p]
+        if as_first and not is_odd(magnitude, a, b, m_i, m_j, m_ij, mag_gate):
+            _cast(a, int(pairs.at_first[p]) - angle, wide, log2, votes)
+        if as_second and not is_odd(magnitude, b, a, m_i, m_j, m_ij, mag_gate):
+            _cast(b, int(pairs.at_second[p]) - angle, wide, log2, votes)
+
+
+@borrowing_kernel
+def _cast(star, turn, wide, log2, votes):
+    """Count one vote in every cell that its tolerance touches."""
+    shift, mask = 16 - log2, (1 << log2) - 1
+    for k in range((turn - wide) >> shift, ((turn + wide) >> shift) + 1):
+        cell = (star << log2) + (k & mask)
+        count = votes.cast[cell] + np.uint8(1)
+        votes.cast[cell] = count
+        if count > 1:  # one vote is never enough
+            votes.reached[count] += 1

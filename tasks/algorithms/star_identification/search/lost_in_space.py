@@ -21,11 +21,8 @@ from epipole.tasks.algorithms.geometry.attitude import (
 )
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.companion_votes import (
-    MAG_GATE,
     count_votes,
-    is_odd,
     make_votes,
-    shown_magnitudes,
 )
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     choice_lost,
@@ -39,7 +36,14 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
     separation,
     try_pair,
 )
-from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
+from epipole.tasks.algorithms.star_identification.search.vote_sift import (
+    MOST_SIFTED,
+    add_vote,
+    agreeing,
+    count_again,
+    gather,
+    make_sift,
+)
 
 # Attitudes closer than this are the same one [rad, about 0.3 degrees].
 SAME_ATTITUDE = 5e-3
@@ -49,8 +53,8 @@ FLOOR, WORTH = -6.0, 2.0
 SLACK = 2  # a hypothesis may lack so many of the votes that are needed
 # Rounds, each more thorough than the one before: pivots; least companions of each; least share of
 # all centroids that are companions; votes after which no more companions are asked; how many of the
-# cells (a star and a turn) with most votes are tried.
-ROUNDS = ((6, 8, 0.5, 10_000, 32), (99, 0, 1.0, 0, 400))
+# cells (a star and a turn) with most votes are sifted.
+ROUNDS = ((6, 8, 0.5, 10_000, 128), (99, 0, 1.0, 0, 2000))
 # Hardly any field has fewer stars than this share of the mean.
 SPARSE = 0.35
 # About so many units of work take a second of CPU time.
@@ -126,43 +130,65 @@ def _is_clear(best, rule):
 
 
 @kernel
-def _try_counted(problem, i, n_companions, log2, votes, least_votes, room, best):
-    """Try the hypotheses of pivot i that have at least so many votes; return the work done."""
+def _try_counted(problem, i, n_votes, fine, n_tried, votes, sift, least_votes, room, best):
+    """Try the sifted hypotheses of pivot i that have at least so many votes; return the work done.
+
+    Only the votes of the first `n_tried` companions lead to a try.
+    """
     centroids, stars, pairs = problem.centroids, problem.stars, problem.pairs
     n, n_checked = len(centroids.u), len(room.gain)
-    work, mag_gate, shift = 0, MAG_GATE * problem.rule.spread, 16 - log2
-    # Of any hypothesis that has enough votes, one of these companions gave one.
-    for m in range(n_companions - least_votes + 1):
+    work, order, prepared = 0, room.no_order, -1
+    for k in range(n_votes):
+        m, p = sift.companion[k], sift.pair[k]
+        if m >= n_tried:
+            break
+        if agreeing(k, fine, sift) < least_votes:
+            continue
         j = votes.companion[m]
-        m_i, m_j, m_ij = shown_magnitudes(problem, i, j)
-        order = room.no_order
-        work += votes.high[m] - votes.low[m]
-        for p in range(votes.low[m], votes.high[m]):
-            for way in range(2):
-                if way == 0:
-                    a, b, turn = pairs.first[p], pairs.second[p], int(pairs.at_first[p])
-                else:
-                    a, b, turn = pairs.second[p], pairs.first[p], int(pairs.at_second[p])
-                turn = ((turn - votes.angle[m]) & (TURN - 1)) >> shift
-                cell = (a << log2) + turn
-                if votes.cast[cell] < least_votes:
-                    continue
-                if is_odd(stars.magnitude, a, b, m_i, m_j, m_ij, mag_gate):
-                    continue
-                if len(order) == 0:
-                    order = prepare_pair(problem, i, j, separation(centroids.u, i, j), room)
-                    work += 5 * n_checked
-                work += 3 * n_checked
-                odds = try_pair(stars, a, b, pairs.chord.s[p], order, FLOOR, room)
-                if odds < WORTH:
-                    votes.cast[cell] -= np.uint8(1)  # this vote was given by chance
-                    continue
-                work += 20 * n
-                evidence = judge_pair(problem, i, a, j, b, best.evidence[1], room)
-                _keep(evidence, room.R, best)
-                if _is_clear(best, problem.rule):
-                    return work
+        if prepared != m:
+            order, prepared = prepare_pair(problem, i, j, separation(centroids.u, i, j), room), m
+            work += 5 * n_checked
+        if sift.way[k] == 0:
+            a, b = pairs.first[p], pairs.second[p]
+        else:
+            a, b = pairs.second[p], pairs.first[p]
+        work += 3 * n_checked
+        odds = try_pair(stars, a, b, pairs.chord.s[p], order, FLOOR, room)
+        if odds < WORTH:
+            add_vote(k, fine, -1, sift)  # this vote was given by chance
+            continue
+        work += 20 * n
+        evidence = judge_pair(problem, i, a, j, b, best.evidence[1], room)
+        _keep(evidence, room.R, best)
+        if _is_clear(best, problem.rule):
+            break
     return work
+
+
+@kernel
+def _try_pivot(problem, i, order, least_companions, step, needed, votes, sift, room, best):
+    """Try the hypotheses of pivot i with most votes; return the work done."""
+    enough_votes, cells = ROUNDS[step][3], ROUNDS[step][4]
+    n_companions, cast, log2 = count_votes(problem, i, order, least_companions, enough_votes, votes)
+    work = cast + (problem.pairs.n_stars << log2) // 100
+    least_votes = max(needed - SLACK, 2)
+    while votes.reached[least_votes] > cells:
+        least_votes += 1
+    n_votes, fine = MOST_SIFTED + 1, 0
+    while n_votes > MOST_SIFTED and votes.reached[least_votes] > 0:
+        n_votes, fine = gather(problem, i, n_companions, log2, votes, least_votes, sift)
+        work += cast
+        least_votes += n_votes > MOST_SIFTED
+    if n_votes > MOST_SIFTED:
+        return work
+    count_again(n_votes, fine, sift)
+    # Of any hypothesis that has enough votes, one of these companions gave one.
+    n_tried = n_companions - least_votes + 1
+    return (
+        work
+        + n_votes
+        + _try_counted(problem, i, n_votes, fine, n_tried, votes, sift, least_votes, room, best)
+    )
 
 
 @kernel
@@ -189,7 +215,7 @@ def search(problem, R_best):
     R_best : (3, 3), out
         The best attitude, sensor from ICRS.
     """
-    n, n_stars = len(problem.centroids.u), len(problem.stars.u)
+    n = len(problem.centroids.u)
     n_pattern = min(n, problem.limits.n_pattern)
     room = make_scratch(n, min(n, N_VERIFIED))
     best = Best(np.array([-1e9, -1e9]), R_best)
@@ -198,21 +224,14 @@ def search(problem, R_best):
     if needed > n:
         return top[0], top[1], work
     order = _mixed_order(n_pattern)
-    votes = make_votes(n_stars, n_pattern)
+    votes, sift = make_votes(problem.pairs.n_stars, n_pattern), make_sift()
     # With so many pivots, one is among the matches of any attitude that has enough.
     n_pivots = min(n_pattern, n - needed + 1)
     for step in range(len(ROUNDS)):
-        pivots, companions, share, enough_votes, cells = ROUNDS[step]
+        pivots, companions, share = ROUNDS[step][:3]
         companions = max(companions, int(share * n_pattern))
         for i in order[: min(n_pivots, pivots)]:
-            n_companions, cast, log2 = count_votes(
-                problem, i, order, companions, enough_votes, votes
-            )
-            least_votes = max(needed - SLACK, 2)
-            while votes.reached[least_votes] > cells:
-                least_votes += 1
-            work += cast + (n_stars << log2) // 100
-            work += _try_counted(problem, i, n_companions, log2, votes, least_votes, room, best)
+            work += _try_pivot(problem, i, order, companions, step, needed, votes, sift, room, best)
             if work > problem.limits.budget or _is_clear(best, problem.rule):
                 return top[0], top[1], work
     return top[0], top[1], work

@@ -20,6 +20,7 @@ class PairTable(NamedTuple):
     first, second : (n,) int32, rows of the catalogue, first the brighter
     at_first, at_second : (n,) uint16, position angle of the other star as seen from each,
         in parts of `TURN`, from `tangent_axes`
+    n_stars : how many of the brightest stars of the catalogue may be in a pair
     """
 
     chord: KVector
@@ -27,6 +28,7 @@ class PairTable(NamedTuple):
     second: npt.NDArray[np.int32]
     at_first: npt.NDArray[np.uint16]
     at_second: npt.NDArray[np.uint16]
+    n_stars: int
 
 
 def build_pair_table(u_icrs: npt.NDArray[np.float64], max_separation_rad: float) -> PairTable:
@@ -44,6 +46,7 @@ def build_pair_table(u_icrs: npt.NDArray[np.float64], max_separation_rad: float)
         b,
         position_angle(along[a], across[a], u_icrs[b]),
         position_angle(along[b], across[b], u_icrs[a]),
+        len(u_icrs),
     )
 
 

@@ -174,3 +174,55 @@ def test_a_dark_log_is_searched_ever_more_rarely():
     table = _pairs()
     _identify([dark] * 300, pairs=counted)
     assert 10 <= len(calls) <= 40
+
+
+def test_a_frame_that_was_skipped_says_so():
+    dark = frame(CATALOGUE, random_attitude(0), 0, n_false=6, missing=1.0)[0]
+    status = _identify([dark] * 200)[1]
+    searched = [k for k, code in enumerate(status) if code == "no_match"]
+    assert set(status) == {"no_match", "not_searched"}
+    assert searched[:6] == [0, 1, 2, 3, 4, 5]  # a few in a row first
+    assert max(np.diff(searched)) == 33
+
+
+@pytest.mark.parametrize("n_dark", [40, 150])
+def test_frames_skipped_before_the_sensor_is_found_are_found_from_there(n_dark):
+    dark = frame(CATALOGUE, random_attitude(0), 0, n_false=6, missing=1.0)[0]
+    R = _turning(60)
+    frames = [dark] * n_dark + [frame(CATALOGUE, r, k)[0] for k, r in enumerate(R)]
+    assert _identify(frames)[1][n_dark:] == [None] * 60
+
+
+def test_what_was_skipped_behind_a_slew_is_searched():
+    dark = frame(CATALOGUE, random_attitude(0), 0, n_false=6, missing=1.0)[0]
+    R = _turning(20, seed=5) + _turning(60, seed=9)  # the first stay is shorter than the skip
+    frames = [dark] * 110 + [frame(CATALOGUE, r, k)[0] for k, r in enumerate(R)]
+    solutions, status = _identify(frames)
+    assert status[110:] == [None] * 80
+    for r, s in zip(R, solutions[110:], strict=True):
+        assert angle_between(s.R_sensor_from_icrs, r) < 300 * ARCSEC
+
+
+def test_a_sensor_that_failed_before_is_searched_rarely_from_the_start():
+    dark = frame(CATALOGUE, random_attitude(0), 0, n_false=6, missing=1.0)[0]
+    frames = join([dark] * 200)
+    _, status = identify_sequence(
+        np.arange(200.0), frames, no_priors(200), SKY, GRID, _pairs, HOW, hopeless=True
+    )
+    assert 5 <= status.count("no_match") <= 8
+
+
+def test_frames_are_followed_from_anchors_both_ways_without_a_search():
+    R = _turning(30, rate=1e-4)
+    frames = [frame(CATALOGUE, r, k)[0] for k, r in enumerate(R)]
+    anchors = no_priors(30)
+    anchors.R_sensor_from_icrs[15], anchors.sigma_rad[15] = R[15], 20 * ARCSEC
+
+    def never():
+        raise AssertionError("searched the whole sky")
+
+    found, status = identify_sequence(
+        np.arange(30.0), join(frames), anchors, SKY, GRID, never, HOW, anchored=True
+    )
+    assert status == [None] * 30
+    assert found.solved.all()
