@@ -18,6 +18,7 @@ from epipole.tasks.algorithms.association.evidence.detection import (
     CERTAIN_LOG_ODDS,
     detection_odds,
     estimated_detection,
+    looks_of,
 )
 from epipole.tasks.algorithms.association.evidence.object_density import (
     revised_odds,
@@ -25,13 +26,11 @@ from epipole.tasks.algorithms.association.evidence.object_density import (
 )
 from epipole.tasks.algorithms.association.evidence.pool import Hypothesis, Pool, distinct
 from epipole.tasks.algorithms.association.hypotheses.contests import settle_contests
-from epipole.tasks.algorithms.association.hypotheses.growth import (
-    GrownSeeds,
-    clear_of_doubt,
-    grow_all,
-)
-from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace
-from epipole.tasks.algorithms.association.hypotheses.seeds import SensorPairs, seeds_between
+from epipole.tasks.algorithms.association.hypotheses.field_index import cones_of, field_index
+from epipole.tasks.algorithms.association.hypotheses.growth import grow_all
+from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace, work_space
+from epipole.tasks.algorithms.association.hypotheses.seeds import seeds_between
+from epipole.tasks.algorithms.association.hypotheses.sensor_pairs import SensorPairs
 from epipole.tasks.algorithms.association.hypotheses.unions import best_union
 from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.sampling.views import views_of
@@ -43,7 +42,7 @@ Indices = npt.NDArray[np.int64]
 DETECTED = 0.9  # probability of detection before the data are known
 FEW_SENSORS = 6  # up to this many, every pair of sensors seeds, so two views are enough
 SEED_SIGMA = 2.5  # with more sensors: another pair seeds the objects that this gate rejects
-UNSEEDED = 0.05  # with more sensors: expected number of objects without a seed
+UNSEEDED = 0.01  # with more sensors: expected number of objects without a seed
 CLEAR_LOG_ODDS = 15.0  # with more sensors: such a group is taken before the next pair seeds
 WORTH_A_LOOK = -3.0  # log-odds of a group that is kept until the number of objects is known
 BEYOND_DOUBT = 20.0  # log-odds that no number of objects makes doubtful
@@ -94,6 +93,7 @@ def associate_tracklets(
         nothing = np.full(len(samples.half_field), np.nan)
         return Groups(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool), nothing)
     views, order = views_of(samples)
+    cones = cones_of(views)
     space = SearchSpace(
         views=views,
         chance=chance_of(samples, max_range_km, DETECTED),
@@ -102,8 +102,10 @@ def associate_tracklets(
         lowest_km=float(EARTH_RADIUS_KM + min_altitude_km),
         farthest_km=float(max_range_km),
         gate_sigma=float(gate_sigma),
+        fields=field_index(cones, float(max_range_km)),
     )
-    return _Search(space, order, ambiguity_log_odds).run(min_log_odds)
+    pairs = SensorPairs(views, space.farthest_km, space.fields, cones)
+    return _Search(space, order, ambiguity_log_odds).run(pairs, min_log_odds)
 
 
 def _weights(shells: Iterable[Shell], farthest_km: float) -> Array:
@@ -125,13 +127,13 @@ class _Search:
 
     def __init__(self, space: SearchSpace, order: Indices, margin: float) -> None:
         self.space, self.order, self.margin = space, order, float(margin)
+        self.work = work_space(space.views)
         self.many = len(space.views.half_field) > FEW_SENSORS
         self.group, self.ambiguous = np.full(len(order), FREE), np.zeros(len(order), np.bool_)
         self.groups: list[Hypothesis] = []
 
-    def run(self, min_log_odds: float) -> Groups:
+    def run(self, pairs: SensorPairs, min_log_odds: float) -> Groups:
         """Return the groups. With many sensors the clear ones are accepted during the search."""
-        pairs = SensorPairs(self.space.views, self.space.farthest_km)
         waiting: list[Hypothesis] = []
         while (pair := pairs.next(self._enough_pairs())) is not None:
             while pair is not None:
@@ -141,7 +143,7 @@ class _Search:
             waiting = self._learn_detection(waiting)
         self.take(waiting, WORTH_A_LOOK)
         nothing_taken = self.space._replace(taken=np.zeros_like(self.space.taken))
-        settle_contests(nothing_taken, self.group, len(self.groups))
+        settle_contests(nothing_taken, self.work, self.group, len(self.groups))
         scores = self._withdraw_doubtful(min_log_odds)
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
         group[self.order], ambiguous[self.order] = self.group, self.ambiguous
@@ -160,43 +162,33 @@ class _Search:
     def hypotheses(self, a: int, b: int) -> list[Hypothesis]:
         """Return what the seeds of two sensors grow into; clear groups are accepted at once."""
         gate_sigma = min(self.space.gate_sigma, SEED_SIGMA) if self.many else self.space.gate_sigma
-        seeds = seeds_between(self.space._replace(gate_sigma=gate_sigma), a, b)
-        clear = CLEAR_LOG_ODDS if self.many else np.inf
-        out = []
-        for h in self.grow(seeds, clear):
-            if clear_of_doubt(self.space.chance, h.outcomes, len(h.members), h.score, clear):
+        seeds = seeds_between(self.space, a, b, gate_sigma)
+        grown, taken = self.grow(seeds, CLEAR_LOG_ODDS if self.many else np.inf)
+        for h, clear in zip(grown, taken, strict=True):
+            if clear:
                 self._accept(h, h.members)
-            else:
-                out.append(h)
-        return distinct(out)
+        return distinct(h for h, clear in zip(grown, taken, strict=True) if not clear)
 
-    def grow(self, seeds: Indices, clear: float = np.inf) -> list[Hypothesis]:
-        """Return what (n, 2) seeds grow into among the free tracklets.
+    def grow(self, seeds: Indices, clear: float = np.inf) -> tuple[list[Hypothesis], list[bool]]:
+        """Return what (n, 2) seeds grow into among the free tracklets, and which are clear.
 
         The tracklets of clear hypotheses are entered in `space.taken`.
         """
-        n, n_sensors = len(seeds), len(self.space.views.half_field)
-        # At most two fragments per sensor are kept; the next span finds the others.
-        room = min(2 * n_sensors, len(self.space.taken))
-        grown = GrownSeeds(
-            size=np.zeros(n, np.int64),
-            score=np.empty(n),
-            x_km=np.empty((n, 3)),
-            outcomes=np.zeros((n, n_sensors), np.int8),
-            members=np.empty((n, room), np.int64),
-        )
-        grow_all(self.space, seeds, float(clear), grown)
-        worth = np.flatnonzero((grown.size > 0) & (grown.score > WORTH_A_LOOK - self.margin))
-        return [
+        if not len(seeds):
+            return [], []
+        least = WORTH_A_LOOK - self.margin
+        grown = grow_all(self.space, self.work, seeds, float(clear), least)
+        hypotheses = [
             Hypothesis(
                 float(grown.score[q]),
-                tuple(seeds[q].tolist()),
-                tuple(sorted(grown.members[q, : grown.size[q]].tolist())),
+                tuple(seeds[grown.seed[q]].tolist()),
+                tuple(np.sort(grown.member[slice(*grown.first_member[q : q + 2])]).tolist()),
                 grown.x_km[q],
-                grown.outcomes[q],
+                grown.missed[slice(*grown.first_missed[q : q + 2])],
             )
-            for q in worth
+            for q in range(len(grown.seed))
         ]
+        return hypotheses, grown.taken.tolist()
 
     def _learn_detection(self, waiting: list[Hypothesis]) -> list[Hypothesis]:
         """Estimate the probabilities of detection; return the hypotheses with their new odds.
@@ -212,11 +204,22 @@ class _Search:
         believed = self.space.chance.detected
         detected = estimated_detection(self.space.views, [*self.groups, *sure], DETECTED)
         self.space = self.space._replace(chance=self.space.chance._replace(detected=detected))
-        self.groups = _with_detection(self.groups, believed, detected)
-        return _with_detection(waiting, believed, detected)
+        self.groups = self._with_detection(self.groups, believed, detected)
+        return self._with_detection(waiting, believed, detected)
+
+    def _with_detection(
+        self, hypotheses: list[Hypothesis], believed: Array, detected: Array
+    ) -> list[Hypothesis]:
+        """Return the hypotheses with their odds for other probabilities of detection."""
+        looks, n = looks_of(self.space.views, hypotheses), len(hypotheses)
+        change = detection_odds(looks, n, detected) - detection_odds(looks, n, believed)
+        return [
+            replace(h, score=h.score + more)
+            for h, more in zip(hypotheses, change.tolist(), strict=True)
+        ]
 
     def _accept(self, h: Hypothesis, members: Iterable[int]) -> None:
-        self.group[sorted(members)] = len(self.groups)
+        self.group[list(members)] = len(self.groups)
         self.groups.append(h)
 
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
@@ -224,16 +227,16 @@ class _Search:
         taken = self.space.taken
         # What a clear group took tracklets from is usually nothing without them: grow it again.
         stale = [h for h in hypotheses if taken[list(h.members)].any()]
-        afresh = self.grow(np.array([h.seed for h in stale], np.int64).reshape(-1, 2))
+        afresh, _ = self.grow(np.array([h.seed for h in stale], np.int64).reshape(-1, 2))
         gone = set(map(id, stale))
         pool = Pool([h for h in hypotheses if id(h) not in gone] + afresh)
         while (best := pool.pop()) is not None and best.score >= min_log_odds:
             if taken[list(best.members)].any():
                 if not taken[list(best.seed)].any():
-                    for again in self.grow(np.array([best.seed])):
+                    for again in self.grow(np.array([best.seed]))[0]:
                         pool.push(again)
                 continue
-            if (union := best_union(self.space, best, pool.sharing(best))) is not None:
+            if (union := best_union(self.space, self.work, best, pool.sharing(best))) is not None:
                 pool.push(best)
                 pool.push(union)
                 continue
@@ -272,16 +275,3 @@ class _Search:
         volume = visible_volume(space.views, shells, space.farthest_km)
         radius_km = np.linalg.norm([h.x_km for h in self.groups], axis=1)
         return revised_odds(scores, radius_km, shells, volume, space.chance)
-
-
-def _with_detection(
-    hypotheses: list[Hypothesis], believed: Array, detected: Array
-) -> list[Hypothesis]:
-    """Return the hypotheses with their odds for other probabilities of detection."""
-    if not hypotheses:
-        return []
-    outcomes = np.array([h.outcomes for h in hypotheses])
-    change = detection_odds(outcomes, detected) - detection_odds(outcomes, believed)
-    return [
-        replace(h, score=h.score + float(more)) for h, more in zip(hypotheses, change, strict=True)
-    ]

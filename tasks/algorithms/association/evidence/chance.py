@@ -44,8 +44,11 @@ def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
     density = np.maximum(share, 1.0) / samples.field_sr
     rate = _rates(samples)
     drift, spread = np.zeros((n_sensors, 3)), np.empty(n_sensors)
+    moving = np.flatnonzero(np.isfinite(rate[:, 0]))
+    moving = moving[np.argsort(samples.sensor[moving], kind="stable")]
+    first = np.searchsorted(samples.sensor[moving], np.arange(n_sensors + 1))
     for s in range(n_sensors):
-        rates = rate[(samples.sensor == s) & np.isfinite(rate[:, 0])]
+        rates = rate[moving[first[s] : first[s + 1]]]
         # One assumed tracklet at 10 arcsec/s steadies the estimate where there are few.
         drift[s] = np.median(rates, axis=0) if len(rates) else 0.0
         squares = np.sum((rates - drift[s]) ** 2) / 2

@@ -17,7 +17,7 @@ from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
 
-SIGHTS = 100  # lines of sight that sample all fields together, at least one per sensor
+SIGHTS = 100  # lines of sight that sample all fields together; with more sensors, of so many
 STEPS = 24  # along a line of sight, in addition to the shells' edges
 MOST = 10.0  # largest rate of a shell over the common rate
 PRIOR_OBJECTS = 1.0  # weight of the prior of a shell, as a number of objects
@@ -38,6 +38,8 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
         return out
     side = max(int(np.sqrt(SIGHTS / len(known))), 1)
     camera = np.ascontiguousarray(views.camera[known, m])
+    of = max(len(known) / SIGHTS, 1.0)  # sensors that each sampled one stands for
+    known = known[(np.arange(int(len(known) / of)) * of).astype(int)]
     middle = (np.arange(side) + 0.5) / side * 2 - 1
     for s in known.tolist():
         a, b = np.meshgrid(*(middle * half for half in views.half_field[s]), indexing="ij")
@@ -53,7 +55,7 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
         radius = np.linalg.norm(x, axis=2)
         for j, (lowest, highest, weight) in enumerate(shells):
             inside = (radius >= lowest) & (radius < highest)
-            out[j] += weight * volume[inside].sum()
+            out[j] += of * weight * volume[inside].sum()
     return out
 
 

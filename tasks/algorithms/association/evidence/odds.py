@@ -3,7 +3,10 @@
 import numpy as np
 
 from epipole.tasks.algorithms.association.evidence.arcs import LN_2PI, arc_odds
-from epipole.tasks.algorithms.association.evidence.visibility import should_detect
+from epipole.tasks.algorithms.association.evidence.visibility import (
+    farthest_range2,
+    should_detect,
+)
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 
@@ -18,23 +21,22 @@ def _det3(M):
 
 
 @borrowing_kernel
-def score(views, chance, members, points, shells, near, outcomes, part):
-    """Return the log-odds of "one object" against "unrelated tracklets".
+def score(space, work, members, near):
+    """Return the log-odds of "one object" against "unrelated tracklets", and the number of misses.
 
     An unrelated tracklet may lie anywhere in its field (`chance.density`), an object anywhere in
     view (`chance.objects_km3`, weighted by altitude with `shells`). Several instants are tied
     together by one orbit, see `arcs`. A sensor that has the point in its field but no tracklet
-    of it counts against the object.
+    of it counts against the object: `work.missed` lists those.
 
     Parameters
     ----------
-    near : (s,) bool
+    space, work
+        `SearchSpace`, and the `WorkSpace` with the solved points.
+    near : (n,) int
         Sensors whose field may hold the points, see `near_fields`.
-    outcomes : (s,) int
-        Output, see `_detections`.
-    part : (11,) float
-        Work space, see `residual`.
     """
+    views, chance, points = space.views, space.chance, work.points
     m, instants = -1, 0
     for k in range(len(views.time_s)):
         if points.seen_by[k] >= 2:
@@ -45,31 +47,43 @@ def score(views, chance, members, points, shells, near, outcomes, part):
         for i in members:
             if views.seen[i, m]:
                 total -= np.log(chance.density[views.sensor[i]] * views.sight[i, m, SPOT_SR])
-                residual(views, i, m, points.x_km[m], part)
-                total -= 0.5 * misfit(part)
+                residual(views, i, m, points.x_km[m], work.part)
+                total -= 0.5 * misfit(work.part)
     else:
         total = arc_odds(views, chance, members, points)
-    total += np.log(chance.objects_km3) + _altitude_weight(points.x_km[m], shells)
-    return total + _detections(views, chance, members, points, near, outcomes)
+    total += np.log(chance.objects_km3) + _altitude_weight(points.x_km[m], space.shells)
+    detections, n_missed = _detections(space, work, members, near)
+    return total + detections, n_missed
 
 
 @borrowing_kernel
-def _detections(views, chance, members, points, near, outcomes):
+def _detections(space, work, members, near):
     """Return the log-probability of which sensors detect the object and which miss it.
 
-    Writes `outcomes` for each sensor: 1 detection, -1 miss, 0 where none is expected.
+    Writes the list of those that miss it; also returns how many they are.
     """
-    total = 0.0
-    outcomes[:] = 0
+    views, detected = space.views, space.chance.detected
+    total, n_missed = 0.0, 0
+    farthest2 = farthest_range2(views, members, work.points)
+    mark = next_mark(work.stamp)
     for i in members:
-        outcomes[views.sensor[i]] = 1
-    for s in range(len(outcomes)):
-        if outcomes[s] == 1:
-            total += np.log(chance.detected[s])
-        elif near[s] and should_detect(views, members, s, points):
-            outcomes[s] = -1
-            total += np.log(1.0 - chance.detected[s])
-    return total
+        s = views.sensor[i]
+        if work.stamp[s] != mark:
+            work.stamp[s] = mark
+            total += np.log(detected[s])
+    for s in near:
+        if work.stamp[s] != mark and should_detect(views, s, work.points, farthest2):
+            work.missed[n_missed] = s
+            n_missed += 1
+            total += np.log(1.0 - detected[s])
+    return total, n_missed
+
+
+@borrowing_kernel
+def next_mark(stamp):
+    """Return the number of a new list of sensors, see `WorkSpace.stamp`."""
+    stamp[-1] += 1
+    return stamp[-1]
 
 
 @borrowing_kernel

@@ -14,14 +14,14 @@ class Hypothesis:
     """Tracklets (`members`) that may be one object, grown from the two of `seed`.
 
     `score` is the log-odds against unrelated tracklets. `x_km` (3,) is the point at the first
-    instant. `outcomes` (s,) is 1 for sensors that detect it, -1 for misses, 0 out of the field.
+    instant. `missed` (n,) are the sensors that have it in their field but no tracklet of it.
     """
 
     score: float
     seed: tuple[int, int]
     members: tuple[int, ...]
     x_km: npt.NDArray[np.float64]
-    outcomes: npt.NDArray[np.int8]
+    missed: npt.NDArray[np.int64]
 
 
 class Pool:

@@ -8,6 +8,7 @@ from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 FAINTER = 1.5  # times the range: the object is 0.9 mag fainter and may not be detected
 INSIDE = 0.98  # of half the field: nearer to its edge misses are frequent
+NEAR_SIGMA = 6.0  # a point may lie this far outside a field and still have tracklets there
 
 
 @borrowing_kernel
@@ -74,31 +75,33 @@ def looks_at(views, s, X, seen_by):
 
 
 @borrowing_kernel
-def should_detect(views, members, s, points):
+def should_detect(views, s, points, farthest_km2):
     """Return whether a sensor without a tracklet of the object counts as a miss.
 
-    It does where the points are in its field, and not much fainter than for the members' sensors.
+    It does where the points are in its field, and not much fainter than for the members' sensors:
+    `farthest_km2` is `farthest_range2` of these.
     """
-    return looks_at(views, s, points.x_km, points.seen_by) and not _too_faint(
-        views, members, s, points
-    )
+    if not looks_at(views, s, points.x_km, points.seen_by):
+        return False
+    for m in range(len(views.time_s)):
+        if points.seen_by[m] >= 2:
+            return _range2(views.camera, s, m, points.x_km[m]) <= FAINTER * FAINTER * farthest_km2
+    return True
 
 
 @borrowing_kernel
-def _too_faint(views, members, s, points):
-    """Return whether sensor s is so far from the object that it may not detect it.
-
-    The range is compared with the longest among the members' sensors, at the first solved instant.
-    """
+def farthest_range2(views, members, points):
+    """Return the longest squared range [km^2] from which members see the first solved point."""
+    farthest2 = 0.0
     for m in range(len(views.time_s)):
         if points.seen_by[m] < 2:
             continue
-        farthest2, x = 0.0, points.x_km[m]
         for i in members:
             if views.seen[i, m]:
-                farthest2 = max(farthest2, _range2(views.camera, views.sensor[i], m, x))
-        return _range2(views.camera, s, m, x) > FAINTER * FAINTER * farthest2
-    return False
+                range2 = _range2(views.camera, views.sensor[i], m, points.x_km[m])
+                farthest2 = max(farthest2, range2)
+        break
+    return farthest2
 
 
 @borrowing_kernel
@@ -109,21 +112,27 @@ def _range2(cam, s, m, x):
 
 
 @borrowing_kernel
-def near_fields(views, X, P, seen_by, near):
-    """Write which sensors may have a point in their field at any solved instant.
+def near_fields(views, points, sensors, near):
+    """Write which of the sensors may have a point in their field at any solved instant.
 
-    A fast first test: within 6 sigma of the cone that holds the sensor's tracklets and field.
+    `near` is the list of these; returns how many they are. A fast first test: within 6 sigma of the
+    cone that holds the sensor's tracklets and field.
     """
-    near[:] = False
-    cam = views.camera
-    for m in range(len(views.time_s)):
-        if seen_by[m] < 2:
-            continue
-        slack = 6.0 * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
-        for s in range(len(near)):
+    n, cam = 0, views.camera
+    X, _, P, seen_by = points
+    for s in sensors:
+        for m in range(len(views.time_s)):
+            if seen_by[m] < 2:
+                continue
             d0, d1, d2 = X[m, 0] - cam[s, m, 0], X[m, 1] - cam[s, m, 1], X[m, 2] - cam[s, m, 2]
             n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
             depth, reach = n0 * d0 + n1 * d1 + n2 * d2, cam[s, m, REACH]
+            if not (reach > 0.0 and depth > 0.0):
+                continue
             away2 = d0 * d0 + d1 * d1 + d2 * d2 - depth * depth
-            if reach > 0.0 and depth > 0.0 and away2 <= (reach * depth + slack) ** 2:
-                near[s] = True
+            slack = NEAR_SIGMA * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
+            if away2 <= (reach * depth + slack) ** 2:
+                near[n] = s
+                n += 1
+                break
+    return n

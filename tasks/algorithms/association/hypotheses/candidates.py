@@ -109,7 +109,7 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
 
 
 @borrowing_kernel
-def best_of_sensor(space, work, s, members, least):
+def best_of_sensor(space, work, s, own, least):
     """Return the free tracklet of sensor s that adds most to the log-odds.
 
     Only grid cells within the gate are searched. A tracklet is weighed once, at the first
@@ -117,8 +117,8 @@ def best_of_sensor(space, work, s, members, least):
 
     Parameters
     ----------
-    members : (n,) int
-        Tracklets of the hypothesis so far.
+    own : (n,) int
+        Tracklets of the sensor that the hypothesis has already.
     least : float
         A tracklet that adds less is not chosen.
 
@@ -130,41 +130,78 @@ def best_of_sensor(space, work, s, members, least):
         What it adds, and what the second best adds; `least` without one.
     """
     views, chance, taken, gate_sigma = space.views, space.chance, space.taken, space.gate_sigma
-    predicted, seen_by, cam = work.predicted, work.points.seen_by, views.camera
+    predicted, seen_by = work.predicted, work.points.seen_by
     best, best_gain, second = -1, least, least
     _predict(views, s, work.points, predicted)
-    gate = np.sqrt(quantile(2, gate_sigma))
     for m in range(len(views.time_s)):
-        side = views.grid[s, m, 1]
-        if seen_by[m] < 2 or side == 0 or not predicted[m, DEPTH] > 0.0:
+        if seen_by[m] < 2 or views.grid[s, m, 1] == 0 or not predicted[m, DEPTH] > 0.0:
             continue
-        begin = views.grid[s, m, 0]
-        place = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
-        errors = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
-        drift = abs(predicted[m, LATER]) * cam[s, m, FASTEST]
-        reach = gate * np.sqrt(predicted[m, H00] + errors) + abs(predicted[m, OWN0]) + drift
-        here = predicted[m, A0] - cam[s, m, CORNER]
-        lo0 = max(int(np.floor((here - reach) * cam[s, m, SCALE])), 0)
-        hi0 = min(int(np.floor((here + reach) * cam[s, m, SCALE])), side - 1)
-        reach = gate * np.sqrt(predicted[m, H11] + errors) + abs(predicted[m, OWN1]) + drift
-        here = predicted[m, A1] - cam[s, m, CORNER + 1]
-        lo1 = max(int(np.floor((here - reach) * cam[s, m, SCALE + 1])), 0)
-        hi1 = min(int(np.floor((here + reach) * cam[s, m, SCALE + 1])), side - 1)
-        if hi1 < lo1:
-            continue
+        reach0, reach1 = _gate(views, s, m, predicted, gate_sigma)
+        lo0, hi0, lo1, hi1 = _window(views, s, m, predicted, reach0, reach1)
         for g0 in range(lo0, hi0 + 1):
-            row = begin + g0 * side
+            row = views.grid[s, m, 0] + g0 * views.grid[s, m, 1]
             for k in range(views.cell_start[row + lo1], views.cell_start[row + hi1 + 1]):
                 c = views.cell_item[k]
                 if taken[c] or _shared_before(views, c, m, seen_by):
                     continue
                 gain = _fit(views, chance, s, c, seen_by, predicted, gate_sigma)
-                if gain > second and not _clashes(views, c, members):
+                if gain > second and not _clashes(views, c, own):
                     if gain > best_gain:
                         best, best_gain, second = c, gain, best_gain
                     else:
                         second = gain
     return best, best_gain, second
+
+
+@borrowing_kernel
+def _gate(views, s, m, predicted, gate_sigma):
+    """Return how far a tracklet may be from the prediction, along both coordinates."""
+    cam = views.camera
+    gate = np.sqrt(quantile(2, gate_sigma))
+    place = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
+    errors = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
+    drift = abs(predicted[m, LATER]) * cam[s, m, FASTEST]
+    reach0 = gate * np.sqrt(predicted[m, H00] + errors) + abs(predicted[m, OWN0]) + drift
+    reach1 = gate * np.sqrt(predicted[m, H11] + errors) + abs(predicted[m, OWN1]) + drift
+    return reach0, reach1
+
+
+@borrowing_kernel
+def _window(views, s, m, predicted, reach0, reach1):
+    """Return the grid cells within the gate: first and last row, first and last in each row."""
+    cam, side = views.camera, views.grid[s, m, 1]
+    here = predicted[m, A0] - cam[s, m, CORNER]
+    lo0 = max(int(np.floor((here - reach0) * cam[s, m, SCALE])), 0)
+    hi0 = min(int(np.floor((here + reach0) * cam[s, m, SCALE])), side - 1)
+    here = predicted[m, A1] - cam[s, m, CORNER + 1]
+    lo1 = max(int(np.floor((here - reach1) * cam[s, m, SCALE + 1])), 0)
+    hi1 = min(int(np.floor((here + reach1) * cam[s, m, SCALE + 1])), side - 1)
+    return (lo0, hi0, lo1, hi1) if hi1 >= lo1 else (0, -1, 0, -1)
+
+
+@borrowing_kernel
+def claims_another(space, work, s, group, g):
+    """Return whether a tracklet of another group than g may be near the points in sensor s.
+
+    A fast first test: not every tracklet within the gate fits.
+    """
+    views, seen_by, predicted = space.views, work.points.seen_by, work.predicted
+    _predict(views, s, work.points, predicted)
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2 or views.grid[s, m, 1] == 0 or not predicted[m, DEPTH] > 0.0:
+            continue
+        reach0, reach1 = _gate(views, s, m, predicted, space.gate_sigma)
+        lo0, hi0, lo1, hi1 = _window(views, s, m, predicted, reach0, reach1)
+        for g0 in range(lo0, hi0 + 1):
+            row = views.grid[s, m, 0] + g0 * views.grid[s, m, 1]
+            for k in range(views.cell_start[row + lo1], views.cell_start[row + hi1 + 1]):
+                c = views.cell_item[k]
+                if group[c] < 0 or group[c] == g:
+                    continue
+                off0 = abs(views.sight[c, m, X] - predicted[m, A0])
+                if off0 <= reach0 and abs(views.sight[c, m, Y] - predicted[m, A1]) <= reach1:
+                    return True
+    return False
 
 
 @borrowing_kernel
@@ -185,13 +222,22 @@ def _shared_before(views, c, m, seen_by):
 
 
 @borrowing_kernel
-def _clashes(views, c, members):
-    """Return whether c is a member, or overlaps in time with a member of its sensor."""
-    for o in members:
-        if o == c:
-            return True
-        if views.sensor[o] == views.sensor[c] and (
-            views.start_s[c] <= views.end_s[o] and views.start_s[o] <= views.end_s[c]
-        ):
+def _clashes(views, c, own):
+    """Return whether c is one of these tracklets of its sensor, or overlaps in time with one."""
+    for o in own:
+        if o == c or (views.start_s[c] <= views.end_s[o] and views.start_s[o] <= views.end_s[c]):
             return True
     return False
+
+
+@borrowing_kernel
+def fills(views, c, seen_by):
+    """Return whether c overlaps with any other tracklet of its sensor that the points may have."""
+    first, last = -1, -1
+    for m in range(len(seen_by)):
+        if seen_by[m] >= 2:
+            first = m if first < 0 else first
+            last = m
+    if first < 0 or not views.bounded[views.sensor[c]]:
+        return False
+    return views.seen[c, first] and views.seen[c, last]

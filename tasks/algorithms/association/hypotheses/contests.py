@@ -8,22 +8,22 @@ to no object where two explain it about equally well.
 import numpy as np
 
 from epipole.tasks.algorithms.association.evidence.points import InstantPoints
-from epipole.tasks.algorithms.association.evidence.visibility import near_fields
-from epipole.tasks.algorithms.association.hypotheses.candidates import best_of_sensor, odds_of_view
+from epipole.tasks.algorithms.association.hypotheses.candidates import (
+    best_of_sensor,
+    claims_another,
+    odds_of_view,
+)
+from epipole.tasks.algorithms.association.hypotheses.field_index import near_points
 from epipole.tasks.algorithms.association.hypotheses.growth import CONTESTED, SPEAKS
 from epipole.tasks.algorithms.association.hypotheses.instant_points import solve
-from epipole.tasks.algorithms.association.hypotheses.search_space import (
-    PREDICTED_COLUMNS,
-    RESIDUAL_PARTS,
-    WorkSpace,
-)
-from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.association.hypotheses.search_space import WorkSpace
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 FEWEST = 3  # tracklets of an object that may gain or lose one
 
 
 @kernel
-def settle_contests(space, group, n_groups):
+def settle_contests(space, work, group, n_groups):
     """Correct `group` (-1: no object) for tracklets that two objects explain.
 
     Only objects of three tracklets or more take part, and none falls below three.
@@ -33,42 +33,83 @@ def settle_contests(space, group, n_groups):
     k, n_sensors = len(views.time_s), views.camera.shape[0]
     X, N = np.zeros((n_groups, k, 3)), np.zeros((k, 3, 3))
     P, seen_by = np.zeros((n_groups, k, 3, 3)), np.zeros((n_groups, k), np.int64)
-    part, predicted = np.empty(RESIDUAL_PARTS), np.empty((k, PREDICTED_COLUMNS))
-    near = np.zeros((n_groups, n_sensors), np.bool_)
     size = np.zeros(n_groups, np.int64)
-    has = np.zeros((n_groups, n_sensors), np.bool_)
     members, first = _by_group(group, n_groups)
+    near, first_near = np.empty((4 * len(group), 2), np.int64), np.zeros(n_sensors + 1, np.int64)
+    n_near = 0
     for g in range(n_groups):
         of_group = members[first[g] : first[g + 1]]
+        if len(of_group) < FEWEST:
+            continue
+        here = _at_points(work, InstantPoints(X[g], N, P[g], seen_by[g]))
+        chi2, _ = solve(views, of_group, here.points, here.part)
+        if np.isnan(chi2):
+            continue
         size[g] = len(of_group)
-        for i in of_group:
-            has[g, views.sensor[i]] = True
-        if size[g] >= FEWEST:
-            chi2, _ = solve(views, of_group, InstantPoints(X[g], N, P[g], seen_by[g]), part)
-            if np.isnan(chi2):
-                size[g] = 0
-            else:
-                near_fields(views, X[g], P[g], seen_by[g], near[g])
+        n = near_points(space, here, *_two_sensors(views, of_group))
+        while n_near + n > len(near):
+            longer = np.empty((2 * len(near), 2), np.int64)
+            longer[:n_near] = near[:n_near]
+            near = longer
+        for s in here.near[:n]:
+            near[n_near, 0], near[n_near, 1] = s, g
+            first_near[s + 1] += 1
+            n_near += 1
+    groups_near = np.empty(n_near, np.int64)
+    first_near = np.cumsum(first_near)
+    filled = first_near.copy()
+    for q in range(n_near):
+        s = near[q, 0]
+        groups_near[filled[s]] = near[q, 1]
+        filled[s] += 1
     for s in range(n_sensors):  # one sensor's tracklets fit into a processor's cache
-        for g in range(n_groups):
-            if size[g] < FEWEST or not near[g, s]:
+        for g in groups_near[first_near[s] : first_near[s + 1]]:
+            if size[g] < FEWEST:
                 continue
-            points = InstantPoints(X[g], N, P[g], seen_by[g])
-            work = WorkSpace(points, part, predicted, near[g])
-            c, gain, _ = best_of_sensor(space, work, s, members[:0], SPEAKS)
+            here = _at_points(work, InstantPoints(X[g], N, P[g], seen_by[g]))
+            if not claims_another(space, here, s, group, g):
+                continue
+            c, gain, _ = best_of_sensor(space, here, s, members[:0], SPEAKS)
             if c < 0 or group[c] < 0 or group[c] == g:
                 continue
             o = group[c]
             if size[o] <= FEWEST:
                 continue
-            points = InstantPoints(X[o], N, P[o], seen_by[o])
-            theirs = odds_of_view(space, WorkSpace(points, part, predicted, near[o]), s, c)
+            there = _at_points(work, InstantPoints(X[o], N, P[o], seen_by[o]))
+            theirs = odds_of_view(space, there, s, c)
             if theirs - gain < CONTESTED:
                 size[o] -= 1
                 group[c] = -1
-                if gain - theirs >= CONTESTED and not has[g, s]:
-                    group[c], has[g, s] = g, True
+                if gain - theirs >= CONTESTED and not _has(views, group, s, g):
+                    group[c] = g
                     size[g] += 1
+
+
+@kernel
+def _at_points(work, points):
+    """Return the work space with other points."""
+    return WorkSpace(
+        points, work.part, work.predicted, work.nearby, work.near, work.missed, work.stamp,
+        work.own, work.members, work.before, work.misfit,
+    )  # fmt: skip
+
+
+@borrowing_kernel
+def _two_sensors(views, members):
+    """Return two sensors of a group's members."""
+    a = b = views.sensor[members[0]]
+    for i in members:
+        b = views.sensor[i] if views.sensor[i] != a else b
+    return a, b
+
+
+@borrowing_kernel
+def _has(views, group, s, g):
+    """Return whether sensor s has a tracklet in group g."""
+    has = False
+    for i in range(views.first[s], views.first[s + 1]):
+        has |= group[i] == g
+    return has
 
 
 @kernel

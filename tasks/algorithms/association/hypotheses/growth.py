@@ -5,14 +5,22 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.evidence.odds import score
-from epipole.tasks.algorithms.association.evidence.visibility import near_fields, should_detect
-from epipole.tasks.algorithms.association.hypotheses.candidates import best_of_sensor
+from epipole.tasks.algorithms.association.evidence.odds import next_mark, score
+from epipole.tasks.algorithms.association.evidence.visibility import (
+    farthest_range2,
+    near_fields,
+    should_detect,
+)
+from epipole.tasks.algorithms.association.hypotheses.candidates import best_of_sensor, fills
+from epipole.tasks.algorithms.association.hypotheses.field_index import sensors_sharing
 from epipole.tasks.algorithms.association.hypotheses.instant_points import join, possible, solve
-from epipole.tasks.algorithms.association.hypotheses.search_space import work_space
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 FEW = 3  # sensors that must have looked before a hypothesis is given up
 GIVEN_UP = -4.0  # log-odds of the sensors beside the seed's at which it is given up
@@ -22,135 +30,198 @@ ENOUGH = 4  # views that fix a point well enough to choose them all again
 WELL_KNOWN = 8  # views after which a sensor's choice needs no review
 COMPLETE = 0.85  # of the expected detections, those of a clear hypothesis
 REVIEWS = 2  # the first may still rest on a false member
+DROPPED_TOGETHER = 64  # of so many members one more is dropped at a time
 
 
-class GrownSeeds(NamedTuple):
-    """What n seeds have grown into.
+class Grown(NamedTuple):
+    """The h hypotheses that seeds have grown into.
 
-    size : (n,) int
-        Number of members; 0 where the hypothesis failed.
-    score : (n,) float
+    seed : (h,) int
+        The seed of each.
+    score : (h,) float
         Log-odds.
-    x_km : (n, 3) float
+    taken : (h,) bool
+        It is clear, and its tracklets are entered in `SearchSpace.taken`.
+    x_km : (h, 3) float
         Position at the first instant.
-    outcomes : (n, s) int
-        Detections (1) and misses (-1) of the sensors, see `odds`.
-    members : (n, m) int
-        Tracklets; the first `size` columns count.
+    first_member, member : (h + 1,), (n,) int
+        Tracklets of hypothesis q are ``member[first_member[q]:first_member[q + 1]]``.
+    first_missed, missed : (h + 1,), (m,) int
+        The same for the sensors that miss it.
     """
 
-    size: npt.NDArray[np.int64]
-    score: npt.NDArray[np.float64]
-    x_km: npt.NDArray[np.float64]
-    outcomes: npt.NDArray[np.int8]
-    members: npt.NDArray[np.int64]
+    seed: Indices
+    score: Array
+    taken: Flags
+    x_km: Array
+    first_member: Indices
+    member: Indices
+    first_missed: Indices
+    missed: Indices
 
 
 @kernel
-def grow_all(space, seeds, clear, out):
-    """Grow every seed and write the result to `out` (`GrownSeeds`).
+def grow_all(space, work, seeds, clear, least):
+    """Return what the seeds grow into, as `Grown`.
 
     Parameters
     ----------
+    space, work
+        `SearchSpace` and `WorkSpace`.
     seeds : (n, 2) int
         Pairs of tracklets. A pair of which one was taken since is skipped.
     clear : float
-        Log-odds at which a hypothesis is taken at once, see `clear_of_doubt`. Its tracklets are
+        Log-odds at which a hypothesis is taken at once, see `_clear_of_doubt`. Its tracklets are
         entered in `space.taken`.
+    least : float
+        Hypotheses of lower log-odds are left out.
     """
-    views, chance, taken = space.views, space.chance, space.taken
-    work = work_space(len(views.time_s), views.camera.shape[0])
-    points = work.points
-    members = np.empty(len(views.sensor) + 2, np.int64)
+    views, taken = space.views, space.taken
+    members = work.members
+    h, n_nearby, a, b = 0, 0, -1, -1
+    seed, value_of, clears = np.empty(4, np.int64), np.empty(4), np.empty(4, np.bool_)
+    x_km, member, missed = np.empty((4, 3)), np.empty(64, np.int64), np.empty(64, np.int64)
+    first_member, first_missed = np.zeros(5, np.int64), np.zeros(5, np.int64)
     for q in range(len(seeds)):
-        out.size[q] = 0
         if taken[seeds[q, 0]] or taken[seeds[q, 1]]:
             continue
         members[0], members[1] = seeds[q, 0], seeds[q, 1]
-        n = _grow(space, work, members)
-        if n < 2 or not possible(space, members[:n], points):
+        if views.sensor[members[0]] != a or views.sensor[members[1]] != b:
+            a, b = views.sensor[members[0]], views.sensor[members[1]]
+            n_nearby = sensors_sharing(
+                space.fields, a, b, work.stamp, next_mark(work.stamp), work.nearby
+            )
+            work.nearby[:n_nearby].sort()
+        n, n_near = _grow(space, work, members, work.nearby[:n_nearby])
+        if n < 2 or not possible(space, members[:n], work.points):
             continue
-        value = score(
-            views, chance, members[:n], points, space.shells, work.near, out.outcomes[q], work.part
-        )
-        out.score[q] = value
-        out.size[q] = min(n, out.members.shape[1])
-        out.x_km[q] = points.x_km[np.argmax(points.seen_by >= 2)]
-        out.members[q, : out.size[q]] = members[: out.size[q]]
-        if clear_of_doubt(chance, out.outcomes[q], n, value, clear):
+        value, n_missed = score(space, work, members[:n], work.near[:n_near])
+        if not value > least:
+            continue
+        if h == len(seed):
+            seed, value_of, clears = _more(seed, h), _more(value_of, h), _more(clears, h)
+            x_km = _more(x_km, h)
+            first_member, first_missed = _more(first_member, h + 1), _more(first_missed, h + 1)
+        begin, skip = first_member[h], first_missed[h]
+        member, missed = _room(member, begin, n), _room(missed, skip, n_missed)
+        member[begin : begin + n] = members[:n]
+        missed[skip : skip + n_missed] = work.missed[:n_missed]
+        x_km[h] = work.points.x_km[np.argmax(work.points.seen_by >= 2)]
+        is_clear = _clear_of_doubt(space, work, members[:n], n_missed, value, clear)
+        seed[h], value_of[h], clears[h] = q, value, is_clear
+        h += 1
+        first_member[h], first_missed[h] = begin + n, skip + n_missed
+        if is_clear:
             for i in members[:n]:
                 taken[i] = True
+    return Grown(
+        seed[:h], value_of[:h], clears[:h], x_km[:h],
+        first_member[: h + 1], member[: first_member[h]],
+        first_missed[: h + 1], missed[: first_missed[h]],
+    )  # fmt: skip
+
+
+@kernel
+def _more(values, n):
+    """Return an array twice as long with the same first n rows."""
+    out = np.empty((2 * len(values), *values.shape[1:]), values.dtype)
+    out[:n] = values[:n]
+    return out
+
+
+@kernel
+def _room(values, n, more):
+    """Return the array, or a longer one with the same first n values and room for more."""
+    while n + more > len(values):
+        values = _more(values, n)
+    return values
 
 
 @borrowing_kernel
-def clear_of_doubt(chance, outcomes, n, value, clear):
+def _clear_of_doubt(space, work, members, n_missed, value, clear):
     """Return whether a hypothesis may be taken at once.
 
     It has many views, and of the sensors that have it in their field about as many detect it
     as usual. A mixture of two objects' tracklets fits in some of the sensors only.
     """
-    has, usual = 0, 0.0
-    for s in range(len(outcomes)):
-        has += outcomes[s] > 0
-        usual += chance.detected[s] * (outcomes[s] != 0)
-    return value > clear and n >= WELL_KNOWN and has >= COMPLETE * usual
+    if not (value > clear and len(members) >= WELL_KNOWN):
+        return False
+    views, detected = space.views, space.chance.detected
+    has, usual, mark = 0, 0.0, next_mark(work.stamp)
+    for i in members:
+        s = views.sensor[i]
+        if work.stamp[s] != mark:
+            work.stamp[s] = mark
+            has += 1
+            usual += detected[s]
+    for s in work.missed[:n_missed]:
+        usual += detected[s]
+    return has >= COMPLETE * usual
 
 
 @borrowing_kernel
-def _grow(space, work, members):
-    """Grow the first two members; return the size, 0 where the hypothesis fails.
+def _grow(space, work, members, nearby):
+    """Grow the first two members; return the size and the number of sensors in `work.near`.
 
-    Sensor after sensor, the tracklet that adds most to the odds joins. A miss counts against
-    the hypothesis. It is given up as soon as the other sensors speak clearly against it (Wald's
-    sequential test).
+    The size is 0 where the hypothesis fails. Sensor after sensor, the tracklet that adds most to
+    the odds joins. A miss counts against the hypothesis. It is given up as soon as the other
+    sensors speak clearly against it (Wald's sequential test).
     """
-    views = space.views
+    views, near = space.views, work.near
     n = np.int64(2)  # a plain 2 is a type of its own to numba: all would compile twice
-    if not _begin(space, work, members[:n]):
-        return np.int64(0)
-    n_sensors = views.camera.shape[0]
+    n_near = _begin(space, work, members[:n], nearby)
+    if n_near < 0:
+        return np.int64(0), np.int64(0)
     a, b = views.sensor[members[0]], views.sensor[members[1]]
     evidence, looked, early = 0.0, 0, np.int64(0)
-    for turn in range(n_sensors + 2):
+    farthest2 = farthest_range2(views, members[:n], work.points)
+    begin = 0
+    while begin < n_near and near[begin] < a:
+        begin += 1
+    for turn in range(n_near + 2):
         # The seed's own sensors come last: they may hold another fragment of the object.
-        s = (a + turn) % n_sensors
-        if turn >= n_sensors:
-            s = a if turn == n_sensors else b
-        elif s in (a, b) or not work.near[s]:
-            continue
+        if turn < n_near:
+            s = near[(begin + turn) % n_near]
+            if s in (a, b):
+                continue
+        else:
+            s = a if turn == n_near else b
         before = n
         n, evidence, detected = _join_sensor(space, work, s, members, n, evidence)
         if n < 0:
-            return np.int64(0)
+            return np.int64(0), np.int64(0)
         if n > before and before < WELL_KNOWN:
             early = min(n, np.int64(WELL_KNOWN))
-        if turn < n_sensors:
-            expected = detected or should_detect(views, members[:n], s, work.points)
+            farthest2 = farthest_range2(views, members[:n], work.points)
+        elif n > before:
+            more = farthest_range2(views, members[before:n], work.points)
+            farthest2 = max(farthest2, more)
+        if turn < n_near:
+            expected = detected or should_detect(views, s, work.points, farthest2)
             looked += expected
             if expected and not detected:
                 evidence += np.log(1.0 - space.chance.detected[s])
             if looked >= FEW and evidence < GIVEN_UP:
-                return np.int64(0)
+                return np.int64(0), np.int64(0)
     if n < 2 * WELL_KNOWN:
         n = _settle(space, work, members, n)
     for _ in range(REVIEWS if n < 2 * WELL_KNOWN else 1):
         if n >= ENOUGH:
             n = _review(space, work, members, n, early)
-    return n
+    return n, n_near
 
 
 @borrowing_kernel
-def _begin(space, work, members):
-    """Solve the points of a seed; return whether an object can be there."""
+def _begin(space, work, members, nearby):
+    """Solve the points of a seed; return how many sensors may see them, -1 if none can be there."""
     points = work.points
     points.seen_by[:] = 0
     chi2, dof = solve(space.views, members, points, work.part)
     if not chi2 <= quantile(max(dof, 1), space.gate_sigma):
-        return False
+        return np.int64(-1)
     if not possible(space, members, points):
-        return False
-    near_fields(space.views, points.x_km, points.cov_km2, points.seen_by, work.near)
-    return True
+        return np.int64(-1)
+    return np.int64(near_fields(space.views, points, nearby, work.near))
 
 
 @borrowing_kernel
@@ -161,27 +232,32 @@ def _join_sensor(space, work, s, members, n, evidence):
     with what they add, and whether the sensor detects the object: it does also where two
     tracklets are about equal and none joins.
     """
-    detected = False
+    views, detected, n_own = space.views, False, 0
+    for i in members[:2]:
+        if views.sensor[i] == s:
+            work.own[n_own] = i
+            n_own += 1
     while n < len(members):
         known = n >= WELL_KNOWN
         least = SPEAKS if known else np.log(1.0 - space.chance.detected[s])
-        c, gain, second = best_of_sensor(space, work, s, members[:n], least)
+        c, gain, second = best_of_sensor(space, work, s, work.own[:n_own], least)
         if c < 0 or (known and second > SPEAKS and gain - second < CONTESTED):
             detected |= c >= 0
             break
         detected = True
         evidence += gain
-        members[n] = c
+        members[n], work.own[n_own] = c, c
         n += 1
-        if not join(space.views, c, work.points, work.part):
+        n_own += 1
+        if not join(views, c, work.points, work.part):
             return np.int64(-1), evidence, detected
         # A sensor has one tracklet of an object at a time.
-        if len(space.views.time_s) == 1:
+        if fills(views, c, work.points.seen_by):
             break
     return n, evidence, detected
 
 
-@kernel
+@borrowing_kernel
 def _review(space, work, members, n, early):
     """Choose the early members again, now that the points are well known; return the size.
 
@@ -189,28 +265,42 @@ def _review(space, work, members, n, early):
     a tracklet joins only where it clearly speaks for the object, and a sensor with two such
     tracklets that are about equal contributes none.
     """
-    views = space.views
-    before = members[:n].copy()
-    again = np.zeros(views.camera.shape[0], np.bool_)
-    for q in range(min(early, n)):
-        again[views.sensor[members[q]]] = True
+    views, stamp, early = space.views, work.stamp, min(early, n)
+    mark = next_mark(stamp)
+    n_again = 0  # the sensors of the early members, in order, in `work.missed`
+    for i in members[:early]:
+        s = views.sensor[i]
+        if stamp[s] != mark:
+            stamp[s] = mark
+            place = n_again
+            while place > 0 and work.missed[place - 1] > s:
+                work.missed[place] = work.missed[place - 1]
+                place -= 1
+            work.missed[place] = s
+            n_again += 1
+    before = work.before
+    for q in range(n):
+        before[q] = members[q]
     kept = np.int64(0)
-    for i in before:
-        if not again[views.sensor[i]] and _speaks(space, work, i):
+    for i in before[:n]:
+        if stamp[views.sensor[i]] != mark and _speaks(space, work, i):
             members[kept] = i
             kept += 1
-    for s in range(len(again)):
-        while again[s] and kept < len(members):
-            c, gain, second = best_of_sensor(space, work, s, members[:kept], SPEAKS)
+    for s in work.missed[:n_again]:
+        n_own = 0
+        while kept < len(members):
+            c, gain, second = best_of_sensor(space, work, s, work.own[:n_own], SPEAKS)
             if c < 0 or (second > SPEAKS and gain - second < CONTESTED):
                 break
-            members[kept] = c
+            members[kept], work.own[n_own] = c, c
             kept += 1
-            if len(views.time_s) == 1:
+            n_own += 1
+            if fills(views, c, work.points.seen_by):
                 break
     if kept < ENOUGH - 1:
         kept = n
-        members[:n] = before
+        for q in range(n):
+            members[q] = before[q]
     return _settle(space, work, members, kept)
 
 
@@ -230,9 +320,10 @@ def _speaks(space, work, i):
 
 @borrowing_kernel
 def _settle(space, work, members, n):
-    """Solve, and drop the member that fits worst until all fit; return the size.
+    """Solve, and drop the members that fit worst until all fit; return the size.
 
-    The seed's tracklets may be dropped too. 0 where fewer than two are left.
+    The seed's tracklets may be dropped too. One is dropped at a time, of many a share: so the work
+    goes with their number. 0 where fewer than two are left.
     """
     views, part = space.views, work.part
     X, _, _, seen_by = work.points
@@ -242,7 +333,6 @@ def _settle(space, work, members, n):
             return n
         if n == 2:
             break
-        worst, largest = 0, -1.0
         for q in range(n):
             total, shared = 0.0, 1e-9
             for m in range(len(views.time_s)):
@@ -252,10 +342,13 @@ def _settle(space, work, members, n):
                     total = np.inf
                 total += misfit(part)
                 shared += 1
-            if total / shared > largest:
-                worst, largest = q, total / shared
-        for q in range(worst, n - 1):
-            members[q] = members[q + 1]
-        n -= 1
+            work.misfit[q] = total / shared
+        for _ in range(1 + n // DROPPED_TOGETHER):
+            worst = 0
+            for q in range(n):
+                worst = q if work.misfit[q] > work.misfit[worst] else worst
+            for q in range(worst, n - 1):
+                members[q], work.misfit[q] = members[q + 1], work.misfit[q + 1]
+            n -= 1
         seen_by[:] = 0
     return np.int64(0)

@@ -7,39 +7,44 @@ from epipole.tasks.algorithms.association.hypotheses.sight_lines import BEYOND, 
 from epipole.tasks.algorithms.association.sampling.views import direction, residual
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.geometry.triangulation import invert3
-from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 ITERATIONS = 6
 CONVERGED = 1e-4  # sigmas squared
+RHS = 11  # where the right-hand side of the normal equations begins, after the residual
 
 
-@kernel
-def _start(views, members, m, x):
+@borrowing_kernel
+def _start(views, members, m, points, part):
     """Write the point nearest to the members' lines; return false where they are parallel."""
-    N, inverse, rhs, u = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3), np.empty(3)
+    x, N, inverse = points.x_km[m], points.normal[m], points.cov_km2[m]
+    N[:] = 0.0
+    part[RHS : RHS + 3] = 0.0
     count = 0
     for i in members:
         if not views.seen[i, m]:
             continue
         count += 1
-        direction(views, i, m, u)
+        direction(views, i, m, part)
         for a in range(3):
             for b in range(3):
-                p = (1.0 if a == b else 0.0) - u[a] * u[b]
+                p = (1.0 if a == b else 0.0) - part[a] * part[b]
                 N[a, b] += p
-                rhs[a] += p * views.camera[views.sensor[i], m, b]
+                part[RHS + a] += p * views.camera[views.sensor[i], m, b]
     if invert3(N, inverse) < 1e-12 * count**3:
         return False
     for a in range(3):
-        x[a] = inverse[a, 0] * rhs[0] + inverse[a, 1] * rhs[1] + inverse[a, 2] * rhs[2]
+        x[a] = inverse[a, 0] * part[RHS]
+        x[a] += inverse[a, 1] * part[RHS + 1] + inverse[a, 2] * part[RHS + 2]
     return True
 
 
 @borrowing_kernel
-def add_view(views, i, m, x, N, rhs, part):
+def _add_view(views, i, m, x, N, part):
     """Add a view to the normal equations (upper half); return its chi-square.
 
-    NaN where the point is behind the sensor.
+    `part` (14,) holds the residual, and the right-hand side from `RHS` on. NaN where the point is
+    behind the sensor.
     """
     if residual(views, i, m, x, part) == 0.0:
         return np.nan
@@ -47,7 +52,7 @@ def add_view(views, i, m, x, N, rhs, part):
     g1 = part[9] * part[0] + part[10] * part[1]
     for a in range(3):
         u, v = part[2 + a], part[5 + a]
-        rhs[a] -= u * g0 + v * g1
+        part[RHS + a] -= u * g0 + v * g1
         h0, h1 = part[8] * u + part[9] * v, part[9] * u + part[10] * v
         for b in range(a, 3):
             N[a, b] += h0 * part[2 + b] + h1 * part[5 + b]
@@ -55,19 +60,19 @@ def add_view(views, i, m, x, N, rhs, part):
 
 
 @borrowing_kernel
-def step(x, N, rhs, P):
+def _step(x, N, part, P):
     """Invert N into P and move x; return the decrease of chi-square, NaN where it diverges."""
     if invert3(N, P) == 0.0:
         return np.nan
     gain = 0.0
     for a in range(3):
-        move = P[a, 0] * rhs[0] + P[a, 1] * rhs[1] + P[a, 2] * rhs[2]
+        move = P[a, 0] * part[RHS] + P[a, 1] * part[RHS + 1] + P[a, 2] * part[RHS + 2]
         x[a] += move
-        gain += move * rhs[a]
+        gain += move * part[RHS + a]
     return gain if gain < 1e12 else np.nan  # nearly parallel
 
 
-@kernel
+@borrowing_kernel
 def solve(views, members, points, part):
     """Solve every instant that two members share; return chi-square and degrees of freedom.
 
@@ -75,7 +80,7 @@ def solve(views, members, points, part):
     instant has no solution.
     """
     X, N, P, seen_by = points
-    total, dof, rhs = 0.0, 0, np.empty(3)
+    total, dof = 0.0, 0
     for m in range(len(views.time_s)):
         count = 0
         for i in members:
@@ -84,17 +89,17 @@ def solve(views, members, points, part):
         seen_by[m] = count
         if count < 2:
             continue
-        if not solved and not _start(views, members, m, X[m]):
+        if not solved and not _start(views, members, m, points, part):
             return np.nan, 0
         chi2 = np.nan
         for _ in range(ITERATIONS):
             N[m] = 0.0
-            rhs[:] = 0.0
+            part[RHS : RHS + 3] = 0.0
             chi2 = 0.0
             for i in members:
                 if views.seen[i, m]:
-                    chi2 += add_view(views, i, m, X[m], N[m], rhs, part)
-            gain = step(X[m], N[m], rhs, P[m])
+                    chi2 += _add_view(views, i, m, X[m], N[m], part)
+            gain = _step(X[m], N[m], part, P[m])
             chi2 -= gain
             if not gain >= CONVERGED:
                 break
@@ -105,18 +110,17 @@ def solve(views, members, points, part):
     return total, dof
 
 
-@kernel
+@borrowing_kernel
 def join(views, c, points, part):
     """Update the solved points with tracklet c (Kalman); return false where it fails."""
     X, N, P, seen_by = points
-    rhs = np.empty(3)
     for m in range(len(views.time_s)):
         if not views.seen[c, m]:
             continue
         if seen_by[m] >= 2:
-            rhs[:] = 0.0
-            chi2 = add_view(views, c, m, X[m], N[m], rhs, part)
-            if np.isnan(chi2 + step(X[m], N[m], rhs, P[m])):
+            part[RHS : RHS + 3] = 0.0
+            chi2 = _add_view(views, c, m, X[m], N[m], part)
+            if np.isnan(chi2 + _step(X[m], N[m], part, P[m])):
                 return False
         seen_by[m] += seen_by[m] >= 2
     return True

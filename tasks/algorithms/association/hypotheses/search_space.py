@@ -7,13 +7,14 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.evidence.chance import Chance
 from epipole.tasks.algorithms.association.evidence.points import InstantPoints
+from epipole.tasks.algorithms.association.hypotheses.field_index import FieldIndex
 from epipole.tasks.algorithms.association.sampling.views import Views
-from epipole.tasks.algorithms.kernels import kernel
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-RESIDUAL_PARTS = 11  # of `views.residual`
+RESIDUAL_PARTS = 14  # of `views.residual`, and the right-hand side of `instant_points`
 PREDICTED_COLUMNS = 10  # of `candidates`
 
 
@@ -30,6 +31,8 @@ class SearchSpace(NamedTuple):
         Distances from the Earth's centre between which objects are sought.
     gate_sigma : float
         Views of one object agree within this (as a chi-square of the same probability).
+    fields
+        Which sensors' fields share space.
     """
 
     views: Views
@@ -39,6 +42,7 @@ class SearchSpace(NamedTuple):
     lowest_km: float
     farthest_km: float
     gate_sigma: float
+    fields: FieldIndex
 
 
 class WorkSpace(NamedTuple):
@@ -46,29 +50,49 @@ class WorkSpace(NamedTuple):
 
     points
         Its points.
-    part : (11,) float
-        Residual of one view, see `views.residual`.
+    part : (14,) float
+        Residual of one view, see `views.residual`, and right-hand side, see `instant_points`.
     predicted : (k, 10) float
         Predictions for one sensor, see `candidates`.
-    near : (s,) bool
-        Sensors whose field may hold the points, see `visibility.near_fields`.
+    nearby, near, missed : (s,) int
+        Lists of sensors: those that share space with two sensors, of these the ones whose field
+        may hold the points, and of these the ones that miss the object. The first ones count.
+    stamp : (s + 1,) int
+        Which sensors are in a list, by the number of the list; the last one counts the lists.
+    own : (c,) int
+        Tracklets of one sensor among the members, see `candidates.best_of_sensor`.
+    members, before, misfit : (t + 2,) int, int, float
+        Members, those before a review, and how badly they fit.
     """
 
     points: InstantPoints
     part: Array
     predicted: Array
-    near: Flags
+    nearby: Indices
+    near: Indices
+    missed: Indices
+    stamp: Indices
+    own: Indices
+    members: Indices
+    before: Indices
+    misfit: Array
 
 
-@kernel
-def work_space(k, n_sensors):
-    """Return a `WorkSpace` for k instants, without points."""
-    points = InstantPoints(
-        np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3)), np.zeros(k, np.int64)
-    )
+def work_space(views: Views) -> WorkSpace:
+    """Return a `WorkSpace` without points."""
+    k, n_sensors, n = len(views.time_s), len(views.camera), len(views.sensor)
     return WorkSpace(
-        points,
-        np.empty(RESIDUAL_PARTS),
-        np.empty((k, PREDICTED_COLUMNS)),
-        np.empty(n_sensors, np.bool_),
+        points=InstantPoints(
+            np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3)), np.zeros(k, np.int64)
+        ),
+        part=np.empty(RESIDUAL_PARTS),
+        predicted=np.empty((k, PREDICTED_COLUMNS)),
+        nearby=np.empty(n_sensors, np.int64),
+        near=np.empty(n_sensors, np.int64),
+        missed=np.empty(n_sensors, np.int64),
+        stamp=np.zeros(n_sensors + 1, np.int64),
+        own=np.empty(int(np.diff(views.first).max(initial=0)) + 1, np.int64),
+        members=np.empty(n + 2, np.int64),
+        before=np.empty(n + 2, np.int64),
+        misfit=np.empty(n + 2),
     )

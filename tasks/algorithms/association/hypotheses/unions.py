@@ -11,32 +11,35 @@ import numpy as np
 
 from epipole.tasks.algorithms.association.evidence.odds import score
 from epipole.tasks.algorithms.association.evidence.pool import Hypothesis
-from epipole.tasks.algorithms.association.evidence.visibility import near_fields
+from epipole.tasks.algorithms.association.hypotheses.field_index import near_points
 from epipole.tasks.algorithms.association.hypotheses.instant_points import possible, solve
-from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace, work_space
+from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace, WorkSpace
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
 from epipole.tasks.algorithms.kernels import kernel
 
 
 @kernel
-def _weigh(space, members, outcomes, x_km):
-    """Return the log-odds of a set of tracklets as one object; -inf where they do not fit.
+def _weigh(space, work, members, x_km):
+    """Return the log-odds of a set of tracklets as one object, and how many sensors miss it.
 
-    Writes `outcomes` (s,), see `odds.score`, and the point `x_km` (3,) at the first solved instant.
+    -inf where they do not fit. Writes `work.missed`, and the point `x_km` (3,) at the first solved
+    instant.
     """
-    views = space.views
-    work = work_space(len(views.time_s), views.camera.shape[0])
-    points = work.points
+    views, points = space.views, work.points
+    points.seen_by[:] = 0
     chi2, dof = solve(views, members, points, work.part)
     if not chi2 <= quantile(max(dof, 1), space.gate_sigma) or not possible(space, members, points):
-        return -np.inf
-    near_fields(views, points.x_km, points.cov_km2, points.seen_by, work.near)
+        return -np.inf, 0
+    a = b = views.sensor[members[0]]
+    for i in members:
+        b = views.sensor[i] if views.sensor[i] != a else b
+    n_near = near_points(space, work, a, b)
     x_km[:] = points.x_km[np.argmax(points.seen_by >= 2)]
-    return score(views, space.chance, members, points, space.shells, work.near, outcomes, work.part)
+    return score(space, work, members, work.near[:n_near])
 
 
 def best_union(
-    space: SearchSpace, h: Hypothesis, others: Iterable[Hypothesis]
+    space: SearchSpace, work: WorkSpace, h: Hypothesis, others: Iterable[Hypothesis]
 ) -> Hypothesis | None:
     """Return the likeliest union of a hypothesis with another one, if it is likelier than both.
 
@@ -55,8 +58,8 @@ def best_union(
         if not more or members in tried or space.taken[more].any() or seen[more][:, solved].any():
             continue
         tried.add(members)
-        x_km, outcomes = np.empty(3), np.zeros(len(space.views.half_field), np.int8)
-        value = float(_weigh(space, np.array(members, np.int64), outcomes, x_km))
+        x_km = np.empty(3)
+        value, n_missed = _weigh(space, work, np.array(members, np.int64), x_km)
         if value > max(h.score, other.score, best.score if best else -np.inf):
-            best = Hypothesis(value, h.seed, members, x_km, outcomes)
+            best = Hypothesis(value, h.seed, members, x_km, work.missed[:n_missed].copy())
     return best

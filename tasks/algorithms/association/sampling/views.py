@@ -12,7 +12,6 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.sampling.samples import Samples
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 Array = npt.NDArray[np.float64]
@@ -50,6 +49,8 @@ class Views(NamedTuple):
         First cell of a sensor and instant in `cell_start`, and the number of cells per side.
     cell_start, cell_item : (c,), (v,) int
         Tracklets of a cell are ``cell_item[cell_start[q]:cell_start[q + 1]]``.
+    bounded : (s,) bool
+        No tracklet of the sensor is seen before its start or after its end.
     """
 
     first: Indices
@@ -63,6 +64,7 @@ class Views(NamedTuple):
     grid: Indices
     cell_start: Indices
     cell_item: Indices
+    bounded: Flags
 
     @property
     def place_km(self) -> Array:
@@ -124,23 +126,51 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
         grid=grid,
         cell_start=cell_start,
         cell_item=cell_item,
+        bounded=_bounded(samples),
     )
     return views, order
 
 
-def _planes(first: Indices, seen: Flags, u: Array) -> Array:
-    """Return each sensor's planes. Their axes follow the normal from instant to instant."""
+def _bounded(samples: Samples) -> Flags:
+    """Return whether each sensor's tracklets are seen from their start to their end only, (s,)."""
+    outside = samples.seen & (
+        (samples.time_s < samples.start_s[:, None]) | (samples.time_s > samples.end_s[:, None])
+    )
+    bounded = np.ones(len(samples.half_field), np.bool_)
+    bounded[samples.sensor[outside.any(axis=1)]] = False
+    return bounded
+
+
+@kernel
+def _planes(first, seen, u):
+    """Return each sensor's planes, (s, k, 3, 3). Their axes follow the normal between instants."""
     plane = np.zeros((len(first) - 1, seen.shape[1], 3, 3))
+    axis, across = np.zeros(3), np.zeros(3)
     for s in range(len(plane)):
-        of_sensor = slice(first[s], first[s + 1])
-        total = np.einsum("tk,tki->ki", seen[of_sensor].astype(float), u[of_sensor])
-        length = np.linalg.norm(total, axis=1)
-        axis = None
-        for m in np.flatnonzero(length > 0).tolist():
-            normal = total[m] / length[m]
-            across = tangent_basis(normal)[0] if axis is None else axis - (axis @ normal) * normal
-            axis = across / np.linalg.norm(across)
-            plane[s, m] = axis, np.cross(normal, axis), normal
+        begun = False
+        for m in range(seen.shape[1]):
+            normal = plane[s, m, 2]
+            for i in range(first[s], first[s + 1]):
+                if seen[i, m]:
+                    normal += u[i, m]
+            length = np.sqrt(np.sum(normal * normal))
+            if not length > 0.0:
+                continue
+            normal /= length
+            if not begun:  # as in `sky.tangent_basis`
+                axis[:] = 0.0
+                axis[2 if abs(normal[2]) < 0.9 else 0] = 1.0
+                for a in range(3):
+                    b, c = (a + 1) % 3, (a + 2) % 3
+                    across[a] = axis[b] * normal[c] - axis[c] * normal[b]
+                begun = True
+            else:
+                across[:] = axis - np.sum(axis * normal) * normal
+            axis[:] = across / np.sqrt(np.sum(across * across))
+            plane[s, m, 0] = axis
+            for a in range(3):
+                b, c = (a + 1) % 3, (a + 2) % 3
+                plane[s, m, 1, a] = normal[b] * axis[c] - normal[c] * axis[b]
     return plane
 
 
