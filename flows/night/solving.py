@@ -13,12 +13,11 @@ import numpy as np
 
 from epipole.flows.night.progress import results
 from epipole.flows.night.work import Work
-from epipole.io.work.parts import Parts
-from epipole.io.work.places import SensorParts, SolvedParts
+from epipole.io.work.places import SensorParts, SolvedParts, ViewedParts
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
-from epipole.schemas.spans import Span
+from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.tasks.solve.association.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.association.number_objects import number_objects
@@ -35,9 +34,9 @@ MOST_LINES = 100_000  # of sight, of a span, that are kept for the check of the 
 
 
 class _Night(NamedTuple):
-    """What all steps work on: sensors with their parts, in the order of the ids."""
+    """What all steps work on; the sensors are in the order of their ids."""
 
-    sensors: list[tuple[str, SensorParts]]
+    sensors: list[Sensor]
     spans: list[Span]
     grid: EpochGrid
     work: Work
@@ -45,9 +44,9 @@ class _Night(NamedTuple):
     solved: SolvedParts
 
     @property
-    def viewed(self) -> dict[int, Parts]:
-        """The views of each sensor, by its number."""
-        return {of.number: of.viewed for _, of in self.sensors}
+    def viewed(self) -> ViewedParts:
+        """Where the views of the sensors are."""
+        return self.work.folder.viewed(self.work.round)
 
     @property
     def margin_ns(self) -> int:
@@ -68,8 +67,7 @@ def solve_objects(
         Number of positions.
     """
     solved = work.folder.solved(work.round, all_sensors=not left_out)
-    sensors = [(sensor.sensor_id, parts) for sensor, parts in sorted(
-        work.sensor_parts().items(), key=lambda pair: pair[0].sensor_id)]  # fmt: skip
+    sensors = sorted(work.spans, key=lambda sensor: sensor.sensor_id)
     grid = epoch_grid(work, settings)
     night = _Night(sensors, work.all_spans(), grid, work, settings, solved)
     n_views = _view(night)
@@ -134,8 +132,8 @@ def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str
         for of_task in [blocks] if together else [[block] for block in blocks]:
             futures.append(
                 associate_blocks.submit(
-                    night.sensors, of_task, night.work.cameras, left_out, night.settings,
-                    night.solved.blocks,
+                    night.sensors, night.viewed, of_task, night.work.cameras, left_out,
+                    night.settings, night.solved.blocks,
                 )
             )  # fmt: skip
     results(Stage.SOLVE, futures, (1, STEPS))

@@ -171,9 +171,9 @@ class Checked(NamedTuple):
 def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     """Judge the sensors by all spans; correct wrong clocks if the settings say so."""
     step(Stage.CHECK, 0, 1)
-    sensors = {of.sensor_id: work.folder.viewed(of, work.round) for of in sorted(
-        work.spans, key=lambda sensor: sensor.sensor_id)}  # fmt: skip
-    verdicts: list[SensorVerdict] = check_sensors(solved, sensors, work.all_spans())
+    sensors = sorted(work.spans, key=lambda sensor: sensor.sensor_id)
+    viewed = work.folder.viewed(work.round)
+    verdicts: list[SensorVerdict] = check_sensors(solved, viewed, sensors, work.all_spans())
     tell_verdicts(verdicts)
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
     late = [verdict for verdict in faulty if verdict.is_late]

@@ -51,7 +51,7 @@ class Work(NamedTuple):
                 self.identified[sensor],
                 self.folder.tracked(sensor, self.round),
                 self.folder.tracklet_names(sensor, self.round),
-                self.folder.viewed(sensor, self.round),
+                self.folder.viewed(self.round)[sensor.number],
             )
             for sensor in self.spans
         }

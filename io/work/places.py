@@ -20,6 +20,7 @@ Parts of reading belong to a run; all others to the nights and a key (see `folde
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -72,14 +73,25 @@ class WorkFolder(NamedTuple):
         """Return the parts with names in the night: `SPAN_NAMES`, and `NIGHT_TRACKLETS`."""
         return Parts(self.root / Stage.TRACK / str(round_) / f"{sensor.number}-names")
 
-    def viewed(self, sensor: Sensor, round_: int) -> Parts:
-        """Return a sensor's views: `VIEWED`."""
-        return Parts(self.root / Stage.SOLVE / str(round_) / "views" / str(sensor.number))
+    def viewed(self, round_: int) -> "ViewedParts":
+        """Return the parts with the views of all sensors."""
+        return ViewedParts(self.root / Stage.SOLVE / str(round_) / "views")
 
     def solved(self, round_: int, all_sensors: bool = True) -> "SolvedParts":
         """Return the parts of `solve`: of all sensors, or without those left out."""
         which = "all" if all_sensors else "some"
         return SolvedParts(self.root / Stage.SOLVE / str(round_) / which)
+
+
+@dataclass(frozen=True)
+class ViewedParts:
+    """The views of sensors, by their numbers in the run: `VIEWED`."""
+
+    root: Path
+
+    def __getitem__(self, number: int) -> Parts:
+        """Return the parts of a sensor."""
+        return Parts(self.root / str(number))
 
 
 class SolvedParts(NamedTuple):

@@ -9,11 +9,11 @@ import numpy.typing as npt
 import polars as pl
 
 from epipole.io.work.parts import Parts
-from epipole.io.work.places import SolvedParts
+from epipole.io.work.places import SolvedParts, ViewedParts
 from epipole.schemas.bridge import array, concat, stack, stack_covariance, to_polars
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.rejects import Reason
-from epipole.schemas.spans import Span
+from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import CLOCK_LINES, MOVING_OBJECTS, VIEWS
 from epipole.tasks.algorithms.constants import ARCSEC
@@ -96,7 +96,7 @@ class SensorVerdict(NamedTuple):
 
 @stage_task(Stage.CHECK, "sensors")
 def check_sensors(
-    solved: SolvedParts, sensors: Mapping[str, Parts], spans: Sequence[Span]
+    solved: SolvedParts, viewed: ViewedParts, sensors: Sequence[Sensor], spans: Sequence[Span]
 ) -> list[SensorVerdict]:
     """Return the verdicts on the sensors that the lines of sight of the night determine.
 
@@ -104,18 +104,18 @@ def check_sensors(
     ----------
     solved
         The parts of `solve` of these spans.
-    sensors
-        The parts of the views of each sensor.
+    viewed
+        The parts of the views of the sensors.
     """
     lines, objects = _of_objects(solved, spans)
     if not len(objects):
         return []
     first_guess, of_objects = {}, [lines]
-    for sensor_id, viewed in sensors.items():
-        own = lines.filter(pl.col("sensor_id") == sensor_id)
-        match = _search(_others(viewed, spans, own, objects))
+    for number, name in sensors:
+        own = lines.filter(pl.col("sensor_id") == name)
+        match = _search(_others(viewed[number], spans, own, objects))
         if match is not None:
-            first_guess[sensor_id], matched = match
+            first_guess[name], matched = match
             of_objects.append(matched.join(lines, on=KEY, how="anti"))
     return verdicts_of(pl.concat(of_objects), first_guess)
 

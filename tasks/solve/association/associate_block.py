@@ -7,11 +7,11 @@ import pyarrow as pa
 
 from epipole.io.work.part_tables import ASSOCIATED
 from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import SensorParts
+from epipole.io.work.places import ViewedParts
 from epipole.schemas.bridge import array, concat, empty, table
 from epipole.schemas.rejects import Outcome, Reason, reject_rows
 from epipole.schemas.settings import Settings
-from epipole.schemas.spans import BLOCK_NS, Span
+from epipole.schemas.spans import BLOCK_NS, Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import OBJECT_MEMBERS, TRACKLET_OUTCOMES
@@ -23,7 +23,8 @@ from epipole.tasks.solve.judge_tracklets import best_outcomes, outcomes
 
 @stage_task(Stage.SOLVE, "objects {blocks[0]}")
 def associate_blocks(
-    sensors: Sequence[tuple[str, SensorParts]],
+    sensors: Sequence[Sensor],
+    viewed: ViewedParts,
     blocks: Sequence[Span],
     cameras: pa.Table,
     left_out: Mapping[str, Reason],
@@ -35,7 +36,9 @@ def associate_blocks(
     Parameters
     ----------
     sensors
-        Ids and parts, in the order of the ids.
+        In the order of their ids.
+    viewed
+        The parts of their views.
     left_out
         Sensors at fault, each with its reason; their views are not used.
     parts
@@ -43,7 +46,9 @@ def associate_blocks(
     """
     for block in blocks:
         if not parts.holds(block):
-            tables = _associate(sensors, block, cameras, left_out, settings)
+            held = [of for of in sensors if viewed[of.number].holds(block.span)]
+            views = [sensor_views(of, viewed[of.number], block.span) for of in held]
+            tables = _associate(views, block, cameras, left_out, settings)
             write_part(parts.of(block), ASSOCIATED, tables)
 
 
@@ -54,12 +59,11 @@ def blocks_of(span: Span, settings: Settings) -> list[Span]:
     return [Span(t, t + BLOCK_NS) for t in range(span.start_ns, span.end_ns, BLOCK_NS)]
 
 
-def sensor_views(sensor_id: str, sensor: SensorParts, span: Span) -> SensorViews:
+def sensor_views(sensor: Sensor, viewed: Parts, span: Span) -> SensorViews:
     """Return the views of a sensor in a span, mapped into memory."""
-    viewed = sensor.viewed
     return SensorViews(
         sensor.number,
-        sensor_id,
+        sensor.sensor_id,
         viewed.read(span, "views"),
         viewed.read(span, "epochs"),
         viewed.read(span, "tracklets"),
@@ -67,18 +71,15 @@ def sensor_views(sensor_id: str, sensor: SensorParts, span: Span) -> SensorViews
 
 
 def _associate(
-    sensors: Sequence[tuple[str, SensorParts]],
+    sensors: Sequence[SensorViews],
     block: Span,
     cameras: pa.Table,
     left_out: Mapping[str, Reason],
     settings: Settings,
 ) -> dict[str, pa.Table]:
-    span = block.span
-    held = [(name, of) for name, of in sensors if of.viewed.holds(span)]
-    views = [sensor_views(name, of, span) for name, of in held if name not in left_out]
-    faulty = [sensor_views(name, of, span) for name, of in held if name in left_out]
+    faulty = [of for of in sensors if of.sensor_id in left_out]
     rejects = _left_out(faulty, block, left_out)
-    views = [of for of in views if of.epochs.num_rows]
+    views = [of for of in sensors if of.sensor_id not in left_out and of.epochs.num_rows]
     if not any(of.views.num_rows for of in views):
         return {
             "members": empty(OBJECT_MEMBERS),

@@ -1,13 +1,13 @@
 """Gather views: all views of some objects, from the parts of all sensors."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from epipole.io.work.parts import Parts
+from epipole.io.work.places import ViewedParts
 from epipole.schemas.bridge import array, concat, to_polars
 from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.work_tables import VIEWS
@@ -15,15 +15,13 @@ from epipole.schemas.work_tables import VIEWS
 Indices = npt.NDArray[np.int64]
 
 
-def gather_views(
-    viewed: Mapping[int, Parts], members: pa.Table, time: Span
-) -> tuple[pa.Table, Indices]:
+def gather_views(viewed: ViewedParts, members: pa.Table, time: Span) -> tuple[pa.Table, Indices]:
     """Return the VIEWS of objects in a time, and the number of the object of each.
 
     Parameters
     ----------
     viewed
-        The parts of the views of each sensor, by its number.
+        The parts of the views of the sensors.
     members
         OBJECT_MEMBERS of the objects.
 

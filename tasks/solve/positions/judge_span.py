@@ -1,14 +1,12 @@
 """Judge a span: the sensors whose shared errors are larger than stated, part to part."""
 
-from collections.abc import Mapping
-
 import numpy as np
 import polars as pl
 import pyarrow as pa
 
 from epipole.io.work.part_tables import JUDGED
-from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import SolvedParts
+from epipole.io.work.parts import write_part
+from epipole.io.work.places import SolvedParts, ViewedParts
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
@@ -25,7 +23,7 @@ MOST_VIEWS = 100_000
 
 @stage_task(Stage.SOLVE, "errors {span}")
 def judge_span(
-    viewed: Mapping[int, Parts],
+    viewed: ViewedParts,
     span: Span,
     margin_ns: int,
     settings: Settings,
@@ -36,7 +34,7 @@ def judge_span(
     Parameters
     ----------
     viewed
-        The parts of the views of each sensor, by its number.
+        The parts of the views of the sensors.
     solved
         `objects` is read, `errors` gets the part.
     """

@@ -5,14 +5,13 @@ epochs rest on as much as all others. Rows of the margins are not kept: they bel
 neighbouring spans.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import pyarrow as pa
 
 from epipole.io.work.part_tables import SOLVED
-from epipole.io.work.parts import Parts, is_written, read_part, write_part
-from epipole.io.work.places import SolvedParts
+from epipole.io.work.parts import is_written, read_part, write_part
+from epipole.io.work.places import SolvedParts, ViewedParts
 from epipole.schemas.bridge import concat
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
@@ -45,7 +44,7 @@ class Piece(NamedTuple):
 
 @stage_task(Stage.SOLVE, "{piece}")
 def solve_piece(
-    viewed: Mapping[int, Parts],
+    viewed: ViewedParts,
     piece: Piece,
     margin_ns: int,
     line_epochs_ns: int,
@@ -57,7 +56,7 @@ def solve_piece(
     Parameters
     ----------
     viewed
-        The parts of the views of each sensor, by its number.
+        The parts of the views of the sensors.
     line_epochs_ns
         Lines of sight are kept for the check of the sensors at epochs that are multiples of this.
     solved
@@ -75,7 +74,7 @@ def solve_piece(
 
 
 def _solve(
-    viewed: Mapping[int, Parts],
+    viewed: ViewedParts,
     piece: Piece,
     margin_ns: int,
     line_epochs_ns: int,

@@ -1,10 +1,10 @@
 """Check of sensors: what was corrected and what remains; nothing from nothing."""
 
 from epipole.io.work.part_tables import SOLVED
-from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import SolvedParts
+from epipole.io.work.parts import write_part
+from epipole.io.work.places import SolvedParts, ViewedParts
 from epipole.schemas.bridge import empty, to_polars
-from epipole.schemas.spans import SPAN_NS, Span
+from epipole.schemas.spans import SPAN_NS, Sensor, Span
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS
 from epipole.schemas.work_tables import CLOCK_LINES, VIEWS
 from epipole.tasks.check.check_sensors import (
@@ -38,8 +38,8 @@ def test_without_views_no_clock_is_known():
 
 def test_without_objects_no_clock_is_known(tmp_path):
     solved, spans = SolvedParts(tmp_path), [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in (7, 8)]
-    sensors = {"a": Parts(tmp_path / "views")}
-    assert check_sensors.fn(solved, sensors, spans) == []
+    sensors = ViewedParts(tmp_path / "views"), [Sensor(0, "a")]
+    assert check_sensors.fn(solved, *sensors, spans) == []
     tables = {name: empty(schema) for name, schema in SOLVED.items()}
     write_part(solved.piece(spans[1], 0), SOLVED, tables)
-    assert check_sensors.fn(solved, sensors, spans) == []
+    assert check_sensors.fn(solved, *sensors, spans) == []

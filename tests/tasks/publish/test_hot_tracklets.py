@@ -67,7 +67,7 @@ def night(tmp_path, tracks: dict[Sensor, dict[str, str]], suspects=()) -> NightP
         sensors.append(
             SensorParts(
                 sensor.number, folder.identified(sensor), folder.tracked(sensor, 0), names_of,
-                folder.viewed(sensor, 0),
+                folder.viewed(0)[sensor.number],
             )
         )  # fmt: skip
     return NightParts(NIGHT, SPANS[:1], SPANS, sensors, folder.solved(0), {}, {})

@@ -7,10 +7,10 @@ from scenes.associations import SPAN, START_NS, block_of, sensor_views, tables, 
 from scenes.tracklet_scenes import Scene
 
 from epipole.io.work.parts import Parts
-from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import array, to_polars
 from epipole.schemas.rejects import Outcome, Reason
 from epipole.schemas.settings import AssociationSettings, Settings
+from epipole.schemas.spans import Sensor
 from epipole.schemas.work_tables import OBJECT_MEMBERS
 from epipole.tasks.solve.association.associate_block import (
     associate_blocks,
@@ -28,12 +28,10 @@ def found_by(folder, of, left_out, settings=SETTINGS, blocks=None) -> Parts:
     """Associate the blocks of a scene's span, from the parts of its sensors."""
     sensors = sensor_views(of, settings)
     viewed = write_views(folder / "views", sensors, SPAN)
-    none = Parts(folder / "none")
-    named = [(one.sensor_id, SensorParts(one.number, none, none, none, viewed[one.number]))
-             for one in sensors]  # fmt: skip
+    named = [Sensor(one.number, one.sensor_id) for one in sensors]
     parts = Parts(folder / "blocks")
     blocks = blocks or blocks_of(SPAN, settings)
-    associate_blocks.fn(named, blocks, of.cameras, left_out, settings, parts)
+    associate_blocks.fn(named, viewed, blocks, of.cameras, left_out, settings, parts)
     return parts
 
 

@@ -1,0 +1,136 @@
+"""CPU and memory of a night of many sensors, by stage, and what a unit of its data costs.
+
+`python tests/benchmarks/bench_scaling.py [--sensors 8 32 128] [--hours 0.17] [--objects 60]`. Each
+row is one `epipole run` of `epipole simulate night`, in its own process and with cached kernels.
+Needs Linux: the CPU of each stage is read from /proc at the log line that ends it.
+"""
+
+import argparse
+import itertools
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pyarrow.parquet as pq
+
+COMMAND = "from epipole.flows.command_line.main import main; main()"
+# How the log line at the end of each stage begins.
+STAGES = {
+    "read": "read ",
+    "identify": "identified ",
+    "track": "followed ",
+    "solve": "solved ",
+    "check": "clocks of ",
+    "name": "named ",
+    "publish": "published ",
+}
+TABLES = ("frames", "stars", "detections", "associations", "positions")
+TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
+
+
+class Night(NamedTuple):
+    """CPU seconds of the stages and of all processes, memory [MiB], and rows of tables."""
+
+    stages: dict[str, float]
+    cpu_s: float
+    mib: float
+    rows: dict[str, int]
+    bytes: int
+
+
+def simulate(log: Path, sensors: int, objects: int, hours: float) -> None:
+    """Write the log of a night."""
+    numbers = ["--sensors", sensors, "--objects", objects, "--hours", hours]
+    command = [sys.executable, "-c", COMMAND, "simulate", "night", *map(str, numbers)]
+    subprocess.run([*command, "--out", str(log)], check=True, stdout=subprocess.DEVNULL)
+
+
+def run(log: Path, out: Path) -> Night:
+    """Run the log once."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, "run", str(log), "--out", str(out), "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    cpu = {"start": 0.0}
+    for line in process.stderr:
+        text = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
+        if text.startswith("found "):
+            cpu["start"] = _cpu_s(process.pid)
+        for stage, word in STAGES.items():
+            if text.startswith(word):
+                cpu[stage] = _cpu_s(process.pid)
+    summary = json.loads(process.stdout.read() if process.stdout else "{}")
+    assert process.wait() == 0, summary
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    names = ["start", *(name for name in STAGES if name in cpu)]
+    return Night(
+        {b: cpu[b] - cpu[a] for a, b in itertools.pairwise(names)},
+        after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+        after.ru_maxrss / 1024,
+        _rows(out),
+        sum(file.stat().st_size for file in out.rglob("*.parquet")),
+    )
+
+
+def _cpu_s(pid: int) -> float:
+    """Return the CPU seconds of a process without its children."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * TICK_S
+
+
+def _rows(out: Path) -> dict[str, int]:
+    return {
+        name: sum(pq.read_metadata(file).num_rows for file in out.glob(f"night=*/{name}/*.parquet"))
+        for name in TABLES
+    }
+
+
+def prices(night: Night) -> dict[str, float]:
+    """Return what a unit costs [microseconds of CPU]: of each stage by what it works on."""
+    rows, of = night.rows, night.stages
+    return {
+        "read, a centroid": 1e6 * of["read"] / (rows["stars"] + rows["detections"]),
+        "identify, a frame": 1e6 * of["identify"] / rows["frames"],
+        "identify, a star": 1e6 * of["identify"] / max(rows["stars"], 1),
+        "track, a detection": 1e6 * of["track"] / rows["detections"],
+        "solve, a detection": 1e6 * of["solve"] / rows["detections"],
+        "solve, a view": 1e6 * of["solve"] / max(rows["associations"], 1),
+        "solve, an object's epoch": 1e6 * of["solve"] / max(rows["positions"], 1),
+        "publish, a row": 1e6 * of["publish"] / sum(rows.values()),
+    }
+
+
+def main() -> None:
+    """Print the rows of the tables in BENCHMARKS.md."""
+    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    arguments.add_argument("--sensors", type=int, nargs="+", default=[8, 32, 128])
+    arguments.add_argument("--objects", type=int, default=60)
+    arguments.add_argument("--hours", type=float, default=0.17)
+    chosen: Any = arguments.parse_args()
+    print("| sensors | frames | detections | " + " | ".join(STAGES) + " | CPU s | MiB | disk MiB |")
+    with tempfile.TemporaryDirectory() as folder:
+        for sensors in chosen.sensors:
+            log, out = Path(folder) / f"{sensors}.mcap", Path(folder) / f"out{sensors}"
+            simulate(log, sensors, chosen.objects, chosen.hours)
+            night = run(log, out)
+            log.unlink()
+            stages = " | ".join(f"{night.stages.get(name, 0.0):.1f}" for name in STAGES)
+            print(
+                f"| {sensors} | {night.rows['frames']:,} | {night.rows['detections']:,} | {stages} "
+                f"| {night.cpu_s:.1f} | {night.mib:,.0f} | {night.bytes / 2**20:,.0f} |",
+                flush=True,
+            )
+            for what, price in prices(night).items():
+                print(f"{what:>26s}: {price:8.2f} us", flush=True)
+
+
+if __name__ == "__main__":
+    main()
