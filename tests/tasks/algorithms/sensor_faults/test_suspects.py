@@ -1,0 +1,63 @@
+"""Suspects: of many sensors the wrong ones are found, as if all were judged together."""
+
+import numpy as np
+from scenes.many_sensors import POSITION_KM, lines_of_many
+
+from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
+    CLOCK,
+    EPHEMERIS,
+    SOUND,
+    judge_sensors,
+)
+from epipole.tasks.algorithms.sensor_faults.suspects import MOST_TOGETHER, judge_many_sensors
+
+
+def judged(lines, n_sensors, judge=judge_many_sensors, guess_s=None):
+    guess = np.zeros(n_sensors) if guess_s is None else guess_s
+    return judge(lines, np.full(n_sensors, POSITION_KM), np.zeros(n_sensors), guess)
+
+
+def faults(found):
+    return {s: cause for s, cause in enumerate(found.cause) if cause != SOUND}
+
+
+def test_few_sensors_are_judged_together():
+    lines = lines_of_many(1, 6, 60, late_s={2: 0.4})
+    for one, other in zip(judged(lines, 6), judged(lines, 6, judge_sensors), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_the_faults_of_many_are_those_that_all_together_have():
+    n = MOST_TOGETHER + 6
+    lines = lines_of_many(2, n, 300, late_s={3: 0.3}, off_km={7: 1.5})
+    many, together = judged(lines, n), judged(lines, n, judge_sensors)
+    assert faults(many) == faults(together) == {3: CLOCK, 7: EPHEMERIS}
+    apart = np.abs(many.offset_s - together.offset_s)
+    assert (apart < 0.5 * together.sigma_s).all()
+    assert abs(many.offset_s[3] - 0.3) < 4 * many.sigma_s[3]
+
+
+def test_of_a_hundred_sensors_no_sound_one_is_at_fault_and_offsets_are_honest():
+    scores = []
+    for seed in range(8):
+        lines = lines_of_many(10 + seed, 100, 250, late_s={50: 0.5})
+        found = judged(lines, 100)
+        assert faults(found) == {50: CLOCK}
+        scores.append(np.delete(found.offset_s / found.sigma_s, 50))
+    assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.2
+
+
+def test_more_wrong_sensors_than_are_judged_together_are_all_found():
+    late = dict.fromkeys(range(MOST_TOGETHER + 3), 0.6)
+    found = judged(lines_of_many(20, 120, 400, late_s=late), 120)
+    assert faults(found) == dict.fromkeys(late, CLOCK)
+
+
+def test_a_sensor_without_lines_has_no_offset():
+    lines = lines_of_many(30, 40, 50)
+    few = lines._replace(
+        **{name: getattr(lines, name)[lines.sensor != 5] for name in lines._fields}
+    )
+    found = judged(few, 40)
+    assert np.isnan(found.offset_s[5])
+    assert found.cause[5] == SOUND
