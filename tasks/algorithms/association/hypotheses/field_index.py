@@ -112,7 +112,7 @@ class Entering(NamedTuple):
         The sensor that was last entered in each cell.
     own_cell : (v,) int
         Cells of the sensors, one after the other.
-    count : (2,) int
+    filled : (2,) int
         How many entries and cells there are.
     low, high : (3,) int
         Lowest and highest coordinates of the cells about a ball.
@@ -123,7 +123,7 @@ class Entering(NamedTuple):
     slots: Indices
     latest: Indices
     own_cell: Indices
-    count: Indices
+    filled: Indices
     low: Indices
     high: Indices
 
@@ -199,7 +199,7 @@ def _enter(cones, farthest_km, size, room):
         np.empty(3, np.int64),
         np.empty(3, np.int64),
     )
-    own_cell, count = entering.own_cell, entering.count
+    own_cell, count = entering.own_cell, entering.filled
     for s in range(n_sensors):
         m = 0
         while m < n_instants:
@@ -277,7 +277,7 @@ def _along(cones, s, m, at):
 @borrowing_kernel
 def _enter_ball(cones, sweep, x, ball, entering):
     """Enter a sensor in the cells that a ball and its cone touch; return whether there was room."""
-    size, low, high, count = entering.size, entering.low, entering.high, entering.count
+    size, low, high, count = entering.size, entering.low, entering.high, entering.filled
     keys, slots, latest = entering.keys, entering.slots, entering.latest
     distance = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
     per_km, radius = _cells_per_km(distance, size), ball * _cells_per_km(distance - ball, size)
