@@ -136,6 +136,11 @@ class Reason(StrEnum):
         Stage.IDENTIFY,
         "No state of the sensor is near enough in time: the frames give no position.",
     )
+    TOO_MANY_DETECTIONS = (
+        "too_many_detections",
+        Stage.IDENTIFY,
+        "The sensor reports more detections than are followed: the faintest of its fullest frames.",
+    )
     # Of tracklets and views.
     HOT_PIXEL = (
         "hot_pixel",

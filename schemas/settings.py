@@ -119,6 +119,12 @@ class TrackletSettings(Group):
         "the default `min_detections`): what no tracklet claimed is followed again with it. It "
         "counts every pair of detections as a test; 1 to 5 % of it are measured.",
     )
+    most_detections: int = Field(
+        500_000,
+        ge=1_000,
+        description="Most detections of a sensor in half an hour that are followed; of more, the "
+        "fullest frames keep the brightest. It bounds the memory of a task: about 1 kB each.",
+    )
     link_method: LinkMethod = Field(
         "likelihood_ratio", description="How tracklets of one object are joined after a gap."
     )

@@ -66,11 +66,13 @@ def identify_stars(
     matches = _matches(found, rows)
     stars = stars_table(exposures, places, centroids, attitudes, matches)
     stars = with_catalogue(stars, catalogue.schema)
+    most = settings.tracklets.most_detections
+    detections, left_out = detections_table(exposures, centroids, attitudes, matches, most)
     result = IdentifiedTables(
         solutions_table(exposures, places, centroids, attitudes, matches, stars),
         stars,
-        detections_table(exposures, centroids, attitudes, matches),
-        rejects_table(exposures, centroids),
+        detections,
+        rejects_table(exposures, centroids, left_out),
     )
     LOGGER.info(
         "%s: identified %d of %d frames, %d stars, %d other centroids",

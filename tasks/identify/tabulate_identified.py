@@ -6,15 +6,24 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, nullable, stack, table, unstack, unstack_covariance
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    nullable,
+    stack,
+    table,
+    unstack,
+    unstack_covariance,
+)
 from epipole.schemas.rejects import Reason, reject_rows
-from epipole.schemas.tables import DETECTIONS, STARS
+from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import project
 from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
 from epipole.tasks.algorithms.geometry.sky import aberrate, boresight_angles, radec_from_unit
 from epipole.tasks.algorithms.time.time_scales import earth_velocity
+from epipole.tasks.identify.bound_detections import within_bound
 from epipole.tasks.identify.flatten_centroids import FlatCentroids
 
 Array = npt.NDArray[np.float64]
@@ -134,20 +143,24 @@ def solutions_table(
 
 
 def detections_table(
-    exposures: pa.Table, c: FlatCentroids, a: StarAttitudes, m: MatchedStars
-) -> pa.Table:
-    """Return DETECTIONS: each centroid that is no star, in frames with a camera.
+    exposures: pa.Table, c: FlatCentroids, a: StarAttitudes, m: MatchedStars, most: int
+) -> tuple[pa.Table, npt.NDArray[np.int64]]:
+    """Return DETECTIONS: each centroid that is no star, in frames with a camera; at most so many.
 
-    It has no direction where the frame has no attitude.
+    It has no direction where the frame has no attitude. The numbers of detections left out, by
+    frame, come second.
     """
     left = (c.camera_of_frame >= 0)[c.frame]
     left[m.at] = False
     at = np.flatnonzero(left)
+    kept = within_bound(c.frame[at], c.flux[at], most)
+    left_out = np.bincount(c.frame[at[~kept]], minlength=exposures.num_rows)
+    at = at[kept]
     frame = c.frame[at]
     u_icrs = np.einsum("nji,nj->ni", a.R[frame], c.u[at])
     ra, dec = radec_from_unit(u_icrs)
     sigma_px = np.where(np.isnan(c.sigma_px[at]), 1.0, c.sigma_px[at]) * m.scale
-    return table(
+    rows = table(
         DETECTIONS,
         _frame_key(exposures, frame)
         | {
@@ -163,20 +176,34 @@ def detections_table(
             "track_id": pa.nulls(len(at), pa.string()),
         },
     )
+    return rows, left_out
 
 
-def rejects_table(exposures: pa.Table, c: FlatCentroids) -> pa.Table:
-    """Return a row of `rejects` per log: how many centroids lie in frames without a camera."""
-    counts, frames = np.diff(c.first), c.camera_of_frame < 0
+def rejects_table(
+    exposures: pa.Table, c: FlatCentroids, left_out: npt.NDArray[np.int64]
+) -> pa.Table:
+    """Return rows of `rejects`, per log: how many centroids lie in frames without a camera, and
+    how many detections were left out, by frame, because there were too many."""
+    uncalibrated = np.where(c.camera_of_frame < 0, np.diff(c.first), 0)
+    return concat(
+        REJECTS,
+        [
+            _counted(Reason.NO_CALIBRATION, exposures, uncalibrated),
+            _counted(Reason.TOO_MANY_DETECTIONS, exposures, left_out),
+        ],
+    )
+
+
+def _counted(reason: Reason, exposures: pa.Table, counts: npt.NDArray[np.int64]) -> pa.Table:
+    """Return a row of `rejects` per log in which something of a frame was left out."""
     sources, times = array(exposures, "source"), array(exposures, "time")
     rows = []
-    for source in sorted(set(sources[frames])):
-        at = np.flatnonzero(frames & (sources == source) & (counts > 0))
-        if len(at):
-            rows.append((source, int(times[at[0]]), int(counts[at].sum())))
+    for source in sorted(set(sources[counts > 0])):
+        at = np.flatnonzero((sources == source) & (counts > 0))
+        rows.append((source, int(times[at[0]]), int(counts[at].sum())))
     source, time, count = zip(*rows, strict=True) if rows else ((), (), ())
     return reject_rows(
-        Reason.NO_CALIBRATION,
+        reason,
         source=list(source),
         sensor_id=exposures["sensor_id"][0].as_py(),
         time=list(time),

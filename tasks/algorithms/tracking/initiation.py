@@ -33,7 +33,7 @@ P_DETECTION = 0.9  # probability that an object in the field is detected in a fr
 MISSED = np.log(1.0 - P_DETECTION)
 N_RATES = 24  # classes of the rate, for which the best evidence is tabulated
 SLOWEST_RAD_S = 1e-6  # upper end of the first class
-MOST_PAIRS = 500_000  # per frame: where more are possible, the fastest objects are not searched for
+MOST_PAIRS = 500_000  # per frame, however few frames there are
 FEW_TO_ASK = 1_000  # up to so many pairs, only the classes of rate that they have are tabulated
 FEW_PAIRS = 50_000  # up to so many, pairs that are two frames apart are tried as well
 
@@ -75,6 +75,7 @@ class TrackRule(NamedTuple):
     gate2 : squared distance in sigmas within which a detection continues a track
     field_sr : solid angle of the field
     enough : evidence (ln) beyond the number of pairs tried that begins a track
+    most_pairs : per frame; where more are possible, the fastest objects are not searched for
     """
 
     max_rate: float
@@ -84,6 +85,7 @@ class TrackRule(NamedTuple):
     gate2: float
     field_sr: float
     enough: float
+    most_pairs: float
 
 
 class _Pair(NamedTuple):
@@ -279,15 +281,15 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, room):
 
 
 @kernel
-def _fastest(best, class_rates, wanted, dt, pairs_sr, max_rate):
+def _fastest(best, class_rates, wanted, dt, pairs_sr, rule):
     """Return the highest rate to search for: chains can reach the evidence wanted, and the pairs
     are not too many."""
     top = 0.0
     for c in range(N_RATES):
         if best[c, 0] >= wanted:
             top = class_rates[c + 1]
-    most = np.sqrt(MOST_PAIRS / (np.pi * pairs_sr)) / abs(dt)
-    return min(top, most, max_rate)
+    most = np.sqrt(rule.most_pairs / (np.pi * pairs_sr)) / abs(dt)
+    return min(top, most, rule.max_rate)
 
 
 @kernel
@@ -420,7 +422,7 @@ def _strongest_chains(f, depth, detections, recent, rule):
         for c in range(N_RATES):
             best[c] -= best[c, n_back]
         best = best[:, : n_back + 1].copy()
-        rate = _fastest(best, class_rates, wanted, dt, pairs_sr, rule.max_rate)
+        rate = _fastest(best, class_rates, wanted, dt, pairs_sr, rule)
         if g < f - 1 and pairs_sr * np.pi * (rate * dt) ** 2 > FEW_PAIRS:
             continue
         # No chord is longer than its arc, so this reach holds everything up to that rate.

@@ -263,6 +263,18 @@ def test_thousands_of_centroids_end_in_bounded_time(sky, log, catalogue):
     assert set(found.solutions["attitude_source"].to_pylist()) == {"none"}
 
 
+def test_of_too_many_detections_some_are_left_out_and_counted(log, catalogue):
+    rng = np.random.default_rng(4)
+    x = [rng.uniform(0, 1023, 60) for _ in range(40)]
+    exposures = log.make_exposures(x, x[::-1])
+    settings = Settings(tracklets={"most_detections": 1_000})
+    found = identify_stars(exposures, log.places, log.cameras, catalogue, settings)
+    assert found.detections.num_rows == 1_000
+    assert found.rejects["reason"].to_pylist() == ["too_many_detections"]
+    assert found.rejects["count"].to_pylist() == [60 * 40 - 1_000]
+    assert array(found.solutions, "n_centroids").sum() == 60 * 40
+
+
 def test_no_frames_give_empty_tables(log, catalogue):
     found = log.run(catalogue, exposures=log.exposures.slice(0, 0), places=log.places.slice(0, 0))
     assert [t.num_rows for t in found] == [0, 0, 0, 0]
