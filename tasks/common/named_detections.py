@@ -1,7 +1,5 @@
 """One sensor's detections, with the names of their tracklets in the night."""
 
-from typing import NamedTuple
-
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -9,23 +7,6 @@ from epipole.io.work.places import SensorParts
 from epipole.schemas.bridge import concat
 from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.tables import DETECTIONS
-
-
-class UnnamedDetections(NamedTuple):
-    """A sensor's detections in a span, with the names of its tracklets aside."""
-
-    detections: pa.Table
-    names: pa.Table
-
-    def named(self, detections: pa.Table) -> pa.Table:
-        """Return some of the detections with the names of their tracklets in the night."""
-        return _named(detections, self.names)
-
-
-def unnamed_detections(sensor: SensorParts, span: Span) -> UnnamedDetections:
-    """Return a sensor's detections in a span, which has a part, as they lie in the work folder."""
-    detections = span.of(sensor.tracked.read(span, "detections"), "time")
-    return UnnamedDetections(detections, sensor.names.read(span, "names"))
 
 
 def detections_within(sensor: SensorParts, span: Span) -> pa.Table:
@@ -36,11 +17,15 @@ def detections_within(sensor: SensorParts, span: Span) -> pa.Table:
             continue
         detections = other.of(sensor.tracked.read(other, "detections"), "time")
         names = sensor.names.read(other, "names")
-        rows.append(_named(span.of(detections, "time"), names))
+        rows.append(with_names(span.of(detections, "time"), names))
     return concat(DETECTIONS, rows)
 
 
-def _named(detections: pa.Table, names: pa.Table) -> pa.Table:
+def with_names(detections: pa.Table, names: pa.Table) -> pa.Table:
+    """Return detections of a span with the names of their tracklets in the night.
+
+    `names` are the sensor's TRACKLET_NAMES of the span.
+    """
     row = pc.index_in(detections["tracklet_id"], names["span_name"])
     row = pc.if_else(detections["tracklet_id"].is_valid(), row, pa.scalar(None, pa.int32()))
     if pc.any(pc.and_(row.is_null(), detections["tracklet_id"].is_valid())).as_py():

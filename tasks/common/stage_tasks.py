@@ -1,12 +1,14 @@
 """Tasks of a stage: their name is the stage, the name of a run is the stage and its work."""
 
 from collections.abc import Callable
+from functools import wraps
 from typing import Any, TypeVar
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
 
 from epipole.schemas.stages import Stage
+from epipole.tasks.common.memory import give_back_memory
 from epipole.tasks.common.retries import DELAYS_S, RETRIES, storage_failed
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -34,4 +36,23 @@ def stage_task(stage: Stage, works_on: str, *, retried: bool = False) -> Callabl
             "retry_delay_seconds": DELAYS_S,
             "retry_condition_fn": storage_failed,
         }
-    return task(name=stage.value, task_run_name=f"{stage} {works_on}".strip(), **options)
+
+    def decorated(function: F) -> Any:
+        return task(name=stage.value, task_run_name=f"{stage} {works_on}".strip(), **options)(
+            _giving_back(function)
+        )
+
+    return decorated
+
+
+def _giving_back(function: F) -> Callable[..., Any]:
+    """Return the function; what it no longer needs goes back to the system when it ends."""
+
+    @wraps(function)
+    def called(*arguments: Any, **named: Any) -> Any:
+        try:
+            return function(*arguments, **named)
+        finally:
+            give_back_memory()
+
+    return called

@@ -1,7 +1,6 @@
 """Time slices: a span's rows from many parts, merged in times short enough to hold."""
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -12,27 +11,31 @@ from epipole.schemas.spans import Span
 MOST_ROWS = 200_000  # in a slice, about
 
 
-def in_slices(tables: Sequence[pa.Table], span: Span, column: str) -> Iterator[list[pa.Table]]:
+def in_slices(
+    tables: Sequence[Callable[[], pa.Table]], span: Span, column: str
+) -> Iterator[list[pa.Table]]:
     """Yield the rows of each table in one time after the other; together they are the span.
 
     Parameters
     ----------
     tables
-        In any order of time; rows outside the span are left out.
+        What reads each table: it is read again for each slice, so that all of a span is never
+        held. In any order of time; rows outside the span are left out.
     column
         The time of the rows.
 
     Notes
     -----
-    The times depend on the number of rows only. The rows of a slice are views of the tables.
+    The times depend on the number of rows only.
     """
-    tables = [_in_order(rows, column) for rows in tables]
-    count = max(-(-sum(rows.num_rows for rows in tables) // MOST_ROWS), 1)
+    n_rows = sum(read().num_rows for read in tables)
+    count = max(-(-n_rows // MOST_ROWS), 1)
     edges = np.linspace(span.start_ns, span.end_ns, count + 1).astype(np.int64)
-    cuts = [np.searchsorted(array(rows, column), edges).tolist() for rows in tables]
-    for k, _ in enumerate(itertools.pairwise(edges)):
+    cuts = [np.searchsorted(array(_in_order(read(), column), column), edges) for read in tables]
+    for k in range(count):
         yield [
-            rows.slice(cut[k], cut[k + 1] - cut[k]) for rows, cut in zip(tables, cuts, strict=True)
+            _in_order(read(), column).slice(int(cut[k]), int(cut[k + 1] - cut[k]))
+            for read, cut in zip(tables, cuts, strict=True)
         ]
 
 

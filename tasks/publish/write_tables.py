@@ -1,6 +1,7 @@
 """Write tables: the parts of a night's spans, joined to the tables of a dataset."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pyarrow.compute as pc
 
 from epipole.io.datasets.dataset import in_order, rows_of_night
 from epipole.io.datasets.night_files import write_table
+from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import array, concat, conform, table
 from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.rejects import Reason, reject_rows
@@ -19,7 +21,7 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.common.lone_detections import with_lone_objects
-from epipole.tasks.common.named_detections import unnamed_detections
+from epipole.tasks.common.named_detections import with_names
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.hot_tracklets import (
     confirmed_tracklets,
@@ -95,7 +97,7 @@ def _of_span(name: str, parts: NightParts, span: Span) -> Iterator[list[pa.Table
         return
     column = "solutions" if name == "frames" else name
     schema = SOLUTIONS if name == "frames" else TABLES[name]
-    tables = [of.identified.rows_within(span, schema, column) for of in parts.sensors]
+    tables = [partial(of.identified.rows_within, span, schema, column) for of in parts.sensors]
     for rows in in_slices(tables, span, "time"):
         yield [conform(TABLES[name], of_sensor) for of_sensor in rows]
 
@@ -103,9 +105,14 @@ def _of_span(name: str, parts: NightParts, span: Span) -> Iterator[list[pa.Table
 def _detections(parts: NightParts, span: Span) -> Iterator[list[pa.Table]]:
     hot = hot_tracklets(parts)["tracklet_id"]
     lone = lone_views(parts, span)
-    found = [unnamed_detections(of, span) for of in parts.sensors if of.tracked.holds(span)]
-    for rows in in_slices([part.detections for part in found], span, "time"):
-        named = [part.named(of_part) for part, of_part in zip(found, rows, strict=True)]
+    held = [of for of in parts.sensors if of.tracked.holds(span)]
+    tables = [partial(of.tracked.read, span, "detections") for of in held]
+    for rows in in_slices(tables, span, "time"):
+        named = [
+            with_names(of_sensor, of.names.read(span, "names"))
+            for of, of_sensor in zip(held, rows, strict=True)
+            if of_sensor.num_rows
+        ]
         together = with_lone_objects(concat(TABLES["detections"], named), lone)
         yield [with_hot_pixels(together, hot)]
 
@@ -129,9 +136,10 @@ def lone_views(parts: NightParts, span: Span) -> pa.Table:
 def _of_spans(name: str, parts: NightParts) -> Iterator[pa.Table]:
     for span in parts.spans:
         if name == "epochs":
-            tables = [of.viewed.read(span, name) for of in parts.sensors if of.viewed.holds(span)]
+            held = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
+            tables = [partial(viewed.read, span, name) for viewed in held]
         else:
-            tables = parts.solved.read(span, name)
+            tables = [partial(read_part, piece, name) for piece in parts.solved.pieces(span)]
         names = parts.names.get(span.folder, {})
         for rows in in_slices(tables, span, "epoch"):
             together = concat(TABLES[name], [conform(TABLES[name], of) for of in rows])

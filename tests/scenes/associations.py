@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -110,6 +111,10 @@ def tables(scene: Scene, names=None) -> SceneTables:
     return SceneTables(views, tracklets, solutions, cameras)
 
 
+def _same(rows: pa.Table) -> pa.Table:
+    return rows
+
+
 def sensor_views(of: SceneTables, settings: Settings | None = None) -> list[SensorViews]:
     """Return the views of each sensor, in the order of the ids, as the part of a span has them."""
     instants = np.union1d(array(of.solutions, "time"), array(of.views, "epoch"))
@@ -124,7 +129,11 @@ def sensor_views(of: SceneTables, settings: Settings | None = None) -> list[Sens
         )
         epochs = align_epochs(solutions, settings or Settings(), grid)
         tracklets = viewed_tracklets(of.tracklets.filter(of_sensor), views)
-        out.append(SensorViews(number, name, views, sensor_epochs(epochs, solutions), tracklets))
+        out.append(
+            SensorViews(
+                number, name, partial(_same, views), sensor_epochs(epochs, solutions), tracklets
+            )
+        )
     return out
 
 
@@ -141,7 +150,7 @@ def write_views(folder: Path, sensors: Sequence[SensorViews], span: Span) -> Map
     """Write the parts of the views of sensors in a span, and return them by sensor number."""
     viewed = {of.number: Parts(folder / str(of.number)) for of in sensors}
     for of in sensors:
-        tables = {"views": of.views, "epochs": of.epochs, "tracklets": of.tracklets}
+        tables = {"views": of.read_views(), "epochs": of.epochs, "tracklets": of.tracklets}
         write_part(viewed[of.number].of(span), VIEWED, tables)
     return viewed
 

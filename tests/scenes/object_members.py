@@ -1,6 +1,7 @@
 """OBJECT_MEMBERS and views of sensors for tests: a few rows, times in seconds."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def views_of(sensor: int, tracklets: Mapping[str, Sequence[float]], missed=()) -
     names = sorted(tracklets)
     runs = filled(TRACKLET_RUNS, len(names), {"tracklet_id": names, "track_id": names})
     epochs = filled(SENSOR_EPOCHS, 0, {})
-    return SensorViews(sensor, f"s{sensor}", views, epochs, viewed_tracklets(runs, views))
+    return SensorViews(sensor, f"s{sensor}", lambda: views, epochs, viewed_tracklets(runs, views))
 
 
 def write_spans(folder: Path, sensors: Sequence[SensorViews]) -> Mapping[int, Parts]:
@@ -52,11 +53,15 @@ def write_spans(folder: Path, sensors: Sequence[SensorViews]) -> Mapping[int, Pa
     viewed: dict[int, Parts] = {of.number: Parts(folder / str(of.number)) for of in sensors}
     for span in SPANS:
         for of in sensors:
-            views = span.of(of.views, "epoch")
+            views = span.of(of.read_views(), "epoch")
             if views.num_rows:
                 known = [field.name for field in TRACKLET_RUNS]
                 tracklets = viewed_tracklets(of.tracklets.select(known), views)
-                write_views(folder, [of._replace(views=views, tracklets=tracklets)], span)
+                write_views(
+                    folder,
+                    [of._replace(read_views=partial(pa.Table.slice, views), tracklets=tracklets)],
+                    span,
+                )
     return viewed
 
 

@@ -1,6 +1,7 @@
 """Associate blocks: the objects of each block of time, from the views of all sensors."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -64,7 +65,7 @@ def sensor_views(sensor: Sensor, viewed: Parts, span: Span) -> SensorViews:
     return SensorViews(
         sensor.number,
         sensor.sensor_id,
-        viewed.read(span, "views"),
+        partial(viewed.read, span, "views"),
         viewed.read(span, "epochs"),
         viewed.read(span, "tracklets"),
     )
@@ -80,7 +81,7 @@ def _associate(
     faulty = [of for of in sensors if of.sensor_id in left_out]
     rejects = _left_out(faulty, block, left_out)
     views = [of for of in sensors if of.sensor_id not in left_out and of.epochs.num_rows]
-    if not any(of.views.num_rows for of in views):
+    if not any(of.tracklets.num_rows for of in views):
         return {
             "members": empty(OBJECT_MEMBERS),
             "rejects": rejects,
@@ -157,7 +158,7 @@ def _left_out(
     """Return a row of `rejects` per sensor that is left out: its views in the block."""
     tables = [empty(REJECTS)]
     for of in sensors:
-        epoch_ns = array(of.views, "epoch")
+        epoch_ns = array(of.read_views(), "epoch")
         epoch_ns = epoch_ns[block.holds(epoch_ns)]
         if len(epoch_ns):
             tables.append(

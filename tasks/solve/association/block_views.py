@@ -5,7 +5,7 @@ few instants at which tracklets are compared.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +43,7 @@ class SensorViews(NamedTuple):
 
     number: int
     sensor_id: str
-    views: pa.Table
+    read_views: Callable[[], pa.Table]  # they stay in their file: all views are too many to hold
     epochs: pa.Table
     tracklets: pa.Table
 
@@ -96,7 +96,8 @@ class BlockViews:
         self._rows, self._epoch_ns, self._tracklet, self._clear = [], [], [], []
         before, parts = 0, []
         for s, of in enumerate(self.sensors):
-            epoch_ns = array(of.views, "epoch")
+            views = of.read_views()
+            epoch_ns = array(views, "epoch")
             rows = np.flatnonzero(block.holds(epoch_ns))
             n = of.tracklets.num_rows
             local = np.repeat(np.arange(n), array(of.tracklets, "n_views"))[rows]
@@ -105,7 +106,7 @@ class BlockViews:
             self._rows.append(rows)
             self._epoch_ns.append(epoch_ns[rows])
             self._tracklet.append(tracklet)
-            self._clear.append(clear_views(of.views)[rows])
+            self._clear.append(clear_views(views)[rows])
             parts.append(_items(epoch_ns[rows], tracklet, s, self.window_ns))
         window, *columns = (np.concatenate(c).astype(np.int64) for c in zip(*parts, strict=True))
         order = np.lexsort((columns[0], window))
@@ -152,14 +153,14 @@ class BlockViews:
 
         With `items`, only the views of these items.
         """
-        tables, tracklets = [self.sensors[0].views.select(SAMPLED).slice(0, 0)], []
+        tables, tracklets = [VIEWS.empty_table().select(SAMPLED)], []
         wanted = np.isin(self.epochs, instants)
         key = self._item_key(items) if items is not None else None
         for s, of in enumerate(self.sensors):
             chosen = np.flatnonzero(wanted[self._epoch[s]] & self._clear[s])
             if key is not None:
                 chosen = chosen[np.isin(self._view_key(s, chosen), key)]
-            tables.append(of.views.select(SAMPLED).take(self._rows[s][chosen]))
+            tables.append(of.read_views().select(SAMPLED).take(self._rows[s][chosen]))
             tracklets.append(self._tracklet[s][chosen])
         return pa.concat_tables(tables), np.concatenate(tracklets)
 

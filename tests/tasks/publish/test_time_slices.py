@@ -1,5 +1,7 @@
 """Time slices: together they hold every row of a span once, in order, whatever their number."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scenes.associations import filled
@@ -18,7 +20,7 @@ def epochs(*times_ns: int):
 
 def test_rows_outside_the_span_are_left_out():
     rows = epochs(9, 10, 10, 19, 20, 21)
-    (found,) = in_slices([rows], Span(10, 20), "epoch")
+    (found,) = in_slices([lambda: rows], Span(10, 20), "epoch")
     assert found[0]["frame_number"].to_pylist() == [10, 10, 19]
 
 
@@ -27,7 +29,9 @@ def test_slices_together_have_every_row_once_in_order(monkeypatch, most, count):
     monkeypatch.setattr(time_slices, "MOST_ROWS", most)
     rng = np.random.default_rng(0)
     times = [np.sort(rng.integers(SPAN.start_ns, SPAN.end_ns, n)) for n in (0, 1, 500)]
-    cut = list(in_slices([epochs(*of_table.tolist()) for of_table in times], SPAN, "epoch"))
+    cut = list(
+        in_slices([partial(epochs, *of_table.tolist()) for of_table in times], SPAN, "epoch")
+    )
     assert len(cut) == count
     for k, of_table in enumerate(times):
         found = [t for of_slice in cut for t in of_slice[k]["frame_number"].to_pylist()]
@@ -35,10 +39,10 @@ def test_slices_together_have_every_row_once_in_order(monkeypatch, most, count):
 
 
 def test_a_table_in_another_order_is_sorted():
-    (found,) = in_slices([epochs(15, 11, 13)], Span(10, 20), "epoch")
+    (found,) = in_slices([partial(epochs, 15, 11, 13)], Span(10, 20), "epoch")
     assert found[0]["frame_number"].to_pylist() == [11, 13, 15]
 
 
 def test_no_rows_are_one_empty_slice():
-    assert [rows[0].num_rows for rows in in_slices([epochs()], SPAN, "epoch")] == [0]
+    assert [rows[0].num_rows for rows in in_slices([epochs], SPAN, "epoch")] == [0]
     assert list(in_slices([], SPAN, "epoch")) == [[]]
