@@ -217,7 +217,8 @@ ASSOCIATIONS = schema(
             "epipolar_px",
             F64,
             unit="px",
-            doc="Distance from the epipolar lines of the other views, rms.",
+            doc="Distance from the epipolar lines of the other views, rms; of the eight with the "
+            "least position error, where there are more.",
         ),
         column(
             "used",

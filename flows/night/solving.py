@@ -22,6 +22,7 @@ from epipole.schemas.stages import Stage
 from epipole.tasks.solve.association.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.association.number_objects import number_objects
 from epipole.tasks.solve.positions.judge_span import judge_span
+from epipole.tasks.solve.positions.keep_lines import Kept
 from epipole.tasks.solve.positions.solve_piece import Piece, solve_piece
 from epipole.tasks.solve.views.align_epochs import EpochGrid, frames_that_serve, grid_of
 from epipole.tasks.solve.views.view_sensors import view_sensors
@@ -30,7 +31,7 @@ STEPS = 4  # of the progress
 MARGIN_NS = 30_000_000_000  # beyond a span: the positions there show an object's motion
 FEWEST_EPOCHS = 6  # of a margin
 VIEWS_AT_ONCE = 4  # tasks that share what one task may hold: small tasks are spread evenly
-MOST_LINES = 100_000  # of sight, of a span, that are kept for the check of the sensors
+MOST_LINES = 50_000  # of sight, of a span, that are kept for the check of the sensors
 
 
 class _Night(NamedTuple):
@@ -152,7 +153,7 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     }
     futures = [
         solve_piece.submit(
-            viewed, Piece(span, number, count), margin_ns, _between_lines_ns(night, n_views[span]),
+            viewed, Piece(span, number, count), margin_ns, _kept_lines(night, n_views[span]),
             settings, solved, wait_for=[judged[span]],
         )
         for span, count in zip(spans, counts, strict=True)
@@ -161,14 +162,13 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     return sum(results(Stage.SOLVE, futures, (3, STEPS)))
 
 
-def _between_lines_ns(night: _Night, n_views: int) -> int:
-    """Return the time between the epochs whose lines of sight are kept.
+def _kept_lines(night: _Night, n_views: int) -> Kept:
+    """Return which lines of sight of a span are kept.
 
     Epochs nearer than twice the window of the local motion share detections.
     """
     if night.grid.instants_ns is not None:
-        return 1
+        return Kept(1)
     interval_ns = night.grid.interval_ns
-    epochs = math.ceil(2e9 * night.settings.alignment.window_s / interval_ns)
-    fewer = max(math.ceil(n_views / max(epochs, 1) / MOST_LINES), 1)
-    return max(epochs, 1) * fewer * interval_ns
+    epochs = max(math.ceil(2e9 * night.settings.alignment.window_s / interval_ns), 1)
+    return Kept(epochs * interval_ns, max(math.ceil(n_views / epochs / MOST_LINES), 1))

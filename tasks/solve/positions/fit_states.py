@@ -178,16 +178,20 @@ def _used_views(
 ) -> pl.DataFrame:
     """Return the views used for independent positions, with their arc numbers."""
     key = ["epoch", "sensor_id", "frame_number", "x_px", "y_px"]
-    claimed = to_polars(associations).filter("used").select([*key, "object_id"])
     solved = to_polars(positions).select("epoch", "object_id", "independent")
     solved = solved.sort("object_id", "epoch")
     name, kept = solved["object_id"].to_numpy(), solved["independent"].to_numpy()
     arc = _arcs(name, solved["epoch"].cast(pl.Int64).to_numpy(), settings.states.arc_s)
     arc = np.where(_long_enough(arc, kept, settings.states.min_epochs), arc, -1)
     solved = solved.with_columns(arc=arc).filter(pl.Series(kept & (arc >= 0)))
+    # Few epochs are independent: the others need no look.
+    epochs = np.unique(solved["epoch"].cast(pl.Int64).to_numpy())
+    seen, claims = (
+        to_polars(rows.take(np.flatnonzero(np.isin(array(rows, "epoch"), epochs))))
+        for rows in (views, associations.select([*key, "object_id", "used"]))
+    )
     return (
-        to_polars(views)
-        .join(claimed, on=key)
+        seen.join(claims.filter("used").select([*key, "object_id"]), on=key)
         .join(solved, on=["epoch", "object_id"])
         .with_columns(sensor=pl.col("sensor_id").rank("dense").cast(pl.Int64) - 1)
         .sort("arc", "epoch", "sensor")

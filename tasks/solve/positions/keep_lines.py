@@ -1,5 +1,8 @@
 """Keep lines: the lines of sight to objects, and the objects, that the check of sensors needs."""
 
+import zlib
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 import polars as pl
@@ -19,6 +22,14 @@ PLACE = ["x_km", "y_km", "z_km"]
 VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 
 
+class Kept(NamedTuple):
+    """Which lines of sight are kept: at epochs that are multiples of a time since midnight, one in
+    so many of these."""
+
+    every_ns: int
+    one_in: int = 1
+
+
 def moving_objects(positions: pa.Table, every_ns: int) -> pa.Table:
     """Return MOVING_OBJECTS: the positions at epochs that are multiples of a time since
     midnight, with velocities from the positions near them."""
@@ -36,8 +47,12 @@ def moving_objects(positions: pa.Table, every_ns: int) -> pa.Table:
     return from_polars(MOVING_OBJECTS, kept.select(MOVING_OBJECTS.names))
 
 
-def keep_lines(views: pa.Table, associations: pa.Table, objects: pa.Table) -> pa.Table:
-    """Return CLOCK_LINES: the views of objects at the epochs of MOVING_OBJECTS.
+def keep_lines(views: pa.Table, associations: pa.Table, objects: pa.Table, kept: Kept) -> pa.Table:
+    """Return CLOCK_LINES: views of objects at the epochs of MOVING_OBJECTS.
+
+    Where only some are kept, each object loses other sensors at each epoch, and each sensor other
+    objects: a sensor is judged by many epochs, because all lines of a frame share the error of its
+    attitude.
 
     Parameters
     ----------
@@ -46,10 +61,22 @@ def keep_lines(views: pa.Table, associations: pa.Table, objects: pa.Table) -> pa
     """
     epochs = np.unique(array(objects, "epoch"))
     rows = np.flatnonzero(np.isin(array(associations, "epoch"), epochs))
+    rows = rows[_turn(associations.take(rows), kept) == 0]
     seen = to_polars(views.take(rows)).with_columns(
         object_id=pl.Series(associations["object_id"].take(rows).to_pylist(), dtype=pl.String)
     )
     return meetings(seen, to_polars(objects), on=["epoch", "object_id"])
+
+
+def _turn(associations: pa.Table, kept: Kept) -> Indices:
+    """Return a number below `one_in` of each view, evenly spread over sensors and objects."""
+    numbers = []
+    for name in ("sensor_id", "object_id"):
+        values = associations[name].combine_chunks().dictionary_encode()
+        of_value = [zlib.crc32(value.encode()) for value in values.dictionary.to_pylist()]
+        numbers.append(np.array(of_value, np.int64)[values.indices.to_numpy()])
+    epoch = array(associations, "epoch") // kept.every_ns
+    return np.asarray((numbers[0] + numbers[1] + epoch) % kept.one_in)
 
 
 def meetings(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Table:

@@ -26,7 +26,7 @@ from epipole.tasks.solve.positions.fit_states import (
     with_stated_errors,
 )
 from epipole.tasks.solve.positions.gather_views import gather_views
-from epipole.tasks.solve.positions.keep_lines import keep_lines, moving_objects
+from epipole.tasks.solve.positions.keep_lines import Kept, keep_lines, moving_objects
 from epipole.tasks.solve.positions.solve_positions import solve_positions
 
 
@@ -47,7 +47,7 @@ def solve_piece(
     viewed: ViewedParts,
     piece: Piece,
     margin_ns: int,
-    line_epochs_ns: int,
+    kept: Kept,
     settings: Settings,
     solved: SolvedParts,
 ) -> int:
@@ -57,8 +57,8 @@ def solve_piece(
     ----------
     viewed
         The parts of the views of the sensors.
-    line_epochs_ns
-        Lines of sight are kept for the check of the sensors at epochs that are multiples of this.
+    kept
+        Lines of sight that are kept for the check of the sensors.
     solved
         `objects` and `errors` are read; the part goes to `piece`.
 
@@ -69,7 +69,7 @@ def solve_piece(
     """
     part = solved.piece(piece.span, piece.number)
     if not is_written(part):
-        write_part(part, SOLVED, _solve(viewed, piece, margin_ns, line_epochs_ns, settings, solved))
+        write_part(part, SOLVED, _solve(viewed, piece, margin_ns, kept, settings, solved))
     return read_part(part, "positions").num_rows
 
 
@@ -77,7 +77,7 @@ def _solve(
     viewed: ViewedParts,
     piece: Piece,
     margin_ns: int,
-    line_epochs_ns: int,
+    kept: Kept,
     settings: Settings,
     solved: SolvedParts,
 ) -> dict[str, pa.Table]:
@@ -89,7 +89,7 @@ def _solve(
     states, misfits = refuse_misfits(
         fit_states(found.views, found.associations, found.positions, settings)
     )
-    objects = moving_objects(found.positions, line_epochs_ns)
+    objects = moving_objects(found.positions, kept.every_ns)
     return {
         "associations": found.associations,
         "positions": found.positions,
@@ -98,6 +98,8 @@ def _solve(
         "rejects": concat(REJECTS, [found.rejects, misfits]),
         "outcomes": judge_views(found.associations),
         # The check of the sensors holds the lines against the errors that the sensors state.
-        "lines": keep_lines(with_stated_errors(found.views, errors), found.associations, objects),
+        "lines": keep_lines(
+            with_stated_errors(found.views, errors), found.associations, objects, kept
+        ),
         "objects": objects,
     }
