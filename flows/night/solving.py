@@ -31,7 +31,7 @@ STEPS = 4  # of the progress
 MARGIN_NS = 30_000_000_000  # beyond a span: the positions there show an object's motion
 FEWEST_EPOCHS = 6  # of a margin
 VIEWS_AT_ONCE = 4  # tasks that share what one task may hold: small tasks are spread evenly
-MOST_LINES = 50_000  # of sight, of a span, that are kept for the check of the sensors
+MOST_LINES = 30_000  # of sight, of a span, that are kept for the check of the sensors
 
 
 class _Night(NamedTuple):

@@ -33,7 +33,7 @@ from epipole.tasks.solve.positions.keep_lines import meetings
 Array = npt.NDArray[np.float64]
 
 MOST_EPOCHS = 300  # more do not help: the offset is one constant
-MOST_LINES = 100_000  # of sight to objects, of all sensors together
+MOST_LINES = 30_000  # of sight to objects, of all sensors together
 MOST_PAIRS = 100_000  # of a view and an object, of one sensor
 KEY = ["epoch", "object_id", "sensor_id"]
 KNOWN_S = 1.0  # with a larger sigma a clock counts as unknown

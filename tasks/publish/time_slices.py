@@ -3,12 +3,14 @@
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array
 from epipole.schemas.spans import Span
 
 MOST_ROWS = 200_000  # in a slice, about
+ROWS_OF_TABLE = 1_000  # with many tables a slice has more rows: each table is opened for each slice
 
 
 def in_slices(
@@ -26,21 +28,28 @@ def in_slices(
 
     Notes
     -----
-    The times depend on the number of rows only.
+    The times depend on the number of rows and tables only.
     """
-    n_rows = sum(read().num_rows for read in tables)
-    count = max(-(-n_rows // MOST_ROWS), 1)
+    times = [array(read(), column).copy() for read in tables]
+    orders = [None if (np.diff(t) >= 0).all() else np.argsort(t, kind="stable") for t in times]
+    most = max(MOST_ROWS, ROWS_OF_TABLE * len(tables))
+    count = max(-(-sum(len(t) for t in times) // most), 1)
     edges = np.linspace(span.start_ns, span.end_ns, count + 1).astype(np.int64)
-    cuts = [np.searchsorted(array(_in_order(read(), column), column), edges) for read in tables]
+    cuts = [
+        np.searchsorted(t if order is None else t[order], edges)
+        for t, order in zip(times, orders, strict=True)
+    ]
+    del times
     for k in range(count):
         yield [
-            _in_order(read(), column).slice(int(cut[k]), int(cut[k + 1] - cut[k]))
-            for read, cut in zip(tables, cuts, strict=True)
+            _rows(read, order, int(cut[k]), int(cut[k + 1]))
+            for read, order, cut in zip(tables, orders, cuts, strict=True)
         ]
 
 
-def _in_order(rows: pa.Table, column: str) -> pa.Table:
-    time_ns = array(rows, column)
-    if (np.diff(time_ns) >= 0).all():
-        return rows
-    return rows.take(np.argsort(time_ns, kind="stable"))
+def _rows(
+    read: Callable[[], pa.Table], order: npt.NDArray[np.int64] | None, first: int, last: int
+) -> pa.Table:
+    """Return a copy of some rows: of a file that is mapped into memory, only these are kept."""
+    rows = np.arange(first, last) if order is None else order[first:last]
+    return read().take(rows)

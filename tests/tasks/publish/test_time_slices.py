@@ -27,6 +27,7 @@ def test_rows_outside_the_span_are_left_out():
 @pytest.mark.parametrize(("most", "count"), [(501, 1), (500, 2), (100, 6)])
 def test_slices_together_have_every_row_once_in_order(monkeypatch, most, count):
     monkeypatch.setattr(time_slices, "MOST_ROWS", most)
+    monkeypatch.setattr(time_slices, "ROWS_OF_TABLE", 1)
     rng = np.random.default_rng(0)
     times = [np.sort(rng.integers(SPAN.start_ns, SPAN.end_ns, n)) for n in (0, 1, 500)]
     cut = list(
