@@ -31,8 +31,8 @@ def test_a_stage_is_a_package_whose_tasks_have_its_name(stage):
     assert f"Stage `{stage}`" in package.__doc__
     tasks = [
         value
-        for module in pkgutil.iter_modules(package.__path__)
-        for value in vars(importlib.import_module(f"{package.__name__}.{module.name}")).values()
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+        for value in vars(importlib.import_module(module.name)).values()
         if isinstance(value, Task) and value.fn.__module__.startswith(package.__name__)
     ]
     assert tasks

@@ -20,7 +20,7 @@ def test_no_two_places_are_one(tmp_path):
         places += [folder.corrected(sensor, k) for k in (1, 2)]
         for k in range(3):
             places += [folder.tracked(sensor, k), folder.tracklet_names(sensor, k)]
-            places.append(folder.viewed(sensor, k))
+            places.append(folder.viewed(k)[sensor.number])
     solved = [folder.solved(k, everyone) for k in range(3) for everyone in (True, False)]
     for of in solved:
         places += [of.blocks, of.objects, of.errors]
@@ -37,7 +37,7 @@ def test_each_place_lies_under_its_stage(tmp_path):
         Stage.CALIBRATE: folder.identified_again(sensor, 1),
         Stage.CHECK: folder.corrected(sensor, 1),
         Stage.TRACK: folder.tracked(sensor, 0),
-        Stage.SOLVE: folder.viewed(sensor, 0),
+        Stage.SOLVE: folder.viewed(0)[sensor.number],
     }
     for stage, parts in by_stage.items():
         assert parts.folder.relative_to(tmp_path).parts[0] == stage
