@@ -6,9 +6,6 @@ per frame.
 """
 
 import argparse
-import json
-import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -17,19 +14,20 @@ import tomllib
 from datetime import datetime
 from pathlib import Path
 
+from whole_runs import whole_run
+
 SCENES = Path(__file__).parents[2] / "io" / "simulation" / "built_in"
 HOURS = 11.4  # the Earth hides the field of view for a third of it
-COMMAND = "from epipole.flows.command_line.main import main; main()"
 # How the log line at the end of each stage begins.
-STAGES = (
-    ("find", "found "),
-    ("read", "read "),
-    ("identify", "identified "),
-    ("track", "followed "),
-    ("solve", "solved "),
-    ("name", "named "),
-    ("publish", "published "),
-)
+STAGES = {
+    "find": "found ",
+    "read": "read ",
+    "identify": "identified ",
+    "track": "followed ",
+    "solve": "solved ",
+    "name": "named ",
+    "publish": "published ",
+}
 EMPTY_TASKS = """
 import statistics, sys, time
 from prefect import flow, task
@@ -73,34 +71,16 @@ def simulate_night(log: Path, hours: float) -> None:
 
 def run(log: Path, out: Path) -> dict[str, float]:
     """Return the seconds of each stage of a run, its total CPU seconds, and its memory [MiB]."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     started = time.monotonic()
-    process = subprocess.Popen(
-        [sys.executable, "-c", COMMAND, "run", str(log), "--out", str(out), "--json"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stderr is not None
-    times = {"start": 0.0}
-    for line in process.stderr:
-        text = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
-        for stage, word in STAGES:
-            if text.startswith(word):
-                times[stage] = time.monotonic() - started
-    out_text = process.stdout.read() if process.stdout else ""
-    assert process.wait() == 0, out_text
-    found = json.loads(out_text)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    names = [name for name, _ in STAGES if name in times]
-    seconds = {b: times[b] - times[a] for a, b in zip(["start", *names[:-1]], names, strict=True)}
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    done = whole_run(log, out, STAGES, lambda _: time.monotonic() - started)
     return {
-        **seconds,
-        "night": times["publish"] - times["find"],
+        **done.stages(),
+        "night": done.at["publish"] - done.at["find"],
         "all": time.monotonic() - started,
-        "cpu": cpu,
-        "mib": after.ru_maxrss / 1024,
-        "frames": found["frames"],
-        "positions": found["positions"],
+        "cpu": done.cpu_s,
+        "mib": done.mib,
+        "frames": done.summary["frames"],
+        "positions": done.summary["positions"],
     }
 
 

@@ -6,22 +6,18 @@ Needs Linux: the CPU of each stage is read from /proc at the log line that ends 
 """
 
 import argparse
-import itertools
-import json
 import os
-import re
-import resource
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow.parquet as pq
+from whole_runs import COMMAND, whole_run
 
-COMMAND = "from epipole.flows.command_line.main import main; main()"
 # How the log line at the end of each stage begins.
 STAGES = {
+    "find": "found ",
     "read": "read ",
     "identify": "identified ",
     "track": "followed ",
@@ -47,37 +43,15 @@ class Night(NamedTuple):
 def simulate(log: Path, sensors: int, objects: int, hours: float) -> None:
     """Write the log of a night."""
     numbers = ["--sensors", sensors, "--objects", objects, "--hours", hours]
-    command = [sys.executable, "-c", COMMAND, "simulate", "night", *map(str, numbers)]
-    subprocess.run([*command, "--out", str(log)], check=True, stdout=subprocess.DEVNULL)
+    command = [*COMMAND, "simulate", "night", *map(str, numbers), "--out", str(log)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
 def run(log: Path, out: Path) -> Night:
     """Run the log once."""
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    process = subprocess.Popen(
-        [sys.executable, "-c", COMMAND, "run", str(log), "--out", str(out), "--json"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stderr is not None
-    cpu = {"start": 0.0}
-    for line in process.stderr:
-        text = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
-        if text.startswith("found "):
-            cpu["start"] = _cpu_s(process.pid)
-        for stage, word in STAGES.items():
-            if text.startswith(word):
-                cpu[stage] = _cpu_s(process.pid)
-    summary = json.loads(process.stdout.read() if process.stdout else "{}")
-    assert process.wait() == 0, summary
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    names = ["start", *(name for name in STAGES if name in cpu)]
-    return Night(
-        {b: cpu[b] - cpu[a] for a, b in itertools.pairwise(names)},
-        after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
-        after.ru_maxrss / 1024,
-        _rows(out),
-        sum(file.stat().st_size for file in out.rglob("*.parquet")),
-    )
+    done = whole_run(log, out, STAGES, _cpu_s)
+    size = sum(file.stat().st_size for file in out.rglob("*.parquet"))
+    return Night(done.stages(), done.cpu_s, done.mib, _rows(out), size)
 
 
 def _cpu_s(pid: int) -> float:

@@ -1,0 +1,56 @@
+"""Whole runs of `epipole run` in a process of their own, for the benchmarks of nights."""
+
+import itertools
+import json
+import re
+import resource
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+COMMAND = [sys.executable, "-c", "from epipole.flows.command_line.main import main; main()"]
+
+
+class WholeRun(NamedTuple):
+    """A run: what was measured as each stage ended, its summary, CPU [s] and memory [MiB]."""
+
+    at: dict[str, float]
+    summary: dict[str, Any]
+    cpu_s: float
+    mib: float
+
+    def stages(self) -> dict[str, float]:
+        """Return what was measured in each stage."""
+        names = list(self.at)
+        return {b: self.at[b] - self.at[a] for a, b in itertools.pairwise(names)}
+
+
+def whole_run(
+    log: Path, out: Path, stages: Mapping[str, str], measure: Callable[[int], float]
+) -> WholeRun:
+    """Run a log once.
+
+    Parameters
+    ----------
+    stages
+        How the line of log that ends each stage begins.
+    measure
+        What is measured at these lines, such as the time, by the id of the process.
+    """
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    process = subprocess.Popen(
+        [*COMMAND, "run", str(log), "--out", str(out), "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stderr is not None
+    at = {"start": measure(process.pid)}
+    for line in process.stderr:
+        text = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
+        at |= {name: measure(process.pid) for name, word in stages.items() if text.startswith(word)}
+    written = process.stdout.read() if process.stdout else ""
+    assert process.wait() == 0, written
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return WholeRun(at, json.loads(written), cpu_s, after.ru_maxrss / 1024)
