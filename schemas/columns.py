@@ -7,6 +7,8 @@ import pyarrow as pa
 TIME = pa.timestamp("ns", tz="UTC")
 
 STATE_AXES = ("x", "y", "z", "vx", "vy", "vz")  # of a position and velocity
+PLACE = ["x_km", "y_km", "z_km"]  # of an object
+VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 TANGENT_AXES = ("1", "2")  # of the plane at right angles to a direction
 
 

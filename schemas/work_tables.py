@@ -328,6 +328,12 @@ CLOCK_LINES = schema(
     ],
 )
 
+CLAIMED_VIEWS = schema(
+    "claimed_views",
+    "One row per view of an object, at the epochs of `clock_lines`, also where no line was kept.",
+    [VIEWS.field(name) for name in ("epoch", "sensor_id", "tracklet_id")],
+)
+
 MOVING_OBJECTS = schema(
     "moving_objects",
     "One row per object, at the epochs of `clock_lines`: where it is and how it moves.",

@@ -20,6 +20,7 @@ from epipole.schemas.tables import (
 )
 from epipole.schemas.work_tables import (
     CAMERAS,
+    CLAIMED_VIEWS,
     CLOCK_LINES,
     EXPOSURES,
     FRAME_INDEX,
@@ -79,6 +80,7 @@ SOLVED: Final[PartTables] = {
     "rejects": REJECTS,
     "outcomes": TRACKLET_OUTCOMES,
     "lines": CLOCK_LINES,
+    "claims": CLAIMED_VIEWS,
     "objects": MOVING_OBJECTS,
 }
 

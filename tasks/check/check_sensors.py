@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import polars as pl
+import pyarrow as pa
 
 from epipole.io.work.parts import Parts
 from epipole.io.work.places import SolvedParts, ViewedParts
@@ -15,7 +16,7 @@ from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.rejects import Reason
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
-from epipole.schemas.work_tables import CLOCK_LINES, MOVING_OBJECTS, VIEWS
+from epipole.schemas.work_tables import CLAIMED_VIEWS, CLOCK_LINES, VIEWS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.sensor_faults.clock_search import Meetings, search_offset
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
@@ -107,12 +108,15 @@ def check_sensors(
     viewed
         The parts of the views of the sensors.
     """
-    lines, objects = _of_objects(solved, spans)
-    if not len(objects):
+    epochs = _epochs(solved, spans)
+    if not len(epochs):
         return []
+    lines, objects = (_of_objects(solved, spans, name, epochs) for name in ("lines", "objects"))
+    claims = _at(solved, spans, "claims", epochs).partition_by("sensor_id", as_dict=True)
+    nothing = pl.DataFrame(CLAIMED_VIEWS.empty_table())
     first_guess, of_objects = {}, [lines]
     for number, name in sensors:
-        own = lines.filter(pl.col("sensor_id") == name)
+        own = claims.get((name,), nothing)
         match = _search(_others(viewed[number], spans, own, objects))
         if match is not None:
             first_guess[name], matched = match
@@ -120,31 +124,33 @@ def check_sensors(
     return verdicts_of(pl.concat(of_objects), first_guess)
 
 
-def _of_objects(solved: SolvedParts, spans: Sequence[Span]) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Return lines of sight to objects, and the objects: at some of the epochs, evenly spread."""
-    epochs = [
-        to_polars(rows)
-        for span in spans
-        for rows in solved.read(span, "lines", ["epoch"])
-        if rows.num_rows
-    ]
-    if not epochs:
-        return pl.DataFrame(CLOCK_LINES.empty_table()), pl.DataFrame(MOVING_OBJECTS.empty_table())
-    per_epoch = pl.concat(epochs).group_by("epoch").len().sort("epoch")
+def _epochs(solved: SolvedParts, spans: Sequence[Span]) -> pl.Series:
+    """Return some of the epochs with lines of sight, evenly spread."""
+    columns = [CLOCK_LINES.empty_table().select(["epoch"])]
+    columns += [rows for span in spans for rows in solved.read(span, "lines", ["epoch"])]
+    per_epoch = to_polars(pa.concat_tables(columns)).group_by("epoch").len().sort("epoch")
     fewer = max(len(per_epoch) / MOST_EPOCHS, per_epoch["len"].sum() / MOST_LINES)
-    kept = per_epoch["epoch"][:: max(math.ceil(fewer), 1)]
-    both = []
-    for name in ("lines", "objects"):
-        rows = [
-            # The ids of objects are those of the span.
-            to_polars(rows)
-            .filter(pl.col("epoch").is_in(kept.implode()))
-            .with_columns(object_id=pl.format("{}/{}", pl.lit(span.folder), "object_id"))
-            for span in spans
-            for rows in solved.read(span, name)
-        ]
-        both.append(pl.concat(rows))
-    return both[0], both[1]
+    return per_epoch["epoch"][:: max(math.ceil(fewer), 1)]
+
+
+def _at(solved: SolvedParts, spans: Sequence[Span], name: str, epochs: pl.Series) -> pl.DataFrame:
+    """Return a table's rows at some epochs, with the span that each is of."""
+    return pl.concat(
+        to_polars(rows)
+        .filter(pl.col("epoch").is_in(epochs.implode()))
+        .with_columns(span=pl.lit(span.folder))
+        for span in spans
+        for rows in solved.read(span, name)
+    )
+
+
+def _of_objects(
+    solved: SolvedParts, spans: Sequence[Span], name: str, epochs: pl.Series
+) -> pl.DataFrame:
+    """Return a table's rows at some epochs; the ids of objects, which are those of the span, are
+    made ids of the night."""
+    rows = _at(solved, spans, name, epochs)
+    return rows.with_columns(object_id=pl.format("{}/{}", "span", "object_id")).drop("span")
 
 
 def _others(
@@ -154,15 +160,20 @@ def _others(
 
     If a sensor's clock is seconds off, none of its views fits an object. A sensor with most of its
     views on objects has none that are to be searched.
+
+    Parameters
+    ----------
+    own
+        CLAIMED_VIEWS of the sensor.
     """
     epochs = objects["epoch"].unique().sort()
     tables = [viewed.read(span, "views") for span in spans if viewed.holds(span)]
     wanted = epochs.cast(pl.Int64).to_numpy()
-    tables = [rows.take(np.flatnonzero(np.isin(array(rows, "epoch"), wanted))) for rows in tables]
-    views = to_polars(concat(VIEWS, tables))
-    free = views.join(own, on=["epoch", "tracklet_id"], how="anti")
-    if 2 * len(own) >= len(views):
-        free = free.clear()
+    at = [np.flatnonzero(np.isin(array(rows, "epoch"), wanted)) for rows in tables]
+    if 2 * len(own) >= sum(map(len, at)):
+        return pl.DataFrame(CLOCK_LINES.empty_table())
+    views = concat(VIEWS, [rows.take(k) for rows, k in zip(tables, at, strict=True)])
+    free = to_polars(views).join(own, on=["epoch", "tracklet_id"], how="anti")
     n_objects = objects.group_by("epoch").agg(n=pl.len())
     pairs = free.select("epoch").join(n_objects, on="epoch")["n"].sum()
     fewer = epochs[:: max(-(-pairs // MOST_PAIRS), 1)]

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.schemas.bridge import stack_covariance
-from epipole.schemas.columns import STATE_AXES
+from epipole.schemas.columns import PLACE, STATE_AXES, VELOCITY
 from epipole.schemas.settings import Settings
 from epipole.schemas.stages import Stage
 from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, chains, link_by_motion
@@ -19,8 +19,6 @@ from epipole.tasks.common.stage_tasks import stage_task
 Array = npt.NDArray[np.float64]
 
 COUNTS = ("n_epochs", "n_views", "dof", "chi2")  # of a state, not of its motion
-PLACE = ["x_km", "y_km", "z_km"]
-VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 
 
 @stage_task(Stage.NAME, "objects")

@@ -8,18 +8,16 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, from_polars, stack, to_polars
+from epipole.schemas.bridge import array, conform, from_polars, stack, to_polars
+from epipole.schemas.columns import PLACE, VELOCITY
 from epipole.schemas.spans import DAY_NS
-from epipole.schemas.work_tables import CLOCK_LINES, MOVING_OBJECTS
+from epipole.schemas.work_tables import CLAIMED_VIEWS, CLOCK_LINES, MOVING_OBJECTS
 from epipole.tasks.algorithms.geometry.light_time import apparent_places
 from epipole.tasks.algorithms.orbits.object_motion import velocities
+from epipole.tasks.solve.positions.solve_positions import VELOCITY_WINDOW_S
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
-
-VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
-PLACE = ["x_km", "y_km", "z_km"]
-VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 
 
 class Kept(NamedTuple):
@@ -47,6 +45,11 @@ def moving_objects(positions: pa.Table, every_ns: int) -> pa.Table:
     return from_polars(MOVING_OBJECTS, kept.select(MOVING_OBJECTS.names))
 
 
+def claimed_views(views: pa.Table, objects: pa.Table) -> pa.Table:
+    """Return CLAIMED_VIEWS: the views of objects at the epochs of MOVING_OBJECTS."""
+    return conform(CLAIMED_VIEWS, views.take(_at_epochs(views, objects)))
+
+
 def keep_lines(views: pa.Table, associations: pa.Table, objects: pa.Table, kept: Kept) -> pa.Table:
     """Return CLOCK_LINES: views of objects at the epochs of MOVING_OBJECTS.
 
@@ -59,13 +62,18 @@ def keep_lines(views: pa.Table, associations: pa.Table, objects: pa.Table, kept:
     views, associations
         VIEWS of objects, and ASSOCIATIONS, row by row the same.
     """
-    epochs = np.unique(array(objects, "epoch"))
-    rows = np.flatnonzero(np.isin(array(associations, "epoch"), epochs))
+    rows = _at_epochs(associations, objects)
     rows = rows[_turn(associations.take(rows), kept) == 0]
     seen = to_polars(views.take(rows)).with_columns(
         object_id=pl.Series(associations["object_id"].take(rows).to_pylist(), dtype=pl.String)
     )
     return meetings(seen, to_polars(objects), on=["epoch", "object_id"])
+
+
+def _at_epochs(rows: pa.Table, objects: pa.Table) -> Indices:
+    """Return the rows at the epochs of MOVING_OBJECTS."""
+    epochs = np.unique(array(objects, "epoch"))
+    return np.flatnonzero(np.isin(array(rows, "epoch"), epochs))
 
 
 def _turn(associations: pa.Table, kept: Kept) -> Indices:

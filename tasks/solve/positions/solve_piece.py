@@ -26,7 +26,7 @@ from epipole.tasks.solve.positions.fit_states import (
     with_stated_errors,
 )
 from epipole.tasks.solve.positions.gather_views import gather_views
-from epipole.tasks.solve.positions.keep_lines import Kept, keep_lines, moving_objects
+from epipole.tasks.solve.positions.keep_lines import Kept, claimed_views, keep_lines, moving_objects
 from epipole.tasks.solve.positions.solve_positions import solve_positions
 
 
@@ -101,5 +101,6 @@ def _solve(
         "lines": keep_lines(
             with_stated_errors(found.views, errors), found.associations, objects, kept
         ),
+        "claims": claimed_views(found.views, objects),
         "objects": objects,
     }

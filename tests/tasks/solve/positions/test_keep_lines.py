@@ -10,7 +10,7 @@ from scenes.associations import START_NS, filled
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS
 from epipole.schemas.work_tables import VIEWS
-from epipole.tasks.solve.positions.keep_lines import Kept, keep_lines, moving_objects
+from epipole.tasks.solve.positions.keep_lines import Kept, claimed_views, keep_lines, moving_objects
 
 EVERY_NS = 10_000_000_000
 N_EPOCHS, N_OBJECTS, N_SENSORS = 20, 12, 30
@@ -38,6 +38,7 @@ def kept_lines():
     def kept(one_in: int) -> pl.DataFrame:
         choice = Kept(EVERY_NS, one_in)
         objects = moving_objects(positions, choice.every_ns)
+        assert claimed_views(views, objects).num_rows == len(seen) // 2  # whatever is kept
         return to_polars(keep_lines(views, associations, objects, choice))
 
     return kept
