@@ -44,6 +44,11 @@ class Span(NamedTuple):
         return Span(start_ns, start_ns + SPAN_NS)
 
     @property
+    def blocks(self) -> list["Span"]:
+        """The blocks of time that a half hour consists of."""
+        return [Span(t, t + BLOCK_NS) for t in range(self.start_ns, self.end_ns, BLOCK_NS)]
+
+    @property
     def folder(self) -> str:
         """Name of the span's parts in the folder of a stage: its start [s since 1970]."""
         return f"{self.start_ns // 1_000_000_000}"

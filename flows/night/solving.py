@@ -17,18 +17,19 @@ from epipole.io.work.places import SensorParts, SolvedParts, ViewedParts
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
-from epipole.schemas.spans import Sensor, Span
+from epipole.schemas.spans import Sensor, Span, spans_between
 from epipole.schemas.stages import Stage
 from epipole.tasks.solve.association.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.association.number_objects import number_objects
 from epipole.tasks.solve.positions.judge_span import judge_span
 from epipole.tasks.solve.positions.keep_lines import Kept
 from epipole.tasks.solve.positions.solve_piece import Piece, solve_piece
+from epipole.tasks.solve.positions.solve_positions import VELOCITY_WINDOW_S
 from epipole.tasks.solve.views.align_epochs import EpochGrid, frames_that_serve, grid_of
 from epipole.tasks.solve.views.view_sensors import view_sensors
 
-STEPS = 4  # of the progress
-MARGIN_NS = 30_000_000_000  # beyond a span: the positions there show an object's motion
+STEPS = 5  # of the progress
+MARGIN_NS = round(VELOCITY_WINDOW_S * 1e9)  # beyond a span: its positions show an object's motion
 FEWEST_EPOCHS = 6  # of a margin
 VIEWS_AT_ONCE = 4  # tasks that share what one task may hold: small tasks are spread evenly
 MOST_LINES = 30_000  # of sight, of a span, that are kept for the check of the sensors
@@ -68,9 +69,8 @@ def solve_objects(
         Number of positions.
     """
     solved = work.folder.solved(work.round, all_sensors=not left_out)
-    sensors = sorted(work.spans, key=lambda sensor: sensor.sensor_id)
     grid = epoch_grid(work, settings)
-    night = _Night(sensors, work.all_spans(), grid, work, settings, solved)
+    night = _Night(list(work.spans), work.all_spans(), grid, work, settings, solved)
     n_views = _view(night)
     _associate(night, n_views, left_out)
     return solved, _solve(night, n_views)
@@ -90,10 +90,9 @@ def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
 def _view(night: _Night) -> dict[Span, int]:
     """View the tracklets of all sensors, some of them a task; return the views of each span."""
     work, settings = night.work, night.settings
+    sensors, most = work.sensor_parts(), settings.work.most_views // VIEWS_AT_ONCE
     groups = [
-        (span, group)
-        for span in night.spans
-        for group in _sensor_groups(work, span, settings.work.most_views // VIEWS_AT_ONCE)
+        (span, group) for span in night.spans for group in _sensor_groups(work, sensors, span, most)
     ]
     futures = [
         view_sensors.submit(group, span, night.grid, work.cameras, settings)
@@ -106,13 +105,14 @@ def _view(night: _Night) -> dict[Span, int]:
     return total
 
 
-def _sensor_groups(work: Work, span: Span, most: int) -> list[list[SensorParts]]:
+def _sensor_groups(
+    work: Work, sensors: Mapping[Sensor, SensorParts], span: Span, most: int
+) -> list[list[SensorParts]]:
     """Return the sensors with frames in a span, or near it, in groups of so many detections."""
-    near = {span, *(Span(t, t + span.end_ns - span.start_ns) for t in (
-        2 * span.start_ns - span.end_ns, span.end_ns))}  # fmt: skip
+    near = set(spans_between(*span.widened(1)))
     groups: list[list[SensorParts]] = []
     held = most
-    for sensor, parts in work.sensor_parts().items():
+    for sensor, parts in sensors.items():
         if near.isdisjoint(work.spans[sensor]):
             continue
         if held >= most:
@@ -146,20 +146,21 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     numbered = number_objects.submit(spans, night.margin_ns, settings, solved)
     (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
     viewed, margin_ns = night.viewed, night.margin_ns
-    judged = {
-        span: judge_span.submit(viewed, span, margin_ns, settings, solved)
+    judged = [
+        judge_span.submit(viewed, span, margin_ns, settings, solved)
         for span, count in zip(spans, counts, strict=True)
         if count
-    }
+    ]
+    results(Stage.SOLVE, judged, (3, STEPS))
     futures = [
         solve_piece.submit(
             viewed, Piece(span, number, count), margin_ns, _kept_lines(night, n_views[span]),
-            settings, solved, wait_for=[judged[span]],
+            settings, solved,
         )
         for span, count in zip(spans, counts, strict=True)
         for number in range(count)
     ]  # fmt: skip
-    return sum(results(Stage.SOLVE, futures, (3, STEPS)))
+    return sum(results(Stage.SOLVE, futures, (4, STEPS)))
 
 
 def _kept_lines(night: _Night, n_views: int) -> Kept:

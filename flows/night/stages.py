@@ -171,9 +171,8 @@ class Checked(NamedTuple):
 def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     """Judge the sensors by all spans; correct wrong clocks if the settings say so."""
     step(Stage.CHECK, 0, 1)
-    sensors = sorted(work.spans, key=lambda sensor: sensor.sensor_id)
-    viewed = work.folder.viewed(work.round)
-    verdicts: list[SensorVerdict] = check_sensors(solved, viewed, sensors, work.all_spans())
+    viewed, spans = work.folder.viewed(work.round), work.all_spans()
+    verdicts: list[SensorVerdict] = check_sensors(solved, viewed, list(work.spans), spans)
     tell_verdicts(verdicts)
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
     late = [verdict for verdict in faulty if verdict.is_late]

@@ -47,7 +47,6 @@ class Work(NamedTuple):
         """Return where the parts of each sensor lie in this round."""
         return {
             sensor: SensorParts(
-                sensor.number,
                 self.identified[sensor],
                 self.folder.tracked(sensor, self.round),
                 self.folder.tracklet_names(sensor, self.round),

@@ -27,7 +27,7 @@ from typing import NamedTuple
 import pyarrow as pa
 
 from epipole.io.work.parts import Parts, read_part
-from epipole.schemas.spans import BLOCK_NS, Sensor, Span
+from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 
 
@@ -130,8 +130,7 @@ class SolvedParts(NamedTuple):
 
     def of_blocks(self, span: Span, name: str) -> list[pa.Table]:
         """Return a table of each block of a span."""
-        blocks = [Span(t, t + BLOCK_NS) for t in range(span.start_ns, span.end_ns, BLOCK_NS)]
-        return [self.blocks.read(block, name) for block in blocks if self.blocks.holds(block)]
+        return [self.blocks.read(block, name) for block in span.blocks if self.blocks.holds(block)]
 
     def read(self, span: Span, name: str, columns: Sequence[str] | None = None) -> list[pa.Table]:
         """Return a table of each piece of a span."""
@@ -141,7 +140,6 @@ class SolvedParts(NamedTuple):
 class SensorParts(NamedTuple):
     """The parts of one sensor that the later stages read."""
 
-    number: int
     identified: Parts
     tracked: Parts
     names: Parts

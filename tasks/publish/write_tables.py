@@ -83,38 +83,37 @@ def _of_night(name: str, parts: NightParts) -> pa.Table:
 
 def _of_sensors(name: str, parts: NightParts) -> Iterator[pa.Table]:
     """Yield the rows of all sensors, sorted by time and then sensor, some time of a span each."""
-    schema = TABLES[name]
-    for span in parts.spans:
-        for rows in _of_span(name, parts, span):
-            together = concat(schema, rows)
-            yield together.take(np.argsort(array(together, "time"), kind="stable"))
+    slices = _detections(parts) if name == "detections" else _identified(name, parts)
+    for rows in slices:
+        together = concat(TABLES[name], rows)
+        yield together.take(np.argsort(array(together, "time"), kind="stable"))
 
 
-def _of_span(name: str, parts: NightParts, span: Span) -> Iterator[list[pa.Table]]:
-    """Yield the rows of each sensor, in the order of the sensors, some time of the span each."""
-    if name == "detections":
-        yield from _detections(parts, span)
-        return
+def _identified(name: str, parts: NightParts) -> Iterator[list[pa.Table]]:
+    """Yield the rows of each sensor, in the order of the sensors, some time of a span each."""
     column = "solutions" if name == "frames" else name
     schema = SOLUTIONS if name == "frames" else TABLES[name]
-    tables = [partial(of.identified.rows_within, span, schema, column) for of in parts.sensors]
-    for rows in in_slices(tables, span, "time"):
-        yield [conform(TABLES[name], of_sensor) for of_sensor in rows]
+    for span in parts.spans:
+        tables = [partial(of.identified.rows_within, span, schema, column) for of in parts.sensors]
+        for rows in in_slices(tables, span, "time"):
+            yield [conform(TABLES[name], of_sensor) for of_sensor in rows]
 
 
-def _detections(parts: NightParts, span: Span) -> Iterator[list[pa.Table]]:
+def _detections(parts: NightParts) -> Iterator[list[pa.Table]]:
+    """Yield the detections, in the order of the sensors, some time of a span each."""
     hot = hot_tracklets(parts)["tracklet_id"]
-    lone = lone_views(parts, span)
-    held = [of for of in parts.sensors if of.tracked.holds(span)]
-    tables = [partial(of.tracked.read, span, "detections") for of in held]
-    for rows in in_slices(tables, span, "time"):
-        named = [
-            with_names(of_sensor, of.names.read(span, "names"))
-            for of, of_sensor in zip(held, rows, strict=True)
-            if of_sensor.num_rows
-        ]
-        together = with_lone_objects(concat(TABLES["detections"], named), lone)
-        yield [with_hot_pixels(together, hot)]
+    for span in parts.spans:
+        lone = lone_views(parts, span)
+        held = [of for of in parts.sensors if of.tracked.holds(span)]
+        tables = [partial(of.tracked.read, span, "detections") for of in held]
+        for rows in in_slices(tables, span, "time"):
+            named = [
+                with_names(of_sensor, of.names.read(span, "names"))
+                for of, of_sensor in zip(held, rows, strict=True)
+                if of_sensor.num_rows
+            ]
+            together = with_lone_objects(concat(TABLES["detections"], named), lone)
+            yield [with_hot_pixels(together, hot)]
 
 
 def lone_views(parts: NightParts, span: Span) -> pa.Table:

@@ -16,6 +16,7 @@ from epipole.schemas.spans import BLOCK_NS, Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import OBJECT_MEMBERS, TRACKLET_OUTCOMES
+from epipole.tasks.common.equal_runs import bounds_of_runs
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.association.associate_objects import Associated, associate_objects
 from epipole.tasks.solve.association.block_views import BlockViews, SensorViews
@@ -55,9 +56,7 @@ def associate_blocks(
 
 def blocks_of(span: Span, settings: Settings) -> list[Span]:
     """Return the blocks of a span: as long as the longest evidence, or else the span."""
-    if settings.association.span_s * 1e9 > BLOCK_NS:
-        return [span]
-    return [Span(t, t + BLOCK_NS) for t in range(span.start_ns, span.end_ns, BLOCK_NS)]
+    return [span] if settings.association.span_s * 1e9 > BLOCK_NS else span.blocks
 
 
 def sensor_views(sensor: Sensor, viewed: Parts, span: Span) -> SensorViews:
@@ -105,10 +104,8 @@ def object_members(block: BlockViews, associated: Associated) -> pa.Table:
     items, number = block.items, associated.object_number
     order = np.lexsort((items.window, items.tracklet))
     tracklet, object_ = items.tracklet[order], number[order]
-    begins = np.ones(len(order), bool)
-    begins[1:] = (tracklet[1:] != tracklet[:-1]) | (object_[1:] != object_[:-1])
-    first = np.flatnonzero(begins)
-    last = np.append(first[1:], len(order)) - 1
+    bounds = bounds_of_runs(tracklet, object_)
+    first, last = bounds[:-1], bounds[1:] - 1
     n_views = np.add.reduceat(items.n_views[order], first) if len(first) else first
     rows = np.flatnonzero(object_[first] >= 0)
     rows = rows[np.lexsort((tracklet[first[rows]], object_[first[rows]]))]

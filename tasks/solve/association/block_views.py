@@ -16,6 +16,7 @@ from epipole.schemas.bridge import array
 from epipole.schemas.spans import Span
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.association.verdicts import Items
+from epipole.tasks.common.equal_runs import bounds_of_runs
 from epipole.tasks.solve.association.choose_instants import (
     clear_views,
     even_instants,
@@ -139,7 +140,7 @@ class BlockViews:
         for epoch_ns, epoch, tracklet, clear in zip(
             self._epoch_ns, self._epoch, self._tracklet, self._clear, strict=True
         ):
-            bounds = _bounds(epoch_ns // self.window_ns, tracklet)
+            bounds = bounds_of_runs(epoch_ns // self.window_ns, tracklet)
             there = wanted[epoch] & clear
             has = np.add.reduceat(there, bounds[:-1]) > 0 if len(there) else np.zeros(0, bool)
             for k in np.flatnonzero(~has).tolist():
@@ -172,19 +173,12 @@ class BlockViews:
         return np.asarray(window * len(self.tracklet_id) + self._tracklet[sensor][rows])
 
 
-def _bounds(window: Indices, tracklet: Indices) -> Indices:
-    """Return where each tracklet's views in each window begin, and where the last ones end."""
-    begins = np.ones(len(window), bool)
-    begins[1:] = (window[1:] != window[:-1]) | (tracklet[1:] != tracklet[:-1])
-    return np.append(np.flatnonzero(begins), len(window))
-
-
 def _items(
     epoch_ns: Indices, tracklet: Indices, sensor: int, window_ns: int
 ) -> tuple[Indices, ...]:
     """Return the columns of ITEMS of one sensor, whose views are sorted by tracklet and epoch."""
     window = epoch_ns // window_ns
-    bounds = _bounds(window, tracklet)
+    bounds = bounds_of_runs(window, tracklet)
     first, last = bounds[:-1], bounds[1:] - 1
     return (
         window[first],

@@ -29,6 +29,7 @@ from epipole.schemas.work_tables import SHARED_ERRORS, VIEWS
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, FittedOrbits, fit_orbits, prior_of
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, scale_shared_errors
+from epipole.tasks.common.equal_runs import bounds_of_runs
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -133,13 +134,12 @@ class _NamedArcs(NamedTuple):
 def _arcs_of(rows: pl.DataFrame) -> _NamedArcs:
     """Return the arcs of views that are sorted by arc and epoch."""
     arc = rows["arc"].to_numpy()
-    begins = np.flatnonzero(np.append(True, arc[1:] != arc[:-1]))
-    offsets = np.append(begins, len(arc)).astype(np.int64)
+    offsets = bounds_of_runs(arc)
     epoch_ns = rows["epoch"].cast(pl.Int64).to_numpy()
     epochs = [np.unique(epoch_ns[lo:hi]) for lo, hi in itertools.pairwise(offsets)]
     n_epochs = np.array([len(of_arc) for of_arc in epochs])
     middle = np.array([of_arc[len(of_arc) // 2] for of_arc in epochs])
-    object_id = rows["object_id"].to_numpy()[begins]
+    object_id = rows["object_id"].to_numpy()[offsets[:-1]]
     arcs = Arcs(
         offsets=offsets,
         time_s=(epoch_ns - np.repeat(middle, np.diff(offsets))) / 1e9,
@@ -218,8 +218,7 @@ def _starts(positions: pa.Table, object_id: npt.NDArray[np.object_], middle_ns: 
     """Return initial states: the position at each arc's middle, and the slope there."""
     rows = to_polars(positions).sort("object_id", "epoch")
     name, epoch_ns = rows["object_id"].to_numpy(), rows["epoch"].cast(pl.Int64).to_numpy()
-    begins = np.flatnonzero(np.append(True, name[1:] != name[:-1]))
-    offsets = np.append(begins, len(name)).astype(np.int64)
+    offsets = bounds_of_runs(name)
     x_km = stack(rows, "{}_km")
     v_km_s, _ = velocities(offsets, (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)
     at = dict(zip(zip(name, epoch_ns.tolist(), strict=True), range(len(name)), strict=True))

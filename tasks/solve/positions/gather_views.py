@@ -11,6 +11,7 @@ from epipole.io.work.places import ViewedParts
 from epipole.schemas.bridge import array, concat, to_polars
 from epipole.schemas.spans import Span, spans_between
 from epipole.schemas.work_tables import VIEWS
+from epipole.tasks.common.equal_runs import bounds_of_runs
 
 Indices = npt.NDArray[np.int64]
 
@@ -85,11 +86,6 @@ def _seen_by_two(views: pa.Table, number: Indices) -> Indices:
     missed = ~views["centroid"].is_valid().to_numpy()
     epoch_ns = array(views, "epoch")
     order = np.lexsort((missed, sensor, number, epoch_ns))
-    key = np.column_stack([epoch_ns[order], number[order], sensor[order]])
-    first = np.ones(len(order), bool)
-    first[1:] = (key[1:] != key[:-1]).any(axis=1)
-    order, key = order[first], key[first]
-    changes = np.ones(len(order), bool)
-    changes[1:] = (key[1:, :2] != key[:-1, :2]).any(axis=1)
-    group = np.cumsum(changes) - 1
-    return order[np.bincount(group)[group] >= 2] if len(order) else order
+    order = order[bounds_of_runs(epoch_ns[order], number[order], sensor[order])[:-1]]
+    count = np.diff(bounds_of_runs(epoch_ns[order], number[order]))
+    return order[np.repeat(count, count) >= 2]

@@ -24,6 +24,7 @@ from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import neglected_motion, velocities
+from epipole.tasks.common.equal_runs import bounds_of_runs
 from epipole.tasks.common.lone_detections import only_id
 from epipole.tasks.solve.positions.pair_views import association_table, pair_table
 from epipole.tasks.solve.positions.view_groups import ViewGroups
@@ -76,9 +77,7 @@ def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> ViewG
     )
     views, number = views.take(order), object_number[order]
     epoch_ns = array(views, "epoch")
-    begins = np.ones(len(number), bool)
-    begins[1:] = (epoch_ns[1:] != epoch_ns[:-1]) | (number[1:] != number[:-1])
-    offsets = np.append(np.flatnonzero(begins), len(number)).astype(np.int64)
+    offsets = bounds_of_runs(epoch_ns, number)
     r_km, sigma_km = stack(views, "{}_km"), array(views, "position_sigma_km")
     start = offsets[:-1]
     velocity = np.zeros((len(start), 3))

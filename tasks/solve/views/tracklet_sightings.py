@@ -17,6 +17,7 @@ from epipole.tasks.algorithms.geometry.direction_errors import centroid_covarian
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
+from epipole.tasks.common.equal_runs import bounds_of_runs
 from epipole.tasks.common.sightings import Frames, sightings_of
 
 Array = npt.NDArray[np.float64]
@@ -56,7 +57,7 @@ def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
     sightings = sightings_of(frames, tracked)
     name = array(tracked, "tracklet_id")[sightings.row]
     order = np.lexsort((sightings.frame, name.astype(str)))
-    bounds = _bounds(name[order])
+    bounds = bounds_of_runs(name[order])
     return TrackletSightings(
         sightings.frame[order],
         array(tracked, "centroid")[sightings.row[order]],
@@ -137,9 +138,3 @@ def _with_split_prior(
     noise[prior] += share[:, None, None] * bias[prior]
     bias[prior] *= stays[:, None, None]
     return tracklets._replace(cov_noise=noise, cov_bias=bias)
-
-
-def _bounds(names: npt.NDArray[np.object_]) -> Indices:
-    """Return where each run of equal names begins, and where the last one ends."""
-    change = np.flatnonzero(names[1:] != names[:-1]) + 1
-    return np.concatenate([[0], change, [len(names)]]).astype(np.int64)

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.io.work.part_tables import VIEWED
@@ -14,6 +13,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import SENSOR_EPOCHS, SOLUTIONS, VIEWED_TRACKLETS
+from epipole.tasks.common.equal_runs import bounds_of_runs
 from epipole.tasks.common.lone_detections import with_lone_tracklets
 from epipole.tasks.common.named_detections import detections_within
 from epipole.tasks.common.sightings import solved_frames
@@ -81,16 +81,8 @@ def sensor_epochs(epochs: pa.Table, solutions: pa.Table) -> pa.Table:
 
 def viewed_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
     """Return VIEWED_TRACKLETS of one sensor, in the order of the ids, as the views are."""
-    names = array(views, "tracklet_id")
-    begins = _begins(names)
-    rows = with_lone_tracklets(tracklets, views.take(begins)).sort_by("tracklet_id")
+    bounds = bounds_of_runs(array(views, "tracklet_id"))
+    rows = with_lone_tracklets(tracklets, views.take(bounds[:-1])).sort_by("tracklet_id")
     columns = {name: rows[name] for name in rows.column_names}
-    n_views = np.diff(np.append(begins, len(names)))
-    return table(VIEWED_TRACKLETS, columns | {"first_view": begins, "n_views": n_views})
-
-
-def _begins(names: npt.NDArray[np.object_]) -> npt.NDArray[np.int64]:
-    """Return where each run of equal names begins."""
-    changes = np.ones(len(names), bool)
-    changes[1:] = names[1:] != names[:-1]
-    return np.flatnonzero(changes)
+    where = {"first_view": bounds[:-1], "n_views": np.diff(bounds)}
+    return table(VIEWED_TRACKLETS, columns | where)

@@ -18,9 +18,8 @@ Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its plane
-MIDDLE = (
-    0.5  # share of a crowded field that counts as covered by a pair: its edges are not looked at
-)
+# Share of a crowded field that counts as covered by a pair: its edges are not looked at.
+MIDDLE = 0.5
 
 
 class SensorPairs:
