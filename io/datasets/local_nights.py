@@ -15,6 +15,7 @@ import contextlib
 import fcntl
 import os
 import shutil
+import stat
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -102,7 +103,12 @@ def _locked(dataset: Path) -> Iterator[Path]:
     path = staging / "lock"
     while True:
         with contextlib.suppress(FileNotFoundError):  # the last holder has just removed the folder
-            staging.mkdir(parents=True, exist_ok=True)
+            try:
+                staging.mkdir(parents=True, exist_ok=True)
+            except FileExistsError:  # `mkdir` looks twice: it was removed in between, or is a file
+                if stat.S_ISDIR(staging.lstat().st_mode):
+                    continue
+                raise
             lock = path.open("w")
             fcntl.flock(lock, fcntl.LOCK_EX)
             if path.exists() and os.path.samestat(os.fstat(lock.fileno()), path.stat()):

@@ -219,6 +219,28 @@ def test_two_runs_at_once_publish_whole_nights_and_a_reader_never_misses_one(tmp
     assert [p.name for p in tmp_path.iterdir()] == [f"night={NIGHT}"]
 
 
+def test_a_staging_folder_that_goes_while_it_is_made_is_made_again(tmp_path, monkeypatch):
+    staging, is_dir = tmp_path / ".staging", Path.is_dir
+
+    def removed_first(path: Path) -> bool:
+        if path == staging and not any(staging.iterdir()):
+            staging.rmdir()
+            monkeypatch.undo()
+        return is_dir(path)
+
+    staging.mkdir()
+    monkeypatch.setattr(Path, "is_dir", removed_first)
+    publish(tmp_path, night_tables(TIMES), [NIGHT])
+    assert Path.is_dir is is_dir
+    assert [p.name for p in tmp_path.iterdir()] == [f"night={NIGHT}"]
+
+
+def test_a_file_in_the_place_of_the_staging_folder_is_named(tmp_path):
+    (tmp_path / ".staging").write_text("")
+    with pytest.raises(DatasetError, match="File exists"):
+        publish(tmp_path, night_tables(TIMES), [NIGHT])
+
+
 def test_a_damaged_night_is_named(tmp_path):
     publish(tmp_path, night_tables(TIMES), [NIGHT])
     (tmp_path / f"night={NIGHT}/sources/part-0.parquet").write_bytes(b"not parquet")
