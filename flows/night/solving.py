@@ -32,6 +32,9 @@ STEPS = 5  # of the progress
 MARGIN_NS = round(VELOCITY_WINDOW_S * 1e9)  # beyond a span: its positions show an object's motion
 FEWEST_EPOCHS = 6  # of a margin
 VIEWS_AT_ONCE = 4  # tasks that share what one task may hold: small tasks are spread evenly
+# Views that show the errors of the sensors of a span. Not a setting: positions do not depend on the
+# memory of a task.
+MOST_JUDGED = 100_000
 MOST_LINES = 30_000  # of sight, of a span, that are kept for the check of the sensors
 
 
@@ -54,6 +57,18 @@ class _Night(NamedTuple):
     def margin_ns(self) -> int:
         """Time beyond a span whose positions show the motion at its ends."""
         return max(MARGIN_NS, FEWEST_EPOCHS * self.grid.interval_ns)
+
+    @property
+    def epochs_apart(self) -> int:
+        """Number of epochs after which no detection serves again."""
+        if self.grid.instants_ns is not None:
+            return 1
+        return math.floor(2e9 * self.settings.alignment.window_s / self.grid.interval_ns) + 1
+
+    @property
+    def apart_ns(self) -> int:
+        """Time between these epochs, which are multiples of it; 1 where all epochs are."""
+        return 1 if self.grid.instants_ns is not None else self.epochs_apart * self.grid.interval_ns
 
 
 def solve_objects(
@@ -146,8 +161,9 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     numbered = number_objects.submit(spans, night.margin_ns, settings, solved)
     (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
     viewed, margin_ns = night.viewed, night.margin_ns
+    most_views = MOST_JUDGED * night.epochs_apart
     judged = [
-        judge_span.submit(viewed, span, margin_ns, settings, solved)
+        judge_span.submit(viewed, span, margin_ns, night.apart_ns, most_views, settings, solved)
         for span, count in zip(spans, counts, strict=True)
         if count
     ]
@@ -164,12 +180,5 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
 
 
 def _kept_lines(night: _Night, n_views: int) -> Kept:
-    """Return which lines of sight of a span are kept.
-
-    Epochs nearer than twice the window of the local motion share detections.
-    """
-    if night.grid.instants_ns is not None:
-        return Kept(1)
-    interval_ns = night.grid.interval_ns
-    epochs = max(math.ceil(2e9 * night.settings.alignment.window_s / interval_ns), 1)
-    return Kept(epochs * interval_ns, max(math.ceil(n_views / epochs / MOST_LINES), 1))
+    """Return which lines of sight of a span are kept."""
+    return Kept(night.apart_ns, max(math.ceil(n_views / night.epochs_apart / MOST_LINES), 1))

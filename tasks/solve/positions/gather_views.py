@@ -9,14 +9,16 @@ import pyarrow as pa
 
 from epipole.io.work.places import ViewedParts
 from epipole.schemas.bridge import array, concat, to_polars
-from epipole.schemas.spans import Span, spans_between
+from epipole.schemas.spans import DAY_NS, Span, spans_between
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.common.equal_runs import bounds_of_runs
 
 Indices = npt.NDArray[np.int64]
 
 
-def gather_views(viewed: ViewedParts, members: pa.Table, time: Span) -> tuple[pa.Table, Indices]:
+def gather_views(
+    viewed: ViewedParts, members: pa.Table, time: Span, every_ns: int = 1
+) -> tuple[pa.Table, Indices]:
     """Return the VIEWS of objects in a time, and the number of the object of each.
 
     Parameters
@@ -25,6 +27,8 @@ def gather_views(viewed: ViewedParts, members: pa.Table, time: Span) -> tuple[pa
         The parts of the views of the sensors.
     members
         OBJECT_MEMBERS of the objects.
+    every_ns
+        Only epochs that are multiples of this time since midnight.
 
     Notes
     -----
@@ -32,18 +36,24 @@ def gather_views(viewed: ViewedParts, members: pa.Table, time: Span) -> tuple[pa
     counts: the one with a centroid in the frame, or else the first. Views at epochs at which no
     second sensor has one are left out.
     """
-    tables, numbers = [], []
-    for sensor, of_sensor in to_polars(members).group_by("sensor", maintain_order=True):
+    tables, numbers, sensors = [], [], []
+    for sensor, own in to_polars(members).group_by("sensor", maintain_order=True):
         for span in spans_between(*time):
             if not viewed[int(sensor[0])].holds(span):
                 continue
             parts = viewed[int(sensor[0])]
             views = parts.read(span, "views")
-            rows, number = _rows(views, parts.read(span, "tracklets"), of_sensor, time)
+            rows, number = _rows(views, parts.read(span, "tracklets"), own, time)
+            kept = array(views, "epoch")[rows] % DAY_NS % every_ns == 0
+            rows, number = rows[kept], number[kept]
             tables.append(views.take(rows))
             numbers.append(number)
-    views, number = concat(VIEWS, tables), np.concatenate([*numbers, np.zeros(0, np.int64)])
-    kept = _seen_by_two(views, number)
+            sensors.append(np.full(len(number), sensor[0]))
+    views = concat(VIEWS, tables)
+    number, sensor_number = (
+        np.concatenate([*parts, np.zeros(0, np.int64)]) for parts in (numbers, sensors)
+    )
+    kept = _seen_by_two(views, number, sensor_number)
     return views.take(kept), number[kept]
 
 
@@ -79,10 +89,9 @@ def _asked(members: pl.DataFrame, time: Span) -> Iterator[tuple[str, int, int, i
     yield from columns.iter_rows()
 
 
-def _seen_by_two(views: pa.Table, number: Indices) -> Indices:
+def _seen_by_two(views: pa.Table, number: Indices, sensor: Indices) -> Indices:
     """Return the rows of views, one per sensor, of objects that two sensors see at the epoch; in
     the order of epochs, objects and sensors."""
-    sensor = np.unique(array(views, "sensor_id").astype(str), return_inverse=True)[1]
     missed = ~views["centroid"].is_valid().to_numpy()
     epoch_ns = array(views, "epoch")
     order = np.lexsort((missed, sensor, number, epoch_ns))

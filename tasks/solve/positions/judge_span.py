@@ -17,8 +17,6 @@ from epipole.tasks.solve.positions.gather_views import gather_views
 from epipole.tasks.solve.positions.solve_positions import solve_positions
 
 ENOUGH = 8  # objects that show the errors of a sensor
-# Views of these objects. Not a setting: positions do not depend on the memory of a task.
-MOST_VIEWS = 100_000
 
 
 @stage_task(Stage.SOLVE, "errors {span}")
@@ -26,6 +24,8 @@ def judge_span(
     viewed: ViewedParts,
     span: Span,
     margin_ns: int,
+    every_ns: int,
+    most_views: int,
     settings: Settings,
     solved: SolvedParts,
 ) -> None:
@@ -35,13 +35,16 @@ def judge_span(
     ----------
     viewed
         The parts of the views of the sensors.
+    every_ns, most_views
+        Only epochs that are multiples of this time since midnight are solved, and objects with so
+        many views at most, all epochs counted.
     solved
         `objects` is read, `errors` gets the part.
     """
     if solved.errors.holds(span):
         return
-    members = telling_objects(solved.objects.read(span, "members"), MOST_VIEWS)
-    views, number = gather_views(viewed, members, span.widened(margin_ns))
+    members = telling_objects(solved.objects.read(span, "members"), most_views)
+    views, number = gather_views(viewed, members, span.widened(margin_ns), every_ns)
     found = solve_positions(views, number, settings, span)
     errors = judge_errors(views, found.associations, found.positions, settings)
     write_part(solved.errors.of(span), JUDGED, {"errors": errors})

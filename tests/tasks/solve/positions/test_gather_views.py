@@ -5,7 +5,7 @@ import pyarrow.compute as pc
 from scenes.object_members import SECOND_NS, SPANS, members, ns, seconds, views_of, write_spans
 
 from epipole.schemas.bridge import empty
-from epipole.schemas.spans import Span
+from epipole.schemas.spans import DAY_NS, Span
 from epipole.schemas.work_tables import OBJECT_MEMBERS, VIEWS
 from epipole.tasks.solve.positions.gather_views import gather_views
 
@@ -83,6 +83,16 @@ def test_views_outside_the_time_are_left_out(tmp_path):
     found = members((0, 0, "a1", "a1", 0, 9, 10), (0, 1, "b1", "b1", 0, 9, 10))
     views, _ = gather_views(viewed, found, Span(ns(3), ns(6)))
     assert seconds(views)[::2] == [3.0, 4.0, 5.0]  # a span has its start, not its end
+
+
+def test_only_epochs_that_are_multiples_of_a_time_are_gathered(tmp_path):
+    times = np.arange(10.0)
+    viewed = write_spans(tmp_path, [views_of(0, {"a1": times}), views_of(1, {"b1": times})])
+    found = members((0, 0, "a1", "a1", 0, 9, 10), (0, 1, "b1", "b1", 0, 9, 10))
+    views, number = gather_views(viewed, found, EVER, 4 * SECOND_NS)
+    midnight_s = ns(0) % DAY_NS // SECOND_NS
+    assert seconds(views)[::2] == [t for t in times if (midnight_s + t) % 4 == 0]
+    assert len(number) == views.num_rows > 0
 
 
 def test_members_outside_the_time_have_no_views(tmp_path):
