@@ -124,13 +124,16 @@ def scale_table(seeds: int) -> None:
     associate(scene(0, 8, 20, 10).samples)
     for seed in range(seeds):
         points = scene(seed, 100, 1000, 1000)
-        begun = time.thread_time()
-        groups = associate(points.samples)
-        took = time.thread_time() - begun
+        took = []
+        for _ in range(5):
+            begun = time.thread_time()
+            groups = associate(points.samples)
+            took.append(time.thread_time() - begun)
         score = judge_once(points, groups.group)
         ghosts = score.groups - score.right - score.strays
         print(
-            f"seed {seed}: {1e3 * took:.0f} ms, {len(points.who)} points, {score.wanted} objects, "
+            f"seed {seed}: {1e3 * np.median(took):.0f} ms, {len(points.who)} points, "
+            f"{score.wanted} objects, "
             f"{score.right} right, {score.strays} with a stray, {ghosts} ghosts",
             flush=True,
         )

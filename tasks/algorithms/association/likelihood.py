@@ -7,7 +7,6 @@ What two hypotheses explain about equally well is not decided: it is ambiguous.
 """
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,7 +29,7 @@ from epipole.tasks.algorithms.association.hypotheses.field_index import cones_of
 from epipole.tasks.algorithms.association.hypotheses.growth import grow_all
 from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace, work_space
 from epipole.tasks.algorithms.association.hypotheses.seeds import seeds_between
-from epipole.tasks.algorithms.association.hypotheses.sensor_pairs import SensorPairs
+from epipole.tasks.algorithms.association.hypotheses.sensor_pairs import EveryPair, SensorPairs
 from epipole.tasks.algorithms.association.hypotheses.unions import best_union
 from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.sampling.views import views_of
@@ -104,8 +103,13 @@ def associate_tracklets(
         gate_sigma=float(gate_sigma),
         fields=field_index(cones, float(max_range_km)),
     )
-    pairs = SensorPairs(views, space.farthest_km, space.fields, cones)
-    return _Search(space, order, ambiguity_log_odds).run(pairs, min_log_odds)
+    search = _Search(space, order, ambiguity_log_odds)
+    pairs = (
+        SensorPairs(views, space.farthest_km, space.fields, cones)
+        if search.many
+        else EveryPair(space.fields, cones, space.farthest_km)
+    )
+    return search.run(pairs, min_log_odds)
 
 
 def _weights(shells: Iterable[Shell], farthest_km: float) -> Array:
@@ -132,7 +136,7 @@ class _Search:
         self.group, self.ambiguous = np.full(len(order), FREE), np.zeros(len(order), np.bool_)
         self.groups: list[Hypothesis] = []
 
-    def run(self, pairs: SensorPairs, min_log_odds: float) -> Groups:
+    def run(self, pairs: EveryPair | SensorPairs, min_log_odds: float) -> Groups:
         """Return the groups. With many sensors the clear ones are accepted during the search."""
         waiting: list[Hypothesis] = []
         while (pair := pairs.next(self._enough_pairs())) is not None:
@@ -143,7 +147,8 @@ class _Search:
             waiting = self._learn_detection(waiting)
         self.take(waiting, WORTH_A_LOOK)
         nothing_taken = self.space._replace(taken=np.zeros_like(self.space.taken))
-        settle_contests(nothing_taken, self.work, self.group, len(self.groups))
+        x_km = np.array([h.x_km for h in self.groups]).reshape(-1, 3)
+        settle_contests(nothing_taken, self.work, self.group, x_km)
         scores = self._withdraw_doubtful(min_log_odds)
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
         group[self.order], ambiguous[self.order] = self.group, self.ambiguous
@@ -152,10 +157,8 @@ class _Search:
     def _enough_pairs(self) -> float:
         """Return how many pairs must cover a place, so that few objects there have no seed.
 
-        A pair misses an object where either sensor does. With few sensors: all pairs.
+        A pair misses an object where either sensor does.
         """
-        if not self.many:
-            return np.inf
         missed = 1 - float(np.mean(self.space.chance.detected)) ** 2
         return float(np.ceil(np.log(UNSEEDED / max(len(self.groups), 1)) / np.log(missed)))
 
@@ -178,15 +181,20 @@ class _Search:
             return [], []
         least = WORTH_A_LOOK - self.margin
         grown = grow_all(self.space, self.work, seeds, float(clear), least)
+        member, first, skip = (
+            values.tolist() for values in (grown.member, grown.first_member, grown.first_missed)
+        )
         hypotheses = [
             Hypothesis(
-                float(grown.score[q]),
-                tuple(seeds[grown.seed[q]].tolist()),
-                tuple(np.sort(grown.member[slice(*grown.first_member[q : q + 2])]).tolist()),
+                score,
+                (a, b),
+                tuple(member[first[q] : first[q + 1]]),
                 grown.x_km[q],
-                grown.missed[slice(*grown.first_missed[q : q + 2])],
+                grown.missed[skip[q] : skip[q + 1]],
             )
-            for q in range(len(grown.seed))
+            for q, (score, (a, b)) in enumerate(
+                zip(grown.score.tolist(), seeds[grown.seed].tolist(), strict=True)
+            )
         ]
         return hypotheses, grown.taken.tolist()
 
@@ -214,7 +222,7 @@ class _Search:
         looks, n = looks_of(self.space.views, hypotheses), len(hypotheses)
         change = detection_odds(looks, n, detected) - detection_odds(looks, n, believed)
         return [
-            replace(h, score=h.score + more)
+            Hypothesis(h.score + more, h.seed, h.members, h.x_km, h.missed)
             for h, more in zip(hypotheses, change.tolist(), strict=True)
         ]
 

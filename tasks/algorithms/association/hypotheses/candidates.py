@@ -21,7 +21,7 @@ from epipole.tasks.algorithms.association.sampling.views import (
     Y,
     later_s,
 )
-from epipole.tasks.algorithms.kernels import borrowing_kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel
 
 # Columns of `WorkSpace.predicted`: coordinates and covariance on the sensor's plane, depth [km],
 # stretch of the plane, the delay of `later_s` [s], and how far the sensor's own motion moves the
@@ -108,7 +108,7 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
     return gain if n > 0 and total <= quantile(2 * n, gate_sigma) else -np.inf
 
 
-@borrowing_kernel
+@inlined_kernel
 def best_of_sensor(space, work, s, own, least):
     """Return the free tracklet of sensor s that adds most to the log-odds.
 

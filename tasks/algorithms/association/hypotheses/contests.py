@@ -7,7 +7,6 @@ to no object where two explain it about equally well.
 
 import numpy as np
 
-from epipole.tasks.algorithms.association.evidence.points import InstantPoints
 from epipole.tasks.algorithms.association.hypotheses.candidates import (
     best_of_sensor,
     claims_another,
@@ -16,23 +15,22 @@ from epipole.tasks.algorithms.association.hypotheses.candidates import (
 from epipole.tasks.algorithms.association.hypotheses.field_index import near_points
 from epipole.tasks.algorithms.association.hypotheses.growth import CONTESTED, SPEAKS
 from epipole.tasks.algorithms.association.hypotheses.instant_points import solve
-from epipole.tasks.algorithms.association.hypotheses.search_space import WorkSpace
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 FEWEST = 3  # tracklets of an object that may gain or lose one
 
 
 @kernel
-def settle_contests(space, work, group, n_groups):
+def settle_contests(space, work, group, x_km):
     """Correct `group` (-1: no object) for tracklets that two objects explain.
 
     Only objects of three tracklets or more take part, and none falls below three.
-    `space.taken` must be all false.
+    `space.taken` must be all false. `x_km` (g, 3) are the objects' points at their first instant.
     """
-    views = space.views
+    views, n_groups = space.views, len(x_km)
     k, n_sensors = len(views.time_s), views.camera.shape[0]
-    X, N = np.zeros((n_groups, k, 3)), np.zeros((k, 3, 3))
-    P, seen_by = np.zeros((n_groups, k, 3, 3)), np.zeros((n_groups, k), np.int64)
+    X, P = np.zeros((n_groups, k, 3)), np.zeros((n_groups, k, 3, 3))
+    seen_by = np.zeros((n_groups, k), np.int64)
     size = np.zeros(n_groups, np.int64)
     members, first = _by_group(group, n_groups)
     near, first_near = np.empty((4 * len(group), 2), np.int64), np.zeros(n_sensors + 1, np.int64)
@@ -41,17 +39,20 @@ def settle_contests(space, work, group, n_groups):
         of_group = members[first[g] : first[g + 1]]
         if len(of_group) < FEWEST:
             continue
-        here = _at_points(work, InstantPoints(X[g], N, P[g], seen_by[g]))
-        chi2, _ = solve(views, of_group, here.points, here.part)
+        work.points.seen_by[:] = 0
+        if k == 1:  # a good start
+            work.points.x_km[0], work.points.seen_by[0] = x_km[g], 2
+        chi2, _ = solve(views, of_group, work.points, work.part)
         if np.isnan(chi2):
             continue
+        X[g], P[g], seen_by[g] = work.points.x_km, work.points.cov_km2, work.points.seen_by
         size[g] = len(of_group)
-        n = near_points(space, here, *_two_sensors(views, of_group))
+        n = near_points(space, work, *_two_sensors(views, of_group))
         while n_near + n > len(near):
             longer = np.empty((2 * len(near), 2), np.int64)
             longer[:n_near] = near[:n_near]
             near = longer
-        for s in here.near[:n]:
+        for s in work.near[:n]:
             near[n_near, 0], near[n_near, 1] = s, g
             first_near[s + 1] += 1
             n_near += 1
@@ -66,17 +67,17 @@ def settle_contests(space, work, group, n_groups):
         for g in groups_near[first_near[s] : first_near[s + 1]]:
             if size[g] < FEWEST:
                 continue
-            here = _at_points(work, InstantPoints(X[g], N, P[g], seen_by[g]))
-            if not claims_another(space, here, s, group, g):
+            _enter_points(work.points, g, X, P, seen_by)
+            if not claims_another(space, work, s, group, g):
                 continue
-            c, gain, _ = best_of_sensor(space, here, s, members[:0], SPEAKS)
+            c, gain, _ = best_of_sensor(space, work, s, members[:0], SPEAKS)
             if c < 0 or group[c] < 0 or group[c] == g:
                 continue
             o = group[c]
             if size[o] <= FEWEST:
                 continue
-            there = _at_points(work, InstantPoints(X[o], N, P[o], seen_by[o]))
-            theirs = odds_of_view(space, there, s, c)
+            _enter_points(work.points, o, X, P, seen_by)
+            theirs = odds_of_view(space, work, s, c)
             if theirs - gain < CONTESTED:
                 size[o] -= 1
                 group[c] = -1
@@ -85,13 +86,15 @@ def settle_contests(space, work, group, n_groups):
                     size[g] += 1
 
 
-@kernel
-def _at_points(work, points):
-    """Return the work space with other points."""
-    return WorkSpace(
-        points, work.part, work.predicted, work.nearby, work.near, work.missed, work.stamp,
-        work.own, work.members, work.before, work.misfit,
-    )  # fmt: skip
+@borrowing_kernel
+def _enter_points(points, g, X, P, seen_by):
+    """Enter the points of group g."""
+    for m in range(len(points.seen_by)):
+        points.seen_by[m] = seen_by[g, m]
+        for a in range(3):
+            points.x_km[m, a] = X[g, m, a]
+            for b in range(3):
+                points.cov_km2[m, a, b] = P[g, m, a, b]
 
 
 @borrowing_kernel

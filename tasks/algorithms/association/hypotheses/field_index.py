@@ -29,6 +29,7 @@ Indices = npt.NDArray[np.int64]
 FEW_SENSORS = 32  # up to this many: one cell, all sensors share it
 SMALLEST_CELL = 0.05  # at the Earth's surface, over the Earth's radius
 MOST_CELLS = 400  # per sensor, on average: with more, the cells are made twice as large
+SAMPLED = 16  # sensors that are entered first, to find a size of cells
 PIECE = 0.5  # length of a piece of a cone over the size of the cells there
 EDGE_RAD, WIDEST_RAD = 1e-3, 1.5  # added to the half-angle of a cone, and the largest one
 AXIS, TANGENT = 3, 6  # columns of a cone
@@ -65,12 +66,14 @@ def field_index(cones: Array, farthest_km: float) -> FieldIndex:
             np.array([0, n]), np.arange(n), np.arange(n + 1), np.zeros(n, np.int64), 0.0,
             np.zeros(1, np.int64), np.zeros(1, np.int64),
         )  # fmt: skip
-    size, room = SMALLEST_CELL, MOST_CELLS * n
-    while True:
-        own_first, own_cell, n_cells, keys, slots = _enter(cones, farthest_km, size, room)
-        if n_cells >= 0:
-            break
-        size *= 2
+    size = SMALLEST_CELL
+    for few in (cones[:: -(-n // SAMPLED)], cones):  # most sizes that are too small: by a few
+        while True:
+            room = MOST_CELLS * len(few)
+            own_first, own_cell, n_cells, keys, slots = _enter(few, farthest_km, size, room)
+            if n_cells >= 0:
+                break
+            size *= 2
     sensor = np.repeat(np.arange(n), np.diff(own_first))
     order = np.argsort(own_cell, kind="stable")
     first = np.searchsorted(own_cell[order], np.arange(n_cells + 1))

@@ -16,7 +16,7 @@ from epipole.tasks.algorithms.association.hypotheses.field_index import sensors_
 from epipole.tasks.algorithms.association.hypotheses.instant_points import join, possible, solve
 from epipole.tasks.algorithms.association.hypotheses.sight_lines import quantile
 from epipole.tasks.algorithms.association.sampling.views import SPOT_SR, misfit, residual
-from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -45,7 +45,7 @@ class Grown(NamedTuple):
     x_km : (h, 3) float
         Position at the first instant.
     first_member, member : (h + 1,), (n,) int
-        Tracklets of hypothesis q are ``member[first_member[q]:first_member[q + 1]]``.
+        Tracklets of hypothesis q are ``member[first_member[q]:first_member[q + 1]]``, in order.
     first_missed, missed : (h + 1,), (m,) int
         The same for the sensors that miss it.
     """
@@ -107,6 +107,7 @@ def grow_all(space, work, seeds, clear, least):
         member[begin : begin + n] = members[:n]
         missed[skip : skip + n_missed] = work.missed[:n_missed]
         x_km[h] = work.points.x_km[np.argmax(work.points.seen_by >= 2)]
+        member[begin : begin + n].sort()
         is_clear = _clear_of_doubt(space, work, members[:n], n_missed, value, clear)
         seed[h], value_of[h], clears[h] = q, value, is_clear
         h += 1
@@ -224,7 +225,7 @@ def _begin(space, work, members, nearby):
     return np.int64(near_fields(space.views, points, nearby, work.near))
 
 
-@borrowing_kernel
+@inlined_kernel
 def _join_sensor(space, work, s, members, n, evidence):
     """Add the tracklets of sensor s that fit to the members.
 
@@ -350,5 +351,6 @@ def _settle(space, work, members, n):
             for q in range(worst, n - 1):
                 members[q], work.misfit[q] = members[q + 1], work.misfit[q + 1]
             n -= 1
-        seen_by[:] = 0
+        if np.isnan(chi2):
+            seen_by[:] = 0  # such points are no start
     return np.int64(0)

@@ -22,6 +22,18 @@ N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its 
 MIDDLE = 0.5
 
 
+class EveryPair:
+    """All pairs of sensors whose fields meet: of few sensors, two may be all that see an object."""
+
+    def __init__(self, index: FieldIndex, cones: Array, farthest_km: float) -> None:
+        a, b = meeting_pairs(index, cones, farthest_km)
+        self._pairs = zip(a.tolist(), b.tolist(), strict=True)
+
+    def next(self, enough: float = np.inf) -> tuple[int, int] | None:
+        """Return the next pair, None after the last; a pair is never covered enough."""
+        return next(self._pairs, None)
+
+
 class SensorPairs:
     """Pairs of sensors that may see one object, in the order in which they should seed.
 

@@ -92,22 +92,24 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
     n_sensors, n_instants = samples.sensor_km.shape[:2]
     order = np.argsort(samples.sensor, kind="stable")
     sensor = np.ascontiguousarray(samples.sensor[order], np.int64)
-    seen = np.ascontiguousarray(samples.seen[order])
     first = np.searchsorted(sensor, np.arange(n_sensors + 1)).astype(np.int64)
-    sight = np.zeros((len(order), n_instants, N_SIGHT))
-    sight[..., SIGMA_KM] = samples.sigma_km[order]
+    seen, u = np.ascontiguousarray(samples.seen), np.ascontiguousarray(samples.u, float)
+    plane = _planes(first, order, seen, u)
+    _sort_by_place(first, order, seen, u, plane)
     camera = np.zeros((n_sensors, n_instants, N_CAMERA))
     camera[..., R_KM:PLANE] = samples.sensor_km
+    camera[..., PLANE:TURN] = plane.reshape(n_sensors, n_instants, 9)
     camera[..., TURN:HALF] = samples.R_sensor_from_icrs.reshape(n_sensors, n_instants, 9)
     camera[..., HALF:CORNER] = samples.half_field[:, None]
-    rate = np.zeros_like(samples.u)
+    rate = np.zeros((0, n_instants, 3))
     if samples.rate is not None and samples.sensor_km_s is not None:
-        rate, camera[..., V_KM_S:FASTEST] = samples.rate, np.nan_to_num(samples.sensor_km_s)
-    rate = np.ascontiguousarray(rate[order], float)
-    u = np.ascontiguousarray(samples.u[order], float)
-    camera[..., PLANE:TURN] = _planes(first, seen, u).reshape(n_sensors, n_instants, 9)
-    cov = np.ascontiguousarray(samples.cov[order], float)
-    _flatten(sensor, seen, u, cov, rate, camera, sight)
+        rate = np.ascontiguousarray(samples.rate, float)
+        camera[..., V_KM_S:FASTEST] = np.nan_to_num(samples.sensor_km_s)
+    sight = np.empty((len(order), n_instants, N_SIGHT))
+    sight[..., SIGMA_KM] = samples.sigma_km[order]
+    cov = np.ascontiguousarray(samples.cov, float)
+    _flatten(sensor, order, seen, u, cov, rate, camera, sight)
+    seen = seen[order]
     n_seen = int(np.count_nonzero(seen))
     grid = np.zeros((n_sensors, n_instants, 2), np.int64)
     cell_start = np.zeros(n_seen + n_sensors * n_instants + 1, np.int64)
@@ -142,15 +144,18 @@ def _bounded(samples: Samples) -> Flags:
 
 
 @kernel
-def _planes(first, seen, u):
-    """Return each sensor's planes, (s, k, 3, 3). Their axes follow the normal between instants."""
+def _planes(first, order, seen, u):
+    """Return each sensor's planes, (s, k, 3, 3). Their axes follow the normal between instants.
+
+    `order` sorts the tracklets by sensor.
+    """
     plane = np.zeros((len(first) - 1, seen.shape[1], 3, 3))
     axis, across = np.zeros(3), np.zeros(3)
     for s in range(len(plane)):
         begun = False
         for m in range(seen.shape[1]):
             normal = plane[s, m, 2]
-            for i in range(first[s], first[s + 1]):
+            for i in order[first[s] : first[s + 1]]:
                 if seen[i, m]:
                     normal += u[i, m]
             length = np.sqrt(np.sum(normal * normal))
@@ -174,6 +179,44 @@ def _planes(first, seen, u):
     return plane
 
 
+@kernel
+def _sort_by_place(first, order, seen, u, plane):
+    """Sort the tracklets of each sensor by cells of its plane at the first instant they are seen.
+
+    A hypothesis looks at the few tracklets near its points: these lie side by side in memory.
+    """
+    n_instants = seen.shape[1]
+    cell, place, sorted_ = np.empty(len(order), np.int64), np.empty((len(order), 2)), order.copy()
+    low, high = np.empty(2), np.empty(2)
+    for s in range(len(first) - 1):
+        lo, hi = first[s], first[s + 1]
+        low[:], high[:] = np.inf, -np.inf
+        for k in range(lo, hi):
+            i, m = order[k], 0
+            while m < n_instants - 1 and not seen[i, m]:
+                m += 1
+            for a in range(2):
+                here = 0.0
+                for b in range(3):
+                    here += plane[s, m, a, b] * u[i, m, b]
+                place[k, a] = here if np.isfinite(here) else 0.0
+                low[a], high[a] = min(low[a], place[k, a]), max(high[a], place[k, a])
+        side = int(np.sqrt(hi - lo))
+        start = np.zeros(side * side + 1, np.int64)
+        for k in range(lo, hi):
+            q = 0
+            for a in range(2):
+                share = (place[k, a] - low[a]) / max(high[a] - low[a], 1e-12)
+                q = q * side + min(int(share * side), side - 1)
+            cell[k] = q
+            start[q + 1] += 1
+        start = lo + np.cumsum(start)
+        for k in range(lo, hi):
+            sorted_[start[cell[k]]] = order[k]
+            start[cell[k]] += 1
+    order[:] = sorted_
+
+
 def _reach(camera: Array, grid: Indices) -> Array:
     """Return tangents of the cones about the planes' normals that hold field and tracklets."""
     side = grid[..., 1:]
@@ -187,16 +230,23 @@ def _reach(camera: Array, grid: Indices) -> Array:
 
 
 @kernel
-def _flatten(sensor, seen, u, cov, rate, camera, sight):
-    """Project directions, rates, and covariances on `sky.tangent_basis` onto the planes."""
+def _flatten(sensor, order, seen, u, cov, rate, camera, sight):
+    """Project directions, rates, and covariances on `sky.tangent_basis` onto the planes.
+
+    `sensor` and `sight` are in the order of the search, the samples are not.
+    """
     M, t, p = np.empty((2, 2)), np.empty((2, 3)), np.empty((3, 3))
-    for i in range(seen.shape[0]):
+    for n in range(len(order)):
+        i, s = order[n], sensor[n]
         for m in range(seen.shape[1]):
+            for a in range(N_SIGHT):
+                if a != SIGMA_KM:
+                    sight[n, m, a] = 0.0
             if not seen[i, m]:
                 continue
             x, y, z = u[i, m, 0], u[i, m, 1], u[i, m, 2]
             for a in range(9):
-                p[a // 3, a % 3] = camera[sensor[i], m, PLANE + a]
+                p[a // 3, a % 3] = camera[s, m, PLANE + a]
             if abs(z) < 0.9:
                 length = np.sqrt(x * x + y * y)
                 t[0, 0], t[0, 1], t[0, 2] = -y / length, x / length, 0.0
@@ -209,25 +259,25 @@ def _flatten(sensor, seen, u, cov, rate, camera, sight):
             depth = max(p[2, 0] * x + p[2, 1] * y + p[2, 2] * z, 1e-3)
             for a in range(2):
                 here = (p[a, 0] * x + p[a, 1] * y + p[a, 2] * z) / depth
-                sight[i, m, X + a] = here
-                moved = 0.0
-                for b in range(3):
-                    moved += (p[a, b] - here * p[2, b]) * rate[i, m, b] / depth
-                    if rate[i, m, b] != 0.0:
-                        sight[i, m, MOVES] = 1.0
-                sight[i, m, DX + a] = moved
-                fastest = camera[sensor[i], m, FASTEST]
-                camera[sensor[i], m, FASTEST] = max(fastest, abs(moved))
+                sight[n, m, X + a] = here
+                if len(rate) > 0:
+                    moved = 0.0
+                    for b in range(3):
+                        moved += (p[a, b] - here * p[2, b]) * rate[i, m, b] / depth
+                        if rate[i, m, b] != 0.0:
+                            sight[n, m, MOVES] = 1.0
+                    sight[n, m, DX + a] = moved
+                    camera[s, m, FASTEST] = max(camera[s, m, FASTEST], abs(moved))
                 for b in range(2):
                     M[a, b] = 0.0
                     for c in range(3):
                         M[a, b] += (p[a, c] - here * p[2, c]) * t[b, c] / depth
             c00, c01, c11 = cov[i, m, 0, 0], cov[i, m, 0, 1], cov[i, m, 1, 1]
-            sight[i, m, SPOT_SR] = 2 * np.pi * np.sqrt(max(c00 * c11 - c01 * c01, 0.0))
+            sight[n, m, SPOT_SR] = 2 * np.pi * np.sqrt(max(c00 * c11 - c01 * c01, 0.0))
             for k in range(3):
                 a, b = k // 2, (k + 1) // 2  # xx, xy, yy
                 along, across = c00 * M[b, 0] + c01 * M[b, 1], c01 * M[b, 0] + c11 * M[b, 1]
-                sight[i, m, XX + k] = M[a, 0] * along + M[a, 1] * across
+                sight[n, m, XX + k] = M[a, 0] * along + M[a, 1] * across
 
 
 @kernel
