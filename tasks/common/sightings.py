@@ -93,9 +93,8 @@ def sightings_of(frames: Frames, detections: pa.Table) -> Sightings:
         np.radians(array(detections, "ra_deg")[row]), np.radians(array(detections, "dec_deg")[row])
     )
     noise = centroid_covariance(u, array(detections, "sigma_arcsec")[row] * ARCSEC)
-    attitude = attitude_covariance(
-        u, matrix_from_quaternion(frames.q_sensor_from_icrs[frame]), frames.cov_att_rad2[frame]
-    )
+    R = matrix_from_quaternion(frames.q_sensor_from_icrs)
+    attitude = attitude_covariance(u, (np.swapaxes(R, -1, -2) @ frames.cov_att_rad2 @ R)[frame])
     stars = frames.from_stars[frame][:, None, None]
     return Sightings(
         row,

@@ -27,6 +27,11 @@ class Camera(NamedTuple):
     k3: float = 0.0
 
     @property
+    def distorts(self) -> bool:
+        """Whether there is any distortion."""
+        return any((self.k1, self.k2, self.p1, self.p2, self.k3))
+
+    @property
     def pixel_rad(self) -> float:
         """Angle of one pixel at the principal point [rad]."""
         return 1.0 / np.sqrt(self.fx_px * self.fy_px)
@@ -41,11 +46,26 @@ class Camera(NamedTuple):
 
 def distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
     """Return distorted normalised coordinates (OpenCV, camera calibration, eq. plumb_bob)."""
+    if not camera.distorts:
+        return np.array(x, float), np.array(y, float)
     r2 = x * x + y * y
     radial = 1 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
     xd = x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x)
     yd = y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y
     return xd, yd
+
+
+def _slopes(camera: Camera, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    """Return the derivatives of `distort`: of x by x, of x by y (and y by x), of y by y."""
+    k1, k2, p1, p2, k3 = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # d radial / d r2, times 2
+    return (
+        radial + slope * x * x + 2 * p1 * y + 6 * p2 * x,
+        slope * x * y + 2 * p1 * x + 2 * p2 * y,
+        radial + slope * y * y + 6 * p1 * y + 2 * p2 * x,
+    )
 
 
 def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
@@ -55,20 +75,15 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     returned. The field of a star sensor does not reach there.
     """
     x, y = np.array(xd, float), np.array(yd, float)
-    k1, k2, p1, p2, k3 = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
-    if not any((k1, k2, p1, p2, k3)):
+    if not camera.distorts:
         return x, y
     for _ in range(8):
         ex, ey = distort(camera, x, y)
-        ex, ey = ex - xd, ey - yd
+        ex -= xd
+        ey -= yd
         # Convergence is quadratic: after a step from below 1e-9 the rest is rounding.
         last = max(np.abs(ex).max(initial=0.0), np.abs(ey).max(initial=0.0)) < 1e-9
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # d radial / d r2, times 2
-        jxx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        jyy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-        jxy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+        jxx, jxy, jyy = _slopes(camera, x, y)
         determinant = jxx * jyy - jxy * jxy
         x, y = (
             x - (jyy * ex - jxy * ey) / determinant,
@@ -108,12 +123,8 @@ def pixel_angle(camera: Camera, u: Array) -> Array:
     The geometric mean of both image axes (the root of the solid angle). Off the boresight a
     pixel covers less: by the cosine of the field angle on one axis, its square on the other.
     """
-    x, y = u[..., 0] / u[..., 2], u[..., 1] / u[..., 2]
-    step = 1e-6
-    xa, ya = distort(camera, x + step, y)
-    xb, yb = distort(camera, x - step, y)
-    xc, yc = distort(camera, x, y + step)
-    xd, yd = distort(camera, x, y - step)
-    stretch = np.abs((xa - xb) * (yc - yd) - (ya - yb) * (xc - xd)) / (4 * step * step)
-    solid = u[..., 2] ** 3 / (camera.fx_px * camera.fy_px * np.maximum(stretch, 1e-6))
+    solid = u[..., 2] * u[..., 2] * u[..., 2] / (camera.fx_px * camera.fy_px)
+    if camera.distorts:
+        jxx, jxy, jyy = _slopes(camera, u[..., 0] / u[..., 2], u[..., 1] / u[..., 2])
+        solid /= np.maximum(np.abs(jxx * jyy - jxy * jxy), 1e-6)
     return np.sqrt(solid)

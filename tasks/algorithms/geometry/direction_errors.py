@@ -27,24 +27,22 @@ def centroid_covariance(u_icrs: Array, sigma_rad: Array) -> Array:
     return across * np.square(sigma_rad)[:, None, None]
 
 
-def attitude_covariance(u_icrs: Array, R_sensor_from_icrs: Array, cov_att_rad2: Array) -> Array:
+def attitude_covariance(u_icrs: Array, cov_icrs_rad2: Array) -> Array:
     """Return (n, 3, 3) covariances of directions due to attitude errors.
 
     Parameters
     ----------
     u_icrs : (n, 3) float
         Unit vectors.
-    R_sensor_from_icrs : (n, 3, 3) float
-        Attitudes of their frames.
-    cov_att_rad2 : (n, 3, 3) float
-        Covariance of the attitude's small rotation about the sensor axes [rad^2].
+    cov_icrs_rad2 : (n, 3, 3) float
+        Covariance of the small rotation of their frame, about the axes of the ICRS [rad^2].
 
     Notes
     -----
     A small rotation phi moves a direction by phi x u; the sign of phi does not matter.
     """
-    to_direction = -skew(u_icrs) @ np.swapaxes(R_sensor_from_icrs, -1, -2)
-    return to_direction @ cov_att_rad2 @ np.swapaxes(to_direction, -1, -2)
+    across = skew(u_icrs)
+    return across @ cov_icrs_rad2 @ np.swapaxes(across, -1, -2)
 
 
 def on_tangent_plane(u_icrs: Array, cov: Array) -> Array:

@@ -57,7 +57,7 @@ def velocities(
         spread = square - n * mean_t**2
         cross = total(t[:, None] * x) - mean_t[:, None] * total(x)
         # The slope of half the square of the time since `at`.
-        bent = (total(t**3) - mean_t * square) / 2 - at * spread
+        bent = (total(t * t * t) - mean_t * square) / 2 - at * spread
         fall = gravity(r_km[known[0]] + total(x) / n[:, None])
         with np.errstate(invalid="ignore", divide="ignore"):
             slope = (cross - bent[:, None] * fall) / spread[:, None]
@@ -95,7 +95,7 @@ def neglected_motion(object_state: Array, sensor_state: Array, moments: Array) -
     away, rate, bend, jerk = (derivative / reach for derivative in at)
 
     def along(a: Array, b: Array) -> Array:
-        return np.sum(a * b, axis=1, keepdims=True)
+        return np.einsum("ij,ij->i", a, b)[:, None]
 
     # Derivatives of u = d / rho, from those of d = rho u; all over rho.
     rate_rho = along(away, rate)

@@ -53,40 +53,46 @@ def planet_directions(
     if not len(time_ns):
         return np.zeros((0, len(NUMBERS), 3)), np.zeros((0, len(NUMBERS)))
     origin = int(time_ns.min())
-    paths = _paths(origin, int(time_ns.max()))
     t = (time_ns - origin) / 1e9
-    here, sun = paths.earth_km(t) + r_gcrf_km, paths.sun_km(t)
-    from_sun = np.stack([planet(t) for planet in paths.planets_km], axis=1)
-    for _ in range(2):
-        line = sun[:, None] + from_sun - here[:, None]
-        delay_s = np.linalg.norm(line, axis=-1) / SPEED_OF_LIGHT_KM_S
-        # The motion of the Sun is neglected: 0.01 arcsec in the four hours of light from Neptune.
-        planets = enumerate(paths.planets_km)
-        from_sun = np.stack([planet(t - delay_s[:, k]) for k, planet in planets], axis=1)
-    line = sun[:, None] + from_sun - here[:, None]
-    reach = np.linalg.norm(line, axis=-1)
-    velocity = paths.earth_km.derivative()(t) + v_gcrf_km_s
-    u = aberrate(line / reach[..., None], velocity[:, None])
-    error_km = _ERROR_ARCSEC * ARCSEC * np.linalg.norm(from_sun, axis=-1) + _RADIUS_KM
-    return u, error_km / reach
+    paths = _paths(origin, int(time_ns.max()))
+    seen, earth_km_s = paths.seen(t), paths.earth_km(t, 1)
+    line = seen[..., :3] - r_gcrf_km[:, None]
+    reach = np.sqrt(np.einsum("npa,npa->np", line, line))
+    u = aberrate(line / reach[..., None], (earth_km_s + v_gcrf_km_s)[:, None])
+    return u, seen[..., 3] / reach
 
 
 class _Paths(NamedTuple):
-    """Splines over time [s]: barycentric Earth and Sun, heliocentric planets."""
+    """Splines over time [s].
 
+    seen : (7, 4), for each planet the vector from the Earth to where its light left that now is at
+        the Earth, and the bound of its error [km]. A sensor's own light time differs: 0.05 arcsec.
+    earth_km : (3,), barycentric
+    """
+
+    seen: CubicSpline
     earth_km: CubicSpline
-    sun_km: CubicSpline
-    planets_km: list[CubicSpline]
 
 
 def _paths(first_ns: int, last_ns: int) -> _Paths:
-    """Return the paths from first to last time, and five hours earlier for the light time."""
-    nodes = np.arange(first_ns - 30 * _NODE_NS, last_ns + 3 * _NODE_NS, _NODE_NS)
+    """Return the paths from first to last time."""
+    # Light from Neptune takes more than four hours.
+    nodes = np.arange(first_ns - 33 * _NODE_NS, last_ns + 3 * _NODE_NS, _NODE_NS)
     at = (nodes - first_ns) / 1e9
     jd = tt_julian_date(nodes)
     from_sun, barycentric = erfa.epv00(*jd)
-    return _Paths(
-        CubicSpline(at, barycentric["p"] * AU_KM),
-        CubicSpline(at, (barycentric["p"] - from_sun["p"]) * AU_KM),
-        [CubicSpline(at, erfa.plan94(*jd, k)["p"] * AU_KM) for k in NUMBERS],
-    )
+    earth_km = CubicSpline(at, barycentric["p"] * AU_KM)
+    here = from_sun["p"] * AU_KM
+    asked = at >= -3 * _NODE_NS / 1e9
+    seen = np.empty((np.count_nonzero(asked), len(NUMBERS), 4))
+    for k, number in enumerate(NUMBERS):
+        planet = CubicSpline(at, erfa.plan94(*jd, number)["p"] * AU_KM)
+        delay_s = np.zeros(len(seen))
+        for _ in range(3):
+            # The motion of the Sun is neglected: 0.01 arcsec in the hours of light from Neptune.
+            place = planet(at[asked] - delay_s)
+            line = place - here[asked]
+            delay_s = np.linalg.norm(line, axis=1) / SPEED_OF_LIGHT_KM_S
+        seen[:, k, :3] = line
+        seen[:, k, 3] = _ERROR_ARCSEC[k] * ARCSEC * np.linalg.norm(place, axis=1) + _RADIUS_KM[k]
+    return _Paths(CubicSpline(at[asked], seen), earth_km)

@@ -119,12 +119,14 @@ def gravity(r_km: Array) -> Array:
     ----------
     Vallado (2013), Fundamentals of Astrodynamics and Applications, eq. 8-30.
     """
-    radius = np.linalg.norm(r_km, axis=-1, keepdims=True)
-    flattening = 1.5 * J2 * (EARTH_RADIUS_KM / radius) ** 2
-    z2 = 5 * (r_km[..., 2:] / radius) ** 2
-    factor = 1 + flattening * (np.array([1.0, 1.0, 3.0]) - z2)
-    acceleration = -GM_KM3_S2 / radius**3 * r_km * factor
-    return np.where(radius > LOWEST_ORBIT_KM, acceleration, 0.0)
+    radius2 = np.einsum("...i,...i->...", r_km, r_km)
+    flattening = 1.5 * J2 * EARTH_RADIUS_KM**2 / radius2
+    z2 = 5 * r_km[..., 2] ** 2 / radius2
+    # Products: a power that is no square takes ten times as long.
+    pull = np.where(radius2 > LOWEST_ORBIT_KM**2, -GM_KM3_S2 / (radius2 * np.sqrt(radius2)), 0.0)
+    across = pull * (1 + flattening * (1 - z2))
+    along = pull * (1 + flattening * (3 - z2))
+    return np.stack([across, across, along], axis=-1) * r_km
 
 
 def _bridge(
@@ -138,7 +140,8 @@ def _bridge(
     h, s = step_s[:, None], share[:, None]
     ra, rb, va, vb = r_km[a], r_km[b], v_km_s[a], v_km_s[b]
     ga, gb = gravity(ra), gravity(rb)
-    s3, s4, s5 = s**3, s**4, s**5
+    s3 = s * s * s
+    s4, s5 = s3 * s, s3 * s * s
     rise = 10 * s3 - 15 * s4 + 6 * s5
     r = ra + (rb - ra) * rise
     r += h * ((s - 6 * s3 + 8 * s4 - 3 * s5) * va + (-4 * s3 + 7 * s4 - 3 * s5) * vb)

@@ -32,12 +32,14 @@ class _Queries(NamedTuple):
 
 
 class _MotionDetections(NamedTuple):
-    """Times (n,), directions (n, 3), and errors (n, 3, 3), independent and shared."""
+    """Times (n,), directions (n, 3), and errors (n, 3, 3), independent and shared; their traces."""
 
     t: Array
     u: Array
     noise: Array
     bias: Array
+    noise_trace: Array
+    bias_trace: Array
 
 
 class _MotionPlaces(NamedTuple):
@@ -177,11 +179,11 @@ def _fit(detections, lo, hi, at, rate, half, unknown_rate):
     tau, weight = detections.t[lo:hi] - at, np.empty(n)
     least = np.inf
     for k in range(lo, hi):
-        least = min(least, np.trace(detections.bias[k]))
+        least = min(least, detections.bias_trace[k])
     for k in range(n):
         # What all share has no part in the weights; what some have more of has.
-        more = np.trace(detections.bias[lo + k]) - least
-        weight[k] = 2.0 / (np.trace(detections.noise[lo + k]) + more)
+        more = detections.bias_trace[lo + k] - least
+        weight[k] = 2.0 / (detections.noise_trace[lo + k] + more)
     value, slope = np.empty(n), np.empty(n)
     if n == 1:
         value[0], slope[0] = 1.0, 0.0
@@ -198,34 +200,38 @@ def _fit(detections, lo, hi, at, rate, half, unknown_rate):
 
 
 @kernel
-def _enter_errors(q, value, unmodelled, noise, bias, places):
-    """Write the propagated errors of query q."""
+def _enter_errors(q, lo, value, unmodelled, detections, places):
+    """Write the propagated errors of query q, fitted to the detections from `lo` on."""
+    noise, bias = detections.noise, detections.bias
     # One error, larger in some frames than in others (0 where stars gave the attitude): it
     # adds up with its signs, and its square is never negative.
-    n = len(value)
     amplitude, total = 0.0, 0.0
-    for k in range(n):
-        square = np.trace(bias[k])
-        amplitude += value[k] * np.sqrt(square)
-        total += abs(value[k]) * square
+    for k in range(len(value)):
+        square = detections.bias_trace[lo + k]
+        if square > 0.0:
+            amplitude += value[k] * np.sqrt(square)
+            total += abs(value[k]) * square
     share = amplitude * amplitude / total if total > 0.0 else 0.0
     for a in range(3):
-        for b in range(3):
+        for b in range(a, 3):
             independent, shared = 0.0, 0.0
-            for k in range(n):
-                independent += value[k] * value[k] * noise[k, a, b]
-                shared += abs(value[k]) * bias[k, a, b]
-            places.noise[q, a, b] = independent + (max(unmodelled, 0.0) if a == b else 0.0)
-            places.bias[q, a, b] = share * shared
+            for k in range(len(value)):
+                independent += value[k] * value[k] * noise[lo + k, a, b]
+            if share > 0.0:
+                for k in range(len(value)):
+                    shared += abs(value[k]) * bias[lo + k, a, b]
+            independent += max(unmodelled, 0.0) if a == b else 0.0
+            places.noise[q, a, b] = places.noise[q, b, a] = independent
+            places.bias[q, a, b] = places.bias[q, b, a] = share * shared
 
 
 @kernel
 def _evaluate(queries, detections, places):
-    t, u, noise, bias = detections.t, detections.u, detections.noise, detections.bias
+    t, u = detections.t, detections.u
     for q in range(len(queries.at)):
         first, last, at = queries.first[q], queries.last[q], queries.at[q]
         nearest = _nearest(t, first, last, at)
-        sigma = np.sqrt(np.trace(noise[nearest]) / 2)
+        sigma = np.sqrt(detections.noise_trace[nearest] / 2)
         lo, hi, rate, half = _window(t, u, first, last, at, sigma, queries.widest)
         places.fitted[q, 0], places.fitted[q, 1] = lo, hi
         value, slope, unmodelled = _fit(detections, lo, hi, at, rate, half, queries.unknown_rate)
@@ -243,7 +249,7 @@ def _evaluate(queries, detections, places):
             places.moments[q, 1] += value[k] * tau * tau
             places.moments[q, 2] += value[k] * tau * tau * tau
         places.unmodelled[q] = max(unmodelled, 0.0)
-        _enter_errors(q, value, unmodelled, noise[lo:hi], bias[lo:hi], places)
+        _enter_errors(q, lo, value, unmodelled, detections, places)
 
 
 def directions_at(
@@ -291,7 +297,8 @@ def directions_at(
         float(widest_s),
     )
     detections = _MotionDetections(
-        *(np.ascontiguousarray(a, float) for a in (time_s, u_icrs, cov_noise, cov_bias))
+        *(np.ascontiguousarray(a, float) for a in (time_s, u_icrs, cov_noise, cov_bias)),
+        *(np.trace(cov, axis1=1, axis2=2) for cov in (cov_noise, cov_bias)),
     )
     places = _MotionPlaces(
         np.empty((q, 3)), np.empty((q, 3)), np.empty((q, 3, 3)), np.empty((q, 3, 3)),

@@ -23,9 +23,11 @@ from epipole.schemas.tables import POSITIONS, REJECTS
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
+from epipole.tasks.algorithms.orbits.independent_epochs import keep_independent
 from epipole.tasks.algorithms.orbits.object_motion import neglected_motion, velocities
 from epipole.tasks.common.equal_runs import bounds_of_runs
 from epipole.tasks.common.lone_detections import only_id
+from epipole.tasks.common.text_ranks import ranked
 from epipole.tasks.solve.positions.pair_views import association_table, pair_table
 from epipole.tasks.solve.positions.view_groups import ViewGroups
 
@@ -72,10 +74,7 @@ def solve_positions(
 
 
 def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> ViewGroups:
-    order = np.lexsort(
-        (array(views, "sensor_id").astype(str), object_number, array(views, "epoch"))
-    )
-    views, number = views.take(order), object_number[order]
+    views, number = _in_order(views, object_number)
     epoch_ns = array(views, "epoch")
     offsets = bounds_of_runs(epoch_ns, number)
     r_km, sigma_km = stack(views, "{}_km"), array(views, "position_sigma_km")
@@ -100,6 +99,14 @@ def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> ViewG
         views, offsets, object_names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
         x_km, cov_km2, chi2, used, mean_range, velocity, np.zeros(len(start), bool),
     )  # fmt: skip
+
+
+def _in_order(views: pa.Table, number: Indices) -> tuple[pa.Table, Indices]:
+    """Return the views in the order of epochs, objects and sensors."""
+    order = np.lexsort((ranked(views, "sensor_id").rank, number, array(views, "epoch")))
+    if np.array_equal(order, np.arange(len(order))):
+        return views, number
+    return views.take(order), number[order]
 
 
 def with_neglected_motion(
@@ -180,14 +187,12 @@ def _independent(groups: ViewGroups, span: Span | None) -> npt.NDArray[np.bool_]
     if span is not None:
         outside = ~(span.holds(first_ns) & span.holds(last_ns))
         apart[groups.group[outside & groups.used]] = False
-    track = array(groups.views, "tracklet_id").tolist()
-    bounds = groups.offsets.tolist()
-    used_until = dict.fromkeys(track, -1)
-    for g in np.flatnonzero(apart).tolist():
-        views = [v for v in range(bounds[g], bounds[g + 1]) if groups.used[v]]
-        apart[g] = all(first_ns[v] > used_until[track[v]] for v in views)
-        if apart[g]:
-            used_until.update({track[v]: last_ns[v] for v in views})
+    track, names = ranked(groups.views, "tracklet_id")
+    until = np.full(len(names), np.iinfo(np.int64).min)
+    # Copies: to numba a read-only array is another type.
+    keep_independent(
+        groups.offsets, groups.used, track, first_ns.copy(), last_ns.copy(), until, apart
+    )
     return apart
 
 
@@ -262,17 +267,17 @@ def _reject_table(groups: ViewGroups) -> pa.Table:
         Reason.VIEW_REJECTED: ~groups.used & ~unsolved,
         Reason.NO_POSITION: unsolved,
     }
-    sensor = array(groups.views, "sensor_id").astype(str)
+    sensor, names = ranked(groups.views, "sensor_id")
     tracklet_id = array(groups.views, "tracklet_id")
     epoch_ns = array(groups.views, "epoch")
     tables = []
     for reason, left_out in which.items():
-        for name in np.unique(sensor[left_out]):
-            rows = left_out & (sensor == name)
+        for k in np.unique(sensor[left_out]):
+            rows = left_out & (sensor == k)
             tables.append(
                 reject_rows(
                     reason,
-                    sensor_id=str(name),
+                    sensor_id=str(names[k]),
                     tracklet_id=only_id(tracklet_id[rows]),
                     time=[int(epoch_ns[rows].min())],
                     count=[int(rows.sum())],

@@ -19,6 +19,7 @@ from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_varianc
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.equal_runs import bounds_of_runs
 from epipole.tasks.common.sightings import Frames, sightings_of
+from epipole.tasks.common.text_ranks import ranked
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -55,9 +56,10 @@ def tracklet_sightings(
 
 def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
     sightings = sightings_of(frames, tracked)
-    name = array(tracked, "tracklet_id")[sightings.row]
-    order = np.lexsort((sightings.frame, name.astype(str)))
-    bounds = bounds_of_runs(name[order])
+    rank, names = ranked(tracked, "tracklet_id")
+    rank = rank[sightings.row]
+    order = np.lexsort((sightings.frame, rank))
+    bounds = bounds_of_runs(rank[order])
     return TrackletSightings(
         sightings.frame[order],
         array(tracked, "centroid")[sightings.row[order]],
@@ -66,7 +68,7 @@ def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
         sightings.cov_bias[order],
         array(tracked, "flux").astype(float)[sightings.row[order]],
         bounds,
-        name[order[bounds[:-1]]],
+        names[rank[order[bounds[:-1]]]].astype(object),
     )
 
 
