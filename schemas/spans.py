@@ -34,8 +34,10 @@ class Span(NamedTuple):
 
     def of(self, rows: pa.Table, column: str) -> pa.Table:
         """Return the rows whose time lies in the span, in their order."""
-        inside = self.holds(array(rows, column))
-        return rows if inside.all() else rows.filter(pa.array(inside))
+        inside = np.flatnonzero(self.holds(array(rows, column)))
+        if len(inside) and inside[-1] - inside[0] + 1 == len(inside):  # not copied
+            return rows.slice(inside[0], len(inside))
+        return rows.take(inside)
 
     @property
     def span(self) -> "Span":

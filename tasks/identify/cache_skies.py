@@ -53,16 +53,35 @@ class Catalogue:
     def __init__(self, stars: pa.Table) -> None:
         self.stars = stars
         self.epoch = label_of(stars.schema).epoch
-        digest = hashlib.blake2b(repr(self.epoch).encode(), digest_size=16)
-        for name in STAR_CATALOGUE.names:
-            digest.update(array(stars, name).tobytes())
-        self.key = digest.hexdigest()
+        self.key = _digest(_Same(stars))
 
     def __hash__(self) -> int:
         return hash(self.key)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Catalogue) and self.key == other.key
+
+
+class _Same:
+    """A table that equals only itself: to look at its content once."""
+
+    def __init__(self, stars: pa.Table) -> None:
+        self.stars = stars
+
+    def __hash__(self) -> int:
+        return id(self.stars)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.stars is other.stars
+
+
+@lru_cache(maxsize=2)
+def _digest(catalogue: _Same) -> str:
+    stars = catalogue.stars
+    digest = hashlib.blake2b(repr(label_of(stars.schema).epoch).encode(), digest_size=16)
+    for name in STAR_CATALOGUE.names:
+        digest.update(array(stars, name).tobytes())
+    return digest.hexdigest()
 
 
 class CachedSkies:

@@ -1,6 +1,6 @@
 """Tabulate identified frames: stars, attitudes and other centroids as tables."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -59,8 +59,12 @@ def barycentric_velocity(time_ns: npt.NDArray[np.int64], places: pa.Table) -> Ar
     return earth_velocity(time_ns) + np.nan_to_num(stack(places, "v{}_km_s"))
 
 
-def _frame_key(exposures: pa.Table, frame: npt.NDArray[np.int64]) -> dict[str, pa.ChunkedArray]:
-    return {name: exposures[name].take(frame) for name in ("sensor_id", "frame_number", "time")}
+def _frame_key(exposures: pa.Table, frame: npt.NDArray[np.int64]) -> dict[str, Any]:
+    """Return the columns that name the frames of rows; all are of one sensor."""
+    return {
+        "sensor_id": pa.repeat(exposures["sensor_id"][0], len(frame)),
+        **{name: array(exposures, name)[frame] for name in ("frame_number", "time")},
+    }
 
 
 def stars_table(

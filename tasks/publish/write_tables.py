@@ -36,8 +36,8 @@ from epipole.tasks.publish.time_slices import in_slices
 BY_SENSOR = ("frames", "stars", "detections")
 BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
 WHOLE = ("tracklets", "calibrations", "sources", "rejects")
-# The tables of one task; each task has about a third of the work.
-SHARES = (("stars",), ("detections",), ("frames", *BY_SPAN, *WHOLE))
+# The tables of one task each; stars are most of the work.
+SHARES = (("stars",), ("detections",), ("frames",), (*BY_SPAN, *WHOLE))
 SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
 # These are counted over the night: a row per span would tell nothing more.
 COUNTED = (
