@@ -10,7 +10,7 @@ from epipole.schemas.bridge import array
 from epipole.schemas.spans import Span
 
 MOST_ROWS = 200_000  # in a slice, about
-ROWS_OF_TABLE = 1_000  # with many tables a slice has more rows: each table is opened for each slice
+ROWS_OF_TABLE = 600  # with many tables a slice has more rows: each table is opened for each slice
 
 
 def in_slices(
