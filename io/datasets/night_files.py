@@ -44,7 +44,8 @@ def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
 
 
 def _write(folder: Path, name: str, pieces: Iterable[pa.Table]) -> int:
-    folder.mkdir(parents=True)
+    # It exists where a worker was killed as it wrote: the task starts again, the file anew.
+    folder.mkdir(parents=True, exist_ok=True)
     count = 0
     writer = None
     for rows in pieces:

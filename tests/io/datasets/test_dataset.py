@@ -235,6 +235,16 @@ def test_a_staging_folder_that_goes_while_it_is_made_is_made_again(tmp_path, mon
     assert [p.name for p in tmp_path.iterdir()] == [f"night={NIGHT}"]
 
 
+def test_a_task_that_was_killed_as_it_wrote_writes_its_table_anew(tmp_path):
+    rows = night_tables(TIMES)["frames"]
+    (tmp_path / "frames").mkdir()
+    (tmp_path / "frames/part-0.parquet").write_bytes(b"PAR1 half a file")
+    assert night_files.write_table(tmp_path, "frames", [rows]) == rows.num_rows
+    assert pq.read_table(tmp_path / "frames/part-0.parquet", partitioning=None).num_rows == len(
+        TIMES
+    )
+
+
 def test_a_file_in_the_place_of_the_staging_folder_is_named(tmp_path):
     (tmp_path / ".staging").write_text("")
     with pytest.raises(DatasetError, match="File exists"):
