@@ -83,9 +83,7 @@ def scene(
         )
         u_icrs = sight @ (turn @ R)
         error = centroid_covariance(u_icrs, np.full(len(order), CENTROID_PX * PIXEL_RAD))
-        error += attitude_covariance(
-            u_icrs, np.broadcast_to(R, (len(order), 3, 3)), np.diag(ATTITUDE_RAD**2)
-        )
+        error += attitude_covariance(u_icrs, R.T @ np.diag(ATTITUDE_RAD**2) @ R)
         sensor.append(np.full(len(order), s))
         who.append(label[order])
         u.append(u_icrs)
