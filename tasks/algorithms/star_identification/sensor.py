@@ -35,7 +35,9 @@ from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-PROBED = 3  # frames, spread over all, which are searched until any is identified
+# Frames, spread over all, which are searched until any is identified; more where a frame has so
+# many centroids that most are no stars.
+PROBED, PROBED_CROWDED, CROWDED = 3, 8, 100
 SAMPLED = 24  # frames around these from which a sensor is learned
 # Centroids may be mostly objects or clutter: skies that are brighter by this are tried as well.
 BRIGHTER_MAG = (1.0, 2.0)
@@ -98,7 +100,8 @@ def identify_sensor(
         limit = skies.limit_for(density / spots.optics[0].solid_angle_sr)
     known = _Known(1.0, limit, magnitude_limit is None, how, True, not stated)
     whole = _Sample(t_s, spots, priors)
-    rows = usable[_spread(len(usable), PROBED)]
+    crowded = len(usable) > 0 and np.median(spots.counts[usable]) > CROWDED
+    rows = usable[_spread(len(usable), PROBED_CROWDED if crowded else PROBED)]
     known, probed = _first_scale(
         whole.take(rows), skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
     )
@@ -230,9 +233,10 @@ def _first_scale(
     probe: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...]
 ) -> tuple[_Known, list[Solution | None]]:
     """Return what is known, with a scale of errors that identifies frames, and the solutions."""
-    quick = known.how._replace(time_limit_s=known.how.time_limit_s / 4)
-    for tried in _attempts(probe.spots, skies, known, scales):
-        found = _identify(probe, skies, tried._replace(how=quick))[0].each()
+    quick = known.how._replace(time_limit_s=known.how.time_limit_s / 4, crowded=False)
+    for k, tried in enumerate(_attempts(probe.spots, skies, known, scales)):
+        how = known.how if k == 0 and len(probe.t_s) > PROBED else quick
+        found = _identify(probe, skies, tried._replace(how=how))[0].each()
         if any(found):
             return _likeliest_scale(probe.spots, found, skies, tried, scales)
     return known._replace(scale=scales[0]), [None] * len(probe.t_s)

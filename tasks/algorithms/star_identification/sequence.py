@@ -104,8 +104,11 @@ def identify_sequence(
     sequence = _Sequence(frames, arrays, stars, rule, solutions, status)
     forth, back, none = Walk(0, n, 1, False), Walk(n - 1, -1, -1, False), no_priors(n)
 
-    def search(k: int) -> tuple[Solution | None, bool]:
-        return identify_lost(frames.frame(k), sky, grid, pairs(), how)
+    def search(k: int, failures: int) -> tuple[Solution | None, bool]:
+        # Crowded frames take long: where the stars' brightness is unknown, ever fewer are tried.
+        often = not np.isnan(how.zero_point_mag)
+        tried = how._replace(crowded=how.crowded and (often or failures.bit_count() <= 1))
+        return identify_lost(frames.frame(k), sky, grid, pairs(), tried)
 
     if anchored:
         sequence.follow(forth, priors)
@@ -161,7 +164,7 @@ class _Sequence(NamedTuple):
         self,
         walk: Walk,
         priors: Priors,
-        search: Callable[[int], tuple[Solution | None, bool]],
+        search: Callable[[int, int], tuple[Solution | None, bool]],
         failures: int,
     ) -> None:
         """The same, but frames that fail are searched; so many searches have failed before."""
@@ -171,7 +174,7 @@ class _Sequence(NamedTuple):
                            self.rule, memory, self.solutions, self.status))  # fmt: skip
             if k == walk.stop:
                 return
-            solution, cut_short = search(k)
+            solution, cut_short = search(k, failures)
             if solution is None:
                 failures += 1
                 memory.held[2] = _skipped(failures, self._refused(k, walk.step))

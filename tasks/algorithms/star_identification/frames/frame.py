@@ -40,8 +40,11 @@ LOST_MARGIN = 6.0
 CLEAR_LEAD = 7.0
 # Prior odds (ln) that a frame has enough stars to be identified: 99 in 100 frames do.
 STARLIT = 4.6
-N_SEARCHED = 200  # brightest centroids that are used in a search of the whole sky
-N_PATTERN_CENTROIDS = 40  # brightest centroids that are paired, lost in space
+# Brightest centroids that are used in a search of the whole sky, that are paired, and that each
+# hypothesis is tried on; where half of them are stars.
+N_SEARCHED, N_PATTERN, N_TRIED, STAR_SHARE = 200, 40, 64, 0.5
+# The same where that fails, for frames of which most centroids are no stars: all are paired.
+N_CROWDED, LEAST_STARS = 800, 8.0
 
 
 class FieldOfView(NamedTuple):
@@ -103,6 +106,8 @@ class Search(NamedTuple):
     time_limit_s : CPU time of one search lost in space
     zero_point_mag : star minus instrumental magnitude; NaN while unknown
     spread_mag : its scatter, 1-sigma
+    crowded : where a search fails, the frame is searched again as one that shows few stars among
+        many other centroids
     """
 
     gate_sigma: float
@@ -110,6 +115,7 @@ class Search(NamedTuple):
     time_limit_s: float
     zero_point_mag: float
     spread_mag: float = TYPICAL_SPREAD_MAG
+    crowded: bool = True
 
 
 class Verdict(NamedTuple):
@@ -183,22 +189,41 @@ def search_lost(
 ) -> Verdict:
     """Search the whole sky for the frame's attitude; see `lost_in_space.search`."""
     # Centroids far outside any image have no direction.
-    at = np.flatnonzero(np.isfinite(frame.u[:, 0]))[:N_SEARCHED]
-    frame = frame._replace(
+    at = np.flatnonzero(np.isfinite(frame.u[:, 0]))
+    verdict = _search(_rows(frame, at[:N_SEARCHED]), sky, grid, pairs, how, crowded=False)
+    if verdict.is_clear or not how.crowded or len(at) <= N_PATTERN:
+        return verdict
+    return _search(_rows(frame, at[:N_CROWDED]), sky, grid, pairs, how, crowded=True)
+
+
+def _rows(frame: FrameCentroids, at: npt.NDArray[np.int64]) -> FrameCentroids:
+    return frame._replace(
         u=frame.u[at], sigma_rad=frame.sigma_rad[at], instrumental_mag=frame.instrumental_mag[at]
     )
-    if len(at) < 3:
+
+
+def _search(
+    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search, crowded: bool
+) -> Verdict:
+    n = len(frame.u)
+    if n < 3:
         return Verdict(False, np.eye(3), -np.inf, -np.inf, False)
     R, least = np.zeros((3, 3)), how.threshold - LOST_MARGIN - STARLIT
     area, budget = frame.optics.solid_angle_sr, how.time_limit_s * WORK_PER_S
+    in_view = sky.rho * area
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))
+    if crowded:
+        share = min(LEAST_STARS / n, STAR_SHARE)
+        limits = SearchLimits(min_chord, n, n, share, (2, 3), budget)
+    else:
+        limits = SearchLimits(min_chord, N_PATTERN, N_TRIED, STAR_SHARE, (0, 2), budget)
     problem = Problem(
         Centroids(*frame[:4]),
         Stars(sky.catalogue.u_icrs, sky.catalogue.magnitude, grid),
         pairs,
-        Image(frame.optics.box, area, sky.rho * area),
+        Image(frame.optics.box, area, in_view),
         rule_of(how, sky)._replace(least=least, enough=least + CLEAR_LEAD + 2.0),
-        SearchLimits(min_chord, N_PATTERN_CENTROIDS, budget),
+        limits,
     )
     best, runner_up, work = search(problem, R)
     is_clear = best > least and best - runner_up > CLEAR_LEAD

@@ -47,14 +47,17 @@ from epipole.tasks.algorithms.star_identification.search.vote_sift import (
 
 # Attitudes closer than this are the same one [rad, about 0.3 degrees].
 SAME_ATTITUDE = 5e-3
-N_VERIFIED = 64  # brightest centroids that each hypothesis is tried on
 # Log odds at which a hypothesis is dropped, and with which it is refined.
 FLOOR, WORTH = -6.0, 2.0
 SLACK = 2  # a hypothesis may lack so many of the votes that are needed
 # Rounds, each more thorough than the one before: pivots; least companions of each; least share of
 # all centroids that are companions; votes after which no more companions are asked; how many of the
 # cells (a star and a turn) with most votes are sifted.
-ROUNDS = ((6, 8, 0.5, 10_000, 128), (99, 0, 1.0, 0, 2000))
+# The last one is for frames of which most centroids are no stars: many pivots, each with other
+# companions.
+ROUNDS = ((6, 8, 0.5, 10_000, 128), (99, 0, 1.0, 0, 2000), (9999, 0, 0.5, 0, 2000))
+CROWDED = 2
+CROWDED_VOTES = 5  # fewer are mostly chance there
 # Hardly any field has fewer stars than this share of the mean.
 SPARSE = 0.35
 # About so many units of work take a second of CPU time.
@@ -138,6 +141,7 @@ def _try_counted(problem, i, n_votes, fine, n_tried, votes, sift, least_votes, r
     centroids, stars, pairs = problem.centroids, problem.stars, problem.pairs
     n, n_checked = len(centroids.u), len(room.gain)
     work, order, prepared = 0, room.no_order, -1
+    log_miss = math.log(1.0 - problem.limits.star_share)
     for k in range(n_votes):
         m, p = sift.companion[k], sift.pair[k]
         if m >= n_tried:
@@ -153,7 +157,7 @@ def _try_counted(problem, i, n_votes, fine, n_tried, votes, sift, least_votes, r
         else:
             a, b = pairs.second[p], pairs.first[p]
         work += 3 * n_checked
-        odds = try_pair(stars, a, b, pairs.chord.s[p], order, FLOOR, room)
+        odds = try_pair(stars, a, b, pairs.chord.s[p], order, log_miss, FLOOR, room)
         if odds < WORTH:
             add_vote(k, fine, -1, sift)  # this vote was given by chance
             continue
@@ -172,6 +176,8 @@ def _try_pivot(problem, i, order, least_companions, step, needed, votes, sift, r
     n_companions, cast, log2 = count_votes(problem, i, order, least_companions, enough_votes, votes)
     work = cast + (problem.pairs.n_stars << log2) // 100
     least_votes = max(needed - SLACK, 2)
+    if step == CROWDED:
+        least_votes = max(least_votes * n_companions // len(order), CROWDED_VOTES)
     while votes.reached[least_votes] > cells:
         least_votes += 1
     n_votes, fine = MOST_SIFTED + 1, 0
@@ -217,21 +223,25 @@ def search(problem, R_best):
     """
     n = len(problem.centroids.u)
     n_pattern = min(n, problem.limits.n_pattern)
-    room = make_scratch(n, min(n, N_VERIFIED))
+    room = make_scratch(n, min(n, problem.limits.n_tried))
     best = Best(np.array([-1e9, -1e9]), R_best)
     top, work = best.evidence, 0
     needed = _matches_needed(problem)
     if needed > n:
         return top[0], top[1], work
     order = _mixed_order(n_pattern)
+    asked = order
     votes, sift = make_votes(problem.pairs.n_stars, n_pattern), make_sift()
     # With so many pivots, one is among the matches of any attitude that has enough.
     n_pivots = min(n_pattern, n - needed + 1)
-    for step in range(len(ROUNDS)):
+    for step in range(problem.limits.rounds[0], problem.limits.rounds[1]):
         pivots, companions, share = ROUNDS[step][:3]
         companions = max(companions, int(share * n_pattern))
-        for i in order[: min(n_pivots, pivots)]:
-            work += _try_pivot(problem, i, order, companions, step, needed, votes, sift, room, best)
+        for p in range(min(n_pivots, pivots)):
+            i = order[p]
+            if step == CROWDED:  # other pivots ask other companions
+                asked = np.roll(asked, -companions)
+            work += _try_pivot(problem, i, asked, companions, step, needed, votes, sift, room, best)
             if work > problem.limits.budget or _is_clear(best, problem.rule):
                 return top[0], top[1], work
     return top[0], top[1], work

@@ -20,8 +20,6 @@ from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid, n
 
 Array = npt.NDArray[np.float64]
 
-STAR_SHARE = 0.5  # of the centroids, before anything is known
-LOG_MISS = math.log(1.0 - STAR_SHARE)
 MAX_BETA = 1.1e-4  # of an observer near the Earth
 
 
@@ -51,11 +49,17 @@ class SearchLimits(NamedTuple):
 
     min_chord : closest centroids that are paired [rad]
     n_pattern : how many of the brightest centroids are paired
+    n_tried : on how many of the brightest centroids each hypothesis is tried
+    star_share : what share of the centroids are stars, before anything is known
+    rounds : (first, last), rows of `lost_in_space.ROUNDS`
     budget : most work, see `WORK_PER_S`
     """
 
     min_chord: float
     n_pattern: int
+    n_tried: int
+    star_share: float
+    rounds: tuple[int, int]
     budget: float
 
 
@@ -135,6 +139,7 @@ def prepare_pair(problem, i, j, c, room):
     be looked up (compiled)."""
     u, sigma, t = problem.centroids.u, problem.centroids.sigma, room.t
     image, gate, grid_radius = problem.image, problem.rule.gate, problem.stars.grid.radius_rad
+    share = problem.limits.star_share
     noise2 = sigma[i] * sigma[i] + sigma[j] * sigma[j]
     E, fall, gain = room.E, room.fall, room.gain
     _basis(u[i], u[j], c, E)
@@ -147,9 +152,9 @@ def prepare_pair(problem, i, j, c, room):
         s2 = sigma[k] * sigma[k] + 0.5 * noise2 * (0.5 + 2.0 * d2 / (c * c))
         s2 += MAX_BETA * MAX_BETA * d2
         fall[k] = 0.5 / s2
-        gain[k] = math.log(STAR_SHARE * image.area * fall[k] / (math.pi * image.in_view))
+        gain[k] = math.log(share * image.area * fall[k] / (math.pi * image.in_view))
         # Farther away, a hit would be worth less than a miss.
-        near = min(gate * gate, 2.0 * max(gain[k] - LOG_MISS, 0.0))
+        near = min(gate * gate, 2.0 * max(gain[k] - math.log(1.0 - share), 0.0))
         room.radius[k] = min(math.sqrt(near * s2), grid_radius)
     # The pair itself comes first and is cut off. The nearest follow: the pair predicts their
     # places best. Not by brightness: false centroids may be the brightest.
@@ -158,12 +163,12 @@ def prepare_pair(problem, i, j, c, room):
 
 
 @borrowing_kernel
-def try_pair(stars, a, b, c, order, floor, room):
+def try_pair(stars, a, b, c, order, log_miss, floor, room):
     """Return the log odds of the attitude that puts stars a and b on the pair's centroids,
     by all other centroids (compiled).
 
     A sequential probability ratio test (Wald 1945): it stops as soon as the odds are below
-    `floor`. Writes F and row_of of the scratch.
+    `floor`. A centroid without a star adds `log_miss`. Writes F and row_of of the scratch.
     """
     F, t = room.F, room.t
     _basis(stars.u[a], stars.u[b], c, F)
@@ -179,7 +184,7 @@ def try_pair(stars, a, b, c, order, floor, room):
             stars.grid.star,
             stars.grid.n_face,
         )
-        odds += room.gain[k] - room.fall[k] * d2 if room.row_of[k] >= 0 else LOG_MISS
+        odds += room.gain[k] - room.fall[k] * d2 if room.row_of[k] >= 0 else log_miss
         if odds < floor:
             break
     return odds

@@ -2,7 +2,16 @@
 
 import numpy as np
 import pytest
-from scenes.random_stars import BETA, CAMERA, HOW, frame, optics, random_attitude, random_catalogue
+from scenes.random_stars import (
+    BETA,
+    CAMERA,
+    HOW,
+    angle_between,
+    frame,
+    optics,
+    random_attitude,
+    random_catalogue,
+)
 
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.sky import aberrate
@@ -47,3 +56,28 @@ def test_only_the_brightest_centroids_are_searched():
     )
     assert n < N_SEARCHED
     assert search_lost(crowded, sky, grid, pairs, HOW).is_clear
+
+
+def test_few_stars_among_many_other_centroids_are_found():
+    """Some 37 stars among 300 false points of the same brightness."""
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    found = {True: 0, False: 0}
+    for seed in range(8):
+        R = random_attitude(seed)
+        seen = frame(CATALOGUE, R, seed, n_false=300)[0]
+        for crowded in found:
+            verdict = search_lost(seen, sky, grid, pairs, HOW._replace(crowded=crowded))
+            if verdict.is_clear:
+                assert angle_between(verdict.R_sensor_from_icrs, R) < 1e-3
+                found[crowded] += 1
+    assert found[True] >= 6
+    assert found[False] <= 2
+
+
+def test_many_centroids_without_any_star_are_refused():
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    for seed in range(8):
+        seen = frame(CATALOGUE, random_attitude(seed), seed, n_false=300, missing=1.0)[0]
+        assert not search_lost(seen, sky, grid, pairs, HOW).is_clear
