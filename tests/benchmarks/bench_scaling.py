@@ -13,19 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow.parquet as pq
-from whole_runs import COMMAND, whole_run
+from whole_runs import COMMAND, STAGES, whole_run
 
-# How the log line at the end of each stage begins.
-STAGES = {
-    "find": "found ",
-    "read": "read ",
-    "identify": "identified ",
-    "track": "followed ",
-    "solve": "solved ",
-    "check": "clocks of ",
-    "name": "named ",
-    "publish": "published ",
-}
 TABLES = ("frames", "stars", "detections", "associations", "positions")
 TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 

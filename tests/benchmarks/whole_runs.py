@@ -12,6 +12,18 @@ from typing import Any, NamedTuple
 
 COMMAND = [sys.executable, "-c", "from epipole.flows.command_line.main import main; main()"]
 
+# How the line of log that ends each stage begins.
+STAGES = {
+    "find": "found ",
+    "read": "read ",
+    "identify": "identified ",
+    "track": "followed ",
+    "solve": "solved ",
+    "check": "clocks of ",
+    "name": "named ",
+    "publish": "published ",
+}
+
 
 class WholeRun(NamedTuple):
     """A run: what was measured as each stage ended, its summary, CPU [s] and memory [MiB]."""
@@ -35,7 +47,7 @@ def whole_run(
     Parameters
     ----------
     stages
-        How the line of log that ends each stage begins.
+        Those of `STAGES` that are told apart.
     measure
         What is measured at these lines, such as the time, by the id of the process.
     """

@@ -18,6 +18,7 @@ from epipole.tasks.algorithms.star_identification.search.field import (
     stars_in_cone,
 )
 from epipole.tasks.algorithms.star_identification.search.lost_in_space import (
+    CROWDED,
     WORK_PER_S,
     search,
 )
@@ -214,9 +215,9 @@ def _search(
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))
     if crowded:
         share = min(LEAST_STARS / n, STAR_SHARE)
-        limits = SearchLimits(min_chord, n, n, share, (2, 3), budget)
+        limits = SearchLimits(min_chord, n, n, share, (CROWDED, CROWDED + 1), budget)
     else:
-        limits = SearchLimits(min_chord, N_PATTERN, N_TRIED, STAR_SHARE, (0, 2), budget)
+        limits = SearchLimits(min_chord, N_PATTERN, N_TRIED, STAR_SHARE, (0, CROWDED), budget)
     problem = Problem(
         Centroids(*frame[:4]),
         Stars(sky.catalogue.u_icrs, sky.catalogue.magnitude, grid),

@@ -56,7 +56,7 @@ SLACK = 2  # a hypothesis may lack so many of the votes that are needed
 # The last one is for frames of which most centroids are no stars: many pivots, each with other
 # companions.
 ROUNDS = ((6, 8, 0.5, 10_000, 128), (99, 0, 1.0, 0, 2000), (9999, 0, 0.5, 0, 2000))
-CROWDED = 2
+CROWDED = 2  # the row of these frames
 CROWDED_VOTES = 5  # fewer are mostly chance there
 # Hardly any field has fewer stars than this share of the mean.
 SPARSE = 0.35
