@@ -111,6 +111,18 @@ def array(values: pa.Table, name: str) -> npt.NDArray[Any]:
     return column.to_numpy()
 
 
+def rows_of(values: pa.Table) -> list[dict[str, Any]]:
+    """Return the rows of a small table as mappings; times are nanoseconds since 1970.
+
+    Arrow itself refuses to return a time that is no whole number of microseconds.
+    """
+    for k, field in enumerate(values.schema):
+        if pa.types.is_timestamp(field.type):
+            as_number = pa.field(field.name, pa.int64())
+            values = values.set_column(k, as_number, values.column(k).cast(pa.int64()))
+    return values.to_pylist()  # type: ignore[no-any-return]
+
+
 def stack(
     values: pa.Table | pl.DataFrame, pattern: str, names: Sequence[str] = "xyz"
 ) -> npt.NDArray[np.float64]:

@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.parts import Parts
-from epipole.schemas.bridge import array, concat, empty, table
+from epipole.schemas.bridge import array, concat, empty, rows_of, table
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS, STARS
@@ -77,7 +77,7 @@ def calibrate_sensors(stars: pa.Table, cameras: pa.Table) -> Calibrated:
         if fit.gain > REAL_GAIN:
             changed[name] = fit.camera._asdict()
         LOGGER.info("%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px)
-    new = [row | changed.get(row["sensor_id"], {}) for row in cameras.to_pylist()]
+    new = [row | changed.get(row["sensor_id"], {}) for row in rows_of(cameras)]
     return Calibrated(
         concat(CALIBRATIONS, rows) if rows else empty(CALIBRATIONS),
         pa.Table.from_pylist(new, schema=CAMERAS),
@@ -91,7 +91,7 @@ def _single(cameras: pa.Table) -> list[dict[str, Any]]:
     With two calibrations, it is not known which of them a star was identified with.
     """
     first: dict[str, dict[str, Any] | None] = {}
-    for row in cameras.to_pylist():
+    for row in rows_of(cameras):
         optics = {name: row[name] for name in Camera._fields}
         known = first.setdefault(row["sensor_id"], optics)
         if known != optics:

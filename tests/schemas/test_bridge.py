@@ -13,6 +13,7 @@ from epipole.schemas.bridge import (
     flatten,
     from_polars,
     nullable,
+    rows_of,
     stack,
     stack_covariance,
     table,
@@ -135,3 +136,8 @@ def test_lists_come_back_flat():
     assert values.tolist() == [3.0]
     assert values.dtype == np.float64
     assert offsets.tolist() == [0, 0, 1]
+
+
+def test_rows_of_a_table_keep_the_nanoseconds_of_its_times():
+    (row,) = rows_of(table(schema("times", "Times.", [time_column()]), {"time": [NS]}))
+    assert row == {"time": NS}
