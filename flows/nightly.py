@@ -12,6 +12,7 @@ from epipole.flows.night.stages import (
     Destination,
     calibrate,
     check,
+    find_cameras,
     identify,
     name,
     publish,
@@ -78,6 +79,7 @@ def nightly(
             work_folder(work_root(out), chosen, key) as folder,
         ):
             work = identify(frames, spans, WorkFolder(folder), settings)
+            work = find_cameras(work, settings)
             work, calibrations = calibrate(work, settings)
             while True:
                 track(work, settings)

@@ -286,7 +286,7 @@ STATES = schema(
 
 _OPTICS = [
     ("fx_px", "px", "Focal length along columns."),
-    ("fy_px", "px", "Focal length along rows."),
+    ("fy_px", "px", "Focal length along rows; negative where rows count upward."),
     ("cx_px", "px", "Principal point, column."),
     ("cy_px", "px", "Principal point, row."),
     ("k1", "", "Brown-Conrady radial."),

@@ -72,7 +72,7 @@ def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table)
 def _field_deg(camera: dict[str, Any]) -> list[float]:
     """Return the width and height of the field of view, without distortion."""
     return [
-        float(np.degrees(2 * np.arctan(camera[size] / 2 / camera[focal])))
+        float(np.degrees(2 * np.arctan(camera[size] / 2 / abs(camera[focal]))))
         for size, focal in (("width", "fx_px"), ("height", "fy_px"))
     ]
 

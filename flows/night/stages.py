@@ -29,6 +29,7 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS, POSITIONS, STATES
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensor
+from epipole.tasks.calibrate.find_camera import CameraFinding, find_sensor_camera
 from epipole.tasks.check.check_sensors import (
     REASONS,
     SensorVerdict,
@@ -83,6 +84,31 @@ def _identify(stage: Stage, work: Work, settings: Settings) -> Work:
     LOGGER.info("identified %s of %s by %s", f"{by_stars:,}", many(frames, "frame"),
                 many(stars, "star"))  # fmt: skip
     return work
+
+
+def find_cameras(work: Work, settings: Settings) -> Work:
+    """Search for the cameras of sensors that identify nothing; identify these again."""
+    mode = settings.identification.calibrate
+    if mode == "off":
+        return work
+    futures = [
+        find_sensor_camera.submit(
+            work.frames, sensor, work.identified[sensor], spans, work.cameras, settings
+        )
+        for sensor, spans in work.spans.items()
+    ]
+    findings: list[CameraFinding] = [
+        finding for finding in results(Stage.CALIBRATE, futures) if finding is not None
+    ]
+    for finding in findings:
+        used = "" if finding.camera is None else "; used" if mode == "use" else "; not used"
+        LOGGER.warning("%s%s", finding, used)
+    found = [finding for finding in findings if finding.camera is not None]
+    if mode == "report" or not found:
+        return work
+    names = {finding.sensor_id for finding in found}
+    cameras = [finding.cameras(work.cameras) for finding in found]
+    return _identify_again(work, cameras, names, 0, settings)
 
 
 def calibrate(work: Work, settings: Settings) -> tuple[Work, pa.Table]:

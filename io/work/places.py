@@ -6,7 +6,8 @@ Parts of reading belong to a run; all others to the nights and a key (see `folde
     read/sensor-0                 a sensor's frames in order of time, and its states
 
     identify/0/1554091200         sensor 0, the span that begins at this second since 1970
-    calibrate/1/0/1554091200      identified again, with the optics of the first calibration
+    calibrate/0/0/1554091200      identified again, with a camera that was searched for
+    calibrate/1/0/1554091200      the same, with the optics of the first calibration
     check/1/0/1554091200          frames at their true times, from the first check on
     track/0/0/1554091200          tracklets of the span, before any check
     track/0/0-names/1554091200    the names of these tracklets in the night
@@ -58,7 +59,8 @@ class WorkFolder(NamedTuple):
         return Parts(self.root / Stage.IDENTIFY / str(sensor.number))
 
     def identified_again(self, sensor: Sensor, calibration: int) -> Parts:
-        """Return the parts identified with the optics of calibration 1 or 2: `IDENTIFIED`."""
+        """Return the parts identified with the optics of calibration 1 or 2, or with a camera that
+        was searched for (0): `IDENTIFIED`."""
         return Parts(self.root / Stage.CALIBRATE / str(calibration) / str(sensor.number))
 
     def corrected(self, sensor: Sensor, round_: int) -> Parts:

@@ -14,9 +14,9 @@ from epipole.schemas.star_catalogue import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC, DAY_NS, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.camera import Camera, undistort
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
+from epipole.tasks.algorithms.star_identification.frames.frame import Search
 from epipole.tasks.algorithms.star_identification.frames.spots import (
     UnscaledCentroids,
     brightest_first,
@@ -82,22 +82,6 @@ def identify_stars(
     return result
 
 
-def _optics(camera: Camera) -> FieldOfView:
-    """Return the field of view of a camera, with its distortion."""
-    n = 9
-    side = np.linspace(-0.5, camera.width - 0.5, n)
-    down = np.linspace(-0.5, camera.height - 0.5, n)
-    x_px = np.concatenate([side, side, np.full(n, side[0]), np.full(n, side[-1])])
-    y_px = np.concatenate([np.full(n, down[0]), np.full(n, down[-1]), down, down])
-    x, y = undistort(
-        camera, (x_px - camera.cx_px) / camera.fx_px, (y_px - camera.cy_px) / camera.fy_px
-    )
-    half_diagonal = float(np.arctan(np.max(np.hypot(x, y))))
-    return FieldOfView(
-        half_diagonal, np.array([x.min(), x.max(), y.min(), y.max()]), camera.pixel_rad
-    )
-
-
 def _identify(
     exposures: pa.Table, places: pa.Table, c: FlatCentroids, catalogue: pa.Table, settings: Settings
 ) -> tuple[IdentifiedSensor | None, npt.NDArray[np.int64]]:
@@ -115,7 +99,7 @@ def _identify(
         c.sigma_px[rows],
         -2.5 * np.log10(c.flux[rows]),
         beta,
-        [_optics(camera) for camera in c.cameras.values()],
+        [field_of_view(camera) for camera in c.cameras.values()],
         np.searchsorted(np.array(list(c.cameras)), c.camera_of_frame),
     )
     day = int(time_ns[len(time_ns) // 2] // DAY_NS)

@@ -69,7 +69,7 @@ def _camera_fault(calibration: CalibrationMessage) -> Reason | None:
     if len(calibration.D) not in (0, 4, 5) or not np.isfinite(calibration.D).all():
         return Reason.BAD_DISTORTION
     K = calibration.K
-    if len(K) != 9 or not np.isfinite(K).all() or K[0] <= 0 or K[4] <= 0:
+    if len(K) != 9 or not np.isfinite(K).all() or K[0] <= 0 or K[4] == 0:
         return Reason.BAD_CAMERA_MATRIX
     # The pipeline has no camera model with skew or scale.
     zeros, scale = (K[1], K[3], K[6], K[7]), 1e-9 * K[0]

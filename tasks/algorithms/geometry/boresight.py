@@ -1,8 +1,9 @@
 """Boresight and focal length from a few identified stars, by hand and without an attitude.
 
-The pipeline does not need this: it finds whole attitudes (`attitude`) and calibrates from
-thousands of stars (`optics_calibration`). This is for a single image with three or more stars
-whose names are known. The page ``docs/methods/boresight.md`` has the equations and an example.
+The pipeline finds whole attitudes (`attitude`) and calibrates from thousands of stars
+(`optics_calibration`). Where the focal length that a log tells is wrong, it starts from
+`focal_length_from_separations`. The rest is for a single image with three or more stars whose
+names are known. The page ``docs/methods/boresight.md`` has the equations and an example.
 
 A star at distance a [px] from the principal point is at the angle arctan(a / f) from the
 boresight d, so ``u . d = f / sqrt(f^2 + a^2)``: linear in d. Three stars give d; with

@@ -12,7 +12,10 @@ Array = npt.NDArray[np.float64]
 
 
 class Camera(NamedTuple):
-    """Intrinsics of a sensor [px; the distortion coefficients have no unit]."""
+    """Intrinsics of a sensor [px; the distortion coefficients have no unit].
+
+    A negative `fy_px` is an image whose rows count upward.
+    """
 
     width: int
     height: int
@@ -34,14 +37,22 @@ class Camera(NamedTuple):
     @property
     def pixel_rad(self) -> float:
         """Angle of one pixel at the principal point [rad]."""
-        return 1.0 / np.sqrt(self.fx_px * self.fy_px)
+        return 1.0 / np.sqrt(self.fx_px * abs(self.fy_px))
 
     @property
     def half_diagonal_rad(self) -> float:
         """Angle from the boresight to the farthest corner, without distortion [rad]."""
         x = max(self.cx_px + 0.5, self.width - 0.5 - self.cx_px) / self.fx_px
-        y = max(self.cy_px + 0.5, self.height - 0.5 - self.cy_px) / self.fy_px
+        y = max(self.cy_px + 0.5, self.height - 0.5 - self.cy_px) / abs(self.fy_px)
         return float(np.arctan(np.hypot(x, y)))
+
+
+def mirrored(camera: Camera) -> Camera:
+    """Return the camera of the same image with its rows counted the other way round.
+
+    The sky stays as it is seen: x right, y down. A mirror changes the sign of `p1`.
+    """
+    return camera._replace(fy_px=-camera.fy_px, p1=-camera.p1)
 
 
 def distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
@@ -123,7 +134,7 @@ def pixel_angle(camera: Camera, u: Array) -> Array:
     The geometric mean of both image axes (the root of the solid angle). Off the boresight a
     pixel covers less: by the cosine of the field angle on one axis, its square on the other.
     """
-    solid = u[..., 2] * u[..., 2] * u[..., 2] / (camera.fx_px * camera.fy_px)
+    solid = u[..., 2] * u[..., 2] * u[..., 2] / (camera.fx_px * abs(camera.fy_px))
     if camera.distorts:
         jxx, jxy, jyy = _slopes(camera, u[..., 0] / u[..., 2], u[..., 1] / u[..., 2])
         solid /= np.maximum(np.abs(jxx * jyy - jxy * jxy), 1e-6)

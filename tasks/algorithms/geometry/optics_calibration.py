@@ -156,7 +156,7 @@ def _moved(camera: Camera, step: Array) -> Camera:
 
 def _prior_sigma(camera: Camera) -> Array:
     """Return the 1-sigma prior of each number of OPTICS."""
-    f, r = np.sqrt(camera.fx_px * camera.fy_px), np.tan(camera.half_diagonal_rad)
+    f, r = np.sqrt(camera.fx_px * abs(camera.fy_px)), np.tan(camera.half_diagonal_rad)
     at_corner = CORNER_PX / f / np.array([r**3, r**5, r**2, r**2, r**7])
     return np.array([FOCAL_SHARE * f] * 2 + [PRINCIPAL_POINT_PX] * 2 + at_corner.tolist())
 

@@ -40,7 +40,9 @@ class SensorPoses:
         half_field, focal_px = [], []
         for rows in epochs:
             camera = camera_of(cameras, int(array(rows, "camera")[0]) if rows.num_rows else 0)
-            half_field.append((camera.width / camera.fx_px / 2, camera.height / camera.fy_px / 2))
+            half_field.append(
+                (camera.width / camera.fx_px / 2, camera.height / abs(camera.fy_px) / 2)
+            )
             focal_px.append(camera.fx_px)
         self.half_field = np.array(half_field, float).reshape(-1, 2)
         self.focal_px = np.array(focal_px, float)

@@ -320,6 +320,15 @@ def test_an_unusable_calibration_is_a_row(tmp_path, changes, reason):
     assert reasons(contents) == [(reason, "sat1", 1)]
 
 
+def test_a_calibration_of_rows_that_count_upward_is_valid(tmp_path):
+    values = calibration_values("sat1", START_NS, CAMERA | {"fy_px": -CAMERA["fy_px"]})
+    contents = read_with_good_frame(
+        tmp_path, (CALIBRATION_NAME, protobuf.encode(CALIBRATION, values))
+    )
+    assert array(contents.cameras, "fy_px").tolist() == [-CAMERA["fy_px"]]
+    assert reasons(contents) == []
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [

@@ -1,0 +1,181 @@
+"""Calibrate the cameras of logs: what to write into a log whose calibration is missing or wrong."""
+
+import json
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.flows.night.summary import many
+from epipole.io.logs.listing import list_logs
+from epipole.io.work.places import ReadFolder
+from epipole.schemas.bridge import concat
+from epipole.schemas.errors import LogError
+from epipole.schemas.settings import Settings
+from epipole.schemas.work_tables import EXPOSURES
+from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.calibrate.calibrate_unknown import (
+    CameraReport,
+    calibrate_unknown,
+)
+from epipole.tasks.read.order_frames import (
+    OrderedFrames,
+    frames_between,
+    order_logs,
+    states_between,
+)
+from epipole.tasks.read.read_logs import read_log_into
+
+MOST_FRAMES = 100  # of a sensor, spread over the logs
+ALL_TIME = (-(2**63), 2**63 - 1)
+
+
+def calibrate(
+    logs: list[str],
+    field_deg: float | None = None,
+    settings: Settings = Settings(),  # noqa: B008
+) -> list[CameraReport]:
+    """Return the camera of each sensor of the logs, from at most 100 of its frames.
+
+    Parameters
+    ----------
+    logs
+        MCAP files, folders, globs or URLs of them.
+    field_deg
+        Field of view along the columns, about, of all sensors. None: as the logs' calibrations
+        say, and unknown for a sensor without one.
+
+    Raises
+    ------
+    LogError
+        Where a file is not a log, or the logs have no frames.
+    """
+    paths = [log for where in logs for log in list_logs(where)[0]]
+    with tempfile.TemporaryDirectory(prefix="epipole-") as made:
+        folder = ReadFolder(Path(made))
+        read = [read_log_into.fn(folder, k, path) for k, path in enumerate(paths)]
+        frames = order_logs(folder, read, settings)
+        numbers = [k for k, time_ns in enumerate(frames.time_ns) if len(time_ns)]
+        if not numbers:
+            raise LogError(f"{', '.join(paths)}: no frames in these logs; check the recording")
+        return [_of_sensor(frames, number, field_deg, settings) for number in numbers]
+
+
+def _of_sensor(
+    frames: OrderedFrames, number: int, field_deg: float | None, settings: Settings
+) -> CameraReport:
+    time_ns = frames.time_ns[number]
+    rows = np.unique(np.linspace(0, len(time_ns) - 1, MOST_FRAMES).astype(np.int64))
+    parts = [frames_between(frames.folder, number, t, t + 1) for t in time_ns[rows].tolist()]
+    exposures: pa.Table = concat(EXPOSURES, parts).combine_chunks()
+    states = states_between(frames.folder, number, *ALL_TIME)
+    cameras = frames.cameras.filter(pc.field("sensor_id") == frames.sensors[number])
+    return calibrate_unknown(exposures, states, cameras, field_deg, settings)
+
+
+def calibration_message(report: CameraReport) -> dict[str, Any]:
+    """Return the fields of a foxglove.CameraCalibration with the camera that was found."""
+    c = report.camera
+    assert c is not None
+    return {
+        "frame_id": report.sensor_id,
+        "width": c.width,
+        "height": c.height,
+        "distortion_model": "plumb_bob",
+        "D": [round(v, 9) for v in (c.k1, c.k2, c.p1, c.p2, c.k3)],
+        "K": [round(v, 3) for v in (c.fx_px, 0.0, c.cx_px, 0.0, c.fy_px, c.cy_px, 0.0, 0.0, 1.0)],
+    }
+
+
+def as_dict(report: CameraReport) -> dict[str, Any]:
+    """Return a report for JSON."""
+    found = report.camera is not None
+    return {
+        "sensor_id": report.sensor_id,
+        "found": found,
+        "mirrored": report.is_mirrored,
+        "frames": report.n_frames,
+        "identified": report.n_identified,
+        "stars": report.n_stars,
+        "residual_px": None if math.isnan(report.residual_px) else report.residual_px,
+        "told": report.told._asdict() if report.is_told else None,
+        "sigma": report.sigma,
+        "calibration": calibration_message(report) if found else None,
+    }
+
+
+def lines(report: CameraReport) -> list[str]:
+    """Return a report as lines for people."""
+    if report.camera is None:
+        return [report.sensor_id, *_not_found(report)]
+    out = [
+        report.sensor_id,
+        f"  identified       {report.n_identified} of {many(report.n_frames, 'frame')} by "
+        f"{many(report.n_stars, 'star')}{_residual(report)}",
+        f"  image            {_image(report)}",
+        f"  focal length     {_focal(report)}",
+    ]
+    if report.sigma:
+        names = ("cx_px", "cy_px"), ("k1", "k2", "p1", "p2", "k3")
+        out += [f"  principal point  {_values(report, names[0])}",
+                f"  distortion       {_values(report, names[1])}"]  # fmt: skip
+    else:
+        out.append("  distortion       as told; 60 stars in 3 frames are needed to fit it")
+    if report.is_mirrored:
+        out.append(
+            "  mirrored         rows count upward (y up): the second focal length of K is < 0"
+        )
+    return [*out, "  foxglove.CameraCalibration to write into the log:",
+            f"    {json.dumps(calibration_message(report))}"]  # fmt: skip
+
+
+def _not_found(report: CameraReport) -> list[str]:
+    told = report.told
+    narrow, wide = (
+        _field_deg(told._replace(fx_px=told.fx_px * factor))
+        for factor in (report.reach, 1 / report.reach)
+    )
+    return [
+        f"  not found        no two of the frames tried ({many(report.n_frames, 'frame')}) show "
+        f"the same camera, for any field of {narrow:.1f} to {wide:.1f} deg",
+        "                   check that the frames show stars; give another --field",
+    ]
+
+
+def _residual(report: CameraReport) -> str:
+    return "" if math.isnan(report.residual_px) else f", rms {report.residual_px:.2f} px per axis"
+
+
+def _image(report: CameraReport) -> str:
+    size = f"{report.told.width} x {report.told.height} px"
+    return (
+        size if report.is_told else f"{size}, as far as centroids reach: no calibration in the log"
+    )
+
+
+def _field_deg(camera: Camera) -> float:
+    return 2 * math.degrees(math.atan(camera.width / 2 / camera.fx_px))
+
+
+def _focal(report: CameraReport) -> str:
+    c, told = report.camera, report.told
+    assert c is not None
+    sigma = f" +- {report.sigma['fx_px']:.2f}" if report.sigma else ""
+    text = f"{c.fx_px:.2f}{sigma} px, a field of {_field_deg(c):.2f} deg along the columns"
+    if not report.is_told:
+        return text
+    percent = 100 * (c.fx_px / told.fx_px - 1)
+    return f"{text}; {percent:+.2f} % of {told.fx_px:.2f}"
+
+
+def _values(report: CameraReport, names: tuple[str, ...]) -> str:
+    digits = 2 if names[0].endswith("_px") else 5
+    values = report.camera._asdict() if report.camera else {}
+    return ", ".join(
+        f"{name.removesuffix('_px')} {values[name]:.{digits}f} +- {report.sigma[name]:.{digits}f}"
+        for name in names
+    )

@@ -1,0 +1,144 @@
+"""Calibrate an unknown camera: one sensor's optics from a few of its frames, told or not."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.io.catalogues.star_catalogue import read_star_catalogue
+from epipole.schemas.bridge import array, flatten, table
+from epipole.schemas.settings import Settings
+from epipole.schemas.work_tables import CAMERAS
+from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.star_identification.camera_search import FEWEST
+from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensors
+from epipole.tasks.calibrate.find_camera import find_agreed_camera, image_frames, skies_at
+from epipole.tasks.identify.identify_stars import identify_stars
+from epipole.tasks.identify.place_sensors import place_sensors
+
+TRIED = 6  # frames in which a camera is searched for
+REACH = 1.5  # by which a told focal length may be off, either way
+NARROWEST_DEG, WIDEST_DEG = 2.0, 60.0  # fields of an unknown focal length
+ROUNDS = 3  # with better optics more stars take part
+
+
+class CameraReport(NamedTuple):
+    """What is known of a sensor's camera after calibration.
+
+    told : the log's; a guess of image and field where `is_told` is false
+    reach : by which factor other focal lengths than the told one were tried
+    camera : the one found, None where the frames show no stars
+    sigma : by the names of the optics; empty with too few stars for a fit
+    n_frames, n_identified, n_stars : frames looked at, identified, and their stars
+    residual_px : rms of the stars' residuals per axis, NaN without a fit
+    """
+
+    sensor_id: str
+    told: Camera
+    reach: float
+    is_told: bool
+    camera: Camera | None
+    sigma: dict[str, float]
+    n_frames: int
+    n_identified: int
+    n_stars: int
+    residual_px: float
+
+    @property
+    def is_mirrored(self) -> bool:
+        """Whether the rows count the other way than told."""
+        return self.camera is not None and (self.camera.fy_px < 0) != (self.told.fy_px < 0)
+
+
+def calibrate_unknown(
+    exposures: pa.Table,
+    states: pa.Table,
+    cameras: pa.Table,
+    field_deg: float | None,
+    settings: Settings,
+) -> CameraReport:
+    """Return one sensor's camera from some of its frames.
+
+    Parameters
+    ----------
+    exposures, states
+        EXPOSURES and SENSOR_STATES of the sensor, sorted by time; at least one frame.
+    cameras
+        CAMERAS of the sensor; of several rows the first is used. It may be empty.
+    field_deg
+        Field of view along the columns, about; None: as the calibration says, else unknown.
+    """
+    sensor_id = exposures["sensor_id"][0].as_py()
+    told, reach = _told(exposures, cameras, field_deg)
+    places = place_sensors(exposures, states, settings)
+    found = _search(exposures, places, told, reach, settings)
+    nothing = CameraReport(
+        sensor_id, told, reach, cameras.num_rows > 0, None, {}, exposures.num_rows, 0, 0, np.nan
+    )
+    if found is None:
+        return nothing
+    values = {name: [value] for name, value in found._asdict().items()}
+    row = table(CAMERAS, {"sensor_id": [sensor_id], "time": exposures["time"][:1]} | values)
+    return _fitted(nothing, exposures, places, row, settings)
+
+
+def _told(exposures: pa.Table, cameras: pa.Table, field_deg: float | None) -> tuple[Camera, float]:
+    """Return the camera to start from, and by which factor its focal length may be off."""
+    if cameras.num_rows:
+        camera = Camera(**cameras.select(list(Camera._fields)).slice(0, 1).to_pylist()[0])
+        if field_deg is None:
+            return camera, REACH
+        camera = camera._replace(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)
+    else:
+        width, height = (_side_px(exposures, name) for name in ("x_px", "y_px"))
+        camera = Camera(width, height, 1.0, 1.0, (width - 1) / 2, (height - 1) / 2)
+    narrow, wide = np.tan(np.radians([NARROWEST_DEG, WIDEST_DEG]) / 2)
+    half = np.sqrt(narrow * wide) if field_deg is None else np.tan(np.radians(field_deg) / 2)
+    f = float(camera.width / 2 / half)
+    reach = float(np.sqrt(wide / narrow)) if field_deg is None else REACH
+    return camera._replace(fx_px=f, fy_px=f * np.sign(camera.fy_px)), reach
+
+
+def _side_px(exposures: pa.Table, name: str) -> int:
+    """Return a side of the image, as far as centroids reach, in whole multiples of 8."""
+    farthest = np.nanmax(flatten(exposures, name)[0], initial=0.0)
+    return max(8 * int(np.ceil((farthest + 0.5) / 8)), 8)
+
+
+def _search(
+    exposures: pa.Table, places: pa.Table, told: Camera, reach: float, settings: Settings
+) -> Camera | None:
+    counts = np.diff(flatten(exposures, "x_px")[1])
+    rows = np.flatnonzero(counts >= FEWEST)
+    if not len(rows):
+        return None
+    # Not those with most centroids: these may be mostly clutter.
+    rows = rows[np.argsort(np.abs(counts[rows] - np.median(counts[rows])), kind="stable")]
+    rows = np.sort(rows[:TRIED])
+    images = image_frames(exposures.take(rows), places.take(rows), settings)
+    skies = skies_at(int(array(exposures, "time")[rows[0]]), settings)
+    found = find_agreed_camera(images, told, reach, skies, settings)
+    return found and found.camera
+
+
+def _fitted(
+    report: CameraReport, exposures: pa.Table, places: pa.Table, cameras: pa.Table,
+    settings: Settings,
+) -> CameraReport:  # fmt: skip
+    """Return the report with the camera fitted to the stars of all frames."""
+    catalogue = read_star_catalogue(settings.identification.catalogue)
+    for _ in range(ROUNDS):
+        identified = identify_stars(exposures, places, cameras, catalogue, settings)
+        fit: Calibrated = calibrate_sensors(identified.stars, cameras)
+        cameras = fit.cameras
+        if not fit.departed:
+            break
+    camera = Camera(**cameras.select(list(Camera._fields)).to_pylist()[0])
+    solved = pc.sum(pc.equal(identified.solutions["attitude_source"], "stars")).as_py()
+    report = report._replace(camera=camera, n_identified=solved, n_stars=identified.stars.num_rows)
+    if not fit.calibrations.num_rows:
+        return report
+    values: dict[str, Any] = fit.calibrations.to_pylist()[0]
+    sigma = {name[6:]: value for name, value in values.items() if name.startswith("sigma_")}
+    return report._replace(sigma=sigma, residual_px=values["residual_px"])

@@ -1,0 +1,114 @@
+"""Logs whose calibration is wrong or missing: what a run makes of them, and `calibrate`."""
+
+import logging
+
+import polars as pl
+import pytest
+from scenes.mirrored_logs import write_mirrored
+from scenes.simulated import scene_of
+
+from epipole.flows.calibrate import as_dict, calibrate, lines
+from epipole.flows.nightly import nightly
+from epipole.flows.simulate import simulate
+from epipole.io.logs.reader import read_log
+from epipole.io.logs.writer import LogWriter
+from epipole.schemas.bridge import array
+from epipole.schemas.errors import LogError
+from epipole.schemas.settings import Settings
+
+FOCAL = 0.05  # by which the true focal length is longer than told
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """Frames of one sensor in a low orbit, a field of 12 degrees, no prior attitudes."""
+    camera = {"fov_deg": 12.0, "departure": {"focal": FOCAL}}
+    pointing = {"mode": "random", "clear_of_earth_deg": 15.0}
+    scene = scene_of({"camera": camera, "pointing": pointing})
+    return simulate(scene, tmp_path_factory.mktemp("log") / "n.mcap", seed=3).logs[0]
+
+
+@pytest.fixture(scope="module")
+def told_px(log):
+    return float(array(read_log(str(log)).cameras, "fx_px")[0])
+
+
+def run(log, out, **identification):
+    settings = Settings.model_validate({"identification": identification})
+    nightly([str(log)], str(out), settings)
+    return {
+        name: pl.read_parquet(f"{out}/night=*/{name}/*.parquet")
+        for name in ("frames", "calibrations")
+    }
+
+
+@pytest.mark.usefixtures("prefect")
+def test_a_run_finds_a_focal_length_and_says_so(log, told_px, tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        made = run(log, tmp_path / "out")
+    assert (made["frames"]["attitude_source"] == "stars").mean() > 0.9
+    assert made["calibrations"]["fx_px"][0] == pytest.approx(told_px * (1 + FOCAL), rel=2e-3)
+    assert any("a: the focal length is 5.0 % longer than told" in r.message for r in caplog.records)
+    assert any(r.message.endswith("; used") for r in caplog.records)
+
+
+@pytest.mark.usefixtures("prefect")
+@pytest.mark.parametrize(("mode", "said"), [("report", True), ("off", False)])
+def test_a_camera_is_not_used_where_the_settings_say_so(log, tmp_path, caplog, mode, said):
+    with caplog.at_level(logging.WARNING):
+        made = run(log, tmp_path / "out", calibrate=mode)
+    assert (made["frames"]["attitude_source"] == "stars").sum() == 0
+    assert any("longer than told" in r.message for r in caplog.records) == said
+
+
+@pytest.mark.usefixtures("prefect")
+def test_a_mirrored_log_is_solved(log, tmp_path, caplog):
+    mirrored = write_mirrored(log, tmp_path / "m.mcap")
+    with caplog.at_level(logging.WARNING):
+        made = run(mirrored, tmp_path / "out")
+    straight = run(log, tmp_path / "straight")["frames"]
+    assert (made["frames"]["attitude_source"] == "stars").mean() > 0.9
+    assert made["calibrations"]["fy_px"][0] < 0
+    assert any("mirrored (y up?)" in r.message for r in caplog.records)
+    # The same boresights as of the log with rows that count down.
+    off = made["frames"].join(straight, on="frame_number", suffix="_straight")
+    assert (off["dec_deg"] - off["dec_deg_straight"]).abs().max() < 2e-3
+
+
+@pytest.mark.parametrize("field_deg", [None, 10.0])
+def test_a_camera_without_a_calibration_is_calibrated(log, told_px, tmp_path, field_deg):
+    bare = write_mirrored(log, tmp_path / "m.mcap", calibrated=False)
+    (report,) = calibrate([str(bare)], field_deg)
+    assert report.camera.fx_px == pytest.approx(told_px * (1 + FOCAL), rel=2e-3)
+    assert report.camera.fy_px < 0
+    assert as_dict(report)["told"] is None
+    assert any("no calibration in the log" in line for line in lines(report))
+
+
+def test_what_calibrate_prints_makes_the_log_right(log, told_px):
+    (report,) = calibrate([str(log)])
+    assert report.n_identified > 0.9 * report.n_frames
+    K = as_dict(report)["calibration"]["K"]
+    assert K[0] == pytest.approx(told_px * (1 + FOCAL), rel=2e-3)
+    assert any(f'"K": [{K[0]}' in line for line in lines(report))
+
+
+def test_frames_without_stars_are_not_calibrated(tmp_path):
+    path = tmp_path / "n.mcap"
+    with LogWriter(path) as writer:
+        for k in range(8):
+            at = [100.0 * (1 + (j * 7 + k * 3) % 9) + j for j in range(8)]
+            writer.frame("a", 10**18 + k * 10**9, frame_number=k, exposure_s=0.1, x_px=at,
+                         y_px=at[::-1])  # fmt: skip
+    (report,) = calibrate([str(path)], 12.0)
+    assert report.camera is None
+    assert as_dict(report)["calibration"] is None
+    assert any("not found" in line for line in lines(report))
+
+
+def test_a_log_without_frames_is_refused(tmp_path):
+    path = tmp_path / "n.mcap"
+    with LogWriter(path) as writer:
+        writer.state("a", 10**18, position_km=[7000.0, 0.0, 0.0])
+    with pytest.raises(LogError, match="no frames"):
+        calibrate([str(path)])

@@ -1,0 +1,107 @@
+"""Camera search: focal length and handedness are found from one frame, and nothing in noise."""
+
+import numpy as np
+import pytest
+
+from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.schemas.bridge import array
+from epipole.tasks.algorithms.geometry.camera import Camera, inside, mirrored, project, unproject
+from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
+from epipole.tasks.algorithms.star_identification.camera_search import (
+    ImageFrame,
+    agrees,
+    find_camera,
+)
+from epipole.tasks.algorithms.star_identification.frames.frame import Search
+from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
+
+TRUE = Camera(1024, 1024, 4850.0, 4850.0, 505.0, 517.0, k1=-0.1, p1=1e-3)  # 12 degrees
+DAY = 17_987  # 2019-04-01
+HOW = Search(3.7, -np.log(1e-5), 0.5, np.nan)
+
+
+@pytest.fixture(scope="module")
+def catalogue():
+    return Catalogue(read_hipparcos())
+
+
+@pytest.fixture(scope="module")
+def skies_of(catalogue):
+    return lambda pixel_rad: CachedSkies(catalogue, DAY, pixel_rad, 2.0)
+
+
+def frame(camera, seed, flux=True, strays=5, limit=6.3):
+    """A frame of Hipparcos' stars and strays in a random direction, brightest first."""
+    rng = np.random.default_rng(seed)
+    stars = read_hipparcos()
+    bright = array(stars, "magnitude") < limit
+    ra, dec = (np.radians(array(stars, name)[bright]) for name in ("ra_deg", "dec_deg"))
+    u = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    R = matrix_from_quaternion(canonical(rng.normal(size=(1, 4))))[0]
+    x, y = project(camera, u @ R.T)
+    seen = inside(camera, x, y) & (u @ R[2] > 0.9)
+    magnitude = array(stars, "magnitude")[bright][seen] + rng.normal(0, 0.2, seen.sum())
+    x = np.concatenate([x[seen], rng.uniform(0, 1023, strays)]) + rng.normal(
+        0, 0.2, seen.sum() + strays
+    )
+    y = np.concatenate([y[seen], rng.uniform(0, 1023, strays)])
+    magnitude = np.concatenate([magnitude, rng.uniform(3, limit, strays)])
+    order = np.argsort(magnitude)
+    if not flux:
+        order, magnitude = rng.permutation(len(order)), np.full(len(order), np.nan)
+    return ImageFrame(x[order], y[order], np.full(len(x), np.nan), magnitude[order], np.zeros(3))
+
+
+def scaled(camera, factor):
+    return camera._replace(fx_px=camera.fx_px * factor, fy_px=camera.fy_px * factor)
+
+
+@pytest.mark.parametrize("told", [0.91, 0.98, 1.0, 1.03, 1.09])
+@pytest.mark.parametrize("flux", [True, False])
+def test_a_focal_length_off_by_up_to_a_tenth_is_found(told, flux, skies_of):
+    found = find_camera([frame(TRUE, 1, flux)], scaled(TRUE, told), 1.11, skies_of, HOW)
+    assert found.camera.fx_px == pytest.approx(TRUE.fx_px, rel=2e-3)
+    assert found.camera.fy_px > 0
+    assert found.n_stars >= 6
+
+
+def test_a_mirrored_image_is_found_and_its_sky_is_not_mirrored(skies_of):
+    shown = frame(mirrored(TRUE), 2)
+    found = find_camera([shown], scaled(TRUE, 1.04), 1.11, skies_of, HOW)
+    assert found.camera.fy_px == pytest.approx(-TRUE.fy_px, rel=2e-3)
+    assert found.camera.p1 == -TRUE.p1
+    # The same directions as in the image with rows that count down.
+    u = unproject(mirrored(TRUE), shown.x_px, shown.y_px)
+    straight = unproject(TRUE, *project(TRUE, u))
+    np.testing.assert_allclose(u, straight, atol=1e-9)
+
+
+def test_a_frame_beyond_the_reach_and_a_starless_one_show_no_camera(skies_of):
+    rng = np.random.default_rng(3)
+    noise = ImageFrame(
+        rng.uniform(0, 1023, 25), rng.uniform(0, 1023, 25), np.full(25, np.nan),
+        np.sort(rng.uniform(3, 6, 25)), np.zeros(3),
+    )  # fmt: skip
+    far = scaled(TRUE, 1.25)
+    assert find_camera([frame(TRUE, 4), noise], far, 1.05, skies_of, HOW) is None
+    assert find_camera([frame(TRUE, 4)], far, 1.5, skies_of, HOW) is not None
+
+
+def test_few_and_invalid_centroids_show_no_camera(skies_of):
+    few = ImageFrame(*(column[:5] for column in frame(TRUE, 5)[:4]), np.zeros(3))
+    none = ImageFrame(*[np.empty(0)] * 4, np.zeros(3))
+    nan = ImageFrame(*[np.full(20, np.nan)] * 4, np.zeros(3))
+    assert find_camera([few, none, nan], TRUE, 1.02, skies_of, HOW) is None
+    assert find_camera([], TRUE, 1.02, skies_of, HOW) is None
+
+
+def test_the_second_frame_is_searched_where_the_first_shows_nothing(skies_of):
+    none = ImageFrame(*[np.empty(0)] * 4, np.zeros(3))
+    found = find_camera([none, frame(TRUE, 6)], TRUE, 1.02, skies_of, HOW)
+    assert found.frame == 1
+
+
+def test_another_frame_agrees_with_the_true_camera_alone(skies_of):
+    assert agrees(frame(TRUE, 7), TRUE, skies_of, HOW)
+    assert agrees(frame(TRUE, 7), scaled(TRUE, 1.2), skies_of, HOW) is None
+    assert agrees(frame(TRUE, 7), mirrored(TRUE), skies_of, HOW) is None
