@@ -9,6 +9,7 @@ TIME = pa.timestamp("ns", tz="UTC")
 STATE_AXES = ("x", "y", "z", "vx", "vy", "vz")  # of a position and velocity
 PLACE = ["x_km", "y_km", "z_km"]  # of an object
 VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
+OPTICS_AXES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # numbers of a camera
 TANGENT_AXES = ("1", "2")  # of the plane at right angles to a direction
 
 
@@ -69,8 +70,8 @@ def covariance(
     pattern: str,
     *,
     unit: str,
-    frame: str,
     doc: str,
+    frame: str = "",
     null: bool = False,
     names: Sequence[str] = "xyz",
 ) -> list[pa.Field]:

@@ -3,6 +3,7 @@
 import pyarrow as pa
 
 from epipole.schemas.columns import (
+    OPTICS_AXES,
     TANGENT_AXES,
     axes,
     column,
@@ -69,7 +70,7 @@ SENSOR_STATES = schema(
 
 CAMERAS = schema(
     "cameras",
-    "One row per calibration of the log.",
+    "One row per calibration of the log, or of the fit to its stars where the log's is wrong.",
     [
         SENSOR_ID,
         time_column(doc="Start of its validity, UTC. The first also holds before."),
@@ -79,6 +80,12 @@ CAMERAS = schema(
             column(name, F64, doc="Pinhole and Brown-Conrady coefficients.")
             for name in ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
         ],
+        *covariance(
+            "cov_{}",
+            unit="products of the units of both numbers",
+            doc="Covariance of the optics; 0 as the log tells them.",
+            names=OPTICS_AXES,
+        ),
     ],
 )
 
@@ -125,7 +132,8 @@ SOLUTIONS = schema(
             unit="arcsec^2",
             frame="sensor",
             null=True,
-            doc="Covariance of the small rotation from the true to the reported sensor axes.",
+            doc="Covariance of the small rotation from the true to the reported sensor axes. If "
+            "from stars: of what is independent in each frame; the sigmas include the optics.",
         ),
         USED_SIGMA,
         column("camera", I64, doc="Row of `cameras` that is valid for the frame."),

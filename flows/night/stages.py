@@ -114,12 +114,12 @@ def find_cameras(work: Work, settings: Settings) -> Work:
 def calibrate(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     """Fit each sensor's optics to its stars; identify again the sensors whose optics differ."""
     mode = settings.identification.calibrate
-    calibrations = CALIBRATIONS.empty_table()
+    calibrations, told = CALIBRATIONS.empty_table(), work.cameras
     for number in range(1, 3 if mode == "use" else 2):  # with better optics more stars take part
         if mode == "off":
             break
         futures = [
-            calibrate_sensor.submit(sensor, work.identified[sensor], spans, work.cameras)
+            calibrate_sensor.submit(sensor, work.identified[sensor], spans, work.cameras, told)
             for sensor, spans in work.spans.items()
         ]
         fits: list[Calibrated] = results(Stage.CALIBRATE, futures)

@@ -2,22 +2,32 @@
 
 import logging
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.parts import Parts
-from epipole.schemas.bridge import array, concat, empty, rows_of, table
+from epipole.schemas.bridge import array, concat, empty, rows_of, table, unstack_covariance
+from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS, STARS
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
-from epipole.tasks.algorithms.geometry.optics_calibration import OPTICS, OpticsFit, calibrate_optics
+from epipole.tasks.algorithms.geometry.optics_calibration import (
+    OpticsFit,
+    StarImages,
+    calibrate_in_steps,
+    calibrate_optics,
+)
+from epipole.tasks.algorithms.geometry.optics_errors import OPTICS
+from epipole.tasks.common.sightings import camera_of, optics_covariance_of
 from epipole.tasks.common.stage_tasks import stage_task
 
+Array = npt.NDArray[np.float64]
 LOGGER = logging.getLogger(__name__)
 
 MAX_STARS = 20_000  # with more, the sigmas would be smaller than the errors of the model
@@ -30,7 +40,8 @@ class Calibrated(NamedTuple):
     """Fitted optics.
 
     `calibrations` is CALIBRATIONS, a row per sensor with enough stars. `cameras` is CAMERAS, with
-    the fitted optics of the sensors in `departed`: theirs certainly differ from the calibration.
+    the fitted optics and their covariance for the sensors in `departed`: theirs certainly differ
+    from the calibration.
     """
 
     calibrations: pa.Table
@@ -40,11 +51,23 @@ class Calibrated(NamedTuple):
 
 @stage_task(Stage.CALIBRATE, "{sensor}")
 def calibrate_sensor(
-    sensor: Sensor, identified: Parts, spans: Sequence[Span], cameras: pa.Table
+    sensor: Sensor,
+    identified: Parts,
+    spans: Sequence[Span],
+    cameras: pa.Table,
+    told: pa.Table,
 ) -> Calibrated:
-    """Fit one sensor's optics to its stars of all spans; `identified` has its parts."""
-    of_sensor = cameras.filter(pc.field("sensor_id") == sensor.sensor_id)
-    return calibrate_sensors(_spread(identified, spans), of_sensor)
+    """Fit one sensor's optics to its stars of all spans.
+
+    Parameters
+    ----------
+    identified
+        The parts of the sensor, with the stars.
+    cameras, told
+        CAMERAS that the stars were identified with, and those of the log.
+    """
+    own = pc.field("sensor_id") == sensor.sensor_id
+    return calibrate_sensors(_spread(identified, spans), cameras.filter(own), told.filter(own))
 
 
 def _spread(identified: Parts, spans: Sequence[Span]) -> pa.Table:
@@ -65,17 +88,22 @@ def _every(stars: pa.Table, step: int) -> pa.Table:
     return stars.take(np.flatnonzero(number % step == 0))
 
 
-def calibrate_sensors(stars: pa.Table, cameras: pa.Table) -> Calibrated:
-    """Return the optics that fit the stars; `stars` of a sensor are in order of time."""
+def calibrate_sensors(stars: pa.Table, cameras: pa.Table, told: pa.Table) -> Calibrated:
+    """Return the optics that fit the stars; `stars` of a sensor are in order of time.
+
+    `cameras` are those that the stars were identified with, `told` those of the log.
+    """
     rows, changed = [], {}
-    for camera_row in _single(cameras):
-        name = camera_row["sensor_id"]
-        fit = _fit(stars.filter(pc.field("sensor_id") == name), camera_row)
-        if fit is None:
+    given = _single(told)
+    for name, present in _single(cameras).items():
+        images = _images(stars.filter(pc.field("sensor_id") == name), present.camera)
+        fitted = _fit(given.get(name, present).camera, present, images)
+        if fitted is None:
             continue
+        fit, departs = fitted
         rows.append(_row(name, fit))
-        if fit.gain > REAL_GAIN:
-            changed[name] = fit.camera._asdict()
+        if departs:
+            changed[name] = fit.camera._asdict() | _covariance_columns(fit.cov)
         LOGGER.info("%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px)
     new = [row | changed.get(row["sensor_id"], {}) for row in rows_of(cameras)]
     return Calibrated(
@@ -85,31 +113,53 @@ def calibrate_sensors(stars: pa.Table, cameras: pa.Table) -> Calibrated:
     )
 
 
-def _single(cameras: pa.Table) -> list[dict[str, Any]]:
-    """Return the cameras of sensors with one calibration.
+class _Optics(NamedTuple):
+    camera: Camera
+    is_fitted: bool  # as the covariance says
+
+
+def _single(cameras: pa.Table) -> dict[str, _Optics]:
+    """Return the optics of sensors with one calibration.
 
     With two calibrations, it is not known which of them a star was identified with.
     """
-    first: dict[str, dict[str, Any] | None] = {}
-    for row in rows_of(cameras):
-        optics = {name: row[name] for name in Camera._fields}
-        known = first.setdefault(row["sensor_id"], optics)
-        if known != optics:
-            first[row["sensor_id"]] = None
-    return [{"sensor_id": name} | value for name, value in first.items() if value is not None]
+    found: dict[str, set[_Optics]] = {}
+    for k, name in enumerate(cameras["sensor_id"].to_pylist()):
+        optics = _Optics(camera_of(cameras, k), bool(optics_covariance_of(cameras, k).any()))
+        found.setdefault(name, set()).add(optics)
+    return {name: optics.pop() for name, optics in found.items() if len(optics) == 1}
 
 
-def _fit(stars: pa.Table, row: dict[str, Any]) -> OpticsFit | None:
-    camera = Camera(**{name: row[name] for name in Camera._fields})
+def _images(stars: pa.Table, camera: Camera) -> StarImages:
+    """Return the images of the stars of whole frames, spread evenly over the night."""
     x, y, frame = array(stars, "x_px"), array(stars, "y_px"), array(stars, "frame_number")
     dx, dy = array(stars, "dx_px"), array(stars, "dy_px")
-    # Whole frames, spread evenly over the night.
     number = np.cumsum(np.diff(frame, prepend=frame[:1]) != 0) if len(frame) else frame
     step = max(1, -(-len(frame) // MAX_STARS))
     kept = np.isfinite(dx) & np.isfinite(dy) & (number % step == 0)
     x, y, dx, dy = x[kept], y[kept], dx[kept], dy[kept]
-    star = array(stars, "star_id")[kept]
-    return calibrate_optics(camera, x, y, unproject(camera, x - dx, y - dy), number[kept], star)
+    u_sensor = unproject(camera, x - dx, y - dy)
+    return StarImages(x, y, u_sensor, number[kept], array(stars, "star_id")[kept])
+
+
+def _fit(given: Camera, present: _Optics, images: StarImages) -> tuple[OpticsFit, bool] | None:
+    """Return the optics, and whether frames must be identified again with them.
+
+    Optics that the log tells wrong are fitted in steps; then what they leave uncertain must reach
+    the frames once, however near the present optics are.
+    """
+    free = calibrate_optics(given, images, present.camera)
+    if free is None:
+        return None
+    if present.camera == given and not present.is_fitted and free.gain <= REAL_GAIN:
+        return free, False
+    fit = calibrate_in_steps(given, images, free, present.camera)
+    return fit, not present.is_fitted or fit.gain > REAL_GAIN
+
+
+def _covariance_columns(cov: Array) -> dict[str, float]:
+    columns = unstack_covariance("cov_{}", cov[None], OPTICS_AXES)
+    return {name: float(values[0]) for name, values in columns.items()}
 
 
 def _row(sensor_id: str, fit: OpticsFit) -> pa.Table:

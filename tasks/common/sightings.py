@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.schemas.columns import OPTICS_AXES
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.direction_errors import (
@@ -145,3 +146,8 @@ def camera_of(cameras: pa.Table, row: int) -> Camera:
     """Return the camera in a row of `cameras`."""
     # Not the time: a Python datetime has no nanoseconds.
     return Camera(**cameras.select(list(Camera._fields)).slice(row, 1).to_pylist()[0])
+
+
+def optics_covariance_of(cameras: pa.Table, row: int) -> Array:
+    """Return the covariance (9, 9) of the optics in a row of `cameras`; 0 as the log tells them."""
+    return stack_covariance(cameras.slice(row, 1), "cov_{}", OPTICS_AXES)[0]

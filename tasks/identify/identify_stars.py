@@ -14,6 +14,7 @@ from epipole.schemas.star_catalogue import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC, DAY_NS, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.optics_errors import shared_attitude_covariance
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
 from epipole.tasks.algorithms.star_identification.frames.frame import Search
@@ -23,6 +24,7 @@ from epipole.tasks.algorithms.star_identification.frames.spots import (
 )
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
+from epipole.tasks.common.sightings import optics_covariance_of
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 from epipole.tasks.identify.flatten_centroids import FlatCentroids, flatten_centroids
 from epipole.tasks.identify.tabulate_identified import (
@@ -62,8 +64,8 @@ def identify_stars(
     exposures, places = exposures.take(order), places.take(order)
     centroids = flatten_centroids(exposures, cameras, settings)
     found, rows = _identify(exposures, places, centroids, catalogue, settings)
-    attitudes = _attitudes(places, found, settings)
-    matches = _matches(found, rows)
+    attitudes, matches = _attitudes(places, found, settings), _matches(found, rows)
+    attitudes = _with_optics(attitudes, centroids, matches, cameras)
     stars = stars_table(exposures, places, centroids, attitudes, matches)
     stars = with_catalogue(stars, catalogue.schema)
     most = settings.tracklets.most_detections
@@ -133,12 +135,31 @@ def _attitudes(
     source = np.where(np.isfinite(q[:, 3]), "prior", "none").astype(object)
     cov[source == "none"] = np.nan
     if found is None:
-        return StarAttitudes(source, ["no_calibration"] * n, R, cov)
+        return StarAttitudes(source, ["no_calibration"] * n, R, cov, np.zeros_like(cov))
     solved = found.solutions.solved
     source[solved] = "stars"
     R[solved] = found.solutions.R_sensor_from_icrs[solved]
     cov[solved] = found.solutions.cov_rad2[solved] / ARCSEC**2
-    return StarAttitudes(source, found.status, R, cov)
+    return StarAttitudes(source, found.status, R, cov, np.zeros_like(cov))
+
+
+def _with_optics(
+    a: StarAttitudes, c: FlatCentroids, m: MatchedStars, cameras: pa.Table
+) -> StarAttitudes:
+    """Return the attitudes with the errors that those from stars have from errors of the optics."""
+    shared, of = a.shared_arcsec2.copy(), c.frame[m.at]
+    for row, camera in c.cameras.items():
+        cov_optics = optics_covariance_of(cameras, row)
+        solved = np.flatnonzero((a.source == "stars") & (c.camera_of_frame == row))
+        if not cov_optics.any() or not len(solved):
+            continue
+        stars = np.flatnonzero(np.isin(of, solved))
+        at = m.at[stars]
+        sigma_rad = np.where(np.isnan(c.sigma_px[at]), 1.0, c.sigma_px[at]) * c.pixel_rad[at]
+        offsets = np.append(np.searchsorted(of[stars], solved), len(stars))
+        cov = shared_attitude_covariance(camera, cov_optics, c.u[at], sigma_rad, offsets)
+        shared[solved] = cov / ARCSEC**2
+    return a._replace(shared_arcsec2=shared)
 
 
 def _matches(found: IdentifiedSensor | None, rows: npt.NDArray[np.int64]) -> MatchedStars:

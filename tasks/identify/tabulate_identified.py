@@ -35,7 +35,8 @@ class StarAttitudes(NamedTuple):
     source: npt.NDArray[np.object_]
     status: list[str | None]
     R: Array  # sensor from ICRS
-    cov_arcsec2: Array
+    cov_arcsec2: Array  # independent in each frame, if from stars
+    shared_arcsec2: Array  # by the error of the optics, which all frames share
 
 
 class MatchedStars(NamedTuple):
@@ -117,7 +118,7 @@ def solutions_table(
     q = np.full((n, 4), np.nan)
     q[known] = quaternion_from_matrix(a.R[known])
     ra, dec, roll = boresight_angles(a.R)
-    sigma = np.sqrt(np.diagonal(a.cov_arcsec2, axis1=1, axis2=2))
+    sigma = np.sqrt(np.diagonal(a.cov_arcsec2 + a.shared_arcsec2, axis1=1, axis2=2))
     values = {
         **unstack("q{}", q, "xyzw"),
         **unstack("sigma_{}_arcsec", sigma),

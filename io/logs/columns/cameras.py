@@ -8,7 +8,8 @@ import pyarrow as pa
 from epipole.io.logs.damage import RejectList
 from epipole.io.logs.messages.batches import MessageBatch, fault, known_id
 from epipole.io.logs.messages.decoded import CalibrationMessage
-from epipole.schemas.bridge import table
+from epipole.schemas.bridge import table, unstack_covariance
+from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import CAMERAS
 
@@ -57,6 +58,7 @@ class CameraColumns:
                 "cx_px": matrices[:, 2],
                 "cy_px": matrices[:, 5],
                 **dict(zip(("k1", "k2", "p1", "p2", "k3"), distortion.T, strict=True)),
+                **unstack_covariance("cov_{}", np.zeros((len(rows), 9, 9)), OPTICS_AXES),
             },
         )
 

@@ -2,36 +2,86 @@
 
 All frames share the optics. Each frame has its own small rotation, which is eliminated frame by
 frame (Schur complement), so the cost grows linearly with the number of stars.
+
+Two fits: `calibrate_optics` with all numbers free tells whether the optics differ from the given
+ones. If they do, `calibrate_in_steps` moves only the numbers that the stars demand.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.camera import Camera, project
+from epipole.tasks.algorithms.geometry.optics_errors import OPTICS, image_derivatives
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-OPTICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 # 1-sigma prior about the given calibration. It only matters for what the stars do not determine:
 # in a narrow field a shift of the principal point equals a rotation of the sensor, and the
 # higher terms of the distortion are negligible.
 FOCAL_SHARE = 0.02
 CORNER_PX = 20.0
-PRINCIPAL_POINT_PX = 5.0
-STEPS = 15
+# A detector of 6 mm that is set behind its lens with usual tolerances, about 30 micrometres.
+PRINCIPAL_POINT_SHARE = 0.005  # of the image's size
+ITERATIONS = 15
 HUBER = 2.0  # [sigma] larger residuals have less weight
 LEAST_FRAMES, LEAST_STARS = 3, 60
+# The principal point moves only where its sigma, with all numbers free, is below this share of its
+# prior. Otherwise it stands for a rotation of the sensor.
+TOLD_APART = 0.5
+
+
+def _direction(**weights: float) -> Array:
+    """Return a direction in the space of `OPTICS`, of length 1, as a column."""
+    column = np.array([[weights.get(name, 0.0)] for name in OPTICS])
+    return column / np.linalg.norm(column)
+
+
+# In the order in which lenses differ from their calibration, the largest effect first.
+STEPS = (
+    _direction(fx_px=1.0, fy_px=1.0),
+    _direction(k1=1.0),
+    _direction(fx_px=1.0, fy_px=-1.0),  # pixels that are not square
+    _direction(k2=1.0),
+    _direction(k3=1.0),
+)
+NOTHING = np.zeros((9, 0))
+TANGENTIAL = np.hstack([_direction(p1=1.0), _direction(p2=1.0)])
+PRINCIPAL_POINT = np.hstack([_direction(cx_px=1.0), _direction(cy_px=1.0)])
+
+
+class StarImages(NamedTuple):
+    """Images of identified stars, frame by frame.
+
+    x_px, y_px : (n,) float
+        Measured image places.
+    u_sensor : (n, 3) float
+        Catalogue directions in the sensor frame. The attitudes may come from wrong optics: a
+        rotation of each frame is fitted too.
+    frame : (n,) int
+        Number of the frame; the stars of a frame are consecutive.
+    star : (n,) int
+        Number of the star. Errors of the catalogue, and of close pairs that are one image, are
+        the same in every frame. Covariances include them, however many frames there are.
+    """
+
+    x_px: Array
+    y_px: Array
+    u_sensor: Array
+    frame: Indices
+    star: Indices
 
 
 class OpticsFit(NamedTuple):
     """Optics with their covariance (9, 9), in the order of OPTICS.
 
     residual_px : robust rms of the image residuals, per axis
-    gain : decrease of chi-square from the given optics, with free attitudes in both; at most
+    gain : decrease of chi-square from the present optics, with free attitudes in both; at most
         the squared distance of the optics in units of `cov`; about 9 by chance
+    n_independent : number of independent images that would tell the optics as well
     """
 
     camera: Camera
@@ -39,41 +89,46 @@ class OpticsFit(NamedTuple):
     n_stars: int
     residual_px: float
     gain: float
+    n_independent: float
+
+
+class _Images(NamedTuple):
+    """The images as the fits take them."""
+
+    xy: Array
+    starts: Indices  # of each frame
+    of_frame: Indices
+    of_star: Indices
 
 
 class _Fit(NamedTuple):
     camera: Camera
     u: Array  # stars in the sensor frame, after the fitted rotations
-    cov: Array  # of the optics, in units of their prior
+    moved: Array  # (k,) what is free, minus the given calibration, in units of the prior
+    cov: Array  # (k, k) its covariance
     residual: Array
     sigma_px: float
-    score: Array  # (n, 9): weighted gradient of each star image, in units of the prior
+    score: Array  # (n, k): weighted gradient of each star image
+
+
+class _Choice(NamedTuple):
+    """What is free, and the fit with it."""
+
+    fit: _Fit
+    basis: Array
 
 
 def calibrate_optics(
-    camera: Camera,
-    x_px: Array,
-    y_px: Array,
-    u_sensor: Array,
-    frame: npt.NDArray[np.int64],
-    star: npt.NDArray[np.int64],
+    given: Camera, images: StarImages, present: Camera | None = None
 ) -> OpticsFit | None:
     """Return the optics that fit identified stars best, None with too few stars.
 
     Parameters
     ----------
-    camera
-        The given calibration: start and prior of the fit.
-    x_px, y_px : (n,) float
-        Measured image places of the stars.
-    u_sensor : (n, 3) float
-        Their catalogue directions in the sensor frame. The attitudes may come from wrong
-        optics: a rotation of each frame is fitted too.
-    frame : (n,) int
-        Number of the frame; the stars of a frame are consecutive.
-    star : (n,) int
-        Number of the star. Errors of the catalogue, and of close pairs that are one image, are
-        the same in every frame. The covariance includes them, however many frames there are.
+    given
+        The calibration of the log: the prior of the fit.
+    present
+        The optics to begin with, which the gain is counted from; default: the given ones.
 
     References
     ----------
@@ -81,68 +136,178 @@ def calibrate_optics(
     complement); Huber's weights, scaled by the median absolute residual. Cameron and Miller
     (2015), A practitioner's guide to cluster-robust inference: errors shared by a star's images.
     """
-    change = np.flatnonzero(np.diff(frame)) + 1
-    starts = np.concatenate([[0], change])
-    if len(frame) < LEAST_STARS or len(starts) < LEAST_FRAMES:
+    taken = _taken(images)
+    if taken is None:
         return None
-    xy = np.stack([x_px, y_px], axis=1)
-    fixed = _fit(camera, xy, u_sensor, starts, False)
-    free = _fit(camera, xy, fixed.u, starts, True)
-    cost = [_huber_cost(f.residual / free.sigma_px) for f in (fixed, free)]
-    cov = _with_shared_errors(free, star) * np.outer(*[_prior_sigma(camera)] * 2)
-    off = _values(free.camera) - _values(camera)
-    distance = float(off @ np.linalg.solve(cov, off))
-    return OpticsFit(free.camera, cov, len(frame), free.sigma_px, min(cost[0] - cost[1], distance))
+    present = present or given
+    fixed = _fit(given, present, taken, images.u_sensor, NOTHING)
+    free = _fit(given, present, taken, fixed.u, np.eye(9))
+    shared, scale = _with_shared_errors(free, taken.of_star), _prior_sigma(given)
+    cov = shared * np.outer(scale, scale)
+    gain = _gain(fixed, free, cov, free.sigma_px)
+    times = float(np.trace(np.linalg.solve(free.cov, shared))) / 9
+    n = len(taken.xy)
+    return OpticsFit(free.camera, cov, n, free.sigma_px, gain, n / times)
 
 
-def _with_shared_errors(fit: _Fit, star: npt.NDArray[np.int64]) -> Array:
+def calibrate_in_steps(
+    given: Camera, images: StarImages, free: OpticsFit, present: Camera | None = None
+) -> OpticsFit:
+    """Return optics that differ from the given ones only in what the stars demand.
+
+    Where a number is free that the stars do not demand, it takes up errors of others: the
+    principal point those of the tangential terms, and the attitude moves with it.
+
+    Parameters
+    ----------
+    given
+        The calibration of the log. It is shown to be wrong, so its principal point is as uncertain
+        as the prior says, unless the stars say more.
+    free
+        The fit of all numbers to the same images, from `calibrate_optics`.
+    present
+        The optics to begin with, which the gain is counted from; default: the given ones.
+
+    Returns
+    -------
+    OpticsFit
+        `cov` is the mean square of the error: the covariance with all numbers free, and the square
+        of what they would move. So it includes the numbers that are not moved.
+
+    References
+    ----------
+    Schwarz (1978), Estimating the dimension of a model: a number is demanded if it lowers
+    chi-square by more than the logarithm of the number of images. Kish (1965), Survey sampling,
+    section 8.2: of images that share errors, fewer are independent.
+    """
+    taken = _taken(images)
+    if taken is None:
+        return free
+    sigma, price = free.residual_px, np.log(max(free.n_independent, 1.0))
+    fixed = start = _fit(given, present or given, taken, images.u_sensor, NOTHING, sigma)
+    if present not in (None, given):
+        start = _fit(given, given, taken, fixed.u, NOTHING, sigma)
+    radial = _extended(given, taken, _Choice(start, NOTHING), STEPS, price)
+    best = _extended(given, taken, radial, [TANGENTIAL], price)
+    if _told_apart(free.cov, _prior_sigma(given)):
+        # Tangential terms may only stand for the principal point, so it is also tried before them.
+        before = _extended(given, taken, radial, [PRINCIPAL_POINT, TANGENTIAL], price)
+        after = _extended(given, taken, best, [PRINCIPAL_POINT], price)
+        best = min(before, after, key=lambda choice: _criterion(given, choice, price))
+    rest = _values(free.camera) - _values(best.fit.camera)
+    return free._replace(
+        camera=best.fit.camera,
+        cov=free.cov + np.outer(rest, rest),
+        residual_px=_robust_sigma(best.fit.residual, _degrees_of_freedom(taken, best.basis)),
+        gain=_gain(fixed, best.fit, free.cov, sigma),
+    )
+
+
+def _taken(images: StarImages) -> _Images | None:
+    """Return the images as the fits take them, None if they are too few."""
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(images.frame)) + 1])
+    n = len(images.frame)
+    if n < LEAST_STARS or len(starts) < LEAST_FRAMES:
+        return None
+    of_frame = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, n)))
+    _, of_star = np.unique(images.star, return_inverse=True)
+    return _Images(np.stack([images.x_px, images.y_px], axis=1), starts, of_frame, of_star)
+
+
+def _told_apart(cov: Array, scale: Array) -> bool:
+    """Return whether the stars tell the principal point from a rotation of the sensor."""
+    place = [OPTICS.index("cx_px"), OPTICS.index("cy_px")]
+    worst = np.linalg.eigvalsh(cov[np.ix_(place, place)])[-1]
+    return bool(np.sqrt(worst) < TOLD_APART * scale[place[0]])
+
+
+def _gain(fixed: _Fit, fit: _Fit, cov: Array, sigma_px: float) -> float:
+    """Return the decrease of chi-square, at most the squared distance in units of `cov`."""
+    off = _values(fit.camera) - _values(fixed.camera)
+    decrease = _huber_cost(fixed.residual / sigma_px) - _huber_cost(fit.residual / sigma_px)
+    return min(decrease, float(off @ np.linalg.solve(cov, off)))
+
+
+def _extended(
+    given: Camera, images: _Images, choice: _Choice, steps: Sequence[Array], price: float
+) -> _Choice:
+    """Return the choice with those of the steps that the stars demand, each after the other."""
+    for step in steps:
+        wider, n = np.hstack([choice.basis, step]), step.shape[1]
+        fit = _fit(given, choice.fit.camera, images, choice.fit.u, wider, choice.fit.sigma_px)
+        decrease = _cost(given, choice.fit) - _cost(given, fit)
+        # What all images of a star have in common may lower chi-square without any meaning.
+        cov, moved = _with_shared_errors(fit, images.of_star)[-n:, -n:], fit.moved[-n:]
+        if min(decrease, float(moved @ np.linalg.solve(cov, moved))) > n * price:
+            choice = _Choice(fit, wider)
+    return choice
+
+
+def _criterion(given: Camera, choice: _Choice, price: float) -> float:
+    return _cost(given, choice.fit) + price * choice.basis.shape[1]
+
+
+def _cost(given: Camera, fit: _Fit) -> float:
+    """Return chi-square, with the prior's part."""
+    prior = (_values(fit.camera) - _values(given)) / _prior_sigma(given)
+    return _huber_cost(fit.residual / fit.sigma_px) + float(prior @ prior)
+
+
+def _with_shared_errors(fit: _Fit, of_star: Indices) -> Array:
     """Return the covariance, in units of the prior, with the errors that a star's images share."""
-    _, of_star = np.unique(star, return_inverse=True)
-    n = of_star.max() + 1
-    pull = np.zeros((n, 9))
+    n, k = of_star.max() + 1, len(fit.cov)
+    pull = np.zeros((n, k))
     np.add.at(pull, of_star, fit.score)
-    few = n / max(n - 9, 1)  # for the degrees of freedom of the fit
+    few = n / max(n - k, 1)  # for the degrees of freedom of the fit
     shared = fit.cov @ (few * pull.T @ pull - fit.score.T @ fit.score) @ fit.cov
     value, vector = np.linalg.eigh(shared)
     return fit.cov + (vector * np.maximum(value, 0.0)) @ vector.T
 
 
-def _fit(camera: Camera, xy: Array, u: Array, starts: Indices, optics: bool) -> _Fit:
-    """Return the best rotations of the frames and, if `optics`, the best optics."""
-    scale = _prior_sigma(camera)
-    came = _values(camera)
-    of_frame = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, len(xy))))
-    used = 2 * len(xy) - 3 * len(starts) - 9
-    for _ in range(STEPS):
-        r, J_turn, J_optics = _linearise(camera, xy, u)
-        sigma = _robust_sigma(r, used)
+def _fit(
+    given: Camera, camera: Camera, images: _Images, u: Array, basis: Array, sigma_px: float = 0.0
+) -> _Fit:
+    """Return the best rotations of the frames, and the best optics in the space of `basis`.
+
+    Parameters
+    ----------
+    basis : (9, k) float
+        What is free, in units of the prior.
+    sigma_px
+        Error of the images, per axis; 0: that of the residuals.
+    """
+    scale, told, k = _prior_sigma(given), _values(given), basis.shape[1]
+    used = _degrees_of_freedom(images, basis)
+    for _ in range(ITERATIONS):
+        r, J_turn, J_optics = _linearise(camera, images.xy, u)
+        sigma = sigma_px or _robust_sigma(r, used)
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12)) / sigma**2
-        J_optics = J_optics * scale
-        A = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_turn), starts)
+        J_optics = J_optics * scale @ basis
+        A = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_turn), images.starts)
         A += (
             1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         )  # all stars at one place
-        b = np.add.reduceat(np.einsum("nai,na->ni", J_turn, weight * r), starts)
-        step, cov, score = np.zeros(9), np.zeros((9, 9)), np.zeros((len(xy), 9))
+        b = np.add.reduceat(np.einsum("nai,na->ni", J_turn, weight * r), images.starts)
         turn = np.linalg.solve(A, b[..., None])[..., 0]
-        if optics:
-            B = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_optics), starts)
-            lever = np.linalg.solve(A, B)  # rotations that compensate a change of the optics
-            C = np.einsum("nai,na,naj->ij", J_optics, weight, J_optics) + np.eye(9)
-            C -= np.einsum("fki,fkj->ij", B, lever)
-            c = np.einsum("nai,na->i", J_optics, weight * r) - (_values(camera) - came) / scale
-            cov = np.linalg.inv(C)
-            step = cov @ (c - np.einsum("fki,fk->i", B, turn))
-            turn = turn - lever @ step
-            reduced = J_optics - J_turn @ lever[of_frame]
-            score = np.einsum("nai,na->ni", reduced, weight * r)
-            camera = _moved(camera, step * scale)
-        u = u + np.cross(turn[of_frame], u)
+        B = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_optics), images.starts)
+        lever = np.linalg.solve(A, B)  # rotations that compensate a change of the optics
+        C = np.einsum("nai,na,naj->ij", J_optics, weight, J_optics) + np.eye(k)
+        C -= np.einsum("fki,fkj->ij", B, lever)
+        c = np.einsum("nai,na->i", J_optics, weight * r)
+        c -= basis.T @ ((_values(camera) - told) / scale)
+        cov = np.linalg.inv(C)
+        step = cov @ (c - np.einsum("fki,fk->i", B, turn))
+        turn = turn - lever @ step
+        score = np.einsum("nai,na->ni", J_optics - J_turn @ lever[images.of_frame], weight * r)
+        camera = _moved(camera, (basis @ step) * scale)
+        u = u + np.cross(turn[images.of_frame], u)
         u = u / np.linalg.norm(u, axis=1, keepdims=True)
-        if np.abs(turn).max() < 1e-3 * sigma * camera.pixel_rad and np.abs(step).max() < 1e-6:
+        still = np.abs(step).max(initial=0.0) < 1e-6
+        if still and np.abs(turn).max() < 1e-3 * sigma * camera.pixel_rad:
             break
-    r, _, _ = _linearise(camera, xy, u)
-    return _Fit(camera, u, cov, r, _robust_sigma(r, used), score)
+    r, _, _ = _linearise(camera, images.xy, u)
+    moved = basis.T @ ((_values(camera) - told) / scale)
+    return _Fit(camera, u, moved, cov, r, sigma_px or _robust_sigma(r, used), score)
 
 
 def _values(camera: Camera) -> Array:
@@ -158,7 +323,12 @@ def _prior_sigma(camera: Camera) -> Array:
     """Return the 1-sigma prior of each number of OPTICS."""
     f, r = np.sqrt(camera.fx_px * abs(camera.fy_px)), np.tan(camera.half_diagonal_rad)
     at_corner = CORNER_PX / f / np.array([r**3, r**5, r**2, r**2, r**7])
-    return np.array([FOCAL_SHARE * f] * 2 + [PRINCIPAL_POINT_PX] * 2 + at_corner.tolist())
+    place_px = PRINCIPAL_POINT_SHARE * max(camera.width, camera.height)
+    return np.array([FOCAL_SHARE * f] * 2 + [place_px] * 2 + at_corner.tolist())
+
+
+def _degrees_of_freedom(images: _Images, basis: Array) -> int:
+    return 2 * len(images.xy) - 3 * len(images.starts) - basis.shape[1]
 
 
 def _robust_sigma(residual: Array, degrees_of_freedom: int) -> float:
@@ -173,28 +343,5 @@ def _huber_cost(z: Array) -> float:
 
 
 def _linearise(camera: Camera, xy: Array, u: Array) -> tuple[Array, Array, Array]:
-    """Return residuals (n, 2) [px], and derivatives of the image places by the rotation (n, 2, 3)
-    and by the optics (n, 2, 9)."""
-    x, y = u[:, 0] / u[:, 2], u[:, 1] / u[:, 2]
-    r2, xy2 = x * x + y * y, 2 * x * y
-    k1, k2, p1, p2, k3 = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
-    stretch = np.empty((len(x), 2, 2))
-    stretch[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    stretch[:, 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    stretch[:, 0, 1] = stretch[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    turned = np.empty((len(x), 2, 3))  # derivative of the undistorted place by the rotation vector
-    turned[:, 0] = np.stack([-x * y, 1 + x * x, -y], axis=1)
-    turned[:, 1] = np.stack([-1 - y * y, x * y, x], axis=1)
-    f = np.array([camera.fx_px, camera.fy_px])
-    px, py = project(camera, u)
-    moved = np.zeros((len(x), 2, 9))
-    moved[:, 0, 0], moved[:, 1, 1] = (px - camera.cx_px) / f[0], (py - camera.cy_px) / f[1]
-    moved[:, 0, 2] = moved[:, 1, 3] = 1.0
-    for column, power in ((4, 1), (5, 2), (8, 3)):
-        moved[:, 0, column], moved[:, 1, column] = f[0] * x * r2**power, f[1] * y * r2**power
-    moved[:, 0, 6], moved[:, 1, 6] = f[0] * xy2, f[1] * (r2 + 2 * y * y)
-    moved[:, 0, 7], moved[:, 1, 7] = f[0] * (r2 + 2 * x * x), f[1] * xy2
-    J_turn = f[:, None] * np.einsum("nij,njk->nik", stretch, turned)
-    return xy - np.stack([px, py], axis=1), J_turn, moved
+    """Return residuals (n, 2) [px], and `image_derivatives`."""
+    return xy - np.stack(project(camera, u), axis=1), *image_derivatives(camera, u)

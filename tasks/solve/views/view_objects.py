@@ -20,7 +20,7 @@ from epipole.tasks.algorithms.geometry.rotations import (
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.lone_detections import in_lone_frames, with_lone_detections
-from epipole.tasks.common.sightings import Frames, camera_of, solved_frames
+from epipole.tasks.common.sightings import Frames, camera_of, optics_covariance_of, solved_frames
 from epipole.tasks.solve.views.tracklet_sightings import TrackletSightings, tracklet_sightings
 
 Array = npt.NDArray[np.float64]
@@ -50,7 +50,8 @@ def view_objects(
     if not tracked.num_rows or not epochs.num_rows:
         return empty(VIEWS)
     camera = camera_of(cameras, int(frames.camera[0]))
-    tracklets = tracklet_sightings(frames, tracked, camera, settings)
+    cov_optics = optics_covariance_of(cameras, int(frames.camera[0]))
+    tracklets = tracklet_sightings(frames, tracked, camera, cov_optics, settings)
     query = _queries(tracklets, epochs, frames)
     return _view_table(frames, tracklets, query, epochs, camera, settings)
 

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scenes.cameras import cameras_of
 from scipy.spatial.transform import Rotation
 
-from epipole.schemas.bridge import array, concat, table
+from epipole.schemas.bridge import array, concat, stack_covariance, table
+from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.tables import STARS
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, project
@@ -14,8 +16,8 @@ SENT = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)
 TRUE = SENT._replace(fx_px=3671.0, fy_px=3671.0, k1=-0.08)
 
 
-def stars_of(sensor_id, camera, seed=0, n_frames=40):
-    """Return STARS of a sensor, identified with the camera SENT and attitudes with small errors."""
+def stars_of(sensor_id, camera, seed=0, n_frames=40, used=SENT):
+    """Return STARS of a sensor, identified with the camera `used` and attitudes with errors."""
     rng = np.random.default_rng(seed)
     parts = []
     for k in range(n_frames):
@@ -23,7 +25,7 @@ def stars_of(sensor_id, camera, seed=0, n_frames=40):
         x, y = project(camera, v)
         seen = inside(camera, x, y)
         x, y = (c[seen] + rng.normal(0, 0.15, seen.sum()) for c in (x, y))
-        px, py = project(SENT, Rotation.from_rotvec(rng.normal(0, 3e-4, 3)).apply(v[seen]))
+        px, py = project(used, Rotation.from_rotvec(rng.normal(0, 3e-4, 3)).apply(v[seen]))
         n = len(x)
         parts.append(
             table(
@@ -37,17 +39,12 @@ def stars_of(sensor_id, camera, seed=0, n_frames=40):
 
 
 def cameras(*sensor_ids, **changes):
-    values = SENT._replace(**changes)._asdict()
-    n = len(sensor_ids)
-    return table(
-        CAMERAS,
-        {"sensor_id": list(sensor_ids), "time": [0] * n} | {k: [v] * n for k, v in values.items()},
-    )
+    return cameras_of({name: SENT._replace(**changes) for name in sensor_ids})
 
 
 def test_only_a_sensor_whose_optics_differ_gets_new_ones():
-    stars = concat(STARS, [stars_of("a", TRUE), stars_of("b", SENT)])
-    found = calibrate_sensors(stars, cameras("a", "b"))
+    stars, told = concat(STARS, [stars_of("a", TRUE), stars_of("b", SENT)]), cameras("a", "b")
+    found = calibrate_sensors(stars, told, told)
     assert found.departed == ["a"]
     assert found.calibrations["sensor_id"].to_pylist() == ["a", "b"]
     fx = array(found.cameras, "fx_px")
@@ -57,14 +54,43 @@ def test_only_a_sensor_whose_optics_differ_gets_new_ones():
     assert np.all(np.abs(off) < 4 * array(found.calibrations, "sigma_fx_px"))
 
 
+def test_only_new_optics_have_a_covariance_and_it_is_the_published_one():
+    stars, told = concat(STARS, [stars_of("a", TRUE), stars_of("b", SENT)]), cameras("a", "b")
+    found = calibrate_sensors(stars, told, told)
+    cov = stack_covariance(found.cameras, "cov_{}", OPTICS_AXES)
+    assert not cov[1].any()
+    assert array(found.cameras, "cx_px")[0] == SENT.cx_px  # the stars do not demand another
+    assert 2.0 < np.sqrt(cov[0, 2, 2]) < 10.0  # but it is as uncertain as it was not calibrated
+    published = [array(found.calibrations, f"sigma_{name}")[0] for name in ("cx_px", "k1")]
+    np.testing.assert_allclose(np.sqrt(np.diagonal(cov[0])[[2, 4]]), published)
+
+
+def test_frames_identified_with_the_fitted_optics_are_not_identified_again():
+    told = cameras("a")
+    first = calibrate_sensors(stars_of("a", TRUE), told, told).cameras
+    fitted = Camera(**first.select(list(Camera._fields)).to_pylist()[0])
+    again = calibrate_sensors(stars_of("a", TRUE, used=fitted), first, told)
+    assert again.departed == []
+    assert again.cameras.equals(first)
+    assert array(again.calibrations, "fx_px")[0] == pytest.approx(TRUE.fx_px, abs=1.0)
+
+
+def test_other_optics_than_the_log_tells_get_a_covariance_once():
+    present = cameras_of({"a": TRUE})  # right, but from elsewhere: nothing says how uncertain
+    found = calibrate_sensors(stars_of("a", TRUE, used=TRUE), present, cameras("a"))
+    assert found.departed == ["a"]
+    assert stack_covariance(found.cameras, "cov_{}", OPTICS_AXES)[0, 2, 2] > 1.0
+
+
 def test_few_stars_give_no_row_and_an_unchanged_camera():
-    found = calibrate_sensors(stars_of("a", TRUE, n_frames=2), cameras("a", "b"))
+    told = cameras("a", "b")
+    found = calibrate_sensors(stars_of("a", TRUE, n_frames=2), told, told)
     assert found.calibrations.num_rows == 0
-    assert found.cameras.equals(cameras("a", "b"))
+    assert found.cameras.equals(told)
 
 
 def test_a_sensor_with_two_calibrations_is_unchanged():
     both = concat(CAMERAS, [cameras("a"), cameras("a", fx_px=3700.0)])
-    found = calibrate_sensors(stars_of("a", TRUE), both)
+    found = calibrate_sensors(stars_of("a", TRUE), both, both)
     assert found.calibrations.num_rows == 0
     assert found.cameras.equals(both)

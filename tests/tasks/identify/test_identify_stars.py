@@ -3,13 +3,14 @@
 import numpy as np
 import pyarrow as pa
 import pytest
+from scenes.cameras import cameras_of
 from scenes.random_stars import CAMERA
 from scipy.spatial.transform import Rotation
 
 from epipole.io.catalogues.hipparcos import HIPPARCOS_EPOCH, read_hipparcos
 from epipole.schemas.bridge import array, stack, stack_covariance, table
 from epipole.schemas.settings import Settings
-from epipole.schemas.work_tables import CAMERAS, EXPOSURES, PLACES
+from epipole.schemas.work_tables import EXPOSURES, PLACES
 from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue, places_at
 from epipole.tasks.algorithms.geometry.camera import inside, project
 from epipole.tasks.algorithms.geometry.rotations import canonical
@@ -73,11 +74,7 @@ class Log:
         self.key = {"sensor_id": ["s"] * n, "frame_number": np.arange(n), "time": time}
         self.exposures = self.make_exposures(x_px, y_px, fluxes if flux else None, stated)
         self.places = self.make_places()
-        self.cameras = table(
-            CAMERAS,
-            {"sensor_id": ["s"], "time": [int(time[0])]}
-            | {name: [value] for name, value in DISTORTED._asdict().items()},
-        )
+        self.cameras = cameras_of({"s": DISTORTED})
 
     def make_exposures(self, x_px, y_px, flux=None, stated=None):
         n = len(x_px)

@@ -3,12 +3,14 @@
 import numpy as np
 import pyarrow as pa
 import pytest
+from scenes.cameras import cameras_of
 
 from epipole.schemas.bridge import table
 from epipole.schemas.columns import TIME
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import DETECTIONS
-from epipole.schemas.work_tables import CAMERAS, SOLUTIONS
+from epipole.schemas.work_tables import SOLUTIONS
+from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.track.build_tracklets import build_tracklets
 
 N = 600
@@ -44,9 +46,7 @@ def kinds(rate_arcsec_s):
         dec_deg=90.0 - off / 3600, sigma_arcsec=np.full(N, 3.0), kind=["unknown"] * N,
         x_px=500 + off / 21.1, y_px=np.full(N, 300.3) + rng.normal(0, 0.14, N),
     )  # fmt: skip
-    cameras = table(
-        CAMERAS, {"sensor_id": ["a"], "time": [0]} | {k: [v] for k, v in CAMERA.items()}
-    )
+    cameras = cameras_of({"a": Camera(**CAMERA)})
     built = build_tracklets(solutions, detections, cameras, Settings())
     return built.detections["kind"].to_pylist()
 
