@@ -258,7 +258,9 @@ def _with_shared_errors(fit: _Fit, of_star: Indices) -> Array:
     n, k = of_star.max() + 1, len(fit.cov)
     pull = np.zeros((n, k))
     np.add.at(pull, of_star, fit.score)
-    few = n / max(n - k, 1)  # for the degrees of freedom of the fit
+    # A star bends the fit towards its own error, which hides a part of it: as much as its share in
+    # the fit. Squared, so that few stars state rather too much (CV3 of Cameron and Miller).
+    few = (n / max(n - k, 1)) ** 2
     shared = fit.cov @ (few * pull.T @ pull - fit.score.T @ fit.score) @ fit.cov
     value, vector = np.linalg.eigh(shared)
     return fit.cov + (vector * np.maximum(value, 0.0)) @ vector.T

@@ -1,8 +1,7 @@
 """Tracklet sightings: one sensor's detections by tracklet, with honest errors.
 
 Two errors are told by the detections together: which part of a prior attitude's error changes from
-frame to frame, and what the light of a neighbour may add to a centroid. The error of fitted optics
-comes with them.
+frame to frame, and what the light of a neighbour may add to a centroid.
 """
 
 from typing import NamedTuple
@@ -15,8 +14,6 @@ from epipole.schemas.bridge import array
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance, scatter_beyond
-from epipole.tasks.algorithms.geometry.optics_errors import shared_direction_covariance
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
@@ -50,14 +47,11 @@ class TrackletSightings(NamedTuple):
 
 
 def tracklet_sightings(
-    frames: Frames, tracked: pa.Table, camera: Camera, cov_optics: Array, settings: Settings
+    frames: Frames, tracked: pa.Table, camera: Camera, settings: Settings
 ) -> TrackletSightings:
-    """Return the sightings of one sensor's detections that have a tracklet and a direction.
-
-    `cov_optics` is the covariance (9, 9) of the camera's optics.
-    """
+    """Return the sightings of one sensor's detections that have a tracklet and a direction."""
     sightings = _with_split_prior(_by_tracklet(frames, tracked), frames, settings)
-    return _with_optics(_with_blends(sightings, frames, camera), frames, camera, cov_optics)
+    return _with_blends(sightings, frames, camera)
 
 
 def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
@@ -105,19 +99,6 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
         left[tracklets.bounds],
         tracklets.name,
     )
-
-
-def _with_optics(
-    tracklets: TrackletSightings, frames: Frames, camera: Camera, cov_optics: Array
-) -> TrackletSightings:
-    """Return the sightings with the error of the optics, which all frames of the sensor share."""
-    if not cov_optics.any():
-        return tracklets
-    R = matrix_from_quaternion(frames.q_sensor_from_icrs)[tracklets.frame]
-    u_sensor = np.einsum("nij,nj->ni", R, tracklets.u_icrs)
-    stars = frames.from_stars[tracklets.frame]
-    shared = shared_direction_covariance(camera, cov_optics, u_sensor, stars)
-    return tracklets._replace(cov_bias=tracklets.cov_bias + np.swapaxes(R, 1, 2) @ shared @ R)
 
 
 def _with_split_prior(

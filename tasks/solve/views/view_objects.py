@@ -13,6 +13,7 @@ from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.geometry.camera import Camera, project
 from epipole.tasks.algorithms.geometry.direction_errors import on_tangent_plane
+from epipole.tasks.algorithms.geometry.optics_errors import shared_direction_covariance
 from epipole.tasks.algorithms.geometry.rotations import (
     interpolate_quaternions,
     matrix_from_quaternion,
@@ -50,10 +51,10 @@ def view_objects(
     if not tracked.num_rows or not epochs.num_rows:
         return empty(VIEWS)
     camera = camera_of(cameras, int(frames.camera[0]))
-    cov_optics = optics_covariance_of(cameras, int(frames.camera[0]))
-    tracklets = tracklet_sightings(frames, tracked, camera, cov_optics, settings)
+    tracklets = tracklet_sightings(frames, tracked, camera, settings)
     query = _queries(tracklets, epochs, frames)
-    return _view_table(frames, tracklets, query, epochs, camera, settings)
+    cov_optics = optics_covariance_of(cameras, int(frames.camera[0]))
+    return _view_table(frames, tracklets, query, epochs, camera, cov_optics, settings)
 
 
 class _EpochQueries(NamedTuple):
@@ -102,6 +103,7 @@ def _view_table(
     query: _EpochQueries,
     epochs: pa.Table,
     camera: Camera,
+    cov_optics: Array,
     settings: Settings,
 ) -> pa.Table:
     tracklet, row, served = query
@@ -124,11 +126,16 @@ def _view_table(
     centroid, missed = _centroids(tracklets, query)
     q = interpolate_quaternions((frames.time_ns - origin) / 1e9, frames.q_sensor_from_icrs, at_s)
     u, fitted = motion.u, motion.fitted
-    u_sensor = np.einsum("nij,nj->ni", matrix_from_quaternion(q), aberrate(u, v[served]))
+    R = matrix_from_quaternion(q)
+    u_sensor = np.einsum("nij,nj->ni", R, aberrate(u, v[served]))
     x_px, y_px = project(camera, u_sensor)
     r_km, v_km_s = _carried(frames, served, array(epochs, "dt_s")[row])
     cov_noise, cov_bias = (on_tangent_plane(u, cov) for cov in motion[2:4])
     cov_noise, cov_bias, blend_rad2 = _without_blends(tracklet, cov_noise, cov_bias)
+    if cov_optics.any():
+        stars = frames.from_stars[served]
+        shared = shared_direction_covariance(camera, cov_optics, u_sensor, stars)
+        cov_bias = cov_bias + on_tangent_plane(u, np.swapaxes(R, 1, 2) @ shared @ R)
     kept = np.isfinite(x_px) & np.isfinite(r_km[:, 0])
     columns = {
         "epoch": array(epochs, "epoch")[row],

@@ -145,6 +145,18 @@ def test_attitude_errors_are_honest(log, found):
     np.testing.assert_allclose(sigma**2, np.diagonal(cov, axis1=1, axis2=2), rtol=1e-12)
 
 
+def test_the_error_of_the_optics_is_in_the_sigma_of_every_attitude(log, found, catalogue):
+    cov = np.zeros((9, 9))
+    cov[2, 2] = 5.0**2  # a principal point off along columns: a turn about y
+    fitted = log.run(catalogue, cameras=cameras_of({"s": DISTORTED}, cov))
+    before, after = (stack(f.solutions, "sigma_{}_arcsec") for f in (found, fitted))
+    expected = np.hypot(before[:, 1], 5.0 * DISTORTED.pixel_rad / ARCSEC)
+    np.testing.assert_allclose(after[:, 1], expected, rtol=0.05)
+    np.testing.assert_allclose(after[:, 0], before[:, 0], rtol=0.2)
+    own = [stack_covariance(f.solutions, "cov_att_{}_arcsec2") for f in (found, fitted)]
+    np.testing.assert_array_equal(own[0], own[1])
+
+
 def test_an_unknown_centroid_error_is_estimated(found):
     at_centre = array(found.detections, "sigma_arcsec").max() * ARCSEC / DISTORTED.pixel_rad
     assert at_centre == pytest.approx(0.2, rel=0.05)

@@ -3,13 +3,15 @@
 import numpy as np
 import pytest
 from scenes.associations import filled
+from scenes.cameras import cameras_of
 
 from epipole.schemas.bridge import array, stack, stack_covariance, unstack
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import DETECTIONS, EPOCHS
-from epipole.schemas.work_tables import CAMERAS, SOLUTIONS
+from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
 from epipole.tasks.algorithms.geometry.sky import radec_from_unit, tangent_basis, unit_from_radec
 from epipole.tasks.solve.views.view_objects import view_objects
@@ -18,6 +20,7 @@ T0 = 1_554_091_200_000_000_000
 N_FRAMES, N_OBJECTS = 61, 4
 CENTROID, STATED = 4.0, 35.0  # [arcsec]
 PIXEL = 1 / 3000  # [rad]
+CAMERA = Camera(1024, 1024, 1 / PIXEL, 1 / PIXEL, 511.5, 511.5)
 RATE = 40 * ARCSEC  # [rad/s]
 APART_S = 13  # epochs so far apart share no detection
 
@@ -40,8 +43,8 @@ def views_of_priors(seed, white, constant):
     return views, stack(views, "u{}") - true[order] / np.linalg.norm(true[order], axis=1)[:, None]
 
 
-def views_of(seen, source, flux):
-    """Views of objects by a sensor that looks along x of the ICRS.
+def views_of(seen, source, flux, cov_optics=None):
+    """Views of objects by a sensor that looks along x of the ICRS, errors of its optics or not.
 
     `seen` has the frame, the number of the object and the direction of each detection.
     """
@@ -67,10 +70,7 @@ def views_of(seen, source, flux):
         "tracklet_id": name[item], "track_id": name[item], "flux": flux,
     })  # fmt: skip
     epochs = filled(EPOCHS, N_FRAMES, key | {"epoch": time, "dt_s": np.zeros(N_FRAMES)})
-    camera = filled(CAMERAS, 1, {
-        "sensor_id": ["s"], "width": [1024], "height": [1024], "fx_px": [1 / PIXEL],
-        "fy_px": [1 / PIXEL], "cx_px": [511.5], "cy_px": [511.5],
-    })  # fmt: skip
+    camera = cameras_of({"s": CAMERA}, cov_optics)
     views = view_objects(epochs, solutions, detections, camera, Settings())
     return views.sort_by([("tracklet_id", "ascending"), ("epoch", "ascending")])
 
@@ -146,3 +146,28 @@ def test_a_neighbour_s_light_widens_the_error_of_the_views_it_touches(seed):
     # Without what the blend adds, some would be far outside their covariance.
     own = np.trace(cov, axis1=1, axis2=2) / 2 - blend
     assert (np.sum(e**2, axis=1) / own).max() > 30
+
+
+@pytest.mark.parametrize(
+    ("number", "sigma", "in_stars_px", "in_prior_px"),
+    [(2, 5.0, 0.0, 5.0), (0, 30.0, 2.2, 2.2)],  # principal point; focal length, 1 %
+)
+def test_what_the_attitude_does_not_compensate_of_the_optics_is_a_bias(
+    number, sigma, in_stars_px, in_prior_px
+):
+    """An object 220 px from the middle of the image, along columns."""
+    t = np.arange(N_FRAMES)
+    at = np.array([1.0, 220 * PIXEL, 0.0]) + np.outer(t * 1e-9, [0.0, 1.0, 0.0])
+    seen = {"frame": t, "item": np.zeros(N_FRAMES, int), "u": at}
+    cov_optics = np.zeros((9, 9))
+    cov_optics[number, number] = sigma**2
+    for source, expected_px in (("stars", in_stars_px), ("prior", in_prior_px)):
+        bias = [
+            stack_covariance(
+                views_of(seen, source, np.full(N_FRAMES, np.nan), cov), "cov_bias_{}_rad2",
+                TANGENT_AXES,
+            )
+            for cov in (np.zeros((9, 9)), cov_optics)
+        ]  # fmt: skip
+        added_px = np.sqrt(np.trace(bias[1] - bias[0], axis1=1, axis2=2)) / PIXEL
+        np.testing.assert_allclose(added_px, expected_px, atol=0.15)
