@@ -83,7 +83,8 @@ FRAMES = schema(
             unit="arcsec",
             frame="sensor",
             null=True,
-            doc="1-sigma attitude error about the sensor axis",
+            doc="1-sigma attitude error about the sensor axis, the error that all frames share "
+            "from fitted optics included",
         ),
         column("residual_px", F64, unit="px", null=True, doc="Rms of the stars' image residuals."),
         *axes("{}_km", unit="km", frame="GCRF", null=True, doc="Sensor position"),
