@@ -276,13 +276,13 @@ def _fit(
     basis : (9, k) float
         What is free, in units of the prior.
     sigma_px
-        Error of the images, per axis; 0: that of the residuals.
+        Error of the images, per axis, if it is known; 0: that of the residuals.
     """
     scale, told, k = _prior_sigma(given), _values(given), basis.shape[1]
     used = _degrees_of_freedom(images, basis)
     for _ in range(ITERATIONS):
         r, J_turn, J_optics = _linearise(camera, images.xy, u)
-        sigma = sigma_px or _robust_sigma(r, used)
+        sigma = max(sigma_px, _robust_sigma(r, used))  # far from the stars all weigh alike
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12)) / sigma**2
         J_optics = J_optics * scale @ basis
         A = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_turn), images.starts)
