@@ -14,5 +14,5 @@ def cameras_of(optics: dict[str, Camera], cov: np.ndarray | None = None) -> pa.T
     n = len(optics)
     covs = np.tile(np.zeros((9, 9)) if cov is None else cov, (n, 1, 1))
     values = {name: [getattr(c, name) for c in optics.values()] for name in Camera._fields}
-    key = {"sensor_id": list(optics), "time": [0] * n}
+    key = {"sensor_id": list(optics), "time": [1] * n}
     return table(CAMERAS, key | values | unstack_covariance("cov_{}", covs, OPTICS_AXES))

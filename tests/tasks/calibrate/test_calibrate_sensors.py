@@ -50,6 +50,7 @@ def test_only_a_sensor_whose_optics_differ_gets_new_ones():
     fx = array(found.cameras, "fx_px")
     assert fx[0] == pytest.approx(TRUE.fx_px, abs=1.0)
     assert fx[1] == SENT.fx_px
+    assert found.cameras["time"].equals(told["time"])
     off = array(found.calibrations, "fx_px") - [TRUE.fx_px, SENT.fx_px]
     assert np.all(np.abs(off) < 4 * array(found.calibrations, "sigma_fx_px"))
 
