@@ -54,6 +54,9 @@ Names = Mapping[str, Mapping[str, str]]
 
 # After the first correction the views of a sensor fit objects; from these the second is exact.
 MOST_CORRECTIONS = 2
+# With better optics more stars take part, and they fit better still. Two are enough but for a
+# sensor that was hardly identified before.
+MOST_CALIBRATIONS = 4
 
 
 def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> OrderedFrames:
@@ -115,7 +118,8 @@ def calibrate(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     """Fit each sensor's optics to its stars; identify again the sensors whose optics differ."""
     mode = settings.identification.calibrate
     calibrations, told = CALIBRATIONS.empty_table(), work.cameras
-    for number in range(1, 3 if mode == "use" else 2):  # with better optics more stars take part
+    most = MOST_CALIBRATIONS if mode == "use" else 1
+    for number in range(1, most + 1):
         if mode == "off":
             break
         futures = [

@@ -59,8 +59,8 @@ class WorkFolder(NamedTuple):
         return Parts(self.root / Stage.IDENTIFY / str(sensor.number))
 
     def identified_again(self, sensor: Sensor, calibration: int) -> Parts:
-        """Return the parts identified with the optics of calibration 1 or 2, or with a camera that
-        was searched for (0): `IDENTIFIED`."""
+        """Return the parts identified with the optics of a calibration, from 1, or with a camera
+        that was searched for (0): `IDENTIFIED`."""
         return Parts(self.root / Stage.CALIBRATE / str(calibration) / str(sensor.number))
 
     def corrected(self, sensor: Sensor, round_: int) -> Parts:
