@@ -194,7 +194,8 @@ def objects(field: float, kind: str, seed: int, seconds: int) -> str:
         evaluate = [*COMMAND, "evaluate", str(out), "--truth", f"{log}.truth", "--json"]
         made = subprocess.run(evaluate, check=True, capture_output=True, text=True)
         found = json.loads(made.stdout)
-    numbers = " | ".join(f"{found[name]:.4g}" for name in MEASURES)
+    known = (found[name] for name in MEASURES)  # null where nothing was found
+    numbers = " | ".join("" if value is None else f"{value:.4g}" for value in known)
     return f"| {field:g} | {kind} | {seed} | {numbers} |"
 
 
