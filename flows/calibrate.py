@@ -153,7 +153,9 @@ def _residual(report: CameraReport) -> str:
 def _image(report: CameraReport) -> str:
     size = f"{report.told.width} x {report.told.height} px"
     return (
-        size if report.is_told else f"{size}, as far as centroids reach: no calibration in the log"
+        size
+        if report.image_is_told
+        else f"{size}, as far as centroids reach: no calibration in the log"
     )
 
 

@@ -79,8 +79,8 @@ def nightly(
             work_folder(work_root(out), chosen, key) as folder,
         ):
             work = identify(frames, spans, WorkFolder(folder), settings)
-            work = find_cameras(work, settings)
-            work, calibrations = calibrate(work, settings)
+            work, told = find_cameras(work, settings)
+            work, calibrations = calibrate(work, told, settings)
             while True:
                 track(work, settings)
                 solved = solve(work, settings)

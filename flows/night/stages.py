@@ -89,11 +89,19 @@ def _identify(stage: Stage, work: Work, settings: Settings) -> Work:
     return work
 
 
-def find_cameras(work: Work, settings: Settings) -> Work:
-    """Search for the cameras of sensors that identify nothing; identify these again."""
+def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
+    """Search for the cameras of sensors that identify nothing; identify these again.
+
+    Returns
+    -------
+    work
+        With the cameras that were found.
+    told
+        CAMERAS as the log tells them, but mirrored where the images are.
+    """
     mode = settings.identification.calibrate
     if mode == "off":
-        return work
+        return work, work.cameras
     futures = [
         find_sensor_camera.submit(
             work.frames, sensor, work.identified[sensor], spans, work.cameras, settings
@@ -108,16 +116,20 @@ def find_cameras(work: Work, settings: Settings) -> Work:
         LOGGER.warning("%s%s", finding, used)
     found = [finding for finding in findings if finding.camera is not None]
     if mode == "report" or not found:
-        return work
+        return work, work.cameras
     names = {finding.sensor_id for finding in found}
-    cameras = [finding.cameras(work.cameras) for finding in found]
-    return _identify_again(work, cameras, names, 0, settings)
+    told = _with_cameras(work.cameras, [f.cameras(work.cameras, f.as_told) for f in found], names)
+    cameras = [f.cameras(work.cameras, f.camera) for f in found if f.camera]
+    return _identify_again(work, cameras, names, 0, settings), told
 
 
-def calibrate(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
-    """Fit each sensor's optics to its stars; identify again the sensors whose optics differ."""
+def calibrate(work: Work, told: pa.Table, settings: Settings) -> tuple[Work, pa.Table]:
+    """Fit each sensor's optics to its stars; identify again the sensors whose optics differ.
+
+    `told` are the cameras of `find_cameras`.
+    """
     mode = settings.identification.calibrate
-    calibrations, told = CALIBRATIONS.empty_table(), work.cameras
+    calibrations = CALIBRATIONS.empty_table()
     most = MOST_CALIBRATIONS if mode == "use" else 1
     for number in range(1, most + 1):
         if mode == "off":
@@ -145,18 +157,21 @@ def _identify_again(
     settings: Settings,
 ) -> Work:
     """Identify the sensors whose optics differ again, with the fitted optics."""
-    unchanged = work.cameras.filter(
-        pc.invert(pc.is_in(work.cameras["sensor_id"], pa.array(sorted(departed))))
-    )
-    cameras = concat(CAMERAS, [unchanged, *fitted]).sort_by(
-        [("sensor_id", "ascending"), ("time", "ascending")]
-    )
+    cameras = _with_cameras(work.cameras, fitted, departed)
     spans = {sensor: of_sensor for sensor, of_sensor in work.spans.items()
              if sensor.sensor_id in departed}  # fmt: skip
     where = {sensor: work.folder.identified_again(sensor, number) for sensor in spans}
     departed_work = work._replace(cameras=cameras, spans=spans, identified=where)
     _identify(Stage.CALIBRATE, departed_work, settings)
     return work._replace(cameras=cameras, identified={**work.identified, **where})
+
+
+def _with_cameras(cameras: pa.Table, others: Sequence[pa.Table], sensors: set[str]) -> pa.Table:
+    """Return CAMERAS with other rows for these sensors, sorted."""
+    unchanged = cameras.filter(pc.invert(pc.is_in(cameras["sensor_id"], pa.array(sorted(sensors)))))
+    return concat(CAMERAS, [unchanged, *others]).sort_by(
+        [("sensor_id", "ascending"), ("time", "ascending")]
+    )
 
 
 def track(work: Work, settings: Settings) -> None:

@@ -16,7 +16,11 @@ from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS, STARS
 from epipole.schemas.work_tables import CAMERAS
-from epipole.tasks.algorithms.geometry.camera import Camera, unproject
+from epipole.tasks.algorithms.geometry.camera import (
+    Camera,
+    counted_the_other_way,
+    unproject,
+)
 from epipole.tasks.algorithms.geometry.optics_calibration import (
     OpticsFit,
     StarImages,
@@ -157,6 +161,8 @@ def _fit(given: Camera, present: _Optics, images: StarImages) -> tuple[OpticsFit
     Optics that the log tells wrong are fitted in steps; then what they leave uncertain must reach
     the frames once, however near the present optics are.
     """
+    if present.camera.fy_px < 0:
+        return _fit_upward(given, present, images)
     free = calibrate_optics(given, images, present.camera)
     if free is None:
         return None
@@ -164,6 +170,21 @@ def _fit(given: Camera, present: _Optics, images: StarImages) -> tuple[OpticsFit
         return free, False
     fit = calibrate_in_steps(given, images, free, present.camera)
     return fit, not present.is_fitted or fit.gain > REAL_GAIN
+
+
+def _fit_upward(
+    given: Camera, present: _Optics, images: StarImages
+) -> tuple[OpticsFit, bool] | None:
+    """Return what `_fit` does for rows that count upward: fitted as rows that count down."""
+    given, _ = counted_the_other_way(given, images.y_px)
+    camera, y_px = counted_the_other_way(present.camera, images.y_px)
+    fitted = _fit(given, present._replace(camera=camera), images._replace(y_px=y_px))
+    if fitted is None:
+        return None
+    fit, departs = fitted
+    upward, _ = counted_the_other_way(fit.camera, y_px)
+    sign = np.where(np.isin(OPTICS, ["fy_px", "cy_px"]), -1.0, 1.0)
+    return fit._replace(camera=upward, cov=fit.cov * np.outer(sign, sign)), departs
 
 
 def _covariance_columns(cov: Array) -> dict[str, float]:

@@ -7,10 +7,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
-from epipole.schemas.bridge import array, flatten, table
+from epipole.schemas.bridge import array, flatten, table, unstack_covariance
+from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CAMERAS
-from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
 from epipole.tasks.algorithms.star_identification.camera_search import FEWEST
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensors
 from epipole.tasks.calibrate.find_camera import find_agreed_camera, image_frames, skies_at
@@ -20,13 +21,15 @@ from epipole.tasks.identify.place_sensors import place_sensors
 TRIED = 6  # frames in which a camera is searched for
 REACH = 1.5  # by which a told focal length may be off, either way
 NARROWEST_DEG, WIDEST_DEG = 2.0, 60.0  # fields of an unknown focal length
+NEAR = 1.001  # a guessed focal length is wrong: optics are fitted in steps
 ROUNDS = 3  # with better optics more stars take part
 
 
 class CameraReport(NamedTuple):
     """What is known of a sensor's camera after calibration.
 
-    told : the log's; a guess of image and field where `is_told` is false
+    told : the log's; a guess where `is_told` is false
+    image_is_told : the size of the image is the log's
     reach : by which factor other focal lengths than the told one were tried
     camera : the one found, None where the frames show no stars
     sigma : by the names of the optics; empty with too few stars for a fit
@@ -38,6 +41,7 @@ class CameraReport(NamedTuple):
     told: Camera
     reach: float
     is_told: bool
+    image_is_told: bool
     camera: Camera | None
     sigma: dict[str, float]
     n_frames: int
@@ -73,14 +77,15 @@ def calibrate_unknown(
     told, reach = _told(exposures, cameras, field_deg)
     places = place_sensors(exposures, states, settings)
     found = _search(exposures, places, told, reach, settings)
+    is_told = cameras.num_rows > 0 and field_deg is None
     nothing = CameraReport(
-        sensor_id, told, reach, cameras.num_rows > 0, None, {}, exposures.num_rows, 0, 0, np.nan
-    )
+        sensor_id, told, reach, is_told, cameras.num_rows > 0, None, {}, exposures.num_rows, 0, 0,
+        np.nan,
+    )  # fmt: skip
     if found is None:
         return nothing
-    values = {name: [value] for name, value in found._asdict().items()}
-    row = table(CAMERAS, {"sensor_id": [sensor_id], "time": exposures["time"][:1]} | values)
-    return _fitted(nothing, exposures, places, row, settings)
+    start = nothing._replace(camera=found)
+    return _fitted(start, exposures, places, settings)
 
 
 def _told(exposures: pa.Table, cameras: pa.Table, field_deg: float | None) -> tuple[Camera, float]:
@@ -122,15 +127,33 @@ def _search(
     return found and found.camera
 
 
+def _as_table(report: CameraReport, camera: Camera) -> pa.Table:
+    """Return CAMERAS of the sensor, as a log would tell this camera."""
+    key = {"sensor_id": [report.sensor_id], "time": [0]}
+    values = {name: [value] for name, value in camera._asdict().items()}
+    cov = unstack_covariance("cov_{}", np.zeros((1, 9, 9)), OPTICS_AXES)
+    return table(CAMERAS, key | values | cov)
+
+
+def _given(report: CameraReport) -> Camera:
+    """Return the camera that the fit starts from: the told one, or one near that found."""
+    if report.is_told:
+        return mirrored(report.told) if report.is_mirrored else report.told
+    assert report.camera is not None
+    f = report.camera.fx_px * NEAR
+    return report.camera._replace(fx_px=f, fy_px=f * np.sign(report.camera.fy_px))
+
+
 def _fitted(
-    report: CameraReport, exposures: pa.Table, places: pa.Table, cameras: pa.Table,
-    settings: Settings,
-) -> CameraReport:  # fmt: skip
+    report: CameraReport, exposures: pa.Table, places: pa.Table, settings: Settings
+) -> CameraReport:
     """Return the report with the camera fitted to the stars of all frames."""
     catalogue = read_star_catalogue(settings.identification.catalogue)
+    assert report.camera is not None
+    cameras, told = _as_table(report, report.camera), _as_table(report, _given(report))
     for _ in range(ROUNDS):
         identified = identify_stars(exposures, places, cameras, catalogue, settings)
-        fit: Calibrated = calibrate_sensors(identified.stars, cameras)
+        fit: Calibrated = calibrate_sensors(identified.stars, cameras, told)
         cameras = fit.cameras
         if not fit.departed:
             break

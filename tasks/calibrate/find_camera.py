@@ -18,7 +18,7 @@ from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES
 from epipole.tasks.algorithms.constants import DAY_NS, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
 from epipole.tasks.algorithms.star_identification.camera_search import (
     FEWEST,
     FoundCamera,
@@ -55,11 +55,16 @@ class CameraFinding(NamedTuple):
     told: Camera
     camera: Camera | None
 
-    def cameras(self, told: pa.Table) -> pa.Table:
-        """Return the sensor's rows of CAMERAS with the camera that was found."""
-        assert self.camera is not None
+    @property
+    def as_told(self) -> Camera:
+        """The camera that the log tells, mirrored where the image is."""
+        upward = self.camera is not None and self.camera.fy_px < 0
+        return mirrored(self.told) if upward != (self.told.fy_px < 0) else self.told
+
+    def cameras(self, told: pa.Table, camera: Camera) -> pa.Table:
+        """Return the sensor's rows of CAMERAS with this camera."""
         rows = rows_of(told.filter(pc.field("sensor_id") == self.sensor_id))
-        return pa.Table.from_pylist([row | self.camera._asdict() for row in rows], schema=CAMERAS)
+        return pa.Table.from_pylist([row | camera._asdict() for row in rows], schema=CAMERAS)
 
     def __str__(self) -> str:
         """Return what was found, in a line for people."""
