@@ -1,6 +1,6 @@
 """Alignment: position errors of sensors that never expose together, or always do.
 
-python tests/benchmarks/bench_alignment.py
+python tests/benchmarks/bench_alignment.py [--seeds N] [--seconds N]
 """
 
 import argparse
@@ -29,14 +29,14 @@ CASES = {
 }
 
 
-def scene_of(rates_hz: list[float], changes: dict[str, float | None]) -> Scene:
+def scene_of(rates_hz: list[float], changes: dict[str, float | None], seconds: float) -> Scene:
     """Return four low sensors and nine geostationary objects at other frame rates."""
     scene = read_scene("four_sensor_geo")
     sensors = [
         sensor.model_copy(update={"rate_hz": rate, **changes})
         for sensor, rate in zip(scene.sensors, rates_hz, strict=True)
     ]
-    return scene.model_copy(update={"sensors": sensors})
+    return scene.model_copy(update={"sensors": sensors, "duration_s": seconds})
 
 
 def errors_of(scene: Scene, seed: int) -> Array:
@@ -53,10 +53,11 @@ def errors_of(scene: Scene, seed: int) -> Array:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each scene")
     chosen = parser.parse_args()
     print(f"{'exposures':<28} {'positions':>9} {'median km':>9} {'rms km':>7} {'95 % km':>8}")
     for name, (rates_hz, changes) in CASES.items():
-        scene = scene_of(rates_hz, changes)
+        scene = scene_of(rates_hz, changes, chosen.seconds)
         found = np.concatenate([errors_of(scene, seed) for seed in range(chosen.seeds)])
         rms, high = np.sqrt(np.mean(found**2)), np.quantile(found, 0.95)
         print(

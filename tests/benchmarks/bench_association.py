@@ -1,7 +1,7 @@
 """Association: points at one instant, many sensors, tracklets, and the published method.
 
-``python tests/benchmarks/bench_association.py [TABLE ...] [--seeds N]``, tables: points, openptv,
-floor, scale, tracklets.
+``python tests/benchmarks/bench_association.py [TABLE ...] [--seeds N] [--false N ...]``,
+tables: points, openptv, floor, scale, tracklets.
 
 Points: F1 over the objects that at least three sensors detect. A group is right if it holds at
 least three points of its object and no other point. OpenPTV runs on the same points if `optv` is
@@ -79,7 +79,7 @@ def cell(
     return 100 * total.f1, total, 1e3 * float(np.median(took))
 
 
-def openptv_table(seeds: int) -> None:
+def openptv_table(seeds: int, false: list[int]) -> None:
     """Print OpenPTV's F1 on the same points, 4 sensors, by the width of its epipolar band."""
     try:
         from openptv import associate_by_openptv
@@ -87,7 +87,7 @@ def openptv_table(seeds: int) -> None:
         print("\nOpenPTV: not installed (pip install '.[bench]')")
         return
     print("\nOpenPTV, groups in all four sensors or in three: F1 % (median ms) by band, px")
-    for n_false in FALSE:
+    for n_false in false:
         best = []
         for eps_px in BANDS_PX:
 
@@ -101,16 +101,16 @@ def openptv_table(seeds: int) -> None:
         print(f"4 | {n_false} | " + " | ".join(best), flush=True)
 
 
-def points_table(seeds: int) -> None:
+def points_table(seeds: int, false: list[int]) -> None:
     """Print the table of points at one instant."""
     associate(scene(0, 4, 20, 10).samples)  # compiles, before the timing
     print(f"\nPoints at one instant, 20 objects, {seeds} seeds per cell: F1 % (median ms)")
     print("sensors | false points | default | wanted, groups, right | published, L = 1 px")
     for n_sensors in (4, 8, 20):
-        for n_false in FALSE:
+        for n_false in false:
             f1, total, ms = cell(associate, n_sensors, 20, n_false, seeds)
             few = max(seeds // 10, 3) if n_sensors > 4 else seeds
-            lines, _, lines_ms = cell(by_lines, n_sensors, 20, n_false, min(few, 10))
+            lines, _, lines_ms = cell(by_lines, n_sensors, 20, n_false, min(few, seeds, 10))
             print(
                 f"{n_sensors} | {n_false} | {f1:.2f} ({ms:.1f}) | {total.wanted}, "
                 f"{total.groups}, {total.right} | {lines:.1f} ({lines_ms:.0f})",
@@ -269,11 +269,12 @@ def main() -> None:
         "tables", nargs="*", default=["points", "openptv", "floor", "scale", "tracklets"]
     )
     parser.add_argument("--seeds", type=int, default=30, help="scenes a cell")
+    parser.add_argument("--false", type=int, nargs="+", default=FALSE, help="false points")
     args = parser.parse_args()
     if "points" in args.tables:
-        points_table(args.seeds)
+        points_table(args.seeds, args.false)
     if "openptv" in args.tables:
-        openptv_table(args.seeds)
+        openptv_table(args.seeds, args.false)
     if "floor" in args.tables:
         floor_table(args.seeds)
     if "scale" in args.tables:

@@ -1,6 +1,6 @@
 """Star catalogues: what building one for a sensor costs, and what a deep one gives narrow fields.
 
-    python tests/benchmarks/bench_catalogue.py [build] [narrow] [--seeds 1 2 3]
+    python tests/benchmarks/bench_catalogue.py [build] [narrow] [--seeds 1 2 3] [--repeats 5]
 
 build: CPU time to the stars of a day, their grid and their pairs for four cameras, made and read
 from disk. narrow: simulated 2 degree fields of Gaia's stars to V 10 (512 px, a new attitude in
@@ -44,7 +44,6 @@ NOISE = {
     "0.5 px, 10 false, 20 % missing": {"sigma_px": 0.5, "false_points": 10.0, "star_drop": 0.2},
 }
 DAY = 18_000
-REPEATS = 5
 
 
 def cpu_ms(work: Callable[[], Any]) -> float:
@@ -53,19 +52,18 @@ def cpu_ms(work: Callable[[], Any]) -> float:
     return 1e3 * (time.process_time() - started)
 
 
-def bench_build(folder: Path) -> None:
+def bench_build(folder: Path, repeats: int) -> None:
     made = {"hipparcos": read_hipparcos, "deep": build_deep_catalogue}
     tables = {}
     for name, make in made.items():
-        took = [cpu_ms(make) for _ in range(REPEATS)]
-        tables[name] = make()
+        took = [cpu_ms(lambda: tables.update({name: make()})) for _ in range(repeats)]  # noqa: B023
         print(f"{name}: {tables[name].num_rows} stars, table made in {np.median(took):.0f} ms")
     print("camera, disk: stars ms, grid ms, pairs ms (stars, pairs)")
     for name, field, pixels, centroids in CAMERAS:
         catalogue = Catalogue(tables[name])
         for disk in ("off", str(folder / "cache")):
             os.environ["EPIPOLE_CACHE"] = disk
-            rows = [sky_cost(catalogue, field, pixels, centroids) for _ in range(REPEATS + 1)]
+            rows = [sky_cost(catalogue, field, pixels, centroids) for _ in range(repeats + 1)]
             stars, grid, pairs, *counts = np.median(rows[1:], axis=0)  # the first fills the disk
             where = "made" if disk == "off" else "from disk"
             print(f"{name} {field:g} deg, {where}: {stars:.0f}, {grid:.0f}, {pairs:.0f} {counts}")
@@ -146,10 +144,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("parts", nargs="*", default=["build", "narrow"])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
+    parser.add_argument("--repeats", type=int, default=5, help="of build")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         if "build" in arguments.parts:
-            bench_build(Path(folder))
+            bench_build(Path(folder), arguments.repeats)
         if "narrow" in arguments.parts:
             bench_narrow(Path(folder), arguments.seeds)
 

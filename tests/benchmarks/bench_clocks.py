@@ -1,6 +1,11 @@
-"""Clocks: offsets estimated from a minute of data, over their sigmas, and the decisions."""
+"""Clocks: offsets estimated from a minute of data, over their sigmas, and the decisions.
 
+python tests/benchmarks/bench_clocks.py [--offsets 0 0.005 ...]
+"""
+
+import argparse
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from four_sensors import runs
@@ -12,6 +17,9 @@ OFFSETS_S = (0.0, 0.005, -0.02, 0.05, -0.1, 0.2, -0.3, 0.5, -0.7, 1.0, -1.3, 2.0
 
 def main() -> None:
     """Print a row for each offset, then the scatter of all estimates over their sigmas."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--offsets", type=float, nargs="+", default=OFFSETS_S, help="seconds")
+    offsets_s = parser.parse_args().offsets
     estimates: list[Any] = []
     check_sensors = stages.check_sensors
 
@@ -19,11 +27,10 @@ def main() -> None:
         estimates.append(check_sensors(*args))
         return estimates[-1]
 
-    stages.check_sensors = recorded
     scores, wrong = [], 0
     print("| true s | estimate s | sigma s | wrong clock | others called wrong | left out |")
-    with runs() as run:
-        for k, offset_s in enumerate(OFFSETS_S):
+    with runs() as run, mock.patch.object(stages, "check_sensors", recorded):
+        for k, offset_s in enumerate(offsets_s):
 
             def late(scene: dict[str, Any], k: int = k, offset_s: float = offset_s) -> None:
                 scene["seed"] = 300 + k

@@ -1,5 +1,9 @@
-"""Identity: nine objects are observed for a minute, then not for a while, then again."""
+"""Identity: nine objects are observed for a minute, then not for a while, then again.
 
+python tests/benchmarks/bench_identity.py [--gaps 120 300 ...] [--seeds 1 2 3]
+"""
+
+import argparse
 from typing import Any
 
 import polars as pl
@@ -11,11 +15,15 @@ SEEDS = (1, 2, 3)
 
 def main() -> None:
     """Print for each gap: objects on both sides, recognised, and mistaken for another."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--gaps", type=int, nargs="+", default=GAPS_S, help="seconds")
+    parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
+    chosen = parser.parse_args()
     print("| gap s | on both sides | recognised | mistaken |")
     with runs() as run:
-        for gap_s in GAPS_S:
+        for gap_s in chosen.gaps:
             both = again = mistaken = 0
-            for seed in SEEDS:
+            for seed in chosen.seeds:
 
                 def gap(scene: dict[str, Any], gap_s: int = gap_s, seed: int = seed) -> None:
                     scene |= {"seed": seed, "duration_s": 120.0 + gap_s}

@@ -1,9 +1,9 @@
 """Two sensors over ten minutes, end to end: objects of both sensors, and of one sensor only.
 
-``python tests/benchmarks/bench_long_evidence.py [--seeds N] [--lone N] [--work DIR]`` simulates
-logs, runs them with and without evidence over more than half a minute, and evaluates. There are
-twenty geostationary objects. Objects that only one sensor sees are half way to these, and their
-motion in the image differs by 2"/s.
+``python tests/benchmarks/bench_long_evidence.py [--seeds N] [--lone N] [--minutes N]
+[--longest S ...] [--work DIR]`` simulates logs, runs them with and without evidence over more than
+half a minute, and evaluates. There are twenty geostationary objects. Objects that only one sensor
+sees are half way to these, and their motion in the image differs by 2"/s.
 """
 
 import argparse
@@ -22,8 +22,6 @@ from epipole.tasks.algorithms.simulation.orbits import state_at
 
 Array = npt.NDArray[np.float64]
 
-DURATION_S = 600.0
-MIDDLE_S = DURATION_S / 2  # when all objects are near the middle of the fields
 GEO_KM = np.array([-39359.89, 15125.76, 64.30])
 EARTH_RATE_RAD_S = np.array([0.0, 0.0, 7.2921159e-5])
 V_GEO_KM_S = np.cross(EARTH_RATE_RAD_S, GEO_KM)
@@ -58,14 +56,15 @@ magnitude = {magnitude}
 """
 
 
-def low_orbits(rng: np.random.Generator) -> list[Array]:
+def low_orbits(rng: np.random.Generator, duration_s: float) -> list[Array]:
     """Return the elements of two orbits from which the objects are always in view."""
+    times_s = np.array([0.0, duration_s / 2, duration_s])
     toward = GEO_KM / np.linalg.norm(GEO_KM)
     orbits: list[tuple[Array, Array]] = []
     while len(orbits) < 2:
         angles = np.radians([rng.uniform(20, 100), rng.uniform(0, 360), 0, rng.uniform(0, 360)])
         elements = np.array([rng.uniform(6950, 7500), 0.0, *angles])
-        path = np.array([state_at(elements, np.float64(t))[0] for t in (0, MIDDLE_S, DURATION_S)])
+        path = np.array([state_at(elements, np.float64(t))[0] for t in times_s])
         apart = [np.cross(path - other, toward) for _, other in orbits]
         if (path @ toward > 2000).all() and all(
             np.linalg.norm(a, axis=1).min() > SHORTEST_BASELINE_KM for a in apart
@@ -74,14 +73,15 @@ def low_orbits(rng: np.random.Generator) -> list[Array]:
     return [elements for elements, _ in orbits]
 
 
-def scene(seed: int, n_lone: int) -> str:
+def scene(seed: int, n_lone: int, duration_s: float) -> str:
     """Return a scene as TOML."""
     rng = np.random.default_rng(seed)
-    orbits = low_orbits(rng)
-    followed = propagate(np.concatenate([GEO_KM, V_GEO_KM_S]), -MIDDLE_S)
+    orbits = low_orbits(rng, duration_s)
+    middle_s = duration_s / 2  # when all objects are near the middle of the fields
+    followed = propagate(np.concatenate([GEO_KM, V_GEO_KM_S]), -middle_s)
     parts = [
         HEAD.format(
-            duration_s=DURATION_S, seed=seed, r=followed[:3].tolist(), v=followed[3:].tolist()
+            duration_s=duration_s, seed=seed, r=followed[:3].tolist(), v=followed[3:].tolist()
         )
     ]
     for number, elements in enumerate(orbits):
@@ -99,10 +99,10 @@ def scene(seed: int, n_lone: int) -> str:
         for _ in range(OBJECTS)
     ]
     for elements in orbits:
-        r, v = state_at(elements, np.float64(MIDDLE_S))
+        r, v = state_at(elements, np.float64(middle_s))
         states += [lone(rng, r, v) for _ in range(n_lone)]
     for state in states:
-        start = propagate(state, -MIDDLE_S)
+        start = propagate(state, -middle_s)
         parts.append(
             TARGET.format(
                 r=start[:3].tolist(), v=start[3:].tolist(), magnitude=float(rng.uniform(7, 9))
@@ -143,15 +143,17 @@ def main() -> None:
     parser.add_argument(
         "--work", type=Path, help="folder for logs and datasets; default: temporary"
     )
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--longest", type=float, nargs="+", default=[0.0, 600.0], help="seconds")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         work = args.work or Path(folder)
         work.mkdir(parents=True, exist_ok=True)
         for seed in range(1, args.seeds + 1):
             log, toml = work / f"{seed}.mcap", work / f"{seed}.toml"
-            toml.write_text(scene(seed, args.lone))
+            toml.write_text(scene(seed, args.lone, 60.0 * args.minutes))
             epipole("simulate", toml, "--out", log)
-            for longest_s in (0.0, 600.0):
+            for longest_s in args.longest:
                 settings = work / f"{longest_s:.0f}.toml"
                 settings.write_text(f"[association]\nlongest_span_s = {longest_s}\n")
                 out = work / f"{seed}-{longest_s:.0f}"

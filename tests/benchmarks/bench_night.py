@@ -1,8 +1,8 @@
 """Time and memory of a whole night, by stage, and how they grow with the length of the night.
 
-`python tests/benchmarks/bench_night.py [--shares 16 4 1]`. Each row is one `epipole run` of a
-simulated log, in its own process and with cached kernels: 4 sensors at 5 Hz with about 25 centroids
-per frame.
+`python tests/benchmarks/bench_night.py [--shares 16 4 1] [--hours 11.4]`. Each row is
+one `epipole run` of a simulated log, in its own process and with cached kernels: 4 sensors at 5 Hz
+with about 25 centroids per frame.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from pathlib import Path
 from whole_runs import STAGES, whole_run
 
 SCENES = Path(__file__).parents[2] / "io" / "simulation" / "built_in"
-HOURS = 11.4  # the Earth hides the field of view for a third of it
+HOURS = 11.4  # of the whole night; the Earth hides the field of view for a third of it
 TOLD_APART = {name: begins for name, begins in STAGES.items() if name != "check"}
 EMPTY_TASKS = """
 import statistics, sys, time
@@ -91,6 +91,7 @@ def main() -> None:
     """Print the rows of the tables in BENCHMARKS.md."""
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--shares", type=int, nargs="+", default=[16, 4, 1])
+    arguments.add_argument("--hours", type=float, default=HOURS)
     chosen = arguments.parse_args()
     columns = [
         "find",
@@ -109,14 +110,14 @@ def main() -> None:
         where = Path(folder)
         for share in chosen.shares:
             log = where / f"night{share}.mcap"
-            simulate_night(log, HOURS / share)
+            simulate_night(log, chosen.hours / share)
             got = run(log, where / f"out{share}")
             values = [f"{got[name]:.1f}" for name in columns]
             per_frame = f"{got['cpu'] / got['frames'] * 1e6:.0f}"
             print(f"| 1/{share} | {got['frames']:,} | " + " | ".join([*values, per_frame]) + " |",
                   flush=True)  # fmt: skip
             log.unlink()
-    spans = int(HOURS * 2) + 1
+    spans = int(chosen.hours * 2) + 1
     n_tasks = spans * (4 + 4 + 1) + 3 * 4
     cpu, wall = prefect_share(n_tasks)
     print(f"{n_tasks} tasks that do nothing: {cpu:.2f} s CPU, {wall:.2f} s wall")

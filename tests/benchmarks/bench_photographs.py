@@ -20,18 +20,18 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
+from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.sky import boresight_angles
 from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
-from epipole.tasks.algorithms.star_identification.sensor import (
-    IdentifiedSensor,
-    UnscaledCentroids,
-    identify_sensor,
-)
+from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, identify_sensor
+from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 Array = npt.NDArray[np.float64]
-HOW = Search(3.7, -np.log(1e-6), 0.5, np.nan)  # the defaults of a run
+DEFAULT = Settings().identification
+HOW = Search(DEFAULT.gate_sigma, -np.log(DEFAULT.false_alarm), DEFAULT.time_limit_s, np.nan)
 
 
 def read_list(path: Path) -> tuple[Array, Array, npt.NDArray[np.int64]]:
@@ -52,9 +52,12 @@ def identify(
     unknown = np.full(len(x_px), np.nan)
     u = unproject(camera, x_px, y_px)
     optics = FieldOfView(camera.half_diagonal_rad, box, camera.pixel_rad)
-    spots = UnscaledCentroids(u, pixel_angle(camera, u), unknown, unknown, np.zeros(3), optics)
+    spots = UnscaledCentroids(
+        np.array([0, len(u)]), u, pixel_angle(camera, u), unknown, unknown, np.zeros((1, 3)),
+        [optics], np.zeros(1, np.int64),
+    )  # fmt: skip
     skies = CachedSkies(catalogue, day, camera.pixel_rad, 2.0)
-    return identify_sensor(np.zeros(1), [spots], [None], skies, None, HOW)
+    return identify_sensor(np.zeros(1), spots, no_priors(1), skies, None, HOW)
 
 
 def main() -> None:
@@ -79,7 +82,7 @@ def main() -> None:
         f = focal * (1 + percent / 100)
         camera = Camera(arguments.width, arguments.height, f, f, *middle)
         found = identify(x_px, y_px, camera, catalogue, day)
-        solution = found.solutions[0]
+        solution = found.solutions.frame(0)
         if solution is None:
             refused += 1
             continue

@@ -32,8 +32,13 @@ def bench_simulate(hours: float, sensors: int) -> dict[str, float]:
     }
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Print time and memory as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--hours", type=float, default=2.0)
     parser.add_argument("--sensors", type=int, default=6)
     print(json.dumps(bench_simulate(**vars(parser.parse_args()))))
+
+
+if __name__ == "__main__":
+    main()

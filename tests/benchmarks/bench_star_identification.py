@@ -187,7 +187,7 @@ def solvers(frames: Frames, cache: Path, peers: bool) -> dict[str, Callable[[], 
     return made
 
 
-def tracking_us(frames: Frames, n_frames: int = 20_000) -> tuple[float, float]:
+def tracking_us(frames: Frames, n_frames: int) -> tuple[float, float]:
     """Return CPU microseconds per frame of a sensor that is followed, and centroids per frame.
 
     It turns evenly, sees 90 % of its stars to 0.2 px, and 3 false points.
@@ -226,6 +226,7 @@ def main() -> None:
     options.add_argument("--no-peers", action="store_true")
     options.add_argument("--only", default="", help="solvers whose names contain this")
     options.add_argument("--cells", action="store_true", help="right %% by cell as well")
+    options.add_argument("--tracked", type=int, default=20_000, help="frames that are followed")
     given = options.parse_args()
     cache = Path(gettempdir()) / "epipole-bench"
     cache.mkdir(exist_ok=True)
@@ -252,7 +253,7 @@ def main() -> None:
             if given.cells:
                 print_cells(row, frames)
         if given.only in "tracking":
-            us, centroids_a_frame = tracking_us(frames)
+            us, centroids_a_frame = tracking_us(frames, given.tracked)
             print(f"tracking, {centroids_a_frame:.1f} centroids: {us:.1f} CPU microseconds a frame")
 
 

@@ -14,11 +14,11 @@ import pyarrow.compute as pc
 from epipole.flows.command_line.log_info import of_sensor, sensor_ids
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.io.work.part_tables import VIEWED
-from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import SensorParts, SolvedParts
+from epipole.io.work.parts import write_part
+from epipole.io.work.places import SolvedParts, ViewedParts
 from epipole.schemas.bridge import array, concat, stack
 from epipole.schemas.settings import Settings
-from epipole.schemas.spans import Span, spans_between
+from epipole.schemas.spans import Sensor, Span, spans_between
 from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import HOT_SUSPECTS, OBJECT_MEMBERS, SOLUTIONS, TRACKLET_RUNS
 from epipole.tasks.algorithms.simulation.orbits import state_at
@@ -90,34 +90,32 @@ def track(seen: IdentifiedLog, settings: Settings) -> Tracked:
 def solve(seen: IdentifiedLog, tracked: Tracked, settings: Settings) -> Solved:
     """Align, associate and triangulate: as the flow does, but all positions at once."""
     with tempfile.TemporaryDirectory() as folder:
-        sensors = _view(Path(folder), seen, tracked, settings)
+        viewed = ViewedParts(Path(folder) / "views")
+        sensors = _view(viewed, seen, tracked, settings)
         spans = spans_between(*_ends(align_epochs(seen.solutions, settings)))
         solved = SolvedParts(Path(folder))
         for span in spans:
-            associate_blocks.fn(
-                sensors, blocks_of(span, settings), seen.cameras, {}, settings, solved.blocks
-            )
+            blocks = blocks_of(span, settings)
+            associate_blocks.fn(sensors, viewed, blocks, seen.cameras, {}, settings, solved.blocks)
         number_objects.fn(spans, 0, settings, solved)
         members = [solved.objects.read(span, "members") for span in spans]
-        viewed = {of.number: of.viewed for _, of in sensors}
         time = Span(spans[0].start_ns, spans[-1].end_ns)
         views, number = gather_views(viewed, concat(OBJECT_MEMBERS, members), time)
     return solve_positions(views, number, settings)
 
 
 def _view(
-    folder: Path, seen: IdentifiedLog, tracked: Tracked, settings: Settings
-) -> list[tuple[str, SensorParts]]:
+    viewed: ViewedParts, seen: IdentifiedLog, tracked: Tracked, settings: Settings
+) -> list[Sensor]:
     """Write the views of all sensors, a part per sensor and span."""
     epochs = align_epochs(seen.solutions, settings)
-    sensors = []
-    for number, name in enumerate(sorted(sensor_ids(epochs))):
-        solutions = of_sensor(seen.solutions, name)
-        own = of_sensor(epochs, name)
-        detections = of_sensor(tracked.detections, name)
+    sensors = [Sensor(k, name) for k, name in enumerate(sorted(sensor_ids(epochs)))]
+    for sensor in sensors:
+        solutions = of_sensor(seen.solutions, sensor.sensor_id)
+        own = of_sensor(epochs, sensor.sensor_id)
+        detections = of_sensor(tracked.detections, sensor.sensor_id)
         views = view_objects(own, solutions, detections, seen.cameras, settings)
-        tracklets = of_sensor(tracked.tracklets, name)
-        parts = SensorParts(number, *(Parts(folder / f"{part}-{number}") for part in "itnv"))
+        tracklets = of_sensor(tracked.tracklets, sensor.sensor_id)
         for span in spans_between(*_ends(own)):
             of_span = span.of(views, "epoch")
             tables = {
@@ -125,8 +123,7 @@ def _view(
                 "epochs": sensor_epochs(span.of(own, "epoch"), solutions),
                 "tracklets": viewed_tracklets(tracklets, of_span),
             }
-            write_part(parts.viewed.of(span), VIEWED, tables)
-        sensors.append((name, parts))
+            write_part(viewed[sensor.number].of(span), VIEWED, tables)
     return sensors
 
 
