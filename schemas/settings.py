@@ -82,7 +82,8 @@ class IdentificationSettings(Group):
         1e-5,
         gt=0,
         lt=1,
-        description="Accepted probability that a reported attitude is a chance match.",
+        description="Accepted share of a sensor's frames that get an attitude by chance; of those "
+        "without stars, where these are half or more.",
     )
     time_limit_s: float = Field(
         0.5,

@@ -23,6 +23,7 @@ TINY = {
     "catalogue": "build --repeats 1",
     "clocks": "--offsets 0.1",
     "epipolar": "--scenes 2",
+    "false_alarms": "followed alone --frames 20",
     "identity": "--gaps 120 --seeds 1",
     "ingest": "--frames 400 --runs 1",
     "long_evidence": "--seeds 1 --lone 2 --minutes 0.5 --longest 600",

@@ -233,8 +233,13 @@ def _first_scale(
     probe: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...]
 ) -> tuple[_Known, list[Solution | None]]:
     """Return what is known, with a scale of errors that identifies frames, and the solutions."""
-    quick = known.how._replace(time_limit_s=known.how.time_limit_s / 4, crowded=False)
-    for k, tried in enumerate(_attempts(probe.spots, skies, known, scales)):
+    attempts = list(_attempts(probe.spots, skies, known, scales))
+    # Each further attempt is one more chance of a false alarm.
+    least = known.how.threshold + np.log(max(len(attempts) - 1, 1))
+    quick = known.how._replace(
+        time_limit_s=known.how.time_limit_s / 4, threshold=least, crowded=False
+    )
+    for k, tried in enumerate(attempts):
         how = known.how if k == 0 and len(probe.t_s) > PROBED else quick
         found = _identify(probe, skies, tried._replace(how=how))[0].each()
         if any(found):

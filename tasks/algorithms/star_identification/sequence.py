@@ -104,10 +104,13 @@ def identify_sequence(
     sequence = _Sequence(frames, arrays, stars, rule, solutions, status)
     forth, back, none = Walk(0, n, 1, False), Walk(n - 1, -1, -1, False), no_priors(n)
 
-    def search(k: int, failures: int) -> tuple[Solution | None, bool]:
+    def search(k: int, failures: int, step: int) -> tuple[Solution | None, bool]:
         # Crowded frames take long: where the stars' brightness is unknown, ever fewer are tried.
         often = not np.isnan(how.zero_point_mag)
-        tried = how._replace(crowded=how.crowded and (often or failures.bit_count() <= 1))
+        tried = how._replace(
+            crowded=how.crowded and (often or failures.bit_count() <= 1),
+            starlit=sequence.starlit(k, step),
+        )
         return identify_lost(frames.frame(k), sky, grid, pairs(), tried)
 
     if anchored:
@@ -164,7 +167,7 @@ class _Sequence(NamedTuple):
         self,
         walk: Walk,
         priors: Priors,
-        search: Callable[[int, int], tuple[Solution | None, bool]],
+        search: Callable[[int, int, int], tuple[Solution | None, bool]],
         failures: int,
     ) -> None:
         """The same, but frames that fail are searched; so many searches have failed before."""
@@ -174,7 +177,7 @@ class _Sequence(NamedTuple):
                            self.rule, memory, self.solutions, self.status))  # fmt: skip
             if k == walk.stop:
                 return
-            solution, cut_short = search(k, failures)
+            solution, cut_short = search(k, failures, walk.step)
             if solution is None:
                 failures += 1
                 memory.held[2] = _skipped(failures, self._refused(k, walk.step))
@@ -185,6 +188,16 @@ class _Sequence(NamedTuple):
                 self.solutions.enter(k, solution)
                 remember(memory, self.arrays.t_s[k], solution.R_sensor_from_icrs, solution.cov_rad2)
             k += walk.step
+
+    def starlit(self, k: int, step: int) -> float:
+        """Return the odds (ln) that frame k shows stars, from those before it on this walk.
+
+        With them, chance identifies the stated share of all frames, more of those without stars.
+        """
+        before = slice(0, k) if step > 0 else slice(k + 1, None)
+        status, solved = self.status[before], self.solutions.solved[before]
+        refused = ((status == NO_MATCH) | (status == TIME_LIMIT)) & ~solved
+        return float(np.log((solved.sum() + 1) / (refused.sum() + 1)))
 
     def _refused(self, k: int, step: int) -> int:
         """Return how many frames before k, on this walk, are not solved."""

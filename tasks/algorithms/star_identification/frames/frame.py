@@ -8,6 +8,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     TYPICAL_SPREAD_MAG,
     MatchRule,
+    chance_margin,
 )
 from epipole.tasks.algorithms.star_identification.search.field import (
     Attitude,
@@ -34,13 +35,12 @@ from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-# Lost in space, chance reaches a log evidence x with a probability below exp(-(x + 6)), as measured
-# on 12,000 random frames of three cameras. Markov's inequality only bounds it by exp(-x).
+# Lost in space, this is taken off the threshold at most: see `chance_margin`.
 LOST_MARGIN = 6.0
 # The best attitude must be this much (in log) more probable than any other.
 CLEAR_LEAD = 7.0
-# Prior odds (ln) that a frame has enough stars to be identified: 99 in 100 frames do.
-STARLIT = 4.6
+# Prior odds (ln) that a frame has enough stars to be identified: at most 99 in 100 frames do.
+MOST_STARLIT = 4.6
 # Brightest centroids that are used in a search of the whole sky, that are paired, and that each
 # hypothesis is tried on; where half of them are stars.
 N_SEARCHED, N_PATTERN, N_TRIED, STAR_SHARE = 200, 40, 64, 0.5
@@ -107,6 +107,8 @@ class Search(NamedTuple):
     time_limit_s : CPU time of one search lost in space
     zero_point_mag : star minus instrumental magnitude; NaN while unknown
     spread_mag : its scatter, 1-sigma
+    starlit : prior odds (ln) that a frame has enough stars to be identified, as the sensor's other
+        frames show; of an unknown sensor even ones
     crowded : where a search fails, the frame is searched again as one that shows few stars among
         many other centroids
     """
@@ -117,6 +119,12 @@ class Search(NamedTuple):
     zero_point_mag: float
     spread_mag: float = TYPICAL_SPREAD_MAG
     crowded: bool = True
+    starlit: float = 0.0
+
+    @property
+    def least_lost(self) -> float:
+        """Least log evidence of an attitude that was searched lost in space."""
+        return self.threshold - LOST_MARGIN - min(max(self.starlit, 0.0), MOST_STARLIT)
 
 
 class Verdict(NamedTuple):
@@ -171,7 +179,12 @@ def identify_predicted(
         Attitude(R0, P0), lost, Centroids(*frame[:4]), StarPlaces(a, stars.magnitude[row]),
         frame.optics.box, rule_of(how, sky), Attitude(R, P), Matches(star, chi2),
     )  # fmt: skip
-    if not evidence > how.threshold - (LOST_MARGIN + STARLIT if lost else 0.0):
+    least = how.threshold
+    if lost and evidence > how.least_lost:
+        in_view = sky.rho * frame.optics.solid_angle_sr
+        margin = chance_margin(int(np.sum(star >= 0)), n, in_view)
+        least = how.least_lost + LOST_MARGIN - min(margin, LOST_MARGIN)
+    if not evidence > least:
         return None
     return Solution(R, P, np.where(star >= 0, row[star], -1), chi2, evidence)
 
@@ -209,7 +222,7 @@ def _search(
     n = len(frame.u)
     if n < 3:
         return Verdict(False, np.eye(3), -np.inf, -np.inf, False)
-    R, least = np.zeros((3, 3)), how.threshold - LOST_MARGIN - STARLIT
+    R, least = np.zeros((3, 3)), how.least_lost
     area, budget = frame.optics.solid_angle_sr, how.time_limit_s * WORK_PER_S
     in_view = sky.rho * area
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))

@@ -13,8 +13,7 @@ anywhere in the image. Its parts:
   space, that is sqrt(det 2 pi P) / (8 pi^2).
 
 So the log evidence does not depend on how many hypotheses were tried. The probability that chance
-alone reaches x is below exp(-x), by Markov's inequality, over frames with as many false centroids
-as the prior of `log_ways` assumes.
+alone reaches x is below exp(-x), by Markov's inequality. `chance_margin` says how far below.
 """
 
 import math
@@ -22,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import gammainc
 
 from epipole.tasks.algorithms.geometry.attitude import invert_symmetric
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
@@ -34,6 +34,11 @@ N_BINS = 72
 TYPICAL_SPREAD_MAG = 0.4  # of a sensor's magnitudes about V, colours included; until it is learned
 OUTLIER_SHARE = 0.15  # variables, blends, odd colours
 MAG_RANGE = 6.0
+# Stars per field over their mean: the sky is uneven.
+DENSITIES = np.array([0.6, 1.0, 1.4])
+# Of the attitudes that chance gives, a search reports this share (ln) at most: others that come
+# near and matches that are not clear rule them out. Measured: a tenth (bench_false_alarms).
+REPORTED = -1.5
 
 
 class MatchRule(NamedTuple):
@@ -104,6 +109,29 @@ def log_ways(n, matches, in_view):
         math.log(4.0) + math.lgamma(k + 4.0) + math.lgamma(m - k + 1.0) - math.lgamma(m + 5.0)
     )
     return centroids - detected
+
+
+def chance_margin(matches: int, n: int, in_view: float) -> float:
+    """Return how far chance stays below Markov's bound: lost in space, it reaches a log evidence x
+    with so many matches in a starless frame with a probability below exp(-(x + margin)).
+
+    Over such frames, the mean of exp(evidence), summed over all attitudes and sets of k matches, is
+    the prior probability of k matches: that of `log_ways`, here over fields whose stars are Poisson
+    distributed. With it, the mean number of attitudes above x follows from the volume of residuals
+    that leave so much: 2 k - 3 degrees of freedom, chi-square as of true stars.
+
+    Parameters
+    ----------
+    matches, n : int
+        Matches, at least 3, and centroids of the frame.
+    in_view : float
+        Stars in a field, the mean over the sky.
+    """
+    k, m = matches, in_view * DENSITIES
+    prior = 4.0 * (k + 1) * (k + 2) * (k + 3) * np.mean(gammainc(k + 4.0, m) / m**4)
+    prior *= (n + 1) / (n - k + 1)
+    volume = 0.5 * np.log(2.0 * np.pi * (k - 1.5))
+    return float(volume - np.log(max(prior, 1e-300)) - REPORTED)
 
 
 @borrowing_kernel

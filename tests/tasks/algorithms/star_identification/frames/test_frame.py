@@ -81,3 +81,10 @@ def test_many_centroids_without_any_star_are_refused():
     for seed in range(8):
         seen = frame(CATALOGUE, random_attitude(seed), seed, n_false=300, missing=1.0)[0]
         assert not search_lost(seen, sky, grid, pairs, HOW).is_clear
+
+
+def test_odds_of_stars_lower_the_threshold_of_a_search_within_limits():
+    least = HOW.least_lost
+    assert HOW._replace(starlit=2.0).least_lost == pytest.approx(least - 2.0)
+    assert HOW._replace(starlit=-3.0).least_lost == least
+    assert HOW._replace(starlit=9.0).least_lost == HOW._replace(starlit=6.0).least_lost

@@ -7,6 +7,7 @@ import pytest
 
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     MatchRule,
+    chance_margin,
     choice_lost,
     choice_predicted,
     log_brightness_ratio,
@@ -95,3 +96,15 @@ def test_a_prediction_as_sharp_as_the_data_costs_little_and_being_off_costs_more
 def test_the_density_of_magnitudes_integrates_to_one():
     density = np.exp(log_magnitude_density(np.random.default_rng(0).normal(6, 1, 1000)))
     assert np.sum(density) * 0.25 == pytest.approx(1.0)
+
+
+def test_chance_needs_more_luck_for_few_matches_where_a_field_shows_many_stars():
+    few_stars, many_stars = (
+        [chance_margin(k, 12, in_view) for k in (3, 4, 5)] for in_view in (5.0, 30.0)
+    )
+    assert all(a + 2.0 < b for a, b in zip(few_stars, many_stars, strict=True))
+    assert many_stars == sorted(many_stars, reverse=True)
+
+
+def test_matches_of_all_centroids_are_the_likelier_by_chance():
+    assert chance_margin(4, 4, 17.0) < chance_margin(4, 40, 17.0)
