@@ -35,7 +35,7 @@ from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
     sky_to_limit,
 )
 from epipole.tasks.algorithms.star_identification.sky.kvector import KVector
-from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
+from epipole.tasks.algorithms.star_identification.sky.pair_table import NearStars, PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 from epipole.tasks.algorithms.time import time_scales
 from epipole.tasks.algorithms.time.time_scales import earth_barycentric, julian_year
@@ -158,17 +158,24 @@ def _pairs(
         u_icrs = _navigation(catalogue, day, pixel_rad, merge_px).u_icrs[:n]
         table = pattern_pairs(u_icrs, diagonal)
         line = np.array([table.chord.slope, table.chord.intercept])
+        near = table.near
         return {
             "s": table.chord.s, "below": table.chord.below, "line": line,
             "first": table.first, "second": table.second,
             "at_first": table.at_first, "at_second": table.at_second,
+            "near_first": near.first, "near_other": near.other, "near_chord": near.chord,
+            "near_turn": near.turn, "near_reach": np.array([near.reach]),
         }  # fmt: skip
 
     key = _disk_key("pairs", catalogue, day, pixel_rad, merge_px, n, diagonal)
     kept: dict[str, npt.NDArray[Any]] = dict(cached(key, make))
     slope, intercept = kept.pop("line").tolist()
     chord = KVector(kept.pop("s"), kept.pop("below"), slope, intercept)
-    return PairTable(chord, **kept, n_stars=n)
+    near = NearStars(
+        kept.pop("near_first"), kept.pop("near_other"), kept.pop("near_chord"),
+        kept.pop("near_turn"), float(kept.pop("near_reach")[0]),
+    )  # fmt: skip
+    return PairTable(chord, **kept, n_stars=n, near=near)
 
 
 def _disk_key(what: str, catalogue: Catalogue, *inputs: float) -> str:

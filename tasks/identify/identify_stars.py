@@ -1,6 +1,7 @@
 """Identify stars: which centroids are stars, and the attitude of each frame."""
 
 import logging
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +15,12 @@ from epipole.schemas.star_catalogue import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC, DAY_NS, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.camera import inside
 from epipole.tasks.algorithms.geometry.optics_errors import shared_attitude_covariance
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
 from epipole.tasks.algorithms.star_identification.frames.frame import Search
+from epipole.tasks.algorithms.star_identification.frames.persistent import persistent
 from epipole.tasks.algorithms.star_identification.frames.spots import (
     UnscaledCentroids,
     brightest_first,
@@ -39,6 +42,11 @@ from epipole.tasks.identify.tabulate_identified import (
 
 Array = npt.NDArray[np.float64]
 LOGGER = logging.getLogger(__name__)
+
+
+# Centroids of a frame that stay at one pixel: of more, stars are first searched without them; all
+# take part where so few frames are then identified.
+MANY_STAY, IDENTIFIES = 40, 0.5
 
 
 class IdentifiedTables(NamedTuple):
@@ -64,7 +72,8 @@ def identify_stars(
     exposures, places = exposures.take(order), places.take(order)
     centroids = flatten_centroids(exposures, cameras, settings)
     found, rows = _identify(exposures, places, centroids, catalogue, settings)
-    attitudes, matches = _attitudes(places, found, settings), _matches(found, rows)
+    attitudes = _attitudes(places, found, settings)
+    matches = _matches(found, rows, len(centroids.x_px))
     attitudes = _with_optics(attitudes, centroids, matches, cameras)
     stars = stars_table(exposures, places, centroids, attitudes, matches)
     stars = with_catalogue(stars, catalogue.schema)
@@ -87,15 +96,54 @@ def identify_stars(
 def _identify(
     exposures: pa.Table, places: pa.Table, c: FlatCentroids, catalogue: pa.Table, settings: Settings
 ) -> tuple[IdentifiedSensor | None, npt.NDArray[np.int64]]:
-    """Return the identified stars, and the order of centroids: brightest first in each frame."""
-    time_ns = array(exposures, "time")
+    """Return the identified stars, and the centroids that took part: brightest first in each
+    frame."""
     rows = brightest_first(c.first, c.flux)
     if not c.cameras:
         return None, rows
+    time_ns = array(exposures, "time")
+    day = int(time_ns[len(time_ns) // 2] // DAY_NS)
+    pixel_rad = next(iter(c.cameras.values())).pixel_rad
     rule = settings.identification
+    skies = CachedSkies(Catalogue(catalogue), day, pixel_rad, rule.merge_px)
+    how = Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
+    identify = load_method(STAR_IDENTIFICATION, rule.method)
+    t_s, priors = (time_ns - time_ns[0]) / 1e9, _priors(places, settings)
     beta = barycentric_velocity(time_ns, places) / SPEED_OF_LIGHT_KM_S
-    spots = UnscaledCentroids(
-        c.first,
+    best, taken = None, rows
+    for kept in _selections(c):
+        part = rows[kept[rows]]
+        spots = _spots(c, part, kept, beta)
+        found = identify(t_s, spots, priors, skies, rule.magnitude_limit, how)
+        if best is None or found.solutions.solved.sum() > best.solutions.solved.sum():
+            best, taken = found, part
+        if best.solutions.solved.mean() > IDENTIFIES:
+            break
+    return best, taken
+
+
+def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
+    """Yield which centroids may be stars: without those that stay, if there are many; then all.
+
+    A centroid outside the image is never one.
+    """
+    shown = np.zeros(len(c.x_px), np.bool_)
+    camera_of = c.camera_of_frame[c.frame]
+    for row, camera in c.cameras.items():
+        shown |= (camera_of == row) & inside(camera, c.x_px, c.y_px)
+    stays = shown & persistent(c.first, c.x_px, c.y_px)
+    if np.median(np.bincount(c.frame[stays], minlength=len(c.first) - 1)) > MANY_STAY:
+        yield shown & ~stays
+    yield shown
+
+
+def _spots(
+    c: FlatCentroids, rows: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], beta: Array
+) -> UnscaledCentroids:
+    """Return these centroids, which are those kept in another order."""
+    counts = np.bincount(c.frame[kept], minlength=len(c.first) - 1)
+    return UnscaledCentroids(
+        np.concatenate([[0], np.cumsum(counts)]),
         c.u[rows],
         c.pixel_rad[rows],
         c.sigma_px[rows],
@@ -104,14 +152,6 @@ def _identify(
         [field_of_view(camera) for camera in c.cameras.values()],
         np.searchsorted(np.array(list(c.cameras)), c.camera_of_frame),
     )
-    day = int(time_ns[len(time_ns) // 2] // DAY_NS)
-    pixel_rad = next(iter(c.cameras.values())).pixel_rad
-    skies = CachedSkies(Catalogue(catalogue), day, pixel_rad, rule.merge_px)
-    how = Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
-    identify = load_method(STAR_IDENTIFICATION, rule.method)
-    t_s = (time_ns - time_ns[0]) / 1e9
-    priors = _priors(places, settings)
-    return identify(t_s, spots, priors, skies, rule.magnitude_limit, how), rows
 
 
 def _priors(places: pa.Table, settings: Settings) -> Priors:
@@ -162,11 +202,12 @@ def _with_optics(
     return a._replace(shared_arcsec2=shared)
 
 
-def _matches(found: IdentifiedSensor | None, rows: npt.NDArray[np.int64]) -> MatchedStars:
+def _matches(found: IdentifiedSensor | None, rows: npt.NDArray[np.int64], n: int) -> MatchedStars:
+    """Return the stars of n centroids, of which these rows took part, in this order."""
     if found is None:
         none = np.empty(0, np.int64)
         return MatchedStars(none, none, np.empty(0), np.empty((0, 3)), 1.0)
-    star = np.empty_like(rows)
+    star = np.full(n, -1)
     star[rows] = found.solutions.star
     at = np.flatnonzero(star >= 0)
     star = star[at]

@@ -86,6 +86,11 @@ def folder(tmp_path, monkeypatch):
     _forget()
 
 
+def _arrays(pairs):
+    """Return all that a table of pairs consists of."""
+    return (*pairs.chord, *pairs.near, *(v for v in pairs[1:] if not isinstance(v, tuple)))
+
+
 def test_what_another_process_left_on_disk_gives_the_same_numbers(folder, monkeypatch):
     made = _skies().sky(5.0), _skies().pairs(5.0, optics())
     _forget()
@@ -94,7 +99,7 @@ def test_what_another_process_left_on_disk_gives_the_same_numbers(folder, monkey
     read = _skies().sky(5.0), _skies().pairs(5.0, optics())
     for a, b in zip(made[0].catalogue, read[0].catalogue, strict=True):
         np.testing.assert_array_equal(a, b)
-    for a, b in zip((*made[1].chord, *made[1][1:]), (*read[1].chord, *read[1][1:]), strict=True):
+    for a, b in zip(_arrays(made[1]), _arrays(read[1]), strict=True):
         np.testing.assert_array_equal(a, b)
         assert type(a) is type(b)
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.star_identification.search.crowded_frames import search_crowded
 from epipole.tasks.algorithms.star_identification.search.evidence import (
     TYPICAL_SPREAD_MAG,
     MatchRule,
@@ -18,11 +19,7 @@ from epipole.tasks.algorithms.star_identification.search.field import (
     solve_predicted,
     stars_in_cone,
 )
-from epipole.tasks.algorithms.star_identification.search.lost_in_space import (
-    CROWDED,
-    WORK_PER_S,
-    search,
-)
+from epipole.tasks.algorithms.star_identification.search.lost_in_space import WORK_PER_S, search
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import (
     Image,
     Problem,
@@ -46,6 +43,7 @@ MOST_STARLIT = 4.6
 N_SEARCHED, N_PATTERN, N_TRIED, STAR_SHARE = 200, 40, 64, 0.5
 # The same where that fails, for frames of which most centroids are no stars: all are paired.
 N_CROWDED, LEAST_STARS = 800, 8.0
+CROWDED_TIMES = 4.0  # as long as another search: hardly any pivot is a star
 
 
 class FieldOfView(NamedTuple):
@@ -228,9 +226,10 @@ def _search(
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * float(np.median(frame.sigma_rad)))
     if crowded:
         share = min(LEAST_STARS / n, STAR_SHARE)
-        limits = SearchLimits(min_chord, n, n, share, (CROWDED, CROWDED + 1), budget)
+        budget *= CROWDED_TIMES
+        limits = SearchLimits(min_chord, n, n, share, budget)
     else:
-        limits = SearchLimits(min_chord, N_PATTERN, N_TRIED, STAR_SHARE, (0, CROWDED), budget)
+        limits = SearchLimits(min_chord, N_PATTERN, N_TRIED, STAR_SHARE, budget)
     problem = Problem(
         Centroids(*frame[:4]),
         Stars(sky.catalogue.u_icrs, sky.catalogue.magnitude, grid),
@@ -239,7 +238,7 @@ def _search(
         rule_of(how, sky)._replace(least=least, enough=least + CLEAR_LEAD + 2.0),
         limits,
     )
-    best, runner_up, work = search(problem, R)
+    best, runner_up, work = search_crowded(problem, R) if crowded else search(problem, R)
     is_clear = best > least and best - runner_up > CLEAR_LEAD
     return Verdict(is_clear, R, best, runner_up, work > budget)
 

@@ -53,11 +53,7 @@ SLACK = 2  # a hypothesis may lack so many of the votes that are needed
 # Rounds, each more thorough than the one before: pivots; least companions of each; least share of
 # all centroids that are companions; votes after which no more companions are asked; how many of the
 # cells (a star and a turn) with most votes are sifted.
-# The last one is for frames of which most centroids are no stars: many pivots, each with other
-# companions.
-ROUNDS = ((6, 8, 0.5, 10_000, 128), (99, 0, 1.0, 0, 2000), (9999, 0, 0.5, 0, 2000))
-CROWDED = 2  # the row of these frames
-CROWDED_VOTES = 5  # fewer are mostly chance there
+ROUNDS = ((6, 8, 0.5, 10_000, 128), (99, 0, 1.0, 0, 2000))
 # Hardly any field has fewer stars than this share of the mean.
 SPARSE = 0.35
 # About so many units of work take a second of CPU time.
@@ -76,7 +72,7 @@ class Best(NamedTuple):
 
 
 @borrowing_kernel
-def _keep(evidence, R, best):
+def keep(evidence, R, best):
     """Enter an attitude where it is the best, or the best other one."""
     top = best.evidence
     if evidence <= top[1]:
@@ -96,7 +92,7 @@ def _keep(evidence, R, best):
 
 
 @kernel
-def _matches_needed(problem):
+def matches_needed(problem):
     """Return how many matches an attitude needs at least for `rule.least`; more than there are
     centroids where no number is enough."""
     centroids, rule, image = problem.centroids, problem.rule, problem.image
@@ -126,7 +122,7 @@ def _matches_needed(problem):
 
 
 @borrowing_kernel
-def _is_clear(best, rule):
+def is_clear(best, rule):
     """Tell whether the best attitude is beyond doubt."""
     top = best.evidence
     return top[0] > rule.enough and top[0] - top[1] > rule.enough
@@ -163,8 +159,8 @@ def _try_counted(problem, i, n_votes, fine, n_tried, votes, sift, least_votes, r
             continue
         work += 20 * n
         evidence = judge_pair(problem, i, a, j, b, best.evidence[1], room)
-        _keep(evidence, room.R, best)
-        if _is_clear(best, problem.rule):
+        keep(evidence, room.R, best)
+        if is_clear(best, problem.rule):
             break
     return work
 
@@ -176,8 +172,6 @@ def _try_pivot(problem, i, order, least_companions, step, needed, votes, sift, r
     n_companions, cast, log2 = count_votes(problem, i, order, least_companions, enough_votes, votes)
     work = cast + (problem.pairs.n_stars << log2) // 100
     least_votes = max(needed - SLACK, 2)
-    if step == CROWDED:
-        least_votes = max(least_votes * n_companions // len(order), CROWDED_VOTES)
     while votes.reached[least_votes] > cells:
         least_votes += 1
     n_votes, fine = MOST_SIFTED + 1, 0
@@ -198,7 +192,7 @@ def _try_pivot(problem, i, order, least_companions, step, needed, votes, sift, r
 
 
 @kernel
-def _mixed_order(n):
+def mixed_order(n):
     """Return 0 .. n - 1, taken in turn from the bright end and from the middle.
 
     False centroids are often all bright, or all faint.
@@ -226,22 +220,19 @@ def search(problem, R_best):
     room = make_scratch(n, min(n, problem.limits.n_tried))
     best = Best(np.array([-1e9, -1e9]), R_best)
     top, work = best.evidence, 0
-    needed = _matches_needed(problem)
+    needed = matches_needed(problem)
     if needed > n:
         return top[0], top[1], work
-    order = _mixed_order(n_pattern)
-    asked = order
+    order = mixed_order(n_pattern)
     votes, sift = make_votes(problem.pairs.n_stars, n_pattern), make_sift()
     # With so many pivots, one is among the matches of any attitude that has enough.
     n_pivots = min(n_pattern, n - needed + 1)
-    for step in range(problem.limits.rounds[0], problem.limits.rounds[1]):
+    for step in range(len(ROUNDS)):
         pivots, companions, share = ROUNDS[step][:3]
         companions = max(companions, int(share * n_pattern))
         for p in range(min(n_pivots, pivots)):
             i = order[p]
-            if step == CROWDED:  # other pivots ask other companions
-                asked = np.roll(asked, -companions)
-            work += _try_pivot(problem, i, asked, companions, step, needed, votes, sift, room, best)
-            if work > problem.limits.budget or _is_clear(best, problem.rule):
+            work += _try_pivot(problem, i, order, companions, step, needed, votes, sift, room, best)
+            if work > problem.limits.budget or is_clear(best, problem.rule):
                 return top[0], top[1], work
     return top[0], top[1], work

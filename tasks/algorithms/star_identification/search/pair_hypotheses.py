@@ -51,7 +51,6 @@ class SearchLimits(NamedTuple):
     n_pattern : how many of the brightest centroids are paired
     n_tried : on how many of the brightest centroids each hypothesis is tried
     star_share : what share of the centroids are stars, before anything is known
-    rounds : (first, last), rows of `lost_in_space.ROUNDS`
     budget : most work, see `WORK_PER_S`
     """
 
@@ -59,7 +58,6 @@ class SearchLimits(NamedTuple):
     n_pattern: int
     n_tried: int
     star_share: float
-    rounds: tuple[int, int]
     budget: float
 
 

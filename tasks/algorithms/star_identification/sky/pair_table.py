@@ -12,6 +12,28 @@ from epipole.tasks.algorithms.star_identification.sky.kvector import KVector, bu
 TURN = 1 << 16
 
 
+NEAR_SHARE = 0.24  # of the longest separation: a third of a square field's stars are so near
+
+
+class NearStars(NamedTuple):
+    """The near neighbours of each star, star by star.
+
+    Star k has the rows first[k]:first[k + 1].
+
+    first : (n_stars + 1,) int64
+    other : (m,) int32, the neighbour, a row of the catalogue
+    chord : (m,) float, as in `PairTable`
+    turn : (m,) uint16, position angle of the neighbour as seen from the star, in parts of `TURN`
+    reach : float, the longest of these chords
+    """
+
+    first: npt.NDArray[np.int64]
+    other: npt.NDArray[np.int32]
+    chord: npt.NDArray[np.float64]
+    turn: npt.NDArray[np.uint16]
+    reach: float
+
+
 class PairTable(NamedTuple):
     """Pairs of stars by separation.
 
@@ -21,6 +43,7 @@ class PairTable(NamedTuple):
     at_first, at_second : (n,) uint16, position angle of the other star as seen from each,
         in parts of `TURN`, from `tangent_axes`
     n_stars : how many of the brightest stars of the catalogue may be in a pair
+    near : the pairs that are closer than `NEAR_SHARE` of the longest, star by star
     """
 
     chord: KVector
@@ -29,6 +52,7 @@ class PairTable(NamedTuple):
     at_first: npt.NDArray[np.uint16]
     at_second: npt.NDArray[np.uint16]
     n_stars: int
+    near: NearStars
 
 
 def build_pair_table(u_icrs: npt.NDArray[np.float64], max_separation_rad: float) -> PairTable:
@@ -40,13 +64,31 @@ def build_pair_table(u_icrs: npt.NDArray[np.float64], max_separation_rad: float)
     order = np.lexsort((pairs[:, 1], pairs[:, 0], chord))
     a, b = np.ascontiguousarray(pairs[order].T)
     along, across = tangent_axes(u_icrs)
-    return PairTable(
-        build_kvector(chord[order]),
-        a,
-        b,
-        position_angle(along[a], across[a], u_icrs[b]),
-        position_angle(along[b], across[b], u_icrs[a]),
-        len(u_icrs),
+    at_a = position_angle(along[a], across[a], u_icrs[b])
+    at_b = position_angle(along[b], across[b], u_icrs[a])
+    near = _near_stars(a, b, chord[order], at_a, at_b, len(u_icrs), NEAR_SHARE * reach)
+    return PairTable(build_kvector(chord[order]), a, b, at_a, at_b, len(u_icrs), near)
+
+
+def _near_stars(
+    a: npt.NDArray[np.int32],
+    b: npt.NDArray[np.int32],
+    chord: npt.NDArray[np.float64],
+    at_a: npt.NDArray[np.uint16],
+    at_b: npt.NDArray[np.uint16],
+    n_stars: int,
+    reach: float,
+) -> NearStars:
+    """Return the pairs below a chord as seen from each of their stars; `chord` ascends."""
+    n = int(np.searchsorted(chord, reach, side="right"))
+    star = np.concatenate([a[:n], b[:n]])
+    order = np.argsort(star, kind="stable")
+    return NearStars(
+        np.concatenate([[0], np.cumsum(np.bincount(star, minlength=n_stars))]).astype(np.int64),
+        np.concatenate([b[:n], a[:n]])[order],
+        np.concatenate([chord[:n], chord[:n]])[order],
+        np.concatenate([at_a[:n], at_b[:n]])[order],
+        reach,
     )
 
 

@@ -59,19 +59,19 @@ def test_only_the_brightest_centroids_are_searched():
 
 
 def test_few_stars_among_many_other_centroids_are_found():
-    """Some 37 stars among 300 false points of the same brightness."""
+    """Some 37 stars among 500 false points of the same brightness."""
     sky = sky_to_limit(CATALOGUE, 99.0)
     grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
     found = {True: 0, False: 0}
     for seed in range(8):
         R = random_attitude(seed)
-        seen = frame(CATALOGUE, R, seed, n_false=300)[0]
+        seen = frame(CATALOGUE, R, seed, n_false=500)[0]
         for crowded in found:
             verdict = search_lost(seen, sky, grid, pairs, HOW._replace(crowded=crowded))
             if verdict.is_clear:
                 assert angle_between(verdict.R_sensor_from_icrs, R) < 1e-3
                 found[crowded] += 1
-    assert found[True] >= 6
+    assert found[True] >= 7
     assert found[False] <= 2
 
 
