@@ -2,6 +2,7 @@
 
 import csv
 import importlib
+import logging
 import os
 import sys
 from pathlib import Path
@@ -51,7 +52,7 @@ WITH_PACKAGES = {
 
 @pytest.fixture
 def play(monkeypatch, tmp_path, prefect):
-    """Return a function that runs a benchmark of this name with these arguments."""
+    """Yield a function that runs a benchmark of this name with these arguments."""
     from prefect.settings import PREFECT_API_URL
 
     monkeypatch.setenv("PREFECT_API_URL", PREFECT_API_URL.value())  # one for all their processes
@@ -64,7 +65,11 @@ def play(monkeypatch, tmp_path, prefect):
         monkeypatch.setattr(sys, "argv", [f"bench_{name}.py", *given])
         importlib.import_module(f"bench_{name}").main()
 
-    return run
+    logger = logging.getLogger("epipole")
+    level = logger.level
+    yield run
+    logging.disable(logging.NOTSET)  # benchmarks may be quieter than tests
+    logger.setLevel(level)
 
 
 def write_list(path: Path) -> None:
