@@ -2,9 +2,9 @@
 
 Of hundreds of centroids hardly any pivot is a star, so that many have to be asked, each quickly.
 The companions of a pivot are its near ones only: of these, nearly as large a share are stars, and
-the sky has fewer pairs that are so close. For each star in turn, its near neighbours are held
-against these companions. A pair of the right separation says how the image is turned about the
-pivot; where enough of them agree, the attitude is tried on all centroids, as in `lost_in_space`.
+the sky has fewer pairs that are so close. Each pair of stars of a companion's separation says which
+star the pivot may be, and how the image is turned about it. Where enough of them agree, the
+attitude is tried on all centroids, as in `lost_in_space`.
 
 One star's turns are counted in the bits of a few words: bit k of word m tells that m + 1 or more of
 its neighbours say a turn in bin k of 64.
