@@ -6,7 +6,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -17,7 +16,7 @@ from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import EXPOSURES
-from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.star_identification.sensor import spread
 from epipole.tasks.calibrate.calibrate_unknown import (
     CameraReport,
     calibrate_unknown,
@@ -69,7 +68,7 @@ def _of_sensor(
     frames: OrderedFrames, number: int, field_deg: float | None, settings: Settings
 ) -> CameraReport:
     time_ns = frames.time_ns[number]
-    rows = np.unique(np.linspace(0, len(time_ns) - 1, MOST_FRAMES).astype(np.int64))
+    rows = spread(len(time_ns), MOST_FRAMES)
     parts = [frames_between(frames.folder, number, t, t + 1) for t in time_ns[rows].tolist()]
     exposures: pa.Table = concat(EXPOSURES, parts).combine_chunks()
     states = states_between(frames.folder, number, *ALL_TIME)
@@ -136,7 +135,7 @@ def lines(report: CameraReport) -> list[str]:
 def _not_found(report: CameraReport) -> list[str]:
     told = report.told
     narrow, wide = (
-        _field_deg(told._replace(fx_px=told.fx_px * factor))
+        told._replace(fx_px=told.fx_px * factor).field_deg[0]
         for factor in (report.reach, 1 / report.reach)
     )
     return [
@@ -159,15 +158,11 @@ def _image(report: CameraReport) -> str:
     )
 
 
-def _field_deg(camera: Camera) -> float:
-    return 2 * math.degrees(math.atan(camera.width / 2 / camera.fx_px))
-
-
 def _focal(report: CameraReport) -> str:
     c, told = report.camera, report.told
     assert c is not None
     sigma = f" +- {report.sigma['fx_px']:.2f}" if report.sigma else ""
-    text = f"{c.fx_px:.2f}{sigma} px, a field of {_field_deg(c):.2f} deg along the columns"
+    text = f"{c.fx_px:.2f}{sigma} px, a field of {c.field_deg[0]:.2f} deg along the columns"
     if not report.is_told:
         return text
     percent = 100 * (c.fx_px / told.fx_px - 1)

@@ -8,6 +8,7 @@ import pyarrow.compute as pc
 
 from epipole.io.logs.reader import read_log
 from epipole.schemas.bridge import array, flatten
+from epipole.tasks.common.sightings import camera_of
 
 
 def describe(log: str) -> dict[str, Any]:
@@ -51,7 +52,8 @@ def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table)
     frames, states = of_sensor(exposures, name), of_sensor(states, name)
     time_ns = np.sort(array(frames, "time"))
     interval_ns = float(np.median(np.diff(time_ns))) if len(time_ns) > 1 else None
-    camera = of_sensor(cameras, name).drop_columns("time").to_pylist()
+    told = of_sensor(cameras, name)
+    camera = camera_of(told, 0) if told.num_rows else None
     centroids, _ = flatten(frames, "x_px")
     return {
         "sensor_id": name,
@@ -64,17 +66,9 @@ def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table)
         "state_frames": sorted(set(states["frame"].to_pylist())),
         "states_with_attitude": states.num_rows - states["qw"].null_count,
         "states_with_velocity": states.num_rows - states["vx_km_s"].null_count,
-        "image_px": [camera[0]["width"], camera[0]["height"]] if camera else None,
-        "field_deg": _field_deg(camera[0]) if camera else None,
+        "image_px": [camera.width, camera.height] if camera else None,
+        "field_deg": list(camera.field_deg) if camera else None,
     }
-
-
-def _field_deg(camera: dict[str, Any]) -> list[float]:
-    """Return the width and height of the field of view, without distortion."""
-    return [
-        float(np.degrees(2 * np.arctan(camera[size] / 2 / abs(camera[focal]))))
-        for size, focal in (("width", "fx_px"), ("height", "fy_px"))
-    ]
 
 
 def _iso(time_ns: int) -> str:

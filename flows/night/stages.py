@@ -29,7 +29,7 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS, POSITIONS, STATES
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensor
-from epipole.tasks.calibrate.find_camera import CameraFinding, find_sensor_camera
+from epipole.tasks.calibrate.find_camera import CameraFinding, find_sensor_camera, refuses
 from epipole.tasks.check.check_sensors import (
     REASONS,
     SensorVerdict,
@@ -107,6 +107,7 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
             work.frames, sensor, work.identified[sensor], spans, work.cameras, settings
         )
         for sensor, spans in work.spans.items()
+        if refuses(work.identified[sensor], spans)
     ]
     findings: list[CameraFinding] = [
         finding for finding in results(Stage.CALIBRATE, futures) if finding is not None

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.parts import Parts
-from epipole.schemas.bridge import array, concat, empty, table, unstack_covariance
+from epipole.schemas.bridge import array, concat, empty, rows_of, table, unstack_covariance
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
@@ -111,19 +111,15 @@ def calibrate_sensors(stars: pa.Table, cameras: pa.Table, told: pa.Table) -> Cal
         LOGGER.info("%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px)
     return Calibrated(
         concat(CALIBRATIONS, rows) if rows else empty(CALIBRATIONS),
-        _with_changes(cameras, changed),
+        with_optics(cameras, changed),
         sorted(changed),
     )
 
 
-def _with_changes(cameras: pa.Table, changed: Mapping[str, Mapping[str, float]]) -> pa.Table:
+def with_optics(cameras: pa.Table, changed: Mapping[str, dict[str, Any]]) -> pa.Table:
     """Return CAMERAS with other values for some sensors."""
-    sensor = array(cameras, "sensor_id")
-    columns = {name: cameras[name].to_numpy().copy() for name in cameras.column_names}
-    for sensor_id, values in changed.items():
-        for name, value in values.items():
-            columns[name][sensor == sensor_id] = value
-    return table(CAMERAS, columns)
+    rows = [row | changed.get(row["sensor_id"], {}) for row in rows_of(cameras)]
+    return pa.Table.from_pylist(rows, schema=CAMERAS)
 
 
 class _Optics(NamedTuple):

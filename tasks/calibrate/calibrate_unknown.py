@@ -15,6 +15,7 @@ from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
 from epipole.tasks.algorithms.star_identification.camera_search import FEWEST
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensors
 from epipole.tasks.calibrate.find_camera import find_agreed_camera, image_frames, skies_at
+from epipole.tasks.common.sightings import camera_of
 from epipole.tasks.identify.identify_stars import identify_stars
 from epipole.tasks.identify.place_sensors import place_sensors
 
@@ -91,7 +92,7 @@ def calibrate_unknown(
 def _told(exposures: pa.Table, cameras: pa.Table, field_deg: float | None) -> tuple[Camera, float]:
     """Return the camera to start from, and by which factor its focal length may be off."""
     if cameras.num_rows:
-        camera = Camera(**cameras.select(list(Camera._fields)).slice(0, 1).to_pylist()[0])
+        camera = camera_of(cameras, 0)
         if field_deg is None:
             return camera, REACH
         camera = camera._replace(k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0)
@@ -157,7 +158,7 @@ def _fitted(
         cameras = fit.cameras
         if not fit.departed:
             break
-    camera = Camera(**cameras.select(list(Camera._fields)).to_pylist()[0])
+    camera = camera_of(cameras, 0)
     solved = pc.sum(pc.equal(identified.solutions["attitude_source"], "stars")).as_py()
     report = report._replace(camera=camera, n_identified=solved, n_stars=identified.stars.num_rows)
     if not fit.calibrations.num_rows:

@@ -5,14 +5,13 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.io.work.parts import Parts
 from epipole.io.work.places import ReadFolder
-from epipole.schemas.bridge import array, concat, flatten, rows_of
+from epipole.schemas.bridge import array, concat, flatten
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
@@ -26,13 +25,15 @@ from epipole.tasks.algorithms.star_identification.camera_search import (
     agrees,
     find_camera,
 )
-from epipole.tasks.algorithms.star_identification.frames.frame import Search
 from epipole.tasks.algorithms.star_identification.frames.spots import brightest_first
-from epipole.tasks.algorithms.star_identification.sensor import Skies
+from epipole.tasks.algorithms.star_identification.sensor import Skies, spread
+from epipole.tasks.calibrate.calibrate_sensors import with_optics
+from epipole.tasks.common.sightings import camera_of
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 from epipole.tasks.identify.flatten_centroids import flatten_centroids
 from epipole.tasks.identify.identify_span import states_about
+from epipole.tasks.identify.identify_stars import search_of
 from epipole.tasks.identify.place_sensors import place_sensors
 from epipole.tasks.identify.tabulate_identified import barycentric_velocity
 from epipole.tasks.read.order_frames import frames_between
@@ -63,8 +64,8 @@ class CameraFinding(NamedTuple):
 
     def cameras(self, told: pa.Table, camera: Camera) -> pa.Table:
         """Return the sensor's rows of CAMERAS with this camera."""
-        rows = rows_of(told.filter(pc.field("sensor_id") == self.sensor_id))
-        return pa.Table.from_pylist([row | camera._asdict() for row in rows], schema=CAMERAS)
+        of_sensor = told.filter(pc.field("sensor_id") == self.sensor_id)
+        return with_optics(of_sensor, {self.sensor_id: camera._asdict()})
 
     def __str__(self) -> str:
         """Return what was found, in a line for people."""
@@ -87,6 +88,19 @@ class CameraFinding(NamedTuple):
         return f"{name}: {' and '.join(parts) or 'its stars were found in a second search'}"
 
 
+def refuses(identified: Parts, spans: Sequence[Span]) -> bool:
+    """Return whether hardly any frame of a sensor could be identified that has enough centroids."""
+    rows = _solutions(identified, spans)
+    tried = pc.sum(pc.greater_equal(rows["n_centroids"], FEWEST)).as_py() or 0
+    solved = pc.sum(pc.equal(rows["attitude_source"], "stars")).as_py() or 0
+    return tried > 0 and solved <= REFUSES * tried
+
+
+def _solutions(identified: Parts, spans: Sequence[Span]) -> pa.Table:
+    columns = ["time", "n_centroids", "attitude_source"]
+    return pa.concat_tables([identified.read(span, "solutions", columns) for span in spans])
+
+
 @stage_task(Stage.CALIBRATE, "{sensor}")
 def find_sensor_camera(
     frames: ReadFolder,
@@ -96,18 +110,16 @@ def find_sensor_camera(
     cameras: pa.Table,
     settings: Settings,
 ) -> CameraFinding | None:
-    """Return what can be found of the camera of a sensor that refuses all its frames.
+    """Return what can be found of the camera of a sensor that `refuses` its frames.
 
-    None for any other sensor, and for one with several calibrations.
+    None for one with several calibrations.
     """
     camera = _only_camera(cameras, sensor.sensor_id)
-    columns = ["time", "n_centroids", "attitude_source"]
-    rows = pa.concat_tables([identified.read(span, "solutions", columns) for span in spans])
-    tried = rows.filter(pc.field("n_centroids") >= FEWEST)
-    solved = pc.sum(pc.equal(rows["attitude_source"], "stars")).as_py() or 0
-    if camera is None or not tried.num_rows or solved > REFUSES * tried.num_rows:
+    if camera is None:
         return None
-    times = array(tried, "time")[_spread(tried.num_rows, TRIED)]
+    tried = _solutions(identified, spans).filter(pc.field("n_centroids") >= FEWEST)
+    rows = spread(tried.num_rows, TRIED)
+    times = array(tried, "time")[np.roll(rows, -(len(rows) // 2))]  # first from the middle
     parts = [image_frames(*_placed(frames, sensor, int(t), settings), settings) for t in times]
     images = [frame for part in parts for frame in part]
     found = find_agreed_camera(images, camera, REACH, skies_at(int(times[0]), settings), settings)
@@ -133,12 +145,6 @@ def find_agreed_camera(
     if others and not any(agrees(frame, found.camera, skies_of, how) for frame in others):
         return None
     return found
-
-
-def search_of(settings: Settings) -> Search:
-    """Return how frames are judged."""
-    rule = settings.identification
-    return Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
 
 
 def skies_at(time_ns: int, settings: Settings) -> Callable[[float], Skies]:
@@ -178,12 +184,6 @@ def _placed(
 
 def _only_camera(cameras: pa.Table, sensor_id: str) -> Camera | None:
     """Return the camera of a sensor, None where it has several."""
-    rows = cameras.filter(pc.field("sensor_id") == sensor_id).select(list(Camera._fields))
-    different = {Camera(**row) for row in rows.to_pylist()}
+    rows = cameras.filter(pc.field("sensor_id") == sensor_id)
+    different = {camera_of(rows, k) for k in range(rows.num_rows)}
     return different.pop() if len(different) == 1 else None
-
-
-def _spread(n: int, wanted: int) -> npt.NDArray[np.int64]:
-    """Return so many rows of n, spread evenly; the first is from the middle."""
-    rows = np.unique(np.linspace(0, n - 1, min(wanted, n)).astype(np.int64))
-    return np.roll(rows, -(len(rows) // 2))

@@ -106,7 +106,6 @@ def _identify(
     pixel_rad = next(iter(c.cameras.values())).pixel_rad
     rule = settings.identification
     skies = CachedSkies(Catalogue(catalogue), day, pixel_rad, rule.merge_px)
-    how = Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
     identify = load_method(STAR_IDENTIFICATION, rule.method)
     t_s, priors = (time_ns - time_ns[0]) / 1e9, _priors(places, settings)
     beta = barycentric_velocity(time_ns, places) / SPEED_OF_LIGHT_KM_S
@@ -114,12 +113,18 @@ def _identify(
     for kept in _selections(c):
         part = rows[kept[rows]]
         spots = _spots(c, part, kept, beta)
-        found = identify(t_s, spots, priors, skies, rule.magnitude_limit, how)
+        found = identify(t_s, spots, priors, skies, rule.magnitude_limit, search_of(settings))
         if best is None or found.solutions.solved.sum() > best.solutions.solved.sum():
             best, taken = found, part
         if best.solutions.solved.mean() > IDENTIFIES:
             break
     return best, taken
+
+
+def search_of(settings: Settings) -> Search:
+    """Return how frames are judged, before anything is known of their sensor."""
+    rule = settings.identification
+    return Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
 
 
 def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
@@ -131,9 +136,10 @@ def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
     camera_of = c.camera_of_frame[c.frame]
     for row, camera in c.cameras.items():
         shown |= (camera_of == row) & inside(camera, c.x_px, c.y_px)
-    stays = shown & persistent(c.first, c.x_px, c.y_px)
-    if np.median(np.bincount(c.frame[stays], minlength=len(c.first) - 1)) > MANY_STAY:
-        yield shown & ~stays
+    if np.median(np.diff(c.first)) > MANY_STAY:
+        stays = shown & persistent(c.first, c.x_px, c.y_px)
+        if np.median(np.bincount(c.frame[stays], minlength=len(c.first) - 1)) > MANY_STAY:
+            yield shown & ~stays
     yield shown
 
 

@@ -40,6 +40,13 @@ class Camera(NamedTuple):
         return 1.0 / np.sqrt(self.fx_px * abs(self.fy_px))
 
     @property
+    def field_deg(self) -> tuple[float, float]:
+        """Width and height of the field of view, without distortion [deg]."""
+        sides = (self.width, self.fx_px), (self.height, abs(self.fy_px))
+        across, down = (float(np.degrees(2 * np.arctan(n / 2 / f))) for n, f in sides)
+        return across, down
+
+    @property
     def half_diagonal_rad(self) -> float:
         """Angle from the boresight to the farthest corner, without distortion [rad]."""
         x = max(self.cx_px + 0.5, self.width - 0.5 - self.cx_px) / self.fx_px

@@ -101,7 +101,7 @@ def identify_sensor(
     known = _Known(1.0, limit, magnitude_limit is None, how, True, not stated)
     whole = _Sample(t_s, spots, priors)
     crowded = len(usable) > 0 and np.median(spots.counts[usable]) > CROWDED
-    rows = usable[_spread(len(usable), PROBED_CROWDED if crowded else PROBED)]
+    rows = usable[spread(len(usable), PROBED_CROWDED if crowded else PROBED)]
     known, probed = _first_scale(
         whole.take(rows), skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
     )
@@ -111,7 +111,7 @@ def identify_sensor(
     solutions, status = _identify(whole, skies, known, hopeless)
     if hopeless and solutions.solved.any():  # the probe was poor: learn from the others
         solved = np.flatnonzero(solutions.solved)
-        rows = solved[_spread(len(solved), SAMPLED)]
+        rows = solved[spread(len(solved), SAMPLED)]
         sampled = [solutions.frame(i) for i in rows]
         known = _learn(whole.take(rows).spots, sampled, skies, known)
         solutions, status = _identify(whole.anchored(rows, sampled), skies, known)
@@ -169,7 +169,7 @@ class _Sample(NamedTuple):
         return self._replace(priors=Priors(R, sigma), anchors=True)
 
 
-def _spread(n: int, wanted: int) -> npt.NDArray[np.int64]:
+def spread(n: int, wanted: int) -> npt.NDArray[np.int64]:
     """Return so many rows of n, spread evenly."""
     return np.unique(np.linspace(0, max(n - 1, 0), wanted).astype(np.int64))[:n]
 

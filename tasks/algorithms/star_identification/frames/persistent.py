@@ -28,7 +28,7 @@ def persistent(first: npt.NDArray[np.int64], x_px: Array, y_px: Array) -> npt.ND
     at = np.flatnonzero(np.isfinite(x_px) & np.isfinite(y_px))
     for shift in (0.0, 0.5):  # a place on the border of two pixels lies in the middle of another
         cell = _cells(x_px[at] + shift, y_px[at] + shift)
-        once = np.unique(np.stack([cell, frame[at]]), axis=1)[0]
+        once = np.unique(cell * n_frames + frame[at]) // n_frames
         cells, frames = np.unique(once, return_counts=True)
         stays[at] |= np.isin(cell, cells[frames >= least])
     return stays
@@ -37,4 +37,4 @@ def persistent(first: npt.NDArray[np.int64], x_px: Array, y_px: Array) -> npt.ND
 def _cells(x_px: Array, y_px: Array) -> npt.NDArray[np.int64]:
     """Return a number for each pixel."""
     column, row = (np.clip(np.floor(v), -1e6, 1e6).astype(np.int64) for v in (x_px, y_px))
-    return column * 4_000_000 + row
+    return (column + 1_000_000) * 4_000_000 + row + 1_000_000
