@@ -23,7 +23,8 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.sky import boresight_angles
-from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
+from epipole.tasks.algorithms.star_identification.frames.frame import Search
 from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
@@ -46,12 +47,9 @@ def identify(
     x_px: Array, y_px: Array, camera: Camera, catalogue: Catalogue, day: int
 ) -> IdentifiedSensor:
     """Return the default method's result for one frame without brightness."""
-    side = np.array([-0.5, camera.width - 0.5]) - camera.cx_px
-    down = np.array([-0.5, camera.height - 0.5]) - camera.cy_px
-    box = np.concatenate([side, down]) / camera.fx_px
     unknown = np.full(len(x_px), np.nan)
     u = unproject(camera, x_px, y_px)
-    optics = FieldOfView(camera.half_diagonal_rad, box, camera.pixel_rad)
+    optics = field_of_view(camera)
     spots = UnscaledCentroids(
         np.array([0, len(u)]), u, pixel_angle(camera, u), unknown, unknown, np.zeros((1, 3)),
         [optics], np.zeros(1, np.int64),

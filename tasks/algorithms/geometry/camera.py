@@ -79,7 +79,7 @@ def distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
     return xd, yd
 
 
-def _slopes(camera: Camera, x: Array, y: Array) -> tuple[Array, Array, Array]:
+def slopes(camera: Camera, x: Array, y: Array) -> tuple[Array, Array, Array]:
     """Return the derivatives of `distort`: of x by x, of x by y (and y by x), of y by y."""
     k1, k2, p1, p2, k3 = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
     r2 = x * x + y * y
@@ -107,7 +107,7 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
         ey -= yd
         # Convergence is quadratic: after a step from below 1e-9 the rest is rounding.
         last = max(np.abs(ex).max(initial=0.0), np.abs(ey).max(initial=0.0)) < 1e-9
-        jxx, jxy, jyy = _slopes(camera, x, y)
+        jxx, jxy, jyy = slopes(camera, x, y)
         determinant = jxx * jyy - jxy * jxy
         x, y = (
             x - (jyy * ex - jxy * ey) / determinant,
@@ -149,6 +149,6 @@ def pixel_angle(camera: Camera, u: Array) -> Array:
     """
     solid = u[..., 2] * u[..., 2] * u[..., 2] / (camera.fx_px * abs(camera.fy_px))
     if camera.distorts:
-        jxx, jxy, jyy = _slopes(camera, u[..., 0] / u[..., 2], u[..., 1] / u[..., 2])
+        jxx, jxy, jyy = slopes(camera, u[..., 0] / u[..., 2], u[..., 1] / u[..., 2])
         solid /= np.maximum(np.abs(jxx * jyy - jxy * jxy), 1e-6)
     return np.sqrt(solid)

@@ -8,7 +8,7 @@ compensate each other, and the direction of an object there is nearly right.
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.geometry.camera import Camera, project, unproject
+from epipole.tasks.algorithms.geometry.camera import Camera, project, slopes, unproject
 from epipole.tasks.algorithms.geometry.rotations import skew
 
 Array = npt.NDArray[np.float64]
@@ -36,13 +36,8 @@ def image_derivatives(camera: Camera, u: Array) -> tuple[Array, Array]:
     """
     x, y = u[:, 0] / u[:, 2], u[:, 1] / u[:, 2]
     r2, xy2 = x * x + y * y, 2 * x * y
-    k1, k2, p1, p2, k3 = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))
-    stretch = np.empty((len(x), 2, 2))
-    stretch[:, 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    stretch[:, 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    stretch[:, 0, 1] = stretch[:, 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    across, mixed, down = slopes(camera, x, y)
+    stretch = np.stack([across, mixed, mixed, down], axis=1).reshape(-1, 2, 2)
     turned = np.empty((len(x), 2, 3))  # derivative of the undistorted place by the rotation vector
     turned[:, 0] = np.stack([-x * y, 1 + x * x, -y], axis=1)
     turned[:, 1] = np.stack([-1 - y * y, x * y, x], axis=1)

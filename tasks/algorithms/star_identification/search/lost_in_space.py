@@ -230,8 +230,7 @@ def search(problem, R_best):
     for step in range(len(ROUNDS)):
         pivots, companions, share = ROUNDS[step][:3]
         companions = max(companions, int(share * n_pattern))
-        for p in range(min(n_pivots, pivots)):
-            i = order[p]
+        for i in order[: min(n_pivots, pivots)]:
             work += _try_pivot(problem, i, order, companions, step, needed, votes, sift, room, best)
             if work > problem.limits.budget or is_clear(best, problem.rule):
                 return top[0], top[1], work
