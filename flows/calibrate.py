@@ -2,14 +2,13 @@
 
 import json
 import math
-import tempfile
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.flows.night.summary import many
+from epipole.io.caches.private_folders import temporary_folder
 from epipole.io.logs.listing import list_logs
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import concat
@@ -54,8 +53,8 @@ def calibrate(
         Where a file is not a log, or the logs have no frames.
     """
     paths = [log for where in logs for log in list_logs(where)[0]]
-    with tempfile.TemporaryDirectory(prefix="epipole-") as made:
-        folder = ReadFolder(Path(made))
+    with temporary_folder("calibrate") as made:
+        folder = ReadFolder(made)
         read = [read_log_into.fn(folder, k, path) for k, path in enumerate(paths)]
         frames = order_logs(folder, read, settings)
         numbers = [k for k, time_ns in enumerate(frames.time_ns) if len(time_ns)]

@@ -11,6 +11,7 @@ from epipole.io.catalogues.hipparcos import NAME as HIPPARCOS
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.io.catalogues.star_list import read_star_list
+from epipole.io.names import fault_of_name
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import CatalogueError
 from epipole.schemas.star_catalogue import UNKNOWN_MOTION_MAS_YR, label_of
@@ -77,6 +78,8 @@ def build_catalogue(
     CatalogueError
         Where the source is invalid; no file is then written.
     """
+    if (fault := fault_of_name(out.name)) is not None:
+        raise CatalogueError(f"file {out}: {fault}")
     if source in (HIPPARCOS, DEEP) and (epoch is not None or name is not None):
         raise CatalogueError(f"{source} has its own epoch and name; leave these options out")
     ignored: list[str] = []

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Sequence
 
 import numpy as np
+import pyarrow as pa
 from prefect import flow
 
 from epipole.flows.night.log_choice import find_logs
@@ -20,7 +21,7 @@ from epipole.flows.night.stages import (
     solve,
     track,
 )
-from epipole.flows.night.summary import Summary
+from epipole.flows.night.summary import Summary, by_reason
 from epipole.flows.night.work import plan_spans
 from epipole.flows.prefect.page import shown_on_page
 from epipole.flows.prefect.runners import runner_asked
@@ -68,8 +69,8 @@ def nightly(
     with claim_nights(out, [night] if night else []) as run:
         frames = read(given.paths, ReadFolder(run), settings)
 
-        nights = nights_of(np.concatenate(frames.time_ns))
-        chosen = choose_nights(given.paths, nights, night)
+        nights = nights_of(np.concatenate([np.empty(0, np.int64), *frames.time_ns]))
+        chosen = choose_nights(given.paths, nights, night, frames.rejects)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
         spans, uncalibrated = plan_spans(frames, chosen)
@@ -102,12 +103,21 @@ def nightly(
     return summary
 
 
-def choose_nights(logs: Sequence[str], nights: Sequence[str], night: str | None) -> list[str]:
+def choose_nights(
+    logs: Sequence[str], nights: Sequence[str], night: str | None, rejects: pa.Table
+) -> list[str]:
     """Return the nights to publish: all that the logs have frames of, or the one asked for."""
+    if not nights:
+        raise LogError(f"{', '.join(logs)}: no frames in these logs; {_advice(rejects)}")
     if night is None:
-        if not nights:
-            raise LogError(f"{', '.join(logs)}: no frames in these logs; check the recording")
         return list(nights)
     if night not in nights:
         raise LogError(f"no frames on {night} in these logs; they have {', '.join(nights)}")
     return [night]
+
+
+def _advice(rejects: pa.Table) -> str:
+    left_out = ", ".join(f"{reason} {count}" for reason, count in by_reason(rejects).items())
+    if left_out:
+        return f"left out: {left_out}; check the recording"
+    return "record epipole.CentroidFrame messages (the schema's name decides, not the topic)"

@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.io.logs.writer import LogWriter
+from epipole.io.names import fault_of_name
 from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.truth import SUFFIX, TruthWriter
 from epipole.schemas.errors import SceneError
@@ -93,6 +94,8 @@ def simulate(
     if logs < 1:
         raise SceneError(f"logs = {logs}: give 1 or more")
     out = Path(out)
+    if (fault := fault_of_name(out.name)) is not None:
+        raise SceneError(f"log {out}: {fault}")
     names = [out] if logs == 1 else [out.with_stem(f"{out.stem}-{k + 1}") for k in range(logs)]
     truth = Path(str(out) + SUFFIX)
     simulation = simulate_scene(settled)

@@ -45,12 +45,17 @@ class Reason(StrEnum):
     MISSING_MESSAGES = (
         "missing_messages",
         Stage.READ,
-        "The log's summary counts more messages than the log holds.",
+        "The log's summary, or the index of a chunk, counts more messages than the log holds.",
     )
     UNKNOWN_CHANNEL = (
         "unknown_channel",
         Stage.READ,
         "Messages of a channel that the log does not declare.",
+    )
+    UNKNOWN_ENCODING = (
+        "unknown_encoding",
+        Stage.READ,
+        "Messages of a channel in an encoding that is not registered.",
     )
     # Of a chunk, with the number of its messages where an index tells it.
     BAD_CHECKSUM = "bad_checksum", Stage.READ, "The chunk's checksum does not fit its bytes."
@@ -65,7 +70,11 @@ class Reason(StrEnum):
         Stage.READ,
         "The chunk's declared size is not the size of its content.",
     )
-    CHUNK_TOO_LARGE = "chunk_too_large", Stage.READ, "The chunk declares more bytes than allowed."
+    CHUNK_TOO_LARGE = (
+        "chunk_too_large",
+        Stage.READ,
+        "The chunk declares more bytes than allowed, by itself or with those before it.",
+    )
     DAMAGED_CHUNK = "damaged_chunk", Stage.READ, "The records in the chunk are damaged."
     # Of any message.
     UNDECODABLE_FRAME = "undecodable_frame", Stage.READ, "A frame's message cannot be decoded."
@@ -76,12 +85,35 @@ class Reason(StrEnum):
         "A calibration's message cannot be decoded.",
     )
     BAD_SENSOR_ID = "bad_sensor_id", Stage.READ, "The sensor id is empty or no valid text."
-    NO_TIMESTAMP = "no_timestamp", Stage.READ, "The message has no time, or an impossible one."
+    NO_TIMESTAMP = (
+        "no_timestamp",
+        Stage.READ,
+        "The message has no timestamp, or one that is out of bounds.",
+    )
     # Of a frame.
     NAN = "nan", Stage.READ, "The frame has a centroid whose position is not a finite number."
+    BAD_CENTROID = (
+        "bad_centroid",
+        Stage.READ,
+        "The frame has a centroid whose x_px or y_px is out of bounds.",
+    )
     UNEQUAL_ARRAYS = "unequal_arrays", Stage.READ, "The frame's arrays differ in length."
-    BAD_SIGMA = "bad_sigma", Stage.READ, "The frame has an invalid centroid error."
+    BAD_SIGMA = (
+        "bad_sigma",
+        Stage.READ,
+        "The frame has a centroid whose sigma_px is invalid or out of bounds.",
+    )
+    BAD_EXPOSURE = (
+        "bad_exposure",
+        Stage.READ,
+        "The frame's exposure_s is out of bounds; the frame is used, its exposure time unknown.",
+    )
     BAD_FRAME_NUMBER = "bad_frame_number", Stage.READ, "The frame number is out of range."
+    STRAY_TIME = (
+        "stray_time",
+        Stage.READ,
+        "The frame's time is more than two days from the median time of its log's frames.",
+    )
     DUPLICATE_FRAME = (
         "duplicate_frame",
         Stage.READ,
@@ -102,14 +134,29 @@ class Reason(StrEnum):
     BAD_POSITION = (
         "bad_position",
         Stage.READ,
-        "The state's position is not three finite numbers, or is farther than ten million km.",
+        "The state's position_km is not three finite numbers, or is farther than ten million km.",
     )
     INSIDE_EARTH = "inside_earth", Stage.READ, "The state's position lies inside the Earth."
-    BAD_VELOCITY = "bad_velocity", Stage.READ, "The state's velocity is invalid."
+    BAD_VELOCITY = (
+        "bad_velocity",
+        Stage.READ,
+        "The state's velocity_km_s is not three finite numbers, or is faster than 1,000 km/s.",
+    )
+    BAD_POSITION_SIGMA = (
+        "bad_position_sigma",
+        Stage.READ,
+        "The state's position_sigma_km is above 1,000 km, which is no position.",
+    )
     BAD_ATTITUDE = (
         "bad_attitude",
         Stage.READ,
-        "The state's attitude is invalid; its position is used.",
+        "The state's attitude_xyzw is no unit quaternion; its position is used.",
+    )
+    VAGUE_ATTITUDE = (
+        "vague_attitude",
+        Stage.READ,
+        "The state's attitude_sigma_arcsec is above 2 degrees, which is no help; its position is "
+        "used.",
     )
     DUPLICATE_STATE = (
         "duplicate_state",
@@ -117,13 +164,26 @@ class Reason(StrEnum):
         "Another state of the sensor has the same time.",
     )
     # Of a calibration.
-    BAD_IMAGE_SIZE = "bad_image_size", Stage.READ, "The calibration's image size is invalid."
+    BAD_IMAGE_SIZE = (
+        "bad_image_size",
+        Stage.READ,
+        "The calibration's width or height is out of bounds.",
+    )
     BAD_CAMERA_MATRIX = (
         "bad_camera_matrix",
         Stage.READ,
-        "The calibration's camera matrix is invalid.",
+        "The calibration's K is no camera matrix without skew, or is out of bounds.",
     )
-    BAD_DISTORTION = "bad_distortion", Stage.READ, "The calibration's distortion is invalid."
+    BAD_DISTORTION = (
+        "bad_distortion",
+        Stage.READ,
+        "The calibration's D has not 4 or 5 finite numbers, or one that is out of bounds.",
+    )
+    FOLDED_IMAGE = (
+        "folded_image",
+        Stage.READ,
+        "The calibration's D folds the image: two directions would have one place in it.",
+    )
     UNKNOWN_DISTORTION_MODEL = (
         "unknown_distortion_model",
         Stage.READ,
@@ -134,7 +194,13 @@ class Reason(StrEnum):
     NO_STATE = (
         "no_state",
         Stage.IDENTIFY,
-        "No state of the sensor is near enough in time: the frames give no position.",
+        "No state of the sensor is near enough in time, or its states give an impossible speed: "
+        "the frames give no position.",
+    )
+    OUTSIDE_IMAGE = (
+        "outside_image",
+        Stage.IDENTIFY,
+        "Centroids outside the image that the calibration states.",
     )
     TOO_MANY_DETECTIONS = (
         "too_many_detections",
@@ -191,6 +257,17 @@ class Reason(StrEnum):
         "The sensor is at fault, and it is not clear whether by its clock, ephemeris or attitude; "
         "its views are left out.",
     )
+
+
+# Why a calibration that a log has is not used.
+OF_CALIBRATIONS = (
+    Reason.UNDECODABLE_CALIBRATION,
+    Reason.BAD_IMAGE_SIZE,
+    Reason.BAD_CAMERA_MATRIX,
+    Reason.BAD_DISTORTION,
+    Reason.FOLDED_IMAGE,
+    Reason.UNKNOWN_DISTORTION_MODEL,
+)
 
 
 class Outcome(Declared):

@@ -4,13 +4,15 @@ They come from a TOML file or from flow parameters. They are passed in, never re
 """
 
 import hashlib
-import tomllib
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from epipole.schemas.errors import SettingsError
+from epipole.schemas.logs.bounds import ATTITUDE_SIGMA, POSITION_SIGMA
 from epipole.schemas.methods import ASSOCIATION, STAR_IDENTIFICATION, TRACK_LINKING
+from epipole.schemas.text.shown import as_line
+from epipole.schemas.text.toml_text import toml_values
 
 if TYPE_CHECKING:
     StarMethod = str
@@ -22,6 +24,12 @@ else:  # the names that the registries list
     AssociationMethod = Literal[tuple(ASSOCIATION)]
 
 
+LONGEST_VALUE = 80  # of an invalid value in a message
+# Bounds beyond which no sensor and no object is; a larger value is a slip of the pen.
+DAY_S = 86_400
+FARTHEST_KM = 1e6  # twice as far as the Moon
+MOST_SIGMA = 100
+MOST_LOG_ODDS = 1000
 BYTES_PER_VIEW = 2000  # of memory, where positions are solved
 
 
@@ -35,19 +43,29 @@ class SensorSettings(Group):
     """Values that are used where a log has none."""
 
     attitude_sigma_arcsec: float = Field(
-        60.0, gt=0, description="1-sigma of a prior attitude that has no sigma in the log."
+        60.0,
+        gt=0,
+        le=ATTITUDE_SIGMA.greatest,
+        description="1-sigma of a prior attitude that has no sigma in the log.",
     )
     position_sigma_km: float = Field(
-        0.05, gt=0, description="1-sigma of a position that has no sigma in the log."
+        0.05,
+        gt=0,
+        le=POSITION_SIGMA.greatest,
+        description="1-sigma of a position that has no sigma in the log.",
     )
     centroid_sigma_px: float | None = Field(
         None,
         gt=0,
+        le=100,
         description="1-sigma of a centroid that has no sigma in the log. "
         "Default: estimated from the stars.",
     )
     state_gap_s: float = Field(
-        30.0, gt=0, description="A frame farther than this from the nearest state gets no position."
+        30.0,
+        gt=0,
+        le=DAY_S,
+        description="A frame farther than this from the nearest state gets no position.",
     )
 
 
@@ -66,16 +84,20 @@ class IdentificationSettings(Group):
     )
     magnitude_limit: float | None = Field(
         None,
+        ge=-2,
+        le=25,
         description="Faintest star to search for. Default: from the number of centroids.",
     )
     merge_px: float = Field(
         2.0,
         ge=0,
+        le=100,
         description="Stars closer than this make one spot. It gets the id of the brighter star.",
     )
     gate_sigma: float = Field(
         3.7,
         gt=0,
+        le=MOST_SIGMA,
         description="Largest distance of a centroid from the predicted place of its star.",
     )
     false_alarm: float = Field(
@@ -88,6 +110,7 @@ class IdentificationSettings(Group):
     time_limit_s: float = Field(
         0.5,
         gt=0,
+        le=3600,
         description="Longest search for one frame, in seconds of a reference machine: work is "
         "counted.",
     )
@@ -103,19 +126,28 @@ class TrackletSettings(Group):
     """How detections of one sensor are joined to tracklets."""
 
     gate_sigma: float = Field(
-        4.0, gt=0, description="Largest distance of a detection from the prediction of its track."
+        4.0,
+        gt=0,
+        le=MOST_SIGMA,
+        description="Largest distance of a detection from the prediction of its track.",
     )
-    max_rate_deg_s: float = Field(2.0, gt=0, description="Fastest apparent motion to search for.")
+    max_rate_deg_s: float = Field(
+        2.0, gt=0, le=180, description="Fastest apparent motion to search for."
+    )
     max_missed: int = Field(
-        3, ge=0, description="Most frames in a row in which a tracklet may have no detection."
+        3,
+        ge=0,
+        le=1000,
+        description="Most frames in a row in which a tracklet may have no detection.",
     )
-    min_detections: int = Field(3, ge=2, description="Fewest detections of a tracklet.")
+    min_detections: int = Field(3, ge=2, le=1000, description="Fewest detections of a tracklet.")
     false_alarm: float = Field(
         1e-4, gt=0, lt=1, description="Accepted number of false tracklets per frame."
     )
     false_alarm_sequence: float = Field(
         1.0,
         gt=0,
+        le=1000,
         description="Accepted number of false tracklets in a sequence of at most 24 frames (with "
         "the default `min_detections`): what no tracklet claimed is followed again with it. It "
         "counts every pair of detections as a test; 1 to 5 % of it are measured.",
@@ -123,6 +155,7 @@ class TrackletSettings(Group):
     most_detections: int = Field(
         500_000,
         ge=1_000,
+        le=1_000_000_000,
         description="Most detections of a sensor in half an hour that are followed; of more, the "
         "fullest frames keep the brightest. It bounds the memory of a task: about 1 kB each.",
     )
@@ -132,6 +165,7 @@ class TrackletSettings(Group):
     link_gap_s: float | None = Field(
         None,
         gt=0,
+        le=DAY_S,
         description="Longest gap across which tracklets are joined. Default: as far as their "
         "motion can be foretold; three minutes where the gap lies over the end of a span.",
     )
@@ -141,6 +175,7 @@ class TrackletSettings(Group):
     link_noise_px: float = Field(
         1e-3,
         gt=0,
+        le=1000,
         description="Process noise of the method 'prediction', in px^2/s^3.",
     )
 
@@ -150,17 +185,20 @@ class AlignmentSettings(Group):
 
     interval_s: float | None = Field(
         None,
-        gt=0,
+        ge=1e-3,
+        le=DAY_S,
         description="Time between epochs. Default: the frame interval of the slowest sensor.",
     )
     window_s: float = Field(
         6.0,
         gt=0,
+        le=3600,
         description="Half-width of the time window in which the motion around an epoch is fitted.",
     )
     max_gap_s: float | None = Field(
         None,
         gt=0,
+        le=DAY_S,
         description="Longest time between an epoch and the frame used for it. Default: half the "
         "frame interval or half the interval between epochs, whichever is longer.",
     )
@@ -174,8 +212,8 @@ class AlignmentSettings(Group):
 class AltitudeShell(Group):
     """Altitudes (above the equatorial radius) that hold a share of all objects."""
 
-    lowest_km: float = Field(ge=0, description="Lower altitude.")
-    highest_km: float = Field(gt=0, description="Upper altitude.")
+    lowest_km: float = Field(ge=0, le=FARTHEST_KM, description="Lower altitude.")
+    highest_km: float = Field(gt=0, le=FARTHEST_KM, description="Upper altitude.")
     share: float = Field(gt=0, lt=1, description="Share of all objects between them.")
 
 
@@ -197,24 +235,29 @@ class AssociationSettings(Group):
     threshold_px: float = Field(
         8.0,
         gt=0,
+        le=10_000,
         description="Method 'epipolar': largest distance of a view from the epipolar line. "
         "Published values are 8 to 12 px.",
     )
     gate_sigma: float = Field(
-        4.5, gt=0, description="Largest disagreement between views of one object."
+        4.5, gt=0, le=MOST_SIGMA, description="Largest disagreement between views of one object."
     )
     min_altitude_km: float = Field(
-        100.0, ge=0, description="Altitude of the lowest object to search for."
+        100.0, ge=0, le=FARTHEST_KM, description="Altitude of the lowest object to search for."
     )
     max_range_km: float = Field(
-        1.0e5, gt=0, description="Range of the farthest object to search for."
+        1.0e5, gt=0, le=FARTHEST_KM, description="Range of the farthest object to search for."
     )
     span_s: float = Field(
-        30.0, gt=0, description="Length of the time spans over which evidence is first summed."
+        30.0,
+        ge=1,
+        le=3600,
+        description="Length of the time spans over which evidence is first summed.",
     )
     longest_span_s: float = Field(
         600.0,
         ge=0,
+        le=DAY_S,
         description="Undecided tracklets are judged again over spans of 2 and then 10 minutes, "
         "up to this length. 0: never.",
     )
@@ -224,11 +267,15 @@ class AssociationSettings(Group):
         "prior.",
     )
     min_log_odds: float = Field(
-        0.5, description="Least log-odds (ln) of a reported object against chance."
+        0.5,
+        ge=-MOST_LOG_ODDS,
+        le=MOST_LOG_ODDS,
+        description="Least log-odds (ln) of a reported object against chance.",
     )
     ambiguity_log_odds: float = Field(
         2.0,
         ge=0,
+        le=MOST_LOG_ODDS,
         description="Least difference in log-odds (ln) between two rival hypotheses. Below it, "
         "neither is reported.",
     )
@@ -237,7 +284,9 @@ class AssociationSettings(Group):
 class PositionSettings(Group):
     """Positions of objects at epochs, by least squares."""
 
-    reject_sigma: float = Field(4.0, gt=0, description="Largest residual of a view that is used.")
+    reject_sigma: float = Field(
+        4.0, gt=0, le=MOST_SIGMA, description="Largest residual of a view that is used."
+    )
     all_pairs: bool = Field(
         False,
         description="Whether `pairs` has every two views of an object at an epoch, or each view "
@@ -249,22 +298,28 @@ class StateSettings(Group):
     """States (position and velocity) of objects over arcs, and objects that are seen again."""
 
     arc_s: float = Field(
-        600.0, gt=0, description="Longest arc of one state. Arcs also end at every half hour."
+        600.0,
+        gt=0,
+        le=DAY_S,
+        description="Longest arc of one state. Arcs also end at every half hour.",
     )
     min_epochs: int = Field(
         3,
         ge=2,
+        le=1000,
         description="Fewest independent epochs of an arc. A state from only two cannot be checked.",
     )
     link_gap_s: float = Field(
         7200.0,
         ge=0,
+        le=7 * DAY_S,
         description="Longest time without detections after which an object is recognised by its "
         "motion. The default is more than half a low orbit. 0: never.",
     )
     link_log_odds: float = Field(
         4.6,
         gt=0,
+        le=MOST_LOG_ODDS,
         description="Least log-odds (ln) that it is the same object. At the default, 1 in 100 "
         "links is wrong.",
     )
@@ -276,6 +331,7 @@ class WorkSettings(Group):
     memory_mib: int = Field(
         512,
         ge=64,
+        le=16 * 1024**2,
         description="Memory that a task of `solve` takes at most, about [MiB]. Nights of many "
         "sensors are divided into more tasks; the objects stay the same.",
     )
@@ -298,9 +354,36 @@ class Settings(Group):
     states: StateSettings = StateSettings()
     work: WorkSettings = WorkSettings()
 
+    @model_validator(mode="after")
+    def _agree(self) -> Self:
+        """Refuse settings that contradict each other."""
+        if (contradiction := _contradiction(self)) is not None:
+            raise ValueError(contradiction)
+        return self
+
     def key(self) -> str:
         """Return a digest of the settings."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+
+
+def _contradiction(settings: Settings) -> str | None:
+    """Return which settings contradict each other; None: none do."""
+    association = settings.association
+    for shell in association.shells:
+        if shell.lowest_km >= shell.highest_km:
+            return (
+                f"association.shells: lowest_km = {shell.lowest_km:g} is not below "
+                f"highest_km = {shell.highest_km:g}"
+            )
+    share = sum(shell.share for shell in association.shells)
+    if share > 1:
+        return f"association.shells: the shares add up to {share:.3g}, which is more than 1"
+    if association.min_altitude_km >= association.max_range_km:
+        return (
+            f"association.min_altitude_km = {association.min_altitude_km:g} is not below "
+            f"association.max_range_km = {association.max_range_km:g}"
+        )
+    return None
 
 
 def parse_settings(text: str, where: str) -> Settings:
@@ -312,9 +395,10 @@ def parse_settings(text: str, where: str) -> Settings:
         Names the setting, the value given and the value expected.
     """
     try:
-        return validate_settings(tomllib.loads(text), where)
-    except tomllib.TOMLDecodeError as error:
+        values = toml_values(text)
+    except ValueError as error:
         raise SettingsError(f"{where}: not TOML: {error}") from error
+    return validate_settings(values, where)
 
 
 def validate_settings(values: dict[str, Any], where: str) -> Settings:
@@ -327,7 +411,10 @@ def validate_settings(values: dict[str, Any], where: str) -> Settings:
 
 def _first_fault(error: ValidationError) -> str:
     fault = error.errors()[0]
-    name = ".".join(str(part) for part in fault["loc"])
+    if not fault["loc"] and "ctx" in fault:  # of several settings
+        return str(fault["ctx"]["error"])
+    name = as_line(".".join(str(part) for part in fault["loc"]), LONGEST_VALUE)
+    value = as_line(repr(fault["input"]), LONGEST_VALUE)
     if fault["type"] == "extra_forbidden":
         return f"unknown setting {name}; `epipole settings` lists them all"
-    return f"{name} = {fault['input']!r}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
+    return f"{name} = {value}: {fault['msg'][0].lower()}{fault['msg'][1:]}"

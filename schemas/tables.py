@@ -341,8 +341,12 @@ SOURCES = schema(
         column("name", pa.string(), doc="File name of the log."),
         column("size", I64, unit="byte", doc="Size of the log."),
         column("sha256", pa.string(), doc="Digest of its bytes."),
-        time_column("first_time", doc="First frame in the log, UTC."),
-        time_column("last_time", doc="Last frame in the log, UTC."),
+        time_column("first_time", doc="First frame in the log, UTC; see `last_time`."),
+        time_column(
+            "last_time",
+            doc="Last frame in the log, UTC; of a log without frames, its last state; without "
+            "these either, the last frame of the run.",
+        ),
         column("code_version", pa.string(), doc="Version of epipole that made the night."),
         column("settings_key", pa.string(), doc="Digest of the settings that made the night."),
     ],

@@ -17,7 +17,7 @@ def describe(log: str) -> dict[str, Any]:
     Raises
     ------
     LogError
-        Where the file is not a log, or has no frames.
+        Where the file is not a log.
     """
     contents = read_log(log)
     return {
@@ -26,7 +26,7 @@ def describe(log: str) -> dict[str, Any]:
         "sha256": contents.source.sha256,
         "sensors": [
             _sensor(name, contents.exposures, contents.states, contents.cameras)
-            for name in sensor_ids(contents.exposures)
+            for name in sorted({*sensor_ids(contents.exposures), *sensor_ids(contents.states)})
         ],
         "left_out": [
             {"reason": row["reason"], "sensor_id": row["sensor_id"], "count": row["count_sum"]}
@@ -58,10 +58,10 @@ def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table)
     return {
         "sensor_id": name,
         "frames": frames.num_rows,
-        "first": _iso(time_ns[0]),
-        "last": _iso(time_ns[-1]),
+        "first": _iso(time_ns[0]) if len(time_ns) else None,
+        "last": _iso(time_ns[-1]) if len(time_ns) else None,
         "rate_hz": 1e9 / interval_ns if interval_ns else None,
-        "centroids_per_frame": len(centroids) / frames.num_rows,
+        "centroids_per_frame": len(centroids) / max(frames.num_rows, 1),
         "states": states.num_rows,
         "state_frames": sorted(set(states["frame"].to_pylist())),
         "states_with_attitude": states.num_rows - states["qw"].null_count,
@@ -82,7 +82,7 @@ def lines(described: dict[str, Any]) -> list[str]:
         rate = f" at {sensor['rate_hz']:.3g} Hz" if sensor["rate_hz"] else ""
         out += [
             f"  {sensor['sensor_id']}",
-            f"    frames       {sensor['frames']:,}{rate}, {sensor['first']} to {sensor['last']}",
+            f"    frames       {sensor['frames']:,}{rate}{_times(sensor)}",
             f"    centroids    {sensor['centroids_per_frame']:.1f} per frame",
             f"    states       {_states(sensor)}",
             f"    calibration  {_calibration(sensor)}",
@@ -91,6 +91,10 @@ def lines(described: dict[str, Any]) -> list[str]:
         whose = f" of {row['sensor_id']}" if row["sensor_id"] else ""
         out.append(f"  left out: {row['count']:,} {row['reason']}{whose}")
     return out
+
+
+def _times(sensor: dict[str, Any]) -> str:
+    return f", {sensor['first']} to {sensor['last']}" if sensor["first"] else ""
 
 
 def _states(sensor: dict[str, Any]) -> str:

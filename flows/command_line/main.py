@@ -6,8 +6,10 @@ What a command needs is imported when it runs, so that ``epipole --help`` answer
 
 import datetime
 import json
+import signal
 import sys
 import warnings
+from collections.abc import Iterable
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
@@ -16,9 +18,19 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
+from epipole.flows.command_line.environment import prepare_environment
 from epipole.io.logs.messages.encodings.registry import ENCODINGS
 from epipole.schemas.errors import EpipoleError
 from epipole.schemas.runner import Runner
+from epipole.schemas.text.shown import as_line
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM came, as when a scheduler stops a run: it ends as after Ctrl-C, and clears up."""
+
+
+def _terminate(*_: Any) -> None:
+    raise Terminated
 
 
 class _Commands(typer.core.TyperGroup):
@@ -30,12 +42,14 @@ class _Commands(typer.core.TyperGroup):
             return super().invoke(ctx)
         except EpipoleError as error:
             _fail(str(error), 1)
+        except Terminated:
+            _fail("stopped", 128 + signal.SIGTERM)
         except KeyboardInterrupt:
-            _fail("interrupted", 130)
+            _fail("interrupted", 128 + signal.SIGINT)
 
 
 def _fail(message: str, code: int) -> None:
-    print(f"epipole: {' '.join(message.split())}", file=sys.stderr)
+    print(f"epipole: {as_line(' '.join(message.split()))}", file=sys.stderr)
     sys.exit(code)
 
 
@@ -54,6 +68,11 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        prepare_environment()
+    except EpipoleError as error:
+        _fail(str(error), 1)
     app()
 
 
@@ -134,17 +153,17 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Turn logs into a dataset: run the nightly flow on this machine now."""
+    if not verbose:
+        warnings.simplefilter("ignore")
     from epipole.flows.command_line.run import RunOptions, run_nightly
 
     _check_night(night)
-    if not verbose:
-        warnings.simplefilter("ignore")
     options = RunOptions(settings, night, replace, runner, workers, scheduler, quiet, verbose)
     summary, seconds = run_nightly(logs, out, options)
     if as_json:
         _print_json(summary.as_dict() | {"seconds": round(seconds, 2)})
     elif not quiet:
-        typer.echo("\n".join([*summary.lines(), f"took        {seconds:.1f} s"]))
+        _print_lines([*summary.lines(), f"took        {seconds:.1f} s"])
 
 
 def _check_night(night: str | None) -> None:
@@ -167,7 +186,7 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
     if as_json:
         _print_json(described)
     else:
-        typer.echo("\n".join(line for log in described for line in lines(log)))
+        _print_lines(line for log in described for line in lines(log))
 
 
 @app.command()
@@ -201,7 +220,7 @@ def calibrate(
     if as_json:
         _print_json([as_dict(report) for report in reports])
     else:
-        typer.echo("\n".join(line for report in reports for line in lines(report)))
+        _print_lines(line for report in reports for line in lines(report))
     if not any(report.camera for report in reports):
         sys.exit(1)
 
@@ -285,12 +304,12 @@ def simulate(
     if as_json:
         _print_json(vars(made) | {"logs": [str(p) for p in made.logs], "truth": str(made.truth)})
         return
-    typer.echo(f"log    {', '.join(str(log) for log in made.logs)}")
-    typer.echo(f"truth  {made.truth}")
-    typer.echo(
+    counts = (
         f"{many(made.sensors, 'sensor')}, {many(made.objects, 'object')}, "
         f"{many(made.frames, 'frame')}, {many(made.centroids, 'centroid')}"
     )
+    logs_made = ", ".join(str(log) for log in made.logs)
+    _print_lines([f"log    {logs_made}", f"truth  {made.truth}", counts])
 
 
 @app.command()
@@ -391,7 +410,13 @@ def build(
     if as_json:
         _print_json(built.as_dict())
     else:
-        typer.echo("\n".join(built.lines()))
+        _print_lines(built.lines())
+
+
+def _print_lines(lines: Iterable[str]) -> None:
+    """Print lines that may have names from a log in them."""
+    for line in lines:
+        typer.echo(as_line(line))
 
 
 def _print_json(value: Any) -> None:

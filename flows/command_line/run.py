@@ -49,21 +49,24 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
         list_logs(where)
     with shown(options.quiet, options.verbose), compile_beside() as compiling:
         prepare("start Prefect")
-        from epipole.flows.prefect.defaults import embedded_prefect, quiet_console
+        from epipole.flows.prefect.defaults import (
+            embedded_prefect,
+            lost_server_as_line,
+            quiet_console,
+        )
+        from epipole.flows.prefect.runners import check_scheduler, task_runner
 
         if not options.verbose:
             quiet_console()
         if compiling:
             LOGGER.info("first run of this version: compiling takes about a minute")
+        runner = task_runner(options.runner, options.workers, options.scheduler)
+        if options.scheduler is not None:
+            check_scheduler(options.scheduler)
         with embedded_prefect():
-            summary = _run(logs, out, settings, options)
+            from epipole.flows.nightly import nightly
+
+            flow = nightly.with_options(task_runner=runner)
+            with lost_server_as_line():
+                summary = flow(logs, out, settings, options.night, options.replace)
     return summary, time.monotonic() - started
-
-
-def _run(logs: list[str], out: str, settings: Settings, options: RunOptions) -> Summary:
-    from epipole.flows.nightly import nightly
-    from epipole.flows.prefect.runners import task_runner
-
-    runner = task_runner(options.runner, options.workers, options.scheduler)
-    flow = nightly.with_options(task_runner=runner)
-    return flow(logs, out, settings, options.night, options.replace)

@@ -5,6 +5,7 @@ and prints nothing. So the stages do not depend on terminals or pages.
 """
 
 import contextlib
+import copy
 import itertools
 import logging
 import sys
@@ -16,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from epipole.schemas.stages import Stage
+from epipole.schemas.text.shown import as_line
 
 ROOT = logging.getLogger("epipole")
 STEPS = logging.getLogger("epipole.steps")
@@ -84,12 +86,13 @@ def shown(quiet: bool, verbose: bool) -> Iterator[None]:
             stack.callback(STEPS.removeHandler, handler)
         else:
             handler = logging.StreamHandler()
-            handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
+            handler.setFormatter(_OneLine("%(asctime)s %(message)s", "%H:%M:%S"))
         ROOT.setLevel(logging.INFO)
         propagates, ROOT.propagate = ROOT.propagate, False  # or Prefect's console shows them again
         stack.callback(setattr, ROOT, "propagate", propagates)
         if not verbose:
             handler.addFilter(_is_of_the_flow)
+            handler.addFilter(_Once())
         ROOT.addHandler(handler)
         stack.callback(ROOT.removeHandler, handler)
         stack.callback(ROOT.setLevel, level)
@@ -97,8 +100,40 @@ def shown(quiet: bool, verbose: bool) -> Iterator[None]:
 
 
 def _is_of_the_flow(record: logging.LogRecord) -> bool:
-    """Return whether to show a line: warnings, and lines of stages but not of their many tasks."""
-    return record.levelno >= logging.WARNING or record.name.startswith("epipole.flows.")
+    """Return whether to show a record: progress, warnings, and lines of stages but not of their
+    many tasks."""
+    of_the_flow = record.name.startswith(("epipole.flows.", STEPS.name))
+    return of_the_flow or record.levelno >= logging.WARNING
+
+
+class _Once(logging.Filter):
+    """Lets each warning pass once; a night that is solved again would give it again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._said: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        if record.levelno < logging.WARNING:
+            return True
+        message = record.getMessage()
+        is_new = message not in self._said
+        self._said.add(message)
+        return is_new
+
+
+class _OneLine(logging.Formatter):
+    """Escapes what a log or a file name brings into a message."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return super().format(with_safe_text(record))
+
+
+def with_safe_text(record: logging.LogRecord) -> logging.LogRecord:
+    """Return the record with its message as one line that can be shown."""
+    safe = copy.copy(record)
+    safe.msg, safe.args = as_line(record.getMessage()), None
+    return safe
 
 
 class StageDisplay(logging.Handler):
@@ -123,7 +158,7 @@ class StageDisplay(logging.Handler):
         """Move the bar, or print a line above it."""
         stage: str | None = getattr(record, "stage", None)
         if stage is None:
-            self._bar.console.print(record.getMessage(), highlight=False, markup=False)
+            self._bar.console.print(as_line(record.getMessage()), highlight=False, markup=False)
             return
         if stage != self._stage:
             self._bar.remove_task(self._task)

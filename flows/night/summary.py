@@ -120,7 +120,7 @@ def summarise(
         epochs=pc.count_distinct(tables["epochs"]["epoch"]).as_py(),
         objects=pc.count_distinct(tables["positions"]["object_id"]).as_py(),
         positions=tables["positions"].num_rows,
-        rejects=_by_reason(tables["rejects"]),
+        rejects=by_reason(tables["rejects"]),
         faults=[str(verdict) for verdict in verdicts if verdict.is_faulty],
         by_sensor=[
             _of_sensor(frames.filter(pc.field("sensor_id") == name), tables["tracklets"], name)
@@ -141,7 +141,8 @@ def _of_sensor(frames: pa.Table, tracklets: pa.Table, sensor_id: str) -> SensorS
     )
 
 
-def _by_reason(rejects: pa.Table) -> dict[str, int]:
+def by_reason(rejects: pa.Table) -> dict[str, int]:
+    """Return the counts of what was left out, by reason, the most frequent first."""
     counts = rejects.group_by("reason").aggregate([("count", "sum")])
     ordered = counts.sort_by([("count_sum", "descending"), ("reason", "ascending")])
     return {row["reason"]: row["count_sum"] for row in ordered.to_pylist()}

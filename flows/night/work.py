@@ -11,7 +11,7 @@ from epipole.io.work.parts import Parts
 from epipole.io.work.places import ReadFolder, SensorParts, WorkFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
-from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.rejects import OF_CALIBRATIONS, Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.check.check_sensors import SensorVerdict
@@ -87,10 +87,18 @@ def plan_spans(frames: OrderedFrames, nights: Sequence[str]) -> tuple[Spans, pa.
     if not spans:
         raise LogError(
             f"{', '.join(log.name for log in frames.sources)}: no sensor has a calibration "
-            f"({', '.join(frames.sensors)}); record foxglove.CameraCalibration "
-            "with the sensor's id as frame_id"
+            f"({', '.join(frames.sensors)}); {_why_not(frames.rejects)}"
         )
     return spans, concat(REJECTS, rejects)
+
+
+def _why_not(rejects: pa.Table) -> str:
+    """Return what is wrong with the calibrations that there are, or what to record."""
+    found = set(rejects["reason"].to_pylist())
+    sentences = [f"{reason}: {reason.sentence}" for reason in OF_CALIBRATIONS if reason in found]
+    if sentences:
+        return "those in the log are invalid: " + " ".join(sentences)
+    return "record foxglove.CameraCalibration with the sensor's id as frame_id"
 
 
 def _wanted(numbers: np.ndarray, days: Sequence[int]) -> list[Span]:

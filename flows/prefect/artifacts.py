@@ -22,9 +22,11 @@ from prefect.artifacts import (
 from prefect.exceptions import PrefectException
 
 from epipole.flows.night.summary import Summary, many
+from epipole.schemas.text.shown import as_line, as_markdown_text
 
 LOGGER = logging.getLogger(__name__)
 
+LONGEST_ID = 100
 UPDATED_EVERY_S = 3.0
 _PAGE_ERRORS = (httpx.HTTPError, PrefectException, OSError, RuntimeError)
 
@@ -76,12 +78,15 @@ def show_summary(summary: Summary) -> None:
     nights = ", ".join(summary.nights)
     with _as_warning("the summary"):
         create_markdown_artifact(as_markdown(summary), "night", f"Night {nights}")
-        rows = [sensor.as_row() for sensor in summary.by_sensor]
+        rows = [
+            sensor.as_row() | {"sensor": as_line(sensor.sensor_id, LONGEST_ID)}
+            for sensor in summary.by_sensor
+        ]
         create_table_artifact(rows, "sensors", f"Sensors of {nights}")
         for night in summary.nights:
             folder = f"{summary.dataset.rstrip('/')}/night={night}"
             link = folder if "://" in folder else Path(folder).absolute().as_uri()
-            create_link_artifact(link, folder, "dataset", f"Tables of {night}")
+            create_link_artifact(link, as_line(folder), "dataset", f"Tables of {night}")
 
 
 def as_markdown(summary: Summary) -> str:
@@ -99,7 +104,12 @@ def as_markdown(summary: Summary) -> str:
     }
     lines = [f"# Night {', '.join(summary.nights)}", "", *_table("what", counts)]
     if summary.faults:
-        lines += ["", "Sensors at fault:", "", *(f"- {fault}" for fault in summary.faults)]
+        lines += [
+            "",
+            "Sensors at fault:",
+            "",
+            *(f"- {as_markdown_text(fault)}" for fault in summary.faults),
+        ]
     if summary.rejects:
         lines += ["", f"Left out: {many(sum(summary.rejects.values()), 'thing')}", ""]
         lines += _table("reason", summary.rejects)

@@ -6,17 +6,24 @@ locked"), so they are off. A user's own settings, profile or server take precede
 """
 
 import contextlib
-import contextvars
 import logging
-import signal
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from urllib.parse import urlsplit
 
+import httpx
 from prefect.client.orchestration import get_client
 from prefect.logging.configuration import setup_logging
 from prefect.logging.handlers import PrefectConsoleHandler
-from prefect.server.api.server import SubprocessASGIServer
-from prefect.settings import PREFECT_API_URL, get_current_settings, temporary_settings
+from prefect.settings import (
+    PREFECT_API_URL,
+    PREFECT_CLIENT_MAX_RETRIES,
+    get_current_settings,
+    temporary_settings,
+)
+
+from epipole.flows.prefect.embedded_server import start_server
+from epipole.io.remote_files import line_of
+from epipole.schemas.errors import EpipoleError
 
 # Services that only a permanent server needs.
 _SERVICES = (
@@ -40,36 +47,68 @@ _DEFAULTS = {
     "server.ephemeral.startup_timeout_seconds": 120,
 }
 
+ANSWERS_WITHIN_S = 5.0
+
 # Their errors are also raised to the caller, who prints them.
 _RUN_LOGGERS = ("prefect.flow_runs", "prefect.task_runs")
 
 
 @contextlib.contextmanager
 def embedded_prefect() -> Iterator[None]:
-    """Run flows on an embedded API, unless the user's Prefect has an API set."""
+    """Run flows on an embedded API, unless the user's Prefect has an API set.
+
+    Raises
+    ------
+    EpipoleError
+        Where the user's server does not answer, or the embedded one cannot start.
+    """
     with contextlib.ExitStack() as stack:
-        if get_current_settings().api.url is None:
+        url = get_current_settings().api.url
+        if url is None:
             stack.enter_context(temporary_settings(set_defaults=_DEFAULTS))
-            _start_server()
-            # Without it, a worker in another process would start a second API.
-            url = SubprocessASGIServer().api_url
-            stack.enter_context(temporary_settings({PREFECT_API_URL: url}))
+            # Workers in other processes use the same API.
+            stack.enter_context(temporary_settings({PREFECT_API_URL: start_server()}))
+        else:
+            _check_server(url)
         yield
 
 
-def _start_server() -> None:
-    """Start the embedded server so that Ctrl-C does not stop it.
+@contextlib.contextmanager
+def lost_server_as_line() -> Iterator[None]:
+    """Turn the errors of a server that ends during a run into one line.
 
-    The server also gets the signal, but it must record how the run ended. Signals that are
-    blocked in a thread stay blocked in the processes that the thread starts.
+    Raises
+    ------
+    EpipoleError
+        Where Prefect's client has given up.
     """
+    try:
+        yield
+    except httpx.HTTPError as error:
+        url = get_current_settings().api.url or ""
+        raise EpipoleError(
+            f"Prefect's server {_without_password(url)} was lost during the run "
+            f"({line_of(error)}); the dataset has all nights of the run or none: run again"
+        ) from error
 
-    def start() -> None:
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        get_client(sync_client=True)
 
-    with ThreadPoolExecutor(1) as pool:
-        pool.submit(contextvars.copy_context().run, start).result()
+def _check_server(url: str) -> None:
+    """Raise unless the user's server answers. Otherwise Prefect ends the run with a traceback."""
+    with (
+        temporary_settings({PREFECT_CLIENT_MAX_RETRIES: 0}),
+        get_client(httpx_settings={"timeout": ANSWERS_WITHIN_S}, sync_client=True) as client,
+    ):
+        error = client.api_healthcheck()
+    if error is not None:
+        raise EpipoleError(
+            f"Prefect's server {_without_password(url)} does not answer ({line_of(error)}); "
+            "start it, or unset PREFECT_API_URL to run without it"
+        ) from error
+
+
+def _without_password(url: str) -> str:
+    parts = urlsplit(url)
+    return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
 
 
 def quiet_console() -> None:

@@ -9,7 +9,7 @@ from typing import ParamSpec
 from prefect.context import FlowRunContext, TaskRunContext
 from prefect.logging.handlers import APILogHandler
 
-from epipole.flows.night.progress import ROOT, STEPS
+from epipole.flows.night.progress import ROOT, STEPS, with_safe_text
 from epipole.flows.night.summary import Summary
 from epipole.flows.prefect.artifacts import ProgressBar, show_summary
 
@@ -40,7 +40,7 @@ class _RunLog(APILogHandler):
 
     def emit(self, record: logging.LogRecord) -> None:
         if TaskRunContext.get() or FlowRunContext.get():  # neither in a thread of a library
-            super().emit(record)
+            super().emit(with_safe_text(record))
 
 
 @contextlib.contextmanager

@@ -1,13 +1,17 @@
 """What runs the tasks of a run: threads of this process, or Dask."""
 
+import asyncio
 import logging
 import os
 from typing import Any
 
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
+from epipole.io.remote_files import line_of
 from epipole.schemas.errors import EpipoleError
 from epipole.schemas.runner import Runner
+
+ANSWERS_WITHIN_S = 5.0
 
 
 def task_runner(
@@ -53,6 +57,40 @@ def task_runner(
             "dashboard_address": None,
             "env": quiet,
         }
+    )
+
+
+def check_scheduler(address: str) -> None:
+    """Raise unless a Dask scheduler answers. Prefect waits longer, and ends with a traceback.
+
+    Raises
+    ------
+    EpipoleError
+        Where nothing answers, or something else does.
+    """
+    try:
+        kind = asyncio.run(asyncio.wait_for(_kind_of(address), ANSWERS_WITHIN_S))
+    # MemoryError: bytes of something else, read as the length of an answer.
+    except (OSError, ValueError, MemoryError) as error:
+        raise _no_scheduler(address, f"does not answer ({line_of(error)})") from error
+    if kind != "Scheduler":
+        raise _no_scheduler(address, f"is a {kind}")
+
+
+async def _kind_of(address: str) -> str:
+    """Return what a Dask process is: a Scheduler or a Worker."""
+    from distributed import Security
+    from distributed.core import rpc
+
+    arguments = Security().get_connection_args("client")
+    async with rpc(address, timeout=ANSWERS_WITHIN_S, connection_args=arguments) as process:
+        told: dict[str, str] = await process.identity()
+    return told["type"]
+
+
+def _no_scheduler(address: str, why: str) -> EpipoleError:
+    return EpipoleError(
+        f"scheduler {address}: {why}; start one (dask scheduler), or leave --scheduler out"
     )
 
 

@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from epipole.io.caches.private_folders import fault_of, is_ours, private_folder
+
 Arrays = Mapping[str, npt.NDArray[Any]]
 log = logging.getLogger(__name__)
 
@@ -27,12 +29,31 @@ def cache_folder() -> Path | None:
     """Return the cache folder. None: the user has switched the cache off.
 
     EPIPOLE_CACHE names the folder ("off": no cache). Otherwise it is ``epipole`` in the cache
-    folder of the user, by the XDG base directory specification.
+    folder of the user, by the XDG base directory specification. Where that folder cannot be
+    written or trusted, a warning says so, and a private temporary folder takes its place for this
+    process and those that it starts.
     """
-    folder = os.environ.get("EPIPOLE_CACHE")
-    if folder:
-        return None if folder == OFF else Path(folder)
-    home = os.environ.get("XDG_CACHE_HOME")
+    if os.environ.get("EPIPOLE_CACHE") == OFF:
+        return None
+    folder = _folder_asked()
+    fault = "there is no home folder" if folder is None else fault_of(folder)
+    if folder is not None and fault is None:
+        return folder
+    private = private_folder("cache")
+    log.warning(
+        "%s: no cache here (%s): this run compiles for a minute and keeps nothing; "
+        "set EPIPOLE_CACHE to a folder that only you can write to",
+        folder or "~/.cache/epipole",
+        fault,
+    )
+    os.environ["EPIPOLE_CACHE"] = str(private)
+    return private
+
+
+def _folder_asked() -> Path | None:
+    named, home = os.environ.get("EPIPOLE_CACHE"), os.environ.get("XDG_CACHE_HOME")
+    if named:
+        return Path(named)
     try:
         return (Path(home) if home else Path.home() / ".cache") / "epipole"
     except RuntimeError:  # the user has no home folder
@@ -65,6 +86,8 @@ def cached(key: str, make: Callable[[], Arrays]) -> Arrays:
 
 def _read(path: Path) -> dict[str, npt.NDArray[Any]] | None:
     try:
+        if not is_ours(path.lstat()):
+            raise OSError("belongs to another user")
         with np.load(path, allow_pickle=False) as file:  # checks the CRC of every array
             arrays = {name: file[name] for name in file.files}
         with contextlib.suppress(OSError):
@@ -72,7 +95,7 @@ def _read(path: Path) -> dict[str, npt.NDArray[Any]] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        log.info("%s: damaged and written again (%s)", path, error)
+        log.info("%s: cannot be used and is written again (%s)", path, error)
         return None
     return arrays
 

@@ -9,6 +9,7 @@ neither can happen.
 import contextlib
 import fcntl
 import hashlib
+import logging
 import os
 import shutil
 import sys
@@ -16,6 +17,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from epipole.io.caches.arrays import cache_folder
+from epipole.io.caches.private_folders import fault_of, is_ours, private_folder
+
+LOGGER = logging.getLogger(__name__)
 
 KEPT = 8  # folders: several versions and environments of one user
 _USED = "used"  # this file exists after a run has succeeded
@@ -24,27 +28,62 @@ _USED = "used"  # this file exists after a run has succeeded
 def use_kernel_cache(*code: Path) -> None:
     """Let numba keep kernels in the user's cache folder, under a digest of the code.
 
-    A user's NUMBA_CACHE_DIR takes precedence. With EPIPOLE_CACHE=off they are kept beside the code.
+    A user's NUMBA_CACHE_DIR takes precedence, if it can be written. With EPIPOLE_CACHE=off they
+    are kept beside the code if it can be written, else for this process only.
 
     Parameters
     ----------
     code
         The folders that hold all kernels and what they call.
     """
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    if named and _is_writable(Path(named)):
+        return
     root = cache_folder()
-    if root is None or os.environ.get("NUMBA_CACHE_DIR"):
+    if root is not None:
+        folder = _trusted(root / "kernels", _digest(code))
+    elif all(os.access(part, os.W_OK) for part in code):
         return
-    folder = root / "kernels" / _digest(code)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        os.utime(folder)
-        _prune(folder.parent)
-    except OSError:  # numba uses its default place
-        return
+    else:
+        folder = private_folder("kernels")
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     numba = sys.modules.get("numba")
     if numba is not None:
         numba.config.CACHE_DIR = str(folder)
+
+
+def _is_writable(named: Path) -> bool:
+    """Return whether kernels can be kept in the folder that the user has named."""
+    try:
+        named.mkdir(parents=True, exist_ok=True)
+        reason = None if os.access(named, os.W_OK | os.X_OK) else "cannot be written"
+    except OSError as error:
+        reason = error.strerror or str(error)
+    if reason is not None:
+        LOGGER.warning("NUMBA_CACHE_DIR=%s: kernels are not kept here (%s)", named, reason)
+    return reason is None
+
+
+def _trusted(kernels: Path, name: str) -> Path:
+    """Return the folder of this name; a private one where others may have put kernels into it.
+
+    A kernel is code: numba runs what it finds.
+    """
+    folder = kernels / name
+    fault = fault_of(kernels) or fault_of(folder)
+    if fault is None and not all(is_ours(path.lstat()) for path in folder.rglob("*")):
+        fault = "has files of another user"
+    if fault is not None:
+        LOGGER.warning(
+            "%s: kernels are not kept here (%s), this run compiles for a minute; remove the folder",
+            folder,
+            fault,
+        )
+        return private_folder("kernels")
+    with contextlib.suppress(OSError):  # another run may remove the same old folders
+        os.utime(folder)
+        _prune(kernels)
+    return folder
 
 
 def new_kernel_folder() -> Path | None:

@@ -8,7 +8,7 @@ half a night. A run that fails or is killed leaves the dataset unchanged.
 
 import contextlib
 import datetime
-import tempfile
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,10 +19,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from epipole.io.caches.private_folders import temporary_folder
 from epipole.io.datasets import local_nights
 from epipole.io.datasets.folder_swap import sync
 from epipole.io.datasets.local_nights import STAGING
 from epipole.io.datasets.store_nights import StoreNights, store_nights
+from epipole.io.names import fault_of_name
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.bridge import array, conform, empty
 from epipole.schemas.columns import TIME
@@ -47,6 +49,8 @@ def check_folder(dataset: Where) -> None:
     DatasetError
         Where it is a file, or a folder with other contents than a dataset.
     """
+    if (fault := fault_of_name(str(dataset))) is not None:
+        raise DatasetError(f"dataset {dataset}: {fault}")
     if (store := _store(dataset)) is not None:
         with _reading(dataset):
             names = store.names()
@@ -70,6 +74,7 @@ def nights_in(dataset: Where) -> list[str]:
     if (store := _store(dataset)) is not None:
         with _reading(dataset):
             return store.nights()
+    local_nights.recover(_folder(dataset))
     return sorted(p.name.removeprefix("night=") for p in _folder(dataset).glob("night=*"))
 
 
@@ -107,6 +112,7 @@ def read_table(dataset: Where, table: str, night: str) -> pa.Table:
         with _reading(dataset):
             parts: Sequence[Any] = [pa.BufferReader(part) for part in store.read(night, table)]
     else:
+        local_nights.recover(_folder(dataset))
         parts = sorted((_folder(dataset) / f"night={night}" / table).glob("*.parquet"))
     try:
         rows = [conform(schema, pq.read_table(part, partitioning=None)) for part in parts]
@@ -140,7 +146,7 @@ def claim_nights(dataset: Where, nights: Sequence[str]) -> Iterator[Path]:
         with _writing(dataset):
             if (store := _store(dataset)) is not None:
                 held.enter_context(store.claims.claim(nights))
-                work = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="epipole-")))
+                work = held.enter_context(temporary_folder("night"))
             else:
                 work = held.enter_context(local_nights.claim(_folder(dataset), nights))
         yield work
@@ -199,7 +205,10 @@ def _require_whole(folder: Path) -> None:
 def _store(dataset: Where) -> StoreNights | None:
     """Return the object store that a URL names. None: the dataset is a local folder."""
     where = str(dataset)
-    return store_nights(where) if "://" in where and not where.startswith("file://") else None
+    if "://" not in where or where.startswith("file://"):
+        return None
+    with _reading(dataset):
+        return store_nights(where)
 
 
 def dataset_folder(dataset: Where) -> Path | None:
@@ -221,6 +230,9 @@ def _writing(dataset: Where) -> Iterator[None]:
         raise
     except kinds as error:
         reason = getattr(error, "strerror", None) or line_of(error)
+        where = getattr(error, "filename", None)
+        if where is not None and STAGING in Path(os.fsdecode(where)).parts:
+            reason = f"{os.fsdecode(where)}: {reason}"
         raise DatasetError(
             f"{dataset}: cannot be written ({reason}); the dataset is unchanged"
         ) from error

@@ -32,9 +32,18 @@ class Holder:
         return cls(sorted(nights), host, os.getpid(), since, _machine(), token)
 
     @classmethod
-    def read(cls, text: str | bytes) -> Self:
-        """Return the holder that `text` wrote."""
-        return cls(**json.loads(text))
+    def read(cls, text: str | bytes, where: object) -> Self:
+        """Return the holder that `text` wrote; `where` names the file in messages.
+
+        Raises
+        ------
+        DatasetError
+            Where it is no claim.
+        """
+        try:
+            return cls(**json.loads(text))
+        except (TypeError, ValueError) as error:
+            raise DatasetError(f"{where}: is not a claim of a run; remove it") from error
 
     def text(self) -> str:
         """Return the holder as a line of JSON."""

@@ -116,7 +116,7 @@ class StoreClaims:
 
     def _read(self, path: str) -> Holder | None:
         try:
-            return Holder.read(self._storage.cat_file(path))
+            return Holder.read(self._storage.cat_file(path), path)
         except FileNotFoundError:
             return None
 

@@ -47,12 +47,29 @@ class StoreNights:
         self.claims = StoreClaims(storage, root, dataset)
 
     def names(self) -> list[str]:
-        """Return the names at the top of the dataset."""
-        self._storage.invalidate_cache()
+        """Return the names at the top of the dataset; see `require_bucket`."""
+        names = [entry.rstrip("/").rpartition("/")[2] for entry in self._ls(self._root)]
+        if not names:
+            self.require_bucket()
+        return names
+
+    def require_bucket(self) -> None:
+        """Raise where the bucket is missing; a missing folder in it is an empty dataset.
+
+        Raises
+        ------
+        DatasetError
+            Names the bucket.
+        """
+        bucket = self._root.partition("/")[0]
         try:
-            return [entry.rstrip("/").rpartition("/")[2] for entry in self._ls(self._root)]
-        except FileNotFoundError:
-            return []
+            is_there = not bucket or self._storage.exists(bucket)
+        except PermissionError:  # it is there; only a folder in it may be listed
+            return
+        if not is_there:
+            raise DatasetError(
+                f"{self._dataset}: there is no bucket {bucket}; create it, or check the name"
+            )
 
     def nights(self) -> list[str]:
         """Return the nights that are published, in order."""
@@ -65,6 +82,7 @@ class StoreNights:
             with contextlib.suppress(FileNotFoundError):  # put in place or replaced meanwhile
                 paths = self._paths(night, table)
                 return [bytes(self._storage.cat_file(path)) for path in paths]
+        self.require_bucket()
         raise DatasetError(f"{self._dataset}/night={night}: is being replaced; try again")
 
     def publish(self, staged: Mapping[str, Path]) -> None:
@@ -155,8 +173,12 @@ class StoreNights:
         commits = []
         for path in sorted(self._storage.glob(f"{staging}/commit-*.json")):
             with contextlib.suppress(FileNotFoundError):  # finished meanwhile
-                commit = json.loads(self._storage.cat_file(path))
-                commits.append(Commit(path, f"{staging}/{commit['staged']}", commit["files"]))
+                text = self._storage.cat_file(path)
+                try:
+                    commit = json.loads(text)
+                    commits.append(Commit(path, f"{staging}/{commit['staged']}", commit["files"]))
+                except (KeyError, TypeError, ValueError) as error:
+                    raise DatasetError(f"{path}: is not a commit of a run; remove it") from error
         return commits
 
     def _ls(self, folder: str) -> Iterator[str]:

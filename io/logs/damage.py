@@ -44,20 +44,14 @@ class RejectList:
         i = self._last[key]
         self._rows[i] = (*self._rows[i][:-1], self._rows[i][-1] + count)
 
-    def summary(self) -> str:
-        """Return the reasons, the most frequent first: ``nan 3, no_timestamp 1``."""
-        counts: dict[str, int] = {}
-        for *_, reason, count in self._rows:
-            counts[reason] = counts.get(reason, 0) + count
-        ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-        return ", ".join(f"{reason} {count}" for reason, count in ordered)
-
-    def table(self, first_ns: int, last_ns: int) -> pa.Table:
-        """Return the rows of `rejects`; the log's frames are of `first_ns` to `last_ns`.
+    def table(self, own_ns: tuple[int, int] | None) -> pa.Table:
+        """Return the rows of `rejects`; `own_ns`: the log's first and last time.
 
         A row gets the time of the first frame if its own is unknown, or a day or more outside
         the log, which only damage can explain. Else no night that is made would have the row.
+        Of a log without a time of its own, the night is chosen when those of the run are known.
         """
+        first_ns, last_ns = own_ns or (0, 0)
         near_ns = range(first_ns - DAY_NS + 1, last_ns + DAY_NS)
         rows = self._rows
         return reject_rows(

@@ -3,10 +3,12 @@
 import glob
 from pathlib import Path
 
+from epipole.io.names import fault_of_name
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.errors import LogError
 
-PATTERN = "*.mcap"  # the logs in a folder
+SUFFIX = ".mcap"  # of the logs in a folder
+PATTERN = f"*{SUFFIX}"
 
 
 def list_logs(where: str) -> tuple[list[str], bool]:
@@ -15,18 +17,23 @@ def list_logs(where: str) -> tuple[list[str], bool]:
     Parameters
     ----------
     where
-        A file, a folder (its ``*.mcap``, without those in sub-folders) or a glob (``**`` matches
-        sub-folders). It is local or an fsspec URL such as ``s3://bucket/logs``. A ``file://``
-        URL becomes a local path.
+        A file, a folder (its ``*.mcap``, however deep) or a glob (``**`` matches sub-folders). It
+        is local or an fsspec URL such as ``s3://bucket/logs``. A ``file://`` URL becomes a local
+        path.
 
     Raises
     ------
     LogError
         Where there are no logs, or the storage does not answer.
     """
+    if (fault := fault_of_name(where)) is not None:
+        raise LogError(f"log {where}: {fault}")
     logs, is_one = _list_url(where) if "://" in where else _list_local(where)
     if not logs:
         raise LogError(f"{where}: {_nothing(where)}")
+    for log in logs:
+        if (fault := fault_of_name(log)) is not None:
+            raise LogError(f"{log}: {fault}")
     return sorted(logs), is_one
 
 
@@ -34,9 +41,11 @@ def _list_local(where: str) -> tuple[list[str], bool]:
     path = Path(where)
     try:
         if path.is_dir():
-            return [str(file) for file in path.glob(PATTERN) if file.is_file()], False
-        if path.exists():
+            return [str(file) for file in path.rglob(PATTERN) if file.is_file()], False
+        if path.is_file():
             return [where], True
+        if path.exists():
+            raise LogError(f"{where}: is a pipe or a device, not a file; give a file")
         return [name for name in glob.iglob(where, recursive=True) if Path(name).is_file()], False
     except OSError as error:
         raise LogError(f"{where}: cannot be read: {error.strerror}") from error
@@ -54,9 +63,15 @@ def _list_url(where: str) -> tuple[list[str], bool]:
         is_glob = glob.has_magic(path)
         if not is_glob and storage.isfile(path):
             return [where], True
-        pattern = path if is_glob else f"{path.rstrip('/')}/{PATTERN}"
-        entries = storage.glob(pattern, detail=True).values()
-        files = [entry["name"] for entry in entries if entry["type"] == "file"]
+        if is_glob:
+            entries = storage.glob(path, detail=True).values()
+        else:
+            entries = storage.find(path, detail=True).values()
+        files = [
+            entry["name"]
+            for entry in entries
+            if entry["type"] == "file" and (is_glob or entry["name"].endswith(SUFFIX))
+        ]
         return [storage.unstrip_protocol(name) for name in files], False
     except FileNotFoundError as error:
         raise LogError(f"{where}: no such folder; check the URL") from error

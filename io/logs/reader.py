@@ -2,13 +2,14 @@
 
 Channels are chosen by the name of their schema. Their messages may be in any registered
 encoding, and one log may mix encodings. Damage does not stop the reading: what cannot be used
-becomes a row of `rejects`. Only a log without any frame is an error.
+becomes a row of `rejects`. A log without frames is none the less part of its night: its states
+may be those of another log's frames.
 """
 
+import logging
 import os
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -19,18 +20,27 @@ from epipole.io.logs.columns.frames import FrameColumns
 from epipole.io.logs.columns.states import StateColumns
 from epipole.io.logs.damage import RejectList
 from epipole.io.logs.mcap.bytes import LogBytes, open_log
-from epipole.io.logs.mcap.channels import ChannelTable
+from epipole.io.logs.mcap.channels import Channel, ChannelTable
 from epipole.io.logs.mcap.records import Block, RecordWalk
 from epipole.io.logs.mcap.summary import MAGIC, read_summary
 from epipole.io.logs.messages.batches import batches_of
 from epipole.io.logs.messages.encodings.registry import kinds_of_schemas, message_encodings
+from epipole.io.logs.own_time import own_range, stray_rejects, without_strays
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
 from epipole.schemas.logs.log_tables import LogContents, LogPiece, LogSource
 from epipole.schemas.logs.messages import CALIBRATION, FRAME, KINDS, STATE
+from epipole.schemas.rejects import Reason
 from epipole.schemas.tables import REJECTS
+from epipole.schemas.text.shown import as_line
 
+LOGGER = logging.getLogger(__name__)
+
+Nanoseconds = npt.NDArray[np.int64]
+
+PER_MESSAGE = ("channel", "time_ns", "start", "end", "offset")  # columns of a block
 THREADS = 2  # that decompress and check chunks, in addition to the one that decodes
+LONGEST_NAME = 80  # of a topic or an encoding in a message
 PIECE_BYTES = 64 << 20  # of frames and states in one piece of a log
 
 
@@ -51,8 +61,7 @@ def read_log(path: str | os.PathLike[str]) -> LogContents:
     Raises
     ------
     LogError
-        Where there is no such file, it is a folder or not MCAP, messages are in an unknown
-        encoding, or the log has no frames.
+        Where there is no such file, or it is a folder or not MCAP.
     """
     pieces = list(read_log_pieces(path))
     exposures, states, cameras, rejects = (
@@ -61,6 +70,10 @@ def read_log(path: str | os.PathLike[str]) -> LogContents:
     )
     source = pieces[-1].source
     assert source is not None  # the last piece has it
+    if source.first_time_ns is not None and source.last_time_ns is not None:
+        own = source.first_time_ns, source.last_time_ns
+        exposures, strays = without_strays(exposures, *own)
+        rejects = pa.concat_tables([rejects, stray_rejects(strays)])
     return LogContents(exposures, states, cameras, rejects, source)
 
 
@@ -71,14 +84,15 @@ def read_log_pieces(
 
     A piece has about `piece_bytes` of frames and states, at most one chunk of the log more. Each
     message comes once, in the order of the file. There is at least one piece. The last one has
-    the rejects and the source. Errors that need the whole log are raised in its place.
+    the rejects and the source, which tells the log's own time: frames outside it are strays.
     """
     where = os.fspath(path)
     with _open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
         reading = _Reading(where, data, pool)
         for block in reading.blocks():
-            for kind, chosen in _by_kind(block, where):
-                for batch in batches_of(block, kind, chosen, reading.rejects):
+            known = reading.in_known_encodings(block)
+            for kind, chosen in _by_kind(known):
+                for batch in batches_of(known, kind, chosen, reading.rejects):
                     reading.columns[kind].add(batch)
             if reading.n_bytes >= piece_bytes:
                 yield reading.piece()
@@ -124,7 +138,9 @@ class _Reading:
             CALIBRATION: self._cameras,
         }
         self._walk = RecordWalk(data, frozenset(kinds_of_schemas()), pool)
-        self._frames_ns = _TimeRange()
+        self._frames_ns: list[Nanoseconds] = []
+        self._states_ns: list[Nanoseconds] = []
+        self._unknown: dict[Channel, int] = {}  # messages in unknown encodings
 
     def blocks(self) -> Iterator[Block]:
         """Yield the wanted messages of the log."""
@@ -138,69 +154,53 @@ class _Reading:
     def piece(self) -> LogPiece:
         """Return the rows since the last piece."""
         exposures, states = self._frames.take(), self._states.take()
-        self._frames_ns.add(exposures)
+        self._frames_ns.append(array(exposures, "time"))
+        self._states_ns.append(array(states, "time"))
         return LogPiece(exposures, states, self._cameras.take(), REJECTS.empty_table(), None)
 
     def last_piece(self) -> LogPiece:
-        """Return the remaining rows, the rejects of the whole log, and its source.
-
-        Raises
-        ------
-        LogError
-            Where the whole log has no frames.
-        """
+        """Return the remaining rows, the rejects of the whole log, and its source."""
         piece = self.piece()
         for damage in self._walk.damage:
             self.rejects.add(
                 damage.reason, time_ns=damage.time_ns, offset=damage.offset, count=damage.n
             )
-        first, last = self._frames_ns.first, self._frames_ns.last
-        if first is None:
-            raise LogError(f"{self._where}: no frames in it; {_advice(self.rejects)}")
+        for channel, count in self._unknown.items():
+            LOGGER.warning(
+                "%s: topic %s: messages are encoded as %s; write %s as one of %s",
+                self._where, as_line(channel.topic, LONGEST_NAME),
+                as_line(repr(channel.encoding), LONGEST_NAME), channel.schema,
+                ", ".join(message_encodings()),
+            )  # fmt: skip
+            self.rejects.add(Reason.UNKNOWN_ENCODING, time_ns=0, count=count)
+        own = own_range(self._frames_ns) or own_range(self._states_ns)
+        first, last = own or (None, None)
         source = LogSource(self._name, len(self._data), self._data.sha256(), first, last)
-        return piece._replace(rejects=self.rejects.table(first, last), source=source)
+        return piece._replace(rejects=self.rejects.table(own), source=source)
+
+    def in_known_encodings(self, block: Block) -> Block:
+        """Return the messages of the channels whose encoding is registered; count the others."""
+        encodings = message_encodings()
+        known = {n: c for n, c in block.channels.items() if c.encoding in encodings}
+        if len(known) == len(block.channels):
+            return block
+        for number, channel in block.channels.items():
+            if number not in known:
+                count = int(np.count_nonzero(block.channel == number))
+                self._unknown[channel] = self._unknown.get(channel, 0) + count
+        keep = np.isin(block.channel, list(known))
+        columns = {name: getattr(block, name)[keep] for name in PER_MESSAGE}
+        return block._replace(channels=known, **columns)
 
 
-@dataclass
-class _TimeRange:
-    """The first and the last time of rows."""
-
-    first: int | None = None
-    last: int = 0
-
-    def add(self, rows: pa.Table) -> None:
-        """Include rows, which have a `time`."""
-        if rows.num_rows:
-            time_ns = array(rows, "time")
-            low, high = int(time_ns.min()), int(time_ns.max())
-            self.first = low if self.first is None else min(low, self.first)
-            self.last = max(high, self.last)
-
-
-def _by_kind(block: Block, where: str) -> Iterator[tuple[str, npt.NDArray[np.int64]]]:
-    """Yield the kinds of message in a block, each with the numbers of its messages.
-
-    Raises
-    ------
-    LogError
-        Where a channel is in an encoding that is not registered.
-    """
-    kinds, encodings = kinds_of_schemas(), message_encodings()
+def _by_kind(block: Block) -> Iterator[tuple[str, npt.NDArray[np.int64]]]:
+    """Yield the kinds of message in a block, each with the numbers of its messages."""
+    if not block.channels:
+        return
+    kinds = kinds_of_schemas()
     code = np.zeros(max(block.channels) + 1, np.uint8)
     for number, channel in block.channels.items():
-        if channel.encoding not in encodings:
-            raise LogError(
-                f"{where}: topic {channel.topic}: messages are encoded as {channel.encoding!r}; "
-                f"write {channel.schema} as one of {', '.join(encodings)}"
-            )
         code[number] = KINDS.index(kinds[channel.schema])
     of_message = code[block.channel]
     for i in np.unique(code[list(block.channels)]).tolist():
         yield KINDS[i], np.flatnonzero(of_message == i)
-
-
-def _advice(rejects: RejectList) -> str:
-    left_out = rejects.summary()
-    if left_out:
-        return f"left out: {left_out}; check the recording"
-    return "record epipole.CentroidFrame messages (the schema's name decides, not the topic)"

@@ -7,13 +7,13 @@ nights, this program's code and the libraries that compute. So no part in it can
 import contextlib
 import hashlib
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 
 from epipole.io.caches.arrays import cache_folder
+from epipole.io.caches.private_folders import fault_of, private_folder
 from epipole.io.catalogues import hipparcos
 from epipole.io.datasets.dataset import dataset_folder
 from epipole.io.datasets.local_nights import STAGING
@@ -47,12 +47,18 @@ def work_folder(root: Path, nights: Sequence[str], key: str) -> Iterator[Path]:
 
 
 def work_root(dataset: str) -> Path:
-    """Return where a dataset's work folders lie: in it, or for a URL in the user's cache folder."""
+    """Return where a dataset's work folders lie: in it, or for a URL in the user's cache folder.
+
+    Without a cache folder that can be trusted, it is a private temporary folder of this process.
+    """
     folder = dataset_folder(dataset)
     if folder is not None:
         return folder / STAGING
-    root = cache_folder() or Path(tempfile.gettempdir()) / "epipole"
-    return root / "work" / hashlib.sha256(dataset.encode()).hexdigest()[:12]
+    cache = cache_folder()
+    root = cache / "work" if cache is not None else private_folder("work")
+    if fault_of(root) is not None:
+        root = private_folder("work")
+    return root / hashlib.sha256(dataset.encode()).hexdigest()[:12]
 
 
 def work_key(logs: Sequence[LogSource], settings: Settings, nights: Sequence[str]) -> str:

@@ -39,8 +39,8 @@ class LogSource(NamedTuple):
     name: str
     size: int  # bytes
     sha256: str
-    first_time_ns: int  # of its frames
-    last_time_ns: int
+    first_time_ns: int | None  # of its frames, else of its states; None without both
+    last_time_ns: int | None
 
 
 class LogPiece(NamedTuple):

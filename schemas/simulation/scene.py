@@ -4,7 +4,6 @@ A scene may leave values to chance (``count``, ``random`` orbits, the spread of 
 then drawn with the scene's seed.
 """
 
-import tomllib
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal, Self
 
@@ -13,6 +12,7 @@ from pydantic import AwareDatetime, Field, ValidationError, model_validator
 from epipole.schemas.errors import SceneError
 from epipole.schemas.settings import Group
 from epipole.schemas.simulation.orbit import Orbit, Vector
+from epipole.schemas.text.toml_text import toml_values
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,62}$"
 
@@ -325,8 +325,8 @@ def parse_scene(text: str, where: str) -> Scene:
 def scene_values(text: str, where: str) -> dict[str, Any]:
     """Return the nested mappings of a TOML text, not validated."""
     try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+        return toml_values(text)
+    except ValueError as error:
         raise SceneError(f"{where}: not TOML: {error}") from error
 
 

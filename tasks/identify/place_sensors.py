@@ -8,6 +8,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, nullable, stack, table, unstack
+from epipole.schemas.logs.bounds import POSITION, SPEED
 from epipole.schemas.settings import SensorSettings, Settings
 from epipole.schemas.work_tables import PLACES
 from epipole.tasks.algorithms.orbits.state_interpolation import (
@@ -17,6 +18,9 @@ from epipole.tasks.algorithms.orbits.state_interpolation import (
 )
 
 LOGGER = logging.getLogger(__name__)
+
+# Earth-fixed axes turn: states of a log may be twice as fast in GCRF.
+FASTEST_KM_S, FARTHEST_KM = 2 * SPEED.greatest, 2 * POSITION.greatest
 
 
 def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> pa.Table:
@@ -39,7 +43,7 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
             time_ns[frames],
             settings.sensors.state_gap_s,
         )
-        for column, values in zip(placed, places, strict=True):
+        for column, values in zip(placed, _possible(places), strict=True):
             column[frames] = values
     without = np.count_nonzero(np.isnan(placed.r_gcrf_km[:, 0]))
     LOGGER.info("placed %d frames, %d have no state near in time", n - without, without)
@@ -53,6 +57,22 @@ def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> 
     }
     key = {name: exposures[name] for name in ("sensor_id", "frame_number", "time")}
     return table(PLACES, {**key, **{name: nullable(value) for name, value in by_name.items()}})
+
+
+def _possible(places: Places) -> Places:
+    """Return the places, without a position where the states would have the sensor too fast.
+
+    States with a clock or a position of their own tell no speed that a log would be refused for:
+    it shows between them.
+    """
+    speed = np.linalg.norm(places.v_gcrf_km_s, axis=1)
+    radius = np.linalg.norm(places.r_gcrf_km, axis=1)
+    known = (speed <= FASTEST_KM_S) & (radius <= FARTHEST_KM)
+    return places._replace(
+        r_gcrf_km=np.where(known[:, None], places.r_gcrf_km, np.nan),
+        v_gcrf_km_s=np.where(known[:, None], places.v_gcrf_km_s, np.nan),
+        position_sigma_km=np.where(known, places.position_sigma_km, np.nan),
+    )
 
 
 def _told(states: pa.Table, at_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:

@@ -15,12 +15,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
+from epipole.io.logs.own_time import frames_left_out, stray_rejects
 from epipole.io.work.part_tables import READ_SENSOR
 from epipole.io.work.parts import read_part, write_part
 from epipole.io.work.places import ReadFolder
 from epipole.schemas.bridge import array, concat, conform, nullable, stack, table, unstack
 from epipole.schemas.logs.log_tables import ITRF, LOG_STATES, LogSource
-from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX, SENSOR_STATES
@@ -66,13 +67,14 @@ def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) 
     logs = _distinct(logs)
     pieces = {(log.number, k): folder.piece(log.number, k) for log in logs
               for k in range(log.n_pieces)}  # fmt: skip
-    keys = _keys(pieces)
+    keys, strays = _without_strays(_keys(pieces), logs)
     sensors = sorted(_names(pieces, "exposures") | _names(pieces, "states"))
     sensor = _numbers(keys["sensor_id"], sensors)
     order, verdict = order_frames(sensor, array(keys, "time"), array(keys, "frame_number"))
-    rejects = [_piece_tables(pieces, "rejects", REJECTS)]
+    rejects = [_piece_tables(pieces, "rejects", REJECTS), stray_rejects(strays)]
     rejects += [
-        _repeats(keys.take(order[verdict == code]), reason) for code, reason in _DUPLICATES.items()
+        frames_left_out(keys.take(order[verdict == code]), reason)
+        for code, reason in _DUPLICATES.items()
     ]
     kept = order[verdict == KEEP]
     time_ns = []
@@ -84,7 +86,8 @@ def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) 
         time_ns.append(array(index, "time"))
     cameras = _sorted_cameras(_piece_tables(pieces, "cameras", CAMERAS))
     left_out = concat(REJECTS, rejects)
-    return OrderedFrames(folder, sensors, time_ns, cameras, [log.source for log in logs], left_out)
+    sources = _dated([log.source for log in logs], array(keys, "time"))
+    return OrderedFrames(folder, sensors, time_ns, cameras, sources, left_out)
 
 
 def frames_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) -> pa.Table:
@@ -159,18 +162,29 @@ def _piece_tables(pieces: Mapping[tuple[int, int], Path], name: str, schema: pa.
     return concat(schema, [read_part(part, name) for part in pieces.values()])
 
 
-def _repeats(frames: pa.Table, reason: Reason) -> pa.Table:
-    """Return a row of `rejects` per sensor and log: the first repeat's time, and how many."""
-    grouped = frames.group_by(["sensor_id", "source"], use_threads=False).aggregate(
-        [("time", "min"), ("time", "count")]
-    )
-    return reject_rows(
-        reason,
-        source=grouped["source"],
-        sensor_id=grouped["sensor_id"],
-        time=grouped["time_min"],
-        count=grouped["time_count"],
-    )
+def _without_strays(keys: pa.Table, logs: Sequence[ReadLog]) -> tuple[pa.Table, pa.Table]:
+    """Return the keys of frames within their log's own time, and those of strays."""
+    most = max((log.number for log in logs), default=-1) + 1
+    first, last = np.zeros(most, np.int64), np.zeros(most, np.int64)
+    for log in logs:
+        first[log.number] = log.source.first_time_ns or 0
+        last[log.number] = log.source.last_time_ns or 0
+    log_of, time_ns = array(keys, "log"), array(keys, "time")
+    own = (time_ns >= first[log_of]) & (time_ns <= last[log_of])
+    return keys.filter(pa.array(own)), keys.filter(pa.array(~own))
+
+
+def _dated(sources: Sequence[LogSource], time_ns: Indices) -> list[LogSource]:
+    """Return the sources; one without a time of its own is part of the whole run."""
+    if not len(time_ns):
+        return list(sources)
+    first, last = int(time_ns.min()), int(time_ns.max())
+    return [
+        source._replace(first_time_ns=first, last_time_ns=last)
+        if source.first_time_ns is None
+        else source
+        for source in sources
+    ]
 
 
 def _sorted_states(
@@ -186,7 +200,7 @@ def _sorted_states(
     rows = concat(LOG_STATES, states)
     order, repeats = order_states(np.zeros(rows.num_rows, np.int64), array(rows, "time"))
     named = rows.select(["sensor_id", "time"]).append_column("source", pa.array(names, pa.string()))
-    rejects = _repeats(named.take(pa.array(order[repeats])), Reason.DUPLICATE_STATE)
+    rejects = frames_left_out(named.take(pa.array(order[repeats])), Reason.DUPLICATE_STATE)
     return _turned_to_gcrf(rows.take(pa.array(order[~repeats])), settings), rejects
 
 

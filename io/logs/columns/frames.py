@@ -13,6 +13,14 @@ from epipole.io.logs.messages.batches import MessageBatch, Received, fault, know
 from epipole.io.logs.messages.decoded import FrameMessage
 from epipole.io.logs.messages.scan import FrameRows, scan_frames
 from epipole.schemas.bridge import table
+from epipole.schemas.logs.bounds import (
+    CENTROID_SIGMA,
+    EXPOSURE,
+    FLUX,
+    FRAME_NUMBER,
+    PLACE,
+    Bound,
+)
 from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import EXPOSURES
 
@@ -20,7 +28,6 @@ Floats = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 Integers = npt.NDArray[np.int64]
 
-MAX_FRAME_NUMBER = (1 << 63) - 1
 BATCH = 65536  # frames in one table of those that are joined
 BATCH_CENTROIDS = 1 << 21
 # The x and y of a centroid take 8 bytes in binary and at least 4 as text.
@@ -67,8 +74,8 @@ class FrameColumns:
     def add(self, batch: MessageBatch) -> None:
         """Take the frames whose time, sensor, number and arrays are valid.
 
-        Flux is never relied on: an invalid value becomes NaN, and the frame stays. An invalid
-        exposure time becomes 0, which is unknown.
+        Flux is never relied on: a value out of bounds becomes NaN, and the frame stays. An
+        exposure time out of bounds is a reject too, and becomes 0, which is unknown.
         """
         messages = batch.messages
         self._make_room(len(batch), batch.n_bytes // BYTES_OF_A_CENTROID)
@@ -129,10 +136,13 @@ class FrameColumns:
         for item in received:
             frame: FrameMessage = item.message
             reason = fault(frame.time_ns, frame.sensor_id) or _frame_fault(frame)
-            if reason is None:
-                sound.append(item)
-            else:
+            if reason is not None:
                 self._leave_out(item, reason)
+                continue
+            if frame.exposure_s not in EXPOSURE:
+                self._leave_out(item, Reason.BAD_EXPOSURE)
+                item = item._replace(message=frame._replace(exposure_s=0.0))
+            sound.append(item)
         if sound:
             self._append(sound)
 
@@ -152,12 +162,15 @@ class FrameColumns:
         sigma, has_sigma = _joined_or_nan([f.sigma_px for f in frames], lengths)
         flux, has_flux = _joined_or_nan([f.flux for f in frames], lengths)
         with np.errstate(invalid="ignore"):
-            bad_place = _any(~(np.isfinite(x) & np.isfinite(y)), lengths)
-            bad_sigma = _any(~((sigma > 0) & np.isfinite(sigma)), lengths) & has_sigma
-            flux[~((flux > 0) & np.isfinite(flux))] = np.nan
+            not_finite = _any(~(np.isfinite(x) & np.isfinite(y)), lengths)
+            bad_place = _any(~(_within(PLACE, x) & _within(PLACE, y)), lengths)
+            bad_sigma = _any(~_within(CENTROID_SIGMA, sigma), lengths) & has_sigma
+            flux[~_within(FLUX, flux)] = np.nan
         keep = ~(bad_place | bad_sigma)
+        bad_number = np.where(bad_place, Reason.BAD_CENTROID, Reason.BAD_SIGMA)
+        reasons = np.where(not_finite, Reason.NAN, bad_number)
         for i in np.flatnonzero(~keep).tolist():
-            self._leave_out(received[i], Reason.NAN if bad_place[i] else Reason.BAD_SIGMA)
+            self._leave_out(received[i], Reason(reasons[i]))
         each = np.repeat(keep, lengths)
         values = (x[each], y[each], flux[each], sigma[each])
         kept = np.flatnonzero(keep).tolist()
@@ -176,10 +189,9 @@ class FrameColumns:
             column[low : low + len(numbers)] = numbers
         for item, length in zip(received, lengths.tolist(), strict=True):
             n, frame = rows.n, item.message
-            exposure_s = frame.exposure_s
             c.sensor[n] = self._sensors.code(frame.sensor_id)
             c.number[n], c.time_ns[n] = frame.frame_number, frame.time_ns
-            c.exposure_s[n] = exposure_s if 0 < exposure_s < np.inf else 0.0
+            c.exposure_s[n] = frame.exposure_s
             c.first[n + 1] = c.first[n] + length
             rows.offset[n] = item.offset
             rows.n += 1
@@ -191,12 +203,18 @@ def _arrow_floats(n: int) -> Floats:
 
 
 def _frame_fault(frame: FrameMessage) -> Reason | None:
-    if not 0 <= frame.frame_number <= MAX_FRAME_NUMBER:
-        return Reason.BAD_FRAME_NUMBER
+    if frame.frame_number not in FRAME_NUMBER:
+        return FRAME_NUMBER.reason
     n = len(frame.x_px)
     if len(frame.y_px) != n or len(frame.flux) not in (0, n) or len(frame.sigma_px) not in (0, n):
         return Reason.UNEQUAL_ARRAYS
     return None
+
+
+def _within(bound: Bound, values: Floats) -> Bools:
+    """Return which values lie within a bound, as float32 like the values; false for NaN."""
+    least, greatest = np.float32(bound.least), np.float32(bound.greatest)
+    return np.asarray((values >= least) & (values <= greatest))
 
 
 def _joined(arrays: Sequence[npt.NDArray[np.floating]]) -> Floats:

@@ -14,15 +14,19 @@ from epipole.io.logs.messages.batches import MessageBatch, Received, fault, know
 from epipole.io.logs.messages.decoded import StateMessage
 from epipole.io.logs.messages.scan import StateRows, scan_states
 from epipole.schemas.bridge import nullable, table, unstack
+from epipole.schemas.logs.bounds import (
+    ARCSEC_OF_HALF_A_TURN,
+    ATTITUDE_SIGMA,
+    POSITION,
+    POSITION_SIGMA,
+    QUATERNION,
+    SPEED,
+)
 from epipole.schemas.logs.log_tables import LOG_STATES, STATE_FRAMES
 from epipole.schemas.rejects import Reason
 
 Array = npt.NDArray[np.floating]
 
-# Less than the polar radius of 6357 km: no sensor is there, in any frame and with any error.
-LOWEST_KM = 6340.0
-FARTHEST_KM = 1.0e7  # far beyond the Moon; positions in metres are farther
-QUATERNION_TOLERANCE = 1e-2  # a larger |q| - 1 is more than rounding of a unit quaternion
 BATCH = 16384  # states in one table of those that are joined
 ROW_BYTES = 150  # in the table
 _FRAMES = NameCodes(STATE_FRAMES)
@@ -104,8 +108,10 @@ class StateColumns:
             if reason is not None:
                 self._leave_out(item, reason)
                 continue
-            if len(state.attitude_xyzw) and not _is_attitude(state.attitude_xyzw):
-                self._leave_out(item, Reason.BAD_ATTITUDE)
+            if _is_without_attitude(state):
+                state = state._replace(attitude_xyzw=state.attitude_xyzw[:0])
+            elif (reason := _attitude_fault(state)) is not None:
+                self._leave_out(item, reason)
                 state = state._replace(attitude_xyzw=state.attitude_xyzw[:0])
             self._write(state, item.message.time_ns)
 
@@ -134,15 +140,23 @@ def _state_fault(state: StateMessage) -> Reason | None:
         return Reason.UNKNOWN_FRAME
     # The length is finite only if every component is finite.
     radius_km = math.hypot(*state.position_km)
-    if len(state.position_km) != 3 or not radius_km <= FARTHEST_KM:
-        return Reason.BAD_POSITION
+    if len(state.position_km) != 3 or not radius_km <= POSITION.greatest:
+        return POSITION.reason
     velocity = state.velocity_km_s
-    if len(velocity) not in (0, 3) or not math.isfinite(math.hypot(*velocity)):
-        return Reason.BAD_VELOCITY
-    return Reason.INSIDE_EARTH if radius_km < LOWEST_KM else None
+    if len(velocity) not in (0, 3) or math.hypot(*velocity) not in SPEED:
+        return SPEED.reason
+    if state.position_sigma_km > POSITION_SIGMA.greatest:
+        return POSITION_SIGMA.reason
+    return Reason.INSIDE_EARTH if radius_km < POSITION.least else None
 
 
-def _is_attitude(q: Array) -> bool:
-    """Return whether the numbers are a unit quaternion, but for rounding."""
-    norm = math.hypot(*q) if len(q) == 4 else math.nan
-    return abs(norm - 1.0) < QUATERNION_TOLERANCE
+def _is_without_attitude(state: StateMessage) -> bool:
+    """Return whether the state has no attitude, or says that it may be any."""
+    return len(state.attitude_xyzw) == 0 or state.attitude_sigma_arcsec >= ARCSEC_OF_HALF_A_TURN
+
+
+def _attitude_fault(state: StateMessage) -> Reason | None:
+    q = state.attitude_xyzw
+    if len(q) != 4 or math.hypot(*q) not in QUATERNION:
+        return QUATERNION.reason
+    return ATTITUDE_SIGMA.reason if state.attitude_sigma_arcsec > ATTITUDE_SIGMA.greatest else None

@@ -104,15 +104,16 @@ def open_log(where: str) -> LogBytes:
         raise LogError(f"{where}: no such file; check the path") from error
     except OSError as error:
         raise LogError(f"{where}: cannot be read: {error.strerror}") from error
-    size = os.fstat(descriptor).st_size
-    return LogBytes(where, size, _FileReader(where, size, descriptor))
+    opened = os.fstat(descriptor)
+    return LogBytes(where, opened.st_size, _FileReader(where, opened, descriptor))
 
 
 class _FileReader:
     """A local file; a thread hashes it while it is read."""
 
-    def __init__(self, where: str, size: int, descriptor: int) -> None:
-        self._where, self._size, self._descriptor = where, size, descriptor
+    def __init__(self, where: str, opened: os.stat_result, descriptor: int) -> None:
+        self._where, self._opened, self._descriptor = where, opened, descriptor
+        self._size = opened.st_size
         self._worker = ThreadPoolExecutor(1, "hash log")
         self._hashing: Future[str] | None = None
         self._closed = False
@@ -143,7 +144,18 @@ class _FileReader:
     def sha256(self) -> str:
         self.stream()
         assert self._hashing is not None  # `stream` starts it
-        return self._hashing.result()
+        digest = self._hashing.result()
+        now = os.fstat(self._descriptor)
+        # A recorder may go on writing behind the bytes that are read. Only then is it worth the
+        # time to look whether these have stayed as they were.
+        if now.st_mtime_ns != self._opened.st_mtime_ns and (
+            now.st_size <= self._size or self._hash() != digest
+        ):
+            raise LogError(
+                f"{self._where}: has changed while it was read; "
+                "read it when no program writes to it"
+            )
+        return digest
 
     def close(self) -> None:
         self._closed = True

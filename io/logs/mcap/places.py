@@ -1,7 +1,8 @@
 """Where the records of an MCAP file lie, found by their lengths, in a damaged file too.
 
 The data section is walked from its start. Where a length is damaged, the walk goes on at the
-next chunk that the summary lists.
+next chunk that the summary lists, if there is one: the summary may be damaged too. Records may be
+longer than their fields; what is behind the fields is skipped.
 """
 
 import struct
@@ -52,23 +53,24 @@ class LogPlaces:
         while at + RECORD.size <= end:
             opcode, length = RECORD.unpack(data.view(at, at + RECORD.size))
             after = at + RECORD.size + length
-            skipped_to = self._next_chunk(at)
-            limit = end if skipped_to is None else skipped_to
             head = self._head(at) if opcode == CHUNK else None
-            if head is not None and head.end <= limit:
+            skipped_to = self._next_chunk(at, after if head is None else max(after, head.end))
+            limit = end if skipped_to is None else skipped_to
+            if head is not None and head.end <= limit and not self._is_padded(head, after, limit):
                 after = head.end  # the length in the chunk counts, not that of its record
             if opcode == 0 or after > limit:
                 if skipped_to is None:
                     if opcode == CHUNK:
                         cut = data.view(at, min(end, at + MAX_RECORD_BYTES))
-                        yield Place(CHUNK, at, end, data=cut, cut=True)
+                        size = 0 if head is None else head.size
+                        yield Place(CHUNK, at, end, data=cut, size=size, cut=True)
                     break
                 yield Place(opcode, at, skipped_to, Reason.DAMAGED_RECORD)
                 at = skipped_to
             elif opcode == DATA_END and (another := next_log(data, after)) is not None:
                 yield Place(0, another, another, Reason.LOG_BEHIND_LOG)
                 at = another + len(MAGIC)
-            elif opcode == DATA_END and length == 4 and self.summary.data_end in (None, at):
+            elif opcode == DATA_END and length >= 4 and self.summary.data_end in (None, at):
                 return
             else:
                 place = self._place(opcode, at, after, limit, head)
@@ -81,8 +83,8 @@ class LogPlaces:
         if opcode == CHUNK:
             if after - at > MAX_RECORD_BYTES:
                 return Place(CHUNK, at, after, Reason.CHUNK_TOO_LARGE)
-            size = 0 if head is None else head.size
-            return Place(CHUNK, at, after, None, self.data.view(at, after), size)
+            size, chunk_end = (0, after) if head is None else (head.size, min(head.end, after))
+            return Place(CHUNK, at, after, None, self.data.view(at, chunk_end), size)
         if opcode == MESSAGE_INDEX and (index := self._index(at, after)) is not None:
             return Place(opcode, at, after, counted=index)
         if opcode in LOOSE:
@@ -97,11 +99,40 @@ class LogPlaces:
         foreign = opcode < PRIVATE and opcode not in IGNORED  # not of a data section
         return Place(opcode, at, after, Reason.DAMAGED_RECORD if foreign else None)
 
-    def _next_chunk(self, at: int) -> int | None:
-        """Return the first place after `at` where the summary lists a chunk."""
+    def _next_chunk(self, at: int, after: int) -> int | None:
+        """Return the first place after `at` where the summary lists a chunk.
+
+        One within the record from `at` to `after` counts only if a chunk begins there.
+        """
         offsets = self.summary.chunk_offsets
-        i = bisect_right(offsets, at)
-        return offsets[i] if i < len(offsets) else None
+        for i in range(bisect_right(offsets, at), len(offsets)):
+            if offsets[i] >= after or self._begins_chunk(offsets[i]):
+                return offsets[i]
+        return None
+
+    def _begins_chunk(self, at: int) -> bool:
+        if at + RECORD.size > len(self.data):
+            return False
+        opcode, length = RECORD.unpack(self.data.view(at, at + RECORD.size))
+        head = self._head(at) if opcode == CHUNK else None
+        # Either length may be damaged, but not both: then nothing says that this is a chunk.
+        return head is not None and (
+            head.end <= len(self.data) or at + RECORD.size + length <= len(self.data)
+        )
+
+    def _is_padded(self, head: ChunkHead, after: int, limit: int) -> bool:
+        """Return whether a chunk's record goes on behind its fields, to where a record begins."""
+        return (
+            head.end < after <= limit
+            and self._begins_record(after, limit)
+            and not self._begins_record(head.end, limit)
+        )
+
+    def _begins_record(self, at: int, limit: int) -> bool:
+        if at + RECORD.size > limit:
+            return at == limit
+        opcode, length = RECORD.unpack(self.data.view(at, at + RECORD.size))
+        return opcode != 0 and at + RECORD.size + length <= len(self.data)
 
     def _head(self, at: int) -> ChunkHead | None:
         try:
@@ -115,5 +146,5 @@ class LogPlaces:
         if after - body < _INDEX.size:
             return None
         number, size = _INDEX.unpack(self.data.view(body, body + _INDEX.size))
-        whole = size == after - body - _INDEX.size and size % 16 == 0
+        whole = size <= after - body - _INDEX.size and size % 16 == 0
         return (number, size // 16) if whole else None

@@ -28,8 +28,19 @@ from epipole.io.logs.mcap.record_scan import MESSAGE, Bytes, RecordIndex, index_
 from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
 from epipole.schemas.rejects import Reason
 
+# All chunks of a log together may declare so many times the bytes of the file, and at least so many
+# bytes: what they cost is bounded by the file. Logs of frames shrink to a half or a tenth.
+MOST_EXPANSION = 200
+LEAST_UNPACKED_BYTES = 16 << 20
+MOST_ALIKE = 1000  # damaged records that are listed; the last one counts the others too
+
 AHEAD_BYTES = 8 << 20  # of chunks that are opened while the chunk before them is decoded
 
+# A summary that counts more messages per byte of the log is damaged: the best compression of
+# empty messages has about 300.
+MOST_PER_BYTE = 1000
+
+PER_RECORD = ("opcode", "channel", "time_ns", "start", "end")  # columns of an index
 Numbers = npt.NDArray[np.int64]
 
 
@@ -66,7 +77,12 @@ class RecordWalk:
     _unknown: dict[int, int] = field(default_factory=dict)
     _counts: dict[int, int] = field(default_factory=dict)
     _lost: dict[int, int] = field(default_factory=dict)  # lost messages, by index of `damage`
+    _promised: frozenset[int] = frozenset()  # channels that are wanted, by the summary
+    _declared: dict[tuple[int, bytes], bytes] = field(default_factory=dict)  # by kind and number
+    _n_damaged: int = 0  # damaged records so far, and where in `damage` the last row of them is
+    _last_damaged: int = 0
     _lost_chunk: int | None = None  # index in `damage` of the chunk that message indexes follow
+    _in_chunk: dict[int, int] = field(default_factory=dict)  # its messages by channel, if read
 
     def __post_init__(self) -> None:
         self._channels = ChannelTable(self.wanted)
@@ -75,6 +91,7 @@ class RecordWalk:
     def blocks(self) -> Iterator[Block]:
         """Yield the wanted messages in the order of the file."""
         self._places.summary = self._summary = read_summary(self.data, self._channels)
+        self._promised = frozenset(filter(self._channels.find, self._summary.declared))
         self.data.stream()
         for place, opening in self._opened_ahead(self._places):
             yield from self._walk_place(place, opening)
@@ -85,9 +102,14 @@ class RecordWalk:
     ) -> Iterator[tuple[Place, Future[OpenedChunk] | None]]:
         """Yield the places; if there is a pool, it is already opening their chunks."""
         waiting: deque[tuple[Place, Future[OpenedChunk] | None]] = deque()
-        ahead = 0
+        ahead, unpacked = 0, 0
+        most = max(LEAST_UNPACKED_BYTES, MOST_EXPANSION * len(self.data))
         for place in places:
             opening = None
+            if place.opcode == CHUNK and not place.reason:
+                if unpacked + place.size > most:
+                    place = Place(CHUNK, place.at, place.after, Reason.CHUNK_TOO_LARGE)
+                unpacked += place.size
             if self.pool is not None and place.opcode == CHUNK and not (place.reason or place.cut):
                 opening = self.pool.submit(open_chunk, place.data)
             waiting.append((place, opening))
@@ -101,17 +123,19 @@ class RecordWalk:
     # What is in the file
 
     def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
-        if place.cut:
-            yield from self._walk_chunk(place.at, open_cut_chunk(place.data), cut=True)
-        elif place.reason:
+        if place.counted is None:
+            self._in_chunk = {}  # only indexes that follow a chunk at once are about it
+        if place.reason:
             self._leave_out(place.at, 0, place.reason)
             if place.opcode == CHUNK:
                 self._lost_chunk = len(self.damage) - 1
+        elif place.cut:
+            yield from self._walk_chunk(place.at, open_cut_chunk(place.data), cut=True)
         elif place.opcode == CHUNK:
             opened = open_chunk(place.data) if opening is None else opening.result()
             yield from self._walk_chunk(place.at, opened)
         elif place.counted is not None:
-            self._count_lost(*place.counted)
+            self._count_lost(place.at, *place.counted)
         elif place.opcode in LOOSE:
             yield from self._walk_loose(place)
 
@@ -125,6 +149,8 @@ class RecordWalk:
             return
         offset = np.full(len(index.start), at)
         yield from self._walk_index(_bytes(records), index, offset, start_ns)
+        counts = np.bincount(index.channel[index.opcode == MESSAGE])
+        self._in_chunk = {n: int(counts[n]) for n in np.flatnonzero(counts).tolist()}
         if index.n_strange:
             self._leave_out(at, start_ns, Reason.DAMAGED_RECORD, index.n_strange)
         if index.walked < len(records) and not cut:
@@ -161,6 +187,7 @@ class RecordWalk:
         self, data: Bytes, index: RecordIndex, offset: Numbers, start_ns: int
     ) -> Iterator[Block]:
         """Yield the runs of messages between declarations of schemas and channels."""
+        index, offset = self._without_repeats(data, index, offset)
         declared = np.flatnonzero(index.opcode != MESSAGE)
         at = 0
         for i in [*declared.tolist(), len(index.opcode)]:
@@ -175,6 +202,24 @@ class RecordWalk:
             except ChunkError:
                 self._leave_out(int(offset[i]), start_ns, Reason.DAMAGED_RECORD)
 
+    def _without_repeats(
+        self, data: Bytes, index: RecordIndex, offset: Numbers
+    ) -> tuple[RecordIndex, Numbers]:
+        """Return the records without declarations that say again what was declared last.
+
+        Some recorders declare a channel before each of its messages.
+        """
+        keep = np.ones(len(index.opcode), bool)
+        for i in np.flatnonzero(index.opcode != MESSAGE).tolist():
+            body = data[index.start[i] : index.end[i]].tobytes()
+            key = int(index.opcode[i]), body[:2]
+            keep[i] = self._declared.get(key) != body
+            self._declared[key] = body
+        if keep.all():
+            return index, offset
+        columns = {name: getattr(index, name)[keep] for name in PER_RECORD}
+        return index._replace(**columns), offset[keep]
+
     def _wanted(
         self, data: Bytes, index: RecordIndex, offset: Numbers, run: slice
     ) -> Iterator[Block]:
@@ -184,8 +229,10 @@ class RecordWalk:
         counts = np.bincount(channel)
         for number in np.flatnonzero(counts).tolist():
             n = int(counts[number])
-            self._counts[number] = self._counts.get(number, 0) + n
             known = self._channels.find(number)
+            # Where a damaged declaration hides a channel that the summary has, they are missing.
+            if known is not None or number not in self._promised:
+                self._counts[number] = self._counts.get(number, 0) + n
             if known is not None:
                 wanted[number] = known
             elif number not in self._channels:
@@ -208,12 +255,26 @@ class RecordWalk:
     # What is missing in it
 
     def _leave_out(self, offset: int, time_ns: int, reason: Reason, count: int = 1) -> None:
+        if reason == Reason.DAMAGED_RECORD and self._lost_chunk != len(self.damage) - 1:
+            self._n_damaged += 1
+            if self._n_damaged > MOST_ALIKE:
+                last = self.damage[self._last_damaged]
+                self.damage[self._last_damaged] = last._replace(n=last.n + count)
+                return
+            self._last_damaged = len(self.damage)
         self.damage.append(Damage(offset, time_ns, reason, count))
 
-    def _count_lost(self, number: int, n: int) -> None:
-        """Count the messages of a chunk that is left out, by an index after it."""
-        if self._lost_chunk is None or (self._channels and not self._channels.find(number)):
+    def _count_lost(self, at: int, number: int, n: int) -> None:
+        """Count the messages that an index has and the chunk before it had not.
+
+        The chunk was left out, or it was no chunk any more, or a part of it was damaged.
+        """
+        n -= self._in_chunk.get(number, 0)
+        if n <= 0 or (self._channels and not self._channels.find(number)):
             return
+        if self._lost_chunk is None:
+            self._lost_chunk = len(self.damage)
+            self._leave_out(at, 0, Reason.MISSING_MESSAGES)
         self._counts[number] = self._counts.get(number, 0) + n
         index = self._lost_chunk
         self._lost[index] = self._lost.get(index, 0) + n
@@ -226,9 +287,11 @@ class RecordWalk:
         missing = sum(
             max(0, count - self._counts.get(number, 0))
             for number, count in declared.items()
-            if self._channels.find(number)
+            if number in self._promised or self._channels.find(number)
         )
-        if missing:
+        if missing > MOST_PER_BYTE * len(self.data):
+            self._leave_out(0, 0, Reason.DAMAGED_RECORD)  # the counts themselves are damaged
+        elif missing:
             self._leave_out(0, 0, Reason.MISSING_MESSAGES, missing)
 
 

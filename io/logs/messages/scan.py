@@ -15,15 +15,32 @@ import numpy.typing as npt
 from epipole.io.logs.kernels import kernel
 from epipole.io.logs.mcap.byte_loads import load_int32, load_uint64
 from epipole.io.logs.mcap.record_scan import Bytes
+from epipole.schemas.logs import bounds
 
 MAX_NAMES = 1024  # sensors that a scan can tell apart; decoding has no limit
 NAME_BYTES = 63
-INFINITY_BITS, NAN_BITS = np.int32(0x7F800000), np.int32(0x7FC00000)  # of a float32
+NAN_BITS, NO_SIGN = np.int32(0x7FC00000), np.int32(0x7FFFFFFF)  # of a float32
 
-# Limits within which a scan takes a state. They are narrower than those of `columns.states` by
-# more than rounding, so that a state near a limit is judged in one place.
-NEAREST_KM, FARTHEST_KM = 6341.0, 9.9e6
-MIN_NORM2, MAX_NORM2 = 0.985, 1.015  # of a quaternion, squared
+
+def _bits(value: float) -> np.int32:
+    """Return the bits of a float32; of positive ones they are in the order of the values."""
+    return np.float32(value).view(np.int32)
+
+
+# Limits within which a scan takes a message. Those of lengths, which are squared here, are
+# narrower than the declared ones by more than rounding, so that a state near a limit is judged in
+# one place.
+EARLIEST_NS, LATEST_NS = int(bounds.TIME.least), int(bounds.TIME.greatest)
+LONGEST_S = bounds.EXPOSURE.greatest
+FARTHEST_BITS = _bits(bounds.PLACE.greatest)
+FLUX_BITS = _bits(bounds.FLUX.least), _bits(bounds.FLUX.greatest)
+SIGMA_BITS = _bits(bounds.CENTROID_SIGMA.least), _bits(bounds.CENTROID_SIGMA.greatest)
+NEAREST_KM2 = (bounds.POSITION.least * 1.0001) ** 2
+FARTHEST_KM2 = (bounds.POSITION.greatest * 0.99) ** 2
+FASTEST_KM2_S2 = (bounds.SPEED.greatest * 0.99) ** 2
+MIN_NORM2, MAX_NORM2 = 1.005 * bounds.QUATERNION.least**2, 0.995 * bounds.QUATERNION.greatest**2
+MOST_SIGMA_KM = bounds.POSITION_SIGMA.greatest
+VAGUE_ARCSEC, ANY_ARCSEC = bounds.ATTITUDE_SIGMA.greatest, float(bounds.ARCSEC_OF_HALF_A_TURN)
 
 
 # Columns of `fields`: where a field of a CentroidFrame begins, and of a SensorState.
@@ -137,29 +154,30 @@ def _sensor(data, at, n, names, channel):
 
 @kernel
 def _copy_places(data, at, bits, low, n):
-    """Copy the bits of `n` float32 from byte `at` on; return whether all are finite."""
+    """Copy the bits of `n` float32 from byte `at` on; return whether all are within bounds."""
     to, bad = np.uint64(low), np.int32(0)  # unsigned: numba need not check for negative indices
     for k in range(n):
         value = load_int32(data, at + 4 * k)
         bits[to + np.uint64(k)] = value
-        bad |= np.int32((value & INFINITY_BITS) == INFINITY_BITS)
+        bad |= np.int32((value & NO_SIGN) > FARTHEST_BITS)
     return bad == 0
 
 
 @kernel
-def _copy_positive(data, at, n_sent, bits, low, n):
-    """Copy the bits of float32, NaN where a value is not positive and finite or was not sent.
+def _copy_positive(data, at, n_sent, limits, bits, low, n):
+    """Copy the bits of float32, NaN where a value is out of bounds or was not sent.
 
-    Return whether all values that were sent are positive and finite.
+    Return whether all values that were sent are within the bounds, which are positive.
     """
     to, bad = np.uint64(low), np.int32(0)
     if not n_sent:
         for k in range(n):
             bits[to + np.uint64(k)] = NAN_BITS
         return True
+    least, greatest = limits
     for k in range(n):
         value = load_int32(data, at + 4 * k)
-        wrong = (value <= 0) | (value >= INFINITY_BITS)
+        wrong = (value < least) | (value > greatest)
         bits[to + np.uint64(k)] = NAN_BITS if wrong else value
         bad |= np.int32(wrong)
     return bad == 0
@@ -183,12 +201,15 @@ def scan_frames(messages, i, names, rows, n):
             break
         if fields[i, NUMBER] < 0:  # a number of 2**63 or more
             break
+        exposed_s = np.uint64(fields[i, EXPOSURE]).view(np.float64)
+        if not (EARLIEST_NS <= fields[i, TIME] <= LATEST_NS and 0 <= exposed_s <= LONGEST_S):
+            break
         good = _copy_places(data, fields[i, X], x_bits, low, size)
         good &= _copy_places(data, fields[i, Y], y_bits, low, size)
-        good &= _copy_positive(data, fields[i, SIGMA], n_sigma, sigma_bits, low, size)
+        good &= _copy_positive(data, fields[i, SIGMA], n_sigma, SIGMA_BITS, sigma_bits, low, size)
         if not good:
             break
-        _copy_positive(data, fields[i, FLUX], n_flux, flux_bits, low, size)
+        _copy_positive(data, fields[i, FLUX], n_flux, FLUX_BITS, flux_bits, low, size)
         code = _sensor(data, fields[i, ID], fields[i, ID + 1], names, channel[i])
         if code < 0:
             break
@@ -199,8 +220,7 @@ def scan_frames(messages, i, names, rows, n):
             fields[i, TIME],
             low,
         )
-        exposed_s = np.uint64(fields[i, EXPOSURE]).view(np.float64)
-        exposure_s[n] = exposed_s if 0 < exposed_s < np.inf else 0.0
+        exposure_s[n] = exposed_s
         has_flux[n], has_sigma[n] = n_flux > 0, n_sigma > 0
         i += 1
         n += 1
@@ -229,22 +249,29 @@ def scan_states(messages, i, names, frames, rows, n):
         n_velocity, n_attitude = fields[i, VELOCITY + 1], fields[i, ATTITUDE + 1]
         if fields[i, POSITION + 1] != 3 or n_velocity not in (0, 3) or n_attitude not in (0, 4):
             break
+        if not EARLIEST_NS <= fields[i, TIME] <= LATEST_NS:
+            break
         radius2 = _copy_doubles(data, fields[i, POSITION], 3, rows.r_km[n])
-        if not NEAREST_KM**2 < radius2 < FARTHEST_KM**2:
+        if not NEAREST_KM2 < radius2 < FARTHEST_KM2:
             break
         speed2 = _copy_doubles(data, fields[i, VELOCITY], n_velocity, rows.v_km_s[n])
-        if n_velocity and not speed2 < np.inf:
+        if n_velocity and not speed2 < FASTEST_KM2_S2:
             break
         norm2 = _copy_doubles(data, fields[i, ATTITUDE], n_attitude, rows.q[n])
         if n_attitude and not MIN_NORM2 < norm2 < MAX_NORM2:
             break
+        sigma_km = np.uint64(fields[i, POSITION_SIGMA]).view(np.float64)
+        sigma_arcsec = np.uint64(fields[i, ATTITUDE_SIGMA]).view(np.float64)
+        if sigma_km > MOST_SIGMA_KM or (VAGUE_ARCSEC < sigma_arcsec < ANY_ARCSEC and n_attitude):
+            break
+        if sigma_arcsec >= ANY_ARCSEC:  # the attitude may be any
+            rows.q[n] = np.nan
         frame = _find(data, fields[i, REFERENCE], fields[i, REFERENCE + 1], frames)
         code = _sensor(data, fields[i, ID], fields[i, ID + 1], names, channel[i])
         if frame < 0 or code < 0:
             break
         rows.sensor[n], rows.frame[n], rows.time_ns[n] = code, frame, fields[i, TIME]
-        rows.sigma[n, 0] = np.uint64(fields[i, POSITION_SIGMA]).view(np.float64)
-        rows.sigma[n, 1] = np.uint64(fields[i, ATTITUDE_SIGMA]).view(np.float64)
+        rows.sigma[n, 0], rows.sigma[n, 1] = sigma_km, sigma_arcsec
         i += 1
         n += 1
     return i, n

@@ -73,9 +73,9 @@ BAD_LOGS = {
     "a folder": (Path.mkdir, "no logs in this folder"),
     "empty": (Path.touch, "not an MCAP file"),
     "text": (lambda path: path.write_text("PNG"), "not an MCAP file"),
-    "without frames": (without_frames, "no frames in it"),
-    "of an unknown encoding": (of_unknown_encoding, "flatbuffer"),
-    "of a sensor that leaves its folder": (of_a_sensor_called("../x"), "no frames in it"),
+    "without frames": (without_frames, "no frames in these logs"),
+    "of an unknown encoding": (of_unknown_encoding, "left out: unknown_encoding 1"),
+    "of a sensor that leaves its folder": (of_a_sensor_called("../x"), "left out: bad_sensor_id 1"),
     "without calibration": (of_a_sensor_called("a"), "no sensor has a calibration"),
 }
 
@@ -239,21 +239,56 @@ def test_a_run_by_itself_leaves_nothing_of_its_libraries_on_the_terminal(night_l
     assert all(re.match(r"\d\d:\d\d:\d\d ", line) for line in ran.stderr.splitlines()), ran.stderr
 
 
-def test_ctrl_c_ends_a_run_with_one_line_and_nothing_half_written(night_log, tmp_path):
+@pytest.mark.parametrize(
+    ("by", "says"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "stopped")]
+)
+def test_a_run_that_is_stopped_says_so_and_leaves_nothing_half_written(
+    night_log, tmp_path, by, says
+):
     run = subprocess.Popen(
         [*EPIPOLE, "run", str(night_log), "--out", "out"], cwd=tmp_path, text=True,
         stderr=subprocess.PIPE, start_new_session=True,
     )  # fmt: skip
     lines = [run.stderr.readline()]  # the first stage has ended: Prefect runs
-    os.killpg(run.pid, signal.SIGINT)  # to its server too, as a terminal does
+    os.killpg(run.pid, by)  # to its server too, as a terminal does
     lines += run.stderr.readlines()
-    assert run.wait(timeout=60) == 130
-    assert one_line("".join(lines)) == "epipole: interrupted"
+    assert run.wait(timeout=60) == 128 + by
+    assert one_line("".join(lines)) == f"epipole: {says}"
     time.sleep(0.1)
-    assert list(tmp_path.iterdir()) == []
+    assert only_finished_parts(tmp_path)
+
+
+def only_finished_parts(folder: Path) -> bool:
+    """Return whether a stopped run left no more than whole parts, which the next run reuses."""
+    staging = folder / "out" / ".staging"
+    left = [path for path in folder.rglob("*") if path not in (staging.parent, staging)]
+    work = [path for path in left if path.relative_to(folder).match("out/.staging/work-*")]
+    whole = not any(path.name.startswith(".") for path in left)
+    return whole and all(path in work or set(work) & set(path.parents) for path in left)
 
 
 def test_the_dataset_of_an_evaluation_may_be_a_url(epipole, s3, night_log):
     code, _, err = epipole("evaluate", "s3://nights/none", "--truth", night_log)
     assert code == 1
     assert "s3://nights/none: no dataset here" in one_line(err)
+
+
+@pytest.mark.parametrize("name", ["", "\udcff"], ids=["empty", "not UTF-8"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("info",),
+        ("calibrate",),
+        ("run", "--out", "out"),
+        ("run", "log.mcap", "--out"),
+        ("simulate", "four_sensor_geo", "--out"),
+        ("catalog", "build", "hipparcos", "--out"),
+    ],
+    ids=" ".join,
+)
+def test_a_name_that_cannot_be_used_is_one_line(command, name, epipole, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = epipole(*command, name)
+    assert (code, out) == (1, "")
+    assert ("is empty" if not name else "is not UTF-8") in one_line(err)
+    assert list(tmp_path.iterdir()) == []

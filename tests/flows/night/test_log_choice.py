@@ -60,10 +60,16 @@ def test_a_folder_a_glob_and_a_url_give_the_same_logs(where, folder):
         memory.rm("/logs", recursive=True)
 
 
-def test_logs_in_subfolders_are_found_only_by_a_glob_that_has_them(folder):
-    deep = write_log(folder / "sat9" / "x.mcap", *[instant("2019-04-02T12:00:00")] * 2)
-    assert str(deep) not in find_logs(str(folder), "2019-04-02").paths
-    assert str(deep) in find_logs(f"{folder}/**/*.mcap", "2019-04-02").paths
+@pytest.mark.parametrize("where", ["{}", "{}/**/*.mcap", "memory://logs", "file://{}"])
+def test_logs_in_subfolders_are_found_however_deep(where, folder):
+    write_log(folder / "sat9" / "2019" / "x.mcap", *[instant("2019-04-02T12:00:00")] * 2)
+    (folder / "sat9" / "notes.txt").touch()
+    memory = fsspec.filesystem("memory")
+    memory.put(str(folder), "/logs", recursive=True)
+    try:
+        assert names(where.format(folder), "2019-04-02") == sorted([*OF_THE_SECOND, "x"])
+    finally:
+        memory.rm("/logs", recursive=True)
 
 
 def test_a_log_that_is_named_twice_counts_once(folder):

@@ -11,6 +11,7 @@ from epipole.io.work.places import ReadFolder, WorkFolder
 from epipole.schemas.bridge import empty
 from epipole.schemas.errors import LogError
 from epipole.schemas.logs.log_tables import LogSource
+from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import CAMERAS
@@ -61,6 +62,13 @@ def test_a_sensor_without_calibration_has_a_reject_and_no_spans():
 def test_no_calibration_at_all_is_an_error_that_says_what_to_do():
     with pytest.raises(LogError, match=r"no sensor has a calibration \(a\).*frame_id"):
         plan_spans(frames([], a=[1.0]), [NIGHT])
+
+
+def test_invalid_calibrations_are_named_where_there_are_no_others():
+    found = frames([], a=[1.0])
+    invalid = reject_rows(Reason.FOLDED_IMAGE, sensor_id="a", time=[0], count=[1])
+    with pytest.raises(LogError, match=r"those in the log are invalid: folded_image: .*D folds"):
+        plan_spans(found._replace(rejects=invalid), [NIGHT])
 
 
 def test_neighbours_are_worked_on_together():

@@ -76,3 +76,11 @@ def test_a_page_that_fails_in_the_middle_is_not_asked_again(monkeypatch, caplog)
         STEPS.removeHandler(bar)
     assert len(asked) == 1
     assert caplog.text.count("could not be shown") == 1
+
+
+def test_names_from_a_log_are_no_markdown():
+    fault = "<img src=x>\n\n# [a](https://b.c)|"
+    page = as_markdown(Summary(**FOUND | {"faults": [fault]}))
+    (line,) = [line for line in page.splitlines() if "img" in line]
+    assert line.startswith("- &#60;img src=x&#62;")
+    assert not set(line.replace("&#", "")) & set("<>[]|#:")

@@ -10,7 +10,7 @@ import pytest
 from prefect.task_runners import ThreadPoolTaskRunner
 
 from epipole.flows.nightly import nightly
-from epipole.flows.prefect.runners import runner_asked, task_runner
+from epipole.flows.prefect.runners import check_scheduler, runner_asked, task_runner
 from epipole.io.work.folder import work_root
 from epipole.schemas.errors import EpipoleError
 from epipole.schemas.runner import Runner
@@ -75,3 +75,29 @@ def test_a_killed_dask_worker_is_replaced_and_the_night_is_the_same(
         nightly.with_options(task_runner=runner)([str(night_log)], str(out))
     assert killed
     assert contents(out) == contents(night_dataset)
+
+
+@pytest.mark.parametrize(
+    ("address", "why"),
+    [
+        ("tcp://127.0.0.1:1", r"does not answer \("),
+        ("nowhere", r"does not answer \(missing port"),
+        ("pigeon://a:1", r"does not answer \(unknown address scheme"),
+    ],
+)
+def test_a_scheduler_that_does_not_answer_is_said_soon(address, why):
+    pytest.importorskip("distributed")
+    started_s = time.monotonic()
+    with pytest.raises(EpipoleError, match=f"^scheduler {address}: {why}"):
+        check_scheduler(address)
+    assert time.monotonic() - started_s < 10
+
+
+def test_only_a_scheduler_is_a_scheduler():
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address=None
+    ) as cluster:
+        check_scheduler(cluster.scheduler_address)
+        with pytest.raises(EpipoleError, match="is a Worker; start one"):
+            check_scheduler(cluster.workers[0].worker_address)

@@ -1,13 +1,17 @@
 """Nights that a run has claimed: refused to others, free again however the run ends."""
 
+import os
 import subprocess
 import sys
+import threading
+from pathlib import Path
 
 import pytest
-from scenes.dataset_tables import NEXT_NIGHT, NIGHT, TIMES, night_tables
+from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, TIMES, contents, night_tables
 from scenes.published import publish
 
-from epipole.io.datasets.dataset import claim_nights, publish_folders, read_table
+from epipole.io.datasets import local_nights
+from epipole.io.datasets.dataset import claim_nights, nights_in, publish_folders, read_table
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
@@ -98,3 +102,109 @@ def test_an_error_in_a_run_leaves_nothing_behind(tmp_path):
     with pytest.raises(RuntimeError):
         run()
     assert not (tmp_path / "out").exists()
+
+
+# Publishes two nights and is killed before a move; the first move writes the commit.
+KILLED = """
+import os, pathlib, signal, sys
+from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, night_tables
+from scenes.published import publish
+from epipole.io.datasets import folder_swap
+
+left = int(sys.argv[2])
+
+def counted(work):
+    def do(*args):
+        global left
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        left -= 1
+        return work(*args)
+    return do
+
+pathlib.Path.rename = counted(pathlib.Path.rename)
+supported = sys.argv[3] == "exchange"
+folder_swap.exchange = counted(folder_swap.exchange) if supported else lambda *_: False
+publish(sys.argv[1], night_tables(OVER_MIDNIGHT, seed=9), [NIGHT, NEXT_NIGHT])
+"""
+
+
+@pytest.fixture(scope="module")
+def old_and_new(tmp_path_factory):
+    """Return two nights before and after they are published again."""
+    both = []
+    for seed in (0, 9):
+        folder = tmp_path_factory.mktemp("made")
+        publish(folder, night_tables(OVER_MIDNIGHT, seed=seed), [NIGHT, NEXT_NIGHT])
+        both.append(contents(folder))
+    return both
+
+
+@pytest.mark.parametrize("exchange", ["exchange", "two renames"])
+@pytest.mark.parametrize("moves", range(5))
+@pytest.mark.parametrize("next_one", ["reads", "runs"])
+def test_a_publisher_killed_at_any_move_has_published_both_nights_or_none(
+    tmp_path, old_and_new, moves, exchange, next_one
+):
+    publish(tmp_path, night_tables(OVER_MIDNIGHT), [NIGHT, NEXT_NIGHT])
+    paths = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path), str(moves), exchange],
+        env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert killed.returncode == -9, killed.stderr
+    if next_one == "reads":
+        assert nights_in(tmp_path) == [NIGHT, NEXT_NIGHT]
+    with claim_nights(tmp_path, []):  # clears what was not committed
+        pass
+    assert contents(tmp_path) == old_and_new[moves > 0]
+
+
+def test_a_reader_that_may_not_write_reads_what_is_there(tmp_path, monkeypatch):
+    publish(tmp_path, night_tables(TIMES), [NIGHT])
+    (tmp_path / ".staging" / "swap-0").mkdir(parents=True)
+    (tmp_path / ".staging" / "swap-0" / "commit.json").write_text("{}")
+
+    def refused(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(Path, "open", refused)
+    assert nights_in(tmp_path) == [NIGHT]
+
+
+def test_a_staging_folder_that_is_a_link_is_not_followed(tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / "run-1").mkdir(parents=True)
+    publish(tmp_path / "out", night_tables(TIMES), [NIGHT])
+    (tmp_path / "out" / ".staging").symlink_to(elsewhere)
+    with pytest.raises(DatasetError, match=r"\.staging: is a symbolic link; remove it"):
+        publish(tmp_path / "out", night_tables(TIMES), [NIGHT])
+    assert [path.name for path in elsewhere.iterdir()] == ["run-1"]
+
+
+def test_links_and_stray_files_in_the_staging_folder_stop_nothing(tmp_path):
+    (tmp_path / "kept" / "inside").mkdir(parents=True)
+    staging = tmp_path / "out" / ".staging"
+    staging.mkdir(parents=True)
+    for name in ("run-stray", "swap-stray", ".DS_Store"):
+        (staging / name).touch()
+    (staging / "run-link").symlink_to(tmp_path / "kept")
+    publish(tmp_path / "out", night_tables(TIMES), [NIGHT])
+    assert nights_in(tmp_path / "out") == [NIGHT]
+    assert (tmp_path / "kept" / "inside").is_dir()
+    assert len(list(staging.iterdir())) == 4
+
+
+def test_a_thread_does_not_wait_for_a_lock_that_an_interruption_left_open(tmp_path):
+    def twice():
+        interrupted = local_nights._locked(tmp_path)
+        interrupted.__enter__()  # the exception of a Ctrl-C would keep it so
+        with local_nights._locked(tmp_path):
+            pass
+        done.append(interrupted)
+
+    done = []
+    thread = threading.Thread(target=twice, daemon=True)
+    thread.start()
+    thread.join(10)
+    assert done

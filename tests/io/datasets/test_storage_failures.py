@@ -71,7 +71,7 @@ def test_a_write_that_the_system_refuses_leaves_the_dataset_as_it_was(tmp_path, 
     ("then", "reason"),
     [
         ("true", "No space left on device"),
-        ('mount -o remount,ro "$1"', "Read-only file system"),
+        ('mount -o remount,ro,bind "$1"', "Read-only file system"),
     ],
 )
 def test_a_full_or_read_only_disk_is_one_line_and_the_night_stays(tmp_path, then, reason):

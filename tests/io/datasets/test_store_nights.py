@@ -88,7 +88,7 @@ def test_what_is_no_dataset_is_refused(s3, out):
     with pytest.raises(DatasetError, match="holds other files and no dataset"):
         check_folder(out)
     with (
-        pytest.raises(DatasetError, match="cannot be written"),
+        pytest.raises(DatasetError, match="there is no bucket no-such-bucket; create it"),
         claim_nights("s3://no-such-bucket/ds", [NIGHT]),
     ):
         pytest.fail("no bucket")
@@ -254,3 +254,23 @@ def test_a_store_that_is_not_there_is_an_error_of_one_line(s3, out, monkeypatch)
     with pytest.raises(DatasetError, match="cannot be read") as caught:
         check_folder(out)
     assert "\n" not in str(caught.value)
+
+
+def test_a_missing_bucket_is_named_by_readers_too(s3):
+    for read in (nights_in, lambda where: read_table(where, "frames", NIGHT)):
+        with pytest.raises(DatasetError, match="there is no bucket no-such-bucket"):
+            read("s3://no-such-bucket/ds")
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        (f"claim-night={NIGHT}.json", "is not a claim of a run; remove it"),
+        ("commit-stray.json", "is not a commit of a run; remove it"),
+    ],
+)
+def test_a_stray_file_among_the_claims_is_named(name, says, s3, out):
+    publish(out, night_tables(TIMES), [NIGHT])
+    s3.pipe_file(f"{out}/.staging/{name}", b"[]")
+    with pytest.raises(DatasetError, match=f"{name}: {says}"):
+        publish(out, night_tables(TIMES), [NIGHT])

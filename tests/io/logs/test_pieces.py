@@ -1,5 +1,7 @@
 """A log that is read in pieces: the same rows as at once, in bounded memory."""
 
+import hashlib
+import os
 import subprocess
 import sys
 
@@ -57,11 +59,12 @@ def test_a_piece_is_at_most_a_chunk_larger_than_asked_for(log):
     assert all(40_000 < size < 60_000 for size in sizes[:-1])
 
 
-def test_a_log_without_frames_is_an_error_after_its_states(tmp_path):
+def test_a_log_without_frames_has_the_times_of_its_states(tmp_path):
     with LogWriter(tmp_path / "a.mcap") as out:
         out.state("sat1", START_NS, position_km=[7000.0, 0.0, 2.0])
-    with pytest.raises(LogError, match="no frames in it"):
-        list(read_log_pieces(tmp_path / "a.mcap"))
+    (piece,) = read_log_pieces(tmp_path / "a.mcap")
+    assert piece.source is not None
+    assert (piece.source.first_time_ns, piece.source.last_time_ns) == (START_NS, START_NS)
 
 
 def test_reading_may_stop_early(log):
@@ -121,6 +124,31 @@ def test_a_log_that_is_cut_while_it_is_read_is_an_error_of_one_line(tmp_path, lo
         file.truncate(1000)
     with pytest.raises(LogError, match=f"a.mcap: has become shorter than {size:,} bytes"):
         list(pieces)
+
+
+def rewritten_while_read(path, log, change):
+    """Read the first piece, change the bytes of the file in place, read the rest."""
+    path.write_bytes(log.read_bytes())
+    os.utime(path, ns=(START_NS, START_NS))
+    pieces = read_log_pieces(path, piece_bytes=1)
+    next(pieces)
+    with path.open("r+b") as file:
+        change(file)
+    return list(pieces)
+
+
+def test_a_log_that_is_overwritten_while_it_is_read_is_an_error_of_one_line(tmp_path, log):
+    with pytest.raises(LogError, match=r"a\.mcap: has changed while it was read; read it when"):
+        rewritten_while_read(tmp_path / "a.mcap", log, lambda f: f.write(log.read_bytes()[::-1]))
+
+
+def test_a_log_that_grows_while_it_is_read_is_read(tmp_path, log):
+    def append(file):
+        file.seek(0, os.SEEK_END)
+        file.write(bytes(1000))
+
+    pieces = rewritten_while_read(tmp_path / "a.mcap", log, append)
+    assert pieces[-1].source.sha256 == hashlib.sha256(log.read_bytes()).hexdigest()
 
 
 def test_a_log_that_is_deleted_while_it_is_read_is_read(tmp_path, log):

@@ -38,7 +38,7 @@ def write(path, sensor_id, frames, *, states=(), frame="GCRF", sigma_km=0.0, cam
                 frame_number=number,
                 exposure_s=0.1,
                 x_px=[number],
-                y_px=[second],
+                y_px=[second % 1000],
             )
     return path
 

@@ -2,16 +2,18 @@
 
 import io
 import struct
+import time
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
+import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from scenes.log_bytes import log_bytes
 
 from epipole.io.logs.mcap.chunks import MAX_CHUNK_BYTES
-from epipole.io.logs.mcap.records import RecordWalk
+from epipole.io.logs.mcap.records import MOST_ALIKE, RecordWalk
 from epipole.io.logs.mcap.summary import MAGIC
 
 N = 40
@@ -159,7 +161,31 @@ def test_a_chunk_with_a_damaged_opcode_is_reported(opcode):
     data[chunks(data)[2][0]] = opcode
     found, damage = walk(data)
     assert found == [n for n in range(N) if n not in lost]
+    # By the chunk's indexes or by the summary: a chunk that looks like an index hides a part.
+    assert sum(n for reason, n in damage if reason == "missing_messages") == len(lost)
+
+
+@pytest.mark.parametrize("opcode", [0x09, 0x20, 0x80, 0xFF])
+def test_without_a_summary_the_indexes_of_a_chunk_tell_what_is_missing(opcode):
+    """A record of a private opcode would else be skipped without a word."""
+    data = bytearray(log())
+    places, lost = chunks(data), chunk_messages(data, 2)
+    data[places[2][0]] = opcode
+    found, damage = walk(data[: places[-1][0]])
+    assert found == [n for n in range(chunk_messages(log(), -1)[0]) if n not in lost]
     assert ("missing_messages", len(lost)) in damage
+
+
+def test_the_index_of_a_chunk_counts_the_messages_behind_damage_in_it():
+    data = bytearray(log(CompressionType.NONE, enable_crcs=False))
+    at, length = chunks(data)[2]
+    lost = chunk_messages(data, 2)
+    head = HEAD.pack(5, 22 + 100)
+    second = data.index(head, data.index(head, at) + 1, at + length)
+    data[second + 8] = 0x7F  # its length is beyond the chunk
+    found, damage = walk(data)
+    assert found == [n for n in range(N) if n not in lost[1:]]
+    assert damage == [("damaged_chunk", 1), ("missing_messages", len(lost) - 1)]
 
 
 def test_a_file_that_ends_in_zeros_is_read_to_there():
@@ -221,12 +247,40 @@ def test_a_message_that_only_the_statistics_count_is_reported_as_missing():
     assert damage == [("missing_messages", 1)]
 
 
+@pytest.mark.parametrize("count", [1 << 62, 1 << 63, (1 << 64) - 1])
+def test_a_count_beyond_all_that_a_log_can_hold_is_damage(count):
+    data = bytearray(log())
+    start = len(data) - 8 - 29 + 9
+    (summary,) = struct.unpack_from("<Q", data, start)
+    statistics = data.find(b"\x0b", summary)
+    while HEAD.unpack_from(data, statistics)[1] > len(data) - statistics:
+        statistics = data.find(b"\x0b", statistics + 1)
+    (size,) = struct.unpack_from("<I", data, statistics + HEAD.size + 42)
+    for at in range(0, size, 10):
+        struct.pack_into("<Q", data, statistics + HEAD.size + 46 + at + 2, count)
+    struct.pack_into("<I", data, start + 16, 0)  # no checksum of the summary
+    found, damage = walk(data)
+    assert found == list(range(N))
+    assert damage == [("damaged_record", 1)]
+
+
 def test_a_wrong_summary_is_not_used():
     data = bytearray(log())
     summary = make_reader(io.BytesIO(data)).get_summary()
     assert summary is not None
     place = data.rfind(b"/b")
     data[place + 1] = ord("c")
+    assert walk(data) == (list(range(N)), [])
+
+
+@pytest.mark.parametrize("bit", range(12))
+def test_an_offset_in_the_summary_that_is_wrong_costs_no_chunk(bit):
+    data = bytearray(log())
+    start = len(data) - 8 - 29 + 9
+    struct.pack_into("<I", data, start + 16, 0)  # no checksum of the summary
+    at, _ = chunks(data)[3]
+    place = data.rfind(struct.pack("<Q", at), struct.unpack_from("<Q", data, start)[0])
+    data[place + bit // 8] ^= 1 << bit % 8
     assert walk(data) == (list(range(N)), [])
 
 
@@ -271,6 +325,53 @@ def test_channels_may_be_declared_before_every_message():
 def test_a_chunk_in_a_chunk_is_left_out_and_reported():
     records = DECLARED + message(0) + chunk(message(1)) + message(2)
     assert walk(hand_made(chunk(records))) == ([0, 2], [("damaged_record", 1)])
+
+
+@pytest.mark.parametrize("padding", [b"\0" * 40, b"\xff" * 7, b"\0"])
+def test_records_that_are_longer_than_their_fields_are_sound(padding):
+    def padded(whole):
+        return record(whole[0], whole[HEAD.size :] + padding)
+
+    declared = padded(record(3, SCHEMA_BODY)) + padded(record(4, CHANNEL_BODY))
+    index = record(7, struct.pack("<HI", 1, 16) + bytes(16))
+    data = hand_made(
+        padded(chunk(declared + message(3))), padded(index), padded(chunk(message(5))), message(4)
+    )
+    at_end = data.rfind(record(15, bytes(4)))
+    data = data[:at_end] + record(15, bytes(4) + padding) + data[at_end + HEAD.size + 4 :]
+    assert walk(data) == ([3, 5, 4], [])
+
+
+def cpu_seconds(data):
+    started = time.process_time()
+    got = walk(data)
+    return got, time.process_time() - started
+
+
+def test_what_a_small_log_unpacks_is_bounded():
+    """Ten million empty messages in 40 kB."""
+    empty = record(5, struct.pack("<HIQQ", 1, 0, 1000, 0)) * 250_000
+    packed = zstandard.ZstdCompressor().compress(empty)
+    head = struct.pack("<QQQI", 1000, 2000, len(empty), 0) + struct.pack("<I", 4) + b"zstd"
+    bomb = record(6, head + struct.pack("<Q", len(packed)) + packed)
+    walked = RecordWalk(log_bytes(hand_made(DECLARED, *[bomb] * 40)), frozenset([SCHEMA]))
+    assert sum(len(block.start) for block in walked.blocks()) == 2 * 250_000
+    assert [d.reason for d in walked.damage] == ["chunk_too_large"] * 38
+
+
+def test_a_channel_that_is_declared_again_and_again_costs_little():
+    records = (DECLARED + message(1)) * 100_000
+    (found, damage), seconds = cpu_seconds(hand_made(chunk(records)))
+    assert (len(found), damage) == (100_000, [])
+    assert seconds < 5
+
+
+def test_damaged_records_without_number_are_few_rows_that_count_them_all():
+    data = hand_made(DECLARED, message(1), *[record(0x20, b"")] * 20_000)
+    found, damage = walk(data)
+    assert found == [1]
+    assert len(damage) == MOST_ALIKE
+    assert sum(n for _, n in damage) == 20_000
 
 
 def test_messages_that_are_too_short_are_counted():

@@ -1,0 +1,1 @@
+"""Text from outside: how it is shown to people, and TOML that people wrote."""
