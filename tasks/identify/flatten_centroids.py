@@ -8,7 +8,7 @@ import pyarrow as pa
 
 from epipole.schemas.bridge import array, flatten
 from epipole.schemas.settings import Settings
-from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
+from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, unproject
 
 Array = npt.NDArray[np.float64]
 
@@ -28,6 +28,7 @@ class FlatCentroids(NamedTuple):
     sigma_px: Array  # NaN where unknown
     u: Array  # sensor axes
     pixel_rad: Array
+    in_image: npt.NDArray[np.bool_]  # of the frame's camera; false without one
     camera_of_frame: npt.NDArray[np.int64]
     cameras: dict[int, Camera]
 
@@ -42,13 +43,15 @@ def flatten_centroids(exposures: pa.Table, cameras: pa.Table, settings: Settings
         sigma_px = np.where(np.isnan(sigma_px), settings.sensors.centroid_sigma_px, sigma_px)
     camera_of_frame, used = _cameras_of(exposures, cameras)
     u, pixel_rad = np.zeros((len(x_px), 3)), np.ones(len(x_px))
+    in_image = np.zeros(len(x_px), np.bool_)
     for row, camera in used.items():
         at = camera_of_frame[frame] == row
         u[at] = unproject(camera, x_px[at], y_px[at])
         pixel_rad[at] = pixel_angle(camera, u[at])
+        in_image[at] = inside(camera, x_px[at], y_px[at])
     flux = _optional(exposures, "flux", len(x_px))
     return FlatCentroids(
-        first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, camera_of_frame, used
+        first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, in_image, camera_of_frame, used
     )
 
 

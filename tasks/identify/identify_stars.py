@@ -15,7 +15,6 @@ from epipole.schemas.star_catalogue import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC, DAY_NS, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.camera import inside
 from epipole.tasks.algorithms.geometry.optics_errors import shared_attitude_covariance
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
@@ -73,7 +72,7 @@ def identify_stars(
     centroids = flatten_centroids(exposures, cameras, settings)
     found, rows = _identify(exposures, places, centroids, catalogue, settings)
     attitudes = _attitudes(places, found, settings)
-    matches = _matches(found, rows, len(centroids.x_px))
+    matches = _matches(found, rows, centroids)
     attitudes = _with_optics(attitudes, centroids, matches, cameras)
     stars = stars_table(exposures, places, centroids, attitudes, matches)
     stars = with_catalogue(stars, catalogue.schema)
@@ -132,15 +131,11 @@ def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
 
     A centroid outside the image is never one.
     """
-    shown = np.zeros(len(c.x_px), np.bool_)
-    camera_of = c.camera_of_frame[c.frame]
-    for row, camera in c.cameras.items():
-        shown |= (camera_of == row) & inside(camera, c.x_px, c.y_px)
     if np.median(np.diff(c.first)) > MANY_STAY:
-        stays = shown & persistent(c.first, c.x_px, c.y_px)
+        stays = c.in_image & persistent(c.first, c.x_px, c.y_px)
         if np.median(np.bincount(c.frame[stays], minlength=len(c.first) - 1)) > MANY_STAY:
-            yield shown & ~stays
-    yield shown
+            yield c.in_image & ~stays
+    yield c.in_image
 
 
 def _spots(
@@ -208,12 +203,14 @@ def _with_optics(
     return a._replace(shared_arcsec2=shared)
 
 
-def _matches(found: IdentifiedSensor | None, rows: npt.NDArray[np.int64], n: int) -> MatchedStars:
-    """Return the stars of n centroids, of which these rows took part, in this order."""
+def _matches(
+    found: IdentifiedSensor | None, rows: npt.NDArray[np.int64], c: FlatCentroids
+) -> MatchedStars:
+    """Return the stars of the centroids, of which these rows took part, in this order."""
     if found is None:
-        none = np.empty(0, np.int64)
-        return MatchedStars(none, none, np.empty(0), np.empty((0, 3)), 1.0)
-    star = np.full(n, -1)
+        none, frames = np.empty(0, np.int64), len(c.first) - 1
+        return MatchedStars(none, none, np.empty(0), np.empty((0, 3)), np.ones(frames))
+    star = np.full(len(c.x_px), -1)
     star[rows] = found.solutions.star
     at = np.flatnonzero(star >= 0)
     star = star[at]

@@ -42,14 +42,14 @@ class StarAttitudes(NamedTuple):
 class MatchedStars(NamedTuple):
     """Identified stars: the index of each one's centroid, and the star.
 
-    `scale` is the factor on the centroid errors that the stars' residuals show.
+    `scale` is the factor on each frame's centroid errors that the stars' residuals show.
     """
 
     at: npt.NDArray[np.int64]
     star_id: npt.NDArray[np.int64]
     magnitude: Array
     u_icrs: Array
-    scale: float
+    scale: Array
 
 
 def barycentric_velocity(time_ns: npt.NDArray[np.int64], places: pa.Table) -> Array:
@@ -150,12 +150,12 @@ def solutions_table(
 def detections_table(
     exposures: pa.Table, c: FlatCentroids, a: StarAttitudes, m: MatchedStars, most: int
 ) -> tuple[pa.Table, npt.NDArray[np.int64]]:
-    """Return DETECTIONS: each centroid that is no star, in frames with a camera; at most so many.
+    """Return DETECTIONS: each centroid in its camera's image that is no star; at most so many.
 
     It has no direction where the frame has no attitude. The numbers of detections left out, by
     frame, come second.
     """
-    left = (c.camera_of_frame >= 0)[c.frame]
+    left = c.in_image.copy()
     left[m.at] = False
     at = np.flatnonzero(left)
     kept = within_bound(c.frame[at], c.flux[at], most)
@@ -164,7 +164,7 @@ def detections_table(
     frame = c.frame[at]
     u_icrs = np.einsum("nji,nj->ni", a.R[frame], c.u[at])
     ra, dec = radec_from_unit(u_icrs)
-    sigma_px = np.where(np.isnan(c.sigma_px[at]), 1.0, c.sigma_px[at]) * m.scale
+    sigma_px = np.where(np.isnan(c.sigma_px[at]), 1.0, c.sigma_px[at]) * m.scale[frame]
     rows = table(
         DETECTIONS,
         _frame_key(exposures, frame)
@@ -187,13 +187,16 @@ def detections_table(
 def rejects_table(
     exposures: pa.Table, c: FlatCentroids, left_out: npt.NDArray[np.int64]
 ) -> pa.Table:
-    """Return rows of `rejects`, per log: how many centroids lie in frames without a camera, and
-    how many detections were left out, by frame, because there were too many."""
+    """Return rows of `rejects`, per log: how many centroids lie in frames without a camera or
+    outside the image, and how many detections were left out, by frame, because there were too
+    many."""
     uncalibrated = np.where(c.camera_of_frame < 0, np.diff(c.first), 0)
+    outside = np.bincount(c.frame[~c.in_image], minlength=exposures.num_rows) - uncalibrated
     return concat(
         REJECTS,
         [
             _counted(Reason.NO_CALIBRATION, exposures, uncalibrated),
+            _counted(Reason.OUTSIDE_IMAGE, exposures, outside),
             _counted(Reason.TOO_MANY_DETECTIONS, exposures, left_out),
         ],
     )

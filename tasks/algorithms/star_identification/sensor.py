@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.star_identification.frame_quality import frame_scales
 from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search, Solution
 from epipole.tasks.algorithms.star_identification.frames.spots import (
     SensorCentroids,
@@ -38,6 +39,7 @@ Array = npt.NDArray[np.float64]
 # Frames, spread over all, which are searched until any is identified; more where a frame has so
 # many centroids that most are no stars.
 PROBED, PROBED_CROWDED, CROWDED = 3, 8, 100
+STARS_IN_CROWD, DEEPER_IN_CROWD_MAG = 25.0, 1.5  # a field shows so many stars there, or deeper ones
 SAMPLED = 24  # frames around these from which a sensor is learned
 # Centroids may be mostly objects or clutter: skies that are brighter by this are tried as well.
 BRIGHTER_MAG = (1.0, 2.0)
@@ -46,6 +48,9 @@ KNOWN_SCALES = (1.0, 3.0, 0.4)  # factors to try on errors that the log or the s
 UNKNOWN_SCALES_PX = (0.5, 1.5, 0.15)  # errors to try where none are stated
 LEAST_SPREAD_MAG = 0.15  # of brightness: a sample may scatter less than all
 WRONG_GATE = 0.02  # a sample that misses the errors of all frames by more is corrected
+# Frames of other quality: rounds of learning it, the change (ln) that ends them, and the factor on
+# errors from which frames are searched again.
+QUALITY_ROUNDS, SETTLED, OTHER_QUALITY = 6, 0.02, 1.25
 DEEPER_MAG = 2.0  # how far beyond the first guess the faintest star is searched for
 
 
@@ -70,13 +75,13 @@ class IdentifiedSensor(NamedTuple):
 
     solutions, status : of each frame, see `identify_sequence`
     sky : the solutions' stars are rows of its catalogue
-    sigma_scale : factor on the centroid errors as stated, or on 1 px where none are
+    sigma_scale : (F,) float, factor on the centroid errors as stated, or on 1 px where none are
     """
 
     solutions: Solutions
     status: list[str | None]
     sky: Sky
-    sigma_scale: float
+    sigma_scale: Array
 
 
 def identify_sensor(
@@ -89,21 +94,23 @@ def identify_sensor(
 ) -> IdentifiedSensor:
     """Identify the stars of a sensor's frames, which are in order of time.
 
-    Errors that are not stated are estimated from the residuals. Stated errors are scaled where
-    residuals contradict them beyond doubt, so that reported sigmas are true.
+    Errors that are not stated are estimated from the residuals, frame by frame where frames differ.
+    Stated errors are scaled where residuals contradict them beyond doubt, so that reported sigmas
+    are true.
     """
     spots, stated = _fill_sigmas(spots)
     usable = np.flatnonzero(spots.counts >= 4)
+    density = 1.2 * float(np.median(spots.counts[usable])) if len(usable) else 10.0
+    crowded = density > 1.2 * CROWDED
     limit = magnitude_limit
-    if limit is None:
-        density = 1.2 * float(np.median(spots.counts[usable])) if len(usable) else 10.0
-        limit = skies.limit_for(density / spots.optics[0].solid_angle_sr)
+    if limit is None:  # of a crowd, nobody knows how many are stars
+        in_view = STARS_IN_CROWD if crowded else density
+        limit = skies.limit_for(in_view / spots.optics[0].solid_angle_sr)
     known = _Known(1.0, limit, magnitude_limit is None, how, True, not stated)
     whole = _Sample(t_s, spots, priors)
-    crowded = len(usable) > 0 and np.median(spots.counts[usable]) > CROWDED
     rows = usable[spread(len(usable), PROBED_CROWDED if crowded else PROBED)]
     known, probed = _first_scale(
-        whole.take(rows), skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
+        whole.take(rows), skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX, crowded
     )
     hopeless = not any(probed)
     if not hopeless:
@@ -132,7 +139,57 @@ def identify_sensor(
     if residuals.dof > 0 and (known.adjusted or is_significant(residuals)):
         known = known._replace(scale=known.scale * residuals.scale)
         solutions = solutions.rescaled(residuals.scale)
-    return IdentifiedSensor(solutions, status, skies.sky(known.limit), known.scale)
+    quality = np.ones(len(spots.counts))
+    if not stated:
+        solutions, quality = _by_quality(whole._replace(spots=spots), solutions, skies, known)
+        status = [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
+    return IdentifiedSensor(solutions, status, skies.sky(known.limit), known.scale * quality)
+
+
+def _by_quality(
+    whole: "_Sample", solutions: Solutions, skies: Skies, known: "_Known"
+) -> tuple[Solutions, Array]:
+    """Return the solutions with each frame's own errors, and these over those of the sensor.
+
+    Where frames differ, those that are not identified are searched as better and as worse ones.
+    """
+    solutions, quality = _settle_quality(whole, solutions, np.ones(len(whole.t_s)), skies, known)
+    if not solutions.solved.any():
+        return solutions, quality
+    how = known.how._replace(threshold=known.how.threshold + np.log(2.0))
+    for other in np.quantile(quality[solutions.solved], (0.9, 0.1)):
+        rows = np.flatnonzero(~solutions.solved & (whole.spots.counts >= 4))
+        if abs(np.log(other)) < np.log(OTHER_QUALITY) or not len(rows):
+            continue
+        tried = whole.take(rows).of_quality(np.full(len(rows), other))
+        found = _identify(tried, skies, known._replace(how=how), hopeless=True)[0]
+        solved = np.flatnonzero(found.solved)
+        solutions.enter_all(rows[solved], found, solved)
+        quality[rows[solved]] = other
+    return _settle_quality(whole, solutions, quality, skies, known)
+
+
+def _settle_quality(
+    whole: "_Sample", solutions: Solutions, quality: Array, skies: Skies, known: "_Known"
+) -> tuple[Solutions, Array]:
+    """Return the solutions and each frame's errors over the sensor's, which depend on each
+    other."""
+    n, counts = len(quality), whole.spots.counts
+    sky, frame = skies.sky(known.limit), np.repeat(np.arange(n), counts)
+    for _ in range(QUALITY_ROUNDS):
+        stars = np.bincount(frame, solutions.star >= 0, minlength=n)
+        dof = np.where(solutions.solved, 2 * stars - 3, 0).astype(np.int64)
+        chi2 = np.bincount(frame, np.where(solutions.star >= 0, solutions.chi2, 0.0), minlength=n)
+        found = frame_scales(chi2 * quality**2, dof)
+        if np.ptp(found) == 0.0 or np.abs(np.log(found / quality)).max() < SETTLED:
+            break
+        quality = found
+        frames = whole.of_quality(quality).spots.frames(known.scale, known.use_flux)
+        again = identify_again(whole.t_s, frames, solutions, sky, known.how)
+        lost = np.flatnonzero(solutions.solved & ~again.solved)
+        again.enter_all(lost, solutions, lost)
+        solutions = again
+    return solutions, quality
 
 
 class _Known(NamedTuple):
@@ -167,6 +224,11 @@ class _Sample(NamedTuple):
                 # Errors and sky were other ones: it may be off by more than it says.
                 sigma[row] = 3.0 * np.sqrt(np.trace(solution.cov_rad2) / 3.0)
         return self._replace(priors=Priors(R, sigma), anchors=True)
+
+    def of_quality(self, quality: Array) -> "_Sample":
+        """Return the frames, none of whose errors are stated, with these factors on them."""
+        spots = self.spots
+        return self._replace(spots=spots._replace(sigma_px=np.repeat(quality, spots.counts)))
 
 
 def spread(n: int, wanted: int) -> npt.NDArray[np.int64]:
@@ -230,17 +292,20 @@ def _faintest(
 
 
 def _first_scale(
-    probe: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...]
+    probe: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...], crowded: bool
 ) -> tuple[_Known, list[Solution | None]]:
     """Return what is known, with a scale of errors that identifies frames, and the solutions."""
-    attempts = list(_attempts(probe.spots, skies, known, scales))
+    attempts = list(_attempts(probe.spots, skies, known, scales, crowded))
     # Each further attempt is one more chance of a false alarm.
     least = known.how.threshold + np.log(max(len(attempts) - 1, 1))
     quick = known.how._replace(
         time_limit_s=known.how.time_limit_s / 4, threshold=least, crowded=False
     )
-    for k, tried in enumerate(attempts):
-        how = known.how if k == 0 and len(probe.t_s) > PROBED else quick
+    thorough = known.how._replace(threshold=least)
+    for tried in attempts:
+        # In a crowd, nothing less finds stars: as many as expected, or more.
+        in_crowd = crowded and tried.scale == scales[0] and tried.use_flux
+        how = thorough if in_crowd else quick
         found = _identify(probe, skies, tried._replace(how=how))[0].each()
         if any(found):
             return _likeliest_scale(probe.spots, found, skies, tried, scales)
@@ -248,7 +313,11 @@ def _first_scale(
 
 
 def _attempts(
-    probe: UnscaledCentroids, skies: Skies, known: _Known, scales: tuple[float, ...]
+    probe: UnscaledCentroids,
+    skies: Skies,
+    known: _Known,
+    scales: tuple[float, ...],
+    crowded: bool,
 ) -> Iterator[_Known]:
     """Yield what may be assumed of a sensor, the likeliest first."""
     flux = bool(np.isfinite(probe.instrumental_mag).any())
@@ -256,8 +325,10 @@ def _attempts(
     for use_flux in [True, False] if flux else [True]:  # it may be unrelated to brightness
         tried = known._replace(scale=scales[0], use_flux=use_flux)
         yield tried
+        if crowded and known.limit_is_open and use_flux:
+            yield tried._replace(limit=known.limit + DEEPER_IN_CROWD_MAG)
         for brighter in BRIGHTER_MAG if known.limit_is_open and use_flux else ():
-            if skies.sky(known.limit - brighter).rho * area > LEAST_IN_VIEW:
+            if not crowded and skies.sky(known.limit - brighter).rho * area > LEAST_IN_VIEW:
                 yield tried._replace(limit=known.limit - brighter)
         for scale in scales[1:]:
             yield tried._replace(scale=scale)

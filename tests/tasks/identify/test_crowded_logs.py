@@ -41,11 +41,19 @@ def with_points(exposures, x_px, y_px, shown, seed=0):
     return pa.Table.from_arrays(arrays, schema=EXPOSURES)
 
 
-def identified(log, exposures):
-    """Return which frames have an attitude from stars, and the rows of STARS."""
+def all_of(log, exposures):
+    """Return the tables of identified stars; each centroid is in one of them, once."""
     places = place_sensors(exposures, log.states, SETTINGS)
     found = identify_stars(exposures, places, log.cameras, read_hipparcos(), SETTINGS)
-    assert found.stars.num_rows + found.detections.num_rows == sum(map(len, exposures["x_px"]))
+    left_out = sum(found.rejects["count"].to_pylist())
+    rows = found.stars.num_rows + found.detections.num_rows + left_out
+    assert rows == sum(map(len, exposures["x_px"]))
+    return found
+
+
+def identified(log, exposures):
+    """Return which frames have an attitude from stars, and the rows of STARS."""
+    found = all_of(log, exposures)
     return array(found.solutions, "attitude_source") == "stars", found.stars
 
 
@@ -81,3 +89,12 @@ def test_centroids_outside_the_image_are_no_stars(log):
     out, among = identified(log, with_points(log.exposures, x_px, -x_px, 1.1))
     assert out.tolist() == clean.tolist()
     assert among.num_rows == stars.num_rows
+
+
+def test_centroids_outside_the_image_are_no_detections_and_are_counted(log):
+    x_px = np.random.default_rng(4).uniform(1100, 2000, 30)
+    clean = all_of(log, log.exposures)
+    among = all_of(log, with_points(log.exposures, x_px, -x_px, 1.1))
+    assert among.detections.num_rows == clean.detections.num_rows
+    assert among.rejects["reason"].to_pylist() == ["outside_image"]
+    assert among.rejects["count"].to_pylist() == [30 * log.exposures.num_rows]

@@ -80,3 +80,16 @@ def test_places_of_the_sample_logs_are_those_of_their_truth(name):
     # Errors are a bias of each sensor and noise of each state; where neither was added, metres.
     assert np.sqrt(np.mean((off_km / sigma_km[:, None]) ** 2)) < 1.6
     assert np.abs(stack(places, "v{}_km_s") - stack(truth, "v{}")).max() < 1e-5
+
+
+def test_states_that_give_an_impossible_speed_give_no_position(tmp_path):
+    """Without velocities: 60 km from one nanosecond to the next."""
+    with LogWriter(tmp_path / "a.mcap") as log:
+        for i in range(5):
+            log.state("a", START_NS + i, position_km=[7000.0, 60.0 * i, 0.0])
+            log.frame(
+                "a", START_NS + i * SECOND_NS, frame_number=i, exposure_s=0.0, x_px=[1], y_px=[1]
+            )
+    _, places = place(tmp_path / "a.mcap")
+    for name in ("x_km", "vx_km_s", "position_sigma_km", "used_position_sigma_km"):
+        assert places[name].null_count == 5, name

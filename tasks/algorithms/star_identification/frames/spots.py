@@ -132,6 +132,13 @@ class Solutions(NamedTuple):
         self.star[at], self.chi2[at] = solution.star, solution.chi2
         self.evidence[k] = solution.evidence
 
+    def enter_all(self, rows: Rows, other: "Solutions", of: Rows) -> None:
+        """Write other solutions' frames `of`, which are solved, as the frames `rows`."""
+        for row, k in zip(rows.tolist(), of.tolist(), strict=True):
+            solution = other.frame(k)
+            if solution is not None:
+                self.enter(row, solution)
+
     def rescaled(self, scale: float) -> "Solutions":
         """Return the solutions for errors this many times as large."""
         return self._replace(cov_rad2=self.cov_rad2 * scale**2, chi2=self.chi2 / scale**2)

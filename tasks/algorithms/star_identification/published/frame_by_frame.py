@@ -90,7 +90,8 @@ def identify_each_frame(
     if residuals.dof > 0 and not stated:
         scale = residuals.scale
         solutions = solutions.rescaled(scale)
-    return IdentifiedSensor(solutions, status, sky, scale if stated else scale * ASSUMED_SIGMA_PX)
+    factor = scale if stated else scale * ASSUMED_SIGMA_PX
+    return IdentifiedSensor(solutions, status, sky, np.full(len(status), factor))
 
 
 def _status(n: int, solved: bool) -> str | None:

@@ -16,17 +16,19 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
+from epipole.tasks.algorithms.star_identification.search.best_attitude import (
+    FLOOR,
+    WORTH,
+    is_clear,
+    keep,
+    no_attitude,
+)
 from epipole.tasks.algorithms.star_identification.search.companion_votes import (
     MAG_GATE,
     companion,
     shown_magnitudes,
 )
 from epipole.tasks.algorithms.star_identification.search.lost_in_space import (
-    FLOOR,
-    WORTH,
-    Best,
-    is_clear,
-    keep,
     matches_needed,
     mixed_order,
 )
@@ -231,7 +233,7 @@ def _try_star(problem, i, s, k, turns, room, best):
     odds = try_pair(problem.stars, s, other, c, order, log_miss, FLOOR, room)
     if odds < WORTH:
         return 8 * n_checked
-    keep(judge_pair(problem, i, s, j, other, best.evidence[1], room), room.R, best)
+    keep(judge_pair(problem, i, s, j, other, best.evidence[1], room), problem, room, best)
     return 8 * n_checked + 20 * n
 
 
@@ -263,7 +265,7 @@ def search_crowded(problem, R_best):
     """
     n = len(problem.centroids.u)
     room = make_scratch(n, n)
-    best = Best(np.array([-1e9, -1e9]), R_best)
+    best = no_attitude(R_best)
     top, work = best.evidence, 0
     needed = matches_needed(problem)
     if needed > n:

@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammainc
 
 from epipole.tasks.algorithms.geometry.attitude import invert_symmetric
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
@@ -35,7 +34,7 @@ TYPICAL_SPREAD_MAG = 0.4  # of a sensor's magnitudes about V, colours included; 
 OUTLIER_SHARE = 0.15  # variables, blends, odd colours
 MAG_RANGE = 6.0
 # Stars per field over their mean: the sky is uneven.
-DENSITIES = np.array([0.6, 1.0, 1.4])
+DENSITIES = (0.6, 1.0, 1.4)
 # Of the attitudes that chance gives, a search reports this share (ln) at most: others that come
 # near and matches that are not clear rule them out. Measured: a tenth (bench_false_alarms).
 REPORTED = -1.5
@@ -111,14 +110,15 @@ def log_ways(n, matches, in_view):
     return centroids - detected
 
 
-def chance_margin(matches: int, n: int, in_view: float) -> float:
+@kernel
+def chance_margin(matches, n, in_view):
     """Return how far chance stays below Markov's bound: lost in space, it reaches a log evidence x
     with so many matches in a starless frame with a probability below exp(-(x + margin)).
 
     Over such frames, the mean of exp(evidence), summed over all attitudes and sets of k matches, is
     the prior probability of k matches: that of `log_ways`, here over fields whose stars are Poisson
     distributed. With it, the mean number of attitudes above x follows from the volume of residuals
-    that leave so much: 2 k - 3 degrees of freedom, chi-square as of true stars.
+    that leave so much: 2 k - 3 degrees of freedom, chi-square as of true stars (compiled).
 
     Parameters
     ----------
@@ -127,11 +127,31 @@ def chance_margin(matches: int, n: int, in_view: float) -> float:
     in_view : float
         Stars in a field, the mean over the sky.
     """
-    k, m = matches, in_view * DENSITIES
-    prior = 4.0 * (k + 1) * (k + 2) * (k + 3) * np.mean(gammainc(k + 4.0, m) / m**4)
-    prior *= (n + 1) / (n - k + 1)
-    volume = 0.5 * np.log(2.0 * np.pi * (k - 1.5))
-    return float(volume - np.log(max(prior, 1e-300)) - REPORTED)
+    k, prior = matches, 0.0
+    for density in DENSITIES:
+        m = in_view * density
+        prior += _more_than(k + 3, m) / m**4 / len(DENSITIES)
+    prior *= 4.0 * (k + 1) * (k + 2) * (k + 3) * (n + 1) / (n - k + 1)
+    volume = 0.5 * math.log(2.0 * math.pi * (k - 1.5))
+    return volume - math.log(max(prior, 1e-300)) - REPORTED
+
+
+@borrowing_kernel
+def _more_than(k, mean):
+    """Return the probability that a Poisson variable is more than k."""
+    if mean > k + 1.0:  # the sum of the others converges, and the result is no small difference
+        term = total = math.exp(-mean)
+        for j in range(1, k + 1):
+            term *= mean / j
+            total += term
+        return 1.0 - total
+    term = total = math.exp((k + 1) * math.log(mean) - mean - math.lgamma(k + 2.0))
+    j = k + 2
+    while term > 1e-17 * total:
+        term *= mean / j
+        total += term
+        j += 1
+    return total
 
 
 @borrowing_kernel

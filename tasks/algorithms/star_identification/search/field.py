@@ -21,6 +21,8 @@ Array = npt.NDArray[np.float64]
 CLEARLY_BETTER = 6.0
 # Brightest centroids onto which a predicted star is shifted.
 N_NUDGED = 12
+# Distances that are compared for this, at most: about 0.2 s.
+MOST_COMPARED = 100_000_000
 # A match whose brightness is this far off is a coincidence [mag].
 ODD_MAG = 2.5
 
@@ -102,6 +104,18 @@ def stars_in_cone(u_icrs, n_stars, R, radius, row):
             row[n] = s
             n += 1
     return n
+
+
+@kernel
+def stars_about(stars, R, radius, beta):
+    """Return the stars within `radius` [rad] of the boresight as an observer at beta sees them, and
+    their rows (compiled)."""
+    row = np.empty(len(stars.u), np.int64)
+    row = row[: stars_in_cone(stars.u, len(row), R, radius, row)].copy()
+    u = np.empty((len(row), 3))
+    for k, s in enumerate(row):
+        aberrated(stars.u[s, 0], stars.u[s, 1], stars.u[s, 2], beta, u[k])
+    return StarPlaces(u, stars.magnitude[row]), row
 
 
 @borrowing_kernel
@@ -263,13 +277,14 @@ def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
     brings most other stars onto centroids (compiled).
 
     For predictions with an error wider than the stars are apart: their pattern, shifted as
-    a whole, decides. The `N_NUDGED` brightest centroids are tried.
+    a whole, decides. The `N_NUDGED` brightest centroids are tried, as long as the distances
+    that are compared are fewer than `MOST_COMPARED`: a wide error in a crowded sky has no end.
     """
     u, sigma = centroids.u, centroids.sigma
     n, m = len(u), len(a)
     v, w, trial = np.empty((m, 3)), np.empty((m, 3)), np.empty((3, 3))
     turn_stars(R0, a, v)
-    best = 0.0
+    best, compared = 0.0, 0
     copy_matrix(R0, R)
     for i in range(min(n, N_NUDGED)):
         off2 = u[i, 0] * u[i, 0] + u[i, 1] * u[i, 1]
@@ -278,6 +293,9 @@ def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
             dx, dy = v[s, 0] - u[i, 0], v[s, 1] - u[i, 1]
             if dx * dx + dy * dy > reach2 or v[s, 2] <= 0.0:
                 continue
+            compared += n * m
+            if compared > MOST_COMPARED:
+                return
             copy_matrix(R0, trial)
             _nudge(trial, u, i, a, s)
             turn_stars(trial, a, w)

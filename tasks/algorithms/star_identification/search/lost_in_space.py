@@ -1,25 +1,31 @@
 """Lost in space: the attitude of one frame with no prior, by likelihood over all centroids.
 
-Hypotheses are pairs of centroids taken for pairs of stars, from the table of catalogue
-pairs. One centroid after the other is the pivot. Votes of its companions sift its hypotheses
-(`companion_votes`). Those with most votes are compared with all other centroids and judged by
-their log evidence (`pair_hypotheses`). The search ends as soon as an attitude is beyond doubt, or
+Hypotheses are pairs of centroids taken for pairs of stars, from the table of catalogue pairs. Those
+of the brightest centroids are tried first (`brightest_pairs`). Then one centroid after the other is
+the pivot. Votes of its companions sift its hypotheses (`companion_votes`). Those with most votes
+are compared with all other centroids and judged by their log evidence (`pair_hypotheses`).
+The search ends as soon as an attitude is beyond doubt, or
 when too few pivots are left for an attitude that would be. The amount of work is counted and
 bounded, so that a search takes bounded time and gives the same answer on every machine.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import (
     attitude_information,
-    copy_matrix,
     invert_symmetric,
 )
-from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.star_identification.search.best_attitude import (
+    FLOOR,
+    WORTH,
+    is_clear,
+    keep,
+    no_attitude,
+)
+from epipole.tasks.algorithms.star_identification.search.brightest_pairs import try_brightest
 from epipole.tasks.algorithms.star_identification.search.companion_votes import (
     count_votes,
     make_votes,
@@ -45,10 +51,6 @@ from epipole.tasks.algorithms.star_identification.search.vote_sift import (
     make_sift,
 )
 
-# Attitudes closer than this are the same one [rad, about 0.3 degrees].
-SAME_ATTITUDE = 5e-3
-# Log odds at which a hypothesis is dropped, and with which it is refined.
-FLOOR, WORTH = -6.0, 2.0
 SLACK = 2  # a hypothesis may lack so many of the votes that are needed
 # Rounds, each more thorough than the one before: pivots; least companions of each; least share of
 # all centroids that are companions; votes after which no more companions are asked; how many of the
@@ -58,37 +60,6 @@ ROUNDS = ((6, 8, 0.5, 10_000, 128), (99, 0, 1.0, 0, 2000))
 SPARSE = 0.35
 # About so many units of work take a second of CPU time.
 WORK_PER_S = 4e7
-
-
-class Best(NamedTuple):
-    """The best attitude so far.
-
-    evidence : (2,) float, log evidence of the best, and of the best that is another attitude
-    R : (3, 3) float
-    """
-
-    evidence: npt.NDArray[np.float64]
-    R: npt.NDArray[np.float64]
-
-
-@borrowing_kernel
-def keep(evidence, R, best):
-    """Enter an attitude where it is the best, or the best other one."""
-    top = best.evidence
-    if evidence <= top[1]:
-        return
-    gap2 = 0.0
-    for r in range(3):
-        for m in range(3):
-            gap2 += (R[r, m] - best.R[r, m]) ** 2
-    same = gap2 < 2.0 * SAME_ATTITUDE * SAME_ATTITUDE
-    if evidence > top[0]:
-        if not same:
-            top[1] = top[0]
-        top[0] = evidence
-        copy_matrix(R, best.R)
-    elif not same:
-        top[1] = evidence
 
 
 @kernel
@@ -119,13 +90,6 @@ def matches_needed(problem):
         if k >= 2 and total + choice - log_ways(n, k + 1, in_view) >= rule.least:
             return k + 1
     return n + 1
-
-
-@borrowing_kernel
-def is_clear(best, rule):
-    """Tell whether the best attitude is beyond doubt."""
-    top = best.evidence
-    return top[0] > rule.enough and top[0] - top[1] > rule.enough
 
 
 @kernel
@@ -159,7 +123,7 @@ def _try_counted(problem, i, n_votes, fine, n_tried, votes, sift, least_votes, r
             continue
         work += 20 * n
         evidence = judge_pair(problem, i, a, j, b, best.evidence[1], room)
-        keep(evidence, room.R, best)
+        keep(evidence, problem, room, best)
         if is_clear(best, problem.rule):
             break
     return work
@@ -218,10 +182,13 @@ def search(problem, R_best):
     n = len(problem.centroids.u)
     n_pattern = min(n, problem.limits.n_pattern)
     room = make_scratch(n, min(n, problem.limits.n_tried))
-    best = Best(np.array([-1e9, -1e9]), R_best)
+    best = no_attitude(R_best)
     top, work = best.evidence, 0
     needed = matches_needed(problem)
     if needed > n:
+        return top[0], top[1], work
+    work += try_brightest(problem, room, best)
+    if is_clear(best, problem.rule):
         return top[0], top[1], work
     order = mixed_order(n_pattern)
     votes, sift = make_votes(problem.pairs.n_stars, n_pattern), make_sift()

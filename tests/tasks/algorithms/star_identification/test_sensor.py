@@ -135,6 +135,16 @@ def test_an_error_missing_in_one_frame_is_taken_from_the_others():
     assert found.sigma_scale == pytest.approx(1.0, abs=0.06)
 
 
+def test_frames_of_other_quality_have_their_own_errors_where_none_is_stated():
+    rng = np.random.default_rng(0)
+    sigma_px = rng.choice([0.2, 0.6, 1.8], 60)
+    shots = [_shot(k, sigma_px[k], np.nan, n_false=3) for k in range(60)]
+    found = _identify([shot for shot, *_ in shots])
+    assert found.solutions.solved.all()
+    assert np.abs(np.log(found.sigma_scale / sigma_px)).max() < 0.7
+    assert np.abs(np.median(np.log(found.sigma_scale / sigma_px))) < 0.1
+
+
 def test_an_error_that_is_nowhere_stated_counts_as_one_pixel_times_the_scale():
     shot, _ = _shot(0, 0.3)
     scaled = join_spots(*zip(shot, strict=True)).frames(0.5, use_flux=False)
@@ -145,7 +155,9 @@ def test_an_error_that_is_nowhere_stated_counts_as_one_pixel_times_the_scale():
 def test_what_a_poor_sample_hides_is_learned_from_the_frames_that_are_solved(monkeypatch):
     # The sample is made to fail: then 0.4 px stated as 0.3 would go through as stated.
     spots = [_shot(k, 0.4, 0.3, n_false=5)[0] for k in range(25)]
-    monkeypatch.setattr(sensor, "_first_scale", lambda sample, skies, known, scales: (known, []))
+    monkeypatch.setattr(
+        sensor, "_first_scale", lambda sample, skies, known, scales, crowded: (known, [])
+    )
     found = _identify(spots)
     assert found.sigma_scale * 0.3 == pytest.approx(0.4, rel=0.06)
     assert found.sky.catalogue.magnitude[-1] <= 6.25

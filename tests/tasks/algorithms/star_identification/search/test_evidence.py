@@ -4,8 +4,11 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import gammainc
 
 from epipole.tasks.algorithms.star_identification.search.evidence import (
+    DENSITIES,
+    REPORTED,
     MatchRule,
     chance_margin,
     choice_lost,
@@ -108,3 +111,12 @@ def test_chance_needs_more_luck_for_few_matches_where_a_field_shows_many_stars()
 
 def test_matches_of_all_centroids_are_the_likelier_by_chance():
     assert chance_margin(4, 4, 17.0) < chance_margin(4, 40, 17.0)
+
+
+@pytest.mark.parametrize("k", [3, 4, 9, 30])
+@pytest.mark.parametrize("in_view", [0.5, 6.0, 30.0, 200.0])
+def test_the_margin_of_chance_is_that_of_the_formula_by_scipy(k, in_view):
+    m = in_view * np.array(DENSITIES)
+    prior = 4 * (k + 1) * (k + 2) * (k + 3) * np.mean(gammainc(k + 4, m) / m**4) * 41 / (41 - k)
+    expected = 0.5 * np.log(2 * np.pi * (k - 1.5)) - np.log(prior) - REPORTED
+    assert chance_margin(k, 40, in_view) == pytest.approx(expected, rel=1e-9)

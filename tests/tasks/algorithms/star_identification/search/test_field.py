@@ -1,5 +1,7 @@
 """Identification near a known attitude."""
 
+import time
+
 import numpy as np
 import pytest
 from scenes.random_stars import BETA, HOW, angle_between, frame, random_attitude, random_catalogue
@@ -8,8 +10,10 @@ from scipy.spatial.transform import Rotation
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.star_identification.frames.frame import identify_predicted
 from epipole.tasks.algorithms.star_identification.search.field import (
+    Centroids,
     Matches,
     aberrated,
+    best_nudge,
     count_in_view,
     match_stars,
     stars_in_cone,
@@ -117,3 +121,16 @@ def test_centroids_all_on_one_spot_give_no_attitude():
     seen, _ = frame(CATALOGUE, random_attitude(0), 0)
     spot = seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0))
     assert identify_predicted(spot, SKY, random_attitude(0), np.eye(3) * 1e-8, HOW) is None
+
+
+def test_the_search_of_a_wide_prediction_ends_in_a_crowded_sky():
+    """A thousand million distances and more would be compared, for some 10 s."""
+    rng = np.random.default_rng(0)
+    u = rng.normal(size=(3000, 3)) * [0.1, 0.1, 0.0] + [0.0, 0.0, 1.0]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    sigma = np.full(200, 1e-5)
+    centroids = Centroids(u[:200], sigma, np.zeros(200), np.zeros(3))
+    best_nudge(np.eye(3), 1e-3, 1e-3, centroids, u[:10], 3.7, np.empty((3, 3)))  # compiles
+    started = time.process_time()
+    best_nudge(np.eye(3), 0.3, 0.3, centroids, u, 3.7, np.empty((3, 3)))
+    assert time.process_time() - started < 2.0

@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
 
-from epipole.tasks.algorithms.star_identification.frames.frame import identify_lost, search_lost
+from epipole.tasks.algorithms.star_identification.frames.frame import (
+    identify_lost,
+    problem_of,
+    search_lost,
+)
+from epipole.tasks.algorithms.star_identification.search.best_attitude import (
+    is_clear,
+    keep,
+    no_attitude,
+)
+from epipole.tasks.algorithms.star_identification.search.brightest_pairs import try_brightest
+from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import make_scratch
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
     pattern_pairs,
     pattern_size,
@@ -42,6 +53,47 @@ def test_any_attitude_is_found(sigma_px, n_false, missing, flux, grid, pairs):
         assert angle_between(found.R_sensor_from_icrs, R) < 1200 * ARCSEC * sigma_px
         claimed = found.star >= 0
         assert np.mean(found.star[claimed] == true[claimed]) > 0.97
+
+
+def by_the_brightest(seen, grid, pairs):
+    """Return whether pairs of the brightest centroids give a clear attitude, which, and the
+    work."""
+    problem = problem_of(seen, SKY, grid, pairs, HOW, crowded=False)
+    best, n = no_attitude(np.zeros((3, 3))), len(seen.u)
+    work = try_brightest(problem, make_scratch(n, min(n, 64)), best)
+    return is_clear(best, problem.rule), best.R, work
+
+
+def test_in_most_frames_pairs_of_the_brightest_centroids_are_enough(grid, pairs):
+    found = 0
+    for seed in range(40):
+        R = random_attitude(seed)
+        seen, _ = frame(CATALOGUE, R, seed, 0.5, 3, 0.1)
+        clear, R_best, _ = by_the_brightest(seen, grid, pairs)
+        found += clear
+        assert not clear or angle_between(R_best, R) < 1e-3
+    assert found > 30
+
+
+def test_without_brightness_no_pair_is_tried_for_being_bright(grid, pairs):
+    seen, _ = frame(CATALOGUE, random_attitude(0), 0, 0.5, 0, 0.0, False)
+    assert by_the_brightest(seen, grid, pairs)[::2] == (False, 0)
+
+
+def test_a_search_goes_on_where_most_matches_are_in_one_place(grid, pairs):
+    """In a cluster of stars, a wrong attitude may match many of them, and little else."""
+    seen, _ = frame(CATALOGUE, random_attitude(0), 0, 0.3)
+    problem = problem_of(seen, SKY, grid, pairs, HOW, crowded=False)
+    n = len(seen.u)
+    by_distance = np.argsort(np.linalg.norm(seen.u - seen.u[0], axis=1))
+    side = problem.image.box[1] - problem.image.box[0]
+    n_near = int(np.sum(np.linalg.norm(seen.u - seen.u[0], axis=1) < 0.1 * side))
+    for matched, clear in ((by_distance[: 2 * n_near - 1], False), (np.arange(n), True)):
+        room, best = make_scratch(n, min(n, 64)), no_attitude(np.zeros((3, 3)))
+        room.row_of[matched] = np.arange(len(matched))
+        room.R[:] = np.eye(3)
+        keep(100.0, problem, room, best)
+        assert is_clear(best, problem.rule) == clear
 
 
 def test_frames_without_stars_are_refused(grid, pairs):
