@@ -20,6 +20,7 @@ import polars as pl
 import pyarrow as pa
 from pydantic.fields import FieldInfo
 
+from epipole.schemas.logs.bounds import BOUNDS, TIME
 from epipole.schemas.rejects import FrameStatus, Outcome, Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.simulation.orbit import Orbit
@@ -98,6 +99,18 @@ def reasons() -> str:
     """Return the reasons of `rejects`, with their stages."""
     rows = [(f"`{reason}`", str(reason.stage), reason.sentence) for reason in Reason]
     return _markdown(("reason", "stage", "meaning"), rows)
+
+
+def bounds() -> str:
+    """Return the bounds of every value in a log."""
+    rows = []
+    for kind, of_kind in BOUNDS.items():
+        for b in of_kind:
+            low, high = ("1972", "2100") if b is TIME else (f"{b.least:g}", f"{b.greatest:g}")
+            reason = f"`{b.reason}`" if b.reason else ""
+            rows.append((kind, f"`{b.field}`", low, high, b.unit, reason, b.why))
+    head = ("message", "field", "least", "greatest", "unit", "reason", "why")
+    return _markdown(head, rows)
 
 
 def outcomes() -> str:
@@ -206,6 +219,7 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "outcomes": outcomes,
         "statuses": statuses,
     },
+    "docs/input.md": {"bounds": bounds},
     "docs/settings.md": {"settings": settings},
     "docs/scenes.md": {"scene": scene},
     "CONTRIBUTING.md": {"packages": rooms},

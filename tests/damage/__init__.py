@@ -1,0 +1,1 @@
+"""Damaged input: logs that are altered by number, odd values, bombs, and who judges the reader."""
