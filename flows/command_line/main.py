@@ -6,31 +6,23 @@ What a command needs is imported when it runs, so that ``epipole --help`` answer
 
 import datetime
 import json
-import signal
 import sys
 import warnings
 from collections.abc import Iterable
 from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 import typer.core
 
 from epipole.flows.command_line.environment import prepare_environment
+from epipole.flows.command_line.stopping import stop_by_signals, stopped_in_one_line
 from epipole.io.logs.messages.encodings.registry import ENCODINGS
 from epipole.schemas.errors import EpipoleError
 from epipole.schemas.runner import Runner
 from epipole.schemas.text.shown import as_line
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM came, as when a scheduler stops a run: it ends as after Ctrl-C, and clears up."""
-
-
-def _terminate(*_: Any) -> None:
-    raise Terminated
 
 
 class _Commands(typer.core.TyperGroup):
@@ -39,18 +31,15 @@ class _Commands(typer.core.TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run the command. An error that is not the user's shows its traceback."""
         try:
-            return super().invoke(ctx)
+            with stopped_in_one_line():
+                return super().invoke(ctx)
         except EpipoleError as error:
-            _fail(str(error), 1)
-        except Terminated:
-            _fail("stopped", 128 + signal.SIGTERM)
-        except KeyboardInterrupt:
-            _fail("interrupted", 128 + signal.SIGINT)
+            _fail(str(error))
 
 
-def _fail(message: str, code: int) -> None:
+def _fail(message: str) -> NoReturn:
     print(f"epipole: {as_line(' '.join(message.split()))}", file=sys.stderr)
-    sys.exit(code)
+    sys.exit(1)
 
 
 app = typer.Typer(
@@ -68,11 +57,11 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line."""
-    signal.signal(signal.SIGTERM, _terminate)
+    stop_by_signals()
     try:
         prepare_environment()
     except EpipoleError as error:
-        _fail(str(error), 1)
+        _fail(str(error))
     app()
 
 

@@ -48,25 +48,23 @@ def claim(dataset: Path, nights: Sequence[str]) -> Iterator[Path]:
         Where the folder cannot be written.
     """
     made = not dataset.exists()
-    dataset.mkdir(parents=True, exist_ok=True)
+    run = dataset / STAGING / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
     try:
+        dataset.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as held:
             with _locked(dataset) as staging:
                 _clear(dataset, staging)
                 for other in _folders(staging, "run-*"):
                     claimed = other / CLAIM
                     Holder.read(claimed.read_text(), claimed).refuse(dataset, nights)
-                run = staging / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
                 run.mkdir()
                 file = held.enter_context((run / CLAIM).open("w"))
                 fcntl.flock(file, fcntl.LOCK_EX)
                 file.write(Holder.of(nights).text())
                 file.flush()
-            try:
-                yield run
-            finally:
-                _release(dataset, run)
-    finally:
+            yield run
+    finally:  # of the claim too: Ctrl-C may come between any two of its steps
+        _release(dataset, run)
         if made:
             with contextlib.suppress(OSError):  # not empty if nights were published
                 dataset.rmdir()
@@ -74,8 +72,11 @@ def claim(dataset: Path, nights: Sequence[str]) -> Iterator[Path]:
 
 def _release(dataset: Path, run: Path) -> None:
     """Remove the folder of a run that ends. What cannot be removed the next run removes."""
-    with contextlib.suppress(OSError), _locked(dataset):
-        shutil.rmtree(run, ignore_errors=True)
+    if not run.exists() and not (dataset / STAGING / "lock").exists():
+        return  # refused, or never made
+    with contextlib.suppress(OSError, DatasetError), _locked(dataset):
+        gone = run.rename(run.with_name(f"{run.name}-gone"))  # a task may still be writing there
+        shutil.rmtree(gone, ignore_errors=True)
 
 
 def put_all_in_place(dataset: Path, staged: Mapping[str, Path]) -> None:

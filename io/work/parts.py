@@ -23,24 +23,34 @@ from epipole.schemas.spans import Span, spans_between
 CLOCK_NS = 10_000_000_000  # the largest correction of a clock
 
 
-def write_part(part: Path, declared: PartTables, tables: Mapping[str, pa.Table]) -> None:
+def write_part(
+    part: Path,
+    declared: PartTables,
+    tables: Mapping[str, pa.Table],
+    within: Path | None = None,
+) -> None:
     """Write the tables of a part, all of them or none. A part that exists stays unchanged.
 
     Parameters
     ----------
     declared
         The tables that the part must have: one of `epipole.io.work.part_tables`.
+    within
+        A folder of the part that must exist. It is not made: a task that outlives its run would
+        bring the run's folder back.
 
     Raises
     ------
     DatasetError
-        Where the disk cannot be written.
+        Where the disk cannot be written, or `within` is missing.
     ValueError
         Where the tables are not the declared ones.
     """
     check_tables(f"{part.parent.name}/{part.name}", declared, tables)
     making = part.with_name(f".{part.name}-{uuid.uuid4().hex}")
     try:
+        if within is not None and not within.is_dir():
+            raise OSError(None, "its run has ended", str(within))
         making.mkdir(parents=True)
         for name, rows in tables.items():
             with (

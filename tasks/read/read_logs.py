@@ -44,6 +44,7 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
                 "cameras": piece.cameras,
                 "rejects": piece.rejects,
             },
+            within=folder.root,
         )
         n_pieces += 1
         n_frames += piece.exposures.num_rows

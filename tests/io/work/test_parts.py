@@ -1,5 +1,7 @@
 """Parts: whole or not at all, the first writer's stays, rows found across spans."""
 
+import shutil
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -49,6 +51,16 @@ def test_a_folder_that_cannot_be_made_is_an_error_for_people(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DatasetError, match="cannot be written"):
         write_part(tmp_path / "file" / "1", ONE, {"a": rows(1)})
+
+
+def test_a_task_that_outlives_its_run_does_not_bring_its_folder_back(tmp_path):
+    run = tmp_path / "run"
+    run.mkdir()
+    write_part(run / "read" / "1", ONE, {"a": rows(1)}, within=run)
+    shutil.rmtree(run)
+    with pytest.raises(DatasetError, match="its run has ended"):
+        write_part(run / "read" / "2", ONE, {"a": rows(1)}, within=run)
+    assert not run.exists()
 
 
 def test_rows_within_a_span_come_from_all_parts_that_it_touches(tmp_path):

@@ -1,0 +1,91 @@
+"""Signals come at any moment: into an import, into a library, twice, into a wait without end."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+START = """
+import logging, os, signal, sys, time
+from epipole.flows.command_line import stopping
+stopping.stop_by_signals()
+def signalled():
+    os.kill(os.getpid(), signal.{by})
+"""
+
+LIBRARY = """
+with stopping.stopped_in_one_line():
+    try:
+        signalled()
+        time.sleep(60)
+    except KeyboardInterrupt as error:
+        raise ValueError("cannot be serialised") from error
+"""
+
+IMPORT = """
+with stopping.stopped_in_one_line():
+    import signalled_in
+    print("imported")
+    time.sleep(60)
+"""
+
+TWICE = """
+with stopping.stopped_in_one_line():
+    try:
+        signalled()
+        time.sleep(60)
+    finally:
+        signalled()
+        logging.getLogger("prefect").error("was cancelled")
+        time.sleep(0.1)
+        print("cleared up")
+"""
+
+WAITS = """
+stopping._PATIENCE_S = 0.2
+with stopping.stopped_in_one_line():
+    try:
+        signalled()
+        time.sleep(60)
+    finally:
+        time.sleep(60)
+"""
+
+
+def run(code, tmp_path, by="SIGINT"):
+    """Return what a program wrote that signals itself, and its exit code."""
+    ran = subprocess.run(
+        [sys.executable, "-c", START.format(by=by) + code], cwd=tmp_path, timeout=50,
+        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )  # fmt: skip
+    return ran.returncode, ran.stdout, ran.stderr
+
+
+@pytest.mark.parametrize(("by", "says"), [("SIGINT", "interrupted"), ("SIGTERM", "stopped")])
+def test_an_exception_that_a_library_made_of_the_signal_is_one_line(by, says, tmp_path):
+    expected = 128 + signal.Signals[by], "", f"epipole: {says}\n"
+    assert run(LIBRARY, tmp_path, by) == expected
+
+
+def test_an_import_is_finished_first(tmp_path):
+    module = "import __main__, time\n__main__.signalled()\ntime.sleep(0.2)\nprint('whole')\n"
+    (tmp_path / "signalled_in.py").write_text(module)
+    code, out, err = run(IMPORT, tmp_path)
+    assert (code, err) == (130, "epipole: interrupted\n")
+    assert out.startswith("whole\n")
+
+
+def test_a_second_signal_does_not_disturb_the_clearing_up(tmp_path):
+    assert run(TWICE, tmp_path) == (130, "cleared up\n", "epipole: interrupted\n")
+
+
+def test_a_wait_that_does_not_end_is_ended(tmp_path):
+    assert run(WAITS, tmp_path) == (130, "", "epipole: interrupted\n")
+
+
+def test_an_error_without_a_signal_stays(tmp_path):
+    code, _, err = run("with stopping.stopped_in_one_line(): 1 / 0", tmp_path)
+    assert code == 1
+    assert "ZeroDivisionError" in err
