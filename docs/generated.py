@@ -10,6 +10,7 @@ import ast
 import contextlib
 import io
 import re
+import runpy
 import sys
 from collections.abc import Callable, Iterable
 from enum import StrEnum
@@ -47,7 +48,7 @@ MADE_BY = {
     Stage.CALIBRATE: ("calibrations",),
     Stage.TRACK: ("tracklets",),
     Stage.SOLVE: ("epochs", "associations", "pairs", "positions", "states"),
-    Stage.PUBLISH: ("sources", "rejects"),
+    Stage.PUBLISH: ("observations", "sources", "rejects"),
 }
 
 SCENE_PARTS = (
@@ -203,13 +204,21 @@ def output(folder: Path) -> str:
     return f"```\n{printed.getvalue()}```\n"
 
 
+def orbit(folder: Path) -> str:
+    """Return what the example's fit prints where `folder` holds out/."""
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        runpy.run_path(str(ROOT / "examples" / "fit_orbit.py"))["main"](f"{folder}/out")
+    return f"```\n{printed.getvalue()}```\n"
+
+
 def code(page: str, name: str, out: str) -> str:
     """Return the Python code of a page's part, which reads its dataset from `out`."""
     text = part((ROOT / page).read_text(), name)
     return text.split("```")[1].removeprefix("python\n").replace('"out/', f'"{out}')
 
 
-# Each page's parts. What needs a dataset is `output` alone.
+# Each page's parts but those that need a dataset: `output` and `orbit`.
 PARTS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"stages": stages},
     "docs/tables.md": {
@@ -253,8 +262,11 @@ def write(folder: Path) -> None:
         for name, content in parts.items():
             text = with_part(text, name, content())
         (ROOT / page).write_text(text)
-    readme = ROOT / "README.md"
-    readme.write_text(with_part(readme.read_text(), "output", output(folder)))
+    for page, name, made in (
+        ("README.md", "output", output(folder)),
+        ("docs/orbits.md", "orbit", orbit(folder)),
+    ):
+        (ROOT / page).write_text(with_part((ROOT / page).read_text(), name, made))
 
 
 def _markdown(heading: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:

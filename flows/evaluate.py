@@ -13,7 +13,10 @@ from epipole.schemas.errors import DatasetError
 from epipole.schemas.simulation.report import Report
 from epipole.tasks.evaluate.evaluate_dataset import evaluate_dataset
 
-TABLES = ("frames", "stars", "detections", "epochs", "associations", "positions", "states")
+TABLES = (
+    *("frames", "stars", "detections", "epochs"),
+    *("associations", "positions", "observations", "states"),
+)
 
 
 def evaluate(dataset: str | os.PathLike[str], truth: str | os.PathLike[str]) -> Report:

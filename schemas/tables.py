@@ -257,6 +257,75 @@ POSITIONS = schema(
     ],
 )
 
+OBSERVATIONS = schema(
+    "observations",
+    "One row per detection of an object, with all that an orbit determination from angles needs.",
+    [
+        FRAME_TIME,
+        OBJECT_ID,
+        SENSOR_ID,
+        FRAME_NUMBER,
+        CENTROID,
+        column(
+            "ra_deg",
+            F64,
+            unit="deg",
+            frame="GCRF",
+            doc="Astrometric direction from the sensor: the aberration by the sensor's geocentric "
+            "velocity is removed (where that is known), the light time is not. It points to where "
+            "the object was when its light left.",
+        ),
+        column("dec_deg", F64, unit="deg", frame="GCRF", doc="The same."),
+        column(
+            "sigma_ra_arcsec",
+            F64,
+            unit="arcsec",
+            doc="1-sigma of ra times cos dec: of the centroid and of the frame's attitude. It is "
+            "independent in each frame.",
+        ),
+        column("sigma_dec_arcsec", F64, unit="arcsec", doc="1-sigma of dec, of the same."),
+        column("correlation", F64, doc="Of both."),
+        column(
+            "bias_sigma_arcsec",
+            F64,
+            unit="arcsec",
+            doc="1-sigma per axis of what all frames of the sensor have in common: fitted optics, "
+            "a prior attitude. 0 where nothing is known to be common.",
+        ),
+        *axes("{}_km", unit="km", frame="GCRF", doc="Sensor position at that time"),
+        *axes(
+            "v{}_km_s",
+            unit="km/s",
+            frame="GCRF",
+            null=True,
+            doc="Sensor velocity; null where unknown",
+        ),
+        column(
+            "position_sigma_km",
+            F64,
+            unit="km",
+            doc="1-sigma of the sensor position, per axis: of the log, or of the settings where "
+            "it tells none; larger where the objects show so. Mostly common to all frames of the "
+            "sensor.",
+        ),
+        column(
+            "magnitude",
+            F64,
+            unit="mag",
+            null=True,
+            doc="V by the frame's identified stars; null without flux, or without such stars.",
+        ),
+        column(
+            "magnitude_sigma",
+            F64,
+            unit="mag",
+            null=True,
+            doc="1-sigma: of the flux and of the frame's zero point. An object's colour may differ "
+            "from the stars'.",
+        ),
+    ],
+)
+
 _STATE = ("x", "y", "z", "vx", "vy", "vz")
 
 
@@ -382,6 +451,7 @@ TABLES: dict[str, pa.Schema] = {
     "epochs": EPOCHS,
     "associations": ASSOCIATIONS,
     "positions": POSITIONS,
+    "observations": OBSERVATIONS,
     "states": STATES,
     "calibrations": CALIBRATIONS,
     "pairs": PAIRS,

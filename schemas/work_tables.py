@@ -20,6 +20,7 @@ from epipole.schemas.tables import (
     FRAMES,
     I64,
     OBJECT_ID,
+    OBSERVATIONS,
     SENSOR_ID,
     TRACKLETS,
 )
@@ -137,6 +138,33 @@ SOLUTIONS = schema(
         ),
         USED_SIGMA,
         column("camera", I64, doc="Row of `cameras` that is valid for the frame."),
+        column(
+            "zero_mag",
+            F64,
+            unit="mag",
+            null=True,
+            doc="Magnitude of a flux of 1; null where no identified star has a flux.",
+        ),
+        column("zero_variance_mag2", F64, unit="mag^2", null=True, doc="Its variance."),
+        column(
+            "flux_floor_mag2",
+            F64,
+            unit="mag^2",
+            doc="Variance of the magnitude of one bright centroid.",
+        ),
+        column(
+            "flux_photon_mag2", F64, unit="mag^2", doc="Divided by the flux, it adds to the floor."
+        ),
+    ],
+)
+
+SIGHTINGS = schema(
+    "sightings",
+    "One row per detection of a tracklet of one sensor: the columns of `observations`, the "
+    "tracklet instead of the object.",
+    [
+        *[field for field in OBSERVATIONS if field.name != "object_id"],
+        id_column("tracklet_id", doc="Its id in the night; see `lone_detections` for those alone."),
     ],
 )
 

@@ -30,6 +30,7 @@ from epipole.schemas.work_tables import (
     SENSOR_EPOCHS,
     SENSOR_STATES,
     SHARED_ERRORS,
+    SIGHTINGS,
     SOLUTIONS,
     TRACKLET_NAMES,
     TRACKLET_OUTCOMES,
@@ -63,6 +64,7 @@ NIGHT_TRACKLETS: Final[PartTables] = {"tracklets": TRACKLET_RUNS, "suspects": HO
 VIEWED: Final[PartTables] = {
     "epochs": SENSOR_EPOCHS,
     "views": VIEWS,
+    "sightings": SIGHTINGS,
     "tracklets": VIEWED_TRACKLETS,
 }
 ASSOCIATED: Final[PartTables] = {

@@ -190,6 +190,36 @@ class Report:
         "ghosts are skipped.",
     )
 
+    observations: int | None = _measure(
+        "observations", "of objects", definition="Rows of the table observations."
+    )
+    observations_of_others: int | None = _measure(
+        "observations",
+        "of something else",
+        definition="Those that do not show the true object of their id: the one that most of its "
+        "observations show.",
+    )
+    observation_recall: float | None = _measure(
+        "observations",
+        "recall",
+        "share",
+        definition="The others, as a share of all centroids of true objects that have a position.",
+    )
+    observation_nees_mean: float | None = _measure(
+        "observations",
+        "NEES / 2, mean (expected: 1)",
+        "number",
+        definition="Mean over the true objects of the mean NEES / 2 of their observations, by all "
+        "errors that a row states; 1 where these are right.",
+    )
+    observation_nees_mean_sigma: float | None = _measure(
+        "observations",
+        "its standard error",
+        "number",
+        definition="Standard error of observation_nees_mean. Errors that all frames of a sensor "
+        "share are not in it.",
+    )
+
     states: int | None = _measure(
         "states",
         "of true objects",

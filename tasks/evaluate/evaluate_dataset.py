@@ -22,6 +22,7 @@ from epipole.tasks.evaluate.match_claims import (
 from epipole.tasks.evaluate.match_points import Measures, detected_objects
 from epipole.tasks.evaluate.measure_associations import measure_associations, measure_lost_objects
 from epipole.tasks.evaluate.measure_frames import measure_attitudes, measure_stars
+from epipole.tasks.evaluate.measure_observations import measure_observations
 from epipole.tasks.evaluate.measure_positions import (
     measure_coverage,
     measure_ids,
@@ -37,8 +38,8 @@ def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:
     Parameters
     ----------
     tables
-        `frames`, `stars`, `detections`, `epochs`, `associations`, `positions` and `states` of the
-        nights of the truth.
+        `frames`, `stars`, `detections`, `epochs`, `associations`, `positions`, `observations` and
+        `states` of the nights of the truth.
     truth
         The truth of all logs of these nights.
 
@@ -68,6 +69,7 @@ def _measure_objects(
     measures |= measure_positions(tables["positions"], matched, truth)
     measures |= measure_coverage(measures["positions"], truth, to_polars(truth.frames), points)
     measures |= measure_ids(matched)
+    measures |= measure_observations(tables["observations"], points, matched, truth)
     measures |= measure_states(tables["states"], matched, truth)
     return measures | measure_tracks(detections, points)
 

@@ -22,6 +22,7 @@ from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import project
 from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
 from epipole.tasks.algorithms.geometry.sky import aberrate, boresight_angles, radec_from_unit
+from epipole.tasks.algorithms.photometry import flux_scale
 from epipole.tasks.algorithms.time.time_scales import earth_velocity
 from epipole.tasks.identify.bound_detections import within_bound
 from epipole.tasks.identify.flatten_centroids import FlatCentroids
@@ -128,6 +129,8 @@ def solutions_table(
         "roll_deg": np.degrees(roll),
         "residual_px": residual,
     }
+    scale = flux_scale(frame, m.star_id, m.magnitude, c.flux[m.at], n)
+    values["zero_mag"], values["zero_variance_mag2"] = scale.zero_mag, scale.zero_variance_mag2
     kept = [
         *("x_km", "y_km", "z_km", "vx_km_s", "vy_km_s", "vz_km_s"),
         *("position_sigma_km", "used_position_sigma_km"),
@@ -143,6 +146,8 @@ def solutions_table(
             "attitude_source": a.source,
             "status": a.status,
             "camera": c.camera_of_frame,
+            "flux_floor_mag2": scale.floor_mag2,
+            "flux_photon_mag2": scale.photon_mag2,
         },
     )
 

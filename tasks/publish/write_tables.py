@@ -30,6 +30,7 @@ from epipole.tasks.publish.hot_tracklets import (
     with_hot_pixels,
 )
 from epipole.tasks.publish.night_parts import NightParts
+from epipole.tasks.publish.observed_objects import observations
 from epipole.tasks.publish.time_slices import in_slices
 
 # These tables may not fit in memory as a whole: they are written in slices of time.
@@ -37,7 +38,7 @@ BY_SENSOR = ("frames", "stars", "detections")
 BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
 WHOLE = ("tracklets", "calibrations", "sources", "rejects")
 # The tables of one task each; stars are most of the work.
-SHARES = (("stars",), ("detections",), ("frames",), (*BY_SPAN, *WHOLE))
+SHARES = (("stars",), ("detections",), ("observations",), ("frames",), (*BY_SPAN, *WHOLE))
 SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
 # These are counted over the night: a row per span would tell nothing more.
 COUNTED = (
@@ -64,6 +65,8 @@ def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None
         rows: Iterator[pa.Table]
         if name in BY_SENSOR:
             rows = _of_sensors(name, parts)
+        elif name == "observations":
+            rows = observations(parts)
         elif name in BY_SPAN:
             rows = _of_spans(name, parts)
         else:

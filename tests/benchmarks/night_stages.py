@@ -29,6 +29,8 @@ from epipole.tasks.solve.association.number_objects import number_objects
 from epipole.tasks.solve.positions.gather_views import gather_views
 from epipole.tasks.solve.positions.solve_positions import Solved, solve_positions
 from epipole.tasks.solve.views.align_epochs import align_epochs
+from epipole.tasks.solve.views.tabulate_sightings import tabulate_sightings
+from epipole.tasks.solve.views.tracklet_sightings import sight_objects
 from epipole.tasks.solve.views.view_objects import view_objects
 from epipole.tasks.solve.views.view_sensors import sensor_epochs, viewed_tracklets
 from epipole.tasks.track.build_tracklets import Tracked, build_tracklets
@@ -114,12 +116,15 @@ def _view(
         solutions = of_sensor(seen.solutions, sensor.sensor_id)
         own = of_sensor(epochs, sensor.sensor_id)
         detections = of_sensor(tracked.detections, sensor.sensor_id)
-        views = view_objects(own, solutions, detections, seen.cameras, settings)
+        sighted = sight_objects(solutions, detections, seen.cameras, settings)
+        views = view_objects(own, sighted, settings)
+        sightings = tabulate_sightings(sighted)
         tracklets = of_sensor(tracked.tracklets, sensor.sensor_id)
         for span in spans_between(*_ends(own)):
             of_span = span.of(views, "epoch")
             tables = {
                 "views": of_span,
+                "sightings": span.of(sightings, "time"),
                 "epochs": sensor_epochs(span.of(own, "epoch"), solutions),
                 "tracklets": viewed_tracklets(tracklets, of_span),
             }

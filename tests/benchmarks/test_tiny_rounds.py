@@ -30,6 +30,7 @@ TINY = {
     "long_evidence": "--seeds 1 --lone 2 --minutes 0.5 --longest 600",
     "many_sensors": "ring --sensors 8",
     "night": "--shares 1 --hours 0.02",
+    "orbit_fits": "--seeds 1",
     "page": "--rounds 1",
     "photographs": "{folder}/list.csv --width 1024 --height 1024 --field 20 --year 2024 --reach 0",
     "positions": "--positions 20",

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import pytest
-from generated import MADE_BY, PARTS, ROOT, code, output, part
+from generated import MADE_BY, PARTS, ROOT, code, orbit, output, part
 
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import TABLES
@@ -53,6 +53,24 @@ def test_the_two_commands_stand_as_they_are(command):
 
 def test_the_query_prints_what_the_readme_says(example):
     assert output(example) == part((ROOT / "README.md").read_text(), "output"), STALE
+
+
+def test_the_fit_prints_what_its_page_says(example):
+    said, found = part((ROOT / "docs" / "orbits.md").read_text(), "orbit"), orbit(example)
+    number = r"-?\d+(?:\.\d+)?"
+    assert re.sub(number, "", found).split() == re.sub(number, "", said).split(), STALE
+    told, made = ([float(n) for n in re.findall(number, text)] for text in (said, found))
+    assert made == pytest.approx(told, abs=0.003), (
+        STALE
+    )  # the last steps of a fit are its machine's
+
+
+def test_the_arcs_of_the_page_about_orbits_are_found(example):
+    names: dict = {}
+    exec(code("docs/orbits.md", "read", f"{example}/out/"), names)
+    arcs = names["arcs"]
+    assert arcs["object_id"].n_unique() == 9
+    assert arcs["magnitude"].is_between(5, 12).all()
 
 
 def test_the_questions_have_answers(night_dataset):

@@ -12,10 +12,10 @@ import pyarrow.compute as pc
 
 from epipole.io.work.part_tables import VIEWED
 from epipole.io.work.parts import Parts, write_part
-from epipole.schemas.bridge import array
+from epipole.schemas.bridge import array, empty
 from epipole.schemas.settings import AssociationSettings, Settings
 from epipole.schemas.spans import SPAN_NS, Span
-from epipole.schemas.work_tables import CAMERAS, SOLUTIONS, TRACKLET_RUNS, VIEWS
+from epipole.schemas.work_tables import CAMERAS, SIGHTINGS, SOLUTIONS, TRACKLET_RUNS, VIEWS
 from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
 from epipole.tasks.solve.association.associate_block import blocks_of, object_members
 from epipole.tasks.solve.association.associate_objects import associate_objects
@@ -151,6 +151,7 @@ def write_views(folder: Path, sensors: Sequence[SensorViews], span: Span) -> Map
     viewed = {of.number: Parts(folder / str(of.number)) for of in sensors}
     for of in sensors:
         tables = {"views": of.read_views(), "epochs": of.epochs, "tracklets": of.tracklets}
+        tables["sightings"] = empty(SIGHTINGS)
         write_part(viewed[of.number].of(span), VIEWED, tables)
     return viewed
 

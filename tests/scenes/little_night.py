@@ -1,5 +1,7 @@
 """A little night by hand: two sensors, two objects, one star, and a dataset of it with errors."""
 
+import math
+
 from epipole.io.simulation.truth import Truth
 from epipole.schemas.bridge import table
 from epipole.schemas.tables import (
@@ -7,6 +9,7 @@ from epipole.schemas.tables import (
     DETECTIONS,
     EPOCHS,
     FRAMES,
+    OBSERVATIONS,
     POSITIONS,
     STARS,
     STATES,
@@ -53,7 +56,10 @@ def little_truth(n_frames: int = 1) -> Truth:
 
 
 def little_dataset():
-    """Object 0 right, 1 km and one sigma off; a ghost of object 1 and a star; one star wrong."""
+    """Object 0 right, 1 km and one sigma off; a ghost of object 1 and a star; one star wrong.
+
+    Two observations: one is a sigma off, the other shows a star.
+    """
     half = {"qx": 5e-5, "qw": 1.0}  # a turn by 1e-4 rad about x
     frames = [{"sensor_id": s, "attitude_source": "stars", **QUAT, **half} for s in "ab"]
     stars = [{"sensor_id": "a", "star_id": 77}, {"sensor_id": "b", "star_id": 78}]
@@ -66,6 +72,13 @@ def little_dataset():
     positions = [{"object_id": "o1", "x_km": 42165.0, **cov}, {"object_id": "o2", **cov}]
     tracked = {"kind": "object", "track_id": "a1", "tracklet_id": "a1"}
     detections = [{"sensor_id": "a", "centroid": k, **tracked} for k in (1, 2, 0)]
+    # Where its light left, object 0 stands behind by its speed over that of light.
+    seen = {"ra_deg": -math.degrees(SPEED_KM_S / 299792.458), "dec_deg": 1 / 3600}
+    sigma = {"sigma_ra_arcsec": 1.0, "sigma_dec_arcsec": 1.0}
+    observations = [
+        {"object_id": "o1", "sensor_id": s, "centroid": k, **seen, **sigma}
+        for s, k in (("a", 1), ("b", 0))
+    ]
     return {
         "frames": rows(FRAMES, *frames),
         "stars": rows(STARS, *stars),
@@ -73,6 +86,7 @@ def little_dataset():
         "epochs": rows(EPOCHS, {"sensor_id": "a"}, {"sensor_id": "b"}),
         "associations": rows(ASSOCIATIONS, *associations),
         "positions": rows(POSITIONS, *positions),
+        "observations": rows(OBSERVATIONS, *observations),
         "states": rows(STATES, little_state("o1", x_km=1.0), little_state("o2")),
     }
 

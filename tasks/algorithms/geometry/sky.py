@@ -52,6 +52,13 @@ def tangent_basis(u: Array) -> Array:
     return np.stack([first, np.cross(u, first)], axis=-2)
 
 
+def east_north(u: Array) -> Array:
+    """Return (..., 2, 3): the unit vectors towards growing right ascension and declination."""
+    ra, _ = radec_from_unit(u)
+    east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=-1)
+    return np.stack([east, np.cross(u, east)], axis=-2)
+
+
 def boresight_angles(R_sensor_from_icrs: Array) -> tuple[Array, Array, Array]:
     """Return right ascension, declination and roll [rad] of (..., 3, 3) attitudes.
 
@@ -60,7 +67,6 @@ def boresight_angles(R_sensor_from_icrs: Array) -> tuple[Array, Array, Array]:
     """
     up, boresight = -R_sensor_from_icrs[..., 1, :], R_sensor_from_icrs[..., 2, :]
     ra, dec = radec_from_unit(boresight)
-    east = np.stack([-np.sin(ra), np.cos(ra), np.zeros_like(ra)], axis=-1)
-    north = np.cross(boresight, east)
-    roll = np.arctan2(np.sum(up * east, axis=-1), np.sum(up * north, axis=-1))
+    to_east, to_north = np.einsum("...ij,...j->i...", east_north(boresight), up)
+    roll = np.arctan2(to_east, to_north)
     return ra, dec, roll % (2 * np.pi)

@@ -18,7 +18,14 @@ from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.equal_runs import bounds_of_runs
-from epipole.tasks.common.sightings import Frames, sightings_of
+from epipole.tasks.common.lone_detections import in_lone_frames, with_lone_detections
+from epipole.tasks.common.sightings import (
+    Frames,
+    camera_of,
+    optics_covariance_of,
+    sightings_of,
+    solved_frames,
+)
 from epipole.tasks.common.text_ranks import ranked
 
 Array = npt.NDArray[np.float64]
@@ -28,7 +35,8 @@ Indices = npt.NDArray[np.int64]
 class TrackletSightings(NamedTuple):
     """Sightings sorted by tracklet, then frame.
 
-    Tracklet k has the rows ``bounds[k]:bounds[k + 1]``, and the id ``name[k]``.
+    Tracklet k has the rows ``bounds[k]:bounds[k + 1]``, and the id ``name[k]``. `blend_rad2` is a
+    part of `cov_bias`: what the light of a neighbour may add, per axis.
     """
 
     frame: Indices
@@ -36,6 +44,7 @@ class TrackletSightings(NamedTuple):
     u_icrs: Array
     cov_noise: Array
     cov_bias: Array
+    blend_rad2: Array
     flux: Array
     bounds: Indices
     name: npt.NDArray[np.object_]
@@ -46,12 +55,44 @@ class TrackletSightings(NamedTuple):
         return np.repeat(np.arange(len(self.name)), np.diff(self.bounds))
 
 
-def tracklet_sightings(
-    frames: Frames, tracked: pa.Table, camera: Camera, settings: Settings
-) -> TrackletSightings:
-    """Return the sightings of one sensor's detections that have a tracklet and a direction."""
-    sightings = _with_split_prior(_by_tracklet(frames, tracked), frames, settings)
-    return _with_blends(sightings, frames, camera)
+class Sighted(NamedTuple):
+    """The sightings of one sensor, its frames and its optics."""
+
+    frames: Frames
+    tracklets: TrackletSightings
+    camera: Camera
+    cov_optics: Array
+
+
+def sight_objects(
+    solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
+) -> Sighted | None:
+    """Return the sightings of one sensor's detections that have a tracklet and a direction.
+
+    A detection in a lone frame is a tracklet of one detection. None where there are none.
+    """
+    frames = solved_frames(solutions)
+    detections = _with_lone(frames, detections, settings)
+    # Detections without a direction were tracked in the image alone.
+    placed = pa.compute.field("tracklet_id").is_valid() & pa.compute.field("ra_deg").is_valid()
+    tracked = detections.filter(placed)
+    if not tracked.num_rows:
+        return None
+    row = int(frames.camera[0])
+    camera = camera_of(cameras, row)
+    tracklets = _with_split_prior(_by_tracklet(frames, tracked), frames, settings)
+    tracklets = _with_blends(tracklets, frames, camera)
+    return Sighted(frames, tracklets, camera, optics_covariance_of(cameras, row))
+
+
+def _with_lone(frames: Frames, detections: pa.Table, settings: Settings) -> pa.Table:
+    """Return the detections; unknown ones in lone frames get the id of a tracklet of their own."""
+    lone_frames = frames.number[in_lone_frames(frames.time_ns, settings.tracklets)]
+    if not len(lone_frames):
+        return detections
+    unknown = array(detections, "kind") == "unknown"
+    lone = unknown & np.isin(array(detections, "frame_number"), lone_frames)
+    return with_lone_detections(detections, lone)
 
 
 def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
@@ -66,6 +107,7 @@ def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
         sightings.u_icrs[order],
         sightings.cov_noise[order],
         sightings.cov_bias[order],
+        np.zeros(len(order)),
         array(tracked, "flux").astype(float)[sightings.row[order]],
         bounds,
         names[rank[order[bounds[:-1]]]].astype(object),
@@ -95,6 +137,7 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
         tracklets.u_icrs[own],
         tracklets.cov_noise[own],
         cov_bias[own],
+        variance[own],
         tracklets.flux[own],
         left[tracklets.bounds],
         tracklets.name,

@@ -11,7 +11,7 @@ from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import GM_KM3_S2
-from epipole.tasks.algorithms.geometry.camera import Camera, project
+from epipole.tasks.algorithms.geometry.camera import project
 from epipole.tasks.algorithms.geometry.direction_errors import on_tangent_plane
 from epipole.tasks.algorithms.geometry.optics_errors import shared_direction_covariance
 from epipole.tasks.algorithms.geometry.rotations import (
@@ -20,21 +20,14 @@ from epipole.tasks.algorithms.geometry.rotations import (
 )
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
-from epipole.tasks.common.lone_detections import in_lone_frames, with_lone_detections
-from epipole.tasks.common.sightings import Frames, camera_of, optics_covariance_of, solved_frames
-from epipole.tasks.solve.views.tracklet_sightings import TrackletSightings, tracklet_sightings
+from epipole.tasks.common.sightings import Frames
+from epipole.tasks.solve.views.tracklet_sightings import Sighted, TrackletSightings
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 
-def view_objects(
-    epochs: pa.Table,
-    solutions: pa.Table,
-    detections: pa.Table,
-    cameras: pa.Table,
-    settings: Settings,
-) -> pa.Table:
+def view_objects(epochs: pa.Table, sighted: Sighted | None, settings: Settings) -> pa.Table:
     """Return VIEWS of one sensor: each tracklet at each epoch that it covers, in this order.
 
     A detection in a lone frame is a tracklet of one detection, at an unknown rate.
@@ -43,18 +36,10 @@ def view_objects(
     than an epoch may be from its frame. The aberration by the sensor's geocentric velocity is
     removed from each detection before the motion is fitted.
     """
-    frames = solved_frames(solutions)
-    detections = _with_lone(frames, detections, settings)
-    # Detections without a direction were tracked in the image alone.
-    placed = pa.compute.field("tracklet_id").is_valid() & pa.compute.field("ra_deg").is_valid()
-    tracked = detections.filter(placed)
-    if not tracked.num_rows or not epochs.num_rows:
+    if sighted is None or not epochs.num_rows:
         return empty(VIEWS)
-    camera = camera_of(cameras, int(frames.camera[0]))
-    tracklets = tracklet_sightings(frames, tracked, camera, settings)
-    query = _queries(tracklets, epochs, frames)
-    cov_optics = optics_covariance_of(cameras, int(frames.camera[0]))
-    return _view_table(frames, tracklets, query, epochs, camera, cov_optics, settings)
+    query = _queries(sighted.tracklets, epochs, sighted.frames)
+    return _view_table(sighted, query, epochs, settings)
 
 
 class _EpochQueries(NamedTuple):
@@ -63,16 +48,6 @@ class _EpochQueries(NamedTuple):
     tracklet: Indices
     row: Indices  # of `epochs`
     frame: Indices  # that serves the epoch
-
-
-def _with_lone(frames: Frames, detections: pa.Table, settings: Settings) -> pa.Table:
-    """Return the detections; unknown ones in lone frames get the id of a tracklet of their own."""
-    lone_frames = frames.number[in_lone_frames(frames.time_ns, settings.tracklets)]
-    if not len(lone_frames):
-        return detections
-    unknown = array(detections, "kind") == "unknown"
-    lone = unknown & np.isin(array(detections, "frame_number"), lone_frames)
-    return with_lone_detections(detections, lone)
 
 
 def frames_of(epochs: pa.Table, frames: Frames) -> Indices:
@@ -98,14 +73,9 @@ def _queries(tracklets: TrackletSightings, epochs: pa.Table, frames: Frames) -> 
 
 
 def _view_table(
-    frames: Frames,
-    tracklets: TrackletSightings,
-    query: _EpochQueries,
-    epochs: pa.Table,
-    camera: Camera,
-    cov_optics: Array,
-    settings: Settings,
+    sighted: Sighted, query: _EpochQueries, epochs: pa.Table, settings: Settings
 ) -> pa.Table:
+    frames, tracklets, camera, cov_optics = sighted
     tracklet, row, served = query
     origin = frames.time_ns[0]
     bounds = tracklets.bounds

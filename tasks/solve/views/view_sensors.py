@@ -19,6 +19,8 @@ from epipole.tasks.common.named_detections import detections_within
 from epipole.tasks.common.sightings import solved_frames
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.views.align_epochs import EpochGrid, align_epochs
+from epipole.tasks.solve.views.tabulate_sightings import tabulate_sightings
+from epipole.tasks.solve.views.tracklet_sightings import sight_objects
 from epipole.tasks.solve.views.view_objects import frames_of, view_objects
 
 FEWEST_FRAMES = 6  # beyond the ends of a span: the motion at an epoch is fitted to these too
@@ -55,11 +57,13 @@ def _view(
     wide = span.widened(margin_ns)
     solutions = sensor.identified.rows_within(wide, SOLUTIONS, "solutions")
     epochs = span.of(align_epochs(solutions, settings, grid), "epoch")
-    views = view_objects(epochs, solutions, detections_within(sensor, wide), cameras, settings)
+    sighted = sight_objects(solutions, detections_within(sensor, wide), cameras, settings)
+    views = view_objects(epochs, sighted, settings)
     tracklets = read_part(sensor.names.of_night(), "tracklets")
     return {
         "epochs": sensor_epochs(epochs, solutions),
         "views": views,
+        "sightings": span.of(tabulate_sightings(sighted), "time"),
         "tracklets": viewed_tracklets(tracklets, views),
     }
 

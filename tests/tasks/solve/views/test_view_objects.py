@@ -14,6 +14,7 @@ from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
 from epipole.tasks.algorithms.geometry.sky import radec_from_unit, tangent_basis, unit_from_radec
+from epipole.tasks.solve.views.tracklet_sightings import sight_objects
 from epipole.tasks.solve.views.view_objects import view_objects
 
 T0 = 1_554_091_200_000_000_000
@@ -71,7 +72,8 @@ def views_of(seen, source, flux, cov_optics=None):
     })  # fmt: skip
     epochs = filled(EPOCHS, N_FRAMES, key | {"epoch": time, "dt_s": np.zeros(N_FRAMES)})
     camera = cameras_of({"s": CAMERA}, cov_optics)
-    views = view_objects(epochs, solutions, detections, camera, Settings())
+    sighted = sight_objects(solutions, detections, camera, Settings())
+    views = view_objects(epochs, sighted, Settings())
     return views.sort_by([("tracklet_id", "ascending"), ("epoch", "ascending")])
 
 

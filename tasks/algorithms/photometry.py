@@ -1,0 +1,164 @@
+"""Magnitudes from fluxes: each frame's zero point from its stars, with honest errors.
+
+What a sensor measures is not V: a star's colour moves it by a tenth of a magnitude, in all frames
+alike. That is an error of the zero point. How well the sensor measures a flux shows where it
+measures one star twice.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import nnls
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+FEWEST = 20  # values that tell a variance
+OF_A_BIN = 25  # values; at least, where the variance depends on the flux
+MOST_BINS = 8
+UNTOLD_MAG2 = 0.3**2  # of a star, where too few stars tell: colours and variable stars
+LEAST_MAG2 = 1e-8
+CLIPPED = 3.5  # sigmas: stars beyond are variable, blended or wrong in the catalogue
+LEFT = 1e-6  # of their weight
+ITERATIONS = 3  # of zero points and the variance about them
+MOST_SHARE = 0.8  # of a star image in the means that are taken from it
+MOST_IMAGES = 5000  # of stars that are measured again and again: they tell the variance well
+SWEEPS = 10  # over frames and stars, each a mean of what is left
+GAUSSIAN = 1.4826  # standard deviation over median absolute deviation
+
+
+class FluxScale(NamedTuple):
+    """How fluxes of one sensor become magnitudes, a row per frame or per flux.
+
+    zero_mag : (n,) float
+        Magnitude of a flux of 1; NaN where no star has a flux.
+    zero_variance_mag2 : (n,) float
+        Its variance.
+    floor_mag2, photon_mag2 : (n,) float
+        The variance of one measured magnitude is ``floor_mag2 + photon_mag2 / flux``.
+    """
+
+    zero_mag: Array
+    zero_variance_mag2: Array
+    floor_mag2: Array
+    photon_mag2: Array
+
+    def magnitudes(self, flux: Array) -> tuple[Array, Array]:
+        """Return the magnitude of a flux in each row, and its 1-sigma error [mag].
+
+        NaN where there is no zero point, or no flux.
+        """
+        known = np.where(flux > 0, flux, np.nan)
+        variance = self.zero_variance_mag2 + self.floor_mag2 + self.photon_mag2 / known
+        return self.zero_mag - 2.5 * np.log10(known), np.sqrt(variance)
+
+
+def flux_scale(
+    frame: Indices, star: Indices, magnitude: Array, flux: Array, n_frames: int
+) -> FluxScale:
+    """Return how fluxes become magnitudes, from the identified stars of one sensor.
+
+    Parameters
+    ----------
+    frame, star : (n,) int
+        Frame and catalogue number of each star image.
+    magnitude, flux : (n,) float
+        V in the catalogue, and the measured flux; NaN where unknown.
+    """
+    usable = np.isfinite(magnitude) & (flux > 0) & np.isfinite(flux)
+    frame, star, magnitude = frame[usable], star[usable], magnitude[usable]
+    offset = magnitude + 2.5 * np.log10(flux[usable])
+    count = np.bincount(frame, minlength=n_frames)
+    zero = _medians(frame, offset, n_frames)
+    # The expected flux: a star that is too bright by far must not stand among the bright ones.
+    flux = 10 ** (-0.4 * (magnitude - zero[frame]))
+    of_star = (UNTOLD_MAG2, 0.0)
+    for _ in range(ITERATIONS):
+        residual = offset - zero[frame]
+        of_star = _variance_by_flux(*_with_others(residual, flux, count[frame]))
+        weight = 1.0 / _variance(of_star, flux)
+        weight[np.abs(residual) > CLIPPED / np.sqrt(weight)] *= LEFT  # it counts where it is alone
+        total = np.bincount(frame, weight, n_frames)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            zero, variance = np.bincount(frame, weight * offset, n_frames) / total, 1.0 / total
+    zero[count == 0] = variance[count == 0] = np.nan
+    own = _own_variance(frame, star, offset, flux, n_frames) or of_star
+    return FluxScale(zero, variance, *(np.full(n_frames, value) for value in own))
+
+
+def _own_variance(
+    frame: Indices, star: Indices, offset: Array, flux: Array, n_frames: int
+) -> tuple[float, float] | None:
+    """Return the variance of a measured flux: what is left when each star has an offset of its
+    own, and each frame. None where too few stars are measured often."""
+    some = frame - np.min(frame, initial=0) <= _frames_of(frame, MOST_IMAGES)
+    frame, offset, flux = frame[some], offset[some], flux[some]
+    _, star = np.unique(star[some], return_inverse=True)
+    often = (np.bincount(star)[star] > 1) & (np.bincount(frame, minlength=n_frames)[frame] > 1)
+    frame, star, offset, flux = frame[often], star[often], offset[often], flux[often]
+    if len(offset) - len(np.unique(star)) - len(np.unique(frame)) < FEWEST:
+        return None
+    model = (1.0, 0.0)  # equal weights first
+    for _ in range(ITERATIONS):
+        weight = 1.0 / _variance(model, flux)
+        total = [np.maximum(np.bincount(group, weight), LEFT) for group in (frame, star)]
+        residual = offset
+        for _ in range(SWEEPS):
+            for group, of_group in zip((frame, star), total, strict=True):
+                mean = np.bincount(group, weight * residual) / of_group
+                residual = residual - mean[group]
+        own_share = weight / total[0][frame] + weight / total[1][star]
+        free = own_share < MOST_SHARE
+        residual = residual[free] / np.sqrt(1.0 - own_share[free])
+        model = _variance_by_flux(residual, flux[free])
+    return model
+
+
+def _frames_of(frame: Indices, most: int) -> int:
+    """Return the distance from the first frame to that of the last of so many star images."""
+    in_order = np.sort(frame)
+    return int(in_order[min(most, len(frame) - 1)] - in_order[0]) if len(frame) else 0
+
+
+def _with_others(residual: Array, flux: Array, count: Indices) -> tuple[Array, Array]:
+    """Return residuals from a mean of several stars, of which each is one, as from the truth."""
+    others = count > 1
+    n = count[others]
+    return residual[others] * np.sqrt(n / (n - 1)), flux[others]
+
+
+def _medians(group: Indices, value: Array, n: int) -> Array:
+    order = np.lexsort((value, group))
+    count = np.bincount(group, minlength=n)
+    first = np.cumsum(count) - count
+    low, high = first + (count - 1) // 2, first + count // 2
+    sorted_values = np.append(value[order], np.nan)
+    last = len(value)
+    low, high = (np.where(count > 0, at, last) for at in (low, high))
+    return np.asarray((sorted_values[low] + sorted_values[high]) / 2)
+
+
+def _variance_by_flux(residual: Array, flux: Array) -> tuple[float, float]:
+    """Return (floor, photon) of the variance ``floor + photon / flux``, from medians by flux."""
+    if len(residual) < FEWEST:
+        return UNTOLD_MAG2, 0.0
+    n_bins = int(np.clip(len(residual) // OF_A_BIN, 1, MOST_BINS))
+    order = np.argsort(flux, kind="stable")
+    of_bin = np.array_split(order, n_bins)
+    variance = np.array([(GAUSSIAN * np.median(np.abs(residual[b]))) ** 2 for b in of_bin])
+    variance = np.maximum(variance, LEAST_MAG2)
+    if n_bins < 3:
+        return float(np.mean(variance)), 0.0
+    unit = np.median(flux)
+    typical = np.array([np.median(flux[b]) for b in of_bin]) / unit
+    terms = np.stack([np.ones(n_bins), 1.0 / typical], axis=1)
+    expected = variance
+    for _ in range(ITERATIONS):  # weights by the measured variances alone would favour small ones
+        (floor, photon), _ = nnls(terms / expected[:, None], variance / expected)
+        expected = np.maximum(terms @ [floor, photon], LEAST_MAG2)
+    return max(float(floor), LEAST_MAG2), float(photon * unit)
+
+
+def _variance(model: tuple[float, float], flux: Array) -> Array:
+    return np.asarray(model[0] + model[1] / flux)

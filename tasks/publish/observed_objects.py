@@ -1,0 +1,117 @@
+"""Observed objects: the sightings of tracklets, each as an observation of its object.
+
+A tracklet is an unbroken run of detections of one object. So its detections before and after the
+epochs at which other sensors saw the object are observations of it too. Near an epoch at which the
+position was solved without the tracklet, they are not.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Literal
+
+import polars as pl
+import pyarrow as pa
+
+from epipole.schemas.bridge import concat, from_polars, to_polars
+from epipole.schemas.spans import Span
+from epipole.schemas.tables import ASSOCIATIONS, OBSERVATIONS
+from epipole.schemas.work_tables import SHARED_ERRORS, SIGHTINGS
+from epipole.tasks.common.lone_detections import MARK
+from epipole.tasks.publish.night_parts import NightParts
+from epipole.tasks.publish.time_slices import in_slices
+
+_KEY = ["sensor_id", "frame_number", "centroid"]
+
+
+def observations(parts: NightParts) -> Iterator[pa.Table]:
+    """Yield OBSERVATIONS, sorted by time, sensor and centroid, some time of a span each."""
+    runs = object_runs(parts)
+    for span in parts.spans:
+        held = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
+        tables = [partial(viewed.read, span, "sightings") for viewed in held]
+        errors = _shared_errors(parts, span)
+        for rows in in_slices(tables, span, "time"):
+            seen = of_objects(to_polars(concat(SIGHTINGS, rows)), runs)
+            yield from_polars(OBSERVATIONS, with_shared_errors(seen, errors))
+
+
+def object_runs(parts: NightParts) -> pl.DataFrame:
+    """Return the epochs of each tracklet that follow each other and tell the same.
+
+    Returns
+    -------
+    polars.DataFrame
+        tracklet_id, object_id, used, first and last (epochs), sorted by first.
+    """
+    columns = ["epoch", "object_id", *_KEY, "tracklet_id", "used"]
+    schema = pa.schema([ASSOCIATIONS.field(name) for name in columns])
+    spans = []
+    for span in parts.all_spans:
+        pieces = (
+            parts.solved.read(span, "associations", columns) if parts.solved.holds(span) else []
+        )
+        if any(piece.num_rows for piece in pieces):
+            names = parts.names.get(span.folder, {})
+            rows = to_polars(concat(schema, pieces))
+            spans.append(runs_of_views(rows.with_columns(pl.col("object_id").replace(names))))
+    if not spans:
+        spans = [runs_of_views(to_polars(schema.empty_table()))]
+    return pl.concat(spans).sort("first", "tracklet_id")
+
+
+def runs_of_views(views: pl.DataFrame) -> pl.DataFrame:
+    lone = pl.format("{}{}-{}-{}", pl.lit(MARK), *_KEY)
+    views = views.with_columns(pl.col("tracklet_id").fill_null(lone)).drop_nulls("tracklet_id")
+    views = views.sort("tracklet_id", "epoch", "object_id")
+    told = pl.struct("tracklet_id", "object_id", "used")
+    return (
+        views.group_by(told.rle_id().alias("run"), maintain_order=True)
+        .agg(
+            pl.col("tracklet_id", "object_id", "used").first(),
+            pl.col("epoch").first().alias("first"),
+            pl.col("epoch").last().alias("last"),
+        )
+        .drop("run")
+    )
+
+
+def of_objects(sightings: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
+    """Return the sightings whose tracklet shows an object at the nearest of its epochs."""
+    rows = sightings.sort("time", maintain_order=True).with_row_index("row")
+    before, after = _asof(rows, runs, "first", "backward"), _asof(rows, runs, "last", "forward")
+    # Within a run both are the same run; between two runs the nearer one counts.
+    to_last = (before["time"] - before["last"]).dt.total_nanoseconds()
+    to_first = (after["first"] - after["time"]).dt.total_nanoseconds()
+    is_before = to_first.is_null() | (to_last.is_not_null() & (to_last <= to_first))
+    told = [
+        before[name].zip_with(is_before.fill_null(True), after[name]).alias(name)
+        for name in ("object_id", "used")
+    ]
+    return rows.with_columns(told).filter(pl.col("used").fill_null(False)).sort("row")
+
+
+def _asof(
+    rows: pl.DataFrame, runs: pl.DataFrame, edge: str, strategy: Literal["backward", "forward"]
+) -> pl.DataFrame:
+    """Return the run of each row's tracklet whose edge is the nearest in this direction."""
+    return rows.join_asof(
+        runs.sort(edge), left_on="time", right_on=edge, by="tracklet_id", strategy=strategy,
+        check_sortedness=False,
+    )  # fmt: skip
+
+
+def _shared_errors(parts: NightParts, span: Span) -> pl.DataFrame:
+    errors = parts.solved.errors
+    tables = [errors.read(span, "errors")] if errors.holds(span) else []
+    return to_polars(concat(SHARED_ERRORS, tables))
+
+
+def with_shared_errors(rows: pl.DataFrame, errors: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows; shared errors that are larger than stated are as large as they are."""
+    factors = rows.select("sensor_id").join(
+        errors, on="sensor_id", how="left", maintain_order="left"
+    )
+    return rows.with_columns(
+        pl.col("bias_sigma_arcsec") * factors["direction"].fill_null(1.0).sqrt(),
+        pl.col("position_sigma_km") * factors["place"].fill_null(1.0).sqrt(),
+    )

@@ -1,0 +1,83 @@
+"""Observations of objects: each sighting is of the object at the nearest epoch of its tracklet."""
+
+import polars as pl
+import pytest
+from scenes.associations import filled
+
+from epipole.schemas.bridge import to_polars
+from epipole.schemas.work_tables import SIGHTINGS
+from epipole.tasks.publish.observed_objects import of_objects, runs_of_views, with_shared_errors
+
+SECOND = 1_000_000_000
+
+
+def sightings(*rows: tuple[str, float]) -> pl.DataFrame:
+    """Sightings of tracklets at these seconds, numbered in this order."""
+    names, seconds = zip(*rows, strict=True) if rows else ((), ())
+    return to_polars(filled(SIGHTINGS, len(rows), {
+        "tracklet_id": list(names), "time": [round(s * SECOND) for s in seconds],
+        "centroid": list(range(len(rows))),
+    }))  # fmt: skip
+
+
+def runs(*views: tuple[str | None, str, float, bool]) -> pl.DataFrame:
+    """The runs of these views: tracklet, object, second, whether it was used."""
+    tracklet, object_, second, used = zip(*views, strict=True) if views else ((),) * 4
+    time = to_polars(filled(SIGHTINGS, len(views), {"time": [round(s * SECOND) for s in second]}))
+    return runs_of_views(pl.DataFrame(
+        {
+            "tracklet_id": list(tracklet), "object_id": list(object_), "epoch": time["time"],
+            "used": list(used), "sensor_id": ["s"] * len(views),
+            "frame_number": [7] * len(views), "centroid": [3] * len(views),
+        },
+        schema_overrides={"tracklet_id": pl.String, "object_id": pl.String, "used": pl.Boolean},
+    )).sort("first", "tracklet_id")  # fmt: skip
+
+
+def objects(seen: pl.DataFrame, of_runs: pl.DataFrame) -> dict[int, str]:
+    found = of_objects(seen, of_runs)
+    return dict(zip(found["centroid"].to_list(), found["object_id"].to_list(), strict=True))
+
+
+def test_a_tracklet_shows_its_object_before_between_and_after_its_epochs():
+    of_runs = runs(*[("t", "o", k, True) for k in (10, 11, 12)], ("u", "p", 11, True))
+    seen = sightings(("t", 0), ("t", 10.4), ("u", 12), ("t", 99), ("v", 11))
+    assert objects(seen, of_runs) == {0: "o", 1: "o", 2: "p", 3: "o"}
+
+
+def test_near_an_epoch_that_was_rejected_it_is_no_observation():
+    of_runs = runs(("t", "o", 10, True), ("t", "o", 11, False), ("t", "o", 12, True))
+    seen = sightings(*[("t", s) for s in (10.4, 10.6, 11.0, 11.4, 11.6)])
+    assert objects(seen, of_runs) == {0: "o", 4: "o"}
+
+
+def test_a_tracklet_that_passes_to_another_object_changes_halfway():
+    of_runs = runs(("t", "o", 10, True), ("t", "p", 20, True), ("t", "p", 21, True))
+    seen = sightings(*[("t", s) for s in (9, 14, 16, 20.5, 30)])
+    assert objects(seen, of_runs) == {0: "o", 1: "o", 2: "p", 3: "p", 4: "p"}
+
+
+def test_a_lone_detection_has_the_object_that_used_it():
+    of_runs = runs((None, "o", 10, True))
+    assert objects(sightings(("lone:s-7-3", 10.2), ("lone:s-7-4", 10.2)), of_runs) == {0: "o"}
+
+
+@pytest.mark.parametrize("views", [[], [("t", "o", 10, False)]])
+def test_without_used_views_there_are_no_observations(views):
+    assert objects(sightings(("t", 10)), runs(*views)) == {}
+
+
+def test_rows_are_in_the_order_of_time_and_then_as_they_came():
+    of_runs = runs(("t", "o", 10, True), ("u", "p", 10, True))
+    found = of_objects(sightings(("u", 11), ("t", 10), ("u", 10), ("t", 11)), of_runs)
+    assert found["centroid"].to_list() == [1, 2, 0, 3]
+
+
+def test_shared_errors_are_as_large_as_the_objects_show():
+    seen = sightings(("t", 10), ("u", 10)).with_columns(
+        sensor_id=pl.Series(["a", "b"]), bias_sigma_arcsec=2.0, position_sigma_km=0.1
+    )
+    errors = pl.DataFrame({"sensor_id": ["b"], "direction": [9.0], "place": [4.0]})
+    found = with_shared_errors(seen, errors)
+    assert found["bias_sigma_arcsec"].to_list() == [2.0, 6.0]
+    assert found["position_sigma_km"].to_list() == [0.1, 0.2]
