@@ -49,7 +49,7 @@ def fit(rows, epoch, guess):
     )
     correlation, place_km = rows["correlation"].to_numpy(), rows["position_sigma_km"].to_numpy()
     sensor = rows["sensor_id"].rank("dense").to_numpy().astype(int) - 1
-    scale = np.array([1e-2] * 3 + [1e-5] * 3)
+    scale = np.array([100.0] * 3 + [0.1] * 3)  # so that the steps of the derivatives are not noise
 
     def residuals(x):
         shared = x[6:].reshape(-1, 5)[sensor]  # of each sensor, in its sigmas
@@ -64,7 +64,8 @@ def fit(rows, epoch, guess):
         second = (off[:, 1] / s_dec - correlation * first) / np.sqrt(1 - correlation**2)
         return np.concatenate([first, second, x[6:]])
 
-    found = least_squares(residuals, np.zeros(6 + 5 * (sensor.max() + 1)), x_scale="jac")
+    start = np.zeros(6 + 5 * (sensor.max() + 1))
+    found = least_squares(residuals, start, jac="3-point", x_scale="jac")
     cov = np.linalg.inv(found.jac.T @ found.jac)[:6, :6] * np.outer(scale, scale)
     return guess + found.x[:6] * scale, cov, 2 * found.cost, 2 * len(rows) - 6
 

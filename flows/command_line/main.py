@@ -1,5 +1,5 @@
 """The command line: ``epipole run``, ``simulate``, ``info``, ``calibrate``, ``evaluate``,
-``settings``, ``catalog build``.
+``export``, ``settings``, ``catalog build``.
 
 What a command needs is imported when it runs, so that ``epipole --help`` answers at once.
 """
@@ -20,8 +20,8 @@ import typer.core
 from epipole.flows.command_line.environment import prepare_environment
 from epipole.flows.command_line.stopping import stop_by_signals, stopped_in_one_line
 from epipole.io.logs.messages.encodings.registry import ENCODINGS
+from epipole.schemas.choices import Message, Runner
 from epipole.schemas.errors import EpipoleError
-from epipole.schemas.runner import Runner
 from epipole.schemas.text.shown import as_line
 
 
@@ -324,6 +324,39 @@ def evaluate(
         _print_json(report.as_dict())
     else:
         show(report)
+
+
+@app.command()
+def export(
+    message: Annotated[Message, typer.Argument(metavar="KIND", help="tdm, oem or opm.")],
+    dataset: Annotated[
+        str,
+        typer.Argument(metavar="DATASET", help="Folder or URL that `epipole run` published to."),
+    ],
+    night: Annotated[str, typer.Option(metavar="DATE", help="The night, a UTC date (YYYY-MM-DD).")],
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder to write to, new or empty.")],
+    object_ids: Annotated[
+        list[str] | None,
+        typer.Option("--object", metavar="ID", help="Only this object; may be given again."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a night's objects as CCSDS messages for orbit determination (KVN).
+
+    tdm: the directions of each object (TDM 2.0), with an ephemeris of each sensor
+
+    oem: each object's states, moved through their arcs (OEM 3.0)
+
+    opm: each state with its covariance (OPM 3.0)
+    """
+    from epipole.flows.export import export
+
+    _check_night(night)
+    files = export(message, dataset, night, out, object_ids or ())
+    if as_json:
+        _print_json({"folder": str(out), "files": files})
+    else:
+        _print_lines([f"folder  {out}", f"files   {len(files)}: {files[0]} to {files[-1]}"])
 
 
 def _instant(text: str | None) -> datetime.datetime | None:

@@ -12,7 +12,7 @@ from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder
 from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
-from epipole.schemas.runner import Runner
+from epipole.schemas.choices import Runner
 from epipole.schemas.settings import Settings
 
 LOGGER = logging.getLogger(__name__)

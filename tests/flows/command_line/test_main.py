@@ -290,3 +290,15 @@ def test_a_name_that_cannot_be_used_is_one_line(command, name, epipole, tmp_path
     assert (code, out) == (1, "")
     assert ("is empty" if not name else "is not UTF-8") in one_line(err)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_export_says_what_it_wrote(epipole, night_dataset, tmp_path):
+    night = "2019-04-01"
+    command = ("export", "opm", night_dataset, "--night", night, "--out")
+    code, out, err = epipole(*command, "a")
+    assert (code, err) == (0, "")
+    assert out.startswith("folder  a\nfiles   ")
+    _, as_json, _ = epipole(*command, "b", "--json")
+    assert json.loads(as_json)["files"] == sorted(p.name for p in (tmp_path / "b").iterdir())
+    code, _, err = epipole(*command, "b")
+    assert (code, err.count("\n")) == (1, 1)

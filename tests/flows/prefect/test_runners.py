@@ -12,8 +12,8 @@ from prefect.task_runners import ThreadPoolTaskRunner
 from epipole.flows.nightly import nightly
 from epipole.flows.prefect.runners import check_scheduler, runner_asked, task_runner
 from epipole.io.work.folder import work_root
+from epipole.schemas.choices import Runner
 from epipole.schemas.errors import EpipoleError
-from epipole.schemas.runner import Runner
 
 
 def contents(folder: Path) -> dict[str, bytes]:

@@ -1,0 +1,1 @@
+"""CCSDS messages for orbit determination: tracking data, ephemerides, states; as text (KVN)."""
