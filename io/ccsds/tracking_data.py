@@ -16,7 +16,8 @@ class Directions(NamedTuple):
     """One sensor's directions of an object, sorted by time.
 
     time_ns : (n,) int, UTC
-    ra_deg, dec_deg : (n,) float, astrometric
+    ra_deg, dec_deg : (n,) float
+        Astrometric, in the axes of EME2000: TDM names no GCRF, and readers need data for ICRF.
     magnitude : (n,) float, NaN where unknown
     aberration_deg : float
         Mean angle of the aberration that was removed.
@@ -55,7 +56,7 @@ def _segment(object_id: str, sensor: str, seen: Directions) -> ccsds.TdmSegment:
         ephemeris_name_1=seen.ephemeris,
         timetag_ref="RECEIVE",
         angle_type="RADEC",
-        reference_frame="ICRF",
+        reference_frame="EME2000",
         correction_aberration_yearly=0.0,
         correction_aberration_diurnal=seen.aberration_deg,
         corrections_applied="YES",

@@ -9,7 +9,8 @@ from epipole.io.ccsds.orbit_data import Ephemeris
 from epipole.io.ccsds.tracking_data import Directions
 from epipole.schemas.columns import PLACE, VELOCITY
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import unit_from_radec
+from epipole.tasks.algorithms.geometry.sky import radec_from_unit, unit_from_radec
+from epipole.tasks.algorithms.orbits.reference_frames import EME2000_FROM_GCRF
 
 
 def directions(observations: pl.DataFrame, ephemerides: Mapping[str, str]) -> dict[str, Directions]:
@@ -30,8 +31,8 @@ def directions(observations: pl.DataFrame, ephemerides: Mapping[str, str]) -> di
 
 
 def _of_sensor(rows: pl.DataFrame, ephemeris: str) -> Directions:
-    ra_deg, dec_deg = rows["ra_deg"].to_numpy(), rows["dec_deg"].to_numpy()
-    u = unit_from_radec(np.radians(ra_deg), np.radians(dec_deg))
+    u = unit_from_radec(*(np.radians(rows[name].to_numpy()) for name in ("ra_deg", "dec_deg")))
+    ra_eme, dec_eme = (np.degrees(angle) for angle in radec_from_unit(u @ EME2000_FROM_GCRF.T))
     v = np.nan_to_num(rows.select(VELOCITY).to_numpy().astype(float))
     across = np.linalg.norm(np.cross(u, v), axis=1)
     ra, dec, bias, place = (
@@ -41,13 +42,13 @@ def _of_sensor(rows: pl.DataFrame, ephemeris: str) -> Directions:
     )  # fmt: skip
     return Directions(
         rows["time"].dt.epoch("ns").to_numpy(),
-        ra_deg,
-        dec_deg,
+        ra_eme,
+        dec_eme,
         rows["magnitude"].cast(pl.Float64).fill_null(float("nan")).to_numpy(),
         round(float(np.degrees(np.mean(across) / SPEED_OF_LIGHT_KM_S)), 6),
         ephemeris,
         [
-            "Astrometric directions in GCRF axes from the sensor, whose ephemeris is named below.",
+            "Astrometric directions from the sensor, whose ephemeris (in GCRF) is named below.",
             "Aberration: that by the sensor's velocity around the Earth is removed from each",
             "direction (CORRECTION_ABERRATION_DIURNAL has the mean angle), the Earth's own with",
             "the stars. Light time is not removed.",

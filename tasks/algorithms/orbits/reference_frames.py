@@ -25,6 +25,7 @@ from epipole.tasks.algorithms.time.time_scales import (
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 
+EME2000_FROM_GCRF: Array = erfa.bp06(2451545.0, 0.0)[0]  # rotation matrix: the frame bias
 FRAMES = ("GCRF", "EME2000", "TEME", "ITRF")
 MJD_JD = 2400000.5
 # The fastest term of nutation takes days: linear over ten minutes to 1e-6 arcsec.
@@ -80,8 +81,7 @@ def gcrf_from_eme2000(r_km: Array, v_km_s: Array) -> tuple[Array, Array]:
 
     They differ by the frame bias only: 0.02 arcsec.
     """
-    R_eme2000_from_gcrf = erfa.bp06(2451545.0, 0.0)[0]
-    return r_km @ R_eme2000_from_gcrf, v_km_s @ R_eme2000_from_gcrf
+    return r_km @ EME2000_FROM_GCRF, v_km_s @ EME2000_FROM_GCRF
 
 
 def gcrf_from_teme(

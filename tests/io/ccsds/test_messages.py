@@ -72,7 +72,7 @@ def test_tracking_data_have_a_segment_per_sensor():
     assert [s.metadata.participant_1 for s in read.segments] == ["sat1", "sat2"]
     meta = read.segments[0].metadata
     assert (meta.participant_2, meta.path, meta.timetag_ref) == ("20190401-00001", "2,1", "RECEIVE")
-    assert (meta.angle_type, meta.reference_frame) == ("RADEC", "ICRF")
+    assert (meta.angle_type, meta.reference_frame) == ("RADEC", "EME2000")
     assert meta.ephemeris_name_1 == "sat1.oem"
     rows = [(o.epoch, o.keyword, o.value) for o in read.segments[0].data.observations]
     first, second = times(time_ns)
