@@ -11,6 +11,14 @@ from epipole.schemas.errors import DatasetError
 
 NIGHT = "2019-04-01"
 
+# EME2000 from GCRF as a small rotation: IERS Conventions (2010), equation 5.21 and after.
+FRAME_BIAS = np.radians(np.array([6.8192, -16.617, -14.6]) / 3.6e6)
+
+
+def directions(ra_deg, dec_deg):
+    ra, dec = np.radians(ra_deg), np.radians(dec_deg)
+    return np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+
 
 def observed(dataset, table="observations"):
     return pl.read_parquet(dataset / f"night={NIGHT}/{table}/*.parquet")
@@ -23,8 +31,11 @@ def test_tracking_data_are_the_observations_and_their_sensors_places(night_datas
     assert files == sorted([*(f"{o}.tdm" for o in objects), *(f"{s}.oem" for s in sensors)])
     message = ccsds.Tdm.from_file(str(tmp_path / "out" / f"{objects[0]}.tdm"))
     own = rows.filter(pl.col("object_id") == objects[0]).sort("sensor_id", "time")
-    ra = [o.value for s in message.segments for o in s.data.observations if o.keyword == "ANGLE_1"]
-    assert ra == pytest.approx(own["ra_deg"].to_list(), abs=1e-9)
+    rows = [o for s in message.segments for o in s.data.observations]
+    ra, dec = (np.array([o.value for o in rows if o.keyword == f"ANGLE_{k}"]) for k in "12")
+    gcrf = directions(own["ra_deg"].to_numpy(), own["dec_deg"].to_numpy())
+    off = directions(ra, dec) - (gcrf - np.cross(FRAME_BIAS, gcrf))
+    assert np.abs(off).max() < 1e-10
     states = ccsds.Oem.from_file(str(tmp_path / "out" / f"{sensors[0]}.oem")).segments[0].data
     first = own.filter(pl.col("sensor_id") == sensors[0]).row(0, named=True)
     epoch = first["time"].strftime("%Y-%m-%dT%H:%M:%S")
