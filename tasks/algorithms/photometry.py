@@ -49,7 +49,7 @@ class FluxScale(NamedTuple):
 
         NaN where there is no zero point, or no flux.
         """
-        known = np.where(flux > 0, flux, np.nan)
+        known = np.where((flux > 0) & np.isfinite(flux), flux, np.nan)
         variance = self.zero_variance_mag2 + self.floor_mag2 + self.photon_mag2 / known
         return self.zero_mag - 2.5 * np.log10(known), np.sqrt(variance)
 
@@ -92,7 +92,7 @@ def _own_variance(
 ) -> tuple[float, float] | None:
     """Return the variance of a measured flux: what is left when each star has an offset of its
     own, and each frame. None where too few stars are measured often."""
-    some = frame - np.min(frame, initial=0) <= _frames_of(frame, MOST_IMAGES)
+    some = frame <= np.sort(frame)[: MOST_IMAGES + 1].max(initial=-1)  # whole frames
     frame, offset, flux = frame[some], offset[some], flux[some]
     _, star = np.unique(star[some], return_inverse=True)
     often = (np.bincount(star)[star] > 1) & (np.bincount(frame, minlength=n_frames)[frame] > 1)
@@ -113,12 +113,6 @@ def _own_variance(
         residual = residual[free] / np.sqrt(1.0 - own_share[free])
         model = _variance_by_flux(residual, flux[free])
     return model
-
-
-def _frames_of(frame: Indices, most: int) -> int:
-    """Return the distance from the first frame to that of the last of so many star images."""
-    in_order = np.sort(frame)
-    return int(in_order[min(most, len(frame) - 1)] - in_order[0]) if len(frame) else 0
 
 
 def _with_others(residual: Array, flux: Array, count: Indices) -> tuple[Array, Array]:

@@ -72,6 +72,14 @@ def test_frames_without_stars_or_flux_have_no_zero_point():
     assert np.isfinite(np.delete(found, without)).all()
 
 
+def test_frames_before_the_first_star_change_nothing():
+    _, frame, star, magnitude, flux = measured(1, 8, 0.1, 0.02, 0.0)
+    scale = flux_scale(frame, star, magnitude, flux, N_FRAMES)
+    later = flux_scale(frame + 50_000, star, magnitude, flux, N_FRAMES + 50_000)
+    assert np.array_equal(later.zero_mag[50_000:], scale.zero_mag)
+    assert later.floor_mag2[0] == scale.floor_mag2[0]
+
+
 def test_no_stars_at_all():
     none, no = np.zeros(0, np.int64), np.zeros(0)
     scale = flux_scale(none, none, no, no, 2)
@@ -82,7 +90,7 @@ def test_no_stars_at_all():
 def test_objects_without_flux_have_no_magnitude():
     _, frame, star, magnitude, flux = measured(1, 8, 0.0, 0.02, 0.0)
     scale = flux_scale(frame, star, magnitude, flux, N_FRAMES)
-    odd = np.resize([np.nan, 0.0, -1.0], N_FRAMES)
+    odd = np.resize([np.nan, 0.0, -1.0, np.inf], N_FRAMES)
     with np.errstate(all="raise"):
         found, sigma = scale.magnitudes(odd)
     assert np.isnan(found).all()
