@@ -60,6 +60,7 @@ def object_runs(parts: NightParts) -> pl.DataFrame:
 
 
 def runs_of_views(views: pl.DataFrame) -> pl.DataFrame:
+    """Return the runs of ASSOCIATIONS, as `object_runs` does; lone detections by their mark."""
     lone = pl.format("{}{}-{}-{}", pl.lit(MARK), *_KEY)
     views = views.with_columns(pl.col("tracklet_id").fill_null(lone)).drop_nulls("tracklet_id")
     views = views.sort("tracklet_id", "epoch", "object_id")
