@@ -21,7 +21,7 @@ def test_a_log_becomes_pieces_with_the_declared_tables(tmp_path, caplog):
             log.frame(
                 "s", START_NS + k, frame_number=k, exposure_s=0.1, x_px=[1.0], y_px=[2.0]
             )  # fmt: skip
-    folder = ReadFolder(tmp_path / "work")
+    folder = ReadFolder(tmp_path)
     with caplog.at_level(logging.INFO):
         read = read_log_into.fn(folder, 3, str(tmp_path / "a.mcap"))
     assert (read.number, read.source.name) == (3, "a.mcap")
@@ -35,5 +35,5 @@ def test_a_log_becomes_pieces_with_the_declared_tables(tmp_path, caplog):
 def test_a_file_that_is_no_log_is_an_error_and_leaves_no_part(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"PNG")
     with pytest.raises(LogError, match=r"a\.mcap"):
-        read_log_into.fn(ReadFolder(tmp_path / "work"), 0, str(tmp_path / "a.mcap"))
-    assert not (tmp_path / "work").exists()
+        read_log_into.fn(ReadFolder(tmp_path), 0, str(tmp_path / "a.mcap"))
+    assert not (tmp_path / "read").exists()

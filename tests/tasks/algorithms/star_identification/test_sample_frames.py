@@ -78,10 +78,12 @@ def answers(name, how):
     ("name", "how", "least_right"),
     [
         ("a_fov20", CALIBRATED, 1.0),
-        ("b_fov12", CALIBRATED, 0.977),  # 178 are solved with their true stars
+        # 178 are solved with their true stars. A false-alarm probability that holds costs three;
+        # two answers are right but more than 0.05 degrees off.
+        ("b_fov12", CALIBRATED, 0.96),
         ("c_fov08", CALIBRATED, 1.0),
         ("a_fov20", HOW, 0.998),
-        ("b_fov12", HOW, 0.972),
+        ("b_fov12", HOW, 0.96),
         ("c_fov08", HOW, 0.998),
     ],
 )
