@@ -61,11 +61,11 @@ class Prefect:
 
     def get(self, path: str) -> Any:
         """Return the API's answer to GET."""
-        return httpx.get(f"{self.url}/{path}", timeout=30).raise_for_status().json()
+        return _answer(lambda: httpx.get(f"{self.url}/{path}", timeout=30))
 
     def post(self, path: str, asked: dict[str, Any]) -> Any:
         """Return the API's answer to POST."""
-        return httpx.post(f"{self.url}/{path}", json=asked, timeout=30).raise_for_status().json()
+        return _answer(lambda: httpx.post(f"{self.url}/{path}", json=asked, timeout=30))
 
     def find(self, what: str, **asked: Any) -> list[dict[str, Any]]:
         """Return all flow runs, task runs, logs or artifacts that match a filter."""
@@ -121,6 +121,16 @@ def wait_for(what: Callable[[], Any], why: str, seconds: float = 120) -> Any:
             return value
         time.sleep(0.1)
     raise AssertionError(f"waited {seconds:.0f} s for {why}")
+
+
+def _answer(ask: Callable[[], httpx.Response], seconds: float = 60) -> Any:
+    """Return the content of an answer. A server whose database is busy says 503: come again."""
+    end = time.monotonic() + seconds
+    while (answer := ask()).status_code == httpx.codes.SERVICE_UNAVAILABLE:
+        if time.monotonic() > end:
+            break
+        time.sleep(0.5)
+    return answer.raise_for_status().json()
 
 
 def _answers(url: str) -> bool:
