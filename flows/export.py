@@ -94,15 +94,15 @@ def _write_tracking_data(night: _NightTables, wanted: Sequence[str], folder: Pat
 def _write_states(kind: Message, night: _NightTables, wanted: Sequence[str], folder: Path) -> None:
     objects = night.by_object("states", wanted)
     positions = night.read("positions") if kind == Message.oem else None
-    for name, states in objects.items():
+    for name, file in _file_names(list(objects), kind.value).items():
+        states, path = objects[name], folder / file
         if positions is not None:
             of_object = positions.filter(pl.col("object_id") == name)
-            text = ephemeris_message(name, arcs(states, of_object), [OF_ARC])
-            write_message(folder / f"{safe_name(name)}.oem", text)
+            write_message(path, ephemeris_message(name, arcs(states, of_object), [OF_ARC]))
             continue
         for number, state in enumerate(single_states(states.sort("epoch")), 1):
-            file = folder / f"{safe_name(name)}-{number}.opm"
-            write_message(file, state_message(name, state, [OF_STATE]))
+            numbered = path.with_name(f"{path.stem}-{number}{path.suffix}")
+            write_message(numbered, state_message(name, state, [OF_STATE]))
 
 
 def _file_names(names: Sequence[str], ending: str) -> Mapping[str, str]:

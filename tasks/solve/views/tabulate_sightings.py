@@ -8,11 +8,10 @@ from epipole.schemas.bridge import array, empty, nullable, table, unstack
 from epipole.schemas.work_tables import SIGHTINGS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance
-from epipole.tasks.algorithms.geometry.optics_errors import shared_direction_covariance
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 from epipole.tasks.algorithms.geometry.sky import aberrate, east_north, radec_from_unit
 from epipole.tasks.algorithms.photometry import FluxScale
-from epipole.tasks.solve.views.tracklet_sightings import Sighted
+from epipole.tasks.solve.views.tracklet_sightings import Sighted, optics_covariance
 
 Array = npt.NDArray[np.float64]
 
@@ -28,7 +27,10 @@ def tabulate_sightings(sighted: Sighted | None) -> pa.Table:
     ra, dec = radec_from_unit(u)
     cov_blend = centroid_covariance(u, np.sqrt(tracklets.blend_rad2))
     noise = _on_sky(u, tracklets.cov_noise + cov_blend)
-    shared = _on_sky(u, tracklets.cov_bias - cov_blend + _by_optics(sighted))
+    R = matrix_from_quaternion(frames.q_sensor_from_icrs[frame])
+    u_sensor = np.einsum("nij,nj->ni", R, tracklets.u_icrs)
+    by_optics = optics_covariance(sighted, R, u_sensor, frames.from_stars[frame])
+    shared = _on_sky(u, tracklets.cov_bias - cov_blend + by_optics)
     sigma = np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
     r_km = frames.r_gcrf_km[frame]
     magnitude, magnitude_sigma = _magnitudes(sighted)
@@ -66,18 +68,6 @@ def _on_sky(u: Array, cov: Array) -> Array:
     """Return (n, 3, 3) covariances as (n, 2, 2), east and north."""
     basis = east_north(u)
     return basis @ cov @ np.swapaxes(basis, 1, 2)
-
-
-def _by_optics(sighted: Sighted) -> Array:
-    """Return (n, 3, 3) covariances, ICRS, of what the error of the optics adds."""
-    frames, tracklets, camera, cov_optics = sighted
-    if not cov_optics.any():
-        return np.zeros((len(tracklets.frame), 3, 3))
-    R = matrix_from_quaternion(frames.q_sensor_from_icrs[tracklets.frame])
-    u_sensor = np.einsum("nij,nj->ni", R, tracklets.u_icrs)
-    stars = frames.from_stars[tracklets.frame]
-    shared = shared_direction_covariance(camera, cov_optics, u_sensor, stars)
-    return np.swapaxes(R, 1, 2) @ shared @ R
 
 
 def _magnitudes(sighted: Sighted) -> tuple[Array, Array]:

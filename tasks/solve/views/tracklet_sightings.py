@@ -14,6 +14,7 @@ from epipole.schemas.bridge import array
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance, scatter_beyond
+from epipole.tasks.algorithms.geometry.optics_errors import shared_direction_covariance
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
@@ -83,6 +84,28 @@ def sight_objects(
     tracklets = _with_split_prior(_by_tracklet(frames, tracked), frames, settings)
     tracklets = _with_blends(tracklets, frames, camera)
     return Sighted(frames, tracklets, camera, optics_covariance_of(cameras, row))
+
+
+def optics_covariance(
+    sighted: Sighted, R: Array, u_sensor: Array, from_stars: npt.NDArray[np.bool_]
+) -> Array:
+    """Return (n, 3, 3) covariances of directions, ICRS, due to the error of fitted optics [rad^2].
+
+    It is shared by all frames; 0 where the optics are those of the log.
+
+    Parameters
+    ----------
+    R : (n, 3, 3) float
+        Attitudes, sensor from ICRS.
+    u_sensor : (n, 3) float
+        Measured directions, sensor axes.
+    from_stars : (n,) bool
+        Whether stars gave the attitude.
+    """
+    if not sighted.cov_optics.any():
+        return np.zeros_like(R)
+    shared = shared_direction_covariance(sighted.camera, sighted.cov_optics, u_sensor, from_stars)
+    return np.asarray(np.swapaxes(R, 1, 2) @ shared @ R)
 
 
 def _with_lone(frames: Frames, detections: pa.Table, settings: Settings) -> pa.Table:

@@ -13,7 +13,6 @@ from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.geometry.camera import project
 from epipole.tasks.algorithms.geometry.direction_errors import on_tangent_plane
-from epipole.tasks.algorithms.geometry.optics_errors import shared_direction_covariance
 from epipole.tasks.algorithms.geometry.rotations import (
     interpolate_quaternions,
     matrix_from_quaternion,
@@ -21,7 +20,11 @@ from epipole.tasks.algorithms.geometry.rotations import (
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.sightings import Frames
-from epipole.tasks.solve.views.tracklet_sightings import Sighted, TrackletSightings
+from epipole.tasks.solve.views.tracklet_sightings import (
+    Sighted,
+    TrackletSightings,
+    optics_covariance,
+)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -75,7 +78,7 @@ def _queries(tracklets: TrackletSightings, epochs: pa.Table, frames: Frames) -> 
 def _view_table(
     sighted: Sighted, query: _EpochQueries, epochs: pa.Table, settings: Settings
 ) -> pa.Table:
-    frames, tracklets, camera, cov_optics = sighted
+    frames, tracklets, camera = sighted.frames, sighted.tracklets, sighted.camera
     tracklet, row, served = query
     origin = frames.time_ns[0]
     bounds = tracklets.bounds
@@ -102,10 +105,9 @@ def _view_table(
     r_km, v_km_s = _carried(frames, served, array(epochs, "dt_s")[row])
     cov_noise, cov_bias = (on_tangent_plane(u, cov) for cov in motion[2:4])
     cov_noise, cov_bias, blend_rad2 = _without_blends(tracklet, cov_noise, cov_bias)
-    if cov_optics.any():
-        stars = frames.from_stars[served]
-        shared = shared_direction_covariance(camera, cov_optics, u_sensor, stars)
-        cov_bias = cov_bias + on_tangent_plane(u, np.swapaxes(R, 1, 2) @ shared @ R)
+    if sighted.cov_optics.any():
+        by_optics = optics_covariance(sighted, R, u_sensor, frames.from_stars[served])
+        cov_bias = cov_bias + on_tangent_plane(u, by_optics)
     kept = np.isfinite(x_px) & np.isfinite(r_km[:, 0])
     columns = {
         "epoch": array(epochs, "epoch")[row],
