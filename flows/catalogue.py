@@ -13,8 +13,8 @@ from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.io.catalogues.star_list import read_star_list
 from epipole.io.names import fault_of_name
 from epipole.schemas.bridge import array
+from epipole.schemas.catalogues.star_catalogue import UNKNOWN_MOTION_MAS_YR, label_of
 from epipole.schemas.errors import CatalogueError
-from epipole.schemas.star_catalogue import UNKNOWN_MOTION_MAS_YR, label_of
 from epipole.tasks.catalogue.build_deep_catalogue import build_deep_catalogue
 
 DEEP = "deep"

@@ -15,8 +15,8 @@ from epipole.io.logs.writer import LogWriter
 from epipole.io.names import fault_of_name
 from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.truth import SUFFIX, TruthWriter
+from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.element_set import ElementSet
 from epipole.schemas.simulation.scene import Scene, validate_scene
 from epipole.tasks.algorithms.simulation.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposures

@@ -22,7 +22,7 @@ class SceneError(EpipoleError):
 
 
 class CatalogueError(EpipoleError):
-    """A star catalogue that is missing or invalid."""
+    """A catalogue, of stars or of known objects, that is missing or invalid."""
 
 
 class DatasetError(EpipoleError):

@@ -9,7 +9,7 @@ import pyarrow as pa
 from epipole.io.catalogues.gaia import GAIA_EPOCH, NAME, GaiaStars, gaia_source, read_gaia
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array, table
-from epipole.schemas.star_catalogue import (
+from epipole.schemas.catalogues.star_catalogue import (
     STAR_CATALOGUE,
     UNKNOWN_MOTION_MAS_YR,
     CatalogueLabel,

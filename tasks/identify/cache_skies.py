@@ -14,7 +14,7 @@ import scipy
 
 from epipole.io.caches.arrays import cached
 from epipole.schemas.bridge import array
-from epipole.schemas.star_catalogue import STAR_CATALOGUE, label_of
+from epipole.schemas.catalogues.star_catalogue import STAR_CATALOGUE, label_of
 from epipole.tasks.algorithms.catalogue import star_catalogue
 from epipole.tasks.algorithms.catalogue.star_catalogue import (
     NavigationCatalogue,

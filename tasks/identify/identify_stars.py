@@ -9,9 +9,9 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, empty, stack
+from epipole.schemas.catalogues.star_catalogue import with_catalogue
 from epipole.schemas.methods import STAR_IDENTIFICATION, load_method
 from epipole.schemas.settings import Settings
-from epipole.schemas.star_catalogue import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC, DAY_NS, SPEED_OF_LIGHT_KM_S

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.element_set import ElementSet
 from epipole.schemas.simulation.scene import Scene, SceneTargets
 from epipole.tasks.algorithms.simulation.objects import SimulatedObjects
 from epipole.tasks.algorithms.simulation.paths import Paths, joined_paths, two_body_paths

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.element_set import ElementSet
 from epipole.schemas.simulation.scene import Scene, SceneSensor
 from epipole.tasks.algorithms.simulation.constants import ARCSEC
 from epipole.tasks.algorithms.simulation.paths import Paths, resting_path, two_body_paths

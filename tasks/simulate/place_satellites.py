@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.io.simulation.element_files import read_element_sets
+from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.element_set import ElementSet
 from epipole.schemas.simulation.orbit import Orbit
 from epipole.schemas.simulation.scene import Scene
 from epipole.tasks.algorithms.simulation.constants import DAY_S, SECOND_NS

@@ -12,8 +12,8 @@ import pyarrow as pa
 
 from epipole.io.simulation.sky import SkyStars, read_stars
 from epipole.schemas.bridge import table, unstack
+from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.element_set import ElementSet
 from epipole.schemas.simulation.scene import Scene, SceneSensor
 from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_ORBITS, TRUE_POINTS
 from epipole.tasks.algorithms.simulation.constants import SECOND_NS

@@ -57,7 +57,11 @@ class ObservedMotions(NamedTuple):
 
 
 def link_by_motion(
-    motions: ObservedMotions, *, gap_s: float, log_odds: float
+    motions: ObservedMotions,
+    *,
+    gap_s: float,
+    log_odds: float,
+    allowed: npt.NDArray[np.bool_] | None = None,
 ) -> tuple[Indices, Array]:
     """Return which object continues which.
 
@@ -70,6 +74,8 @@ def link_by_motion(
     log_odds
         Each link must raise the log-odds of all links by this, against the best ones without
         it. So an object is not linked where two could be its continuation.
+    allowed : (n, n) bool
+        Whether the first may continue as the second; None: any.
 
     Returns
     -------
@@ -86,7 +92,7 @@ def link_by_motion(
     """
     n = len(motions.first_s)
     before, odds = np.full(n, NONE), np.full(n, np.nan)
-    pairs = _pairs(motions, gap_s)
+    pairs = _pairs(motions, gap_s, allowed)
     gain = _gains(motions, pairs)
     likely = gain > 0.0
     earlier, later, gain = pairs.earlier[likely], pairs.later[likely], gain[likely]
@@ -120,10 +126,14 @@ class _CandidatePairs(NamedTuple):
     cov: Array
 
 
-def _pairs(motions: ObservedMotions, gap_s: float) -> _CandidatePairs:
+def _pairs(
+    motions: ObservedMotions, gap_s: float, allowed: npt.NDArray[np.bool_] | None = None
+) -> _CandidatePairs:
     """Return the pairs that may be one object, by time and energy, with their differences."""
     gap = motions.first_s - motions.last_s[:, None]
     timely = (gap > 0.0) & (gap <= gap_s)
+    if allowed is not None:
+        timely &= allowed
     moving, moves = np.isfinite(motions.tail[:, 3]), np.isfinite(motions.head[:, 3])
     kept = timely & _alike(motions)
     parts = []
@@ -197,15 +207,22 @@ def _gains(motions: ObservedMotions, pairs: _CandidatePairs) -> Array:
 def _propagated(state: Array, cov: Array, dt_s: Array) -> tuple[Array, Array]:
     """Return a state propagated by several times, with covariances.
 
-    The neglected forces grow in it as a constant acceleration does.
+    Half of the variance of the neglected forces is that of a constant acceleration, half that of
+    one that changes all the time: the pull of Sun and Moon turns within hours.
     """
     there, transition = trajectory(state, dt_s)
     gravity = GM_KM3_S2 / float(state[:3] @ state[:3])
     left_out = ACCELERATION_KM_S2 + SHARE_OF_GRAVITY * gravity
-    lever = np.zeros((len(dt_s), 6, 3))
-    lever[:, :3] = np.eye(3) * (dt_s**2 / 2)[:, None, None]
-    lever[:, 3:] = np.eye(3) * dt_s[:, None, None]
-    grown = left_out**2 * lever @ np.swapaxes(lever, -1, -2)
+    # Of position, of both, of velocity: the constant one, and white noise of the same position.
+    shares = np.array([[1 / 4, 1 / 2, 1.0], [1 / 4, 3 / 8, 3 / 4]]).mean(axis=0)
+    of_place, of_both, of_velocity = (
+        left_out**2 * shares[:, None] * dt_s ** np.array([[4], [3], [2]])
+    )
+    grown = np.zeros((len(dt_s), 6, 6))
+    axes = np.arange(3)
+    grown[:, axes, axes] = of_place[:, None]
+    grown[:, axes, axes + 3] = grown[:, axes + 3, axes] = of_both[:, None]
+    grown[:, axes + 3, axes + 3] = of_velocity[:, None]
     return there, transition @ cov @ np.swapaxes(transition, -1, -2) + grown
 
 

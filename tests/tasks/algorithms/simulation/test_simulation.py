@@ -24,9 +24,9 @@ from epipole.io.logs.reader import read_log
 from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.sky import read_hipparcos_stars, read_stars
 from epipole.schemas.bridge import flatten, table
+from epipole.schemas.catalogues.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
 from epipole.schemas.errors import SceneError
 from epipole.schemas.simulation.scene import validate_scene
-from epipole.schemas.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
 from epipole.tasks.algorithms.catalogue.catalogue_join import moved
 from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
 from epipole.tasks.algorithms.simulation.ephemeris import (

@@ -13,6 +13,7 @@ class ElementSet(NamedTuple):
     # radii, rad/min^2 (half the first derivative), rad/min^3 (a sixth of the second), and angles
     # in rad; the mean motion in rad/min.
     elements: tuple[float, ...]
+    cospar_id: str = ""  # such as 1998-067A; empty where the file has none
 
     @property
     def label(self) -> str:

@@ -1,0 +1,185 @@
+"""Files of published element sets: two-line elements, and CCSDS OMM in JSON, CSV or XML."""
+
+import csv
+import json
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+from sgp4 import omm
+from sgp4.api import WGS72, Satrec
+from sgp4.io import compute_checksum
+
+from epipole.schemas.catalogues.element_set import ElementSet
+from epipole.schemas.errors import CatalogueError
+
+_UNIX_EPOCH_JD = 2440587.5
+_SGP4_EPOCH_JD = 2433281.5  # 1949 December 31, 0h
+_DAY_NS = 86_400_000_000_000
+_LINE_LENGTH = 69
+_MEAN = ("bstar", "ndot", "nddot", "ecco", "argpo", "inclo", "mo", "no_kozai", "nodeo")
+
+
+class Fault(NamedTuple):
+    """A record that is no element set: where it is in the file, and what is wrong."""
+
+    where: str
+    what: str
+
+    def __str__(self) -> str:
+        """Return both, as a message says it."""
+        return f"{self.where}: {self.what}"
+
+
+def parse_element_sets(data: bytes) -> tuple[list[ElementSet], list[Fault]]:
+    """Return the element sets of a file, in its order, and the records that are none.
+
+    The content shows which form it has: lines of two-line elements with or without names before
+    them ("0 " before a name is left away, lines that begin with # are comments), or OMM with the
+    keywords of CCSDS 502.0-B, as CelesTrak and Space-Track publish them.
+
+    Raises
+    ------
+    CatalogueError
+        Where the whole is no text, no JSON or no XML.
+    """
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise CatalogueError(f"not text: {error}") from error
+    found = list(_parsed(text, data))
+    return (
+        [each for each in found if isinstance(each, ElementSet)],
+        [each for each in found if isinstance(each, Fault)],
+    )
+
+
+def _parsed(text: str, data: bytes) -> Iterator[ElementSet | Fault]:
+    start = text.lstrip()[:1]
+    if start in ("[", "{"):
+        return _messages(_json_messages(text))
+    if start == "<":
+        return _messages(_xml_messages(data))
+    if "MEAN_MOTION" in text.lstrip().partition("\n")[0]:
+        return _messages(csv.DictReader(text.lstrip().splitlines()))
+    return _two_line_sets(text)
+
+
+def _two_line_sets(text: str) -> Iterator[ElementSet | Fault]:
+    title, first, number = "", None, 0
+    for number, raw in enumerate(text.splitlines(), start=1):
+        line = raw.rstrip()
+        if not line or line.startswith("#"):
+            continue
+        is_long = len(line) >= _LINE_LENGTH - 1
+        if first is not None and line.startswith("2 "):
+            yield _two_line_set(title, first, (number, line))
+            title, first = "", None
+            continue
+        if first is not None:
+            what = f"expected line 2 of the elements, found {line[:20]!r}"
+            yield Fault(f"line {number}", what)
+            title, first = "", None
+        if line.startswith("1 ") and is_long:
+            first = number, line
+        elif line.startswith("2 ") and is_long:
+            yield Fault(f"line {number}", "line 2 of the elements without line 1")
+            title = ""
+        else:
+            title = line.removeprefix("0 ").strip()
+    if first is not None:
+        yield Fault(f"line {number}", "the file ends after line 1 of an element set")
+
+
+def _two_line_set(title: str, *lines: tuple[int, str]) -> ElementSet | Fault:
+    """Return the element set of two lines, each with its number in the file."""
+    for number, line in lines:
+        if (what := _fault_of(line)) is not None:
+            return Fault(f"line {number}", what)
+    first, second = (line[:_LINE_LENGTH] for _, line in lines)
+    try:
+        satellite = Satrec.twoline2rv(first, second, WGS72)
+        if first[2:7] != second[2:7]:
+            raise ValueError(f"of satellite {second[2:7]}, line 1 is of {first[2:7]}")
+        return _element_set(title, int(satellite.satnum), _cospar_id(first[9:17]), satellite)
+    except ValueError as error:
+        return Fault(f"line {lines[1][0]}", str(error))
+
+
+def _fault_of(line: str) -> str | None:
+    """Return what is wrong with a line; what follows its checksum does not count."""
+    body = line[:_LINE_LENGTH]
+    if len(body) < _LINE_LENGTH:
+        return f"{len(body)} characters; elements have {_LINE_LENGTH}"
+    if body[-1] != str(compute_checksum(body)):
+        return f"its checksum is {body[-1]}, expected {compute_checksum(body)}"
+    return None
+
+
+def _cospar_id(designator: str) -> str:
+    """Return the international designator of two-line elements (98067A) as 1998-067A."""
+    year, rest = designator[:2], designator[2:].strip()
+    if not (year.isdigit() and rest):
+        return ""
+    return f"{'19' if int(year) >= 57 else '20'}{year}-{rest}"
+
+
+def _json_messages(text: str) -> list[Mapping[str, Any]]:
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise CatalogueError(f"not JSON: {error}") from error
+    return found if isinstance(found, list) else [found]
+
+
+def _xml_messages(data: bytes) -> list[Mapping[str, Any]]:
+    try:
+        return list(omm.parse_xml(pa.BufferReader(data)))
+    except (ET.ParseError, AttributeError, TypeError, LookupError) as error:
+        raise CatalogueError(f"not an OMM in XML: {error}") from error
+
+
+def _messages(messages: Iterable[Mapping[str, Any]]) -> Iterator[ElementSet | Fault]:
+    for number, fields in enumerate(messages, start=1):
+        satellite = Satrec()
+        try:
+            text = _texts(fields)
+            satellite_number = int(text["NORAD_CAT_ID"])
+            omm.initialize(satellite, _with_defaults(text))
+            yield _element_set(
+                text.get("OBJECT_NAME", ""), satellite_number, text.get("OBJECT_ID", ""), satellite
+            )
+        except (KeyError, ValueError, AttributeError, OverflowError) as error:
+            what = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
+            yield Fault(f"message {number}", f"not an OMM: {what}")
+
+
+def _texts(fields: Any) -> dict[str, str]:
+    if not isinstance(fields, Mapping):
+        raise ValueError("no keywords")
+    return {str(key): str(value).strip() for key, value in fields.items() if value is not None}
+
+
+def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
+    """Return the fields with those that the orbit does not need, and an epoch as sgp4 reads it."""
+    unused = {
+        "CLASSIFICATION_TYPE": "U", "OBJECT_ID": "", "EPHEMERIS_TYPE": "0",
+        "ELEMENT_SET_NO": "0", "REV_AT_EPOCH": "0",
+    }  # fmt: skip
+    if not fields.get("MEAN_ELEMENT_THEORY", "SGP4").startswith("SGP"):
+        raise ValueError(f"MEAN_ELEMENT_THEORY is {fields['MEAN_ELEMENT_THEORY']}, expected SGP4")
+    epoch = fields["EPOCH"].removesuffix("Z")
+    # sgp4 refuses the numbers above 339999, which two-line elements cannot hold.
+    changed = {"EPOCH": epoch if "." in epoch else f"{epoch}.0", "NORAD_CAT_ID": "0"}
+    return unused | fields | changed
+
+
+def _element_set(title: str, number: int, cospar_id: str, satellite: Any) -> ElementSet:
+    day, part = satellite.jdsatepoch, satellite.jdsatepochF
+    epoch_ns = round((day - _UNIX_EPOCH_JD) * _DAY_NS) + round(part * _DAY_NS)
+    if not (math.isfinite(day) and satellite.no_kozai > 0.0 and 0.0 <= satellite.ecco < 1.0):
+        raise ValueError("mean motion, eccentricity or epoch is out of bounds")
+    elements = (day - _SGP4_EPOCH_JD + part, *(float(getattr(satellite, n)) for n in _MEAN))
+    return ElementSet(title, number, epoch_ns, elements, cospar_id)

@@ -1,0 +1,1 @@
+"""Catalogues: stars to navigate by, and element sets of known objects."""

@@ -1,0 +1,210 @@
+"""Predictions: where the satellites of a catalogue are, by SGP4, and how well that is known.
+
+Published element sets have no covariance. What is known of their errors: they are a few hundred
+metres to kilometres at the epoch, and grow mostly along the track, by about a kilometre a day
+(Kelso 2007, Validation of SGP4 and IS-GPS-200D against GPS precision ephemerides, AAS 07-127;
+Vallado and Cefola 2012, Two-line element sets, practice and use, IAC-12-C1.6.12). `ElementErrors`
+has these sizes; they are a start, and are learnt from the matches of a night (`learning`).
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from sgp4.api import WGS72, Satrec, SatrecArray
+
+from epipole.tasks.algorithms.constants import GM_KM3_S2
+from epipole.tasks.algorithms.orbits.reference_frames import Orientation, gcrf_from_teme
+from epipole.tasks.algorithms.time.time_scales import utc_julian_date
+
+Array = npt.NDArray[np.float64]
+Nanoseconds = npt.NDArray[np.int64]
+Satellites = Sequence[Satrec]
+
+DAY_S = 86400.0
+UNIX_EPOCH_JD = 2440587.5
+SGP4_EPOCH_JD = 2433281.5  # 1949 December 31, 0h
+LEAST_TILT = 1e-4  # sine of an inclination: below it the node says nothing
+DRAG_UNKNOWN = 0.15  # share of the drag that is not known: density and area change from day to day
+# Mean motions [rad/s] below this are of periods above 225 minutes: SGP4's deep space.
+DEEP_SPACE_RAD_S = 2 * np.pi / (225 * 60)
+
+
+class ElementErrors(NamedTuple):
+    """1-sigma errors of element sets: along the track, radial, and across the orbit plane.
+
+    Each is the root of the squares of its error at the epoch [km], and of its growth [km/day]
+    times the age.
+    """
+
+    along_km: float
+    along_km_day: float
+    radial_km: float
+    radial_km_day: float
+    across_km: float
+    across_km_day: float
+
+
+LOW_ORBIT = ElementErrors(0.7, 1.0, 0.25, 0.03, 0.25, 0.05)
+HIGH_ORBIT = ElementErrors(2.0, 0.7, 1.0, 0.1, 1.0, 0.1)
+
+
+def satellites_of(elements: Array) -> list[Satrec]:
+    """Return SGP4's satellites of (n, 10) mean elements: the arguments of `sgp4init`, in order."""
+    made = []
+    for row in np.asarray(elements, float).tolist():
+        satellite = Satrec()
+        satellite.sgp4init(WGS72, "i", 0, *row)
+        made.append(satellite)
+    return made
+
+
+def predict(satellites: Satellites, time_ns: Nanoseconds) -> Array:
+    """Return states of satellites by SGP4.
+
+    Parameters
+    ----------
+    satellites
+        n of them.
+    time_ns : (m,) int
+        UTC since 1970.
+
+    Returns
+    -------
+    (n, m, 6) float
+        Position [km] and velocity [km/s], GCRF; NaN where SGP4 fails, as for one that has decayed.
+
+    References
+    ----------
+    Vallado et al. (2006), Revisiting Spacetrack Report 3, AIAA 2006-6753.
+    """
+    shape = len(satellites), len(time_ns)
+    if not all(shape):
+        return np.empty((*shape, 6))
+    utc = utc_julian_date(time_ns)
+    code, r_km, v_km_s = SatrecArray(list(satellites)).sgp4(*utc)
+    none = np.zeros(len(time_ns))
+    # The rotation from TEME hardly depends on UT1, for which UTC is taken.
+    orientation = Orientation(utc, none, none, none)
+    axes = [np.tile(axis, (len(time_ns), 1)) for axis in np.eye(3)]
+    R = np.stack([gcrf_from_teme(time_ns, x, x, orientation)[0] for x in axes], axis=2)
+    states = np.concatenate(
+        [np.einsum("mij,nmj->nmi", R, x) for x in (r_km, v_km_s)], axis=2, dtype=float
+    )
+    bad = (np.asarray(code) != 0) | ~np.isfinite(states).all(axis=2)
+    return np.where(bad[:, :, None], np.nan, states)
+
+
+def is_deep_space(satellite: Any) -> bool:
+    """Return whether a satellite's period is above 225 minutes."""
+    return bool(satellite.no_kozai / 60.0 < DEEP_SPACE_RAD_S)
+
+
+def sigmas(satellite: Any, age_days: float, errors: ElementErrors) -> Array:
+    """Return the 1-sigma errors of a satellite's elements, (6,), in the order of `SENSITIVE_TO`.
+
+    Unknown drag grows with the square of the age: it is a share of the change of the mean motion by
+    which SGP4 has brought a low satellite ahead.
+    """
+    a_km = semi_major_axis(satellite)
+    minutes = abs(age_days) * DAY_S / 60.0
+    drag_km = DRAG_UNKNOWN * a_km * abs(_sped_up(satellite, minutes)) * minutes / 2
+    along = np.hypot(np.hypot(errors.along_km, errors.along_km_day * age_days), drag_km)
+    radial = np.hypot(errors.radial_km, errors.radial_km_day * age_days)
+    across = np.hypot(errors.across_km, errors.across_km_day * age_days)
+    drift = np.hypot(errors.along_km_day, 2 * drag_km / max(abs(age_days), 1.0))
+    return np.array([along, radial, radial, across, across, drift])
+
+
+# What the errors of elements do: ahead along the track [km], the eccentricity as a vector, times
+# the semi-major axis [km], the pole of the orbit plane [km at the semi-major axis], and a drift
+# along the track [km/day].
+SENSITIVE_TO = ("along", "radial", "radial", "across", "across", "drift")
+
+
+def sensitivities(satellite: Any, time_ns: Nanoseconds, anchor: int) -> Array:
+    """Return the derivatives of a satellite's places by the errors of its elements.
+
+    They are differences of SGP4's own places, so that they hold for days: two bodies alone would be
+    wrong by a tenth after one orbit.
+
+    Parameters
+    ----------
+    time_ns : (m,) int
+        UTC since 1970.
+    anchor
+        Row of the time about which the drift turns.
+
+    Returns
+    -------
+    (m, 3, 6) float
+        GCRF; km per unit of `SENSITIVE_TO`.
+    """
+    a_km = semi_major_axis(satellite)
+    ex, ey = satellite.ecco * np.cos(satellite.argpo), satellite.ecco * np.sin(satellite.argpo)
+    tilt = 1.0 / a_km
+    node = tilt / max(abs(np.sin(satellite.inclo)), LEAST_TILT)
+    epoch_ns = (satellite.jdsatepoch - UNIX_EPOCH_JD + satellite.jdsatepochF) * DAY_S * 1e9
+    minutes = (float(time_ns[anchor]) - epoch_ns) / 60e9
+    motion = 1.0 / a_km / (DAY_S / 60.0)
+    none = _changed(satellite, ex, ey)
+    changed = [
+        none,
+        _changed(satellite, ex, ey, longitude=1.0 / a_km),
+        _changed(satellite, ex + 1.0 / a_km, ey),
+        _changed(satellite, ex, ey + 1.0 / a_km),
+        _changed(satellite, ex, ey, inclination=tilt),
+        _changed(satellite, ex, ey, node=node, longitude=-node * np.cos(satellite.inclo)),
+        _changed(satellite, ex, ey, motion=motion, longitude=-motion * minutes),
+    ]
+    places = predict(satellites_of(np.array(changed)), time_ns)[:, :, :3]
+    return np.asarray(np.moveaxis(places[1:] - places[0], 0, 2))
+
+
+def _changed(
+    satellite: Any,
+    ex: float,
+    ey: float,
+    longitude: float = 0.0,
+    inclination: float = 0.0,
+    node: float = 0.0,
+    motion: float = 0.0,
+) -> list[float]:
+    """Return the mean elements with another eccentricity vector and other angles [rad].
+
+    A turn of perigee leaves the mean argument of latitude as it is.
+    """
+    argument = np.arctan2(ey, ex)
+    anomaly = satellite.mo + satellite.argpo - argument + longitude
+    epoch_days = satellite.jdsatepoch - SGP4_EPOCH_JD + satellite.jdsatepochF
+    return [
+        epoch_days, satellite.bstar, satellite.ndot, satellite.nddot, np.hypot(ex, ey), argument,
+        satellite.inclo + inclination, anomaly, satellite.no_kozai + motion,
+        satellite.nodeo + node,
+    ]  # fmt: skip
+
+
+def semi_major_axis(satellite: Any) -> float:
+    """Return the semi-major axis of the mean motion [km]."""
+    return float(GM_KM3_S2 / (satellite.no_kozai / 60.0) ** 2) ** (1 / 3)
+
+
+def _sped_up(satellite: Any, minutes: float) -> float:
+    """Return the change of the mean motion by drag, as SGP4 has it [rad/min]."""
+    if is_deep_space(satellite):
+        return 0.0
+    mean_motions = []
+    for t in (0.0, minutes):
+        satellite.sgp4_tsince(t)
+        mean_motions.append(float(satellite.nm))
+    return mean_motions[1] - mean_motions[0]
+
+
+def along_up_across(state: Array) -> Array:
+    """Return the unit vectors along the velocity, at right angles to it in the orbit plane, and
+    across the plane, as rows; (3, 3)."""
+    ahead = state[3:] / np.linalg.norm(state[3:])
+    side = np.cross(state[:3], state[3:])
+    side /= np.linalg.norm(side)
+    return np.array([ahead, np.cross(ahead, side), side])
