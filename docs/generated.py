@@ -22,7 +22,7 @@ import pyarrow as pa
 from pydantic.fields import FieldInfo
 
 from epipole.schemas.logs.bounds import BOUNDS, TIME
-from epipole.schemas.rejects import FrameStatus, Outcome, Reason
+from epipole.schemas.rejects import FrameStatus, NameStatus, Outcome, Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.simulation.orbit import Orbit
 from epipole.schemas.simulation.scene import (
@@ -48,6 +48,7 @@ MADE_BY = {
     Stage.CALIBRATE: ("calibrations",),
     Stage.TRACK: ("tracklets",),
     Stage.SOLVE: ("epochs", "associations", "pairs", "positions", "states"),
+    Stage.NAME: ("identifications",),
     Stage.PUBLISH: ("observations", "sources", "rejects"),
 }
 
@@ -122,6 +123,11 @@ def outcomes() -> str:
 def statuses() -> str:
     """Return the statuses of frames without an attitude from stars."""
     return _words("status", FrameStatus)
+
+
+def names() -> str:
+    """Return what may be known of an object's name."""
+    return _words("status", NameStatus)
 
 
 def _words(heading: str, words: Iterable[StrEnum]) -> str:
@@ -227,6 +233,7 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "reasons": reasons,
         "outcomes": outcomes,
         "statuses": statuses,
+        "names": names,
     },
     "docs/input.md": {"bounds": bounds},
     "docs/settings.md": {"settings": settings},

@@ -1,39 +1,53 @@
 """The nightly flow: logs of star sensors go in, a dataset of space objects comes out."""
 
+import contextlib
 import logging
 from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 from prefect import flow
 
+from epipole.flows.night.earlier_nights import EarlierNights
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.parameters import Night, night_asked, run_name
 from epipole.flows.night.stages import (
     Destination,
     calibrate,
     check,
+    choose_elements,
     find_cameras,
     identify,
     name,
+    name_known,
     publish,
     read,
     solve,
     track,
+    write_night,
 )
 from epipole.flows.night.summary import Summary, by_reason
-from epipole.flows.night.work import plan_spans
+from epipole.flows.night.work import Work, plan_spans
 from epipole.flows.prefect.page import shown_on_page
 from epipole.flows.prefect.runners import runner_asked
+from epipole.io.catalogues.known_objects import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
-from epipole.io.datasets.dataset import check_folder, check_sources, claim_nights, nights_of
+from epipole.io.datasets.dataset import (
+    check_folder,
+    check_sources,
+    claim_nights,
+    nights_of,
+)
 from epipole.io.work.folder import work_folder, work_key, work_root
-from epipole.io.work.places import ReadFolder, WorkFolder
+from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.publish.write_tables import into_nights, source_table
+from epipole.tasks.read.order_frames import OrderedFrames
 
 LOGGER = logging.getLogger(__name__)
 
@@ -46,6 +60,7 @@ def nightly(
     settings: Settings = Settings(),  # noqa: B008  frozen
     night: Night = None,
     replace: bool = False,
+    known: str | None = None,
 ) -> Summary:
     """Turn logs into a dataset.
 
@@ -58,6 +73,8 @@ def nightly(
         night: Publish only this UTC date: YYYY-MM-DD, or yesterday (the day before the run was
             scheduled). None: every night that the logs have frames of.
         replace: Replace a night even if one of its earlier logs is not given.
+        known: A file of element sets, to name known objects by: two-line elements, or OMM in CSV,
+            JSON or XML. A path or URL. None: no object gets a name.
 
     Raises:
         EpipoleError: If the work cannot be done; the dataset is then unchanged.
@@ -65,42 +82,70 @@ def nightly(
     night = night_asked(night)
     check_folder(out)
     check_star_catalogue(settings.identification.catalogue)
+    catalogue = read_known_objects(known) if known else None
     given = find_logs(logs, night)
-    with claim_nights(out, [night] if night else []) as run:
+    with contextlib.ExitStack() as held:
+        run = held.enter_context(claim_nights(out, [night] if night else []))
         frames = read(given.paths, ReadFolder(run), settings)
 
         nights = nights_of(np.concatenate([np.empty(0, np.int64), *frames.time_ns]))
         chosen = choose_nights(given.paths, nights, night, frames.rejects)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
-        spans, uncalibrated = plan_spans(frames, chosen)
-        key = work_key(frames.sources, settings, chosen)
-        with (
-            claim_nights(out, [] if night else chosen) as staging,
-            work_folder(work_root(out), chosen, key) as folder,
-        ):
-            work = identify(frames, spans, WorkFolder(folder), settings)
-            work, told = find_cameras(work, settings)
-            work, calibrations = calibrate(work, told, settings)
-            while True:
-                track(work, settings)
-                solved = solve(work, settings)
-                work, again, left_out = check(work, solved, settings)
-                if not again:
-                    break  # else: back to `track`, with corrected times
-            if left_out:
-                solved = solve(work, settings, left_out)
-            names = name(work, solved, settings)
-            rejects = concat(REJECTS, [given.rejects, frames.rejects, uncalibrated])
-            whole = {
-                "calibrations": calibrations,
-                "sources": sources,
-                "rejects": into_nights(rejects, nights),
-            }
-            staged = {date: staging / f"night={date}" for date in chosen}
-            summary = publish(work, solved, names, whole, Destination(out, staged, replace))
+        rejects = into_nights(concat(REJECTS, [given.rejects, frames.rejects]), nights)
+        staging = held.enter_context(claim_nights(out, [] if night else chosen))
+        staged: dict[str, Path] = {}
+        verdicts, residuals = {}, {}
+        for date in chosen:
+            if len(chosen) > 1:
+                LOGGER.info("night %s", date)
+            key = work_key(frames.sources, settings, date)
+            work = held.enter_context(work_folder(work_root(out), date, key))
+            made = make_night(frames, date, WorkFolder(work), settings)
+            earlier = EarlierNights(out, staged)
+            names = name(made.work, made.solved, date, earlier.last_views(date), settings)
+            elements, unused = choose_elements(catalogue, date, settings)
+            whole = {"sources": sources, "calibrations": made.calibrations,
+                     "rejects": concat(REJECTS, [rejects, made.rejects, unused])}  # fmt: skip
+            staged[date] = staging / f"night={date}"
+            write_night(made.work, made.solved, date, names, whole, staged[date])
+            states = earlier.last_states(date, settings)
+            residuals[date] = name_known(staged[date], elements, states, settings)
+            verdicts[date] = made.work.verdicts
+        summary = publish(Destination(out, staged, replace), sources, verdicts, residuals)
     LOGGER.info("published %s", ", ".join(f"{out}/night={date}" for date in chosen))
     return summary
+
+
+class MadeNight(NamedTuple):
+    """The objects of a night, solved: `rejects` and `calibrations` belong to no span."""
+
+    work: Work
+    solved: SolvedParts
+    calibrations: pa.Table
+    rejects: pa.Table
+
+
+def make_night(
+    frames: OrderedFrames, night: str, folder: WorkFolder, settings: Settings
+) -> MadeNight:
+    """Turn the frames of a night, and of half an hour before and after it, into solved objects.
+
+    What a night holds does not depend on the other nights of the run.
+    """
+    spans, uncalibrated = plan_spans(frames, night)
+    work = identify(frames, spans, folder, settings)
+    work, told = find_cameras(work, settings)
+    work, calibrations = calibrate(work, told, settings)
+    while True:
+        track(work, night, settings)
+        solved = solve(work, settings)
+        work, again, left_out = check(work, solved, settings)
+        if not again:
+            break  # else: back to `track`, with corrected times
+    if left_out:
+        solved = solve(work, settings, left_out)
+    return MadeNight(work, solved, calibrations, uncalibrated)
 
 
 def choose_nights(

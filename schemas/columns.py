@@ -35,9 +35,11 @@ def column(
     )
 
 
-def time_column(name: str = "time", *, doc: str = "Mid-exposure time, UTC.") -> pa.Field:
+def time_column(
+    name: str = "time", *, doc: str = "Mid-exposure time, UTC.", null: bool = False
+) -> pa.Field:
     """Return a UTC time column in integer nanoseconds."""
-    return column(name, TIME, unit="ns", doc=doc)
+    return column(name, TIME, unit="ns", doc=doc, null=null)
 
 
 def id_column(name: str, *, doc: str, null: bool = False) -> pa.Field:

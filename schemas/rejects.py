@@ -257,6 +257,27 @@ class Reason(StrEnum):
         "The sensor is at fault, and it is not clear whether by its clock, ephemeris or attitude; "
         "its views are left out.",
     )
+    # Of the catalogue of known objects.
+    BAD_ELEMENTS = (
+        "bad_elements",
+        Stage.NAME,
+        "A record of the catalogue of known objects is no element set.",
+    )
+    OTHER_ELEMENTS = (
+        "other_elements",
+        Stage.NAME,
+        "The catalogue has another element set of the object, nearer to the night.",
+    )
+    OLD_ELEMENTS = (
+        "old_elements",
+        Stage.NAME,
+        "The epoch of the element set is too far from the night.",
+    )
+    FAILED_ELEMENTS = (
+        "failed_elements",
+        Stage.NAME,
+        "SGP4 has no position for the element set, as of an object that has come down.",
+    )
 
 
 # Why a calibration that a log has is not used.
@@ -293,6 +314,14 @@ class Outcome(Declared):
         "not_compared",
         "It was not compared with other sensors: it has no attitude, sensor position or epoch.",
     )
+
+
+class NameStatus(Declared):
+    """What is known of an object's name."""
+
+    KNOWN = "known", "It is one satellite of the catalogue."
+    AMBIGUOUS = "ambiguous", "It may be one of several satellites, or none; it has no name."
+    UNKNOWN = "unknown", "It is none of the catalogue, or there is no catalogue."
 
 
 class FrameStatus(Declared):

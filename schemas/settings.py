@@ -325,6 +325,27 @@ class StateSettings(Group):
     )
 
 
+class KnownObjectSettings(Group):
+    """Objects held against a catalogue of known ones, and against earlier nights."""
+
+    probability: float = Field(
+        0.99, gt=0.5, lt=1, description="Least probability of a name that is given to an object."
+    )
+    most_days: float = Field(
+        30.0,
+        gt=0,
+        le=3660,
+        description="Element sets whose epoch is farther from the night are not used [days].",
+    )
+    earlier_h: float = Field(
+        36.0,
+        ge=0,
+        le=240,
+        description="Longest time without detections after which an unknown object is recognised "
+        "as one of an earlier night [hours]. 0: never.",
+    )
+
+
 class WorkSettings(Group):
     """How the work of a night is divided."""
 
@@ -352,6 +373,7 @@ class Settings(Group):
     association: AssociationSettings = AssociationSettings()
     positions: PositionSettings = PositionSettings()
     states: StateSettings = StateSettings()
+    known_objects: KnownObjectSettings = KnownObjectSettings()
     work: WorkSettings = WorkSettings()
 
     @model_validator(mode="after")

@@ -52,7 +52,8 @@ class Stage(Declared):
     )
     NAME = (
         "name",
-        "Gives each object one id for the whole night, also across gaps.",
+        "Gives each object one id for the whole night, also across gaps and midnight, and its "
+        "name in a catalogue of known objects.",
     )
     PUBLISH = (
         "publish",

@@ -354,6 +354,54 @@ STATES = schema(
     ],
 )
 
+IDENTIFICATIONS = schema(
+    "identifications",
+    "One row per object of the night, held against a catalogue of known ones.",
+    [
+        OBJECT_ID,
+        column("status", pa.string(), doc="A `NameStatus`: known, ambiguous or unknown."),
+        id_column(
+            "same_as",
+            null=True,
+            doc="Id of an earlier night that an object which is not known had there; null where "
+            "it is new, or the motion does not decide. Objects followed over midnight keep their "
+            "id.",
+        ),
+        column(
+            "norad_id", I64, null=True, doc="Number in the satellite catalogue, where it is known."
+        ),
+        id_column("cospar_id", null=True, doc="International designator, such as 1998-067A."),
+        column(
+            "name",
+            pa.string(),
+            null=True,
+            doc="Name in the catalogue. Of an ambiguous object: all that it may be, the likeliest "
+            "first.",
+        ),
+        time_column(
+            "element_epoch",
+            null=True,
+            doc="Epoch of the elements of the likeliest satellite, UTC; with the two columns that "
+            "follow it is null where none is near. Of an unknown object all three are of the "
+            "nearest one that it is not.",
+        ),
+        column(
+            "distance_km", F64, unit="km", null=True, doc="Distance of the object from its place."
+        ),
+        column(
+            "mahalanobis",
+            F64,
+            null=True,
+            doc="The same in units of its standard deviation: of the elements, by their age, and "
+            "of the position.",
+        ),
+        column("probability", F64, null=True, doc="Of the status; null without a catalogue."),
+        column(
+            "catalogue", pa.string(), null=True, doc="Digest (sha256) of the catalogue's bytes."
+        ),
+    ],
+)
+
 _OPTICS = [
     ("fx_px", "px", "Focal length along columns."),
     ("fy_px", "px", "Focal length along rows; negative where rows count upward."),
@@ -453,6 +501,7 @@ TABLES: dict[str, pa.Schema] = {
     "positions": POSITIONS,
     "observations": OBSERVATIONS,
     "states": STATES,
+    "identifications": IDENTIFICATIONS,
     "calibrations": CALIBRATIONS,
     "pairs": PAIRS,
     "sources": SOURCES,

@@ -121,6 +121,13 @@ def run(
             "--replace", help="Replace a night even if one of its earlier logs is not given."
         ),
     ] = False,
+    known: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="Name known objects by these element sets: TLE, or OMM in CSV, JSON or XML.",
+        ),
+    ] = None,
     runner: Annotated[
         Runner, typer.Option(help="Run the tasks in threads or with Dask.")
     ] = Runner.threads,
@@ -147,7 +154,9 @@ def run(
     from epipole.flows.command_line.run import RunOptions, run_nightly
 
     _check_night(night)
-    options = RunOptions(settings, night, replace, runner, workers, scheduler, quiet, verbose)
+    options = RunOptions(
+        settings, night, replace, known, runner, workers, scheduler, quiet, verbose
+    )
     summary, seconds = run_nightly(logs, out, options)
     if as_json:
         _print_json(summary.as_dict() | {"seconds": round(seconds, 2)})

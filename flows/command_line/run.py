@@ -8,6 +8,7 @@ from pathlib import Path
 from epipole.flows.night.progress import prepare, shown
 from epipole.flows.night.summary import Summary
 from epipole.io.caches.kernel_warm_up import compile_beside
+from epipole.io.catalogues.known_objects import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder
 from epipole.io.logs.listing import list_logs
@@ -25,6 +26,7 @@ class RunOptions:
     settings: Path | None = None
     night: str | None = None
     replace: bool = False
+    known: str | None = None
     runner: Runner = Runner.threads
     workers: int | None = None
     scheduler: str | None = None
@@ -45,6 +47,8 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
     settings = read_settings(options.settings) if options.settings else Settings()
     check_folder(out)
     check_star_catalogue(settings.identification.catalogue)
+    if options.known is not None:
+        read_known_objects(options.known)
     for where in logs:
         list_logs(where)
     with shown(options.quiet, options.verbose), compile_beside() as compiling:
@@ -68,5 +72,5 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
 
             flow = nightly.with_options(task_runner=runner)
             with lost_server_as_line():
-                summary = flow(logs, out, settings, options.night, options.replace)
+                summary = flow(logs, out, settings, options.night, options.replace, options.known)
     return summary, time.monotonic() - started

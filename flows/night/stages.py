@@ -17,7 +17,8 @@ import pyarrow.compute as pc
 from epipole.flows.night.progress import results, step
 from epipole.flows.night.solving import solve_objects
 from epipole.flows.night.summary import Summary, many, summarise
-from epipole.flows.night.work import Spans, Work
+from epipole.flows.night.work import Spans, Work, day_of, spans_of_night
+from epipole.io.catalogues.known_objects import KnownObjects
 from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
 from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder
@@ -26,7 +27,7 @@ from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span
 from epipole.schemas.stages import Stage
-from epipole.schemas.tables import CALIBRATIONS, POSITIONS, STATES
+from epipole.schemas.tables import CALIBRATIONS, POSITIONS, REJECTS, STATES
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensor
 from epipole.tasks.calibrate.find_camera import CameraFinding, find_sensor_camera, refuses
@@ -38,8 +39,12 @@ from epipole.tasks.check.check_sensors import (
 )
 from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.identify.identify_span import identify_span
+from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
+from epipole.tasks.name.followed_objects import VIEWS, followed_objects
 from epipole.tasks.name.link_objects import link_objects, outermost, renamed
-from epipole.tasks.name.name_objects import name_objects
+from epipole.tasks.name.name_known import name_known_objects
+from epipole.tasks.name.name_objects import Names, name_objects, number_objects
+from epipole.tasks.name.sensor_residuals import SensorResidual
 from epipole.tasks.publish.night_parts import NightParts
 from epipole.tasks.publish.publish_nights import publish_nights
 from epipole.tasks.publish.write_tables import SHARES, write_tables
@@ -49,8 +54,6 @@ from epipole.tasks.track.join_tracklets import join_tracklets
 from epipole.tasks.track.track_span import track_span
 
 LOGGER = logging.getLogger(__name__)
-
-Names = Mapping[str, Mapping[str, str]]
 
 # After the first correction the views of a sensor fit objects; from these the second is exact.
 MOST_CORRECTIONS = 2
@@ -175,7 +178,7 @@ def _with_cameras(cameras: pa.Table, others: Sequence[pa.Table], sensors: set[st
     )
 
 
-def track(work: Work, settings: Settings) -> None:
+def track(work: Work, night: str, settings: Settings) -> None:
     """Follow detections from frame to frame, a task per sensor and span, and name tracklets."""
     parts = work.sensor_parts()
     futures = [
@@ -186,7 +189,7 @@ def track(work: Work, settings: Settings) -> None:
     ]
     results(Stage.TRACK, futures)
     futures = [
-        join_tracklets.submit(sensor, parts[sensor].tracked, spans, parts[sensor].names)
+        join_tracklets.submit(sensor, parts[sensor].tracked, spans, night, parts[sensor].names)
         for sensor, spans in work.spans.items()
     ]
     count = sum(results(Stage.TRACK, futures))
@@ -297,27 +300,47 @@ def _enter_spans(parts: Parts, spans: Sequence[Span]) -> list[Span]:
     return entered
 
 
-def name(work: Work, solved: SolvedParts, settings: Settings) -> Names:
-    """Return, for each span, the names of its objects in the night."""
+def name(
+    work: Work, solved: SolvedParts, night: str, before: pa.Table, settings: Settings
+) -> Names:
+    """Return, for each span, the names of its objects in the night.
+
+    `before` are the `VIEWS` of the night before, as far as it is known.
+    """
     step(Stage.NAME, 0, 1)
     spans = [span for span in work.all_spans() if solved.holds(span)]
-    names = name_objects(solved, spans)
+    numbers = number_objects(solved, spans)
     ends: dict[str, list[pa.Table]] = {"positions": [], "states": []}
     for span in spans:
         for table, rows in ends.items():
             for piece in solved.read(span, table):
-                rows.append(renamed(outermost(piece), names[span.folder]))
-    new_id: dict[str, str] = link_objects(
+                rows.append(renamed(outermost(piece), numbers[span.folder]))
+    first: dict[str, str] = link_objects(
         concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
     )
-    objects = {new_id.get(old, old) for of_span in names.values() for old in of_span.values()}
-    LOGGER.info("named %s", many(len(objects), "object"))
-    if new_id:
-        LOGGER.info("recognised %s after a gap", many(len(new_id), "object"))
-    return {
-        span: {name: new_id.get(old, old) for name, old in of_span.items()}
-        for span, of_span in names.items()
+    linked = {
+        folder: {old: first.get(number, number) for old, number in of_span.items()}
+        for folder, of_span in numbers.items()
     }
+    views = [
+        renamed(rows, linked[span.folder])
+        for span in spans
+        if span.end_ns <= day_of(night) * DAY_NS
+        for rows in solved.read(span, "associations", VIEWS.names)
+    ]
+    followed = followed_objects(views, before)
+    names = name_objects(linked, spans_of_night(spans, night), night, followed)
+    _tell_names(names, followed, len(first))
+    return names
+
+
+def _tell_names(names: Names, followed: Mapping[str, str], linked: int) -> None:
+    ids = {new for of_span in names.values() for new in of_span.values()}
+    LOGGER.info("named %s", many(len(ids), "object"))
+    if known := ids.intersection(followed.values()):
+        LOGGER.info("followed %s from the night before", many(len(known), "object"))
+    if linked:
+        LOGGER.info("recognised %s after a gap", many(linked, "object"))
 
 
 class Destination(NamedTuple):
@@ -328,29 +351,65 @@ class Destination(NamedTuple):
     replace: bool
 
 
-def publish(
+def write_night(
     work: Work,
     solved: SolvedParts,
+    night: str,
     names: Names,
     whole: Mapping[str, pa.Table],
-    destination: Destination,
-) -> Summary:
-    """Write the tables of each night, three tasks per night, and put all nights in place.
+    folder: Path,
+) -> None:
+    """Write the tables of a night to its folder.
 
     Parameters
     ----------
     whole
         Tables of the whole run: `calibrations`, `sources`, and `rejects` that belong to no span.
     """
+    spans = work.all_spans()
     sensors = list(work.sensor_parts().values())
-    all_spans = work.all_spans()
-    futures = []
-    for night, folder in destination.staged.items():
-        day = int(np.datetime64(night, "D").astype(np.int64))
-        spans = [span for span in all_spans if span.start_ns // DAY_NS == day]
-        parts = NightParts(night, spans, all_spans, sensors, solved, names, whole)
-        futures += [write_tables.submit(tables, folder, parts) for tables in SHARES]
-    results(Stage.PUBLISH, futures)
-    summary = summarise(destination.dataset, destination.staged, work.verdicts)
-    publish_nights(destination.dataset, destination.staged, whole["sources"], destination.replace)
+    parts = NightParts(night, spans_of_night(spans, night), spans, sensors, solved, names, whole)
+    results(Stage.PUBLISH, [write_tables.submit(tables, folder, parts) for tables in SHARES])
+
+
+def choose_elements(
+    known: KnownObjects | None, night: str, settings: Settings
+) -> tuple[ElementsOfNight | None, pa.Table]:
+    """Return the elements of known objects that are used in a night, and `rejects` of others."""
+    if known is None:
+        return None, REJECTS.empty_table()
+    if known.faults:
+        LOGGER.warning("%s: %s skipped, the first is %s", known.file,
+                       many(len(known.faults), "invalid record"), known.faults[0])  # fmt: skip
+    elements, rejects = elements_of_night(known, night, settings)
+    if not elements.sets:
+        newest = np.datetime64(max(each.epoch_ns for each in known.sets), "ns")
+        LOGGER.warning(
+            "%s: no element set is within %g days of %s (the newest is of %s): no object is named",
+            known.file, settings.known_objects.most_days, night, newest.astype("datetime64[D]"),
+        )  # fmt: skip
+    return elements, rejects
+
+
+def name_known(
+    folder: Path, known: ElementsOfNight | None, earlier: pa.Table, settings: Settings
+) -> list[SensorResidual]:
+    """Name the known objects of a night whose tables are written; see `name_known_objects`."""
+    future = name_known_objects.submit(folder, known, earlier, settings)
+    (residuals,) = results(Stage.PUBLISH, [future])
+    return residuals
+
+
+def publish(
+    destination: Destination,
+    sources: pa.Table,
+    verdicts: Mapping[str, Sequence[SensorVerdict]],
+    residuals: Mapping[str, Sequence[SensorResidual]],
+) -> Summary:
+    """Put all nights in place, and return what they hold.
+
+    `verdicts` and `residuals` are of the sensors of each night.
+    """
+    summary = summarise(destination.dataset, destination.staged, verdicts, residuals)
+    publish_nights(destination.dataset, destination.staged, sources, destination.replace)
     return summary

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.datasets.night_files import count_rows, read_columns
-from epipole.schemas.rejects import Reason
+from epipole.schemas.rejects import NameStatus, Reason
 from epipole.tasks.check.check_sensors import SensorVerdict
+from epipole.tasks.name.sensor_residuals import SensorResidual
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,11 @@ class SensorSummary:
 
 @dataclass(frozen=True)
 class Summary:
-    """Counts of what was published; `rejects` by reason, `faults` of sensors, a sentence each."""
+    """Counts of what was published.
+
+    `names` are the objects by what is known of their names; empty without a catalogue. `faults` of
+    sensors and `residuals` of their known objects are a sentence each.
+    """
 
     dataset: str
     nights: list[str]
@@ -52,8 +58,10 @@ class Summary:
     epochs: int
     objects: int
     positions: int
+    names: dict[str, int]
     rejects: dict[str, int]
     faults: list[str]
+    residuals: list[str]
     by_sensor: list[SensorSummary]
 
     def as_dict(self) -> dict[str, Any]:
@@ -70,10 +78,18 @@ class Summary:
             f"objects     {self.objects:,} in {self.detections:,} detections, "
             f"{many(self.tracklets, 'tracklet')}",
             f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
+            *self._names(),
             *[f"fault       {fault}" for fault in self.faults],
             *self._left_out(),
             f"dataset     {self.dataset}",
         ]
+
+    def _names(self) -> list[str]:
+        """Return what is known of the objects' names, and of the sensors by known objects."""
+        if not self.names:
+            return []
+        counts = ", ".join(f"{count:,} {status}" for status, count in self.names.items())
+        return [f"names       {counts}", *[f"  {residual}" for residual in self.residuals]]
 
     def _left_out(self) -> list[str]:
         """Return what was left out, by reason; nothing where nothing was."""
@@ -94,14 +110,19 @@ _COLUMNS = {
     "epochs": ["epoch"],
     "positions": ["object_id"],
     "sources": ["sha256"],
+    "identifications": ["status", "catalogue"],
     "rejects": ["reason", "count"],
 }
 
 
 def summarise(
-    dataset: str, staged: Mapping[str, Path], verdicts: Sequence[SensorVerdict] = ()
+    dataset: str,
+    staged: Mapping[str, Path],
+    verdicts: Mapping[str, Sequence[SensorVerdict]] = MappingProxyType({}),
+    residuals: Mapping[str, Sequence[SensorResidual]] = MappingProxyType({}),
 ) -> Summary:
-    """Return the summary of staged nights, and of the sensors that are at fault."""
+    """Return the summary of staged nights, of the sensors that are at fault in each, and of the
+    residuals of their known objects."""
     tables = {
         name: pa.concat_tables([read_columns(folder, name, columns) for folder in staged.values()])
         for name, columns in _COLUMNS.items()
@@ -120,13 +141,36 @@ def summarise(
         epochs=pc.count_distinct(tables["epochs"]["epoch"]).as_py(),
         objects=pc.count_distinct(tables["positions"]["object_id"]).as_py(),
         positions=tables["positions"].num_rows,
+        names=_names(tables["identifications"]),
         rejects=by_reason(tables["rejects"]),
-        faults=[str(verdict) for verdict in verdicts if verdict.is_faulty],
+        faults=_by_night(
+            {
+                night: [verdict for verdict in of_night if verdict.is_faulty]
+                for night, of_night in verdicts.items()
+            }
+        ),
+        residuals=_by_night(residuals),
         by_sensor=[
             _of_sensor(frames.filter(pc.field("sensor_id") == name), tables["tracklets"], name)
             for name in sorted(pc.unique(frames["sensor_id"]).to_pylist())
         ],
     )
+
+
+def _names(identifications: pa.Table) -> dict[str, int]:
+    """Return the objects by status; none where there is no catalogue."""
+    held = identifications.filter(pc.is_valid(identifications["catalogue"]))["status"]
+    counts = dict(zip(*(c.to_pylist() for c in pc.value_counts(held).flatten()), strict=True))
+    return {status.value: counts[status] for status in NameStatus if status in counts}
+
+
+def _by_night(sentences: Mapping[str, Sequence[object]]) -> list[str]:
+    """Return the sentences of all nights; they name the night where there are several."""
+    return [
+        f"{night}: {sentence}" if len(sentences) > 1 else str(sentence)
+        for night, of_night in sentences.items()
+        for sentence in of_night
+    ]
 
 
 def _of_sensor(frames: pa.Table, tracklets: pa.Table, sensor_id: str) -> SensorSummary:

@@ -1,4 +1,4 @@
-"""The work of a run: its sensors, the spans with frames of each, and the places of their parts."""
+"""The work of a night: its sensors, their spans with frames, and the places of their parts."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -21,7 +21,7 @@ Spans = dict[Sensor, list[Span]]
 
 
 class Work(NamedTuple):
-    """The work of a run.
+    """The work of a night.
 
     A round is one pass from `track` to `check`. After a correction of clocks comes another round.
     """
@@ -56,38 +56,35 @@ class Work(NamedTuple):
         }
 
 
-def plan_spans(frames: OrderedFrames, nights: Sequence[str]) -> tuple[Spans, pa.Table]:
-    """Return the spans with frames, by sensor: of these nights, and one before and after each.
+def plan_spans(frames: OrderedFrames, night: str) -> tuple[Spans, pa.Table]:
+    """Return the spans with frames, by sensor: of a night, and one before and after it.
 
     A sensor without a calibration has no spans, but a row of the `rejects` that are returned.
 
     Raises
     ------
     LogError
-        If no sensor has a calibration.
+        If no sensor with frames of the night has a calibration.
     """
     calibrated = set(pc.unique(frames.cameras["sensor_id"]).to_pylist())
-    days = [int(np.datetime64(night, "D").astype(np.int64)) for night in nights]
+    day = day_of(night)
     spans: Spans = {}
     rejects = []
     for number, sensor_id in enumerate(frames.sensors):
         time_ns = frames.time_ns[number]
-        wanted = _wanted(np.unique(time_ns // SPAN_NS), days)
+        wanted = _wanted(np.unique(time_ns // SPAN_NS), day)
         if wanted and sensor_id in calibrated:
             spans[Sensor(number, sensor_id)] = wanted
-        elif wanted:
+        elif len(own := time_ns[time_ns // DAY_NS == day]):
             rejects.append(
                 reject_rows(
-                    Reason.NO_CALIBRATION,
-                    sensor_id=sensor_id,
-                    time=time_ns[:1],
-                    count=[len(time_ns)],
+                    Reason.NO_CALIBRATION, sensor_id=sensor_id, time=own[:1], count=[len(own)]
                 )
             )
     if not spans:
         raise LogError(
             f"{', '.join(log.name for log in frames.sources)}: no sensor has a calibration "
-            f"({', '.join(frames.sensors)}); {_why_not(frames.rejects)}"
+            f"({', '.join(frames.sensors)}) on {night}; {_why_not(frames.rejects)}"
         )
     return spans, concat(REJECTS, rejects)
 
@@ -101,8 +98,17 @@ def _why_not(rejects: pa.Table) -> str:
     return "record foxglove.CameraCalibration with the sensor's id as frame_id"
 
 
-def _wanted(numbers: np.ndarray, days: Sequence[int]) -> list[Span]:
-    """Return the spans of these days, and one before and after: no track is cut at midnight."""
-    day = (numbers[:, None] + [-1, 0, 1]) * SPAN_NS // DAY_NS
-    wanted = numbers[np.isin(day, days).any(axis=1)]
-    return [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in wanted.tolist()]
+def spans_of_night(spans: Sequence[Span], night: str) -> list[Span]:
+    """Return the spans that belong to a night."""
+    return [span for span in spans if span.start_ns // DAY_NS == day_of(night)]
+
+
+def day_of(night: str) -> int:
+    """Return the number of days from 1970 to a UTC date."""
+    return int(np.datetime64(night, "D").astype(np.int64))
+
+
+def _wanted(numbers: np.ndarray, day: int) -> list[Span]:
+    """Return the spans of a day, and one before and after: no track is cut at midnight."""
+    near = (numbers[:, None] + [-1, 0, 1]) * SPAN_NS // DAY_NS == day
+    return [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in numbers[near.any(axis=1)].tolist()]

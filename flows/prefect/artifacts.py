@@ -101,7 +101,7 @@ def as_markdown(summary: Summary) -> str:
         "objects": summary.objects,
         "epochs": summary.epochs,
         "positions": summary.positions,
-    }
+    } | {f"objects {status}": count for status, count in summary.names.items()}
     lines = [f"# Night {', '.join(summary.nights)}", "", *_table("what", counts)]
     if summary.faults:
         lines += [
@@ -110,6 +110,9 @@ def as_markdown(summary: Summary) -> str:
             "",
             *(f"- {as_markdown_text(fault)}" for fault in summary.faults),
         ]
+    if summary.residuals:
+        lines += ["", "Known objects, observed minus predicted:", ""]
+        lines += [f"- {as_markdown_text(residual)}" for residual in summary.residuals]
     if summary.rejects:
         lines += ["", f"Left out: {many(sum(summary.rejects.values()), 'thing')}", ""]
         lines += _table("reason", summary.rejects)

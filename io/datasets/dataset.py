@@ -99,8 +99,21 @@ def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, repl
             )
 
 
-def read_table(dataset: Where, table: str, night: str) -> pa.Table:
+def read_table(
+    dataset: Where,
+    table: str,
+    night: str,
+    columns: Sequence[str] | None = None,
+    since_ns: int | None = None,
+) -> pa.Table:
     """Return a table of a night. It has no rows where the night is missing.
+
+    Parameters
+    ----------
+    columns
+        Names of those to read; None: all.
+    since_ns
+        Rows of earlier epochs are left out. Only for a table that has epochs.
 
     Raises
     ------
@@ -108,6 +121,8 @@ def read_table(dataset: Where, table: str, night: str) -> pa.Table:
         Where its files cannot be read, or do not hold this table.
     """
     schema = TABLES[table]
+    if columns is not None:
+        schema = pa.schema([schema.field(name) for name in columns], schema.metadata)
     if (store := _store(dataset)) is not None:
         with _reading(dataset):
             parts: Sequence[Any] = [pa.BufferReader(part) for part in store.read(night, table)]
@@ -115,13 +130,23 @@ def read_table(dataset: Where, table: str, night: str) -> pa.Table:
         local_nights.recover(_folder(dataset))
         parts = sorted((_folder(dataset) / f"night={night}" / table).glob("*.parquet"))
     try:
-        rows = [conform(schema, pq.read_table(part, partitioning=None)) for part in parts]
+        rows = [
+            conform(
+                schema,
+                pq.read_table(part, partitioning=None, columns=columns, filters=_since(since_ns)),
+            )
+            for part in parts
+        ]
     except (OSError, ValueError) as error:
         raise DatasetError(
             f"{dataset}/night={night}/{table}: cannot be read ({error}); "
             "remove the folder of the night and run the night again"
         ) from error
     return pa.concat_tables([empty(schema), *rows])
+
+
+def _since(since_ns: int | None) -> pc.Expression | None:
+    return None if since_ns is None else pc.field("epoch") >= pa.scalar(since_ns, TIME)
 
 
 @contextlib.contextmanager

@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
@@ -69,6 +71,25 @@ def _writer(folder: Path, schema: pa.Schema) -> pq.ParquetWriter:
 def read_columns(night: Path, name: str, columns: Sequence[str]) -> pa.Table:
     """Return some columns of a table that `write_table` wrote."""
     return pq.read_table(night / name / PART, columns=list(columns), partitioning=None)
+
+
+def take_rows(
+    night: Path, name: str, columns: Sequence[str], rows: npt.NDArray[np.int64]
+) -> pa.Table:
+    """Return some rows of a table that `write_table` wrote; `rows` are in order."""
+    file = pq.ParquetFile(night / name / PART)
+    start, taken = 0, []
+    for group in range(file.num_row_groups):
+        end = start + file.metadata.row_group(group).num_rows
+        own = rows[(rows >= start) & (rows < end)] - start
+        if len(own):
+            taken.append(file.read_row_group(group, columns=list(columns)).take(own))
+        start = end
+    schema = TABLES[name]
+    return pa.concat_tables(
+        [pa.schema([schema.field(column) for column in columns]).empty_table(), *taken],
+        promote_options="permissive",
+    )
 
 
 def count_rows(night: Path, name: str) -> int:

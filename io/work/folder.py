@@ -1,7 +1,7 @@
-"""The work folder of a run. If the run is killed, the next run reuses its finished parts.
+"""The work folder of a night. If the run is killed, the next run reuses its finished parts.
 
 Its name has a digest of everything that its parts depend on: the logs' content, the settings, the
-nights, this program's code and the libraries that compute. So no part in it can be out of date.
+night, this program's code and the libraries that compute. So no part in it can be out of date.
 """
 
 import contextlib
@@ -25,13 +25,13 @@ _LIBRARIES = ("numba", "numpy", "polars", "pyarrow", "pyerfa", "scipy")
 
 
 @contextlib.contextmanager
-def work_folder(root: Path, nights: Sequence[str], key: str) -> Iterator[Path]:
-    """Yield the folder for these nights and this key. It is removed when the work succeeds.
+def work_folder(root: Path, night: str, key: str) -> Iterator[Path]:
+    """Yield the folder for a night and this key. It is removed when the work succeeds.
 
-    Folders of the same nights under another key are removed: they were made from other logs,
-    settings or code. The caller has claimed the nights.
+    Folders of the same night under another key are removed: they were made from other logs,
+    settings or code. The caller has claimed the night.
     """
-    name = f"work-{'-'.join([nights[0], nights[-1]])}"
+    name = f"work-{night}"
     for other in root.glob(f"{name}-*"):
         if other.name != f"{name}-{key}":
             shutil.rmtree(other, ignore_errors=True)
@@ -61,7 +61,7 @@ def work_root(dataset: str) -> Path:
     return root / hashlib.sha256(dataset.encode()).hexdigest()[:12]
 
 
-def work_key(logs: Sequence[LogSource], settings: Settings, nights: Sequence[str]) -> str:
+def work_key(logs: Sequence[LogSource], settings: Settings, night: str) -> str:
     """Return a digest of everything that results depend on.
 
     Parameters
@@ -73,7 +73,7 @@ def work_key(logs: Sequence[LogSource], settings: Settings, nights: Sequence[str
     digest = hashlib.sha256()
     logs_read = sorted(f"{log.sha256} {log.name}" for log in logs)
     catalogue = _catalogue_key(settings.identification.catalogue)
-    for part in (*logs_read, settings.key(), *nights, catalogue, code_key()):
+    for part in (*logs_read, settings.key(), night, catalogue, code_key()):
         digest.update(part.encode() + b"\0")
     return digest.hexdigest()[:16]
 

@@ -12,9 +12,9 @@ from epipole.schemas.spans import Span
 class NightParts(NamedTuple):
     """The parts and tables from which the tables of a night are made.
 
-    `spans` are the night's, in order, and `all_spans` the run's. `names` has, for the folder of
-    each span, the names of its objects in the night. `whole` has tables of the whole run:
-    `calibrations`, `sources`, and the `rejects` that belong to no span.
+    `spans` are the night's, in order; `all_spans` also has one before and after it. `names` has,
+    for the folder of each span, the names in the night of its objects. `whole` has tables that
+    belong to no span: `calibrations`, `sources`, and some of the `rejects`.
     """
 
     night: str

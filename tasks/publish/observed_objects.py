@@ -5,7 +5,7 @@ epochs at which other sensors saw the object are observations of it too. Near an
 position was solved without the tracklet, they are not.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Literal
 
@@ -53,10 +53,16 @@ def object_runs(parts: NightParts) -> pl.DataFrame:
         if any(piece.num_rows for piece in pieces):
             names = parts.names.get(span.folder, {})
             rows = to_polars(concat(schema, pieces))
-            spans.append(runs_of_views(rows.with_columns(pl.col("object_id").replace(names))))
+            spans.append(runs_of_views(_named(rows, names)))
     if not spans:
         spans = [runs_of_views(to_polars(schema.empty_table()))]
     return pl.concat(spans).sort("first", "tracklet_id")
+
+
+def _named(views: pl.DataFrame, names: Mapping[str, str]) -> pl.DataFrame:
+    """Return the views of named objects: others have a position only before or after the night."""
+    named = pl.col("object_id").replace_strict(names, default=None, return_dtype=pl.String)
+    return views.with_columns(named).drop_nulls("object_id")
 
 
 def runs_of_views(views: pl.DataFrame) -> pl.DataFrame:

@@ -13,7 +13,7 @@ import polars as pl
 from epipole.io.work.part_tables import NIGHT_TRACKLETS, SPAN_NAMES
 from epipole.io.work.parts import Parts, is_written, read_part, write_part
 from epipole.schemas.bridge import from_polars, to_polars
-from epipole.schemas.spans import Sensor, Span
+from epipole.schemas.spans import DAY_NS, Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import HOT_SUSPECTS, TRACKLET_NAMES, TRACKLET_RUNS
 from epipole.tasks.algorithms.tracking.linking.chains import chain_heads
@@ -23,7 +23,9 @@ KEY = ["frame_number", "centroid"]
 
 
 @stage_task(Stage.TRACK, "{sensor} all spans")
-def join_tracklets(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts: Parts) -> int:
+def join_tracklets(
+    sensor: Sensor, tracked: Parts, spans: Sequence[Span], night: str, parts: Parts
+) -> int:
     """Name one sensor's tracklets for the night, unless the parts exist.
 
     Parameters
@@ -32,6 +34,8 @@ def join_tracklets(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts:
         The sensor's parts of `track_span`.
     spans
         The spans of these parts, in order.
+    night
+        UTC date.
     parts
         Where the parts go: `SPAN_NAMES` of each span, and `NIGHT_TRACKLETS`.
 
@@ -44,14 +48,15 @@ def join_tracklets(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts:
     -----
     A detection belongs to the tracklet that it has in the span it lies in. A tracklet keeps its
     number of the span before, if the two share more detections than either shares with another.
-    Which tracklet it continues is taken from the span in which it begins.
+    Which tracklet it continues is taken from the span in which it begins. A tracklet that crosses
+    midnight is one in each night: its id, times and counts are of its detections in the night.
     """
     if not is_written(parts.of_night()):
-        _join(sensor, tracked, spans, parts)
+        _join(sensor, tracked, spans, night, parts)
     return read_part(parts.of_night(), "tracklets").num_rows
 
 
-def _join(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts: Parts) -> None:
+def _join(sensor: Sensor, tracked: Parts, spans: Sequence[Span], night: str, parts: Parts) -> None:
     count = 0
     before: pl.DataFrame | None = None  # the span before: its detections' tracklet numbers
     summed, linked = [], []
@@ -67,7 +72,16 @@ def _join(sensor: Sensor, tracked: Parts, spans: Sequence[Span], parts: Parts) -
         linked.append(_links(part, numbers).with_columns(span=pl.lit(k, pl.Int64)))
         summed.append(_summed(rows.filter("inside"), part).with_columns(span=pl.lit(k, pl.Int64)))
         before = rows.select(*KEY, "number")
-    _write(spans, parts, pl.concat(linked), pl.concat(summed), sensor.sensor_id)
+    own = _of_night(pl.concat(summed), spans, night)
+    _write(spans, parts, pl.concat(linked), own, sensor.sensor_id)
+
+
+def _of_night(summed: pl.DataFrame, spans: Sequence[Span], night: str) -> pl.DataFrame:
+    """Return the rows without those outside the night, where the tracklet has others."""
+    start_ns = int(np.datetime64(night, "ns").astype(np.int64))
+    own = [k for k, span in enumerate(spans) if start_ns <= span.start_ns < start_ns + DAY_NS]
+    inside = pl.col("span").is_in(own)
+    return summed.filter(inside | ~inside.any().over("number"))
 
 
 def _tracked(part: Path) -> pl.DataFrame:

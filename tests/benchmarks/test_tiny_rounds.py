@@ -27,6 +27,7 @@ TINY = {
     "false_alarms": "followed alone --frames 20",
     "identity": "--gaps 120 --seeds 1",
     "ingest": "--frames 400 --runs 1",
+    "known_objects": "--objects 6 --ages 3 --catalogue 60",
     "long_evidence": "--seeds 1 --lone 2 --minutes 0.5 --longest 600",
     "many_sensors": "ring --sensors 8",
     "night": "--shares 1 --hours 0.02",

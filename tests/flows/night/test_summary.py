@@ -15,7 +15,7 @@ from epipole.tasks.check.check_sensors import SensorVerdict
 FOUND = Summary(
     dataset="/data/out", nights=["2019-04-01"], logs=1, sensors=2, frames=1234, identified=1200,
     stars=9000, detections=8, tracklets=1, epochs=6, objects=5, positions=4, rejects={},
-    faults=[], by_sensor=[],
+    faults=[], by_sensor=[], names={}, residuals=[],
 )  # fmt: skip
 
 
@@ -73,7 +73,9 @@ def test_staged_nights_are_counted_together(tmp_path):
         sources={"sha256": ["s"]},
     )  # fmt: skip
     clocks = [SensorVerdict("a", 0.5, 0.01, "clock"), SensorVerdict("b", 0.0, 0.01)]
-    summary = summarise("/data", {"2019-04-01": first, "2019-04-02": second}, clocks)
+    summary = summarise(
+        "/data", {"2019-04-01": first, "2019-04-02": second}, {"2019-04-01": clocks}
+    )
     assert (summary.logs, summary.sensors, summary.frames) == (1, 2, 4)
     assert (summary.identified, summary.stars, summary.tracklets) == (2, 4, 3)
     assert (summary.epochs, summary.objects, summary.positions) == (2, 2, 4)

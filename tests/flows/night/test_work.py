@@ -41,7 +41,7 @@ def frames(calibrated: list[str], **hours: list[float]) -> OrderedFrames:
 
 def test_a_night_has_one_more_span_before_and_after():
     found = frames(["a"], a=[-1.0, -0.4, 0.1, 0.2, 12.0, 24.2, 24.6])
-    spans, rejects = plan_spans(found, [NIGHT])
+    spans, rejects = plan_spans(found, NIGHT)
     ((sensor, own),) = spans.items()
     assert (sensor.number, sensor.sensor_id) == (0, "a")
     hours = [(span.start_ns - MIDNIGHT_NS) / 3600e9 for span in own]
@@ -51,7 +51,7 @@ def test_a_night_has_one_more_span_before_and_after():
 
 
 def test_a_sensor_without_calibration_has_a_reject_and_no_spans():
-    spans, rejects = plan_spans(frames(["b"], a=[1.0, 2.0], b=[1.0]), [NIGHT])
+    spans, rejects = plan_spans(frames(["b"], a=[1.0, 2.0], b=[1.0]), NIGHT)
     assert [sensor.sensor_id for sensor in spans] == ["b"]
     (row,) = rejects.select(["sensor_id", "stage", "reason", "count"]).to_pylist()
     assert row == {
@@ -61,19 +61,19 @@ def test_a_sensor_without_calibration_has_a_reject_and_no_spans():
 
 def test_no_calibration_at_all_is_an_error_that_says_what_to_do():
     with pytest.raises(LogError, match=r"no sensor has a calibration \(a\).*frame_id"):
-        plan_spans(frames([], a=[1.0]), [NIGHT])
+        plan_spans(frames([], a=[1.0]), NIGHT)
 
 
 def test_invalid_calibrations_are_named_where_there_are_no_others():
     found = frames([], a=[1.0])
     invalid = reject_rows(Reason.FOLDED_IMAGE, sensor_id="a", time=[0], count=[1])
     with pytest.raises(LogError, match=r"those in the log are invalid: folded_image: .*D folds"):
-        plan_spans(found._replace(rejects=invalid), [NIGHT])
+        plan_spans(found._replace(rejects=invalid), NIGHT)
 
 
 def test_neighbours_are_worked_on_together():
     found = frames(["a", "b"], a=[1.0, 2.0], b=[1.0, 2.0])
-    spans, _ = plan_spans(found, [NIGHT])
+    spans, _ = plan_spans(found, NIGHT)
     work = Work(found.folder, WorkFolder(Path("/nowhere")), spans, found.cameras, {})
     order = [(sensor.sensor_id, span.start_ns % DAY_NS) for sensor, span in work.by_span()]
     one, two = 2 * SPAN_NS, 4 * SPAN_NS

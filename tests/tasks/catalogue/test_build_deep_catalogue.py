@@ -6,7 +6,7 @@ import pytest
 from epipole.io.catalogues.gaia import read_gaia
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
-from epipole.schemas.star_catalogue import UNKNOWN_MOTION_MAS_YR, label_of
+from epipole.schemas.catalogues.star_catalogue import UNKNOWN_MOTION_MAS_YR, label_of
 from epipole.tasks.algorithms.catalogue.star_catalogue import places_at
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.sky import unit_from_radec
