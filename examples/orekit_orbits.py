@@ -29,6 +29,7 @@ from org.hipparchus.geometry.euclidean.threed import Vector3D
 from org.hipparchus.optim.nonlinear.vector.leastsquares import LevenbergMarquardtOptimizer
 from org.orekit.bodies import AnalyticalSolarPositionProvider, OneAxisEllipsoid
 from org.orekit.data import DataContext, DataSource, DirectoryCrawler
+from org.orekit.errors import OrekitException
 from org.orekit.estimation.leastsquares import BatchLSEstimator
 from org.orekit.estimation.measurements import PV, AngularRaDec, GroundStation, ObservableSatellite
 from org.orekit.files.ccsds.ndm import ParserBuilder
@@ -221,7 +222,11 @@ def main(folder):
     """Print the orbit of each object."""
     give_data()
     for path in sorted(Path(folder).glob("*.tdm")):
-        epoch, state, cov, chi2, freedom = fit(half_hour(read(path)))
+        try:
+            epoch, state, cov, chi2, freedom = fit(half_hour(read(path)))
+        except OrekitException as error:
+            print(f"{path.stem}: {error.getMessage()}")
+            continue
         print(f"{path.stem} at {epoch}: chi2 {chi2:.0f} of {freedom} degrees of freedom")
         for name, value, sigma in zip(AXES, state, np.sqrt(np.diag(cov)), strict=True):
             print(f"  {name:8} {value:12.4f} +- {sigma:.4f}")
