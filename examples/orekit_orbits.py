@@ -31,7 +31,14 @@ from org.orekit.bodies import AnalyticalSolarPositionProvider, OneAxisEllipsoid
 from org.orekit.data import DataContext, DataSource, DirectoryCrawler
 from org.orekit.errors import OrekitException
 from org.orekit.estimation.leastsquares import BatchLSEstimator
-from org.orekit.estimation.measurements import PV, AngularRaDec, GroundStation, ObservableSatellite
+from org.orekit.estimation.measurements import (
+    PV,
+    AngularRaDec,
+    EstimatedMeasurementBase,
+    GroundStation,
+    ObservableSatellite,
+)
+from org.orekit.estimation.measurements.modifiers import OutlierFilter
 from org.orekit.files.ccsds.ndm import ParserBuilder
 from org.orekit.forces.gravity import J2OnlyPerturbation, ThirdBodyAttraction
 from org.orekit.frames import FramesFactory, TopocentricFrame
@@ -46,6 +53,8 @@ from org.orekit.utils import IERSConventions, ParameterDriver, PVCoordinates
 GM, SUN_GM, J2 = 398600.4418e9, 1.32712440018e20, 1.08262668e-3
 EARTH_M, FLATTENING, ARCSEC = 6378136.3, 1 / 298.257223563, np.pi / 648000
 LONGEST_S = 1800.0  # of an arc: the Moon, left out, then moves a geostationary object by 3 m
+GATE_SIGMA = 5.0  # directions that are farther off after a first fit are left out
+REJECTED = EstimatedMeasurementBase.Status.REJECTED
 AXES = ("x_km", "y_km", "z_km", "vx_km_s", "vy_km_s", "vz_km_s")
 
 
@@ -195,7 +204,8 @@ def measurements(rows, epoch, earth):
         station = GroundStation(TopocentricFrame(earth, point, str(name)))
         noise = [sigmas[0] / np.cos(angles[1]), sigmas[1]]
         frame = FramesFactory.getEME2000()
-        yield AngularRaDec(station, frame, date, angles, noise, [1.0, 1.0], one), shared[name]
+        direction = AngularRaDec(station, frame, date, angles, noise, [1.0, 1.0], one)
+        yield direction, shared[name]
 
 
 def fit(rows):
@@ -205,17 +215,23 @@ def fit(rows):
     epoch = sorted(rows.date)[len(rows.date) // 2]
     orbit = moved(first_guess(rows, epoch), epoch, earth)
     estimator = BatchLSEstimator(LevenbergMarquardtOptimizer(), orbit)
-    for measurement, shared in measurements(rows, epoch, earth):
+    made = list(measurements(rows, epoch, earth))
+    for measurement, shared in made:
         measurement.addModifier(shared)
         estimator.addMeasurement(measurement)
     estimator.setParametersConvergenceThreshold(1e-3)
     estimator.setMaxIterations(25)
     estimator.setMaxEvaluations(50)
+    estimator.estimate()
+    for measurement, _ in made:
+        measurement.addModifier(OutlierFilter(-1, GATE_SIGMA))  # -1: from the start on
     found = estimator.estimate()[0].getInitialState().getPVCoordinates()
     state = np.array([*found.getPosition().toArray(), *found.getVelocity().toArray()])
     cov = np.array(estimator.getPhysicalCovariances(1e-15).getData())[:6, :6]
     chi2 = estimator.getOptimum().getCost() ** 2
-    return epoch, state / 1e3, cov / 1e6, chi2, 2 * len(rows.date) - 6
+    used = sum(one.getStatus() != REJECTED for one in estimator.getLastEstimations().values())
+    used -= len(set(rows.sensor))  # what was known before
+    return epoch, state / 1e3, cov / 1e6, chi2, 2 * used - 6
 
 
 def main(folder):
