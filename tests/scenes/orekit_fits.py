@@ -1,6 +1,12 @@
-"""Orbits that Orekit fits to the exported messages of a night, against the truth of its log."""
+"""Orbits that Orekit fits to the exported messages of a night, against the truth of its log.
 
+python tests/scenes/orekit_fits.py LOG DATASET MESSAGES     # prints a table as JSON
+"""
+
+import io
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,18 +23,13 @@ from epipole.tasks.evaluate.locate_objects import locate_objects
 from epipole.tasks.evaluate.match_points import true_objects, with_truth
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "orekit_orbits.py"
-ENOUGH_S, ENOUGH_SENSORS = 30.0, 2  # of an arc: a shorter one hardly tells a velocity
+ENOUGH_S, ENOUGH_SENSORS = 10.0, 2  # what a fit needs: less tells no velocity, or no distance
 
 
-def load_orekit() -> SimpleNamespace:
-    """Return the example's functions; Java runs from here on, with Orekit's data."""
-    example = SimpleNamespace(**runpy.run_path(str(EXAMPLE)))
-    example.give_data()
-    return example
-
-
-def orekit_fits(log: Path, dataset: Path, messages: Path, example: SimpleNamespace) -> pl.DataFrame:
+def orekit_fits(log: Path, dataset: Path, messages: Path) -> pl.DataFrame:
     """Return a row for each object of a night: how Orekit's fit went, and its errors.
+
+    It runs in a process of its own, because Java takes over a process's signals.
 
     Parameters
     ----------
@@ -42,22 +43,31 @@ def orekit_fits(log: Path, dataset: Path, messages: Path, example: SimpleNamespa
     Returns
     -------
     DataFrame
-        `enough`: whether the arc is. `converged`. `chi2` and `freedom`. `nees`: the squared error
-        over the covariance, over 6. `km`: the error of the position. Null without a fit.
+        `object`, `directions`, `enough`: whether it has sensors and seconds enough, `converged`;
+        `chi2` and its degrees of `freedom`, `nees`: the squared error over the covariance, over 6,
+        and `km`: the error of the position, all null without a fit.
     """
+    command = [sys.executable, __file__, str(log), str(dataset), str(messages)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
+    return pl.read_json(io.BytesIO(done.stdout), infer_schema_length=None)
+
+
+def main(log: Path, dataset: Path, messages: Path) -> None:
+    """Print the table of `orekit_fits`."""
     (night,) = (path.name.removeprefix("night=") for path in dataset.glob("night=*"))
     if not messages.exists():
         export(Message.tdm, str(dataset), night, messages)
+    example = SimpleNamespace(**runpy.run_path(str(EXAMPLE)))
+    example.give_data()
     truth, shown = read_truth(log), objects_shown(log, dataset)
     rows = []
     for path in sorted(messages.glob("*.tdm")):
         seen = example.half_hour(example.read(path))
-        arc_s = max(date.durationFrom(min(seen.date)) for date in seen.date)
-        sensors = len(set(seen.sensor))
-        row = {"object": path.stem, "directions": len(seen.date), "sensors": sensors, "arc_s": arc_s}
-        row["enough"] = arc_s >= ENOUGH_S and sensors >= ENOUGH_SENSORS
+        arc_s, sensors = max(seen.date).durationFrom(min(seen.date)), len(set(seen.sensor))
+        enough = arc_s >= ENOUGH_S and sensors >= ENOUGH_SENSORS
+        row = {"object": path.stem, "directions": len(seen.date), "enough": enough}
         rows.append(row | fitted(example, seen, truth, shown[path.stem]))
-    return pl.DataFrame(rows, infer_schema_length=None)
+    print(pl.DataFrame(rows, infer_schema_length=None).write_json())
 
 
 def objects_shown(log: Path, dataset: Path) -> dict[str, int]:
@@ -80,3 +90,7 @@ def fitted(example: SimpleNamespace, seen: Any, truth: Truth, shown: int) -> dic
     nees = float(squared_normalised_errors(error[None], cov[None])[0]) / 6
     km = float(np.linalg.norm(error[:3]))
     return {"chi2": chi2, "freedom": freedom, "nees": nees, "km": km, "converged": True}
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))
