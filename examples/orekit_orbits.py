@@ -6,6 +6,7 @@
     python examples/orekit_orbits.py messages/
 
 What all directions of a sensor share (in the TDM's comments) is fitted with its sigma as prior.
+Nothing is downloaded.
 """
 
 import re
@@ -69,7 +70,7 @@ class LeapSeconds:
 
 
 def give_data():
-    """Give Orekit leap seconds and the Earth's orientation, of a package: nothing is downloaded."""
+    """Give Orekit the leap seconds and the Earth's orientation of astropy-iers-data."""
     TimeScalesFactory.addUTCTAIOffsetsLoader(LeapSeconds())
     folder = File(str(Path(astropy_iers_data.IERS_A_FILE).parent))
     DataContext.getDefault().getDataProvidersManager().addProvider(DirectoryCrawler(folder))
@@ -161,7 +162,9 @@ def rows_of(segment, folder):
 def half_hour(rows):
     """Return the rows of the half hour that has most of them."""
     t = np.array([date.durationFrom(rows.date[0]) for date in rows.date])
-    begin = t[np.argmax([np.sum((t >= a) & (t <= a + LONGEST_S)) for a in t])]
+    begins = np.sort(t)
+    count = np.searchsorted(begins, begins + LONGEST_S, "right") - np.arange(len(t))
+    begin = begins[np.argmax(count)]
     return Rows(*(column[(t >= begin) & (t <= begin + LONGEST_S)] for column in rows))
 
 
