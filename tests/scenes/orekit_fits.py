@@ -1,6 +1,6 @@
 """Orbits that Orekit fits to the exported messages of a night, against the truth of its log.
 
-python tests/scenes/orekit_fits.py LOG DATASET MESSAGES     # prints a table as JSON
+python tests/scenes/orekit_fits.py LOG DATASET MESSAGES [medians]     # prints a table as JSON
 """
 
 import io
@@ -26,7 +26,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "orekit_orbits.py"
 ENOUGH_S, ENOUGH_SENSORS = 10.0, 2  # what a fit needs: less tells no velocity, or no distance
 
 
-def orekit_fits(log: Path, dataset: Path, messages: Path) -> pl.DataFrame:
+def orekit_fits(log: Path, dataset: Path, messages: Path, medians: bool = False) -> pl.DataFrame:
     """Return a row for each object of a night: how Orekit's fit went, and its errors.
 
     It runs in a process of its own, because Java takes over a process's signals.
@@ -39,6 +39,8 @@ def orekit_fits(log: Path, dataset: Path, messages: Path) -> pl.DataFrame:
         The dataset of this log, of one night.
     messages
         The folder for the exported messages; those that it has are used.
+    medians
+        Whether all directions have the median sigmas of the messages' comments, not their own.
 
     Returns
     -------
@@ -48,11 +50,12 @@ def orekit_fits(log: Path, dataset: Path, messages: Path) -> pl.DataFrame:
         and `km`: the error of the position, all null without a fit.
     """
     command = [sys.executable, __file__, str(log), str(dataset), str(messages)]
+    command += ["medians"] if medians else []
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE)
     return pl.read_json(io.BytesIO(done.stdout), infer_schema_length=None)
 
 
-def main(log: Path, dataset: Path, messages: Path) -> None:
+def main(log: Path, dataset: Path, messages: Path, *medians: Path) -> None:
     """Print the table of `orekit_fits`."""
     (night,) = (path.name.removeprefix("night=") for path in dataset.glob("night=*"))
     if not messages.exists():
@@ -62,7 +65,10 @@ def main(log: Path, dataset: Path, messages: Path) -> None:
     truth, shown = read_truth(log), objects_shown(log, dataset)
     rows = []
     for path in sorted(messages.glob("*.tdm")):
-        seen = example.half_hour(example.read(path))
+        seen = example.read(path)
+        if not medians:
+            seen = example.with_own_sigmas(seen, path.stem, dataset)
+        seen = example.half_hour(seen)
         arc_s, sensors = max(seen.date).durationFrom(min(seen.date)), len(set(seen.sensor))
         enough = arc_s >= ENOUGH_S and sensors >= ENOUGH_SENSORS
         row = {"object": path.stem, "directions": len(seen.date), "enough": enough}
