@@ -16,6 +16,7 @@ import epipole.tasks  # noqa: F401  before EPIPOLE_CACHE is set, so that kernels
 
 sys.path.append(str(Path(__file__).parent))  # for the helpers in tests/scenes
 
+ROOT = Path(__file__).parents[1]
 START_S = 60  # longest start of the S3 server
 
 # Before anything imports prefect: these runs must not use the Prefect of the developer.
@@ -55,6 +56,16 @@ def night_dataset(prefect, night_log, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("dataset") / "out"
     nightly([str(night_log)], str(out))
     return out
+
+
+@pytest.fixture(scope="session")
+def example(prefect, tmp_path_factory) -> Path:
+    """Return a folder that holds out/, made by the README's first command."""
+    from epipole.flows.nightly import nightly
+
+    folder = tmp_path_factory.mktemp("example")
+    nightly([str(ROOT / "examples" / "four_sensor_geo.mcap")], str(folder / "out"))
+    return folder
 
 
 @pytest.fixture(scope="session")

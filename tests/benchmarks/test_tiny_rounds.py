@@ -47,6 +47,7 @@ TINY = {
 }
 # Rounds with other tools, of packages that CI does not install.
 WITH_PACKAGES = {
+    ("orekit_orbits", "orekit_jpype"): "",
     ("epipolar", "matplotlib"): "--scenes 2 --out {folder}",
     ("track_linking", "laptrack"): "--seeds 1 --rivals",
 }
@@ -91,7 +92,8 @@ def write_list(path: Path) -> None:
 
 
 def test_the_table_names_every_benchmark():
-    assert sorted(TINY) == sorted(path.stem[len("bench_") :] for path in HERE.glob("bench_*.py"))
+    named = {*TINY, *(name for name, _ in WITH_PACKAGES)}
+    assert sorted(named) == sorted(path.stem[len("bench_") :] for path in HERE.glob("bench_*.py"))
 
 
 @pytest.mark.parametrize("name", TINY)
@@ -107,5 +109,5 @@ def test_a_tiny_round_ends(name, play, tmp_path, capsys):
 
 @pytest.mark.parametrize(("name", "package"), WITH_PACKAGES)
 def test_a_tiny_round_with_other_packages_ends(name, package, play):
-    pytest.importorskip(package, reason=f"{package} is of the extra bench")
+    pytest.importorskip(package, reason=f"{package} is of an extra")
     play(name, WITH_PACKAGES[name, package])

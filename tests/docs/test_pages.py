@@ -73,6 +73,17 @@ def test_the_arcs_of_the_page_about_orbits_are_found(example):
     assert arcs["magnitude"].is_between(5, 12).all()
 
 
+def test_sql_finds_the_same_arcs_and_keeps_nanoseconds(example):
+    pytest.importorskip("duckdb", minversion="2.0", reason="duckdb keeps nanoseconds from 2.0 on")
+    by_polars, by_sql = {}, {}
+    exec(code("docs/orbits.md", "read", f"{example}/out/"), by_polars)
+    exec(code("docs/orbits.md", "duckdb", f"{example}/out/"), by_sql)
+    rows = by_sql["arcs"].fetchall()
+    assert [row[:3] for row in rows] == [row[:3] for row in by_polars["arcs"].iter_rows()]
+    last = by_polars["observations"].collect()["time"].dt.epoch("ns").max()
+    assert by_sql["observations"].aggregate("epoch_ns(max(time))").fetchall() == [(last,)]
+
+
 def test_the_questions_have_answers(night_dataset):
     names: dict = {}
     exec(code("docs/tables.md", "questions", f"{night_dataset}/"), names)
