@@ -309,6 +309,13 @@ TRUE_POINTS = schema(
         column("centroid", pa.int32(), doc="Index in the arrays of the frame's message."),
         column("kind", pa.int8(), doc="0 star, 1 object, 2 false point."),
         column("source", I64, doc="Star number, object index, or -1."),
+        column(
+            "magnitude",
+            F64,
+            unit="mag",
+            null=True,
+            doc="V as the sensor should see it; null where the truth does not tell.",
+        ),
     ],
 )
 

@@ -35,7 +35,7 @@ from epipole.schemas.tables import TABLES
 # The time column that decides to which night a row belongs, where it is not `time`. Calibrations
 # and sources belong to a whole night.
 _NIGHT_COLUMN = {"tracklets": "start_time"}
-_WHOLE_NIGHT = {"calibrations", "sources"}
+_WHOLE_NIGHT = {"calibrations", "identifications", "sources"}
 
 
 Where = Path | str

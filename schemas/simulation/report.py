@@ -219,6 +219,24 @@ class Report:
         definition="Standard error of observation_nees_mean. Errors that all frames of a sensor "
         "share are not in it.",
     )
+    magnitudes: int | None = _measure(
+        "observations",
+        "magnitudes",
+        definition="Observations of true objects with a magnitude, where the truth tells it.",
+    )
+    magnitude_error_median: float | None = _measure(
+        "observations",
+        "magnitude error, median",
+        "mag",
+        definition="Median size of the error of these magnitudes.",
+    )
+    magnitude_nees_mean: float | None = _measure(
+        "observations",
+        "magnitude error over sigma, squared, mean (expected: 1)",
+        "number",
+        definition="Mean over the true objects of the mean squared error over variance of their "
+        "magnitudes.",
+    )
 
     states: int | None = _measure(
         "states",
@@ -305,6 +323,7 @@ def _text(value: Any, style: str) -> str:
         "arcsec": "{:.2f} arcsec",
         "km": "{:.4f} km",
         "bare": "{:.4f}",
+        "mag": "{:.3f} mag",
         "number": "{:.2f}",
     }[style]
     return form.format(value)

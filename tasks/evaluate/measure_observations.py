@@ -62,7 +62,26 @@ def measure_observations(
     seen, of_object = observations.filter(pa.array(right)), shown[right]
     nees = _squared_errors(seen, of_object, truth)
     mean, sigma = mean_of_group_means(of_object, nees / AXES)
-    return measures | {"observation_nees_mean": mean, "observation_nees_mean_sigma": sigma}
+    measures |= {"observation_nees_mean": mean, "observation_nees_mean_sigma": sigma}
+    return measures | _magnitudes(seen, of_object, points)
+
+
+def _magnitudes(seen: pa.Table, of_object: Indices, points: pl.DataFrame) -> Measures:
+    """Return the errors of magnitudes, where the truth tells them."""
+    rows = to_polars(seen.select([*POINT, "magnitude", "magnitude_sigma"]))
+    true = points.select(*POINT, true="magnitude")
+    rows = rows.join(true, on=POINT, how="left", maintain_order="left")
+    error = (rows["magnitude"] - rows["true"]).cast(pl.Float64).to_numpy()
+    sigma = rows["magnitude_sigma"].cast(pl.Float64).to_numpy()
+    known = np.isfinite(error / sigma)
+    if not known.any():
+        return {}
+    nees, _ = mean_of_group_means(of_object[known], (error[known] / sigma[known]) ** 2)
+    return {
+        "magnitudes": int(known.sum()),
+        "magnitude_error_median": float(np.median(np.abs(error[known]))),
+        "magnitude_nees_mean": nees,
+    }
 
 
 def _squared_errors(seen: pa.Table, of_object: Indices, truth: Truth) -> Array:

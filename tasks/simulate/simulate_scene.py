@@ -111,6 +111,7 @@ def true_tables(sensor_id: str, exposed: Exposures) -> tuple[pa.Table, pa.Table]
             "centroid": (np.arange(len(first)) - first).astype(np.int32),
             "kind": exposed.kind,
             "source": exposed.source,
+            "magnitude": exposed.magnitude,
         },
     )
     return frames, points

@@ -45,7 +45,14 @@ def little_truth(n_frames: int = 1) -> Truth:
     ]
     shown = [(STAR, 77), (OBJECT, 0), (OBJECT, 1)]
     points = [
-        {"sensor_id": s, "frame_number": i, "centroid": k, "kind": kind, "source": source}
+        {
+            "sensor_id": s,
+            "frame_number": i,
+            "centroid": k,
+            "kind": kind,
+            "source": source,
+            "magnitude": 8.0,
+        }
         for s in ("a", "b")
         for i in range(n_frames)
         for k, (kind, source) in enumerate(shown)
@@ -58,7 +65,7 @@ def little_truth(n_frames: int = 1) -> Truth:
 def little_dataset():
     """Object 0 right, 1 km and one sigma off; a ghost of object 1 and a star; one star wrong.
 
-    Two observations: one is a sigma off, the other shows a star.
+    Two observations: one is a sigma off, its magnitude two; the other shows a star.
     """
     half = {"qx": 5e-5, "qw": 1.0}  # a turn by 1e-4 rad about x
     frames = [{"sensor_id": s, "attitude_source": "stars", **QUAT, **half} for s in "ab"]
@@ -75,8 +82,9 @@ def little_dataset():
     # Where its light left, object 0 stands behind by its speed over that of light.
     seen = {"ra_deg": -math.degrees(SPEED_KM_S / 299792.458), "dec_deg": 1 / 3600}
     sigma = {"sigma_ra_arcsec": 1.0, "sigma_dec_arcsec": 1.0}
+    bright = {"magnitude": 8.1, "magnitude_sigma": 0.05}
     observations = [
-        {"object_id": "o1", "sensor_id": s, "centroid": k, **seen, **sigma}
+        {"object_id": "o1", "sensor_id": s, "centroid": k, **seen, **sigma, **bright}
         for s, k in (("a", 1), ("b", 0))
     ]
     return {

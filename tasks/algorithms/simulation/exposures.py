@@ -74,6 +74,7 @@ class Exposures:
     sigma_px: Array
     kind: npt.NDArray[np.int8]
     source: Indices
+    magnitude: Array  # without noise
 
 
 class Exposing:
@@ -289,6 +290,7 @@ class Exposing:
             sigma[order][mixed],
             spots.kind[order][mixed],
             spots.source[order][mixed],
+            spots.magnitude[order][mixed],
         )
 
 
@@ -319,5 +321,5 @@ def _nothing(
     none, whole = np.empty(0), np.empty(0, np.int64)
     return Exposures(
         frame_number, time_ns, r_km, v_km_s, attitude, np.zeros(1, np.int64),
-        none, none, none, none, np.empty(0, np.int8), whole,
+        none, none, none, none, np.empty(0, np.int8), whole, none,
     )  # fmt: skip

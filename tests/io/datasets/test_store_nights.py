@@ -28,7 +28,7 @@ from epipole.io.datasets.store_nights import store_nights
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
-WHOLE_NIGHT = ("sources", "calibrations")  # tables that are not of an instant
+WHOLE_NIGHT = ("sources", "calibrations", "identifications")  # tables that are not of an instant
 
 
 @pytest.fixture

@@ -33,6 +33,8 @@ def test_every_measure_of_a_little_night_is_what_it_is_by_hand():
         "observations": 2, "observations_of_others": 1, "observation_recall": 0.5,
         "observation_nees_mean": pytest.approx(0.5, rel=1e-4),
         "observation_nees_mean_sigma": 0.0,
+        "magnitudes": 1, "magnitude_error_median": pytest.approx(0.1),
+        "magnitude_nees_mean": pytest.approx(4.0),
         "states": 1, "states_of_nothing": 1, "states_err_km_median": pytest.approx(1.0),
         "states_nees_mean": pytest.approx(4 / 6), "states_nees_median": pytest.approx(4.0),
         "states_nees_max": pytest.approx(4.0), "states_in_99": 1.0,
