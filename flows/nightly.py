@@ -1,8 +1,8 @@
 """The nightly flow: logs of star sensors go in, a dataset of space objects comes out."""
 
-import contextlib
 import logging
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
@@ -84,8 +84,8 @@ def nightly(
     check_star_catalogue(settings.identification.catalogue)
     catalogue = read_known_objects(known) if known else None
     given = find_logs(logs, night)
-    with contextlib.ExitStack() as held:
-        run = held.enter_context(claim_nights(out, [night] if night else []))
+    # Claims are held by `with`: a signal that came while an ExitStack takes one would leave it.
+    with claim_nights(out, [night] if night else []) as run:
         frames = read(given.paths, ReadFolder(run), settings)
 
         nights = nights_of(np.concatenate([np.empty(0, np.int64), *frames.time_ns]))
@@ -93,26 +93,26 @@ def nightly(
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
         rejects = into_nights(concat(REJECTS, [given.rejects, frames.rejects]), nights)
-        staging = held.enter_context(claim_nights(out, [] if night else chosen))
         staged: dict[str, Path] = {}
         verdicts, residuals = {}, {}
-        for date in chosen:
-            if len(chosen) > 1:
-                LOGGER.info("night %s", date)
-            key = work_key(frames.sources, settings, date)
-            work = held.enter_context(work_folder(work_root(out), date, key))
-            made = make_night(frames, date, WorkFolder(work), settings)
-            earlier = EarlierNights(out, staged)
-            names = name(made.work, made.solved, date, earlier.last_views(date), settings)
-            elements, unused = choose_elements(catalogue, date, settings)
-            whole = {"sources": sources, "calibrations": made.calibrations,
-                     "rejects": concat(REJECTS, [rejects, made.rejects, unused])}  # fmt: skip
-            staged[date] = staging / f"night={date}"
-            write_night(made.work, made.solved, date, names, whole, staged[date])
-            states = earlier.last_states(date, settings)
-            residuals[date] = name_known(staged[date], elements, states, settings)
-            verdicts[date] = made.work.verdicts
-        summary = publish(Destination(out, staged, replace), sources, verdicts, residuals)
+        with claim_nights(out, [] if night else chosen) as staging, ExitStack() as kept:
+            for date in chosen:
+                if len(chosen) > 1:
+                    LOGGER.info("night %s", date)
+                key = work_key(frames.sources, settings, date)
+                work = kept.enter_context(work_folder(work_root(out), date, key))
+                made = make_night(frames, date, WorkFolder(work), settings)
+                earlier = EarlierNights(out, staged)
+                names = name(made.work, made.solved, date, earlier.last_views(date), settings)
+                elements, unused = choose_elements(catalogue, date, settings)
+                whole = {"sources": sources, "calibrations": made.calibrations,
+                         "rejects": concat(REJECTS, [rejects, made.rejects, unused])}  # fmt: skip
+                staged[date] = staging / f"night={date}"
+                write_night(made.work, made.solved, date, names, whole, staged[date])
+                states = earlier.last_states(date, settings)
+                residuals[date] = name_known(staged[date], elements, states, settings)
+                verdicts[date] = made.work.verdicts
+            summary = publish(Destination(out, staged, replace), sources, verdicts, residuals)
     LOGGER.info("published %s", ", ".join(f"{out}/night={date}" for date in chosen))
     return summary
 
