@@ -43,12 +43,9 @@ def parse_element_sets(data: bytes) -> tuple[list[ElementSet], list[Fault]]:
     Raises
     ------
     CatalogueError
-        Where the whole is no text, no JSON or no XML.
+        Where the whole is no JSON or no XML.
     """
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise CatalogueError(f"not text: {error}") from error
+    text = data.decode("utf-8-sig", "replace")  # a damaged letter costs its record at most
     found = list(_parsed(text, data))
     return (
         [each for each in found if isinstance(each, ElementSet)],
@@ -151,7 +148,7 @@ def _messages(messages: Iterable[Mapping[str, Any]]) -> Iterator[ElementSet | Fa
             yield _element_set(
                 text.get("OBJECT_NAME", ""), satellite_number, text.get("OBJECT_ID", ""), satellite
             )
-        except (KeyError, ValueError, AttributeError, OverflowError) as error:
+        except (KeyError, ValueError, AttributeError, OverflowError, TypeError) as error:
             what = f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
             yield Fault(f"message {number}", f"not an OMM: {what}")
 
@@ -163,8 +160,8 @@ def _texts(fields: Any) -> dict[str, str]:
 
 
 def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
-    """Return the fields with those that the orbit does not need, and an epoch as sgp4 reads it."""
-    unused = {
+    """Return the fields as sgp4 reads them; those that the orbit does not need have one value."""
+    unused = {  # sgp4 wants them, and refuses some values
         "CLASSIFICATION_TYPE": "U", "OBJECT_ID": "", "EPHEMERIS_TYPE": "0",
         "ELEMENT_SET_NO": "0", "REV_AT_EPOCH": "0",
     }  # fmt: skip
@@ -173,13 +170,14 @@ def _with_defaults(fields: dict[str, str]) -> dict[str, str]:
     epoch = fields["EPOCH"].removesuffix("Z")
     # sgp4 refuses the numbers above 339999, which two-line elements cannot hold.
     changed = {"EPOCH": epoch if "." in epoch else f"{epoch}.0", "NORAD_CAT_ID": "0"}
-    return unused | fields | changed
+    return fields | unused | changed
 
 
 def _element_set(title: str, number: int, cospar_id: str, satellite: Any) -> ElementSet:
     day, part = satellite.jdsatepoch, satellite.jdsatepochF
-    epoch_ns = round((day - _UNIX_EPOCH_JD) * _DAY_NS) + round(part * _DAY_NS)
-    if not (math.isfinite(day) and satellite.no_kozai > 0.0 and 0.0 <= satellite.ecco < 1.0):
-        raise ValueError("mean motion, eccentricity or epoch is out of bounds")
     elements = (day - _SGP4_EPOCH_JD + part, *(float(getattr(satellite, n)) for n in _MEAN))
+    is_orbit = satellite.no_kozai > 0.0 and 0.0 <= satellite.ecco < 1.0
+    if not (is_orbit and all(map(math.isfinite, elements))):
+        raise ValueError("mean motion, eccentricity, epoch or an angle is out of bounds")
+    epoch_ns = round((day - _UNIX_EPOCH_JD) * _DAY_NS) + round(part * _DAY_NS)
     return ElementSet(title, number, epoch_ns, elements, cospar_id)

@@ -55,7 +55,7 @@ def omm(**changed):
     [
         {"MEAN_MOTION": "fast"}, {"MEAN_MOTION": "0"}, {"MEAN_MOTION": "nan"},
         {"ECCENTRICITY": 1.5}, {"EPOCH": "yesterday"}, {"NORAD_CAT_ID": None},
-        {"MEAN_ELEMENT_THEORY": "DSST"},
+        {"MEAN_ELEMENT_THEORY": "DSST"}, {"MEAN_MOTION": "9" * 400},
     ],
 )  # fmt: skip
 def test_one_bad_message_is_told_and_the_others_are_read(bad, tmp_path):
@@ -63,6 +63,20 @@ def test_one_bad_message_is_told_and_the_others_are_read(bad, tmp_path):
     known = read_known_objects(write(tmp_path / "a.json", text))
     assert [each.number for each in known.sets] == [25544]
     assert [fault.where for fault in known.faults] == ["message 1", "message 3"]
+
+
+def test_what_the_orbit_does_not_need_may_be_anything(tmp_path):
+    odd = omm(
+        CLASSIFICATION_TYPE="", REV_AT_EPOCH="many", EPHEMERIS_TYPE="\u00e9", OBJECT_ID="\ud55c"
+    )
+    known = read_known_objects(write(tmp_path / "a.json", json.dumps([odd])))
+    assert [(each.number, each.cospar_id) for each in known.sets] == [(25544, "\ud55c")]
+
+
+def test_a_letter_that_is_no_text_costs_nothing_but_itself(tmp_path):
+    (tmp_path / "a.tle").write_bytes(GOOD.encode().replace(b"ZARYA", b"Z\xffRYA"))
+    (found,) = read_known_objects(str(tmp_path / "a.tle")).sets
+    assert found.name == "ISS (Z\N{REPLACEMENT CHARACTER}RYA)"
 
 
 def test_numbers_may_have_more_than_five_digits(tmp_path):
@@ -104,7 +118,7 @@ def test_what_is_no_file_is_refused(tmp_path):
     with pytest.raises(CatalogueError, match="is no file"):
         read_known_objects(str(tmp_path))
     (tmp_path / "a.bin").write_bytes(b"\xff\xfe\x00\xd8")
-    with pytest.raises(CatalogueError, match="not text"):
+    with pytest.raises(CatalogueError, match="has no element sets"):
         read_known_objects(str(tmp_path / "a.bin"))
 
 
