@@ -178,6 +178,37 @@ def test_a_publisher_killed_at_any_write_has_published_both_nights_or_none(s3, o
         assert len([p for p in s3.find(out) if NEXT_NIGHT in p]) == len(TABLES)
 
 
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.5, 0.7, 0.95])
+def test_a_store_that_refuses_a_write_ends_in_one_line_and_no_half_night(
+    s3, out, share, monkeypatch
+):
+    publish(out, night_tables(OVER_MIDNIGHT[:8]), [NIGHT])
+    storage = store_nights(out)._storage
+    limit, done = int(share * (4 * len(TABLES) + 5)), []
+
+    def refusing(work):
+        def do(*arguments, **named):
+            done.append(1)
+            if len(done) > limit:
+                raise PermissionError("the store is read-only now")
+            return work(*arguments, **named)
+
+        return do
+
+    with monkeypatch.context() as patched:
+        for name in ("put_file", "pipe_file", "cp_file"):
+            patched.setattr(storage, name, refusing(getattr(storage, name)))
+        with pytest.raises(DatasetError, match="read-only now") as caught:
+            publish(out, night_tables(OVER_MIDNIGHT, seed=5), [NIGHT, NEXT_NIGHT])
+    assert "\n" not in str(caught.value)
+    storage.invalidate_cache()
+    found = {night: counts(out, night)["frames"] for night in (NIGHT, NEXT_NIGHT)}
+    assert found in ({NIGHT: 8, NEXT_NIGHT: 0}, {NIGHT: 10, NEXT_NIGHT: 10})
+    publish(out, night_tables(OVER_MIDNIGHT), [NIGHT])
+    assert counts(out, NIGHT)["frames"] == 10
+    assert [p for p in s3.find(out) if "/.staging/" in p] == []
+
+
 def test_a_second_run_of_a_night_is_refused_and_told_of_the_first(s3, out):
     with claim_nights(out, [NIGHT, NEXT_NIGHT]):
         other = Holder(["2019-04-05"], "far", 7, "2026-01-01T00:00:00Z", "", "t")
