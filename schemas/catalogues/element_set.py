@@ -1,5 +1,6 @@
 """A published element set: the mean elements of a satellite for SGP4."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 
@@ -23,3 +24,13 @@ class ElementSet(NamedTuple):
     def is_called(self, name: str) -> bool:
         """Return whether this is its name, in any case, or its catalogue number."""
         return name.strip().upper() in (self.name.upper(), str(self.number))
+
+
+def nearest_sets(sets: Iterable[ElementSet], time_ns: int) -> list[ElementSet]:
+    """Return one set for each object: that whose epoch is nearest to a time."""
+    nearest: dict[int, ElementSet] = {}
+    for each in sets:
+        other = nearest.get(each.number)
+        if other is None or abs(each.epoch_ns - time_ns) < abs(other.epoch_ns - time_ns):
+            nearest[each.number] = each
+    return list(nearest.values())

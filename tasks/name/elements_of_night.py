@@ -1,6 +1,5 @@
 """Elements of a night: one usable element set for each object of a catalogue."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +7,7 @@ import pyarrow as pa
 
 from epipole.io.catalogues.known_objects import KnownObjects
 from epipole.schemas.bridge import concat
-from epipole.schemas.catalogues.element_set import ElementSet
+from epipole.schemas.catalogues.element_set import ElementSet, nearest_sets
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS
@@ -37,7 +36,7 @@ def elements_of_night(
     """
     middle_ns = int(np.datetime64(night, "ns").astype(np.int64)) + DAY_NS // 2
     most_ns = settings.known_objects.most_days * DAY_NS
-    nearest = _nearest(known.sets, middle_ns)
+    nearest = nearest_sets(known.sets, middle_ns)
     recent = [each for each in nearest if abs(each.epoch_ns - middle_ns) <= most_ns]
     made = ElementsOfNight(known.sha256, recent)
     states = predict(satellites_of(made.elements), np.array([middle_ns]))
@@ -55,13 +54,3 @@ def elements_of_night(
         if count
     ]
     return made._replace(sets=used), concat(REJECTS, rejects)
-
-
-def _nearest(sets: Sequence[ElementSet], time_ns: int) -> list[ElementSet]:
-    """Return one set for each object: that whose epoch is nearest to a time."""
-    nearest: dict[int, ElementSet] = {}
-    for each in sets:
-        other = nearest.get(each.number)
-        if other is None or abs(each.epoch_ns - time_ns) < abs(other.epoch_ns - time_ns):
-            nearest[each.number] = each
-    return list(nearest.values())

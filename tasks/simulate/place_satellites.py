@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from epipole.io.simulation.element_files import read_element_sets
-from epipole.schemas.catalogues.element_set import ElementSet
+from epipole.schemas.catalogues.element_set import ElementSet, nearest_sets
 from epipole.schemas.errors import SceneError
 from epipole.schemas.simulation.orbit import Orbit
 from epipole.schemas.simulation.scene import Scene
@@ -38,7 +38,7 @@ def place_satellites(scene: Scene, orbit: Orbit, t0_ns: int) -> Satellites:
     if orbit.elements is None:
         raise SceneError(f"{scene.name}: an orbit without elements has no satellites")
     middle_ns = t0_ns + round(scene.duration_s / 2 * SECOND_NS)
-    sets = _nearest(_chosen(read_element_sets(orbit.elements), orbit), middle_ns)
+    sets = nearest_sets(_chosen(read_element_sets(orbit.elements), orbit), middle_ns)
     for element_set in sets:
         _require_near(element_set, middle_ns, scene, orbit.elements)
     t_s = scene_nodes(scene)
@@ -91,16 +91,6 @@ def _chosen(sets: list[ElementSet], orbit: Orbit) -> list[ElementSet]:
             raise SceneError(f"{orbit.elements}: has no satellite {wanted}{hint}")
         chosen += [s for s in found if s not in chosen]
     return chosen
-
-
-def _nearest(sets: list[ElementSet], time_ns: int) -> list[ElementSet]:
-    """Return one set for each satellite: the one whose epoch is nearest to a time."""
-    nearest: dict[int, ElementSet] = {}
-    for element_set in sets:
-        other = nearest.get(element_set.number)
-        if other is None or abs(element_set.epoch_ns - time_ns) < abs(other.epoch_ns - time_ns):
-            nearest[element_set.number] = element_set
-    return list(nearest.values())
 
 
 def _require_near(element_set: ElementSet, time_ns: int, scene: Scene, file: str) -> None:
