@@ -1,1 +1,1 @@
-"""The command line."""
+"""The command line: the program, its options, and how it stops."""
