@@ -49,7 +49,7 @@ MADE_BY = {
     Stage.TRACK: ("tracklets",),
     Stage.SOLVE: ("epochs", "associations", "pairs", "positions", "states"),
     Stage.NAME: ("identifications",),
-    Stage.PUBLISH: ("observations", "sources", "rejects"),
+    Stage.PUBLISH: ("observations", "sources", "nights", "rejects"),
 }
 
 SCENE_PARTS = (

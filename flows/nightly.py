@@ -12,6 +12,7 @@ from prefect import flow
 
 from epipole.flows.night.earlier_nights import EarlierNights
 from epipole.flows.night.log_choice import find_logs
+from epipole.flows.night.night_rows import write_night_row
 from epipole.flows.night.parameters import Night, night_asked, run_name
 from epipole.flows.night.stages import (
     Destination,
@@ -28,7 +29,8 @@ from epipole.flows.night.stages import (
     track,
     write_night,
 )
-from epipole.flows.night.summary import Summary, by_reason
+from epipole.flows.night.summary import Summary, by_reason, many, summarise
+from epipole.flows.night.unchanged import unchanged_nights
 from epipole.flows.night.work import Work, plan_spans
 from epipole.flows.prefect.page import shown_on_page
 from epipole.flows.prefect.runners import runner_asked
@@ -38,12 +40,14 @@ from epipole.io.datasets.dataset import (
     check_folder,
     check_sources,
     claim_nights,
+    night_place,
     nights_of,
 )
-from epipole.io.work.folder import work_folder, work_key, work_root
+from epipole.io.work.folder import work_folder, work_root
 from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder
+from epipole.io.work.recipe import logs_key, recipe_of
 from epipole.schemas.bridge import concat
-from epipole.schemas.errors import LogError
+from epipole.schemas.errors import LogError, NoFramesError
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.publish.write_tables import into_nights, source_table
@@ -61,6 +65,7 @@ def nightly(
     night: Night = None,
     replace: bool = False,
     known: str | None = None,
+    again: bool = False,
 ) -> Summary:
     """Turn logs into a dataset.
 
@@ -75,6 +80,7 @@ def nightly(
         replace: Replace a night even if one of its earlier logs is not given.
         known: A file of element sets, to name known objects by: two-line elements, or OMM in CSV,
             JSON or XML. A path or URL. None: no object gets a name.
+        again: Make a night again even if nothing has changed since it was made.
 
     Raises:
         EpipoleError: If the work cannot be done; the dataset is then unchanged.
@@ -84,6 +90,11 @@ def nightly(
     check_star_catalogue(settings.identification.catalogue)
     catalogue = read_known_objects(known) if known else None
     given = find_logs(logs, night)
+    LOGGER.info("found %s%s", many(len(given.paths), "log"), f" of {night}" if night else "")
+    known_key = catalogue.sha256 if catalogue else None
+    if not again and (same := unchanged_nights(out, given, night, settings, known_key)):
+        LOGGER.info("unchanged: %s", ", ".join(same))
+        return summarise(out, {date: night_place(out, date) for date in same}, unchanged=True)
     # Claims are held by `with`: a signal that came while an ExitStack takes one would leave it.
     with claim_nights(out, [night] if night else []) as run:
         frames = read(given.paths, ReadFolder(run), settings)
@@ -93,16 +104,24 @@ def nightly(
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
         rejects = into_nights(concat(REJECTS, [given.rejects, frames.rejects]), nights)
+        recipe = recipe_of(
+            logs_key(
+                [(log.name, log.sha256) for log in frames.sources],
+                given.rejects["source"].to_pylist(),
+            ),
+            settings,
+            known_key,
+        )
         staged: dict[str, Path] = {}
-        verdicts, residuals = {}, {}
         with claim_nights(out, [] if night else chosen) as staging, ExitStack() as kept:
             for date in chosen:
                 if len(chosen) > 1:
                     LOGGER.info("night %s", date)
-                key = work_key(frames.sources, settings, date)
-                work = kept.enter_context(work_folder(work_root(out), date, key))
-                made = make_night(frames, date, WorkFolder(work), settings)
+                work = work_folder(work_root(out), date, recipe.work_key(date))
+                folder = WorkFolder(kept.enter_context(work))
+                made = make_night(frames, date, folder, settings)
                 earlier = EarlierNights(out, staged)
+                earlier_key = earlier.key(date, settings)
                 names = name(made.work, made.solved, date, earlier.last_views(date), settings)
                 elements, unused = choose_elements(catalogue, date, settings)
                 whole = {"sources": sources, "calibrations": made.calibrations,
@@ -110,9 +129,10 @@ def nightly(
                 staged[date] = staging / f"night={date}"
                 write_night(made.work, made.solved, date, names, whole, staged[date])
                 states = earlier.last_states(date, settings)
-                residuals[date] = name_known(staged[date], elements, states, settings)
-                verdicts[date] = made.work.verdicts
-            summary = publish(Destination(out, staged, replace), sources, verdicts, residuals)
+                residuals = name_known(staged[date], elements, states, settings)
+                faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]
+                write_night_row(staged[date], recipe, earlier_key, faults, residuals)
+            summary = publish(Destination(out, staged, replace), sources)
     LOGGER.info("published %s", ", ".join(f"{out}/night={date}" for date in chosen))
     return summary
 
@@ -157,7 +177,7 @@ def choose_nights(
     if night is None:
         return list(nights)
     if night not in nights:
-        raise LogError(f"no frames on {night} in these logs; they have {', '.join(nights)}")
+        raise NoFramesError(f"no frames on {night} in these logs; they have {', '.join(nights)}")
     return [night]
 
 

@@ -13,6 +13,10 @@ class LogError(EpipoleError):
     """A log that cannot be used: missing, not MCAP, without frames, of an unknown encoding."""
 
 
+class NoFramesError(LogError):
+    """Logs that have no frames of the night that is asked for."""
+
+
 class SettingsError(EpipoleError):
     """A settings file that cannot be read, or an invalid setting."""
 

@@ -76,3 +76,8 @@ def spans_between(start_ns: int, end_ns: int) -> list[Span]:
     """Return the spans that cover the time from one instant to another."""
     first, last = start_ns // SPAN_NS, -(-end_ns // SPAN_NS)
     return [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in range(first, last)]
+
+
+def day_of(night: str) -> int:
+    """Return the number of days from 1970 to a UTC date."""
+    return int(np.datetime64(night, "D").astype(np.int64))

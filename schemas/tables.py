@@ -469,6 +469,50 @@ SOURCES = schema(
     ],
 )
 
+# Parquet calls the items "element"; under another name a table would not be as it was written.
+TEXTS = pa.list_(pa.field("element", pa.string()))
+
+_COUNTS = [
+    ("logs", "Logs that it was made from."),
+    ("sensors", "Star sensors."),
+    ("frames", "Rows of `frames`."),
+    ("identified", "Frames with an attitude from stars."),
+    ("stars", "Rows of `stars`."),
+    ("detections", "Rows of `detections`."),
+    ("tracklets", "Rows of `tracklets`."),
+    ("epochs", "Different epochs in `epochs`."),
+    ("objects", "Different objects in `positions`."),
+    ("positions", "Rows of `positions`."),
+    ("left_out", "Sum of the counts in `rejects`."),
+]
+
+NIGHTS = schema(
+    "nights",
+    "One row: what the night was made from and with, and what it holds. Two nights of one date "
+    "whose keys are all equal are the same, byte for byte.",
+    [
+        column("logs_key", pa.string(), doc="Digest of the logs: their bytes and names."),
+        column("settings_key", pa.string(), doc="Digest of the settings."),
+        column("star_catalogue_key", pa.string(), doc="Digest of the star catalogue."),
+        column("code_version", pa.string(), doc="Version of epipole."),
+        column("code_key", pa.string(), doc="Digest of its code, and versions of libraries."),
+        column(
+            "known_key",
+            pa.string(),
+            null=True,
+            doc="Digest (sha256) of the catalogue of known objects; null without one.",
+        ),
+        column("earlier_key", pa.string(), doc="Digest of these keys of the nights before."),
+        *[column(name, I64, doc=doc) for name, doc in _COUNTS],
+        column("faults", TEXTS, doc="Sensors at fault, a sentence each."),
+        column(
+            "residuals",
+            TEXTS,
+            doc="Sensors by their known objects, a sentence each.",
+        ),
+    ],
+)
+
 REJECTS = schema(
     "rejects",
     "One row per thing that was left out, or per group of equal ones.",
@@ -505,5 +549,6 @@ TABLES: dict[str, pa.Schema] = {
     "calibrations": CALIBRATIONS,
     "pairs": PAIRS,
     "sources": SOURCES,
+    "nights": NIGHTS,
     "rejects": REJECTS,
 }

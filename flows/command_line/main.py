@@ -16,6 +16,7 @@ from epipole.flows.command_line.commands import (
     evaluate,
     export,
     info,
+    nights,
     run,
     settings,
     simulate,
@@ -84,6 +85,7 @@ def _options(
 
 for command in (
     run.run,
+    nights.nights,
     info.info,
     calibrate.calibrate,
     simulate.simulate,

@@ -11,11 +11,12 @@ Logs = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output.")]
 
 
-def check_night(night: str | None) -> None:
+def check_night(night: str | None, option: str = "--night") -> None:
+    """Raise unless a night is a date; None is no night."""
     try:
         if night is not None and datetime.date.fromisoformat(night).isoformat() != night:
             raise ValueError(night)
     except ValueError:
         raise typer.BadParameter(
-            f"{night!r} is not a date such as 2019-04-01", param_hint="--night"
+            f"{night!r} is not a date such as 2019-04-01", param_hint=option
         ) from None

@@ -9,10 +9,10 @@ import typer
 from epipole.schemas.text.shown import as_line
 
 
-def print_lines(lines: Iterable[str]) -> None:
+def print_lines(lines: Iterable[str], to_errors: bool = False) -> None:
     """Print lines that may have names from a log in them."""
     for line in lines:
-        typer.echo(as_line(line))
+        typer.echo(as_line(line), err=to_errors)
 
 
 def print_json(value: Any) -> None:

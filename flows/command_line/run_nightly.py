@@ -1,19 +1,26 @@
 """The nightly flow started from the command line, on an embedded Prefect."""
 
+import contextlib
 import logging
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from epipole.flows.night.held_nights import held_nights
+from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.progress import prepare, shown
-from epipole.flows.night.summary import Summary
+from epipole.flows.night.summary import Summary, summarise
+from epipole.flows.night.unchanged import unchanged_nights
 from epipole.io.caches.kernel_warm_up import compile_beside
 from epipole.io.catalogues.known_objects import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
-from epipole.io.datasets.dataset import check_folder
+from epipole.io.datasets.dataset import check_folder, night_place
 from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
 from epipole.schemas.choices import Runner
+from epipole.schemas.errors import EpipoleError, NoFramesError
 from epipole.schemas.settings import Settings
 
 LOGGER = logging.getLogger(__name__)
@@ -21,12 +28,12 @@ LOGGER = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The options of a run."""
+    """The options of a run, but for the nights."""
 
     settings: Path | None = None
-    night: str | None = None
     replace: bool = False
     known: str | None = None
+    again: bool = False
     runner: Runner = Runner.threads
     workers: int | None = None
     scheduler: str | None = None
@@ -34,24 +41,99 @@ class RunOptions:
     verbose: bool = False
 
 
-def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary, float]:
-    """Return what a run found, and how many seconds it took.
+@dataclass(frozen=True)
+class Ended:
+    """How the run of a night ended: with a summary, or with the reason that there is none."""
 
-    Raises
-    ------
-    EpipoleError
-        Where the work cannot be done. Settings, catalogue, output and logs are checked before
-        Prefect starts.
-    """
-    started = time.monotonic()
-    settings = read_settings(options.settings) if options.settings else Settings()
-    check_folder(out)
-    check_star_catalogue(settings.identification.catalogue)
-    if options.known is not None:
-        read_known_objects(options.known)
-    for where in logs:
-        list_logs(where)
-    with shown(options.quiet, options.verbose), compile_beside() as compiling:
+    night: str | None
+    summary: Summary | None
+    seconds: float
+    error: str | None = None  # None without a summary: the logs have no frames of the night
+
+    @property
+    def outcome(self) -> str:
+        """How it ended, in a word or three."""
+        if self.summary is None:
+            return "without frames" if self.error is None else "failed"
+        return "unchanged" if self.summary.unchanged else "made"
+
+    def line(self) -> str:
+        """Return what was made, or why nothing was."""
+        if self.summary is None:
+            return f"failed: {self.error}" if self.error is not None else "no frames"
+        if self.summary.unchanged:
+            return "unchanged"
+        return f"{self.summary.sentence()} ({self.seconds:.0f} s)"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return how it ended as JSON takes it."""
+        summary = None if self.summary is None else self.summary.as_dict()
+        return {
+            "night": self.night, "outcome": self.outcome, "seconds": round(self.seconds, 2),
+            "error": self.error, "summary": summary,
+        }  # fmt: skip
+
+
+class Nights:
+    """Runs of the nightly flow, a night each; Prefect starts with the first that needs it."""
+
+    def __init__(self, logs: list[str], out: str, options: RunOptions) -> None:
+        """Check settings, catalogues, output and logs.
+
+        Raises
+        ------
+        EpipoleError
+            Where one of them cannot be used.
+        """
+        self._logs, self._out, self._options = logs, out, options
+        self._settings = read_settings(options.settings) if options.settings else Settings()
+        check_folder(out)
+        check_star_catalogue(self._settings.identification.catalogue)
+        known = read_known_objects(options.known) if options.known is not None else None
+        self._known_key = known.sha256 if known else None
+        for where in logs:
+            list_logs(where)
+
+    def run(self, nights: Sequence[str | None]) -> Iterator[Ended]:
+        """Run the flow for each night, and yield how it ended.
+
+        A night that fails does not stop those after it; the only one raises its error.
+        """
+        options = self._options
+        with shown(options.quiet, options.verbose), contextlib.ExitStack() as started:
+            make: Callable[[str | None], Summary] | None = None
+            for night in nights:
+                begun = time.monotonic()
+                error, summary = None, None
+                try:
+                    summary = self._unchanged(night)
+                    if summary is None:
+                        make = make or self._start(started)
+                        summary = make(night)
+                except EpipoleError as failed:
+                    if len(nights) == 1:
+                        raise
+                    error = None if isinstance(failed, NoFramesError) else str(failed)
+                yield Ended(night, summary, time.monotonic() - begun, error)
+
+    def stale(self) -> list[str]:
+        """Return the published nights that a run with these settings would make otherwise."""
+        held = held_nights(self._out, self._settings, self._known_key)
+        return [night.date for night in held if night.stale]
+
+    def _unchanged(self, night: str | None) -> Summary | None:
+        """Return the summary of what need not be made again. This needs no Prefect."""
+        if self._options.again:
+            return None
+        given = find_logs(self._logs, night)
+        same = unchanged_nights(self._out, given, night, self._settings, self._known_key)
+        places = {date: night_place(self._out, date) for date in same}
+        return summarise(self._out, places, unchanged=True) if same else None
+
+    def _start(self, started: contextlib.ExitStack) -> Callable[[str | None], Summary]:
+        """Start Prefect, and return what makes a night."""
+        options = self._options
+        compiling = started.enter_context(compile_beside())
         prepare("start Prefect")
         from epipole.flows.prefect.defaults import (
             embedded_prefect,
@@ -67,10 +149,17 @@ def run_nightly(logs: list[str], out: str, options: RunOptions) -> tuple[Summary
         runner = task_runner(options.runner, options.workers, options.scheduler)
         if options.scheduler is not None:
             check_scheduler(options.scheduler)
-        with embedded_prefect():
-            from epipole.flows.nightly import nightly
+        started.enter_context(embedded_prefect())
+        from epipole.flows.nightly import nightly
 
-            flow = nightly.with_options(task_runner=runner)
+        flow = nightly.with_options(task_runner=runner)
+
+        def make(night: str | None) -> Summary:
             with lost_server_as_line():
-                summary = flow(logs, out, settings, options.night, options.replace, options.known)
-    return summary, time.monotonic() - started
+                made: Summary = flow(
+                    self._logs, self._out, self._settings, night, options.replace, options.known,
+                    options.again,
+                )  # fmt: skip
+            return made
+
+        return make

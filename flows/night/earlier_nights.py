@@ -8,13 +8,14 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from epipole.flows.night.work import day_of
+from epipole.flows.night.night_rows import key_of
 from epipole.io.datasets.dataset import nights_in, read_table
+from epipole.io.work.recipe import digest_of
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.settings import Settings
-from epipole.schemas.spans import DAY_NS, SPAN_NS
-from epipole.schemas.tables import STATES, TABLES
+from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
+from epipole.schemas.tables import NIGHTS, STATES, TABLES
 from epipole.tasks.name.followed_objects import VIEWS
 
 LOGGER = logging.getLogger(__name__)
@@ -41,12 +42,34 @@ class EarlierNights(NamedTuple):
         """Return the STATES before a night, as far back as objects are recognised."""
         start_ns = day_of(night) * DAY_NS
         since_ns = start_ns - round(settings.known_objects.earlier_h * HOUR_NS)
-        days = range(since_ns // DAY_NS, day_of(night))
-        nights = {str(np.datetime64(day, "D")) for day in days}
-        held = sorted(nights.intersection([*nights_in(self.dataset), *self.staged]))
-        return concat(STATES, [self._read("states", date, STATES.names, since_ns) for date in held])
+        return concat(
+            STATES,
+            [
+                self._read("states", date, STATES.names, since_ns)
+                for date in self._dates(night, settings)
+            ],
+        )
 
-    def _read(self, table: str, night: str, columns: Sequence[str], since_ns: int) -> pa.Table:
+    def _dates(self, night: str, settings: Settings) -> list[str]:
+        """Return the nights before a night that it depends on, at least that of the day before."""
+        back_ns = max(round(settings.known_objects.earlier_h * HOUR_NS), SPAN_NS)
+        first = (day_of(night) * DAY_NS - back_ns) // DAY_NS
+        nights = {str(np.datetime64(day, "D")) for day in range(first, day_of(night))}
+        return sorted(nights.intersection([*nights_in(self.dataset), *self.staged]))
+
+    def key(self, night: str, settings: Settings) -> str:
+        """Return a digest of what the nights were made from that the other methods read."""
+        made_from = {
+            date: self._read("nights", date, NIGHTS.names).to_pylist()
+            for date in self._dates(night, settings)
+        }
+        return digest_of(
+            f"{date} {key_of(rows[0] if rows else None)}" for date, rows in made_from.items()
+        )
+
+    def _read(
+        self, table: str, night: str, columns: Sequence[str], since_ns: int | None = None
+    ) -> pa.Table:
         """Return the end of a table of an earlier night; no rows where it cannot be read.
 
         A damaged night does not stop the nights after it.

@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from epipole.flows.night.summary import many
 from epipole.io.logs.listing import list_logs
 from epipole.io.logs.reader import read_log_times
-from epipole.schemas.errors import LogError
+from epipole.schemas.errors import LogError, NoFramesError
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
 
@@ -72,9 +71,14 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
         else:
             spans.append(logged_ns)
     if not chosen:
-        raise LogError(f"{', '.join(named)}: {_none_chosen(night, spans, broken)}")
-    LOGGER.info("found %s%s", many(len(chosen), "log"), f" of {night}" if night else "")
+        kind = NoFramesError if spans else LogError
+        raise kind(f"{', '.join(named)}: {_none_chosen(night, spans, broken)}")
     return FoundLogs(chosen, _rejects(broken, night))
+
+
+def name_of(path: str) -> str:
+    """Return the name of a log, without its folders."""
+    return path.rstrip("/").rpartition("/")[2]
 
 
 def _listed(named: Sequence[str]) -> dict[str, bool]:
@@ -104,7 +108,7 @@ def _none_chosen(night: str | None, spans: Sequence[tuple[int, int]], broken: Se
 def _rejects(broken: Sequence[str], night: str | None) -> pa.Table:
     return reject_rows(
         Reason.NO_MCAP,
-        source=[path.rpartition("/")[2] for path in broken],
+        source=[name_of(path) for path in broken],
         time=[_start_ns(night) if night else 0] * len(broken),
         count=[1] * len(broken),
     )

@@ -10,9 +10,8 @@ import itertools
 import logging
 import sys
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, Protocol
 
-from prefect.futures import PrefectFuture
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -55,9 +54,14 @@ def _send(what: str, done: int, total: int, percent: float) -> None:
     STEPS.info("%s: %d of %d", what, done, total, extra=counts)
 
 
-def results(
-    stage: Stage, futures: Sequence[PrefectFuture[Any]], part: tuple[int, int] = (0, 1)
-) -> list[Any]:
+class Future(Protocol):
+    """What a task returns that was submitted: Prefect's future."""
+
+    def result(self) -> Any:
+        """Wait for the task, and return its result."""
+
+
+def results(stage: Stage, futures: Sequence[Future], part: tuple[int, int] = (0, 1)) -> list[Any]:
     """Return the results of a stage's tasks, or of a part's, in the order of submission.
 
     So the rows of a night do not depend on which task ends first.

@@ -17,7 +17,7 @@ import pyarrow.compute as pc
 from epipole.flows.night.progress import results, step
 from epipole.flows.night.solving import solve_objects
 from epipole.flows.night.summary import Summary, many, summarise
-from epipole.flows.night.work import Spans, Work, day_of, spans_of_night
+from epipole.flows.night.work import Spans, Work, spans_of_night
 from epipole.io.catalogues.known_objects import KnownObjects
 from epipole.io.work.part_tables import IDENTIFIED
 from epipole.io.work.parts import Parts, write_part
@@ -25,7 +25,7 @@ from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import array, concat
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
-from epipole.schemas.spans import DAY_NS, SPAN_NS, Span
+from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS, POSITIONS, REJECTS, STATES
 from epipole.schemas.work_tables import CAMERAS
@@ -400,16 +400,8 @@ def name_known(
     return residuals
 
 
-def publish(
-    destination: Destination,
-    sources: pa.Table,
-    verdicts: Mapping[str, Sequence[SensorVerdict]],
-    residuals: Mapping[str, Sequence[SensorResidual]],
-) -> Summary:
-    """Put all nights in place, and return what they hold.
-
-    `verdicts` and `residuals` are of the sensors of each night.
-    """
-    summary = summarise(destination.dataset, destination.staged, verdicts, residuals)
+def publish(destination: Destination, sources: pa.Table) -> Summary:
+    """Put all nights in place, and return what they hold."""
+    summary = summarise(destination.dataset, destination.staged)
     publish_nights(destination.dataset, destination.staged, sources, destination.replace)
     return summary

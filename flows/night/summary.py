@@ -2,18 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.datasets.night_files import count_rows, read_columns
+from epipole.io.datasets.night_files import Where, count_rows, read_columns
 from epipole.schemas.rejects import NameStatus, Reason
-from epipole.tasks.check.check_sensors import SensorVerdict
-from epipole.tasks.name.sensor_residuals import SensorResidual
 
 
 @dataclass(frozen=True)
@@ -43,7 +39,8 @@ class Summary:
     """Counts of what was published.
 
     `names` are the objects by what is known of their names; empty without a catalogue. `faults` of
-    sensors and `residuals` of their known objects are a sentence each.
+    sensors and `residuals` of their known objects are a sentence each. `unchanged` nights were not
+    made again.
     """
 
     dataset: str
@@ -62,6 +59,7 @@ class Summary:
     rejects: dict[str, int]
     faults: list[str]
     residuals: list[str]
+    unchanged: bool
     by_sensor: list[SensorSummary]
 
     def as_dict(self) -> dict[str, Any]:
@@ -71,7 +69,8 @@ class Summary:
     def lines(self) -> list[str]:
         """Return the summary as people read it."""
         return [
-            f"nights      {', '.join(self.nights)}",
+            f"nights      {', '.join(self.nights)}"
+            + (", unchanged: not made again (--again makes them)" if self.unchanged else ""),
             f"frames      {self.frames:,} of {many(self.sensors, 'sensor')} "
             f"in {many(self.logs, 'log')}",
             f"identified  {self.identified:,} by {self.stars:,} stars",
@@ -83,6 +82,19 @@ class Summary:
             *self._left_out(),
             f"dataset     {self.dataset}",
         ]
+
+    def sentence(self) -> str:
+        """Return what was found as one line, with what needs a look."""
+        parts = [
+            many(self.objects, "object"),
+            many(self.positions, "position"),
+            f"{self.identified:,} of {many(self.frames, 'frame')} identified",
+        ]
+        if self.faults:
+            parts.append(f"{many(len(self.faults), 'sensor')} at fault")
+        if self.rejects:
+            parts.append(f"{sum(self.rejects.values()):,} left out")
+        return ", ".join(parts)
 
     def _names(self) -> list[str]:
         """Return what is known of the objects' names, and of the sensors by known objects."""
@@ -115,46 +127,56 @@ _COLUMNS = {
 }
 
 
-def summarise(
-    dataset: str,
-    staged: Mapping[str, Path],
-    verdicts: Mapping[str, Sequence[SensorVerdict]] = MappingProxyType({}),
-    residuals: Mapping[str, Sequence[SensorResidual]] = MappingProxyType({}),
-) -> Summary:
-    """Return the summary of staged nights, of the sensors that are at fault in each, and of the
-    residuals of their known objects."""
-    tables = {
-        name: pa.concat_tables([read_columns(folder, name, columns) for folder in staged.values()])
-        for name, columns in _COLUMNS.items()
-    }
+def count(folders: Sequence[Where]) -> dict[str, int]:
+    """Return the counts of nights together, as the table `nights` has them of one night."""
+    tables = _tables(folders)
     frames = tables["frames"]
+    return {
+        "logs": pc.count_distinct(tables["sources"]["sha256"]).as_py(),
+        "sensors": pc.count_distinct(frames["sensor_id"]).as_py(),
+        "frames": frames.num_rows,
+        "identified": pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
+        "stars": sum(count_rows(folder, "stars") for folder in folders),
+        "detections": sum(count_rows(folder, "detections") for folder in folders),
+        "tracklets": tables["tracklets"].num_rows,
+        "epochs": pc.count_distinct(tables["epochs"]["epoch"]).as_py(),
+        "objects": pc.count_distinct(tables["positions"]["object_id"]).as_py(),
+        "positions": tables["positions"].num_rows,
+        "left_out": pc.sum(tables["rejects"]["count"]).as_py() or 0,
+    }
+
+
+def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False) -> Summary:
+    """Return the summary of nights, by the folder or URL of each."""
+    folders = list(nights.values())
+    tables, counts = _tables(folders), count(folders)
+    counts.pop("left_out")  # told by reason
+    frames = tables["frames"]
+    told = {
+        night: read_columns(folder, "nights", ["faults", "residuals"]).to_pylist()[0]
+        for night, folder in nights.items()
+    }
     return Summary(
         dataset=dataset,
-        nights=list(staged),
-        logs=pc.count_distinct(tables["sources"]["sha256"]).as_py(),
-        sensors=pc.count_distinct(frames["sensor_id"]).as_py(),
-        frames=frames.num_rows,
-        identified=pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
-        stars=sum(count_rows(folder, "stars") for folder in staged.values()),
-        detections=sum(count_rows(folder, "detections") for folder in staged.values()),
-        tracklets=tables["tracklets"].num_rows,
-        epochs=pc.count_distinct(tables["epochs"]["epoch"]).as_py(),
-        objects=pc.count_distinct(tables["positions"]["object_id"]).as_py(),
-        positions=tables["positions"].num_rows,
+        nights=list(nights),
+        **counts,
         names=_names(tables["identifications"]),
         rejects=by_reason(tables["rejects"]),
-        faults=_by_night(
-            {
-                night: [verdict for verdict in of_night if verdict.is_faulty]
-                for night, of_night in verdicts.items()
-            }
-        ),
-        residuals=_by_night(residuals),
+        faults=_by_night({night: row["faults"] for night, row in told.items()}),
+        residuals=_by_night({night: row["residuals"] for night, row in told.items()}),
+        unchanged=unchanged,
         by_sensor=[
             _of_sensor(frames.filter(pc.field("sensor_id") == name), tables["tracklets"], name)
             for name in sorted(pc.unique(frames["sensor_id"]).to_pylist())
         ],
     )
+
+
+def _tables(folders: Sequence[Where]) -> dict[str, pa.Table]:
+    return {
+        name: pa.concat_tables([read_columns(folder, name, columns) for folder in folders])
+        for name, columns in _COLUMNS.items()
+    }
 
 
 def _names(identifications: pa.Table) -> dict[str, int]:
@@ -164,10 +186,10 @@ def _names(identifications: pa.Table) -> dict[str, int]:
     return {status.value: counts[status] for status in NameStatus if status in counts}
 
 
-def _by_night(sentences: Mapping[str, Sequence[object]]) -> list[str]:
+def _by_night(sentences: Mapping[str, Sequence[str]]) -> list[str]:
     """Return the sentences of all nights; they name the night where there are several."""
     return [
-        f"{night}: {sentence}" if len(sentences) > 1 else str(sentence)
+        f"{night}: {sentence}" if len(sentences) > 1 else sentence
         for night, of_night in sentences.items()
         for sentence in of_night
     ]

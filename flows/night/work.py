@@ -12,7 +12,7 @@ from epipole.io.work.places import ReadFolder, SensorParts, WorkFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import OF_CALIBRATIONS, Reason, reject_rows
-from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span
+from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span, day_of
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.read.order_frames import OrderedFrames
@@ -101,11 +101,6 @@ def _why_not(rejects: pa.Table) -> str:
 def spans_of_night(spans: Sequence[Span], night: str) -> list[Span]:
     """Return the spans that belong to a night."""
     return [span for span in spans if span.start_ns // DAY_NS == day_of(night)]
-
-
-def day_of(night: str) -> int:
-    """Return the number of days from 1970 to a UTC date."""
-    return int(np.datetime64(night, "D").astype(np.int64))
 
 
 def _wanted(numbers: np.ndarray, day: int) -> list[Span]:

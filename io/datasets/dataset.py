@@ -35,7 +35,7 @@ from epipole.schemas.tables import TABLES
 # The time column that decides to which night a row belongs, where it is not `time`. Calibrations
 # and sources belong to a whole night.
 _NIGHT_COLUMN = {"tracklets": "start_time"}
-_WHOLE_NIGHT = {"calibrations", "identifications", "sources"}
+_WHOLE_NIGHT = {"calibrations", "identifications", "nights", "sources"}
 
 
 Where = Path | str
@@ -147,6 +147,25 @@ def read_table(
 
 def _since(since_ns: int | None) -> pc.Expression | None:
     return None if since_ns is None else pc.field("epoch") >= pa.scalar(since_ns, TIME)
+
+
+def missing_tables(dataset: Where, night: str) -> list[str]:
+    """Return the tables that a night has no file of: made by an older version, or damaged."""
+    if (store := _store(dataset)) is not None:
+        with _reading(dataset):
+            held = store.tables(night)
+    else:
+        local_nights.recover(_folder(dataset))
+        files = (_folder(dataset) / f"night={night}").glob("*/*.parquet")
+        held = {file.parent.name for file in files}
+    return [name for name in TABLES if name not in held]
+
+
+def night_place(dataset: Where, night: str) -> Where:
+    """Return the folder of a night; of a dataset in a store, its URL."""
+    folder = dataset_folder(dataset)
+    name = f"night={night}"
+    return f"{str(dataset).rstrip('/')}/{name}" if folder is None else folder / name
 
 
 @contextlib.contextmanager

@@ -70,6 +70,12 @@ def claim(dataset: Path, nights: Sequence[str]) -> Iterator[Path]:
                 dataset.rmdir()
 
 
+def claimed_nights(dataset: Path) -> set[str]:
+    """Return the nights that living runs have claimed."""
+    claims = [run / CLAIM for run in _folders(dataset / STAGING, "run-*") if _is_alive(run)]
+    return {night for file in claims for night in Holder.read(file.read_text(), file).nights}
+
+
 def _release(dataset: Path, run: Path) -> None:
     """Remove the folder of a run that ends. What cannot be removed the next run removes."""
     if not run.exists() and not (dataset / STAGING / "lock").exists():

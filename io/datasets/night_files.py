@@ -1,7 +1,9 @@
 """The Parquet files of an unpublished night: one per table, written span by span."""
 
-from collections.abc import Iterable, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +16,8 @@ from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
 PART = "part-0.parquet"
+
+Where = Path | str  # the folder of a night, or its URL
 
 
 def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
@@ -68,9 +72,10 @@ def _writer(folder: Path, schema: pa.Schema) -> pq.ParquetWriter:
     return pq.ParquetWriter(folder / PART, schema, **part_options(schema))
 
 
-def read_columns(night: Path, name: str, columns: Sequence[str]) -> pa.Table:
+def read_columns(night: Where, name: str, columns: Sequence[str]) -> pa.Table:
     """Return some columns of a table that `write_table` wrote."""
-    return pq.read_table(night / name / PART, columns=list(columns), partitioning=None)
+    with _opened(night, name) as file:
+        return pq.read_table(file, columns=list(columns), partitioning=None)
 
 
 def take_rows(
@@ -92,7 +97,20 @@ def take_rows(
     )
 
 
-def count_rows(night: Path, name: str) -> int:
+def count_rows(night: Where, name: str) -> int:
     """Return the number of rows of a table that `write_table` wrote."""
-    rows: int = pq.read_metadata(night / name / PART).num_rows
+    with _opened(night, name) as file:
+        rows: int = pq.read_metadata(file).num_rows
     return rows
+
+
+@contextlib.contextmanager
+def _opened(night: Where, name: str) -> Iterator[Any]:
+    """Open a table's file. Of a URL only the ranges that are read are fetched."""
+    if isinstance(night, Path):
+        yield night / name / PART
+        return
+    import fsspec
+
+    with fsspec.open(f"{night}/{name}/{PART}", cache_type="readahead") as file:
+        yield file

@@ -85,6 +85,14 @@ class StoreNights:
         self.require_bucket()
         raise DatasetError(f"{self._dataset}/night={night}: is being replaced; try again")
 
+    def tables(self, night: str) -> set[str]:
+        """Return the names of the tables that a night has files of."""
+        for commit in self._commits():
+            if night in commit.files:
+                return {name.partition("/")[0] for name in commit.files[night]}
+        paths = self._storage.glob(f"{self._root}/night={night}/*/*.parquet")
+        return {path.rsplit("/", 2)[1] for path in paths}
+
     def publish(self, staged: Mapping[str, Path]) -> None:
         """Publish these nights, which this process has claimed: all or none.
 

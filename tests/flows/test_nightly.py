@@ -114,7 +114,7 @@ def test_the_parts_of_a_night_in_any_order_give_the_same_rows(night_log, night_d
     nightly(parts, str(tmp_path / "a"))
     nightly([*parts[::-1], parts[0]], str(tmp_path / "b"))
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
-    for table in set(TABLES) - {"sources"}:
+    for table in set(TABLES) - {"sources", "nights"}:
         whole, cut = (read_table(d, table, NIGHT) for d in (night_dataset, tmp_path / "a"))
         assert cut.equals(whole), table
 

@@ -9,9 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from epipole.io.work.folder import work_key, work_root
-from epipole.schemas.logs.log_tables import LogSource
-from epipole.schemas.settings import Settings, validate_settings
+from epipole.io.work.folder import work_root
 
 NIGHT = "2019-04-01"
 WAIT_S = 240
@@ -106,14 +104,3 @@ def test_two_runs_of_one_night_at_once_end_with_one_night(run, tmp_path, night_d
     for code, output in zip(codes, outputs, strict=True):
         assert code == 0 or "has worked on it since" in output
     assert contents(out) == contents(night_dataset)
-
-
-def test_finished_parts_are_reused_only_for_the_same_logs_settings_and_nights():
-    a, b = (LogSource(f"{name}.mcap", 1, name, 0, 1) for name in "ab")
-    key = work_key([a, b], Settings(), NIGHT)
-    assert key == work_key([b, a], Settings(), NIGHT)
-    other = validate_settings({"tracklets": {"gate_sigma": 5.0}}, "test")
-    assert key != work_key([a, b], other, NIGHT)
-    assert key != work_key([a], Settings(), NIGHT)
-    assert key != work_key([a, b._replace(name="c.mcap")], Settings(), NIGHT)
-    assert key != work_key([a, b], Settings(), "2019-04-02")

@@ -57,6 +57,8 @@ def filled(schema: pa.Schema, n: int, columns: dict) -> pa.Table:
             arrays.append(pa.nulls(n, field.type))
         elif pa.types.is_string(field.type):
             arrays.append(pa.array([""] * n, field.type))
+        elif pa.types.is_list(field.type):
+            arrays.append(pa.array([[]] * n, field.type))
         else:
             arrays.append(pa.array(np.zeros(n, np.int64)).cast(field.type))
     return pa.Table.from_arrays(arrays, schema=schema)

@@ -20,6 +20,8 @@ def rows(schema: pa.Schema, times: np.ndarray, seed: int = 0) -> pa.Table:
     def values(field: pa.Field) -> pa.Array:
         if field.type == TIME:
             return pa.array(times, pa.int64()).cast(TIME)
+        if pa.types.is_list(field.type):
+            return pa.array([["one", "two"]] * len(times), field.type)
         if field.type == pa.string():
             return pa.array([f"s{i % 3}" for i in range(len(times))])
         return pa.array(rng.uniform(0, 100, len(times))).cast(field.type, safe=False)

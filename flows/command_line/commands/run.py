@@ -1,14 +1,20 @@
 """`epipole run`: logs to a dataset, now."""
 
+import datetime
 import warnings
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from epipole.flows.command_line.options import AsJson, Logs, check_night
 from epipole.flows.command_line.printing import print_json, print_lines
 from epipole.schemas.choices import Runner
+
+if TYPE_CHECKING:  # imported when the command runs
+    from epipole.flows.command_line.run_nightly import Ended
 
 
 def run(
@@ -26,6 +32,17 @@ def run(
     night: Annotated[
         str | None, typer.Option(metavar="DATE", help="Publish only this UTC date (YYYY-MM-DD).")
     ] = None,
+    to: Annotated[
+        str | None,
+        typer.Option(metavar="DATE", help="With --night: every night to this one, one by one."),
+    ] = None,
+    stale: Annotated[
+        bool,
+        typer.Option("--stale", help="Make the nights again that `epipole nights` calls stale."),
+    ] = False,
+    again: Annotated[
+        bool, typer.Option("--again", help="Make a night again even if nothing has changed.")
+    ] = False,
     replace: Annotated[
         bool,
         typer.Option(
@@ -59,17 +76,64 @@ def run(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Turn logs into a dataset: run the nightly flow on this machine now."""
+    """Turn logs into a dataset: run the nightly flow on this machine now.
+
+    A night that is published, and was made from the same logs with the same settings by
+    the same code, is not made again.
+    """
     if not verbose:
         warnings.simplefilter("ignore")
-    from epipole.flows.command_line.run_nightly import RunOptions, run_nightly
+    from epipole.flows.command_line.run_nightly import Nights, RunOptions
 
     check_night(night)
     options = RunOptions(
-        settings, night, replace, known, runner, workers, scheduler, quiet, verbose
+        settings, replace, known, again, runner, workers, scheduler, quiet, verbose
     )
-    summary, seconds = run_nightly(logs, out, options)
+    nights = Nights(logs, out, options)
+    dates = _dates(night, to)
+    if stale:
+        dates = nights.stale()
+    if to is None and not stale:
+        (ended,) = nights.run(dates)
+        _print_one(ended, quiet, as_json)
+    elif _print_each(nights.run(dates), quiet, as_json):
+        raise typer.Exit(1)
+
+
+def _dates(night: str | None, to: str | None) -> Sequence[str | None]:
+    """Return the nights that are asked for; None: every night of the logs."""
+    if to is None:
+        return [night]
+    check_night(to, "--to")
+    if night is None:
+        raise typer.BadParameter("give the first night by --night", param_hint="--to")
+    first, last = datetime.date.fromisoformat(night), datetime.date.fromisoformat(to)
+    if last < first:
+        raise typer.BadParameter(f"{to} is before {night}", param_hint="--to")
+    days = range((last - first).days + 1)
+    return [(first + datetime.timedelta(days=day)).isoformat() for day in days]
+
+
+def _print_one(ended: "Ended", quiet: bool, as_json: bool) -> None:
+    assert ended.summary is not None  # else its error was raised
     if as_json:
-        print_json(summary.as_dict() | {"seconds": round(seconds, 2)})
+        print_json(ended.summary.as_dict() | {"seconds": round(ended.seconds, 2)})
     elif not quiet:
-        print_lines([*summary.lines(), f"took        {seconds:.1f} s"])
+        print_lines([*ended.summary.lines(), f"took        {ended.seconds:.1f} s"])
+
+
+def _print_each(all_ended: Iterable["Ended"], quiet: bool, as_json: bool) -> bool:
+    """Print how each night ended as soon as it has; return whether any has failed."""
+    told = []
+    for ended in all_ended:
+        told.append(ended)
+        if not (quiet or as_json):
+            print_lines([f"{ended.night}  {ended.line()}"])
+        elif ended.error is not None:
+            print_lines([f"epipole: {ended.night}: {ended.error}"], to_errors=True)
+    if as_json:
+        print_json([ended.as_dict() for ended in told])
+    elif not quiet:
+        counts = Counter(ended.outcome for ended in told)
+        print_lines([", ".join(f"{n} {outcome}" for outcome, n in counts.items()) or "no night"])
+    return any(ended.error is not None for ended in told)

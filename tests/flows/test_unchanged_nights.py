@@ -1,0 +1,114 @@
+"""Runs of a night that has not changed: it is not made again, unless that is asked for."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from epipole.flows.command_line.main import app
+from epipole.flows.nightly import nightly
+
+NIGHT = "2019-04-01"
+
+pytestmark = pytest.mark.usefixtures("prefect")
+
+
+def state(folder: Path) -> dict[str, tuple[int, bytes]]:
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(p.relative_to(folder)): (p.stat().st_ino, p.read_bytes()) for p in files}
+
+
+@pytest.fixture(scope="module")
+def made(night_log, tmp_path_factory):
+    out = tmp_path_factory.mktemp("unchanged") / "out"
+    return out, nightly([str(night_log)], str(out))
+
+
+def run(*arguments) -> tuple[int, str]:
+    ended = CliRunner().invoke(app, ["run", *map(str, arguments)])
+    return ended.exit_code, ended.stdout
+
+
+def test_a_run_tells_what_an_unchanged_night_holds_and_writes_nothing(made, night_log):
+    out, first = made
+    before = state(out)
+    second = nightly([str(night_log)], str(out))
+    assert state(out) == before
+    assert second.unchanged
+    assert second.as_dict() | {"unchanged": False} == first.as_dict()
+
+
+def test_a_run_that_is_asked_to_makes_the_same_night_again(made, night_log):
+    out, first = made
+    before = state(out)
+    again = nightly([str(night_log)], str(out), again=True)
+    after = state(out)
+    assert again == first
+    assert {name: data for name, (_, data) in after.items()} == {
+        name: data for name, (_, data) in before.items()
+    }
+    assert all(after[name][0] != before[name][0] for name in after)
+
+
+def test_the_command_line_knows_it_before_prefect_is_there(made, night_log, monkeypatch):
+    import epipole.flows.command_line.run_nightly as started
+
+    def fail(*_):
+        raise AssertionError("Prefect was started")
+
+    monkeypatch.setattr(started.Nights, "_start", fail)
+    code, text = run(night_log, "--out", made[0], "--quiet", "--json")
+    told = json.loads(text)
+    assert code == 0
+    assert told["unchanged"]
+    assert told["positions"] == made[1].positions
+
+
+def test_a_range_of_nights_tells_how_each_ended(made, night_log, monkeypatch):
+    arguments = (night_log, "--out", made[0], "--night", "2019-03-31", "--to", "2019-04-01")
+    code, text = run(*arguments)
+    assert code == 0
+    assert text.splitlines() == [
+        "2019-03-31  no frames", "2019-04-01  unchanged", "1 without frames, 1 unchanged",
+    ]  # fmt: skip
+    code, text = run(*arguments, "--quiet", "--json")
+    assert [night["outcome"] for night in json.loads(text)] == ["without frames", "unchanged"]
+
+
+def test_a_night_that_fails_does_not_stop_the_next(made, night_log, monkeypatch):
+    import epipole.flows.command_line.run_nightly as started
+    from epipole.schemas.errors import DatasetError
+
+    real = started.unchanged_nights
+
+    def fail(dataset, given, night, *rest):
+        if night == "2019-03-31":
+            raise DatasetError("the disk is full")
+        return real(dataset, given, night, *rest)
+
+    monkeypatch.setattr(started, "unchanged_nights", fail)
+    code, text = run(night_log, "--out", made[0], "--night", "2019-03-31", "--to", NIGHT)
+    assert code == 1
+    assert text.splitlines() == [
+        "2019-03-31  failed: the disk is full", "2019-04-01  unchanged", "1 failed, 1 unchanged",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--to", NIGHT], "give the first night"),
+        (["--night", NIGHT, "--to", "2019-03-31"], "is before"),
+        (["--night", NIGHT, "--to", "tomorrow"], "is not a date"),
+    ],
+)
+def test_a_range_that_is_none_is_refused(night_log, tmp_path, options, says):
+    ended = CliRunner().invoke(app, ["run", str(night_log), "--out", str(tmp_path), *options])
+    assert ended.exit_code == 2
+    assert says in ended.output
+
+
+def test_stale_nights_are_made_again_and_others_are_not(made, night_log):
+    code, text = run(night_log, "--out", made[0], "--stale")
+    assert (code, text.splitlines()) == (0, ["no night"])

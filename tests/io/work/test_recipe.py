@@ -1,0 +1,46 @@
+"""Recipes: all that a night depends on is in its keys, and nothing else."""
+
+from epipole.io.work.recipe import code_key, digest_of, logs_key, recipe_of
+from epipole.schemas.settings import Settings, validate_settings
+
+NIGHT = "2019-04-01"
+A, B = ("a.mcap", "0a"), ("b.mcap", "0b")
+
+
+def work_key(logs, settings=None, night=NIGHT, known=None):
+    return recipe_of(logs_key(logs), settings or Settings(), known).work_key(night)
+
+
+def test_finished_parts_are_reused_only_for_the_same_logs_settings_and_nights():
+    key = work_key([A, B])
+    assert key == work_key([B, A])
+    other = validate_settings({"tracklets": {"gate_sigma": 5.0}}, "test")
+    assert key != work_key([A, B], other)
+    assert key != work_key([A])
+    assert key != work_key([A, ("c.mcap", B[1])])
+    assert key != work_key([A, B], night="2019-04-02")
+
+
+def test_names_are_given_after_the_parts_so_the_parts_do_not_depend_on_them():
+    assert work_key([A]) == work_key([A], known="f00")
+    assert recipe_of("", Settings()) != recipe_of("", Settings(), "f00")
+
+
+def test_a_file_that_is_no_log_counts_too():
+    assert logs_key([A]) != logs_key([A], ["broken.mcap"])
+    assert logs_key([A], ["x", "y"]) == logs_key([A], ["y", "x"])
+
+
+def test_a_star_catalogue_counts_by_its_bytes(tmp_path):
+    file = tmp_path / "stars.parquet"
+    keys = []
+    for content in (b"one", b"two", b"one"):
+        file.write_bytes(content)
+        settings = validate_settings({"identification": {"catalogue": str(file)}}, "test")
+        keys.append(recipe_of("", settings).star_catalogue)
+    assert keys[0] == keys[2] != keys[1]
+
+
+def test_digests_do_not_run_together():
+    assert digest_of(["ab", "c"]) != digest_of(["a", "bc"])
+    assert len(code_key()) == 64
