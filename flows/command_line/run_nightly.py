@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from epipole.flows.command_line.terminal import shown
 from epipole.flows.night.held_nights import held_nights
 from epipole.flows.night.log_choice import find_logs
-from epipole.flows.night.progress import prepare, shown
+from epipole.flows.night.progress import compile_step, prepare
 from epipole.flows.night.summary import Summary, summarise
 from epipole.flows.night.unchanged import unchanged_nights
-from epipole.io.caches.kernel_warm_up import compile_beside
+from epipole.flows.prefect.server_process import launch
+from epipole.io.caches.kernel_warm_up import compile_beside, compiling_told
 from epipole.io.catalogues.known_objects import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder, night_place
@@ -133,8 +135,10 @@ class Nights:
     def _start(self, started: contextlib.ExitStack) -> Callable[[str | None], Summary]:
         """Start Prefect, and return what makes a night."""
         options = self._options
-        compiling = started.enter_context(compile_beside())
+        is_first = started.enter_context(compile_beside())
+        started.enter_context(compiling_told(compile_step, is_first))
         prepare("start Prefect")
+        early = launch({})  # while this process imports Prefect, the server's does too
         from epipole.flows.prefect.defaults import (
             embedded_prefect,
             lost_server_as_line,
@@ -144,12 +148,12 @@ class Nights:
 
         if not options.verbose:
             quiet_console()
-        if compiling:
+        if is_first:
             LOGGER.info("first run of this version: compiling takes about a minute")
         runner = task_runner(options.runner, options.workers, options.scheduler)
         if options.scheduler is not None:
             check_scheduler(options.scheduler)
-        started.enter_context(embedded_prefect())
+        started.enter_context(embedded_prefect(early))
         from epipole.flows.nightly import nightly
 
         flow = nightly.with_options(task_runner=runner)

@@ -21,6 +21,7 @@ from prefect.artifacts import (
 )
 from prefect.exceptions import PrefectException
 
+from epipole.flows.night.progress import COMPILE
 from epipole.flows.night.summary import Summary, many
 from epipole.schemas.text.shown import as_line, as_markdown_text
 
@@ -53,9 +54,9 @@ class ProgressBar(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Show a step, at most one every `UPDATED_EVERY_S`."""
-        if self._id is None or time.monotonic() < self._next_s:
-            return
         counts = vars(record)
+        if self._id is None or time.monotonic() < self._next_s or counts["stage"] == COMPILE:
+            return
         self._show(counts["percent"], f"{counts['stage']}: {counts['done']} of {counts['total']}")
 
     def finish(self, how: str) -> None:

@@ -22,30 +22,9 @@ from prefect.settings import (
 )
 
 from epipole.flows.prefect.embedded_server import start_server
+from epipole.flows.prefect.server_process import DEFAULTS, Launched
 from epipole.io.remote_files import line_of
 from epipole.schemas.errors import EpipoleError
-
-# Services that only a permanent server needs.
-_SERVICES = (
-    "cancellation_cleanup",
-    "cleanup_reconciler",
-    "event_logger",
-    "event_persister",
-    "foreman",
-    "late_runs",
-    "pause_expirations",
-    "repossessor",
-    "scheduler",
-    "task_run_recorder",
-    "triggers",
-)
-
-_DEFAULTS = {
-    **{f"server.services.{name}.enabled": False for name in _SERVICES},
-    "server.analytics_enabled": False,
-    # The default of 20 s is too short on a busy machine.
-    "server.ephemeral.startup_timeout_seconds": 120,
-}
 
 ANSWERS_WITHIN_S = 5.0
 
@@ -54,8 +33,10 @@ _RUN_LOGGERS = ("prefect.flow_runs", "prefect.task_runs")
 
 
 @contextlib.contextmanager
-def embedded_prefect() -> Iterator[None]:
+def embedded_prefect(early: Launched | None = None) -> Iterator[None]:
     """Run flows on an embedded API, unless the user's Prefect has an API set.
+
+    `early` is a process of the server that was launched before Prefect was imported.
 
     Raises
     ------
@@ -65,10 +46,12 @@ def embedded_prefect() -> Iterator[None]:
     with contextlib.ExitStack() as stack:
         url = get_current_settings().api.url
         if url is None:
-            stack.enter_context(temporary_settings(set_defaults=_DEFAULTS))
+            stack.enter_context(temporary_settings(set_defaults=DEFAULTS))
             # Workers in other processes use the same API.
-            stack.enter_context(temporary_settings({PREFECT_API_URL: start_server()}))
+            stack.enter_context(temporary_settings({PREFECT_API_URL: start_server(early)}))
         else:
+            if early is not None:
+                early.stop()
             _check_server(url)
         yield
 

@@ -7,123 +7,102 @@ spoil each other's new database.
 
 import atexit
 import contextlib
-import fcntl
 import logging
-import os
 import re
-import signal
 import socket
 import sqlite3
-import subprocess
-import sys
-import tempfile
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-import uvicorn
 from prefect.settings import get_current_settings
 from sqlalchemy.engine import URL, make_url
 
+from epipole.flows.prefect.server_process import HOST, Launched, launch
 from epipole.io.caches.private_folders import private_folder
 from epipole.schemas.errors import EpipoleError
 
 LOGGER = logging.getLogger(__name__)
 
-HOST = "127.0.0.1"
-STOPS_WITHIN_S = 5.0
 MOST_RESTARTS = 3
-# With these Prefect's application knows that it is embedded.
-_EMBEDDED = {
-    "PREFECT_UI_ENABLED": "0",
-    "PREFECT__SERVER_EPHEMERAL": "1",
-    "PREFECT__SERVER_FINAL": "1",
-}
-_STARTING = "epipole-starting.lock"  # in Prefect's home
 _LAST_LINE = re.compile(r"^[\w.]+(?:Error|Exception)\b.*", re.MULTILINE)
 
 
-def start_server() -> str:
+def start_server(early: Launched | None = None) -> str:
     """Start the server, and return the address of its API. It stops when this process ends.
+
+    `early` is a process that was launched before Prefect was imported; it is used if it can be.
 
     Raises
     ------
     EpipoleError
         Where its database cannot be written, or it does not start.
     """
-    home = _writable_home()
-    with contextlib.ExitStack() as stack:
-        listener = stack.enter_context(socket.socket())
-        listener.bind((HOST, 0))  # held from now on: no other server can get this port
-        output = stack.enter_context(tempfile.TemporaryFile())
-        server = _Server(listener, output, home)
-        atexit.register(server.stop)
-        address = listener.getsockname()
-        _wait_until_ready(server.process, address, output, home)
-        stack.pop_all()  # held until the run ends, for a server that has to be started again
-        threading.Thread(target=server.keep_alive, daemon=True, name="Prefect's server").start()
-    return f"http://{HOST}:{address[1]}/api"
+    with contextlib.ExitStack() as not_needed:
+        if early is not None:
+            not_needed.callback(early.stop)
+        home = _writable_home()
+        if early is not None and home == get_current_settings().home:
+            not_needed.pop_all()
+            launched = early
+        else:
+            launched = launch(_environment(home))
+    try:
+        launched.serve()
+        _wait_until_ready(launched, home)
+    except BaseException:
+        launched.stop()
+        raise
+    server = _Server(launched, home)
+    atexit.register(server.stop)
+    threading.Thread(target=server.keep_alive, daemon=True, name="Prefect's server").start()
+    return f"http://{HOST}:{launched.listener.getsockname()[1]}/api"
 
 
 class _Server:
-    """The process of the server; one that ends before the run is started again.
+    """The server of a run; a process that ends before the run is started again.
 
     Meanwhile requests wait at its socket, which this process holds.
     """
 
-    def __init__(self, listener: socket.socket, output: IO[bytes], home: Path) -> None:
-        self._listener, self._output, self._home = listener, output, home
+    def __init__(self, launched: Launched, home: Path) -> None:
+        self._launched, self._home = launched, home
         self._stopping = threading.Event()
-        self.process = _launch(listener, output, home)
 
     def keep_alive(self) -> None:
         """Start the server again when it ends, a few times."""
         for _ in range(MOST_RESTARTS):
-            self.process.wait()
+            self._launched.process.wait()
             if self._stopping.is_set():
                 return
             LOGGER.warning("Prefect's server has ended before the run; it is started again")
-            self.process = _launch(self._listener, self._output, self._home)
-        self.process.wait()
-        self._listener.close()  # a request fails at once instead of waiting
+            self._launched = launch(_environment(self._home), self._launched.listener)
+            self._launched.serve()
+        self._launched.process.wait()
+        self._launched.listener.close()  # a request fails at once instead of waiting
 
     def stop(self) -> None:
         """Stop the server: the run has ended."""
         self._stopping.set()
-        self.process.terminate()
-        try:
-            self.process.wait(STOPS_WITHIN_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        self._launched.stop()
 
 
-def _launch(listener: socket.socket, output: IO[bytes], home: Path) -> subprocess.Popen[bytes]:
+def _environment(home: Path) -> dict[str, str]:
     settings = get_current_settings().to_environment_variables(exclude_unset=True)
-    return subprocess.Popen(
-        [sys.executable, "-m", __name__, str(listener.fileno())],
-        stdin=subprocess.PIPE,  # closed when this process ends
-        stdout=output,
-        stderr=output,
-        env={**os.environ, **settings, **_EMBEDDED, "PREFECT_HOME": str(home)},
-        pass_fds=[listener.fileno()],
-        start_new_session=True,  # Ctrl-C must not stop it: it records how the run ended
-    )
+    return {**settings, "PREFECT_HOME": str(home)}
 
 
-def _wait_until_ready(
-    server: subprocess.Popen[bytes], address: tuple[str, int], output: IO[bytes], home: Path
-) -> None:
+def _wait_until_ready(server: Launched, home: Path) -> None:
+    address = server.listener.getsockname()
     limit_s = get_current_settings().server.ephemeral.startup_timeout_seconds
     end_s = time.monotonic() + limit_s
     while time.monotonic() < end_s:
         with contextlib.suppress(OSError), socket.create_connection(address, timeout=1):
             return  # it listens when its database is ready
-        if server.poll() is not None:
+        if server.process.poll() is not None:
             raise EpipoleError(
-                f"Prefect's server did not start ({_reason(output)}); its database lies in "
+                f"Prefect's server did not start ({_reason(server.output)}); its database lies in "
                 f"{home}: repair or remove it, or set PREFECT_HOME to another folder"
             )
         time.sleep(0.05)
@@ -191,40 +170,3 @@ def _try_database(url: URL) -> None:
         except sqlite3.OperationalError as error:
             if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:  # another run writes to it
                 raise
-
-
-class _OneAtATime(uvicorn.Server):
-    """Starts while no other embedded server does: the first one makes the database."""
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        with _alone():
-            await super().startup(sockets)
-
-
-@contextlib.contextmanager
-def _alone() -> Iterator[None]:
-    with contextlib.ExitStack() as stack:
-        with contextlib.suppress(OSError):  # a home that cannot be written: no file database in it
-            lock = stack.enter_context((get_current_settings().home / _STARTING).open("w"))
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
-
-
-def _end_with_run() -> None:
-    sys.stdin.buffer.read()  # returns when the run has ended and its end of the pipe is closed
-    os.kill(os.getpid(), signal.SIGTERM)
-    time.sleep(STOPS_WITHIN_S)
-    os._exit(0)
-
-
-def main() -> None:
-    """Serve Prefect's API on the socket that the run has opened."""
-    threading.Thread(target=_end_with_run, daemon=True).start()
-    config = uvicorn.Config(
-        "prefect.server.api.server:create_app", factory=True, log_level="error", lifespan="on"
-    )
-    _OneAtATime(config).run(sockets=[socket.socket(fileno=int(sys.argv[1]))])
-
-
-if __name__ == "__main__":
-    main()

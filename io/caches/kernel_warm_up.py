@@ -10,12 +10,17 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
 
 from epipole.io.caches.kernels import mark_used, new_kernel_folder, only_one
 
 LOGGER = logging.getLogger(__name__)
+
+# Files in the kernel folder after a first run of the example, one per function; for a bar only.
+FILES_OF_A_RUN = 220
+LOOKED_EVERY_S = 0.5
 
 
 @contextlib.contextmanager
@@ -36,6 +41,41 @@ def compile_beside() -> Iterator[bool]:
         if helper is not None:
             helper.kill()
             helper.communicate()
+
+
+@contextlib.contextmanager
+def compiling_told(told: Callable[[int, int], None], is_first: bool) -> Iterator[None]:
+    """Tell how many functions are compiled, as long as this lasts.
+
+    Parameters
+    ----------
+    told
+        Called with the number of new files in the kernel folder, and with how many a first run
+        makes; this is 0 in a later run, where nobody knows how many more it needs.
+    """
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    if not named:
+        yield
+        return
+    folder, ended = Path(named), threading.Event()
+    before = 0 if is_first else _count(folder)
+
+    def watch() -> None:
+        while not ended.wait(LOOKED_EVERY_S):
+            if new := _count(folder) - before:
+                told(new, max(FILES_OF_A_RUN, new) if is_first else 0)
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watcher.join()
+
+
+def _count(folder: Path) -> int:
+    return sum(1 for _ in folder.glob("*/*.nbi"))
 
 
 def _start() -> Popen[bytes] | None:

@@ -1,13 +1,10 @@
-"""Progress of a run: results in the order of the tasks, steps, and which lines are shown."""
+"""Progress of a run: results in the order of the tasks, and steps."""
 
-import io
 import logging
-import sys
-import time
 
 import pytest
 
-from epipole.flows.night.progress import ROOT, STEPS, prepare, results, shown, step
+from epipole.flows.night.progress import STEPS, prepare, results, step
 from epipole.schemas.stages import Stage
 
 
@@ -78,71 +75,3 @@ def test_a_stage_without_tasks_is_a_step(steps):
     ((stage, done, total, percent),) = steps
     assert (stage, done, total) == ("solve", 0, 0)
     assert 0 < percent < 100
-
-
-def written(capsys, **how) -> str:
-    with shown(**how):
-        logging.getLogger("epipole.flows.night.stages").info("read 3 frames")
-        logging.getLogger("epipole.tasks.read.read_logs").info("a.mcap: read 3 frames")
-        logging.getLogger("epipole.tasks.read.read_logs").warning("a.mcap: damaged")
-    return capsys.readouterr().err
-
-
-def test_lines_of_stages_and_warnings_are_shown(capsys):
-    lines = written(capsys, quiet=False, verbose=False).splitlines()
-    assert [line.split(" ", 1)[1] for line in lines] == ["read 3 frames", "a.mcap: damaged"]
-
-
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
-
-
-def test_the_bar_on_a_terminal_shows_the_stage_and_moves(monkeypatch):
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    monkeypatch.setenv("TERM", "xterm")
-    with shown(quiet=False, verbose=False):
-        step(Stage.TRACK, 1, 4)
-        time.sleep(0.3)  # the bar is drawn ten times per second
-        step(Stage.TRACK, 3, 4)
-        time.sleep(0.3)
-    drawn = sys.stderr.getvalue()
-    assert "track" in drawn
-    assert "1/4" in drawn
-    assert "3/4" in drawn
-
-
-def test_lines_of_tasks_are_shown_on_request(capsys):
-    assert "a.mcap: read 3 frames" in written(capsys, quiet=False, verbose=True)
-
-
-def test_a_quiet_run_shows_nothing(capsys, monkeypatch):
-    monkeypatch.setattr(ROOT, "handlers", list(ROOT.handlers))
-    monkeypatch.setattr(ROOT, "propagate", True)
-    assert written(capsys, quiet=True, verbose=False) == ""
-
-
-def test_no_line_is_shown_twice(capsys):
-    also = logging.StreamHandler()  # such as Prefect's console handler
-    logging.getLogger().addHandler(also)
-    try:
-        assert written(capsys, quiet=False, verbose=False).count("damaged") == 1
-    finally:
-        logging.getLogger().removeHandler(also)
-
-
-def test_afterwards_logging_is_as_before(capsys):
-    before = (list(ROOT.handlers), ROOT.level, ROOT.propagate)
-    written(capsys, quiet=False, verbose=True)
-    assert (ROOT.handlers, ROOT.level, ROOT.propagate) == before
-
-
-def test_a_line_is_one_line_and_a_warning_is_shown_once(capfd):
-    log = logging.getLogger("epipole.flows.here")
-    with shown(quiet=False, verbose=False):
-        log.info("sensor \x1b[2J\nof a log")
-        for _ in range(2):
-            log.warning("twice")
-    first, second = capfd.readouterr().err.splitlines()
-    assert first.endswith(" sensor \\x1b[2J\\nof a log")
-    assert second.endswith(" twice")

@@ -11,7 +11,7 @@ SETTINGS = """
 from prefect.settings import get_current_settings
 from epipole.flows.prefect import defaults as prefect_defaults
 started = []
-prefect_defaults.start_server = lambda: started.append(True) or "http://127.0.0.1:1/api"
+prefect_defaults.start_server = lambda early: started.append(True) or "http://127.0.0.1:1/api"
 prefect_defaults._check_server = lambda url: None
 with prefect_defaults.embedded_prefect():
     server = get_current_settings().server

@@ -72,7 +72,7 @@ def server_of(run: subprocess.Popen[str]) -> int:
     """Return the process of a run's server."""
     children = Path(f"/proc/{run.pid}/task").glob("*/children")
     pids = [pid for file in children for pid in file.read_text().split()]
-    (pid,) = [p for p in pids if b"embedded_server" in Path(f"/proc/{p}/cmdline").read_bytes()]
+    (pid,) = [p for p in pids if b"server_process" in Path(f"/proc/{p}/cmdline").read_bytes()]
     return int(pid)
 
 

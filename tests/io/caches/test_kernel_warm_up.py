@@ -2,11 +2,16 @@
 
 import subprocess
 import sys
+import time
 
 import pytest
 
 from epipole.io.caches import kernel_warm_up
-from epipole.io.caches.kernel_warm_up import compile_beside, compile_kernels
+from epipole.io.caches.kernel_warm_up import (
+    compile_beside,
+    compile_kernels,
+    compiling_told,
+)
 from epipole.io.caches.kernels import new_kernel_folder, only_one
 
 
@@ -120,3 +125,25 @@ def test_a_kernel_that_cannot_be_compiled_is_left_to_the_run(monkeypatch):
     monkeypatch.setattr(kernel_list, "kernel", lambda name: there[name])
     compile_kernels()
     assert [tuple(map(str, types)) for types in compiled] == [("int64",)]
+
+
+def test_what_is_compiled_is_counted_from_the_files_that_appear(folder, monkeypatch):
+    monkeypatch.setattr(kernel_warm_up, "LOOKED_EVERY_S", 0.01)
+
+    def counted(is_first: bool) -> list[tuple[int, int]]:
+        told = []
+        with compiling_told(lambda *count: told.append(count), is_first):
+            (folder / "some").mkdir(exist_ok=True)
+            (folder / "some" / f"{len(list(folder.glob('*/*')))}.nbi").touch()
+            while not told:
+                time.sleep(0.01)
+        return told
+
+    assert counted(True)[-1] == (1, kernel_warm_up.FILES_OF_A_RUN)
+    assert counted(False)[-1] == (1, 0)  # one more: nobody knows how many are needed
+
+
+def test_a_run_that_compiles_nothing_tells_nothing(folder, monkeypatch):
+    monkeypatch.setattr(kernel_warm_up, "LOOKED_EVERY_S", 0.01)
+    with compiling_told(lambda *_: pytest.fail("nothing was compiled"), False):
+        time.sleep(0.05)
