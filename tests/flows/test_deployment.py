@@ -106,7 +106,7 @@ def test_runs_are_scheduled_for_six_in_the_morning(deployed):
 
 
 def test_a_killed_run_leaves_nothing_and_the_next_makes_the_night(deployed, night_dataset):
-    run_id, processes = deployed.in_the_middle(night=NIGHT)
+    run_id, processes = deployed.in_the_middle(night=NIGHT, again=True)
     for pid in processes:
         os.kill(pid, signal.SIGKILL)
     deployed.ends_as(run_id, "CRASHED")
@@ -165,7 +165,7 @@ def test_a_night_without_logs_fails_with_the_line_that_says_why(deployed):
 def test_a_killed_worker_leaves_the_dataset_and_the_next_one_goes_on(deployed, night_dataset):
     before = contents(deployed.out)
     assert before == contents(night_dataset)
-    run_id, processes = deployed.in_the_middle(night=NIGHT)
+    run_id, processes = deployed.in_the_middle(night=NIGHT, again=True)
     for pid in (deployed.worker.pid, *processes):
         os.kill(pid, signal.SIGKILL)
     deployed.worker.wait(timeout=30)

@@ -27,7 +27,7 @@ def run(night_log, tmp_path):
 
     def start(out: Path) -> subprocess.Popen:
         process = subprocess.Popen(
-            [sys.executable, "-c", COMMAND, "run", str(night_log), "--out", str(out)],
+            [sys.executable, "-c", COMMAND, "run", str(night_log), "--out", str(out), "--again"],
             env=os.environ | {"PREFECT_HOME": str(tmp_path / "prefect")},
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
         )  # fmt: skip

@@ -146,7 +146,7 @@ class FailingRuns:
         from epipole.flows.nightly import nightly
 
         try:
-            nightly([str(self.logs[log])], str(self.out), replace=True)
+            nightly([str(self.logs[log])], str(self.out), replace=True, again=True)
         except Exception as error:
             return error
         return None

@@ -150,7 +150,8 @@ class StoppedRuns:
     def _start(self, log: int, code: str, *arguments: str) -> subprocess.Popen[str]:
         kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
         own = {"TMPDIR": str(self.temporary), "PREFECT_HOME": str(self.home)}
-        asked = ["run", str(self.logs[log]), "--out", str(self.out), "--replace", "--quiet"]
+        asked = ["run", str(self.logs[log]), "--out", str(self.out), "--replace", "--again"]
+        asked.append("--quiet")
         return subprocess.Popen(
             [sys.executable, "-c", code, *arguments, *asked], env=kept | own,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,

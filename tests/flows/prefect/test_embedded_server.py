@@ -28,7 +28,7 @@ try:
 except EpipoleError as error:
     sys.exit(f"error: {error}")
 """
-SOON_S = 10
+SOON_S = 60  # of a busy machine; without the check, two minutes
 
 
 def started(home: Path | None, *arguments: str, **environment: str) -> subprocess.Popen[str]:
