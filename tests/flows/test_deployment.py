@@ -171,7 +171,7 @@ def test_a_killed_worker_leaves_the_dataset_and_the_next_one_goes_on(deployed, n
     deployed.worker.wait(timeout=30)
     assert published(deployed.out) == before
     deployed.worker = deployed.prefect.start_worker()
-    next_id = deployed.ask(night=NIGHT)
+    next_id = deployed.ask(night=NIGHT, again=True)
     wait_for(
         lambda: deployed.prefect.run(next_id)["state_name"] == "AwaitingConcurrencySlot",
         "the next run to wait for the place of the dead one",
