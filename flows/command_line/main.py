@@ -21,6 +21,7 @@ from epipole.flows.command_line.commands import (
     settings,
     simulate,
 )
+from epipole.flows.command_line.compiling import tells_compiling
 from epipole.flows.command_line.environment import prepare_environment
 from epipole.flows.command_line.stopping import stop_by_signals, stopped_in_one_line
 from epipole.schemas.errors import EpipoleError
@@ -83,8 +84,8 @@ def _options(
     """Options of every command."""
 
 
+app.command()(run.run)  # shows by itself what it compiles
 for command in (
-    run.run,
     nights.nights,
     info.info,
     calibrate.calibrate,
@@ -93,5 +94,5 @@ for command in (
     export.export,
     settings.settings,
 ):
-    app.command()(command)
+    app.command()(tells_compiling(command))
 app.add_typer(catalog.app, name="catalog")

@@ -7,8 +7,10 @@ from prefect.runtime import flow_run
 from pydantic import Field
 
 from epipole.schemas.errors import EpipoleError
+from epipole.schemas.text.shown import as_line
 
 YESTERDAY = "yesterday"
+LONGEST_NAME = 60  # of a log in a run's name
 
 Night = Annotated[str | None, Field(pattern=rf"^(\d{{4}}-\d\d-\d\d|{YESTERDAY})$")]
 
@@ -41,4 +43,12 @@ def run_name() -> str:
         night = night_asked(asked.get("night"))
     except EpipoleError:  # the run itself reports it
         night = asked["night"]
-    return f"night {night}" if night else "every night"
+    return f"night {night}" if night else f"all nights of {_what(asked.get('logs'))}"
+
+
+def _what(logs: Any) -> str:
+    """Return what the logs are called: the name of the only one, or how many were given."""
+    named = [logs] if isinstance(logs, str) else list(logs or ())
+    if len(named) != 1:
+        return f"{len(named)} logs"
+    return as_line(named[0].rstrip("/").rpartition("/")[2] or named[0], LONGEST_NAME)

@@ -44,7 +44,7 @@ def compile_beside() -> Iterator[bool]:
 
 
 @contextlib.contextmanager
-def compiling_told(told: Callable[[int, int], None], is_first: bool) -> Iterator[None]:
+def compiling_told(told: Callable[[int, int], None], is_first: bool = False) -> Iterator[None]:
     """Tell how many functions are compiled, as long as this lasts.
 
     Parameters
@@ -53,16 +53,15 @@ def compiling_told(told: Callable[[int, int], None], is_first: bool) -> Iterator
         Called with the number of new files in the kernel folder, and with how many a first run
         makes; this is 0 in a later run, where nobody knows how many more it needs.
     """
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    if not named:
-        yield
-        return
-    folder, ended = Path(named), threading.Event()
-    before = 0 if is_first else _count(folder)
+    ended = threading.Event()
+    before = 0 if is_first else _count()
 
     def watch() -> None:
+        nonlocal before
         while not ended.wait(LOOKED_EVERY_S):
-            if new := _count(folder) - before:
+            # The folder is known as soon as the first module with kernels is imported.
+            before = _count() if before is None else before
+            if new := (_count() or 0) - (before or 0):
                 told(new, max(FILES_OF_A_RUN, new) if is_first else 0)
 
     watcher = threading.Thread(target=watch, daemon=True)
@@ -74,8 +73,10 @@ def compiling_told(told: Callable[[int, int], None], is_first: bool) -> Iterator
         watcher.join()
 
 
-def _count(folder: Path) -> int:
-    return sum(1 for _ in folder.glob("*/*.nbi"))
+def _count() -> int | None:
+    """Return the number of files in the kernel folder; None: there is no folder yet."""
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    return sum(1 for _ in Path(named).glob("*/*.nbi")) if named else None
 
 
 def _start() -> Popen[bytes] | None:

@@ -13,7 +13,7 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from epipole.io.caches.arrays import cache_folder
@@ -21,20 +21,19 @@ from epipole.io.caches.private_folders import fault_of, is_ours, private_folder
 
 LOGGER = logging.getLogger(__name__)
 
+_ROOT = Path(__file__).parents[2]
+CODE = (_ROOT / "tasks" / "algorithms", _ROOT / "io")  # all kernels, and what they call
 KEPT = 8  # folders: several versions and environments of one user
 _USED = "used"  # this file exists after a run has succeeded
 
 
-def use_kernel_cache(*code: Path) -> None:
+def use_kernel_cache(code: Sequence[Path] = CODE) -> None:
     """Let numba keep kernels in the user's cache folder, under a digest of the code.
 
     A user's NUMBA_CACHE_DIR takes precedence, if it can be written. With EPIPOLE_CACHE=off they
     are kept beside the code if it can be written, else for this process only.
 
-    Parameters
-    ----------
-    code
-        The folders that hold all kernels and what they call.
+    Called before any kernel is declared: numba then decides where it is kept.
     """
     named = os.environ.get("NUMBA_CACHE_DIR")
     if named and _is_writable(Path(named)):

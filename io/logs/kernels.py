@@ -7,6 +7,10 @@ from typing import Any
 
 from numba import njit
 
+from epipole.io.caches.kernels import use_kernel_cache
+
+use_kernel_cache()
+
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": True}
 
 kernel = njit(**_OPTIONS)

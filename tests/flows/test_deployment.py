@@ -196,7 +196,7 @@ def test_a_run_from_the_command_line_goes_to_the_server_of_the_users_profile(
         env=kept | {"PREFECT_HOME": str(tmp_path)}, cwd=tmp_path, capture_output=True, text=True,
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
-    named = {"name": {"any_": ["every night"]}}
+    named = {"name": {"any_": [f"all nights of {night_log.name}"]}}
     (run,) = deployed.prefect.find("flow_runs", flow_runs=named)
     assert run["state_type"] == "COMPLETED"
     assert not list(tmp_path.glob("*.db*"))  # no embedded server's database

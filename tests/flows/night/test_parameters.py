@@ -49,9 +49,22 @@ def test_yesterday_is_the_day_before_the_run_was_scheduled():
         assert night_asked("yesterday") == "2019-04-01"
         assert run_name() == "night 2019-04-01"
     zone = datetime.timezone(datetime.timedelta(hours=9))
-    with patch.object(parameters, "flow_run", DueAt(due.astimezone(zone), {})):
+    with patch.object(parameters, "flow_run", DueAt(due.astimezone(zone), {"logs": "/data/logs"})):
         assert night_asked("yesterday") == "2019-04-01"
-        assert run_name() == "every night"
+        assert run_name() == "all nights of logs"
+
+
+@pytest.mark.parametrize(
+    ("logs", "name"),
+    [
+        ("/data/a.mcap", "a.mcap"), (["s3://b/logs/"], "logs"), (["a", "b"], "2 logs"), ("/", "/"),
+        ("a\nb" * 40, ("a\\nb" * 40)[:60]),
+    ],
+)  # fmt: skip
+def test_a_run_of_no_one_night_is_called_by_its_logs(logs, name):
+    with patch.object(parameters, "flow_run", DueAt(None, {"logs": logs})):
+        assert run_name().startswith(f"all nights of {name[:50]}")
+        assert len(run_name()) < 90
 
 
 class DueAt:

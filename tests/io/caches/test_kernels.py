@@ -25,25 +25,25 @@ def kept():
 
 
 def test_the_same_code_has_the_same_folder_and_other_code_another(code):
-    use_kernel_cache(code)
+    use_kernel_cache([code])
     first = kept()
     assert first == numba.config.CACHE_DIR
     os.environ["NUMBA_CACHE_DIR"] = ""
-    use_kernel_cache(code)
+    use_kernel_cache([code])
     assert kept() == first
     (code / "inner" / "kernel.py").write_text("a = 2\n")
     os.environ["NUMBA_CACHE_DIR"] = ""
-    use_kernel_cache(code)
+    use_kernel_cache([code])
     assert kept() != first
 
 
 def test_a_users_own_folder_wins(code, monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "mine"))
-    use_kernel_cache(code)
+    use_kernel_cache([code])
     assert kept() == str(tmp_path / "mine")
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     monkeypatch.setenv("EPIPOLE_CACHE", "off")
-    use_kernel_cache(code)
+    use_kernel_cache([code])
     assert kept() == ""
 
 
@@ -53,7 +53,7 @@ def test_folders_of_code_that_is_long_gone_are_removed(code, tmp_path):
         folder = tmp_path / "cache" / "kernels" / f"old{k}"
         folder.mkdir(parents=True)
         os.utime(folder, (old + k, old + k))
-    use_kernel_cache(code)
+    use_kernel_cache([code])
     left = {p.name for p in (tmp_path / "cache" / "kernels").iterdir()}
     assert len(left) == KEPT
     assert os.path.basename(kept()) in left

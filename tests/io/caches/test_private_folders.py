@@ -77,7 +77,7 @@ def test_a_new_cache_is_private_whatever_the_umask(folder):
     try:
         folder.rmdir()
         assert cache_folder() == folder
-        use_kernel_cache(CODE)
+        use_kernel_cache([CODE])
     finally:
         os.umask(old)
     kernels = Path(os.environ["NUMBA_CACHE_DIR"])
@@ -85,13 +85,13 @@ def test_a_new_cache_is_private_whatever_the_umask(folder):
 
 
 def test_kernels_that_another_user_has_left_are_not_run(folder, monkeypatch, caplog):
-    use_kernel_cache(CODE)
+    use_kernel_cache([CODE])
     kernels = Path(os.environ["NUMBA_CACHE_DIR"])
     assert kernels.parent == folder / "kernels"
     (kernels / "planted.nbi").touch()
     give_away(kernels / "planted.nbi")
     monkeypatch.setenv("NUMBA_CACHE_DIR", "")
-    use_kernel_cache(CODE)
+    use_kernel_cache([CODE])
     assert Path(os.environ["NUMBA_CACHE_DIR"]) == private_folder("kernels")
     assert "has files of another user" in caplog.text
 
@@ -99,7 +99,7 @@ def test_kernels_that_another_user_has_left_are_not_run(folder, monkeypatch, cap
 def test_a_kernel_folder_that_others_can_write_to_is_not_used(folder, monkeypatch):
     (folder / "kernels").mkdir()
     (folder / "kernels").chmod(0o777)
-    use_kernel_cache(CODE)
+    use_kernel_cache([CODE])
     assert Path(os.environ["NUMBA_CACHE_DIR"]) == private_folder("kernels")
 
 
@@ -144,7 +144,7 @@ def test_without_a_writable_home_one_line_says_so(tmp_path):
 def test_without_a_cache_and_with_code_that_cannot_be_written_kernels_are_temporary(monkeypatch):
     monkeypatch.setenv("EPIPOLE_CACHE", "off")
     monkeypatch.setattr(os, "access", lambda path, mode: False)
-    use_kernel_cache(CODE)
+    use_kernel_cache([CODE])
     assert Path(os.environ["NUMBA_CACHE_DIR"]) == private_folder("kernels")
 
 
@@ -186,7 +186,7 @@ def test_without_a_place_for_temporary_folders_one_line_says_so(tmp_path, monkey
 def test_a_kernel_folder_of_the_user_that_cannot_be_written_is_not_used(folder, monkeypatch):
     (folder / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder / "file"))
-    use_kernel_cache(CODE)
+    use_kernel_cache([CODE])
     assert Path(os.environ["NUMBA_CACHE_DIR"]).parent == folder / "kernels"
 
 
