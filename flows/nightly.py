@@ -43,6 +43,7 @@ from epipole.io.datasets.dataset import (
     night_place,
     nights_of,
 )
+from epipole.io.settings_file import merged_settings
 from epipole.io.work.folder import work_folder, work_root
 from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder
 from epipole.io.work.recipe import logs_key, recipe_of
@@ -66,6 +67,7 @@ def nightly(
     replace: bool = False,
     known: str | None = None,
     again: bool = False,
+    settings_file: str | None = None,
 ) -> Summary:
     """Turn logs into a dataset.
 
@@ -81,11 +83,14 @@ def nightly(
         known: A file of element sets, to name known objects by: two-line elements, or OMM in CSV,
             JSON or XML. A path or URL. None: no object gets a name.
         again: Make a night again even if nothing has changed since it was made.
+        settings_file: A file of settings (TOML) on the machine of the worker; settings that are
+            given count more.
 
     Raises:
         EpipoleError: If the work cannot be done; the dataset is then unchanged.
     """
     night = night_asked(night)
+    settings = merged_settings(settings_file, settings)
     check_folder(out)
     check_star_catalogue(settings.identification.catalogue)
     catalogue = read_known_objects(known) if known else None

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from epipole.schemas.errors import SettingsError
-from epipole.schemas.settings import Group, Settings, parse_settings
+from epipole.schemas.settings import Group, Settings, parse_settings, validate_settings
 
 WIDTH = 88
 
@@ -30,6 +30,24 @@ def read_settings(path: Path) -> Settings:
             f"{path}: {error.strerror}; `epipole settings` prints a file to start from"
         ) from error
     return parse_settings(text, str(path))
+
+
+def merged_settings(file: str | None, given: Settings) -> Settings:
+    """Return the settings of a file, and in place of some those that were given.
+
+    Where both leave a setting out, it keeps its default.
+
+    Raises
+    ------
+    SettingsError
+        As `read_settings`; also where what was given contradicts the file.
+    """
+    if file is None:
+        return given
+    below = read_settings(Path(file)).model_dump(exclude_unset=True)
+    for group, values in given.model_dump(exclude_unset=True).items():
+        below[group] = {**below.get(group, {}), **values}
+    return validate_settings(below, f"{file} and the settings given")
 
 
 def settings_text(settings: Settings) -> str:

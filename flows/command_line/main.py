@@ -13,6 +13,7 @@ import typer.core
 from epipole.flows.command_line.commands import (
     calibrate,
     catalog,
+    deploy_files,
     evaluate,
     export,
     info,
@@ -93,6 +94,7 @@ for command in (
     evaluate.evaluate,
     export.export,
     settings.settings,
+    deploy_files.deploy_files,
 ):
     app.command()(tells_compiling(command))
 app.add_typer(catalog.app, name="catalog")

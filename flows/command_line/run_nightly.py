@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from epipole.flows.command_line.terminal import shown
 from epipole.flows.night.held_nights import held_nights
@@ -160,10 +160,10 @@ class Nights:
 
         def make(night: str | None) -> Summary:
             with lost_server_as_line():
-                made: Summary = flow(
+                made = flow(
                     self._logs, self._out, self._settings, night, options.replace, options.known,
                     options.again,
                 )  # fmt: skip
-            return made
+            return cast(Summary, made)  # Prefect takes it out of the flow's last state
 
         return make

@@ -9,26 +9,34 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.datasets.night_files import Where, count_rows, read_columns
+from epipole.schemas.bridge import array
 from epipole.schemas.rejects import NameStatus, Reason
 
 
 @dataclass(frozen=True)
 class SensorSummary:
-    """Counts of one sensor. The residual is the median of its frames; None without stars."""
+    """Counts of one sensor.
+
+    The residual is the median of its frames, the gap the longest time between frames that were
+    identified; None without stars.
+    """
 
     sensor_id: str
     frames: int
     identified: int
     residual_px: float | None
+    gap_s: float | None
     tracks: int
 
     def as_row(self) -> dict[str, Any]:
         """Return the counts as a row of a table that people read."""
         residual = "" if self.residual_px is None else f"{self.residual_px:.3f}"
+        gap = "" if self.gap_s is None else f"{self.gap_s:,.0f}"
         return {
             "sensor": self.sensor_id,
             "frames": self.frames,
             "identified": self.identified,
+            "longest gap s": gap,
             "residual px": residual,
             "tracks": self.tracks,
         }
@@ -85,6 +93,8 @@ class Summary:
 
     def sentence(self) -> str:
         """Return what was found as one line, with what needs a look."""
+        if self.unchanged:
+            return f"unchanged: {', '.join(self.nights)}"
         parts = [
             many(self.objects, "object"),
             many(self.positions, "position"),
@@ -117,7 +127,7 @@ class Summary:
 
 # The columns that are counted: all columns of a whole night would not fit in memory.
 _COLUMNS = {
-    "frames": ["sensor_id", "attitude_source", "residual_px"],
+    "frames": ["sensor_id", "time", "attitude_source", "residual_px"],
     "tracklets": ["sensor_id", "track_id"],
     "epochs": ["epoch"],
     "positions": ["object_id"],
@@ -198,11 +208,14 @@ def _by_night(sentences: Mapping[str, Sequence[str]]) -> list[str]:
 def _of_sensor(frames: pa.Table, tracklets: pa.Table, sensor_id: str) -> SensorSummary:
     tracklets = tracklets.filter(pc.field("sensor_id") == sensor_id)
     residual_px = frames["residual_px"].drop_null().to_numpy()
+    identified = frames.filter(pc.field("attitude_source") == "stars")
+    times_ns = np.sort(array(identified, "time"))
     return SensorSummary(
         sensor_id=sensor_id,
         frames=frames.num_rows,
         identified=pc.sum(pc.equal(frames["attitude_source"], "stars")).as_py() or 0,
         residual_px=float(np.median(residual_px)) if len(residual_px) else None,
+        gap_s=float(np.diff(times_ns).max() * 1e-9) if len(times_ns) > 1 else None,
         tracks=pc.count_distinct(tracklets["track_id"]).as_py(),
     )
 

@@ -1,4 +1,4 @@
-"""Artifacts of a night on Prefect's page: its progress, its results, where the dataset is.
+"""Artifacts of a night on Prefect's page: its progress and its results.
 
 A page that cannot be written is a warning, never an error.
 """
@@ -7,13 +7,11 @@ import contextlib
 import logging
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import cast
 from uuid import UUID
 
 import httpx
 from prefect.artifacts import (
-    create_link_artifact,
     create_markdown_artifact,
     create_progress_artifact,
     create_table_artifact,
@@ -23,6 +21,7 @@ from prefect.exceptions import PrefectException
 
 from epipole.flows.night.progress import COMPILE
 from epipole.flows.night.summary import Summary, many
+from epipole.schemas.rejects import Reason
 from epipole.schemas.text.shown import as_line, as_markdown_text
 
 LOGGER = logging.getLogger(__name__)
@@ -75,7 +74,7 @@ class ProgressBar(logging.Handler):
 
 
 def show_summary(summary: Summary) -> None:
-    """Show the results of a run: its counts, a table of its sensors, a link to its nights."""
+    """Show the results of a run: its counts and where its nights are, and a table of sensors."""
     nights = ", ".join(summary.nights)
     with _as_warning("the summary"):
         create_markdown_artifact(as_markdown(summary), "night", f"Night {nights}")
@@ -84,10 +83,6 @@ def show_summary(summary: Summary) -> None:
             for sensor in summary.by_sensor
         ]
         create_table_artifact(rows, "sensors", f"Sensors of {nights}")
-        for night in summary.nights:
-            folder = f"{summary.dataset.rstrip('/')}/night={night}"
-            link = folder if "://" in folder else Path(folder).absolute().as_uri()
-            create_link_artifact(link, as_line(folder), "dataset", f"Tables of {night}")
 
 
 def as_markdown(summary: Summary) -> str:
@@ -103,7 +98,11 @@ def as_markdown(summary: Summary) -> str:
         "epochs": summary.epochs,
         "positions": summary.positions,
     } | {f"objects {status}": count for status, count in summary.names.items()}
-    lines = [f"# Night {', '.join(summary.nights)}", "", *_table("what", counts)]
+    lines = [f"# Night {', '.join(summary.nights)}", "", *_table("what", counts), ""]
+    if summary.unchanged:
+        lines += ["Nothing has changed since it was made, so it was not made again.", ""]
+    # No link: browsers open neither files nor buckets from a page.
+    lines += ["Tables:", "", *(f"- {as_markdown_text(place)}" for place in _places(summary))]
     if summary.faults:
         lines += [
             "",
@@ -116,8 +115,16 @@ def as_markdown(summary: Summary) -> str:
         lines += [f"- {as_markdown_text(residual)}" for residual in summary.residuals]
     if summary.rejects:
         lines += ["", f"Left out: {many(sum(summary.rejects.values()), 'thing')}", ""]
-        lines += _table("reason", summary.rejects)
+        lines += ["| reason | count | what it means |", "|---|---:|---|"]
+        lines += [
+            f"| {reason} | {n:,} | {Reason(reason).sentence} |"
+            for reason, n in summary.rejects.items()
+        ]
     return "\n".join(lines) + "\n"
+
+
+def _places(summary: Summary) -> list[str]:
+    return [f"{summary.dataset.rstrip('/')}/night={night}" for night in summary.nights]
 
 
 def _table(heading: str, counts: dict[str, int]) -> list[str]:

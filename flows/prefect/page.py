@@ -6,8 +6,10 @@ import logging
 from collections.abc import Callable, Iterator
 from typing import ParamSpec
 
+from prefect.client.schemas.objects import State
 from prefect.context import FlowRunContext, TaskRunContext
 from prefect.logging.handlers import APILogHandler
+from prefect.states import Completed
 
 from epipole.flows.night.progress import ROOT, STEPS, with_safe_text
 from epipole.flows.night.summary import Summary
@@ -16,11 +18,11 @@ from epipole.flows.prefect.artifacts import ProgressBar, show_summary
 P = ParamSpec("P")
 
 
-def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, Summary]:
+def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, State[Summary]]:
     """Return the flow's function, with its log lines, progress and summary on Prefect's page."""
 
     @functools.wraps(flow)
-    def shown(*args: P.args, **kwargs: P.kwargs) -> Summary:
+    def shown(*args: P.args, **kwargs: P.kwargs) -> State[Summary]:
         bar = ProgressBar()
         with _added(ROOT, _RunLog(logging.INFO)), _added(STEPS, bar):
             try:
@@ -30,7 +32,8 @@ def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, Summary]:
                 raise
             bar.finish("done")
             show_summary(summary)
-            return summary
+            # The flow's caller gets the summary; the page, and --watch, show the message.
+            return Completed(message=summary.sentence(), data=summary)
 
     return shown
 

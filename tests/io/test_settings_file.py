@@ -2,7 +2,7 @@
 
 import pytest
 
-from epipole.io.settings_file import read_settings, settings_text
+from epipole.io.settings_file import merged_settings, read_settings, settings_text
 from epipole.schemas.errors import SettingsError
 from epipole.schemas.settings import Settings
 
@@ -31,3 +31,16 @@ def test_absurd_text_is_one_short_line(text, tmp_path):
         read_settings(tmp_path / "settings.toml")
     assert str(raised.value).startswith(str(tmp_path / "settings.toml"))
     assert len(str(raised.value)) < 400
+
+
+def test_settings_that_are_given_count_more_than_the_file_and_the_file_more_than_defaults(tmp_path):
+    file = tmp_path / "s.toml"
+    file.write_text("[sensors]\ncentroid_sigma_px = 0.25\nstate_gap_s = 7.0\n")
+    given = Settings.model_validate({"sensors": {"state_gap_s": 9.0}, "tracklets": {}})
+    merged = merged_settings(str(file), given)
+    assert (merged.sensors.centroid_sigma_px, merged.sensors.state_gap_s) == (0.25, 9.0)
+    assert merged.positions == Settings().positions
+    assert merged_settings(None, given) == given
+    assert merged_settings(str(file), Settings()) == read_settings(file)
+    with pytest.raises(SettingsError, match="No such file"):
+        merged_settings(str(tmp_path / "none.toml"), given)

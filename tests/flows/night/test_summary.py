@@ -68,6 +68,7 @@ def test_staged_nights_are_counted_together(tmp_path):
         rejects=reject_rows(reasons, time=[1, 2, 3, 4], count=[3, 8, 3, 1]),
         frames={
             "sensor_id": ["a"], "attitude_source": ["stars"], "residual_px": pa.array([0.75]),
+            "time": [7_000_000_000],
         },
         positions={"object_id": ["o"]},
         sources={"sha256": ["s"]},
@@ -82,7 +83,13 @@ def test_staged_nights_are_counted_together(tmp_path):
     assert summary.faults == ["2019-04-01: the clock of a is late"]
     rows = [sensor.as_row() for sensor in summary.by_sensor]
     assert rows == [
-        {"sensor": "a", "frames": 3, "identified": 2, "residual px": "0.500", "tracks": 1},
-        {"sensor": "b", "frames": 1, "identified": 0, "residual px": "", "tracks": 1},
-    ]
+        {
+            "sensor": "a", "frames": 3, "identified": 2, "longest gap s": "7",
+            "residual px": "0.500", "tracks": 1,
+        },
+        {
+            "sensor": "b", "frames": 1, "identified": 0, "longest gap s": "", "residual px": "",
+            "tracks": 1,
+        },
+    ]  # fmt: skip
     assert summary.as_dict()["by_sensor"][1]["residual_px"] is None

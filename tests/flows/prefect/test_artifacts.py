@@ -6,12 +6,13 @@ from epipole.flows.night.progress import STEPS, step
 from epipole.flows.night.summary import Summary
 from epipole.flows.prefect import artifacts
 from epipole.flows.prefect.artifacts import ProgressBar, as_markdown, show_summary
+from epipole.schemas.rejects import Reason
 from epipole.schemas.stages import Stage
 
 FOUND = {
     "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
     "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "epochs": 6, "objects": 5,
-    "positions": 4, "rejects": {"no_state": 34, "bad_crc": 1}, "faults": [], "by_sensor": [],
+    "positions": 4, "rejects": {"no_state": 34, "bad_sigma": 1}, "faults": [], "by_sensor": [],
     "names": {}, "residuals": [], "unchanged": False,
 }  # fmt: skip
 
@@ -21,7 +22,15 @@ def test_the_page_of_a_night_has_its_counts_and_what_was_left_out_by_reason():
     assert "# Night 2019-04-01" in page
     assert "| frames | 1,234 |" in page
     assert "Left out: 35 things" in page
-    assert "| no_state | 34 |\n| bad_crc | 1 |" in page
+    no_state, bad_sigma = Reason.NO_STATE, Reason.BAD_SIGMA
+    rows = f"| no_state | 34 | {no_state.sentence} |\n| bad_sigma | 1 | {bad_sigma.sentence} |"
+    assert rows in page
+    assert "not made again" not in page
+    assert "- /data/out/night=2019-04-01" in page
+
+
+def test_the_page_of_an_unchanged_night_says_that_it_was_not_made_again():
+    assert "not made again" in as_markdown(Summary(**FOUND | {"unchanged": True}))
 
 
 def test_progress_only_grows_though_a_stage_is_done_again(monkeypatch):
@@ -48,7 +57,7 @@ def test_a_page_that_cannot_be_written_is_one_warning_and_no_failure(monkeypatch
     def refused(*_, **__):
         raise httpx.ConnectError("connection refused")
 
-    for name in ("progress", "markdown", "table", "link"):
+    for name in ("progress", "markdown", "table"):
         monkeypatch.setattr(artifacts, f"create_{name}_artifact", refused)
     monkeypatch.setattr(artifacts, "update_progress_artifact", refused)
     bar = ProgressBar()

@@ -47,7 +47,7 @@ def test_the_run_is_named_and_has_its_artifacts(page):
     (run,) = page("flow_runs")
     assert run["name"].startswith("all nights of ")
     shown = {artifact["key"]: artifact for artifact in page("artifacts")}
-    assert set(shown) == {"progress", "night", "sensors", "dataset"}
+    assert set(shown) == {"progress", "night", "sensors"}
     assert shown["progress"]["data"] == 100
     assert shown["progress"]["description"] == "done"
     assert "| objects | 9 |" in shown["night"]["data"]
@@ -56,7 +56,10 @@ def test_the_run_is_named_and_has_its_artifacts(page):
     assert [row["frames"] for row in sensors] == [60] * 4
     assert all(row["identified"] > 50 and row["tracks"] == 9 for row in sensors)
     assert all(0.05 < float(row["residual px"]) < 0.5 for row in sensors)
-    assert "out/night=2019-04-01](file:///" in shown["dataset"]["data"]
+    assert all(0.9 < float(row["longest gap s"]) < 10 for row in sensors)
+    assert "night=2019-04-01" in shown["night"]["data"]
+    assert run["state"]["message"].startswith("9 objects, ")
+    assert "240 of 240 frames identified" in run["state"]["message"]
 
 
 def test_a_run_that_fails_says_so_and_leaves_no_handler(monkeypatch):
