@@ -18,6 +18,7 @@ from epipole.flows.command_line.commands import (
     export,
     info,
     nights,
+    overlay,
     run,
     settings,
     simulate,
@@ -93,6 +94,7 @@ for command in (
     simulate.simulate,
     evaluate.evaluate,
     export.export,
+    overlay.overlay,
     settings.settings,
     deploy_files.deploy_files,
 ):

@@ -29,7 +29,7 @@ from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.bridge import array, conform, empty
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.spans import DAY_NS
+from epipole.schemas.spans import DAY_NS, Span
 from epipole.schemas.tables import TABLES
 
 # The time column that decides to which night a row belongs, where it is not `time`. Calibrations
@@ -105,6 +105,7 @@ def read_table(
     night: str,
     columns: Sequence[str] | None = None,
     since_ns: int | None = None,
+    during: Span | None = None,
 ) -> pa.Table:
     """Return a table of a night. It has no rows where the night is missing.
 
@@ -114,6 +115,8 @@ def read_table(
         Names of those to read; None: all.
     since_ns
         Rows of earlier epochs are left out. Only for a table that has epochs.
+    during
+        Rows of other epochs are left out, or of other times where the table has no epochs.
 
     Raises
     ------
@@ -129,12 +132,10 @@ def read_table(
     else:
         local_nights.recover(_folder(dataset))
         parts = sorted((_folder(dataset) / f"night={night}" / table).glob("*.parquet"))
+    chosen = _chosen(TABLES[table], since_ns, during)
     try:
         rows = [
-            conform(
-                schema,
-                pq.read_table(part, partitioning=None, columns=columns, filters=_since(since_ns)),
-            )
+            conform(schema, pq.read_table(part, partitioning=None, columns=columns, filters=chosen))
             for part in parts
         ]
     except (OSError, ValueError) as error:
@@ -145,8 +146,13 @@ def read_table(
     return pa.concat_tables([empty(schema), *rows])
 
 
-def _since(since_ns: int | None) -> pc.Expression | None:
-    return None if since_ns is None else pc.field("epoch") >= pa.scalar(since_ns, TIME)
+def _chosen(schema: pa.Schema, since_ns: int | None, during: Span | None) -> pc.Expression | None:
+    if since_ns is not None:
+        return pc.field("epoch") >= pa.scalar(since_ns, TIME)
+    if during is None:
+        return None
+    time = pc.field("epoch" if "epoch" in schema.names else "time")
+    return (time >= pa.scalar(during.start_ns, TIME)) & (time < pa.scalar(during.end_ns, TIME))
 
 
 def missing_tables(dataset: Where, night: str) -> list[str]:

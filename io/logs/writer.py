@@ -2,22 +2,16 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy.typing as npt
-from mcap.writer import CompressionType, Writer
 
+from epipole.io.logs.mcap_file import McapFile, Schema
 from epipole.io.logs.messages.encodings.encoding import Values
 from epipole.io.logs.messages.encodings.registry import encoding_named
 from epipole.schemas.logs.messages import CALIBRATION, FRAME, STATE
 
-COMPRESSIONS = {
-    "zstd": CompressionType.ZSTD,
-    "lz4": CompressionType.LZ4,
-    "none": CompressionType.NONE,
-}
 _TOPICS = {FRAME: "centroids", STATE: "state", CALIBRATION: "calibration"}
 Numbers = npt.ArrayLike
 
@@ -54,19 +48,10 @@ class LogWriter:
         chunk_size: int = 1 << 20,
     ) -> None:
         self._encoding = encoding_named(encoding)
-        if compression not in COMPRESSIONS:
-            raise ValueError(f"compression {compression!r}: not one of {', '.join(COMPRESSIONS)}")
-        self._path = Path(path)
-        self._partial = self._path.with_name(self._path.name + ".partial")
-        self._file = self._partial.open("wb")
-        self._writer = Writer(
-            self._file, compression=COMPRESSIONS[compression], chunk_size=chunk_size
+        self._file = McapFile(
+            path, profile=self._encoding.profile, compression=compression, chunk_size=chunk_size
         )
-        # The default library name has a version in it, which would change the bytes.
-        self._writer.start(profile=self._encoding.profile, library="epipole")
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[tuple[str, str], int] = {}
-        self._sequences: dict[int, int] = {}
+        self._schemas: dict[str, Schema] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -77,17 +62,11 @@ class LogWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self._file.close()
-            self._partial.unlink(missing_ok=True)
+        self._file.__exit__(kind, error, trace)
 
     def close(self) -> None:
         """Write the summary and give the file its name."""
-        self._writer.finish()
         self._file.close()
-        self._partial.replace(self._path)
 
     def camera(self, sensor_id: str, time_ns: int, camera: Mapping[str, Any] | Any) -> None:
         """Write a calibration that holds from `time_ns` on.
@@ -158,24 +137,19 @@ class LogWriter:
 
     def _write(self, kind: str, time_ns: int, sensor_id: str, values: Values) -> None:
         data = self._encoding.encode(kind, values)
-        channel = self._channels.get((kind, sensor_id)) or self._open(kind, sensor_id)
-        sequence = self._sequences[channel]
-        self._sequences[channel] = sequence + 1
-        self._writer.add_message(channel, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
+        schema = self._schemas.get(kind) or self._schema(kind)
+        self._file.write(f"/{sensor_id}/{_TOPICS[kind]}", schema, time_ns, data)
 
-    def _open(self, kind: str, sensor_id: str) -> int:
+    def _schema(self, kind: str) -> Schema:
         encoding = self._encoding
-        name = encoding.schema_names[kind][0]
-        if name not in self._schemas:
-            self._schemas[name] = self._writer.register_schema(
-                name, encoding.schema_encoding, encoding.schema(kind)
-            )
-        channel = self._writer.register_channel(
-            f"/{sensor_id}/{_TOPICS[kind]}", encoding.message_encoding, self._schemas[name]
+        schema = Schema(
+            encoding.schema_names[kind][0],
+            encoding.schema_encoding,
+            encoding.schema(kind),
+            encoding.message_encoding,
         )
-        self._channels[(kind, sensor_id)] = channel
-        self._sequences[channel] = 0
-        return channel
+        self._schemas[kind] = schema
+        return schema
 
 
 def calibration_values(sensor_id: str, time_ns: int, camera: Values) -> dict[str, Any]:

@@ -109,16 +109,17 @@ def protobuf_schema(kind: str) -> bytes:
     """Return the content of an MCAP schema of encoding `protobuf`: the file and all it needs."""
     files = descriptor_pb2.FileDescriptorSet()
     if kind == CALIBRATION:
-        _add_file(files, CameraCalibration.DESCRIPTOR.file)
+        add_file(files, CameraCalibration.DESCRIPTOR.file)
     else:
-        _add_file(files, timestamp_pb2.DESCRIPTOR)
+        add_file(files, timestamp_pb2.DESCRIPTOR)
         files.file.append(file_descriptor())
     return files.SerializeToString(deterministic=True)
 
 
-def _add_file(files: descriptor_pb2.FileDescriptorSet, file: Any) -> None:
+def add_file(files: descriptor_pb2.FileDescriptorSet, file: Any) -> None:
+    """Add a schema's file, and those that it needs, unless they are there."""
     for dependency in file.dependencies:
-        _add_file(files, dependency)
+        add_file(files, dependency)
     if file.name not in [added.name for added in files.file]:
         file.CopyToProto(files.file.add())
 

@@ -1,0 +1,167 @@
+"""A night drawn over its logs, for viewers of MCAP files: stars, tracks, objects, what is left out.
+
+It is written half an hour at a time, so that a night of any size fits into memory.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+from foxglove_schemas_protobuf.Log_pb2 import Log
+
+from epipole.io.datasets.dataset import nights_in, nights_of, read_table
+from epipole.io.logs.listing import list_logs
+from epipole.io.logs.reader import read_log_pieces
+from epipole.io.logs.viewer_file import ViewerFile
+from epipole.schemas.bridge import array, to_polars
+from epipole.schemas.errors import DatasetError, LogError, NoFramesError
+from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
+from epipole.tasks.overlay.messages import (
+    OBJECTS,
+    SCENE,
+    SpanTables,
+    ViewerMessage,
+    camera_shapes,
+    epoch_messages,
+    frame_messages,
+    log_message,
+    log_messages,
+    with_objects,
+)
+from epipole.tasks.overlay.scene import earth
+
+HIPPARCOS = "hipparcos"  # its stars are named by their number in it
+SHOWN_EPOCHS = 3  # an object is shown as long, if no later epoch has it
+
+
+@dataclass(frozen=True)
+class Overlay:
+    """What was written."""
+
+    out: str
+    nights: list[str]
+    frames: int
+    epochs: int
+    log_lines: int
+    without_rows: int  # frames of the logs that the dataset does not have
+
+
+class _Logs:
+    """What the logs tell: calibrations, and the times of the frames of each sensor."""
+
+    def __init__(self, paths: Sequence[str]) -> None:
+        cameras, exposures = [], []
+        for path in paths:
+            for piece in read_log_pieces(path):
+                cameras.append(piece.cameras)
+                exposures.append(piece.exposures.select(["sensor_id", "time"]))
+        self.cameras: pa.Table = pa.concat_tables(cameras)
+        frames = pl.concat([to_polars(rows) for rows in exposures])
+        self.frames = frames.unique().sort("time", "sensor_id")
+        if not len(self.frames):
+            raise LogError(f"{', '.join(paths)}: no frames in these logs; give others")
+        self.nights = nights_of(self.frames["time"].dt.timestamp("ns").to_numpy())
+
+
+def overlay(
+    dataset: str, logs: Sequence[str], out: Path, night: str | None = None, images: bool = False
+) -> Overlay:
+    """Write what the dataset says of the frames of the logs.
+
+    Parameters
+    ----------
+    night
+        Only this UTC date; None: all nights of the logs that the dataset has.
+    images
+        Also write an image for each frame, drawn from its centroids.
+
+    Raises
+    ------
+    EpipoleError
+        Where the dataset has no night of the logs, or the file cannot be written.
+    """
+    paths = [path for where in logs for path in list_logs(where)[0]]
+    told = _Logs(paths)
+    nights = [date for date in nights_in(dataset) if date in told.nights and night in (None, date)]
+    if not nights:
+        asked = night or ", ".join(told.nights)
+        raise NoFramesError(f"{dataset}: has no night of these logs ({asked}); run them first")
+    counts = {"frames": 0, "epochs": 0, "log_lines": 0}
+    try:
+        with ViewerFile(out) as file:
+            for date in nights:
+                _calibrations(file, told, date)
+                for message in _of_night(dataset, date, told, images, counts):
+                    file.message(message.topic, message.schema, message.time_ns, message.data)
+    except OSError as error:
+        raise DatasetError(f"{out}: cannot be written: {error.strerror}; give another") from error
+    asked_frames = told.frames.filter(pl.col("time").dt.date().cast(pl.String).is_in(nights))
+    return Overlay(
+        str(out), nights, **counts, without_rows=max(len(asked_frames) - counts["frames"], 0)
+    )
+
+
+def _calibrations(file: ViewerFile, told: _Logs, night: str) -> None:
+    """Write the calibrations of a night; the first of a sensor holds from its first frame."""
+    start_ns = day_of(night) * DAY_NS
+    first_ns = dict(
+        told.frames.group_by("sensor_id")
+        .agg(pl.col("time").min().dt.timestamp("ns"))
+        .sort("sensor_id")
+        .iter_rows()
+    )
+    rows = to_polars(told.cameras).sort("sensor_id", "time").unique(maintain_order=True)
+    for (sensor,), own in rows.partition_by("sensor_id", as_dict=True, maintain_order=True).items():
+        times_ns = own["time"].dt.timestamp("ns").to_list()
+        for number, row in enumerate(own.iter_rows(named=True)):
+            since_ns = times_ns[number] if number else first_ns.get(sensor, times_ns[0])
+            file.calibration(str(sensor), max(since_ns, start_ns), row)
+
+
+def _of_night(
+    dataset: str, night: str, told: _Logs, images: bool, counts: dict[str, int]
+) -> Iterator[ViewerMessage]:
+    sensors = sorted(set(told.frames["sensor_id"]))
+    times_ns = told.frames["time"].dt.timestamp("ns").to_numpy()
+    row = next(iter(read_table(dataset, "nights", night).to_pylist()), None)
+    named = row is not None and row["star_catalogue_key"].startswith(HIPPARCOS)
+    shapes = camera_shapes(told.cameras) if images else {}
+    positions = array(read_table(dataset, "positions", night, ["epoch"]), "epoch")
+    apart_ns = np.diff(np.unique(positions))
+    lifetime_ns = SHOWN_EPOCHS * int(np.median(apart_ns)) if len(apart_ns) else SPAN_NS
+    day = day_of(night)
+    spans = [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in np.unique(times_ns // SPAN_NS).tolist()]
+    of_night = [span for span in spans if span.start_ns // DAY_NS == day]
+    start_ns = int(times_ns[times_ns // DAY_NS == day].min())
+    yield ViewerMessage(start_ns, OBJECTS, SCENE, earth(start_ns))
+    for fault in row["faults"] if row is not None else ():
+        yield log_message(start_ns, Log.Level.ERROR, "check", fault)
+    for span in of_night:
+        tables = _tables(dataset, night, span, sensors)
+        messages = [
+            *frame_messages(tables, "HIP " if named else "", shapes),
+            *epoch_messages(tables, lifetime_ns),
+        ]
+        lines = list(log_messages(to_polars(read_table(dataset, "rejects", night, during=span))))
+        counts["frames"] += len(tables.frames)
+        counts["epochs"] += tables.positions["epoch"].n_unique()
+        counts["log_lines"] += len(lines)
+        yield from sorted([*messages, *lines])
+
+
+def _tables(dataset: str, night: str, span: Span, sensors: Sequence[str]) -> SpanTables:
+    def read(table: str) -> pl.DataFrame:
+        return to_polars(read_table(dataset, table, night, during=span))
+
+    seen = pl.col("sensor_id").is_in(sensors)
+    associations = read("associations")
+    return SpanTables(
+        read("frames").filter(seen),
+        read("stars").filter(seen),
+        with_objects(read("detections").filter(seen), associations),
+        associations.filter(pl.col("used") & seen),
+        read("positions"),
+    )

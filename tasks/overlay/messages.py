@@ -1,0 +1,129 @@
+"""The messages of a span of a night: of each frame, of each epoch, and of what was left out."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import polars as pl
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.Log_pb2 import Log
+
+from epipole.schemas.bridge import to_polars
+from epipole.schemas.columns import PLACE
+from epipole.schemas.rejects import Reason
+from epipole.schemas.work_tables import CAMERAS
+from epipole.tasks.overlay.annotations import annotations, image_of
+from epipole.tasks.overlay.png import png
+from epipole.tasks.overlay.scene import objects, transform
+
+ANNOTATIONS, CALIBRATION, IMAGE = (
+    "foxglove.ImageAnnotations", "foxglove.CameraCalibration", "foxglove.CompressedImage",
+)  # fmt: skip
+TRANSFORM, SCENE, LOG = "foxglove.FrameTransform", "foxglove.SceneUpdate", "foxglove.Log"
+OBJECTS, TRANSFORMS, LEFT_OUT = "/epipole/objects", "/epipole/transforms", "/epipole/rejects"
+
+
+class ViewerMessage(NamedTuple):
+    """A message to be written; messages are sorted by time, then by topic."""
+
+    time_ns: int
+    topic: str
+    schema: str
+    data: bytes
+
+
+class SpanTables(NamedTuple):
+    """Rows of a span: FRAMES, STARS, DETECTIONS with `object_id`, used ASSOCIATIONS, POSITIONS."""
+
+    frames: pl.DataFrame
+    stars: pl.DataFrame
+    detections: pl.DataFrame
+    associations: pl.DataFrame
+    positions: pl.DataFrame
+
+
+def frame_messages(
+    tables: SpanTables, star_names: str, shapes: Mapping[str, tuple[int, int]]
+) -> Iterator[ViewerMessage]:
+    """Yield annotations and transforms of all frames.
+
+    `shapes` (rows, columns) are of the sensors whose images are drawn; others get none.
+    """
+    key = ["sensor_id", "frame_number"]
+    stars = tables.stars.partition_by(key, as_dict=True)
+    detections = tables.detections.partition_by(key, as_dict=True)
+    for row in _timed(tables.frames, "time").iter_rows(named=True):
+        sensor, number, time_ns = row["sensor_id"], row["frame_number"], row["time_ns"]
+        own = (
+            stars.get((sensor, number), tables.stars.clear()),
+            detections.get((sensor, number), tables.detections.clear()),
+        )
+        data = annotations(time_ns, *own, star_names)
+        yield ViewerMessage(time_ns, f"/{sensor}/annotations", ANNOTATIONS, data)
+        if sensor in shapes:
+            yield ViewerMessage(
+                time_ns, f"/{sensor}/image", IMAGE, _image(time_ns, sensor, shapes[sensor], own)
+            )
+        if row["qw"] is not None and row["x_km"] is not None:
+            yield ViewerMessage(time_ns, TRANSFORMS, TRANSFORM, transform(time_ns, sensor, row))
+
+
+def _image(
+    time_ns: int, sensor: str, shape: tuple[int, int], centroids: tuple[pl.DataFrame, ...]
+) -> bytes:
+    message: Any = CompressedImage(frame_id=sensor, format="png")
+    message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
+    places = pl.concat([rows.select("x_px", "y_px") for rows in centroids])
+    message.data = png(image_of(shape, places.to_numpy()))
+    data: bytes = message.SerializeToString(deterministic=True)
+    return data
+
+
+def epoch_messages(tables: SpanTables, lifetime_ns: int) -> Iterator[ViewerMessage]:
+    """Yield the objects of each epoch, with the lines of sight to them."""
+    places = tables.frames.select("sensor_id", "frame_number", *PLACE)
+    lines = tables.associations.join(places, on=["sensor_id", "frame_number"], how="inner")
+    by_epoch = lines.drop_nulls(PLACE).partition_by("epoch", as_dict=True)
+    for (epoch,), positions in (
+        _timed(tables.positions, "epoch")
+        .partition_by("epoch", as_dict=True, maintain_order=True)
+        .items()
+    ):
+        time_ns = positions["time_ns"][0]
+        data = objects(time_ns, positions, by_epoch.get((epoch,), lines.clear()), lifetime_ns)
+        yield ViewerMessage(time_ns, OBJECTS, SCENE, data)
+
+
+def log_messages(rejects: pl.DataFrame) -> Iterator[ViewerMessage]:
+    """Yield a line of log for each row of REJECTS."""
+    for row in _timed(rejects, "time").iter_rows(named=True):
+        about = " ".join(filter(None, (row["source"], row["sensor_id"], row["tracklet_id"])))
+        text = f"{about}: {Reason(row['reason']).sentence} ({row['count']:,})"
+        yield log_message(row["time_ns"], Log.Level.WARNING, row["stage"], text)
+
+
+def log_message(time_ns: int, level: int, name: str, text: str) -> ViewerMessage:
+    """Return a line of log."""
+    message: Any = Log(level=level, name=name, message=text)  # type: ignore[arg-type]
+    message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
+    return ViewerMessage(time_ns, LEFT_OUT, LOG, message.SerializeToString(deterministic=True))
+
+
+def with_objects(detections: pl.DataFrame, associations: pl.DataFrame) -> pl.DataFrame:
+    """Return DETECTIONS with the object that their tracklet shows, if it shows one."""
+    shown = associations.select("tracklet_id", "object_id").unique().sort("tracklet_id")
+    shown = shown.unique("tracklet_id", keep="first", maintain_order=True)
+    return detections.join(shown, on="tracklet_id", how="left", maintain_order="left")
+
+
+def camera_shapes(cameras: Any) -> dict[str, tuple[int, int]]:
+    """Return the size (rows, columns) of each sensor's image, of CAMERAS."""
+    assert cameras.schema.equals(CAMERAS)
+    rows = to_polars(cameras).sort("time").unique("sensor_id", keep="first", maintain_order=True)
+    return {row["sensor_id"]: (row["height"], row["width"]) for row in rows.iter_rows(named=True)}
+
+
+def _timed(rows: pl.DataFrame, column: str) -> pl.DataFrame:
+    """Return the rows by time, with it as nanoseconds."""
+    return rows.sort(column, maintain_order=True).with_columns(
+        time_ns=pl.col(column).dt.timestamp("ns")
+    )

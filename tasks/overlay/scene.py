@@ -1,0 +1,118 @@
+"""Sensors and objects in space, as messages that a viewer draws in three dimensions.
+
+The frame is GCRF, lengths are metres. What is small beside the Earth is drawn large enough to be
+seen: an object is a sphere of `SEEN_KM`, and around it stands its error ellipsoid of three sigma.
+"""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+from epipole.schemas.columns import PLACE
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
+from epipole.tasks.overlay.annotations import BLUE, ORANGE, _colour, _time
+
+ROOT_FRAME = "GCRF"
+KM = 1000.0  # m
+SEEN_KM = 100.0  # diameter
+SIGMAS = 3.0
+GREY = (0.6, 0.6, 0.6)
+
+
+def transform(time_ns: int, sensor_id: str, row: dict[str, Any]) -> bytes:
+    """Return where a sensor is and how it is turned, from a row of FRAMES with an attitude."""
+    message: Any = FrameTransform(parent_frame_id=ROOT_FRAME, child_frame_id=sensor_id)
+    _time(message.timestamp, time_ns)
+    _vector(message.translation, [row[name] for name in PLACE])
+    # The quaternion of FRAMES turns GCRF into the sensor; a transform is the way back.
+    turn = message.rotation
+    turn.x, turn.y, turn.z, turn.w = -row["qx"], -row["qy"], -row["qz"], row["qw"]
+    data: bytes = message.SerializeToString(deterministic=True)
+    return data
+
+
+def earth(time_ns: int) -> bytes:
+    """Return the Earth as a sphere that stays."""
+    message: Any = SceneUpdate()
+    ball = _entity(message, time_ns, "Earth").spheres.add()
+    _size(ball, [2 * EARTH_RADIUS_KM] * 3)
+    _colour(ball.color, GREY, 0.4)
+    data: bytes = message.SerializeToString(deterministic=True)
+    return data
+
+
+def objects(time_ns: int, positions: pl.DataFrame, lines: pl.DataFrame, lifetime_ns: int) -> bytes:
+    """Return the objects of an epoch, and the lines of sight that see them.
+
+    Parameters
+    ----------
+    positions
+        POSITIONS of the epoch.
+    lines
+        Used ASSOCIATIONS of the epoch, each with the sensor's place (x_km, y_km, z_km).
+    lifetime_ns
+        How long they are shown, if no later message has them.
+    """
+    message: Any = SceneUpdate()
+    for row in positions.iter_rows(named=True):
+        entity = _entity(message, time_ns, row["object_id"])
+        entity.lifetime.seconds, entity.lifetime.nanos = divmod(lifetime_ns, 1_000_000_000)
+        place = [row[name] for name in PLACE]
+        _sphere(entity, place, [SEEN_KM] * 3, ORANGE, 0.9)
+        _ellipsoid(entity, row)
+        label = entity.texts.add(text=row["object_id"], font_size=14.0, billboard=True)
+        label.scale_invariant = True
+        _vector(label.pose.position, place)
+        label.pose.orientation.w = 1.0
+        _colour(label.color, ORANGE)
+        seen = lines.filter(pl.col("object_id") == row["object_id"])
+        sight = entity.lines.add(type=2, thickness=1.0, scale_invariant=True)  # pairs of points
+        sight.pose.orientation.w = 1.0
+        for sensor_km in seen.select(PLACE).iter_rows():
+            _vector(sight.points.add(), sensor_km)
+            _vector(sight.points.add(), place)
+        _colour(sight.color, BLUE, 0.6)
+    data: bytes = message.SerializeToString(deterministic=True)
+    return data
+
+
+def _entity(message: Any, time_ns: int, name: str) -> Any:
+    entity = message.entities.add(frame_id=ROOT_FRAME, id=name)
+    _time(entity.timestamp, time_ns)
+    return entity
+
+
+def _ellipsoid(entity: Any, row: dict[str, Any]) -> None:
+    upper = [row[f"cov_{axes}"] for axes in ("xx", "xy", "xz", "yy", "yz", "zz")]
+    xx, xy, xz, yy, yz, zz = upper
+    values, vectors = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    if np.linalg.det(vectors) < 0:  # a reflection is no rotation
+        vectors[:, 0] = -vectors[:, 0]
+    axes_km = 2 * SIGMAS * np.sqrt(np.maximum(values, 0))
+    ball = _sphere(entity, [row[name] for name in PLACE], axes_km, ORANGE, 0.3)
+    turn = ball.pose.orientation
+    turn.x, turn.y, turn.z, turn.w = quaternion_from_matrix(vectors).tolist()
+
+
+def _sphere(
+    entity: Any, place_km: Any, axes_km: Any, colour: tuple[float, ...], opacity: float
+) -> Any:
+    ball = entity.spheres.add()
+    _vector(ball.pose.position, place_km)
+    _size(ball, axes_km)
+    _colour(ball.color, colour, opacity)
+    return ball
+
+
+def _size(ball: Any, axes_km: npt.ArrayLike) -> None:
+    ball.pose.orientation.w = 1.0
+    _vector(ball.size, axes_km)
+
+
+def _vector(vector: Any, km: Any) -> None:
+    vector.x, vector.y, vector.z = (float(value) * KM for value in km)

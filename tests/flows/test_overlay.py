@@ -1,0 +1,202 @@
+"""The overlay of a night: read back by public tools, and held against tables and geometry."""
+
+import json
+import shutil
+from collections import Counter, defaultdict
+
+import numpy as np
+import polars as pl
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from epipole.flows.command_line.main import app
+from epipole.flows.overlay import overlay
+from epipole.schemas.errors import DatasetError, NoFramesError
+
+NIGHT = "2019-04-01"
+
+
+def messages(path) -> dict[str, list]:
+    """Return the messages of each schema: (topic, log time, message)."""
+    found = defaultdict(list)
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, message, decoded in reader.iter_decoded_messages():
+            found[schema.name].append((channel.topic, message.log_time, decoded))
+    return found
+
+
+@pytest.fixture(scope="module")
+def written(night_log, night_dataset, tmp_path_factory):
+    path = tmp_path_factory.mktemp("overlay") / "overlay.mcap"
+    made = overlay(str(night_dataset), [str(night_log)], path, images=True)
+    return path, made, messages(path)
+
+
+def table(dataset, name) -> pl.DataFrame:
+    return pl.read_parquet(f"{dataset}/night={NIGHT}/{name}/*.parquet")
+
+
+def at(stamp) -> int:
+    return stamp.seconds * 1_000_000_000 + stamp.nanos
+
+
+def test_every_frame_has_its_stars_and_detections_at_its_time(written, night_dataset):
+    _, made, found = written
+    frames = table(night_dataset, "frames")
+    drawn = found["foxglove.ImageAnnotations"]
+    assert made.frames == len(drawn) == len(frames)
+    assert made.without_rows == 0
+    times = frames["time"].dt.timestamp("ns").to_list()
+    topics = [f"/{sensor}/annotations" for sensor in frames["sensor_id"]]
+    expected = sorted(zip(topics, times, strict=True))
+    assert sorted((topic, time_ns) for topic, time_ns, _ in drawn) == expected
+    assert sum(len(m.circles) for _, _, m in drawn) == len(table(night_dataset, "stars"))
+    detections = table(night_dataset, "detections")
+    assert sum(len(m.points) for _, _, m in drawn) == len(detections)
+    assert all(at(c.timestamp) == time_ns for _, time_ns, m in drawn for c in m.circles)
+
+
+def test_a_star_is_named_and_ringed_half_a_pixel_from_its_centroid(written, night_dataset):
+    _, _, found = written
+    stars = table(night_dataset, "stars")
+    star, ns = stars.row(100, named=True), stars["time"].dt.timestamp("ns")[100]
+    (drawn,) = [
+        message
+        for topic, time_ns, message in found["foxglove.ImageAnnotations"]
+        if (topic, time_ns) == (f"/{star['sensor_id']}/annotations", ns)
+    ]
+    places = [(circle.position.x, circle.position.y) for circle in drawn.circles]
+    assert (star["x_px"] + 0.5, star["y_px"] + 0.5) in places
+    assert f"HIP {star['star_id']}" in [text.text for text in drawn.texts]
+
+
+def test_detections_of_an_object_carry_its_id(written, night_dataset):
+    _, _, found = written
+    shown = table(night_dataset, "associations").select("tracklet_id", "object_id").unique()
+    of_object = table(night_dataset, "detections").join(shown, on="tracklet_id")
+    named = Counter(text.text for _, _, m in found["foxglove.ImageAnnotations"] for text in m.texts)
+    expected = Counter(of_object["object_id"].to_list())
+    assert len(expected) == 9
+    assert {name: named[name] for name in expected} == dict(expected)
+
+
+def test_an_object_lies_behind_its_detection_by_the_files_own_geometry(written, night_dataset):
+    _, _, found = written
+    cameras = {m.frame_id: m for _, _, m in found["foxglove.CameraCalibration"]}
+    poses = {(m.child_frame_id, at(m.timestamp)): m for _, _, m in found["foxglove.FrameTransform"]}
+    frames = table(night_dataset, "frames")
+    keys = zip(frames["sensor_id"], frames["frame_number"], strict=True)
+    when = dict(zip(keys, frames["time"].dt.timestamp("ns"), strict=True))
+    seen = table(night_dataset, "associations").filter("used")
+    seen = seen.with_columns(ns=pl.col("epoch").dt.timestamp("ns"))
+    places = {
+        (entity.id, time_ns): entity.spheres[0].pose.position
+        for _, time_ns, update in found["foxglove.SceneUpdate"]
+        for entity in update.entities
+    }
+    off_px = []
+    for row in seen.iter_rows(named=True):
+        pose = poses[row["sensor_id"], when[row["sensor_id"], row["frame_number"]]]
+        place = places[row["object_id"], row["ns"]]
+        q, t = pose.rotation, pose.translation
+        line = np.array([place.x - t.x, place.y - t.y, place.z - t.z])
+        x, y, z = Rotation.from_quat([q.x, q.y, q.z, q.w]).inv().apply(line)
+        k = cameras[row["sensor_id"]].K
+        off = k[0] * x / z + k[2] - row["x_px"], k[4] * y / z + k[5] - row["y_px"]
+        off_px.append(np.hypot(*off))
+    # The sensor has moved between the frame and the epoch, and the Earth's motion moves stars by
+    # 20 arcsec, which is in the attitude. A pixel is 14 arcsec.
+    assert len(off_px) > 1000
+    assert np.median(off_px) < 4
+
+
+def test_the_scene_has_each_object_with_a_line_of_sight_per_view(written, night_dataset):
+    _, made, found = written
+    positions = table(night_dataset, "positions")
+    updates = [m for _, _, m in found["foxglove.SceneUpdate"]]
+    earth = [e for m in updates for e in m.entities if e.id == "Earth"]
+    assert [e.spheres[0].size.x for e in earth] == [2 * 6_378_137.0]
+    entities = [e for m in updates for e in m.entities if e.id != "Earth"]
+    assert len(entities) == len(positions)
+    assert made.epochs == positions["epoch"].n_unique()
+    used = table(night_dataset, "associations").filter("used")
+    assert sum(len(e.lines[0].points) for e in entities) == 2 * len(used)
+    sigma_km = positions.select(pl.sum_horizontal("cov_xx", "cov_yy", "cov_zz").sqrt())
+    sizes = [e.spheres[1].size for e in entities]
+    axes_m = [np.linalg.norm([size.x, size.y, size.z]) for size in sizes]
+    np.testing.assert_allclose(sorted(axes_m), sorted(6000 * sigma_km.to_series()), rtol=1e-6)
+
+
+def test_an_error_ellipsoid_is_turned_as_its_covariance(written, night_dataset):
+    _, _, found = written
+    row = table(night_dataset, "positions").sort("epoch", "object_id").row(0, named=True)
+    (entity,) = [
+        e for _, _, m in found["foxglove.SceneUpdate"][:2] for e in m.entities
+        if e.id == row["object_id"]
+    ]  # fmt: skip
+    ball = entity.spheres[1]
+    turn = ball.pose.orientation
+    axes = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    half_km = np.array([ball.size.x, ball.size.y, ball.size.z]) / 2000 / 3
+    xx, xy, xz, yy, yz, zz = (row[f"cov_{a}"] for a in ("xx", "xy", "xz", "yy", "yz", "zz"))
+    covariance = axes @ np.diag(half_km**2) @ axes.T
+    np.testing.assert_allclose(covariance, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], rtol=1e-6)
+
+
+def test_images_show_the_centroids(written):
+    _, _, found = written
+    images = [m for _, _, m in found["foxglove.CompressedImage"]]
+    assert len(images) == 240
+    assert {image.format for image in images} == {"png"}
+    assert all(image.data.startswith(b"\x89PNG") for image in images)
+
+
+def test_what_is_left_out_is_a_line_of_log(written, night_dataset):
+    _, made, found = written
+    rejects = table(night_dataset, "rejects")
+    assert made.log_lines == len(found["foxglove.Log"]) == len(rejects)
+    assert [m.name for _, _, m in found["foxglove.Log"]] == rejects["stage"].to_list()
+
+
+def test_the_same_night_gives_the_same_bytes(written, night_log, night_dataset, tmp_path):
+    overlay(str(night_dataset), [str(night_log)] * 2, tmp_path / "again.mcap", images=True)
+    assert (tmp_path / "again.mcap").read_bytes() == written[0].read_bytes()
+
+
+def test_without_images_there_are_none(night_log, night_dataset, tmp_path):
+    overlay(str(night_dataset), [str(night_log)], tmp_path / "x.mcap")
+    assert "foxglove.CompressedImage" not in messages(tmp_path / "x.mcap")
+
+
+def test_a_night_that_the_dataset_does_not_have_is_one_line(night_log, night_dataset, tmp_path):
+    with pytest.raises(NoFramesError, match=r"has no night of these logs \(2019-04-01\)"):
+        overlay(str(tmp_path / "none"), [str(night_log)], tmp_path / "x.mcap")
+    with pytest.raises(NoFramesError, match="2019-05-05"):
+        overlay(str(night_dataset), [str(night_log)], tmp_path / "x.mcap", night="2019-05-05")
+    with pytest.raises(DatasetError, match="cannot be written"):
+        overlay(str(night_dataset), [str(night_log)], tmp_path / "no" / "x.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_night_without_positions_still_has_its_stars(night_log, night_dataset, tmp_path):
+    out = shutil.copytree(night_dataset, tmp_path / "out")
+    for name in ("positions", "associations", "nights"):
+        shutil.rmtree(out / f"night={NIGHT}" / name)
+    made = overlay(str(out), [str(night_log)], tmp_path / "x.mcap")
+    assert (made.frames, made.epochs) == (240, 0)
+    drawn = messages(tmp_path / "x.mcap")["foxglove.ImageAnnotations"]
+    assert all(m.circles for _, _, m in drawn)
+    assert not any("HIP" in text.text for _, _, m in drawn for text in m.texts)
+
+
+def test_the_command_tells_what_it_wrote(night_log, night_dataset, tmp_path):
+    asked = ["overlay", str(night_dataset), str(night_log), "--out", str(tmp_path / "x.mcap")]
+    ended = CliRunner().invoke(app, asked)
+    assert ended.exit_code == 0, ended.output
+    assert "frames  240 annotated, " in ended.stdout
+    told = json.loads(CliRunner().invoke(app, [*asked, "--json"]).stdout)
+    assert told["frames"] == 240
