@@ -21,6 +21,7 @@ autodoc_typehints = "none"  # the docstrings say more: shapes and units
 numpydoc_show_class_members = False
 numpydoc_attributes_as_param_list = True
 
+default_role = "code"  # of docstrings
 html_theme = "furo"
 html_title = f"epipole {release}"
 html_math_renderer = "drawn"
