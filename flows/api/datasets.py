@@ -16,7 +16,8 @@ class Dataset(Mapping[str, pl.LazyFrame]):
     """The tables of a dataset by their names, all nights together.
 
     Each table is a polars `LazyFrame` with the column `night` (a date) in addition. A filter on
-    `night` reads the files of these nights only.
+    `night` reads the files of these nights only. A column that was not yet made when a night was
+    published is null there.
 
     Attributes
     ----------
@@ -32,10 +33,19 @@ class Dataset(Mapping[str, pl.LazyFrame]):
         if name not in TABLES:
             raise KeyError(f"{name}: there is no such table; the tables are {', '.join(TABLES)}")
         folder = dataset_folder(self._where)
-        if folder is not None:
-            parts = f"{folder.absolute()}/night=*/{name}/*.parquet"
-            return pl.scan_parquet(parts, hive_partitioning=True, try_parse_hive_dates=True)
-        return pl.concat([self._of_night(name, night) for night in self.nights])
+        if folder is None:
+            return pl.concat([self._of_night(name, night) for night in self.nights])
+        parts = sorted(folder.absolute().glob(f"night=*/{name}/*.parquet"))
+        rows: pa.Table = empty(TABLES[name])
+        if not parts:
+            return pl.LazyFrame(rows).with_columns(night=pl.lit(None, pl.Date))
+        return pl.scan_parquet(
+            parts,
+            schema=pl.DataFrame(rows).schema,
+            hive_schema={"night": pl.Date},
+            hive_partitioning=True,
+            missing_columns="insert",
+        )
 
     def _of_night(self, name: str, night: str) -> pl.LazyFrame:
         rows: pa.Table = pa.concat_tables(

@@ -28,6 +28,23 @@ def test_the_night_is_a_column(night_dataset):
     assert of_night.schema["night"] == pl.Date
 
 
+def test_nights_of_an_earlier_version_may_lack_columns_and_tables(night_dataset, tmp_path):
+    for night, left_out in (("2019-03-31", ["magnitude", "chi2"]), ("2019-04-01", [])):
+        for part in night_dataset.glob("night=2019-04-01/*/part-*.parquet"):
+            rows = pl.read_parquet(part).drop(left_out, strict=False)
+            old = tmp_path / f"night={night}" / part.parent.name / part.name
+            if part.parent.name != "sources":
+                old.parent.mkdir(parents=True, exist_ok=True)
+                rows.write_parquet(old)
+    tables = api.open_dataset(tmp_path)
+    positions = tables["positions"].collect()
+    by_night = (
+        positions.group_by("night").agg(pl.col("chi2").null_count(), n=pl.len()).sort("night")
+    )
+    assert by_night["chi2"].to_list() == [by_night["n"][0], 0]
+    assert tables["sources"].collect().height == 0
+
+
 def test_a_dataset_in_a_store_has_the_same_rows(night_dataset, tmp_path):
     there = api.open_dataset(night_dataset)
     url = api.open_dataset(f"file://{night_dataset}")
