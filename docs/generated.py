@@ -8,6 +8,7 @@ pages against the functions here. To write all parts again:
 
 import ast
 import contextlib
+import inspect
 import io
 import re
 import runpy
@@ -21,6 +22,7 @@ import polars as pl
 import pyarrow as pa
 from pydantic.fields import FieldInfo
 
+from epipole.flows import api
 from epipole.schemas.logs.bounds import BOUNDS, TIME
 from epipole.schemas.rejects import FrameStatus, NameStatus, Outcome, Reason
 from epipole.schemas.settings import Settings
@@ -51,6 +53,8 @@ MADE_BY = {
     Stage.NAME: ("identifications",),
     Stage.PUBLISH: ("observations", "sources", "nights", "rejects"),
 }
+
+TUTORIAL = "docs/first_night.md"
 
 SCENE_PARTS = (
     "scene", "sensors", "targets", "orbit", "pointing", "camera", "camera.departure", "detection",
@@ -125,7 +129,7 @@ def statuses() -> str:
     return _words("status", FrameStatus)
 
 
-def names() -> str:
+def object_names() -> str:
     """Return what may be known of an object's name."""
     return _words("status", NameStatus)
 
@@ -145,7 +149,7 @@ def settings() -> str:
             for key, option in group.model_fields.items()
         ]
         table = _markdown(("setting", "default", "meaning"), rows)
-        sections.append(f"### {name}\n\n{group.__doc__}\n\n{table}")
+        sections.append(f"## {name}\n\n{group.__doc__}\n\n{table}")
     return "\n".join(sections)
 
 
@@ -180,6 +184,16 @@ def _default(value: object) -> str:
     if isinstance(value, tuple):
         return f"{len(value)} entries"
     return f"`{str(value).lower() if isinstance(value, bool) else value}`"
+
+
+def public_names() -> str:
+    """Return the functions for notebooks, each with the first line of its docstring."""
+    rows = [
+        (f"`{name}`", (inspect.getdoc(getattr(api, name)) or "").partition("\n")[0])
+        for name in api.__all__
+        if inspect.isfunction(getattr(api, name))
+    ]
+    return _markdown(("name", "what it does"), rows)
 
 
 def rooms() -> str:
@@ -224,6 +238,27 @@ def code(page: str, name: str, out: str) -> str:
     return text.split("```")[1].removeprefix("python\n").replace('"out/', f'"{out}')
 
 
+def with_outputs(text: str, folder: Path) -> str:
+    """Return a tutorial with what its Python code prints where `folder` holds out/.
+
+    A block of Python and the block of text that follows it are code and output. All blocks are
+    one program, in the page's order.
+    """
+    names: dict = {}
+
+    def run(match: re.Match[str]) -> str:
+        printed, source = io.StringIO(), match[1]
+        source = source.replace('"out/', f'"{folder}/out/')
+        source = source.replace('"night.png"', f'"{folder}/night.png"')
+        with contextlib.redirect_stdout(printed), pl.Config(tbl_width_chars=100):
+            exec(source, names)
+        output = f"```text\n{printed.getvalue()}```\n" if match[2] else ""
+        return f"```python\n{match[1]}```\n" + ("\n" if output else "") + output
+
+    blocks = r"^```python\n(.*?)^```\n(?:\n(```text\n.*?^```\n))?"
+    return re.sub(blocks, run, text, flags=re.DOTALL | re.MULTILINE)
+
+
 # Each page's parts but those that need a dataset: `output` and `orbit`.
 PARTS: dict[str, dict[str, Callable[[], str]]] = {
     "README.md": {"stages": stages},
@@ -233,10 +268,11 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "reasons": reasons,
         "outcomes": outcomes,
         "statuses": statuses,
-        "names": names,
+        "names": object_names,
     },
     "docs/input.md": {"bounds": bounds},
     "docs/settings.md": {"settings": settings},
+    "docs/api.md": {"names": public_names},
     "docs/scenes.md": {"scene": scene},
     "CONTRIBUTING.md": {"packages": rooms},
 }
@@ -274,6 +310,7 @@ def write(folder: Path) -> None:
         ("docs/orbits.md", "orbit", orbit(folder)),
     ):
         (ROOT / page).write_text(with_part((ROOT / page).read_text(), name, made))
+    (ROOT / TUTORIAL).write_text(with_outputs((ROOT / TUTORIAL).read_text(), folder))
 
 
 def _markdown(heading: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:

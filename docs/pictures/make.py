@@ -6,6 +6,15 @@ python docs/pictures/make.py [DATASET]      # out/ if none is named
 import sys
 from pathlib import Path
 
+from concepts_of_objects import (
+    draw_clocks,
+    draw_first_night,
+    draw_gates,
+    draw_planes,
+    draw_sigma,
+    draw_triangulation,
+)
+from concepts_of_stars import draw_boresight, draw_optics, draw_votes
 from figures import draw_association, draw_identification, draw_positions, draw_tracking
 from night import read_night
 from pipeline import draw_pipeline
@@ -19,6 +28,15 @@ PICTURES = {
     "tracking": draw_tracking,
     "association": draw_association,
     "positions": draw_positions,
+    "boresight": draw_boresight,
+    "clocks": draw_clocks,
+    "first_night": draw_first_night,
+    "gates": draw_gates,
+    "optics": draw_optics,
+    "planes": draw_planes,
+    "sigma": draw_sigma,
+    "triangulation": draw_triangulation,
+    "votes": draw_votes,
 }
 
 

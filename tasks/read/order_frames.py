@@ -14,18 +14,16 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.io.logs.own_time import frames_left_out, stray_rejects
 from epipole.io.work.part_tables import READ_SENSOR
 from epipole.io.work.parts import read_part, write_part
 from epipole.io.work.places import ReadFolder
-from epipole.schemas.bridge import array, concat, conform, nullable, stack, table, unstack
-from epipole.schemas.logs.log_tables import ITRF, LOG_STATES, LogSource
+from epipole.schemas.bridge import array, concat, conform
+from epipole.schemas.logs.log_tables import LOG_STATES, LogSource
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
-from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX, SENSOR_STATES
-from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_gcrf
+from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX
 from epipole.tasks.algorithms.time.frame_order import (
     DUPLICATE_FRAME,
     DUPLICATE_NUMBER,
@@ -35,6 +33,7 @@ from epipole.tasks.algorithms.time.frame_order import (
     order_states,
 )
 from epipole.tasks.read.read_logs import ReadLog
+from epipole.tasks.read.turn_states import states_in_gcrf
 
 LOGGER = logging.getLogger(__name__)
 
@@ -201,42 +200,7 @@ def _sorted_states(
     order, repeats = order_states(np.zeros(rows.num_rows, np.int64), array(rows, "time"))
     named = rows.select(["sensor_id", "time"]).append_column("source", pa.array(names, pa.string()))
     rejects = frames_left_out(named.take(pa.array(order[repeats])), Reason.DUPLICATE_STATE)
-    return _turned_to_gcrf(rows.take(pa.array(order[~repeats])), settings), rejects
-
-
-def _turned_to_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
-    """Return SENSOR_STATES for the rows of LOG_STATES.
-
-    For times outside the Earth-orientation table, sigmas of Earth-fixed positions are increased by
-    the uncertainty of the Earth's rotation.
-    """
-    time_ns, frame = array(states, "time"), array(states, "frame")
-    r_km, v_km_s = stack(states, "{}_km"), stack(states, "v{}_km_s")
-    sigma_km = array(states, "position_sigma_km").copy()
-    for name in sorted(set(frame)):
-        i = np.flatnonzero(frame == name)
-        orientation = orientation_at(time_ns[i], *read_earth_orientation())
-        r_km[i], v_km_s[i] = to_gcrf(name, time_ns[i], r_km[i], v_km_s[i], orientation)
-        if name == ITRF and orientation.sigma_rad.any():
-            turn_km = orientation.sigma_rad * np.linalg.norm(r_km[i], axis=1)
-            known_km = np.where(sigma_km[i] > 0, sigma_km[i], settings.sensors.position_sigma_km)
-            sigma_km[i] = np.where(turn_km > 0, np.hypot(known_km, turn_km), sigma_km[i])
-            _warn_of_orientation(turn_km)
-    values = {name: states[name] for name in SENSOR_STATES.names}
-    values.update(unstack("{}_km", r_km), position_sigma_km=sigma_km)
-    values.update({n: nullable(v) for n, v in unstack("v{}_km_s", v_km_s).items()})
-    return table(SENSOR_STATES, values)
-
-
-def _warn_of_orientation(turn_km: npt.NDArray[np.float64]) -> None:
-    end = np.datetime64("1858-11-17") + int(read_earth_orientation().mjd[-1])
-    LOGGER.warning(
-        "%d ITRF states lie outside the Earth-orientation table, which ends %s; their positions "
-        "are uncertain by up to %.3f km more; install a newer astropy-iers-data",
-        np.count_nonzero(turn_km),
-        end,
-        turn_km.max(),
-    )
+    return states_in_gcrf(rows.take(pa.array(order[~repeats])), settings), rejects
 
 
 def _sorted_cameras(cameras: pa.Table) -> pa.Table:

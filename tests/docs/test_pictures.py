@@ -17,4 +17,4 @@ def test_the_script_draws_the_pictures_that_are_kept(example, tmp_path):
 
 
 def test_the_pictures_are_small():
-    assert 0 < sum(picture.stat().st_size for picture in PICTURES.glob("*.png")) < 300_000
+    assert 0 < sum(picture.stat().st_size for picture in PICTURES.glob("*.png")) < 350_000

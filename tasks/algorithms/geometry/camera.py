@@ -15,6 +15,17 @@ class Camera(NamedTuple):
     """Intrinsics of a sensor [px; the distortion coefficients have no unit].
 
     A negative `fy_px` is an image whose rows count upward.
+
+    Attributes
+    ----------
+    width, height : int
+        Size of the image.
+    fx_px, fy_px : float
+        Focal lengths along columns and rows.
+    cx_px, cy_px : float
+        Principal point; (0, 0) is the middle of the top-left pixel.
+    k1, k2, p1, p2, k3 : float
+        Distortion, Brown-Conrady, in the order of OpenCV.
     """
 
     width: int

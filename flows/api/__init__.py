@@ -1,0 +1,35 @@
+"""The public names for notebooks and scripts: logs, frames, objects, datasets.
+
+    from epipole.flows import api
+
+These names keep their meaning from version to version; all others may change. They call what the
+nightly run calls. Units stand in the names, frames in the docstrings.
+"""
+
+from importlib.metadata import version
+
+from epipole.flows.api.datasets import Dataset, open_dataset
+from epipole.flows.api.frames import IdentifiedFrame, identify_frame, view_frame
+from epipole.flows.api.logs import LogTables, read_log, write_log
+from epipole.flows.api.objects import FoundObjects, Positions, View, associate, triangulate
+from epipole.tasks.algorithms.geometry.camera import Camera
+
+__version__ = version("epipole")
+
+__all__ = [
+    "Camera",
+    "Dataset",
+    "FoundObjects",
+    "IdentifiedFrame",
+    "LogTables",
+    "Positions",
+    "View",
+    "__version__",
+    "associate",
+    "identify_frame",
+    "open_dataset",
+    "read_log",
+    "triangulate",
+    "view_frame",
+    "write_log",
+]

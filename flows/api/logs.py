@@ -1,0 +1,197 @@
+"""Logs as tables, in and out."""
+
+import heapq
+import os
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import polars as pl
+import pyarrow as pa
+
+from epipole.io.logs import reader
+from epipole.io.logs.writer import LogWriter
+from epipole.schemas.bridge import rows_of, table, to_polars
+from epipole.schemas.settings import Settings
+from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES
+from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.read.turn_states import states_in_gcrf
+
+
+class LogTables(NamedTuple):
+    """The content of a log.
+
+    Attributes
+    ----------
+    frames : polars.DataFrame
+        One row per frame: `sensor_id`, `frame_number`, `time` (middle of the exposure, UTC),
+        `exposure_s`, and the lists `x_px`, `y_px`, `flux`, `sigma_px` of its centroids. The last
+        two are null where the log has none.
+    states : polars.DataFrame
+        One row per state of a sensor: `sensor_id`, `time`, position `x_km`, `y_km`, `z_km` and
+        velocity `vx_km_s`, `vy_km_s`, `vz_km_s` (GCRF), `position_sigma_km` (0: unknown), the
+        prior attitude `qx`, `qy`, `qz`, `qw` (sensor from ICRS, null where there is none) and
+        `attitude_sigma_arcsec` (0: unknown).
+    cameras : polars.DataFrame
+        One row per calibration: `sensor_id`, `time` (from when on it holds), and the fields of
+        `Camera`.
+    rejects : polars.DataFrame
+        One row per thing that could not be used, with its reason.
+    """
+
+    frames: pl.DataFrame
+    states: pl.DataFrame
+    cameras: pl.DataFrame
+    rejects: pl.DataFrame
+
+
+_FRAMES = pa.schema([f for f in EXPOSURES if f.name not in ("source", "offset")],
+                    {"table": "frames"})  # fmt: skip
+_STATES = pa.schema(list(SENSOR_STATES), {"table": "states"})
+_CAMERAS = pa.schema([f for f in CAMERAS if not f.name.startswith("cov_")], {"table": "cameras"})
+# What a column has that is left out.
+_DEFAULTS: dict[str, Any] = {
+    "exposure_s": 0.0, "flux": None, "sigma_px": None,
+    "vx_km_s": None, "vy_km_s": None, "vz_km_s": None, "position_sigma_km": 0.0,
+    "qx": None, "qy": None, "qz": None, "qw": None, "attitude_sigma_arcsec": 0.0,
+    "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k3": 0.0,
+}  # fmt: skip
+
+
+def read_log(path: str | os.PathLike[str]) -> LogTables:
+    """Return what a log holds, as tables.
+
+    Parameters
+    ----------
+    path
+        An MCAP file, or an fsspec URL such as ``s3://bucket/night.mcap``.
+
+    Returns
+    -------
+    LogTables
+        Frames, states (in GCRF, whatever the frame of the log), cameras, and what could not be
+        used, in the order of the log. The whole log is in memory.
+
+    Raises
+    ------
+    LogError
+        Where there is no such file, or it is not MCAP. It is a `ValueError`.
+
+    Examples
+    --------
+    >>> from epipole.flows import api
+    >>> log = api.read_log("examples/four_sensor_geo.mcap")
+    >>> log.frames.height, log.states.height, log.cameras["sensor_id"].to_list()
+    (240, 260, ['sat1', 'sat2', 'sat3', 'sat4'])
+    >>> log.frames["x_px"].list.len().median()
+    18.0
+    """
+    found = reader.read_log(path)
+    states = states_in_gcrf(found.states, Settings())
+    return LogTables(
+        to_polars(found.exposures.select(_FRAMES.names)),
+        to_polars(states.select(_STATES.names)),
+        to_polars(found.cameras.select(_CAMERAS.names)),
+        to_polars(found.rejects),
+    )
+
+
+def write_log(
+    path: str | os.PathLike[str],
+    frames: pl.DataFrame,
+    states: pl.DataFrame,
+    cameras: pl.DataFrame,
+    *,
+    encoding: str = "protobuf",
+) -> None:
+    """Write a log from tables like those of `read_log`.
+
+    Parameters
+    ----------
+    path
+        The MCAP file to write. It gets its name when it is complete.
+    frames, states, cameras
+        Tables with the columns that `LogTables` names, in any order of rows. These columns may be
+        left out: `exposure_s`, `flux`, `sigma_px`; velocities, sigmas and attitudes of states;
+        distortions `k1`, `k2`, `p1`, `p2`, `k3` of cameras. Times are UTC, positions GCRF.
+    encoding
+        Of the messages: protobuf, json or ros2.
+
+    Raises
+    ------
+    ValueError
+        Where a column is missing, unknown, of the wrong type, or null where it may not be; where
+        the lists of a frame differ in length; where the encoding is unknown.
+
+    Notes
+    -----
+    Values beyond the bounds of a log are written all the same; a reader leaves them out and says
+    why (`LogTables.rejects`).
+
+    Examples
+    --------
+    >>> from epipole.flows import api
+    >>> log = api.read_log("examples/four_sensor_geo.mcap")
+    >>> api.write_log("copy.mcap", log.frames, log.states, log.cameras)
+    >>> copy = api.read_log("copy.mcap")
+    >>> copy.frames.equals(log.frames.sort("time", "sensor_id"))
+    True
+    """
+    messages = heapq.merge(
+        _messages("camera", _checked(_CAMERAS, cameras)),
+        _messages("state", _checked(_STATES, states)),
+        _messages("frame", _same_lengths(_checked(_FRAMES, frames))),
+        key=lambda message: message[0],
+    )
+    with LogWriter(path, encoding=encoding) as log:
+        for time_ns, kind, row in messages:
+            _write(log, kind, time_ns, row)
+
+
+def _checked(schema: pa.Schema, rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the rows with all columns of the schema, in order of time."""
+    columns: dict[str, Any] = {name: rows[name].to_arrow() for name in rows.columns}
+    for name in schema.names:
+        if name not in columns and name in _DEFAULTS:
+            columns[name] = [_DEFAULTS[name]] * rows.height
+    return to_polars(table(schema, columns)).sort("time", "sensor_id", maintain_order=True)
+
+
+def _same_lengths(frames: pl.DataFrame) -> pl.DataFrame:
+    n = frames["x_px"].list.len()
+    for name in ("y_px", "flux", "sigma_px"):
+        differs = frames.filter((frames[name].list.len() != n).fill_null(value=False))
+        if differs.height:
+            row = differs.row(0, named=True)
+            raise ValueError(
+                f"table frames: x_px and {name} differ in length in frame {row['frame_number']} "
+                f"of {row['sensor_id']}: {len(row['x_px'])} and {len(row[name])}"
+            )
+    return frames
+
+
+def _messages(kind: str, rows: pl.DataFrame) -> Iterator[tuple[int, str, dict[str, Any]]]:
+    for row in rows_of(rows.to_arrow()):
+        yield row.pop("time"), kind, row
+
+
+def _write(log: LogWriter, kind: str, time_ns: int, row: dict[str, Any]) -> None:
+    sensor_id = row.pop("sensor_id")
+    if kind == "camera":
+        log.camera(sensor_id, time_ns, Camera(**row))
+    elif kind == "frame":
+        log.frame(sensor_id, time_ns, **row)
+    else:
+        log.state(
+            sensor_id,
+            time_ns,
+            position_km=[row[name] for name in ("x_km", "y_km", "z_km")],
+            velocity_km_s=_vector(row, "vx_km_s", "vy_km_s", "vz_km_s"),
+            position_sigma_km=row["position_sigma_km"],
+            attitude_xyzw=_vector(row, "qx", "qy", "qz", "qw"),
+            attitude_sigma_arcsec=row["attitude_sigma_arcsec"],
+        )
+
+
+def _vector(row: dict[str, Any], *names: str) -> list[float] | None:
+    values = [row[name] for name in names]
+    return None if None in values else values

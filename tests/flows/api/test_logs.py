@@ -1,0 +1,94 @@
+"""Logs as tables, in and out."""
+
+import datetime
+
+import polars as pl
+import pytest
+from mcap.reader import make_reader
+from polars.testing import assert_frame_equal
+
+from epipole.flows import api
+from epipole.io.logs.writer import LogWriter
+from epipole.schemas.errors import LogError
+from epipole.tasks.algorithms.orbits.reference_frames import EME2000_FROM_GCRF
+
+TIME = datetime.datetime(2019, 4, 1, 4, tzinfo=datetime.UTC)
+CAMERA = {"width": 512, "height": 512, "fx_px": 1e3, "fy_px": 1e3, "cx_px": 255.5, "cy_px": 255.5}
+
+
+def tables(**changes):
+    """Return frames, states and cameras with the fewest columns; `changes` are of the frames."""
+    key = {"sensor_id": ["a"], "time": [TIME]}
+    frames = {"frame_number": [7], "x_px": [[1.0, 2.0]], "y_px": [[3.0, 4.0]]}
+    return (
+        pl.DataFrame(key | frames | changes),
+        pl.DataFrame(key | {"x_km": [7000.0], "y_km": [0.0], "z_km": [0.0]}),
+        pl.DataFrame(key | {name: [value] for name, value in CAMERA.items()}),
+    )
+
+
+def test_a_log_comes_back_as_it_was_written(night_log, tmp_path):
+    log = api.read_log(night_log)
+    for encoding in ("protobuf", "json", "ros2"):
+        copy = tmp_path / f"{encoding}.mcap"
+        api.write_log(copy, log.frames, log.states, log.cameras, encoding=encoding)
+        again = api.read_log(copy)
+        assert again.frames.equals(log.frames.sort("time", "sensor_id"))
+        # A quaternion that is normalised again differs in its last digit.
+        assert_frame_equal(again.states, log.states.sort("time", "sensor_id"), abs_tol=1e-15)
+        assert again.cameras.equals(log.cameras.sort("time", "sensor_id"))
+        assert again.rejects.height == 0
+
+
+def test_messages_are_written_in_order_of_time(night_log, tmp_path):
+    log = api.read_log(night_log)
+    api.write_log(tmp_path / "a.mcap", log.frames.reverse(), log.states, log.cameras)
+    with (tmp_path / "a.mcap").open("rb") as file:
+        times = [m.log_time for *_, m in make_reader(file).iter_messages(log_time_order=False)]
+    assert times == sorted(times)
+
+
+def test_columns_that_are_left_out_are_unknown(tmp_path):
+    api.write_log(tmp_path / "a.mcap", *tables())
+    frames, states, cameras, rejects = api.read_log(tmp_path / "a.mcap")
+    assert frames["flux"].to_list() == frames["sigma_px"].to_list() == [None]
+    assert frames["frame_number"].to_list() == [7]
+    assert states.select("vx_km_s", "qw").row(0) == (None, None)
+    assert states["position_sigma_km"].to_list() == [0.0]
+    assert cameras["k1"].to_list() == [0.0]
+    assert rejects.height == 0
+
+
+def test_states_are_in_gcrf_whatever_the_frame_of_the_log(tmp_path):
+    with LogWriter(tmp_path / "a.mcap") as log:
+        log.state("a", 1_554_091_200_000_000_000, position_km=[7e3, 1e3, 0], frame="EME2000")
+    states = api.read_log(tmp_path / "a.mcap").states
+    expected = EME2000_FROM_GCRF.T @ [7e3, 1e3, 0]
+    assert states.select("x_km", "y_km", "z_km").row(0) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"y_px": [[3.0]]}, "x_px and y_px differ in length in frame 7 of a: 2 and 1"),
+        ({"flux": [[1.0, 2.0, 3.0]]}, "x_px and flux differ in length"),
+        ({"brightness": [1.0]}, r"unknown columns \['brightness'\]"),
+        ({"time": ["noon"]}, "column time is not timestamp"),
+        ({"frame_number": [None]}, "column frame_number"),
+    ],
+)
+def test_wrong_tables_are_named(tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
+        api.write_log(tmp_path / "a.mcap", *tables(**change))
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_columns_are_named(tmp_path):
+    frames, states, cameras = tables()
+    with pytest.raises(ValueError, match=r"table frames: missing columns \['x_px'\]"):
+        api.write_log(tmp_path / "a.mcap", frames.drop("x_px"), states, cameras)
+
+
+def test_a_file_that_is_no_log_is_named(tmp_path):
+    with pytest.raises(LogError, match="missing"):
+        api.read_log(tmp_path / "missing.mcap")

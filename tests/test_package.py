@@ -1,0 +1,98 @@
+"""The package: what is in the source distribution and the wheel, and what an index shows."""
+
+import importlib.metadata
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("build", reason="build is of the extra dev")
+
+ROOT = Path(__file__).parents[1]
+LEFT_OUT = shutil.ignore_patterns(
+    ".git", ".venv", "build", "dist", "out", "*.egg-info", "__pycache__", ".*_cache", ".hypothesis"
+)
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory) -> Path:
+    """Return a copy of the repository: to build leaves files in it."""
+    if int(importlib.metadata.version("setuptools").partition(".")[0]) < 77:
+        pytest.skip("setuptools 77 or later is of the extra dev")
+    return Path(shutil.copytree(ROOT, tmp_path_factory.mktemp("tree") / "tree", ignore=LEFT_OUT))
+
+
+@pytest.fixture(scope="module")
+def dist(tree) -> Path:
+    """Return a folder with the source distribution, and the wheel that was built from it."""
+    files = tree.with_name("dist")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", files, tree]
+    made = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr
+    return files
+
+
+def packed(dist: Path) -> set[str]:
+    with tarfile.open(next(dist.glob("*.tar.gz"))) as archive:
+        return {m.name.partition("/")[2] for m in archive.getmembers() if m.isfile()}
+
+
+def test_the_source_distribution_has_the_whole_repository(tree, dist):
+    folders = (".ci", "docs", "examples", "tests", "schemas", "io", "tasks", "flows")
+    files = [p for folder in folders for p in (tree / folder).rglob("*") if p.is_file()]
+    files += [*tree.glob("*.md"), *tree.glob("*.toml"), *tree.glob("*.yaml"), tree / "LICENSE"]
+    wanted = {p.relative_to(tree).as_posix() for p in (*files, tree / "constraints.txt")}
+    assert wanted - packed(dist) == set()
+    for name in ("examples/four_sensor_geo.mcap", "docs/first_night.md", "tests/conftest.py"):
+        assert name in packed(dist)
+
+
+def test_the_wheel_has_all_modules_and_their_data_and_nothing_else(dist):
+    with zipfile.ZipFile(next(dist.glob("*.whl"))) as wheel:
+        names = {n for n in wheel.namelist() if ".dist-info/" not in n}
+    homes = ("schemas", "io", "tasks", "flows")
+    files = (p for home in homes for p in (ROOT / home).rglob("*") if p.is_file())
+    wanted = {f"epipole/{p.relative_to(ROOT).as_posix()}" for p in files if p.suffix != ".pyc"}
+    assert names == wanted
+
+
+def metadata(dist: Path):
+    with zipfile.ZipFile(next(dist.glob("*.whl"))) as wheel:
+        name = next(n for n in wheel.namelist() if n.endswith(".dist-info/METADATA"))
+        return Parser().parsestr(wheel.read(name).decode())
+
+
+def test_an_index_shows_the_readme_without_dead_links(dist):
+    text = metadata(dist).get_payload()
+    assert text.lstrip().startswith("# epipole")
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    assert re.findall(r"\]\((?!https?://)", prose) == []
+    assert "![" not in prose
+    assert "<!--" not in text
+    readme = (ROOT / "README.md").read_text()
+    for heading in re.findall(r"^## .+$", readme, re.MULTILINE):
+        assert heading in text
+    assert "(`docs/orbits.md`)" in text
+
+
+def test_the_metadata_are_complete(dist):
+    found = metadata(dist)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert found["Author"] in (ROOT / "LICENSE").read_text()
+    assert found["License-Expression"] == "MIT"
+    assert found.get_all("Classifier") == project["classifiers"]
+    assert found["Version"] == importlib.metadata.version("epipole")
+
+
+def test_twine_finds_nothing_wrong(dist):
+    pytest.importorskip("twine", reason="twine is of no extra: it is needed to upload only")
+    files = [*dist.glob("*.tar.gz"), *dist.glob("*.whl")]
+    command = [sys.executable, "-m", "twine", "check", "--strict", *files]
+    subprocess.run(command, check=True, capture_output=True)
