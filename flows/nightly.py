@@ -83,7 +83,7 @@ def nightly(
         known: A file of element sets, to name known objects by: two-line elements, or OMM in CSV,
             JSON or XML. A path or URL. None: no object gets a name.
         again: Make a night again even if nothing has changed since it was made.
-        settings_file: A file of settings (TOML) on the machine of the worker; settings that are
+        settings_file: A file of settings (TOML), a path or URL that the worker can read; settings that are
             given count more.
 
     Raises:

@@ -5,7 +5,8 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from epipole.schemas.errors import SettingsError
+from epipole.io.remote_files import open_remote
+from epipole.schemas.errors import LogError, SettingsError
 from epipole.schemas.settings import Group, Settings, parse_settings, validate_settings
 
 WIDTH = 88
@@ -44,10 +45,22 @@ def merged_settings(file: str | None, given: Settings) -> Settings:
     """
     if file is None:
         return given
-    below = read_settings(Path(file)).model_dump(exclude_unset=True)
+    below = _read(file).model_dump(exclude_unset=True)
     for group, values in given.model_dump(exclude_unset=True).items():
         below[group] = {**below.get(group, {}), **values}
     return validate_settings(below, f"{file} and the settings given")
+
+
+def _read(file: str) -> Settings:
+    """Return the settings of a local file or of an fsspec URL."""
+    if "://" not in file:
+        return read_settings(Path(file))
+    try:
+        size, read, _ = open_remote(file)
+        text = read(0, size).decode()
+    except (LogError, UnicodeDecodeError) as error:
+        raise SettingsError(f"settings {file}: {error}") from error
+    return parse_settings(text, file)
 
 
 def settings_text(settings: Settings) -> str:

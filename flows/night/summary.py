@@ -36,6 +36,7 @@ class SensorSummary:
             "sensor": self.sensor_id,
             "frames": self.frames,
             "identified": self.identified,
+            "identified %": f"{100 * self.identified / self.frames:.1f}",
             "longest gap s": gap,
             "residual px": residual,
             "tracks": self.tracks,

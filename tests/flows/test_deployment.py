@@ -136,7 +136,7 @@ def test_the_page_shows_named_task_runs_logs_and_artifacts(deployed):
     assert f"found 1 log of {NIGHT}" in lines
     assert any(line.startswith("identified 240 of 240 frames by") for line in lines)
     shown = {artifact["key"]: artifact["data"] for artifact in prefect.find("artifacts", **of_run)}
-    assert set(shown) == {"progress", "night", "sensors", "dataset"}
+    assert set(shown) == {"progress", "night", "sensors"}
     assert shown["progress"] == 100
     assert "| objects | 9 |" in shown["night"]
 

@@ -44,3 +44,6 @@ def test_settings_that_are_given_count_more_than_the_file_and_the_file_more_than
     assert merged_settings(str(file), Settings()) == read_settings(file)
     with pytest.raises(SettingsError, match="No such file"):
         merged_settings(str(tmp_path / "none.toml"), given)
+    assert merged_settings(file.as_uri(), given) == merged
+    with pytest.raises(SettingsError, match="no such file"):
+        merged_settings((tmp_path / "none.toml").as_uri(), given)

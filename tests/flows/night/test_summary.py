@@ -84,12 +84,12 @@ def test_staged_nights_are_counted_together(tmp_path):
     rows = [sensor.as_row() for sensor in summary.by_sensor]
     assert rows == [
         {
-            "sensor": "a", "frames": 3, "identified": 2, "longest gap s": "7",
-            "residual px": "0.500", "tracks": 1,
+            "sensor": "a", "frames": 3, "identified": 2, "identified %": "66.7",
+            "longest gap s": "7", "residual px": "0.500", "tracks": 1,
         },
         {
-            "sensor": "b", "frames": 1, "identified": 0, "longest gap s": "", "residual px": "",
-            "tracks": 1,
+            "sensor": "b", "frames": 1, "identified": 0, "identified %": "0.0",
+            "longest gap s": "", "residual px": "", "tracks": 1,
         },
     ]  # fmt: skip
     assert summary.as_dict()["by_sensor"][1]["residual_px"] is None
