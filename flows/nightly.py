@@ -83,8 +83,8 @@ def nightly(
         known: A file of element sets, to name known objects by: two-line elements, or OMM in CSV,
             JSON or XML. A path or URL. None: no object gets a name.
         again: Make a night again even if nothing has changed since it was made.
-        settings_file: A file of settings (TOML), a path or URL that the worker can read; settings that are
-            given count more.
+        settings_file: A file of settings (TOML): a path or URL that the worker can read. Settings
+            that are given count more.
 
     Raises:
         EpipoleError: If the work cannot be done; the dataset is then unchanged.
