@@ -13,6 +13,7 @@ from prefect import flow
 from epipole.flows.night.earlier_nights import EarlierNights
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.parameters import Night, night_asked, run_name
+from epipole.flows.night.reports import with_reports
 from epipole.flows.night.stages import (
     Destination,
     calibrate,
@@ -113,6 +114,8 @@ def nightly(
                 residuals[date] = name_known(staged[date], elements, states, settings)
                 verdicts[date] = made.work.verdicts
             summary = publish(Destination(out, staged, replace), sources, verdicts, residuals)
+            if settings.report.write:
+                summary = with_reports(summary, staged, staging)
     LOGGER.info("published %s", ", ".join(f"{out}/night={date}" for date in chosen))
     return summary
 

@@ -16,6 +16,7 @@ from epipole.flows.command_line.commands import (
     evaluate,
     export,
     info,
+    report,
     run,
     settings,
     simulate,
@@ -89,6 +90,7 @@ for command in (
     simulate.simulate,
     evaluate.evaluate,
     export.export,
+    report.report,
     settings.settings,
 ):
     app.command()(command)

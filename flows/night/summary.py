@@ -1,7 +1,7 @@
 """The summary of a run: counts of what it found, and of what it left out by reason."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,6 +14,7 @@ from epipole.io.datasets.night_files import count_rows, read_columns
 from epipole.schemas.rejects import NameStatus, Reason
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.name.sensor_residuals import SensorResidual
+from epipole.tasks.report.report_extract import ReportExtract
 
 
 @dataclass(frozen=True)
@@ -63,10 +64,13 @@ class Summary:
     faults: list[str]
     residuals: list[str]
     by_sensor: list[SensorSummary]
+    extracts: tuple[ReportExtract, ...] = ()  # of the nights' reports, for Prefect's page
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts by name, as JSON takes them."""
-        return asdict(self)
+        counts = asdict(replace(self, extracts=()))
+        del counts["extracts"]
+        return counts
 
     def lines(self) -> list[str]:
         """Return the summary as people read it."""

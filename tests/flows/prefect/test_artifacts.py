@@ -7,11 +7,13 @@ from epipole.flows.night.summary import Summary
 from epipole.flows.prefect import artifacts
 from epipole.flows.prefect.artifacts import ProgressBar, as_markdown, show_summary
 from epipole.schemas.stages import Stage
+from epipole.tasks.report.frame_series import Gap
+from epipole.tasks.report.report_extract import PagePicture, ReportExtract
 
 FOUND = {
     "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
     "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "epochs": 6, "objects": 5,
-    "positions": 4, "rejects": {"no_state": 34, "bad_crc": 1}, "faults": [], "by_sensor": [],
+    "positions": 4, "rejects": {"no_state": 34, "bad_checksum": 1}, "faults": [], "by_sensor": [],
     "names": {}, "residuals": [],
 }  # fmt: skip
 
@@ -21,7 +23,19 @@ def test_the_page_of_a_night_has_its_counts_and_what_was_left_out_by_reason():
     assert "# Night 2019-04-01" in page
     assert "| frames | 1,234 |" in page
     assert "Left out: 35 things" in page
-    assert "| no_state | 34 |\n| bad_crc | 1 |" in page
+    rows = [row.split(" | ") for row in page.splitlines() if row.startswith(("| no_", "| bad_"))]
+    assert [row[:2] for row in rows] == [["| no_state", "34"], ["| bad_checksum", "1"]]
+    assert rows[0][2].startswith("No state of the sensor is near enough in time")
+
+
+def test_the_page_of_a_night_has_pictures_and_the_gaps_of_sensors():
+    gaps = (Gap("a|b", 0, 7_000_000_000), Gap("a|b", 9_000_000_000, 12_000_000_000))
+    pictures = (PagePicture("Coverage", b"\x89PNG"),)
+    extract = ReportExtract("2019-04-01", pictures, gaps, {"a|b": 10.0})
+    page = as_markdown(Summary(**FOUND, extracts=(extract,)))
+    assert "![Coverage](data:image/png;base64,iVBORw==)" in page
+    assert "| a&#124;b | 2 | 10 |" in page
+    assert "extracts" not in Summary(**FOUND, extracts=(extract,)).as_dict()
 
 
 def test_progress_only_grows_though_a_stage_is_done_again(monkeypatch):
