@@ -14,6 +14,7 @@ from epipole.flows.night.earlier_nights import EarlierNights
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.night_rows import write_night_row
 from epipole.flows.night.parameters import Night, night_asked, run_name
+from epipole.flows.night.reports import with_reports
 from epipole.flows.night.stages import (
     Destination,
     calibrate,
@@ -138,6 +139,8 @@ def nightly(
                 faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]
                 write_night_row(staged[date], recipe, earlier_key, faults, residuals)
             summary = publish(Destination(out, staged, replace), sources)
+            if settings.report.write:
+                summary = with_reports(summary, staged, staging)
     LOGGER.info("published %s", ", ".join(f"{out}/night={date}" for date in chosen))
     return summary
 

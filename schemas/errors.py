@@ -31,3 +31,7 @@ class CatalogueError(EpipoleError):
 
 class DatasetError(EpipoleError):
     """An output folder that is not a dataset, or that cannot be read or written."""
+
+
+class ReportError(EpipoleError):
+    """A report that cannot be drawn or written."""

@@ -363,6 +363,16 @@ class WorkSettings(Group):
         return self.memory_mib * 2**20 // BYTES_PER_VIEW
 
 
+class ReportSettings(Group):
+    """The report of a night: a page with pictures. It changes no table."""
+
+    write: bool = Field(
+        True,
+        description="Whether a run writes `reports/DATE.html` into the dataset. Without matplotlib "
+        "(the extra `report`) it writes none.",
+    )
+
+
 class Settings(Group):
     """All settings of a run."""
 
@@ -375,6 +385,7 @@ class Settings(Group):
     states: StateSettings = StateSettings()
     known_objects: KnownObjectSettings = KnownObjectSettings()
     work: WorkSettings = WorkSettings()
+    report: ReportSettings = ReportSettings()
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
@@ -384,8 +395,9 @@ class Settings(Group):
         return self
 
     def key(self) -> str:
-        """Return a digest of the settings."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+        """Return a digest of the settings that results depend on."""
+        text = self.model_dump_json(exclude={"report"})
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _contradiction(settings: Settings) -> str | None:

@@ -19,6 +19,7 @@ from epipole.flows.command_line.commands import (
     info,
     nights,
     overlay,
+    report,
     run,
     settings,
     simulate,
@@ -95,6 +96,7 @@ for command in (
     evaluate.evaluate,
     export.export,
     overlay.overlay,
+    report.report,
     settings.settings,
     deploy_files.deploy_files,
 ):

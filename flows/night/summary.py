@@ -1,7 +1,7 @@
 """The summary of a run: counts of what it found, and of what it left out by reason."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ import pyarrow.compute as pc
 from epipole.io.datasets.night_files import Where, count_rows, read_columns
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import NameStatus, Reason
+from epipole.tasks.report.report_extract import ReportExtract
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,13 @@ class Summary:
     residuals: list[str]
     unchanged: bool
     by_sensor: list[SensorSummary]
+    extracts: tuple[ReportExtract, ...]  # of the nights' reports, for Prefect's page
 
     def as_dict(self) -> dict[str, Any]:
         """Return the counts by name, as JSON takes them."""
-        return asdict(self)
+        counts = asdict(replace(self, extracts=()))
+        del counts["extracts"]
+        return counts
 
     def lines(self) -> list[str]:
         """Return the summary as people read it."""
@@ -180,6 +184,7 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
             _of_sensor(frames.filter(pc.field("sensor_id") == name), tables["tracklets"], name)
             for name in sorted(pc.unique(frames["sensor_id"]).to_pylist())
         ],
+        extracts=(),
     )
 
 

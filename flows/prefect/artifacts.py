@@ -3,10 +3,11 @@
 A page that cannot be written is a warning, never an error.
 """
 
+import base64
 import contextlib
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import cast
 from uuid import UUID
 
@@ -23,10 +24,12 @@ from epipole.flows.night.progress import COMPILE
 from epipole.flows.night.summary import Summary, many
 from epipole.schemas.rejects import Reason
 from epipole.schemas.text.shown import as_line, as_markdown_text
+from epipole.tasks.report.report_extract import ReportExtract
 
 LOGGER = logging.getLogger(__name__)
 
 LONGEST_ID = 100
+MOST_SENSORS = 50  # that the table of gaps names
 UPDATED_EVERY_S = 3.0
 _PAGE_ERRORS = (httpx.HTTPError, PrefectException, OSError, RuntimeError)
 
@@ -115,12 +118,32 @@ def as_markdown(summary: Summary) -> str:
         lines += [f"- {as_markdown_text(residual)}" for residual in summary.residuals]
     if summary.rejects:
         lines += ["", f"Left out: {many(sum(summary.rejects.values()), 'thing')}", ""]
-        lines += ["| reason | count | what it means |", "|---|---:|---|"]
-        lines += [
-            f"| {reason} | {n:,} | {Reason(reason).sentence} |"
-            for reason, n in summary.rejects.items()
-        ]
+        lines += _left_out(summary.rejects)
+    for extract in summary.extracts:
+        lines += _extract(extract)
     return "\n".join(lines) + "\n"
+
+
+def _left_out(rejects: Mapping[str, int]) -> list[str]:
+    rows = [
+        f"| {reason} | {count:,} | {Reason(reason).sentence} |" for reason, count in rejects.items()
+    ]
+    return ["| reason | count | meaning |", "|---|---:|---|", *rows]
+
+
+def _extract(extract: ReportExtract) -> list[str]:
+    """Return a night's pictures, as data in their addresses, and its gaps by sensor."""
+    lines = ["", f"## Report of {extract.night}"]
+    for picture in extract.pictures:
+        data = base64.b64encode(picture.png).decode()
+        lines += ["", f"![{as_markdown_text(picture.alt)}](data:image/png;base64,{data})"]
+    if extract.lost_s:
+        lines += ["", "| sensor | gaps | seconds without frames |", "|---|---:|---:|"]
+        for sensor, lost_s in list(extract.lost_s.items())[:MOST_SENSORS]:
+            count = sum(gap.sensor_id == sensor for gap in extract.gaps)
+            name = as_markdown_text(sensor, LONGEST_ID)
+            lines.append(f"| {name} | {count:,} | {lost_s:,.0f} |")
+    return lines
 
 
 def _places(summary: Summary) -> list[str]:

@@ -23,6 +23,7 @@ from epipole.io.caches.private_folders import temporary_folder
 from epipole.io.datasets import local_nights
 from epipole.io.datasets.folder_swap import sync
 from epipole.io.datasets.local_nights import STAGING
+from epipole.io.datasets.night_reader import NightReader
 from epipole.io.datasets.store_nights import StoreNights, store_nights
 from epipole.io.names import fault_of_name
 from epipole.io.remote_files import line_of, storage_errors
@@ -37,6 +38,7 @@ from epipole.schemas.tables import TABLES
 _NIGHT_COLUMN = {"tracklets": "start_time"}
 _WHOLE_NIGHT = {"calibrations", "identifications", "nights", "sources"}
 
+REPORTS = "reports"  # beside the nights, never in them: readers scan night=*
 
 Where = Path | str
 
@@ -62,7 +64,8 @@ def check_folder(dataset: Where) -> None:
             names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
         except OSError as error:
             raise DatasetError(f"{dataset}: {error.strerror}; give another folder") from error
-    if names and not any(name == STAGING or name.startswith("night=") for name in names):
+    own = (STAGING, REPORTS)
+    if names and not any(name in own or name.startswith("night=") for name in names):
         raise DatasetError(
             f"{dataset}: holds other files and no dataset (no night=... folder); "
             "give an empty folder or a dataset"
@@ -172,6 +175,38 @@ def night_place(dataset: Where, night: str) -> Where:
     folder = dataset_folder(dataset)
     name = f"night={night}"
     return f"{str(dataset).rstrip('/')}/{name}" if folder is None else folder / name
+
+
+def night_reader(dataset: Where, night: str) -> NightReader:
+    """Return a published night, to be read piece by piece."""
+    where = f"{dataset}/night={night}"
+    if (store := _store(dataset)) is not None:
+        return NightReader(where, night, lambda table: store.opened(night, table))
+    local_nights.recover(_folder(dataset))
+    return NightReader.of_folder(_folder(dataset) / f"night={night}", night)
+
+
+def write_report(dataset: Where, night: str, text: str, staging: Path) -> None:
+    """Write the report of a night into the dataset, in the place of an earlier one.
+
+    Parameters
+    ----------
+    staging
+        The folder of this run; see `claim_nights`.
+
+    Raises
+    ------
+    DatasetError
+        Where it cannot be written.
+    """
+    with _writing(dataset):
+        if (store := _store(dataset)) is not None:
+            store.write(f"{REPORTS}/{night}.html", text.encode())
+            return
+        staged, folder = staging / f"{night}.html", _folder(dataset) / REPORTS
+        staged.write_text(text, encoding="utf-8")
+        folder.mkdir(exist_ok=True)
+        staged.replace(folder / staged.name)
 
 
 @contextlib.contextmanager

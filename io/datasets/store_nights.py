@@ -93,6 +93,14 @@ class StoreNights:
         paths = self._storage.glob(f"{self._root}/night={night}/*/*.parquet")
         return {path.rsplit("/", 2)[1] for path in paths}
 
+    def opened(self, night: str, table: str) -> list[Any]:
+        """Return the files of a table of a night, open: only what is asked for is fetched."""
+        return [self._storage.open(path, "rb") for path in self._paths(night, table)]
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write one object at the top of the dataset, or in a folder there."""
+        self._storage.pipe_file(f"{self._root}/{name}", data)
+
     def publish(self, staged: Mapping[str, Path]) -> None:
         """Publish these nights, which this process has claimed: all or none.
 

@@ -8,12 +8,14 @@ from epipole.flows.prefect import artifacts
 from epipole.flows.prefect.artifacts import ProgressBar, as_markdown, show_summary
 from epipole.schemas.rejects import Reason
 from epipole.schemas.stages import Stage
+from epipole.tasks.report.frame_series import Gap
+from epipole.tasks.report.report_extract import PagePicture, ReportExtract
 
 FOUND = {
     "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
     "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "epochs": 6, "objects": 5,
     "positions": 4, "rejects": {"no_state": 34, "bad_sigma": 1}, "faults": [], "by_sensor": [],
-    "names": {}, "residuals": [], "unchanged": False,
+    "names": {}, "residuals": [], "unchanged": False, "extracts": (),
 }  # fmt: skip
 
 
@@ -31,6 +33,16 @@ def test_the_page_of_a_night_has_its_counts_and_what_was_left_out_by_reason():
 
 def test_the_page_of_an_unchanged_night_says_that_it_was_not_made_again():
     assert "not made again" in as_markdown(Summary(**FOUND | {"unchanged": True}))
+
+
+def test_the_page_of_a_night_has_pictures_and_the_gaps_of_sensors():
+    gaps = (Gap("a|b", 0, 7_000_000_000), Gap("a|b", 9_000_000_000, 12_000_000_000))
+    pictures = (PagePicture("Coverage", b"\x89PNG"),)
+    extract = ReportExtract("2019-04-01", pictures, gaps, {"a|b": 10.0})
+    page = as_markdown(Summary(**FOUND | {"extracts": (extract,)}))
+    assert "![Coverage](data:image/png;base64,iVBORw==)" in page
+    assert "| a&#124;b | 2 | 10 |" in page
+    assert "extracts" not in Summary(**FOUND | {"extracts": (extract,)}).as_dict()
 
 
 def test_progress_only_grows_though_a_stage_is_done_again(monkeypatch):

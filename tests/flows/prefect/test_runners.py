@@ -16,8 +16,10 @@ from epipole.schemas.choices import Runner
 from epipole.schemas.errors import EpipoleError
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+def contents(dataset: Path) -> dict[str, bytes]:
+    """The tables; a report names the folder of its dataset."""
+    files = dataset.glob("night=*/**/*")
+    return {str(p.relative_to(dataset)): p.read_bytes() for p in files if p.is_file()}
 
 
 def test_threads_are_the_default_one_a_cpu(monkeypatch):

@@ -1,0 +1,70 @@
+"""The reports of nights: made from what is published, and written beside the nights."""
+
+import dataclasses
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from epipole.flows.night.summary import Summary
+from epipole.io.datasets.dataset import night_reader, nights_in, write_report
+from epipole.io.datasets.night_reader import NightReader
+from epipole.io.remote_files import line_of
+from epipole.schemas.errors import ReportError
+from epipole.tasks.report.night_facts import NightFacts, read_night_facts
+from epipole.tasks.report.report_extract import ReportExtract
+from epipole.tasks.report.trend import MOST_NIGHTS
+
+LOGGER = logging.getLogger(__name__)
+
+
+def with_reports(summary: Summary, staged: Mapping[str, Path], staging: Path) -> Summary:
+    """Write the reports of published nights; return the summary with their extracts.
+
+    The nights are published: whatever happens here, the run has succeeded. So an error is a line.
+
+    Parameters
+    ----------
+    staged
+        The folders in which the nights were made. Where they still exist, the dataset lies in an
+        object store, and nothing has to be fetched from it.
+    staging
+        The folder of this run.
+    """
+    extracts = []
+    try:
+        nights = nights_in(summary.dataset)
+        for night in summary.nights:
+            own = staged[night] if staged[night].is_dir() else None
+            text, extract = _page_and_extract(night_facts(summary.dataset, night, nights, own))
+            write_report(summary.dataset, night, text, staging)
+            extracts.append(extract)
+    except ReportError as error:
+        LOGGER.info("no report is written: %s", error)
+    except Exception as error:  # of drawing, of the store, of anything: the night is done
+        LOGGER.warning("the report could not be made: %s", line_of(error))
+    return dataclasses.replace(summary, extracts=tuple(extracts))
+
+
+def night_facts(
+    dataset: str, night: str, nights: Sequence[str], folder: Path | None = None
+) -> NightFacts:
+    """Return what the report of a night says.
+
+    Parameters
+    ----------
+    nights
+        All nights of the dataset, in order: those before this one are its trend.
+    folder
+        Where the night's tables lie too, on this machine.
+    """
+    before = [each for each in nights if each < night][-(MOST_NIGHTS - 1) :]
+    own = night_reader(dataset, night) if folder is None else NightReader.of_folder(folder, night)
+    return read_night_facts(own, dataset, [night_reader(dataset, each) for each in before])
+
+
+def _page_and_extract(facts: NightFacts) -> tuple[str, ReportExtract]:
+    # Without matplotlib these modules cannot be imported: they raise `ReportError`.
+    from epipole.tasks.report.page.extract import report_extract
+    from epipole.tasks.report.page.night_page import night_page
+
+    return night_page(facts), report_extract(facts)

@@ -1,0 +1,1 @@
+"""The pictures of the report: what was computed, drawn with matplotlib."""

@@ -1,0 +1,151 @@
+"""Frames over the night, by sensor: how they got their attitude, how good it is, and gaps."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from epipole.io.datasets.night_reader import NightReader
+from epipole.tasks.report.time_bins import TimeBins, bins_between
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+COLUMNS = ["time", "sensor_id", "attitude_source", "status", "n_stars", "sigma_x_arcsec",
+           "sigma_y_arcsec", "sigma_z_arcsec", "residual_px"]  # fmt: skip
+SOURCES = ("stars", "prior", "none")
+GAP_FRAMES = 10  # a time without frames that is this many frame intervals long is a gap
+SHORTEST_GAP_S = 5.0
+MOST_GAPS = 200
+# Sums of a bin: squares of sigmas (across, about the boresight) and of the stars' residual.
+SUMS = ("across", "about", "residual")
+
+
+class Gap(NamedTuple):
+    """A time in which a sensor has no frames."""
+
+    sensor_id: str
+    start_ns: int
+    end_ns: int
+
+    @property
+    def seconds(self) -> float:
+        """Its length."""
+        return (self.end_ns - self.start_ns) / 1e9
+
+
+@dataclass
+class FrameSeries:
+    """The frames of a night in bins of time.
+
+    counts : (sources, sensors, bins), frames by `SOURCES`
+    rms : for each of `SUMS`, (sensors, bins), NaN where no frame has it
+    failed : frames by sensor and status
+    gaps : the longest ones, of all sensors, in order of time
+    lost_s : the length of all gaps, by sensor
+    stars : the mean number of stars of an identified frame, by sensor
+    """
+
+    sensors: list[str]
+    bins: TimeBins
+    counts: Indices
+    rms: dict[str, Array]
+    failed: dict[tuple[str, str], int]
+    gaps: list[Gap]
+    lost_s: Array
+    stars: Array
+
+    @property
+    def frames(self) -> Indices:
+        """Frames by sensor."""
+        total: Indices = self.counts.sum(axis=(0, 2))
+        return total
+
+    @property
+    def identified_share(self) -> Array:
+        """The share of each sensor's frames that are identified."""
+        share: Array = self.counts[0].sum(axis=1) / np.maximum(self.frames, 1)
+        return share
+
+
+def read_frame_series(night: NightReader) -> FrameSeries | None:
+    """Return the frames of a night; None: it has none."""
+    ends = night.bounds_ns("frames", "time")
+    if ends is None:
+        return None
+    busiest: dict[str, int] = {}
+    for rows in night.pieces("frames", ["sensor_id"]):
+        for name, count in rows["sensor_id"].value_counts().iter_rows():
+            busiest[name] = busiest.get(name, 0) + count
+    sums = _SeriesSums(sorted(busiest), bins_between(*ends, max(busiest.values())))
+    for rows in night.pieces("frames", COLUMNS):
+        sums.add(rows)
+    return sums.result()
+
+
+class _SeriesSums:
+    """The sums over the pieces of the table."""
+
+    def __init__(self, sensors: list[str], bins: TimeBins) -> None:
+        shape = (len(sensors), bins.number)
+        self.sensors, self.bins = sensors, bins
+        self.counts = np.zeros((len(SOURCES), *shape), np.int64)
+        self.squares = {name: np.zeros(shape) for name in SUMS}
+        self.numbers = {name: np.zeros(shape, np.int64) for name in SUMS}
+        self.failed: dict[tuple[str, str], int] = {}
+        self.gaps: list[Gap] = []
+        self.lost_s = np.zeros(len(sensors))
+        self.stars = np.zeros(len(sensors))
+        self.last_ns = np.full(len(sensors), -1, np.int64)
+        self.interval_ns = np.zeros(len(sensors))
+
+    def add(self, rows: pl.DataFrame) -> None:
+        """Add a piece of the table."""
+        sensor = codes(rows["sensor_id"], self.sensors)
+        source = codes(rows["attitude_source"], list(SOURCES))
+        time_ns = rows["time"].dt.epoch("ns").to_numpy()
+        bin_ = self.bins.of(time_ns)
+        np.add.at(self.counts, (source, sensor, bin_), 1)
+        x, y, z, residual = (rows[name].to_numpy() for name in COLUMNS[5:])
+        for name, square in (("across", (x * x + y * y) / 2), ("about", z * z),
+                             ("residual", residual * residual)):  # fmt: skip
+            known = np.isfinite(square)
+            np.add.at(self.squares[name], (sensor[known], bin_[known]), square[known])
+            np.add.at(self.numbers[name], (sensor[known], bin_[known]), 1)
+        self.stars += np.bincount(sensor, rows["n_stars"].to_numpy(), len(self.sensors))
+        failed = rows.filter(pl.col("status").is_not_null()).group_by("sensor_id", "status").len()
+        for name, status, count in failed.iter_rows():
+            self.failed[name, status] = self.failed.get((name, status), 0) + count
+        for k in np.unique(sensor).tolist():
+            self._find_gaps(k, time_ns[sensor == k])
+
+    def _find_gaps(self, k: int, time_ns: Indices) -> None:
+        if self.last_ns[k] >= 0:
+            time_ns = np.concatenate([self.last_ns[k : k + 1], time_ns])
+        self.last_ns[k] = time_ns[-1]
+        steps = np.diff(time_ns)
+        if not self.interval_ns[k] and len(steps):
+            self.interval_ns[k] = np.median(steps)
+        longest = max(GAP_FRAMES * self.interval_ns[k], SHORTEST_GAP_S * 1e9)
+        for i in np.flatnonzero(steps > longest).tolist():
+            self.lost_s[k] += steps[i] / 1e9
+            self.gaps.append(Gap(self.sensors[k], int(time_ns[i]), int(time_ns[i + 1])))
+        if len(self.gaps) > MOST_GAPS:
+            self.gaps = sorted(self.gaps, key=lambda gap: -gap.seconds)[:MOST_GAPS]
+
+    def result(self) -> FrameSeries:
+        """Return the series."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            rms = {name: np.sqrt(self.squares[name] / self.numbers[name]) for name in SUMS}
+            stars = self.stars / self.counts[0].sum(axis=1)
+        gaps = sorted(self.gaps, key=lambda gap: (gap.start_ns, gap.sensor_id))
+        return FrameSeries(self.sensors, self.bins, self.counts, rms,
+                           dict(sorted(self.failed.items())), gaps, self.lost_s, stars)  # fmt: skip
+
+
+def codes(names: pl.Series, known: list[str]) -> Indices:
+    """Return the place of each name in a list of names; those that it lacks get its last place."""
+    places = names.cast(pl.Enum(known), strict=False).to_physical().fill_null(len(known) - 1)
+    return places.to_numpy().astype(np.int64)

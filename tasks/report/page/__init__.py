@@ -1,0 +1,1 @@
+"""The page of the report: HTML of one file, with its sections, tables and pictures."""

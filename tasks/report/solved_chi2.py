@@ -1,0 +1,108 @@
+"""Whether the sigmas of pairs, positions and states hold: chi-squares of a night."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.io.datasets.night_reader import NightReader
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+PAIR_BINS = np.linspace(0.0, 5.0, 26)  # edges, in sigmas
+MOST_FREEDOM = 4000  # degrees of freedom that are told apart
+FEWEST_BINS, MOST_BINS = 8, 40
+
+
+class Chi2(NamedTuple):
+    """Chi-squares of one kind.
+
+    edges, counts : histogram; (n + 1,) and (n,). The last bin also has what lies beyond it
+    freedom : (m,) how many have this many degrees of freedom, by the number
+    total, freedoms : sums of the chi-squares and of the degrees of freedom
+    independent : how many share no detection with each other
+    """
+
+    edges: Array
+    counts: Indices
+    freedom: Indices
+    total: float
+    freedoms: int
+    independent: int
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
+        return int(self.counts.sum())
+
+    @property
+    def mean(self) -> float:
+        """The chi-square per degree of freedom: 1 where the sigmas hold."""
+        return self.total / self.freedoms if self.freedoms else float("nan")
+
+
+class SolvedChi2(NamedTuple):
+    """Pair distances (in sigmas), and the chi-squares of positions and of states; None: no rows."""
+
+    pairs: Chi2 | None
+    positions: Chi2 | None
+    states: Chi2 | None
+
+
+def read_solved_chi2(night: NightReader) -> SolvedChi2:
+    """Return the chi-squares of a night."""
+    return SolvedChi2(_pairs(night), _positions(night), _states(night))
+
+
+def _pairs(night: NightReader) -> Chi2 | None:
+    counts, total, number = np.zeros(len(PAIR_BINS) - 1, np.int64), 0.0, 0
+    for rows in night.pieces("pairs", ["mahalanobis"]):
+        z = rows["mahalanobis"].to_numpy()
+        z = z[np.isfinite(z)]
+        counts += np.histogram(np.minimum(z, PAIR_BINS[-1]), PAIR_BINS)[0]
+        total, number = total + float(z @ z), number + len(z)
+    freedom = np.array([0, number])
+    return Chi2(PAIR_BINS, counts, freedom, total, number, number) if number else None
+
+
+def _positions(night: NightReader) -> Chi2 | None:
+    freedom = np.zeros(MOST_FREEDOM + 1, np.int64)
+    total, independent = 0.0, 0
+    columns = ["n_sensors", "chi2", "independent"]
+    for rows in night.pieces("positions", columns):
+        dof = np.clip(2 * rows["n_sensors"].to_numpy() - 3, 1, MOST_FREEDOM)
+        freedom += np.bincount(dof, minlength=len(freedom))
+        total += float(rows["chi2"].sum())
+        independent += int(rows["independent"].sum())
+    if not freedom.sum():
+        return None
+    edges = _edges(freedom)
+    counts = np.zeros(len(edges) - 1, np.int64)
+    for rows in night.pieces("positions", ["chi2"]):
+        counts += np.histogram(np.minimum(rows["chi2"].to_numpy(), edges[-1]), edges)[0]
+    return _chi2(edges, counts, freedom, total, independent)
+
+
+def _states(night: NightReader) -> Chi2 | None:
+    rows = night.read("states", ["chi2", "dof"])
+    if not len(rows):
+        return None
+    dof = np.clip(rows["dof"].to_numpy(), 1, MOST_FREEDOM)
+    freedom = np.bincount(dof, minlength=MOST_FREEDOM + 1)
+    edges = _edges(freedom)
+    chi2 = rows["chi2"].to_numpy()
+    counts = np.histogram(np.minimum(chi2, edges[-1]), edges)[0]
+    return _chi2(edges, counts, freedom, float(chi2.sum()), len(rows))
+
+
+def _edges(freedom: Indices) -> Array:
+    """Return bins as far as nearly all chi-squares should lie."""
+    dof = int(np.searchsorted(np.cumsum(freedom), 0.95 * freedom.sum()))
+    bins = int(np.clip(2 * np.sqrt(freedom.sum()), FEWEST_BINS, MOST_BINS))
+    return np.linspace(0.0, dof + 4.5 * np.sqrt(2.0 * max(dof, 1)), bins + 1)
+
+
+def _chi2(edges: Array, counts: Indices, freedom: Indices, total: float, independent: int) -> Chi2:
+    freedoms = int(freedom @ np.arange(len(freedom)))
+    return Chi2(edges, counts, np.trim_zeros(freedom, "b"), total, freedoms, independent)

@@ -1,0 +1,163 @@
+"""The report: as a command, at the end of a run, in a browser."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+from scenes.dataset_tables import contents
+
+from epipole.flows.night import reports
+from epipole.flows.nightly import nightly
+from epipole.flows.report import report
+from epipole.io.datasets.dataset import check_folder, nights_in
+from epipole.schemas.errors import DatasetError, ReportError
+from epipole.schemas.settings import ReportSettings, Settings
+
+NIGHT = "2019-04-01"
+WITHOUT = Settings(report=ReportSettings(write=False))
+
+
+def test_a_run_writes_the_report_beside_its_nights(night_dataset, tmp_path):
+    written = night_dataset / "reports" / f"{NIGHT}.html"
+    size = report(str(night_dataset), NIGHT, tmp_path / "sub" / "night.html")
+    made = (tmp_path / "sub" / "night.html").read_bytes()
+    assert size == len(made) < 1_000_000
+    assert written.read_bytes() == made
+    assert nights_in(night_dataset) == [NIGHT]
+    assert sorted(p.name for p in (tmp_path / "sub").iterdir()) == ["night.html"]
+
+
+def test_the_setting_changes_no_table(night_dataset, night_log, tmp_path):
+    nightly([str(night_log)], str(tmp_path / "out"), settings=WITHOUT)
+    assert not (tmp_path / "out" / "reports").exists()
+    night = f"night={NIGHT}"
+    assert contents(tmp_path / "out" / night) == contents(night_dataset / night)
+
+
+def test_a_report_that_fails_is_a_warning_and_the_night_is_published(
+    night_log, prefect, tmp_path, monkeypatch, caplog
+):
+    def broken(*_):
+        raise RuntimeError("no\nlight")
+
+    monkeypatch.setattr(reports, "night_facts", broken)
+    summary = nightly([str(night_log)], str(tmp_path / "out"))
+    assert summary.positions > 0
+    assert summary.extracts == ()
+    assert nights_in(tmp_path / "out") == [NIGHT]
+    warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert warnings == ["the report could not be made: no light"]
+
+
+def without_matplotlib(code, *arguments):
+    hidden = f"import sys; sys.modules['matplotlib'] = None; {code}"
+    return subprocess.run(
+        [sys.executable, "-c", hidden, *arguments], capture_output=True, text=True, check=False
+    )
+
+
+def test_without_matplotlib_one_line_says_which_extra_to_install(night_dataset, tmp_path):
+    code = "from epipole.flows.command_line.main import main; main()"
+    out = tmp_path / "night.html"
+    told = without_matplotlib(code, "report", str(night_dataset), "--night", NIGHT,
+                              "--out", str(out))  # fmt: skip
+    assert told.returncode == 1
+    assert told.stderr.count("\n") == 1
+    assert "epipole[report]" in told.stderr
+    assert not out.exists()
+
+
+def test_without_matplotlib_a_run_goes_on():
+    told = without_matplotlib("import epipole.flows.nightly, epipole.flows.prefect.artifacts")
+    assert told.returncode == 0, told.stderr
+
+
+def test_bad_input_is_one_error(night_dataset, tmp_path):
+    with pytest.raises(DatasetError, match="has no night 2019-04-02"):
+        report(str(night_dataset), "2019-04-02", tmp_path / "a.html")
+    with pytest.raises(ReportError, match="is a folder"):
+        report(str(night_dataset), NIGHT, tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(ReportError, match="cannot be written"):
+        report(str(night_dataset), NIGHT, tmp_path / "file" / "a.html")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_table_that_cannot_be_read_is_named(night_dataset, tmp_path):
+    broken = tmp_path / "out"
+    shutil.copytree(night_dataset, broken)
+    (broken / f"night={NIGHT}" / "stars" / "part-0.parquet").write_bytes(b"no parquet")
+    with pytest.raises(DatasetError, match="stars: cannot be read"):
+        report(str(broken), NIGHT, tmp_path / "a.html")
+
+
+def test_a_dataset_of_which_only_reports_are_left_is_one(night_dataset, tmp_path):
+    (tmp_path / "reports").mkdir()
+    check_folder(tmp_path)
+
+
+def test_in_an_object_store_the_report_is_the_same(s3, night_log, prefect, night_dataset, tmp_path):
+    out = "s3://nights/reported"
+    nightly([str(night_log)], out)
+    stored = s3.cat_file(f"nights/reported/reports/{NIGHT}.html").decode()
+    local = (night_dataset / "reports" / f"{NIGHT}.html").read_text()
+    assert stored.replace(out, "OUT") == local.replace(str(night_dataset), "OUT")
+    report(out, NIGHT, tmp_path / "a.html")
+    assert (tmp_path / "a.html").read_text() == stored
+
+
+def test_the_trend_is_of_the_nights_before(night_dataset, tmp_path):
+    dataset = tmp_path / "out"
+    for night in ("2019-03-30", "2019-03-31", "2019-04-01", "2019-04-02"):
+        shutil.copytree(night_dataset / f"night={NIGHT}", dataset / f"night={night}")
+    report(str(dataset), NIGHT, tmp_path / "a.html")
+    page = (tmp_path / "a.html").read_text()
+    assert "of 3 nights" in page
+    assert "2019-04-02" not in page
+
+
+CHROMIUM = shutil.which("chromium")
+# Adds to the page what a browser can say of it: its width, and the pictures that it could not draw.
+PROBE = """<script>addEventListener("load", () => { const pictures = [...document.images];
+document.title = JSON.stringify({wide: document.documentElement.scrollWidth - innerWidth,
+inner: innerWidth, drawn: pictures.filter(p => p.complete && p.naturalWidth > 0).length,
+pictures: pictures.length, fetched: performance.getEntriesByType("resource")
+  .filter(e => !e.name.startsWith("data:")).length}); })</script></body>"""
+
+
+def browse(page, folder, width):
+    """Return what the browser says of a page, and its console."""
+    # A page may not be narrower than 500 px in a window: a frame in it may.
+    allowed = "default-src 'none'", "script-src 'unsafe-inline'; default-src 'none'"
+    inner = page.replace("</body>", PROBE).replace(*allowed)
+    (folder / "page.html").write_text(inner)
+    (folder / "frame.html").write_text(
+        f'<iframe id=f src="page.html" style="width:{width}px;height:800px;border:0"></iframe>'
+        "<script>f.onload = () => setTimeout(() => "
+        "{document.title = f.contentDocument.title}, 50)</script>"
+    )
+    told = subprocess.run(
+        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic",
+         "--no-first-run", "--disable-background-networking", "--disable-component-update",
+         "--disable-sync", f"--user-data-dir={folder / 'profile'}", "--enable-logging=stderr",
+         "--allow-file-access-from-files", "--virtual-time-budget=5000", "--window-size=1300,900",
+         "--dump-dom", (folder / "frame.html").as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    title = told.stdout.partition("<title>")[2].partition("</title>")[0]
+    console = [line for line in told.stderr.splitlines() if "CONSOLE" in line]
+    return json.loads(title), console
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+@pytest.mark.parametrize("width", [360, 1200])
+def test_a_browser_shows_all_of_it_without_scrolling_sideways(night_dataset, tmp_path, width):
+    page = (night_dataset / "reports" / f"{NIGHT}.html").read_text()
+    seen, console = browse(page, tmp_path, width)
+    assert seen["inner"] == width
+    assert seen["wide"] <= 0
+    assert seen["drawn"] == seen["pictures"] >= 12
+    assert seen["fetched"] == 0
+    assert console == []

@@ -1,0 +1,52 @@
+"""Frames over the night: what they became, gaps, and sums that do not depend on the pieces."""
+
+import numpy as np
+from scenes.made_nights import START_NS, filled, reader_of, seconds
+
+from epipole.tasks.report.frame_series import read_frame_series
+
+
+def night(in_group=1000, count=400):
+    time = seconds(count)
+    time = np.concatenate([time[:200], time[300:]])
+    half = len(time) // 2
+    return reader_of({
+        "frames": filled(
+            "frames", sensor_id=["a"] * len(time), time=time,
+            attitude_source=["stars"] * half + ["prior"] * (half - 10) + ["none"] * 10,
+            status=[None] * half + ["no_match"] * half, n_stars=[7] * half + [0] * half,
+            sigma_x_arcsec=[3.0] * half + [None] * half, residual_px=[0.2] * half + [None] * half,
+            sigma_y_arcsec=[4.0] * half + [None] * half,
+            sigma_z_arcsec=[50.0] * half + [None] * half)}, in_group=in_group)  # fmt: skip
+
+
+def test_frames_are_counted_by_the_source_of_their_attitude():
+    series = read_frame_series(night())
+    assert series.counts.sum(axis=(1, 2)).tolist() == [150, 140, 10]
+    assert series.failed == {("a", "no_match"): 150}
+    assert series.identified_share.tolist() == [0.5]
+    assert series.stars.tolist() == [7.0]
+
+
+def test_a_time_without_frames_is_a_gap():
+    series = read_frame_series(night())
+    (gap,) = series.gaps
+    assert gap.seconds == 101
+    assert gap.start_ns == START_NS + 199 * 10**9
+    assert series.lost_s.tolist() == [101]
+
+
+def test_sigmas_are_root_mean_squares():
+    series = read_frame_series(night())
+    assert np.nanmax(abs(series.rms["across"] - np.sqrt(12.5))) < 1e-12
+    assert np.nanmax(abs(series.rms["about"] - 50)) < 1e-12
+
+
+def test_pieces_of_a_table_change_nothing():
+    whole, pieces = read_frame_series(night()), read_frame_series(night(in_group=7))
+    assert (whole.counts == pieces.counts).all()
+    assert whole.gaps == pieces.gaps
+
+
+def test_a_night_without_frames_has_no_series():
+    assert read_frame_series(reader_of({})) is None

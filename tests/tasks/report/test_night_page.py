@@ -1,0 +1,141 @@
+"""The page: whole for every kind of night, safe from names, small, the same each time."""
+
+import re
+from html.parser import HTMLParser
+from urllib.parse import unquote
+from xml.etree import ElementTree
+
+import pytest
+from scenes.made_nights import filled, hostile_night, reader_of, seconds
+
+from epipole.io.datasets.dataset import night_reader
+from epipole.tasks.report.night_facts import read_night_facts
+
+pytest.importorskip("matplotlib")
+from epipole.tasks.report.page.extract import report_extract
+from epipole.tasks.report.page.night_page import night_page
+
+NIGHT = "2019-04-01"
+HOSTILE = [
+    "<script>alert(1)</script>",
+    '"><img src=x onerror=alert(1)>',
+    "a\nb\r\n\x00\x1b[31m",
+    "$x_{1}$ \\frac & % # ' ]]>",
+    "s" * 5000,
+    "\u202eabc\u4e2d\u6587\U0001f680",
+]
+EMPTY_TAGS = {"meta", "link", "img", "br"}
+
+
+class Outline(HTMLParser):
+    """The tags of a page, which must be closed in their order, and its pictures."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.tags, self.pictures = [], [], []
+        self.feed(page)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        if tag == "img":
+            self.pictures.append(dict(attrs))
+        if tag not in EMPTY_TAGS:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def page_of(night):
+    return night_page(read_night_facts(night, "out"))
+
+
+def drawings(page):
+    for picture in Outline(page).pictures:
+        kind, _, data = picture["src"].partition(",")
+        assert kind == "data:image/svg+xml"
+        assert picture["alt"]
+        yield ElementTree.fromstring(unquote(data))
+
+
+@pytest.fixture(scope="module")
+def page(night_dataset):
+    return page_of(night_reader(night_dataset, NIGHT))
+
+
+def test_a_run_has_every_section_and_its_pictures(page):
+    assert len(list(drawings(page))) >= 12
+    assert "Nothing needs a look." in page
+    assert "HIP numbers" in page
+    for section in ("counts", "coverage", "sigmas", "attitudes", "frame", "image", "sky",
+                    "epipolar", "objects", "trend", "logs"):  # fmt: skip
+        assert f'<section id="{section}">' in page
+        assert f'href="#{section}"' in page
+
+
+def test_it_needs_no_other_file_and_no_script(page):
+    outline = Outline(page)
+    assert not {"script", "iframe", "object", "embed", "form"} & set(outline.tags)
+    addresses = re.findall(r'(?:href|src)="([^"]{0,20})', page)
+    assert {address.partition(":")[0][:1] for address in addresses} <= {"#", "d"}
+    assert "http" not in re.sub(r'src="data:[^"]*"|http-equiv', "", page)
+
+
+def test_it_is_small_and_the_same_each_time(page, night_dataset):
+    assert len(page.encode()) < 1_000_000
+    assert page_of(night_reader(night_dataset, NIGHT)) == page
+
+
+@pytest.mark.parametrize("name", HOSTILE, ids=range(len(HOSTILE)))
+def test_names_from_a_log_are_text(name):
+    page = page_of(hostile_night(name))
+    outline = Outline(page)
+    assert "script" not in outline.tags
+    assert all("onerror" not in picture for picture in outline.pictures)
+    for drawing in drawings(page):
+        assert not [each for each in drawing.iter() if each.tag.endswith("script")]
+    assert len(page.encode()) < 1_000_000
+
+
+def nights():
+    time, n = seconds(30), 30
+    frames = {"sensor_id": ["a"] * n, "time": time}
+    yield "empty", reader_of({})
+    yield "no stars", reader_of({"frames": filled(
+        "frames", **frames, attitude_source=["none"] * n, status=["no_match"] * n)})  # fmt: skip
+    yield "one frame", reader_of({"frames": filled(
+        "frames", sensor_id=["a"], attitude_source=["stars"])})  # fmt: skip
+    yield "no positions", reader_of({
+        "frames": filled("frames", **frames, attitude_source=["stars"] * n, n_stars=[4] * n),
+        "stars": filled("stars", sensor_id=["a"] * n, time=time, x_px=[9.0] * n, y_px=[9.0] * n),
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize("night", [pytest.param(made, id=name) for name, made in nights()])
+def test_sections_without_data_say_so(night):
+    page = page_of(night)
+    list(drawings(page))
+    assert "No object has a position." in page
+    assert "The dataset has no earlier night." in page
+    assert page.count('class="nothing"') >= 4
+
+
+def test_hundreds_of_sensors_stay_within_a_megabyte():
+    sensors = [f"sensor-{k:03}" for k in range(300)]
+    n = 20
+    frames = filled(
+        "frames", sensor_id=sensors * n, time=seconds(n).repeat(len(sensors)),
+        attitude_source=["stars"] * (n * len(sensors)), sigma_x_arcsec=[1.0] * (n * len(sensors)),
+        sigma_y_arcsec=[1.0] * (n * len(sensors)), sigma_z_arcsec=[1.0] * (n * len(sensors)),
+        residual_px=[0.1] * (n * len(sensors)))  # fmt: skip
+    page = page_of(reader_of({"frames": frames}))
+    assert "16 of 300 sensors" in page
+    assert len(page.encode()) < 1_000_000
+
+
+def test_the_extract_is_small_enough_for_an_artifact(night_dataset):
+    extract = report_extract(read_night_facts(night_reader(night_dataset, NIGHT), "out"))
+    assert len(extract.pictures) == 4
+    assert all(picture.png.startswith(b"\x89PNG") for picture in extract.pictures)
+    assert sum(len(picture.png) for picture in extract.pictures) * 4 / 3 < 200_000
