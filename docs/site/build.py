@@ -23,7 +23,8 @@ SECTIONS = {
     "Start": ("docs/first_night.md", "examples/README.md"),
     "Use": (
         "docs/operations.md", "docs/commands.md", "docs/input.md", "docs/tables.md",
-        "docs/orbits.md", "docs/api.md", "docs/settings.md", "docs/scaling.md", "docs/scenes.md",
+        "docs/orbits.md", "docs/overlay.md", "docs/api.md", "docs/settings.md", "docs/scaling.md",
+        "docs/scenes.md",
     ),
     "Concepts": (
         "docs/conventions.md", "docs/methods/identification.md", "docs/methods/optics.md",
