@@ -54,7 +54,7 @@ from epipole.tasks.algorithms.star_identification.search.turn_sieve import (
 from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
 
 # Rounds: least votes that agree, and most stars of a pivot whose votes are counted closely.
-ROUNDS = ((4, 600), (3, 4000))
+ROUNDS = ((4, 600), (3, 4000), (2, 4000))
 WORTH_ALL = 5.0  # log odds of a field with which an attitude is tried on all centroids
 MOST_TURNS = 512  # of one star
 BIN_SHIFT = 8  # of a turn: 256 bins

@@ -41,7 +41,7 @@ def test_stars_among_a_thousand_points_are_found(zero_point, flux, tables):
     assert found >= 5
 
 
-def test_few_stars_are_found_in_the_second_round(tables):
+def test_few_stars_are_found_in_later_rounds(tables):
     """Some 18 of 520 centroids, of whose stars a third is paired."""
     found = 0
     for seed in range(6):
