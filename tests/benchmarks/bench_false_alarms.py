@@ -1,7 +1,7 @@
 """False alarms: how often frames without a star of the catalogue get an attitude from stars.
 
     python tests/benchmarks/bench_false_alarms.py [WAY ...] [--frames N] [--seconds S]
-        [--false-alarm P] [--seed S]
+        [--false-alarm P] [--points LEAST MOST] [--every N] [--seed S]
 
 Each sensor is drawn: field, number of its points and how they lie, centroid error, flux or none.
 Ways: `searched`: between frames of stars far apart in time, so that the sensor is known, but not
@@ -10,6 +10,8 @@ its attitude. `followed`: between frames a second apart, which have priors, and 
 
 All goes through `identify_sensor` with the settings of a run. Counted are the frames that were
 tried, and attitudes among them, beside the setting, with the upper bound of Poisson's law (95 %).
+One frame in N has no stars (2): where most frames of a sensor have stars, less evidence is enough.
+Ctrl-C prints what is counted so far.
 """
 
 import argparse
@@ -45,7 +47,7 @@ WIDTH = 1024
 APART_S = {"searched": 1e4, "followed": 1.0, "prior": 1e4, "alone": 1e4}
 PRIORS_ARCSEC = (20.0, 60.0, 600.0)
 DAY = 19_723
-FRAMES = 300  # of a sensor, every other one of stars
+STARLESS = 150  # frames of a sensor without stars, between those with stars
 FRAMES_ALONE = 8
 SCATTER_MAG = 0.2
 TRIED = (None, "no_match", "time_limit")
@@ -73,13 +75,15 @@ class Drawn(NamedTuple):
         ]
 
 
-def draw(rng: Rng) -> Drawn:
-    """Return a sensor."""
+def draw(rng: Rng, points: tuple[int, int]) -> Drawn:
+    """Return a sensor whose frames have so many points, at least and at most."""
+    least, most = points
     return Drawn(
         int(rng.choice(list(LIMITS))),
         bool(rng.random() < 0.5),
         float(np.exp(rng.uniform(np.log(0.05), np.log(2.0)))),
-        int(3 * (61 / 3) ** (rng.random() ** 2)),  # few more often: they are cheap and deceive
+        # Few points more often: they are cheap, and deceive.
+        int(least * ((most + 1) / least) ** (rng.random() ** 2)),
         str(rng.choice(LAYOUTS)),
     )
 
@@ -147,12 +151,13 @@ class Shooter:
         )  # fmt: skip
 
 
-def run_sensor(way: str, catalogue: Catalogue, how: Search, rng: Rng) -> tuple[Drawn, int, int]:
-    """Return a sensor, how many of its frames without stars were tried, and false attitudes."""
-    of = draw(rng)
+def run_sensor(
+    way: str, of: Drawn, every: int, catalogue: Catalogue, how: Search, rng: Rng
+) -> tuple[int, int]:
+    """Return how many of a sensor's frames without stars were tried, and false attitudes."""
     shooter = Shooter(of, catalogue, rng)
-    n = FRAMES_ALONE if way == "alone" else FRAMES
-    starless = np.full(n, True) if way == "alone" else np.arange(n) % 2 == 1
+    n = FRAMES_ALONE if way == "alone" else STARLESS * every
+    starless = np.full(n, True) if way == "alone" else np.arange(n) % every == every - 1
     q = rng.normal(size=(n if APART_S[way] > 1 else 1, 4))
     R = matrix_from_quaternion(q / np.linalg.norm(q, axis=1, keepdims=True))
     if len(R) < n:
@@ -171,14 +176,35 @@ def run_sensor(way: str, catalogue: Catalogue, how: Search, rng: Rng) -> tuple[D
     t_s = np.arange(n) * APART_S[way]
     found = identify_sensor(t_s, shooter.centroids(frames), priors, shooter.skies, None, how)
     tried = starless & np.array([way == "followed" or s in TRIED for s in found.status])
-    return of, int(tried.sum()), int((tried & found.solutions.solved).sum())
+    return int(tried.sum()), int((tried & found.solutions.solved).sum())
 
 
-def row(name: str, tried: int, false: int, setting: float) -> str:
+def count(chosen: argparse.Namespace, way: str, catalogue: Catalogue, how: Search) -> None:
+    """Print the table of a way."""
+    counts: dict[str, Any] = defaultdict(lambda: np.zeros(3, int))
+    rng, started = np.random.default_rng([chosen.seed, WAYS.index(way)]), time.process_time()
+    try:
+        while counts["all"][1] < chosen.frames and time.process_time() - started < chosen.seconds:
+            of = draw(rng, chosen.points)
+            found = run_sensor(way, of, chosen.every, catalogue, how, rng)
+            for kind in of.kinds():
+                counts[kind] += 1, *found
+    except KeyboardInterrupt:
+        print("\nstopped", end="")
+    ms = 1e3 * (time.process_time() - started) / max(counts["all"][1], 1)
+    print(f"\n{way}, one frame in {chosen.every} without stars, {ms:.2f} ms of CPU per such frame; "
+          f"setting {chosen.false_alarm:g}")  # fmt: skip
+    print("| kind | sensors | frames | attitudes | rate | at most, 95 % | that over the setting |")
+    print("|---|---|---|---|---|---|---|")
+    for kind in sorted(counts, key=_natural):
+        print(row(kind, *counts[kind].tolist(), chosen.false_alarm), flush=True)
+
+
+def row(name: str, sensors: int, tried: int, false: int, setting: float) -> str:
     """Return a row of the table."""
     bound = chi2.ppf(0.95, 2 * (false + 1)) / 2 / max(tried, 1)
     return (
-        f"| {name} | {tried:,} | {false} | {false / max(tried, 1):.1e} | {bound:.1e} "
+        f"| {name} | {sensors:,} | {tried:,} | {false} | {false / max(tried, 1):.1e} | {bound:.1e} "
         f"| {bound / setting:.1f} |"
     )
 
@@ -191,23 +217,14 @@ def main() -> None:
     rule = Settings().identification
     parser.add_argument("--false-alarm", type=float, default=rule.false_alarm, help="the setting")
     parser.add_argument("--seconds", type=float, default=600.0, help="CPU time of each way")
+    parser.add_argument("--points", type=int, nargs=2, default=(3, 60), help="in a frame")
+    parser.add_argument("--every", type=int, default=2, help="one frame in so many has no stars")
     parser.add_argument("--seed", type=int, default=1)
     chosen = parser.parse_args()
     catalogue = Catalogue(read_hipparcos())
     how = Search(rule.gate_sigma, -np.log(chosen.false_alarm), rule.time_limit_s, np.nan)
     for way in chosen.ways:
-        counts: dict[str, Any] = defaultdict(lambda: np.zeros(2, int))
-        rng, started = np.random.default_rng([chosen.seed, WAYS.index(way)]), time.process_time()
-        while counts["all"][0] < chosen.frames and time.process_time() - started < chosen.seconds:
-            of, tried, false = run_sensor(way, catalogue, how, rng)
-            for kind in of.kinds():
-                counts[kind] += tried, false
-        ms = 1e3 * (time.process_time() - started) / counts["all"][0]
-        print(f"\n{way}, {ms:.2f} ms of CPU per frame; setting {chosen.false_alarm:g}")
-        print("| kind | frames | attitudes | rate | at most, 95 % | that over the setting |")
-        print("|---|---|---|---|---|---|")
-        for kind in sorted(counts, key=_natural):
-            print(row(kind, *counts[kind].tolist(), chosen.false_alarm), flush=True)
+        count(chosen, way, catalogue, how)
 
 
 def _natural(kind: str) -> tuple[int, str]:

@@ -1,7 +1,7 @@
 """Untold optics: errors of attitudes and positions over their sigmas where the log is wrong.
 
     python tests/benchmarks/bench_untold_optics.py [--sensors N] [--frames N] [--fields DEG ...]
-                                                   [--objects] [--tiny]
+        [--untold KIND ...] [--place drawn|told] [--seed S] [--objects] [--tiny]
 
 Sensors that turn over the sky, none with a prior attitude; each has its own true optics, and the
 log tells a pinhole of the nominal field. Each kind of departure has N sensors in each field, with a
@@ -118,12 +118,12 @@ def run(scene: str, folder: Path) -> tuple[Path, Path]:
     return out, log
 
 
-def sky(field: float, drawn: bool, n: int, seconds: int) -> str:
-    """Return a scene of `n` sensors of each kind."""
-    rng = np.random.default_rng([int(field), drawn])
-    text = SKY.format(seconds=seconds, seed=int(field), limit=LIMITS[field])
+def sky(field: float, drawn: bool, asked: argparse.Namespace) -> str:
+    """Return a scene of so many sensors of each kind that is asked for."""
+    rng = np.random.default_rng([int(field), drawn, *[asked.seed] * (asked.seed > 0)])
+    text = SKY.format(seconds=asked.frames, seed=int(field) + asked.seed, limit=LIMITS[field])
     for kind_number, kind in enumerate(KINDS):
-        for k in range(n):
+        for k in range(asked.sensors * (kind in asked.untold)):
             text += SENSOR.format(
                 name=f"{kind_number}-{k:03d}", ra=rng.uniform(0, 360), dec=rng.uniform(-60, 60),
                 axis=rng.normal(size=3).round(3).tolist(), field=field,
@@ -206,6 +206,9 @@ def main() -> None:
     parser.add_argument("--sensors", type=int, default=20, help="per kind and field")
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--fields", type=float, nargs="+", default=list(LIMITS))
+    parser.add_argument("--untold", nargs="+", default=list(KINDS), metavar="KIND")
+    parser.add_argument("--place", choices=("told", "drawn"), help="principal point; else both")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--objects", action="store_true")
     parser.add_argument("--tiny", action="store_true", help="one field, two sensors per kind")
     asked = parser.parse_args()
@@ -222,11 +225,10 @@ def main() -> None:
     print("| field deg | untold | principal point | optics | sensors | frames | error \" "
           "| sigma \" | across | about |\n|---|---|---|---|---|---|---|---|---|---|")  # fmt: skip
     for field in asked.fields:
-        for drawn in (False, True):
+        for place in (asked.place,) if asked.place else ("told", "drawn"):
             with tempfile.TemporaryDirectory() as folder:
-                scene = sky(field, drawn, asked.sensors, asked.frames)
-                out, log = run(scene, Path(folder))
-                lines = table_of(field, "drawn" if drawn else "told", out, log)
+                out, log = run(sky(field, place == "drawn", asked), Path(folder))
+                lines = table_of(field, place, out, log)
             print("\n".join(lines), flush=True)
 
 

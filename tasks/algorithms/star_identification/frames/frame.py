@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.frames.clusters import thinned
 from epipole.tasks.algorithms.star_identification.search.crowded_frames import search_crowded
 from epipole.tasks.algorithms.star_identification.search.evidence import (
@@ -179,14 +180,21 @@ def identify_predicted(
         Attitude(R0, P0), lost, Centroids(*frame[:4]), seen, frame.optics.box, rule_of(how, sky),
         Attitude(R, P), Matches(star, chi2),
     )  # fmt: skip
-    least = how.threshold
-    if lost and evidence > how.least_lost:
-        in_view = sky.rho * frame.optics.solid_angle_sr
-        margin = chance_margin(np.count_nonzero(star >= 0), n, in_view)
-        least = how.least_lost + LOST_MARGIN - min(margin, LOST_MARGIN)
-    if not evidence > least:
+    in_view = sky.rho * frame.optics.solid_angle_sr
+    if not evidence > (_least_of_lost(star, evidence, in_view, how) if lost else how.threshold):
         return None
     return Solution(R, P, np.where(star >= 0, row[star], -1), chi2, evidence)
+
+
+def _least_of_lost(
+    star: npt.NDArray[np.int64], evidence: float, in_view: float, how: Search
+) -> float:
+    """Return the least evidence of an attitude with these matches that was searched lost in
+    space."""
+    if not evidence > how.least_lost:
+        return how.threshold
+    margin = chance_margin(np.count_nonzero(star >= 0), len(star), in_view)
+    return float(how.least_lost + LOST_MARGIN - min(margin, LOST_MARGIN))
 
 
 def aberrate_all(u_icrs: Array, beta: Array) -> Array:
@@ -261,11 +269,58 @@ def _middle(values: Array) -> float:
     return float(np.sort(values)[len(values) // 2])
 
 
+@kernel
+def _search_and_solve(problem, reach, R_found, solution, matches):
+    """Search a frame and match all its stars, in one call: each takes as long to call as to run.
+
+    Returns evidence, runner-up's evidence and work of the search, and the evidence of the
+    solution, which is written as by `solve_predicted` (compiled).
+    """
+    best, runner_up, work = search(problem, R_found)
+    if not (best > problem.rule.least and best - runner_up > CLEAR_LEAD):
+        return best, runner_up, work, -1e9
+    centroids = problem.centroids
+    sigma = 2.0 * np.sort(centroids.sigma)[len(centroids.sigma) // 2]
+    near = Attitude(R_found, np.eye(3) * (sigma * sigma))
+    places = StarPlaces(problem.stars.u, problem.stars.magnitude)
+    seen, row = stars_about(places, R_found, min(reach + 4.0 * sigma, 1.5), centroids.beta)
+    if len(row) < 3:
+        return best, runner_up, work, -1e9
+    evidence = solve_predicted(
+        near, True, centroids, seen, problem.image.box, problem.rule, solution, matches
+    )
+    for k in range(len(matches.star)):
+        if matches.star[k] >= 0:
+            matches.star[k] = row[matches.star[k]]
+    return best, runner_up, work, evidence
+
+
+def _identify_few(
+    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search
+) -> tuple[Solution | None, bool]:
+    """Return the same as `identify_lost` for a frame that is no crowd."""
+    problem = problem_of(frame, sky, grid, pairs, how, crowded=False)
+    n = len(frame.u)
+    R, P = np.empty((3, 3)), np.empty((3, 3))
+    star, chi2 = np.full(n, -1, np.int64), np.zeros(n)
+    reach = frame.optics.half_diagonal_rad + 1e-4
+    best, runner_up, work, evidence = _search_and_solve(
+        problem, reach, np.zeros((3, 3)), Attitude(R, P), Matches(star, chi2)
+    )
+    if not (best > how.least_lost and best - runner_up > CLEAR_LEAD):
+        return None, work > problem.limits.budget
+    if not evidence > _least_of_lost(star, evidence, problem.image.in_view, how):
+        return None, False
+    return Solution(R, P, star, chi2, evidence), False
+
+
 def identify_lost(
     frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search
 ) -> tuple[Solution | None, bool]:
     """Return the solution without a prior, None where no attitude is beyond doubt, and whether the
     search reached its time limit."""
+    if 3 <= len(frame.u) <= N_PATTERN and np.isfinite(frame.u).all():
+        return _identify_few(frame, sky, grid, pairs, how)
     verdict = search_lost(frame, sky, grid, pairs, how)
     if not verdict.is_clear:
         return None, verdict.exhausted

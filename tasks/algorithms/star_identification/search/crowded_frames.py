@@ -2,20 +2,23 @@
 
 Of hundreds of centroids hardly any pivot is a star, so that many have to be asked, each quickly.
 The companions of a pivot are its near ones only: of these, nearly as large a share are stars, and
-the sky has fewer pairs that are so close. Each pair of stars of a companion's separation says which
-star the pivot may be, and how the image is turned about it. Where enough of them agree, the
-attitude is tried on all centroids, as in `lost_in_space`.
+the sky has fewer pairs that are so close.
 
-One star's turns are counted in the bits of a few words: bit k of word m tells that m + 1 or more of
-its neighbours say a turn in bin k of 64.
+1. Star after star is taken for the pivot. Where a companion has the separation of one of the star's
+   neighbours, it says how the image is turned. `turn_sieve` counts coarsely how many agree.
+2. Of stars with enough votes these are counted to their own tolerance.
+3. Where enough agree, the other stars of the field are looked up among the centroids
+   (`stars_shown`): some twenty look-ups, where all centroids would be a thousand.
+4. What is left is tried on all centroids, as in `lost_in_space`.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.star_identification.search.best_attitude import (
     FLOOR,
     WORTH,
@@ -38,15 +41,26 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
     prepare_pair,
     try_pair,
 )
-from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
+from epipole.tasks.algorithms.star_identification.search.stars_shown import (
+    by_z,
+    make_places,
+    odds_of_field,
+)
+from epipole.tasks.algorithms.star_identification.search.turn_sieve import (
+    LEVELS,
+    count_turns,
+    make_sieve,
+)
 from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
 
-LEAST_VOTES, LEVELS = 4, 6  # that agree; so many are counted
-MOST_CANDIDATES = 40  # stars of a pivot that are looked at again
-MOST_TURNS = 512  # of one star that are looked at again
-BIN_SHIFT = 10  # of a turn: 64 bins
+# Rounds: least votes that agree, and most stars of a pivot whose votes are counted closely.
+ROUNDS = ((4, 600), (3, 4000), (2, 4000))
+WORTH_ALL = 5.0  # log odds of a field with which an attitude is tried on all centroids
+MOST_TURNS = 512  # of one star
+BIN_SHIFT = 8  # of a turn: 256 bins
 MOST_BINS = 4096  # of separation
-STARS_PER_WORK = 2  # counts of stars that are looked through in the time of a pair
+# In the time of a unit of work: neighbours in the sieve, votes, pairs of votes. A star takes more.
+NEIGHBOURS_PER_WORK, VOTES_PER_WORK, AGREED_PER_WORK, STAR_WORK = 3, 2, 20, 10
 
 
 class Companions(NamedTuple):
@@ -73,12 +87,14 @@ class Companions(NamedTuple):
 
 
 class Turns(NamedTuple):
-    """What one star's neighbours say of the turn: companion, neighbour's row, turn, tolerance."""
+    """What one star's neighbours say of the turn: companion, neighbour's row, turn, tolerance; and
+    the votes of each bin."""
 
     row: npt.NDArray[np.int64]
     entry: npt.NDArray[np.int64]
     turn: npt.NDArray[np.int64]
     wide: npt.NDArray[np.int64]
+    votes: npt.NDArray[np.uint16]
 
 
 @kernel
@@ -116,51 +132,11 @@ def _is_odd(m_s, m_other, q, companions, mag_gate):
 
 
 @borrowing_kernel
-def _bins(turn, wide):
-    """Return the bins of a turn within its tolerance."""
-    said = np.uint64(1) << np.uint64((turn >> BIN_SHIFT) & 63)
-    said |= np.uint64(1) << np.uint64(((turn - wide) >> BIN_SHIFT) & 63)
-    return said | np.uint64(1) << np.uint64(((turn + wide) >> BIN_SHIFT) & 63)
-
-
-@borrowing_kernel
-def _count(words, star, said):
-    """Count what one more neighbour of a star says. No branches: they could not be predicted."""
-    words[star, 5] |= words[star, 4] & said
-    words[star, 4] |= words[star, 3] & said
-    words[star, 3] |= words[star, 2] & said
-    words[star, 2] |= words[star, 1] & said
-    words[star, 1] |= words[star, 0] & said
-    words[star, 0] |= said
-
-
-@inlined_kernel
-def _cast(pairs, magnitude, mag_gate, m_i, companions, words):
-    """Count what the companions of a pivot say of its turn, for each star that it may be; return
-    how many pairs were looked at."""
-    nothing, cast = np.uint64(0), 0
-    for q in range(len(companions.chord)):
-        c, tolerance = companions.chord[q], companions.tolerance[q]
-        angle, wide = companions.angle[q], companions.wide[q]
-        low, high = range_of(pairs.chord, c - tolerance, c + tolerance)
-        cast += high - low
-        for p in range(low, high):
-            a, b = pairs.first[p], pairs.second[p]
-            m_a, m_b = magnitude[a], magnitude[b]
-            # The first star of a pair is the brighter one.
-            said = _bins(int(pairs.at_first[p]) - angle, wide)
-            odd = _is_odd(m_a, m_b, q, companions, mag_gate) | (abs(m_a - m_i) > mag_gate)
-            _count(words, a, nothing if odd else said)
-            said = _bins(int(pairs.at_second[p]) - angle, wide)
-            odd = _is_odd(m_b, m_a, q, companions, mag_gate) | (abs(m_b - m_i) > mag_gate)
-            _count(words, b, nothing if odd else said)
-    return cast
-
-
-@borrowing_kernel
-def _turns_of(s, said, near, magnitude, mag_gate, companions, turns):
-    """Write what neighbours of star s say of turns in these bins; return how many."""
-    n = 0
+def _turns_of(s, near, magnitude, mag_gate, companions, turns):
+    """Write what the neighbours of star s say of the turn; return how many, the bin with most
+    votes, and these."""
+    n, best, most = 0, 0, 0
+    turns.votes[:] = 0
     for entry in range(near.first[s], near.first[s + 1]):
         c, m_other = near.chord[entry], magnitude[near.other[entry]]
         at = int(c * companions.scale)
@@ -170,21 +146,33 @@ def _turns_of(s, said, near, magnitude, mag_gate, companions, turns):
             if _is_odd(magnitude[s], m_other, q, companions, mag_gate):
                 continue
             turn, wide = int(near.turn[entry]) - companions.angle[q], companions.wide[q]
-            touched = False
+            turns.row[n], turns.entry[n] = companions.row[q], entry
+            turns.turn[n], turns.wide[n] = turn, wide
+            n += 1
             for k in range((turn - wide) >> BIN_SHIFT, ((turn + wide) >> BIN_SHIFT) + 1):
-                touched |= (said >> np.uint64(k & 63)) & np.uint64(1) == np.uint64(1)
-            if touched:
-                turns.row[n], turns.entry[n] = companions.row[q], entry
-                turns.turn[n], turns.wide[n] = turn, wide
-                n += 1
-    return n
+                at_bin = k & (len(turns.votes) - 1)
+                turns.votes[at_bin] += np.uint16(1)
+                if turns.votes[at_bin] > most:
+                    best, most = at_bin, int(turns.votes[at_bin])
+    return n, best, most
 
 
 @borrowing_kernel
-def _most_agreed(n, turns):
-    """Return which of the first n turns agrees with most others, and with how many and itself."""
+def _touches(k, at_bin, turns):
+    """Tell whether turn k touches a bin."""
+    first = (turns.turn[k] - turns.wide[k]) >> BIN_SHIFT
+    last = (turns.turn[k] + turns.wide[k]) >> BIN_SHIFT
+    return ((at_bin - first) & (len(turns.votes) - 1)) <= last - first
+
+
+@borrowing_kernel
+def _most_agreed(n, at_bin, turns):
+    """Return which of the first n turns that touch a bin agrees with most others, and with how many
+    and itself."""
     best, most = 0, 0
     for k in range(n):
+        if not _touches(k, at_bin, turns):
+            continue
         agreed = 0
         for m in range(n):
             off = (turns.turn[k] - turns.turn[m]) & (TURN - 1)
@@ -196,40 +184,20 @@ def _most_agreed(n, turns):
 
 
 @kernel
-def _count_pivot(problem, i, words):
-    """Count what the near companions of pivot i say of its turn; return these, and the work."""
-    m_i = problem.centroids.instrumental[i] + problem.rule.zero_point
-    companions = _near_companions(problem, i)
-    words[:] = 0
-    cast = _cast(
-        problem.pairs, problem.stars.magnitude, MAG_GATE * problem.rule.spread, m_i, companions,
-        words,
-    )  # fmt: skip
-    return companions, len(words) // STARS_PER_WORK + cast
-
-
-@borrowing_kernel
-def _least_level(words):
-    """Return the least number of votes that few enough stars have."""
-    least = LEVELS + 1
-    while least > LEAST_VOTES:
-        stars = 0
-        for s in range(len(words)):
-            stars += words[s, least - 2] != 0
-        if stars > MOST_CANDIDATES:
-            break
-        least -= 1
-    return least
+def _stars_like(m_i, magnitude, n_stars, mag_gate):
+    """Return the range of stars, brightest first, that a centroid of this magnitude may be."""
+    if math.isnan(m_i):
+        return 0, n_stars
+    low = np.searchsorted(magnitude[:n_stars], m_i - mag_gate)
+    return low, np.searchsorted(magnitude[:n_stars], m_i + mag_gate)
 
 
 @kernel
-def _try_star(problem, i, s, k, turns, room, best):
-    """Try star s for pivot i, with the turn number k that others agree with; return the work."""
+def _try_star(problem, i, s, j, other, c, room, best):
+    """Try star s for pivot i, and another star for centroid j; return the work."""
     n, n_checked = len(problem.centroids.u), len(room.gain)
-    near, j = problem.pairs.near, turns.row[k]
-    other, c = near.other[turns.entry[k]], near.chord[turns.entry[k]]
     order = prepare_pair(problem, i, j, c, room)
-    log_miss = np.log(1.0 - problem.limits.star_share)
+    log_miss = math.log(1.0 - problem.limits.star_share)
     odds = try_pair(problem.stars, s, other, c, order, log_miss, FLOOR, room)
     if odds < WORTH:
         return 8 * n_checked
@@ -238,22 +206,37 @@ def _try_star(problem, i, s, k, turns, room, best):
 
 
 @kernel
-def _try_pivot(problem, i, words, turns, room, best):
+def _try_pivot(problem, i, step, stars, places, level, turns, room, best):
     """Try the stars that most turns agree on for pivot i; return the work done."""
     near, magnitude = problem.pairs.near, problem.stars.magnitude
     mag_gate = MAG_GATE * problem.rule.spread
-    companions, work = _count_pivot(problem, i, words)
-    least = _least_level(words)
-    for s in range(len(words) if least <= LEVELS else 0):
-        if words[s, least - 1] == 0:
+    companions = _near_companions(problem, i)
+    m_i = problem.centroids.instrumental[i] + problem.rule.zero_point
+    start, stop = _stars_like(m_i, magnitude, problem.pairs.n_stars, mag_gate)
+    sieve = make_sieve(
+        companions.chord, companions.tolerance, companions.angle, companions.wide, near.reach
+    )
+    least = count_turns(near, start, stop, sieve, *ROUNDS[step], level)
+    work = 2 * len(problem.centroids.u)
+    work += (near.first[stop] - near.first[start]) // NEIGHBOURS_PER_WORK
+    for s in range(start, stop if least <= LEVELS else start):
+        if level[s] < least:
             continue
-        n = _turns_of(s, words[s, least - 1], near, magnitude, mag_gate, companions, turns)
-        work += 10 + n * n // 4
-        k, agreed = _most_agreed(n, turns)
-        if agreed >= LEAST_VOTES:
-            work += _try_star(problem, i, s, k, turns, room, best)
-        if is_clear(best, problem.rule):
-            break
+        n, at_bin, most = _turns_of(s, near, magnitude, mag_gate, companions, turns)
+        work += STAR_WORK + n // VOTES_PER_WORK
+        if most < least:
+            continue
+        work += most * n // AGREED_PER_WORK
+        k, agreed = _most_agreed(n, at_bin, turns)
+        if agreed < least:
+            continue
+        j, other, c = turns.row[k], near.other[turns.entry[k]], near.chord[turns.entry[k]]
+        odds, looked = odds_of_field(problem, i, s, j, other, c, stars, places, room)
+        work += looked
+        if odds > WORTH_ALL:
+            work += _try_star(problem, i, s, j, other, c, room, best)
+            if is_clear(best, problem.rule):
+                break
     return work
 
 
@@ -270,15 +253,17 @@ def search_crowded(problem, R_best):
     needed = matches_needed(problem)
     if needed > n:
         return top[0], top[1], work
-    order = mixed_order(n)
-    words = np.empty((problem.pairs.n_stars, LEVELS), np.uint64)
+    order, level = mixed_order(n), np.zeros(problem.pairs.n_stars, np.uint8)
+    stars, places = by_z(problem.stars.u), make_places(problem.centroids.u, problem.image.box)
     turns = Turns(
         np.empty(MOST_TURNS, np.int64), np.empty(MOST_TURNS, np.int64),
         np.empty(MOST_TURNS, np.int64), np.empty(MOST_TURNS, np.int64),
+        np.empty(TURN >> BIN_SHIFT, np.uint16),
     )  # fmt: skip
-    # With so many pivots, one is among the matches of any attitude that has enough.
-    for p in range(n - needed + 1):
-        work += _try_pivot(problem, order[p], words, turns, room, best)
-        if work > problem.limits.budget or is_clear(best, problem.rule):
-            break
+    for step in range(len(ROUNDS)):
+        # With so many pivots, one is among the matches of any attitude that has enough.
+        for p in range(n - needed + 1):
+            work += _try_pivot(problem, order[p], step, stars, places, level, turns, room, best)
+            if work > problem.limits.budget or is_clear(best, problem.rule):
+                return top[0], top[1], work
     return top[0], top[1], work

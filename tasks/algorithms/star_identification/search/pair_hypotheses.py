@@ -189,20 +189,37 @@ def try_pair(stars, a, b, c, order, log_miss, floor, room):
 
 
 @borrowing_kernel
+def _attitude(room):
+    """Write to R of the scratch the attitude that turns F to E."""
+    E, F, R = room.E, room.F, room.R
+    for r in range(3):
+        for m in range(3):
+            R[r, m] = E[0, r] * F[0, m] + E[1, r] * F[1, m] + E[2, r] * F[2, m]
+
+
+@borrowing_kernel
+def pair_attitude(u_i, u_j, star_i, star_j, c, room):
+    """Write to R of the scratch the attitude that puts two stars, c apart, on two centroids
+    (compiled)."""
+    apart2 = (u_i[0] - u_j[0]) ** 2 + (u_i[1] - u_j[1]) ** 2 + (u_i[2] - u_j[2]) ** 2
+    _basis(u_i, u_j, math.sqrt(apart2), room.E)
+    _basis(star_i, star_j, c, room.F)
+    _attitude(room)
+
+
+@borrowing_kernel
 def judge_pair(problem, i, a, j, b, beaten, room):
     """Return the log evidence of the attitude tried last, refined with its matches (compiled).
 
     Where it is not above `beaten`, the number returned is only known to be not above it
     either. Writes the attitude to R of the scratch.
     """
-    row_of, E, F, R = room.row_of, room.E, room.F, room.R
+    row_of = room.row_of
     row_of[i], row_of[j] = a, b
     for k in range(len(room.gain), len(row_of)):
         row_of[k] = -1
-    for r in range(3):
-        for m in range(3):
-            R[r, m] = E[0, r] * F[0, m] + E[1, r] * F[1, m] + E[2, r] * F[2, m]
-    return _judge(problem, beaten, R, room.P, row_of)
+    _attitude(room)
+    return _judge(problem, beaten, room.R, room.P, row_of)
 
 
 @borrowing_kernel

@@ -16,8 +16,11 @@ from scenes.random_stars import (
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.star_identification.frames.frame import (
+    N_PATTERN,
     N_SEARCHED,
     aberrate_all,
+    identify_lost,
+    identify_predicted,
     search_lost,
 )
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
@@ -88,3 +91,26 @@ def test_odds_of_stars_lower_the_threshold_of_a_search_within_limits():
     assert HOW._replace(starlit=2.0).least_lost == pytest.approx(least - 2.0)
     assert HOW._replace(starlit=-3.0).least_lost == least
     assert HOW._replace(starlit=9.0).least_lost == HOW._replace(starlit=6.0).least_lost
+
+
+def test_a_frame_that_is_no_crowd_has_the_same_solution_in_one_call():
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    solved = 0
+    for seed in range(12):
+        seen = frame(CATALOGUE, random_attitude(seed), seed, n_false=3, missing=0.1 * seed)[0]
+        if not 3 <= len(seen.u) <= N_PATTERN:
+            continue
+        found, _ = identify_lost(seen, sky, grid, pairs, HOW)
+        verdict = search_lost(seen, sky, grid, pairs, HOW)
+        if not verdict.is_clear:
+            assert found is None
+            continue
+        near = np.eye(3) * (2 * np.sort(seen.sigma_rad)[len(seen.u) // 2]) ** 2
+        R = verdict.R_sensor_from_icrs
+        for one, other in zip(
+            found, identify_predicted(seen, sky, R, near, HOW, lost=True), strict=True
+        ):
+            np.testing.assert_array_equal(one, other)
+        solved += 1
+    assert solved > 4

@@ -1,0 +1,66 @@
+"""Identification in a crowd without a prior."""
+
+import numpy as np
+import pytest
+from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
+
+from epipole.tasks.algorithms.star_identification.frames.frame import problem_of
+from epipole.tasks.algorithms.star_identification.search.crowded_frames import search_crowded
+from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+    pattern_pairs,
+    sky_grid,
+    sky_to_limit,
+)
+
+CATALOGUE = random_catalogue()
+SKY = sky_to_limit(CATALOGUE, 99.0)
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return sky_grid(SKY, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+
+
+def searched(seen, tables, how=HOW):
+    """Return attitude, evidence and work over its bound."""
+    problem, R = problem_of(seen, SKY, *tables, how, crowded=True), np.zeros((3, 3))
+    evidence, _, work = search_crowded(problem, R)
+    return R, evidence, work / problem.limits.budget
+
+
+@pytest.mark.parametrize(("zero_point", "flux"), [(20.0, True), (np.nan, True), (np.nan, False)])
+def test_stars_among_a_thousand_points_are_found(zero_point, flux, tables):
+    """Some 37 of 990 centroids."""
+    found = 0
+    for seed in range(6):
+        R = random_attitude(seed)
+        seen = frame(CATALOGUE, R, seed, n_false=950, flux=flux)[0]
+        got, evidence, work = searched(seen, tables, HOW._replace(zero_point_mag=zero_point))
+        found += evidence > HOW.threshold and angle_between(got, R) < 1e-3
+        assert work < 1.1
+    assert found >= 5
+
+
+def test_few_stars_are_found_in_later_rounds(tables):
+    """Some 18 of 520 centroids, of whose stars a third is paired."""
+    found = 0
+    for seed in range(6):
+        R = random_attitude(seed)
+        seen = frame(CATALOGUE, R, seed, n_false=500, missing=0.5)[0]
+        got, evidence, _ = searched(seen, tables, HOW._replace(zero_point_mag=20.0))
+        found += evidence > HOW.threshold and angle_between(got, R) < 1e-3
+    assert found >= 4
+
+
+def test_a_crowd_without_stars_has_no_evidence(tables):
+    for seed in range(4):
+        crowd = frame(CATALOGUE, random_attitude(seed), seed, 0.3, 700, 1.0)[0]
+        assert searched(crowd, tables)[1] < HOW.threshold - 10
+
+
+def test_the_same_answer_comes_again_and_ends_at_the_bound(tables):
+    seen = frame(CATALOGUE, random_attitude(3), 3, n_false=800, missing=0.8)[0]
+    first, second = (searched(seen, tables, HOW._replace(time_limit_s=0.01)) for _ in range(2))
+    np.testing.assert_array_equal(first[0], second[0])
+    assert first[1:] == second[1:]
+    assert 1 < first[2] < 2

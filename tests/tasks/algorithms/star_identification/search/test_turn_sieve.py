@@ -1,0 +1,68 @@
+"""Coarse votes of a pivot's companions."""
+
+import numpy as np
+import pytest
+
+from epipole.tasks.algorithms.star_identification.search.turn_sieve import (
+    LEVELS,
+    count_turns,
+    make_sieve,
+)
+from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN, NearStars
+
+REACH, TOLERANCE, WIDE = 0.1, 2e-4, 40
+
+
+def neighbours(rng, counts):
+    """Return the near neighbours of stars that have so many."""
+    n = int(np.sum(counts))
+    return NearStars(
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), np.zeros(n, np.int32),
+        REACH * np.sqrt(rng.uniform(0.01, 1, n)), rng.integers(0, TURN, n).astype(np.uint16), REACH,
+    )  # fmt: skip
+
+
+def levels(near, chord, angle, least=1, most_stars=10_000):
+    """Return the votes of each star, and how many are enough."""
+    n, stars = len(chord), len(near.first) - 1
+    level = np.zeros(stars, np.uint8)
+    sieve = make_sieve(chord, np.full(n, TOLERANCE), angle, np.full(n, WIDE), REACH)
+    enough = count_turns(near, 0, stars, sieve, least, most_stars, level)
+    return level, enough
+
+
+@pytest.mark.parametrize("shown", range(1, 9))
+@pytest.mark.parametrize("turned", [0, 511, 512, 33_000, 65_535])
+def test_all_neighbours_that_are_shown_agree(shown, turned):
+    rng = np.random.default_rng(shown)
+    near = neighbours(rng, [9])
+    chord = near.chord[:shown] + rng.uniform(-1, 1, shown) * TOLERANCE
+    angle = (near.turn[:shown].astype(np.int64) - turned + rng.integers(-WIDE, WIDE, shown)) % TURN
+    level, _ = levels(near, np.minimum(chord, REACH), angle)
+    assert level[0] == min(shown, LEVELS)
+
+
+def test_no_neighbour_agrees_more_often_than_within_a_bin():
+    """Against a count of the turns one by one, whose bins are wider."""
+    rng = np.random.default_rng(1)
+    near = neighbours(rng, rng.integers(0, 12, 300))
+    chord, angle = REACH * np.sqrt(rng.uniform(0, 1, 200)), rng.integers(0, TURN, 200)
+    level, _ = levels(near, chord, angle)
+    for s in range(300):
+        mine = slice(near.first[s], near.first[s + 1])
+        alike = np.abs(near.chord[mine, None] - chord) <= 2 * TOLERANCE
+        entry, q = np.nonzero(alike)
+        turn = (near.turn[mine].astype(np.int64)[entry] - angle[q]) % TURN
+        off = np.abs((turn[:, None] - turn + TURN // 2) % TURN - TURN // 2) <= 1300
+        least = max((len(set(entry[row])) for row in off), default=0)
+        assert level[s] <= min(least, LEVELS)
+
+
+def test_more_votes_are_asked_for_where_too_many_stars_have_enough():
+    rng = np.random.default_rng(2)
+    near = neighbours(rng, np.full(400, 10))
+    chord, angle = REACH * np.sqrt(rng.uniform(0, 1, 300)), rng.integers(0, TURN, 300)
+    level, enough = levels(near, chord, angle, 2, 40)
+    assert np.sum(level >= enough) <= 40 < np.sum(level >= enough - 1)
+    assert levels(near, chord, angle, 5, 400)[1] == 5
+    assert levels(near, chord, angle, 2, -1)[1] == LEVELS + 1
