@@ -74,7 +74,7 @@ def recorded(self, types):
 Dispatcher.compile = recorded
 from epipole.flows.command_line.main import main
 log, out = sys.argv[1:]
-sys.argv = ["epipole", "run", log, "--out", out, "--quiet", "--replace"]
+sys.argv = ["epipole", "run", log, "--out", out, "--quiet", "--again"]
 try:
     main()
 finally:
