@@ -31,6 +31,7 @@ from epipole.flows.night.stages import (
     write_night,
 )
 from epipole.flows.night.summary import Summary, by_reason, many, summarise
+from epipole.flows.night.trail import Trail
 from epipole.flows.night.unchanged import unchanged_nights
 from epipole.flows.night.work import Work, plan_spans
 from epipole.flows.prefect.page import shown_on_page
@@ -103,7 +104,8 @@ def nightly(
         return summarise(out, {date: night_place(out, date) for date in same}, unchanged=True)
     # Claims are held by `with`: a signal that came while an ExitStack takes one would leave it.
     with claim_nights(out, [night] if night else []) as run:
-        frames = read(given.paths, ReadFolder(run), settings)
+        trail = Trail()
+        frames = read(given.paths, ReadFolder(run), settings, trail)
 
         nights = nights_of(np.concatenate([np.empty(0, np.int64), *frames.time_ns]))
         chosen = choose_nights(given.paths, nights, night, frames.rejects)
@@ -125,7 +127,7 @@ def nightly(
                     LOGGER.info("night %s", date)
                 work = work_folder(work_root(out), date, recipe.work_key(date))
                 folder = WorkFolder(kept.enter_context(work))
-                made = make_night(frames, date, folder, settings)
+                made = make_night(frames, date, folder, settings, trail)
                 earlier = EarlierNights(out, staged)
                 earlier_key = earlier.key(date, settings)
                 names = name(made.work, made.solved, date, earlier.last_views(date), settings)
@@ -135,10 +137,10 @@ def nightly(
                 staged[date] = staging / f"night={date}"
                 write_night(made.work, made.solved, date, names, whole, staged[date])
                 states = earlier.last_states(date, settings)
-                residuals = name_known(staged[date], elements, states, settings)
+                residuals = name_known(staged[date], elements, states, settings, trail)
                 faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]
                 write_night_row(staged[date], recipe, earlier_key, faults, residuals)
-            summary = publish(Destination(out, staged, replace), sources)
+            summary = publish(Destination(out, staged, replace), sources, trail)
             if settings.report.write:
                 summary = with_reports(summary, staged, staging)
     LOGGER.info("published %s", ", ".join(f"{out}/night={date}" for date in chosen))
@@ -155,14 +157,14 @@ class MadeNight(NamedTuple):
 
 
 def make_night(
-    frames: OrderedFrames, night: str, folder: WorkFolder, settings: Settings
+    frames: OrderedFrames, night: str, folder: WorkFolder, settings: Settings, trail: Trail
 ) -> MadeNight:
     """Turn the frames of a night, and of half an hour before and after it, into solved objects.
 
     What a night holds does not depend on the other nights of the run.
     """
     spans, uncalibrated = plan_spans(frames, night)
-    work = identify(frames, spans, folder, settings)
+    work = identify(frames, spans, folder, settings, trail)
     work, told = find_cameras(work, settings)
     work, calibrations = calibrate(work, told, settings)
     while True:

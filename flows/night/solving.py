@@ -109,10 +109,15 @@ def _view(night: _Night) -> dict[Span, int]:
     groups = [
         (span, group) for span in night.spans for group in _sensor_groups(work, sensors, span, most)
     ]
+    pairs = [[(sensor, span) for sensor in group] for span, group in groups]
     futures = [
-        view_sensors.submit(group, span, night.grid, work.cameras, settings)
-        for span, group in groups
-    ]
+        view_sensors.submit(
+            [sensors[sensor] for sensor in group], span, night.grid, work.cameras, settings,
+            wait_for=work.trail.after(*own),
+        )
+        for (span, group), own in zip(groups, pairs, strict=True)
+    ]  # fmt: skip
+    work.trail.ran(futures, pairs)
     counts = results(Stage.SOLVE, futures, (0, STEPS))
     total = dict.fromkeys(night.spans, 0)
     for (span, _), count in zip(groups, counts, strict=True):
@@ -122,10 +127,10 @@ def _view(night: _Night) -> dict[Span, int]:
 
 def _sensor_groups(
     work: Work, sensors: Mapping[Sensor, SensorParts], span: Span, most: int
-) -> list[list[SensorParts]]:
+) -> list[list[Sensor]]:
     """Return the sensors with frames in a span, or near it, in groups of so many detections."""
     near = set(spans_between(*span.widened(1)))
-    groups: list[list[SensorParts]] = []
+    groups: list[list[Sensor]] = []
     held = most
     for sensor, parts in sensors.items():
         if near.isdisjoint(work.spans[sensor]):
@@ -133,7 +138,7 @@ def _sensor_groups(
         if held >= most:
             groups.append([])
             held = 0
-        groups[-1].append(parts)
+        groups[-1].append(sensor)
         if parts.tracked.holds(span):
             held += parts.tracked.read(span, "detections", ["time"]).num_rows
     return groups
@@ -141,42 +146,59 @@ def _sensor_groups(
 
 def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str, Reason]) -> None:
     """Find the objects, a task per block, or per span where a task may hold all its views."""
-    futures = []
+    futures, worked_on = [], []
     for span in night.spans:
+        viewed_by = night.work.trail.after(*((sensor, span) for sensor in night.sensors))
         blocks = blocks_of(span, night.settings)
         together = n_views[span] <= night.settings.work.most_views
         for of_task in [blocks] if together else [[block] for block in blocks]:
             futures.append(
                 associate_blocks.submit(
                     night.sensors, night.viewed, of_task, night.work.cameras, left_out,
-                    night.settings, night.solved.blocks,
+                    night.settings, night.solved.blocks, wait_for=viewed_by,
                 )
             )  # fmt: skip
+            worked_on.append([span])
     results(Stage.SOLVE, futures, (1, STEPS))
+    night.work.trail.ran(futures, worked_on)
 
 
 def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     """Solve the objects, a task per piece; return the number of positions."""
     spans, settings, solved = night.spans, night.settings, night.solved
-    numbered = number_objects.submit(spans, night.margin_ns, settings, solved)
+    trail = night.work.trail
+    numbered = number_objects.submit(
+        spans, night.margin_ns, settings, solved, wait_for=trail.after(*spans)
+    )
     (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
+    trail.ran([numbered], [spans])
     viewed, margin_ns = night.viewed, night.margin_ns
     most_views = MOST_JUDGED * night.epochs_apart
+    full = [span for span, count in zip(spans, counts, strict=True) if count]
     judged = [
-        judge_span.submit(viewed, span, margin_ns, night.apart_ns, most_views, settings, solved)
-        for span, count in zip(spans, counts, strict=True)
-        if count
-    ]
-    results(Stage.SOLVE, judged, (3, STEPS))
-    futures = [
-        solve_piece.submit(
-            viewed, Piece(span, number, count), margin_ns, _kept_lines(night, n_views[span]),
-            settings, solved,
+        judge_span.submit(
+            viewed, span, margin_ns, night.apart_ns, most_views, settings, solved,
+            wait_for=trail.after(span),
         )
+        for span in full
+    ]  # fmt: skip
+    results(Stage.SOLVE, judged, (3, STEPS))
+    trail.ran(judged, [[span] for span in full])
+    pieces = [
+        Piece(span, number, count)
         for span, count in zip(spans, counts, strict=True)
         for number in range(count)
+    ]
+    futures = [
+        solve_piece.submit(
+            viewed, piece, margin_ns, _kept_lines(night, n_views[piece.span]), settings, solved,
+            wait_for=trail.after(piece.span),
+        )
+        for piece in pieces
     ]  # fmt: skip
-    return sum(results(Stage.SOLVE, futures, (4, STEPS)))
+    count = sum(results(Stage.SOLVE, futures, (4, STEPS)))
+    trail.ran(futures, [[piece.span] for piece in pieces])
+    return count
 
 
 def _kept_lines(night: _Night, n_views: int) -> Kept:

@@ -17,6 +17,7 @@ import pyarrow.compute as pc
 from epipole.flows.night.progress import results, step
 from epipole.flows.night.solving import solve_objects
 from epipole.flows.night.summary import Summary, many, summarise
+from epipole.flows.night.trail import Trail
 from epipole.flows.night.work import Spans, Work, spans_of_night
 from epipole.io.catalogues.known_objects import KnownObjects
 from epipole.io.work.part_tables import IDENTIFIED
@@ -61,20 +62,28 @@ MOST_CORRECTIONS = 2
 # sensor that was hardly identified before.
 MOST_CALIBRATIONS = 4
 
+WRITTEN = "written"  # in the trail: the tasks that wrote the newest night
 
-def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> OrderedFrames:
+
+def read(
+    logs: Sequence[str], folder: ReadFolder, settings: Settings, trail: Trail
+) -> OrderedFrames:
     """Read the logs, a task per log, and order their frames and states."""
     futures = [read_log_into.submit(folder, k, log) for k, log in enumerate(logs)]
-    frames = order_logs(folder, results(Stage.READ, futures), settings)
+    held = results(Stage.READ, futures)
+    trail.ran(futures, [log.sensors for log in held])
+    frames = order_logs(folder, held, settings)
     count = sum(len(time_ns) for time_ns in frames.time_ns)
     LOGGER.info("read %s of %s", many(count, "frame"), many(len(frames.sources), "log"))
     return frames
 
 
-def identify(frames: OrderedFrames, spans: Spans, folder: WorkFolder, settings: Settings) -> Work:
+def identify(
+    frames: OrderedFrames, spans: Spans, folder: WorkFolder, settings: Settings, trail: Trail
+) -> Work:
     """Place sensors, identify stars and solve attitudes, a task per sensor and span."""
     where = {sensor: folder.identified(sensor) for sensor in spans}
-    work = Work(frames.folder, folder, spans, frames.cameras, where)
+    work = Work(frames.folder, folder, spans, frames.cameras, where, trail)
     return _identify(Stage.IDENTIFY, work, settings)
 
 
@@ -82,10 +91,12 @@ def _identify(stage: Stage, work: Work, settings: Settings) -> Work:
     """Identify the frames of all spans of `work`; the parts go to `work.identified`."""
     futures = [
         identify_span.submit(
-            work.frames, sensor, span, work.cameras, settings, work.identified[sensor]
+            work.frames, sensor, span, work.cameras, settings, work.identified[sensor],
+            wait_for=work.trail.after(sensor.sensor_id, (sensor, span)),
         )
         for sensor, span in work.by_span()
-    ]
+    ]  # fmt: skip
+    work.trail.ran(futures, [[pair] for pair in work.by_span()])
     frames, by_stars, stars = map(sum, zip(*results(stage, futures), strict=True))
     LOGGER.info("identified %s of %s by %s", f"{by_stars:,}", many(frames, "frame"),
                 many(stars, "star"))  # fmt: skip
@@ -105,13 +116,20 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     mode = settings.identification.calibrate
     if mode == "off":
         return work, work.cameras
+    spans = {
+        sensor: of_sensor
+        for sensor, of_sensor in work.spans.items()
+        if refuses(work.identified[sensor], of_sensor)
+    }
+    pairs = work._replace(spans=spans).of_sensors()
     futures = [
         find_sensor_camera.submit(
-            work.frames, sensor, work.identified[sensor], spans, work.cameras, settings
+            work.frames, sensor, work.identified[sensor], of_sensor, work.cameras, settings,
+            wait_for=work.trail.after(*own),
         )
-        for sensor, spans in work.spans.items()
-        if refuses(work.identified[sensor], spans)
-    ]
+        for (sensor, of_sensor), own in zip(spans.items(), pairs, strict=True)
+    ]  # fmt: skip
+    work.trail.ran(futures, pairs)
     findings: list[CameraFinding] = [
         finding for finding in results(Stage.CALIBRATE, futures) if finding is not None
     ]
@@ -139,9 +157,13 @@ def calibrate(work: Work, told: pa.Table, settings: Settings) -> tuple[Work, pa.
         if mode == "off":
             break
         futures = [
-            calibrate_sensor.submit(sensor, work.identified[sensor], spans, work.cameras, told)
-            for sensor, spans in work.spans.items()
-        ]
+            calibrate_sensor.submit(
+                sensor, work.identified[sensor], spans, work.cameras, told,
+                wait_for=work.trail.after(*own),
+            )
+            for (sensor, spans), own in zip(work.spans.items(), work.of_sensors(), strict=True)
+        ]  # fmt: skip
+        work.trail.ran(futures, work.of_sensors())
         fits: list[Calibrated] = results(Stage.CALIBRATE, futures)
         calibrations = concat(CALIBRATIONS, [fit.calibrations for fit in fits])
         departed = {name for fit in fits for name in fit.departed}
@@ -183,15 +205,21 @@ def track(work: Work, night: str, settings: Settings) -> None:
     parts = work.sensor_parts()
     futures = [
         track_span.submit(
-            sensor, parts[sensor].identified, span, work.cameras, settings, parts[sensor].tracked
+            sensor, parts[sensor].identified, span, work.cameras, settings, parts[sensor].tracked,
+            wait_for=work.trail.after((sensor, span)),
         )
         for sensor, span in work.by_span()
-    ]
+    ]  # fmt: skip
+    work.trail.ran(futures, [[pair] for pair in work.by_span()])
     results(Stage.TRACK, futures)
     futures = [
-        join_tracklets.submit(sensor, parts[sensor].tracked, spans, night, parts[sensor].names)
-        for sensor, spans in work.spans.items()
-    ]
+        join_tracklets.submit(
+            sensor, parts[sensor].tracked, spans, night, parts[sensor].names,
+            wait_for=work.trail.after(*own),
+        )
+        for (sensor, spans), own in zip(work.spans.items(), work.of_sensors(), strict=True)
+    ]  # fmt: skip
+    work.trail.ran(futures, work.of_sensors())
     count = sum(results(Stage.TRACK, futures))
     LOGGER.info("followed %s", many(count, "tracklet"))
 
@@ -221,7 +249,9 @@ def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     """Judge the sensors by all spans; correct wrong clocks if the settings say so."""
     step(Stage.CHECK, 0, 1)
     viewed, spans = work.folder.viewed(work.round), work.all_spans()
-    verdicts: list[SensorVerdict] = check_sensors(solved, viewed, list(work.spans), spans)
+    verdicts: list[SensorVerdict] = check_sensors(
+        solved, viewed, list(work.spans), spans, wait_for=work.trail.after(*spans)
+    )
     tell_verdicts(verdicts)
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
     late = [verdict for verdict in faulty if verdict.is_late]
@@ -268,14 +298,15 @@ def _correct_clocks(work: Work, wrong: Sequence[SensorVerdict], settings: Settin
         for sensor in work.spans
         if sensor.sensor_id in clocks
     }
+    pairs = [(sensor, span) for sensor, span in work.by_span() if sensor in where]
     futures = [
         correct_clock.submit(
             work.frames, sensor, work.identified[sensor], span, clocks[sensor.sensor_id], settings,
-            where[sensor],
+            where[sensor], wait_for=work.trail.after((sensor, span), span),
         )
-        for sensor, span in work.by_span()
-        if sensor in where
+        for sensor, span in pairs
     ]  # fmt: skip
+    work.trail.ran(futures, [[pair] for pair in pairs])
     results(Stage.CHECK, futures)
     entered = {sensor: _enter_spans(where[sensor], work.spans[sensor]) for sensor in where}
     spans = {
@@ -316,8 +347,9 @@ def name(
             for piece in solved.read(span, table):
                 rows.append(renamed(outermost(piece), numbers[span.folder]))
     first: dict[str, str] = link_objects(
-        concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
-    )
+        concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings,
+        wait_for=work.trail.after(*spans),
+    )  # fmt: skip
     linked = {
         folder: {old: first.get(number, number) for old, number in of_span.items()}
         for folder, of_span in numbers.items()
@@ -368,8 +400,12 @@ def write_night(
     """
     spans = work.all_spans()
     sensors = list(work.sensor_parts().values())
-    parts = NightParts(night, spans_of_night(spans, night), spans, sensors, solved, names, whole)
-    results(Stage.PUBLISH, [write_tables.submit(tables, folder, parts) for tables in SHARES])
+    own = spans_of_night(spans, night)
+    parts = NightParts(night, own, spans, sensors, solved, names, whole)
+    solved_by = work.trail.after(*own)
+    futures = [write_tables.submit(tables, folder, parts, wait_for=solved_by) for tables in SHARES]
+    results(Stage.PUBLISH, futures)
+    work.trail.ran(futures, [[WRITTEN]] * len(futures))
 
 
 def choose_elements(
@@ -392,16 +428,26 @@ def choose_elements(
 
 
 def name_known(
-    folder: Path, known: ElementsOfNight | None, earlier: pa.Table, settings: Settings
+    folder: Path,
+    known: ElementsOfNight | None,
+    earlier: pa.Table,
+    settings: Settings,
+    trail: Trail,
 ) -> list[SensorResidual]:
     """Name the known objects of a night whose tables are written; see `name_known_objects`."""
-    future = name_known_objects.submit(folder, known, earlier, settings)
+    future = name_known_objects.submit(
+        folder, known, earlier, settings, wait_for=trail.after(WRITTEN)
+    )
     (residuals,) = results(Stage.PUBLISH, [future])
+    trail.ran([future], [[WRITTEN]])
     return residuals
 
 
-def publish(destination: Destination, sources: pa.Table) -> Summary:
+def publish(destination: Destination, sources: pa.Table, trail: Trail) -> Summary:
     """Put all nights in place, and return what they hold."""
     summary = summarise(destination.dataset, destination.staged)
-    publish_nights(destination.dataset, destination.staged, sources, destination.replace)
+    publish_nights(
+        destination.dataset, destination.staged, sources, destination.replace,
+        wait_for=trail.after(WRITTEN),
+    )  # fmt: skip
     return summary
