@@ -4,7 +4,7 @@ import datetime
 
 import polars as pl
 import pytest
-from scenes.killed_runs import contents
+from scenes.dataset_tables import contents
 
 from epipole.flows.nightly import nightly
 from epipole.flows.simulate import simulate

@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 from prefect.task_runners import ThreadPoolTaskRunner
+from scenes.dataset_tables import contents
 
 from epipole.flows.nightly import nightly
 from epipole.flows.simulate import simulate
@@ -33,10 +34,6 @@ def scan(dataset: Path, table: str) -> pl.DataFrame:
 
 def truth(log: Path, table: str) -> pl.DataFrame:
     return pl.read_parquet(f"{log}.truth/{table}.parquet")
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def write_log(path: Path, sensors: dict[str, dict], start_ns: int = START_NS) -> Path:
@@ -104,7 +101,9 @@ def test_every_object_has_a_position_at_nearly_every_epoch(night_dataset):
 def test_a_run_again_on_more_workers_gives_the_same_bytes(night_log, night_dataset, tmp_path):
     for workers in (1, 3):
         runner = ThreadPoolTaskRunner(max_workers=workers)
-        nightly.with_options(task_runner=runner)([str(night_log)], str(tmp_path / "out"))
+        nightly.with_options(task_runner=runner)(
+            [str(night_log)], str(tmp_path / "out"), again=True
+        )
         assert contents(tmp_path / "out") == contents(night_dataset)
 
 

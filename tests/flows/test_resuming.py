@@ -8,16 +8,13 @@ import time
 from pathlib import Path
 
 import pytest
+from scenes.dataset_tables import contents
 
 from epipole.io.work.folder import work_root
 
 NIGHT = "2019-04-01"
 WAIT_S = 240
 COMMAND = "from epipole.flows.command_line.main import main; main()"
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 @pytest.fixture

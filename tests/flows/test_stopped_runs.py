@@ -5,7 +5,8 @@ A short round; the long one is `python tests/scenes/killed_runs.py`.
 
 import signal
 
-from scenes.killed_runs import PUBLISHING, Stop, StoppedRuns, contents, make_logs
+from scenes.dataset_tables import contents
+from scenes.killed_runs import PUBLISHING, Stop, StoppedRuns, make_logs
 
 # The sixth change of a file: one night is in place, the other one is not.
 BETWEEN_NIGHTS = Stop(signal.SIGKILL, write=6, mark=PUBLISHING)

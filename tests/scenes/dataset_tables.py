@@ -55,5 +55,8 @@ TIMES = FIRST_DAY * DAY_NS + np.arange(20) * 1_000_000_001 + 7
 OVER_MIDNIGHT = (FIRST_DAY + 1) * DAY_NS + np.arange(-10, 10) * 1_000_000_001 + 7
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+def contents(dataset: Path) -> dict[str, bytes]:
+    """Return all files of a dataset but its reports, which name the folder they lie in."""
+    files = [path for path in dataset.rglob("*") if path.is_file()]
+    named = {str(path.relative_to(dataset)): path.read_bytes() for path in files}
+    return {name: data for name, data in named.items() if not name.startswith("reports/")}

@@ -29,7 +29,8 @@ from typing import NamedTuple
 
 sys.path.append(str(Path(__file__).parents[1]))
 
-from scenes.killed_runs import Contents, check_dataset, contents, make_logs
+from scenes.dataset_tables import contents
+from scenes.killed_runs import Contents, check_dataset, make_logs
 
 FAULTY = r"""
 #define _GNU_SOURCE

@@ -32,8 +32,11 @@ from typing import NamedTuple
 
 import polars as pl
 
+sys.path.append(str(Path(__file__).parents[1]))
+
 from epipole.io.datasets.dataset import nights_in, read_table
 from epipole.schemas.tables import TABLES
+from scenes.dataset_tables import contents
 
 NIGHTS = ["2019-04-01", "2019-04-02"]
 SCENE = "four_sensor_geo"
@@ -223,11 +226,6 @@ def _processes(home: Path) -> list[str]:
             if entry.name.isdigit() and mark in (entry / "environ").read_bytes():
                 found.append((entry / "cmdline").read_bytes().replace(b"\0", b" ").decode())
     return found
-
-
-def contents(folder: Path) -> Contents:
-    """Return all files of a folder."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
 
 def make_logs(folder: Path) -> list[Path]:

@@ -4,22 +4,16 @@ import os
 import signal
 import threading
 import time
-from pathlib import Path
 
 import pytest
 from prefect.task_runners import ThreadPoolTaskRunner
+from scenes.dataset_tables import contents
 
 from epipole.flows.nightly import nightly
 from epipole.flows.prefect.runners import check_scheduler, runner_asked, task_runner
 from epipole.io.work.folder import work_root
 from epipole.schemas.choices import Runner
 from epipole.schemas.errors import EpipoleError
-
-
-def contents(dataset: Path) -> dict[str, bytes]:
-    """The tables; a report names the folder of its dataset."""
-    files = dataset.glob("night=*/**/*")
-    return {str(p.relative_to(dataset)): p.read_bytes() for p in files if p.is_file()}
 
 
 def test_threads_are_the_default_one_a_cpu(monkeypatch):
