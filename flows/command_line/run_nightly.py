@@ -14,8 +14,8 @@ from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.progress import compile_step, prepare
 from epipole.flows.night.summary import Summary, summarise
 from epipole.flows.night.unchanged import unchanged_nights
-from epipole.flows.prefect.server_process import launch
-from epipole.io.caches.kernel_warm_up import compile_beside, compiling_told
+from epipole.flows.prefect.server_process import Launched, launch
+from epipole.io.caches.kernel_warm_up import compile_beside, compile_kernels, compiling_told
 from epipole.io.catalogues.known_objects import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder, night_place
@@ -79,15 +79,19 @@ class Ended:
 class Nights:
     """Runs of the nightly flow, a night each; Prefect starts with the first that needs it."""
 
-    def __init__(self, logs: list[str], out: str, options: RunOptions) -> None:
+    def __init__(
+        self, logs: list[str], out: str, options: RunOptions, early: Launched | None = None
+    ) -> None:
         """Check settings, catalogues, output and logs.
+
+        `early` is a process of Prefect's server that was launched before.
 
         Raises
         ------
         EpipoleError
             Where one of them cannot be used.
         """
-        self._logs, self._out, self._options = logs, out, options
+        self._logs, self._out, self._options, self._early = logs, out, options, early
         self._settings = read_settings(options.settings) if options.settings else Settings()
         check_folder(out)
         check_star_catalogue(self._settings.identification.catalogue)
@@ -138,7 +142,8 @@ class Nights:
         is_first = started.enter_context(compile_beside())
         started.enter_context(compiling_told(compile_step, is_first))
         prepare("start Prefect")
-        early = launch({})  # while this process imports Prefect, the server's does too
+        early = self._early or launch({})  # it imports Prefect while this process does
+        self._early = None
         from epipole.flows.prefect.defaults import (
             embedded_prefect,
             lost_server_as_line,
@@ -153,9 +158,15 @@ class Nights:
         runner = task_runner(options.runner, options.workers, options.scheduler)
         if options.scheduler is not None:
             check_scheduler(options.scheduler)
-        started.enter_context(embedded_prefect(early))
+        from epipole.flows.night.reports import load_drawing
         from epipole.flows.nightly import nightly
 
+        # Done now, and not when they are needed: the server still starts.
+        if self._settings.report.write:
+            load_drawing()
+        if not is_first:
+            compile_kernels()  # which loads them
+        started.enter_context(embedded_prefect(early))
         flow = nightly.with_options(task_runner=runner)
 
         def make(night: str | None) -> Summary:

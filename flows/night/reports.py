@@ -1,8 +1,9 @@
 """The reports of nights: made from what is published, and written beside the nights."""
 
+import contextlib
 import dataclasses
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from epipole.flows.night.summary import Summary
@@ -45,6 +46,12 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], staging: Path) ->
     return dataclasses.replace(summary, extracts=tuple(extracts))
 
 
+def load_drawing() -> None:
+    """Import what draws reports, which takes a while."""
+    with contextlib.suppress(ReportError):  # it is told when a report is to be drawn
+        _drawing()
+
+
 def night_facts(
     dataset: str, night: str, nights: Sequence[str], folder: Path | None = None
 ) -> NightFacts:
@@ -63,8 +70,13 @@ def night_facts(
 
 
 def _page_and_extract(facts: NightFacts) -> tuple[str, ReportExtract]:
+    night_page, report_extract = _drawing()
+    return night_page(facts), report_extract(facts)
+
+
+def _drawing() -> tuple[Callable[[NightFacts], str], Callable[[NightFacts], ReportExtract]]:
     # Without matplotlib these modules cannot be imported: they raise `ReportError`.
     from epipole.tasks.report.page.extract import report_extract
     from epipole.tasks.report.page.night_page import night_page
 
-    return night_page(facts), report_extract(facts)
+    return night_page, report_extract

@@ -5,6 +5,7 @@ imported Prefect itself, and waits to be told to serve: only then is it known wh
 This module imports nothing but the standard library when the run imports it.
 """
 
+import gc
 import os
 import signal
 import socket
@@ -104,6 +105,7 @@ def launch(environment: Mapping[str, str], listener: socket.socket | None = None
 
 def main() -> None:
     """Serve Prefect's API on the socket that the run has opened, once the run says so."""
+    gc.disable()  # while libraries are imported there is no garbage
     from prefect.settings import temporary_settings
 
     with temporary_settings(set_defaults=DEFAULTS):
@@ -111,6 +113,8 @@ def main() -> None:
 
         if sys.stdin.buffer.readline() != _SERVE:  # the run has ended
             return
+        gc.freeze()
+        gc.enable()
         threading.Thread(target=_end_with_run, daemon=True).start()
         serve_one_at_a_time(socket.socket(fileno=int(sys.argv[1])))
 

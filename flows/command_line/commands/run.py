@@ -1,6 +1,7 @@
 """`epipole run`: logs to a dataset, now."""
 
 import datetime
+import os
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -11,6 +12,7 @@ import typer
 
 from epipole.flows.command_line.options import AsJson, Logs, check_night
 from epipole.flows.command_line.printing import print_json, print_lines
+from epipole.flows.prefect.server_process import Launched, launch
 from epipole.schemas.choices import Runner
 
 if TYPE_CHECKING:  # imported when the command runs
@@ -83,13 +85,14 @@ def run(
     """
     if not verbose:
         warnings.simplefilter("ignore")
+    check_night(night)
+    early = _early_server(out, night, again)
     from epipole.flows.command_line.run_nightly import Nights, RunOptions
 
-    check_night(night)
     options = RunOptions(
         settings, replace, known, again, runner, workers, scheduler, quiet, verbose
     )
-    nights = Nights(logs, out, options)
+    nights = Nights(logs, out, options, early)
     dates = _dates(night, to)
     if stale:
         dates = nights.stale()
@@ -98,6 +101,14 @@ def run(
         _print_one(ended, quiet, as_json)
     elif _print_each(nights.run(dates), quiet, as_json):
         raise typer.Exit(1)
+
+
+def _early_server(out: str, night: str | None, again: bool) -> Launched | None:
+    """Launch Prefect's server at once where it is needed for sure: its start takes longest."""
+    held = f"night={night or '*'}"
+    if "PREFECT_API_URL" in os.environ or "://" in out:
+        return None
+    return launch({}) if again or not any(Path(out).glob(held)) else None
 
 
 def _dates(night: str | None, to: str | None) -> Sequence[str | None]:
