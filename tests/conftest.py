@@ -28,6 +28,15 @@ for name in ("PREFECT_API_URL", "PREFECT_PROFILE"):
     os.environ.pop(name, None)
 
 
+def pytest_collection_modifyitems(config, items):
+    """Leave the long tests out, unless files or a marker are named: `pytest -m long` runs them."""
+    if config.args_source is not pytest.Config.ArgsSource.TESTPATHS or config.getoption("-m"):
+        return
+    left_out = [item for item in items if item.get_closest_marker("long")]
+    items[:] = [item for item in items if not item.get_closest_marker("long")]
+    config.hook.pytest_deselected(items=left_out)
+
+
 @pytest.fixture(scope="session")
 def prefect():
     """Run flows on one embedded API for the whole session."""

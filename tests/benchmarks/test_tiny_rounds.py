@@ -13,6 +13,8 @@ import pytest
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, project
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
 
+pytestmark = pytest.mark.long
+
 HERE = Path(__file__).parent
 BUILT_IN = HERE.parents[1] / "io" / "simulation" / "built_in"
 ORBITS = f"--low {BUILT_IN}/real_leo.tle {BUILT_IN}/real_sensors.tle --geo {BUILT_IN}/real_geo.tle"

@@ -5,6 +5,8 @@ import pytest
 from damage import odd_settings
 from damage.whole_runs import run_of_case, run_of_setting
 
+pytestmark = pytest.mark.long
+
 NUMBERS = (4, 5, 6)
 EVERY = 24  # of the settings at their bounds, one is run
 

@@ -6,6 +6,8 @@ import sys
 import pytest
 from generated import ROOT
 
+pytestmark = pytest.mark.long
+
 PICTURES = ROOT / "docs" / "pictures"
 
 

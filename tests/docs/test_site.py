@@ -12,6 +12,8 @@ from generated import ROOT
 
 from epipole.flows import api
 
+pytestmark = pytest.mark.long
+
 for package in ("sphinx", "furo", "myst_parser", "numpydoc", "matplotlib"):
     pytest.importorskip(package, reason=f"{package} is of the extra docs")
 

@@ -14,6 +14,8 @@ from scenes.prefect_server import POOL, Prefect, serving, wait_for
 
 from epipole.io.logs.writer import LogWriter
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[2]
 NIGHT = "2019-04-01"
 

@@ -10,6 +10,8 @@ import sys
 import pytest
 from scenes import failing_storage
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.skipif(not shutil.which("cc"), reason="needs a C compiler")
 def test_storage_that_fails_at_any_call_is_one_line_and_no_half_night():

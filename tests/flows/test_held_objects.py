@@ -5,6 +5,8 @@ import pytest
 
 from epipole.schemas.simulation.scene import validate_scene
 
+pytestmark = pytest.mark.long
+
 KEY = ["sensor_id", "frame_number", "centroid"]
 GEO_KM = [-39359.89, 15125.76, 64.30]
 

@@ -17,6 +17,8 @@ from epipole.io.datasets.dataset import read_table
 from epipole.io.simulation.element_files import read_element_sets
 from epipole.schemas.errors import CatalogueError
 
+pytestmark = pytest.mark.long
+
 NIGHT = "2026-05-30"
 DAYS, EPOCH_OF_DAYS = 27909.0, np.datetime64("2026-05-30T00:00:00.000000")
 DAY_US = 86_400_000_000

@@ -24,7 +24,7 @@ FOUR_SENSORS = Path(__file__).parents[2] / "io/simulation/built_in/four_sensor_g
 LITTLE_MIB = 64
 SAME = 1e-6  # sigma
 
-pytestmark = pytest.mark.usefixtures("prefect")
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("prefect")]
 
 
 class SolveTasks(logging.Handler):

@@ -10,6 +10,8 @@ from epipole.flows.nightly import nightly
 from epipole.flows.simulate import simulate
 from epipole.io.datasets.dataset import read_table
 
+pytestmark = pytest.mark.long
+
 NIGHTS = ["2019-04-01", "2019-04-02"]
 START = datetime.datetime(2019, 4, 1, 23, 59, 40, tzinfo=datetime.UTC)
 

@@ -12,6 +12,8 @@ from scenes.dataset_tables import contents
 
 from epipole.io.work.folder import work_root
 
+pytestmark = pytest.mark.long
+
 NIGHT = "2019-04-01"
 WAIT_S = 240
 COMMAND = "from epipole.flows.command_line.main import main; main()"

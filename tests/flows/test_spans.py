@@ -39,7 +39,7 @@ orbit = { position_km = [-39360.0, 15126.0, 64.0] }
 magnitude = 8.0
 """
 
-pytestmark = pytest.mark.usefixtures("prefect")
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("prefect")]
 
 
 def rows(out: Path, table: str) -> pl.DataFrame:

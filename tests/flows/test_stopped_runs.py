@@ -5,8 +5,11 @@ A short round; the long one is `python tests/scenes/killed_runs.py`.
 
 import signal
 
+import pytest
 from scenes.dataset_tables import contents
 from scenes.killed_runs import PUBLISHING, Stop, StoppedRuns, make_logs
+
+pytestmark = pytest.mark.long
 
 # The sixth change of a file: one night is in place, the other one is not.
 BETWEEN_NIGHTS = Stop(signal.SIGKILL, write=6, mark=PUBLISHING)

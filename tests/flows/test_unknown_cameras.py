@@ -16,6 +16,8 @@ from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 
+pytestmark = pytest.mark.long
+
 FOCAL = 0.05  # by which the true focal length is longer than told
 
 

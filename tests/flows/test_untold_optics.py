@@ -10,6 +10,8 @@ from epipole.flows.nightly import nightly
 from epipole.flows.simulate import simulate
 from epipole.schemas.simulation.scene import validate_scene
 
+pytestmark = pytest.mark.long
+
 GEO_KM = [-39353.5, 15130.6, 452.2]
 N_SENSORS = 4
 

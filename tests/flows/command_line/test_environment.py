@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 # Python runs this first in every process: the run's, its server's, its helper's.
 LOOK_UPS = """
 import socket

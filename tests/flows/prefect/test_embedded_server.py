@@ -13,6 +13,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 RUN = """
 import sys, time
 from epipole.flows.command_line.environment import prepare_environment

@@ -15,6 +15,8 @@ from epipole.io.work.folder import work_root
 from epipole.schemas.choices import Runner
 from epipole.schemas.errors import EpipoleError
 
+pytestmark = pytest.mark.long
+
 
 def test_threads_are_the_default_one_a_cpu(monkeypatch):
     for name in ("EPIPOLE_RUNNER", "EPIPOLE_WORKERS", "EPIPOLE_SCHEDULER"):

@@ -14,6 +14,8 @@ from numba import types
 
 from epipole.io.caches.kernel_list import KERNELS, Signature, kernel, read_kernels, signature
 
+pytestmark = pytest.mark.long
+
 EXAMPLE = Path(__file__).parents[3] / "examples" / "four_sensor_geo.mcap"
 
 _HEAD = """\

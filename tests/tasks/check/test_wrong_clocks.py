@@ -8,6 +8,8 @@ import pytest
 
 from epipole.schemas.simulation.scene import validate_scene
 
+pytestmark = pytest.mark.long
+
 FOUR_SENSORS = Path(__file__).parents[3] / "io/simulation/built_in/four_sensor_geo.toml"
 
 

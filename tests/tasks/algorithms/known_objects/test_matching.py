@@ -24,6 +24,8 @@ from epipole.tasks.algorithms.known_objects.prediction import (
 )
 from epipole.tasks.algorithms.known_objects.screening import Screen
 
+pytestmark = pytest.mark.long
+
 NOON_NS = NIGHT_NS + 43_200_000_000_000
 
 

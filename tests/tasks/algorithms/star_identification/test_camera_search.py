@@ -15,6 +15,8 @@ from epipole.tasks.algorithms.star_identification.camera_search import (
 from epipole.tasks.algorithms.star_identification.frames.frame import Search
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
+pytestmark = pytest.mark.long
+
 TRUE = Camera(1024, 1024, 4850.0, 4850.0, 505.0, 517.0, k1=-0.1, p1=1e-3)  # 12 degrees
 DAY = 17_987  # 2019-04-01
 HOW = Search(3.7, -np.log(1e-5), 0.5, np.nan)
