@@ -17,6 +17,7 @@ from concepts_of_objects import (
 from concepts_of_stars import draw_boresight, draw_optics, draw_votes
 from figures import draw_association, draw_identification, draw_positions, draw_tracking
 from night import read_night
+from overlaid import draw_overlay
 from pipeline import draw_pipeline
 from style import save
 
@@ -33,6 +34,7 @@ PICTURES = {
     "first_night": draw_first_night,
     "gates": draw_gates,
     "optics": draw_optics,
+    "overlay": draw_overlay,
     "planes": draw_planes,
     "sigma": draw_sigma,
     "triangulation": draw_triangulation,

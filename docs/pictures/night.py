@@ -25,6 +25,8 @@ class Night(NamedTuple):
     cameras: dict[str, Camera]
     elements: Array  # (n, 6), one row per simulated object
     start_ns: int
+    dataset: Path
+    log: Path
 
 
 class Sight(NamedTuple):
@@ -44,6 +46,8 @@ def read_night(dataset: Path, truth_folder: Path) -> Night:
         {s["id"]: Camera(**s["camera"]) for s in truth.scenario["sensors"]},
         elements_of(truth),
         int(truth.scenario["t0_ns"]),
+        dataset,
+        truth_folder.with_suffix(""),
     )
 
 

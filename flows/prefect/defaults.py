@@ -107,6 +107,8 @@ def quiet_console() -> None:
 
 
 def _is_worth_showing(record: logging.LogRecord) -> bool:
+    if record.levelno <= logging.root.manager.disable:
+        return False  # after a signal: Prefect's own loggers do not look
     return record.levelno == logging.WARNING or (
         record.levelno > logging.WARNING and record.name not in _RUN_LOGGERS
     )

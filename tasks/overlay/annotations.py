@@ -13,7 +13,8 @@ import polars as pl
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 
-BLUE, ORANGE, RED, WHITE = (0.0, 0.447, 0.698), (0.902, 0.624, 0.0), (0.835, 0.369, 0.0), (1.0,) * 3
+BLUE, ORANGE, RED = (0.337, 0.706, 0.914), (0.902, 0.624, 0.0), (0.835, 0.369, 0.0)
+BLACK = (0.0, 0.0, 0.0)  # behind words: images of the sky are dark
 HALF_PX = 0.5
 RING_PX, SQUARE_PX, CROSS_PX = 12.0, 8.0, 4.0  # diameter, half side, half length
 TEXT_PX, LINE_PX = 10.0, 1.0
@@ -80,7 +81,7 @@ def _text(message: Any, time_ns: int, place: tuple[float, float], text: str, col
     _time(label.timestamp, time_ns)
     _place(label.position, *place)
     _colour(label.text_color, colour)
-    _colour(label.background_color, WHITE, 0.7)
+    _colour(label.background_color, BLACK, 0.5)
 
 
 def _place(point: Any, x: float, y: float) -> None:
