@@ -29,6 +29,7 @@ from epipole.flows.command_line.commands import (
 )
 from epipole.flows.command_line.compiling import tells_compiling
 from epipole.flows.command_line.environment import prepare_environment
+from epipole.flows.command_line.printing import help_text
 from epipole.flows.command_line.stopping import stop_by_signals, stopped_in_one_line
 from epipole.schemas.errors import EpipoleError
 from epipole.schemas.text.shown import as_line
@@ -104,7 +105,7 @@ def _options(
     """Options of every command."""
 
 
-app.command()(run.run)  # shows by itself what it compiles
+app.command(help=help_text(run.run))(run.run)  # shows by itself what it compiles
 for command in (
     nights.nights,
     info.info,
@@ -117,5 +118,5 @@ for command in (
     settings.settings,
     deploy_files.deploy_files,
 ):
-    app.command()(tells_compiling(command))
+    app.command(help=help_text(command))(tells_compiling(command))
 app.add_typer(catalog.app, name="catalog")

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from epipole.flows.command_line.options import AsJson
-from epipole.flows.command_line.printing import print_json, print_lines
+from epipole.flows.command_line.printing import help_text, print_json, print_lines
 
 app = typer.Typer(help="Build a star catalogue for star identification.", no_args_is_help=True)
 
@@ -16,7 +16,6 @@ def _catalog() -> None:
     """Make `build` a subcommand, though it is the only one."""
 
 
-@app.command()
 def build(
     source: Annotated[
         str,
@@ -59,3 +58,6 @@ def build(
         print_json(built.as_dict())
     else:
         print_lines(built.lines())
+
+
+app.command(help=help_text(build))(build)
