@@ -94,9 +94,10 @@ def spoil(dataset: Path, share: float) -> None:
 
 
 def shared_measures(dataset, log):
-    """The measures that the other tool has too: it does not know the table `observations`."""
+    """The measures that the other tool has too: none of `observations`, nor of magnitudes."""
     found = evaluate(dataset, log).as_dict()
-    return {name: value for name, value in found.items() if not name.startswith("observation")}
+    own = ("observation", "magnitude")
+    return {name: value for name, value in found.items() if not name.startswith(own)}
 
 
 def put(t, column, values):
