@@ -23,8 +23,8 @@ def main() -> None:
     estimates: list[Any] = []
     check_sensors = stages.check_sensors
 
-    def recorded(*args: Any) -> Any:
-        estimates.append(check_sensors(*args))
+    def recorded(*args: Any, **how: Any) -> Any:
+        estimates.append(check_sensors(*args, **how))
         return estimates[-1]
 
     scores, wrong = [], 0
