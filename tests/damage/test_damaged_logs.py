@@ -15,6 +15,7 @@ N_LOGS = 300
 LOOSE = "protobuf_loose"
 
 
+@pytest.mark.long
 def test_no_damage_breaks_the_reader_or_loses_a_message_without_a_reject():
     asked = [*fields_and_bombs(), *(("case", (number,)) for number in range(N_LOGS))]
     answers = list(judged(asked))

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "write_log.py"
 
 
@@ -12,6 +14,7 @@ def run(*command, folder):
     return subprocess.run(command, check=True, capture_output=True, text=True, cwd=folder).stdout
 
 
+@pytest.mark.long
 def test_the_log_is_what_info_finds(tmp_path):
     said = run(sys.executable, EXAMPLE, "my.mcap", folder=tmp_path)
     assert said.splitlines() == ["my.mcap: 30 frames, 6 states", "nothing was left out"]

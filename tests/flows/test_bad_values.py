@@ -41,6 +41,7 @@ def folder(tmp_path_factory):
     return logs
 
 
+@pytest.mark.long
 def test_bad_values_cost_themselves_and_no_night(prefect, folder, tmp_path):
     out = tmp_path / "out"
     for _ in range(2):  # the second run replaces the night, and is not refused

@@ -84,6 +84,7 @@ def test_a_run_names_a_catalogue_that_is_not_there_before_it_starts(epipole, tmp
     assert "epipole: none.parquet: no such catalogue file" in err
 
 
+@pytest.mark.long
 def test_a_run_uses_the_catalogue_of_the_settings_and_names_it_beside_its_ids(
     epipole, tmp_path, night_log, night_dataset
 ):

@@ -156,6 +156,7 @@ def test_the_page_draws_which_task_follows_which(deployed):
         "calibrate",
         "track",
         "solve",
+        "name",
         "publish",
     }
     assert before["track sat3 04:00-04:30"] == {"calibrate sat3"}

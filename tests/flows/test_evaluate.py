@@ -121,6 +121,7 @@ def test_it_agrees_with_the_other_tool_number_for_number(share, night_log, night
     compare(expected, found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("log", LOGS)
 def test_it_agrees_with_the_other_tool_on_the_shared_logs(log, prefect, tmp_path):
     from epipole.flows.nightly import nightly
@@ -171,6 +172,7 @@ def test_what_is_not_there_is_said(night_log, tmp_path):
         evaluate(tmp_path, tmp_path / "x")
 
 
+@pytest.mark.long
 def test_a_truth_over_midnight_is_held_against_both_nights(prefect, tmp_path):
     from epipole.flows.nightly import nightly
 

@@ -98,6 +98,7 @@ def test_every_object_has_a_position_at_nearly_every_epoch(night_dataset):
     np.testing.assert_allclose(radius_km, 42164.0, atol=30.0)
 
 
+@pytest.mark.long
 def test_a_run_again_on_more_workers_gives_the_same_bytes(night_log, night_dataset, tmp_path):
     for workers in (1, 3):
         runner = ThreadPoolTaskRunner(max_workers=workers)
@@ -107,6 +108,7 @@ def test_a_run_again_on_more_workers_gives_the_same_bytes(night_log, night_datas
         assert contents(tmp_path / "out") == contents(night_dataset)
 
 
+@pytest.mark.long
 def test_the_parts_of_a_night_in_any_order_give_the_same_rows(night_log, night_dataset, tmp_path):
     simulate("four_sensor_geo", tmp_path / "cut.mcap", seed=7, logs=2)
     parts = sorted(str(p) for p in tmp_path.glob("*.mcap"))
@@ -118,6 +120,7 @@ def test_the_parts_of_a_night_in_any_order_give_the_same_rows(night_log, night_d
         assert cut.equals(whole), table
 
 
+@pytest.mark.long
 def test_a_run_without_a_log_of_the_night_is_refused_and_names_it(tmp_path):
     simulate("four_sensor_geo", tmp_path / "cut.mcap", seed=7, logs=2)
     parts = sorted(str(p) for p in tmp_path.glob("*.mcap"))
@@ -131,6 +134,7 @@ def test_a_run_without_a_log_of_the_night_is_refused_and_names_it(tmp_path):
     assert read_table(out, "sources", NIGHT)["name"].to_pylist() == ["cut-1.mcap"]
 
 
+@pytest.mark.long
 def test_a_log_over_midnight_makes_two_nights_and_one_can_be_chosen(tmp_path):
     midnight_ns = int(np.datetime64("2019-04-02", "ns").astype(np.int64))
     log = write_log(tmp_path / "n.mcap", {"a": {}}, midnight_ns - 5 * SECOND_NS)

@@ -9,6 +9,7 @@ from epipole.flows.simulate import simulate
 pytestmark = pytest.mark.usefixtures("prefect")
 
 
+@pytest.mark.long
 def test_co_located_satellites_are_told_apart_with_honest_covariances(tmp_path):
     made = simulate("real_geo", tmp_path / "n.mcap", hours=0.03)
     nightly([str(made.logs[0])], str(tmp_path / "out"))

@@ -69,6 +69,7 @@ def test_without_matplotlib_one_line_says_which_extra_to_install(night_dataset, 
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_without_matplotlib_a_run_goes_on():
     told = without_matplotlib("import epipole.flows.nightly, epipole.flows.prefect.artifacts")
     assert told.returncode == 0, told.stderr
@@ -98,6 +99,7 @@ def test_a_dataset_of_which_only_reports_are_left_is_one(night_dataset, tmp_path
     check_folder(tmp_path)
 
 
+@pytest.mark.long
 def test_in_an_object_store_the_report_is_the_same(s3, night_log, prefect, night_dataset, tmp_path):
     out = "s3://nights/reported"
     nightly([str(night_log)], out)

@@ -30,6 +30,7 @@ def run(*arguments) -> tuple[int, str]:
     return ended.exit_code, ended.stdout
 
 
+@pytest.mark.long
 def test_a_run_tells_what_an_unchanged_night_holds_and_writes_nothing(made, night_log):
     out, first = made
     before = state(out)
@@ -39,6 +40,7 @@ def test_a_run_tells_what_an_unchanged_night_holds_and_writes_nothing(made, nigh
     assert second.as_dict() | {"unchanged": False} == first.as_dict()
 
 
+@pytest.mark.long
 def test_a_run_that_is_asked_to_makes_the_same_night_again(made, night_log):
     out, first = made
     before = state(out)

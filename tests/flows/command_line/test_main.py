@@ -167,6 +167,7 @@ def test_a_run_ends_in_a_summary_on_standard_output(epipole, night_log, prefect,
     assert "published out/night=2019-04-01" in err
 
 
+@pytest.mark.long
 def test_a_quiet_run_says_nothing(epipole, night_log, prefect):
     assert epipole("run", night_log, "--out", "out", "--quiet") == (0, "", "")
 
@@ -229,6 +230,7 @@ def test_help_and_version_need_neither_prefect_nor_arrow():
         assert "epipole" in ran.stdout
 
 
+@pytest.mark.long
 def test_a_run_by_itself_leaves_nothing_of_its_libraries_on_the_terminal(night_log, tmp_path):
     ran = subprocess.run(
         [*EPIPOLE, "run", str(night_log), "--out", str(tmp_path / "out")],
@@ -239,6 +241,7 @@ def test_a_run_by_itself_leaves_nothing_of_its_libraries_on_the_terminal(night_l
     assert all(re.match(r"\d\d:\d\d:\d\d ", line) for line in ran.stderr.splitlines()), ran.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("by", "says"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "stopped")]
 )

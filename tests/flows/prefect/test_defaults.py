@@ -33,6 +33,7 @@ def embedded(home: Path, profile: str = "", **environment: str) -> str:
     return ran.stdout.strip()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("profile", "environment", "settings"),
     [

@@ -140,6 +140,7 @@ def old_and_new(tmp_path_factory):
     return both
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("exchange", ["exchange", "two renames"])
 @pytest.mark.parametrize("moves", range(5))
 @pytest.mark.parametrize("next_one", ["reads", "runs"])

@@ -34,6 +34,7 @@ WHOLE_NIGHT = (
     "calibrations",
     "identifications",
 )  # tables that are not of an instant
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture

@@ -41,6 +41,7 @@ def log(tmp_path_factory):
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("piece_bytes", [5_000, 50_000, 1 << 30])
 def test_the_pieces_are_the_log(log, piece_bytes):
     whole = read_log(log)
@@ -89,6 +90,7 @@ print(n, resident_mib() - before)
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="asks Linux for the memory")
 @pytest.mark.parametrize("chunked", [True, False])
 def test_the_memory_of_reading_is_bounded_by_its_pieces_not_by_the_log(tmp_path, log, chunked):

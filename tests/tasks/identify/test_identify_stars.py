@@ -259,6 +259,7 @@ def test_the_newest_calibration_is_used_or_the_first_for_earlier_frames(log, cat
     assert found.solutions["camera"].to_pylist() == [0] * 25 + [1] * 15
 
 
+@pytest.mark.long
 def test_thousands_of_centroids_end_in_bounded_time(sky, log, catalogue):
     rng = np.random.default_rng(0)
     x, y = rng.uniform(0, 1023, (2, 4, 4000))

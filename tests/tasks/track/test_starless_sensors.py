@@ -6,6 +6,8 @@ import pytest
 
 from epipole.schemas.simulation.scene import validate_scene
 
+pytestmark = pytest.mark.long
+
 MIDDLE = [-39367.69, 15079.54, 454.20]
 # Two sensors see stars, the third has a prior attitude alone, the fourth nothing at all.
 SIGHT = {"a": (10.0, True), "b": (10.0, True), "c": (1.0, True), "d": (1.0, False)}

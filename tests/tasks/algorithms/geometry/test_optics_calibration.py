@@ -94,6 +94,7 @@ def test_the_gain_shows_a_departure():
     assert calibrate_optics(SENT, stars(TRUE)).gain > 1000
 
 
+@pytest.mark.long
 def test_catalogue_errors_are_no_departure():
     z, gains = [], []
     for seed in range(20):
@@ -181,6 +182,7 @@ def test_the_principal_point_moves_where_the_stars_tell_it_from_a_rotation():
     assert moved[27].camera.cy_px == pytest.approx(true.cy_px, abs=2.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("field_deg", [8, 12, 20, 27])
 def test_untold_optics_are_in_the_sigma_of_the_attitude(field_deg):
     rng = np.random.default_rng(field_deg)

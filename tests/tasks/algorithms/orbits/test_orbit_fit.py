@@ -44,6 +44,7 @@ def test_without_errors_the_fit_is_the_truth():
     assert np.isfinite(chi2[0])
 
 
+@pytest.mark.long
 def test_errors_over_many_trials_are_as_claimed_though_biases_are_shared():
     n, square, total, dof = 300, 0.0, 0.0, 0
     for seed in range(n):

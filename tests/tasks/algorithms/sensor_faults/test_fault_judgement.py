@@ -26,6 +26,7 @@ def test_the_offset_of_one_sensor_is_found():
     assert (abs(offset[[0, 1, 3]]) < 4 * sigma[[0, 1, 3]]).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("turn_rad", [0.0, 30 * ARCSEC])
 def test_errors_over_sigmas_are_standard_normal(turn_rad):
     true = np.array([0.02, -0.05, 0.1, 0.0])

@@ -1,6 +1,7 @@
 """Suspects: of many sensors the wrong ones are found, as if all were judged together."""
 
 import numpy as np
+import pytest
 from scenes.many_sensors import POSITION_KM, lines_of_many
 
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
@@ -37,6 +38,7 @@ def test_the_faults_of_many_are_those_that_all_together_have():
     assert abs(many.offset_s[3] - 0.3) < 4 * many.sigma_s[3]
 
 
+@pytest.mark.long
 def test_of_a_hundred_sensors_no_sound_one_is_at_fault_and_offsets_are_honest():
     scores = []
     for seed in range(8):
@@ -47,6 +49,7 @@ def test_of_a_hundred_sensors_no_sound_one_is_at_fault_and_offsets_are_honest():
     assert 0.8 < np.sqrt(np.mean(np.square(scores))) < 1.2
 
 
+@pytest.mark.long
 def test_more_wrong_sensors_than_are_judged_together_are_all_found():
     late = dict.fromkeys(range(MOST_TOGETHER + 3), 0.6)
     found = judged(lines_of_many(20, 120, 400, late_s=late), 120)

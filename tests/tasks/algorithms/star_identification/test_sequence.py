@@ -185,6 +185,7 @@ def test_a_frame_that_was_skipped_says_so():
     assert max(np.diff(searched)) == 33
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n_dark", [40, 150])
 def test_frames_skipped_before_the_sensor_is_found_are_found_from_there(n_dark):
     dark = frame(CATALOGUE, random_attitude(0), 0, n_false=6, missing=1.0)[0]
@@ -193,6 +194,7 @@ def test_frames_skipped_before_the_sensor_is_found_are_found_from_there(n_dark):
     assert _identify(frames)[1][n_dark:] == [None] * 60
 
 
+@pytest.mark.long
 def test_what_was_skipped_behind_a_slew_is_searched():
     dark = frame(CATALOGUE, random_attitude(0), 0, n_false=6, missing=1.0)[0]
     R = _turning(20, seed=5) + _turning(60, seed=9)  # the first stay is shorter than the skip

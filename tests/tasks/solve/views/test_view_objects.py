@@ -77,6 +77,7 @@ def views_of(seen, source, flux, cov_optics=None):
     return views.sort_by([("tracklet_id", "ascending"), ("epoch", "ascending")])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("white", "constant"), [(35.0, 0.0), (20.0, 28.7), (0.0, 35.0)])
 def test_the_error_of_a_prior_is_divided_as_the_detections_show(white, constant):
     noise, total = [], []

@@ -79,11 +79,13 @@ def solved(maps, skies, method):
     return right
 
 
+@pytest.mark.long
 @NEEDS_MAPS
 def test_the_match_group_fails_on_the_noisy_maps_3_and_6_as_published(maps, skies):
     assert solved(maps, skies, match_group) == {1, 2, 4, 5, 7, 8}
 
 
+@pytest.mark.long
 @NEEDS_MAPS
 def test_radial_and_cyclic_features_fail_where_stars_are_missing_as_published(maps, skies):
     # Published: 4, 5 and 8 fail. Here the noisy maps 3 and 6 fail as well: in their fields, too few
