@@ -143,7 +143,8 @@ def nightly(
             summary = publish(Destination(out, staged, replace), sources, trail)
             if settings.report.write:
                 summary = with_reports(summary, staged, staging)
-    LOGGER.info("published %s", ", ".join(f"{out}/night={date}" for date in chosen))
+    dataset = out.rstrip("/")
+    LOGGER.info("published %s", ", ".join(f"{dataset}/night={date}" for date in chosen))
     return summary
 
 

@@ -13,7 +13,6 @@ from urllib.parse import urlsplit
 import httpx
 from prefect.client.orchestration import get_client
 from prefect.logging.configuration import setup_logging
-from prefect.logging.handlers import PrefectConsoleHandler
 from prefect.settings import (
     PREFECT_API_URL,
     PREFECT_CLIENT_MAX_RETRIES,
@@ -102,8 +101,12 @@ def quiet_console() -> None:
     setup_logging()
     for handler in _all_handlers():
         # A filter, because Prefect resets the levels when a flow starts.
-        if isinstance(handler, PrefectConsoleHandler):
+        if isinstance(handler, logging.StreamHandler) and _is_of_prefect(handler):
             handler.addFilter(_is_worth_showing)
+
+
+def _is_of_prefect(handler: logging.Handler) -> bool:
+    return type(handler).__module__.startswith("prefect.")
 
 
 def _is_worth_showing(record: logging.LogRecord) -> bool:

@@ -158,11 +158,11 @@ def test_the_settings_it_prints_are_read_back_as_the_defaults(epipole, tmp_path)
 
 
 def test_a_run_ends_in_a_summary_on_standard_output(epipole, night_log, prefect, tmp_path):
-    code, out, err = epipole("run", night_log, "--out", "out")
+    code, out, err = epipole("run", night_log, "--out", "out/")
     assert code == 0
     assert re.search(r"frames +240 of 4 sensors in 1 log\n", out)
     assert re.search(r"objects +9 in [\d,]+ detections, \d+ tracklets\n", out)
-    assert re.search(r"dataset +out\ntook +[\d.]+ s\n$", out)
+    assert re.search(r"dataset +out/\ntook +[\d.]+ s\n$", out)
     assert all(re.match(r"\d\d:\d\d:\d\d ", line) for line in err.splitlines())
     assert "published out/night=2019-04-01" in err
 

@@ -43,6 +43,20 @@ with stopping.stopped_in_one_line():
         print("cleared up")
 """
 
+PREFECT = """
+from epipole.flows.prefect.defaults import quiet_console
+from prefect.logging import get_logger
+quiet_console()
+with stopping.stopped_in_one_line():
+    try:
+        signalled()
+        time.sleep(60)
+    finally:
+        for name in ("prefect", "prefect._internal.concurrency", "prefect.server", "uvicorn"):
+            logging.getLogger(name).error("was cancelled")
+            get_logger(name).error("was cancelled")
+"""
+
 WAITS = """
 stopping._PATIENCE_S = 0.2
 with stopping.stopped_in_one_line():
@@ -79,6 +93,10 @@ def test_an_import_is_finished_first(tmp_path):
 
 def test_a_second_signal_does_not_disturb_the_clearing_up(tmp_path):
     assert run(TWICE, tmp_path) == (130, "cleared up\n", "epipole: interrupted\n")
+
+
+def test_none_of_prefects_loggers_says_more(tmp_path):
+    assert run(PREFECT, tmp_path) == (130, "", "epipole: interrupted\n")
 
 
 def test_a_wait_that_does_not_end_is_ended(tmp_path):
