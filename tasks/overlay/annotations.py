@@ -5,13 +5,14 @@ star is a blue ring, a detection of an object an orange square, another detectio
 The origin of annotations is the corner of the first pixel, ours its middle: half a pixel is added.
 """
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-import polars as pl
+from foxglove_schemas_protobuf.CircleAnnotation_pb2 import CircleAnnotation
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+from foxglove_schemas_protobuf.TextAnnotation_pb2 import TextAnnotation
 
 BLUE, ORANGE, RED = (0.337, 0.706, 0.914), (0.902, 0.624, 0.0), (0.835, 0.369, 0.0)
 BLACK = (0.0, 0.0, 0.0)  # behind words: images of the sky are dark
@@ -20,68 +21,95 @@ RING_PX, SQUARE_PX, CROSS_PX = 12.0, 8.0, 4.0  # diameter, half side, half lengt
 TEXT_PX, LINE_PX = 10.0, 1.0
 
 
+class StarSpot(NamedTuple):
+    """A centroid that is a star [px]."""
+
+    x_px: float
+    y_px: float
+    star_id: int
+
+
+class DetectedSpot(NamedTuple):
+    """A centroid that is no star [px], and the object that it shows, if any."""
+
+    x_px: float
+    y_px: float
+    object_id: str | None
+    kind: str
+
+
 def annotations(
-    time_ns: int, stars: pl.DataFrame, detections: pl.DataFrame, star_names: str
+    time_ns: int, stars: Sequence[StarSpot], detections: Sequence[DetectedSpot], star_names: str
 ) -> bytes:
     """Return the annotations of one frame, as a serialised `foxglove.ImageAnnotations`.
 
-    Parameters
-    ----------
-    stars, detections
-        STARS of the frame; DETECTIONS of the frame with `object_id`, null where there is none.
-    star_names
-        What stands before a star's number, such as "HIP ".
+    `star_names` is what stands before a star's number, such as "HIP ".
     """
     message: Any = ImageAnnotations()
-    for x, y, star in _rows(stars, "star_id"):
-        circle = message.circles.add(diameter=RING_PX, thickness=LINE_PX)
-        _time(circle.timestamp, time_ns)
+    ring, word = _ring(time_ns), _word(time_ns, BLUE)
+    for star in stars:
+        x, y = star.x_px + HALF_PX, star.y_px + HALF_PX
+        circle = message.circles.add()
+        circle.CopyFrom(ring)
         _place(circle.position, x, y)
-        _colour(circle.outline_color, BLUE)
-        _text(message, time_ns, (x + RING_PX / 2, y - RING_PX / 2), f"{star_names}{star}", BLUE)
-    named = detections.filter(pl.col("object_id").is_not_null())
-    for x, y, name in _rows(named, "object_id"):
-        d = SQUARE_PX
-        corners = [(x - d, y - d), (x + d, y - d), (x + d, y + d), (x - d, y + d)]
-        _lines(message, time_ns, PointsAnnotation.LINE_LOOP, corners, ORANGE)
-        _text(message, time_ns, (x + d, y - d), str(name), ORANGE)
-    others = detections.filter(pl.col("object_id").is_null())
-    for x, y, kind in _rows(others, "kind"):
+        place = x + RING_PX / 2, y - RING_PX / 2
+        _text(message, word, place, f"{star_names}{star.star_id}")
+    square, word = _lines(time_ns, PointsAnnotation.LINE_LOOP, ORANGE), _word(time_ns, ORANGE)
+    cross, kind = _lines(time_ns, PointsAnnotation.LINE_LIST, RED), _word(time_ns, RED)
+    for spot in sorted(detections, key=lambda spot: spot.object_id is None):
+        x, y = spot.x_px + HALF_PX, spot.y_px + HALF_PX
+        if spot.object_id is not None:
+            d = SQUARE_PX
+            corners = (x - d, y - d), (x + d, y - d), (x + d, y + d), (x - d, y + d)
+            _points(message, square, corners)
+            _text(message, word, (x + d, y - d), spot.object_id)
+            continue
         d = CROSS_PX
-        ends = [(x - d, y - d), (x + d, y + d), (x - d, y + d), (x + d, y - d)]
-        _lines(message, time_ns, PointsAnnotation.LINE_LIST, ends, RED)
-        if kind != "unknown":
-            _text(message, time_ns, (x + d, y - d), str(kind), RED)
+        ends = (x - d, y - d), (x + d, y + d), (x - d, y + d), (x + d, y - d)
+        _points(message, cross, ends)
+        if spot.kind != "unknown":
+            _text(message, kind, (x + d, y - d), spot.kind)
     data: bytes = message.SerializeToString(deterministic=True)
     return data
 
 
-def _rows(rows: pl.DataFrame, name: str) -> Iterable[tuple[float, float, Any]]:
-    """Yield places, from the corner of the first pixel, and a column."""
-    return zip(
-        (rows["x_px"] + HALF_PX).to_list(),
-        (rows["y_px"] + HALF_PX).to_list(),
-        rows[name].to_list(),
-        strict=True,
-    )
+# What all rings, words and lines of a frame share is made once, and copied: a night has millions.
 
 
-def _lines(
-    message: Any, time_ns: int, kind: int, places: list[tuple[float, float]], colour: Any
-) -> None:
-    lines = message.points.add(type=kind, thickness=LINE_PX)
+def _ring(time_ns: int) -> Any:
+    ring: Any = CircleAnnotation(diameter=RING_PX, thickness=LINE_PX)
+    _time(ring.timestamp, time_ns)
+    _colour(ring.outline_color, BLUE)
+    return ring
+
+
+def _lines(time_ns: int, kind: int, colour: tuple[float, ...]) -> Any:
+    lines: Any = PointsAnnotation(type=kind, thickness=LINE_PX)  # type: ignore[arg-type]
     _time(lines.timestamp, time_ns)
-    for x, y in places:
-        _place(lines.points.add(), x, y)
     _colour(lines.outline_color, colour)
+    return lines
 
 
-def _text(message: Any, time_ns: int, place: tuple[float, float], text: str, colour: Any) -> None:
-    label = message.texts.add(text=text, font_size=TEXT_PX)
-    _time(label.timestamp, time_ns)
+def _word(time_ns: int, colour: tuple[float, ...]) -> Any:
+    word: Any = TextAnnotation(font_size=TEXT_PX)
+    _time(word.timestamp, time_ns)
+    _colour(word.text_color, colour)
+    _colour(word.background_color, BLACK, 0.5)
+    return word
+
+
+def _points(message: Any, like: Any, places: Sequence[tuple[float, float]]) -> None:
+    lines = message.points.add()
+    lines.CopyFrom(like)
+    for x, y in places:
+        lines.points.add(x=x, y=y)
+
+
+def _text(message: Any, like: Any, place: tuple[float, float], text: str) -> None:
+    label = message.texts.add()
+    label.CopyFrom(like)
+    label.text = text
     _place(label.position, *place)
-    _colour(label.text_color, colour)
-    _colour(label.background_color, BLACK, 0.5)
 
 
 def _place(point: Any, x: float, y: float) -> None:

@@ -1,8 +1,10 @@
 """The messages of a span of a night: of each frame, of each epoch, and of what was left out."""
 
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import polars as pl
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -11,7 +13,12 @@ from epipole.schemas.bridge import to_polars
 from epipole.schemas.columns import PLACE
 from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import CAMERAS
-from epipole.tasks.overlay.annotations import annotations, image_of
+from epipole.tasks.overlay.annotations import (
+    DetectedSpot,
+    StarSpot,
+    annotations,
+    image_of,
+)
 from epipole.tasks.overlay.png import png
 from epipole.tasks.overlay.scene import objects, transform
 
@@ -20,6 +27,8 @@ ANNOTATIONS, CALIBRATION, IMAGE = (
 )  # fmt: skip
 TRANSFORM, SCENE, LOG = "foxglove.FrameTransform", "foxglove.SceneUpdate", "foxglove.Log"
 OBJECTS, TRANSFORMS, LEFT_OUT = "/epipole/objects", "/epipole/transforms", "/epipole/rejects"
+
+StarOrDetected = TypeVar("StarOrDetected", StarSpot, DetectedSpot)
 
 
 class ViewerMessage(NamedTuple):
@@ -48,32 +57,39 @@ def frame_messages(
 
     `shapes` (rows, columns) are of the sensors whose images are drawn; others get none.
     """
-    key = ["sensor_id", "frame_number"]
-    stars = tables.stars.partition_by(key, as_dict=True)
-    detections = tables.detections.partition_by(key, as_dict=True)
+    stars = _of_frames(tables.stars, StarSpot)
+    detections = _of_frames(tables.detections, DetectedSpot)
     for row in _timed(tables.frames, "time").iter_rows(named=True):
         sensor, number, time_ns = row["sensor_id"], row["frame_number"], row["time_ns"]
-        own = (
-            stars.get((sensor, number), tables.stars.clear()),
-            detections.get((sensor, number), tables.detections.clear()),
-        )
+        own = stars.get((sensor, number), []), detections.get((sensor, number), [])
         data = annotations(time_ns, *own, star_names)
         yield ViewerMessage(time_ns, f"/{sensor}/annotations", ANNOTATIONS, data)
         if sensor in shapes:
-            yield ViewerMessage(
-                time_ns, f"/{sensor}/image", IMAGE, _image(time_ns, sensor, shapes[sensor], own)
-            )
+            data = _image(time_ns, sensor, shapes[sensor], [*own[0], *own[1]])
+            yield ViewerMessage(time_ns, f"/{sensor}/image", IMAGE, data)
         if row["qw"] is not None and row["x_km"] is not None:
             yield ViewerMessage(time_ns, TRANSFORMS, TRANSFORM, transform(time_ns, sensor, row))
 
 
+def _of_frames(
+    rows: pl.DataFrame, spot: Callable[..., StarOrDetected]
+) -> dict[tuple[str, int], list[StarOrDetected]]:
+    """Return the spots of each frame, by sensor and frame number."""
+    key, fields = ["sensor_id", "frame_number"], spot._fields  # type: ignore[attr-defined]
+    found = rows.group_by(key, maintain_order=True).agg(*fields)
+    return {
+        (sensor, number): [spot(*each) for each in zip(*columns, strict=True)]
+        for sensor, number, *columns in found.select(*key, *fields).iter_rows()
+    }
+
+
 def _image(
-    time_ns: int, sensor: str, shape: tuple[int, int], centroids: tuple[pl.DataFrame, ...]
+    time_ns: int, sensor: str, shape: tuple[int, int], spots: Sequence[StarSpot | DetectedSpot]
 ) -> bytes:
     message: Any = CompressedImage(frame_id=sensor, format="png")
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
-    places = pl.concat([rows.select("x_px", "y_px") for rows in centroids])
-    message.data = png(image_of(shape, places.to_numpy()))
+    places = np.array([spot[:2] for spot in spots], float).reshape(-1, 2)
+    message.data = png(image_of(shape, places))
     data: bytes = message.SerializeToString(deterministic=True)
     return data
 
@@ -82,14 +98,17 @@ def epoch_messages(tables: SpanTables, lifetime_ns: int) -> Iterator[ViewerMessa
     """Yield the objects of each epoch, with the lines of sight to them."""
     places = tables.frames.select("sensor_id", "frame_number", *PLACE)
     lines = tables.associations.join(places, on=["sensor_id", "frame_number"], how="inner")
-    by_epoch = lines.drop_nulls(PLACE).partition_by("epoch", as_dict=True)
+    lines = lines.drop_nulls(PLACE).group_by("epoch", "object_id", maintain_order=True).agg(PLACE)
+    seen_from: dict[Any, dict[str, list[tuple[float, ...]]]] = defaultdict(dict)
+    for epoch, name, *km in lines.select("epoch", "object_id", *PLACE).iter_rows():
+        seen_from[epoch][name] = list(zip(*km, strict=True))
     for (epoch,), positions in (
         _timed(tables.positions, "epoch")
         .partition_by("epoch", as_dict=True, maintain_order=True)
         .items()
     ):
         time_ns = positions["time_ns"][0]
-        data = objects(time_ns, positions, by_epoch.get((epoch,), lines.clear()), lifetime_ns)
+        data = objects(time_ns, positions, seen_from.get(epoch, {}), lifetime_ns)
         yield ViewerMessage(time_ns, OBJECTS, SCENE, data)
 
 

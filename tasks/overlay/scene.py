@@ -4,6 +4,7 @@ The frame is GCRF, lengths are metres. What is small beside the Earth is drawn l
 seen: an object is a sphere of `SEEN_KM`, and around it stands its error ellipsoid of three sigma.
 """
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,15 +47,20 @@ def earth(time_ns: int) -> bytes:
     return data
 
 
-def objects(time_ns: int, positions: pl.DataFrame, lines: pl.DataFrame, lifetime_ns: int) -> bytes:
+def objects(
+    time_ns: int,
+    positions: pl.DataFrame,
+    seen_from: Mapping[str, Sequence[tuple[float, ...]]],
+    lifetime_ns: int,
+) -> bytes:
     """Return the objects of an epoch, and the lines of sight that see them.
 
     Parameters
     ----------
     positions
         POSITIONS of the epoch.
-    lines
-        Used ASSOCIATIONS of the epoch, each with the sensor's place (x_km, y_km, z_km).
+    seen_from
+        The places [km] of the sensors that see each object.
     lifetime_ns
         How long they are shown, if no later message has them.
     """
@@ -70,10 +76,9 @@ def objects(time_ns: int, positions: pl.DataFrame, lines: pl.DataFrame, lifetime
         _vector(label.pose.position, place)
         label.pose.orientation.w = 1.0
         _colour(label.color, ORANGE)
-        seen = lines.filter(pl.col("object_id") == row["object_id"])
         sight = entity.lines.add(type=2, thickness=1.0, scale_invariant=True)  # pairs of points
         sight.pose.orientation.w = 1.0
-        for sensor_km in seen.select(PLACE).iter_rows():
+        for sensor_km in seen_from.get(row["object_id"], ()):
             _vector(sight.points.add(), sensor_km)
             _vector(sight.points.add(), place)
         _colour(sight.color, BLUE, 0.6)
