@@ -111,9 +111,10 @@ class Report:
     positions_per_truth: float | None = _measure(
         "positions",
         "per interval with two sensors",
-        "share",
+        "number",
         definition="Positions of true objects, per object and frame interval of the slowest "
-        "sensor in which at least two sensors see the object.",
+        "sensor in which at least two sensors see the object. 1: one in each; a little more where "
+        "both ends of a sequence have an epoch.",
     )
     pos_err_km_median: float | None = _measure(
         "positions",
