@@ -53,7 +53,8 @@ def compile_step(done: int, total: int) -> None:
 def _send(what: str, count: tuple[int, int], part: tuple[int, int], percent: float) -> None:
     done, total = count
     counts = {"stage": what, "done": done, "total": total, "part": part, "percent": percent}
-    STEPS.info("%s: %d of %d", what, done, total, extra=counts)
+    shown = f"{done} of {total}" if total else str(done)  # how many there will be may be unknown
+    STEPS.info("%s: %s", what, shown, extra=counts)
 
 
 class Future(Protocol):

@@ -1,9 +1,10 @@
-"""The folder of compiled kernels: its name contains a digest of the code.
+"""The folder of compiled kernels: its name contains a digest of the code and of where it lies.
 
 By default numba keeps a kernel beside its source file and checks only that file. It does not notice
 a change in a function of another file that the kernel calls. After an upgrade it may also find
 signatures with classes that no longer exist. With a digest of all code in the folder's name,
-neither can happen.
+neither can happen. numba also tells kernels by the path of their source file: of two environments
+with the same code each compiles its own, so each has a folder of its own.
 """
 
 import contextlib
@@ -115,6 +116,7 @@ def only_one(folder: Path) -> Iterator[bool]:
 def _digest(folders: Iterable[Path]) -> str:
     digest = hashlib.sha256()
     for folder in folders:
+        digest.update(str(folder.resolve()).encode())
         for file in sorted(folder.rglob("*.py")):
             name = file.relative_to(folder).as_posix()
             digest.update(name.encode() + b"\0" + file.read_bytes())

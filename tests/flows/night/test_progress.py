@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from epipole.flows.night.progress import STEPS, prepare, results, step
+from epipole.flows.night.progress import STEPS, compile_step, prepare, results, step
 from epipole.schemas.stages import Stage
 
 
@@ -12,9 +12,11 @@ class Collected(logging.Handler):
     def __init__(self):
         super().__init__()
         self.steps = []
+        self.lines = []
 
     def emit(self, record):
         counts = vars(record)
+        self.lines.append(record.getMessage())
         self.steps.append((counts["stage"], counts["done"], counts["total"], counts["percent"]))
 
 
@@ -68,6 +70,15 @@ def test_the_parts_of_a_stage_make_the_stage(steps):
     assert (percents[0], percents[-2]) == (percents[1], percents[-1])
     assert len(set(percents)) == 9  # two tasks of four parts, and the start
     assert [done for _, done, _, _ in steps][1:-1] == [0, 1, 2] * 4
+
+
+def test_a_line_has_a_total_where_it_is_known():
+    handler = Collected()
+    STEPS.addHandler(handler)
+    compile_step(7, 220)
+    compile_step(7, 0)
+    STEPS.removeHandler(handler)
+    assert handler.lines == ["compile: 7 of 220", "compile: 7"]
 
 
 def test_a_stage_without_tasks_is_a_step(steps):

@@ -1,6 +1,7 @@
 """Compiled kernels are kept apart for other code."""
 
 import os
+import shutil
 import time
 
 import numba
@@ -34,6 +35,15 @@ def test_the_same_code_has_the_same_folder_and_other_code_another(code):
     (code / "inner" / "kernel.py").write_text("a = 2\n")
     os.environ["NUMBA_CACHE_DIR"] = ""
     use_kernel_cache([code])
+    assert kept() != first
+
+
+def test_the_same_code_elsewhere_has_a_folder_of_its_own(code, tmp_path):
+    use_kernel_cache([code])
+    first = kept()
+    shutil.copytree(code, tmp_path / "other_environment")
+    os.environ["NUMBA_CACHE_DIR"] = ""
+    use_kernel_cache([tmp_path / "other_environment"])
     assert kept() != first
 
 
