@@ -52,8 +52,9 @@ def coverage(facts: NightFacts) -> Section:
         as_svg(partial(draw_coverage, series=series), coverage_height(series)),
         f"Frames of {len(series.sensors)} sensors over the night; "
         f"{percent(series.counts[0].sum() / series.frames.sum())} are identified by stars.",
-        "What became of each sensor's frames over time. A strip that is full and of one plain "
-        "colour is well; white is a gap, hatched is a frame without stars." + fewer,
+        "What became of each sensor's frames over time. In a full strip of one plain "
+        "colour every frame was identified; white is a gap, hatched is a frame without stars."
+        + fewer,
     )
     return Section("coverage", "Coverage", figures([picture]) + _frames_table(series)
                    + _statuses(series) + _gaps(series))  # fmt: skip
