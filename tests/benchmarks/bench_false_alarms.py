@@ -15,6 +15,7 @@ Ctrl-C prints what is counted so far.
 """
 
 import argparse
+import signal
 import time
 from collections import defaultdict
 from typing import Any, NamedTuple
@@ -233,4 +234,6 @@ def _natural(kind: str) -> tuple[int, str]:
 
 
 if __name__ == "__main__":
+    # A shell lets its background jobs ignore Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     main()
