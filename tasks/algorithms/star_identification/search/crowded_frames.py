@@ -4,12 +4,15 @@ Of hundreds of centroids hardly any pivot is a star, so that many have to be ask
 The companions of a pivot are its near ones only: of these, nearly as large a share are stars, and
 the sky has fewer pairs that are so close.
 
-1. Star after star is taken for the pivot. Where a companion has the separation of one of the star's
-   neighbours, it says how the image is turned. `turn_sieve` counts coarsely how many agree.
-2. Of stars with enough votes these are counted to their own tolerance.
-3. Where enough agree, the other stars of the field are looked up among the centroids
-   (`stars_shown`): some twenty look-ups, where all centroids would be a thousand.
-4. What is left is tried on all centroids, as in `lost_in_space`.
+1. Pivots in the middle of the image come first: there, all neighbours of a star are in the image.
+2. Star after star is taken for the pivot. Where a companion has the separation of one of the star's
+   neighbours, it says how the image is turned. `turn_sieve` counts coarsely how many agree; where
+   a star has many neighbours, a share of them must.
+3. Of stars with enough votes these are counted to their own tolerance.
+4. Where enough agree, the farthest of them gives the attitude, with which the other stars of the
+   field are looked up among the centroids (`stars_shown`): some twenty look-ups, where all
+   centroids would be a thousand.
+5. What is left is tried on all centroids, as in `lost_in_space`.
 """
 
 import math
@@ -42,7 +45,7 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
     try_pair,
 )
 from epipole.tasks.algorithms.star_identification.search.stars_shown import (
-    by_z,
+    SHOWN,
     make_places,
     odds_of_field,
 )
@@ -52,10 +55,12 @@ from epipole.tasks.algorithms.star_identification.search.turn_sieve import (
     make_sieve,
 )
 from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
+from epipole.tasks.algorithms.star_identification.sky.star_bands import by_bands
 
 # Rounds: least votes that agree, and most stars of a pivot whose votes are counted closely.
 ROUNDS = ((4, 600), (3, 4000), (2, 4000))
-WORTH_ALL = 5.0  # log odds of a field with which an attitude is tried on all centroids
+WORTH_ALL = 8.0  # log odds of a field with which an attitude is tried on all centroids
+SAMPLES, TIERS = 64, 4  # of a pivot's surroundings, and how finely pivots are put in order by them
 MOST_TURNS = 512  # of one star
 BIN_SHIFT = 8  # of a turn: 256 bins
 MOST_BINS = 4096  # of separation
@@ -123,6 +128,27 @@ def _near_companions(problem, i):
     )  # fmt: skip
 
 
+@kernel
+def _shares_inside(u, box, reach):
+    """Return for each pivot which share of its surroundings is in the image."""
+    inside = np.zeros(len(u))
+    for k in range(SAMPLES):
+        # Evenly over the disc: Vogel's spiral (1979).
+        r, turn = reach * math.sqrt((k + 0.5) / SAMPLES), 2.399963 * k
+        dx, dy = r * math.cos(turn), r * math.sin(turn)
+        for i in range(len(u)):
+            x, y = u[i, 0] / u[i, 2] + dx, u[i, 1] / u[i, 2] + dy
+            inside[i] += (box[0] < x < box[1]) & (box[2] < y < box[3])
+    return inside / SAMPLES
+
+
+@kernel
+def _pivots(inside):
+    """Return the pivots, those in the middle of the image first: there, all neighbours are seen."""
+    order = mixed_order(len(inside))
+    return order[np.argsort(-np.floor(TIERS * inside[order]), kind="mergesort")]
+
+
 @borrowing_kernel
 def _is_odd(m_s, m_other, q, companions, mag_gate):
     """Tell whether the brightness of companion q contradicts a pivot and a neighbour of these
@@ -166,6 +192,13 @@ def _touches(k, at_bin, turns):
 
 
 @borrowing_kernel
+def _agree(k, m, turns):
+    """Tell whether two turns agree."""
+    off = (turns.turn[k] - turns.turn[m]) & (TURN - 1)
+    return min(off, TURN - off) <= turns.wide[k] + turns.wide[m]
+
+
+@borrowing_kernel
 def _most_agreed(n, at_bin, turns):
     """Return which of the first n turns that touch a bin agrees with most others, and with how many
     and itself."""
@@ -175,12 +208,23 @@ def _most_agreed(n, at_bin, turns):
             continue
         agreed = 0
         for m in range(n):
-            off = (turns.turn[k] - turns.turn[m]) & (TURN - 1)
-            off = min(off, TURN - off)
-            agreed += off <= turns.wide[k] + turns.wide[m]
+            agreed += _agree(k, m, turns)
         if agreed > most:
             best, most = k, agreed
     return best, most
+
+
+@borrowing_kernel
+def _widest_agreed(n, k, near, turns):
+    """Return the turn with the farthest neighbour of those of the first n that agree with turn k,
+    and with how many it agrees: it says best how the image is turned."""
+    best, agreed = k, 0
+    for m in range(n):
+        if _agree(k, m, turns) and near.chord[turns.entry[m]] > near.chord[turns.entry[best]]:
+            best = m
+    for m in range(n):
+        agreed += _agree(best, m, turns)
+    return best, agreed
 
 
 @kernel
@@ -200,14 +244,15 @@ def _try_star(problem, i, s, j, other, c, room, best):
     log_miss = math.log(1.0 - problem.limits.star_share)
     odds = try_pair(problem.stars, s, other, c, order, log_miss, FLOOR, room)
     if odds < WORTH:
-        return 8 * n_checked
+        return 2 * n_checked
     keep(judge_pair(problem, i, s, j, other, best.evidence[1], room), problem, room, best)
-    return 8 * n_checked + 20 * n
+    return 2 * n_checked + 20 * n
 
 
 @kernel
-def _try_pivot(problem, i, step, stars, places, level, turns, room, best):
-    """Try the stars that most turns agree on for pivot i; return the work done."""
+def _try_pivot(problem, i, inside, step, stars, places, level, turns, room, best):
+    """Try the stars that most turns agree on for pivot i, of whose surroundings this share is in
+    the image; return the work done."""
     near, magnitude = problem.pairs.near, problem.stars.magnitude
     mag_gate = MAG_GATE * problem.rule.spread
     companions = _near_companions(problem, i)
@@ -216,8 +261,8 @@ def _try_pivot(problem, i, step, stars, places, level, turns, room, best):
     sieve = make_sieve(
         companions.chord, companions.tolerance, companions.angle, companions.wide, near.reach
     )
-    least = count_turns(near, start, stop, sieve, *ROUNDS[step], level)
-    work = 2 * len(problem.centroids.u)
+    least = count_turns(near, start, stop, sieve, SHOWN * inside, *ROUNDS[step], level)
+    work = 5 * len(problem.centroids.u)
     work += (near.first[stop] - near.first[start]) // NEIGHBOURS_PER_WORK
     for s in range(start, stop if least <= LEVELS else start):
         if level[s] < least:
@@ -228,6 +273,9 @@ def _try_pivot(problem, i, step, stars, places, level, turns, room, best):
             continue
         work += most * n // AGREED_PER_WORK
         k, agreed = _most_agreed(n, at_bin, turns)
+        if agreed < least:
+            continue
+        k, agreed = _widest_agreed(n, k, near, turns)
         if agreed < least:
             continue
         j, other, c = turns.row[k], near.other[turns.entry[k]], near.chord[turns.entry[k]]
@@ -253,8 +301,9 @@ def search_crowded(problem, R_best):
     needed = matches_needed(problem)
     if needed > n:
         return top[0], top[1], work
-    order, level = mixed_order(n), np.zeros(problem.pairs.n_stars, np.uint8)
-    stars, places = by_z(problem.stars.u), make_places(problem.centroids.u, problem.image.box)
+    inside = _shares_inside(problem.centroids.u, problem.image.box, problem.pairs.near.reach)
+    order, level = _pivots(inside), np.zeros(problem.pairs.n_stars, np.uint8)
+    stars, places = by_bands(problem.stars.u), make_places(problem.centroids.u, problem.image.box)
     turns = Turns(
         np.empty(MOST_TURNS, np.int64), np.empty(MOST_TURNS, np.int64),
         np.empty(MOST_TURNS, np.int64), np.empty(MOST_TURNS, np.int64),
@@ -263,7 +312,8 @@ def search_crowded(problem, R_best):
     for step in range(len(ROUNDS)):
         # With so many pivots, one is among the matches of any attitude that has enough.
         for p in range(n - needed + 1):
-            work += _try_pivot(problem, order[p], step, stars, places, level, turns, room, best)
+            i = order[p]
+            work += _try_pivot(problem, i, inside[i], step, stars, places, level, turns, room, best)
             if work > problem.limits.budget or is_clear(best, problem.rule):
                 return top[0], top[1], work
     return top[0], top[1], work

@@ -1,7 +1,7 @@
 """Whether the stars of a field are among its centroids: a look-up for each star.
 
 In a crowd, the stars that an attitude puts into the image are far fewer than the centroids. Both
-are kept in order: the centroids by cells of the image, the stars by z.
+are kept by cells: the centroids by those of the image, the stars by those of the sky.
 """
 
 import math
@@ -15,27 +15,26 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
     MAX_BETA,
     pair_attitude,
 )
+from epipole.tasks.algorithms.star_identification.sky.star_bands import cell_at, cells_of_cone
 
 Array = npt.NDArray[np.float64]
-Rows = npt.NDArray[np.int64]
 
-CELLS = 64  # along each side of the image
+CELLS = 32  # along each side of the image
 SHOWN = 0.4  # of the stars in an image, at least, are among the centroids
 GATE = 3.0  # of a star's place, in sigmas
-STARS_PER_WORK, LOOK_UPS = 6, 16  # stars by z in a unit of work, and units for the rest
+LOOK_UPS = 100  # work beside that of one for each star near the boresight
 
 
 class CentroidCells(NamedTuple):
     """Centroids by cells of the image.
 
-    first : (CELLS**2 + 1,) int64
-    x, y : (n,) float, normalised image coordinates, cell by cell
+    first : (CELLS**2 + 1,) int32; the centroids of a cell are the rows first[cell]:first[cell + 1]
+    xy : (n, 2) float, normalised image coordinates
     corner, per_cell : (2,) float, of the image, and cells per unit of x and y
     """
 
-    first: Rows
-    x: Array
-    y: Array
+    first: npt.NDArray[np.int32]
+    xy: Array
     corner: Array
     per_cell: Array
 
@@ -49,12 +48,6 @@ class Pair(NamedTuple):
     noise2: float
     c: float
     density: float
-
-
-@kernel
-def by_z(u):
-    """Return directions (n, 3) in the order of their z (compiled)."""
-    return u[np.argsort(u[:, 2])]
 
 
 @borrowing_kernel
@@ -73,10 +66,8 @@ def make_places(u, box):
         column = _cell(u[k, 0] / u[k, 2], corner[0], per_cell[0])
         cell[k] = CELLS * _cell(u[k, 1] / u[k, 2], corner[1], per_cell[1]) + column
     order = np.argsort(cell)
-    first = np.searchsorted(cell[order], np.arange(CELLS * CELLS + 1))
-    return CentroidCells(
-        first, (u[:, 0] / u[:, 2])[order], (u[:, 1] / u[:, 2])[order], corner, per_cell
-    )
+    first = np.searchsorted(cell[order], np.arange(CELLS * CELLS + 1)).astype(np.int32)
+    return CentroidCells(first, (u[:, :2] / u[:, 2:])[order], corner, per_cell)
 
 
 @borrowing_kernel
@@ -88,7 +79,7 @@ def _is_shown(x, y, radius, places):
     bottom = _cell(y - radius, corner[1], per_cell[1])
     for row in range(bottom, _cell(y + radius, corner[1], per_cell[1]) + 1):
         for k in range(places.first[CELLS * row + left], places.first[CELLS * row + right + 1]):
-            dx, dy = places.x[k] - x, places.y[k] - y
+            dx, dy = places.xy[k, 0] - x, places.xy[k, 1] - y
             if dx * dx + dy * dy < radius * radius:
                 return True
     return False
@@ -100,7 +91,7 @@ def odds_of_field(problem, i, s, j, other, c, stars, places, room):
     stars, c apart, and the work done (compiled). Writes E, F and R of the scratch.
 
     Each star of the field beside the two is shown or not; chance shows the share of the image that
-    is near a centroid. `stars` are those of `by_z`.
+    is near a centroid. `stars` are those of `by_bands`.
     """
     u, sigma, box, R = problem.centroids.u, problem.centroids.sigma, problem.image.box, room.R
     pair_attitude(u[i], u[j], problem.stars.u[s], problem.stars.u[other], c, room)
@@ -109,31 +100,33 @@ def odds_of_field(problem, i, s, j, other, c, stars, places, room):
     noise2 = 0.5 * (sigma[i] * sigma[i] + sigma[j] * sigma[j])
     pair = Pair(x, y, noise2, c, math.pi * GATE * GATE * len(u) / problem.image.area)
     least = 1.0 / math.sqrt(1.0 + max(-box[0], box[1]) ** 2 + max(-box[2], box[3]) ** 2)
-    reach = math.sqrt(1.0 - least * least)
-    first = np.searchsorted(stars[:, 2], R[2, 2] - reach)
-    stop = np.searchsorted(stars[:, 2], R[2, 2] + reach)
     # The pair itself is shown however it is chosen.
     odds = -2.0 * math.log(SHOWN / min(pair.density * 2.0 * noise2, 0.5 * SHOWN))
-    for k in range(first, stop):
-        odds += _odds_of_star(stars[k], R, least, box, pair, places)
-    return odds, LOOK_UPS + (stop - first) // STARS_PER_WORK
+    x, y, z = R[2, 0], R[2, 1], R[2, 2]
+    cells, ratio, looked = cells_of_cone(x, y, z, least), 1.0, 0
+    for band in range(cells.low, cells.high + 1):
+        for sector in range(cells.left, cells.left + cells.n_sectors):
+            cell = cell_at(band, sector)
+            for k in range(stars.first[cell], stars.first[cell + 1]):
+                depth = x * stars.u[k, 0] + y * stars.u[k, 1] + z * stars.u[k, 2]
+                if depth > least:
+                    ratio *= _ratio_of_star(stars.u[k], depth, R, box, pair, places)
+                    looked += 1
+    return odds + math.log(ratio), LOOK_UPS + looked
 
 
 @borrowing_kernel
-def _odds_of_star(star, R, least, box, pair, places):
-    """Return what one star adds to the log odds: nothing outside the image."""
-    z = R[2, 0] * star[0] + R[2, 1] * star[1] + R[2, 2] * star[2]
-    if z < least:
-        return 0.0
+def _ratio_of_star(star, z, R, box, pair, places):
+    """Return the likelihood ratio of one star, z along the boresight: 1 outside the image."""
     x = (R[0, 0] * star[0] + R[0, 1] * star[1] + R[0, 2] * star[2]) / z
     y = (R[1, 0] * star[0] + R[1, 1] * star[1] + R[1, 2] * star[2]) / z
     if not (box[0] < x < box[1] and box[2] < y < box[3]):
-        return 0.0
+        return 1.0
     d2 = (x - pair.x) ** 2 + (y - pair.y) ** 2
     s2 = pair.noise2 * (1.5 + 2.0 * d2 / (pair.c * pair.c)) + MAX_BETA * MAX_BETA * d2
     chance = pair.density * s2
     if chance > 0.5 * SHOWN:  # it tells nothing
-        return 0.0
+        return 1.0
     if _is_shown(x, y, GATE * math.sqrt(s2), places):
-        return math.log(SHOWN / chance)
-    return math.log((1.0 - SHOWN) / (1.0 - chance))
+        return SHOWN / chance
+    return (1.0 - SHOWN) / (1.0 - chance)

@@ -79,15 +79,19 @@ def _level(near, s, sieve):
 
 
 @kernel
-def count_turns(near, start, stop, sieve, least, most_stars, level):
-    """Write how many neighbours agree on a turn, for the stars start .. stop - 1; return the least
-    number, at least `least`, that no more than so many stars have (compiled).
+def count_turns(near, start, stop, sieve, share, least, most_stars, level):
+    """Write how many neighbours agree on a turn, for the stars start .. stop - 1, and 0 where that
+    is less than this share of them; return the least number, at least `least`, that no more than
+    so many stars have (compiled).
 
     More than `LEVELS`: there is none.
     """
     stars = np.zeros(LEVELS + 1, np.int64)
     for s in range(start, stop):
-        level[s] = _level(near, s, sieve)
+        agreed = _level(near, s, sieve)
+        # Where there are many neighbours, as many agree by chance.
+        enough = agreed == LEVELS or agreed >= share * (near.first[s + 1] - near.first[s])
+        level[s] = agreed if enough else 0
         stars[level[s]] += 1
     enough, total = LEVELS + 1, 0
     while enough > least and total + stars[enough - 1] <= most_stars:

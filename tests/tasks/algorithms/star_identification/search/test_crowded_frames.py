@@ -5,7 +5,11 @@ import pytest
 from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
 
 from epipole.tasks.algorithms.star_identification.frames.frame import problem_of
-from epipole.tasks.algorithms.star_identification.search.crowded_frames import search_crowded
+from epipole.tasks.algorithms.star_identification.search.crowded_frames import (
+    _pivots,
+    _shares_inside,
+    search_crowded,
+)
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
     pattern_pairs,
     sky_grid,
@@ -56,6 +60,17 @@ def test_a_crowd_without_stars_has_no_evidence(tables):
     for seed in range(4):
         crowd = frame(CATALOGUE, random_attitude(seed), seed, 0.3, 700, 1.0)[0]
         assert searched(crowd, tables)[1] < HOW.threshold - 10
+
+
+def test_pivots_with_all_their_surroundings_in_the_image_come_first():
+    """Points of the middle, of an edge and of a corner: all, half and a quarter is inside."""
+    xy = np.array([[0.3, 0.3], [0.0, 0.0], [0.3, 0.0], [0.02, 0.01]])
+    u = np.column_stack([xy, np.ones(4)]) / np.sqrt(1 + np.sum(xy**2, axis=1))[:, None]
+    inside = _shares_inside(u, np.array([-0.3, 0.3, -0.3, 0.3]), 0.1)
+    np.testing.assert_allclose(inside, [0.25, 1.0, 0.5, 1.0], atol=0.05)
+    order = _pivots(inside)
+    assert set(order[:2]) == {1, 3}
+    np.testing.assert_array_equal(order[2:], [2, 0])
 
 
 def test_the_same_answer_comes_again_and_ends_at_the_bound(tables):

@@ -7,7 +7,6 @@ from scenes.random_stars import HOW, angle_between, frame, random_attitude, rand
 from epipole.tasks.algorithms.star_identification.frames.frame import problem_of
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import make_scratch
 from epipole.tasks.algorithms.star_identification.search.stars_shown import (
-    by_z,
     make_places,
     odds_of_field,
 )
@@ -16,10 +15,11 @@ from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
     sky_grid,
     sky_to_limit,
 )
+from epipole.tasks.algorithms.star_identification.sky.star_bands import by_bands
 
 CATALOGUE = random_catalogue()
 SKY = sky_to_limit(CATALOGUE, 99.0)
-STARS = by_z(SKY.catalogue.u_icrs)
+STARS = by_bands(SKY.catalogue.u_icrs)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_the_true_stars_of_a_pair_are_told_from_others(tables):
         assert angle_between(attitude, R) < 0.01
         assert work > 0
         right.append(found)
-        a, b = rng.permutation(len(STARS))[:2]
+        a, b = rng.permutation(len(STARS.u))[:2]
         wrong.append(odds(problem, i, j, a, b)[0])
     assert np.median(right) > 20
     assert np.mean(np.array(right) > 5) >= 0.9

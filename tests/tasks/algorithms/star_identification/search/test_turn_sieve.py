@@ -22,12 +22,12 @@ def neighbours(rng, counts):
     )  # fmt: skip
 
 
-def levels(near, chord, angle, least=1, most_stars=10_000):
+def levels(near, chord, angle, least=1, most_stars=10_000, share=0.0):
     """Return the votes of each star, and how many are enough."""
     n, stars = len(chord), len(near.first) - 1
     level = np.zeros(stars, np.uint8)
     sieve = make_sieve(chord, np.full(n, TOLERANCE), angle, np.full(n, WIDE), REACH)
-    enough = count_turns(near, 0, stars, sieve, least, most_stars, level)
+    enough = count_turns(near, 0, stars, sieve, share, least, most_stars, level)
     return level, enough
 
 
@@ -66,3 +66,20 @@ def test_more_votes_are_asked_for_where_too_many_stars_have_enough():
     assert np.sum(level >= enough) <= 40 < np.sum(level >= enough - 1)
     assert levels(near, chord, angle, 5, 400)[1] == 5
     assert levels(near, chord, angle, 2, -1)[1] == LEVELS + 1
+
+
+def test_of_many_neighbours_a_share_has_to_agree():
+    """Three neighbours are shown: enough for a star that has four, and not for one that has 40."""
+    rng = np.random.default_rng(3)
+    few, many = neighbours(rng, [4]), neighbours(rng, [40])
+    for near, expected in ((few, 3), (many, 0)):
+        chord, angle = near.chord[:3].copy(), near.turn[:3].astype(np.int64)
+        assert levels(near, chord, angle, share=0.5)[0][0] == expected
+        assert levels(near, chord, angle)[0][0] >= 3
+
+
+def test_more_votes_than_are_counted_are_enough_for_any_share():
+    near = neighbours(np.random.default_rng(4), [40])
+    shown = LEVELS + 1
+    level, _ = levels(near, near.chord[:shown], near.turn[:shown].astype(np.int64), share=0.5)
+    assert level[0] == LEVELS

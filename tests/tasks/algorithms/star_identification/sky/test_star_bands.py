@@ -1,0 +1,71 @@
+"""All stars in a cone."""
+
+import numpy as np
+import pytest
+
+from epipole.tasks.algorithms.star_identification.sky.star_bands import (
+    BANDS,
+    SECTORS,
+    by_bands,
+    cell_at,
+    cells_of_cone,
+)
+
+POLES = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+SEAM = np.array([[-1.0, 0.0, 0.0], [-1.0, -1e-17, 0.0], [-1.0, 1e-9, 0.0]])
+
+
+def directions(seed, n):
+    u = np.random.default_rng(seed).normal(size=(n, 3))
+    return u / np.linalg.norm(u, axis=1, keepdims=True)
+
+
+def rows_of_cone(stars, centre, angle):
+    """Return the rows of the stars in the cells of a cone."""
+    cone = cells_of_cone(*centre, np.cos(angle))
+    cells = [
+        cell_at(band, sector)
+        for band in range(cone.low, cone.high + 1)
+        for sector in range(cone.left, cone.left + cone.n_sectors)
+    ]
+    assert len(set(cells)) == len(cells)
+    rows = [np.arange(stars.first[cell], stars.first[cell + 1]) for cell in cells]
+    return np.concatenate(rows)
+
+
+@pytest.mark.parametrize("angle", [1e-4, 0.02, 0.2, 1.0, 1.57])
+def test_all_stars_of_a_cone_are_in_its_cells(angle):
+    u = np.concatenate([directions(0, 5000), POLES, SEAM])
+    stars = by_bands(u)
+    near_pole = POLES[0] + 0.01 * directions(2, 20)
+    near_pole /= np.linalg.norm(near_pole, axis=1, keepdims=True)
+    for centre in np.concatenate([directions(1, 60), POLES, SEAM, near_pole, -near_pole]):
+        inside = np.flatnonzero(stars.u @ centre > np.cos(angle))
+        assert np.isin(inside, rows_of_cone(stars, centre, angle)).all()
+
+
+def test_a_narrow_cone_has_few_cells():
+    stars = by_bands(directions(3, 20_000))
+    for centre in directions(4, 100):
+        assert len(rows_of_cone(stars, centre, 0.05)) < 0.05 * len(stars.u)
+
+
+def test_each_star_is_in_one_cell():
+    u = np.concatenate([directions(5, 3000), POLES, SEAM])
+    stars = by_bands(u)
+    assert stars.first[0] == 0
+    assert stars.first[-1] == len(u)
+    assert len(stars.first) == BANDS * SECTORS + 1
+    np.testing.assert_array_equal(np.sort(stars.u, axis=0), np.sort(u, axis=0))
+
+
+def test_cells_have_the_same_area():
+    count = np.diff(by_bands(directions(6, 400_000)).first)
+    expected = 400_000 / (BANDS * SECTORS)
+    assert np.mean((count - expected) ** 2 / expected) == pytest.approx(1.0, abs=0.15)
+
+
+def test_without_stars_all_cells_are_empty():
+    stars = by_bands(np.zeros((0, 3)))
+    assert not stars.first.any()
+    assert len(rows_of_cone(stars, POLES[0], 0.3)) == 0
