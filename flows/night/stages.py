@@ -104,7 +104,7 @@ def _identify(stage: Stage, work: Work, settings: Settings) -> Work:
 
 
 def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
-    """Search for the cameras of sensors that identify nothing; identify these again.
+    """Search for the cameras of sensors whose stars contradict them; identify these again.
 
     Returns
     -------
@@ -119,7 +119,7 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     spans = {
         sensor: of_sensor
         for sensor, of_sensor in work.spans.items()
-        if refuses(work.identified[sensor], of_sensor)
+        if refuses(sensor, work.identified[sensor], of_sensor, work.cameras)
     }
     pairs = work._replace(spans=spans).of_sensors()
     futures = [

@@ -1,10 +1,12 @@
-"""Find a camera: focal length and handedness of a sensor that its calibration does not fit."""
+"""Find a camera: focal length, handedness and distortion of a sensor that its calibration does not
+fit."""
 
 import logging
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -15,6 +17,7 @@ from epipole.schemas.bridge import array, concat, flatten
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
+from epipole.schemas.tables import STARS
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES
 from epipole.tasks.algorithms.constants import DAY_NS, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
@@ -23,10 +26,10 @@ from epipole.tasks.algorithms.star_identification.camera_search import (
     FoundCamera,
     ImageFrame,
     agrees,
-    find_camera,
+    find_cameras,
 )
 from epipole.tasks.algorithms.star_identification.frames.spots import brightest_first
-from epipole.tasks.algorithms.star_identification.sensor import Skies, spread
+from epipole.tasks.algorithms.star_identification.sensor import Skies
 from epipole.tasks.calibrate.calibrate_sensors import with_optics
 from epipole.tasks.common.sightings import camera_of
 from epipole.tasks.common.stage_tasks import stage_task
@@ -38,16 +41,23 @@ from epipole.tasks.identify.place_sensors import place_sensors
 from epipole.tasks.identify.tabulate_identified import barycentric_velocity
 from epipole.tasks.read.order_frames import frames_between
 
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 LOGGER = logging.getLogger(__name__)
 
-# Of a sensor that identifies no more of its frames than this, the camera is searched for.
-REFUSES = 0.05
+# Of a sensor that identifies no more of its frames than FEW, the camera is searched for. Where none
+# is found, that is said of one that identifies no more than HARDLY_ANY.
+FEW, HARDLY_ANY = 0.5, 0.05
+# The stars of a frame, if optics are right, are all over the image: their variance is that of even
+# places. With strong distortion, dense clusters of stars match alone.
+ONE_PLACE = 0.1
 REACH = 1.11  # in a run: focal lengths from 10 % shorter to 11 % longer than told
 TRIED = 3  # frames
+RICH = 0.75  # of the frames have no more centroids than those that are tried
 
 
 class CameraFinding(NamedTuple):
-    """The camera of a sensor that refuses everything.
+    """The camera of a sensor that `refuses` its frames.
 
     `camera` is None where none was found; `told` is that of the log.
     """
@@ -73,11 +83,17 @@ class CameraFinding(NamedTuple):
         if camera is None:
             return (
                 f"{name}: its frames show no stars, with focal lengths 10 % shorter to 11 % longer "
-                "than told and with rows counted upward either"
+                "than told, with distortion and with rows counted upward either"
             )
         parts = []
         if (camera.fy_px < 0) != (self.told.fy_px < 0):
             parts.append("the image is mirrored (y up?)")
+        moved_px = (camera.k1 - self.told.k1) * camera.fx_px * np.tan(camera.half_diagonal_rad) ** 3
+        if abs(moved_px) >= 1.0:
+            parts.append(
+                f"distortion moves its corners by some {abs(moved_px):.0f} px more than told "
+                f"(k1 about {camera.k1:.2g}, not {self.told.k1:.2g})"
+            )
         percent = 100 * (camera.fx_px / self.told.fx_px - 1)
         if abs(percent) >= 0.1:
             size = "longer" if percent > 0 else "shorter"
@@ -88,16 +104,49 @@ class CameraFinding(NamedTuple):
         return f"{name}: {' and '.join(parts) or 'its stars were found in a second search'}"
 
 
-def refuses(identified: Parts, spans: Sequence[Span]) -> bool:
-    """Return whether hardly any frame of a sensor could be identified that has enough centroids."""
+def refuses(sensor: Sensor, identified: Parts, spans: Sequence[Span], cameras: pa.Table) -> bool:
+    """Return whether a sensor's stars contradict its camera.
+
+    Few frames could be identified of those that have enough centroids, or all stars of a frame are
+    at one place of the image.
+    """
     rows = _solutions(identified, spans)
     tried = pc.sum(pc.greater_equal(rows["n_centroids"], FEWEST)).as_py() or 0
     solved = pc.sum(pc.equal(rows["attitude_source"], "stars")).as_py() or 0
-    return tried > 0 and solved <= REFUSES * tried
+    camera = _only_camera(cameras, sensor.sensor_id)
+    if tried > 0 and solved <= FEW * tried:
+        return True
+    return camera is not None and at_one_place(_stars(identified, spans), camera)
+
+
+def at_one_place(stars: pa.Table, camera: Camera) -> bool:
+    """Return whether half of the frames or more have all their stars at one place of the image."""
+    frame = array(stars, "frame_number")
+    starts = np.flatnonzero(np.diff(frame, prepend=frame[:1] - 1))
+    n = np.diff(np.append(starts, len(frame)))
+    if not np.any(n > 1):
+        return False
+    of_frame = np.repeat(np.arange(len(n)), n)
+    variance = np.zeros(len(n))
+    for name, side in (("x_px", camera.width), ("y_px", camera.height)):
+        place = array(stars, name) / side
+        off = place - (np.add.reduceat(place, starts) / n)[of_frame]
+        variance += np.add.reduceat(off**2, starts) / np.maximum(n - 1, 1)
+    return bool(np.median(variance[n > 1]) < ONE_PLACE * 2 / 12)
+
+
+def _stars(identified: Parts, spans: Sequence[Span]) -> pa.Table:
+    """Return the stars of the first span that has some: a part is enough."""
+    columns = ["frame_number", "x_px", "y_px"]
+    for span in spans:
+        stars = identified.read(span, "stars", columns)
+        if stars.num_rows:
+            return stars
+    return STARS.empty_table().select(columns)
 
 
 def _solutions(identified: Parts, spans: Sequence[Span]) -> pa.Table:
-    columns = ["time", "n_centroids", "attitude_source"]
+    columns = ["time", "n_centroids", "n_stars", "attitude_source"]
     return pa.concat_tables([identified.read(span, "solutions", columns) for span in spans])
 
 
@@ -112,18 +161,41 @@ def find_sensor_camera(
 ) -> CameraFinding | None:
     """Return what can be found of the camera of a sensor that `refuses` its frames.
 
-    None for one with several calibrations.
+    None for one with several calibrations or with few centroids, and for one that identifies some
+    of its frames with the camera it has and shows hardly more stars with another one.
     """
     camera = _only_camera(cameras, sensor.sensor_id)
-    if camera is None:
-        return None
     tried = _solutions(identified, spans).filter(pc.field("n_centroids") >= FEWEST)
-    rows = spread(tried.num_rows, TRIED)
-    times = array(tried, "time")[np.roll(rows, -(len(rows) // 2))]  # first from the middle
-    parts = [image_frames(*_placed(frames, sensor, int(t), settings), settings) for t in times]
-    images = [frame for part in parts for frame in part]
-    found = find_agreed_camera(images, camera, REACH, skies_at(int(times[0]), settings), settings)
+    solved = tried.filter(pc.field("attitude_source") == "stars")
+    some = solved.num_rows > HARDLY_ANY * tried.num_rows
+    tried = solved if some else tried  # the others may show the Earth
+    if camera is None or not tried.num_rows:
+        return None
+    tried = tried.take(rich_frames(array(tried, "n_centroids")))
+    images = [
+        image._replace(n_stars=n_stars)
+        for t, n_stars in zip(array(tried, "time"), array(tried, "n_stars"), strict=True)
+        for image in image_frames(*_placed(frames, sensor, int(t), settings), settings)
+    ]
+    skies_of = skies_at(int(array(tried, "time")[0]), settings)
+    found = find_agreed_camera(images, camera, REACH, skies_of, settings)
+    if found is None and some:
+        return None
     return CameraFinding(sensor.sensor_id, camera, found and found.camera)
+
+
+def rich_frames(n_centroids: Array) -> Indices:
+    """Return a row of each of `TRIED` parts of the night, of a frame with many centroids; the
+    middle part comes first.
+
+    Not of the frame with most, which may be clutter. There is at least one frame.
+    """
+    parts = np.array_split(np.arange(len(n_centroids)), min(TRIED, len(n_centroids)))
+    rows = []
+    for part in parts:
+        rank = np.argsort(n_centroids[part], kind="stable")
+        rows.append(part[rank[round(RICH * (len(part) - 1))]])
+    return np.roll(np.array(rows, np.int64), -(len(rows) // 2))
 
 
 def find_agreed_camera(
@@ -133,18 +205,14 @@ def find_agreed_camera(
     skies_of: Callable[[float], Skies],
     settings: Settings,
 ) -> FoundCamera | None:
-    """Return the camera of the first frame that shows stars, if another frame agrees.
-
-    A single frame needs no other.
-    """
+    """Return the camera of the first frame that another one agrees with; a single frame needs no
+    other."""
     how = search_of(settings)
-    found = find_camera(frames, told, reach, skies_of, how)
-    if found is None:
-        return None
-    others = [frame for k, frame in enumerate(frames) if k != found.frame]
-    if others and not any(agrees(frame, found.camera, skies_of, how) for frame in others):
-        return None
-    return found
+    for found in find_cameras(frames, told, reach, skies_of, how):
+        others = [frame for k, frame in enumerate(frames) if k != found.frame]
+        if not others or any(agrees(frame, found.camera, skies_of, how) for frame in others):
+            return found
+    return None
 
 
 def skies_at(time_ns: int, settings: Settings) -> Callable[[float], Skies]:

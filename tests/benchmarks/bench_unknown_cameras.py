@@ -18,7 +18,7 @@ from star_frames import Kind, expose, hipparcos_at_epoch, seen_stars
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
 from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
-from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_camera
+from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_cameras
 from epipole.tasks.algorithms.star_identification.frames.frame import Search
 from epipole.tasks.algorithms.star_identification.sensor import Skies
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -61,7 +61,7 @@ def try_frames(kind: Kind, told: float, flux: bool, n: int, reach: float) -> Tal
             fx_px=kind.camera.fx_px * told, fy_px=kind.camera.fy_px * told
         )
         started = time.process_time()
-        found = find_camera([frame], camera, reach, skies_of, HOW)
+        found = next(find_cameras([frame], camera, reach, skies_of, HOW), None)
         seconds.append(time.process_time() - started)
         if found is not None:
             offs.append(found.camera.fx_px / true.fx_px - 1)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
-from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_camera
+from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_cameras
 from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
 from epipole.tasks.algorithms.star_identification.frames.frame import Search
 from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
@@ -60,8 +60,8 @@ def fitted_focal_px(x_px, y_px, listed):
 
 def camera_of(x_px, y_px, skies_of):
     unknown = np.full(len(x_px), np.nan)
-    return find_camera([ImageFrame(x_px, y_px, unknown, unknown, np.zeros(3))], TOLD, 1.11,
-                       skies_of, HOW).camera  # fmt: skip
+    shown = ImageFrame(x_px, y_px, unknown, unknown, np.zeros(3))
+    return next(find_cameras([shown], TOLD, 1.11, skies_of, HOW)).camera
 
 
 def numbers(x_px, y_px, camera, skies_of):

@@ -203,6 +203,25 @@ def calibrate_in_steps(
     )
 
 
+def fit_radial(camera: Camera, x_px: Array, y_px: Array, u_sensor: Array) -> Camera:
+    """Return the camera with the focal length and k1 that fit the stars of one frame best.
+
+    Parameters
+    ----------
+    camera
+        To start from; the prior of the fit.
+    x_px, y_px : (n,) float
+        Measured image places of at least 4 stars.
+    u_sensor : (n, 3) float
+        Their catalogue directions in the sensor frame; a rotation of all is fitted too.
+    """
+    frame = np.zeros(len(x_px), np.int64)
+    images = _Images(np.stack([x_px, y_px], axis=1), frame[:1], frame, frame)
+    focal = _direction(fx_px=1.0, fy_px=np.sign(camera.fy_px))  # < 0: rows that count upward
+    basis = np.hstack([focal, _direction(k1=1.0)])
+    return _fit(camera, camera, images, u_sensor, basis).camera
+
+
 def _taken(images: StarImages) -> _Images | None:
     """Return the images as the fits take them, None if they are too few."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(images.frame)) + 1])

@@ -1,9 +1,14 @@
-"""Camera search: the focal length of a camera, and which way its rows count, from single frames.
+"""Camera search: the focal length of a camera, which way its rows count, and its distortion, from
+single frames.
 
 For a sensor that identifies nothing with the calibration it came with. Focal lengths are tried in
 steps, those nearest to the told one first, each with rows that count down and up. Every trial is a
 search lost in space, with errors that allow for half a step; the verdict pays for the number of
 trials. The focal length then follows from the separations of the stars found.
+
+With strong distortion, another focal length fits a ring of the image, or a cluster of stars fits
+alone. So where many centroids are left over, k1 is fitted to the stars that were found, then other
+values of k1 are tried, and the camera that shows most stars is taken.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +19,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.boresight import focal_length_from_separations
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored, pixel_angle, unproject
+from epipole.tasks.algorithms.geometry.optics_calibration import fit_radial
 from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
 from epipole.tasks.algorithms.star_identification.frames.frame import (
     FieldOfView,
@@ -36,6 +42,11 @@ BLOCK = 0.2  # trials within this share a sky: its depth and its pairs hardly de
 BRIGHTEST = 40  # centroids of a frame that take part
 FEWEST = 6  # of a frame that is tried, and fewest stars of one that counts
 UNKNOWN_SIGMA_PX = 0.5
+# Tried changes of k1: how much longer or shorter they make the image's diagonal.
+DISTORTIONS = (0.04, -0.04, 0.08, -0.08, 0.12, -0.12)
+MOST_SHOWN = 0.8  # share of the centroids that are stars: no distortion is tried
+MORE_STARS = 1.5  # times as many as with the told camera are shown by a better one
+DISTORTED_REACH = 0.08  # of the logarithm of the focal length, with distortion
 SEARCH_S = 0.1  # of one trial, as in `Search.time_limit_s`
 AROUND = 8  # steps on both sides of a trial that shows stars
 REFINED = 4  # times: better focal lengths let more stars match
@@ -46,6 +57,7 @@ class ImageFrame(NamedTuple):
 
     x_px, y_px, sigma_px, instrumental_mag : (n,) float; the last two are NaN where unknown
     beta : (3,) float, the sensor's barycentric velocity over that of light, ICRS axes
+    n_stars : identified with the told camera
     """
 
     x_px: Array
@@ -53,12 +65,13 @@ class ImageFrame(NamedTuple):
     sigma_px: Array
     instrumental_mag: Array
     beta: Array
+    n_stars: int = 0
 
 
 class FoundCamera(NamedTuple):
     """A camera with which a frame shows stars.
 
-    camera : the told one with another focal length, or mirrored
+    camera : the told one with another focal length or k1, or mirrored
     n_stars : identified in the frame
     frame : which one, a row of those that were given
     """
@@ -76,45 +89,117 @@ class _Sky(NamedTuple):
     pairs: PairTable
 
 
-def find_camera(
+class _Trials(NamedTuple):
+    """What all trials share."""
+
+    skies_of: Callable[[float], Skies]
+    how: Search
+
+
+class _Shown(NamedTuple):
+    """A camera, and the stars that a frame shows with it."""
+
+    camera: Camera
+    solution: Solution
+    sky: _Sky
+
+    @property
+    def n_stars(self) -> int:
+        return int(np.sum(self.solution.star >= 0))
+
+
+def _n_stars(shown: _Shown) -> int:
+    return shown.n_stars
+
+
+def find_cameras(
     frames: Sequence[ImageFrame],
     told: Camera,
     reach: float,
     skies_of: Callable[[float], Skies],
     how: Search,
-) -> FoundCamera | None:
-    """Return the camera with which the first frame of all that can be identified shows stars.
+) -> Iterator[FoundCamera]:
+    """Yield the camera with which each frame shows most stars, for the frames that show some.
+
+    A frame's stars must be more than those that are identified with the told camera.
 
     Parameters
     ----------
     frames
         Tried one after the other.
     told
-        Its focal lengths are scaled together; the rest is taken as it is.
+        Its focal lengths are scaled together, and its k1 is changed; the rest is taken as it is.
     reach : float
         Largest factor, and the inverse of the smallest, by which focal lengths are tried.
     skies_of
         Skies for a pixel of this angle [rad].
     how
-        Its false alarm probability is that of the whole call.
+        Its false alarm probability is that of all frames together.
     """
-    blocks = [list(block) for block in _blocks(np.log(reach))]
-    n_trials = 2 * sum(map(len, blocks)) * max(len(frames), 1)
+    reach = float(np.log(reach))
+    n_trials = 2 * (_n_trials(reach) + len(DISTORTIONS) * _n_trials(min(reach, DISTORTED_REACH)))
     how = how._replace(
-        threshold=how.threshold + np.log(n_trials), time_limit_s=SEARCH_S, crowded=False
+        threshold=how.threshold + np.log(n_trials * max(len(frames), 1)),
+        time_limit_s=SEARCH_S,
+        crowded=False,
     )
     for k, frame in enumerate(frames):
         kept = _brightest(frame)
         if len(kept.x_px) < FEWEST:
             continue
-        for block in blocks:
-            shared = _shared_sky(kept, told, block, skies_of)
-            for ratio in block:
-                for camera in (_scaled(told, ratio), mirrored(_scaled(told, ratio))):
-                    found = _try(kept, camera, shared, how)
-                    if found is not None:
-                        return FoundCamera(*found, k)
+        found = _most_shown(kept, told, reach, _Trials(skies_of, how))
+        if found is not None and found.n_stars >= MORE_STARS * frame.n_stars:
+            yield FoundCamera(found.camera, found.n_stars, k)
+
+
+def _most_shown(frame: ImageFrame, told: Camera, reach: float, trials: _Trials) -> _Shown | None:
+    """Return the camera that shows most stars, the one with fewest changes of these."""
+    found, sides = [], [told, mirrored(told)]
+    plain = _first_shown(frame, sides, reach, trials)
+    if plain is not None:
+        found, sides = [plain, _with_fitted_k1(frame, plain, trials.how)], [plain.camera]
+        if any(shown.n_stars > MOST_SHOWN * len(frame.x_px) for shown in found):
+            return max(found, key=_n_stars)
+    for share in DISTORTIONS:
+        distorted = [_distorted(side, share) for side in sides]
+        shown = _first_shown(frame, distorted, min(reach, DISTORTED_REACH), trials)
+        if shown is not None:
+            found.append(_with_fitted_k1(frame, shown, trials.how))
+    return max(found, key=_n_stars, default=None)
+
+
+def _first_shown(
+    frame: ImageFrame, sides: Sequence[Camera], reach: float, trials: _Trials
+) -> _Shown | None:
+    """Return the camera with the first focal length that shows stars.
+
+    `sides` are cameras whose rows count down or up.
+    """
+    for block in _blocks(reach):
+        ratios = list(block)
+        shared = _shared_sky(frame, sides[0], ratios, trials.skies_of)
+        for ratio in ratios:
+            for side in sides:
+                found = _try(frame, _scaled(side, ratio), shared, trials.how)
+                if found is not None:
+                    return found
     return None
+
+
+def _with_fitted_k1(frame: ImageFrame, shown: _Shown, how: Search) -> _Shown:
+    """Return the camera with k1 and focal length fitted to the stars, if it shows no fewer then."""
+    best = shown
+    for _ in range(REFINED):
+        seen = shown.solution.star >= 0
+        stars = shown.sky.sky.catalogue.u_icrs[shown.solution.star[seen]]
+        u = aberrate_all(stars, frame.beta) @ shown.solution.R_sensor_from_icrs.T
+        camera = fit_radial(shown.camera, frame.x_px[seen], frame.y_px[seen], u)
+        solution = _near(frame, camera, shown.solution, shown.sky, how)
+        if solution is None:
+            break
+        shown = shown._replace(camera=camera, solution=solution)
+        best = max(shown, best, key=_n_stars)
+    return best
 
 
 def agrees(
@@ -126,7 +211,7 @@ def agrees(
     if len(kept.x_px) < FEWEST:
         return None
     found = _try(kept, camera, _shared_sky(kept, camera, [1.0], skies_of), how)
-    return None if found is None else FoundCamera(*found, 0)
+    return None if found is None else FoundCamera(found.camera, found.n_stars, 0)
 
 
 def _blocks(reach: float) -> Iterator[Iterator[float]]:
@@ -138,15 +223,25 @@ def _blocks(reach: float) -> Iterator[Iterator[float]]:
         yield (float(np.exp(s)) for s in logs[np.argsort(np.abs(logs), kind="stable")])
 
 
+def _n_trials(reach: float) -> int:
+    return 2 * round(reach / STEP) + 1
+
+
+def _distorted(camera: Camera, share: float) -> Camera:
+    """Return the camera with another k1: its image's diagonal grows by this share."""
+    return camera._replace(k1=camera.k1 + share / float(np.tan(camera.half_diagonal_rad)) ** 2)
+
+
 def _scaled(camera: Camera, ratio: float) -> Camera:
     return camera._replace(fx_px=camera.fx_px * ratio, fy_px=camera.fy_px * ratio)
 
 
 def _brightest(frame: ImageFrame) -> ImageFrame:
     at = np.flatnonzero(np.isfinite(frame.x_px) & np.isfinite(frame.y_px))[:BRIGHTEST]
-    return ImageFrame(
-        frame.x_px[at], frame.y_px[at], frame.sigma_px[at], frame.instrumental_mag[at], frame.beta
-    )
+    return frame._replace(
+        x_px=frame.x_px[at], y_px=frame.y_px[at], sigma_px=frame.sigma_px[at],
+        instrumental_mag=frame.instrumental_mag[at],
+    )  # fmt: skip
 
 
 def _shared_sky(
@@ -170,8 +265,8 @@ def _sigma_px(frame: ImageFrame, camera: Camera) -> Array:
     return np.hypot(sigma, STEP / np.sqrt(12.0) * r)
 
 
-def _try(frame: ImageFrame, camera: Camera, shared: _Sky, how: Search) -> tuple[Camera, int] | None:
-    """Return the camera with a better focal length, and how many stars the frame shows."""
+def _try(frame: ImageFrame, camera: Camera, shared: _Sky, how: Search) -> _Shown | None:
+    """Return the camera with a better focal length, and the stars that the frame shows."""
     solution = identify_lost(_seen_by(frame, camera), *shared, how)[0]
     if solution is None:
         return None
@@ -189,7 +284,7 @@ def _try(frame: ImageFrame, camera: Camera, shared: _Sky, how: Search) -> tuple[
         solution = _near(frame, camera, solution, shared, how)
         if solution is not None and np.array_equal(solution.star, before):
             break
-    return None if solution is None else (camera, int(np.sum(solution.star >= 0)))
+    return None if solution is None else _Shown(camera, solution, shared)
 
 
 def _near(

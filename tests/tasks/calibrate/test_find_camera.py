@@ -1,12 +1,14 @@
-"""Find cameras: what is said of them, and the rows that hold from then on."""
+"""Find cameras: for which sensors, what is said of them, and the rows that hold from then on."""
 
+import numpy as np
 import pyarrow as pa
+import pytest
 from scenes.cameras import cameras_of
 
 from epipole.schemas.bridge import array
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
-from epipole.tasks.calibrate.find_camera import CameraFinding
+from epipole.tasks.calibrate.find_camera import CameraFinding, at_one_place, rich_frames
 
 TOLD = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)
 TIME = 1_554_091_200_630_490_482  # not a whole number of microseconds
@@ -21,6 +23,41 @@ def test_a_finding_says_what_is_different():
     assert "show no stars" in str(CameraFinding("a", TOLD, None))
 
 
+def test_a_finding_says_how_far_distortion_moves_the_corners():
+    found = TOLD._replace(k1=-1.0)
+    said = str(CameraFinding("a", TOLD, found))
+    moved = 3660 * (np.hypot(512, 512) / 3660) ** 3
+    assert said == (
+        f"a: distortion moves its corners by some {moved:.0f} px more than told "
+        "(k1 about -1, not 0)"
+    )
+
+
+def stars(x_px, y_px, frame):
+    columns = {"frame_number": np.asarray(frame, np.int64), "x_px": x_px, "y_px": y_px}
+    return pa.table(columns)
+
+
+@pytest.mark.parametrize(("size_px", "is_one"), [(1023.0, False), (600.0, False), (150.0, True)])
+def test_stars_all_over_the_image_are_told_from_clusters(size_px, is_one):
+    """Clusters of six stars that move through the image."""
+    rng = np.random.default_rng(0)
+    frame = np.repeat(np.arange(30), 6)
+    corner = rng.uniform(0, 1023 - size_px, (30, 2))[frame]
+    x, y = (corner + rng.uniform(0, size_px, (180, 2))).T
+    assert at_one_place(stars(x, y, frame), TOLD) == is_one
+
+
+def test_few_frames_with_a_cluster_say_nothing():
+    rng = np.random.default_rng(1)
+    frame = np.repeat(np.arange(10), 5)
+    x, y = rng.uniform(0, 1023, (2, 50))
+    x[:15], y[:15] = 500 + 0.05 * x[:15], 500 + 0.05 * y[:15]
+    assert not at_one_place(stars(x, y, frame), TOLD)
+    assert not at_one_place(stars(*np.empty((2, 0)), []), TOLD)
+    assert not at_one_place(stars(np.array([3.0]), np.array([4.0]), [7]), TOLD)
+
+
 def test_the_rows_of_the_sensor_get_its_camera_and_keep_their_time():
     told = cameras_of({"a": TOLD, "b": TOLD})
     told = told.set_column(
@@ -32,3 +69,14 @@ def test_the_rows_of_the_sensor_get_its_camera_and_keep_their_time():
     assert found["sensor_id"].to_pylist() == ["b"]
     assert array(found, "fy_px").tolist() == [-TOLD.fy_px]
     assert array(found, "time").tolist() == [TIME]
+
+
+def test_frames_with_many_centroids_of_all_parts_of_the_night_are_tried():
+    n_centroids = np.tile(np.arange(100), 3)
+    assert (rich_frames(n_centroids) % 100 == 74).all()
+    assert (rich_frames(n_centroids) // 100).tolist() == [1, 2, 0]  # the middle comes first
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_each_of_few_frames_is_tried(n):
+    assert sorted(rich_frames(np.full(n, 7))) == list(range(n))
