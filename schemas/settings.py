@@ -61,6 +61,15 @@ class SensorSettings(Group):
         description="1-sigma of a centroid that has no sigma in the log. "
         "Default: estimated from the stars.",
     )
+    principal_point_sigma_px: float | None = Field(
+        None,
+        ge=0,
+        le=1000,
+        description="1-sigma of the principal point of a calibration, per axis: part of the sigma "
+        "of each attitude, as an error that all frames of a sensor share. Default: 0 where the "
+        "stars do not contradict the calibration, half a percent of the image's size where they "
+        "do.",
+    )
     state_gap_s: float = Field(
         30.0,
         gt=0,

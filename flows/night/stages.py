@@ -159,6 +159,7 @@ def calibrate(work: Work, told: pa.Table, settings: Settings) -> tuple[Work, pa.
         futures = [
             calibrate_sensor.submit(
                 sensor, work.identified[sensor], spans, work.cameras, told,
+                settings.sensors.principal_point_sigma_px,
                 wait_for=work.trail.after(*own),
             )
             for (sensor, spans), own in zip(work.spans.items(), work.of_sensors(), strict=True)

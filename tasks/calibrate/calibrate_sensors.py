@@ -24,6 +24,7 @@ from epipole.tasks.algorithms.geometry.camera import (
 from epipole.tasks.algorithms.geometry.optics_calibration import (
     OpticsFit,
     StarImages,
+    ToldOptics,
     calibrate_in_steps,
     calibrate_optics,
 )
@@ -60,6 +61,7 @@ def calibrate_sensor(
     spans: Sequence[Span],
     cameras: pa.Table,
     told: pa.Table,
+    principal_point_px: float | None,
 ) -> Calibrated:
     """Fit one sensor's optics to its stars of all spans.
 
@@ -67,11 +69,12 @@ def calibrate_sensor(
     ----------
     identified
         The parts of the sensor, with the stars.
-    cameras, told
-        CAMERAS that the stars were identified with, and those of the log.
+    cameras, told, principal_point_px
+        As in `calibrate_sensors`.
     """
     own = pc.field("sensor_id") == sensor.sensor_id
-    return calibrate_sensors(_spread(identified, spans), cameras.filter(own), told.filter(own))
+    stars = _spread(identified, spans)
+    return calibrate_sensors(stars, cameras.filter(own), told.filter(own), principal_point_px)
 
 
 def _spread(identified: Parts, spans: Sequence[Span]) -> pa.Table:
@@ -92,16 +95,28 @@ def _every(stars: pa.Table, step: int) -> pa.Table:
     return stars.take(np.flatnonzero(number % step == 0))
 
 
-def calibrate_sensors(stars: pa.Table, cameras: pa.Table, told: pa.Table) -> Calibrated:
-    """Return the optics that fit the stars; `stars` of a sensor are in order of time.
+def calibrate_sensors(
+    stars: pa.Table, cameras: pa.Table, told: pa.Table, principal_point_px: float | None = None
+) -> Calibrated:
+    """Return the optics that fit the stars.
 
-    `cameras` are those that the stars were identified with, `told` those of the log.
+    Parameters
+    ----------
+    stars
+        STARS; those of a sensor are in order of time.
+    cameras, told
+        CAMERAS that the stars were identified with, and those of the log.
+    principal_point_px
+        1-sigma error of the principal points of the log, per axis; None: unknown, and 0 where the
+        stars do not contradict the log.
     """
     rows, changed = [], {}
-    given = _single(told)
-    for name, present in _single(cameras).items():
-        images = _images(stars.filter(pc.field("sensor_id") == name), present.camera)
-        fitted = _fit(given.get(name, present).camera, present, images)
+    logged = _single(told)
+    for name, optics in _single(cameras).items():
+        images = _images(stars.filter(pc.field("sensor_id") == name), optics.camera)
+        own = logged.get(name, optics)
+        present = _Present(optics.camera, optics.cov != own.cov)
+        fitted = _fit(ToldOptics(own.camera, principal_point_px), present, images)
         if fitted is None:
             continue
         fit, departs = fitted
@@ -124,7 +139,12 @@ def with_optics(cameras: pa.Table, changed: Mapping[str, dict[str, Any]]) -> pa.
 
 class _Optics(NamedTuple):
     camera: Camera
-    is_fitted: bool  # as the covariance says
+    cov: bytes
+
+
+class _Present(NamedTuple):
+    camera: Camera
+    is_fitted: bool  # as the covariance says, which is not that of the log
 
 
 def _single(cameras: pa.Table) -> dict[str, _Optics]:
@@ -134,7 +154,7 @@ def _single(cameras: pa.Table) -> dict[str, _Optics]:
     """
     found: dict[str, set[_Optics]] = {}
     for k, name in enumerate(cameras["sensor_id"].to_pylist()):
-        optics = _Optics(camera_of(cameras, k), bool(optics_covariance_of(cameras, k).any()))
+        optics = _Optics(camera_of(cameras, k), optics_covariance_of(cameras, k).tobytes())
         found.setdefault(name, set()).add(optics)
     return {name: optics.pop() for name, optics in found.items() if len(optics) == 1}
 
@@ -151,28 +171,31 @@ def _images(stars: pa.Table, camera: Camera) -> StarImages:
     return StarImages(x, y, u_sensor, number[kept], array(stars, "star_id")[kept])
 
 
-def _fit(given: Camera, present: _Optics, images: StarImages) -> tuple[OpticsFit, bool] | None:
+def _fit(given: ToldOptics, present: _Present, images: StarImages) -> tuple[OpticsFit, bool] | None:
     """Return the optics, and whether frames must be identified again with them.
 
-    Optics that the log tells wrong are fitted in steps; then what they leave uncertain must reach
-    the frames once, however near the present optics are.
+    Optics that the log tells wrong, or whose principal point is said to be uncertain, are fitted in
+    steps; then what they leave uncertain must reach the frames once, however near the present
+    optics are.
     """
     if present.camera.fy_px < 0:
         return _fit_upward(given, present, images)
     free = calibrate_optics(given, images, present.camera)
     if free is None:
         return None
-    if present.camera == given and not present.is_fitted and free.gain <= REAL_GAIN:
+    as_told = present.camera == given.camera and not present.is_fitted
+    if as_told and free.gain <= REAL_GAIN and not given.principal_point_px:
         return free, False
     fit = calibrate_in_steps(given, images, free, present.camera)
     return fit, not present.is_fitted or fit.gain > REAL_GAIN
 
 
 def _fit_upward(
-    given: Camera, present: _Optics, images: StarImages
+    given: ToldOptics, present: _Present, images: StarImages
 ) -> tuple[OpticsFit, bool] | None:
     """Return what `_fit` does for rows that count upward: fitted as rows that count down."""
-    given, _ = counted_the_other_way(given, images.y_px)
+    told, _ = counted_the_other_way(given.camera, images.y_px)
+    given = given._replace(camera=told)
     camera, y_px = counted_the_other_way(present.camera, images.y_px)
     fitted = _fit(given, present._replace(camera=camera), images._replace(y_px=y_px))
     if fitted is None:

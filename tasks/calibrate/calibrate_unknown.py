@@ -154,7 +154,9 @@ def _fitted(
     cameras, told = _as_table(report, report.camera), _as_table(report, _given(report))
     for _ in range(ROUNDS):
         identified = identify_stars(exposures, places, cameras, catalogue, settings)
-        fit: Calibrated = calibrate_sensors(identified.stars, cameras, told)
+        fit: Calibrated = calibrate_sensors(
+            identified.stars, cameras, told, settings.sensors.principal_point_sigma_px
+        )
         cameras = fit.cameras
         if not fit.departed:
             break

@@ -18,7 +18,8 @@ from epipole.io.logs.own_time import frames_left_out, stray_rejects
 from epipole.io.work.part_tables import READ_SENSOR
 from epipole.io.work.parts import read_part, write_part
 from epipole.io.work.places import ReadFolder
-from epipole.schemas.bridge import array, concat, conform
+from epipole.schemas.bridge import array, concat, conform, table, unstack_covariance
+from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.logs.log_tables import LOG_STATES, LogSource
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
@@ -83,7 +84,10 @@ def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) 
         rejects.append(repeats)
         write_part(folder.sensor(number), READ_SENSOR, {"index": index, "states": states})
         time_ns.append(array(index, "time"))
-    cameras = _sorted_cameras(_piece_tables(pieces, "cameras", CAMERAS))
+    cameras = with_uncertain_places(
+        _sorted_cameras(_piece_tables(pieces, "cameras", CAMERAS)),
+        settings.sensors.principal_point_sigma_px or 0.0,
+    )
     left_out = concat(REJECTS, rejects)
     sources = _dated([log.source for log in logs], array(keys, "time"))
     return OrderedFrames(folder, sensors, time_ns, cameras, sources, left_out)
@@ -207,3 +211,11 @@ def _sorted_cameras(cameras: pa.Table) -> pa.Table:
     """Return the calibrations sorted by sensor and time; equal rows count once."""
     unique = cameras.group_by(CAMERAS.names, use_threads=False).aggregate([])
     return conform(CAMERAS, unique.sort_by([(name, "ascending") for name in CAMERAS.names]))
+
+
+def with_uncertain_places(cameras: pa.Table, sigma_px: float) -> pa.Table:
+    """Return CAMERAS with principal points that have this 1-sigma error per axis."""
+    place = np.isin(OPTICS_AXES, ["cx", "cy"])
+    cov = np.broadcast_to(np.diag(place * sigma_px**2), (cameras.num_rows, len(place), len(place)))
+    columns = unstack_covariance("cov_{}", cov, OPTICS_AXES)
+    return table(CAMERAS, {name: cameras[name] for name in CAMERAS.names} | columns)

@@ -1,7 +1,7 @@
 """Untold optics: errors of attitudes and positions over their sigmas where the log is wrong.
 
     python tests/benchmarks/bench_untold_optics.py [--sensors N] [--frames N] [--fields DEG ...]
-        [--untold KIND ...] [--place drawn|told] [--seed S] [--objects] [--tiny]
+        [--untold KIND ...] [--place drawn|told] [--sigma PX] [--seed S] [--objects] [--tiny]
 
 Sensors that turn over the sky, none with a prior attitude; each has its own true optics, and the
 log tells a pinhole of the nominal field. Each kind of departure has N sensors in each field, with a
@@ -109,12 +109,19 @@ def inline(values: dict[str, float]) -> str:
     return "{ " + ", ".join(f"{name} = {value:.8f}" for name, value in values.items()) + " }"
 
 
-def run(scene: str, folder: Path) -> tuple[Path, Path]:
-    """Simulate a scene and run its log; return the dataset and the log."""
+def run(scene: str, folder: Path, sigma_px: float | None) -> tuple[Path, Path]:
+    """Simulate a scene and run its log; return the dataset and the log.
+
+    `sigma_px` is the setting `sensors.principal_point_sigma_px`.
+    """
     path, log, out = folder / "scene.toml", folder / "night.mcap", folder / "out"
     path.write_text(scene)
     simulate(str(path), log)
-    subprocess.run([*COMMAND, "run", str(log), "--out", str(out), "--quiet"], check=True)
+    settings = folder / "settings.toml"
+    told = "" if sigma_px is None else f"[sensors]\nprincipal_point_sigma_px = {sigma_px}\n"
+    settings.write_text(told)
+    command = [*COMMAND, "run", str(log), "--out", str(out), "--settings", str(settings), "--quiet"]
+    subprocess.run(command, check=True)
     return out, log
 
 
@@ -150,8 +157,8 @@ def attitude_errors(out: Path, log: Path) -> pl.DataFrame:
     )
 
 
-def table_of(field: float, draw: str, out: Path, log: Path) -> list[str]:
-    """Return a line per kind of departure."""
+def table_of(field: float, draw: str, out: Path, log: Path, split: bool) -> list[str]:
+    """Return a line per kind of departure; with `split`, fitted sensors have one of their own."""
     errors = attitude_errors(out, log)
     square = {a: (pl.col(f"off_{a}") / pl.col(f"sigma_{a}_arcsec")) ** 2 for a in "xyz"}
     by_sensor = errors.group_by("kind", "sensor_id").agg(
@@ -170,7 +177,9 @@ def table_of(field: float, draw: str, out: Path, log: Path) -> list[str]:
         fitted = own.filter(
             pl.col("sigma") > fitted_arcsec, pl.col("sensor_id").is_in(enough.implode())
         )
-        for which, some in (("fitted", fitted), ("as told", own.join(fitted, "sensor_id", "anti"))):
+        as_told = own.join(fitted, "sensor_id", "anti")
+        parts = {"fitted": fitted, "as told": as_told} if split else {"all": own}
+        for which, some in parts.items():
             if len(some):
                 share = some["n"].sum() / (frames * len(some))
                 lines.append(
@@ -181,16 +190,16 @@ def table_of(field: float, draw: str, out: Path, log: Path) -> list[str]:
     return lines
 
 
-def objects(field: float, kind: str, seed: int, seconds: int) -> str:
+def objects(field: float, kind: str, seed: int, asked: argparse.Namespace) -> str:
     """Return a line: what six sensors with untold optics find, against the truth."""
     rng = np.random.default_rng(seed)
     limit = LIMITS[field]
-    text = RING.format(seconds=seconds, seed=seed, limit=limit)
+    text = RING.format(seconds=asked.frames, seed=seed, limit=limit)
     for k in range(6):
         departure = inline(departure_of(kind, True, rng))
         text += VIEWER.format(k=k, field=field, departure=departure)
     with tempfile.TemporaryDirectory() as folder:
-        out, log = run(text, Path(folder))
+        out, log = run(text, Path(folder), asked.sigma)
         evaluate = [*COMMAND, "evaluate", str(out), "--truth", f"{log}.truth", "--json"]
         made = subprocess.run(evaluate, check=True, capture_output=True, text=True)
         found = json.loads(made.stdout)
@@ -208,6 +217,7 @@ def main() -> None:
     parser.add_argument("--fields", type=float, nargs="+", default=list(LIMITS))
     parser.add_argument("--untold", nargs="+", default=list(KINDS), metavar="KIND")
     parser.add_argument("--place", choices=("told", "drawn"), help="principal point; else both")
+    parser.add_argument("--sigma", type=float, help="of principal points, told to the run [px]")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--objects", action="store_true")
     parser.add_argument("--tiny", action="store_true", help="one field, two sensors per kind")
@@ -220,15 +230,16 @@ def main() -> None:
         for field in asked.fields:
             for kind in ("none", "k1 0.3", "k1 1", "f 1 %"):
                 for seed in range(1, 2 if asked.tiny else 4):
-                    print(objects(field, kind, seed, asked.frames), flush=True)
+                    print(objects(field, kind, seed, asked), flush=True)
         return
     print("| field deg | untold | principal point | optics | sensors | frames | error \" "
           "| sigma \" | across | about |\n|---|---|---|---|---|---|---|---|---|---|")  # fmt: skip
     for field in asked.fields:
         for place in (asked.place,) if asked.place else ("told", "drawn"):
             with tempfile.TemporaryDirectory() as folder:
-                out, log = run(sky(field, place == "drawn", asked), Path(folder))
-                lines = table_of(field, place, out, log)
+                scene = sky(field, place == "drawn", asked)
+                out, log = run(scene, Path(folder), asked.sigma)
+                lines = table_of(field, place, out, log, asked.sigma is None)
             print("\n".join(lines), flush=True)
 
 

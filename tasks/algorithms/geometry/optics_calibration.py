@@ -26,6 +26,7 @@ FOCAL_SHARE = 0.02
 CORNER_PX = 20.0
 # A detector of 6 mm that is set behind its lens with usual tolerances, about 30 micrometres.
 PRINCIPAL_POINT_SHARE = 0.005  # of the image's size
+LEAST_PLACE_PX = 1e-3  # of a principal point that is known
 ITERATIONS = 15
 HUBER = 2.0  # [sigma] larger residuals have less weight
 LEAST_FRAMES, LEAST_STARS = 3, 60
@@ -51,6 +52,28 @@ STEPS = (
 NOTHING = np.zeros((9, 0))
 TANGENTIAL = np.hstack([_direction(p1=1.0), _direction(p2=1.0)])
 PRINCIPAL_POINT = np.hstack([_direction(cx_px=1.0), _direction(cy_px=1.0)])
+
+
+class ToldOptics(NamedTuple):
+    """The calibration of a log: the prior of the fits.
+
+    principal_point_px : its 1-sigma error per axis; None: as of an assembled camera
+    """
+
+    camera: Camera
+    principal_point_px: float | None = None
+
+    @property
+    def sigma(self) -> Array:
+        """1-sigma prior of each number of OPTICS."""
+        camera = self.camera
+        f, r = np.sqrt(camera.fx_px * abs(camera.fy_px)), np.tan(camera.half_diagonal_rad)
+        at_corner = CORNER_PX / f / np.array([r**3, r**5, r**2, r**2, r**7])
+        place_px = self.principal_point_px
+        if place_px is None:
+            place_px = PRINCIPAL_POINT_SHARE * max(camera.width, camera.height)
+        place_px = max(place_px, LEAST_PLACE_PX)
+        return np.array([FOCAL_SHARE * f] * 2 + [place_px] * 2 + at_corner.tolist())
 
 
 class StarImages(NamedTuple):
@@ -119,7 +142,7 @@ class _Choice(NamedTuple):
 
 
 def calibrate_optics(
-    given: Camera, images: StarImages, present: Camera | None = None
+    given: ToldOptics, images: StarImages, present: Camera | None = None
 ) -> OpticsFit | None:
     """Return the optics that fit identified stars best, None with too few stars.
 
@@ -139,10 +162,10 @@ def calibrate_optics(
     taken = _taken(images)
     if taken is None:
         return None
-    present = present or given
+    present = present or given.camera
     fixed = _fit(given, present, taken, images.u_sensor, NOTHING)
     free = _fit(given, present, taken, fixed.u, np.eye(9))
-    shared, scale = _with_shared_errors(free, taken.of_star), _prior_sigma(given)
+    shared, scale = _with_shared_errors(free, taken.of_star), given.sigma
     cov = shared * np.outer(scale, scale)
     gain = _gain(fixed, free, cov, free.sigma_px)
     times = float(np.trace(np.linalg.solve(free.cov, shared))) / 9
@@ -151,7 +174,7 @@ def calibrate_optics(
 
 
 def calibrate_in_steps(
-    given: Camera, images: StarImages, free: OpticsFit, present: Camera | None = None
+    given: ToldOptics, images: StarImages, free: OpticsFit, present: Camera | None = None
 ) -> OpticsFit:
     """Return optics that differ from the given ones only in what the stars demand.
 
@@ -161,7 +184,7 @@ def calibrate_in_steps(
     Parameters
     ----------
     given
-        The calibration of the log. It is shown to be wrong, so its principal point is as uncertain
+        The calibration of the log. If it is shown to be wrong, its principal point is as uncertain
         as the prior says, unless the stars say more.
     free
         The fit of all numbers to the same images, from `calibrate_optics`.
@@ -184,12 +207,12 @@ def calibrate_in_steps(
     if taken is None:
         return free
     sigma, price = free.residual_px, np.log(max(free.n_independent, 1.0))
-    fixed = start = _fit(given, present or given, taken, images.u_sensor, NOTHING, sigma)
-    if present not in (None, given):
-        start = _fit(given, given, taken, fixed.u, NOTHING, sigma)
+    fixed = start = _fit(given, present or given.camera, taken, images.u_sensor, NOTHING, sigma)
+    if present not in (None, given.camera):
+        start = _fit(given, given.camera, taken, fixed.u, NOTHING, sigma)
     radial = _extended(given, taken, _Choice(start, NOTHING), STEPS, price)
     best = _extended(given, taken, radial, [TANGENTIAL], price)
-    if _told_apart(free.cov, _prior_sigma(given)):
+    if _told_apart(free.cov, given.sigma):
         # Tangential terms may only stand for the principal point, so it is also tried before them.
         before = _extended(given, taken, radial, [PRINCIPAL_POINT, TANGENTIAL], price)
         after = _extended(given, taken, best, [PRINCIPAL_POINT], price)
@@ -219,7 +242,7 @@ def fit_radial(camera: Camera, x_px: Array, y_px: Array, u_sensor: Array) -> Cam
     images = _Images(np.stack([x_px, y_px], axis=1), frame[:1], frame, frame)
     focal = _direction(fx_px=1.0, fy_px=np.sign(camera.fy_px))  # < 0: rows that count upward
     basis = np.hstack([focal, _direction(k1=1.0)])
-    return _fit(camera, camera, images, u_sensor, basis).camera
+    return _fit(ToldOptics(camera), camera, images, u_sensor, basis).camera
 
 
 def _taken(images: StarImages) -> _Images | None:
@@ -248,7 +271,7 @@ def _gain(fixed: _Fit, fit: _Fit, cov: Array, sigma_px: float) -> float:
 
 
 def _extended(
-    given: Camera, images: _Images, choice: _Choice, steps: Sequence[Array], price: float
+    given: ToldOptics, images: _Images, choice: _Choice, steps: Sequence[Array], price: float
 ) -> _Choice:
     """Return the choice with those of the steps that the stars demand, each after the other."""
     for step in steps:
@@ -262,13 +285,13 @@ def _extended(
     return choice
 
 
-def _criterion(given: Camera, choice: _Choice, price: float) -> float:
+def _criterion(given: ToldOptics, choice: _Choice, price: float) -> float:
     return _cost(given, choice.fit) + price * choice.basis.shape[1]
 
 
-def _cost(given: Camera, fit: _Fit) -> float:
+def _cost(given: ToldOptics, fit: _Fit) -> float:
     """Return chi-square, with the prior's part."""
-    prior = (_values(fit.camera) - _values(given)) / _prior_sigma(given)
+    prior = (_values(fit.camera) - _values(given.camera)) / given.sigma
     return _huber_cost(fit.residual / fit.sigma_px) + float(prior @ prior)
 
 
@@ -286,7 +309,12 @@ def _with_shared_errors(fit: _Fit, of_star: Indices) -> Array:
 
 
 def _fit(
-    given: Camera, camera: Camera, images: _Images, u: Array, basis: Array, sigma_px: float = 0.0
+    given: ToldOptics,
+    camera: Camera,
+    images: _Images,
+    u: Array,
+    basis: Array,
+    sigma_px: float = 0.0,
 ) -> _Fit:
     """Return the best rotations of the frames, and the best optics in the space of `basis`.
 
@@ -297,7 +325,7 @@ def _fit(
     sigma_px
         Error of the images, per axis, if it is known; 0: that of the residuals.
     """
-    scale, told, k = _prior_sigma(given), _values(given), basis.shape[1]
+    scale, told, k = given.sigma, _values(given.camera), basis.shape[1]
     used = _degrees_of_freedom(images, basis)
     for _ in range(ITERATIONS):
         r, J_turn, J_optics = _linearise(camera, images.xy, u)
@@ -338,14 +366,6 @@ def _values(camera: Camera) -> Array:
 def _moved(camera: Camera, step: Array) -> Camera:
     values = (_values(camera) + step).tolist()
     return camera._replace(**dict(zip(OPTICS, values, strict=True)))
-
-
-def _prior_sigma(camera: Camera) -> Array:
-    """Return the 1-sigma prior of each number of OPTICS."""
-    f, r = np.sqrt(camera.fx_px * abs(camera.fy_px)), np.tan(camera.half_diagonal_rad)
-    at_corner = CORNER_PX / f / np.array([r**3, r**5, r**2, r**2, r**7])
-    place_px = PRINCIPAL_POINT_SHARE * max(camera.width, camera.height)
-    return np.array([FOCAL_SHARE * f] * 2 + [place_px] * 2 + at_corner.tolist())
 
 
 def _degrees_of_freedom(images: _Images, basis: Array) -> int:

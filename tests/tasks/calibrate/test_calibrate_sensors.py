@@ -11,6 +11,7 @@ from epipole.schemas.tables import STARS
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, project
 from epipole.tasks.calibrate.calibrate_sensors import calibrate_sensors
+from epipole.tasks.read.order_frames import with_uncertain_places
 
 SENT = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)
 TRUE = SENT._replace(fx_px=3671.0, fy_px=3671.0, k1=-0.08)
@@ -81,6 +82,32 @@ def test_other_optics_than_the_log_tells_get_a_covariance_once():
     found = calibrate_sensors(stars_of("a", TRUE, used=TRUE), present, cameras("a"))
     assert found.departed == ["a"]
     assert stack_covariance(found.cameras, "cov_{}", OPTICS_AXES)[0, 2, 2] > 1.0
+
+
+def place_sigma(found):
+    """Return the 1-sigma error of the principal point along the columns, of each sensor [px]."""
+    return np.sqrt(stack_covariance(found.cameras, "cov_{}", OPTICS_AXES)[:, 2, 2])
+
+
+@pytest.mark.parametrize("sigma_px", [1.0, 3.0])
+def test_a_principal_point_is_as_uncertain_as_the_settings_say(sigma_px):
+    """Where the stars do not contradict the log, too. In 16 degrees they hardly say more."""
+    stars = concat(STARS, [stars_of("a", TRUE), stars_of("b", SENT)])
+    told = with_uncertain_places(cameras("a", "b"), sigma_px)
+    found = calibrate_sensors(stars, told, told, sigma_px)
+    assert found.departed == ["a", "b"]
+    np.testing.assert_array_less(0.5 * sigma_px, place_sigma(found))
+    np.testing.assert_array_less(place_sigma(found), 1.1 * sigma_px)
+    again = calibrate_sensors(stars_of("b", SENT), found.cameras, told, sigma_px)
+    assert again.departed == []
+
+
+def test_a_principal_point_that_is_known_stays_and_has_no_error():
+    told = with_uncertain_places(cameras("a"), 0.0)
+    found = calibrate_sensors(stars_of("a", TRUE), told, told, 0.0)
+    assert found.departed == ["a"]
+    assert array(found.cameras, "cx_px")[0] == SENT.cx_px
+    assert place_sigma(found)[0] < 0.01
 
 
 def test_few_stars_give_no_row_and_an_unchanged_camera():
