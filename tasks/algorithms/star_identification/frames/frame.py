@@ -18,7 +18,6 @@ from epipole.tasks.algorithms.star_identification.search.field import (
     Attitude,
     Centroids,
     Matches,
-    StarPlaces,
     solve_predicted,
     stars_about,
 )
@@ -170,8 +169,7 @@ def identify_predicted(
         return None
     stars = sky.catalogue
     reach = frame.optics.half_diagonal_rad + 4.0 * math.sqrt(max(P0[0, 0], P0[1, 1])) + 1e-4
-    places = StarPlaces(stars.u_icrs, stars.magnitude)
-    seen, row = stars_about(places, R0, min(reach, 1.5), frame.beta)
+    seen, row = stars_about(sky.bands, stars.magnitude, R0, min(reach, 1.5), frame.beta)
     if len(row) < 3:
         return None
     R, P = np.empty((3, 3)), np.empty((3, 3))
@@ -256,7 +254,7 @@ def problem_of(
         limits = SearchLimits(min_chord, N_PATTERN, N_TRIED, STAR_SHARE, budget)
     return Problem(
         Centroids(*frame[:4]),
-        Stars(sky.catalogue.u_icrs, sky.catalogue.magnitude, grid),
+        Stars(sky.catalogue.u_icrs, sky.catalogue.magnitude, grid, sky.bands),
         pairs,
         Image(frame.optics.box, area, sky.rho * area),
         rule_of(how, sky)._replace(least=least, enough=least + CLEAR_LEAD + 2.0),
@@ -282,8 +280,8 @@ def _search_and_solve(problem, reach, R_found, solution, matches):
     centroids = problem.centroids
     sigma = 2.0 * np.sort(centroids.sigma)[len(centroids.sigma) // 2]
     near = Attitude(R_found, np.eye(3) * (sigma * sigma))
-    places = StarPlaces(problem.stars.u, problem.stars.magnitude)
-    seen, row = stars_about(places, R_found, min(reach + 4.0 * sigma, 1.5), centroids.beta)
+    stars, wide = problem.stars, min(reach + 4.0 * sigma, 1.5)
+    seen, row = stars_about(stars.bands, stars.magnitude, R_found, wide, centroids.beta)
     if len(row) < 3:
         return best, runner_up, work, -1e9
     evidence = solve_predicted(

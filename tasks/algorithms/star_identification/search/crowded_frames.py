@@ -55,7 +55,6 @@ from epipole.tasks.algorithms.star_identification.search.turn_sieve import (
     make_sieve,
 )
 from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
-from epipole.tasks.algorithms.star_identification.sky.star_bands import by_bands
 
 # Rounds: least votes that agree, and most stars of a pivot whose votes are counted closely.
 ROUNDS = ((4, 600), (3, 4000), (2, 4000))
@@ -303,7 +302,7 @@ def search_crowded(problem, R_best):
         return top[0], top[1], work
     inside = _shares_inside(problem.centroids.u, problem.image.box, problem.pairs.near.reach)
     order, level = _pivots(inside), np.zeros(problem.pairs.n_stars, np.uint8)
-    stars, places = by_bands(problem.stars.u), make_places(problem.centroids.u, problem.image.box)
+    stars, places = problem.stars.bands, make_places(problem.centroids.u, problem.image.box)
     turns = Turns(
         np.empty(MOST_TURNS, np.int64), np.empty(MOST_TURNS, np.int64),
         np.empty(MOST_TURNS, np.int64), np.empty(MOST_TURNS, np.int64),

@@ -13,6 +13,7 @@ from epipole.tasks.algorithms.star_identification.search.evidence import (
     choice_predicted,
     match_evidence,
 )
+from epipole.tasks.algorithms.star_identification.sky.star_bands import find_in_cone
 
 Array = npt.NDArray[np.float64]
 
@@ -107,15 +108,20 @@ def stars_in_cone(u_icrs, n_stars, R, radius, row):
 
 
 @kernel
-def stars_about(stars, R, radius, beta):
-    """Return the stars within `radius` [rad] of the boresight as an observer at beta sees them, and
-    their rows (compiled)."""
-    row = np.empty(len(stars.u), np.int64)
-    row = row[: stars_in_cone(stars.u, len(row), R, radius, row)].copy()
-    u = np.empty((len(row), 3))
-    for k, s in enumerate(row):
-        aberrated(stars.u[s, 0], stars.u[s, 1], stars.u[s, 2], beta, u[k])
-    return StarPlaces(u, stars.magnitude[row]), row
+def stars_about(bands, magnitude, R, radius, beta):
+    """Return the stars within `radius` [rad], at most 90 degrees, of the boresight as an observer
+    at beta sees them, and their rows in the catalogue, in order (compiled).
+
+    `bands` are the stars of the catalogue by cells, `magnitude` (n,) theirs by rows.
+    """
+    at = np.empty(len(bands.row), np.int32)
+    at = at[: find_in_cone(bands, R[2, 0], R[2, 1], R[2, 2], math.cos(radius), at)]
+    at = at[np.argsort(bands.row[at])]
+    u, row = np.empty((len(at), 3)), np.empty(len(at), np.int64)
+    for k, m in enumerate(at):
+        row[k] = bands.row[m]
+        aberrated(bands.u[m, 0], bands.u[m, 1], bands.u[m, 2], beta, u[k])
+    return StarPlaces(u, magnitude[row]), row
 
 
 @borrowing_kernel

@@ -17,6 +17,11 @@ from epipole.tasks.algorithms.star_identification.search.evidence import (
 from epipole.tasks.algorithms.star_identification.search.field import Centroids, aberrated
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid, nearest_star
+from epipole.tasks.algorithms.star_identification.sky.star_bands import (
+    StarBands,
+    cell_at,
+    cells_of_cone,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -24,11 +29,13 @@ MAX_BETA = 1.1e-4  # of an observer near the Earth
 
 
 class Stars(NamedTuple):
-    """The catalogue: directions, magnitudes, and the grid for look-ups."""
+    """The catalogue: directions, magnitudes, the grid for look-ups of places, and the stars by
+    cells for those of fields."""
 
     u: Array
     magnitude: Array
     grid: SkyGrid
+    bands: StarBands
 
 
 class Image(NamedTuple):
@@ -244,20 +251,23 @@ def _look_up(R, centroids, k, radius, stars):
 
 
 @borrowing_kernel
-def _stars_in_image(R, beta, star_u, box):
-    """Return how many catalogue stars are in the image."""
+def _stars_in_image(R, beta, stars, box):
+    """Return how many catalogue stars, `StarBands`, are in the image."""
     n = 0
     rx, ry = max(-box[0], box[1]), max(-box[2], box[3])
     c = 1.0 / math.sqrt(1.0 + rx * rx + ry * ry) - 1e-4
-    for s in range(len(star_u)):
-        x, y, z = star_u[s, 0], star_u[s, 1], star_u[s, 2]
-        z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
-        if z > c:
-            x, y, w = x + beta[0], y + beta[1], star_u[s, 2] + beta[2]
-            z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * w
-            across = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * w) / z
-            down = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * w) / z
-            n += box[0] < across < box[1] and box[2] < down < box[3]
+    cells = cells_of_cone(R[2, 0], R[2, 1], R[2, 2], c)
+    for band in range(cells.low, cells.high + 1):
+        for sector in range(cells.left, cells.left + cells.n_sectors):
+            cell = cell_at(band, sector)
+            for k in range(stars.first[cell], stars.first[cell + 1]):
+                x, y = stars.u[k, 0] + beta[0], stars.u[k, 1] + beta[1]
+                w = stars.u[k, 2] + beta[2]
+                z = R[2, 0] * x + R[2, 1] * y + R[2, 2] * w
+                if z > c:
+                    across = (R[0, 0] * x + R[0, 1] * y + R[0, 2] * w) / z
+                    down = (R[1, 0] * x + R[1, 1] * y + R[1, 2] * w) / z
+                    n += box[0] < across < box[1] and box[2] < down < box[3]
     return n
 
 
@@ -307,5 +317,5 @@ def _judge(problem, beaten, R, P, row_of):
     evidence += choice_lost(P)
     if evidence <= beaten:  # even if every star in view was matched
         return evidence
-    in_view = float(_stars_in_image(R, centroids.beta, stars.u, problem.image.box))
+    in_view = float(_stars_in_image(R, centroids.beta, stars.bands, problem.image.box))
     return evidence + log_ways(n, matches, float(matches)) - log_ways(n, matches, in_view)

@@ -9,6 +9,7 @@ from epipole.tasks.algorithms.catalogue.star_catalogue import NavigationCatalogu
 from epipole.tasks.algorithms.star_identification.search.evidence import log_magnitude_density
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable, build_pair_table
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid, build_sky_grid
+from epipole.tasks.algorithms.star_identification.sky.star_bands import StarBands, by_bands
 
 # Mean number of bright stars in a field whose pairs are tabled: enough that sparse fields have
 # several, and few enough that not many pairs share a separation.
@@ -22,11 +23,13 @@ class Sky(NamedTuple):
     catalogue : the stars
     log_density : (72,) float, see `evidence.log_magnitude_density`
     rho : stars per steradian, mean of the sky
+    bands : the stars by cells
     """
 
     catalogue: NavigationCatalogue
     log_density: npt.NDArray[np.float64]
     rho: float
+    bands: StarBands
 
 
 def sky_to_limit(stars: NavigationCatalogue, magnitude_limit: float) -> Sky:
@@ -34,7 +37,8 @@ def sky_to_limit(stars: NavigationCatalogue, magnitude_limit: float) -> Sky:
     n = int(np.searchsorted(stars.magnitude, magnitude_limit, side="right"))
     columns: list[npt.NDArray[Any]] = [np.ascontiguousarray(column[:n]) for column in stars]
     cut = NavigationCatalogue(*columns)
-    return Sky(cut, log_magnitude_density(cut.magnitude), max(n, 1) / (4 * np.pi))
+    rho = max(n, 1) / (4 * np.pi)
+    return Sky(cut, log_magnitude_density(cut.magnitude), rho, by_bands(cut.u_icrs))
 
 
 def pattern_size(sky: Sky, solid_angle_sr: float) -> int:

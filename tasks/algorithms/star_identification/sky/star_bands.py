@@ -14,11 +14,13 @@ BANDS, SECTORS = 32, 64
 class StarBands(NamedTuple):
     """Stars cell by cell.
 
-    first : (BANDS SECTORS + 1,) int32; the stars of a cell are the rows first[cell]:first[cell + 1]
+    first : (BANDS SECTORS + 1,) int32; the stars of a cell are first[cell]:first[cell + 1]
+    row : (n,) int32, rows of the catalogue
     u : (n, 3) float, directions
     """
 
     first: npt.NDArray[np.int32]
+    row: npt.NDArray[np.int32]
     u: npt.NDArray[np.float64]
 
 
@@ -50,7 +52,7 @@ def by_bands(u):
         cell[k] = cell_at(_band(u[k, 2]), _sector(math.atan2(u[k, 1], u[k, 0])))
     order = np.argsort(cell)
     first = np.searchsorted(cell[order], np.arange(BANDS * SECTORS + 1)).astype(np.int32)
-    return StarBands(first, u[order])
+    return StarBands(first, order.astype(np.int32), u[order])
 
 
 @borrowing_kernel
@@ -70,3 +72,18 @@ def cells_of_cone(x, y, z, cosine):
     azimuth, reach = math.atan2(y, x), math.asin(sine / along)
     left = _sector(azimuth - reach)
     return ConeCells(low, high, left, min(_sector(azimuth + reach) - left + 1, SECTORS))
+
+
+@borrowing_kernel
+def find_in_cone(stars, x, y, z, cosine, at):
+    """Write where in `stars` those are that lie within an angle of a unit vector; return how many
+    (compiled). The angle is at most 90 degrees and given by its cosine."""
+    cells, n = cells_of_cone(x, y, z, cosine), 0
+    for band in range(cells.low, cells.high + 1):
+        for sector in range(cells.left, cells.left + cells.n_sectors):
+            cell = cell_at(band, sector)
+            for k in range(stars.first[cell], stars.first[cell + 1]):
+                if x * stars.u[k, 0] + y * stars.u[k, 1] + z * stars.u[k, 2] > cosine:
+                    at[n] = k
+                    n += 1
+    return n

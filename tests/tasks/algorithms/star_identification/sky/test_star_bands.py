@@ -9,6 +9,7 @@ from epipole.tasks.algorithms.star_identification.sky.star_bands import (
     by_bands,
     cell_at,
     cells_of_cone,
+    find_in_cone,
 )
 
 POLES = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
@@ -69,3 +70,14 @@ def test_without_stars_all_cells_are_empty():
     stars = by_bands(np.zeros((0, 3)))
     assert not stars.first.any()
     assert len(rows_of_cone(stars, POLES[0], 0.3)) == 0
+
+
+@pytest.mark.parametrize("angle", [0.02, 0.2, 1.5])
+def test_the_stars_of_a_cone_are_found_with_their_rows(angle):
+    u = directions(7, 5000)
+    stars, at = by_bands(u), np.empty(5000, np.int32)
+    for centre in np.concatenate([directions(8, 20), POLES]):
+        n = find_in_cone(stars, *centre, np.cos(angle), at)
+        rows = np.sort(stars.row[at[:n]])
+        np.testing.assert_array_equal(rows, np.flatnonzero(u @ centre > np.cos(angle)))
+    np.testing.assert_array_equal(u[stars.row], stars.u)
