@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 from prefect import flow
 
+from epipole.flows.night.calibrating import calibrate, find_cameras
 from epipole.flows.night.earlier_nights import EarlierNights
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.night_rows import write_night_row
@@ -17,10 +18,8 @@ from epipole.flows.night.parameters import Night, night_asked, run_name
 from epipole.flows.night.reports import with_reports
 from epipole.flows.night.stages import (
     Destination,
-    calibrate,
     check,
     choose_elements,
-    find_cameras,
     identify,
     name,
     name_known,

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from epipole.flows.night.progress import results, step
 from epipole.flows.night.solving import solve_objects
@@ -28,10 +27,7 @@ from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
 from epipole.schemas.stages import Stage
-from epipole.schemas.tables import CALIBRATIONS, POSITIONS, REJECTS, STATES
-from epipole.schemas.work_tables import CAMERAS
-from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensor
-from epipole.tasks.calibrate.find_camera import CameraFinding, find_sensor_camera, refuses
+from epipole.schemas.tables import POSITIONS, REJECTS, STATES
 from epipole.tasks.check.check_sensors import (
     REASONS,
     SensorVerdict,
@@ -58,9 +54,6 @@ LOGGER = logging.getLogger(__name__)
 
 # After the first correction the views of a sensor fit objects; from these the second is exact.
 MOST_CORRECTIONS = 2
-# With better optics more stars take part, and they fit better still. Two are enough but for a
-# sensor that was hardly identified before.
-MOST_CALIBRATIONS = 4
 
 WRITTEN = "written"  # in the trail: the tasks that wrote the newest night
 
@@ -84,10 +77,10 @@ def identify(
     """Place sensors, identify stars and solve attitudes, a task per sensor and span."""
     where = {sensor: folder.identified(sensor) for sensor in spans}
     work = Work(frames.folder, folder, spans, frames.cameras, where, trail)
-    return _identify(Stage.IDENTIFY, work, settings)
+    return identify_spans(Stage.IDENTIFY, work, settings)
 
 
-def _identify(stage: Stage, work: Work, settings: Settings) -> Work:
+def identify_spans(stage: Stage, work: Work, settings: Settings) -> Work:
     """Identify the frames of all spans of `work`; the parts go to `work.identified`."""
     futures = [
         identify_span.submit(
@@ -101,104 +94,6 @@ def _identify(stage: Stage, work: Work, settings: Settings) -> Work:
     LOGGER.info("identified %s of %s by %s", f"{by_stars:,}", many(frames, "frame"),
                 many(stars, "star"))  # fmt: skip
     return work
-
-
-def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
-    """Search for the cameras of sensors whose stars contradict them; identify these again.
-
-    Returns
-    -------
-    work
-        With the cameras that were found.
-    told
-        CAMERAS as the log tells them, but mirrored where the images are.
-    """
-    mode = settings.identification.calibrate
-    if mode == "off":
-        return work, work.cameras
-    spans = {
-        sensor: of_sensor
-        for sensor, of_sensor in work.spans.items()
-        if refuses(sensor, work.identified[sensor], of_sensor, work.cameras)
-    }
-    pairs = work._replace(spans=spans).of_sensors()
-    futures = [
-        find_sensor_camera.submit(
-            work.frames, sensor, work.identified[sensor], of_sensor, work.cameras, settings,
-            wait_for=work.trail.after(*own),
-        )
-        for (sensor, of_sensor), own in zip(spans.items(), pairs, strict=True)
-    ]  # fmt: skip
-    work.trail.ran(futures, pairs)
-    findings: list[CameraFinding] = [
-        finding for finding in results(Stage.CALIBRATE, futures) if finding is not None
-    ]
-    for finding in findings:
-        used = "" if finding.camera is None else "; used" if mode == "use" else "; not used"
-        LOGGER.warning("%s%s", finding, used)
-    found = [finding for finding in findings if finding.camera is not None]
-    if mode == "report" or not found:
-        return work, work.cameras
-    names = {finding.sensor_id for finding in found}
-    told = _with_cameras(work.cameras, [f.cameras(work.cameras, f.as_told) for f in found], names)
-    cameras = [f.cameras(work.cameras, f.camera) for f in found if f.camera]
-    return _identify_again(work, cameras, names, 0, settings), told
-
-
-def calibrate(work: Work, told: pa.Table, settings: Settings) -> tuple[Work, pa.Table]:
-    """Fit each sensor's optics to its stars; identify again the sensors whose optics differ.
-
-    `told` are the cameras of `find_cameras`.
-    """
-    mode = settings.identification.calibrate
-    calibrations = CALIBRATIONS.empty_table()
-    most = MOST_CALIBRATIONS if mode == "use" else 1
-    for number in range(1, most + 1):
-        if mode == "off":
-            break
-        futures = [
-            calibrate_sensor.submit(
-                sensor, work.identified[sensor], spans, work.cameras, told,
-                settings.sensors.principal_point_sigma_px,
-                wait_for=work.trail.after(*own),
-            )
-            for (sensor, spans), own in zip(work.spans.items(), work.of_sensors(), strict=True)
-        ]  # fmt: skip
-        work.trail.ran(futures, work.of_sensors())
-        fits: list[Calibrated] = results(Stage.CALIBRATE, futures)
-        calibrations = concat(CALIBRATIONS, [fit.calibrations for fit in fits])
-        departed = {name for fit in fits for name in fit.departed}
-        if mode == "report" or not departed:
-            break
-        LOGGER.info("optics of %s differ from the calibration", ", ".join(sorted(departed)))
-        work = _identify_again(work, [fit.cameras for fit in fits if fit.departed], departed,
-                               number, settings)  # fmt: skip
-    return work, calibrations
-
-
-def _identify_again(
-    work: Work,
-    fitted: Sequence[pa.Table],
-    departed: set[str],
-    number: int,
-    settings: Settings,
-) -> Work:
-    """Identify the sensors whose optics differ again, with the fitted optics."""
-    cameras = _with_cameras(work.cameras, fitted, departed)
-    spans = {sensor: of_sensor for sensor, of_sensor in work.spans.items()
-             if sensor.sensor_id in departed}  # fmt: skip
-    where = {sensor: work.folder.identified_again(sensor, number) for sensor in spans}
-    departed_work = work._replace(cameras=cameras, spans=spans, identified=where)
-    _identify(Stage.CALIBRATE, departed_work, settings)
-    return work._replace(cameras=cameras, identified={**work.identified, **where})
-
-
-def _with_cameras(cameras: pa.Table, others: Sequence[pa.Table], sensors: set[str]) -> pa.Table:
-    """Return CAMERAS with other rows for these sensors, sorted."""
-    unchanged = cameras.filter(pc.invert(pc.is_in(cameras["sensor_id"], pa.array(sorted(sensors)))))
-    return concat(CAMERAS, [unchanged, *others]).sort_by(
-        [("sensor_id", "ascending"), ("time", "ascending")]
-    )
 
 
 def track(work: Work, night: str, settings: Settings) -> None:

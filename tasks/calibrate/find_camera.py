@@ -51,6 +51,9 @@ FEW, HARDLY_ANY = 0.5, 0.05
 # The stars of a frame, if optics are right, are all over the image: their variance is that of even
 # places. With strong distortion, dense clusters of stars match alone.
 ONE_PLACE = 0.1
+# If optics are wrong, stars lie farther from their places than any sensor's centroids do [px], and
+# more centroids than this share are no stars.
+FAR_PX, UNMATCHED = 1.0, 0.2
 REACH = 1.11  # in a run: focal lengths from 10 % shorter to 11 % longer than told
 TRIED = 3  # frames
 RICH = 0.75  # of the frames have no more centroids than those that are tried
@@ -107,16 +110,27 @@ class CameraFinding(NamedTuple):
 def refuses(sensor: Sensor, identified: Parts, spans: Sequence[Span], cameras: pa.Table) -> bool:
     """Return whether a sensor's stars contradict its camera.
 
-    Few frames could be identified of those that have enough centroids, or all stars of a frame are
-    at one place of the image.
+    Few frames could be identified of those that have enough centroids, or the stars of a frame are
+    far from their places, or all at one place of the image.
     """
     rows = _solutions(identified, spans)
     tried = pc.sum(pc.greater_equal(rows["n_centroids"], FEWEST)).as_py() or 0
-    solved = pc.sum(pc.equal(rows["attitude_source"], "stars")).as_py() or 0
+    solved = rows.filter(pc.field("attitude_source") == "stars")
     camera = _only_camera(cameras, sensor.sensor_id)
-    if tried > 0 and solved <= FEW * tried:
+    if (tried > 0 and solved.num_rows <= FEW * tried) or far_off(solved):
         return True
     return camera is not None and at_one_place(_stars(identified, spans), camera)
+
+
+def far_off(solved: pa.Table) -> bool:
+    """Return whether the stars of identified frames lie far from their places, and many centroids
+    are no stars."""
+    if not solved.num_rows:
+        return False
+    shown = array(solved, "n_stars") / array(solved, "n_centroids")
+    return bool(np.median(array(solved, "residual_px")) > FAR_PX) and bool(
+        np.median(shown) < 1 - UNMATCHED
+    )
 
 
 def at_one_place(stars: pa.Table, camera: Camera) -> bool:
@@ -146,7 +160,7 @@ def _stars(identified: Parts, spans: Sequence[Span]) -> pa.Table:
 
 
 def _solutions(identified: Parts, spans: Sequence[Span]) -> pa.Table:
-    columns = ["time", "n_centroids", "n_stars", "attitude_source"]
+    columns = ["time", "n_centroids", "n_stars", "attitude_source", "residual_px"]
     return pa.concat_tables([identified.read(span, "solutions", columns) for span in spans])
 
 

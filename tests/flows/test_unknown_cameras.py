@@ -2,6 +2,7 @@
 
 import logging
 
+import numpy as np
 import polars as pl
 import pytest
 from scenes.mirrored_logs import write_mirrored
@@ -15,19 +16,29 @@ from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
+from epipole.tasks.calibrate import calibrate_sensors
 
 pytestmark = pytest.mark.long
 
 FOCAL = 0.05  # by which the true focal length is longer than told
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory):
+def simulated(folder, **departure):
     """Frames of one sensor in a low orbit, a field of 12 degrees, no prior attitudes."""
-    camera = {"fov_deg": 12.0, "departure": {"focal": FOCAL}}
+    camera = {"fov_deg": 12.0, "departure": departure}
     pointing = {"mode": "random", "clear_of_earth_deg": 15.0}
     scene = scene_of({"camera": camera, "pointing": pointing})
-    return simulate(scene, tmp_path_factory.mktemp("log") / "n.mcap", seed=3).logs[0]
+    return simulate(scene, folder / "n.mcap", seed=3).logs[0]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp("log"), focal=FOCAL)
+
+
+@pytest.fixture(scope="module")
+def right_log(tmp_path_factory):
+    return simulated(tmp_path_factory.mktemp("right_log"))
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +46,9 @@ def told_px(log):
     return float(array(read_log(str(log)).cameras, "fx_px")[0])
 
 
-def run(log, out, **identification):
-    settings = Settings.model_validate({"identification": identification})
+def run(log, out, principal_point_sigma_px=None, **identification):
+    sensors = {"principal_point_sigma_px": principal_point_sigma_px}
+    settings = Settings.model_validate({"identification": identification, "sensors": sensors})
     nightly([str(log)], str(out), settings)
     return {
         name: pl.read_parquet(f"{out}/night=*/{name}/*.parquet")
@@ -75,6 +87,37 @@ def test_a_mirrored_log_is_solved(log, tmp_path, caplog):
     # The same boresights as of the log with rows that count down.
     off = made["frames"].join(straight, on="frame_number", suffix="_straight")
     assert (off["dec_deg"] - off["dec_deg_straight"]).abs().max() < 2e-3
+
+
+@pytest.mark.usefixtures("prefect")
+@pytest.mark.parametrize("mode", ["use", "off"])
+def test_a_principal_point_that_is_uncertain_makes_attitudes_as_uncertain(
+    right_log, tmp_path, mode
+):
+    made = run(right_log, tmp_path / "out", principal_point_sigma_px=4.0, calibrate=mode)
+    sigma = made["frames"].filter(pl.col("attitude_source") == "stars")["sigma_x_arcsec"]
+    told = read_log(str(right_log)).cameras
+    pixel_arcsec = np.degrees(1 / array(told, "fx_px")[0]) * 3600
+    assert 0.5 < sigma.median() / (4.0 * pixel_arcsec) < 1.05  # the stars tell a little
+
+
+@pytest.mark.usefixtures("prefect")
+def test_optics_with_which_frames_are_lost_are_not_used(
+    right_log, told_px, tmp_path, caplog, monkeypatch
+):
+    fitted = calibrate_sensors.calibrate_sensors
+
+    def misled(stars, cameras, told, sigma_px):
+        fit = fitted(stars, cameras, told, sigma_px)
+        wrong = calibrate_sensors.with_optics(cameras, {"a": {"fx_px": 2 * told_px}})
+        return fit._replace(cameras=wrong, departed=["a"])
+
+    monkeypatch.setattr(calibrate_sensors, "calibrate_sensors", misled)
+    with caplog.at_level(logging.WARNING):
+        made = run(right_log, tmp_path / "out")
+    assert (made["frames"]["attitude_source"] == "stars").mean() > 0.9
+    assert not len(made["calibrations"])
+    assert any("fitted to the stars of a identify hardly any" in r.message for r in caplog.records)
 
 
 @pytest.mark.parametrize("field_deg", [None, 10.0])

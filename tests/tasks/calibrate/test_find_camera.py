@@ -8,7 +8,7 @@ from scenes.cameras import cameras_of
 from epipole.schemas.bridge import array
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
-from epipole.tasks.calibrate.find_camera import CameraFinding, at_one_place, rich_frames
+from epipole.tasks.calibrate.find_camera import CameraFinding, at_one_place, far_off, rich_frames
 
 TOLD = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)
 TIME = 1_554_091_200_630_490_482  # not a whole number of microseconds
@@ -46,6 +46,19 @@ def test_stars_all_over_the_image_are_told_from_clusters(size_px, is_one):
     corner = rng.uniform(0, 1023 - size_px, (30, 2))[frame]
     x, y = (corner + rng.uniform(0, size_px, (180, 2))).T
     assert at_one_place(stars(x, y, frame), TOLD) == is_one
+
+
+@pytest.mark.parametrize(
+    ("n_stars", "residual_px", "is_far"),
+    [(12, 4.0, True), (24, 4.0, False), (12, 0.4, False), (24, 0.2, False)],
+)
+def test_stars_that_are_few_and_far_from_their_places_contradict_a_camera(
+    n_stars, residual_px, is_far
+):
+    """Many false points alone do not, nor does a sensor with large errors."""
+    solved = {"n_centroids": [25] * 9, "n_stars": [n_stars] * 9, "residual_px": [residual_px] * 9}
+    assert far_off(pa.table(solved)) == is_far
+    assert not far_off(pa.table(solved).slice(0, 0))
 
 
 def test_few_frames_with_a_cluster_say_nothing():

@@ -46,7 +46,7 @@ N_SEARCHED, N_PATTERN, N_TRIED, STAR_SHARE = 200, 40, 64, 0.5
 # The same where that fails, for frames of which most centroids are no stars: all are paired.
 N_CROWDED, LEAST_STARS = 1024, 8.0
 CLUSTERED = 0.75  # of the centroids are left without clusters: then these are searched first
-CROWDED_TIMES = 6.0  # as long as another search: hardly any pivot is a star
+CROWDED_TIMES = 10.0  # as long as another search: hardly any pivot is a star
 
 
 class FieldOfView(NamedTuple):
