@@ -133,6 +133,7 @@ def test_every_kernel_of_the_list_is_one_that_keeps_what_it_compiles():
 
 if __name__ == "__main__":
     os.environ.setdefault("PREFECT_HOME", tempfile.mkdtemp())
+    KERNELS.write_text(_HEAD)  # a run asks for all that is listed, also for what no longer exists
     with tempfile.TemporaryDirectory() as folder:
         kernels_of_a_run(folder)  # compiles: what is loaded below is asked for one by one
         asked, _ = kernels_of_a_run(folder)
