@@ -38,8 +38,8 @@ class Memory(NamedTuple):
 
     t_s, R, P : (2,), (2, 3, 3), (2, 3, 3): times, attitudes and covariances of the last two
         identified frames, the later one last
-    held : (3,) int64: how many of these there are; 1 after a prior was confirmed; how many
-        more frames are not searched
+    held : (3,) int64: how many of these there are; 1 where the last prior of an identified frame
+        was confirmed; how many more frames are not searched
     near, cone : (stars,) int64 and (5,): the stars around a field; how many, the direction
         (3 numbers) and the radius [rad] of the cone that holds them
     """
@@ -290,11 +290,7 @@ def follow(walk, frames, priors, stars, rule, memory, solutions, status):
             status[k] = 0
         else:
             _clear(k, frames.first, solutions)
-            # Where priors were confirmed, a frame that fails has too few stars, not a wrong prior.
-            has_prior = not math.isnan(priors.sigma_rad[k])
-            if has_prior and memory.held[1] == 1:
-                status[k] = NO_MATCH
-            elif status[k] != NO_MATCH and status[k] != TIME_LIMIT:
+            if status[k] != NO_MATCH and status[k] != TIME_LIMIT:
                 if walk.searches and memory.held[2] == 0:
                     return k
                 memory.held[2] = max(memory.held[2] - 1, 0)

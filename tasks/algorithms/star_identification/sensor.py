@@ -16,6 +16,7 @@ from epipole.tasks.algorithms.star_identification.frames.spots import (
     UnscaledCentroids,
     unsolved,
 )
+from epipole.tasks.algorithms.star_identification.second_look import SensorSky, look_again
 from epipole.tasks.algorithms.star_identification.sensor_limits import (
     USELESS_SCATTER_MAG,
     faintest_star,
@@ -36,9 +37,9 @@ from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-# Frames, spread over all, which are searched until any is identified; more where a frame has so
+# Frames, scattered over all, which are searched until any is identified; more where a frame has so
 # many centroids that most are no stars.
-PROBED, PROBED_CROWDED, CROWDED = 3, 8, 100
+PROBED, PROBED_CROWDED, CROWDED = 5, 8, 100
 STARS_IN_CROWD, DEEPER_IN_CROWD_MAG = 25.0, 1.5  # a field shows so many stars there, or deeper ones
 SAMPLED = 24  # frames around these from which a sensor is learned
 # Centroids may be mostly objects or clutter: skies that are brighter by this are tried as well.
@@ -51,6 +52,7 @@ WRONG_GATE = 0.02  # a sample that misses the errors of all frames by more is co
 # Frames of other quality: rounds of learning it, the change (ln) that ends them, and the factor on
 # errors from which frames are searched again.
 QUALITY_ROUNDS, SETTLED, OTHER_QUALITY = 6, 0.02, 1.25
+OTHER_TRIALS = 3  # of frames that failed: other brightness, worse quality, better quality
 DEEPER_MAG = 2.0  # how far beyond the first guess the faintest star is searched for
 
 
@@ -94,9 +96,9 @@ def identify_sensor(
 ) -> IdentifiedSensor:
     """Identify the stars of a sensor's frames, which are in order of time.
 
-    Errors that are not stated are estimated from the residuals, frame by frame where frames differ.
-    Stated errors are scaled where residuals contradict them beyond doubt, so that reported sigmas
-    are true.
+    Errors that are not stated are estimated from the residuals. Stated errors are scaled where
+    residuals contradict them beyond doubt, so that reported sigmas are true; both frame by frame
+    where frames differ.
     """
     spots, stated = _fill_sigmas(spots)
     usable = np.flatnonzero(spots.counts >= 4)
@@ -108,7 +110,7 @@ def identify_sensor(
         limit = skies.limit_for(in_view / spots.optics[0].solid_angle_sr)
     known = _Known(1.0, limit, magnitude_limit is None, how, True, not stated)
     whole = _Sample(t_s, spots, priors)
-    rows = usable[spread(len(usable), PROBED_CROWDED if crowded else PROBED)]
+    rows = usable[scattered(len(usable), PROBED_CROWDED if crowded else PROBED)]
     known, probed = _first_scale(
         whole.take(rows), skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX, crowded
     )
@@ -139,24 +141,47 @@ def identify_sensor(
     if residuals.dof > 0 and (known.adjusted or is_significant(residuals)):
         known = known._replace(scale=known.scale * residuals.scale)
         solutions = solutions.rescaled(residuals.scale)
-    quality = np.ones(len(spots.counts))
-    if not stated:
-        solutions, quality = _by_quality(whole._replace(spots=spots), solutions, skies, known)
-        status = [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
+    whole = whole._replace(spots=spots)
+    if solutions.solved.any():
+        solutions = _of_other_brightness(whole, solutions, skies, known)
+    quality = look_again(
+        spots.frames(known.scale, known.use_flux),
+        solutions,
+        _sky_of(spots, skies, known),
+        known.how,
+    )
+    solutions, quality = _by_quality(whole, solutions, quality, skies, known)
+    status = [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
     return IdentifiedSensor(solutions, status, skies.sky(known.limit), known.scale * quality)
 
 
-def _by_quality(
+def _of_other_brightness(
     whole: "_Sample", solutions: Solutions, skies: Skies, known: "_Known"
+) -> Solutions:
+    """Return the solutions with those of frames whose zero point is not that of the others: other
+    exposure, other gain."""
+    how = known.how._replace(
+        zero_point_mag=np.nan, threshold=known.how.threshold + np.log(OTHER_TRIALS)
+    )
+    rows = np.flatnonzero(~solutions.solved & (whole.spots.counts >= 4))
+    if known.use_flux and not np.isnan(known.how.zero_point_mag) and len(rows):
+        found = _identify(whole.take(rows), skies, known._replace(how=how), hopeless=True)[0]
+        solved = np.flatnonzero(found.solved)
+        solutions.enter_all(rows[solved], found, solved)
+    return solutions
+
+
+def _by_quality(
+    whole: "_Sample", solutions: Solutions, quality: Array, skies: Skies, known: "_Known"
 ) -> tuple[Solutions, Array]:
     """Return the solutions with each frame's own errors, and these over those of the sensor.
 
     Where frames differ, those that are not identified are searched as better and as worse ones.
     """
-    solutions, quality = _settle_quality(whole, solutions, np.ones(len(whole.t_s)), skies, known)
+    solutions, quality = _settle_quality(whole, solutions, quality, skies, known)
     if not solutions.solved.any():
         return solutions, quality
-    how = known.how._replace(threshold=known.how.threshold + np.log(2.0))
+    how = known.how._replace(threshold=known.how.threshold + np.log(OTHER_TRIALS))
     for other in np.quantile(quality[solutions.solved], (0.9, 0.1)):
         rows = np.flatnonzero(~solutions.solved & (whole.spots.counts >= 4))
         if abs(np.log(other)) < np.log(OTHER_QUALITY) or not len(rows):
@@ -226,14 +251,22 @@ class _Sample(NamedTuple):
         return self._replace(priors=Priors(R, sigma), anchors=True)
 
     def of_quality(self, quality: Array) -> "_Sample":
-        """Return the frames, none of whose errors are stated, with these factors on them."""
+        """Return the frames with these factors on their errors."""
         spots = self.spots
-        return self._replace(spots=spots._replace(sigma_px=np.repeat(quality, spots.counts)))
+        stated = np.where(np.isnan(spots.sigma_px), 1.0, spots.sigma_px)
+        scaled = spots._replace(sigma_px=stated * np.repeat(quality, spots.counts))
+        return self._replace(spots=scaled)
 
 
 def spread(n: int, wanted: int) -> npt.NDArray[np.int64]:
     """Return so many rows of n, spread evenly."""
     return np.unique(np.linspace(0, max(n - 1, 0), wanted).astype(np.int64))[:n]
+
+
+def scattered(n: int, wanted: int) -> npt.NDArray[np.int64]:
+    """Return so many rows of n, all over but in no period: every third frame may show the Earth."""
+    golden = 0.5 * (np.sqrt(5.0) - 1.0)
+    return np.unique((np.arange(wanted) * golden % 1.0 * n).astype(np.int64))[:n]
 
 
 def _around(n: int, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -380,11 +413,17 @@ def _identify(
     if not len(sample.t_s):
         return unsolved(sample.spots.first), []
     frames = sample.spots.frames(known.scale, known.use_flux)
-    sky, grid = skies.sky(known.limit), skies.grid(known.limit, _grid_radius(frames, known.how))
-    pairs = partial(skies.pairs, known.limit, frames.optics[0])
     return identify_sequence(
-        sample.t_s, frames, sample.priors, sky, grid, pairs, known.how, sample.anchors, hopeless
-    )
+        sample.t_s, frames, sample.priors, *_sky_of(sample.spots, skies, known), known.how,
+        sample.anchors, hopeless,
+    )  # fmt: skip
+
+
+def _sky_of(spots: UnscaledCentroids, skies: Skies, known: _Known) -> SensorSky:
+    """Return what the frames are searched in."""
+    radius = _grid_radius(spots.frames(known.scale), known.how)
+    pairs = partial(skies.pairs, known.limit, spots.optics[0])
+    return SensorSky(skies.sky(known.limit), skies.grid(known.limit, radius), pairs)
 
 
 def _grid_radius(frames: SensorCentroids, how: Search) -> float:

@@ -39,7 +39,7 @@ Array = npt.NDArray[np.float64]
 
 # Where searches keep failing: after this many, frames are skipped, ever more of them, up to so many
 # or to this share of the frames since the last success. The way back tries them.
-PATIENCE = 6
+PATIENCE, HOPELESS = 6, 1  # `HOPELESS` more than patience, where searches have failed before
 MAX_SKIPPED, SKIPPED_SHARE = 32, 1 / 32
 NO_CENTROIDS = 5
 STATUS = {
@@ -118,7 +118,7 @@ def identify_sequence(
         sequence.follow(back, none)
     if not solutions.solved.all():
         hopeless &= n > MAX_SKIPPED
-        sequence.go(forth, priors, search, PATIENCE + 5 if hopeless else 0)
+        sequence.go(forth, priors, search, PATIENCE + HOPELESS if hopeless else 0)
     if solutions.solved.any() and not solutions.solved.all():
         # Backward, without priors: those were tried on the way forward. What lies behind a slew
         # and was skipped is searched.
@@ -178,12 +178,14 @@ class _Sequence(NamedTuple):
             if k == walk.stop:
                 return
             solution, cut_short = search(k, failures, walk.step)
+            trusted = bool(memory.held[1]) and not np.isnan(priors.sigma_rad[k])
             if solution is None:
-                failures += 1
+                # Where priors were confirmed, a frame mostly fails because it shows few stars.
+                failures = max(failures + 1, PATIENCE + 1 if trusted else 0)
                 memory.held[2] = _skipped(failures, self._refused(k, walk.step))
                 self.status[k] = TIME_LIMIT if cut_short else NO_MATCH
             else:
-                failures = 0
+                failures, memory.held[1] = 0, 0  # it contradicts a prior that the frame has
                 self.status[k] = 0
                 self.solutions.enter(k, solution)
                 remember(memory, self.arrays.t_s[k], solution.R_sensor_from_icrs, solution.cov_rad2)
@@ -210,10 +212,13 @@ def _skipped(failures: int, frames: int) -> int:
     """Return how many frames are not searched after so many failures over so many frames.
 
     A sensor without stars takes bounded time. One that can be identified again is, however
-    long it could not: from some frame on, or for a while that is longer than this.
+    long it could not: from some frame on, or for a while that is longer than this. The number
+    changes all the time: what shows stars may come back in a period.
     """
+    if failures <= PATIENCE:
+        return 0
     most = max(MAX_SKIPPED, int(SKIPPED_SHARE * frames))
-    return min(2 ** min(max(failures - PATIENCE, 0), 20) - 1, most)
+    return min(2 ** min(failures - PATIENCE, 20), most - failures % 3)
 
 
 def _arrays(t_s: Array, frames: SensorCentroids) -> FrameArrays:

@@ -145,6 +145,45 @@ def test_frames_of_other_quality_have_their_own_errors_where_none_is_stated():
     assert np.abs(np.median(np.log(found.sigma_scale / sigma_px))) < 0.1
 
 
+@pytest.mark.parametrize("stated_px", [np.nan, 0.1])
+def test_frames_that_shook_keep_their_stars_and_have_their_own_errors(stated_px):
+    """With errors of the others, some stars are near their places by chance: attitudes were tens of
+    sigmas off."""
+    sigma_px = np.where(np.arange(40) % 4 == 0, 1.2, 0.1)
+    shots, true = zip(*[_shot(k, sigma_px[k], stated_px) for k in range(40)], strict=True)
+    found = _identify(list(shots))
+    assert found.solutions.solved.sum() >= 39
+    z2 = []
+    for k, solution in enumerate(found.solutions.each()):
+        if solution is None:
+            continue
+        assert np.sum(solution.star >= 0) > 0.7 * np.sum(true[k] >= 0)
+        R, R_true = solution.R_sensor_from_icrs, random_attitude(k)
+        off = np.array([R[(i + 2) % 3] @ R_true[(i + 1) % 3] for i in range(3)])
+        z2.append(off[:2] ** 2 / np.diagonal(solution.cov_rad2)[:2])
+    assert np.max(z2) < 20
+    assert 0.6 < np.mean(z2) < 1.5
+
+
+def test_frames_of_another_exposure_are_identified_though_their_zero_point_differs():
+    shots = [_shot(k, 0.15, missing=0.0)[0] for k in range(30)]
+    for k in range(0, 30, 2):
+        longer = shots[k].frame
+        longer = longer._replace(instrumental_mag=longer.instrumental_mag - 2.0)
+        shots[k] = shots[k]._replace(frame=longer)
+    assert _identify(shots).solutions.solved.sum() >= 29
+
+
+@pytest.mark.parametrize("period", [2, 3, 5])
+def test_a_sensor_that_sees_the_sky_in_few_frames_is_identified_in_these(period):
+    dark = [_shot(k, 0.15, n_false=25, missing=1.0)[0] for k in range(120)]
+    clear = np.arange(120) % period == period // 2
+    shots = [_shot(k, 0.15)[0] if clear[k] else dark[k] for k in range(120)]
+    solved = _identify(shots).solutions.solved
+    assert solved[clear].mean() > 0.97
+    assert not solved[~clear].any()
+
+
 def test_an_error_that_is_nowhere_stated_counts_as_one_pixel_times_the_scale():
     shot, _ = _shot(0, 0.3)
     scaled = join_spots(*zip(shot, strict=True)).frames(0.5, use_flux=False)
