@@ -83,8 +83,8 @@ FRAMES = schema(
             unit="arcsec",
             frame="sensor",
             null=True,
-            doc="1-sigma attitude error about the sensor axis, the error that all frames share "
-            "from fitted optics included",
+            doc="1-sigma attitude error about the sensor axis, the errors that frames share "
+            "(fitted optics, an unknown velocity of the sensor) included",
         ),
         column("residual_px", F64, unit="px", null=True, doc="Rms of the stars' image residuals."),
         *axes("{}_km", unit="km", frame="GCRF", null=True, doc="Sensor position"),

@@ -43,7 +43,8 @@ class IdentifiedFrame(NamedTuple):
     attitude_xyzw : (4,) float
         Unit quaternion, scalar last, that turns ICRS into sensor axes; NaN without attitude.
     attitude_cov_arcsec2 : (3, 3) float
-        Covariance of the small rotation about the sensor's axes [arcsec^2].
+        Covariance of the small rotation about the sensor's axes [arcsec^2]; with the error of an
+        unknown velocity, but not that of the optics.
     source : str
         Where the attitude comes from: "stars", "prior" or "none".
     status : str or None
@@ -89,7 +90,8 @@ def identify_frame(
         1-sigma errors of the centroids per axis [px]. None: estimated from the stars.
     velocity_km_s : (3,) float, optional
         Velocity of the sensor, GCRF. None: the Earth's own; the attitude is then off by the
-        aberration, up to 5 arcsec in a low orbit.
+        aberration, up to 5 arcsec in a low orbit. Its covariance has that error: 3 arcsec about
+        each axis across the boresight.
     prior_xyzw : (4,) float, optional
         A prior attitude, sensor from ICRS. None: the whole sky is searched.
     prior_sigma_arcsec : float, optional
@@ -157,10 +159,13 @@ def identify_frame(
     star_id = np.full(n, -1, np.int64)
     star_id[array(made.stars, "centroid")] = array(made.stars, "star_id")
     row = made.solutions
+    cov = stack_covariance(row, "cov_att_{}_arcsec2")[0]
+    if velocity_km_s is None:  # its error is in the sigmas alone: frames may share it
+        np.fill_diagonal(cov, stack(row, "sigma_{}_arcsec")[0] ** 2)
     return IdentifiedFrame(
         star_id,
         stack(row, "q{}", "xyzw")[0],
-        stack_covariance(row, "cov_att_{}_arcsec2")[0],
+        cov,
         row["attitude_source"][0].as_py(),
         row["status"][0].as_py(),
         float(array(row, "residual_px")[0]),

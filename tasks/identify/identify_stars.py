@@ -46,6 +46,9 @@ LOGGER = logging.getLogger(__name__)
 # Centroids of a frame that stay at one pixel: of more, stars are first searched without them; all
 # take part where so few frames are then identified.
 MANY_STAY, IDENTIFIES = 40, 0.5
+# Of a circular orbit 500 km high [km/s], sqrt(GM / r): few sensors move faster. One whose velocity
+# is unknown may move so, in any direction.
+LOW_ORBIT_KM_S = 7.6
 
 
 class IdentifiedTables(NamedTuple):
@@ -74,6 +77,7 @@ def identify_stars(
     attitudes = _attitudes(places, found, settings)
     matches = _matches(found, rows, centroids)
     attitudes = _with_optics(attitudes, centroids, matches, cameras)
+    attitudes = _with_unknown_velocity(attitudes, places)
     stars = stars_table(exposures, places, centroids, attitudes, matches)
     stars = with_catalogue(stars, catalogue.schema)
     most = settings.tracklets.most_detections
@@ -201,6 +205,19 @@ def _with_optics(
         cov = shared_attitude_covariance(camera, cov_optics, c.u[at], sigma_rad, offsets)
         shared[solved] = cov / ARCSEC**2
     return a._replace(shared_arcsec2=shared)
+
+
+def _with_unknown_velocity(a: StarAttitudes, places: pa.Table) -> StarAttitudes:
+    """Return the attitudes with the errors that those from stars have where the sensor's velocity
+    is unknown.
+
+    Its aberration moves all stars of a small field alike: a turn across the boresight. About the
+    boresight the field does not turn.
+    """
+    unknown = (a.source == "stars") & np.isnan(stack(places, "v{}_km_s")).any(axis=1)
+    sigma_arcsec = LOW_ORBIT_KM_S / np.sqrt(3) / SPEED_OF_LIGHT_KM_S / ARCSEC  # per axis
+    across = np.diag([1.0, 1.0, 0.0]) * sigma_arcsec**2
+    return a._replace(shared_arcsec2=a.shared_arcsec2 + unknown[:, None, None] * across)
 
 
 def _matches(

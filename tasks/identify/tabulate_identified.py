@@ -37,7 +37,7 @@ class StarAttitudes(NamedTuple):
     status: list[str | None]
     R: Array  # sensor from ICRS
     cov_arcsec2: Array  # independent in each frame, if from stars
-    shared_arcsec2: Array  # by the error of the optics, which all frames share
+    shared_arcsec2: Array  # by errors that frames share: optics, an unknown velocity
 
 
 class MatchedStars(NamedTuple):

@@ -71,6 +71,24 @@ def test_frames_are_identified_as_the_truth_says(lost):
     assert 1.0 < np.mean(whitened) < 6.0
 
 
+def test_an_unknown_velocity_is_in_the_covariance(lost):
+    log, frames, _ = lost
+    frame = log.frames.row(0, named=True)
+    truth = frames.filter(*[pl.col(n) == frame[n] for n in ("sensor_id", "frame_number")])
+    known, unknown = (
+        api.identify_frame(
+            frame["x_px"], frame["y_px"], frame["flux"], sigma_px=frame["sigma_px"],
+            camera=camera_of(log, frame["sensor_id"]), time=frame["time"], velocity_km_s=velocity,
+        )
+        for velocity in (truth.select("vx", "vy", "vz").row(0), None)
+    )  # fmt: skip
+    assert known.source == unknown.source == "stars"
+    added = (unknown.attitude_cov_arcsec2 - known.attitude_cov_arcsec2)[:2, :2]
+    np.testing.assert_allclose(added, 9.1 * np.eye(2), atol=0.3)
+    about = unknown.attitude_cov_arcsec2[2, 2] / known.attitude_cov_arcsec2[2, 2]
+    assert about == pytest.approx(1.0, rel=0.01)
+
+
 def test_a_prior_is_used_where_there_are_too_few_stars():
     prior = [0.0, 0.6, 0.0, 0.8]
     found = api.identify_frame(

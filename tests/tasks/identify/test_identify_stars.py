@@ -49,18 +49,20 @@ def sky(catalogue):
 class Log:
     """Frames of a slowly turning sensor as tables, and their truth."""
 
-    def __init__(self, sky, n, seed=0, sigma_px=0.2, stated=None, n_false=8, flux=True):
+    def __init__(self, sky, n, seed=0, sigma_px=0.2, stated=None, n_false=8, flux=True,
+                 v_km_s=V_KM_S):  # fmt: skip
         rng = np.random.default_rng(seed)
         star_id, u, magnitude = sky
         time = T0_NS + np.arange(n) * 10**9
         _, v_earth = earth_barycentric(time)
+        velocities = np.broadcast_to(v_km_s, (n, 3))
         first = Rotation.random(random_state=seed)
         self.q = np.empty((n, 4))
         self.ids, x_px, y_px, fluxes = [], [], [], []
         for k in range(n):
             R = Rotation.from_rotvec([2e-3 * k, 1e-3 * k, -1e-3 * k]) * first
             self.q[k] = canonical(R.as_quat())
-            a = aberrate(u, v_earth[k] + V_KM_S) @ R.as_matrix().T
+            a = aberrate(u, v_earth[k] + velocities[k]) @ R.as_matrix().T
             x, y = project(DISTORTED, a)
             near = (a[:, 2] > 0.95) & inside(DISTORTED, x, y)
             false = rng.uniform(0, 1023, (2, n_false))
@@ -202,16 +204,45 @@ def test_the_order_of_rows_does_not_matter(log, found, catalogue):
     assert again.solutions.equals(found.solutions)
 
 
-def test_without_velocity_only_the_earths_aberration_is_left(log, catalogue, found):
-    places = log.places
+def without_velocities(places, frames=slice(None)):
+    """Return the places, the velocities of these frames unknown."""
     for a in "xyz":
         i = places.column_names.index(f"v{a}_km_s")
-        places = places.set_column(i, places.schema.field(i), pa.nulls(40, pa.float64()))
+        values = places[i].to_pylist()
+        values[frames] = [None] * len(values[frames])
+        places = places.set_column(i, places.schema.field(i), pa.array(values, pa.float64()))
+    return places
+
+
+def test_without_velocity_only_the_earths_aberration_is_left(log, catalogue, found):
+    places = without_velocities(log.places)
     moved = log.errors(log.run(catalogue, places=places).solutions) - log.errors(found.solutions)
     # 7.4 km/s are 5.1"; what of it lies across the boresight.
     boresight = Rotation.from_quat(log.q).inv().apply([0, 0, 1])
     across = np.linalg.norm(np.cross(boresight, V_KM_S), axis=1) / 299792.458 / ARCSEC
     np.testing.assert_allclose(np.hypot(moved[:, 0], moved[:, 1]), across, atol=0.05)
+
+
+def test_an_unknown_velocity_is_in_the_sigmas_across_the_boresight(sky, catalogue):
+    v = np.random.default_rng(5).normal(size=(40, 3))
+    v *= 7.6 / np.linalg.norm(v, axis=1, keepdims=True)
+    log = Log(sky, 40, seed=2, sigma_px=0.02, v_km_s=v)
+    solutions = log.run(catalogue, places=without_velocities(log.places)).solutions
+    assert solutions["attitude_source"].to_pylist() == ["stars"] * 40
+    off = log.errors(solutions) / stack(solutions, "sigma_{}_arcsec")
+    # A component of a velocity is even from -7.6 to 7.6 km/s.
+    assert 0.7 < np.mean(off[:, :2] ** 2) < 1.3
+    assert np.abs(off[:, :2]).max() < 2.5
+    assert 0.5 < np.mean(off[:, 2] ** 2) < 2.0
+
+
+def test_sigmas_of_frames_with_a_velocity_do_not_have_its_error(log, catalogue, found):
+    mixed = log.run(catalogue, places=without_velocities(log.places, slice(0, 10)))
+    before, after = (stack(f.solutions, "sigma_{}_arcsec") for f in (found, mixed))
+    np.testing.assert_allclose(before[10:], after[10:], rtol=1e-4)
+    np.testing.assert_allclose(before[:, 2], after[:, 2], rtol=1e-4)
+    added = np.sqrt(after[:10, :2] ** 2 - before[:10, :2] ** 2)
+    np.testing.assert_allclose(added, 7.6 / np.sqrt(3) / 299792.458 / ARCSEC, rtol=1e-3)
 
 
 def test_without_stars_the_prior_is_used_unchanged(sky, log, catalogue):
