@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.schemas.bridge import table
+from epipole.schemas.logs.messages import SENSOR_ID_RULE
 from epipole.schemas.stages import Declared, Stage
 from epipole.schemas.tables import REJECTS
 
@@ -84,7 +85,11 @@ class Reason(StrEnum):
         Stage.READ,
         "A calibration's message cannot be decoded.",
     )
-    BAD_SENSOR_ID = "bad_sensor_id", Stage.READ, "The sensor id is empty or no valid text."
+    BAD_SENSOR_ID = (
+        "bad_sensor_id",
+        Stage.READ,
+        f"The sensor id is not what it has to be: {SENSOR_ID_RULE}.",
+    )
     NO_TIMESTAMP = (
         "no_timestamp",
         Stage.READ,

@@ -9,8 +9,10 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.io.logs import reader
+from epipole.io.logs.messages.batches import valid_sensor_id
 from epipole.io.logs.writer import LogWriter
-from epipole.schemas.bridge import rows_of, table, to_polars
+from epipole.schemas.bridge import rows_of, table, table_name, to_polars
+from epipole.schemas.logs.messages import SENSOR_ID_RULE
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES
 from epipole.tasks.algorithms.geometry.camera import Camera
@@ -46,7 +48,9 @@ class LogTables(NamedTuple):
 
 _FRAMES = pa.schema([f for f in EXPOSURES if f.name not in ("source", "offset")],
                     {"table": "frames"})  # fmt: skip
-_STATES = pa.schema(list(SENSOR_STATES), {"table": "states"})
+_UNKNOWN_IS_0 = ("position_sigma_km", "attitude_sigma_arcsec")
+_STATES = pa.schema([f.with_nullable(f.nullable or f.name in _UNKNOWN_IS_0) for f in SENSOR_STATES],
+                    {"table": "states"})  # fmt: skip
 _CAMERAS = pa.schema([f for f in CAMERAS if not f.name.startswith("cov_")], {"table": "cameras"})
 # What a column has that is left out.
 _DEFAULTS: dict[str, Any] = {
@@ -112,7 +116,9 @@ def write_log(
     frames, states, cameras
         Tables with the columns that `LogTables` names, in any order of rows. These columns may be
         left out: `exposure_s`, `flux`, `sigma_px`; velocities, sigmas and attitudes of states;
-        distortions `k1`, `k2`, `p1`, `p2`, `k3` of cameras. Times are UTC, positions GCRF.
+        distortions `k1`, `k2`, `p1`, `p2`, `k3` of cameras. Times are UTC, positions GCRF. A
+        sensor's id has 1 to 63 letters of A-Z and a-z, digits, - and _; the first is a letter or
+        digit. A null sigma of a state is unknown, as 0 is.
     encoding
         Of the messages: protobuf, json or ros2.
 
@@ -120,7 +126,8 @@ def write_log(
     ------
     ValueError
         Where a column is missing, unknown, of the wrong type, or null where it may not be; where
-        the lists of a frame differ in length; where the encoding is unknown.
+        the lists of a frame differ in length; where a sensor's id is none that a reader takes;
+        where the encoding is unknown.
 
     Notes
     -----
@@ -153,7 +160,14 @@ def _checked(schema: pa.Schema, rows: pl.DataFrame) -> pl.DataFrame:
     for name in schema.names:
         if name not in columns and name in _DEFAULTS:
             columns[name] = [_DEFAULTS[name]] * rows.height
-    return to_polars(table(schema, columns)).sort("time", "sensor_id", maintain_order=True)
+    checked = to_polars(table(schema, columns))
+    for sensor_id in checked["sensor_id"].unique().sort():
+        if not valid_sensor_id(sensor_id):
+            raise ValueError(
+                f"table {table_name(schema)}: sensor_id {sensor_id!r}: expected {SENSOR_ID_RULE}"
+            )
+    unknown = [pl.col(name).fill_null(0.0) for name in _UNKNOWN_IS_0 if name in schema.names]
+    return checked.with_columns(unknown).sort("time", "sensor_id", maintain_order=True)
 
 
 def _same_lengths(frames: pl.DataFrame) -> pl.DataFrame:

@@ -10,6 +10,9 @@ from typing import NamedTuple
 FRAME, STATE, CALIBRATION = "frame", "state", "calibration"
 KINDS = (FRAME, STATE, CALIBRATION)
 
+SENSOR_ID_PATTERN = "[A-Za-z0-9][A-Za-z0-9_-]{0,62}"
+SENSOR_ID_RULE = "1 to 63 letters of A-Z and a-z, digits, - and _; the first a letter or digit"
+
 
 class Member(NamedTuple):
     """A field of a message; `type` is time, string, uint64, double or float."""
@@ -34,7 +37,7 @@ CENTROID_FRAME = MessageType(
     "One exposure of one star sensor, reduced to the centroids of its bright spots.",
     (
         Member("timestamp", 1, "time", "Middle of the exposure, UTC."),
-        Member("sensor_id", 2, "string", "[A-Za-z0-9][A-Za-z0-9_-]{0,62}"),
+        Member("sensor_id", 2, "string", SENSOR_ID_PATTERN),
         Member("frame_number", 3, "uint64", "Unique per sensor, increasing with time."),
         Member("exposure_s", 4, "double", "Exposure time."),
         Member("x_px", 5, "float", "Column; (0, 0) is the middle of the top-left pixel.", True),

@@ -16,10 +16,10 @@ from epipole.io.logs.messages.encodings.registry import message_encodings
 from epipole.io.logs.messages.fields import FIELD_TYPES, no_fields
 from epipole.io.logs.messages.scan import Messages
 from epipole.schemas.logs.bounds import TIME
-from epipole.schemas.logs.messages import CALIBRATION, FRAME, STATE
+from epipole.schemas.logs.messages import CALIBRATION, FRAME, SENSOR_ID_PATTERN, STATE
 from epipole.schemas.rejects import Reason
 
-SENSOR_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,62}")
+SENSOR_ID = re.compile(SENSOR_ID_PATTERN)
 MOST_AT_ONCE = 4096  # messages decoded one at a time before the scan is tried again
 BATCH_MESSAGES = 8192  # so that the located fields of a batch stay small
 UNDECODABLE = {

@@ -1,6 +1,7 @@
 """Logs as tables, in and out."""
 
 import datetime
+import re
 
 import polars as pl
 import pytest
@@ -57,6 +58,38 @@ def test_columns_that_are_left_out_are_unknown(tmp_path):
     assert states["position_sigma_km"].to_list() == [0.0]
     assert cameras["k1"].to_list() == [0.0]
     assert rejects.height == 0
+
+
+@pytest.mark.parametrize("values", [[None, None], [2.0, None]])
+def test_sigmas_of_states_that_are_null_are_unknown(tmp_path, values):
+    frames, states, cameras = tables()
+    states = pl.concat([states, states.with_columns(pl.col("time") + datetime.timedelta(0, 1))])
+    sigmas = [pl.Series(n, values) for n in ("position_sigma_km", "attitude_sigma_arcsec")]
+    api.write_log(tmp_path / "a.mcap", frames, states.with_columns(sigmas), cameras)
+    read = api.read_log(tmp_path / "a.mcap").states
+    for sigma in sigmas:
+        assert read[sigma.name].to_list() == [value or 0.0 for value in values]
+
+
+@pytest.mark.parametrize("sensor_id", ["cam.1", "", "_a", "a" * 64, "caf\u00e9"])
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_sensor_ids_that_a_reader_refuses_are_not_written(tmp_path, sensor_id, number):
+    made = list(tables())
+    made[number] = made[number].with_columns(sensor_id=pl.lit(sensor_id))
+    name = ("frames", "states", "cameras")[number]
+    message = f"table {name}: sensor_id '{sensor_id}': expected 1 to 63 letters of A-Z"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        api.write_log(tmp_path / "a.mcap", *made)
+    assert not list(tmp_path.iterdir())
+
+
+def test_sensor_ids_that_a_reader_takes_are_written(tmp_path):
+    for name in ("a" * 63, "1-_B", "Z"):
+        made = [rows.with_columns(sensor_id=pl.lit(name)) for rows in tables()]
+        api.write_log(tmp_path / "a.mcap", *made)
+        log = api.read_log(tmp_path / "a.mcap")
+        assert log.frames["sensor_id"].to_list() == [name]
+        assert log.rejects.height == 0
 
 
 def test_states_are_in_gcrf_whatever_the_frame_of_the_log(tmp_path):
