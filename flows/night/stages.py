@@ -6,7 +6,7 @@ rows of a night do not depend on which worker made which part, or when.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,7 +35,8 @@ from epipole.tasks.check.check_sensors import (
     check_sensors,
 )
 from epipole.tasks.check.correct_clock import correct_clock
-from epipole.tasks.identify.identify_span import identify_span
+from epipole.tasks.identify.identify_span import Counts, identify_span
+from epipole.tasks.identify.judge_image_sizes import OutsideImage, judge_image_size
 from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
 from epipole.tasks.name.followed_objects import VIEWS, followed_objects
 from epipole.tasks.name.link_objects import link_objects, outermost, renamed
@@ -77,11 +78,17 @@ def identify(
     """Place sensors, identify stars and solve attitudes, a task per sensor and span."""
     where = {sensor: folder.identified(sensor) for sensor in spans}
     work = Work(frames.folder, folder, spans, frames.cameras, where, trail)
-    return identify_spans(Stage.IDENTIFY, work, settings)
+    counts = identify_spans(Stage.IDENTIFY, work, settings)
+    for outside in _outside_images(work, counts, settings):
+        LOGGER.warning("%s", outside)
+    return work
 
 
-def identify_spans(stage: Stage, work: Work, settings: Settings) -> Work:
-    """Identify the frames of all spans of `work`; the parts go to `work.identified`."""
+def identify_spans(stage: Stage, work: Work, settings: Settings) -> list[Counts]:
+    """Identify the frames of all spans of `work`; the parts go to `work.identified`.
+
+    The counts of the parts are in the order of `work.by_span()`.
+    """
     futures = [
         identify_span.submit(
             work.frames, sensor, span, work.cameras, settings, work.identified[sensor],
@@ -90,10 +97,27 @@ def identify_spans(stage: Stage, work: Work, settings: Settings) -> Work:
         for sensor, span in work.by_span()
     ]  # fmt: skip
     work.trail.ran(futures, [[pair] for pair in work.by_span()])
-    frames, by_stars, stars = map(sum, zip(*results(stage, futures), strict=True))
+    counts: list[Counts] = results(stage, futures)
+    frames, by_stars, stars = (
+        sum(getattr(count, name) for count in counts) for name in ("frames", "by_stars", "stars")
+    )
     LOGGER.info("identified %s of %s by %s", f"{by_stars:,}", many(frames, "frame"),
                 many(stars, "star"))  # fmt: skip
-    return work
+    return counts
+
+
+def _outside_images(
+    work: Work, counts: Sequence[Counts], settings: Settings
+) -> Iterator[OutsideImage]:
+    """Yield the sensors that have too many centroids outside the image of their calibration."""
+    by_span = dict(zip(work.by_span(), counts, strict=True))
+    for sensor, spans in work.spans.items():
+        own = [(span, by_span[sensor, span]) for span in spans]
+        found = judge_image_size(
+            work.frames, sensor, work.identified[sensor], own, work.cameras, settings
+        )
+        if found is not None:
+            yield found
 
 
 def track(work: Work, night: str, settings: Settings) -> None:

@@ -27,11 +27,14 @@ BRIDGED_NS = 300_000_000_000  # states this far outside a span help to place its
 
 
 class Counts(NamedTuple):
-    """Counts of a part: frames, frames with an attitude from stars, identified stars."""
+    """Counts of a part; `by_stars` are frames with an attitude from stars, `outside` centroids
+    outside the image."""
 
     frames: int
     by_stars: int
     stars: int
+    centroids: int
+    outside: int
 
 
 @stage_task(Stage.IDENTIFY, "{sensor} {span}")
@@ -60,9 +63,21 @@ def identify_span(
         identified = identify_stars(exposures, places, cameras, catalogue, settings)
         rejects = concat(REJECTS, [identified.rejects, _unplaced(places)])
         write_part(parts.of(span), IDENTIFIED, {**identified._asdict(), "rejects": rejects})
-    source = parts.read(span, "solutions", ["attitude_source"])["attitude_source"]
-    by_stars = pc.sum(pc.equal(source, "stars")).as_py() or 0
-    return Counts(len(source), by_stars, parts.read(span, "stars").num_rows)
+    return _counts(parts, span)
+
+
+def _counts(parts: Parts, span: Span) -> Counts:
+    """Return the counts of a part that is written."""
+    solutions = parts.read(span, "solutions", ["attitude_source", "n_centroids"])
+    rejects = parts.read(span, "rejects", ["reason", "count"])
+    outside = rejects.filter(pc.field("reason") == Reason.OUTSIDE_IMAGE.value)
+    return Counts(
+        solutions.num_rows,
+        pc.sum(pc.equal(solutions["attitude_source"], "stars")).as_py() or 0,
+        parts.read(span, "stars").num_rows,
+        pc.sum(solutions["n_centroids"]).as_py() or 0,
+        pc.sum(outside["count"]).as_py() or 0,
+    )
 
 
 def states_about(frames: ReadFolder, sensor: Sensor, span: Span, settings: Settings) -> pa.Table:
