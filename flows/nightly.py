@@ -11,9 +11,10 @@ import pyarrow as pa
 from prefect import flow
 
 from epipole.flows.night.calibrating import calibrate, find_cameras
-from epipole.flows.night.earlier_nights import EarlierNights
+from epipole.flows.night.dataset.earlier_nights import EarlierNights
+from epipole.flows.night.dataset.night_rows import write_night_row
+from epipole.flows.night.dataset.unchanged import unchanged_nights
 from epipole.flows.night.log_choice import find_logs
-from epipole.flows.night.night_rows import write_night_row
 from epipole.flows.night.parameters import Night, night_asked, run_name
 from epipole.flows.night.reports import with_reports
 from epipole.flows.night.stages import (
@@ -31,7 +32,6 @@ from epipole.flows.night.stages import (
 )
 from epipole.flows.night.summary import Summary, by_reason, many, summarise
 from epipole.flows.night.trail import Trail
-from epipole.flows.night.unchanged import unchanged_nights
 from epipole.flows.night.work import Work, plan_spans
 from epipole.flows.prefect.page import shown_on_page
 from epipole.flows.prefect.runners import runner_asked

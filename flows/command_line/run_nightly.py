@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from epipole.flows.command_line.terminal import shown
-from epipole.flows.night.held_nights import held_nights
+from epipole.flows.night.dataset.held_nights import held_nights
+from epipole.flows.night.dataset.unchanged import unchanged_nights
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.progress import compile_step, prepare
 from epipole.flows.night.summary import Summary, summarise
-from epipole.flows.night.unchanged import unchanged_nights
 from epipole.flows.prefect.server_process import Launched, launch
 from epipole.io.caches.kernel_warm_up import compile_beside, compile_kernels, compiling_told
 from epipole.io.catalogues.known_objects import read_known_objects

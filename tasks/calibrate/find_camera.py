@@ -29,7 +29,7 @@ from epipole.tasks.algorithms.star_identification.camera_search import (
     find_cameras,
 )
 from epipole.tasks.algorithms.star_identification.frames.spots import brightest_first
-from epipole.tasks.algorithms.star_identification.sensor import Skies
+from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
 from epipole.tasks.calibrate.calibrate_sensors import with_optics
 from epipole.tasks.common.sightings import camera_of
 from epipole.tasks.common.stage_tasks import stage_task

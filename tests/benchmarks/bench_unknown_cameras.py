@@ -20,7 +20,7 @@ from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
 from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_cameras
 from epipole.tasks.algorithms.star_identification.frames.frame import Search
-from epipole.tasks.algorithms.star_identification.sensor import Skies
+from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 KINDS = (

@@ -9,7 +9,7 @@ from epipole.flows.command_line.options import AsJson
 from epipole.flows.command_line.printing import print_json, print_lines
 
 if TYPE_CHECKING:  # imported when the command runs
-    from epipole.flows.night.held_nights import HeldNight
+    from epipole.flows.night.dataset.held_nights import HeldNight
 
 HEADINGS = ("night", "frames", "stars", "objects", "positions", "left out", "")
 WIDTHS = (10, 11, 10, 9, 11, 10)
@@ -39,7 +39,7 @@ def nights(
     catalogues, or another night before it, whose objects it follows. `epipole run
     --stale` makes these again. Logs are not looked at.
     """
-    from epipole.flows.night.held_nights import held_nights
+    from epipole.flows.night.dataset.held_nights import held_nights
     from epipole.io.catalogues.known_objects import read_known_objects
     from epipole.io.datasets.dataset import check_folder
     from epipole.io.settings_file import read_settings

@@ -30,7 +30,7 @@ from epipole.tasks.algorithms.star_identification.frames.frame import (
     identify_lost,
     identify_predicted,
 )
-from epipole.tasks.algorithms.star_identification.sensor import Skies
+from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid

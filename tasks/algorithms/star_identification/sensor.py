@@ -2,21 +2,17 @@
 then every frame is identified."""
 
 from collections.abc import Iterator
-from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.star_identification.frame_quality import frame_scales
-from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search, Solution
+from epipole.tasks.algorithms.star_identification.frames.frame import Search, Solution
 from epipole.tasks.algorithms.star_identification.frames.spots import (
-    SensorCentroids,
     Solutions,
     UnscaledCentroids,
-    unsolved,
 )
-from epipole.tasks.algorithms.star_identification.second_look import SensorSky, look_again
+from epipole.tasks.algorithms.star_identification.second_look import look_again
 from epipole.tasks.algorithms.star_identification.sensor_limits import (
     USELESS_SCATTER_MAG,
     faintest_star,
@@ -26,14 +22,19 @@ from epipole.tasks.algorithms.star_identification.sensor_limits import (
     scale_of,
     zero_point,
 )
-from epipole.tasks.algorithms.star_identification.sequence import (
-    Priors,
-    identify_again,
-    identify_sequence,
+from epipole.tasks.algorithms.star_identification.sensor_sample import (
+    Known,
+    Sample,
+    Skies,
+    identify_sample,
+    sky_of,
 )
+from epipole.tasks.algorithms.star_identification.sequence import Priors, identify_again
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
-from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
-from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
+from epipole.tasks.algorithms.star_identification.unlike_frames import (
+    by_quality,
+    of_other_brightness,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -49,27 +50,7 @@ KNOWN_SCALES = (1.0, 3.0, 0.4)  # factors to try on errors that the log or the s
 UNKNOWN_SCALES_PX = (0.5, 1.5, 0.15)  # errors to try where none are stated
 LEAST_SPREAD_MAG = 0.15  # of brightness: a sample may scatter less than all
 WRONG_GATE = 0.02  # a sample that misses the errors of all frames by more is corrected
-# Frames of other quality: rounds of learning it, the change (ln) that ends them, and the factor on
-# errors from which frames are searched again.
-QUALITY_ROUNDS, SETTLED, OTHER_QUALITY = 6, 0.02, 1.25
-OTHER_TRIALS = 3  # of frames that failed: other brightness, worse quality, better quality
 DEEPER_MAG = 2.0  # how far beyond the first guess the faintest star is searched for
-
-
-class Skies(Protocol):
-    """The source of skies; it may cache them, as sensors share them."""
-
-    def limit_for(self, stars_per_sr: float) -> float:
-        """Return the magnitude limit with this mean density."""
-
-    def sky(self, limit: float) -> Sky:
-        """Return the sky to a magnitude."""
-
-    def grid(self, limit: float, radius_rad: float) -> SkyGrid:
-        """Return its grid."""
-
-    def pairs(self, limit: float, optics: FieldOfView) -> PairTable:
-        """Return its pattern pairs for a camera."""
 
 
 class IdentifiedSensor(NamedTuple):
@@ -108,8 +89,8 @@ def identify_sensor(
     if limit is None:  # of a crowd, nobody knows how many are stars
         in_view = STARS_IN_CROWD if crowded else density
         limit = skies.limit_for(in_view / spots.optics[0].solid_angle_sr)
-    known = _Known(1.0, limit, magnitude_limit is None, how, True, not stated)
-    whole = _Sample(t_s, spots, priors)
+    known = Known(1.0, limit, magnitude_limit is None, how, True, not stated)
+    whole = Sample(t_s, spots, priors)
     rows = usable[scattered(len(usable), PROBED_CROWDED if crowded else PROBED)]
     known, probed = _first_scale(
         whole.take(rows), skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX, crowded
@@ -117,13 +98,13 @@ def identify_sensor(
     hopeless = not any(probed)
     if not hopeless:
         known, whole = _learn_around(rows, probed, usable, whole, skies, known)
-    solutions, status = _identify(whole, skies, known, hopeless)
+    solutions, status = identify_sample(whole, skies, known, hopeless)
     if hopeless and solutions.solved.any():  # the probe was poor: learn from the others
         solved = np.flatnonzero(solutions.solved)
         rows = solved[spread(len(solved), SAMPLED)]
         sampled = [solutions.frame(i) for i in rows]
         known = _learn(whole.take(rows).spots, sampled, skies, known)
-        solutions, status = _identify(whole.anchored(rows, sampled), skies, known)
+        solutions, status = identify_sample(whole.anchored(rows, sampled), skies, known)
     residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
     if known.adjusted and abs(residuals.scale - 1) > WRONG_GATE:
         known = known._replace(scale=known.scale * residuals.scale)
@@ -143,119 +124,16 @@ def identify_sensor(
         solutions = solutions.rescaled(residuals.scale)
     whole = whole._replace(spots=spots)
     if solutions.solved.any():
-        solutions = _of_other_brightness(whole, solutions, skies, known)
+        solutions = of_other_brightness(whole, solutions, skies, known)
     quality = look_again(
         spots.frames(known.scale, known.use_flux),
         solutions,
-        _sky_of(spots, skies, known),
+        sky_of(spots, skies, known),
         known.how,
     )
-    solutions, quality = _by_quality(whole, solutions, quality, skies, known)
+    solutions, quality = by_quality(whole, solutions, quality, skies, known)
     status = [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
     return IdentifiedSensor(solutions, status, skies.sky(known.limit), known.scale * quality)
-
-
-def _of_other_brightness(
-    whole: "_Sample", solutions: Solutions, skies: Skies, known: "_Known"
-) -> Solutions:
-    """Return the solutions with those of frames whose zero point is not that of the others: other
-    exposure, other gain."""
-    how = known.how._replace(
-        zero_point_mag=np.nan, threshold=known.how.threshold + np.log(OTHER_TRIALS)
-    )
-    rows = np.flatnonzero(~solutions.solved & (whole.spots.counts >= 4))
-    if known.use_flux and not np.isnan(known.how.zero_point_mag) and len(rows):
-        found = _identify(whole.take(rows), skies, known._replace(how=how), hopeless=True)[0]
-        solved = np.flatnonzero(found.solved)
-        solutions.enter_all(rows[solved], found, solved)
-    return solutions
-
-
-def _by_quality(
-    whole: "_Sample", solutions: Solutions, quality: Array, skies: Skies, known: "_Known"
-) -> tuple[Solutions, Array]:
-    """Return the solutions with each frame's own errors, and these over those of the sensor.
-
-    Where frames differ, those that are not identified are searched as better and as worse ones.
-    """
-    solutions, quality = _settle_quality(whole, solutions, quality, skies, known)
-    if not solutions.solved.any():
-        return solutions, quality
-    how = known.how._replace(threshold=known.how.threshold + np.log(OTHER_TRIALS))
-    for other in np.quantile(quality[solutions.solved], (0.9, 0.1)):
-        rows = np.flatnonzero(~solutions.solved & (whole.spots.counts >= 4))
-        if abs(np.log(other)) < np.log(OTHER_QUALITY) or not len(rows):
-            continue
-        tried = whole.take(rows).of_quality(np.full(len(rows), other))
-        found = _identify(tried, skies, known._replace(how=how), hopeless=True)[0]
-        solved = np.flatnonzero(found.solved)
-        solutions.enter_all(rows[solved], found, solved)
-        quality[rows[solved]] = other
-    return _settle_quality(whole, solutions, quality, skies, known)
-
-
-def _settle_quality(
-    whole: "_Sample", solutions: Solutions, quality: Array, skies: Skies, known: "_Known"
-) -> tuple[Solutions, Array]:
-    """Return the solutions and each frame's errors over the sensor's, which depend on each
-    other."""
-    n, counts = len(quality), whole.spots.counts
-    sky, frame = skies.sky(known.limit), np.repeat(np.arange(n), counts)
-    for _ in range(QUALITY_ROUNDS):
-        stars = np.bincount(frame, solutions.star >= 0, minlength=n)
-        dof = np.where(solutions.solved, 2 * stars - 3, 0).astype(np.int64)
-        chi2 = np.bincount(frame, np.where(solutions.star >= 0, solutions.chi2, 0.0), minlength=n)
-        found = frame_scales(chi2 * quality**2, dof)
-        if np.ptp(found) == 0.0 or np.abs(np.log(found / quality)).max() < SETTLED:
-            break
-        quality = found
-        frames = whole.of_quality(quality).spots.frames(known.scale, known.use_flux)
-        again = identify_again(whole.t_s, frames, solutions, sky, known.how)
-        lost = np.flatnonzero(solutions.solved & ~again.solved)
-        again.enter_all(lost, solutions, lost)
-        solutions = again
-    return solutions, quality
-
-
-class _Known(NamedTuple):
-    """What has been learned of a sensor."""
-
-    scale: float  # on the errors as stated, or on 1 px
-    limit: float  # faintest star searched for
-    limit_is_open: bool  # the settings do not state it
-    how: Search
-    use_flux: bool  # brightness is compared
-    adjusted: bool  # errors are not as stated, or not stated
-
-
-class _Sample(NamedTuple):
-    """Frames, with their priors; `anchors` are frames whose prior is an earlier solution."""
-
-    t_s: Array
-    spots: UnscaledCentroids
-    priors: Priors
-    anchors: bool = False
-
-    def take(self, rows: npt.NDArray[np.int64]) -> "_Sample":
-        priors = Priors(self.priors.R_sensor_from_icrs[rows], self.priors.sigma_rad[rows])
-        return _Sample(self.t_s[rows], self.spots.take(rows), priors, self.anchors)
-
-    def anchored(self, rows: npt.NDArray[np.int64], solutions: list[Solution | None]) -> "_Sample":
-        """Return the frames with these solutions as priors, where they have none of their own."""
-        R, sigma = self.priors.R_sensor_from_icrs.copy(), self.priors.sigma_rad.copy()
-        for row, solution in zip(rows, solutions, strict=True):
-            if solution is not None and np.isnan(self.priors.sigma_rad[row]):
-                R[row] = solution.R_sensor_from_icrs
-                # Errors and sky were other ones: it may be off by more than it says.
-                sigma[row] = 3.0 * np.sqrt(np.trace(solution.cov_rad2) / 3.0)
-        return self._replace(priors=Priors(R, sigma), anchors=True)
-
-    def of_quality(self, quality: Array) -> "_Sample":
-        """Return the frames with these factors on their errors."""
-        spots = self.spots
-        stated = np.where(np.isnan(spots.sigma_px), 1.0, spots.sigma_px)
-        scaled = spots._replace(sigma_px=stated * np.repeat(quality, spots.counts))
-        return self._replace(spots=scaled)
 
 
 def spread(n: int, wanted: int) -> npt.NDArray[np.int64]:
@@ -285,8 +163,8 @@ def _fill_sigmas(spots: UnscaledCentroids) -> tuple[UnscaledCentroids, bool]:
 
 
 def _learn(
-    spots: UnscaledCentroids, solutions: list[Solution | None], skies: Skies, known: _Known
-) -> _Known:
+    spots: UnscaledCentroids, solutions: list[Solution | None], skies: Skies, known: Known
+) -> Known:
     """Return what is known, with errors, zero point and faintest star from solved frames."""
     if not any(solutions):
         return known
@@ -311,7 +189,7 @@ def _learn(
 
 
 def _faintest(
-    spots: UnscaledCentroids, solutions: list[Solution | None], skies: Skies, known: _Known
+    spots: UnscaledCentroids, solutions: list[Solution | None], skies: Skies, known: Known
 ) -> float:
     """Return the magnitude of the faintest star that the sensor detects, or that settings state."""
     if not known.limit_is_open:
@@ -325,8 +203,8 @@ def _faintest(
 
 
 def _first_scale(
-    probe: _Sample, skies: Skies, known: _Known, scales: tuple[float, ...], crowded: bool
-) -> tuple[_Known, list[Solution | None]]:
+    probe: Sample, skies: Skies, known: Known, scales: tuple[float, ...], crowded: bool
+) -> tuple[Known, list[Solution | None]]:
     """Return what is known, with a scale of errors that identifies frames, and the solutions."""
     attempts = list(_attempts(probe.spots, skies, known, scales, crowded))
     # Each further attempt is one more chance of a false alarm.
@@ -339,7 +217,7 @@ def _first_scale(
         # In a crowd, nothing less finds stars: as many as expected, or more.
         in_crowd = crowded and tried.scale == scales[0] and tried.use_flux
         how = thorough if in_crowd else quick
-        found = _identify(probe, skies, tried._replace(how=how))[0].each()
+        found = identify_sample(probe, skies, tried._replace(how=how))[0].each()
         if any(found):
             return _likeliest_scale(probe.spots, found, skies, tried, scales)
     return known._replace(scale=scales[0]), [None] * len(probe.t_s)
@@ -348,10 +226,10 @@ def _first_scale(
 def _attempts(
     probe: UnscaledCentroids,
     skies: Skies,
-    known: _Known,
+    known: Known,
     scales: tuple[float, ...],
     crowded: bool,
-) -> Iterator[_Known]:
+) -> Iterator[Known]:
     """Yield what may be assumed of a sensor, the likeliest first."""
     flux = bool(np.isfinite(probe.instrumental_mag).any())
     area = probe.optics[0].solid_angle_sr
@@ -371,9 +249,9 @@ def _likeliest_scale(
     spots: UnscaledCentroids,
     solutions: list[Solution | None],
     skies: Skies,
-    known: _Known,
+    known: Known,
     scales: tuple[float, ...],
-) -> tuple[_Known, list[Solution | None]]:
+) -> tuple[Known, list[Solution | None]]:
     """Return what is known, with the scale of errors that explains solved frames best, and the
     solutions with it."""
     best, most, chosen = known, -np.inf, solutions
@@ -390,10 +268,10 @@ def _learn_around(
     rows: npt.NDArray[np.int64],
     solutions: list[Solution | None],
     usable: npt.NDArray[np.int64],
-    whole: _Sample,
+    whole: Sample,
     skies: Skies,
-    known: _Known,
-) -> tuple[_Known, _Sample]:
+    known: Known,
+) -> tuple[Known, Sample]:
     """Return what is known, learned from the frames around solved ones, and all frames with
     these as anchors."""
     # With the errors, zero point and faintest star of the solved ones, more can be followed.
@@ -401,33 +279,6 @@ def _learn_around(
     solved = np.array([s is not None for s in solutions])
     near = usable[_around(len(usable), np.searchsorted(usable, rows[solved]))]
     anchored = whole.anchored(rows, solutions)
-    sampled = _identify(anchored.take(near), skies, known)[0].each()
+    sampled = identify_sample(anchored.take(near), skies, known)[0].each()
     known = _learn(whole.take(near).spots, sampled, skies, known)
     return known, whole.anchored(near, sampled) if any(sampled) else anchored
-
-
-def _identify(
-    sample: _Sample, skies: Skies, known: _Known, hopeless: bool = False
-) -> tuple[Solutions, list[str | None]]:
-    """Return the frames' solutions and status; `hopeless` ones have failed so far."""
-    if not len(sample.t_s):
-        return unsolved(sample.spots.first), []
-    frames = sample.spots.frames(known.scale, known.use_flux)
-    return identify_sequence(
-        sample.t_s, frames, sample.priors, *_sky_of(sample.spots, skies, known), known.how,
-        sample.anchors, hopeless,
-    )  # fmt: skip
-
-
-def _sky_of(spots: UnscaledCentroids, skies: Skies, known: _Known) -> SensorSky:
-    """Return what the frames are searched in."""
-    radius = _grid_radius(spots.frames(known.scale), known.how)
-    pairs = partial(skies.pairs, known.limit, spots.optics[0])
-    return SensorSky(skies.sky(known.limit), skies.grid(known.limit, radius), pairs)
-
-
-def _grid_radius(frames: SensorCentroids, how: Search) -> float:
-    """Return the widest look-up [rad], rounded up so that similar sensors share a grid."""
-    sigma = frames.sigma_rad
-    widest = 2.5 * how.gate_sigma * float(np.median(sigma)) if len(sigma) else 1e-3
-    return float(min(2.0 ** (np.ceil(2 * np.log2(widest)) / 2), 0.1))

@@ -18,8 +18,9 @@ from epipole.tasks.algorithms.star_identification.frames.frame import (
     aberrate_all,
 )
 from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids, unsolved
-from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, Skies
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sensor_limits import scale_of
+from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 
 Array = npt.NDArray[np.float64]

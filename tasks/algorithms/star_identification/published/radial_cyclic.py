@@ -28,7 +28,8 @@ from epipole.tasks.algorithms.star_identification.published.frame_by_frame impor
     Matcher,
     identify_each_frame,
 )
-from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, Skies
+from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
+from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from epipole.flows.night.earlier_nights import EarlierNights
-from epipole.flows.night.night_rows import recipe_in
+from epipole.flows.night.dataset.earlier_nights import EarlierNights
+from epipole.flows.night.dataset.night_rows import recipe_in
 from epipole.io.datasets.dataset import missing_tables, nights_in, read_table
 from epipole.io.work.recipe import recipe_of
 from epipole.schemas.errors import DatasetError

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
-from epipole.flows.night.held_nights import held_nights
+from epipole.flows.night.dataset.held_nights import held_nights
 from epipole.io.work import recipe
 from epipole.schemas.settings import Settings, validate_settings
 

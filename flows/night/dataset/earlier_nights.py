@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from epipole.flows.night.night_rows import key_of
+from epipole.flows.night.dataset.night_rows import key_of
 from epipole.io.datasets.dataset import nights_in, read_table
 from epipole.io.work.recipe import digest_of
 from epipole.schemas.bridge import concat

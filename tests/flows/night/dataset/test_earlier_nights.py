@@ -5,7 +5,7 @@ import logging
 import numpy as np
 from scenes.associations import filled
 
-from epipole.flows.night.earlier_nights import EarlierNights
+from epipole.flows.night.dataset.earlier_nights import EarlierNights
 from epipole.io.datasets.night_files import PART, write_table
 from epipole.schemas.settings import KnownObjectSettings, Settings
 from epipole.schemas.tables import ASSOCIATIONS, STATES

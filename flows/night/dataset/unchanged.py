@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from epipole.flows.night.earlier_nights import EarlierNights
+from epipole.flows.night.dataset.earlier_nights import EarlierNights
+from epipole.flows.night.dataset.night_rows import recipe_in
 from epipole.flows.night.log_choice import FoundLogs, name_of
-from epipole.flows.night.night_rows import recipe_in
 from epipole.io.datasets.dataset import missing_tables, nights_in, read_table
 from epipole.io.logs.mcap.bytes import open_log
 from epipole.io.work.recipe import logs_key, recipe_of

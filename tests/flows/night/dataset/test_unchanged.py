@@ -4,8 +4,8 @@ import shutil
 
 import pytest
 
+from epipole.flows.night.dataset.unchanged import unchanged_nights
 from epipole.flows.night.log_choice import FoundLogs, find_logs
-from epipole.flows.night.unchanged import unchanged_nights
 from epipole.io.work import recipe
 from epipole.schemas.settings import Settings, validate_settings
 
