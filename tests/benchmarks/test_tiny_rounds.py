@@ -45,6 +45,7 @@ TINY = {
     "star_identification": "--made 3 --cameras c --tracked 200",
     "track_linking": "--seeds 1",
     "tracking": "--frames 20 --objects 10 --false 2 --repeats 1",
+    "unlike_frames": "--cameras a --kinds shaken errors --frames 8",
     "unknown_cameras": "--frames 1 --told 1.02 --fields 12",
     "untold_optics": "--tiny",
 }

@@ -5,8 +5,8 @@ Two things make them so. The centroids are worse than those of other frames (the
 shook): of many stars, the few that are near their places by chance are matched, and the attitude
 has their error, not that of all. Or a few matches near a predicted attitude are no stars of the
 field: the spots of bright stars that stay on a detector look like the frame before. So these frames
-are matched again with larger errors, and searched again without a prediction. What explains the
-frame better is taken.
+are matched again with larger errors, and the centroids that are left over are searched for another
+attitude. What explains the frame better is taken.
 """
 
 from collections.abc import Callable
@@ -115,9 +115,19 @@ def _near(
 def _searched(
     frame: FrameCentroids, known: Solution, where: SensorSky, how: Search
 ) -> tuple[Solution, float] | None:
-    """Return the solution of a search of the whole sky, None where it is hardly likelier."""
+    """Return the solution of a search of the whole sky with the centroids that are left over, None
+    where it is hardly likelier.
+
+    With all of them, the search would end with the known solution if that is beyond doubt.
+    """
+    rest = known.star < 0
+    left_over = frame._replace(
+        u=frame.u[rest], sigma_rad=frame.sigma_rad[rest],
+        instrumental_mag=frame.instrumental_mag[rest],
+    )  # fmt: skip
     quick = how._replace(crowded=False)
-    found = identify_lost(frame, where.sky, where.grid, where.pairs(), quick)[0]
+    found = identify_lost(left_over, where.sky, where.grid, where.pairs(), quick)[0]
+    found = found and _near(frame, found, where.sky, how, 1.0)
     same = _near(frame, known, where.sky, how, 1.0)  # judged as if it had been searched, too
     if found is None or (same is not None and found.evidence < same.evidence + LIKELIER):
         return None

@@ -18,16 +18,19 @@ Array = npt.NDArray[np.float64]
 # Rounds of learning other errors, the change (ln) that ends them, and the factor on errors from
 # which frames are searched again.
 QUALITY_ROUNDS, SETTLED, OTHER_QUALITY = 6, 0.02, 1.25
-OTHER_TRIALS = 3  # of frames that failed: other brightness, worse quality, better quality
+# Frames that failed are tried with the errors of the sensor's worst and best tenth, and with errors
+# larger by this factor.
+MUCH_WORSE = 8.0
+OTHER_TRIALS = 4  # the brightness, and these
 
 
 def of_other_brightness(
-    whole: "Sample", solutions: Solutions, skies: Skies, known: "Known"
+    whole: Sample, solutions: Solutions, skies: Skies, known: Known
 ) -> Solutions:
     """Return the solutions with those of frames whose zero point is not that of the others: other
     exposure, other gain."""
     how = known.how._replace(
-        zero_point_mag=np.nan, threshold=known.how.threshold + np.log(OTHER_TRIALS)
+        zero_point_mag=np.nan, threshold=known.how.threshold + np.log(OTHER_TRIALS), crowded=False
     )
     rows = np.flatnonzero(~solutions.solved & (whole.spots.counts >= 4))
     if known.use_flux and not np.isnan(known.how.zero_point_mag) and len(rows):
@@ -38,17 +41,17 @@ def of_other_brightness(
 
 
 def by_quality(
-    whole: "Sample", solutions: Solutions, quality: Array, skies: Skies, known: "Known"
+    whole: Sample, solutions: Solutions, quality: Array, skies: Skies, known: Known
 ) -> tuple[Solutions, Array]:
     """Return the solutions with each frame's own errors, and these over those of the sensor.
 
-    Where frames differ, those that are not identified are searched as better and as worse ones.
+    Frames that are not identified are searched as better and as worse ones.
     """
     solutions, quality = _settle_quality(whole, solutions, quality, skies, known)
     if not solutions.solved.any():
         return solutions, quality
-    how = known.how._replace(threshold=known.how.threshold + np.log(OTHER_TRIALS))
-    for other in np.quantile(quality[solutions.solved], (0.9, 0.1)):
+    how = known.how._replace(threshold=known.how.threshold + np.log(OTHER_TRIALS), crowded=False)
+    for other in (*np.quantile(quality[solutions.solved], (0.9, 0.1)), MUCH_WORSE):
         rows = np.flatnonzero(~solutions.solved & (whole.spots.counts >= 4))
         if abs(np.log(other)) < np.log(OTHER_QUALITY) or not len(rows):
             continue
@@ -61,7 +64,7 @@ def by_quality(
 
 
 def _settle_quality(
-    whole: "Sample", solutions: Solutions, quality: Array, skies: Skies, known: "Known"
+    whole: Sample, solutions: Solutions, quality: Array, skies: Skies, known: Known
 ) -> tuple[Solutions, Array]:
     """Return the solutions and each frame's errors over the sensor's, which depend on each
     other."""
