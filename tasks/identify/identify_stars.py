@@ -233,5 +233,6 @@ def _matches(
     star = star[at]
     stars = found.sky.catalogue
     return MatchedStars(
-        at, stars.star_id[star], stars.magnitude[star], stars.u_icrs[star], found.sigma_scale
-    )
+        at, stars.star_id[star], stars.magnitude[star], stars.u_icrs[star], found.sigma_scale,
+        found.sigma_floor_px,
+    )  # fmt: skip

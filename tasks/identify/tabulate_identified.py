@@ -43,7 +43,8 @@ class StarAttitudes(NamedTuple):
 class MatchedStars(NamedTuple):
     """Identified stars: the index of each one's centroid, and the star.
 
-    `scale` is the factor on each frame's centroid errors that the stars' residuals show.
+    `scale` is the factor on each frame's centroid errors that the stars' residuals show, `floor_px`
+    the error that all have beside the stated ones.
     """
 
     at: npt.NDArray[np.int64]
@@ -51,6 +52,7 @@ class MatchedStars(NamedTuple):
     magnitude: Array
     u_icrs: Array
     scale: Array
+    floor_px: float = 0.0
 
 
 def barycentric_velocity(time_ns: npt.NDArray[np.int64], places: pa.Table) -> Array:
@@ -169,7 +171,8 @@ def detections_table(
     frame = c.frame[at]
     u_icrs = np.einsum("nji,nj->ni", a.R[frame], c.u[at])
     ra, dec = radec_from_unit(u_icrs)
-    sigma_px = np.where(np.isnan(c.sigma_px[at]), 1.0, c.sigma_px[at]) * m.scale[frame]
+    sigma_px = np.where(np.isnan(c.sigma_px[at]), 1.0, np.hypot(c.sigma_px[at], m.floor_px))
+    sigma_px *= m.scale[frame]
     rows = table(
         DETECTIONS,
         _frame_key(exposures, frame)

@@ -6,7 +6,8 @@ that go wrong, or the only ones that show the sky.
 
 Sensors of frames at random attitudes without priors, unless said, centroid error 0.15 px, 3 false
 points, 5 % of the stars missing; through `identify_sensor` with the settings of a run. Printed per
-camera, kind, and whether an error is stated (0.15 px): frames identified of those that show the
+camera, kind, and which error is stated (none, 0.15 px, or that of the photons alone: 0.15 px at
+the limit and less for brighter stars): frames identified of those that show the
 sky, wrong ones of all, and the mean squared error of attitudes over covariance across the boresight
 and about it; for kind `errors` by the frames' centroid error.
 """
@@ -135,15 +136,19 @@ SCENES: dict[str, Callable[[Stars, int, Rng], Scene]] = {
     "sky in few": sky_in_few,
 }
 
+STATED = {"like the others": ("none", "true", "photons"), "errors": ("none",)}
 
-def centroids(kind: Kind, shots: list[Array], stated: bool) -> UnscaledCentroids:
+
+def centroids(kind: Kind, shots: list[Array], stated: str) -> UnscaledCentroids:
     """Return the frames as a sensor's."""
     camera = kind.camera
     x, y, magnitude = np.hstack(shots)
     first = np.concatenate([[0], np.cumsum([points.shape[1] for points in shots])])
     u, half = unproject(camera, x, y), kind.width_px / 2 / camera.fx_px
+    photons_px = SIGMA_PX * np.minimum(10.0 ** (0.2 * (magnitude - kind.magnitude_limit)), 1.0)
+    stated_px = {"photons": photons_px, "true": np.full(len(x), SIGMA_PX)}
     return UnscaledCentroids(
-        first, u, pixel_angle(camera, u), np.full(len(x), SIGMA_PX if stated else np.nan),
+        first, u, pixel_angle(camera, u), stated_px.get(stated, np.full(len(x), np.nan)),
         magnitude, np.zeros((len(shots), 3)),
         [FieldOfView(camera.half_diagonal_rad, np.array([-half, half, -half, half]),
                      camera.pixel_rad)],
@@ -162,7 +167,7 @@ def squares(R: Array, true: Array, cov: Array) -> tuple[float, float]:
     return 0.5 * (x + y), z
 
 
-def measure(kind: Kind, scene: Scene, stated: bool) -> list[str]:
+def measure(kind: Kind, scene: Scene, stated: str) -> list[str]:
     """Return rows of the table, one for each centroid error."""
     skies = CachedSkies(Catalogue(read_hipparcos()), DAY, kind.camera.pixel_rad, 2.0)
     rule, n = Settings().identification, len(scene.shots)
@@ -197,7 +202,7 @@ def main() -> None:
         kind = KINDS[name]
         stars = Stars(kind, seen_stars(hipparcos_at_epoch(kind.magnitude_limit + 1.0), kind))
         for label in given.kinds:
-            for stated in (False, True)[: 1 if label == "errors" else 2]:
+            for stated in STATED.get(label, ("none", "true")):
                 rng = np.random.default_rng([given.seed, list(SCENES).index(label)])
                 for row in measure(kind, SCENES[label](stars, given.frames, rng), stated):
                     print(f"| {name} | {label} | {stated} | {row} |", flush=True)

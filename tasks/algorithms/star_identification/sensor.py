@@ -17,6 +17,7 @@ from epipole.tasks.algorithms.star_identification.sensor_limits import (
     USELESS_SCATTER_MAG,
     faintest_star,
     is_significant,
+    likeliest_floor,
     rematch,
     residual_scale,
     scale_of,
@@ -59,12 +60,14 @@ class IdentifiedSensor(NamedTuple):
     solutions, status : of each frame, see `identify_sequence`
     sky : the solutions' stars are rows of its catalogue
     sigma_scale : (F,) float, factor on the centroid errors as stated, or on 1 px where none are
+    sigma_floor_px : the error that all have beside the stated ones, before that factor
     """
 
     solutions: Solutions
     status: list[str | None]
     sky: Sky
     sigma_scale: Array
+    sigma_floor_px: float = 0.0
 
 
 def identify_sensor(
@@ -96,7 +99,15 @@ def identify_sensor(
         whole.take(rows), skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX, crowded
     )
     hopeless = not any(probed)
+    floor_px = 0.0
     if not hopeless:
+        if stated:
+            floor_px = likeliest_floor(
+                whole.take(rows).spots, probed, skies.sky(known.limit), known.how, known.scale
+            )
+            spots = spots.with_floor(floor_px)
+            whole = whole._replace(spots=spots)
+            known = known._replace(scale=1.0 if floor_px else known.scale)
         known, whole = _learn_around(rows, probed, usable, whole, skies, known)
     solutions, status = identify_sample(whole, skies, known, hopeless)
     if hopeless and solutions.solved.any():  # the probe was poor: learn from the others
@@ -105,11 +116,32 @@ def identify_sensor(
         sampled = [solutions.frame(i) for i in rows]
         known = _learn(whole.take(rows).spots, sampled, skies, known)
         solutions, status = identify_sample(whole.anchored(rows, sampled), skies, known)
+    solutions, status, known = _with_true_scale(whole, solutions, status, skies, known)
+    if solutions.solved.any():
+        solutions = of_other_brightness(whole, solutions, skies, known)
+    quality = look_again(
+        spots.frames(known.scale, known.use_flux),
+        solutions,
+        sky_of(spots, skies, known),
+        known.how,
+    )
+    solutions, quality = by_quality(whole, solutions, quality, skies, known)
+    status = [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
+    return IdentifiedSensor(
+        solutions, status, skies.sky(known.limit), known.scale * quality, floor_px
+    )
+
+
+def _with_true_scale(
+    whole: Sample, solutions: Solutions, status: list[str | None], skies: Skies, known: Known
+) -> tuple[Solutions, list[str | None], Known]:
+    """Return the solutions with the errors that the residuals of all frames show."""
+    spots = whole.spots
     residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
     if known.adjusted and abs(residuals.scale - 1) > WRONG_GATE:
         known = known._replace(scale=known.scale * residuals.scale)
         sky, frames = skies.sky(known.limit), spots.frames(known.scale, known.use_flux)
-        again = identify_again(t_s, frames, solutions, sky, known.how)
+        again = identify_again(whole.t_s, frames, solutions, sky, known.how)
         if again.solved[solutions.solved].all():
             solutions = again
             status = [None if solved else s for s, solved in zip(status, again.solved, strict=True)]
@@ -122,18 +154,7 @@ def identify_sensor(
     if residuals.dof > 0 and (known.adjusted or is_significant(residuals)):
         known = known._replace(scale=known.scale * residuals.scale)
         solutions = solutions.rescaled(residuals.scale)
-    whole = whole._replace(spots=spots)
-    if solutions.solved.any():
-        solutions = of_other_brightness(whole, solutions, skies, known)
-    quality = look_again(
-        spots.frames(known.scale, known.use_flux),
-        solutions,
-        sky_of(spots, skies, known),
-        known.how,
-    )
-    solutions, quality = by_quality(whole, solutions, quality, skies, known)
-    status = [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
-    return IdentifiedSensor(solutions, status, skies.sky(known.limit), known.scale * quality)
+    return solutions, status, known
 
 
 def spread(n: int, wanted: int) -> npt.NDArray[np.int64]:

@@ -11,6 +11,7 @@ from epipole.tasks.algorithms.star_identification.frames.frame import (
     Solution,
     identify_predicted,
 )
+from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 
 Array = npt.NDArray[np.float64]
@@ -18,6 +19,9 @@ Array = npt.NDArray[np.float64]
 # Flux that scatters more than this about the catalogue is not used [mag].
 USELESS_SCATTER_MAG = 1.0
 MAGNITUDE_STEP = 0.25
+# Errors beside stated ones that are tried, over the median of these, which must differ by this
+# share; and the log evidence that proves one.
+FLOORS, UNLIKE, CLEARLY = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 8.0), 0.2, 12.0
 
 
 class Scale(NamedTuple):
@@ -82,6 +86,35 @@ def rematch(
         near = solution.cov_rad2 + np.eye(3) * float(np.median(frame.sigma_rad)) ** 2
         out.append(identify_predicted(frame, sky, solution.R_sensor_from_icrs, near, how, True))
     return out
+
+
+def likeliest_floor(
+    spots: UnscaledCentroids, solutions: list[Solution | None], sky: Sky, how: Search, scale: float
+) -> float:
+    """Return the error [px] that all centroids have beside the stated ones, 0 where there is none
+    or where the stated ones times `scale` explain the frames as well.
+
+    Stated errors of photons alone leave out those of pixels, of the lens and of the catalogue. So
+    the brightest stars lie many of their sigmas off. The evidence of solved frames decides.
+
+    Parameters
+    ----------
+    spots
+        The frames, with stated errors.
+    solutions, sky, scale
+        Of these frames, with the stated errors times `scale`. With a floor, these are not scaled.
+    """
+    known = spots.sigma_px[np.isfinite(spots.sigma_px)]
+    if not len(known) or np.ptp(np.quantile(known, [0.1, 0.9])) < UNLIKE * np.median(known):
+        return 0.0
+    floors_px = np.concatenate([[0.0], np.multiply(FLOORS, np.median(known))])
+    evidence = []
+    for floor_px in floors_px:
+        frames = spots.with_floor(floor_px).frames(1.0 if floor_px else scale).each()
+        again = rematch(frames, solutions, sky, how)
+        evidence.append(sum(s.evidence for s in again if s is not None))
+    best = int(np.argmax(evidence))
+    return float(floors_px[best]) if evidence[best] > evidence[0] + CLEARLY else 0.0
 
 
 def faintest_star(

@@ -81,6 +81,10 @@ class UnscaledCentroids(NamedTuple):
             self.beta[frames], self.optics, self.optics_of[frames],
         )  # fmt: skip
 
+    def with_floor(self, floor_px: float) -> "UnscaledCentroids":
+        """Return the centroids with an error that all have beside the stated ones."""
+        return self._replace(sigma_px=np.hypot(self.sigma_px, floor_px))
+
     def frames(self, scale: float, use_flux: bool = True) -> SensorCentroids:
         """Return the frames with their errors scaled; errors that are not stated count as 1 px."""
         sigma_px = np.where(np.isnan(self.sigma_px), 1.0, self.sigma_px) * scale

@@ -165,6 +165,29 @@ def test_frames_that_shook_keep_their_stars_and_have_their_own_errors(stated_px)
     assert 0.6 < np.mean(z2) < 1.5
 
 
+@pytest.mark.parametrize("share", [1.0, 0.0])
+def test_errors_of_photons_alone_get_the_error_that_all_centroids_have(share):
+    """Errors are 0.15 px; stated are those, or a hundredth of a pixel for the brightest stars."""
+    shots, true = zip(*[_shot(k, 0.15, 0.15) for k in range(30)], strict=True)
+    photons = [
+        10.0 ** (0.2 * (s.frame.instrumental_mag - s.frame.instrumental_mag[-1])) for s in shots
+    ]
+    shots = [
+        shot._replace(sigma_px=0.15 * (share + (1.0 - share) * np.minimum(photon, 1.0)))
+        for shot, photon in zip(shots, photons, strict=True)
+    ]
+    found = _identify(shots)
+    assert (found.sigma_floor_px == 0.0) == (share == 1.0)
+    z2, matched = [], 0
+    for k, solution in enumerate(found.solutions.each()):
+        R, R_true = solution.R_sensor_from_icrs, random_attitude(k)
+        off = np.array([R[2] @ R_true[1], R[0] @ R_true[2]])
+        z2.append(off**2 / np.diagonal(solution.cov_rad2)[:2])
+        matched += np.sum(solution.star >= 0) / np.sum(true[k] >= 0) / len(shots)
+    assert matched > 0.95
+    assert 0.6 < np.mean(z2) < 1.6
+
+
 def test_frames_of_another_exposure_are_identified_though_their_zero_point_differs():
     shots = [_shot(k, 0.15, missing=0.0)[0] for k in range(30)]
     for k in range(0, 30, 2):
