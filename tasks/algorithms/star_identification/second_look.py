@@ -20,9 +20,10 @@ from epipole.tasks.algorithms.star_identification.frames.frame import (
     Search,
     Solution,
     identify_lost,
-    identify_predicted,
+    some_centroids,
 )
 from epipole.tasks.algorithms.star_identification.frames.spots import SensorCentroids, Solutions
+from epipole.tasks.algorithms.star_identification.sensor_limits import rematch
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
@@ -108,8 +109,7 @@ def _near(
 ) -> Solution | None:
     """Return the solution near a known one with errors so many times as large."""
     worse = frame._replace(sigma_rad=factor * frame.sigma_rad)
-    near = known.cov_rad2 + np.eye(3) * float(np.median(worse.sigma_rad)) ** 2
-    return identify_predicted(worse, sky, known.R_sensor_from_icrs, near, how, lost=True)
+    return rematch([worse], [known], sky, how)[0]
 
 
 def _searched(
@@ -120,16 +120,14 @@ def _searched(
 
     With all of them, the search would end with the known solution if that is beyond doubt.
     """
-    rest = known.star < 0
-    left_over = frame._replace(
-        u=frame.u[rest], sigma_rad=frame.sigma_rad[rest],
-        instrumental_mag=frame.instrumental_mag[rest],
-    )  # fmt: skip
+    left_over = some_centroids(frame, np.flatnonzero(known.star < 0))
     quick = how._replace(crowded=False)
     found = identify_lost(left_over, where.sky, where.grid, where.pairs(), quick)[0]
     found = found and _near(frame, found, where.sky, how, 1.0)
+    if found is None:
+        return None
     same = _near(frame, known, where.sky, how, 1.0)  # judged as if it had been searched, too
-    if found is None or (same is not None and found.evidence < same.evidence + LIKELIER):
+    if same is not None and found.evidence < same.evidence + LIKELIER:
         return None
     return found, 1.0
 

@@ -213,16 +213,19 @@ def search_lost(
     if len(at) > N_PATTERN:
         spread = at[thinned(frame.u[at], frame.optics.box)]
         if len(spread) < CLUSTERED * len(at):
-            verdict = _search(_rows(frame, spread[:N_SEARCHED]), sky, grid, pairs, how, False)
+            verdict = _search(
+                some_centroids(frame, spread[:N_SEARCHED]), sky, grid, pairs, how, False
+            )
             if verdict.is_clear:
                 return verdict
-    verdict = _search(_rows(frame, at[:N_SEARCHED]), sky, grid, pairs, how, crowded=False)
+    verdict = _search(some_centroids(frame, at[:N_SEARCHED]), sky, grid, pairs, how, crowded=False)
     if verdict.is_clear or not how.crowded or len(at) <= N_PATTERN:
         return verdict
-    return _search(_rows(frame, at[:N_CROWDED]), sky, grid, pairs, how, crowded=True)
+    return _search(some_centroids(frame, at[:N_CROWDED]), sky, grid, pairs, how, crowded=True)
 
 
-def _rows(frame: FrameCentroids, at: npt.NDArray[np.int64]) -> FrameCentroids:
+def some_centroids(frame: FrameCentroids, at: npt.NDArray[np.int64]) -> FrameCentroids:
+    """Return the frame with these of its centroids."""
     return frame._replace(
         u=frame.u[at], sigma_rad=frame.sigma_rad[at], instrumental_mag=frame.instrumental_mag[at]
     )
