@@ -112,5 +112,7 @@ def _opened(night: Where, name: str) -> Iterator[Any]:
         return
     import fsspec
 
-    with fsspec.open(f"{night}/{name}/{PART}", cache_type="readahead") as file:
+    storage, path = fsspec.core.url_to_fs(f"{night}/{name}/{PART}")
+    storage.invalidate_cache()  # an earlier listing may be out of date
+    with storage.open(path, cache_type="readahead") as file:
         yield file

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -15,6 +16,7 @@ from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, TIMES, night
 from scenes.published import publish
 
 from epipole.flows.evaluate import evaluate
+from epipole.flows.night.dataset.held_nights import held_nights
 from epipole.flows.nightly import nightly
 from epipole.io.datasets import store_claims
 from epipole.io.datasets.dataset import (
@@ -26,6 +28,7 @@ from epipole.io.datasets.dataset import (
 from epipole.io.datasets.night_holder import Holder
 from epipole.io.datasets.store_nights import store_nights
 from epipole.schemas.errors import DatasetError
+from epipole.schemas.settings import Settings
 from epipole.schemas.tables import TABLES
 
 WHOLE_NIGHT = (
@@ -276,9 +279,17 @@ def test_a_dataset_may_be_named_by_a_file_url(tmp_path):
 
 def test_a_run_reads_from_a_bucket_and_publishes_to_one(s3, out, prefect, night_log, night_dataset):
     s3.put_file(str(night_log), "logs/run/night.mcap")
-    nightly(["s3://logs/run/night.mcap"], out)
+    made = nightly(["s3://logs/run/night.mcap"], out)
+    before = files(s3, out)
+    again = nightly(["s3://logs/run/night.mcap"], out)  # reads what the first one has published
+    assert again.unchanged
+    assert replace(again, unchanged=False, extracts=made.extracts) == made
+    assert files(s3, out) == before
+    nightly(["s3://logs/run/night.mcap"], out, again=True)
     for name in sorted(set(TABLES) - {"sources", "nights"}):  # these tell the log's name
         assert read_table(out, name, NIGHT).equals(read_table(night_dataset, name, NIGHT)), name
+    for _ in range(2):
+        assert [night.stale for night in held_nights(out, Settings(), None)] == [[]]
     assert evaluate(out, night_log).as_dict() == evaluate(night_dataset, night_log).as_dict()
     others = [path for path in s3.find(out) if "/night=" not in path]
     assert [path.rpartition("/ds/")[2] for path in others] == [f"reports/{NIGHT}.html"]
