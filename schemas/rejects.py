@@ -53,6 +53,11 @@ class Reason(StrEnum):
         Stage.READ,
         "Messages of a channel that the log does not declare.",
     )
+    UNKNOWN_SCHEMA = (
+        "unknown_schema",
+        Stage.READ,
+        "Messages of a channel whose schema the log does not declare.",
+    )
     UNKNOWN_ENCODING = (
         "unknown_encoding",
         Stage.READ,

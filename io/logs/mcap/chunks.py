@@ -38,8 +38,8 @@ class OpenedChunk(NamedTuple):
     """The records of a chunk and where they lie, or the reason for leaving them out."""
 
     start_ns: int
-    records: bytes
-    places: RecordIndex
+    records: bytes | memoryview
+    index: RecordIndex
     reason: Reason | None = None
 
 

@@ -24,8 +24,15 @@ from epipole.io.logs.mcap.channels import Channel, ChannelTable
 from epipole.io.logs.mcap.chunks import OpenedChunk, open_chunk, open_cut_chunk
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.places import CHUNK, LOOSE, LogPlaces, Place
-from epipole.io.logs.mcap.record_scan import MESSAGE, Bytes, RecordIndex, index_records
+from epipole.io.logs.mcap.record_scan import (
+    MESSAGE,
+    MESSAGE_BYTES,
+    Bytes,
+    RecordIndex,
+    index_records,
+)
 from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
+from epipole.io.logs.mcap.undeclared import N_CHANNELS, LateMessages, Undeclared
 from epipole.schemas.rejects import Reason
 
 # All chunks of a log together may declare so many times the bytes of the file, and at least so many
@@ -74,7 +81,7 @@ class RecordWalk:
     pool: Executor | None = None  # opens chunks while the chunk before them is decoded
     damage: list[Damage] = field(default_factory=list)
     _summary: LogSummary = field(default_factory=LogSummary)
-    _unknown: dict[int, int] = field(default_factory=dict)
+    _undeclared: Undeclared = field(default_factory=Undeclared)
     _counts: dict[int, int] = field(default_factory=dict)
     _lost: dict[int, int] = field(default_factory=dict)  # lost messages, by index of `damage`
     _promised: frozenset[int] = frozenset()  # channels that are wanted, by the summary
@@ -85,16 +92,21 @@ class RecordWalk:
     _in_chunk: dict[int, int] = field(default_factory=dict)  # its messages by channel, if read
 
     def __post_init__(self) -> None:
-        self._channels = ChannelTable(self.wanted)
+        self._channels = ChannelTable(self.wanted, ChannelTable(self.wanted))
         self._places = LogPlaces(self.data, self._summary)
 
     def blocks(self) -> Iterator[Block]:
-        """Yield the wanted messages in the order of the file."""
-        self._places.summary = self._summary = read_summary(self.data, self._channels)
-        self._promised = frozenset(filter(self._channels.find, self._summary.declared))
+        """Yield the wanted messages in the order of the file; late declared ones come last."""
+        in_summary = ChannelTable(self.wanted)
+        self._places.summary = self._summary = read_summary(self.data, in_summary)
+        self._channels.summary = in_summary
+        self._promised = frozenset(filter(in_summary.find, self._summary.declared))
         self.data.stream()
         for place, opening in self._opened_ahead(self._places):
             yield from self._walk_place(place, opening)
+        self._end_log()
+        if (late := self._undeclared.late()) is not None:
+            yield from self._walk_again(late)
         self._report_missing()
 
     def _opened_ahead(
@@ -125,46 +137,41 @@ class RecordWalk:
     def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
         if place.counted is None:
             self._in_chunk = {}  # only indexes that follow a chunk at once are about it
+        if place.reason == Reason.LOG_BEHIND_LOG:
+            self._end_log()
         if place.reason:
             self._leave_out(place.at, 0, place.reason)
             if place.opcode == CHUNK:
                 self._lost_chunk = len(self.damage) - 1
-        elif place.cut:
-            yield from self._walk_chunk(place.at, open_cut_chunk(place.data), cut=True)
         elif place.opcode == CHUNK:
-            opened = open_chunk(place.data) if opening is None else opening.result()
-            yield from self._walk_chunk(place.at, opened)
+            yield from self._walk_chunk(place, _open(place, opening))
         elif place.counted is not None:
             self._count_lost(place.at, *place.counted)
         elif place.opcode in LOOSE:
             yield from self._walk_loose(place)
 
-    def _walk_chunk(self, at: int, opened: OpenedChunk, cut: bool = False) -> Iterator[Block]:
-        """Yield the messages of a chunk; `cut`: its last record may be incomplete."""
+    def _walk_chunk(self, place: Place, opened: OpenedChunk) -> Iterator[Block]:
+        """Yield the messages of a chunk."""
         self._lost_chunk = None
-        start_ns, records, index, reason = opened
-        if reason:
-            self._leave_out(at, start_ns, reason)
+        at, start_ns, index = place.at, opened.start_ns, opened.index
+        if opened.reason:
+            self._leave_out(at, start_ns, opened.reason)
             self._lost_chunk = len(self.damage) - 1
             return
-        offset = np.full(len(index.start), at)
-        yield from self._walk_index(_bytes(records), index, offset, start_ns)
+        yield from self._walk_index(_bytes(opened.records), index, _offsets(place, index), start_ns)
         counts = np.bincount(index.channel[index.opcode == MESSAGE])
         self._in_chunk = {n: int(counts[n]) for n in np.flatnonzero(counts).tolist()}
         if index.n_strange:
             self._leave_out(at, start_ns, Reason.DAMAGED_RECORD, index.n_strange)
-        if index.walked < len(records) and not cut:
+        if index.walked < len(opened.records) and not place.cut:
             self._leave_out(at, start_ns, Reason.DAMAGED_CHUNK)
 
     def _walk_loose(self, place: Place) -> Iterator[Block]:
         """Yield the messages of a run of records outside chunks."""
-        data, at = _bytes(place.data), place.at
-        index = index_records(data)
-        offset = at + index.start - RECORD.size
-        offset[index.opcode == MESSAGE] -= 22
+        _, records, index, _ = _open(place, None)
         if index.n_strange:
-            self._leave_out(at, 0, Reason.DAMAGED_RECORD, index.n_strange)
-        for block in self._walk_index(data, index, offset, 0):
+            self._leave_out(place.at, 0, Reason.DAMAGED_RECORD, index.n_strange)
+        for block in self._walk_index(_bytes(records), index, _offsets(place, index), 0):
             if self._sound_outside_chunks:
                 yield block
             else:
@@ -226,6 +233,7 @@ class RecordWalk:
         """Yield the wanted messages of a run; all messages are counted."""
         channel = index.channel[run]
         wanted: dict[int, Channel] = {}
+        undeclared = []
         counts = np.bincount(channel)
         for number in np.flatnonzero(counts).tolist():
             n = int(counts[number])
@@ -235,8 +243,10 @@ class RecordWalk:
                 self._counts[number] = self._counts.get(number, 0) + n
             if known is not None:
                 wanted[number] = known
-            elif number not in self._channels:
-                self._unknown[number] = self._unknown.get(number, 0) + n
+            elif self._channels.missing(number):
+                undeclared.append(number)
+        if undeclared:
+            self._add_undeclared(undeclared, channel, index.time_ns[run], offset[run])
         columns: list[npt.NDArray[Any]] = [
             channel,
             index.time_ns[run],
@@ -251,6 +261,42 @@ class RecordWalk:
             columns = [column[keep] for column in columns]
         if wanted:
             yield Block(data, wanted, *columns)
+
+    # What is declared too late, or never
+
+    def _add_undeclared(
+        self, numbers: list[int], channel: npt.NDArray[np.uint16], time_ns: Any, offset: Numbers
+    ) -> None:
+        first = np.zeros(N_CHANNELS, np.int64)
+        first[channel[::-1]] = np.arange(len(channel))[::-1]  # the last assignment counts
+        counts = np.bincount(channel)
+        for number in numbers:
+            i = first[number]
+            self._undeclared.add(number, int(counts[number]), int(offset[i]), int(time_ns[i]))
+
+    def _end_log(self) -> None:
+        """Forget the declarations of a log at its end; count the messages without any."""
+        for waiting in self._undeclared.settle(self._channels):
+            self._leave_out(waiting.offset, waiting.time_ns, waiting.reason, waiting.n)
+        self._channels.forget()
+        self._declared.clear()
+
+    def _walk_again(self, late: LateMessages) -> Iterator[Block]:
+        """Yield the messages that come before their declarations; no damage is reported again."""
+        n_logs = 0
+        for place, opening in self._opened_ahead(self._places):
+            if not late:
+                return
+            if place.reason == Reason.LOG_BEHIND_LOG:
+                n_logs += 1
+                late.begin_log(n_logs)
+            elif not place.reason and (place.opcode == CHUNK or place.opcode in LOOSE):
+                _, records, index, _ = _open(place, opening)
+                messages = np.flatnonzero(index.opcode == MESSAGE)
+                chosen = messages[late.take(index.channel[messages])]
+                columns = [getattr(index, name)[chosen] for name in PER_RECORD[1:]]
+                offset = _offsets(place, index)[chosen]
+                yield Block(_bytes(records), late.channels, *columns, offset)
 
     # What is missing in it
 
@@ -281,8 +327,6 @@ class RecordWalk:
         self.damage[index] = self.damage[index]._replace(n=max(1, self._lost[index]))
 
     def _report_missing(self) -> None:
-        for _, count in sorted(self._unknown.items()):
-            self._leave_out(0, 0, Reason.UNKNOWN_CHANNEL, count)
         declared = self._summary.declared
         missing = sum(
             max(0, count - self._counts.get(number, 0))
@@ -293,6 +337,24 @@ class RecordWalk:
             self._leave_out(0, 0, Reason.DAMAGED_RECORD)  # the counts themselves are damaged
         elif missing:
             self._leave_out(0, 0, Reason.MISSING_MESSAGES, missing)
+
+
+def _open(place: Place, opening: Future[OpenedChunk] | None) -> OpenedChunk:
+    """Return the records of a chunk, or of a run of records outside chunks."""
+    if opening is not None:
+        return opening.result()
+    if place.opcode == CHUNK:
+        return open_cut_chunk(place.data) if place.cut else open_chunk(place.data)
+    return OpenedChunk(0, place.data, index_records(_bytes(place.data)))
+
+
+def _offsets(place: Place, index: RecordIndex) -> Numbers:
+    """Return where in the file the records lie; those of a chunk lie where the chunk does."""
+    if place.opcode == CHUNK:
+        return np.full(len(index.start), place.at)
+    offset = place.at + index.start - RECORD.size
+    offset[index.opcode == MESSAGE] -= MESSAGE_BYTES
+    return offset
 
 
 def _bytes(data: bytes | memoryview) -> Bytes:

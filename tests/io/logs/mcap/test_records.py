@@ -10,15 +10,24 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from scenes.hand_made_logs import (
+    CHANNEL_BODY,
+    DECLARED,
+    HEAD,
+    SCHEMA,
+    SCHEMA_BODY,
+    chunk,
+    hand_made,
+    message,
+    record,
+    walk,
+)
 from scenes.log_bytes import log_bytes
 
 from epipole.io.logs.mcap.chunks import MAX_CHUNK_BYTES
 from epipole.io.logs.mcap.records import MOST_ALIKE, RecordWalk
-from epipole.io.logs.mcap.summary import MAGIC
 
 N = 40
-SCHEMA = "epipole.CentroidFrame"
-HEAD = struct.Struct("<BQ")
 
 
 def log(compression=CompressionType.ZSTD, **options):
@@ -38,17 +47,6 @@ def log(compression=CompressionType.ZSTD, **options):
         writer.add_message(other, 1001 + 2 * i, b"{}", 0)
     writer.finish()
     return out.getvalue()
-
-
-def walk(data):
-    """Return the numbers of the messages found, and the damage as (reason, count)."""
-    walked = RecordWalk(log_bytes(bytes(data)), frozenset([SCHEMA]))
-    found = [
-        int(block.data[at : at + 4].view("<u4")[0])
-        for block in walked.blocks()
-        for at in block.start
-    ]
-    return found, [(d.reason, d.n) for d in walked.damage]
 
 
 def chunks(data):
@@ -285,32 +283,6 @@ def test_an_offset_in_the_summary_that_is_wrong_costs_no_chunk(bit):
 
 
 # Logs that are made to be a burden
-
-SCHEMA_BODY = struct.pack("<HI", 1, len(SCHEMA)) + SCHEMA.encode() + bytes(8)
-CHANNEL_BODY = struct.pack("<HHI", 1, 1, 2) + b"/a" + struct.pack("<I", 8) + b"protobuf" + bytes(4)
-
-
-def record(opcode, body):
-    return HEAD.pack(opcode, len(body)) + body
-
-
-def message(i):
-    return record(5, struct.pack("<HIQQ", 1, 0, 1000 + i, 0) + struct.pack("<I", i))
-
-
-def chunk(records):
-    head = struct.pack("<QQQI", 1000, 2000, len(records), zlib.crc32(records))
-    return record(6, head + bytes(4) + struct.pack("<Q", len(records)) + records)
-
-
-def hand_made(*records):
-    """Return a log of these records of a data section, with no summary."""
-    footer = record(2, bytes(20))
-    head = record(1, bytes(8))
-    return MAGIC + head + b"".join(records) + record(15, bytes(4)) + footer + MAGIC
-
-
-DECLARED = record(3, SCHEMA_BODY) + record(4, CHANNEL_BODY)
 
 
 def test_a_log_by_hand_is_sound():
