@@ -39,7 +39,7 @@ class OpenedChunk(NamedTuple):
 
     start_ns: int
     records: bytes | memoryview
-    index: RecordIndex
+    record_index: RecordIndex
     reason: Reason | None = None
 
 

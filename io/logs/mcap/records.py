@@ -153,7 +153,7 @@ class RecordWalk:
     def _walk_chunk(self, place: Place, opened: OpenedChunk) -> Iterator[Block]:
         """Yield the messages of a chunk."""
         self._lost_chunk = None
-        at, start_ns, index = place.at, opened.start_ns, opened.index
+        at, start_ns, index = place.at, opened.start_ns, opened.record_index
         if opened.reason:
             self._leave_out(at, start_ns, opened.reason)
             self._lost_chunk = len(self.damage) - 1
@@ -295,8 +295,8 @@ class RecordWalk:
                 messages = np.flatnonzero(index.opcode == MESSAGE)
                 chosen = messages[late.take(index.channel[messages])]
                 columns = [getattr(index, name)[chosen] for name in PER_RECORD[1:]]
-                offset = _offsets(place, index)[chosen]
-                yield Block(_bytes(records), late.channels, *columns, offset)
+                columns.append(_offsets(place, index)[chosen])
+                yield Block(_bytes(records), late.channels, *columns)
 
     # What is missing in it
 
