@@ -63,6 +63,12 @@ class Reason(StrEnum):
         Stage.READ,
         "Messages of a channel in an encoding that is not registered.",
     )
+    BAD_DATA_CHECKSUM = (
+        "bad_data_checksum",
+        Stage.READ,
+        "The checksum of the log's data section does not fit; messages that no chunk's checksum "
+        "covers are used where their values are valid.",
+    )
     # Of a chunk, with the number of its messages where an index tells it.
     BAD_CHECKSUM = "bad_checksum", Stage.READ, "The chunk's checksum does not fit its bytes."
     BAD_COMPRESSION = "bad_compression", Stage.READ, "The chunk cannot be decompressed."

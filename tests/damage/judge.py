@@ -26,7 +26,7 @@ PIECE_BYTES = 20_000  # so that a small log has several pieces
 # Rows of `rejects` that are about no lost message: the frame or state is used, or it is about the
 # file as a whole.
 KEPT = {Reason.BAD_EXPOSURE, Reason.BAD_ATTITUDE, Reason.VAGUE_ATTITUDE}
-OF_FILE = {Reason.TRUNCATED, Reason.LOG_BEHIND_LOG}
+OF_FILE = {Reason.TRUNCATED, Reason.LOG_BEHIND_LOG, Reason.BAD_DATA_CHECKSUM}
 
 
 class Verdict(NamedTuple):

@@ -41,6 +41,7 @@ class OpenedChunk(NamedTuple):
     records: bytes | memoryview
     record_index: RecordIndex
     reason: Reason | None = None
+    is_checked: bool = False  # by a checksum
 
 
 def read_head(data: memoryview, at: int) -> ChunkHead:
@@ -76,7 +77,7 @@ def open_chunk(chunk: memoryview) -> OpenedChunk:
             raise ChunkError(Reason.BAD_CHECKSUM)
     except ChunkError as error:
         return _opened(start_ns, b"", error.reason)
-    return _opened(start_ns, records)
+    return _opened(start_ns, records, is_checked=head.checksum != 0)
 
 
 def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
@@ -92,6 +93,8 @@ def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
     return _opened(head.start_ns, decompress_part(chunk[head.body :], head.compression, size))
 
 
-def _opened(start_ns: int, records: bytes, reason: Reason | None = None) -> OpenedChunk:
+def _opened(
+    start_ns: int, records: bytes, reason: Reason | None = None, is_checked: bool = False
+) -> OpenedChunk:
     index = index_records(np.frombuffer(records, np.uint8))
-    return OpenedChunk(start_ns, records, index, reason)
+    return OpenedChunk(start_ns, records, index, reason, is_checked)

@@ -17,7 +17,14 @@ from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.chunks import HEAD_BYTES, MAX_RECORD_BYTES, ChunkHead, read_head
 from epipole.io.logs.mcap.compression import ChunkError
 from epipole.io.logs.mcap.record_scan import CHANNEL, MESSAGE, PRIVATE, SCHEMA, index_records
-from epipole.io.logs.mcap.summary import DATA_END, MAGIC, RECORD, LogSummary, next_log
+from epipole.io.logs.mcap.summary import (
+    DATA_END,
+    DATA_END_BYTES,
+    MAGIC,
+    RECORD,
+    LogSummary,
+    end_of_log,
+)
 from epipole.schemas.rejects import Reason
 
 HEADER, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA = 0x01, 0x06, 0x07, 0x09, 0x0C
@@ -67,11 +74,15 @@ class LogPlaces:
                     break
                 yield Place(opcode, at, skipped_to, Reason.DAMAGED_RECORD)
                 at = skipped_to
-            elif opcode == DATA_END and (another := next_log(data, after)) is not None:
-                yield Place(0, another, another, Reason.LOG_BEHIND_LOG)
-                at = another + len(MAGIC)
-            elif opcode == DATA_END and length >= 4 and self.summary.data_end in (None, at):
-                return
+            elif opcode == DATA_END and (behind := self._behind(at, after)) is not None:
+                yield Place(
+                    DATA_END, at, after, data=data.view(at, min(after, at + DATA_END_BYTES))
+                )
+                if behind.reason is not None:
+                    yield behind
+                if behind.reason != Reason.LOG_BEHIND_LOG:
+                    return
+                at = behind.after
             else:
                 place = self._place(opcode, at, after, limit, head)
                 yield place
@@ -98,6 +109,24 @@ class LogPlaces:
             return Place(opcode, at, after)
         foreign = opcode < PRIVATE and opcode not in IGNORED  # not of a data section
         return Place(opcode, at, after, Reason.DAMAGED_RECORD if foreign else None)
+
+    def _behind(self, at: int, after: int) -> Place | None:
+        """Return what lies behind the log that a record at `at` ends; None where it ends none."""
+        size = len(self.data)
+        if at == self.summary.data_end:
+            return Place(0, size, size)
+        end = end_of_log(self.data, after)
+        if end is None:
+            return None
+        begins = end + len(MAGIC)
+        if begins <= size and self.data.view(end, begins) == MAGIC:
+            return Place(0, end, begins, Reason.LOG_BEHIND_LOG)
+        if self.summary.data_end is not None:
+            return None
+        if end == size:
+            return Place(0, size, size)
+        reason = Reason.TRUNCATED if end > size else Reason.DAMAGED_RECORD
+        return Place(0, min(end, size), size, reason)
 
     def _next_chunk(self, at: int, after: int) -> int | None:
         """Return the first place after `at` where the summary lists a chunk.

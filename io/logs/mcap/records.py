@@ -6,13 +6,11 @@ reported. The summary is used where it is valid. It repeats the schemas and chan
 chunks (to continue after a damaged record) and counts the messages (to notice missing ones).
 """
 
-import struct
 import zlib
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +29,7 @@ from epipole.io.logs.mcap.record_scan import (
     RecordIndex,
     index_records,
 )
-from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
+from epipole.io.logs.mcap.summary import DATA_END, RECORD, LogSummary, read_summary
 from epipole.io.logs.mcap.undeclared import N_CHANNELS, LateMessages, Undeclared
 from epipole.schemas.rejects import Reason
 
@@ -90,6 +88,8 @@ class RecordWalk:
     _last_damaged: int = 0
     _lost_chunk: int | None = None  # index in `damage` of the chunk that message indexes follow
     _in_chunk: dict[int, int] = field(default_factory=dict)  # its messages by channel, if read
+    _log_start: int = 0  # of this one of several logs in the file
+    _unchecked: bool = False  # whether there are messages that no chunk's checksum covers
 
     def __post_init__(self) -> None:
         self._channels = ChannelTable(self.wanted, ChannelTable(self.wanted))
@@ -101,6 +101,7 @@ class RecordWalk:
         self._places.summary = self._summary = read_summary(self.data, in_summary)
         self._channels.summary = in_summary
         self._promised = frozenset(filter(in_summary.find, self._summary.declared))
+        self._unchecked = self._summary.data_end is None
         self.data.stream()
         for place, opening in self._opened_ahead(self._places):
             yield from self._walk_place(place, opening)
@@ -139,6 +140,7 @@ class RecordWalk:
             self._in_chunk = {}  # only indexes that follow a chunk at once are about it
         if place.reason == Reason.LOG_BEHIND_LOG:
             self._end_log()
+            self._log_start = place.at
         if place.reason:
             self._leave_out(place.at, 0, place.reason)
             if place.opcode == CHUNK:
@@ -149,6 +151,8 @@ class RecordWalk:
             self._count_lost(place.at, *place.counted)
         elif place.opcode in LOOSE:
             yield from self._walk_loose(place)
+        elif place.opcode == DATA_END:
+            self._check_data_section(place)
 
     def _walk_chunk(self, place: Place, opened: OpenedChunk) -> Iterator[Block]:
         """Yield the messages of a chunk."""
@@ -158,6 +162,7 @@ class RecordWalk:
             self._leave_out(at, start_ns, opened.reason)
             self._lost_chunk = len(self.damage) - 1
             return
+        self._unchecked |= not opened.is_checked
         yield from self._walk_index(_bytes(opened.records), index, _offsets(place, index), start_ns)
         counts = np.bincount(index.channel[index.opcode == MESSAGE])
         self._in_chunk = {n: int(counts[n]) for n in np.flatnonzero(counts).tolist()}
@@ -168,27 +173,27 @@ class RecordWalk:
 
     def _walk_loose(self, place: Place) -> Iterator[Block]:
         """Yield the messages of a run of records outside chunks."""
-        _, records, index, _ = _open(place, None)
+        _, records, index, *_ = _open(place, None)
+        self._unchecked |= MESSAGE in index.opcode
         if index.n_strange:
             self._leave_out(place.at, 0, Reason.DAMAGED_RECORD, index.n_strange)
-        for block in self._walk_index(_bytes(records), index, _offsets(place, index), 0):
-            if self._sound_outside_chunks:
-                yield block
-            else:
-                for offset_of_lost, time_ns in zip(block.offset, block.time_ns, strict=True):
-                    self._leave_out(int(offset_of_lost), int(time_ns), Reason.BAD_CHECKSUM)
+        yield from self._walk_index(_bytes(records), index, _offsets(place, index), 0)
 
-    @cached_property
-    def _sound_outside_chunks(self) -> bool:
-        """Whether the data section fits its checksum; messages outside chunks have no other."""
-        at = self._summary.data_end
-        if at is None:
-            return True  # a log that was never closed has no checksum
-        (expected,) = struct.unpack("<I", self.data.view(at + RECORD.size, at + RECORD.size + 4))
-        checksum = 0
-        for low in range(0, at if expected else 0, BLOCK_BYTES):
-            checksum = zlib.crc32(self.data.view(low, min(low + BLOCK_BYTES, at)), checksum)
-        return checksum == expected
+    def _check_data_section(self, place: Place) -> None:
+        """Compare the data section with the checksum at its end, if no other checksum covers it.
+
+        This reads the log again. A wrong checksum does not say which message is damaged: those
+        whose values are valid have been used.
+        """
+        expected = int.from_bytes(place.data[RECORD.size :], "little")
+        if expected and self._unchecked:
+            checksum = 0
+            for low in range(self._log_start, place.at, BLOCK_BYTES):
+                checksum = zlib.crc32(
+                    self.data.view(low, min(low + BLOCK_BYTES, place.at)), checksum
+                )
+            if checksum != expected:
+                self._leave_out(place.at, 0, Reason.BAD_DATA_CHECKSUM)
 
     def _walk_index(
         self, data: Bytes, index: RecordIndex, offset: Numbers, start_ns: int
@@ -291,7 +296,7 @@ class RecordWalk:
                 n_logs += 1
                 late.begin_log(n_logs)
             elif not place.reason and (place.opcode == CHUNK or place.opcode in LOOSE):
-                _, records, index, _ = _open(place, opening)
+                _, records, index, *_ = _open(place, opening)
                 messages = np.flatnonzero(index.opcode == MESSAGE)
                 chosen = messages[late.take(index.channel[messages])]
                 columns = [getattr(index, name)[chosen] for name in PER_RECORD[1:]]

@@ -83,18 +83,20 @@ def _read_records(
                 summary.declared[number] = count
 
 
-def next_log(data: LogBytes, at: int) -> int | None:
-    """Return where a second log begins after the one whose data section ends at `at`."""
+def end_of_log(data: LogBytes, at: int) -> int | None:
+    """Return where the log ends whose summary begins at `at`.
+
+    This is behind the magic bytes that follow its footer; beyond the end of the file where that
+    is cut. None where other records than those of a summary follow.
+    """
     while at + RECORD.size <= len(data):
         opcode, length = RECORD.unpack(data.view(at, at + RECORD.size))
         at += RECORD.size + length
         if opcode == FOOTER:
-            at += len(MAGIC)
-            another = at + len(MAGIC) <= len(data) and data.view(at, at + len(MAGIC)) == MAGIC
-            return at if another else None
+            return at + len(MAGIC)
         if _is_foreign(opcode):
             return None
-    return None
+    return at + RECORD.size
 
 
 def _is_foreign(opcode: int) -> bool:

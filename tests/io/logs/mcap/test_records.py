@@ -223,12 +223,68 @@ def test_a_chunk_of_unknown_compression_is_left_out():
     assert damage == [("unknown_compression", len(chunk_messages(log(), 1)))]
 
 
-def test_a_flipped_bit_outside_chunks_costs_all_messages_outside_chunks():
+def message_place(data, i):
+    """Return where the values of message `i` begin."""
+    return data.find(struct.pack("<I", i) + zlib.crc32(bytes([i, 0])).to_bytes(4, "little"))
+
+
+def without_schema(data):
+    """Return a log without its first schema; the footer stays as it was."""
+    at = data.index(b"\x03", 8 + HEAD.unpack_from(data, 8)[1] + HEAD.size)
+    return data[:at] + data[at + HEAD.size + HEAD.unpack_from(data, at)[1] :]
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_a_flipped_bit_outside_chunks_is_reported_and_costs_no_other_message(closed):
     data = bytearray(log(use_chunking=False, enable_data_crcs=True))
-    data[
-        data.find(struct.pack("<I", 20) + zlib.crc32(bytes([20, 0])).to_bytes(4, "little")) + 9
-    ] ^= 4
-    assert walk(data) == ([], [("bad_checksum", 1)] * N)
+    data[message_place(data, 20) + 9] ^= 4
+    data[-1] ^= not closed  # without a summary the checksum is found by the walk
+    found, damage = walk(data)
+    assert (found, damage) == (list(range(N)), [("bad_data_checksum", 1)])
+
+
+def test_a_wrong_checksum_of_the_data_section_is_reported_at_its_place():
+    data = bytearray(log(use_chunking=False, enable_data_crcs=True))
+    data[message_place(data, 20) + 9] ^= 4
+    walked = RecordWalk(log_bytes(bytes(data)), frozenset([SCHEMA]))
+    assert len(list(walked.blocks())) == 1
+    assert data[walked.damage[0].offset] == 15  # the record that ends the data section
+
+
+@pytest.mark.parametrize("summary", [True, False])
+def test_a_schema_cut_out_of_a_log_with_a_checksum_is_reported(summary):
+    """The footer's offsets do not fit any more, so the summary does not count."""
+    options = {} if summary else {"repeat_schemas": False, "repeat_channels": False}
+    whole = log(use_chunking=False, enable_data_crcs=True, **options)
+    found, damage = walk(without_schema(whole))
+    assert found == []
+    assert damage == [("bad_data_checksum", 1), ("unknown_schema", N)]
+
+
+def test_chunks_without_a_checksum_are_covered_by_that_of_the_data_section():
+    data = bytearray(log(CompressionType.NONE, enable_crcs=False, enable_data_crcs=True))
+    data[message_place(data, 20) + 9] ^= 4
+    assert walk(data) == (list(range(N)), [("bad_data_checksum", 1)])
+
+
+def test_each_log_of_a_sequence_has_its_checksum():
+    data = log(use_chunking=False, enable_data_crcs=True)
+    assert walk(data + data) == ([*range(N), *range(N)], [("log_behind_log", 1)])
+    damaged = bytearray(data + data)
+    damaged[message_place(data, 20) + 9] ^= 4
+    assert walk(damaged)[1] == [("bad_data_checksum", 1), ("log_behind_log", 1)]
+
+
+@pytest.mark.parametrize("kind", [0x0F, 0x02])
+def test_a_record_that_says_it_ends_the_data_ends_nothing_before_the_end(kind):
+    data = hand_made(DECLARED, message(0), record(kind, bytes(4)), message(1))[:-1]
+    found, damage = walk(data)
+    assert found == [0, 1]
+    assert ("damaged_record", 1) in damage
+
+
+def test_bytes_behind_a_log_are_reported():
+    assert walk(hand_made(DECLARED, message(0)) + b"more") == ([0], [("damaged_record", 1)])
 
 
 def test_a_message_that_only_the_statistics_count_is_reported_as_missing():
