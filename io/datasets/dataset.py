@@ -24,13 +24,14 @@ from epipole.io.datasets import local_nights
 from epipole.io.datasets.folder_swap import sync
 from epipole.io.datasets.local_nights import STAGING
 from epipole.io.datasets.night_reader import NightReader
+from epipole.io.datasets.plain_files import refuse_link
 from epipole.io.datasets.store_nights import StoreNights, store_nights
 from epipole.io.names import fault_of_name
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.bridge import array, conform, empty
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.spans import DAY_NS, Span
+from epipole.schemas.spans import DAY_NS, Span, is_night
 from epipole.schemas.tables import TABLES
 
 # The time column that decides to which night a row belongs, where it is not `time`. Calibrations
@@ -73,12 +74,16 @@ def check_folder(dataset: Where) -> None:
 
 
 def nights_in(dataset: Where) -> list[str]:
-    """Return the nights of a dataset, ``YYYY-MM-DD``, in order. A missing dataset has none."""
+    """Return the nights of a dataset, ``YYYY-MM-DD``, in order. A missing dataset has none.
+
+    A folder whose name has no such date is no night.
+    """
     if (store := _store(dataset)) is not None:
         with _reading(dataset):
             return store.nights()
     local_nights.recover(_folder(dataset))
-    return sorted(p.name.removeprefix("night=") for p in _folder(dataset).glob("night=*"))
+    folders = [path for path in _folder(dataset).glob("night=*") if path.is_dir()]
+    return sorted(filter(is_night, (path.name.removeprefix("night=") for path in folders)))
 
 
 def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, replace: bool) -> None:
@@ -205,6 +210,7 @@ def write_report(dataset: Where, night: str, text: str, staging: Path) -> None:
             return
         staged, folder = staging / f"{night}.html", _folder(dataset) / REPORTS
         staged.write_text(text, encoding="utf-8")
+        refuse_link(folder)
         folder.mkdir(exist_ok=True)
         staged.replace(folder / staged.name)
 

@@ -9,7 +9,9 @@ Unfinished work lies in ``DATASET/.staging``:
   nights of a run at once: if the run is killed between two renames, the next run or reader
   finishes them.
 
-Other files in it are left alone.
+Other files in it are left alone. Whoever may write to the dataset may have written these files
+too. So a commit is finished only where it names dates, and folders of runs in the staging folder,
+and where none of these is a link.
 
 The kernel releases a lock when its process ends, however it ends. So a claim that can be locked
 belongs to a run that has ended, and the next run removes its folder.
@@ -18,22 +20,31 @@ belongs to a run that has ended, and the next run removes its folder.
 import contextlib
 import fcntl
 import json
+import logging
 import os
+import re
 import shutil
 import stat
 import threading
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 from epipole.io.datasets.folder_swap import put_in_place, sync, take_back
 from epipole.io.datasets.night_holder import Holder
+from epipole.io.datasets.plain_files import entered, opened, read_small, refuse_link
 from epipole.schemas.errors import DatasetError
+from epipole.schemas.spans import is_night
+
+LOGGER = logging.getLogger(__name__)
 
 STAGING = ".staging"
 CLAIM = "claim"
 COMMIT = "commit.json"
+
+# A folder in the folder of a run, as a commit names it from `swap-*`.
+_STAGED = re.compile(r"\.\./(run-[\w-]+)/([\w=-]+)", re.ASCII)
 
 
 @contextlib.contextmanager
@@ -56,7 +67,7 @@ def claim(dataset: Path, nights: Sequence[str]) -> Iterator[Path]:
                 _clear(dataset, staging)
                 for other in _folders(staging, "run-*"):
                     claimed = other / CLAIM
-                    Holder.read(claimed.read_text(), claimed).refuse(dataset, nights)
+                    Holder.read(read_small(claimed), claimed).refuse(dataset, nights)
                 run.mkdir()
                 file = held.enter_context((run / CLAIM).open("w"))
                 fcntl.flock(file, fcntl.LOCK_EX)
@@ -73,7 +84,7 @@ def claim(dataset: Path, nights: Sequence[str]) -> Iterator[Path]:
 def claimed_nights(dataset: Path) -> set[str]:
     """Return the nights that living runs have claimed."""
     claims = [run / CLAIM for run in _folders(dataset / STAGING, "run-*") if _is_alive(run)]
-    return {night for file in claims for night in Holder.read(file.read_text(), file).nights}
+    return {night for file in claims for night in Holder.read(read_small(file), file).nights}
 
 
 def _release(dataset: Path, run: Path) -> None:
@@ -88,8 +99,8 @@ def _release(dataset: Path, run: Path) -> None:
 def put_all_in_place(dataset: Path, staged: Mapping[str, Path]) -> None:
     """Make these folders the nights of a dataset, each by one rename: all or none.
 
-    Must be called inside `alone`. Where this process is killed once the commit is written, `alone`
-    and `recover` finish it.
+    The folders lie in the folder of a run; see `claim`. Must be called inside `alone`. Where this
+    process is killed once the commit is written, `alone` and `recover` finish it.
 
     Raises
     ------
@@ -124,35 +135,92 @@ def _commit(aside: Path, staged: Mapping[str, Path]) -> None:
     }
     written = aside / f"{COMMIT}.new"
     written.write_text(json.dumps(nights), encoding="utf-8")
+    _read_commit(written)  # what cannot be finished is not begun
     sync(written)
     written.rename(aside / COMMIT)
     sync(aside)
 
 
+class _Move(NamedTuple):
+    """A night of a commit: the run that made it, and its folder there."""
+
+    night: str
+    run: str
+    folder: str
+    inode: int
+
+
+def _read_commit(commit: Path) -> list[_Move]:
+    """Return the nights of a commit.
+
+    Raises
+    ------
+    DatasetError
+        Where `_commit` has not written it.
+    """
+    try:
+        moves = []
+        for night, new in json.loads(read_small(commit)).items():
+            named = _STAGED.fullmatch(new["folder"])
+            if named is None or not is_night(night):
+                raise ValueError(night)
+            moves.append(_Move(night, named[1], named[2], int(new["inode"])))
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{commit}: is not a commit of a run; remove it") from error
+    return moves
+
+
 def recover(dataset: Path) -> None:
-    """Finish what a killed run has committed; a reader that may not write reads what is there."""
+    """Finish what a killed run has committed; a reader that may not write reads what is there.
+
+    Nothing else is changed, and a line says that it was done.
+    """
     if any((dataset / STAGING).glob(f"swap-*/{COMMIT}")):
-        with contextlib.suppress(PermissionError), alone(dataset):
-            pass
+        with contextlib.suppress(PermissionError), _locked(dataset) as staging:
+            for swap in _folders(staging, "swap-*"):
+                _finish(dataset, swap)
 
 
 def _finish(dataset: Path, swap: Path) -> None:
-    """Put in place what a killed run has committed and not moved yet."""
+    """Put in place what a killed run has committed and not moved yet.
+
+    Raises
+    ------
+    DatasetError
+        Where the commit is not one of a run, or a folder that it names is a link.
+    """
     try:
-        nights = json.loads((swap / COMMIT).read_text(encoding="utf-8"))
+        moves = _read_commit(swap / COMMIT)
     except FileNotFoundError:
         return  # killed before it had published anything
-    for night, new in nights.items():
-        target, folder = dataset / f"night={night}", swap / new["folder"]
-        if _inode(target) != new["inode"] and _inode(folder) == new["inode"]:
-            put_in_place(folder, target, swap / f"old-night={night}")
+    for move in moves:
+        refuse_link(dataset / f"night={move.night}")
+        with contextlib.suppress(FileNotFoundError):  # moved before: its run's folder may be gone
+            _finish_one(dataset, swap.name, move)
     sync(dataset)
     (swap / COMMIT).unlink()
+    LOGGER.warning(
+        "%s: finished the publication of %s, in which a run was stopped",
+        dataset,
+        ", ".join(move.night for move in moves),
+    )
+
+
+def _finish_one(dataset: Path, swap: str, move: _Move) -> None:
+    name = f"night={move.night}"
+    with (
+        entered(dataset) as nights,
+        entered(dataset, STAGING, swap) as aside,
+        entered(dataset, STAGING, move.run) as run,
+    ):
+        new, target = run / move.folder, nights / name
+        if _inode(target) != move.inode and _inode(new) == move.inode:
+            put_in_place(new, target, aside / f"old-{name}")
 
 
 def _inode(path: Path) -> int | None:
     try:
-        return path.stat().st_ino
+        return path.lstat().st_ino
     except FileNotFoundError:
         return None
 
@@ -172,8 +240,8 @@ def _locked(dataset: Path) -> Iterator[Path]:
     with contextlib.ExitStack() as held:
         _let_go(path)
         while True:
-            if staging.is_symlink():  # what is behind it is not ours to change
-                raise DatasetError(f"{staging}: is a symbolic link; remove it")
+            refuse_link(staging)  # what is behind it is not ours to change
+            refuse_link(path)
             with contextlib.suppress(FileNotFoundError):  # its last holder has just removed it
                 try:
                     staging.mkdir(parents=True, exist_ok=True)
@@ -181,7 +249,9 @@ def _locked(dataset: Path) -> Iterator[Path]:
                     if stat.S_ISDIR(staging.lstat().st_mode):
                         continue
                     raise
-                lock = held.enter_context(path.open("w"))
+                with entered(dataset, STAGING) as folder:
+                    descriptor = opened(folder / path.name, os.O_RDWR | os.O_CREAT)
+                lock = held.enter_context(open(descriptor, "w"))
                 _HELD[path, threading.get_ident()] = lock
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 if path.exists() and os.path.samestat(os.fstat(lock.fileno()), path.stat()):
@@ -221,7 +291,8 @@ def _clear(dataset: Path, staging: Path) -> None:
         _finish(dataset, swap)
         for old in swap.glob("old-night=*"):
             target = dataset / old.name.removeprefix("old-")
-            if not target.exists():
+            is_one = is_night(target.name.removeprefix("night=")) and not old.is_symlink()
+            if is_one and _inode(target) is None:
                 old.rename(target)
         shutil.rmtree(swap)
     for run in _folders(staging, "run-*"):
@@ -236,7 +307,7 @@ def _folders(staging: Path, pattern: str) -> list[Path]:
 
 def _is_alive(run: Path) -> bool:
     try:
-        with (run / CLAIM).open("r+") as file:
+        with open(opened(run / CLAIM, os.O_RDWR), "r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return True

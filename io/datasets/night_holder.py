@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Self
 
 from epipole.schemas.errors import DatasetError
+from epipole.schemas.spans import is_night
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,15 @@ class Holder:
             Where it is no claim.
         """
         try:
-            return cls(**json.loads(text))
-        except (TypeError, ValueError) as error:
+            holder = cls(**json.loads(text))
+            words = (holder.host, holder.since, holder.machine, holder.token)
+            if not all(isinstance(word, str) for word in words) or type(holder.pid) is not int:
+                raise TypeError
+            if not isinstance(holder.nights, list) or not all(map(is_night, holder.nights)):
+                raise TypeError
+        except (TypeError, ValueError, RecursionError) as error:
             raise DatasetError(f"{where}: is not a claim of a run; remove it") from error
+        return holder
 
     def text(self) -> str:
         """Return the holder as a line of JSON."""
@@ -55,7 +62,7 @@ class Holder:
             return False
         try:
             os.kill(self.pid, 0)
-        except ProcessLookupError:
+        except (ProcessLookupError, OverflowError):
             return True
         except PermissionError:
             pass  # it runs, as another user

@@ -15,6 +15,7 @@ the old night and some of the new one. A new night is complete when it has `sour
 
 import contextlib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -25,9 +26,14 @@ from typing import Any
 from epipole.io.datasets.store_claims import STAGING, StoreClaims
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.errors import DatasetError
+from epipole.schemas.spans import is_night
 
 REQUESTS = 8  # at the same time
 LAST = "sources"  # the table that completes a night
+
+# What a commit may name: the folder of a run, and a file of a table.
+_RUN = re.compile(r"run-[0-9a-f]{32}")
+_FILE = re.compile(r"[a-z_]+/[\w-]+\.parquet", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -74,6 +80,7 @@ class StoreNights:
     def nights(self) -> list[str]:
         """Return the nights that are published, in order."""
         in_place = {n.removeprefix("night=") for n in self.names() if n.startswith("night=")}
+        in_place = set(filter(is_night, in_place))
         return sorted(in_place.union(*(commit.files for commit in self._commits())))
 
     def read(self, night: str, table: str) -> list[bytes]:
@@ -189,12 +196,7 @@ class StoreNights:
         commits = []
         for path in sorted(self._storage.glob(f"{staging}/commit-*.json")):
             with contextlib.suppress(FileNotFoundError):  # finished meanwhile
-                text = self._storage.cat_file(path)
-                try:
-                    commit = json.loads(text)
-                    commits.append(Commit(path, f"{staging}/{commit['staged']}", commit["files"]))
-                except (KeyError, TypeError, ValueError) as error:
-                    raise DatasetError(f"{path}: is not a commit of a run; remove it") from error
+                commits.append(_parsed(path, staging, self._storage.cat_file(path)))
         return commits
 
     def _ls(self, folder: str) -> Iterator[str]:
@@ -208,6 +210,28 @@ class StoreNights:
         with ThreadPoolExecutor(REQUESTS) as pool:
             for done in [pool.submit(work, *move) for move in moves]:
                 done.result()
+
+
+def _parsed(path: str, staging: str, text: bytes) -> Commit:
+    """Return a commit. Whoever may write to the store may have written it.
+
+    Raises
+    ------
+    DatasetError
+        Where it is none of a run: it may name nothing outside the folder of a run and of nights.
+    """
+    try:
+        commit = json.loads(text)
+        staged, files = commit["staged"], commit["files"]
+        is_one = _RUN.fullmatch(staged) and all(
+            is_night(night) and isinstance(names, list) and all(map(_FILE.fullmatch, names))
+            for night, names in files.items()
+        )
+        if not is_one:
+            raise ValueError(staged)
+    except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: is not a commit of a run; remove it") from error
+    return Commit(path, f"{staging}/{staged}", files)
 
 
 def store_nights(dataset: str) -> StoreNights:

@@ -14,6 +14,7 @@ from epipole.io.caches.arrays import cache_folder
 from epipole.io.caches.private_folders import fault_of, private_folder
 from epipole.io.datasets.dataset import dataset_folder
 from epipole.io.datasets.local_nights import STAGING
+from epipole.io.datasets.plain_files import refuse_link
 
 NAME = "work"
 
@@ -23,13 +24,15 @@ def work_folder(root: Path, night: str, key: str) -> Iterator[Path]:
     """Yield the folder for a night and this key. It is removed when the work succeeds.
 
     Folders of the same night under another key are removed: they were made from other logs,
-    settings or code. The caller has claimed the night.
+    settings or code. The caller has claimed the night. A folder that is a link is refused with
+    a `DatasetError`.
     """
     name = f"{NAME}-{night}"
     for other in root.glob(f"{name}-*"):
         if other.name != f"{name}-{key}":
             shutil.rmtree(other, ignore_errors=True)
     folder = root / f"{name}-{key}"
+    refuse_link(folder)
     folder.mkdir(parents=True, exist_ok=True)
     try:
         yield folder

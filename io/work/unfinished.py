@@ -8,6 +8,7 @@ from epipole.io.datasets.dataset import claim_nights, dataset_folder
 from epipole.io.datasets.local_nights import claimed_nights
 from epipole.io.work.folder import NAME, work_root
 from epipole.schemas.errors import DatasetError
+from epipole.schemas.spans import is_night
 
 
 class Unfinished(NamedTuple):
@@ -25,7 +26,8 @@ def unfinished_work(dataset: str) -> list[Unfinished]:
     by_night: dict[str, list[Path]] = {}
     for folder in sorted(work_root(dataset).glob(f"{NAME}-*")):
         night = folder.name.removeprefix(f"{NAME}-")[: len("YYYY-MM-DD")]
-        if folder.is_dir() and not folder.is_symlink() and night not in held:
+        is_work = is_night(night) and folder.is_dir() and not folder.is_symlink()
+        if is_work and night not in held:
             by_night.setdefault(night, []).append(folder)
     return [Unfinished(night, sum(map(_size, f)), f) for night, f in by_night.items()]
 
@@ -48,4 +50,4 @@ def clear_unfinished(dataset: str) -> list[Unfinished]:
 
 
 def _size(folder: Path) -> int:
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    return sum(file.lstat().st_size for file in folder.rglob("*") if file.is_file())

@@ -52,8 +52,9 @@ def _held(dataset: str, date: str, settings: Settings, known: str | None) -> Hel
         rows = read_table(dataset, "nights", date).to_pylist()
     except DatasetError as error:
         return HeldNight(date, {}, [str(error)])
-    if not rows:
-        return HeldNight(date, {}, ["an older version"])
+    if len(rows) != 1:
+        reason = f"{len(rows):,} rows in its table nights" if rows else "an older version"
+        return HeldNight(date, {}, [reason])
     (row,) = rows
     made_from = recipe_in(row)
     today = recipe_of(row["logs_key"], settings, known or row["known_key"])

@@ -1,6 +1,7 @@
 """Publishing: whole nights or nothing, the same rows every time, nothing else touched."""
 
 import errno
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from scenes.dataset_tables import (
 from scenes.published import publish
 
 from epipole.io.datasets import folder_swap, local_nights, night_files
-from epipole.io.datasets.dataset import check_folder, publish_folders, read_table
+from epipole.io.datasets.dataset import check_folder, claim_nights, publish_folders, read_table
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -168,15 +169,19 @@ def test_what_could_not_be_published_is_still_staged_for_another_try(
     publish(out, night_tables(OVER_MIDNIGHT, seed=9), nights)
     publish(tmp_path / "new", night_tables(OVER_MIDNIGHT), nights)
     new = contents(tmp_path / "new")
-    staged = {night: tmp_path / "new" / f"night={night}" for night in nights}
+    sources = night_tables(OVER_MIDNIGHT)["sources"]
     if not exchange_supported:
         monkeypatch.setattr(folder_swap, "exchange", lambda *_: False)
-    with monkeypatch.context() as patch:
-        patch.setattr(local_nights, "sync", _disk_full)
-        with pytest.raises(DatasetError):
-            publish_folders(out, staged, night_tables(OVER_MIDNIGHT)["sources"])
-    assert contents(tmp_path / "new") == new
-    publish_folders(out, staged, night_tables(OVER_MIDNIGHT)["sources"])
+    with claim_nights(out, nights) as work:
+        for night in nights:
+            shutil.copytree(tmp_path / "new" / f"night={night}", work / f"night={night}")
+        staged = {night: work / f"night={night}" for night in nights}
+        with monkeypatch.context() as patch:
+            patch.setattr(local_nights, "sync", _disk_full)
+            with pytest.raises(DatasetError):
+                publish_folders(out, staged, sources)
+        assert contents(work) == new | {"claim": (work / "claim").read_bytes()}
+        publish_folders(out, staged, sources)
     assert contents(out) == new
 
 

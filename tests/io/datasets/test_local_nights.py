@@ -169,7 +169,7 @@ def test_a_reader_that_may_not_write_reads_what_is_there(tmp_path, monkeypatch):
     def refused(*_):
         raise PermissionError
 
-    monkeypatch.setattr(Path, "open", refused)
+    monkeypatch.setattr(local_nights, "opened", refused)
     assert nights_in(tmp_path) == [NIGHT]
 
 
