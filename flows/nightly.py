@@ -58,7 +58,10 @@ from epipole.tasks.read.order_frames import OrderedFrames
 LOGGER = logging.getLogger(__name__)
 
 
-@flow(name="nightly", flow_run_name=run_name, task_runner=runner_asked())
+@flow(
+    name="nightly", flow_run_name=run_name, task_runner=runner_asked(),
+    persist_result=False,  # else a server can name a storage for it
+)  # fmt: skip
 @shown_on_page
 def nightly(
     logs: str | list[str],

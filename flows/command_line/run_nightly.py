@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from epipole.flows.command_line.terminal import shown
 from epipole.flows.night.dataset.held_nights import held_nights
@@ -160,6 +160,7 @@ class Nights:
             check_scheduler(options.scheduler)
         from epipole.flows.night.reports import load_drawing
         from epipole.flows.nightly import nightly
+        from epipole.flows.prefect.page import run_here
 
         # Done now, and not when they are needed: the server still starts.
         if self._settings.report.write:
@@ -171,10 +172,9 @@ class Nights:
 
         def make(night: str | None) -> Summary:
             with lost_server_as_line():
-                made = flow(
-                    self._logs, self._out, self._settings, night, options.replace, options.known,
-                    options.again,
+                return run_here(
+                    flow, self._logs, self._out, self._settings, night, options.replace,
+                    options.known, options.again,
                 )  # fmt: skip
-            return cast(Summary, made)  # Prefect takes it out of the flow's last state
 
         return make

@@ -14,6 +14,7 @@ import httpx
 from prefect.client.orchestration import get_client
 from prefect.logging.configuration import setup_logging
 from prefect.settings import (
+    PREFECT_API_AUTH_STRING,
     PREFECT_API_URL,
     PREFECT_CLIENT_MAX_RETRIES,
     get_current_settings,
@@ -46,8 +47,10 @@ def embedded_prefect(early: Launched | None = None) -> Iterator[None]:
         url = get_current_settings().api.url
         if url is None:
             stack.enter_context(temporary_settings(set_defaults=DEFAULTS))
-            # Workers in other processes use the same API.
-            stack.enter_context(temporary_settings({PREFECT_API_URL: start_server(early)}))
+            served = start_server(early)
+            # Prefect hands these settings to workers in other processes.
+            known = {PREFECT_API_URL: served.url, PREFECT_API_AUTH_STRING: served.secret}
+            stack.enter_context(temporary_settings(known))
         else:
             if early is not None:
                 early.stop()

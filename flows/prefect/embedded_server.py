@@ -14,7 +14,7 @@ import sqlite3
 import threading
 import time
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 from prefect.settings import get_current_settings
 from sqlalchemy.engine import URL, make_url
@@ -29,8 +29,15 @@ MOST_RESTARTS = 3
 _LAST_LINE = re.compile(r"^[\w.]+(?:Error|Exception)\b.*", re.MULTILINE)
 
 
-def start_server(early: Launched | None = None) -> str:
-    """Start the server, and return the address of its API. It stops when this process ends.
+class Served(NamedTuple):
+    """Where the API is served, and the secret that it asks for."""
+
+    url: str
+    secret: str
+
+
+def start_server(early: Launched | None = None) -> Served:
+    """Start the server. It stops when this process ends.
 
     `early` is a process that was launched before Prefect was imported; it is used if it can be.
 
@@ -57,7 +64,8 @@ def start_server(early: Launched | None = None) -> str:
     server = _Server(launched, home)
     atexit.register(server.stop)
     threading.Thread(target=server.keep_alive, daemon=True, name="Prefect's server").start()
-    return f"http://{HOST}:{launched.listener.getsockname()[1]}/api"
+    url = f"http://{HOST}:{launched.listener.getsockname()[1]}/api"
+    return Served(url, launched.secret)
 
 
 class _Server:
@@ -77,7 +85,7 @@ class _Server:
             if self._stopping.is_set():
                 return
             LOGGER.warning("Prefect's server has ended before the run; it is started again")
-            self._launched = launch(_environment(self._home), self._launched.listener)
+            self._launched = launch(_environment(self._home), self._launched)
             self._launched.serve()
         self._launched.process.wait()
         self._launched.listener.close()  # a request fails at once instead of waiting

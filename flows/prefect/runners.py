@@ -56,6 +56,8 @@ def task_runner(
             "threads_per_worker": 1,
             "dashboard_address": None,
             "env": quiet,
+            # Its sockets take code from whoever connects: only holders of a key may.
+            "security": True,
         }
     )
 

@@ -7,6 +7,7 @@ This module imports nothing but the standard library when the run imports it.
 
 import gc
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -26,6 +27,7 @@ _EMBEDDED = {
     "PREFECT__SERVER_FINAL": "1",
 }
 _SERVE = b"serve\n"
+SECRET_VARIABLE = "PREFECT_SERVER_API_AUTH_STRING"  # the server's part; a client has its own
 
 # Services that only a permanent server needs.
 _SERVICES = (
@@ -52,11 +54,15 @@ DEFAULTS = {
 
 
 class Launched(NamedTuple):
-    """A process that has been launched, the socket that it serves, and what it has written."""
+    """A process that has been launched, the socket that it serves, and what it has written.
+
+    `secret` is what a client has to show: anybody on this machine can reach the socket.
+    """
 
     process: subprocess.Popen[bytes]
     listener: socket.socket
     output: IO[bytes]
+    secret: str
 
     def serve(self) -> None:
         """Let it start to serve."""
@@ -77,30 +83,34 @@ class Launched(NamedTuple):
             self.process.wait()
 
 
-def launch(environment: Mapping[str, str], listener: socket.socket | None = None) -> Launched:
+def launch(environment: Mapping[str, str], before: Launched | None = None) -> Launched:
     """Launch the process; it ends when this process does, however that ends.
 
     Parameters
     ----------
     environment
         Variables besides those of this process.
-    listener
-        The socket to serve; None: a new one of this machine only.
+    before
+        A process that has ended, whose socket and secret this one takes over; None: new ones.
     """
-    if listener is None:
+    if before is None:
         listener = socket.socket()
         listener.bind((HOST, 0))  # held from now on: no other server can get this port
+        secret = f"epipole:{secrets.token_urlsafe(32)}"
+    else:
+        listener, secret = before.listener, before.secret
     output = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the process
     process = subprocess.Popen(
         [sys.executable, "-m", __name__, str(listener.fileno())],
         stdin=subprocess.PIPE,  # closed when this process ends
         stdout=output,
         stderr=output,
-        env={**os.environ, **environment, **_EMBEDDED},
+        # The environment of a process is its user's alone to read; a command line is everybody's.
+        env={**os.environ, **environment, **_EMBEDDED, SECRET_VARIABLE: secret},
         pass_fds=[listener.fileno()],
         start_new_session=True,  # Ctrl-C must not stop it: it records how the run ended
     )
-    return Launched(process, listener, output)
+    return Launched(process, listener, output, secret)
 
 
 def main() -> None:

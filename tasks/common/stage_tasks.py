@@ -27,9 +27,10 @@ def stage_task(stage: Stage, works_on: str, *, retried: bool = False) -> Callabl
     Notes
     -----
     Prefect caches no result: to hash the inputs would cost more than most tasks, and finished
-    parts lie in the work folder.
+    parts lie in the work folder. Nor does it keep results, whatever storage a server names: who
+    can write there would have his pickles read.
     """
-    options: dict[str, Any] = {"cache_policy": NO_CACHE}
+    options: dict[str, Any] = {"cache_policy": NO_CACHE, "persist_result": False}
     if retried:
         options |= {
             "retries": RETRIES,

@@ -10,8 +10,10 @@ import pytest
 SETTINGS = """
 from prefect.settings import get_current_settings
 from epipole.flows.prefect import defaults as prefect_defaults
+from epipole.flows.prefect.embedded_server import Served
 started = []
-prefect_defaults.start_server = lambda early: started.append(True) or "http://127.0.0.1:1/api"
+served = Served("http://127.0.0.1:1/api", "user:secret")
+prefect_defaults.start_server = lambda early: started.append(True) or served
 prefect_defaults._check_server = lambda url: None
 with prefect_defaults.embedded_prefect():
     server = get_current_settings().server
