@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from random import Random
 
-from damage.container import FOOTER_BYTES, summary_start, with_footer
+from damage.container import FOOTER_BYTES, HEAD, summary_start, with_footer
 
 Bytes = bytes
 MOST_BITS, LONGEST = 20, 3000
@@ -77,6 +77,15 @@ def damage_footer(chance: Random, log: Bytes) -> Bytes:
     return bytes(out)
 
 
+def damage_data_end(chance: Random, log: Bytes) -> Bytes:
+    """Return the log with any bytes in the record that ends its data, or in its footer."""
+    out, start = bytearray(log), summary_start(log)
+    places = [*range(start - HEAD.size - 4, start), *range(len(log) - FOOTER_BYTES, len(log))]
+    for _ in range(chance.choice((1, 1, 4))):
+        out[chance.choice(places)] = chance.randrange(256)
+    return bytes(out)
+
+
 def damage_number(chance: Random, log: Bytes) -> Bytes:
     """Return the log with an odd integer of 2, 4 or 8 bytes at any place."""
     width = chance.choice((2, 4, 8))
@@ -98,7 +107,9 @@ def _range(chance: Random, log: Bytes) -> tuple[int, int]:
     return at, min(length, len(log) - at)
 
 
+# After these the log still has all its messages: each must be read, or something said.
+KEEPING = (damage_summary, damage_footer, damage_data_end)
 DAMAGES: tuple[Callable[[Random, Bytes], Bytes], ...] = (
     flip_bits, flip_bits, overwrite, delete, insert, duplicate, swap, truncate,
-    damage_summary, damage_footer, damage_number, damage_number, join_logs,
+    damage_summary, damage_footer, damage_data_end, damage_number, damage_number, join_logs,
 )  # fmt: skip

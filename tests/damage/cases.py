@@ -6,8 +6,8 @@ from random import Random
 from typing import NamedTuple
 
 from damage import bombs, byte_damage, odd_values, record_damage
-from damage.container import counts_of
-from damage.sound_logs import FORMS, NAMES, count, sound_log
+from damage.container import counts_of, data_end
+from damage.sound_logs import FORMS, NAMES, Key, count, keys, sound_log
 
 
 class Promise(StrEnum):
@@ -26,6 +26,7 @@ class Case(NamedTuple):
     log: bytes
     n: int  # messages of the sound log
     promise: Promise
+    keys: frozenset[Key] = frozenset()  # of these messages
 
 
 def case(number: int) -> Case:
@@ -51,20 +52,25 @@ def _of_bytes(chance: Random) -> Case:
     log = how(chance, sound_log(name))
     options = FORMS[name].options if name in FORMS else {}
     checked = options.get("enable_crcs", True) and options.get("use_chunking", True)
-    otherwise = Promise.SAID if checked else Promise.NONE
-    return _known(name, how, log, otherwise)
+    if options.get("enable_data_crcs"):
+        checked = data_end(sound_log(name)).data in log  # what is damaged does not fit it
+    said = checked or how in byte_damage.KEEPING
+    return _known(name, how, log, Promise.SAID if said else Promise.NONE)
 
 
 def _of_records(chance: Random) -> Case:
     name, how = chance.choice(NAMES), chance.choice(record_damage.DAMAGES)
-    return _known(name, how, record_damage.damage_records(how, chance, sound_log(name)))
+    log = record_damage.damage_records(how, chance, sound_log(name))
+    said = how in record_damage.KEEPING
+    return _known(name, how, log, Promise.SAID if said else Promise.NONE)
 
 
-def _known(name: str, how: Callable[..., object], log: bytes, otherwise=Promise.NONE) -> Case:
+def _known(name: str, how: Callable[..., object], log: bytes, otherwise: Promise) -> Case:
     before = counts_of(sound_log(name))
     counted = before is not None and counts_of(log) == before
     what = f"{name}: {how.__name__}"
-    return Case(what, log, count(name), Promise.COUNTED if counted else otherwise)
+    promise = Promise.COUNTED if counted else otherwise
+    return Case(what, log, count(name), promise, keys(name))
 
 
 def _of_values(chance: Random) -> Case:

@@ -26,12 +26,22 @@ class Record(NamedTuple):
 
 def records_of(log: bytes) -> list[Record]:
     """Return the records of a sound log, from the header to the footer."""
-    records, at = [], len(MAGIC)
-    while at < len(log) - len(MAGIC):
-        opcode, length = HEAD.unpack_from(log, at)
+    return records_in(log[len(MAGIC) : -len(MAGIC)])
+
+
+def records_in(data: bytes) -> list[Record]:
+    """Return the records in sound bytes, such as those of a chunk."""
+    records, at = [], 0
+    while at < len(data):
+        opcode, length = HEAD.unpack_from(data, at)
         at += HEAD.size + length
-        records.append(Record(opcode, log[at - length : at]))
+        records.append(Record(opcode, data[at - length : at]))
     return records
+
+
+def data_end(log: bytes) -> Record:
+    """Return the record that ends the data section of a sound log."""
+    return next(record for record in records_of(log) if record.opcode == DATA_END)
 
 
 def split(records: list[Record]) -> tuple[list[Record], list[Record]]:

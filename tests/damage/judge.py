@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from damage.cases import Case, Promise
-from damage.sound_logs import count, sound_log
+from damage.sound_logs import count, keys_of, sound_log
 from epipole.io.logs.reader import read_log, read_log_pieces, read_log_times
 from epipole.schemas.bridge import array, flatten
 from epipole.schemas.errors import LogError
@@ -100,8 +100,9 @@ def _wrong_count(case: Case, log: LogContents, reasons: dict[str, int]) -> str |
         return f"{case.n} messages, {read} read, {lost} counted: {reasons}"
     if case.promise == Promise.COUNTED and read + lost < case.n:
         return f"{case.n} messages, only {read} read and {lost} counted: {reasons}"
-    if case.promise == Promise.SAID and read < case.n and not reasons:
-        return f"{case.n} messages, {read} read, and nothing said"
+    if case.promise in (Promise.SAID, Promise.COUNTED) and not reasons:
+        silent = max(case.n - read, len(case.keys - keys_of(log)))
+        return f"{silent} of {case.n} messages lost, and nothing said" if silent > 0 else None
     return None
 
 

@@ -12,6 +12,7 @@ from damage.container import (
     SCHEMA,
     Record,
     joined,
+    records_in,
     records_of,
     split,
 )
@@ -20,6 +21,7 @@ from damage.sound_logs import FORMS, sound_log
 Records = list[Record]
 CHUNK_HEAD = struct.Struct("<QQQI")
 OPCODES = (*range(0x11), 0x20, 0x7F, 0x80, 0xFF)
+DECLARATIONS = (SCHEMA, CHANNEL)
 ODD_TIMES = (0, 1, 1 << 62, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 
 
@@ -48,6 +50,75 @@ def repeat_record(chance: Random, data: Records) -> Records:
     """Return the records with one of them again, at another place."""
     out = list(data)
     out.insert(chance.randrange(len(out)), chance.choice(data))
+    return out
+
+
+def move_record(chance: Random, data: Records) -> Records:
+    """Return the records with one of them at another place, mostly a schema or a channel."""
+    declared = [i for i, record in enumerate(data) if record.opcode in DECLARATIONS]
+    i = (
+        chance.choice(declared)
+        if declared and chance.random() < 0.7
+        else chance.randrange(len(data))
+    )
+    out = [*data[:i], *data[i + 1 :]]
+    out.insert(chance.randrange(len(out) + 1), data[i])
+    return out
+
+
+def remove_declaration(chance: Random, data: Records) -> Records:
+    """Return the records without a schema or a channel, here or in a chunk."""
+    return _declarations_changed(chance, data, _without_one)
+
+
+def exchange_numbers(chance: Random, data: Records) -> Records:
+    """Return the records, two schemas or channels under each other's number."""
+    return _declarations_changed(chance, data, _exchanged)
+
+
+def move_declarations(chance: Random, data: Records) -> Records:
+    """Return the records, those of a chunk or of the data section in another order."""
+    return _declarations_changed(chance, data, shuffle_records)
+
+
+def insert_empty_records(chance: Random, data: Records) -> Records:
+    """Return the records with many empty ones of one kind at one place."""
+    i, n = chance.randrange(len(data) + 1), chance.choice((1, 10, 1000, 20_000))
+    return [*data[:i], *[Record(chance.choice(OPCODES), b"")] * n, *data[i:]]
+
+
+def _declarations_changed(
+    chance: Random, data: Records, change: Callable[[Random, Records], Records]
+) -> Records:
+    """Return the records after a change of those that hold a declaration, or of a chunk's own."""
+    if any(record.opcode in DECLARATIONS for record in data):
+        return change(chance, data)
+    for i, record in enumerate(data):
+        if record.opcode == CHUNK and record.body[28:32] == bytes(4):
+            start, end, *_ = CHUNK_HEAD.unpack_from(record.body)
+            inside = change(chance, records_in(record.body[40:]))
+            packed = b"".join(each.data for each in inside)
+            head = CHUNK_HEAD.pack(start, end, len(packed), zlib.crc32(packed))
+            body = head + bytes(4) + struct.pack("<Q", len(packed)) + packed
+            return _with(data, i, record._replace(body=body))
+    return move_record(chance, data)
+
+
+def _without_one(chance: Random, data: Records) -> Records:
+    places = [i for i, record in enumerate(data) if record.opcode in DECLARATIONS]
+    i = chance.choice(places) if places else 0
+    return data[:i] + data[i + bool(places) :]
+
+
+def _exchanged(chance: Random, data: Records) -> Records:
+    opcode = chance.choice(DECLARATIONS)
+    places = [i for i, record in enumerate(data) if record.opcode == opcode]
+    if len(places) < 2:
+        return data
+    i, j = chance.sample(places, 2)
+    out = list(data)
+    out[i] = data[i]._replace(body=data[j].body[:2] + data[i].body[2:])
+    out[j] = data[j]._replace(body=data[i].body[:2] + data[j].body[2:])
     return out
 
 
@@ -103,7 +174,7 @@ def change_time(chance: Random, data: Records) -> Records:
 
 def change_declaration(chance: Random, data: Records) -> Records:
     """Return the records with a damaged byte in a schema or channel, or one of an odd number."""
-    places = [i for i, record in enumerate(data) if record.opcode in (SCHEMA, CHANNEL)]
+    places = [i for i, record in enumerate(data) if record.opcode in DECLARATIONS]
     if not places:
         return change_inside_chunk(chance, data)
     i = chance.choice(places)
@@ -141,10 +212,14 @@ def _damaged(chance: Random, record: Record, within: int) -> Record:
     return record._replace(body=bytes(body))
 
 
+# After these the log still has all its messages: each must be read, or something said.
+KEEPING: tuple[Callable[[Random, Records], Records], ...] = (
+    swap_records, shuffle_records, repeat_record, move_record, remove_declaration,
+    exchange_numbers, move_declarations, insert_empty_records,
+)  # fmt: skip
 DAMAGES: tuple[Callable[[Random, Records], Records], ...] = (
-    swap_records, shuffle_records, remove_record, repeat_record, change_opcode, change_length,
-    change_chunk_head, take_chunk_of_another_log, change_time, change_declaration,
-    change_inside_chunk,
+    *KEEPING, remove_record, change_opcode, change_length, change_chunk_head,
+    take_chunk_of_another_log, change_time, change_declaration, change_inside_chunk,
 )  # fmt: skip
 
 

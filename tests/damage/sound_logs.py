@@ -11,6 +11,8 @@ from scenes.altered_logs import frame_values, state_values, table_rows
 from epipole.io.logs.messages.encodings.registry import encoding_named
 from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import calibration_values
+from epipole.schemas.bridge import array
+from epipole.schemas.logs.log_tables import LogContents
 from epipole.schemas.logs.messages import CALIBRATION, FRAME, STATE
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "four_sensor_geo.mcap"
@@ -26,6 +28,9 @@ NO_SUMMARY = {
     "use_statistics": False,
     "use_summary_offsets": False,
 }
+
+
+Key = tuple[str, str, int]  # of a message: kind, sensor, time
 
 
 class Message(NamedTuple):
@@ -62,6 +67,8 @@ FORMS = {
     "protobuf_loose": Form("protobuf", NONE, LOOSE),
     "protobuf_loose_with_crc": Form("protobuf", NONE, LOOSE | {"enable_data_crcs": True}),
     "protobuf_loose_without_summary": Form("protobuf", NONE, LOOSE | NO_SUMMARY),
+    "protobuf_none_with_data_crc": Form("protobuf", NONE, NO_CRC | {"enable_data_crcs": True}),
+    "json_loose_with_crc": Form("json", NONE, LOOSE | {"enable_data_crcs": True}),
     "json_zstd": Form("json"),
     "json_none": Form("json", NONE),
     "json_loose": Form("json", NONE, LOOSE),
@@ -108,6 +115,26 @@ def count(name: str) -> int:
         return len(messages())
     log = read_log(EXAMPLE)
     return sum(len(table) for table in (log.exposures, log.states, log.cameras))
+
+
+@cache
+def keys(name: str) -> frozenset[Key]:
+    """Return what tells the messages of a sound log apart."""
+    if name == "example":
+        return keys_of(read_log(EXAMPLE))
+    return frozenset((m.kind, m.sensor_id, m.time_ns) for m in messages())
+
+
+def keys_of(log: LogContents) -> frozenset[Key]:
+    """Return the kind, the sensor and the time of each message that was read."""
+    tables = {FRAME: log.exposures, STATE: log.states, CALIBRATION: log.cameras}
+    return frozenset(
+        (kind, sensor_id, time_ns)
+        for kind, table in tables.items()
+        for sensor_id, time_ns in zip(
+            table["sensor_id"].to_pylist(), array(table, "time").tolist(), strict=True
+        )
+    )
 
 
 def written(encoded: list[tuple[Message, bytes]], form: Form) -> bytes:
