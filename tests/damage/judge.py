@@ -100,7 +100,7 @@ def _wrong_count(case: Case, log: LogContents, reasons: dict[str, int]) -> str |
         return f"{case.n} messages, {read} read, {lost} counted: {reasons}"
     if case.promise == Promise.COUNTED and read + lost < case.n:
         return f"{case.n} messages, only {read} read and {lost} counted: {reasons}"
-    if case.promise in (Promise.SAID, Promise.COUNTED) and not reasons:
+    if case.promise == Promise.SAID and not reasons:
         silent = max(case.n - read, len(case.keys - keys_of(log)))
         return f"{silent} of {case.n} messages lost, and nothing said" if silent > 0 else None
     return None

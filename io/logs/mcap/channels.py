@@ -31,9 +31,6 @@ class ChannelTable:
     _channels: dict[int, tuple[str, str, int]] = field(default_factory=dict)
     _known: dict[int, Channel | None] = field(default_factory=dict)
 
-    def __bool__(self) -> bool:
-        return bool(self._channels or self.summary)
-
     def declare(self, opcode: int, data: Any, at: int, end: int) -> None:
         """Read the body of a schema or channel record.
 

@@ -106,9 +106,9 @@ class RecordWalk:
         for place, opening in self._opened_ahead(self._places):
             yield from self._walk_place(place, opening)
         self._end_log()
+        self._report_missing()
         if (late := self._undeclared.late()) is not None:
             yield from self._walk_again(late)
-        self._report_missing()
 
     def _opened_ahead(
         self, places: Iterable[Place]
@@ -141,6 +141,8 @@ class RecordWalk:
         if place.reason == Reason.LOG_BEHIND_LOG:
             self._end_log()
             self._log_start = place.at
+            self._channels.forget()
+            self._declared.clear()
         if place.reason:
             self._leave_out(place.at, 0, place.reason)
             if place.opcode == CHUNK:
@@ -280,11 +282,9 @@ class RecordWalk:
             self._undeclared.add(number, int(counts[number]), int(offset[i]), int(time_ns[i]))
 
     def _end_log(self) -> None:
-        """Forget the declarations of a log at its end; count the messages without any."""
+        """Leave out the messages of a log that it does not declare."""
         for waiting in self._undeclared.settle(self._channels):
             self._leave_out(waiting.offset, waiting.time_ns, waiting.reason, waiting.n)
-        self._channels.forget()
-        self._declared.clear()
 
     def _walk_again(self, late: LateMessages) -> Iterator[Block]:
         """Yield the messages that come before their declarations; no damage is reported again."""
@@ -321,7 +321,7 @@ class RecordWalk:
         The chunk was left out, or it was no chunk any more, or a part of it was damaged.
         """
         n -= self._in_chunk.get(number, 0)
-        if n <= 0 or (self._channels and not self._channels.find(number)):
+        if n <= 0 or not self._may_be_wanted(number):
             return
         if self._lost_chunk is None:
             self._lost_chunk = len(self.damage)
@@ -331,12 +331,16 @@ class RecordWalk:
         self._lost[index] = self._lost.get(index, 0) + n
         self.damage[index] = self.damage[index]._replace(n=max(1, self._lost[index]))
 
+    def _may_be_wanted(self, number: int) -> bool:
+        """Return whether a channel is wanted, or not declared so far."""
+        return bool(self._channels.find(number) or self._channels.missing(number))
+
     def _report_missing(self) -> None:
         declared = self._summary.declared
         missing = sum(
             max(0, count - self._counts.get(number, 0))
             for number, count in declared.items()
-            if number in self._promised or self._channels.find(number)
+            if number in self._promised or self._may_be_wanted(number)
         )
         if missing > MOST_PER_BYTE * len(self.data):
             self._leave_out(0, 0, Reason.DAMAGED_RECORD)  # the counts themselves are damaged

@@ -1,5 +1,6 @@
 """The summary at the end of a log: its channels, its chunks and how many messages it has."""
 
+import contextlib
 import struct
 import zlib
 from dataclasses import dataclass, field
@@ -70,7 +71,8 @@ def _read_records(
         if at > len(data) or _is_foreign(opcode):
             raise ChunkError(Reason.DAMAGED_RECORD)  # or `start` belongs to another log
         if opcode in (SCHEMA, CHANNEL):
-            channels.declare(opcode, data, body, at)
+            with contextlib.suppress(ChunkError):  # the rest of the summary is of use without it
+                channels.declare(opcode, data, body, at)
         elif opcode == CHUNK_INDEX:
             offset = struct.unpack_from("<Q", data, body + 16)[0]
             if len(MAGIC) <= offset < file_end:
