@@ -7,7 +7,8 @@ import pyarrow as pa
 from rich.console import Console
 from rich.table import Table
 
-from epipole.io.datasets.dataset import nights_in, nights_of, read_table
+from epipole.io.datasets.dataset import nights_in, read_table
+from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.simulation.truth import Truth, read_truth
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.simulation.report import Report

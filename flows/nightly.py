@@ -42,8 +42,8 @@ from epipole.io.datasets.dataset import (
     check_sources,
     claim_nights,
     night_place,
-    nights_of,
 )
+from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.settings_file import merged_settings
 from epipole.io.work.folder import work_folder, work_root
 from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder

@@ -12,7 +12,8 @@ import polars as pl
 import pyarrow as pa
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
-from epipole.io.datasets.dataset import nights_in, nights_of, read_table
+from epipole.io.datasets.dataset import night_row, nights_in, read_table
+from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.logs.listing import list_logs
 from epipole.io.logs.reader import read_log_pieces
 from epipole.io.logs.viewer_file import ViewerFile
@@ -126,7 +127,7 @@ def _of_night(
 ) -> Iterator[ViewerMessage]:
     sensors = sorted(set(told.frames["sensor_id"]))
     times_ns = told.frames["time"].dt.timestamp("ns").to_numpy()
-    row = next(iter(read_table(dataset, "nights", night).to_pylist()), None)
+    row = night_row(dataset, night)
     named = row is not None and row["star_catalogue_key"].startswith(HIPPARCOS)
     shapes = camera_shapes(told.cameras) if images else {}
     positions = array(read_table(dataset, "positions", night, ["epoch"]), "epoch")

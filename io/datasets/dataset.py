@@ -7,17 +7,13 @@ half a night. A run that fails or is killed leaves the dataset unchanged.
 """
 
 import contextlib
-import datetime
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from epipole.io.caches.private_folders import temporary_folder
 from epipole.io.datasets import local_nights
@@ -26,18 +22,13 @@ from epipole.io.datasets.local_nights import STAGING
 from epipole.io.datasets.night_reader import NightReader
 from epipole.io.datasets.plain_files import refuse_link
 from epipole.io.datasets.store_nights import StoreNights, store_nights
+from epipole.io.datasets.table_pieces import Between, read_pieces
 from epipole.io.names import fault_of_name
 from epipole.io.remote_files import line_of, storage_errors
-from epipole.schemas.bridge import array, conform, empty
-from epipole.schemas.columns import TIME
+from epipole.schemas.bridge import conform
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.spans import DAY_NS, Span, is_night
+from epipole.schemas.spans import Span, is_night
 from epipole.schemas.tables import TABLES
-
-# The time column that decides to which night a row belongs, where it is not `time`. Calibrations
-# and sources belong to a whole night.
-_NIGHT_COLUMN = {"tracklets": "start_time"}
-_WHOLE_NIGHT = {"calibrations", "identifications", "nights", "sources"}
 
 REPORTS = "reports"  # beside the nights, never in them: readers scan night=*
 
@@ -98,7 +89,7 @@ def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, repl
         return
     given = set(sources["sha256"].to_pylist())
     for night in nights:
-        recorded = read_table(dataset, "sources", night).select(["name", "sha256"])
+        recorded = read_table(dataset, "sources", night, ["name", "sha256"])
         missing = [row["name"] for row in recorded.to_pylist() if row["sha256"] not in given]
         if missing:
             raise DatasetError(
@@ -112,7 +103,6 @@ def read_table(
     table: str,
     night: str,
     columns: Sequence[str] | None = None,
-    since_ns: int | None = None,
     during: Span | None = None,
 ) -> pa.Table:
     """Return a table of a night. It has no rows where the night is missing.
@@ -121,8 +111,6 @@ def read_table(
     ----------
     columns
         Names of those to read; None: all.
-    since_ns
-        Rows of earlier epochs are left out. Only for a table that has epochs.
     during
         Rows of other epochs are left out, or of other times where the table has no epochs.
 
@@ -131,36 +119,75 @@ def read_table(
     DatasetError
         Where its files cannot be read, or do not hold this table.
     """
-    schema = TABLES[table]
-    if columns is not None:
-        schema = pa.schema([schema.field(name) for name in columns], schema.metadata)
+    names = list(columns or TABLES[table].names)
+    between_ns = None if during is None else (during.start_ns, during.end_ns)
+    pieces = table_pieces(dataset, table, night, names, between_ns)
+    return pa.concat_tables([_schema(table, names).empty_table(), *pieces])
+
+
+def table_pieces(
+    dataset: Where,
+    table: str,
+    night: str,
+    columns: Sequence[str],
+    between_ns: Between | None = None,
+) -> Iterator[pa.Table]:
+    """Yield the rows of a table of a night, some at a time; none where the night is missing.
+
+    Parameters
+    ----------
+    between_ns
+        Rows of other epochs are left out, or of other times where the table has no epochs.
+
+    Raises
+    ------
+    DatasetError
+        As `read_table`.
+    """
+    schema = _schema(table, columns)
+    time = None
+    if between_ns is not None:
+        time = "epoch" if "epoch" in TABLES[table].names else "time"
+    wanted = schema if time is None or time in columns else schema.append(TABLES[table].field(time))
     if (store := _store(dataset)) is not None:
         with _reading(dataset):
             parts: Sequence[Any] = [pa.BufferReader(part) for part in store.read(night, table)]
     else:
         local_nights.recover(_folder(dataset))
         parts = sorted((_folder(dataset) / f"night={night}" / table).glob("*.parquet"))
-    chosen = _chosen(TABLES[table], since_ns, during)
     try:
-        rows = [
-            conform(schema, pq.read_table(part, partitioning=None, columns=columns, filters=chosen))
-            for part in parts
-        ]
-    except (OSError, ValueError) as error:
+        for part in parts:
+            for rows in read_pieces(part, wanted, time, between_ns or (None, None)):
+                yield conform(schema, rows)
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise DatasetError(
-            f"{dataset}/night={night}/{table}: cannot be read ({error}); "
+            f"{dataset}/night={night}/{table}: cannot be read ({line_of(error)}); "
             "remove the folder of the night and run the night again"
         ) from error
-    return pa.concat_tables([empty(schema), *rows])
 
 
-def _chosen(schema: pa.Schema, since_ns: int | None, during: Span | None) -> pc.Expression | None:
-    if since_ns is not None:
-        return pc.field("epoch") >= pa.scalar(since_ns, TIME)
-    if during is None:
-        return None
-    time = pc.field("epoch" if "epoch" in schema.names else "time")
-    return (time >= pa.scalar(during.start_ns, TIME)) & (time < pa.scalar(during.end_ns, TIME))
+def _schema(table: str, columns: Sequence[str]) -> pa.Schema:
+    schema = TABLES[table]
+    return pa.schema([schema.field(name) for name in columns], schema.metadata)
+
+
+def night_row(dataset: Where, night: str) -> dict[str, Any] | None:
+    """Return the row of a night in its table `nights`; None where it has none.
+
+    Raises
+    ------
+    DatasetError
+        As `read_table`; also where it has several.
+    """
+    found = None
+    for rows in table_pieces(dataset, "nights", night, TABLES["nights"].names):
+        if found is not None or rows.num_rows > 1:
+            raise DatasetError(
+                f"{dataset}/night={night}/nights: has several rows, expected one; "
+                "remove the folder of the night and run the night again"
+            )
+        (found,) = rows.to_pylist()
+    return found
 
 
 def missing_tables(dataset: Where, night: str) -> list[str]:
@@ -337,43 +364,3 @@ def _reading(dataset: Where) -> Iterator[None]:
         raise
     except storage_errors() as error:
         raise DatasetError(f"{dataset}: cannot be read: {line_of(error)}") from error
-
-
-def nights_of(time_ns: np.ndarray) -> list[str]:
-    """Return the UTC dates, ``YYYY-MM-DD``, of these times, each once and in order."""
-    return [_date(day) for day in np.unique(time_ns // DAY_NS)]
-
-
-def rows_of_night(name: str, rows: pa.Table, night: str) -> pa.Table:
-    """Return the rows of a table that belong to a night.
-
-    A row belongs to the UTC date of its epoch or, without an epoch, of its time. A log belongs
-    to every night between its first and last frame. A calibration belongs to all nights.
-    """
-    day = _day(night)
-    if name == "sources":
-        first, last = array(rows, "first_time") // DAY_NS, array(rows, "last_time") // DAY_NS
-        return rows.filter(pa.array((first <= day) & (day <= last)))
-    if name in _WHOLE_NIGHT:
-        return rows
-    column = "epoch" if "epoch" in rows.column_names else _NIGHT_COLUMN.get(name, "time")
-    return rows.filter(pa.array(array(rows, column) // DAY_NS == day))
-
-
-def in_order(rows: pa.Table) -> pa.Table:
-    """Return the rows sorted by time, then by the columns that identify them.
-
-    Rows that are equal in all of these keep their order.
-    """
-    times = [field.name for field in rows.schema if field.type == TIME]
-    keys = [f.name for f in rows.schema if pa.types.is_integer(f.type) or f.type == pa.string()]
-    by = [(name, "ascending") for name in (*times, *keys)]
-    return rows.take(pc.sort_indices(rows, sort_keys=by)) if rows.num_rows else rows
-
-
-def _day(night: str) -> int:
-    return (datetime.date.fromisoformat(night) - datetime.date(1970, 1, 1)).days
-
-
-def _date(day: int) -> str:
-    return (datetime.date(1970, 1, 1) + datetime.timedelta(days=int(day))).isoformat()

@@ -8,17 +8,15 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from epipole.io.datasets.table_pieces import MOST_BYTES, read_pieces
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
-
-ROWS_IN_PIECE = 1 << 17
 
 
 class NightReader:
@@ -38,7 +36,13 @@ class NightReader:
 
     def read(self, table: str, columns: Sequence[str]) -> pl.DataFrame:
         """Return all rows of a table that is small, or of few columns."""
-        return pl.concat([self.empty(table, columns), *self.pieces(table, columns)])
+        pieces, size = [self.empty(table, columns)], 0.0
+        for rows in self.pieces(table, columns):
+            size += rows.estimated_size()
+            if size > MOST_BYTES:
+                raise self._unreadable(table, ValueError("its rows are more than a night has"))
+            pieces.append(rows)
+        return pl.concat(pieces)
 
     def pieces(
         self, table: str, columns: Sequence[str], between_ns: tuple[int, int] | None = None
@@ -51,13 +55,12 @@ class NightReader:
             Only rows whose first column is a time from here to before there. Row groups of other
             times are not read. The rows are sorted by that column.
         """
-        for file in self._opened(table):
-            with self._as_dataset_errors(table):
-                groups = _groups(file, columns[0], between_ns)
-                batches = file.iter_batches(ROWS_IN_PIECE, groups, columns=list(columns))
-                for batch in batches if groups else ():
-                    rows = to_polars(pa.Table.from_batches([batch])).select(columns)
-                    yield rows if between_ns is None else rows.filter(_within(rows, between_ns))
+        schema = pa.schema([TABLES[table].field(name) for name in columns])
+        time = None if between_ns is None else columns[0]
+        with self._as_dataset_errors(table):
+            for file in self._files(table):
+                for rows in read_pieces(file, schema, time, between_ns or (None, None)):
+                    yield to_polars(rows)
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""
@@ -95,7 +98,7 @@ class NightReader:
             yield
         except DatasetError:
             raise
-        except (KeyError, pl.exceptions.PolarsError) as error:
+        except (KeyError, pa.ArrowException, pl.exceptions.PolarsError) as error:
             raise self._unreadable(table, error) from error
         except storage_errors() as error:
             raise self._unreadable(table, error) from error
@@ -107,24 +110,3 @@ class NightReader:
 def _rows(file: pq.ParquetFile, group: int) -> int:
     count: int = file.metadata.row_group(group).num_rows
     return count
-
-
-def _groups(file: pq.ParquetFile, column: str, between_ns: tuple[int, int] | None) -> list[int]:
-    """Return the row groups that have rows of these times."""
-    groups = [k for k in range(file.num_row_groups) if _rows(file, k)]
-    if between_ns is None:
-        return groups
-    at = file.schema_arrow.get_field_index(column)
-    kept = []
-    for group in groups:
-        statistics = file.metadata.row_group(group).column(at).statistics
-        known = statistics is not None and statistics.has_min_max
-        low, high = (statistics.min_raw, statistics.max_raw) if known else between_ns
-        if low < between_ns[1] and high >= between_ns[0]:
-            kept.append(group)
-    return kept
-
-
-def _within(rows: pl.DataFrame, between_ns: tuple[int, int]) -> pl.Series:
-    time_ns = rows[rows.columns[0]].dt.epoch("ns").to_numpy()
-    return pl.Series(np.asarray((time_ns >= between_ns[0]) & (time_ns < between_ns[1])))

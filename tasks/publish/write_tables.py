@@ -9,8 +9,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.datasets.dataset import in_order, rows_of_night
 from epipole.io.datasets.night_files import write_table
+from epipole.io.datasets.rows_by_night import in_order, rows_of_night
 from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import array, concat, conform, table
 from epipole.schemas.logs.log_tables import LogSource

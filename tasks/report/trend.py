@@ -1,11 +1,15 @@
 """The last nights of a dataset: a few numbers of each."""
 
+import logging
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import polars as pl
 
 from epipole.io.datasets.night_reader import NightReader
+from epipole.schemas.errors import DatasetError
+
+LOGGER = logging.getLogger(__name__)
 
 MOST_NIGHTS = 30
 
@@ -28,8 +32,14 @@ class NightNumbers(NamedTuple):
 
 
 def read_trend(nights: Iterable[NightReader]) -> list[NightNumbers]:
-    """Return the numbers of nights, in their order."""
-    return [_numbers(night) for night in nights]
+    """Return the numbers of nights, in their order. A night that cannot be read has a line."""
+    numbers = []
+    for night in nights:
+        try:
+            numbers.append(_numbers(night))
+        except DatasetError as error:
+            LOGGER.warning("left out of the trend: %s", error)
+    return numbers
 
 
 def _numbers(night: NightReader) -> NightNumbers:

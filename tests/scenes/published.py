@@ -7,11 +7,10 @@ import pyarrow as pa
 from epipole.io.datasets.dataset import (
     Where,
     claim_nights,
-    in_order,
     publish_folders,
-    rows_of_night,
 )
 from epipole.io.datasets.night_files import write_table
+from epipole.io.datasets.rows_by_night import in_order, rows_of_night
 from epipole.schemas.bridge import empty
 from epipole.schemas.tables import TABLES
 

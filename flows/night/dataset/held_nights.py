@@ -5,7 +5,7 @@ from typing import Any
 
 from epipole.flows.night.dataset.earlier_nights import EarlierNights
 from epipole.flows.night.dataset.night_rows import recipe_in
-from epipole.io.datasets.dataset import missing_tables, nights_in, read_table
+from epipole.io.datasets.dataset import missing_tables, night_row, nights_in
 from epipole.io.work.recipe import recipe_of
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.settings import Settings
@@ -49,13 +49,11 @@ def held_nights(dataset: str, settings: Settings, known: str | None) -> list[Hel
 def _held(dataset: str, date: str, settings: Settings, known: str | None) -> HeldNight:
     try:
         missing = missing_tables(dataset, date)
-        rows = read_table(dataset, "nights", date).to_pylist()
+        row = night_row(dataset, date)
     except DatasetError as error:
         return HeldNight(date, {}, [str(error)])
-    if len(rows) != 1:
-        reason = f"{len(rows):,} rows in its table nights" if rows else "an older version"
-        return HeldNight(date, {}, [reason])
-    (row,) = rows
+    if row is None:
+        return HeldNight(date, {}, ["an older version"])
     made_from = recipe_in(row)
     today = recipe_of(row["logs_key"], settings, known or row["known_key"])
     stale = [

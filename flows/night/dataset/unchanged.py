@@ -10,7 +10,7 @@ import pyarrow as pa
 from epipole.flows.night.dataset.earlier_nights import EarlierNights
 from epipole.flows.night.dataset.night_rows import recipe_in
 from epipole.flows.night.log_choice import FoundLogs, name_of
-from epipole.io.datasets.dataset import missing_tables, nights_in, read_table
+from epipole.io.datasets.dataset import missing_tables, night_row, nights_in, read_table
 from epipole.io.logs.mcap.bytes import open_log
 from epipole.io.work.recipe import logs_key, recipe_of
 from epipole.schemas.bridge import array
@@ -68,8 +68,8 @@ def unchanged_nights(
 def _rows(dataset: str, night: str | None) -> dict[str, dict[str, Any]]:
     """Return the row of `nights` of each published night, or of the one that is asked for."""
     dates = [date for date in nights_in(dataset) if night in (None, date)]
-    rows = {date: read_table(dataset, "nights", date).to_pylist() for date in dates}
-    return {date: of_night[0] for date, of_night in rows.items() if of_night}
+    rows = {date: night_row(dataset, date) for date in dates}
+    return {date: row for date, row in rows.items() if row is not None}
 
 
 def _sources(dataset: str, night: str) -> pa.Table:

@@ -1,0 +1,120 @@
+"""Parquet files of a dataset, read in pieces of bounded size and checked against their schema.
+
+Another program may have written them. A few kilobytes can hold millions of equal rows, or one long
+text millions of times, so neither a file's size nor its number of rows says how much it unpacks to.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from epipole.schemas.bridge import conform
+from epipole.schemas.columns import TIME
+
+ROWS_IN_PIECE = 1 << 17
+# Of the texts of a piece, and of all rows that are kept of a table of an earlier night. Half an
+# hour of 128 sensors that see 60 objects each second has 550 MB of views.
+MOST_BYTES = 1 << 30
+MOST_LISTED = 1 << 20  # values of a list column in a row group: a night's sentences on its sensors
+
+Between = tuple[int | None, int | None]  # from here to before there [ns since 1970]; None: open
+
+
+def read_pieces(
+    file: Any, schema: pa.Schema, time: str | None = None, between_ns: Between = (None, None)
+) -> Iterator[pa.Table]:
+    """Yield the rows of a file, some at a time, in their order, as tables of a schema.
+
+    Parameters
+    ----------
+    file
+        A path, or an open file.
+    schema
+        Only its columns are read.
+    time
+        A column by which rows are chosen; row groups of other times are not read.
+
+    Raises
+    ------
+    OSError, ValueError, pyarrow.ArrowException
+        Where the file is damaged, does not have this schema, or a piece is too large.
+    """
+    metadata = pq.read_metadata(file)
+    held = [name for name in schema.names if name in metadata.schema.to_arrow_schema().names]
+    texts = [name for name in held if schema.field(name).type == pa.string()]
+    parquet = pq.ParquetFile(file, metadata=metadata, read_dictionary=texts)
+    groups = _groups(parquet, time, between_ns)
+    _check_lists(parquet, groups, [f.name for f in schema if pa.types.is_list(f.type)])
+    if len(held) < len(schema):
+        conform(schema, parquet.schema_arrow.empty_table())  # names those that are missing
+    for batch in parquet.iter_batches(ROWS_IN_PIECE, groups, columns=held) if groups else ():
+        _check_texts(batch)
+        rows = conform(schema, pa.Table.from_batches([batch]))
+        rows.validate(full=True)  # invalid UTF-8 would end in an error where it is shown
+        yield rows if time is None else rows.filter(_chosen(rows[time], between_ns))
+
+
+def within_bounds(pieces: Iterable[pa.Table], most_bytes: int) -> Iterator[pa.Table]:
+    """Yield the pieces.
+
+    Raises
+    ------
+    ValueError
+        Where they are larger than this altogether.
+    """
+    total = 0
+    for piece in pieces:
+        total += piece.nbytes
+        if total > most_bytes:
+            raise ValueError(f"its rows unpack to more than {most_bytes >> 20:,} MiB")
+        yield piece
+
+
+def _groups(file: pq.ParquetFile, time: str | None, between_ns: Between) -> list[int]:
+    """Return the row groups that may have rows of these times."""
+    groups = [k for k in range(file.num_row_groups) if file.metadata.row_group(k).num_rows]
+    at = -1 if time is None else file.schema_arrow.get_field_index(time)
+    if at < 0 or file.schema_arrow.field(at).type != TIME:
+        return groups
+    first, end = between_ns
+    kept = []
+    for group in groups:
+        statistics = file.metadata.row_group(group).column(at).statistics
+        if statistics is not None and statistics.has_min_max:
+            low, high = statistics.min_raw, statistics.max_raw
+            if (end is not None and low >= end) or (first is not None and high < first):
+                continue
+        kept.append(group)
+    return kept
+
+
+def _check_lists(file: pq.ParquetFile, groups: Iterable[int], lists: list[str]) -> None:
+    """Raise where a list column has too many values; a single row may hold any number."""
+    for group in map(file.metadata.row_group, groups):
+        for column in map(group.column, range(group.num_columns)):
+            is_list = column.path_in_schema.partition(".")[0] in lists
+            if is_list and column.num_values > MOST_LISTED:
+                raise ValueError(f"column {column.path_in_schema} has {column.num_values:,} values")
+
+
+def _check_texts(batch: pa.RecordBatch) -> None:
+    """Raise where the texts of a batch would unpack to too many bytes."""
+    for name, values in zip(batch.schema.names, batch.columns, strict=True):
+        if pa.types.is_dictionary(values.type):
+            lengths = pc.binary_length(values.dictionary).cast(pa.int64())
+            if (pc.sum(lengths.take(values.indices)).as_py() or 0) > MOST_BYTES:
+                raise ValueError(f"column {name} unpacks to more than {MOST_BYTES >> 20:,} MiB")
+
+
+def _chosen(times: pa.ChunkedArray, between_ns: Between) -> pa.ChunkedArray:
+    first, end = between_ns
+    number = times.cast(pa.int64())
+    chosen = pc.is_valid(number)
+    if first is not None:
+        chosen = pc.and_(chosen, pc.greater_equal(number, first))
+    if end is not None:
+        chosen = pc.and_(chosen, pc.less(number, end))
+    return chosen
