@@ -48,7 +48,7 @@ def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, State[Summary]]:
 
 
 def _ended(how: Summary | BaseException) -> None:
-    """Tell `run_here`. Dask pickles the flow's function with the variables it names: not this one."""
+    """Tell `run_here`; a function, as Dask pickles the flow with the variables that it names."""
     _ENDED.get([]).append(how)
 
 

@@ -7,10 +7,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 import yaml
 from scenes.dataset_tables import contents
-from scenes.prefect_server import POOL, Prefect, serving, wait_for
+from scenes.prefect_server import POOL, Prefect, deploy_files, serving, wait_for
 
 from epipole.io.logs.writer import LogWriter
 
@@ -66,13 +67,10 @@ def deployed(tmp_path_factory, night_log) -> Iterator[Deployed]:
     (folder / "logs" / night_log.name).symlink_to(night_log)
     with LogWriter(folder / "logs" / "another.mcap") as log:  # of another night
         log.frame("a", 1_554_000_000 * 10**9, frame_number=0, exposure_s=0.1, x_px=[], y_px=[])
-    text = (ROOT / "prefect.yaml").read_text()
-    assert yaml.safe_load(text)["deployments"][0]["work_pool"]["name"] == POOL
-    for name, place in (("/data/logs", folder / "logs"), ("/data/dataset", folder / "dataset")):
-        assert text.count(f" {name} ") + text.count(f" {name}\n") == 1
-        text = text.replace(f" {name}", f" {place}")
-    (folder / "prefect.yaml").write_text(text)
-    with serving(folder) as prefect:
+    settings = deploy_files(folder, folder / "logs", folder / "dataset")
+    deployment = yaml.safe_load((folder / "prefect.yaml").read_text())["deployments"][0]
+    assert deployment["work_pool"]["name"] == POOL
+    with serving(folder, **settings) as prefect:
         made = prefect.command("work-pool", "create", POOL, "--type", "process")
         assert made.returncode == 0, made.stderr
         there = prefect.command("deploy", "--all")
@@ -84,6 +82,8 @@ def deployed(tmp_path_factory, night_log) -> Iterator[Deployed]:
 def test_the_commands_that_are_run_here_stand_on_the_page_of_operations():
     page = (ROOT / "docs" / "operations.md").read_text()
     for command in (
+        "epipole deploy-files --out .",
+        "set -a; . ./prefect.env; set +a",
         "prefect server start",
         f"prefect work-pool create {POOL} --type process",
         "prefect deploy --all",
@@ -92,6 +92,15 @@ def test_the_commands_that_are_run_here_stand_on_the_page_of_operations():
         f"prefect deployment run 'nightly/nightly' --param night={NIGHT} --watch",
     ):
         assert f"\n{command}" in page, command
+
+
+def test_the_server_answers_only_who_has_the_secret(deployed):
+    url = f"{deployed.prefect.url}/flow_runs/filter"
+    for told in (None, ("epipole", "@SECRET@"), ("admin", "pass")):
+        assert httpx.post(url, json={}, auth=told).status_code == 401
+    for file in ("worker.txt", "server.txt"):
+        said = (deployed.prefect.folder / file).read_text()
+        assert deployed.prefect.environment["PREFECT_API_AUTH_STRING"].split(":")[1] not in said
 
 
 def test_runs_are_scheduled_for_six_in_the_morning(deployed):
@@ -209,7 +218,7 @@ def test_a_killed_worker_leaves_the_dataset_and_the_next_one_goes_on(deployed, n
 
 def automation_for_lost_runs(prefect: Prefect) -> str:
     """Make the first of the automations that come with epipole, quicker; return its name."""
-    text = (ROOT / "flows/prefect/deploy_files/automations.yaml").read_text()
+    text = (prefect.folder / "automations.yaml").read_text()
     lost = yaml.safe_load(text)["automations"][0]
     assert lost["trigger"]["within"] == 90
     lost["trigger"]["within"] = 40  # a heartbeat comes every 30 s, the shortest that Prefect has
@@ -227,10 +236,12 @@ def test_a_run_from_the_command_line_goes_to_the_server_of_the_users_profile(
         f'active = "ours"\n[profiles.ours]\nPREFECT_API_URL = "{deployed.prefect.url}"\n'
     )
     kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
+    secret = {k: v for k, v in deployed.prefect.environment.items() if k.endswith("AUTH_STRING")}
     command = "from epipole.flows.command_line.main import main; main()"
     ran = subprocess.run(
         [sys.executable, "-c", command, "run", str(night_log), "--out", str(tmp_path / "out")],
-        env=kept | {"PREFECT_HOME": str(tmp_path)}, cwd=tmp_path, capture_output=True, text=True,
+        env=kept | secret | {"PREFECT_HOME": str(tmp_path)},
+        cwd=tmp_path, capture_output=True, text=True,
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
     named = {"name": {"any_": [f"all nights of {night_log.name}"]}}

@@ -37,7 +37,11 @@ class Prefect:
         self.url = f"http://127.0.0.1:{self.port}/api"
         kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
         own = {"PREFECT_HOME": str(self.home), "PREFECT_API_URL": self.url, "NO_COLOR": "1"}
-        self.environment = kept | QUICK | QUIET | own | settings
+        self.environment = kept | QUICK | QUIET | settings | own
+        secret = settings.get("PREFECT_API_AUTH_STRING", "").partition(":")
+        self._client = httpx.Client(
+            base_url=self.url, timeout=30, auth=(secret[0], secret[2]) if secret[0] else None
+        )
 
     def command(self, *arguments: str, timeout: float = 120) -> subprocess.CompletedProcess[str]:
         """Run a command of Prefect to its end."""
@@ -55,17 +59,21 @@ class Prefect:
                 stdin=subprocess.DEVNULL, start_new_session=True,
             )  # fmt: skip
 
+    def start_server(self) -> subprocess.Popen[bytes]:
+        """Start the server."""
+        return self.start("server", "server", "start", "--port", str(self.port))
+
     def start_worker(self) -> subprocess.Popen[bytes]:
         """Start a worker of the pool."""
         return self.start("worker", "worker", "start", "--pool", POOL)
 
     def get(self, path: str) -> Any:
         """Return the API's answer to GET."""
-        return _answer(lambda: httpx.get(f"{self.url}/{path}", timeout=30))
+        return _answer(lambda: self._client.get(f"/{path}"))
 
     def post(self, path: str, asked: dict[str, Any]) -> Any:
         """Return the API's answer to POST."""
-        return _answer(lambda: httpx.post(f"{self.url}/{path}", json=asked, timeout=30))
+        return _answer(lambda: self._client.post(f"/{path}", json=asked))
 
     def find(self, what: str, **asked: Any) -> list[dict[str, Any]]:
         """Return all flow runs, task runs, logs or artifacts that match a filter."""
@@ -82,6 +90,11 @@ class Prefect:
     def flow_processes(self, worker: subprocess.Popen[bytes]) -> list[int]:
         """Return the processes of the flow runs that a worker started."""
         return [pid for pid in self._processes() if _parent(pid) == worker.pid]
+
+    def orphans(self) -> list[int]:
+        """Return the processes of flow runs whose worker has gone."""
+        own = self._processes()
+        return [pid for pid in own if _parent(pid) == 1 and "prefect.engine" in _arguments(pid)]
 
     def kill_all(self) -> None:
         """Kill every process of this server and its workers, orphans too."""
@@ -105,11 +118,27 @@ def serving(folder: Path, **settings: str) -> Iterator[Prefect]:
     """Run a server. At the end all its processes are killed, whatever happened."""
     prefect = Prefect(folder, **settings)
     try:
-        prefect.start("server", "server", "start", "--port", str(prefect.port))
+        prefect.start_server()
         wait_for(lambda: _answers(prefect.url), "the server to start")
         yield prefect
     finally:
         prefect.kill_all()
+
+
+def deploy_files(folder: Path, logs: Path, dataset: Path) -> dict[str, str]:
+    """Write the files of a deployment, two lines changed; return the settings of prefect.env."""
+    command = "from epipole.flows.command_line.main import main; main()"
+    subprocess.run(
+        [sys.executable, "-c", command, "deploy-files", "--out", str(folder)],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    text = (folder / "prefect.yaml").read_text()
+    for name, place in (("/data/logs", logs), ("/data/dataset", dataset)):
+        assert text.count(f" {name} ") + text.count(f" {name}\n") == 1
+        text = text.replace(f" {name}", f" {place}")
+    (folder / "prefect.yaml").write_text(text)
+    lines = (folder / "prefect.env").read_text().splitlines()
+    return dict(line.split("=", 1) for line in lines if not line.startswith("#"))
 
 
 def wait_for(what: Callable[[], Any], why: str, seconds: float = 120) -> Any:
@@ -150,3 +179,9 @@ def _parent(pid: int) -> int:
         stat = Path(f"/proc/{pid}/stat").read_text()
         return int(stat.rpartition(")")[2].split()[1])
     return -1
+
+
+def _arguments(pid: int) -> str:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    return ""

@@ -1,5 +1,7 @@
 """`epipole deploy-files`: what an operator needs to run it every night."""
 
+import os
+import secrets
 from pathlib import Path
 from typing import Annotated
 
@@ -10,12 +12,14 @@ from epipole.schemas.errors import EpipoleError
 
 # Each file, and what it is for.
 FILES = {
+    "prefect.env": "settings of Prefect with a new secret; readable by you only",
     "prefect.yaml": "the deployment, for `prefect deploy --all`",
-    "automations.yaml": "lost, failed and late runs, for `prefect automation create --from-file`",
+    "automations.yaml": "lost, failed and late runs: for `prefect automation create --from-file`",
     "epipole-server.service": "Prefect's server as a systemd unit",
     "epipole-worker.service": "a worker as a systemd unit",
     "Containerfile": "a worker in a container",
 }
+_SECRET = "@SECRET@"
 
 
 def deploy_files(
@@ -24,7 +28,8 @@ def deploy_files(
 ) -> None:
     """Write the files of a nightly deployment: Prefect, systemd, container.
 
-    docs/operations.md goes through them. A file that is there is not replaced.
+    docs/operations.md goes through them. A file that is there is not replaced. prefect.env has the
+    secret that Prefect's server asks for; each call makes another one.
     """
     from importlib.resources import files
 
@@ -34,10 +39,21 @@ def deploy_files(
             f"{out}: has {', '.join(there)}; nothing was written: give another folder, or --force"
         )
     source = files("epipole.flows.prefect") / "deploy_files"
+    secret = secrets.token_urlsafe(32)
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name in FILES:
-            (out / name).write_text((source / name).read_text(encoding="utf-8"), encoding="utf-8")
+            _write(out / name, (source / name).read_text(encoding="utf-8"), secret)
     except OSError as error:
         raise EpipoleError(f"{out}: cannot be written: {error.strerror}; give another") from error
     print_lines(f"{out / name!s:<26}  {use}" for name, use in FILES.items())
+
+
+def _write(file: Path, text: str, secret: str) -> None:
+    """Write a new file; one with the secret is readable by its owner only from the start."""
+    file.unlink(missing_ok=True)
+    mode = 0o600 if _SECRET in text else 0o666  # of which the user's umask takes its part
+    # Not through a link that somebody has put there meanwhile.
+    new = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+    with open(new, "w", encoding="utf-8") as opened:
+        opened.write(text.replace(_SECRET, secret))

@@ -1,6 +1,8 @@
 """The files of a deployment: written as they are in the package, and valid for who reads them."""
 
 import configparser
+import fnmatch
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -42,14 +44,76 @@ def test_the_deployment_at_the_top_of_the_repository_is_the_same(written):
 def test_prefect_understands_the_automations(written):
     held = yaml.safe_load((written / "automations.yaml").read_text())["automations"]
     made = [AutomationCore.model_validate(automation) for automation in held]
-    assert [automation.actions[0].type for automation in made] == [
-        "change-flow-run-state", "do-nothing", "do-nothing",
-    ]  # fmt: skip
+    assert [
+        getattr(automation.actions[0], "state", automation.actions[0].type) for automation in made
+    ] == ["CRASHED", "CRASHED", "SCHEDULED", "FAILED", "do-nothing", "do-nothing"]
     deployed = yaml.safe_load((written / "prefect.yaml").read_text())["deployments"][0]
     beats_s = int(
         deployed["work_pool"]["job_variables"]["env"]["PREFECT_FLOWS_HEARTBEAT_FREQUENCY"]
     )
     assert made[0].trigger.within.total_seconds() >= 3 * beats_s
+
+
+def told_by(automation, event: str, run_count: int) -> bool:
+    """Return whether an event of a run alone makes an automation act."""
+    trigger = automation.trigger
+    counts = trigger.match.root.get("prefect.run-count", "*")
+    negated = counts.startswith("!")
+    fits = fnmatch.fnmatchcase(str(run_count), counts.removeprefix("!")) != negated
+    return trigger.posture.value == "Reactive" and event in trigger.expect and fits
+
+
+@pytest.mark.parametrize("run_count", range(12))
+def test_a_crashed_run_is_made_again_or_has_failed_and_is_told_once(written, run_count):
+    held = yaml.safe_load((written / "automations.yaml").read_text())["automations"]
+    made = [AutomationCore.model_validate(automation) for automation in held]
+
+    def acts(event: str) -> list[str]:
+        fired = [each.actions[0] for each in made if told_by(each, event, run_count)]
+        return [getattr(action, "state", action.type) for action in fired]
+
+    assert acts("prefect.flow-run.Crashed") == (["SCHEDULED"] if run_count < 4 else ["FAILED"])
+    assert acts("prefect.flow-run.Failed") == ["do-nothing"]
+    assert acts("prefect.flow-run.AwaitingRetry") == []
+    for automation in made[-2:]:  # those that tell somebody: once of a run
+        assert automation.trigger.for_each == {"prefect.resource.id"}
+        assert automation.trigger.within.total_seconds() >= 3600
+
+
+def test_the_secret_is_new_each_time_and_its_owners_only(written, tmp_path):
+    old = os.umask(0o000)
+    try:
+        CliRunner().invoke(app, ["deploy-files", "--out", str(tmp_path / "other")])
+    finally:
+        os.umask(old)
+    settings = [
+        dict(
+            line.split("=", 1)
+            for line in (folder / "prefect.env").read_text().splitlines()
+            if not line.startswith("#")
+        )
+        for folder in (written, tmp_path / "other")
+    ]
+    for own in settings:
+        secret = own["PREFECT_SERVER_API_AUTH_STRING"]
+        assert secret == own["PREFECT_API_AUTH_STRING"]
+        assert len(secret.removeprefix("epipole:")) >= 43  # 256 bits
+    assert settings[0] != settings[1]
+    assert (tmp_path / "other" / "prefect.env").stat().st_mode & 0o777 == 0o600
+    for file in (tmp_path / "other").iterdir():
+        if file.name != "prefect.env":
+            assert secret.split(":")[1] not in file.read_text()
+
+
+def test_a_link_in_the_place_of_a_file_is_replaced_and_not_followed(written, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.write_text("another's")
+    (written / "prefect.env").unlink()
+    (written / "prefect.env").symlink_to(elsewhere)
+    forced = CliRunner().invoke(app, ["deploy-files", "--out", str(written), "--force"])
+    assert forced.exit_code == 0
+    assert elsewhere.read_text() == "another's"
+    assert not (written / "prefect.env").is_symlink()
 
 
 @pytest.mark.parametrize("name", ["epipole-server.service", "epipole-worker.service"])
@@ -58,6 +122,9 @@ def test_units_have_what_systemd_needs(written, name):
     unit.optionxform = str
     unit.read(written / name)
     assert unit["Service"]["ExecStart"].startswith("/opt/epipole/bin/prefect ")
+    assert unit["Service"]["EnvironmentFile"] == "/etc/epipole/prefect.env"
+    assert "SECRET" not in (written / name).read_text()
+    assert unit["Service"]["Restart"] == "always"
     assert unit["Install"]["WantedBy"] == "multi-user.target"
 
 
