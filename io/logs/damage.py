@@ -8,6 +8,9 @@ from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS
 
 ROWS_ALIKE = 100  # a log of which everything is damaged does not need a row per message
+# Of one log, so that it cannot fill the memory: a row takes about half a kilobyte until it is
+# written. Behind them each reason has one more row, which counts the rest.
+MOST_ROWS = 50_000
 
 _Key = tuple[int | None, str | None, Reason]
 
@@ -18,8 +21,7 @@ class RejectList:
 
     source: str
     _rows: list[tuple[int | None, str | None, int, Reason, int]] = field(default_factory=list)
-    _alike: dict[_Key, int] = field(default_factory=dict)  # how many are alike
-    _last: dict[_Key, int] = field(default_factory=dict)  # the last row of those alike
+    _alike: dict[_Key, tuple[int, int]] = field(default_factory=dict)  # how many rows, the last
 
     def add(
         self,
@@ -33,16 +35,19 @@ class RejectList:
         """Add a row; a time of 0 is unknown.
 
         Rows with the same chunk, sensor and reason are alike. Only `ROWS_ALIKE` of them are kept;
-        the last of these counts the others too.
+        the last of these counts the others too. Behind `MOST_ROWS` rows all with one reason are
+        alike.
         """
-        key = (offset, sensor_id, reason)
-        n = self._alike[key] = self._alike.get(key, 0) + 1
-        if n <= ROWS_ALIKE:
-            self._rows.append((offset, sensor_id, time_ns, reason, count))
-            self._last[key] = len(self._rows) - 1
-            return
-        i = self._last[key]
-        self._rows[i] = (*self._rows[i][:-1], self._rows[i][-1] + count)
+        key: _Key = (offset, sensor_id, reason)
+        is_full = len(self._rows) >= MOST_ROWS
+        if is_full and key not in self._alike:
+            key = (None, None, reason)
+        n, last = self._alike.get(key, (0, 0))
+        if n == 0 or (n < ROWS_ALIKE and not is_full):
+            self._alike[key] = n + 1, len(self._rows)
+            self._rows.append((key[0], key[1], time_ns, reason, count))
+        else:
+            self._rows[last] = (*self._rows[last][:-1], self._rows[last][-1] + count)
 
     def table(self, own_ns: tuple[int, int] | None) -> pa.Table:
         """Return the rows of `rejects`; `own_ns`: the log's first and last time.

@@ -40,6 +40,7 @@ Nanoseconds = npt.NDArray[np.int64]
 
 PER_MESSAGE = ("channel", "time_ns", "start", "end", "offset")  # columns of a block
 THREADS = 2  # that decompress and check chunks, in addition to the one that decodes
+MOST_WARNINGS = 20  # of unknown encodings in one log: it may have 65,536 channels
 LONGEST_NAME = 80  # of a topic or an encoding in a message
 PIECE_BYTES = 64 << 20  # of frames and states in one piece of a log
 
@@ -140,7 +141,8 @@ class _Reading:
         self._walk = RecordWalk(data, frozenset(kinds_of_schemas()), pool)
         self._frames_ns: list[Nanoseconds] = []
         self._states_ns: list[Nanoseconds] = []
-        self._unknown: dict[Channel, int] = {}  # messages in unknown encodings
+        # Channels in unknown encodings, by number, and their messages.
+        self._unknown: dict[int, tuple[Channel, int]] = {}
 
     def blocks(self) -> Iterator[Block]:
         """Yield the wanted messages of the log."""
@@ -165,8 +167,9 @@ class _Reading:
             self.rejects.add(
                 damage.reason, time_ns=damage.time_ns, offset=damage.offset, count=damage.n
             )
-        for channel, count in self._unknown.items():
-            LOGGER.warning(
+        for i, (channel, count) in enumerate(self._unknown.values()):
+            LOGGER.log(
+                logging.WARNING if i < MOST_WARNINGS else logging.DEBUG,
                 "%s: topic %s: messages are encoded as %s; write %s as one of %s",
                 self._where, as_line(channel.topic, LONGEST_NAME),
                 as_line(repr(channel.encoding), LONGEST_NAME), channel.schema,
@@ -187,7 +190,8 @@ class _Reading:
         for number, channel in block.channels.items():
             if number not in known:
                 count = int(np.count_nonzero(block.channel == number))
-                self._unknown[channel] = self._unknown.get(channel, 0) + count
+                _, before = self._unknown.get(number, (channel, 0))
+                self._unknown[number] = channel, before + count
         keep = np.isin(block.channel, list(known))
         columns = {name: getattr(block, name)[keep] for name in PER_MESSAGE}
         return block._replace(channels=known, **columns)

@@ -4,11 +4,8 @@ import struct
 import zlib
 from typing import NamedTuple
 
-import numpy as np
-
 from epipole.io.logs.mcap.channels import string
 from epipole.io.logs.mcap.compression import ChunkError, decompress, decompress_part
-from epipole.io.logs.mcap.record_scan import RecordIndex, index_records
 from epipole.io.logs.mcap.summary import RECORD
 from epipole.schemas.rejects import Reason
 
@@ -35,11 +32,10 @@ class ChunkHead(NamedTuple):
 
 
 class OpenedChunk(NamedTuple):
-    """The records of a chunk and where they lie, or the reason for leaving them out."""
+    """The records of a chunk, or the reason for leaving them out."""
 
     start_ns: int
-    records: bytes | memoryview
-    record_index: RecordIndex
+    records: bytes | memoryview = b""
     reason: Reason | None = None
     is_checked: bool = False  # by a checksum
 
@@ -76,8 +72,8 @@ def open_chunk(chunk: memoryview) -> OpenedChunk:
         if head.checksum and zlib.crc32(records) != head.checksum:
             raise ChunkError(Reason.BAD_CHECKSUM)
     except ChunkError as error:
-        return _opened(start_ns, b"", error.reason)
-    return _opened(start_ns, records, is_checked=head.checksum != 0)
+        return OpenedChunk(start_ns, b"", error.reason)
+    return OpenedChunk(start_ns, records, is_checked=head.checksum != 0)
 
 
 def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
@@ -88,13 +84,6 @@ def open_cut_chunk(chunk: memoryview) -> OpenedChunk:
     try:
         head = read_head(chunk, 0)
     except ChunkError:
-        return _opened(0, b"")
+        return OpenedChunk(0)
     size = min(head.size, MAX_CHUNK_BYTES)
-    return _opened(head.start_ns, decompress_part(chunk[head.body :], head.compression, size))
-
-
-def _opened(
-    start_ns: int, records: bytes, reason: Reason | None = None, is_checked: bool = False
-) -> OpenedChunk:
-    index = index_records(np.frombuffer(records, np.uint8))
-    return OpenedChunk(start_ns, records, index, reason, is_checked)
+    return OpenedChunk(head.start_ns, decompress_part(chunk[head.body :], head.compression, size))

@@ -5,47 +5,52 @@ next chunk that the summary lists, if there is one: the summary may be damaged t
 longer than their fields; what is behind the fields is skipped.
 """
 
-import struct
-from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from epipole.io.logs.mcap.bytes import LogBytes
+from epipole.io.logs.mcap.bytes import NEAR_BYTES, LogBytes
 from epipole.io.logs.mcap.chunks import HEAD_BYTES, MAX_RECORD_BYTES, ChunkHead, read_head
 from epipole.io.logs.mcap.compression import ChunkError
-from epipole.io.logs.mcap.record_scan import CHANNEL, MESSAGE, PRIVATE, SCHEMA, index_records
-from epipole.io.logs.mcap.summary import (
+from epipole.io.logs.mcap.record_scan import (
+    ATTACHMENT,
+    CHANNEL,
+    CHUNK,
     DATA_END,
-    DATA_END_BYTES,
-    MAGIC,
-    RECORD,
-    LogSummary,
-    end_of_log,
+    HEADER,
+    MESSAGE,
+    MESSAGE_INDEX,
+    METADATA,
+    PRIVATE,
+    SCHEMA,
+    index_counts,
+    length_outside,
 )
+from epipole.io.logs.mcap.summary import DATA_END_BYTES, MAGIC, RECORD, LogSummary, end_of_log
 from epipole.schemas.rejects import Reason
 
-HEADER, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA = 0x01, 0x06, 0x07, 0x09, 0x0C
-IGNORED = (ATTACHMENT, METADATA)
-LOOSE = (SCHEMA, CHANNEL, MESSAGE)  # records that may lie in a chunk or outside chunks
-RUN_BYTES = 4 << 20  # of records outside chunks that are indexed at once
-
-_INDEX = struct.Struct("<HI")  # of a message index: its channel, the bytes of its entries
+RUN = -1  # the opcode of a place with many records outside chunks
+RUN_BYTES = 4 << 20  # of records outside chunks that are walked at once
+# How many are tried first: chunks and other records may take turns, and what is read for a run is
+# read again behind it.
+LEAST_RUN_BYTES = NEAR_BYTES // 4
 
 
 class Place(NamedTuple):
-    """A stretch of the data section: a record, a run of loose records, or damage with a reason."""
+    """A stretch of the data section: a record, a run of records, or damage with a reason."""
 
     opcode: int
     at: int
     after: int
     reason: Reason | None = None
-    data: memoryview = memoryview(b"")  # of a chunk that is to be opened, or of a loose run
+    data: memoryview = memoryview(b"")  # of a chunk that is to be opened, or of a run
     size: int = 0  # of its records in memory, in bytes
     cut: bool = False  # whether the file ends in this chunk
-    counted: tuple[int, int] | None = None  # of a message index: channel, number of messages
+    # Of message indexes: channels, and how many messages of each.
+    counted: tuple[npt.NDArray[np.uint16], npt.NDArray[np.int64]] | None = None
 
 
 @dataclass
@@ -54,9 +59,12 @@ class LogPlaces:
 
     data: LogBytes
     summary: LogSummary
+    _next_listed: int = 0  # the first chunk that the summary lists and the walk has not passed
+    _run_bytes: int = LEAST_RUN_BYTES
 
     def __iter__(self) -> Iterator[Place]:
         data, end, at = self.data, len(self.data), len(MAGIC)
+        self._next_listed = 0
         while at + RECORD.size <= end:
             opcode, length = RECORD.unpack(data.view(at, at + RECORD.size))
             after = at + RECORD.size + length
@@ -90,25 +98,34 @@ class LogPlaces:
         yield Place(0, at, end, Reason.TRUNCATED)
 
     def _place(self, opcode: int, at: int, after: int, limit: int, head: ChunkHead | None) -> Place:
-        """Return the record from `at` to `after`; a loose one together with those that follow."""
+        """Return the record from `at` to `after`; mostly together with those that follow."""
         if opcode == CHUNK:
             if after - at > MAX_RECORD_BYTES:
                 return Place(CHUNK, at, after, Reason.CHUNK_TOO_LARGE)
             size, chunk_end = (0, after) if head is None else (head.size, min(head.end, after))
             return Place(CHUNK, at, after, None, self.data.view(at, chunk_end), size)
-        if opcode == MESSAGE_INDEX and (index := self._index(at, after)) is not None:
-            return Place(opcode, at, after, counted=index)
-        if opcode in LOOSE:
-            if after - at > MAX_RECORD_BYTES:
-                return Place(opcode, at, after, Reason.DAMAGED_RECORD)
-            window = self.data.view(at, min(max(after, at + RUN_BYTES), limit))
-            run = index_records(np.frombuffer(window, np.uint8), only_known=True)
-            after = max(after, at + run.walked)
-            return Place(opcode, at, after, None, window[: after - at], after - at)
+        if opcode == MESSAGE_INDEX:
+            window = self.data.view(at, min(at + LEAST_RUN_BYTES, limit))
+            *counted, walked = index_counts(np.frombuffer(window, np.uint8), limit - at)
+            if walked:
+                return Place(opcode, at, at + walked, counted=(counted[0], counted[1]))
         if opcode == HEADER and self.data.view(at - len(MAGIC), at) == MAGIC:
             return Place(opcode, at, after)
-        foreign = opcode < PRIVATE and opcode not in IGNORED  # not of a data section
-        return Place(opcode, at, after, Reason.DAMAGED_RECORD if foreign else None)
+        return self._run(opcode, at, after, limit)
+
+    def _run(self, opcode: int, at: int, after: int, limit: int) -> Place:
+        """Return the record from `at` to `after`, and those that follow to a chunk or its index."""
+        if after - at <= self._run_bytes or (
+            opcode in (SCHEMA, CHANNEL, MESSAGE) and after - at <= MAX_RECORD_BYTES
+        ):
+            window = self.data.view(at, min(max(after, at + self._run_bytes), limit))
+            walked = length_outside(np.frombuffer(window, np.uint8))
+            is_long = walked > self._run_bytes // 2
+            self._run_bytes = min(4 * self._run_bytes, RUN_BYTES) if is_long else LEAST_RUN_BYTES
+            if walked:
+                return Place(RUN, at, at + walked, None, window[:walked], walked)
+        is_skipped = opcode >= PRIVATE or opcode in (ATTACHMENT, METADATA)
+        return Place(opcode, at, after, None if is_skipped else Reason.DAMAGED_RECORD)
 
     def _behind(self, at: int, after: int) -> Place | None:
         """Return what lies behind the log that a record at `at` ends; None where it ends none."""
@@ -133,11 +150,14 @@ class LogPlaces:
 
         One within the record from `at` to `after` counts only if a chunk begins there.
         """
-        offsets = self.summary.chunk_offsets
-        for i in range(bisect_right(offsets, at), len(offsets)):
-            if offsets[i] >= after or self._begins_chunk(offsets[i]):
-                return offsets[i]
-        return None
+        offsets, i = self.summary.chunk_offsets, self._next_listed
+        # Each is looked at once: one that begins no chunk is not asked about again.
+        while i < len(offsets) and not (
+            offsets[i] >= after or (offsets[i] > at and self._begins_chunk(offsets[i]))
+        ):
+            i += 1
+        self._next_listed = i
+        return offsets[i] if i < len(offsets) else None
 
     def _begins_chunk(self, at: int) -> bool:
         if at + RECORD.size > len(self.data):
@@ -168,12 +188,3 @@ class LogPlaces:
             return read_head(self.data.view(at, min(at + HEAD_BYTES, len(self.data))), at)
         except ChunkError:
             return None
-
-    def _index(self, at: int, after: int) -> tuple[int, int] | None:
-        """Return the channel and the number of messages of a message index; None if invalid."""
-        body = at + RECORD.size
-        if after - body < _INDEX.size:
-            return None
-        number, size = _INDEX.unpack(self.data.view(body, body + _INDEX.size))
-        whole = size <= after - body - _INDEX.size and size % 16 == 0
-        return (number, size // 16) if whole else None

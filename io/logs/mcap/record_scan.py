@@ -1,19 +1,30 @@
-"""The places of all records in a chunk, found by one compiled walk over its bytes."""
+"""The places of records in a chunk or outside, found by compiled walks over the bytes."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from epipole.io.logs.kernels import kernel
-from epipole.io.logs.mcap.byte_loads import load_uint16, load_uint64
+from epipole.io.logs.mcap.byte_loads import load_uint16, load_uint32, load_uint64
 
 Bytes = npt.NDArray[np.uint8]
+Hashes = npt.NDArray[np.uint64]
 
-SCHEMA, CHANNEL, MESSAGE = 0x03, 0x04, 0x05
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = range(1, 8)
+ATTACHMENT, METADATA, DATA_END = 0x09, 0x0C, 0x0F
+CHUNK_INDEX, STATISTICS = 0x08, 0x0B
+# Schemas, channels, indexes of chunks, attachments and metadata, statistics, offsets.
+OF_SUMMARY = (SCHEMA, CHANNEL, CHUNK_INDEX, 0x0A, STATISTICS, 0x0D, 0x0E)
 PRIVATE = 0x80  # opcodes from here on are private to some program; such records are skipped
 HEAD_BYTES = 9  # of a record: its type, its length
 MESSAGE_BYTES = 22  # of a message before its data: channel, sequence, two times
+SCHEMA_BYTES, CHANNEL_BYTES = 6, 12  # of a schema and a channel at least, with empty texts
+INDEX_BYTES = 6  # of a message index before its entries: channel, bytes of the entries
+ENTRY_BYTES = 16  # of an entry of a message index
+# Records in one index, so that its size is bounded: 35 bytes each. Most chunks have fewer.
+MOST_RECORDS = 1 << 20
 
 
 class RecordIndex(NamedTuple):
@@ -28,25 +39,35 @@ class RecordIndex(NamedTuple):
     time_ns: npt.NDArray[np.uint64]
     start: npt.NDArray[np.int64]
     end: npt.NDArray[np.int64]
-    n_strange: int  # records that do not belong here, and messages that are too short
+    n_strange: int  # records that do not belong here or are too short
+    first_strange: int  # where the first of these begins
     walked: int  # bytes up to the end of the walk: all bytes, unless there is damage
 
 
-def index_records(data: Bytes, only_known: bool = False) -> RecordIndex:
-    """Return where the records lie.
+def index_records(data: Bytes, outside: bool = False) -> Iterator[RecordIndex]:
+    """Yield where the records lie, at most `MOST_RECORDS` at once.
 
     Parameters
     ----------
     data
         Consecutive records.
-    only_known
-        End at the first record that is not a message, schema or channel. Else it is skipped.
+    outside
+        They are a run outside chunks (see `length_outside`), where attachments and metadata
+        belong.
     """
-    n, walked, n_strange = _walk(data, only_known, *_columns(0))
-    columns = _columns(n)
-    _walk(data, only_known, *columns)
-    opcode, channel, time_ns, start, end = columns
-    return RecordIndex(opcode, channel, time_ns, start, end, n_strange, walked)
+    at, more = 0, True
+    while more:
+        n, *_ = _walk(data, at, outside, False, MOST_RECORDS, *_columns(0))
+        columns = _columns(n)
+        _, at, n_strange, first_strange = _walk(data, at, outside, False, n, *columns)
+        more = n == MOST_RECORDS and at < len(data)
+        opcode, channel, time_ns, start, end = columns
+        yield RecordIndex(opcode, channel, time_ns, start, end, n_strange, first_strange, at)
+
+
+def length_outside(data: Bytes) -> int:
+    """Return the length of the run that `data` begins with: to a chunk, or the end of the data."""
+    return int(_walk(data, 0, True, True, len(data), *_columns(0))[1])
 
 
 def _columns(n: int) -> list[npt.NDArray[Any]]:
@@ -55,10 +76,19 @@ def _columns(n: int) -> list[npt.NDArray[Any]]:
 
 
 @kernel
-def _walk(data, only_known, opcode, channel, time_ns, start, end):
+def _ends_run(data, kind, after):
+    """Return whether a record outside chunks is none of those that may stand in a run."""
+    if kind == DATA_END and after < len(data):
+        # Where no summary follows, it ends nothing.
+        return data[after] >= PRIVATE or data[after] == FOOTER or data[after] in OF_SUMMARY
+    return kind in (0, CHUNK, MESSAGE_INDEX, DATA_END)
+
+
+@kernel
+def _walk(data, at, outside, ends, most, opcode, channel, time_ns, start, end):
     """Return how many records there are, and write those that the columns have room for."""
-    n, n_strange, size, room = 0, 0, len(data), len(opcode)
-    at = np.int64(0)
+    n, n_strange, first_strange, size, room = 0, 0, np.int64(0), len(data), len(opcode)
+    at = np.int64(at)
     while at + HEAD_BYTES <= size:
         kind = data[at]
         length = load_uint64(data, at + 1)
@@ -66,9 +96,18 @@ def _walk(data, only_known, opcode, channel, time_ns, start, end):
         if length > np.uint64(size - body):
             break
         after = body + np.int64(length)
-        if kind == MESSAGE and after - body < MESSAGE_BYTES:
-            n_strange += 1
-        elif kind in (MESSAGE, SCHEMA, CHANNEL):
+        least = 0
+        if kind == MESSAGE:
+            least = MESSAGE_BYTES
+        elif kind == SCHEMA:
+            least = SCHEMA_BYTES
+        elif kind == CHANNEL:
+            least = CHANNEL_BYTES
+        if ends and _ends_run(data, kind, after):
+            break
+        if least and after - body >= least:
+            if n == most:
+                break
             if n < room:
                 opcode[n] = kind
                 start[n], end[n] = body, after
@@ -77,9 +116,67 @@ def _walk(data, only_known, opcode, channel, time_ns, start, end):
                     time_ns[n] = load_uint64(data, body + 6)
                     start[n] = body + MESSAGE_BYTES
             n += 1
-        elif only_known:
-            break
-        elif kind < PRIVATE:
+        elif least or (kind < PRIVATE and not (outside and kind in (ATTACHMENT, METADATA))):
+            if n_strange == 0:
+                first_strange = at
             n_strange += 1
         at = after
-    return n, at, n_strange
+    return n, at, n_strange, first_strange
+
+
+def index_counts(data: Bytes, limit: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any], int]:
+    """Return the channel and the number of messages of each message index, and where they end.
+
+    `data` begins with a message index; entries of the last one may lie behind it, up to `limit`.
+    The walk ends at the first other or invalid record.
+    """
+    most = len(data) // (HEAD_BYTES + INDEX_BYTES)
+    number, counted = np.zeros(most, np.uint16), np.zeros(most, np.int64)
+    n, at = _walk_indexes(data, limit, number, counted)
+    return number[:n], counted[:n], at
+
+
+@kernel
+def _walk_indexes(data, limit, number, counted):
+    n, at = 0, np.int64(0)
+    while at + HEAD_BYTES + INDEX_BYTES <= len(data) and data[at] == MESSAGE_INDEX:
+        length = load_uint64(data, at + 1)
+        body = at + HEAD_BYTES
+        size = np.uint64(load_uint32(data, body + 2))
+        if length > np.uint64(limit - body) or length < np.uint64(INDEX_BYTES) + size:
+            break
+        if size % np.uint64(ENTRY_BYTES):
+            break
+        number[n], counted[n] = load_uint16(data, body), size // np.uint64(ENTRY_BYTES)
+        n += 1
+        at = body + np.int64(length)
+    return n, at
+
+
+def changed_declarations(data: Bytes, index: RecordIndex, last: Hashes) -> npt.NDArray[np.bool_]:
+    """Return which records are no repetition of the last declaration under their number.
+
+    Some recorders declare a channel before each of its messages. `last` are the hashes of these
+    declarations, from `no_declarations`; they are brought up to date.
+    """
+    return _changed(data, index.opcode, index.start, index.end, last)
+
+
+def no_declarations() -> Hashes:
+    """Return the hashes of the last schema and the last channel under each number: none."""
+    return np.zeros((2, 1 << 16), np.uint64)
+
+
+@kernel
+def _changed(data, opcode, start, end, last):
+    changed = np.ones(len(opcode), np.bool_)
+    for i in range(len(opcode)):
+        if opcode[i] == MESSAGE:
+            continue
+        total = np.uint64(0xCBF29CE484222325)  # FNV-1a of 64 bits
+        for at in range(start[i], end[i]):
+            total = (total ^ np.uint64(data[at])) * np.uint64(0x100000001B3)
+        number = load_uint16(data, start[i])
+        changed[i] = last[opcode[i] - SCHEMA, number] != total
+        last[opcode[i] - SCHEMA, number] = total
+    return changed

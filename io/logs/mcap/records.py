@@ -21,25 +21,32 @@ from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.channels import Channel, ChannelTable
 from epipole.io.logs.mcap.chunks import OpenedChunk, open_chunk, open_cut_chunk
 from epipole.io.logs.mcap.compression import ChunkError
-from epipole.io.logs.mcap.places import CHUNK, LOOSE, LogPlaces, Place
+from epipole.io.logs.mcap.damage_rows import Damage, DamageRows
+from epipole.io.logs.mcap.places import RUN, LogPlaces, Place
 from epipole.io.logs.mcap.record_scan import (
+    CHUNK,
+    DATA_END,
     MESSAGE,
     MESSAGE_BYTES,
     Bytes,
+    Hashes,
     RecordIndex,
+    changed_declarations,
     index_records,
+    no_declarations,
 )
-from epipole.io.logs.mcap.summary import DATA_END, RECORD, LogSummary, read_summary
-from epipole.io.logs.mcap.undeclared import N_CHANNELS, LateMessages, Undeclared
+from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
+from epipole.io.logs.mcap.undeclared import N_CHANNELS, Channels, LateMessages, Undeclared
 from epipole.schemas.rejects import Reason
 
 # All chunks of a log together may declare so many times the bytes of the file, and at least so many
 # bytes: what they cost is bounded by the file. Logs of frames shrink to a half or a tenth.
 MOST_EXPANSION = 200
 LEAST_UNPACKED_BYTES = 16 << 20
-MOST_ALIKE = 1000  # damaged records that are listed; the last one counts the others too
 
 AHEAD_BYTES = 8 << 20  # of chunks that are opened while the chunk before them is decoded
+WAITING_BYTES = 2 << 10  # that a waiting chunk takes beside its records
+SMALL_BYTES = 4 << 10  # a chunk of fewer is opened sooner than given to another thread
 
 # A summary that counts more messages per byte of the log is damaged: the best compression of
 # empty messages has about 300.
@@ -61,32 +68,21 @@ class Block(NamedTuple):
     offset: Numbers  # place in the file of its chunk; outside chunks, of the message
 
 
-class Damage(NamedTuple):
-    """Messages that were left out: where, when (0: unknown), why, how many."""
-
-    offset: int
-    time_ns: int
-    reason: Reason
-    n: int
-
-
 @dataclass
 class RecordWalk:
-    """Reads the records of one log; `damage` is complete when `blocks` has ended."""
+    """Reads the records of one log."""
 
     data: LogBytes
     wanted: frozenset[str]  # names of the schemas whose messages are wanted
     pool: Executor | None = None  # opens chunks while the chunk before them is decoded
-    damage: list[Damage] = field(default_factory=list)
+    _damage: DamageRows = field(default_factory=DamageRows)
     _summary: LogSummary = field(default_factory=LogSummary)
     _undeclared: Undeclared = field(default_factory=Undeclared)
-    _counts: dict[int, int] = field(default_factory=dict)
-    _lost: dict[int, int] = field(default_factory=dict)  # lost messages, by index of `damage`
+    _counts: dict[int, int] = field(default_factory=dict)  # messages by channel
     _promised: frozenset[int] = frozenset()  # channels that are wanted, by the summary
-    _declared: dict[tuple[int, bytes], bytes] = field(default_factory=dict)  # by kind and number
-    _n_damaged: int = 0  # damaged records so far, and where in `damage` the last row of them is
-    _last_damaged: int = 0
-    _lost_chunk: int | None = None  # index in `damage` of the chunk that message indexes follow
+    _declared: Hashes = field(default_factory=no_declarations)  # what was declared last
+    _lost_chunk: int | None = None  # row of the chunk left out that message indexes follow
+    _n_lost: int = 0  # messages of it that these indexes counted
     _in_chunk: dict[int, int] = field(default_factory=dict)  # its messages by channel, if read
     _log_start: int = 0  # of this one of several logs in the file
     _unchecked: bool = False  # whether there are messages that no chunk's checksum covers
@@ -94,6 +90,11 @@ class RecordWalk:
     def __post_init__(self) -> None:
         self._channels = ChannelTable(self.wanted, ChannelTable(self.wanted))
         self._places = LogPlaces(self.data, self._summary)
+
+    @property
+    def damage(self) -> list[Damage]:
+        """What was left out; complete when `blocks` has ended."""
+        return self._damage.rows
 
     def blocks(self) -> Iterator[Block]:
         """Yield the wanted messages in the order of the file; late declared ones come last."""
@@ -123,14 +124,14 @@ class RecordWalk:
                 if unpacked + place.size > most:
                     place = Place(CHUNK, place.at, place.after, Reason.CHUNK_TOO_LARGE)
                 unpacked += place.size
-            if self.pool is not None and place.opcode == CHUNK and not (place.reason or place.cut):
+            is_whole_chunk = place.opcode == CHUNK and not (place.reason or place.cut)
+            if self.pool is not None and is_whole_chunk and _cost(place) > SMALL_BYTES:
                 opening = self.pool.submit(open_chunk, place.data)
             waiting.append((place, opening))
-            ahead += place.size
+            ahead += _cost(place)
             while waiting and (ahead > AHEAD_BYTES or waiting[0][1] is None):
-                first, opening = waiting.popleft()
-                ahead -= first.size
-                yield first, opening
+                ahead -= _cost(waiting[0][0])
+                yield waiting.popleft()
         yield from waiting
 
     # What is in the file
@@ -142,44 +143,50 @@ class RecordWalk:
             self._end_log()
             self._log_start = place.at
             self._channels.forget()
-            self._declared.clear()
+            self._declared = no_declarations()
         if place.reason:
-            self._leave_out(place.at, 0, place.reason)
+            row = self._damage.add(place.at, 0, place.reason)
             if place.opcode == CHUNK:
-                self._lost_chunk = len(self.damage) - 1
+                self._lost_chunk, self._n_lost = row, 0
         elif place.opcode == CHUNK:
             yield from self._walk_chunk(place, _open(place, opening))
         elif place.counted is not None:
             self._count_lost(place.at, *place.counted)
-        elif place.opcode in LOOSE:
-            yield from self._walk_loose(place)
+        elif place.opcode == RUN:
+            yield from self._walk_run(place)
         elif place.opcode == DATA_END:
             self._check_data_section(place)
 
     def _walk_chunk(self, place: Place, opened: OpenedChunk) -> Iterator[Block]:
         """Yield the messages of a chunk."""
         self._lost_chunk = None
-        at, start_ns, index = place.at, opened.start_ns, opened.record_index
+        at, start_ns = place.at, opened.start_ns
         if opened.reason:
-            self._leave_out(at, start_ns, opened.reason)
-            self._lost_chunk = len(self.damage) - 1
+            self._lost_chunk, self._n_lost = self._damage.add(at, start_ns, opened.reason), 0
             return
         self._unchecked |= not opened.is_checked
-        yield from self._walk_index(_bytes(opened.records), index, _offsets(place, index), start_ns)
-        counts = np.bincount(index.channel[index.opcode == MESSAGE])
-        self._in_chunk = {n: int(counts[n]) for n in np.flatnonzero(counts).tolist()}
-        if index.n_strange:
-            self._leave_out(at, start_ns, Reason.DAMAGED_RECORD, index.n_strange)
-        if index.walked < len(opened.records) and not place.cut:
-            self._leave_out(at, start_ns, Reason.DAMAGED_CHUNK)
+        data, n_strange, walked = _bytes(opened.records), 0, 0
+        self._in_chunk = {}
+        for index in index_records(data):
+            yield from self._walk_index(data, index, _offsets(place, index), start_ns)
+            counts = np.bincount(index.channel[index.opcode == MESSAGE])
+            for number in np.flatnonzero(counts).tolist():
+                self._in_chunk[number] = self._in_chunk.get(number, 0) + int(counts[number])
+            n_strange, walked = n_strange + index.n_strange, index.walked
+        if n_strange:
+            self._damage.add(at, start_ns, Reason.DAMAGED_RECORD, n_strange)
+        if walked < len(data) and not place.cut:
+            self._damage.add(at, start_ns, Reason.DAMAGED_CHUNK)
 
-    def _walk_loose(self, place: Place) -> Iterator[Block]:
+    def _walk_run(self, place: Place) -> Iterator[Block]:
         """Yield the messages of a run of records outside chunks."""
-        _, records, index, *_ = _open(place, None)
-        self._unchecked |= MESSAGE in index.opcode
-        if index.n_strange:
-            self._leave_out(place.at, 0, Reason.DAMAGED_RECORD, index.n_strange)
-        yield from self._walk_index(_bytes(records), index, _offsets(place, index), 0)
+        data = _bytes(place.data)
+        for index in index_records(data, outside=True):
+            self._unchecked |= MESSAGE in index.opcode
+            if index.n_strange:
+                at = place.at + index.first_strange
+                self._damage.add(at, 0, Reason.DAMAGED_RECORD, index.n_strange)
+            yield from self._walk_index(data, index, _offsets(place, index), 0)
 
     def _check_data_section(self, place: Place) -> None:
         """Compare the data section with the checksum at its end, if no other checksum covers it.
@@ -195,13 +202,16 @@ class RecordWalk:
                     self.data.view(low, min(low + BLOCK_BYTES, place.at)), checksum
                 )
             if checksum != expected:
-                self._leave_out(place.at, 0, Reason.BAD_DATA_CHECKSUM)
+                self._damage.add(place.at, 0, Reason.BAD_DATA_CHECKSUM)
 
     def _walk_index(
         self, data: Bytes, index: RecordIndex, offset: Numbers, start_ns: int
     ) -> Iterator[Block]:
         """Yield the runs of messages between declarations of schemas and channels."""
-        index, offset = self._without_repeats(data, index, offset)
+        keep = changed_declarations(data, index, self._declared)
+        if not keep.all():
+            columns = {name: getattr(index, name)[keep] for name in PER_RECORD}
+            index, offset = index._replace(**columns), offset[keep]
         declared = np.flatnonzero(index.opcode != MESSAGE)
         at = 0
         for i in [*declared.tolist(), len(index.opcode)]:
@@ -214,25 +224,7 @@ class RecordWalk:
             try:
                 self._channels.declare(int(index.opcode[i]), data.data, start, end)
             except ChunkError:
-                self._leave_out(int(offset[i]), start_ns, Reason.DAMAGED_RECORD)
-
-    def _without_repeats(
-        self, data: Bytes, index: RecordIndex, offset: Numbers
-    ) -> tuple[RecordIndex, Numbers]:
-        """Return the records without declarations that say again what was declared last.
-
-        Some recorders declare a channel before each of its messages.
-        """
-        keep = np.ones(len(index.opcode), bool)
-        for i in np.flatnonzero(index.opcode != MESSAGE).tolist():
-            body = data[index.start[i] : index.end[i]].tobytes()
-            key = int(index.opcode[i]), body[:2]
-            keep[i] = self._declared.get(key) != body
-            self._declared[key] = body
-        if keep.all():
-            return index, offset
-        columns = {name: getattr(index, name)[keep] for name in PER_RECORD}
-        return index._replace(**columns), offset[keep]
+                self._damage.add(int(offset[i]), start_ns, Reason.DAMAGED_RECORD)
 
     def _wanted(
         self, data: Bytes, index: RecordIndex, offset: Numbers, run: slice
@@ -284,7 +276,7 @@ class RecordWalk:
     def _end_log(self) -> None:
         """Leave out the messages of a log that it does not declare."""
         for waiting in self._undeclared.settle(self._channels):
-            self._leave_out(waiting.offset, waiting.time_ns, waiting.reason, waiting.n)
+            self._damage.add(waiting.offset, waiting.time_ns, waiting.reason, waiting.n)
 
     def _walk_again(self, late: LateMessages) -> Iterator[Block]:
         """Yield the messages that come before their declarations; no damage is reported again."""
@@ -295,41 +287,34 @@ class RecordWalk:
             if place.reason == Reason.LOG_BEHIND_LOG:
                 n_logs += 1
                 late.begin_log(n_logs)
-            elif not place.reason and (place.opcode == CHUNK or place.opcode in LOOSE):
-                _, records, index, *_ = _open(place, opening)
-                messages = np.flatnonzero(index.opcode == MESSAGE)
-                chosen = messages[late.take(index.channel[messages])]
-                columns = [getattr(index, name)[chosen] for name in PER_RECORD[1:]]
-                columns.append(_offsets(place, index)[chosen])
-                yield Block(_bytes(records), late.channels, *columns)
+            elif not place.reason and place.opcode in (CHUNK, RUN):
+                data = _bytes(_open(place, opening).records)
+                for index in index_records(data, outside=place.opcode == RUN):
+                    messages = np.flatnonzero(index.opcode == MESSAGE)
+                    chosen = messages[late.take(index.channel[messages])]
+                    columns = [getattr(index, name)[chosen] for name in PER_RECORD[1:]]
+                    columns.append(_offsets(place, index)[chosen])
+                    yield Block(data, late.channels, *columns)
 
     # What is missing in it
 
-    def _leave_out(self, offset: int, time_ns: int, reason: Reason, count: int = 1) -> None:
-        if reason == Reason.DAMAGED_RECORD and self._lost_chunk != len(self.damage) - 1:
-            self._n_damaged += 1
-            if self._n_damaged > MOST_ALIKE:
-                last = self.damage[self._last_damaged]
-                self.damage[self._last_damaged] = last._replace(n=last.n + count)
-                return
-            self._last_damaged = len(self.damage)
-        self.damage.append(Damage(offset, time_ns, reason, count))
-
-    def _count_lost(self, at: int, number: int, n: int) -> None:
-        """Count the messages that an index has and the chunk before it had not.
+    def _count_lost(self, at: int, numbers: Channels, counted: Numbers) -> None:
+        """Count the messages that indexes have and the chunk before them had not.
 
         The chunk was left out, or it was no chunk any more, or a part of it was damaged.
         """
-        n -= self._in_chunk.get(number, 0)
-        if n <= 0 or not self._may_be_wanted(number):
-            return
-        if self._lost_chunk is None:
-            self._lost_chunk = len(self.damage)
-            self._leave_out(at, 0, Reason.MISSING_MESSAGES)
-        self._counts[number] = self._counts.get(number, 0) + n
-        index = self._lost_chunk
-        self._lost[index] = self._lost.get(index, 0) + n
-        self.damage[index] = self.damage[index]._replace(n=max(1, self._lost[index]))
+        some = counted > 0
+        for number, n in zip(numbers[some].tolist(), counted[some].tolist(), strict=True):
+            lost = n - self._in_chunk.get(number, 0)
+            if lost <= 0 or not self._may_be_wanted(number):
+                continue
+            if self._lost_chunk is None:
+                row = self._damage.add(at, 0, Reason.MISSING_MESSAGES)
+                self._lost_chunk, self._n_lost = row, 0
+            self._counts[number] = self._counts.get(number, 0) + lost
+            # The row of the chunk counts one already, for itself.
+            self._damage.count(self._lost_chunk, lost if self._n_lost else lost - 1)
+            self._n_lost += lost
 
     def _may_be_wanted(self, number: int) -> bool:
         """Return whether a channel is wanted, or not declared so far."""
@@ -343,9 +328,14 @@ class RecordWalk:
             if number in self._promised or self._may_be_wanted(number)
         )
         if missing > MOST_PER_BYTE * len(self.data):
-            self._leave_out(0, 0, Reason.DAMAGED_RECORD)  # the counts themselves are damaged
+            self._damage.add(0, 0, Reason.DAMAGED_RECORD)  # the counts themselves are damaged
         elif missing:
-            self._leave_out(0, 0, Reason.MISSING_MESSAGES, missing)
+            self._damage.add(0, 0, Reason.MISSING_MESSAGES, missing)
+
+
+def _cost(place: Place) -> int:
+    """Return about how many bytes a place takes while it waits, and when it is opened."""
+    return place.size + len(place.data) + WAITING_BYTES
 
 
 def _open(place: Place, opening: Future[OpenedChunk] | None) -> OpenedChunk:
@@ -354,7 +344,7 @@ def _open(place: Place, opening: Future[OpenedChunk] | None) -> OpenedChunk:
         return opening.result()
     if place.opcode == CHUNK:
         return open_cut_chunk(place.data) if place.cut else open_chunk(place.data)
-    return OpenedChunk(0, place.data, index_records(_bytes(place.data)))
+    return OpenedChunk(0, place.data)
 
 
 def _offsets(place: Place, index: RecordIndex) -> Numbers:

@@ -3,21 +3,31 @@
 import contextlib
 import struct
 import zlib
+from array import array
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from epipole.io.logs.mcap.bytes import LogBytes
 from epipole.io.logs.mcap.channels import ChannelTable
 from epipole.io.logs.mcap.compression import ChunkError
-from epipole.io.logs.mcap.record_scan import CHANNEL, PRIVATE, SCHEMA
+from epipole.io.logs.mcap.record_scan import (
+    CHANNEL,
+    CHUNK_INDEX,
+    DATA_END,
+    FOOTER,
+    OF_SUMMARY,
+    PRIVATE,
+    SCHEMA,
+    STATISTICS,
+)
 from epipole.schemas.rejects import Reason
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, CHUNK_INDEX, STATISTICS, DATA_END = 0x02, 0x08, 0x0B, 0x0F
-# Schemas, channels, indexes of chunks, attachments and metadata, statistics, offsets.
-SUMMARY = frozenset((SCHEMA, CHANNEL, CHUNK_INDEX, 0x0A, STATISTICS, 0x0D, 0x0E))
 RECORD = struct.Struct("<BQ")  # opcode, length
 DATA_END_BYTES = RECORD.size + 4
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)
+_COUNT = struct.Struct("<HQ")  # channel, its messages
 # The index of a chunk takes about 100 bytes. A summary that declares more than this is invalid.
 MAX_SUMMARY_BYTES = 256 << 20
 
@@ -27,7 +37,7 @@ class LogSummary:
     """What a summary declares; it may be incomplete."""
 
     data_end: int | None = None  # where the data section ends, if the log was closed
-    chunk_offsets: list[int] = field(default_factory=list)  # sorted
+    chunk_offsets: "array[int]" = field(default_factory=lambda: array("Q"))  # sorted
     declared: dict[int, int] = field(default_factory=dict)  # messages of each channel
     logged_ns: tuple[int, int] | None = None  # when the first and the last message were logged
 
@@ -57,7 +67,7 @@ def read_summary(data: LogBytes, channels: ChannelTable) -> LogSummary:
         _read_records(records, at, summary, channels)
     except (struct.error, ChunkError):
         return LogSummary()  # the records are found without it
-    summary.chunk_offsets.sort()
+    summary.chunk_offsets = array("Q", np.sort(summary.chunk_offsets).tobytes())
     return summary
 
 
@@ -80,9 +90,9 @@ def _read_records(
         elif opcode == STATISTICS:
             *logged_ns, size = struct.unpack_from("<QQI", data, body + 26)
             summary.logged_ns = (logged_ns[0], logged_ns[1])
-            for i in range(body + 46, min(body + 46 + size, at), 10):
-                number, count = struct.unpack_from("<HQ", data, i)
-                summary.declared[number] = count
+            counts = data[body + 46 : min(body + 46 + size, at)]
+            whole = counts[: len(counts) // _COUNT.size * _COUNT.size]
+            summary.declared.update(_COUNT.iter_unpack(whole))
 
 
 def end_of_log(data: LogBytes, at: int) -> int | None:
@@ -103,4 +113,4 @@ def end_of_log(data: LogBytes, at: int) -> int | None:
 
 def _is_foreign(opcode: int) -> bool:
     """Return whether a record does not belong into a summary."""
-    return opcode not in SUMMARY and opcode < PRIVATE
+    return opcode not in OF_SUMMARY and opcode < PRIVATE
