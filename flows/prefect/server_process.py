@@ -83,6 +83,15 @@ class Launched(NamedTuple):
             self.process.wait()
 
 
+def new_secret() -> str:
+    """Return a user and a password for a server: 256 bits, and an end that is no secret.
+
+    A server of Prefect's that gets a message of its protocol twice writes the message's last 25
+    characters to its log, as pydantic shows them: those of the password.
+    """
+    return f"epipole:{secrets.token_urlsafe(32)}{'-' * 25}"
+
+
 def launch(environment: Mapping[str, str], before: Launched | None = None) -> Launched:
     """Launch the process; it ends when this process does, however that ends.
 
@@ -96,7 +105,7 @@ def launch(environment: Mapping[str, str], before: Launched | None = None) -> La
     if before is None:
         listener = socket.socket()
         listener.bind((HOST, 0))  # held from now on: no other server can get this port
-        secret = f"epipole:{secrets.token_urlsafe(32)}"
+        secret = new_secret()
     else:
         listener, secret = before.listener, before.secret
     output = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the process

@@ -98,9 +98,10 @@ def test_the_server_answers_only_who_has_the_secret(deployed):
     url = f"{deployed.prefect.url}/flow_runs/filter"
     for told in (None, ("epipole", "@SECRET@"), ("admin", "pass")):
         assert httpx.post(url, json={}, auth=told).status_code == 401
+    secret = deployed.prefect.environment["PREFECT_API_AUTH_STRING"].split(":")[1].rstrip("-")
     for file in ("worker.txt", "server.txt"):
         said = (deployed.prefect.folder / file).read_text()
-        assert deployed.prefect.environment["PREFECT_API_AUTH_STRING"].split(":")[1] not in said
+        assert not [k for k in range(len(secret) - 8) if secret[k : k + 8] in said]
 
 
 def test_runs_are_scheduled_for_six_in_the_morning(deployed):
@@ -220,7 +221,7 @@ def automation_for_lost_runs(prefect: Prefect) -> str:
     """Make the first of the automations that come with epipole, quicker; return its name."""
     text = (prefect.folder / "automations.yaml").read_text()
     lost = yaml.safe_load(text)["automations"][0]
-    assert lost["trigger"]["within"] == 90
+    assert lost["trigger"]["within"] == 180
     lost["trigger"]["within"] = 40  # a heartbeat comes every 30 s, the shortest that Prefect has
     file = prefect.folder / "automation.yaml"
     file.write_text(yaml.safe_dump(lost))

@@ -1,13 +1,13 @@
 """`epipole deploy-files`: what an operator needs to run it every night."""
 
 import os
-import secrets
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from epipole.flows.command_line.printing import print_lines
+from epipole.flows.prefect.server_process import new_secret
 from epipole.schemas.errors import EpipoleError
 
 # Each file, and what it is for.
@@ -39,7 +39,7 @@ def deploy_files(
             f"{out}: has {', '.join(there)}; nothing was written: give another folder, or --force"
         )
     source = files("epipole.flows.prefect") / "deploy_files"
-    secret = secrets.token_urlsafe(32)
+    secret = new_secret()
     try:
         out.mkdir(parents=True, exist_ok=True)
         for name in FILES:
