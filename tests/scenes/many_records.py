@@ -24,6 +24,7 @@ from scenes.hand_made_logs import (
     schema_body,
 )
 
+LATE = record(4, channel_body(9))  # behind the messages of the channel
 MANY_NUMBERS = 60_000  # of schemas and channels: 16 bits have not many more
 
 
@@ -63,6 +64,7 @@ KINDS: dict[str, Callable[[int], bytes]] = {
     "channels": lambda n: b"".join(map(_other_channel, range(n))),
     "empty messages": lambda n: _message() * n,
     "messages without a channel": lambda n: b"".join(_message(i % 65536) for i in range(n)),
+    "logs in sequence": lambda n: hand_made(_message(9), DECLARED, LATE) * n,
     "messages and private records in turn": lambda n: (_message() + record(0x80, b"")) * n,
 }
 
@@ -71,6 +73,8 @@ def log_of(kind: str, n: int) -> bytes:
     """Return a log of `n` records of a kind behind a chunk, or of `n` indexes of chunks."""
     if kind == "chunk indexes":
         return hand_made(DECLARED, summary=b"".join(map(_chunk_index, range(n))))
+    if kind == "logs in sequence":
+        return KINDS[kind](n)
     return hand_made(DECLARED, chunk(b""), KINDS[kind](n))
 
 

@@ -36,7 +36,7 @@ from epipole.io.logs.mcap.record_scan import (
     no_declarations,
 )
 from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
-from epipole.io.logs.mcap.undeclared import N_CHANNELS, Channels, LateMessages, Undeclared
+from epipole.io.logs.mcap.undeclared import Channels, LateMessages, Undeclared
 from epipole.schemas.rejects import Reason
 
 # All chunks of a log together may declare so many times the bytes of the file, and at least so many
@@ -266,7 +266,7 @@ class RecordWalk:
     def _add_undeclared(
         self, numbers: list[int], channel: npt.NDArray[np.uint16], time_ns: Any, offset: Numbers
     ) -> None:
-        first = np.zeros(N_CHANNELS, np.int64)
+        first = np.zeros(int(channel.max()) + 1, np.int64)
         first[channel[::-1]] = np.arange(len(channel))[::-1]  # the last assignment counts
         counts = np.bincount(channel)
         for number in numbers:

@@ -72,8 +72,12 @@ class LateMessages:
     """Finds the messages before the declarations of their channels, in a second walk."""
 
     def __init__(self, late: list[Late]) -> None:
-        self._late = late
+        self._of_log: dict[int, list[Late]] = {}
+        for item in late:
+            self._of_log.setdefault(item.log, []).append(item)
         self._left = sum(item.n for item in late)
+        self._n = np.zeros(N_CHANNELS, np.int64)
+        self.channels: dict[int, Channel] = {}
         self.begin_log(0)
 
     def __bool__(self) -> bool:
@@ -81,11 +85,10 @@ class LateMessages:
 
     def begin_log(self, log: int) -> None:
         """Begin with the log of a number within the file."""
-        self.channels = {item.number: item.channel for item in self._late if item.log == log}
-        self._n = np.zeros(N_CHANNELS, np.int64)
-        for item in self._late:
-            if item.log == log:
-                self._n[item.number] = item.n
+        self._n[list(self.channels)] = 0
+        self.channels = {item.number: item.channel for item in self._of_log.get(log, [])}
+        for item in self._of_log.get(log, []):
+            self._n[item.number] = item.n
 
     def take(self, channel: Channels) -> npt.NDArray[np.int64]:
         """Return which of these messages, the next ones in the file, were not read before."""
@@ -94,6 +97,7 @@ class LateMessages:
         # How many messages of the same channel come before each one.
         rank = np.arange(len(order)) - np.searchsorted(in_order, in_order)
         taken = np.sort(order[rank < self._n[in_order]])
-        self._n -= np.bincount(channel[taken], minlength=N_CHANNELS)
+        counts = np.bincount(channel[taken])
+        self._n[: len(counts)] -= counts
         self._left -= len(taken)
         return taken
