@@ -44,6 +44,7 @@ from epipole.io.datasets.dataset import (
     night_place,
 )
 from epipole.io.datasets.rows_by_night import nights_of
+from epipole.io.remote_files import known_as
 from epipole.io.settings_file import merged_settings
 from epipole.io.work.folder import work_folder, work_root
 from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder
@@ -93,6 +94,8 @@ def nightly(
     Raises:
         EpipoleError: If the work cannot be done; the dataset is then unchanged.
     """
+    logs = [known_as(where) for where in ([logs] if isinstance(logs, str) else logs)]
+    out, known = known_as(out), None if known is None else known_as(known)
     night = night_asked(night)
     settings = merged_settings(settings_file, settings)
     check_folder(out)

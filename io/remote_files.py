@@ -1,11 +1,63 @@
-"""Files behind fsspec URLs, and the errors of object stores as one-line messages."""
+"""Files behind fsspec URLs, and the errors of object stores as one-line messages.
+
+A URL with a password, a token or a signature is known to the rest of the program without it: so
+none is in a message, a table, a parameter of Prefect or the name of a folder. What was cut stays in
+the environment of this process and of those that it starts, and comes back where a file is opened.
+"""
 
 import contextlib
+import os
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from epipole.schemas.errors import LogError
+from epipole.schemas.text.urls import without_secrets
+
+SECRETS = "EPIPOLE_URLS"  # URLs with their secrets, a line each
+
+
+def known_as(where: str) -> str:
+    """Return a path or URL as it may be shown and stored, and keep what was cut from it."""
+    shown = without_secrets(where)
+    if shown != where and "\0" not in where:
+        kept = [url for url in _secrets() if without_secrets(url) != shown]
+        os.environ[SECRETS] = "\n".join([*kept, where.replace("\n", "%0A")])
+    return shown
+
+
+def _secrets() -> list[str]:
+    return os.environ.get(SECRETS, "").split("\n")
+
+
+def _with_secrets(where: str) -> str:
+    """Return a URL as it was given; one that was found in a folder has the folder's password."""
+    by_host = {}
+    for url in reversed(_secrets()):
+        if without_secrets(url) == where:
+            return url
+        scheme, _, rest = url.partition("://")
+        user, is_there, path = rest.partition("/")[0].rpartition("@")
+        if is_there:
+            by_host[scheme, path] = user
+    scheme, _, rest = where.partition("://")
+    user = by_host.get((scheme, rest.partition("/")[0]))
+    return where if user is None else f"{scheme}://{user}@{rest}"
+
+
+def file_system(where: str) -> tuple[Any, str]:
+    """Return the storage that a URL names, as fsspec has it, and the path in it."""
+    import fsspec
+
+    given = _with_secrets(where)
+    parts, options = urlsplit(given), {}  # raises where it is no URL, such as http://[::1
+    if parts.scheme in ("http", "https"):
+        return fsspec.filesystem(parts.scheme), given  # fsspec itself takes :: for something else
+    if parts.scheme in ("s3", "s3a") and "@" in parts.netloc:
+        options = {"key": unquote(parts.username or ""), "secret": unquote(parts.password or "")}
+        given = without_secrets(given)
+    return fsspec.core.url_to_fs(given, **options)  # type: ignore[no-any-return]
 
 
 def open_remote(where: str) -> tuple[int, Callable[[int, int], bytes], Callable[[], None]]:
@@ -18,13 +70,9 @@ def open_remote(where: str) -> tuple[int, Callable[[int, int], bytes], Callable[
     LogError
         Where the file is missing or cannot be read.
     """
-    try:
-        import fsspec
-    except ImportError as error:
-        raise LogError(f"{where}: URLs need the package fsspec; install it") from error
-
+    where = known_as(where)
     with _as_log_errors(where):
-        storage, path = fsspec.core.url_to_fs(where)
+        storage, path = file_system(where)
         storage.invalidate_cache()  # an earlier listing may be out of date
         info, version = storage.info(path), storage.ukey(path)
     if info["type"] == "directory":
@@ -55,14 +103,16 @@ def _as_log_errors(where: str) -> Iterator[None]:
     except LogError:
         raise
     except FileNotFoundError as error:
-        raise LogError(f"{where}: no such file; check the URL") from error
+        raise LogError(f"{where}: no such file; check the URL") from shown_error(error)
     except storage_errors() as error:
-        raise LogError(f"{where}: cannot be read: {line_of(error)}") from error
+        raise LogError(f"{where}: cannot be read: {line_of(error)}") from shown_error(error)
 
 
 def storage_errors() -> tuple[type[Exception], ...]:
-    """Return the errors that a store may raise. Those of S3's client are not all OSErrors."""
+    """Return the errors that a store may raise. Those of its client are not all OSErrors."""
     errors: list[Any] = [OSError, ValueError, ImportError]
+    if (http := sys.modules.get("aiohttp")) is not None:
+        errors.append(http.ClientError)
     client = sys.modules.get("botocore.exceptions")
     if client is not None:
         errors += [client.BotoCoreError, client.ClientError]
@@ -70,5 +120,18 @@ def storage_errors() -> tuple[type[Exception], ...]:
 
 
 def line_of(error: BaseException) -> str:
-    """Return the message of an error as one line."""
-    return " ".join(str(error).split()) or type(error).__name__
+    """Return the message of an error as one line, without the secrets of URLs in it."""
+    return without_secrets(" ".join(str(error).split())) or type(error).__name__
+
+
+def shown_error(error: Exception) -> Exception:
+    """Return an error as the cause of another, whose message may be logged.
+
+    Where it quotes a URL with a secret, it is replaced by one of the same effect: a task is tried
+    again for it or not.
+    """
+    if line_of(error) == (" ".join(str(error).split()) or type(error).__name__):
+        return error
+    lasting = (FileNotFoundError, PermissionError)
+    kind = next((kind for kind in (*lasting, OSError) if isinstance(error, kind)), ValueError)
+    return kind(line_of(error))

@@ -5,7 +5,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from epipole.io.remote_files import open_remote
+from epipole.io.remote_files import known_as, open_remote
 from epipole.schemas.errors import LogError, SettingsError
 from epipole.schemas.settings import Group, Settings, parse_settings, validate_settings
 
@@ -55,6 +55,7 @@ def _read(file: str) -> Settings:
     """Return the settings of a local file or of an fsspec URL."""
     if "://" not in file:
         return read_settings(Path(file))
+    file = known_as(file)
     try:
         size, read, _ = open_remote(file)
         text = read(0, size).decode()

@@ -7,6 +7,7 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.io.datasets.dataset import check_folder, dataset_folder, nights_in, read_table
+from epipole.io.remote_files import known_as
 from epipole.schemas.bridge import empty
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -26,7 +27,7 @@ class Dataset(Mapping[str, pl.LazyFrame]):
     """
 
     def __init__(self, dataset: str | Path) -> None:
-        self._where = dataset
+        self._where = dataset = known_as(str(dataset))
         self.nights = nights_in(dataset)
 
     def __getitem__(self, name: str) -> pl.LazyFrame:
@@ -93,6 +94,7 @@ def open_dataset(dataset: str | Path) -> Dataset:
     >>> positions["object_id"].n_unique()
     9
     """
+    dataset = known_as(str(dataset))
     check_folder(dataset)
     found = Dataset(dataset)
     if not found.nights:

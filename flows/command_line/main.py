@@ -31,12 +31,21 @@ from epipole.flows.command_line.compiling import tells_compiling
 from epipole.flows.command_line.environment import prepare_environment
 from epipole.flows.command_line.printing import help_text
 from epipole.flows.command_line.stopping import stop_by_signals, stopped_in_one_line
+from epipole.io.remote_files import known_as
 from epipole.schemas.errors import EpipoleError
 from epipole.schemas.text.shown import as_line
+from epipole.schemas.text.urls import without_secrets
 
 
 class _Commands(typer.core.TyperGroup):
     """Commands that end in one line where the user can put the error right."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Take the secrets out of URLs: no command shows or stores them."""
+        shown = [known_as(arg) for arg in args]
+        if len(set(shown)) < len(set(args)):
+            _fail("two of the URLs differ only in their passwords or queries; give one of them")
+        return super().parse_args(ctx, shown)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command. An error that is not the user's shows its traceback."""
@@ -48,7 +57,7 @@ class _Commands(typer.core.TyperGroup):
 
 
 def _fail(message: str) -> NoReturn:
-    print(f"epipole: {as_line(' '.join(message.split()))}", file=sys.stderr)
+    print(f"epipole: {as_line(without_secrets(' '.join(message.split())))}", file=sys.stderr)
     sys.exit(1)
 
 

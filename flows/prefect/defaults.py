@@ -8,7 +8,6 @@ locked"), so they are off. A user's own settings, profile or server take precede
 import contextlib
 import logging
 from collections.abc import Iterator
-from urllib.parse import urlsplit
 
 import httpx
 from prefect.client.orchestration import get_client
@@ -25,6 +24,7 @@ from epipole.flows.prefect.embedded_server import start_server
 from epipole.flows.prefect.server_process import DEFAULTS, Launched
 from epipole.io.remote_files import line_of
 from epipole.schemas.errors import EpipoleError
+from epipole.schemas.text.urls import without_secrets
 
 ANSWERS_WITHIN_S = 5.0
 
@@ -72,7 +72,7 @@ def lost_server_as_line() -> Iterator[None]:
     except httpx.HTTPError as error:
         url = get_current_settings().api.url or ""
         raise EpipoleError(
-            f"Prefect's server {_without_password(url)} was lost during the run "
+            f"Prefect's server {without_secrets(url)} was lost during the run "
             f"({line_of(error)}); the dataset has all nights of the run or none: run again"
         ) from error
 
@@ -86,14 +86,9 @@ def _check_server(url: str) -> None:
         error = client.api_healthcheck()
     if error is not None:
         raise EpipoleError(
-            f"Prefect's server {_without_password(url)} does not answer ({line_of(error)}); "
+            f"Prefect's server {without_secrets(url)} does not answer ({line_of(error)}); "
             "start it, or unset PREFECT_API_URL to run without it"
         ) from error
-
-
-def _without_password(url: str) -> str:
-    parts = urlsplit(url)
-    return parts._replace(netloc=parts.netloc.rpartition("@")[2]).geturl()
 
 
 def quiet_console() -> None:

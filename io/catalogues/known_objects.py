@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from epipole.io.catalogues.element_sets import Fault, parse_element_sets
-from epipole.io.remote_files import open_remote
+from epipole.io.remote_files import known_as, open_remote
 from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.errors import CatalogueError, LogError
 
@@ -29,6 +29,7 @@ def read_known_objects(where: str) -> KnownObjects:
     CatalogueError
         Where it is missing, cannot be read or has no element set.
     """
+    where = known_as(where)
     data = _bytes_of(where)
     try:
         sets, faults = parse_element_sets(data)

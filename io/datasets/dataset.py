@@ -24,7 +24,7 @@ from epipole.io.datasets.plain_files import refuse_link
 from epipole.io.datasets.store_nights import StoreNights, store_nights
 from epipole.io.datasets.table_pieces import Between, read_pieces
 from epipole.io.names import fault_of_name
-from epipole.io.remote_files import line_of, storage_errors
+from epipole.io.remote_files import known_as, line_of, shown_error, storage_errors
 from epipole.schemas.bridge import conform
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.spans import Span, is_night
@@ -326,7 +326,7 @@ def _store(dataset: Where) -> StoreNights | None:
     if "://" not in where or where.startswith("file://"):
         return None
     with _reading(dataset):
-        return store_nights(where)
+        return store_nights(known_as(where))
 
 
 def dataset_folder(dataset: Where) -> Path | None:
@@ -363,4 +363,4 @@ def _reading(dataset: Where) -> Iterator[None]:
     except DatasetError:
         raise
     except storage_errors() as error:
-        raise DatasetError(f"{dataset}: cannot be read: {line_of(error)}") from error
+        raise DatasetError(f"{dataset}: cannot be read: {line_of(error)}") from shown_error(error)

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from epipole.io.datasets.parquet_options import ROWS_IN_GROUP, part_options
+from epipole.io.remote_files import file_system
 from epipole.schemas.bridge import conform
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -110,9 +111,7 @@ def _opened(night: Where, name: str) -> Iterator[Any]:
     if isinstance(night, Path):
         yield night / name / PART
         return
-    import fsspec
-
-    storage, path = fsspec.core.url_to_fs(f"{night}/{name}/{PART}")
+    storage, path = file_system(f"{night}/{name}/{PART}")
     storage.invalidate_cache()  # an earlier listing may be out of date
     with storage.open(path, cache_type="readahead") as file:
         yield file

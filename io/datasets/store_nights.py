@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from epipole.io.datasets.store_claims import STAGING, StoreClaims
-from epipole.io.remote_files import line_of, storage_errors
+from epipole.io.remote_files import file_system, line_of, storage_errors
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.spans import is_night
 
@@ -241,7 +241,5 @@ def store_nights(dataset: str) -> StoreNights:
 
 @cache
 def _store_nights(dataset: str) -> StoreNights:
-    import fsspec
-
-    storage, root = fsspec.core.url_to_fs(dataset)
+    storage, root = file_system(dataset)
     return StoreNights(storage, root.rstrip("/"), dataset)

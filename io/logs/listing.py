@@ -4,8 +4,15 @@ import glob
 from pathlib import Path
 
 from epipole.io.names import fault_of_name
-from epipole.io.remote_files import line_of, storage_errors
+from epipole.io.remote_files import (
+    file_system,
+    known_as,
+    line_of,
+    shown_error,
+    storage_errors,
+)
 from epipole.schemas.errors import LogError
+from epipole.schemas.text.urls import without_secrets
 
 SUFFIX = ".mcap"  # of the logs in a folder
 PATTERN = f"*{SUFFIX}"
@@ -27,7 +34,8 @@ def list_logs(where: str) -> tuple[list[str], bool]:
         Where there are no logs, or the storage does not answer.
     """
     if (fault := fault_of_name(where)) is not None:
-        raise LogError(f"log {where}: {fault}")
+        raise LogError(f"log {without_secrets(where)}: {fault}")
+    where = known_as(where)
     logs, is_one = _list_url(where) if "://" in where else _list_local(where)
     if not logs:
         raise LogError(f"{where}: {_nothing(where)}")
@@ -52,11 +60,10 @@ def _list_local(where: str) -> tuple[list[str], bool]:
 
 
 def _list_url(where: str) -> tuple[list[str], bool]:
-    import fsspec
     from fsspec.implementations.local import LocalFileSystem
 
     try:
-        storage, path = fsspec.core.url_to_fs(where)
+        storage, path = file_system(where)
         if isinstance(storage, LocalFileSystem):
             return _list_local(path)
         storage.invalidate_cache()  # a worker runs for weeks, and new logs come every night
@@ -72,11 +79,11 @@ def _list_url(where: str) -> tuple[list[str], bool]:
             for entry in entries
             if entry["type"] == "file" and (is_glob or entry["name"].endswith(SUFFIX))
         ]
-        return [storage.unstrip_protocol(name) for name in files], False
+        return [known_as(storage.unstrip_protocol(name)) for name in files], False
     except FileNotFoundError as error:
-        raise LogError(f"{where}: no such folder; check the URL") from error
+        raise LogError(f"{where}: no such folder; check the URL") from shown_error(error)
     except storage_errors() as error:
-        raise LogError(f"{where}: cannot be read: {line_of(error)}") from error
+        raise LogError(f"{where}: cannot be read: {line_of(error)}") from shown_error(error)
 
 
 def _nothing(where: str) -> str:

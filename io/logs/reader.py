@@ -26,6 +26,7 @@ from epipole.io.logs.mcap.summary import MAGIC, read_summary
 from epipole.io.logs.messages.batches import batches_of
 from epipole.io.logs.messages.encodings.registry import kinds_of_schemas, message_encodings
 from epipole.io.logs.own_time import own_range, stray_rejects, without_strays
+from epipole.io.remote_files import known_as
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
 from epipole.schemas.logs.log_tables import LogContents, LogPiece, LogSource
@@ -87,7 +88,7 @@ def read_log_pieces(
     message comes once, in the order of the file. There is at least one piece. The last one has
     the rejects and the source, which tells the log's own time: frames outside it are strays.
     """
-    where = os.fspath(path)
+    where = known_as(os.fspath(path))
     with _open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
         reading = _Reading(where, data, pool)
         for block in reading.blocks():

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from epipole.io.logs.mcap.blocks import BlockReader
-from epipole.io.remote_files import open_remote
+from epipole.io.remote_files import known_as, open_remote
 from epipole.schemas.errors import LogError
 
 HASHED_BYTES = 1 << 20  # of a file that are hashed at once
@@ -94,6 +94,7 @@ def open_log(where: str) -> LogBytes:
         Where there is no such file, or it cannot be read.
     """
     if "://" in where:
+        where = known_as(where)
         size, fetch, check = open_remote(where)
         return LogBytes(where, size, BlockReader(size, fetch, check))
     if Path(where).is_dir():
