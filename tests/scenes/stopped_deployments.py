@@ -1,6 +1,6 @@
 """A deployed night whose server, worker or run is stopped at a random moment.
 
-    python tests/scenes/stopped_deployments.py [--stops 100] [--seed 1]
+    python tests/scenes/stopped_deployments.py [--stops 100] [--seed 1] [--pending 600]
 
 Server and worker are started with the files of `epipole deploy-files`, and started again by what
 their systemd units say. A run is asked for, something is stopped while it is made, and at once the
@@ -9,8 +9,8 @@ run of the next night is asked for. Then nobody does anything, and this is check
 - both runs are Completed, and each night has the bytes of a run that was never stopped;
 - the run of the next night has begun within six minutes of the stop.
 
-An automation waits ten minutes for a run that its worker has lost before it began; the run that
-follows it need not.
+An automation waits ten minutes for a run that its worker has lost before it began; `--pending` makes
+that less (s). The run that follows need not wait for it.
 """
 
 import argparse
@@ -87,13 +87,17 @@ class Stop(NamedTuple):
 class Deployed:
     """The deployment in a folder of its own, with its server and worker."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, pending_s: int) -> None:
         from epipole.flows.simulate import simulate
 
         (folder / "logs").mkdir()
         simulate(SCENE, folder / "logs" / "night.mcap", seed=7, hours=HOURS, start=START)
         self.out = folder / "dataset"
         self.prefect = Prefect(folder, **deploy_files(folder, folder / "logs", self.out))
+        automations = folder / "automations.yaml"
+        text = automations.read_text()
+        assert text.count("within: 600\n") == 1
+        automations.write_text(text.replace("within: 600\n", f"within: {pending_s}\n"))
         self.server = Unit("server", self.prefect, self.prefect.start_server)
         wait_for(lambda: self._ask(lambda: self.prefect.get("ready")), "the server to start")
         for command in (
@@ -171,10 +175,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--stops", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pending", type=int, default=600)
     asked = parser.parse_args()
     rng, counts, faults, waits = random.Random(asked.seed), Counter[str](), 0, []
     with tempfile.TemporaryDirectory(prefix="stopped-deployments-") as folder:
-        deployed = Deployed(Path(folder))
+        deployed = Deployed(Path(folder), asked.pending)
         try:
             for night in NIGHTS:
                 deployed.wait(deployed.ask(night))
