@@ -9,8 +9,8 @@ run of the next night is asked for. Then nobody does anything, and this is check
 - both runs are Completed, and each night has the bytes of a run that was never stopped;
 - the run of the next night has begun within six minutes of the stop.
 
-An automation waits ten minutes for a run that its worker has lost before it began; `--pending` makes
-that less (s). The run that follows need not wait for it.
+An automation waits ten minutes for a run that its worker has lost before it began; `--pending`
+makes that less (s). The run that follows need not wait for it.
 """
 
 import argparse
