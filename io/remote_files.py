@@ -42,8 +42,8 @@ def _with_secrets(where: str) -> str:
         if is_there:
             by_host[scheme, path] = user
     scheme, _, rest = where.partition("://")
-    user = by_host.get((scheme, rest.partition("/")[0]))
-    return where if user is None else f"{scheme}://{user}@{rest}"
+    known = by_host.get((scheme, rest.partition("/")[0]))
+    return where if known is None else f"{scheme}://{known}@{rest}"
 
 
 def file_system(where: str) -> tuple[Any, str]:
