@@ -37,6 +37,8 @@ from epipole.tasks.simulate.simulate_scene import (
     true_tables,
 )
 
+MOST_LOGS = 500  # all are open at once, and a process may mostly open 1,024 files
+
 
 @dataclass(frozen=True)
 class Simulated:
@@ -91,8 +93,8 @@ def simulate(
     """
     settled = scene if isinstance(scene, Scene) else read_scene(scene)
     settled = _with_options(settled, seed, sensors, objects, hours, rate_hz, start)
-    if logs < 1:
-        raise SceneError(f"logs = {logs}: give 1 or more")
+    if not 1 <= logs <= MOST_LOGS:
+        raise SceneError(f"logs = {logs}: give 1 to {MOST_LOGS}")
     out = Path(out)
     if (fault := fault_of_name(out.name)) is not None:
         raise SceneError(f"log {out}: {fault}")

@@ -38,9 +38,9 @@ def _with_secrets(where: str) -> str:
         if without_secrets(url) == where:
             return url
         scheme, _, rest = url.partition("://")
-        user, is_there, path = rest.partition("/")[0].rpartition("@")
+        of_url, is_there, path = rest.partition("/")[0].rpartition("@")
         if is_there:
-            by_host[scheme, path] = user
+            by_host[scheme, path] = of_url
     scheme, _, rest = where.partition("://")
     known = by_host.get((scheme, rest.partition("/")[0]))
     return where if known is None else f"{scheme}://{known}@{rest}"
@@ -57,7 +57,10 @@ def file_system(where: str) -> tuple[Any, str]:
     if parts.scheme in ("s3", "s3a") and "@" in parts.netloc:
         options = {"key": unquote(parts.username or ""), "secret": unquote(parts.password or "")}
         given = without_secrets(given)
-    return fsspec.core.url_to_fs(given, **options)  # type: ignore[no-any-return]
+    try:
+        return fsspec.core.url_to_fs(given, **options)  # type: ignore[no-any-return]
+    except TypeError as error:  # a storage that needs more than a URL, such as reference://
+        raise ValueError(f"no storage can be opened by this URL ({line_of(error)})") from error
 
 
 def open_remote(where: str) -> tuple[int, Callable[[int, int], bytes], Callable[[], None]]:

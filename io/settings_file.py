@@ -5,6 +5,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
+from epipole.io.names import refuse_device
 from epipole.io.remote_files import known_as, open_remote
 from epipole.schemas.errors import LogError, SettingsError
 from epipole.schemas.settings import Group, Settings, parse_settings, validate_settings
@@ -21,6 +22,7 @@ def read_settings(path: Path) -> Settings:
         Where the file cannot be read, or a setting is invalid or unknown.
     """
     try:
+        refuse_device(path)
         text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
         raise SettingsError(

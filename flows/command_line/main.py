@@ -4,7 +4,9 @@ What a command needs is imported when it runs, so that ``epipole --help`` answer
 """
 
 import contextlib
+import errno
 import gc
+import os
 import sys
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -31,9 +33,10 @@ from epipole.flows.command_line.compiling import tells_compiling
 from epipole.flows.command_line.environment import prepare_environment
 from epipole.flows.command_line.printing import help_text
 from epipole.flows.command_line.stopping import stop_by_signals, stopped_in_one_line
+from epipole.io.names import LONGEST_PATH
 from epipole.io.remote_files import known_as
 from epipole.schemas.errors import EpipoleError
-from epipole.schemas.text.shown import as_line
+from epipole.schemas.text.shown import LONGEST_LINE, as_line
 from epipole.schemas.text.urls import without_secrets
 
 
@@ -42,6 +45,9 @@ class _Commands(typer.core.TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Take the secrets out of URLs: no command shows or stores them."""
+        for arg in args:
+            if "\0" in arg or ("://" not in arg and len(os.fsencode(arg)) > LONGEST_PATH):
+                _fail(f"{as_line(arg, 60)}: is too long, or has a zero character; give another one")
         shown = [known_as(arg) for arg in args]
         if len(set(shown)) < len(set(args)):
             _fail("two of the URLs differ only in their passwords or queries; give one of them")
@@ -54,10 +60,17 @@ class _Commands(typer.core.TyperGroup):
                 return super().invoke(ctx)
         except EpipoleError as error:
             _fail(str(error))
+        except OSError as error:
+            if error.errno != errno.ENAMETOOLONG:
+                raise
+            _fail(f"{as_line(error.filename, 60)}: the name is too long; give a shorter one")
 
 
 def _fail(message: str) -> NoReturn:
-    print(f"epipole: {as_line(without_secrets(' '.join(message.split())))}", file=sys.stderr)
+    line = without_secrets(" ".join(message.split()))
+    if len(line) > LONGEST_LINE:  # a long name must not hide the reason, which stands at the end
+        line = f"{line[: LONGEST_LINE // 2]}...{line[-LONGEST_LINE // 3 :]}"
+    print(f"epipole: {as_line(line)}", file=sys.stderr)
     sys.exit(1)
 
 

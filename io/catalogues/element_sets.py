@@ -60,7 +60,7 @@ def _parsed(text: str, data: bytes) -> Iterator[ElementSet | Fault]:
     if start == "<":
         return _messages(_xml_messages(data))
     if "MEAN_MOTION" in text.lstrip().partition("\n")[0]:
-        return _messages(csv.DictReader(text.lstrip().splitlines()))
+        return _messages(_csv_messages(text))
     return _two_line_sets(text)
 
 
@@ -138,6 +138,13 @@ def _xml_messages(data: bytes) -> list[Mapping[str, Any]]:
         raise CatalogueError(f"not an OMM in XML: {error}") from error
 
 
+def _csv_messages(text: str) -> Iterator[Mapping[str, Any]]:
+    try:
+        yield from csv.DictReader(text.lstrip().splitlines())
+    except csv.Error as error:
+        raise CatalogueError(f"not an OMM in CSV: {error}") from error
+
+
 def _messages(messages: Iterable[Mapping[str, Any]]) -> Iterator[ElementSet | Fault]:
     for number, fields in enumerate(messages, start=1):
         satellite = Satrec()
@@ -156,7 +163,11 @@ def _messages(messages: Iterable[Mapping[str, Any]]) -> Iterator[ElementSet | Fa
 def _texts(fields: Any) -> dict[str, str]:
     if not isinstance(fields, Mapping):
         raise ValueError("no keywords")
-    return {str(key): str(value).strip() for key, value in fields.items() if value is not None}
+    return {
+        str(key): str(value).encode("utf-8", "replace").decode().strip()  # half a surrogate pair
+        for key, value in fields.items()
+        if value is not None
+    }
 
 
 def _with_defaults(fields: dict[str, str]) -> dict[str, str]:

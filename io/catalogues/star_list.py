@@ -10,6 +10,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from epipole.io.names import refuse_device
 from epipole.schemas.bridge import table
 from epipole.schemas.catalogues.star_catalogue import (
     STAR_CATALOGUE,
@@ -71,6 +72,10 @@ def read_star_list(path: Path, epoch: float | None = None, name: str | None = No
     CatalogueError
         Names the missing columns, or the invalid rows and their columns.
     """
+    try:
+        refuse_device(path)
+    except OSError as error:
+        raise CatalogueError(f"{path}: {error.strerror}; give a file") from error
     read = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     missing = [column for column in REQUIRED if column not in read.columns]
     if missing:

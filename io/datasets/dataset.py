@@ -64,6 +64,20 @@ def check_folder(dataset: Where) -> None:
         )
 
 
+def require_dataset(dataset: Where) -> None:
+    """Raise where there is no dataset, not even an empty one.
+
+    Raises
+    ------
+    DatasetError
+        As `check_folder`, and where the folder is missing.
+    """
+    check_folder(dataset)
+    store = _store(dataset)
+    if not (_folder(dataset).is_dir() if store is None else store.names()):
+        raise DatasetError(f"{dataset}: no such folder; check the path")
+
+
 def nights_in(dataset: Where) -> list[str]:
     """Return the nights of a dataset, ``YYYY-MM-DD``, in order. A missing dataset has none.
 
@@ -154,7 +168,7 @@ def table_pieces(
             parts: Sequence[Any] = [pa.BufferReader(part) for part in store.read(night, table)]
     else:
         local_nights.recover(_folder(dataset))
-        parts = sorted((_folder(dataset) / f"night={night}" / table).glob("*.parquet"))
+        parts = sorted((_folder(dataset).absolute() / f"night={night}" / table).glob("*.parquet"))
     try:
         for part in parts:
             for rows in read_pieces(part, wanted, time, between_ns or (None, None)):

@@ -70,7 +70,8 @@ def _write(folder: Path, name: str, pieces: Iterable[pa.Table]) -> int:
 
 
 def _writer(folder: Path, schema: pa.Schema) -> pq.ParquetWriter:
-    return pq.ParquetWriter(folder / PART, schema, **part_options(schema))
+    # Arrow takes a relative path such as http:/x for a URL.
+    return pq.ParquetWriter((folder / PART).absolute(), schema, **part_options(schema))
 
 
 def read_columns(night: Where, name: str, columns: Sequence[str]) -> pa.Table:
@@ -83,7 +84,7 @@ def take_rows(
     night: Path, name: str, columns: Sequence[str], rows: npt.NDArray[np.int64]
 ) -> pa.Table:
     """Return some rows of a table that `write_table` wrote; `rows` are in order."""
-    file = pq.ParquetFile(night / name / PART)
+    file = pq.ParquetFile((night / name / PART).absolute())
     start, taken = 0, []
     for group in range(file.num_row_groups):
         end = start + file.metadata.row_group(group).num_rows
@@ -109,7 +110,7 @@ def count_rows(night: Where, name: str) -> int:
 def _opened(night: Where, name: str) -> Iterator[Any]:
     """Open a table's file. Of a URL only the ranges that are read are fetched."""
     if isinstance(night, Path):
-        yield night / name / PART
+        yield (night / name / PART).absolute()
         return
     storage, path = file_system(f"{night}/{name}/{PART}")
     storage.invalidate_cache()  # an earlier listing may be out of date

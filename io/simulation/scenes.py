@@ -4,6 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from epipole.io.names import refuse_device
 from epipole.schemas.errors import SceneError
 from epipole.schemas.simulation.scene import Scene, scene_values, validate_scene
 
@@ -27,6 +28,7 @@ def read_scene(scene: str | os.PathLike[str]) -> Scene:
     is_built_in = name in built_in_scenes()
     path = _BUILT_IN / f"{name}.toml" if is_built_in else Path(name)
     try:
+        refuse_device(path)
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         known = ", ".join(built_in_scenes())

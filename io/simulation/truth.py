@@ -39,7 +39,7 @@ class TruthWriter:
     """Writes a truth folder, block by block; a context manager."""
 
     def __init__(self, folder: str | os.PathLike[str], scenario: dict[str, Any]) -> None:
-        self._folder = Path(folder)
+        self._folder = Path(folder).absolute()  # Arrow takes http:/x for a URL
         self._folder.mkdir(parents=True, exist_ok=True)
         (self._folder / _ORBITS).unlink(missing_ok=True)  # of an earlier log of this name
         text = json.dumps(scenario, indent=1, allow_nan=False) + "\n"
@@ -89,6 +89,12 @@ def read_truth(path: str | os.PathLike[str]) -> Truth:
         folder = Path(os.fspath(path) + SUFFIX)
     if not folder.is_dir():
         raise DatasetError(f"{path}: no truth folder; `epipole simulate` writes it as LOG{SUFFIX}")
+    needed = [*(f"{name}.parquet" for name in _FILES), "scenario.json"]
+    if missing := [name for name in needed if not (folder / name).is_file()]:
+        raise DatasetError(
+            f"{folder}: {', '.join(missing)} missing; give the folder LOG{SUFFIX} that "
+            "`epipole simulate` writes beside a log"
+        )
     tables = {name: _read(folder / f"{name}.parquet", schema) for name, schema in _FILES.items()}
     where = folder / _ORBITS
     orbits = _read(where, TRUE_ORBITS) if where.exists() else None

@@ -41,12 +41,12 @@ def nights(
     """
     from epipole.flows.night.dataset.held_nights import held_nights
     from epipole.io.catalogues.known_objects import read_known_objects
-    from epipole.io.datasets.dataset import check_folder
+    from epipole.io.datasets.dataset import require_dataset
     from epipole.io.settings_file import read_settings
     from epipole.io.work.unfinished import clear_unfinished, unfinished_work
     from epipole.schemas.settings import Settings
 
-    check_folder(dataset)
+    require_dataset(dataset)
     today = read_settings(settings) if settings else Settings()
     known_key = read_known_objects(known).sha256 if known else None
     held = [n for n in held_nights(dataset, today, known_key) if n.stale or not stale]
