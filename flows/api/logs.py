@@ -16,7 +16,7 @@ from epipole.schemas.logs.messages import SENSOR_ID_RULE
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES
 from epipole.tasks.algorithms.geometry.camera import Camera
-from epipole.tasks.read.turn_states import states_in_gcrf
+from epipole.tasks.read.states_to_gcrf import states_to_gcrf
 
 
 class LogTables(NamedTuple):
@@ -90,7 +90,7 @@ def read_log(path: str | os.PathLike[str]) -> LogTables:
     18.0
     """
     found = reader.read_log(path)
-    states = states_in_gcrf(found.states, Settings())
+    states = states_to_gcrf(found.states, Settings())
     return LogTables(
         to_polars(found.exposures.select(_FRAMES.names)),
         to_polars(states.select(_STATES.names)),

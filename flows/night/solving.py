@@ -22,7 +22,7 @@ from epipole.schemas.stages import Stage
 from epipole.tasks.solve.association.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.association.number_objects import number_objects
 from epipole.tasks.solve.positions.judge_span import judge_span
-from epipole.tasks.solve.positions.keep_lines import Kept
+from epipole.tasks.solve.positions.sample_sight_lines import LineSampling
 from epipole.tasks.solve.positions.solve_piece import Piece, solve_piece
 from epipole.tasks.solve.positions.solve_positions import VELOCITY_WINDOW_S
 from epipole.tasks.solve.views.align_epochs import EpochGrid, frames_that_serve, grid_of
@@ -201,6 +201,8 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     return count
 
 
-def _kept_lines(night: _Night, n_views: int) -> Kept:
+def _kept_lines(night: _Night, n_views: int) -> LineSampling:
     """Return which lines of sight of a span are kept."""
-    return Kept(night.apart_ns, max(math.ceil(n_views / night.epochs_apart / MOST_LINES), 1))
+    return LineSampling(
+        night.apart_ns, max(math.ceil(n_views / night.epochs_apart / MOST_LINES), 1)
+    )

@@ -18,7 +18,7 @@ from epipole.schemas.tables import CALIBRATIONS, STARS
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import (
     Camera,
-    counted_the_other_way,
+    flip_rows,
     unproject,
 )
 from epipole.tasks.algorithms.geometry.optics_calibration import (
@@ -194,14 +194,14 @@ def _fit_upward(
     given: ToldOptics, present: _Present, images: StarImages
 ) -> tuple[OpticsFit, bool] | None:
     """Return what `_fit` does for rows that count upward: fitted as rows that count down."""
-    told, _ = counted_the_other_way(given.camera, images.y_px)
+    told, _ = flip_rows(given.camera, images.y_px)
     given = given._replace(camera=told)
-    camera, y_px = counted_the_other_way(present.camera, images.y_px)
+    camera, y_px = flip_rows(present.camera, images.y_px)
     fitted = _fit(given, present._replace(camera=camera), images._replace(y_px=y_px))
     if fitted is None:
         return None
     fit, departs = fitted
-    upward, _ = counted_the_other_way(fit.camera, y_px)
+    upward, _ = flip_rows(fit.camera, y_px)
     sign = np.where(np.isin(OPTICS, ["fy_px", "cy_px"]), -1.0, 1.0)
     return fit._replace(camera=upward, cov=fit.cov * np.outer(sign, sign)), departs
 

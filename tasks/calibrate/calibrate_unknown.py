@@ -17,7 +17,7 @@ from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sens
 from epipole.tasks.calibrate.find_camera import find_agreed_camera, image_frames, skies_at
 from epipole.tasks.common.sightings import camera_of
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.place_sensors import place_sensors
+from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
 TRIED = 6  # frames in which a camera is searched for
 REACH = 1.5  # by which a told focal length may be off, either way
@@ -76,7 +76,7 @@ def calibrate_unknown(
     """
     sensor_id = exposures["sensor_id"][0].as_py()
     told, reach = _told(exposures, cameras, field_deg)
-    places = place_sensors(exposures, states, settings)
+    places = interpolate_sensor_states(exposures, states, settings)
     found = _search(exposures, places, told, reach, settings)
     is_told = cameras.num_rows > 0 and field_deg is None
     nothing = CameraReport(

@@ -28,7 +28,7 @@ from epipole.tasks.algorithms.star_identification.camera_search import (
     agrees,
     find_cameras,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import brightest_first
+from epipole.tasks.algorithms.star_identification.frames.centroids import brightest_first
 from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
 from epipole.tasks.calibrate.calibrate_sensors import with_optics
 from epipole.tasks.common.sightings import camera_of
@@ -37,7 +37,7 @@ from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 from epipole.tasks.identify.flatten_centroids import flatten_centroids
 from epipole.tasks.identify.identify_span import states_about
 from epipole.tasks.identify.identify_stars import search_of
-from epipole.tasks.identify.place_sensors import place_sensors
+from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 from epipole.tasks.identify.tabulate_identified import barycentric_velocity
 from epipole.tasks.read.order_frames import frames_between
 
@@ -259,7 +259,7 @@ def _placed(
     """Return EXPOSURES of one frame, and its PLACES."""
     instant = Span(time_ns, time_ns + 1)
     exposures = concat(EXPOSURES, [frames_between(frames, sensor.number, *instant)])
-    return exposures, place_sensors(
+    return exposures, interpolate_sensor_states(
         exposures, states_about(frames, sensor, instant, settings), settings
     )
 

@@ -29,7 +29,7 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
 )
 from epipole.tasks.algorithms.sensor_faults.suspects import judge_many_sensors
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.solve.positions.keep_lines import meetings
+from epipole.tasks.solve.positions.sample_sight_lines import meetings
 
 Array = npt.NDArray[np.float64]
 

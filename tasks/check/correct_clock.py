@@ -14,7 +14,7 @@ from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.identify_span import states_about
-from epipole.tasks.identify.place_sensors import place_sensors
+from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
 PLACED = [
     *("x_km", "y_km", "z_km"),
@@ -47,7 +47,7 @@ def correct_clock(
     names = ("solutions", "stars", "detections")
     tables = {name: at_true_times(identified.read(span, name), clock) for name in names}
     states = states_about(frames, sensor, span, settings)
-    places = place_sensors(tables["solutions"], states, settings)
+    places = interpolate_sensor_states(tables["solutions"], states, settings)
     tables["solutions"] = at_places(tables["solutions"], places)
     tables["rejects"] = identified.read(span, "rejects")
     write_part(parts.of(span), IDENTIFIED, tables)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 
-def bounds_of_runs(*keys: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+def group_offsets(*keys: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
     """Return where each run of rows that are equal in all keys begins, and where the last one ends.
 
     Run k has the rows ``bounds[k]:bounds[k + 1]``. Without rows it is [0]: no run.

@@ -18,7 +18,7 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.place_sensors import place_sensors
+from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 from epipole.tasks.read.order_frames import frames_between, states_between
 
 LOGGER = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ def identify_span(
     if not parts.holds(span):
         exposures = frames_between(frames, sensor.number, *span)
         states = states_about(frames, sensor, span, settings)
-        places = place_sensors(exposures, states, settings)
+        places = interpolate_sensor_states(exposures, states, settings)
         catalogue = read_star_catalogue(settings.identification.catalogue)
         identified = identify_stars(exposures, places, cameras, catalogue, settings)
         rejects = concat(REJECTS, [identified.rejects, _unplaced(places)])

@@ -17,13 +17,13 @@ from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC, DAY_NS, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.optics_errors import shared_attitude_covariance
 from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
-from epipole.tasks.algorithms.star_identification.frames.frame import Search
-from epipole.tasks.algorithms.star_identification.frames.persistent import persistent
-from epipole.tasks.algorithms.star_identification.frames.spots import (
-    UnscaledCentroids,
+from epipole.tasks.algorithms.star_identification.frames.centroids import (
+    RawCentroids,
     brightest_first,
 )
+from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
+from epipole.tasks.algorithms.star_identification.frames.frame import Search
+from epipole.tasks.algorithms.star_identification.frames.static_centroids import static_centroids
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.common.sightings import optics_covariance_of
@@ -136,7 +136,7 @@ def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
     A centroid outside the image is never one.
     """
     if np.median(np.diff(c.first)) > MANY_STAY:
-        stays = c.in_image & persistent(c.first, c.x_px, c.y_px)
+        stays = c.in_image & static_centroids(c.first, c.x_px, c.y_px)
         if np.median(np.bincount(c.frame[stays], minlength=len(c.first) - 1)) > MANY_STAY:
             yield c.in_image & ~stays
     yield c.in_image
@@ -144,10 +144,10 @@ def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
 
 def _spots(
     c: FlatCentroids, rows: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], beta: Array
-) -> UnscaledCentroids:
+) -> RawCentroids:
     """Return these centroids, which are those kept in another order."""
     counts = np.bincount(c.frame[kept], minlength=len(c.first) - 1)
-    return UnscaledCentroids(
+    return RawCentroids(
         np.concatenate([[0], np.cumsum(counts)]),
         c.u[rows],
         c.pixel_rad[rows],

@@ -24,8 +24,8 @@ from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
 from epipole.tasks.algorithms.geometry.sky import aberrate, boresight_angles, radec_from_unit
 from epipole.tasks.algorithms.photometry import flux_scale
 from epipole.tasks.algorithms.time.time_scales import earth_velocity
-from epipole.tasks.identify.bound_detections import within_bound
 from epipole.tasks.identify.flatten_centroids import FlatCentroids
+from epipole.tasks.identify.limit_detections import within_limit
 
 Array = npt.NDArray[np.float64]
 
@@ -165,7 +165,7 @@ def detections_table(
     left = c.in_image.copy()
     left[m.at] = False
     at = np.flatnonzero(left)
-    kept = within_bound(c.frame[at], c.flux[at], most)
+    kept = within_limit(c.frame[at], c.flux[at], most)
     left_out = np.bincount(c.frame[at[~kept]], minlength=exposures.num_rows)
     at = at[kept]
     frame = c.frame[at]

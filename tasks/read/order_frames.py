@@ -34,7 +34,7 @@ from epipole.tasks.algorithms.time.frame_order import (
     order_states,
 )
 from epipole.tasks.read.read_logs import ReadLog
-from epipole.tasks.read.turn_states import states_in_gcrf
+from epipole.tasks.read.states_to_gcrf import states_to_gcrf
 
 LOGGER = logging.getLogger(__name__)
 
@@ -204,7 +204,7 @@ def _sorted_states(
     order, repeats = order_states(np.zeros(rows.num_rows, np.int64), array(rows, "time"))
     named = rows.select(["sensor_id", "time"]).append_column("source", pa.array(names, pa.string()))
     rejects = frames_left_out(named.take(pa.array(order[repeats])), Reason.DUPLICATE_STATE)
-    return states_in_gcrf(rows.take(pa.array(order[~repeats])), settings), rejects
+    return states_to_gcrf(rows.take(pa.array(order[~repeats])), settings), rejects
 
 
 def _sorted_cameras(cameras: pa.Table) -> pa.Table:

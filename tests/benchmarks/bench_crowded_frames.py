@@ -20,8 +20,8 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -48,14 +48,14 @@ def shot(
     return points[:, np.argsort(points[2])], int(np.sum(star_id >= 0))
 
 
-def centroids(kind: Kind, shots: list[Array], flux: bool) -> UnscaledCentroids:
+def centroids(kind: Kind, shots: list[Array], flux: bool) -> RawCentroids:
     """Return the frames as a sensor's."""
     camera = kind.camera
     x, y, magnitude = np.hstack(shots)
     first = np.concatenate([[0], np.cumsum([points.shape[1] for points in shots])])
     u, half = unproject(camera, x, y), kind.width_px / 2 / camera.fx_px
     box = np.array([-half, half, -half, half])
-    return UnscaledCentroids(
+    return RawCentroids(
         first, u, pixel_angle(camera, u), np.full(len(x), SIGMA_PX),
         magnitude if flux else np.full(len(x), np.nan), np.zeros((len(shots), 3)),
         [FieldOfView(camera.half_diagonal_rad, box, camera.pixel_rad)],

@@ -31,8 +31,8 @@ from epipole.tasks.algorithms.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -139,13 +139,13 @@ class Shooter:
             places = rng.uniform(0, WIDTH, (2, n))
         return np.clip(places, 0, WIDTH - 1)
 
-    def centroids(self, frames: list[Array]) -> UnscaledCentroids:
+    def centroids(self, frames: list[Array]) -> RawCentroids:
         """Return the frames, brightest centroid first in each."""
         x, y, m = np.hstack([seen[:, np.argsort(seen[2])] for seen in frames])
         first = np.concatenate([[0], np.cumsum([seen.shape[1] for seen in frames])])
         u = unproject(self.camera, x, y)
         n = len(frames)
-        return UnscaledCentroids(
+        return RawCentroids(
             first, u, pixel_angle(self.camera, u), np.full(len(x), self.of.sigma_px),
             m if self.of.flux else np.full(len(x), np.nan), np.zeros((n, 3)), [self.optics],
             np.zeros(n, np.int64),

@@ -23,9 +23,9 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.sky import boresight_angles
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
 from epipole.tasks.algorithms.star_identification.frames.frame import Search
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -50,7 +50,7 @@ def identify(
     unknown = np.full(len(x_px), np.nan)
     u = unproject(camera, x_px, y_px)
     optics = field_of_view(camera)
-    spots = UnscaledCentroids(
+    spots = RawCentroids(
         np.array([0, len(u)]), u, pixel_angle(camera, u), unknown, unknown, np.zeros((1, 3)),
         [optics], np.zeros(1, np.int64),
     )  # fmt: skip

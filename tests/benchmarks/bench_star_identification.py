@@ -38,13 +38,13 @@ from epipole.tasks.algorithms.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
+from epipole.tasks.algorithms.star_identification.frames.centroids import SensorCentroids
 from epipole.tasks.algorithms.star_identification.frames.frame import (
     FieldOfView,
     FrameCentroids,
     Search,
     identify_lost,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import SensorCentroids
 from epipole.tasks.algorithms.star_identification.published import (
     four_base_stars,
     match_group,

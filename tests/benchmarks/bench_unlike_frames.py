@@ -30,8 +30,8 @@ from epipole.tasks.algorithms.geometry.rotations import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors, no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -139,7 +139,7 @@ SCENES: dict[str, Callable[[Stars, int, Rng], Scene]] = {
 STATED = {"like the others": ("none", "true", "photons"), "errors": ("none",)}
 
 
-def centroids(kind: Kind, shots: list[Array], stated: str) -> UnscaledCentroids:
+def centroids(kind: Kind, shots: list[Array], stated: str) -> RawCentroids:
     """Return the frames as a sensor's."""
     camera = kind.camera
     x, y, magnitude = np.hstack(shots)
@@ -147,7 +147,7 @@ def centroids(kind: Kind, shots: list[Array], stated: str) -> UnscaledCentroids:
     u, half = unproject(camera, x, y), kind.width_px / 2 / camera.fx_px
     photons_px = SIGMA_PX * np.minimum(10.0 ** (0.2 * (magnitude - kind.magnitude_limit)), 1.0)
     stated_px = {"photons": photons_px, "true": np.full(len(x), SIGMA_PX)}
-    return UnscaledCentroids(
+    return RawCentroids(
         first, u, pixel_angle(camera, u), stated_px.get(stated, np.full(len(x), np.nan)),
         magnitude, np.zeros((len(shots), 3)),
         [FieldOfView(camera.half_diagonal_rad, np.array([-half, half, -half, half]),

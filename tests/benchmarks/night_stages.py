@@ -23,7 +23,7 @@ from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import HOT_SUSPECTS, OBJECT_MEMBERS, SOLUTIONS, TRACKLET_RUNS
 from epipole.tasks.algorithms.simulation.orbits import state_at
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.place_sensors import place_sensors
+from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 from epipole.tasks.solve.association.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.association.number_objects import number_objects
 from epipole.tasks.solve.positions.gather_views import gather_views
@@ -52,7 +52,7 @@ class IdentifiedLog(NamedTuple):
 def see(log: Path, settings: Settings) -> IdentifiedLog:
     """Read a log and identify its stars."""
     read = read_whole([log], settings)
-    places = place_sensors(read.exposures, read.states, settings)
+    places = interpolate_sensor_states(read.exposures, read.states, settings)
     catalogue = read_star_catalogue(settings.identification.catalogue)
     parts = [
         identify_stars(

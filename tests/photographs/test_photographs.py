@@ -12,9 +12,9 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_cameras
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
 from epipole.tasks.algorithms.star_identification.frames.frame import Search
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -67,7 +67,7 @@ def camera_of(x_px, y_px, skies_of):
 def numbers(x_px, y_px, camera, skies_of):
     """Return the Hipparcos number of each place, 0 where none was found."""
     u, unknown = unproject(camera, x_px, y_px), np.full(len(x_px), np.nan)
-    spots = UnscaledCentroids(
+    spots = RawCentroids(
         np.array([0, len(u)]), u, pixel_angle(camera, u), unknown, unknown, np.zeros((1, 3)),
         [field_of_view(camera)], np.zeros(1, np.int64),
     )  # fmt: skip

@@ -5,15 +5,15 @@ import numpy as np
 from epipole.tasks.algorithms.catalogue.star_catalogue import NavigationCatalogue
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, project, unproject
 from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
+from epipole.tasks.algorithms.star_identification.frames.centroids import (
+    RawCentroids,
+    SensorCentroids,
+)
 from epipole.tasks.algorithms.star_identification.frames.frame import (
     FieldOfView,
     FrameCentroids,
     Search,
     aberrate_all,
-)
-from epipole.tasks.algorithms.star_identification.frames.spots import (
-    SensorCentroids,
-    UnscaledCentroids,
 )
 
 CAMERA = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)  # 16 degrees
@@ -79,7 +79,7 @@ def join(frames):
 def join_spots(frames, sigma_px, pixel_rad):
     """Return frames in flat arrays, with these (n,) errors and pixel sizes of their centroids."""
     flat = join(frames)
-    return UnscaledCentroids(
+    return RawCentroids(
         flat.first, flat.u, np.concatenate(pixel_rad), np.concatenate(sigma_px),
         flat.instrumental_mag, flat.beta, flat.optics, flat.optics_of,
     )  # fmt: skip

@@ -19,18 +19,22 @@ from epipole.tasks.algorithms.association.evidence.detection import (
     estimated_detection,
     looks_of,
 )
+from epipole.tasks.algorithms.association.evidence.hypothesis_queue import (
+    Hypothesis,
+    HypothesisQueue,
+    distinct,
+)
 from epipole.tasks.algorithms.association.evidence.object_density import (
     revised_odds,
     visible_volume,
 )
-from epipole.tasks.algorithms.association.evidence.pool import Hypothesis, Pool, distinct
-from epipole.tasks.algorithms.association.hypotheses.contests import settle_contests
 from epipole.tasks.algorithms.association.hypotheses.field_index import cones_of, field_index
 from epipole.tasks.algorithms.association.hypotheses.growth import grow_all
+from epipole.tasks.algorithms.association.hypotheses.merge_hypotheses import best_union
+from epipole.tasks.algorithms.association.hypotheses.resolve_conflicts import resolve_conflicts
 from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace, work_space
 from epipole.tasks.algorithms.association.hypotheses.seeds import seeds_between
 from epipole.tasks.algorithms.association.hypotheses.sensor_pairs import EveryPair, SensorPairs
-from epipole.tasks.algorithms.association.hypotheses.unions import best_union
 from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.sampling.views import views_of
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
@@ -148,7 +152,7 @@ class _Search:
         self.take(waiting, WORTH_A_LOOK)
         nothing_taken = self.space._replace(taken=np.zeros_like(self.space.taken))
         x_km = np.array([h.x_km for h in self.groups]).reshape(-1, 3)
-        settle_contests(nothing_taken, self.work, self.group, x_km)
+        resolve_conflicts(nothing_taken, self.work, self.group, x_km)
         scores = self._withdraw_doubtful(min_log_odds)
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
         group[self.order], ambiguous[self.order] = self.group, self.ambiguous
@@ -237,7 +241,7 @@ class _Search:
         stale = [h for h in hypotheses if taken[list(h.members)].any()]
         afresh, _ = self.grow(np.array([h.seed for h in stale], np.int64).reshape(-1, 2))
         gone = set(map(id, stale))
-        pool = Pool([h for h in hypotheses if id(h) not in gone] + afresh)
+        pool = HypothesisQueue([h for h in hypotheses if id(h) not in gone] + afresh)
         while (best := pool.pop()) is not None and best.score >= min_log_odds:
             if taken[list(best.members)].any():
                 if not taken[list(best.seed)].any():

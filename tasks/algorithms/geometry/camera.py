@@ -73,7 +73,7 @@ def mirrored(camera: Camera) -> Camera:
     return camera._replace(fy_px=-camera.fy_px, p1=-camera.p1)
 
 
-def counted_the_other_way(camera: Camera, y_px: Array) -> tuple[Camera, Array]:
+def flip_rows(camera: Camera, y_px: Array) -> tuple[Camera, Array]:
     """Return the same camera and image places (n,) with the image's rows counted the other way."""
     last = camera.height - 1
     return camera._replace(fy_px=-camera.fy_px, cy_px=last - camera.cy_px), last - y_px

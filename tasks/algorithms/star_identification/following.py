@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, turn
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
-from epipole.tasks.algorithms.star_identification.frames.spots import Rows
-from epipole.tasks.algorithms.star_identification.search.field import (
+from epipole.tasks.algorithms.star_identification.frames.centroids import Rows
+from epipole.tasks.algorithms.star_identification.search.match_stars import (
     Attitude,
     Centroids,
     Matches,
@@ -84,7 +84,7 @@ class FrameArrays(NamedTuple):
     half_diagonal: Array
 
 
-class Walk(NamedTuple):
+class FrameRange(NamedTuple):
     """The frames start, start + step, ... before stop; whether lost ones are to be searched."""
 
     start: int
@@ -259,7 +259,7 @@ def follow(walk, frames, priors, stars, rule, memory, solutions, status):
 
     Parameters
     ----------
-    walk, frames : Walk, FrameArrays
+    walk, frames : FrameRange, FrameArrays
         The frames, and which of them to go through in which order.
     priors : Priors
         Attitudes that came with the log.

@@ -7,12 +7,18 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.star_identification.frames.frame import Search, Solution
-from epipole.tasks.algorithms.star_identification.frames.spots import (
-    Solutions,
-    UnscaledCentroids,
+from epipole.tasks.algorithms.star_identification.frame_error_scale import (
+    by_quality,
+    of_other_brightness,
 )
-from epipole.tasks.algorithms.star_identification.second_look import look_again
+from epipole.tasks.algorithms.star_identification.frames.centroids import (
+    RawCentroids,
+    Solutions,
+)
+from epipole.tasks.algorithms.star_identification.frames.frame import Search, Solution
+from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import (
+    reidentify_poor_frames,
+)
 from epipole.tasks.algorithms.star_identification.sensor_limits import (
     USELESS_SCATTER_MAG,
     faintest_star,
@@ -32,10 +38,6 @@ from epipole.tasks.algorithms.star_identification.sensor_sample import (
 )
 from epipole.tasks.algorithms.star_identification.sequence import Priors, identify_again
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
-from epipole.tasks.algorithms.star_identification.unlike_frames import (
-    by_quality,
-    of_other_brightness,
-)
 
 Array = npt.NDArray[np.float64]
 
@@ -72,7 +74,7 @@ class IdentifiedSensor(NamedTuple):
 
 def identify_sensor(
     t_s: Array,
-    spots: UnscaledCentroids,
+    spots: RawCentroids,
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,
@@ -119,7 +121,7 @@ def identify_sensor(
     solutions, status, known = _with_true_scale(whole, solutions, status, skies, known)
     if solutions.solved.any():
         solutions = of_other_brightness(whole, solutions, skies, known)
-    quality = look_again(
+    quality = reidentify_poor_frames(
         spots.frames(known.scale, known.use_flux),
         solutions,
         sky_of(spots, skies, known),
@@ -175,7 +177,7 @@ def _around(n: int, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return np.unique(start[:, None] + np.arange(length))
 
 
-def _fill_sigmas(spots: UnscaledCentroids) -> tuple[UnscaledCentroids, bool]:
+def _fill_sigmas(spots: RawCentroids) -> tuple[RawCentroids, bool]:
     """Return the centroids with the median for missing sigmas, and whether any sigma is stated."""
     if not np.isfinite(spots.sigma_px).any():
         return spots, False
@@ -184,7 +186,7 @@ def _fill_sigmas(spots: UnscaledCentroids) -> tuple[UnscaledCentroids, bool]:
 
 
 def _learn(
-    spots: UnscaledCentroids, solutions: list[Solution | None], skies: Skies, known: Known
+    spots: RawCentroids, solutions: list[Solution | None], skies: Skies, known: Known
 ) -> Known:
     """Return what is known, with errors, zero point and faintest star from solved frames."""
     if not any(solutions):
@@ -210,7 +212,7 @@ def _learn(
 
 
 def _faintest(
-    spots: UnscaledCentroids, solutions: list[Solution | None], skies: Skies, known: Known
+    spots: RawCentroids, solutions: list[Solution | None], skies: Skies, known: Known
 ) -> float:
     """Return the magnitude of the faintest star that the sensor detects, or that settings state."""
     if not known.limit_is_open:
@@ -245,7 +247,7 @@ def _first_scale(
 
 
 def _attempts(
-    probe: UnscaledCentroids,
+    probe: RawCentroids,
     skies: Skies,
     known: Known,
     scales: tuple[float, ...],
@@ -267,7 +269,7 @@ def _attempts(
 
 
 def _likeliest_scale(
-    spots: UnscaledCentroids,
+    spots: RawCentroids,
     solutions: list[Solution | None],
     skies: Skies,
     known: Known,

@@ -5,13 +5,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frames.frame import (
     FrameCentroids,
     Search,
     Solution,
     identify_predicted,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 
 Array = npt.NDArray[np.float64]
@@ -89,7 +89,7 @@ def rematch(
 
 
 def likeliest_floor(
-    spots: UnscaledCentroids, solutions: list[Solution | None], sky: Sky, how: Search, scale: float
+    spots: RawCentroids, solutions: list[Solution | None], sky: Sky, how: Search, scale: float
 ) -> float:
     """Return the error [px] that all centroids have beside the stated ones, 0 where there is none
     or where the stated ones times `scale` explain the frames as well.

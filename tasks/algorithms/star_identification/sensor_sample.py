@@ -6,14 +6,14 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search, Solution
-from epipole.tasks.algorithms.star_identification.frames.spots import (
+from epipole.tasks.algorithms.star_identification.frames.centroids import (
+    RawCentroids,
     SensorCentroids,
     Solutions,
-    UnscaledCentroids,
     unsolved,
 )
-from epipole.tasks.algorithms.star_identification.second_look import SensorSky
+from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search, Solution
+from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import SensorSky
 from epipole.tasks.algorithms.star_identification.sequence import Priors, identify_sequence
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
@@ -53,7 +53,7 @@ class Sample(NamedTuple):
     """Frames, with their priors; `anchors` are frames whose prior is an earlier solution."""
 
     t_s: Array
-    spots: UnscaledCentroids
+    spots: RawCentroids
     priors: Priors
     anchors: bool = False
 
@@ -92,7 +92,7 @@ def identify_sample(
     )  # fmt: skip
 
 
-def sky_of(spots: UnscaledCentroids, skies: Skies, known: Known) -> SensorSky:
+def sky_of(spots: RawCentroids, skies: Skies, known: Known) -> SensorSky:
     """Return what the frames are searched in."""
     radius = _grid_radius(spots.frames(known.scale), known.how)
     pairs = partial(skies.pairs, known.limit, spots.optics[0])

@@ -13,10 +13,15 @@ from epipole.tasks.algorithms.star_identification.following import (
     TIME_LIMIT,
     TOO_FEW,
     FrameArrays,
-    Walk,
+    FrameRange,
     follow,
     new_memory,
     remember,
+)
+from epipole.tasks.algorithms.star_identification.frames.centroids import (
+    SensorCentroids,
+    Solutions,
+    unsolved,
 )
 from epipole.tasks.algorithms.star_identification.frames.frame import (
     Search,
@@ -24,13 +29,8 @@ from epipole.tasks.algorithms.star_identification.frames.frame import (
     identify_lost,
     rule_of,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import (
-    SensorCentroids,
-    Solutions,
-    unsolved,
-)
 from epipole.tasks.algorithms.star_identification.search.evidence import MatchRule
-from epipole.tasks.algorithms.star_identification.search.field import StarPlaces
+from epipole.tasks.algorithms.star_identification.search.match_stars import StarPlaces
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
@@ -102,7 +102,7 @@ def identify_sequence(
     arrays, rule = _arrays(t_s, frames), rule_of(how, sky)
     stars = StarPlaces(sky.catalogue.u_icrs, sky.catalogue.magnitude)
     sequence = _Sequence(frames, arrays, stars, rule, solutions, status)
-    forth, back, none = Walk(0, n, 1, False), Walk(n - 1, -1, -1, False), no_priors(n)
+    forth, back, none = FrameRange(0, n, 1, False), FrameRange(n - 1, -1, -1, False), no_priors(n)
 
     def search(k: int, failures: int, step: int) -> tuple[Solution | None, bool]:
         # Crowded frames take long: where the stars' brightness is unknown, ever fewer are tried.
@@ -143,7 +143,7 @@ def identify_again(
     sequence = _Sequence(frames, _arrays(t_s, frames), stars, rule_of(how, sky), again, status)
     # Errors were other ones: an attitude may be off by more than its covariance says.
     sigma = 3.0 * np.sqrt(np.trace(solutions.cov_rad2, axis1=1, axis2=2) / 3.0)
-    sequence.follow(Walk(0, n, 1, False), Priors(solutions.R_sensor_from_icrs, sigma))
+    sequence.follow(FrameRange(0, n, 1, False), Priors(solutions.R_sensor_from_icrs, sigma))
     return again
 
 
@@ -157,7 +157,7 @@ class _Sequence(NamedTuple):
     solutions: Solutions
     status: npt.NDArray[np.int8]
 
-    def follow(self, walk: Walk, priors: Priors) -> None:
+    def follow(self, walk: FrameRange, priors: Priors) -> None:
         """Identify frames from those before them, on one walk, without a search."""
         memory = new_memory(len(self.stars.u))
         follow(walk, self.arrays, priors, self.stars, self.rule, memory, self.solutions,
@@ -165,7 +165,7 @@ class _Sequence(NamedTuple):
 
     def go(
         self,
-        walk: Walk,
+        walk: FrameRange,
         priors: Priors,
         search: Callable[[int, int, int], tuple[Solution | None, bool]],
         failures: int,

@@ -16,7 +16,7 @@ from epipole.schemas.spans import BLOCK_NS, Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import OBJECT_MEMBERS, TRACKLET_OUTCOMES
-from epipole.tasks.common.equal_runs import bounds_of_runs
+from epipole.tasks.common.equal_runs import group_offsets
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.association.associate_objects import Associated, associate_objects
 from epipole.tasks.solve.association.block_views import BlockViews, SensorViews
@@ -104,7 +104,7 @@ def object_members(block: BlockViews, associated: Associated) -> pa.Table:
     items, number = block.items, associated.object_number
     order = np.lexsort((items.window, items.tracklet))
     tracklet, object_ = items.tracklet[order], number[order]
-    bounds = bounds_of_runs(tracklet, object_)
+    bounds = group_offsets(tracklet, object_)
     first, last = bounds[:-1], bounds[1:] - 1
     n_views = np.add.reduceat(items.n_views[order], first) if len(first) else first
     rows = np.flatnonzero(object_[first] >= 0)

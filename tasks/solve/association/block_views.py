@@ -16,7 +16,7 @@ from epipole.schemas.bridge import array
 from epipole.schemas.spans import Span
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.association.verdicts import Items
-from epipole.tasks.common.equal_runs import bounds_of_runs
+from epipole.tasks.common.equal_runs import group_offsets
 from epipole.tasks.solve.association.choose_instants import (
     clear_views,
     even_instants,
@@ -140,7 +140,7 @@ class BlockViews:
         for epoch_ns, epoch, tracklet, clear in zip(
             self._epoch_ns, self._epoch, self._tracklet, self._clear, strict=True
         ):
-            bounds = bounds_of_runs(epoch_ns // self.window_ns, tracklet)
+            bounds = group_offsets(epoch_ns // self.window_ns, tracklet)
             there = wanted[epoch] & clear
             has = np.add.reduceat(there, bounds[:-1]) > 0 if len(there) else np.zeros(0, bool)
             for k in np.flatnonzero(~has).tolist():
@@ -178,7 +178,7 @@ def _items(
 ) -> tuple[Indices, ...]:
     """Return the columns of ITEMS of one sensor, whose views are sorted by tracklet and epoch."""
     window = epoch_ns // window_ns
-    bounds = bounds_of_runs(window, tracklet)
+    bounds = group_offsets(window, tracklet)
     first, last = bounds[:-1], bounds[1:] - 1
     return (
         window[first],

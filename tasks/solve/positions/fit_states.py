@@ -29,7 +29,7 @@ from epipole.schemas.work_tables import SHARED_ERRORS, VIEWS
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, FittedOrbits, fit_orbits, prior_of
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, scale_shared_errors
-from epipole.tasks.common.equal_runs import bounds_of_runs
+from epipole.tasks.common.equal_runs import group_offsets
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -134,7 +134,7 @@ class _NamedArcs(NamedTuple):
 def _arcs_of(rows: pl.DataFrame) -> _NamedArcs:
     """Return the arcs of views that are sorted by arc and epoch."""
     arc = rows["arc"].to_numpy()
-    offsets = bounds_of_runs(arc)
+    offsets = group_offsets(arc)
     epoch_ns = rows["epoch"].cast(pl.Int64).to_numpy()
     epochs = [np.unique(epoch_ns[lo:hi]) for lo, hi in itertools.pairwise(offsets)]
     n_epochs = np.array([len(of_arc) for of_arc in epochs])
@@ -218,7 +218,7 @@ def _starts(positions: pa.Table, object_id: npt.NDArray[np.object_], middle_ns: 
     """Return initial states: the position at each arc's middle, and the slope there."""
     rows = to_polars(positions).sort("object_id", "epoch")
     name, epoch_ns = rows["object_id"].to_numpy(), rows["epoch"].cast(pl.Int64).to_numpy()
-    offsets = bounds_of_runs(name)
+    offsets = group_offsets(name)
     x_km = stack(rows, "{}_km")
     v_km_s, _ = velocities(offsets, (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)
     at = dict(zip(zip(name, epoch_ns.tolist(), strict=True), range(len(name)), strict=True))

@@ -11,7 +11,7 @@ from epipole.io.work.places import ViewedParts
 from epipole.schemas.bridge import array, concat, to_polars
 from epipole.schemas.spans import DAY_NS, Span, spans_between
 from epipole.schemas.work_tables import VIEWS
-from epipole.tasks.common.equal_runs import bounds_of_runs
+from epipole.tasks.common.equal_runs import group_offsets
 
 Indices = npt.NDArray[np.int64]
 
@@ -95,6 +95,6 @@ def _seen_by_two(views: pa.Table, number: Indices, sensor: Indices) -> Indices:
     missed = ~views["centroid"].is_valid().to_numpy()
     epoch_ns = array(views, "epoch")
     order = np.lexsort((missed, sensor, number, epoch_ns))
-    order = order[bounds_of_runs(epoch_ns[order], number[order], sensor[order])[:-1]]
-    count = np.diff(bounds_of_runs(epoch_ns[order], number[order]))
+    order = order[group_offsets(epoch_ns[order], number[order], sensor[order])[:-1]]
+    count = np.diff(group_offsets(epoch_ns[order], number[order]))
     return order[np.repeat(count, count) >= 2]

@@ -26,7 +26,12 @@ from epipole.tasks.solve.positions.fit_states import (
     with_stated_errors,
 )
 from epipole.tasks.solve.positions.gather_views import gather_views
-from epipole.tasks.solve.positions.keep_lines import Kept, claimed_views, keep_lines, moving_objects
+from epipole.tasks.solve.positions.sample_sight_lines import (
+    LineSampling,
+    claimed_views,
+    moving_objects,
+    sample_sight_lines,
+)
 from epipole.tasks.solve.positions.solve_positions import solve_positions
 
 
@@ -47,7 +52,7 @@ def solve_piece(
     viewed: ViewedParts,
     piece: Piece,
     margin_ns: int,
-    kept: Kept,
+    kept: LineSampling,
     settings: Settings,
     solved: SolvedParts,
 ) -> int:
@@ -77,7 +82,7 @@ def _solve(
     viewed: ViewedParts,
     piece: Piece,
     margin_ns: int,
-    kept: Kept,
+    kept: LineSampling,
     settings: Settings,
     solved: SolvedParts,
 ) -> dict[str, pa.Table]:
@@ -98,7 +103,7 @@ def _solve(
         "rejects": concat(REJECTS, [found.rejects, misfits]),
         "outcomes": judge_views(found.associations),
         # The check of the sensors holds the lines against the errors that the sensors state.
-        "lines": keep_lines(
+        "lines": sample_sight_lines(
             with_stated_errors(found.views, errors), found.associations, objects, kept
         ),
         "claims": claimed_views(found.views, objects),

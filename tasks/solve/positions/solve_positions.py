@@ -25,9 +25,9 @@ from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.independent_epochs import keep_independent
 from epipole.tasks.algorithms.orbits.object_motion import neglected_motion, velocities
-from epipole.tasks.common.equal_runs import bounds_of_runs
+from epipole.tasks.common.equal_runs import group_offsets
+from epipole.tasks.common.factorize import factorize
 from epipole.tasks.common.lone_detections import only_id
-from epipole.tasks.common.text_ranks import ranked
 from epipole.tasks.solve.positions.pair_views import association_table, pair_table
 from epipole.tasks.solve.positions.view_groups import ViewGroups
 
@@ -76,7 +76,7 @@ def solve_positions(
 def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> ViewGroups:
     views, number = _in_order(views, object_number)
     epoch_ns = array(views, "epoch")
-    offsets = bounds_of_runs(epoch_ns, number)
+    offsets = group_offsets(epoch_ns, number)
     r_km, sigma_km = stack(views, "{}_km"), array(views, "position_sigma_km")
     start = offsets[:-1]
     velocity = np.zeros((len(start), 3))
@@ -103,7 +103,7 @@ def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> ViewG
 
 def _in_order(views: pa.Table, number: Indices) -> tuple[pa.Table, Indices]:
     """Return the views in the order of epochs, objects and sensors."""
-    order = np.lexsort((ranked(views, "sensor_id").rank, number, array(views, "epoch")))
+    order = np.lexsort((factorize(views, "sensor_id").rank, number, array(views, "epoch")))
     if np.array_equal(order, np.arange(len(order))):
         return views, number
     return views.take(order), number[order]
@@ -187,7 +187,7 @@ def _independent(groups: ViewGroups, span: Span | None) -> npt.NDArray[np.bool_]
     if span is not None:
         outside = ~(span.holds(first_ns) & span.holds(last_ns))
         apart[groups.group[outside & groups.used]] = False
-    track, names = ranked(groups.views, "tracklet_id")
+    track, names = factorize(groups.views, "tracklet_id")
     until = np.full(len(names), np.iinfo(np.int64).min)
     # Copies: to numba a read-only array is another type.
     keep_independent(
@@ -267,7 +267,7 @@ def _reject_table(groups: ViewGroups) -> pa.Table:
         Reason.VIEW_REJECTED: ~groups.used & ~unsolved,
         Reason.NO_POSITION: unsolved,
     }
-    sensor, names = ranked(groups.views, "sensor_id")
+    sensor, names = factorize(groups.views, "sensor_id")
     tracklet_id = array(groups.views, "tracklet_id")
     epoch_ns = array(groups.views, "epoch")
     tables = []

@@ -18,7 +18,8 @@ from epipole.tasks.algorithms.geometry.optics_errors import shared_direction_cov
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
-from epipole.tasks.common.equal_runs import bounds_of_runs
+from epipole.tasks.common.equal_runs import group_offsets
+from epipole.tasks.common.factorize import factorize
 from epipole.tasks.common.lone_detections import in_lone_frames, with_lone_detections
 from epipole.tasks.common.sightings import (
     Frames,
@@ -27,7 +28,6 @@ from epipole.tasks.common.sightings import (
     sightings_of,
     solved_frames,
 )
-from epipole.tasks.common.text_ranks import ranked
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -120,10 +120,10 @@ def _with_lone(frames: Frames, detections: pa.Table, settings: Settings) -> pa.T
 
 def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
     sightings = sightings_of(frames, tracked)
-    rank, names = ranked(tracked, "tracklet_id")
+    rank, names = factorize(tracked, "tracklet_id")
     rank = rank[sightings.row]
     order = np.lexsort((sightings.frame, rank))
-    bounds = bounds_of_runs(rank[order])
+    bounds = group_offsets(rank[order])
     return TrackletSightings(
         sightings.frame[order],
         array(tracked, "centroid")[sightings.row[order]],

@@ -13,7 +13,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import SENSOR_EPOCHS, SOLUTIONS, VIEWED_TRACKLETS
-from epipole.tasks.common.equal_runs import bounds_of_runs
+from epipole.tasks.common.equal_runs import group_offsets
 from epipole.tasks.common.lone_detections import with_lone_tracklets
 from epipole.tasks.common.named_detections import detections_within
 from epipole.tasks.common.sightings import solved_frames
@@ -85,7 +85,7 @@ def sensor_epochs(epochs: pa.Table, solutions: pa.Table) -> pa.Table:
 
 def viewed_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
     """Return VIEWED_TRACKLETS of one sensor, in the order of the ids, as the views are."""
-    bounds = bounds_of_runs(array(views, "tracklet_id"))
+    bounds = group_offsets(array(views, "tracklet_id"))
     rows = with_lone_tracklets(tracklets, views.take(bounds[:-1])).sort_by("tracklet_id")
     columns = {name: rows[name] for name in rows.column_names}
     where = {"first_view": bounds[:-1], "n_views": np.diff(bounds)}

@@ -13,7 +13,11 @@ from epipole.tasks.check.check_sensors import (
     check_sensors,
     verdicts_of,
 )
-from epipole.tasks.solve.positions.keep_lines import Kept, keep_lines, moving_objects
+from epipole.tasks.solve.positions.sample_sight_lines import (
+    LineSampling,
+    moving_objects,
+    sample_sight_lines,
+)
 
 LATE = SensorVerdict("a", 0.25, 0.01, "clock")
 EARLY = SensorVerdict("b", -0.5, 0.01, "clock")
@@ -30,7 +34,7 @@ def test_an_offset_is_the_correction_and_what_remains_of_it():
 
 def test_without_views_no_clock_is_known():
     objects = moving_objects(empty(POSITIONS), 13_000_000_000)
-    lines = keep_lines(empty(VIEWS), empty(ASSOCIATIONS), objects, Kept(1))
+    lines = sample_sight_lines(empty(VIEWS), empty(ASSOCIATIONS), objects, LineSampling(1))
     assert lines.equals(empty(CLOCK_LINES))
     assert verdicts_of(to_polars(lines)) == []
     assert verdicts_of(to_polars(lines), {"a": 0.5}) == []

@@ -11,7 +11,7 @@ from epipole.schemas.bridge import array
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import EXPOSURES
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.place_sensors import place_sensors
+from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
 SETTINGS = Settings()
 
@@ -43,7 +43,7 @@ def with_points(exposures, x_px, y_px, shown, seed=0):
 
 def all_of(log, exposures):
     """Return the tables of identified stars; each centroid is in one of them, once."""
-    places = place_sensors(exposures, log.states, SETTINGS)
+    places = interpolate_sensor_states(exposures, log.states, SETTINGS)
     found = identify_stars(exposures, places, log.cameras, read_hipparcos(), SETTINGS)
     left_out = sum(found.rejects["count"].to_pylist())
     rows = found.stars.num_rows + found.detections.num_rows + left_out

@@ -28,7 +28,7 @@ def test_a_narrow_field_is_identified_lost_in_space_by_the_deep_catalogue(tmp_pa
 
     from epipole.tasks.catalogue.build_deep_catalogue import build_deep_catalogue
     from epipole.tasks.identify.identify_stars import identify_stars
-    from epipole.tasks.identify.place_sensors import place_sensors
+    from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
     stars = build_deep_catalogue()
     deep, log = tmp_path / "deep.parquet", tmp_path / "narrow.mcap"
@@ -36,7 +36,7 @@ def test_a_narrow_field_is_identified_lost_in_space_by_the_deep_catalogue(tmp_pa
     scene = {"name": "narrow", "duration_s": 20.0, "seed": 5, "catalogue": str(deep)}
     simulate(validate_scene(scene | {"sensors": [SENSOR]}, "narrow"), log)
     read = read_whole([str(log)], Settings())
-    places = place_sensors(read.exposures, read.states, Settings())
+    places = interpolate_sensor_states(read.exposures, read.states, Settings())
     found = identify_stars(read.exposures, places, read.cameras, stars, Settings())
 
     by_stars = array(found.solutions, "attitude_source") == "stars"

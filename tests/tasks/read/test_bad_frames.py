@@ -9,7 +9,7 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.settings import Settings
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.place_sensors import place_sensors
+from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 from epipole.tasks.track.build_tracklets import build_tracklets
 
 START_NS = 1_554_091_200_000_000_000
@@ -49,7 +49,7 @@ def track(tmp_path, frames):
                 x_px=places[:, 0], y_px=places[:, 1], sigma_px=np.full(len(places), SIGMA),
             )  # fmt: skip
     read = read_whole([str(path)], SETTINGS)
-    places = place_sensors(read.exposures, read.states, SETTINGS)
+    places = interpolate_sensor_states(read.exposures, read.states, SETTINGS)
     found = identify_stars(read.exposures, places, read.cameras, read_hipparcos(), SETTINGS)
     return build_tracklets(found.solutions, found.detections, read.cameras, SETTINGS), read
 

@@ -37,14 +37,14 @@ def seen(tmp_path_factory):
     from epipole.flows.simulate import simulate
     from epipole.io.catalogues.hipparcos import read_hipparcos
     from epipole.tasks.identify.identify_stars import identify_stars
-    from epipole.tasks.identify.place_sensors import place_sensors
+    from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
     folder = tmp_path_factory.mktemp("kinds")
     (folder / "scene.toml").write_text(SCENE)
     simulate(str(folder / "scene.toml"), folder / "k.mcap")
     settings = validate_settings({}, "test")
     log = read_whole([str(folder / "k.mcap")], settings)
-    places = place_sensors(log.exposures, log.states, settings)
+    places = interpolate_sensor_states(log.exposures, log.states, settings)
     found = identify_stars(log.exposures, places, log.cameras, read_hipparcos(), settings)
     truth = pl.read_parquet(folder / "k.mcap.truth" / "points.parquet")
     return found._replace(detections=steadied(found.detections, truth)), log.cameras, truth

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.evidence.pool import Hypothesis
+from epipole.tasks.algorithms.association.evidence.hypothesis_queue import Hypothesis
 from epipole.tasks.algorithms.association.sampling.views import Views
 
 Array = npt.NDArray[np.float64]

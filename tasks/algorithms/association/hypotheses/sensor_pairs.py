@@ -8,7 +8,7 @@ from epipole.tasks.algorithms.association.hypotheses.field_index import (
     FieldIndex,
     cell_at,
 )
-from epipole.tasks.algorithms.association.hypotheses.partners import meeting_pairs
+from epipole.tasks.algorithms.association.hypotheses.overlapping_fields import meeting_pairs
 from epipole.tasks.algorithms.association.hypotheses.seeds import SHORTEST_BASELINE_KM
 from epipole.tasks.algorithms.association.sampling.views import PLANE, Views, X, Y, direction
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel

@@ -14,14 +14,14 @@ from epipole.tasks.algorithms.star_identification.search.evidence import (
     MatchRule,
     chance_margin,
 )
-from epipole.tasks.algorithms.star_identification.search.field import (
+from epipole.tasks.algorithms.star_identification.search.lost_in_space import WORK_PER_S, search
+from epipole.tasks.algorithms.star_identification.search.match_stars import (
     Attitude,
     Centroids,
     Matches,
     solve_predicted,
     stars_about,
 )
-from epipole.tasks.algorithms.star_identification.search.lost_in_space import WORK_PER_S, search
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import (
     Image,
     Problem,

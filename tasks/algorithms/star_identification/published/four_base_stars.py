@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
     Matcher,
     identify_each_frame,
@@ -66,7 +66,7 @@ def match_four_base_stars(
 
 def identify_by_four_base_stars(
     t_s: Array,
-    frames: UnscaledCentroids,
+    frames: RawCentroids,
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import optimal_attitude
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids, unsolved
 from epipole.tasks.algorithms.star_identification.frames.frame import (
     FieldOfView,
     FrameCentroids,
@@ -17,7 +18,6 @@ from epipole.tasks.algorithms.star_identification.frames.frame import (
     Solution,
     aberrate_all,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids, unsolved
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sensor_limits import scale_of
 from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
@@ -55,7 +55,7 @@ def solve_matches(
 
 def identify_each_frame(
     make_matcher: Callable[[Sky, FieldOfView], Matcher],
-    spots: UnscaledCentroids,
+    spots: RawCentroids,
     skies: Skies,
     magnitude_limit: float | None,
     how: Search,

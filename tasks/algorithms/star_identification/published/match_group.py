@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.published.agreement import agreeing_candidates
 from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
     Matcher,
@@ -61,7 +61,7 @@ def states(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> npt.N
 
 def identify_by_match_group(
     t_s: Array,
-    frames: UnscaledCentroids,
+    frames: RawCentroids,
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
-from epipole.tasks.algorithms.star_identification.frames.spots import UnscaledCentroids
 from epipole.tasks.algorithms.star_identification.published.agreement import agreeing_candidates
 from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
     Matcher,
@@ -80,7 +80,7 @@ def match_radial_cyclic(
 
 def identify_by_radial_cyclic(
     t_s: Array,
-    frames: UnscaledCentroids,
+    frames: RawCentroids,
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,

@@ -6,11 +6,11 @@ the sky has fewer pairs that are so close.
 
 1. Pivots in the middle of the image come first: there, all neighbours of a star are in the image.
 2. Star after star is taken for the pivot. Where a companion has the separation of one of the star's
-   neighbours, it says how the image is turned. `turn_sieve` counts coarsely how many agree; where
+   neighbours, it says how the image is turned. `roll_votes` counts coarsely how many agree; where
    a star has many neighbours, a share of them must.
 3. Of stars with enough votes these are counted to their own tolerance.
 4. Where enough agree, the farthest of them gives the attitude, with which the other stars of the
-   field are looked up among the centroids (`stars_shown`): some twenty look-ups, where all
+   field are looked up among the centroids (`verify_field`): some twenty look-ups, where all
    centroids would be a thousand.
 5. What is left is tried on all centroids, as in `lost_in_space`.
 """
@@ -44,15 +44,15 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
     prepare_pair,
     try_pair,
 )
-from epipole.tasks.algorithms.star_identification.search.stars_shown import (
-    SHOWN,
-    make_places,
-    odds_of_field,
-)
-from epipole.tasks.algorithms.star_identification.search.turn_sieve import (
+from epipole.tasks.algorithms.star_identification.search.roll_votes import (
     LEVELS,
     count_turns,
     make_sieve,
+)
+from epipole.tasks.algorithms.star_identification.search.verify_field import (
+    SHOWN,
+    make_places,
+    odds_of_field,
 )
 from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
 

@@ -42,7 +42,7 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
     separation,
     try_pair,
 )
-from epipole.tasks.algorithms.star_identification.search.vote_sift import (
+from epipole.tasks.algorithms.star_identification.search.refine_votes import (
     MOST_SIFTED,
     add_vote,
     agreeing,

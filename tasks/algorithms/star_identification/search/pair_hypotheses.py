@@ -14,7 +14,7 @@ from epipole.tasks.algorithms.star_identification.search.evidence import (
     log_ways,
     match_evidence,
 )
-from epipole.tasks.algorithms.star_identification.search.field import Centroids, aberrated
+from epipole.tasks.algorithms.star_identification.search.match_stars import Centroids, aberrated
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
 from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid, nearest_star
 from epipole.tasks.algorithms.star_identification.sky.star_bands import (

@@ -14,7 +14,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import SHARED_ERRORS
 from epipole.tasks.solve.association.associate_block import object_members
 from epipole.tasks.solve.association.associate_objects import associate_objects
-from epipole.tasks.solve.positions.keep_lines import Kept
+from epipole.tasks.solve.positions.sample_sight_lines import LineSampling
 from epipole.tasks.solve.positions.solve_piece import Piece, solve_piece
 
 EVERY_NS = 10_000_000_000
@@ -42,7 +42,9 @@ def piece_of(folder, block, errors, piece=0, count=1):
     write_part(solved.objects.of(SPAN), NUMBERED, {"members": members})
     write_part(solved.errors.of(SPAN), JUDGED, {"errors": errors})
     made = Piece(SPAN, piece, count)
-    n_positions = solve_piece.fn(viewed, made, 30_000_000_000, Kept(EVERY_NS), settings, solved)
+    n_positions = solve_piece.fn(
+        viewed, made, 30_000_000_000, LineSampling(EVERY_NS), settings, solved
+    )
     part = solved.piece(SPAN, piece)
     assert read_part(part, "positions").num_rows == n_positions
     return part

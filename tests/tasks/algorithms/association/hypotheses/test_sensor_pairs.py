@@ -7,7 +7,7 @@ import pytest
 from scenes.tracklet_scenes import FIELD, GEO, V_GEO, Scene
 
 from epipole.tasks.algorithms.association.hypotheses.field_index import cones_of, field_index
-from epipole.tasks.algorithms.association.hypotheses.partners import fields_meet
+from epipole.tasks.algorithms.association.hypotheses.overlapping_fields import fields_meet
 from epipole.tasks.algorithms.association.hypotheses.sensor_pairs import SensorPairs
 from epipole.tasks.algorithms.association.sampling.views import views_of
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM

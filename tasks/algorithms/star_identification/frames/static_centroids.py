@@ -9,7 +9,9 @@ Array = npt.NDArray[np.float64]
 FEWEST_FRAMES, SHARE = 4, 0.3
 
 
-def persistent(first: npt.NDArray[np.int64], x_px: Array, y_px: Array) -> npt.NDArray[np.bool_]:
+def static_centroids(
+    first: npt.NDArray[np.int64], x_px: Array, y_px: Array
+) -> npt.NDArray[np.bool_]:
     """Return which centroids of a sensor's frames lie where many of its frames have one.
 
     So do stars where the sensor stares at one place of the sky: the caller decides.

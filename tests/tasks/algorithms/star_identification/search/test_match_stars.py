@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from epipole.tasks.algorithms.geometry.sky import aberrate
 from epipole.tasks.algorithms.star_identification.frames.frame import identify_predicted
-from epipole.tasks.algorithms.star_identification.search.field import (
+from epipole.tasks.algorithms.star_identification.search.match_stars import (
     Centroids,
     Matches,
     aberrated,

@@ -21,7 +21,7 @@ FEWEST = 3  # tracklets of an object that may gain or lose one
 
 
 @kernel
-def settle_contests(space, work, group, x_km):
+def resolve_conflicts(space, work, group, x_km):
     """Correct `group` (-1: no object) for tracklets that two objects explain.
 
     Only objects of three tracklets or more take part, and none falls below three.

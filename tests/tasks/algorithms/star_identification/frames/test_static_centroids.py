@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from epipole.tasks.algorithms.star_identification.frames.persistent import persistent
+from epipole.tasks.algorithms.star_identification.frames.static_centroids import static_centroids
 
 
 def frames(n_frames, hot, n_moving, seed=0, shown=0.8):
@@ -22,26 +22,26 @@ def test_hot_pixels_stay_and_hardly_any_other():
     hot = np.random.default_rng(1).uniform(0, 1023, (500, 2))
     hot[:100] = np.floor(hot[:100]) + 0.5 * np.random.default_rng(2).integers(0, 2, (100, 2))
     first, x, y, is_hot = frames(40, hot, 30)
-    stays = persistent(first, x, y)
+    stays = static_centroids(first, x, y)
     assert stays[is_hot].mean() > 0.99
     assert stays[~is_hot].mean() < 0.005  # those that fall on a hot pixel
 
 
 def test_few_frames_tell_nothing():
     first, x, y, _ = frames(3, np.full((5, 2), 100.0), 2, shown=1.1)
-    assert not persistent(first, x, y).any()
+    assert not static_centroids(first, x, y).any()
 
 
 def test_two_centroids_of_a_frame_at_one_pixel_count_once():
     first = np.arange(0, 22, 2)
     x, y = np.full((2, 20), 7.1)
     x[2 * 2 :] = np.arange(16) * 10.0  # only two frames show the pair
-    assert not persistent(first, x, y).any()
+    assert not static_centroids(first, x, y).any()
 
 
 def test_invalid_places_do_not_stay():
     first, bad = np.arange(11), np.full(10, np.nan)
-    assert not persistent(first, bad, np.full(10, 3.0)).any()
-    assert not persistent(first, np.full(10, np.inf), np.full(10, 3.0)).any()
-    assert not persistent(np.array([0]), np.empty(0), np.empty(0)).any()
-    assert persistent(first, np.full(10, -3.2), np.full(10, 3.0)).all()
+    assert not static_centroids(first, bad, np.full(10, 3.0)).any()
+    assert not static_centroids(first, np.full(10, np.inf), np.full(10, 3.0)).any()
+    assert not static_centroids(np.array([0]), np.empty(0), np.empty(0)).any()
+    assert static_centroids(first, np.full(10, -3.2), np.full(10, 3.0)).all()

@@ -1,4 +1,4 @@
-"""Pool: hypotheses, the likeliest first, and those that share tracklets with a given one."""
+"""Hypotheses, the likeliest first, and those that share tracklets with a given one."""
 
 import heapq
 from collections import defaultdict
@@ -24,7 +24,7 @@ class Hypothesis:
     missed: npt.NDArray[np.int64]
 
 
-class Pool:
+class HypothesisQueue:
     """Hypotheses, the likeliest first; ties by the lowest tracklets."""
 
     def __init__(self, hypotheses: Iterable[Hypothesis]) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from epipole.tasks.algorithms.star_identification.search.turn_sieve import (
+from epipole.tasks.algorithms.star_identification.search.roll_votes import (
     LEVELS,
     count_turns,
     make_sieve,

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from epipole.tasks.algorithms.association.evidence.hypothesis_queue import Hypothesis
 from epipole.tasks.algorithms.association.evidence.odds import score
-from epipole.tasks.algorithms.association.evidence.pool import Hypothesis
 from epipole.tasks.algorithms.association.hypotheses.field_index import near_points
 from epipole.tasks.algorithms.association.hypotheses.instant_points import possible, solve
 from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace, WorkSpace

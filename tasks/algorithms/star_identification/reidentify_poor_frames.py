@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.star_identification.frames.centroids import SensorCentroids, Solutions
 from epipole.tasks.algorithms.star_identification.frames.frame import (
     FrameCentroids,
     Search,
@@ -22,7 +23,6 @@ from epipole.tasks.algorithms.star_identification.frames.frame import (
     identify_lost,
     some_centroids,
 )
-from epipole.tasks.algorithms.star_identification.frames.spots import SensorCentroids, Solutions
 from epipole.tasks.algorithms.star_identification.sensor_limits import rematch
 from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
 from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
@@ -57,7 +57,7 @@ def poor_frames(solutions: Solutions) -> npt.NDArray[np.int64]:
     return np.flatnonzero(solutions.solved & (share < POOR * np.median(share[solutions.solved])))
 
 
-def look_again(
+def reidentify_poor_frames(
     frames: SensorCentroids, solutions: Solutions, where: SensorSky, how: Search
 ) -> Array:
     """Enter better solutions of poor frames; return (F,) factors on the errors of each frame.

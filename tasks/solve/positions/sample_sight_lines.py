@@ -20,7 +20,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 
-class Kept(NamedTuple):
+class LineSampling(NamedTuple):
     """Which lines of sight are kept: at epochs that are multiples of a time since midnight, one in
     so many of these."""
 
@@ -50,7 +50,9 @@ def claimed_views(views: pa.Table, objects: pa.Table) -> pa.Table:
     return conform(CLAIMED_VIEWS, views.take(_at_epochs(views, objects)))
 
 
-def keep_lines(views: pa.Table, associations: pa.Table, objects: pa.Table, kept: Kept) -> pa.Table:
+def sample_sight_lines(
+    views: pa.Table, associations: pa.Table, objects: pa.Table, kept: LineSampling
+) -> pa.Table:
     """Return CLOCK_LINES: views of objects at the epochs of MOVING_OBJECTS.
 
     Where only some are kept, each object loses other sensors at each epoch, and each sensor other
@@ -76,7 +78,7 @@ def _at_epochs(rows: pa.Table, objects: pa.Table) -> Indices:
     return np.flatnonzero(np.isin(array(rows, "epoch"), epochs))
 
 
-def _turn(associations: pa.Table, kept: Kept) -> Indices:
+def _turn(associations: pa.Table, kept: LineSampling) -> Indices:
     """Return a number below `one_in` of each view, evenly spread over sensors and objects."""
     numbers = []
     for name in ("sensor_id", "object_id"):

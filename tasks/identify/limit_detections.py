@@ -6,7 +6,7 @@ import numpy.typing as npt
 Flags = npt.NDArray[np.bool_]
 
 
-def within_bound(frame: npt.NDArray[np.int64], flux: npt.NDArray[np.float64], most: int) -> Flags:
+def within_limit(frame: npt.NDArray[np.int64], flux: npt.NDArray[np.float64], most: int) -> Flags:
     """Return which detections are kept, so that there are at most `most`.
 
     The fullest frames are cut to one number, and keep their brightest. Frames with fewer keep all.

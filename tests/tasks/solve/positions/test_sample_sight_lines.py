@@ -10,7 +10,12 @@ from scenes.associations import START_NS, filled
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS
 from epipole.schemas.work_tables import VIEWS
-from epipole.tasks.solve.positions.keep_lines import Kept, claimed_views, keep_lines, moving_objects
+from epipole.tasks.solve.positions.sample_sight_lines import (
+    LineSampling,
+    claimed_views,
+    moving_objects,
+    sample_sight_lines,
+)
 
 EVERY_NS = 10_000_000_000
 N_EPOCHS, N_OBJECTS, N_SENSORS = 20, 12, 30
@@ -36,10 +41,10 @@ def kept_lines():
     })  # fmt: skip
 
     def kept(one_in: int) -> pl.DataFrame:
-        choice = Kept(EVERY_NS, one_in)
+        choice = LineSampling(EVERY_NS, one_in)
         objects = moving_objects(positions, choice.every_ns)
         assert claimed_views(views, objects).num_rows == len(seen) // 2  # whatever is kept
-        return to_polars(keep_lines(views, associations, objects, choice))
+        return to_polars(sample_sight_lines(views, associations, objects, choice))
 
     return kept
 

@@ -16,7 +16,7 @@ from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_
 LOGGER = logging.getLogger(__name__)
 
 
-def states_in_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
+def states_to_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
     """Return SENSOR_STATES for the rows of LOG_STATES.
 
     For times outside the Earth-orientation table, sigmas of Earth-fixed positions are increased by

@@ -6,7 +6,7 @@ from scenes.random_stars import HOW, angle_between, frame, random_attitude, rand
 
 from epipole.tasks.algorithms.star_identification.frames.frame import problem_of
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import make_scratch
-from epipole.tasks.algorithms.star_identification.search.stars_shown import (
+from epipole.tasks.algorithms.star_identification.search.verify_field import (
     make_places,
     odds_of_field,
 )

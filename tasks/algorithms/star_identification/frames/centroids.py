@@ -47,7 +47,7 @@ class SensorCentroids(NamedTuple):
         return [self.frame(k) for k in range(len(self.beta))]
 
 
-class UnscaledCentroids(NamedTuple):
+class RawCentroids(NamedTuple):
     """Centroids of frames, brightest first in each, with their errors as stated.
 
     first : (F + 1,) int64
@@ -71,17 +71,17 @@ class UnscaledCentroids(NamedTuple):
         """(F,) centroids of each frame."""
         return np.diff(self.first)
 
-    def take(self, frames: Rows) -> "UnscaledCentroids":
+    def take(self, frames: Rows) -> "RawCentroids":
         """Return the centroids of these frames."""
         n = self.counts[frames]
         first = np.concatenate([[0], np.cumsum(n)])
         at = np.arange(first[-1]) + np.repeat(self.first[frames] - first[:-1], n)
-        return UnscaledCentroids(
+        return RawCentroids(
             first, self.u[at], self.pixel_rad[at], self.sigma_px[at], self.instrumental_mag[at],
             self.beta[frames], self.optics, self.optics_of[frames],
         )  # fmt: skip
 
-    def with_floor(self, floor_px: float) -> "UnscaledCentroids":
+    def with_floor(self, floor_px: float) -> "RawCentroids":
         """Return the centroids with an error that all have beside the stated ones."""
         return self._replace(sigma_px=np.hypot(self.sigma_px, floor_px))
 

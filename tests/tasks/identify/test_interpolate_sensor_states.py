@@ -10,7 +10,7 @@ from scenes.whole_logs import read_whole
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import array, stack
 from epipole.schemas.settings import Settings
-from epipole.tasks.identify.place_sensors import place_sensors
+from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -32,7 +32,7 @@ def write(path, sensors, n=5, **state):
 
 def place(path, settings=None):
     log = read_whole([path], Settings())
-    return log, place_sensors(log.exposures, log.states, settings or Settings())
+    return log, interpolate_sensor_states(log.exposures, log.states, settings or Settings())
 
 
 def test_places_go_row_by_row_with_the_exposures(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.star_identification.frame_quality import frame_scales
-from epipole.tasks.algorithms.star_identification.frames.spots import Solutions
+from epipole.tasks.algorithms.star_identification.frames.centroids import Solutions
 from epipole.tasks.algorithms.star_identification.sensor_sample import (
     Known,
     Sample,

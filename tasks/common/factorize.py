@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 
-class Ranked(NamedTuple):
+class Factorized(NamedTuple):
     """The rank of each row's text, (n,) int, among the distinct ones (-1: null); and these, in
     order."""
 
@@ -15,11 +15,11 @@ class Ranked(NamedTuple):
     texts: npt.NDArray[np.str_]
 
 
-def ranked(values: pa.Table, name: str) -> Ranked:
+def factorize(values: pa.Table, name: str) -> Factorized:
     """Return the ranks of a column of texts."""
     encoded = values[name].combine_chunks().dictionary_encode()
     texts = np.array(encoded.dictionary.to_pylist(), np.str_)
     order = np.argsort(texts)
     rank = np.full(len(order) + 1, -1)
     rank[order] = np.arange(len(order))
-    return Ranked(rank[encoded.indices.fill_null(len(order)).to_numpy()], texts[order])
+    return Factorized(rank[encoded.indices.fill_null(len(order)).to_numpy()], texts[order])

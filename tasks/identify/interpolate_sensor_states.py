@@ -23,7 +23,9 @@ LOGGER = logging.getLogger(__name__)
 FASTEST_KM_S, FARTHEST_KM = 2 * SPEED.greatest, 2 * POSITION.greatest
 
 
-def place_sensors(exposures: pa.Table, states: pa.Table, settings: Settings) -> pa.Table:
+def interpolate_sensor_states(
+    exposures: pa.Table, states: pa.Table, settings: Settings
+) -> pa.Table:
     """Return PLACES, one row per row of `exposures`; see `interpolate_states`.
 
     `states` are sorted by sensor and time, each time once, as `order_logs` returns them.
