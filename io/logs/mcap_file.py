@@ -1,5 +1,6 @@
 """An MCAP file that is written: channels, messages, and its name when it is complete."""
 
+import errno
 import os
 from pathlib import Path
 from types import TracebackType
@@ -33,6 +34,8 @@ class McapFile:
     ------
     ValueError
         Where the compression is unknown.
+    OSError
+        Where the path is that of a folder, or the file cannot be written.
     """
 
     def __init__(
@@ -46,6 +49,8 @@ class McapFile:
         if compression not in COMPRESSIONS:
             raise ValueError(f"compression {compression!r}: not one of {', '.join(COMPRESSIONS)}")
         self._path = Path(path)
+        if self._path.is_dir():  # told before all is written; an empty name is the current folder
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         self._partial = self._path.with_name(self._path.name + ".partial")
         self._file = self._partial.open("wb")
         self._writer = Writer(

@@ -4,8 +4,10 @@ import pytest
 from typer.testing import CliRunner
 
 from damage.odd_commands import fault_of, faults
+from damage.sound_logs import EXAMPLE
 from epipole.flows.command_line.main import app
 from epipole.io.catalogues.element_sets import parse_element_sets
+from epipole.schemas.errors import CatalogueError
 
 
 def test_odd_command_lines_end_in_one_line(tmp_path):
@@ -28,12 +30,14 @@ def test_odd_command_lines_end_in_one_line(tmp_path):
         ["run", "a.mcap", "--out", "x" * 300],
         ["deploy-files", "--out", "x/" * 2500], ["deploy-files", "--out", "x" * 300],
         ["evaluate", ".", "--truth", "x" * 300],
+        *(["overlay", "dataset", str(EXAMPLE), "--out", out] for out in ("", ".", "dataset")),
     ],
     ids=lambda words: " ".join(words)[:60],
 )  # fmt: skip
 def test_a_command_that_cannot_work_says_so_in_one_line(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "stray").touch()
+    (tmp_path / "dataset" / "night=2019-04-01" / "nights").mkdir(parents=True)
     assert fault_of(words) is None
     ended = CliRunner().invoke(app, words)
     assert ended.exit_code == 1, ended.stderr
@@ -55,3 +59,9 @@ def test_half_a_surrogate_pair_in_a_name_is_replaced():
     (found,), faults_ = parse_element_sets(f'[{{"OBJECT_NAME": "A\\ud800B", {fields}}}]'.encode())
     assert found.name.encode() == b"A?B"
     assert faults_ == []
+
+
+def test_a_field_of_csv_that_is_longer_than_any_is_an_error_of_one_line():
+    table = b"OBJECT_NAME,MEAN_MOTION\n" + b"x" * 131_073 + b",1\n"
+    with pytest.raises(CatalogueError, match="not an OMM in CSV: field larger than field limit"):
+        parse_element_sets(table)
