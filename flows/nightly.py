@@ -31,7 +31,6 @@ from epipole.flows.night.stages import (
     write_night,
 )
 from epipole.flows.night.summary import Summary, by_reason, many, summarise
-from epipole.flows.night.trail import Trail
 from epipole.flows.night.work import Work, plan_spans
 from epipole.flows.prefect.page import shown_on_page
 from epipole.flows.prefect.runners import runner_asked
@@ -109,8 +108,7 @@ def nightly(
         return summarise(out, {date: night_place(out, date) for date in same}, unchanged=True)
     # Claims are held by `with`: a signal that came while an ExitStack takes one would leave it.
     with claim_nights(out, [night] if night else []) as run:
-        trail = Trail()
-        frames = read(given.paths, ReadFolder(run), settings, trail)
+        frames = read(given.paths, ReadFolder(run), settings)
 
         nights = nights_of(np.concatenate([np.empty(0, np.int64), *frames.time_ns]))
         chosen = choose_nights(given.paths, nights, night, frames.rejects)
@@ -132,7 +130,7 @@ def nightly(
                     LOGGER.info("night %s", date)
                 work = work_folder(work_root(out), date, recipe.work_key(date))
                 folder = WorkFolder(kept.enter_context(work))
-                made = make_night(frames, date, folder, settings, trail)
+                made = make_night(frames, date, folder, settings)
                 earlier = EarlierNights(out, staged)
                 earlier_key = earlier.key(date, settings)
                 names = name(made.work, made.solved, date, earlier.last_views(date), settings)
@@ -142,10 +140,10 @@ def nightly(
                 staged[date] = staging / f"night={date}"
                 write_night(made.work, made.solved, date, names, whole, staged[date])
                 states = earlier.last_states(date, settings)
-                residuals = name_known(staged[date], elements, states, settings, trail)
+                residuals = name_known(staged[date], elements, states, settings)
                 faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]
                 write_night_row(staged[date], recipe, earlier_key, faults, residuals)
-            summary = publish(Destination(out, staged, replace), sources, trail)
+            summary = publish(Destination(out, staged, replace), sources)
             if settings.report.write:
                 summary = with_reports(summary, staged, staging)
     dataset = out.rstrip("/")
@@ -163,14 +161,14 @@ class MadeNight(NamedTuple):
 
 
 def make_night(
-    frames: OrderedFrames, night: str, folder: WorkFolder, settings: Settings, trail: Trail
+    frames: OrderedFrames, night: str, folder: WorkFolder, settings: Settings
 ) -> MadeNight:
     """Turn the frames of a night, and of half an hour before and after it, into solved objects.
 
     What a night holds does not depend on the other nights of the run.
     """
     spans, uncalibrated = plan_spans(frames, night)
-    work = identify(frames, spans, folder, settings, trail)
+    work = identify(frames, spans, folder, settings)
     work, told = find_cameras(work, settings)
     work, calibrations = calibrate(work, told, settings)
     while True:

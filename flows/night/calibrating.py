@@ -46,15 +46,12 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
         for sensor, of_sensor in work.spans.items()
         if refuses(sensor, work.identified[sensor], of_sensor, work.cameras)
     }
-    pairs = work._replace(spans=spans).of_sensors()
     futures = [
         find_sensor_camera.submit(
             work.frames, sensor, work.identified[sensor], of_sensor, work.cameras, settings,
-            wait_for=work.trail.after(*own),
         )
-        for (sensor, of_sensor), own in zip(spans.items(), pairs, strict=True)
+        for sensor, of_sensor in spans.items()
     ]  # fmt: skip
-    work.trail.ran(futures, pairs)
     findings: list[CameraFinding] = [
         finding for finding in results(Stage.CALIBRATE, futures) if finding is not None
     ]
@@ -99,16 +96,13 @@ def calibrate(work: Work, told: pa.Table, settings: Settings) -> tuple[Work, pa.
 def _fit_sensors(work: Work, told: pa.Table, but: set[str], settings: Settings) -> list[Calibrated]:
     """Fit the optics of each sensor but these to its stars."""
     spans = {sensor: own for sensor, own in work.spans.items() if sensor.sensor_id not in but}
-    pairs = work._replace(spans=spans).of_sensors()
     futures = [
         calibrate_sensor.submit(
             sensor, work.identified[sensor], of_sensor, work.cameras, told,
             settings.sensors.principal_point_sigma_px,
-            wait_for=work.trail.after(*own),
         )
-        for (sensor, of_sensor), own in zip(spans.items(), pairs, strict=True)
+        for sensor, of_sensor in spans.items()
     ]  # fmt: skip
-    work.trail.ran(futures, pairs)
     fits: list[Calibrated] = results(Stage.CALIBRATE, futures)
     return fits
 

@@ -109,15 +109,12 @@ def _view(night: _Night) -> dict[Span, int]:
     groups = [
         (span, group) for span in night.spans for group in _sensor_groups(work, sensors, span, most)
     ]
-    pairs = [[(sensor, span) for sensor in group] for span, group in groups]
     futures = [
         view_sensors.submit(
             [sensors[sensor] for sensor in group], span, night.grid, work.cameras, settings,
-            wait_for=work.trail.after(*own),
         )
-        for (span, group), own in zip(groups, pairs, strict=True)
+        for span, group in groups
     ]  # fmt: skip
-    work.trail.ran(futures, pairs)
     counts = results(Stage.SOLVE, futures, (0, STEPS))
     total = dict.fromkeys(night.spans, 0)
     for (span, _), count in zip(groups, counts, strict=True):
@@ -146,44 +143,35 @@ def _sensor_groups(
 
 def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str, Reason]) -> None:
     """Find the objects, a task per block, or per span where a task may hold all its views."""
-    futures, worked_on = [], []
+    futures = []
     for span in night.spans:
-        viewed_by = night.work.trail.after(*((sensor, span) for sensor in night.sensors))
         blocks = blocks_of(span, night.settings)
         together = n_views[span] <= night.settings.work.most_views
         for of_task in [blocks] if together else [[block] for block in blocks]:
             futures.append(
                 associate_blocks.submit(
                     night.sensors, night.viewed, of_task, night.work.cameras, left_out,
-                    night.settings, night.solved.blocks, wait_for=viewed_by,
+                    night.settings, night.solved.blocks,
                 )
             )  # fmt: skip
-            worked_on.append([span])
     results(Stage.SOLVE, futures, (1, STEPS))
-    night.work.trail.ran(futures, worked_on)
 
 
 def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     """Solve the objects, a task per piece; return the number of positions."""
     spans, settings, solved = night.spans, night.settings, night.solved
-    trail = night.work.trail
-    numbered = number_objects.submit(
-        spans, night.margin_ns, settings, solved, wait_for=trail.after(*spans)
-    )
+    numbered = number_objects.submit(spans, night.margin_ns, settings, solved)
     (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
-    trail.ran([numbered], [spans])
     viewed, margin_ns = night.viewed, night.margin_ns
     most_views = MOST_JUDGED * night.epochs_apart
     full = [span for span, count in zip(spans, counts, strict=True) if count]
     judged = [
         judge_span.submit(
             viewed, span, margin_ns, night.apart_ns, most_views, settings, solved,
-            wait_for=trail.after(span),
         )
         for span in full
     ]  # fmt: skip
     results(Stage.SOLVE, judged, (3, STEPS))
-    trail.ran(judged, [[span] for span in full])
     pieces = [
         Piece(span, number, count)
         for span, count in zip(spans, counts, strict=True)
@@ -192,13 +180,11 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     futures = [
         solve_piece.submit(
             viewed, piece, margin_ns, _kept_lines(night, n_views[piece.span]), settings, solved,
-            wait_for=trail.after(piece.span),
         )
         for piece in pieces
     ]  # fmt: skip
-    count = sum(results(Stage.SOLVE, futures, (4, STEPS)))
-    trail.ran(futures, [[piece.span] for piece in pieces])
-    return count
+    n_positions: int = sum(results(Stage.SOLVE, futures, (4, STEPS)))
+    return n_positions
 
 
 def _kept_lines(night: _Night, n_views: int) -> LineSampling:

@@ -16,7 +16,6 @@ import pyarrow as pa
 from epipole.flows.night.progress import results, step
 from epipole.flows.night.solving import solve_objects
 from epipole.flows.night.summary import Summary, many, summarise
-from epipole.flows.night.trail import Trail
 from epipole.flows.night.work import Spans, Work, spans_of_night
 from epipole.io.catalogues.known_objects import KnownObjects
 from epipole.io.work.part_tables import IDENTIFIED
@@ -56,28 +55,21 @@ LOGGER = logging.getLogger(__name__)
 # After the first correction the views of a sensor fit objects; from these the second is exact.
 MOST_CORRECTIONS = 2
 
-WRITTEN = "written"  # in the trail: the tasks that wrote the newest night
 
-
-def read(
-    logs: Sequence[str], folder: ReadFolder, settings: Settings, trail: Trail
-) -> OrderedFrames:
+def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> OrderedFrames:
     """Read the logs, a task per log, and order their frames and states."""
     futures = [read_log_into.submit(folder, k, log) for k, log in enumerate(logs)]
     held = results(Stage.READ, futures)
-    trail.ran(futures, [log.sensors for log in held])
     frames = order_logs(folder, held, settings)
     count = sum(len(time_ns) for time_ns in frames.time_ns)
     LOGGER.info("read %s of %s", many(count, "frame"), many(len(frames.sources), "log"))
     return frames
 
 
-def identify(
-    frames: OrderedFrames, spans: Spans, folder: WorkFolder, settings: Settings, trail: Trail
-) -> Work:
+def identify(frames: OrderedFrames, spans: Spans, folder: WorkFolder, settings: Settings) -> Work:
     """Place sensors, identify stars and solve attitudes, a task per sensor and span."""
     where = {sensor: folder.identified(sensor) for sensor in spans}
-    work = Work(frames.folder, folder, spans, frames.cameras, where, trail)
+    work = Work(frames.folder, folder, spans, frames.cameras, where)
     counts = identify_spans(Stage.IDENTIFY, work, settings)
     for outside in _outside_images(work, counts, settings):
         LOGGER.warning("%s", outside)
@@ -92,11 +84,9 @@ def identify_spans(stage: Stage, work: Work, settings: Settings) -> list[Counts]
     futures = [
         identify_span.submit(
             work.frames, sensor, span, work.cameras, settings, work.identified[sensor],
-            wait_for=work.trail.after(sensor.sensor_id, (sensor, span)),
         )
         for sensor, span in work.by_span()
     ]  # fmt: skip
-    work.trail.ran(futures, [[pair] for pair in work.by_span()])
     counts: list[Counts] = results(stage, futures)
     frames, by_stars, stars = (
         sum(getattr(count, name) for count in counts) for name in ("frames", "by_stars", "stars")
@@ -126,20 +116,16 @@ def track(work: Work, night: str, settings: Settings) -> None:
     futures = [
         track_span.submit(
             sensor, parts[sensor].identified, span, work.cameras, settings, parts[sensor].tracked,
-            wait_for=work.trail.after((sensor, span)),
         )
         for sensor, span in work.by_span()
     ]  # fmt: skip
-    work.trail.ran(futures, [[pair] for pair in work.by_span()])
     results(Stage.TRACK, futures)
     futures = [
         join_tracklets.submit(
             sensor, parts[sensor].tracked, spans, night, parts[sensor].names,
-            wait_for=work.trail.after(*own),
         )
-        for (sensor, spans), own in zip(work.spans.items(), work.of_sensors(), strict=True)
+        for sensor, spans in work.spans.items()
     ]  # fmt: skip
-    work.trail.ran(futures, work.of_sensors())
     count = sum(results(Stage.TRACK, futures))
     LOGGER.info("followed %s", many(count, "tracklet"))
 
@@ -169,9 +155,7 @@ def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     """Judge the sensors by all spans; correct wrong clocks if the settings say so."""
     step(Stage.CHECK, 0, 1)
     viewed, spans = work.folder.viewed(work.round), work.all_spans()
-    verdicts: list[SensorVerdict] = check_sensors(
-        solved, viewed, list(work.spans), spans, wait_for=work.trail.after(*spans)
-    )
+    verdicts: list[SensorVerdict] = check_sensors(solved, viewed, list(work.spans), spans)
     tell_verdicts(verdicts)
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
     late = [verdict for verdict in faulty if verdict.is_late]
@@ -222,11 +206,10 @@ def _correct_clocks(work: Work, wrong: Sequence[SensorVerdict], settings: Settin
     futures = [
         correct_clock.submit(
             work.frames, sensor, work.identified[sensor], span, clocks[sensor.sensor_id], settings,
-            where[sensor], wait_for=work.trail.after((sensor, span), span),
+            where[sensor],
         )
         for sensor, span in pairs
     ]  # fmt: skip
-    work.trail.ran(futures, [[pair] for pair in pairs])
     results(Stage.CHECK, futures)
     entered = {sensor: _enter_spans(where[sensor], work.spans[sensor]) for sensor in where}
     spans = {
@@ -268,7 +251,6 @@ def name(
                 rows.append(renamed(outermost(piece), numbers[span.folder]))
     first: dict[str, str] = link_objects(
         concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings,
-        wait_for=work.trail.after(*spans),
     )  # fmt: skip
     linked = {
         folder: {old: first.get(number, number) for old, number in of_span.items()}
@@ -322,10 +304,8 @@ def write_night(
     sensors = list(work.sensor_parts().values())
     own = spans_of_night(spans, night)
     parts = NightParts(night, own, spans, sensors, solved, names, whole)
-    solved_by = work.trail.after(*own)
-    futures = [write_tables.submit(tables, folder, parts, wait_for=solved_by) for tables in SHARES]
+    futures = [write_tables.submit(tables, folder, parts) for tables in SHARES]
     results(Stage.PUBLISH, futures)
-    work.trail.ran(futures, [[WRITTEN]] * len(futures))
 
 
 def choose_elements(
@@ -352,22 +332,17 @@ def name_known(
     known: ElementsOfNight | None,
     earlier: pa.Table,
     settings: Settings,
-    trail: Trail,
 ) -> list[SensorResidual]:
     """Name the known objects of a night whose tables are written; see `name_known_objects`."""
-    future = name_known_objects.submit(
-        folder, known, earlier, settings, wait_for=trail.after(WRITTEN)
-    )
+    future = name_known_objects.submit(folder, known, earlier, settings)
     (residuals,) = results(Stage.PUBLISH, [future])
-    trail.ran([future], [[WRITTEN]])
     return residuals
 
 
-def publish(destination: Destination, sources: pa.Table, trail: Trail) -> Summary:
+def publish(destination: Destination, sources: pa.Table) -> Summary:
     """Put all nights in place, and return what they hold."""
     summary = summarise(destination.dataset, destination.staged)
     publish_nights(
         destination.dataset, destination.staged, sources, destination.replace,
-        wait_for=trail.after(WRITTEN),
     )  # fmt: skip
     return summary

@@ -7,7 +7,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.flows.night.trail import Trail
 from epipole.io.work.parts import Parts
 from epipole.io.work.places import ReadFolder, SensorParts, WorkFolder
 from epipole.schemas.bridge import concat
@@ -32,7 +31,6 @@ class Work(NamedTuple):
     spans: Spans  # with frames, of each sensor
     cameras: pa.Table
     identified: dict[Sensor, Parts]  # the newest of each sensor
-    trail: Trail
     round: int = 0
     verdicts: tuple[SensorVerdict, ...] = ()  # of the logs, before any correction
 
@@ -44,10 +42,6 @@ class Work(NamedTuple):
         """Return each sensor and span, in order of time: sensors are worked on together."""
         pairs = [(sensor, span) for sensor, spans in self.spans.items() for span in spans]
         return sorted(pairs, key=lambda pair: (pair[1], pair[0]))
-
-    def of_sensors(self) -> list[list[tuple[Sensor, Span]]]:
-        """Return each sensor's spans, as `by_span` has them."""
-        return [[(sensor, span) for span in spans] for sensor, spans in self.spans.items()]
 
     def sensor_parts(self) -> dict[Sensor, SensorParts]:
         """Return where the parts of each sensor lie in this round."""

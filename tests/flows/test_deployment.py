@@ -150,28 +150,6 @@ def test_the_page_shows_named_task_runs_logs_and_artifacts(deployed):
     assert "| objects | 9 |" in shown["night"]
 
 
-def test_the_page_draws_which_task_follows_which(deployed):
-    completed = {"state": {"type": {"any_": ["COMPLETED"]}}}
-    (run,) = deployed.prefect.find("flow_runs", flow_runs=completed)
-    nodes = dict(deployed.prefect.get(f"flow_runs/{run['id']}/graph-v2")["nodes"])
-    before = {
-        node["label"]: {nodes[each["id"]]["label"] for each in node["parents"]}
-        for node in nodes.values()
-    }
-    stages = {name: {each.split()[0] for each in names} for name, names in before.items()}
-    assert [name.split()[0] for name, own in stages.items() if not own] == ["read"]
-    assert {own for of_task in stages.values() for own in of_task} == {
-        "read",
-        "identify",
-        "calibrate",
-        "track",
-        "solve",
-        "name",
-        "publish",
-    }
-    assert before["track sat3 04:00-04:30"] == {"calibrate sat3"}
-
-
 def test_a_wrong_parameter_is_refused_before_a_run_is_made(deployed):
     before = len(deployed.prefect.find("flow_runs"))
     asked = deployed.prefect.command(

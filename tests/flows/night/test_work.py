@@ -6,7 +6,6 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from epipole.flows.night.trail import Trail
 from epipole.flows.night.work import Work, plan_spans
 from epipole.io.work.places import ReadFolder, WorkFolder
 from epipole.schemas.bridge import empty
@@ -75,7 +74,7 @@ def test_invalid_calibrations_are_named_where_there_are_no_others():
 def test_neighbours_are_worked_on_together():
     found = frames(["a", "b"], a=[1.0, 2.0], b=[1.0, 2.0])
     spans, _ = plan_spans(found, NIGHT)
-    work = Work(found.folder, WorkFolder(Path("/nowhere")), spans, found.cameras, {}, Trail())
+    work = Work(found.folder, WorkFolder(Path("/nowhere")), spans, found.cameras, {})
     order = [(sensor.sensor_id, span.start_ns % DAY_NS) for sensor, span in work.by_span()]
     one, two = 2 * SPAN_NS, 4 * SPAN_NS
     assert order == [("a", one), ("b", one), ("a", two), ("b", two)]
