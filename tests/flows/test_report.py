@@ -106,8 +106,9 @@ def test_in_an_object_store_the_report_is_the_same(s3, night_log, prefect, night
     stored = s3.cat_file(f"nights/reported/reports/{NIGHT}.html").decode()
     local = (night_dataset / "reports" / f"{NIGHT}.html").read_text()
     assert stored.replace(out, "OUT") == local.replace(str(night_dataset), "OUT")
-    report(out, NIGHT, tmp_path / "a.html")
-    assert (tmp_path / "a.html").read_text() == stored
+    for name in ("a.html", "b.html"):
+        report(out, NIGHT, tmp_path / name)
+        assert (tmp_path / name).read_text() == stored
 
 
 def test_the_trend_is_of_the_nights_before(night_dataset, tmp_path):

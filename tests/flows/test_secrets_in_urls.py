@@ -133,9 +133,10 @@ def test_keys_of_a_store_may_stand_in_the_url(s3, night_log, tmp_path, monkeypat
         monkeypatch.delenv(name)
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv(SECRETS, "")
-    code, printed = epipole("info", "--json", f"s3://key:{PASSWORD}@logs/keys/night.mcap")
-    assert code == 0, printed
-    assert json.loads(printed[printed.index("[") :])[0]["log"] == "s3://logs/keys/night.mcap"
+    for _ in range(2):
+        code, printed = epipole("info", "--json", f"s3://key:{PASSWORD}@logs/keys/night.mcap")
+        assert code == 0, printed
+        assert json.loads(printed[printed.index("[") :])[0]["log"] == "s3://logs/keys/night.mcap"
 
 
 def test_urls_that_differ_in_secrets_only_are_refused():

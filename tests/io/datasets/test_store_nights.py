@@ -13,18 +13,14 @@ from pathlib import Path
 import polars as pl
 import pytest
 from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, TIMES, night_tables
-from scenes.published import publish
+from scenes.published import publish as publish_once
+from scenes.twice import twice
 
 from epipole.flows.evaluate import evaluate
 from epipole.flows.night.dataset.held_nights import held_nights
 from epipole.flows.nightly import nightly
-from epipole.io.datasets import store_claims
-from epipole.io.datasets.dataset import (
-    check_folder,
-    claim_nights,
-    nights_in,
-    read_table,
-)
+from epipole.io.datasets import dataset, store_claims
+from epipole.io.datasets.dataset import claim_nights
 from epipole.io.datasets.night_holder import Holder
 from epipole.io.datasets.store_nights import store_nights
 from epipole.schemas.errors import DatasetError
@@ -38,6 +34,10 @@ WHOLE_NIGHT = (
     "identifications",
 )  # tables that are not of an instant
 pytestmark = pytest.mark.long
+
+publish = twice(publish_once)  # not where the first time is what is tested
+check_folder, nights_in = twice(dataset.check_folder), twice(dataset.nights_in)
+read_table = twice(dataset.read_table)
 
 
 @pytest.fixture
@@ -69,14 +69,15 @@ def test_a_night_in_a_bucket_is_what_it_is_in_a_folder(s3, out, tmp_path):
 def test_polars_reads_a_dataset_in_a_bucket(s3, out):
     publish(out, night_tables(OVER_MIDNIGHT), [NIGHT, NEXT_NIGHT])
     scan = pl.scan_parquet(f"{out}/night=*/positions/*.parquet", hive_partitioning=True)
-    assert scan.group_by("night").len().sort("night").collect()["len"].to_list() == [10, 10]
+    for _ in range(2):
+        assert scan.group_by("night").len().sort("night").collect()["len"].to_list() == [10, 10]
 
 
 def test_publishing_again_replaces_a_night_whole(s3, out):
     publish(out, night_tables(OVER_MIDNIGHT), [NIGHT, NEXT_NIGHT])
     before = files(s3, out)
     s3.pipe_file(f"{out}/night={NIGHT}/frames/part-1.parquet", b"of an older version")
-    publish(out, night_tables(TIMES[:5]), [NIGHT])
+    publish_once(out, night_tables(TIMES[:5]), [NIGHT])
     assert read_table(out, "frames", NIGHT).num_rows == 5
     after = files(s3, out)
     assert after.keys() == before.keys()
@@ -112,7 +113,7 @@ def test_a_reader_meets_whole_tables_at_every_instant(s3, out):
             path = f"{out}/night=*/positions/*.parquet"
             with contextlib.suppress(pl.exceptions.ComputeError):  # replaced while it was read
                 seen.append(("glob", len(pl.scan_parquet(path, hive_partitioning=True).collect())))
-            seen.append(("read", read_table(out, "positions", NIGHT).num_rows))
+            seen.append(("read", dataset.read_table(out, "positions", NIGHT).num_rows))
 
     reader = threading.Thread(target=look)
     reader.start()
@@ -179,7 +180,7 @@ def test_a_publisher_killed_at_any_write_has_published_both_nights_or_none(s3, o
     for night in old:  # of every table, as our own readers see it
         rows = counts(out, night)
         assert {n for name, n in rows.items() if name not in WHOLE_NIGHT} == {found[night]}
-    publish(out, night_tables(OVER_MIDNIGHT), [NIGHT])
+    publish_once(out, night_tables(OVER_MIDNIGHT), [NIGHT])
     assert counts(out, NIGHT)["frames"] == 10
     assert counts(out, NEXT_NIGHT)["frames"] == found[NEXT_NIGHT]
     assert [p for p in s3.find(out) if "/.staging/" in p] == []
@@ -208,12 +209,12 @@ def test_a_store_that_refuses_a_write_ends_in_one_line_and_no_half_night(
         for name in ("put_file", "pipe_file", "cp_file"):
             patched.setattr(storage, name, refusing(getattr(storage, name)))
         with pytest.raises(DatasetError, match="read-only now") as caught:
-            publish(out, night_tables(OVER_MIDNIGHT, seed=5), [NIGHT, NEXT_NIGHT])
+            publish_once(out, night_tables(OVER_MIDNIGHT, seed=5), [NIGHT, NEXT_NIGHT])
     assert "\n" not in str(caught.value)
     storage.invalidate_cache()
     found = {night: counts(out, night)["frames"] for night in (NIGHT, NEXT_NIGHT)}
     assert found in ({NIGHT: 8, NEXT_NIGHT: 0}, {NIGHT: 10, NEXT_NIGHT: 10})
-    publish(out, night_tables(OVER_MIDNIGHT), [NIGHT])
+    publish_once(out, night_tables(OVER_MIDNIGHT), [NIGHT])
     assert counts(out, NIGHT)["frames"] == 10
     assert [p for p in s3.find(out) if "/.staging/" in p] == []
 
@@ -263,7 +264,7 @@ def test_a_claim_is_renewed_while_its_run_works(s3, out, monkeypatch):
 def test_a_committed_night_is_read_before_its_files_are_in_place(s3, out, monkeypatch):
     store = store_nights(out)
     monkeypatch.setattr(store, "_finish", lambda commit: None)
-    publish(out, night_tables(TIMES), [NIGHT])
+    publish_once(out, night_tables(TIMES), [NIGHT])
     monkeypatch.undo()
     assert nights_in(out) == [NIGHT]
     assert read_table(out, "positions", NIGHT).num_rows == len(TIMES)
