@@ -77,7 +77,11 @@ def test_the_command_shows_a_line_per_night_that_fits_a_terminal(dataset):
 
 
 def test_the_command_says_where_there_is_nothing(dataset, tmp_path):
-    assert nights(tmp_path / "none") == "no nights\n"
+    (tmp_path / "empty").mkdir()
+    assert nights(tmp_path / "empty") == "no nights\n"
+    missing = CliRunner().invoke(app, ["nights", str(tmp_path / "none")])
+    assert missing.exit_code == 1
+    assert missing.output.endswith("none: no such folder; check the path\n")
     assert nights(dataset, "--stale") == "no night is stale\n"
 
 
