@@ -19,8 +19,7 @@ Nanoseconds = npt.NDArray[np.int64]
 def own_range(times: Sequence[Nanoseconds]) -> tuple[int, int] | None:
     """Return the first and last of the times near their median; None where there are none.
 
-    Of an even number the later of the two middle ones counts: clocks that were not set tell
-    times of the past.
+    Unset clocks read early, so take the upper median.
     """
     time_ns = np.concatenate([np.empty(0, np.int64), *times])
     n = len(time_ns)

@@ -45,8 +45,8 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 LOGGER = logging.getLogger(__name__)
 
-# Of a sensor that identifies no more of its frames than FEW, the camera is searched for. Where none
-# is found, that is said of one that identifies no more than HARDLY_ANY.
+# Search for the camera of a sensor if at most FEW of its frames were identified. Warn that none was
+# found only if at most HARDLY_ANY were.
 FEW, HARDLY_ANY = 0.5, 0.05
 # The stars of a frame, if optics are right, are all over the image: their variance is that of even
 # places. With strong distortion, dense clusters of stars match alone.
@@ -175,8 +175,8 @@ def find_sensor_camera(
 ) -> CameraFinding | None:
     """Return what can be found of the camera of a sensor that `refuses` its frames.
 
-    None for one with several calibrations or with few centroids, and for one that identifies some
-    of its frames with the camera it has and shows hardly more stars with another one.
+    None if the sensor has several calibrations or too few centroids, or if it identifies some
+    frames with its own camera and no other camera matches clearly more stars.
     """
     camera = _only_camera(cameras, sensor.sensor_id)
     tried = _solutions(identified, spans).filter(pc.field("n_centroids") >= FEWEST)

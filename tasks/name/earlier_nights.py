@@ -27,7 +27,7 @@ def recognise_objects(
     folder
         The night's folder; its `states` are written.
     objects
-        Ids of the objects to recognise. One that an earlier night has under its id is not asked.
+        Ids of the objects to recognise. Ids that an earlier night knows already are skipped.
     earlier
         STATES of earlier nights.
 

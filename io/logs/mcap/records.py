@@ -39,8 +39,8 @@ from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
 from epipole.io.logs.mcap.undeclared import Channels, LateMessages, Undeclared
 from epipole.schemas.rejects import Reason
 
-# All chunks of a log together may declare so many times the bytes of the file, and at least so many
-# bytes: what they cost is bounded by the file. Logs of frames shrink to a half or a tenth.
+# The uncompressed size of all chunks together may not exceed max(16 MiB, 200 x the file's size):
+# so the file bounds what they cost. Logs of frames shrink to a half or a tenth.
 MOST_EXPANSION = 200
 LEAST_UNPACKED_BYTES = 16 << 20
 

@@ -5,10 +5,10 @@ their rate. A wrong ephemeris moves the lines by its error over the range, a wro
 them all alike. The objects' positions, and for each sensor a clock offset, a bias of its position
 and one of its attitude, are solved together.
 
-Most sensors are sound. For sensors that look in similar directions, several wrong clocks may have
-the effect of another one, and a wrong ephemeris or attitude that of a wrong clock. So all sensors
-are judged together: the fewest faults that explain the lines far better than sound sensors do, and
-better than other faults. Where the sensor is clear and its fault is not, it only disagrees.
+Most sensors are sound. Clock errors of sensors that look the same way cannot be separated, and a
+wrong ephemeris or attitude may look like a wrong clock. So all sensors are judged together: the
+fewest faults that explain the lines far better than sound sensors do, and better than other faults.
+Where the sensor is clear and its fault is not, it only disagrees.
 """
 
 import itertools

@@ -1,9 +1,9 @@
 """How good the centroids of each frame are, where a log does not say: from the stars' residuals.
 
 Frames of one sensor may differ: it turns faster, the image is blurred, exposures change. A frame's
-own residuals say so, but those of few stars say little. So each frame's variance is drawn towards
-that of all, by as much as the frames are alike (empirical Bayes: Smyth, Statistical Applications in
-Genetics and Molecular Biology 3, 2004, article 3, sections 4 and 6.2).
+residuals say so, but with few stars the estimate is noisy. So each frame's variance is shrunk
+towards the sensor's mean (empirical Bayes: Smyth, Statistical Applications in Genetics and
+Molecular Biology 3, 2004, article 3, sections 4 and 6.2).
 """
 
 import numpy as np
@@ -32,7 +32,7 @@ def frame_scales(square_sum: Array, dof: npt.NDArray[np.int64]) -> Array:
 
     Returns
     -------
-    (F,) float, of frames without an attitude that of all.
+    (F,) float. Frames without an attitude get the sensor's scale.
     """
     told = dof > 0
     if not told.any():

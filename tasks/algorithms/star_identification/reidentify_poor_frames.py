@@ -33,9 +33,9 @@ Array = npt.NDArray[np.float64]
 POOR = 0.6  # of the share of centroids that are stars, in the sensor's typical frame
 LEAST_FRAMES = 5  # from which that is known
 MORE_STARS = 1.5  # times as many are shown with larger errors, if these are true
-LIKELIER = 3.0  # (ln) of two attitudes the one whose evidence is larger by this
+LIKELIER = 3.0  # (ln) least gain in evidence to replace an attitude
 WORSE = (2.0, 4.0, 8.0, 16.0)  # factors on errors
-SETTLING, LEAST_DOF = 3, 5  # errors are then those of the residuals, if these are so many
+SETTLING, LEAST_DOF = 3, 5  # iterations of rescaling the errors; least degrees of freedom
 PATIENCE = 4  # searches in a row that find nothing better; then ever fewer frames are searched
 
 

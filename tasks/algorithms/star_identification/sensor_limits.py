@@ -91,8 +91,9 @@ def rematch(
 def likeliest_floor(
     spots: RawCentroids, solutions: list[Solution | None], sky: Sky, how: Search, scale: float
 ) -> float:
-    """Return the error [px] that all centroids have beside the stated ones, 0 where there is none
-    or where the stated ones times `scale` explain the frames as well.
+    """Return the error [px] to add in quadrature to the stated sigmas.
+
+    0 where none is needed, or where the stated sigmas times `scale` explain the frames as well.
 
     Stated errors of photons alone leave out those of pixels, of the lens and of the catalogue. So
     the brightest stars lie many of their sigmas off. The evidence of solved frames decides.

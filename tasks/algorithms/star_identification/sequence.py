@@ -37,8 +37,8 @@ from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
 
 Array = npt.NDArray[np.float64]
 
-# Where searches keep failing: after this many, frames are skipped, ever more of them, up to so many
-# or to this share of the frames since the last success. The way back tries them.
+# Where searches keep failing: after PATIENCE of them, back off exponentially to at most
+# max(32, n / 32) skipped frames of the n since the last success. The backward pass retries them.
 PATIENCE, HOPELESS = 6, 1  # `HOPELESS` more than patience, where searches have failed before
 MAX_SKIPPED, SKIPPED_SHARE = 32, 1 / 32
 NO_CENTROIDS = 5

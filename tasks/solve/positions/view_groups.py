@@ -1,4 +1,4 @@
-"""ViewGroups of views: those of one object at one epoch, and the solution of each."""
+"""Views grouped by object and epoch, and the solution of each group."""
 
 from typing import NamedTuple
 

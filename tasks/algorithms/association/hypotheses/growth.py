@@ -30,7 +30,7 @@ ENOUGH = 4  # views that fix a point well enough to choose them all again
 WELL_KNOWN = 8  # views after which a sensor's choice needs no review
 COMPLETE = 0.85  # of the expected detections, those of a clear hypothesis
 REVIEWS = 2  # the first may still rest on a false member
-DROPPED_TOGETHER = 64  # of so many members one more is dropped at a time
+DROPPED_TOGETHER = 64  # 1 + n // 64 of n members are dropped per pass
 
 
 class Grown(NamedTuple):
