@@ -4,8 +4,6 @@ Spans are counted from 1970, not from the first frame, and a day is a whole numb
 another log of a night does not shift them, and no span contains a midnight.
 """
 
-import datetime
-import re
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +14,6 @@ from epipole.schemas.bridge import array
 
 DAY_NS = 86_400_000_000_000
 SPAN_NS = 1_800_000_000_000  # half an hour: enough tasks for many workers, but few per night
-
-# The years all of whose instants are nanoseconds since 1970 in 64 bits.
-FIRST_YEAR, LAST_YEAR = 1678, 2261
-_DATE = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
 
 BLOCK_NS = 600_000_000_000  # divides a span: the longest evidence that tracklets are one object
 
@@ -82,18 +76,6 @@ def spans_between(start_ns: int, end_ns: int) -> list[Span]:
     """Return the spans that cover the time from one instant to another."""
     first, last = start_ns // SPAN_NS, -(-end_ns // SPAN_NS)
     return [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in range(first, last)]
-
-
-def is_night(text: object) -> bool:
-    """Return whether a text is the name of a night: a UTC date such as ``2019-04-01``."""
-    try:
-        return (
-            isinstance(text, str)
-            and _DATE.fullmatch(text) is not None
-            and FIRST_YEAR <= datetime.date.fromisoformat(text).year <= LAST_YEAR
-        )
-    except ValueError:
-        return False
 
 
 def day_of(night: str) -> int:

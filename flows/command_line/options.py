@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from epipole.schemas.spans import FIRST_YEAR, LAST_YEAR, is_night
+from epipole.schemas.dates import FIRST_YEAR, LAST_YEAR, is_night
 
 Logs = Annotated[
     list[str], typer.Argument(metavar="LOG", help="MCAP files, folders, glob patterns or URLs.")

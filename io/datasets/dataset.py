@@ -26,8 +26,9 @@ from epipole.io.datasets.table_pieces import Between, read_pieces
 from epipole.io.names import fault_of_name
 from epipole.io.remote_files import known_as, line_of, shown_error, storage_errors
 from epipole.schemas.bridge import conform
+from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.spans import Span, is_night
+from epipole.schemas.spans import Span
 from epipole.schemas.tables import TABLES
 
 REPORTS = "reports"  # beside the nights, never in them: readers scan night=*

@@ -34,8 +34,8 @@ from typing import IO, NamedTuple
 from epipole.io.datasets.folder_swap import put_in_place, sync, take_back
 from epipole.io.datasets.night_holder import Holder
 from epipole.io.datasets.plain_files import entered, opened, read_small, refuse_link
+from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.spans import is_night
 
 LOGGER = logging.getLogger(__name__)
 

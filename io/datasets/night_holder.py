@@ -10,8 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Self
 
+from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.spans import is_night
 
 
 @dataclass(frozen=True)

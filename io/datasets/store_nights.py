@@ -25,8 +25,8 @@ from typing import Any
 
 from epipole.io.datasets.store_claims import STAGING, StoreClaims
 from epipole.io.remote_files import file_system, line_of, storage_errors
+from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.spans import is_night
 
 REQUESTS = 8  # at the same time
 LAST = "sources"  # the table that completes a night

@@ -7,8 +7,8 @@ from typing import NamedTuple
 from epipole.io.datasets.dataset import claim_nights, dataset_folder
 from epipole.io.datasets.local_nights import claimed_nights
 from epipole.io.work.folder import NAME, work_root
+from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.spans import is_night
 
 
 class Unfinished(NamedTuple):
