@@ -32,7 +32,7 @@ SECTIONS = {
         "docs/methods/sensors.md", "docs/methods/boresight.md",
     ),
     "How good": ("docs/limits.md", "docs/damage.md", "BENCHMARKS.md"),
-    "Project": ("docs/README.md", "CONTRIBUTING.md", "CHANGELOG.md"),
+    "Project": ("docs/README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"),
 }  # fmt: skip
 RENAMED = {
     "README.md": "index.md",
@@ -42,6 +42,7 @@ RENAMED = {
     "BENCHMARKS.md": "benchmarks.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
 }
 TITLES = {"docs/README.md": "All pages"}  # in the navigation, where the heading says too little
 OFFERED = ("examples/*.py", "prefect.yaml")  # files that can be downloaded from the site
