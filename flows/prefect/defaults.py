@@ -70,9 +70,14 @@ def lost_server_as_line() -> Iterator[None]:
     try:
         yield
     except httpx.HTTPError as error:
-        url = get_current_settings().api.url or ""
+        server = f"Prefect's server {without_secrets(get_current_settings().api.url or '')}"
+        if isinstance(error, httpx.HTTPStatusError) and error.response.status_code == 401:
+            raise EpipoleError(
+                f"{server} asks for a secret; set PREFECT_API_AUTH_STRING to it "
+                "(prefect.env of `epipole deploy-files` has it)"
+            ) from error
         raise EpipoleError(
-            f"Prefect's server {without_secrets(url)} was lost during the run "
+            f"{server} was lost during the run "
             f"({line_of(error)}); the dataset has all nights of the run or none: run again"
         ) from error
 

@@ -60,9 +60,11 @@ WITH_PACKAGES = {
 @pytest.fixture
 def play(monkeypatch, tmp_path, prefect):
     """Yield a function that runs a benchmark of this name with these arguments."""
-    from prefect.settings import PREFECT_API_URL
+    from prefect.settings import get_current_settings
 
-    monkeypatch.setenv("PREFECT_API_URL", PREFECT_API_URL.value())  # one for all their processes
+    api = get_current_settings().api  # one for all their processes
+    monkeypatch.setenv("PREFECT_API_URL", api.url)
+    monkeypatch.setenv("PREFECT_API_AUTH_STRING", api.auth_string.get_secret_value())
     for name in ("EPIPOLE_CACHE", "PREFECT_HOME"):  # benchmarks may change these
         monkeypatch.setenv(name, os.environ[name])
     monkeypatch.syspath_prepend(HERE)

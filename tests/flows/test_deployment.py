@@ -104,6 +104,18 @@ def test_the_server_answers_only_who_has_the_secret(deployed):
         assert not [k for k in range(len(secret) - 8) if secret[k : k + 8] in said]
 
 
+def test_a_run_from_the_command_line_without_the_secret_is_one_line(deployed, night_log, tmp_path):
+    kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
+    command = "from epipole.flows.command_line.main import main; main()"
+    ran = subprocess.run(
+        [sys.executable, "-c", command, "run", str(night_log), "--out", str(tmp_path / "out")],
+        env=kept | {"PREFECT_API_URL": deployed.prefect.url}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert ran.returncode == 1
+    assert "asks for a secret; set PREFECT_API_AUTH_STRING to it" in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
 def test_runs_are_scheduled_for_six_in_the_morning(deployed):
     def scheduled() -> list[dict]:
         return deployed.prefect.find(
