@@ -124,7 +124,11 @@ def storage_errors() -> tuple[type[Exception], ...]:
 
 def line_of(error: BaseException) -> str:
     """Return the message of an error as one line, without the secrets of URLs in it."""
-    return without_secrets(" ".join(str(error).split())) or type(error).__name__
+    return without_secrets(_line(error))
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def shown_error(error: Exception) -> Exception:
@@ -133,7 +137,7 @@ def shown_error(error: Exception) -> Exception:
     Where it quotes a URL with a secret, it is replaced by one of the same effect: a task is tried
     again for it or not.
     """
-    if line_of(error) == (" ".join(str(error).split()) or type(error).__name__):
+    if line_of(error) == _line(error):
         return error
     lasting = (FileNotFoundError, PermissionError)
     kind = next((kind for kind in (*lasting, OSError) if isinstance(error, kind)), ValueError)

@@ -250,8 +250,8 @@ def name(
             for piece in solved.read(span, table):
                 rows.append(renamed(outermost(piece), numbers[span.folder]))
     first: dict[str, str] = link_objects(
-        concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings,
-    )  # fmt: skip
+        concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
+    )
     linked = {
         folder: {old: first.get(number, number) for old, number in of_span.items()}
         for folder, of_span in numbers.items()
@@ -342,7 +342,5 @@ def name_known(
 def publish(destination: Destination, sources: pa.Table) -> Summary:
     """Put all nights in place, and return what they hold."""
     summary = summarise(destination.dataset, destination.staged)
-    publish_nights(
-        destination.dataset, destination.staged, sources, destination.replace,
-    )  # fmt: skip
+    publish_nights(destination.dataset, destination.staged, sources, destination.replace)
     return summary

@@ -12,7 +12,7 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from epipole.io.datasets.table_pieces import MOST_BYTES, read_pieces
+from epipole.io.datasets.table_pieces import MOST_BYTES, read_pieces, within_bounds
 from epipole.io.remote_files import line_of, storage_errors
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
@@ -36,13 +36,9 @@ class NightReader:
 
     def read(self, table: str, columns: Sequence[str]) -> pl.DataFrame:
         """Return all rows of a table that is small, or of few columns."""
-        pieces, size = [self.empty(table, columns)], 0.0
-        for rows in self.pieces(table, columns):
-            size += rows.estimated_size()
-            if size > MOST_BYTES:
-                raise self._unreadable(table, ValueError("its rows are more than a night has"))
-            pieces.append(rows)
-        return pl.concat(pieces)
+        with self._as_dataset_errors(table):
+            pieces = map(to_polars, within_bounds(self._pieces(table, columns), MOST_BYTES))
+            return pl.concat([self.empty(table, columns), *pieces])
 
     def pieces(
         self, table: str, columns: Sequence[str], between_ns: tuple[int, int] | None = None
@@ -55,12 +51,16 @@ class NightReader:
             Only rows whose first column is a time from here to before there. Row groups of other
             times are not read. The rows are sorted by that column.
         """
+        with self._as_dataset_errors(table):
+            yield from map(to_polars, self._pieces(table, columns, between_ns))
+
+    def _pieces(
+        self, table: str, columns: Sequence[str], between_ns: tuple[int, int] | None = None
+    ) -> Iterator[pa.Table]:
         schema = pa.schema([TABLES[table].field(name) for name in columns])
         time = None if between_ns is None else columns[0]
-        with self._as_dataset_errors(table):
-            for file in self._files(table):
-                for rows in read_pieces(file, schema, time, between_ns or (None, None)):
-                    yield to_polars(rows)
+        for file in self._files(table):
+            yield from read_pieces(file, schema, time, between_ns or (None, None))
 
     def count(self, table: str) -> int:
         """Return the number of rows of a table."""

@@ -3,8 +3,6 @@
 import logging
 from typing import NamedTuple
 
-import pyarrow.compute as pc
-
 from epipole.io.logs.reader import read_log_pieces
 from epipole.io.work.part_tables import LOG_PIECE
 from epipole.io.work.parts import write_part
@@ -17,12 +15,11 @@ LOGGER = logging.getLogger(__name__)
 
 
 class ReadLog(NamedTuple):
-    """A log that was read: its number in the run, how many pieces it has, and whose frames."""
+    """A log that was read: its number in the run, and how many pieces it has."""
 
     number: int
     n_pieces: int
     source: LogSource
-    sensors: tuple[str, ...]
 
 
 @stage_task(Stage.READ, "{path}", retried=True)
@@ -37,7 +34,6 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
         If it is not a log; see `read_log_pieces`.
     """
     n_pieces, n_frames, source = 0, 0, None
-    sensors: set[str] = set()
     for piece in read_log_pieces(path):
         write_part(
             folder.piece(number, n_pieces),
@@ -52,8 +48,7 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
         )
         n_pieces += 1
         n_frames += piece.exposures.num_rows
-        sensors.update(pc.unique(piece.exposures["sensor_id"]).to_pylist())
         source = piece.source or source
     assert source is not None, "the last piece has it"
     LOGGER.info("%s: read %d frames in %d pieces", source.name, n_frames, n_pieces)
-    return ReadLog(number, n_pieces, source, tuple(sorted(sensors)))
+    return ReadLog(number, n_pieces, source)

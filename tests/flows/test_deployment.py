@@ -3,15 +3,14 @@
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
 import yaml
-from scenes.dataset_tables import contents
-from scenes.prefect_server import POOL, Prefect, deploy_files, serving, wait_for
+from scenes.dataset_tables import contents, published
+from scenes.prefect_server import EPIPOLE, POOL, Prefect, deploy_files, serving, wait_for
 
 from epipole.io.logs.writer import LogWriter
 
@@ -19,12 +18,6 @@ pytestmark = pytest.mark.long
 
 ROOT = Path(__file__).parents[2]
 NIGHT = "2019-04-01"
-
-
-def published(dataset: Path) -> dict[str, bytes]:
-    """Return what readers of a dataset see: its nights, not what a run has staged."""
-    files = contents(dataset).items()
-    return {name: data for name, data in files if name.startswith("night=")}
 
 
 class Deployed:
@@ -106,9 +99,8 @@ def test_the_server_answers_only_who_has_the_secret(deployed):
 
 def test_a_run_from_the_command_line_without_the_secret_is_one_line(deployed, night_log, tmp_path):
     kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
-    command = "from epipole.flows.command_line.main import main; main()"
     ran = subprocess.run(
-        [sys.executable, "-c", command, "run", str(night_log), "--out", str(tmp_path / "out")],
+        [*EPIPOLE, "run", str(night_log), "--out", str(tmp_path / "out")],
         env=kept | {"PREFECT_API_URL": deployed.prefect.url}, capture_output=True, text=True,
     )  # fmt: skip
     assert ran.returncode == 1
@@ -228,9 +220,8 @@ def test_a_run_from_the_command_line_goes_to_the_server_of_the_users_profile(
     )
     kept = {name: value for name, value in os.environ.items() if "PREFECT" not in name}
     secret = {k: v for k, v in deployed.prefect.environment.items() if k.endswith("AUTH_STRING")}
-    command = "from epipole.flows.command_line.main import main; main()"
     ran = subprocess.run(
-        [sys.executable, "-c", command, "run", str(night_log), "--out", str(tmp_path / "out")],
+        [*EPIPOLE, "run", str(night_log), "--out", str(tmp_path / "out")],
         env=kept | secret | {"PREFECT_HOME": str(tmp_path)},
         cwd=tmp_path, capture_output=True, text=True,
     )  # fmt: skip

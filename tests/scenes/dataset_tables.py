@@ -55,6 +55,12 @@ TIMES = FIRST_DAY * DAY_NS + np.arange(20) * 1_000_000_001 + 7
 OVER_MIDNIGHT = (FIRST_DAY + 1) * DAY_NS + np.arange(-10, 10) * 1_000_000_001 + 7
 
 
+def published(dataset: Path) -> dict[str, bytes]:
+    """Return what readers of a dataset see: its nights, not what a run has staged."""
+    files = contents(dataset).items()
+    return {name: data for name, data in files if name.startswith("night=")}
+
+
 def contents(dataset: Path) -> dict[str, bytes]:
     """Return all files of a dataset but its reports, which name the folder they lie in."""
     files = [path for path in dataset.rglob("*") if path.is_file()]

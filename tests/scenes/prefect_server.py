@@ -14,6 +14,7 @@ from typing import Any
 import httpx
 
 POOL = "nights"
+EPIPOLE = [sys.executable, "-c", "from epipole.flows.command_line.main import main; main()"]
 # A worker asks for runs every second (default: every ten), and so does a run that waits for a free
 # slot (default: every thirty).
 QUICK = {
@@ -127,11 +128,9 @@ def serving(folder: Path, **settings: str) -> Iterator[Prefect]:
 
 def deploy_files(folder: Path, logs: Path, dataset: Path) -> dict[str, str]:
     """Write the files of a deployment, two lines changed; return the settings of prefect.env."""
-    command = "from epipole.flows.command_line.main import main; main()"
     subprocess.run(
-        [sys.executable, "-c", command, "deploy-files", "--out", str(folder)],
-        check=True, capture_output=True,
-    )  # fmt: skip
+        [*EPIPOLE, "deploy-files", "--out", str(folder)], check=True, capture_output=True
+    )
     text = (folder / "prefect.yaml").read_text()
     for name, place in (("/data/logs", logs), ("/data/dataset", dataset)):
         assert text.count(f" {name} ") + text.count(f" {name}\n") == 1

@@ -34,13 +34,10 @@ import httpx
 
 sys.path.append(str(Path(__file__).parents[1]))
 
-from scenes.dataset_tables import contents
+from scenes.dataset_tables import published
+from scenes.killed_runs import HOURS, NIGHTS, SCENE, START
 from scenes.prefect_server import POOL, Prefect, deploy_files, wait_for
 
-NIGHTS = ["2019-04-01", "2019-04-02"]
-SCENE = "four_sensor_geo"
-START = datetime.datetime(2019, 4, 1, 23, 59, 48, tzinfo=datetime.UTC)
-HOURS = 24 / 3600
 RUN_S = 25.0  # from a request to the end of its run
 ENDS_WITHIN_S = 1200.0  # ten minutes until a run that never began is seen to be lost
 NEXT_WITHIN_S = 360.0
@@ -148,12 +145,6 @@ class Deployed:
         with contextlib.suppress(httpx.HTTPError, ValueError):
             return request()
         return None
-
-
-def published(dataset: Path) -> dict[str, bytes]:
-    """Return what readers see of a dataset's nights."""
-    files = contents(dataset).items()
-    return {name: data for name, data in files if name.startswith("night=")}
 
 
 def stop_once(deployed: Deployed, stop: Stop, whole: dict[str, bytes]) -> tuple[bool, float]:

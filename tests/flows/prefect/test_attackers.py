@@ -24,14 +24,13 @@ import pytest
 import websockets
 from prefect.states import Completed, Failed
 from scenes.dataset_tables import contents
-from scenes.prefect_server import serving
+from scenes.prefect_server import EPIPOLE, serving
 
 from epipole.flows.prefect.page import run_here, shown_on_page
 from epipole.flows.prefect.runners import check_scheduler, task_runner
 from epipole.schemas.choices import Runner
 from epipole.schemas.errors import EpipoleError
 
-EPIPOLE = [sys.executable, "-c", "from epipole.flows.command_line.main import main; main()"]
 # What a run of which the server says something else has made all the same.
 OBJECTS = 9
 MADE = f"objects     {OBJECTS} in"
