@@ -23,12 +23,11 @@ import pyarrow as pa
 from pydantic.fields import FieldInfo
 
 from epipole.flows import api
-from epipole.schemas.logs.bounds import BOUNDS, TIME
+from epipole.schemas.log_bounds import BOUNDS, TIME
 from epipole.schemas.rejects import FrameStatus, NameStatus, Outcome, Reason
-from epipole.schemas.settings import Settings
-from epipole.schemas.simulation.orbit import Orbit
-from epipole.schemas.simulation.scene import (
+from epipole.schemas.scene import (
     LensDeparture,
+    Orbit,
     Pointing,
     Scene,
     SceneCamera,
@@ -38,6 +37,7 @@ from epipole.schemas.simulation.scene import (
     SceneStates,
     SceneTargets,
 )
+from epipole.schemas.settings import Settings
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import TABLES
 

@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 from epipole.flows.night.summary import many
 from epipole.io.caches.private_folders import temporary_folder
 from epipole.io.logs.listing import list_logs
-from epipole.io.work.places import ReadFolder
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
@@ -28,7 +28,7 @@ from epipole.tasks.read.order_frames import (
 )
 from epipole.tasks.read.read_logs import read_log_into
 
-MOST_FRAMES = 100  # of a sensor, spread over the logs
+MAX_FRAMES = 100  # of a sensor, spread over the logs
 ALL_TIME = (-(2**63), 2**63 - 1)
 
 
@@ -67,7 +67,7 @@ def _of_sensor(
     frames: OrderedFrames, number: int, field_deg: float | None, settings: Settings
 ) -> CameraReport:
     time_ns = frames.time_ns[number]
-    rows = spread(len(time_ns), MOST_FRAMES)
+    rows = spread(len(time_ns), MAX_FRAMES)
     parts = [frames_between(frames.folder, number, t, t + 1) for t in time_ns[rows].tolist()]
     exposures: pa.Table = concat(EXPOSURES, parts).combine_chunks()
     states = states_between(frames.folder, number, *ALL_TIME)

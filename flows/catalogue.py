@@ -11,11 +11,11 @@ from epipole.io.catalogues.hipparcos import NAME as HIPPARCOS
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.io.catalogues.star_list import read_star_list
-from epipole.io.names import fault_of_name
+from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import array
-from epipole.schemas.catalogues.star_catalogue import UNKNOWN_MOTION_MAS_YR, label_of
 from epipole.schemas.errors import CatalogueError
-from epipole.tasks.catalogue.build_deep_catalogue import build_deep_catalogue
+from epipole.schemas.star_lists import UNKNOWN_MOTION_MAS_YR, label_of
+from epipole.tasks.catalogue import build_deep_catalogue
 
 DEEP = "deep"
 

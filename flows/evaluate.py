@@ -11,7 +11,7 @@ from epipole.io.datasets.dataset import nights_in, read_table
 from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.simulation.truth import Truth, read_truth
 from epipole.schemas.errors import DatasetError
-from epipole.schemas.simulation.report import Report
+from epipole.schemas.evaluation import Report
 from epipole.tasks.evaluate.evaluate_dataset import evaluate_dataset
 
 TABLES = (

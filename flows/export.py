@@ -7,16 +7,19 @@ from pathlib import Path
 
 import polars as pl
 
-from epipole.io.ccsds.orbit_data import ephemeris_message, state_message
-from epipole.io.ccsds.text import safe_name, write_message
-from epipole.io.ccsds.tracking_data import tracking_data
+from epipole.io.ccsds import (
+    ephemeris_message,
+    safe_name,
+    state_message,
+    tracking_data,
+    write_message,
+)
 from epipole.io.datasets.dataset import nights_in, read_table
-from epipole.io.names import fault_of_name
+from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import to_polars
-from epipole.schemas.choices import Message
 from epipole.schemas.errors import DatasetError
-from epipole.tasks.export.object_ephemeris import arcs, single_states
-from epipole.tasks.export.sensor_directions import directions, sensor_ephemeris
+from epipole.schemas.options import Message
+from epipole.tasks.export import arcs, directions, sensor_ephemeris, single_states
 
 OF_STATE = "State of an object, fitted to its lines of sight; covariance in the same frame."
 OF_ARC = "A fitted state, moved through its arc: point mass and J2; not to be extrapolated."

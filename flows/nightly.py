@@ -11,11 +11,8 @@ import pyarrow as pa
 from prefect import flow
 
 from epipole.flows.night.calibrating import calibrate, find_cameras
-from epipole.flows.night.dataset.earlier_nights import EarlierNights
-from epipole.flows.night.dataset.night_rows import write_night_row
-from epipole.flows.night.dataset.unchanged import unchanged_nights
-from epipole.flows.night.log_choice import find_logs
-from epipole.flows.night.parameters import Night, night_asked, run_name
+from epipole.flows.night.log_choice import Night, find_logs, night_asked, run_name
+from epipole.flows.night.recorded_nights import EarlierNights, unchanged_nights, write_night_row
 from epipole.flows.night.reports import with_reports
 from epipole.flows.night.stages import (
     Destination,
@@ -32,9 +29,9 @@ from epipole.flows.night.stages import (
 )
 from epipole.flows.night.summary import Summary, by_reason, many, summarise
 from epipole.flows.night.work import Work, plan_spans
-from epipole.flows.prefect.page import shown_on_page
+from epipole.flows.prefect.artifacts import shown_on_page
 from epipole.flows.prefect.runners import runner_asked
-from epipole.io.catalogues.known_objects import read_known_objects
+from epipole.io.catalogues.element_sets import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import (
     check_folder,
@@ -43,11 +40,11 @@ from epipole.io.datasets.dataset import (
     night_place,
 )
 from epipole.io.datasets.rows_by_night import nights_of
-from epipole.io.remote_files import known_as
+from epipole.io.paths import known_as
 from epipole.io.settings_file import merged_settings
 from epipole.io.work.folder import work_folder, work_root
-from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder
 from epipole.io.work.recipe import logs_key, recipe_of
+from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError, NoFramesError
 from epipole.schemas.settings import Settings

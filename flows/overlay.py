@@ -16,7 +16,7 @@ from epipole.io.datasets.dataset import night_row, nights_in, read_table
 from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.logs.listing import list_logs
 from epipole.io.logs.reader import read_log_pieces
-from epipole.io.logs.viewer_file import ViewerFile
+from epipole.io.logs.writer import ViewerFile
 from epipole.schemas.bridge import array, to_polars
 from epipole.schemas.errors import DatasetError, LogError, NoFramesError
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from epipole.flows.night.reports import night_facts
 from epipole.io.datasets.dataset import nights_in
-from epipole.io.names import fault_of_name
+from epipole.io.paths import fault_of_name
 from epipole.schemas.errors import DatasetError, ReportError
 
 
@@ -28,7 +28,7 @@ def report(dataset: str, night: str, out: Path) -> int:
     if night not in nights:
         raise DatasetError(f"{dataset}: has no night {night}")
     # Without matplotlib this module cannot be imported: it raises `ReportError`.
-    from epipole.tasks.report.page.night_page import night_page
+    from epipole.tasks.report.page import night_page
 
     return _write(out, night_page(night_facts(dataset, night, nights)).encode())
 

@@ -12,12 +12,12 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.io.logs.writer import LogWriter
-from epipole.io.names import fault_of_name
+from epipole.io.paths import fault_of_name
 from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.truth import SUFFIX, TruthWriter
-from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.scene import Scene, validate_scene
+from epipole.schemas.scene import Scene, validate_scene
+from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.simulation.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposures
 from epipole.tasks.algorithms.simulation.paths import Paths
@@ -28,7 +28,7 @@ from epipole.tasks.algorithms.simulation.sensor import (
     seconds_since,
     state_times,
 )
-from epipole.tasks.simulate.scene_optics import sent_optics
+from epipole.tasks.simulate.draw_sensors import sent_optics
 from epipole.tasks.simulate.simulate_scene import (
     Simulation,
     expose_blocks,
@@ -37,7 +37,7 @@ from epipole.tasks.simulate.simulate_scene import (
     true_tables,
 )
 
-MOST_LOGS = 500  # all are open at once, and a process may mostly open 1,024 files
+MAX_LOGS = 500  # all are open at once, and a process may mostly open 1,024 files
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ def simulate(
     """
     settled = scene if isinstance(scene, Scene) else read_scene(scene)
     settled = _with_options(settled, seed, sensors, objects, hours, rate_hz, start)
-    if not 1 <= logs <= MOST_LOGS:
-        raise SceneError(f"logs = {logs}: give 1 to {MOST_LOGS}")
+    if not 1 <= logs <= MAX_LOGS:
+        raise SceneError(f"logs = {logs}: give 1 to {MAX_LOGS}")
     out = Path(out)
     if (fault := fault_of_name(out.name)) is not None:
         raise SceneError(f"log {out}: {fault}")

@@ -5,8 +5,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from epipole.io.names import refuse_device
-from epipole.io.remote_files import known_as, open_remote
+from epipole.io.paths import known_as, open_remote, refuse_device
 from epipole.schemas.errors import LogError, SettingsError
 from epipole.schemas.settings import Group, Settings, parse_settings, validate_settings
 

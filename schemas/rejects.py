@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.schemas.bridge import table
-from epipole.schemas.logs.messages import SENSOR_ID_RULE
+from epipole.schemas.log_messages import SENSOR_ID_RULE
 from epipole.schemas.stages import Declared, Stage
 from epipole.schemas.tables import REJECTS
 

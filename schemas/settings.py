@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from epipole.schemas.errors import SettingsError
-from epipole.schemas.logs.bounds import ATTITUDE_SIGMA, POSITION_SIGMA
-from epipole.schemas.methods import ASSOCIATION, STAR_IDENTIFICATION, TRACK_LINKING
-from epipole.schemas.text.shown import as_line
-from epipole.schemas.text.toml_text import toml_values
+from epipole.schemas.log_bounds import ATTITUDE_SIGMA, POSITION_SIGMA
+from epipole.schemas.options import ASSOCIATION, STAR_IDENTIFICATION, TRACK_LINKING
+from epipole.schemas.text import as_line, toml_values
 
 if TYPE_CHECKING:
     StarMethod = str
@@ -28,8 +27,8 @@ LONGEST_VALUE = 80  # of an invalid value in a message
 # Bounds beyond which no sensor and no object is; a larger value is a slip of the pen.
 DAY_S = 86_400
 FARTHEST_KM = 1e6  # twice as far as the Moon
-MOST_SIGMA = 100
-MOST_LOG_ODDS = 1000
+MAX_SIGMA = 100
+MAX_LOG_ODDS = 1000
 BYTES_PER_VIEW = 2000  # of memory, where positions are solved
 
 
@@ -106,7 +105,7 @@ class IdentificationSettings(Group):
     gate_sigma: float = Field(
         3.7,
         gt=0,
-        le=MOST_SIGMA,
+        le=MAX_SIGMA,
         description="Largest distance of a centroid from the predicted place of its star.",
     )
     false_alarm: float = Field(
@@ -137,7 +136,7 @@ class TrackletSettings(Group):
     gate_sigma: float = Field(
         4.0,
         gt=0,
-        le=MOST_SIGMA,
+        le=MAX_SIGMA,
         description="Largest distance of a detection from the prediction of its track.",
     )
     max_rate_deg_s: float = Field(
@@ -249,7 +248,7 @@ class AssociationSettings(Group):
         "Published values are 8 to 12 px.",
     )
     gate_sigma: float = Field(
-        4.5, gt=0, le=MOST_SIGMA, description="Largest disagreement between views of one object."
+        4.5, gt=0, le=MAX_SIGMA, description="Largest disagreement between views of one object."
     )
     min_altitude_km: float = Field(
         100.0, ge=0, le=FARTHEST_KM, description="Altitude of the lowest object to search for."
@@ -277,14 +276,14 @@ class AssociationSettings(Group):
     )
     min_log_odds: float = Field(
         0.5,
-        ge=-MOST_LOG_ODDS,
-        le=MOST_LOG_ODDS,
+        ge=-MAX_LOG_ODDS,
+        le=MAX_LOG_ODDS,
         description="Least log-odds (ln) of a reported object against chance.",
     )
     ambiguity_log_odds: float = Field(
         2.0,
         ge=0,
-        le=MOST_LOG_ODDS,
+        le=MAX_LOG_ODDS,
         description="Least difference in log-odds (ln) between two rival hypotheses. Below it, "
         "neither is reported.",
     )
@@ -294,7 +293,7 @@ class PositionSettings(Group):
     """Positions of objects at epochs, by least squares."""
 
     reject_sigma: float = Field(
-        4.0, gt=0, le=MOST_SIGMA, description="Largest residual of a view that is used."
+        4.0, gt=0, le=MAX_SIGMA, description="Largest residual of a view that is used."
     )
     all_pairs: bool = Field(
         False,
@@ -328,7 +327,7 @@ class StateSettings(Group):
     link_log_odds: float = Field(
         4.6,
         gt=0,
-        le=MOST_LOG_ODDS,
+        le=MAX_LOG_ODDS,
         description="Least log-odds (ln) that it is the same object. At the default, 1 in 100 "
         "links is wrong.",
     )

@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, Ellipse, Polygon
 from night import Array, Night, column, covariance, rows, sights, true_place
 from style import BLUE, GREEN, GREY, INK, ORANGE, TRACKS, figure, plt
 
-from epipole.tasks.algorithms.geometry.sky import aberrate, unit_from_radec
+from epipole.tasks.algorithms.geometry.directions import aberrate, unit_from_radec
 
 TUTORIAL = Path(__file__).parents[1] / "first_night.md"
 

@@ -12,8 +12,11 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera, project, unproject
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.geometry.sky import east_north, unit_from_radec
+from epipole.tasks.algorithms.geometry.directions import (
+    east_north,
+    matrix_from_quaternion,
+    unit_from_radec,
+)
 
 FRAME = 30
 TOLERANCE = 15 * ARCSEC  # of a separation

@@ -8,7 +8,7 @@ from style import BLUE, GREY, INK, ORANGE, TRACKS, figure, image_axes
 from views import SENSOR
 
 from epipole.tasks.algorithms.geometry.camera import project
-from epipole.tasks.algorithms.geometry.sky import aberrate
+from epipole.tasks.algorithms.geometry.directions import aberrate
 
 ARCSEC = np.pi / 648_000
 

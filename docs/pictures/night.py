@@ -9,9 +9,12 @@ import polars as pl
 
 from epipole.io.simulation.truth import elements_of, read_truth
 from epipole.tasks.algorithms.geometry.camera import Camera
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.geometry.sky import aberrate, unit_from_radec
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.geometry.directions import (
+    aberrate,
+    matrix_from_quaternion,
+    unit_from_radec,
+)
+from epipole.tasks.algorithms.simulation.paths import state_at
 
 Array = npt.NDArray[np.float64]
 

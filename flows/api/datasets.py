@@ -7,7 +7,7 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.io.datasets.dataset import check_folder, dataset_folder, nights_in, read_table
-from epipole.io.remote_files import known_as
+from epipole.io.paths import known_as
 from epipole.schemas.bridge import empty
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES

@@ -23,13 +23,12 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, PLACES
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
-from epipole.tasks.algorithms.geometry.direction_errors import (
+from epipole.tasks.algorithms.geometry.covariances import (
     attitude_covariance,
     centroid_covariance,
     on_tangent_plane,
 )
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.geometry.sky import aberrate
+from epipole.tasks.algorithms.geometry.directions import aberrate, matrix_from_quaternion
 from epipole.tasks.identify.identify_stars import identify_stars
 
 

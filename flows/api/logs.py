@@ -12,7 +12,7 @@ from epipole.io.logs import reader
 from epipole.io.logs.messages.batches import valid_sensor_id
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import rows_of, table, table_name, to_polars
-from epipole.schemas.logs.messages import SENSOR_ID_RULE
+from epipole.schemas.log_messages import SENSOR_ID_RULE
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES
 from epipole.tasks.algorithms.geometry.camera import Camera

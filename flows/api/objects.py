@@ -8,11 +8,11 @@ import numpy.typing as npt
 
 from epipole.flows.api.arguments import Array, floats
 from epipole.schemas.settings import Settings
-from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.geometry import triangulation
 from epipole.tasks.algorithms.geometry.camera import Camera
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.solve.association.association_methods import associate_by_likelihood
+from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
+from epipole.tasks.solve.associate_objects import associate_by_likelihood
 
 Indices = npt.NDArray[np.int64]
 
@@ -30,7 +30,7 @@ class View(NamedTuple):
     cov_rad2 : (n, 2, 2) float
         Their covariances [rad^2], on two axes at right angles to each direction; one (2, 2)
         serves all. Of an isotropic error it is ``sigma_rad**2 * numpy.eye(2)``. The axes are
-        those of `epipole.tasks.algorithms.geometry.sky.tangent_basis`.
+        those of `epipole.tasks.algorithms.geometry.directions.tangent_basis`.
     position_km : (3,) float
         The sensor's position, GCRF.
     position_sigma_km : float

@@ -15,29 +15,26 @@ from typing import Annotated, Any, NoReturn
 import typer
 import typer.core
 
-from epipole.flows.command_line.commands import (
-    calibrate,
-    catalog,
-    deploy_files,
-    evaluate,
-    export,
-    info,
-    nights,
-    overlay,
-    report,
-    run,
-    settings,
-    simulate,
+from epipole.flows.command_line import nights, run, simulate
+from epipole.flows.command_line import tools as calibrate
+from epipole.flows.command_line import tools as catalog
+from epipole.flows.command_line import tools as deploy_files
+from epipole.flows.command_line import tools as evaluate
+from epipole.flows.command_line import tools as export
+from epipole.flows.command_line import tools as info
+from epipole.flows.command_line import tools as overlay
+from epipole.flows.command_line import tools as report
+from epipole.flows.command_line import tools as settings
+from epipole.flows.command_line.options import help_text
+from epipole.flows.command_line.process import (
+    prepare_environment,
+    stop_by_signals,
+    stopped_in_one_line,
+    tells_compiling,
 )
-from epipole.flows.command_line.compiling import tells_compiling
-from epipole.flows.command_line.environment import prepare_environment
-from epipole.flows.command_line.printing import help_text
-from epipole.flows.command_line.stopping import stop_by_signals, stopped_in_one_line
-from epipole.io.names import LONGEST_PATH
-from epipole.io.remote_files import known_as
+from epipole.io.paths import LONGEST_PATH, known_as
 from epipole.schemas.errors import EpipoleError
-from epipole.schemas.text.shown import LONGEST_LINE, as_line
-from epipole.schemas.text.urls import without_secrets
+from epipole.schemas.text import LONGEST_LINE, as_line, without_secrets
 
 
 class _Commands(typer.core.TyperGroup):

@@ -1,10 +1,16 @@
 """What several commands take, and its checks."""
 
-from typing import Annotated
+import inspect
+import json
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any
 
 import typer
 
 from epipole.schemas.dates import FIRST_YEAR, LAST_YEAR, is_night
+from epipole.schemas.text import as_line
+
+# -- What several commands take, and its checks.
 
 Logs = Annotated[
     list[str], typer.Argument(metavar="LOG", help="MCAP files, folders, glob patterns or URLs.")
@@ -19,3 +25,22 @@ def check_night(night: str | None, option: str = "--night") -> None:
             f"{night!r} is not a date such as 2019-04-01, of the years {FIRST_YEAR} to {LAST_YEAR}",
             param_hint=option,
         )
+
+
+# -- What commands print on standard output: lines, or JSON; and their help.
+
+
+def print_lines(lines: Iterable[str], to_errors: bool = False) -> None:
+    """Print lines that may have names from a log in them."""
+    for line in lines:
+        typer.echo(as_line(line), err=to_errors)
+
+
+def help_text(command: Callable[..., Any]) -> str:
+    """Return a command's help: each paragraph is one line, which the terminal's width breaks."""
+    paragraphs = (inspect.getdoc(command) or "").split("\n\n")
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+
+
+def print_json(value: Any) -> None:
+    typer.echo(json.dumps(value, indent=2))

@@ -9,20 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from epipole.flows.command_line.terminal import shown
-from epipole.flows.night.dataset.held_nights import held_nights
-from epipole.flows.night.dataset.unchanged import unchanged_nights
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.progress import compile_step, prepare
+from epipole.flows.night.recorded_nights import held_nights, unchanged_nights
 from epipole.flows.night.summary import Summary, summarise
 from epipole.flows.prefect.server_process import Launched, launch
 from epipole.io.caches.kernel_warm_up import compile_beside, compile_kernels, compiling_told
-from epipole.io.catalogues.known_objects import read_known_objects
+from epipole.io.catalogues.element_sets import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder, night_place
 from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
-from epipole.schemas.choices import Runner
 from epipole.schemas.errors import EpipoleError, NoFramesError
+from epipole.schemas.options import Runner
 from epipole.schemas.settings import Settings
 
 LOGGER = logging.getLogger(__name__)
@@ -160,7 +159,7 @@ class Nights:
             check_scheduler(options.scheduler)
         from epipole.flows.night.reports import load_drawing
         from epipole.flows.nightly import nightly
-        from epipole.flows.prefect.page import run_here
+        from epipole.flows.prefect.artifacts import run_here
 
         # Done now, and not when they are needed: the server still starts.
         if self._settings.report.write:

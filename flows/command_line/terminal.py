@@ -18,7 +18,7 @@ from rich.progress import (
 )
 
 from epipole.flows.night.progress import COMPILE, ROOT, STEPS, with_safe_text
-from epipole.schemas.text.shown import as_line
+from epipole.schemas.text import as_line
 
 TOLD_EVERY_S = 30.0  # progress, where there is no terminal
 

@@ -25,7 +25,7 @@ LOGGER = logging.getLogger(__name__)
 
 # With better optics more stars take part, and they fit better still. Two are enough but for a
 # sensor that was hardly identified before.
-MOST_CALIBRATIONS = 4
+MAX_CALIBRATIONS = 4
 
 
 def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
@@ -75,7 +75,7 @@ def calibrate(work: Work, told: pa.Table, settings: Settings) -> tuple[Work, pa.
     """
     mode = settings.identification.calibrate
     calibrations, misled = CALIBRATIONS.empty_table(), set[str]()
-    for number in range(1, 1 + {"off": 0, "report": 1, "use": MOST_CALIBRATIONS}[mode]):
+    for number in range(1, 1 + {"off": 0, "report": 1, "use": MAX_CALIBRATIONS}[mode]):
         fits = _fit_sensors(work, told, misled, settings)
         calibrations = concat(CALIBRATIONS, [fit.calibrations for fit in fits])
         departed = {name for fit in fits for name in fit.departed}

@@ -3,16 +3,21 @@
 import datetime
 import logging
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
+from prefect.runtime import flow_run
+from pydantic import Field
 
 from epipole.io.logs.listing import list_logs
 from epipole.io.logs.reader import read_log_times
-from epipole.schemas.errors import LogError, NoFramesError
+from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
+from epipole.schemas.text import as_line
+
+# -- The choice of logs: those of a night, out of all in a folder.
 
 LOGGER = logging.getLogger(__name__)
 
@@ -122,3 +127,50 @@ def _date(time_ns: int) -> str:
     return (
         datetime.datetime.fromtimestamp(time_ns // 1_000_000_000, datetime.UTC).date().isoformat()
     )
+
+
+# -- The night that a run is asked for; Prefect checks it before it creates a run.
+
+YESTERDAY = "yesterday"
+LONGEST_NAME = 60  # of a log in a run's name
+
+Night = Annotated[str | None, Field(pattern=rf"^(\d{{4}}-\d\d-\d\d|{YESTERDAY})$")]
+
+
+def night_asked(night: str | None) -> str | None:
+    """Return the UTC date that is asked for; None: every night.
+
+    Yesterday is the day before the run was scheduled, even if the run starts late.
+
+    Raises
+    ------
+    EpipoleError
+        If there is no such date.
+    """
+    if night is None:
+        return None
+    if night == YESTERDAY:
+        due: datetime.datetime = flow_run.scheduled_start_time
+        return (due.astimezone(datetime.UTC).date() - datetime.timedelta(days=1)).isoformat()
+    try:
+        return datetime.date.fromisoformat(night).isoformat()
+    except ValueError as error:
+        raise EpipoleError(f"night {night}: no such date; give one such as 2019-04-01") from error
+
+
+def run_name() -> str:
+    """Return the name of a run on Prefect's page, such as ``night 2019-04-01``."""
+    asked: dict[str, Any] = flow_run.parameters
+    try:
+        night = night_asked(asked.get("night"))
+    except EpipoleError:  # the run itself reports it
+        night = asked["night"]
+    return f"night {night}" if night else f"all nights of {_what(asked.get('logs'))}"
+
+
+def _what(logs: Any) -> str:
+    """Return what the logs are called: the name of the only one, or how many were given."""
+    named = [logs] if isinstance(logs, str) else list(logs or ())
+    if len(named) != 1:
+        return f"{len(named)} logs"
+    return as_line(named[0].rstrip("/").rpartition("/")[2] or named[0], LONGEST_NAME)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol
 
 from epipole.schemas.stages import Stage
-from epipole.schemas.text.shown import as_line
+from epipole.schemas.text import as_line
 
 ROOT = logging.getLogger("epipole")
 STEPS = logging.getLogger("epipole.steps")

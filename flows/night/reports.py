@@ -8,12 +8,11 @@ from pathlib import Path
 
 from epipole.flows.night.summary import Summary
 from epipole.io.datasets.dataset import night_reader, nights_in, write_report
-from epipole.io.datasets.night_reader import NightReader
-from epipole.io.remote_files import line_of
+from epipole.io.datasets.night_tables import NightReader
+from epipole.io.paths import line_of
 from epipole.schemas.errors import ReportError
-from epipole.tasks.report.night_facts import NightFacts, read_night_facts
-from epipole.tasks.report.report_extract import ReportExtract
-from epipole.tasks.report.trend import MOST_NIGHTS
+from epipole.tasks.report.night_facts import NightFacts, ReportExtract, read_night_facts
+from epipole.tasks.report.objects import MAX_NIGHTS
 
 LOGGER = logging.getLogger(__name__)
 
@@ -64,7 +63,7 @@ def night_facts(
     folder
         Where the night's tables lie too, on this machine.
     """
-    before = [each for each in nights if each < night][-(MOST_NIGHTS - 1) :]
+    before = [each for each in nights if each < night][-(MAX_NIGHTS - 1) :]
     own = night_reader(dataset, night) if folder is None else NightReader.of_folder(folder, night)
     return read_night_facts(own, dataset, [night_reader(dataset, each) for each in before])
 
@@ -76,7 +75,6 @@ def _page_and_extract(facts: NightFacts) -> tuple[str, ReportExtract]:
 
 def _drawing() -> tuple[Callable[[NightFacts], str], Callable[[NightFacts], ReportExtract]]:
     # Without matplotlib these modules cannot be imported: they raise `ReportError`.
-    from epipole.tasks.report.page.extract import report_extract
-    from epipole.tasks.report.page.night_page import night_page
+    from epipole.tasks.report.page import night_page, report_extract
 
     return night_page, report_extract

@@ -13,29 +13,28 @@ import numpy as np
 
 from epipole.flows.night.progress import results
 from epipole.flows.night.work import Work
-from epipole.io.work.places import SensorParts, SolvedParts, ViewedParts
+from epipole.io.work.work_layout import SensorParts, SolvedParts, ViewedParts
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span, spans_between
 from epipole.schemas.stages import Stage
-from epipole.tasks.solve.association.associate_block import associate_blocks, blocks_of
-from epipole.tasks.solve.association.number_objects import number_objects
-from epipole.tasks.solve.positions.judge_span import judge_span
-from epipole.tasks.solve.positions.sample_sight_lines import LineSampling
-from epipole.tasks.solve.positions.solve_piece import Piece, solve_piece
-from epipole.tasks.solve.positions.solve_positions import VELOCITY_WINDOW_S
-from epipole.tasks.solve.views.align_epochs import EpochGrid, frames_that_serve, grid_of
-from epipole.tasks.solve.views.view_sensors import view_sensors
+from epipole.tasks.solve.align_epochs import EpochGrid, frames_that_serve, grid_of
+from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
+from epipole.tasks.solve.number_objects import number_objects
+from epipole.tasks.solve.positions import VELOCITY_WINDOW_S
+from epipole.tasks.solve.sample_sight_lines import LineSampling
+from epipole.tasks.solve.solve_piece import Piece, judge_span, solve_piece
+from epipole.tasks.solve.views import view_sensors
 
 STEPS = 5  # of the progress
 MARGIN_NS = round(VELOCITY_WINDOW_S * 1e9)  # beyond a span: its positions show an object's motion
-FEWEST_EPOCHS = 6  # of a margin
+MIN_EPOCHS = 6  # of a margin
 VIEWS_AT_ONCE = 4  # tasks that share what one task may hold: small tasks are spread evenly
 # Views that show the errors of the sensors of a span. Not a setting: positions do not depend on the
 # memory of a task.
-MOST_JUDGED = 100_000
-MOST_LINES = 30_000  # of sight, of a span, that are kept for the check of the sensors
+MAX_JUDGED = 100_000
+MAX_LINES = 30_000  # of sight, of a span, that are kept for the check of the sensors
 
 
 class _Night(NamedTuple):
@@ -56,7 +55,7 @@ class _Night(NamedTuple):
     @property
     def margin_ns(self) -> int:
         """Time beyond a span whose positions show the motion at its ends."""
-        return max(MARGIN_NS, FEWEST_EPOCHS * self.grid.interval_ns)
+        return max(MARGIN_NS, MIN_EPOCHS * self.grid.interval_ns)
 
     @property
     def epochs_apart(self) -> int:
@@ -163,7 +162,7 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     numbered = number_objects.submit(spans, night.margin_ns, settings, solved)
     (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
     viewed, margin_ns = night.viewed, night.margin_ns
-    most_views = MOST_JUDGED * night.epochs_apart
+    most_views = MAX_JUDGED * night.epochs_apart
     full = [span for span, count in zip(spans, counts, strict=True) if count]
     judged = [
         judge_span.submit(
@@ -189,6 +188,4 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
 
 def _kept_lines(night: _Night, n_views: int) -> LineSampling:
     """Return which lines of sight of a span are kept."""
-    return LineSampling(
-        night.apart_ns, max(math.ceil(n_views / night.epochs_apart / MOST_LINES), 1)
-    )
+    return LineSampling(night.apart_ns, max(math.ceil(n_views / night.epochs_apart / MAX_LINES), 1))

@@ -17,10 +17,9 @@ from epipole.flows.night.progress import results, step
 from epipole.flows.night.solving import solve_objects
 from epipole.flows.night.summary import Summary, many, summarise
 from epipole.flows.night.work import Spans, Work, spans_of_night
-from epipole.io.catalogues.known_objects import KnownObjects
-from epipole.io.work.part_tables import IDENTIFIED
-from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import ReadFolder, SolvedParts, WorkFolder
+from epipole.io.catalogues.element_sets import KnownObjects
+from epipole.io.work.parts import IDENTIFIED, Parts, write_part
+from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import array, concat
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
@@ -36,14 +35,19 @@ from epipole.tasks.check.check_sensors import (
 from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.identify.identify_span import Counts, identify_span
 from epipole.tasks.identify.judge_image_sizes import OutsideImage, judge_image_size
-from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
-from epipole.tasks.name.followed_objects import VIEWS, followed_objects
-from epipole.tasks.name.link_objects import link_objects, outermost, renamed
-from epipole.tasks.name.name_known import name_known_objects
-from epipole.tasks.name.name_objects import Names, name_objects, number_objects
+from epipole.tasks.name.known_objects import ElementsOfNight, elements_of_night, name_known_objects
+from epipole.tasks.name.object_ids import (
+    VIEWS,
+    Names,
+    followed_objects,
+    link_objects,
+    name_objects,
+    number_objects,
+    outermost,
+    renamed,
+)
 from epipole.tasks.name.sensor_residuals import SensorResidual
-from epipole.tasks.publish.night_parts import NightParts
-from epipole.tasks.publish.publish_nights import publish_nights
+from epipole.tasks.publish.night_parts import NightParts, publish_nights
 from epipole.tasks.publish.write_tables import SHARES, write_tables
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs
 from epipole.tasks.read.read_logs import read_log_into
@@ -53,7 +57,7 @@ from epipole.tasks.track.track_span import track_span
 LOGGER = logging.getLogger(__name__)
 
 # After the first correction the views of a sensor fit objects; from these the second is exact.
-MOST_CORRECTIONS = 2
+MAX_CORRECTIONS = 2
 
 
 def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> OrderedFrames:
@@ -160,7 +164,7 @@ def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
     late = [verdict for verdict in faulty if verdict.is_late]
     work = work._replace(verdicts=tuple(as_in_the_logs(work.verdicts, verdicts)))
-    correctable = settings.alignment.correct_clocks and work.round < MOST_CORRECTIONS
+    correctable = settings.alignment.correct_clocks and work.round < MAX_CORRECTIONS
     if late and correctable:
         return Checked(_correct_clocks(work, late, settings), again=True, left_out={})
     return Checked(work, again=False, left_out=_taking_part(work, solved, faulty))

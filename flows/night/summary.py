@@ -8,10 +8,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.datasets.night_files import Where, count_rows, read_columns
+from epipole.io.datasets.night_tables import Where, count_rows, read_columns
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import NameStatus, Reason
-from epipole.tasks.report.report_extract import ReportExtract
+from epipole.tasks.report.night_facts import ReportExtract
 
 
 @dataclass(frozen=True)

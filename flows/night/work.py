@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.parts import Parts
-from epipole.io.work.places import ReadFolder, SensorParts, WorkFolder
+from epipole.io.work.work_layout import ReadFolder, SensorParts, WorkFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import OF_CALIBRATIONS, Reason, reject_rows

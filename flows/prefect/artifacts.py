@@ -5,31 +5,43 @@ A page that cannot be written is a warning, never an error.
 
 import base64
 import contextlib
+import functools
 import logging
 import time
-from collections.abc import Iterator, Mapping
-from typing import cast
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from typing import Any, ParamSpec, cast
 from uuid import UUID
 
 import httpx
+from prefect import Flow
 from prefect.artifacts import (
     create_markdown_artifact,
     create_progress_artifact,
     create_table_artifact,
     update_progress_artifact,
 )
+from prefect.client.schemas.objects import State
+from prefect.context import FlowRunContext, TaskRunContext
 from prefect.exceptions import PrefectException
+from prefect.logging.handlers import APILogHandler
+from prefect.states import Completed
 
-from epipole.flows.night.progress import COMPILE
+from epipole.flows.night.progress import COMPILE, ROOT, STEPS, with_safe_text
 from epipole.flows.night.summary import Summary, many
+from epipole.schemas.errors import EpipoleError
 from epipole.schemas.rejects import Reason
-from epipole.schemas.text.shown import as_line, as_markdown_text
-from epipole.tasks.report.report_extract import ReportExtract
+from epipole.schemas.text import as_line, as_markdown_text
+from epipole.tasks.report.night_facts import ReportExtract
+
+# -- Artifacts of a night on Prefect's page: its progress and its results.
+#
+# A page that cannot be written is a warning, never an error.
 
 LOGGER = logging.getLogger(__name__)
 
 LONGEST_ID = 100
-MOST_SENSORS = 50  # that the table of gaps names
+MAX_SENSORS = 50  # that the table of gaps names
 UPDATED_EVERY_S = 3.0
 _PAGE_ERRORS = (httpx.HTTPError, PrefectException, OSError, RuntimeError)
 
@@ -139,7 +151,7 @@ def _extract(extract: ReportExtract) -> list[str]:
         lines += ["", f"![{as_markdown_text(picture.alt)}](data:image/png;base64,{data})"]
     if extract.lost_s:
         lines += ["", "| sensor | gaps | seconds without frames |", "|---|---:|---:|"]
-        for sensor, lost_s in list(extract.lost_s.items())[:MOST_SENSORS]:
+        for sensor, lost_s in list(extract.lost_s.items())[:MAX_SENSORS]:
             count = sum(gap.sensor_id == sensor for gap in extract.gaps)
             name = as_markdown_text(sensor, LONGEST_ID)
             lines.append(f"| {name} | {count:,} | {lost_s:,.0f} |")
@@ -153,3 +165,89 @@ def _places(summary: Summary) -> list[str]:
 def _table(heading: str, counts: dict[str, int]) -> list[str]:
     rows = [f"| {key} | {count:,} |" for key, count in counts.items()]
     return [f"| {heading} | count |", "|---|---:|", *rows]
+
+
+# -- What Prefect's page shows of a run besides its tasks, and what the run's caller gets of it.
+
+P = ParamSpec("P")
+
+# How the flow of this context has ended: what it returned or raised.
+_ENDED: ContextVar[list[Summary | BaseException]] = ContextVar("ended")
+
+
+def shown_on_page(flow: Callable[P, Summary]) -> Callable[P, State[Summary]]:
+    """Return the flow's function, with its log lines, progress and summary on Prefect's page."""
+
+    @functools.wraps(flow)
+    def shown(*args: P.args, **kwargs: P.kwargs) -> State[Summary]:
+        bar = ProgressBar()
+        with _added(ROOT, _RunLog(logging.INFO)), _added(STEPS, bar):
+            try:
+                summary = flow(*args, **kwargs)
+            except BaseException as error:
+                _ended(error)
+                bar.finish("failed; see the log")
+                raise
+            _ended(summary)
+            bar.finish("done")
+            show_summary(summary)
+            # The page, and --watch, show the message.
+            return Completed(message=summary.sentence(), data=summary)
+
+    return shown
+
+
+def _ended(how: Summary | BaseException) -> None:
+    """Tell `run_here`; a function, as Dask pickles the flow with the variables that it names."""
+    _ENDED.get([]).append(how)
+
+
+def run_here(flow: Flow[P, Any], *args: P.args, **kwargs: P.kwargs) -> Summary:
+    """Run a flow that is `shown_on_page`, and return its summary as this process made it.
+
+    Prefect's own call takes the result out of the last state, and the server may answer with a
+    state of someone else's, whose result is a pickle file: code that would run here.
+
+    Raises
+    ------
+    EpipoleError
+        Where the server lets the run not begin.
+    """
+    ended: list[Summary | BaseException] = []
+    token = _ENDED.set(ended)
+    try:
+        state = cast(State[Any], flow(*args, return_state=True, **kwargs))
+    finally:
+        _ENDED.reset(token)
+    if not ended:
+        raise EpipoleError(
+            f"the run did not begin: Prefect's server says {state.name} "
+            f"({as_line(state.message or 'without a reason')}); see who else uses the server"
+        )
+    if isinstance(ended[-1], BaseException):
+        raise ended[-1]
+    return ended[-1]
+
+
+class _RunLog(APILogHandler):
+    """Sends log lines to the flow run or task run in which they are written."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if TaskRunContext.get() or FlowRunContext.get():  # neither in a thread of a library
+            super().emit(with_safe_text(record))
+
+
+@contextlib.contextmanager
+def _added(logger: logging.Logger, handler: logging.Handler) -> Iterator[None]:
+    """Add a handler to a logger, unless the user's logging already sends its lines to Prefect."""
+    if any(type(other) is APILogHandler for other in logger.handlers):
+        yield
+        return
+    level = logger.level
+    logger.setLevel(min(logger.getEffectiveLevel(), handler.level or logging.DEBUG))
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(level)

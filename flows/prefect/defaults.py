@@ -22,9 +22,9 @@ from prefect.settings import (
 
 from epipole.flows.prefect.embedded_server import start_server
 from epipole.flows.prefect.server_process import DEFAULTS, Launched
-from epipole.io.remote_files import line_of
+from epipole.io.paths import line_of
 from epipole.schemas.errors import EpipoleError
-from epipole.schemas.text.urls import without_secrets
+from epipole.schemas.text import without_secrets
 
 ANSWERS_WITHIN_S = 5.0
 

@@ -25,7 +25,7 @@ from epipole.schemas.errors import EpipoleError
 
 LOGGER = logging.getLogger(__name__)
 
-MOST_RESTARTS = 3
+MAX_RESTARTS = 3
 _LAST_LINE = re.compile(r"^[\w.]+(?:Error|Exception)\b.*", re.MULTILINE)
 
 
@@ -80,7 +80,7 @@ class _Server:
 
     def keep_alive(self) -> None:
         """Start the server again when it ends, a few times."""
-        for _ in range(MOST_RESTARTS):
+        for _ in range(MAX_RESTARTS):
             self._launched.process.wait()
             if self._stopping.is_set():
                 return

@@ -7,9 +7,9 @@ from typing import Any
 
 from prefect.task_runners import TaskRunner, ThreadPoolTaskRunner
 
-from epipole.io.remote_files import line_of
-from epipole.schemas.choices import Runner
+from epipole.io.paths import line_of
 from epipole.schemas.errors import EpipoleError
+from epipole.schemas.options import Runner
 
 ANSWERS_WITHIN_S = 5.0
 

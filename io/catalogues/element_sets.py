@@ -1,10 +1,12 @@
 """Files of published element sets: two-line elements, and CCSDS OMM in JSON, CSV or XML."""
 
 import csv
+import hashlib
 import json
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
@@ -12,8 +14,11 @@ from sgp4 import omm
 from sgp4.api import WGS72, Satrec
 from sgp4.io import compute_checksum
 
-from epipole.schemas.catalogues.element_set import ElementSet
-from epipole.schemas.errors import CatalogueError
+from epipole.io.paths import known_as, open_remote
+from epipole.schemas.errors import CatalogueError, LogError
+from epipole.schemas.star_lists import ElementSet
+
+# -- Files of published element sets: two-line elements, and CCSDS OMM in JSON, CSV or XML.
 
 _UNIX_EPOCH_JD = 2440587.5
 _SGP4_EPOCH_JD = 2433281.5  # 1949 December 31, 0h
@@ -192,3 +197,54 @@ def _element_set(title: str, number: int, cospar_id: str, satellite: Any) -> Ele
         raise ValueError("mean motion, eccentricity, epoch or an angle is out of bounds")
     epoch_ns = round((day - _UNIX_EPOCH_JD) * _DAY_NS) + round(part * _DAY_NS)
     return ElementSet(title, number, epoch_ns, elements, cospar_id)
+
+
+# -- The catalogue of known objects: a file of element sets, and its digest.
+
+ADVICE = "give two-line elements, or OMM in CSV, JSON or XML"
+
+
+class KnownObjects(NamedTuple):
+    """The element sets of a file, in its order, and its records that are none."""
+
+    file: str  # its name, without folders
+    sha256: str
+    sets: list[ElementSet]
+    faults: list[Fault]
+
+
+def read_known_objects(where: str) -> KnownObjects:
+    """Return the catalogue of known objects that a path or a URL names.
+
+    Raises
+    ------
+    CatalogueError
+        Where it is missing, cannot be read or has no element set.
+    """
+    where = known_as(where)
+    data = _bytes_of(where)
+    try:
+        sets, faults = parse_element_sets(data)
+    except CatalogueError as error:
+        raise CatalogueError(f"{where}: {error}; {ADVICE}") from error
+    if not sets:
+        first = f" ({faults[0]})" if faults else ""
+        raise CatalogueError(f"{where}: has no element sets{first}; {ADVICE}")
+    return KnownObjects(Path(where).name, hashlib.sha256(data).hexdigest(), sets, faults)
+
+
+def _bytes_of(where: str) -> bytes:
+    if "://" in where:
+        try:
+            size, read, _ = open_remote(where)
+            return read(0, size)
+        except LogError as error:
+            raise CatalogueError(str(error)) from error
+    path = Path(where)
+    if not path.is_file():
+        what = "is no file" if path.exists() else "no such file"
+        raise CatalogueError(f"{where}: {what}; {ADVICE}")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise CatalogueError(f"{where}: cannot be read: {error.strerror}; {ADVICE}") from error

@@ -9,8 +9,8 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import table
-from epipole.schemas.catalogues.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
 from epipole.schemas.errors import CatalogueError
+from epipole.schemas.star_lists import STAR_CATALOGUE, CatalogueLabel, labelled
 
 NAME = "hipparcos"
 HIPPARCOS_EPOCH = 1991.25  # Julian year of all its positions

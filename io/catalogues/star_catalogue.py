@@ -11,13 +11,8 @@ import pyarrow.parquet as pq
 
 from epipole.io.catalogues import hipparcos
 from epipole.schemas.bridge import array, conform
-from epipole.schemas.catalogues.star_catalogue import (
-    STAR_CATALOGUE,
-    CatalogueLabel,
-    label_of,
-    labelled,
-)
 from epipole.schemas.errors import CatalogueError
+from epipole.schemas.star_lists import STAR_CATALOGUE, CatalogueLabel, label_of, labelled
 
 BUILD = "make it with `epipole catalog build`"
 

@@ -10,15 +10,15 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from epipole.io.names import refuse_device
+from epipole.io.paths import refuse_device
 from epipole.schemas.bridge import table
-from epipole.schemas.catalogues.star_catalogue import (
+from epipole.schemas.errors import CatalogueError
+from epipole.schemas.star_lists import (
     STAR_CATALOGUE,
     UNKNOWN_MOTION_MAS_YR,
     CatalogueLabel,
     labelled,
 )
-from epipole.schemas.errors import CatalogueError
 
 REQUIRED = ("star_id", "ra_deg", "dec_deg", "magnitude")
 MOTION = ("pm_ra_mas_yr", "pm_dec_mas_yr")

@@ -16,15 +16,13 @@ from urllib.parse import unquote, urlsplit
 import pyarrow as pa
 
 from epipole.io.caches.private_folders import temporary_folder
-from epipole.io.datasets import local_nights
-from epipole.io.datasets.folder_swap import sync
-from epipole.io.datasets.local_nights import STAGING
-from epipole.io.datasets.night_reader import NightReader
+from epipole.io.datasets import local as local_nights
+from epipole.io.datasets.local import STAGING, sync
+from epipole.io.datasets.night_tables import NightReader
+from epipole.io.datasets.object_store import StoreNights, store_nights
 from epipole.io.datasets.plain_files import refuse_link
-from epipole.io.datasets.store_nights import StoreNights, store_nights
 from epipole.io.datasets.table_pieces import Between, read_pieces
-from epipole.io.names import fault_of_name
-from epipole.io.remote_files import known_as, line_of, shown_error, storage_errors
+from epipole.io.paths import fault_of_name, known_as, line_of, shown_error, storage_errors
 from epipole.schemas.bridge import conform
 from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError

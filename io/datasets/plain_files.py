@@ -14,7 +14,7 @@ from pathlib import Path
 from epipole.schemas.errors import DatasetError
 
 # Of a claim or a commit. One of ten years of nights has less than 1 MB.
-MOST_BYTES = 4 << 20
+MAX_BYTES = 4 << 20
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 _FILE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # of a pipe, opening would wait for ever
@@ -65,9 +65,9 @@ def opened(file: Path, flags: int = os.O_RDONLY) -> int:
 def read_small(file: Path) -> bytes:
     """Return the content of a claim or a commit, which is small; errors are those of `opened`."""
     with open(opened(file), "rb") as opened_file:
-        content = opened_file.read(MOST_BYTES + 1)
-    if len(content) > MOST_BYTES:
-        raise DatasetError(f"{file}: is larger than {MOST_BYTES:,} bytes; remove it")
+        content = opened_file.read(MAX_BYTES + 1)
+    if len(content) > MAX_BYTES:
+        raise DatasetError(f"{file}: is larger than {MAX_BYTES:,} bytes; remove it")
     return content
 
 

@@ -17,8 +17,8 @@ from epipole.schemas.columns import TIME
 ROWS_IN_PIECE = 1 << 17
 # Of the texts of a piece, and of all rows that are kept of a table of an earlier night. Half an
 # hour of 128 sensors that see 60 objects each second has 550 MB of views.
-MOST_BYTES = 1 << 30
-MOST_LISTED = 1 << 20  # values of a list column in a row group: a night's sentences on its sensors
+MAX_BYTES = 1 << 30
+MAX_LISTED = 1 << 20  # values of a list column in a row group: a night's sentences on its sensors
 
 Between = tuple[int | None, int | None]  # from here to before there [ns since 1970]; None: open
 
@@ -96,7 +96,7 @@ def _check_lists(file: pq.ParquetFile, groups: Iterable[int], lists: list[str]) 
     for group in map(file.metadata.row_group, groups):
         for column in map(group.column, range(group.num_columns)):
             is_list = column.path_in_schema.partition(".")[0] in lists
-            if is_list and column.num_values > MOST_LISTED:
+            if is_list and column.num_values > MAX_LISTED:
                 raise ValueError(f"column {column.path_in_schema} has {column.num_values:,} values")
 
 
@@ -105,8 +105,8 @@ def _check_texts(batch: pa.RecordBatch) -> None:
     for name, values in zip(batch.schema.names, batch.columns, strict=True):
         if pa.types.is_dictionary(values.type):
             lengths = pc.binary_length(values.dictionary).cast(pa.int64())
-            if (pc.sum(lengths.take(values.indices)).as_py() or 0) > MOST_BYTES:
-                raise ValueError(f"column {name} unpacks to more than {MOST_BYTES >> 20:,} MiB")
+            if (pc.sum(lengths.take(values.indices)).as_py() or 0) > MAX_BYTES:
+                raise ValueError(f"column {name} unpacks to more than {MAX_BYTES >> 20:,} MiB")
 
 
 def _chosen(times: pa.ChunkedArray, between_ns: Between) -> pa.ChunkedArray:

@@ -3,8 +3,8 @@
 import glob
 from pathlib import Path
 
-from epipole.io.names import fault_of_name
-from epipole.io.remote_files import (
+from epipole.io.paths import (
+    fault_of_name,
     file_system,
     known_as,
     line_of,
@@ -12,7 +12,7 @@ from epipole.io.remote_files import (
     storage_errors,
 )
 from epipole.schemas.errors import LogError
-from epipole.schemas.text.urls import without_secrets
+from epipole.schemas.text import without_secrets
 
 SUFFIX = ".mcap"  # of the logs in a folder
 PATTERN = f"*{SUFFIX}"

@@ -15,25 +15,23 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.io.logs.columns.cameras import CameraColumns
-from epipole.io.logs.columns.frames import FrameColumns
-from epipole.io.logs.columns.states import StateColumns
-from epipole.io.logs.damage import RejectList
+from epipole.io.logs.left_out import RejectList, own_range, stray_rejects, without_strays
 from epipole.io.logs.mcap.bytes import LogBytes, open_log
-from epipole.io.logs.mcap.channels import Channel, ChannelTable
+from epipole.io.logs.mcap.container import MAGIC, Channel, ChannelTable, read_summary
 from epipole.io.logs.mcap.records import Block, RecordWalk
-from epipole.io.logs.mcap.summary import MAGIC, read_summary
 from epipole.io.logs.messages.batches import batches_of
-from epipole.io.logs.messages.encodings.registry import kinds_of_schemas, message_encodings
-from epipole.io.logs.own_time import own_range, stray_rejects, without_strays
-from epipole.io.remote_files import known_as
+from epipole.io.logs.messages.cameras import CameraColumns
+from epipole.io.logs.messages.frames import FrameColumns
+from epipole.io.logs.messages.registry import kinds_of_schemas, message_encodings
+from epipole.io.logs.messages.states import StateColumns
+from epipole.io.paths import known_as
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import LogError
-from epipole.schemas.logs.log_tables import LogContents, LogPiece, LogSource
-from epipole.schemas.logs.messages import CALIBRATION, FRAME, KINDS, STATE
+from epipole.schemas.log_messages import CALIBRATION, FRAME, KINDS, STATE
 from epipole.schemas.rejects import Reason
 from epipole.schemas.tables import REJECTS
-from epipole.schemas.text.shown import as_line
+from epipole.schemas.text import as_line
+from epipole.schemas.work_tables import LogContents, LogPiece, LogSource
 
 LOGGER = logging.getLogger(__name__)
 
@@ -41,7 +39,7 @@ Nanoseconds = npt.NDArray[np.int64]
 
 PER_MESSAGE = ("channel", "time_ns", "start", "end", "offset")  # columns of a block
 THREADS = 2  # that decompress and check chunks, in addition to the one that decodes
-MOST_WARNINGS = 20  # of unknown encodings in one log: it may have 65,536 channels
+MAX_WARNINGS = 20  # of unknown encodings in one log: it may have 65,536 channels
 LONGEST_NAME = 80  # of a topic or an encoding in a message
 PIECE_BYTES = 64 << 20  # of frames and states in one piece of a log
 
@@ -170,7 +168,7 @@ class _Reading:
             )
         for i, (channel, count) in enumerate(self._unknown.values()):
             LOGGER.log(
-                logging.WARNING if i < MOST_WARNINGS else logging.DEBUG,
+                logging.WARNING if i < MAX_WARNINGS else logging.DEBUG,
                 "%s: topic %s: messages are encoded as %s; write %s as one of %s",
                 self._where, as_line(channel.topic, LONGEST_NAME),
                 as_line(repr(channel.encoding), LONGEST_NAME), channel.schema,

@@ -1,16 +1,121 @@
 """Logs out: frames, states and calibrations to an MCAP file."""
 
+import errno
+import importlib
 import os
 from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy.typing as npt
+from google.protobuf import descriptor_pb2
+from mcap.writer import CompressionType, Writer
 
-from epipole.io.logs.mcap_file import McapFile, Schema
-from epipole.io.logs.messages.encodings.encoding import Values
-from epipole.io.logs.messages.encodings.registry import encoding_named
-from epipole.schemas.logs.messages import CALIBRATION, FRAME, STATE
+from epipole.io.logs.messages.encoding import Values
+from epipole.io.logs.messages.protobuf import add_file
+from epipole.io.logs.messages.registry import encoding_named
+from epipole.schemas.log_messages import CALIBRATION, FRAME, STATE
+
+# -- An MCAP file that is written: channels, messages, and its name when it is complete.
+
+COMPRESSIONS = {
+    "zstd": CompressionType.ZSTD,
+    "lz4": CompressionType.LZ4,
+    "none": CompressionType.NONE,
+}
+
+
+class Schema(NamedTuple):
+    """The schema of a channel's messages, and how they are encoded."""
+
+    name: str
+    encoding: str
+    data: bytes
+    message_encoding: str
+
+
+class McapFile:
+    """Writes one file; a context manager. The file gets its name when it is complete.
+
+    The bytes depend only on the messages and their order. `log_time` and `publish_time` are the
+    time of the message.
+
+    Raises
+    ------
+    ValueError
+        Where the compression is unknown.
+    OSError
+        Where the path is that of a folder, or the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        profile: str = "",
+        compression: str = "zstd",
+        chunk_size: int = 1 << 20,
+    ) -> None:
+        if compression not in COMPRESSIONS:
+            raise ValueError(f"compression {compression!r}: not one of {', '.join(COMPRESSIONS)}")
+        self._path = Path(path)
+        if self._path.is_dir():  # told before all is written; an empty name is the current folder
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+        self._partial = self._path.with_name(self._path.name + ".partial")
+        self._file = self._partial.open("wb")
+        self._writer = Writer(
+            self._file, compression=COMPRESSIONS[compression], chunk_size=chunk_size
+        )
+        # The default library name has a version in it, which would change the bytes.
+        self._writer.start(profile=profile, library="epipole")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self._sequences: dict[int, int] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._file.close()
+            self._partial.unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Write the summary and give the file its name."""
+        self._writer.finish()
+        self._file.close()
+        self._partial.replace(self._path)
+
+    def write(self, topic: str, schema: Schema, time_ns: int, data: bytes) -> None:
+        """Write a message; the first of a topic opens its channel."""
+        channel = self._channels.get((topic, schema.name)) or self._open(topic, schema)
+        sequence = self._sequences[channel]
+        self._sequences[channel] = sequence + 1
+        self._writer.add_message(channel, time_ns, data, time_ns, sequence & 0xFFFFFFFF)
+
+    def _open(self, topic: str, schema: Schema) -> int:
+        if schema.name not in self._schemas:
+            self._schemas[schema.name] = self._writer.register_schema(
+                schema.name, schema.encoding, schema.data
+            )
+        channel = self._writer.register_channel(
+            topic, schema.message_encoding, self._schemas[schema.name]
+        )
+        self._channels[(topic, schema.name)] = channel
+        self._sequences[channel] = 0
+        return channel
+
+
+# -- Logs out: frames, states and calibrations to an MCAP file.
 
 _TOPICS = {FRAME: "centroids", STATE: "state", CALIBRATION: "calibration"}
 Numbers = npt.ArrayLike
@@ -166,3 +271,35 @@ def calibration_values(sensor_id: str, time_ns: int, camera: Values) -> dict[str
         "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         "P": [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
     }
+
+
+# -- An MCAP file for viewers: messages of foxglove's public schemas, as protobuf.
+
+PREFIX = "foxglove."
+
+
+class ViewerFile(McapFile):
+    """Writes messages by the name of their schema, such as ``foxglove.SceneUpdate``."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        super().__init__(path)
+        self._protobuf = encoding_named("protobuf")
+
+    def message(self, topic: str, schema: str, time_ns: int, data: bytes) -> None:
+        """Write a serialised message."""
+        self.write(topic, foxglove_schema(schema), time_ns, data)
+
+    def calibration(self, sensor_id: str, time_ns: int, camera: dict[str, Any]) -> None:
+        """Write a calibration, of a row of CAMERAS."""
+        data = self._protobuf.encode(CALIBRATION, calibration_values(sensor_id, time_ns, camera))
+        self.message(f"/{sensor_id}/calibration", f"{PREFIX}CameraCalibration", time_ns, data)
+
+
+@cache
+def foxglove_schema(name: str) -> Schema:
+    """Return one of the public schemas."""
+    kind = name.removeprefix(PREFIX)
+    module = importlib.import_module(f"foxglove_schemas_protobuf.{kind}_pb2")
+    files = descriptor_pb2.FileDescriptorSet()
+    add_file(files, getattr(module, kind).DESCRIPTOR.file)
+    return Schema(name, "protobuf", files.SerializeToString(deterministic=True), "protobuf")

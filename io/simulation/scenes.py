@@ -4,9 +4,13 @@ import os
 from pathlib import Path
 from typing import Any
 
-from epipole.io.names import refuse_device
-from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.scene import Scene, scene_values, validate_scene
+from epipole.io.catalogues.element_sets import parse_element_sets
+from epipole.io.paths import refuse_device
+from epipole.schemas.errors import CatalogueError, SceneError
+from epipole.schemas.scene import Scene, scene_values, validate_scene
+from epipole.schemas.star_lists import ElementSet
+
+# -- Simulation scenes: built-in ones and TOML files.
 
 _BUILT_IN = Path(__file__).parent / "built_in"
 
@@ -50,3 +54,34 @@ def _beside(values: Any, folder: Path) -> Any:
     if isinstance(file, str) and (folder / file).is_file():
         values["elements"] = str((folder / file).resolve())
     return values
+
+
+# -- Element sets for scenes: of a file that comes with the package, or of one on the disk.
+
+
+def built_in_element_files() -> list[str]:
+    """Return the names of the files of element sets that come with the package."""
+    return sorted(path.name for path in _BUILT_IN.glob("*.tle"))
+
+
+def read_element_sets(path: str | os.PathLike[str]) -> list[ElementSet]:
+    """Return the element sets of a file, in its order; see `parse_element_sets`.
+
+    The file is of the package (such as ``real_orbits.tle``) or on the disk.
+
+    Raises
+    ------
+    SceneError
+        Where the file is missing, has no element sets, or one of them is invalid.
+    """
+    name = os.fspath(path)
+    where = _BUILT_IN / name if name in built_in_element_files() else Path(name)
+    try:
+        found, faults = parse_element_sets(where.read_bytes())
+    except (OSError, CatalogueError) as error:
+        raise SceneError(f"{name}: cannot be read as element sets: {error}") from error
+    if faults:
+        raise SceneError(f"{name}, {faults[0]}")
+    if not found:
+        raise SceneError(f"{name}: has no element sets; give two-line elements or OMM")
+    return found

@@ -10,15 +10,123 @@ import shutil
 import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import pyarrow as pa
 import pyarrow.ipc as ipc
 
-from epipole.io.work.part_tables import PartTables, check_tables
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.spans import Span, spans_between
+from epipole.schemas.tables import (
+    ASSOCIATIONS,
+    DETECTIONS,
+    PAIRS,
+    POSITIONS,
+    REJECTS,
+    STARS,
+    STATES,
+)
+from epipole.schemas.work_tables import (
+    CAMERAS,
+    CLAIMED_VIEWS,
+    CLOCK_LINES,
+    EXPOSURES,
+    FRAME_INDEX,
+    HOT_SUSPECTS,
+    LOG_STATES,
+    MOVING_OBJECTS,
+    OBJECT_MEMBERS,
+    SENSOR_EPOCHS,
+    SENSOR_STATES,
+    SHARED_ERRORS,
+    SIGHTINGS,
+    SOLUTIONS,
+    TRACKLET_NAMES,
+    TRACKLET_OUTCOMES,
+    TRACKLET_RUNS,
+    VIEWED_TRACKLETS,
+    VIEWS,
+)
+
+# -- The tables of each kind of part, by name; `write_part` refuses any other.
+#
+# Tables may add metadata to a declared schema, such as the catalogue of `stars`.
+
+PartTables = Mapping[str, pa.Schema]
+
+LOG_PIECE: Final[PartTables] = {
+    "exposures": EXPOSURES,
+    "states": LOG_STATES,
+    "cameras": CAMERAS,
+    "rejects": REJECTS,
+}
+READ_SENSOR: Final[PartTables] = {"index": FRAME_INDEX, "states": SENSOR_STATES}
+IDENTIFIED: Final[PartTables] = {
+    "solutions": SOLUTIONS,
+    "stars": STARS,
+    "detections": DETECTIONS,
+    "rejects": REJECTS,
+}
+TRACKED: Final[PartTables] = {
+    "detections": DETECTIONS,
+    "tracklets": TRACKLET_RUNS,
+    "suspects": HOT_SUSPECTS,
+}
+SPAN_NAMES: Final[PartTables] = {"names": TRACKLET_NAMES}
+NIGHT_TRACKLETS: Final[PartTables] = {"tracklets": TRACKLET_RUNS, "suspects": HOT_SUSPECTS}
+VIEWED: Final[PartTables] = {
+    "epochs": SENSOR_EPOCHS,
+    "views": VIEWS,
+    "sightings": SIGHTINGS,
+    "tracklets": VIEWED_TRACKLETS,
+}
+ASSOCIATED: Final[PartTables] = {
+    "members": OBJECT_MEMBERS,
+    "rejects": REJECTS,
+    "outcomes": TRACKLET_OUTCOMES,
+}
+NUMBERED: Final[PartTables] = {"members": OBJECT_MEMBERS}
+JUDGED: Final[PartTables] = {"errors": SHARED_ERRORS}
+SOLVED: Final[PartTables] = {
+    "associations": ASSOCIATIONS,
+    "positions": POSITIONS,
+    "pairs": PAIRS,
+    "states": STATES,
+    "rejects": REJECTS,
+    "outcomes": TRACKLET_OUTCOMES,
+    "lines": CLOCK_LINES,
+    "claims": CLAIMED_VIEWS,
+    "objects": MOVING_OBJECTS,
+}
+
+
+def check_tables(part: str, declared: PartTables, tables: Mapping[str, pa.Table]) -> None:
+    """Check that the tables of a part are those that are declared for it.
+
+    Raises
+    ------
+    ValueError
+        Names the part, the table, and the columns that are expected.
+    """
+    if set(tables) != set(declared):
+        raise ValueError(f"{part}: tables {sorted(tables)}, expected {sorted(declared)}")
+    for name, rows in tables.items():
+        if not rows.schema.equals(declared[name]):
+            raise ValueError(
+                f"{part}: table {name}: columns {_columns(rows.schema)}, "
+                f"expected {_columns(declared[name])}"
+            )
+
+
+def _columns(schema: pa.Schema) -> str:
+    return ", ".join(str(field.remove_metadata()) for field in schema)
+
+
+# -- Parts: the tables that one task leaves in the work folder for others, as Arrow files.
+#
+# A part appears by one rename, complete or not at all. So any task that finds a part can use it:
+# a later task, another worker on the same storage, or the next run after this one was killed.
 
 CLOCK_NS = 10_000_000_000  # the largest correction of a clock
 
@@ -34,7 +142,7 @@ def write_part(
     Parameters
     ----------
     declared
-        The tables that the part must have: one of `epipole.io.work.part_tables`.
+        The tables that the part must have: one of `epipole.io.work.parts`.
     within
         A folder of the part that must exist. It is not made: a task that outlives its run would
         bring the run's folder back.

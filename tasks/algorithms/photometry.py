@@ -16,14 +16,14 @@ Indices = npt.NDArray[np.int64]
 
 FEWEST = 20  # values that tell a variance
 OF_A_BIN = 25  # values; at least, where the variance depends on the flux
-MOST_BINS = 8
+MAX_BINS = 8
 UNTOLD_MAG2 = 0.3**2  # of a star, where too few stars tell: colours and variable stars
-LEAST_MAG2 = 1e-8
+MIN_MAG2 = 1e-8
 CLIPPED = 3.5  # sigmas: stars beyond are variable, blended or wrong in the catalogue
 LEFT = 1e-6  # of their weight
 ITERATIONS = 3  # of zero points and the variance about them
-MOST_SHARE = 0.8  # of a star image in the means that are taken from it
-MOST_IMAGES = 5000  # of stars that are measured again and again: they tell the variance well
+MAX_SHARE = 0.8  # of a star image in the means that are taken from it
+MAX_IMAGES = 5000  # of stars that are measured again and again: they tell the variance well
 SWEEPS = 10  # over frames and stars, each a mean of what is left
 GAUSSIAN = 1.4826  # standard deviation over median absolute deviation
 
@@ -92,7 +92,7 @@ def _own_variance(
 ) -> tuple[float, float] | None:
     """Return the variance of a measured flux: what is left when each star has an offset of its
     own, and each frame. None where too few stars are measured often."""
-    some = frame <= np.sort(frame)[: MOST_IMAGES + 1].max(initial=-1)  # whole frames
+    some = frame <= np.sort(frame)[: MAX_IMAGES + 1].max(initial=-1)  # whole frames
     frame, offset, flux = frame[some], offset[some], flux[some]
     _, star = np.unique(star[some], return_inverse=True)
     often = (np.bincount(star)[star] > 1) & (np.bincount(frame, minlength=n_frames)[frame] > 1)
@@ -109,7 +109,7 @@ def _own_variance(
                 mean = np.bincount(group, weight * residual) / of_group
                 residual = residual - mean[group]
         own_share = weight / total[0][frame] + weight / total[1][star]
-        free = own_share < MOST_SHARE
+        free = own_share < MAX_SHARE
         residual = residual[free] / np.sqrt(1.0 - own_share[free])
         model = _variance_by_flux(residual, flux[free])
     return model
@@ -137,11 +137,11 @@ def _variance_by_flux(residual: Array, flux: Array) -> tuple[float, float]:
     """Return (floor, photon) of the variance ``floor + photon / flux``, from medians by flux."""
     if len(residual) < FEWEST:
         return UNTOLD_MAG2, 0.0
-    n_bins = int(np.clip(len(residual) // OF_A_BIN, 1, MOST_BINS))
+    n_bins = int(np.clip(len(residual) // OF_A_BIN, 1, MAX_BINS))
     order = np.argsort(flux, kind="stable")
     of_bin = np.array_split(order, n_bins)
     variance = np.array([(GAUSSIAN * np.median(np.abs(residual[b]))) ** 2 for b in of_bin])
-    variance = np.maximum(variance, LEAST_MAG2)
+    variance = np.maximum(variance, MIN_MAG2)
     if n_bins < 3:
         return float(np.mean(variance)), 0.0
     unit = np.median(flux)
@@ -150,8 +150,8 @@ def _variance_by_flux(residual: Array, flux: Array) -> tuple[float, float]:
     expected = variance
     for _ in range(ITERATIONS):  # weights by the measured variances alone would favour small ones
         (floor, photon), _ = nnls(terms / expected[:, None], variance / expected)
-        expected = np.maximum(terms @ [floor, photon], LEAST_MAG2)
-    return max(float(floor), LEAST_MAG2), float(photon * unit)
+        expected = np.maximum(terms @ [floor, photon], MIN_MAG2)
+    return max(float(floor), MIN_MAG2), float(photon * unit)
 
 
 def _variance(model: tuple[float, float], flux: Array) -> Array:

@@ -21,6 +21,7 @@ from epipole.tasks.algorithms.geometry.camera import (
     flip_rows,
     unproject,
 )
+from epipole.tasks.algorithms.geometry.covariances import OPTICS
 from epipole.tasks.algorithms.geometry.optics_calibration import (
     OpticsFit,
     StarImages,
@@ -28,7 +29,6 @@ from epipole.tasks.algorithms.geometry.optics_calibration import (
     calibrate_in_steps,
     calibrate_optics,
 )
-from epipole.tasks.algorithms.geometry.optics_errors import OPTICS
 from epipole.tasks.common.sightings import camera_of, optics_covariance_of
 from epipole.tasks.common.stage_tasks import stage_task
 

@@ -16,8 +16,8 @@ from epipole.tasks.algorithms.star_identification.camera_search import FEWEST
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensors
 from epipole.tasks.calibrate.find_camera import find_agreed_camera, image_frames, skies_at
 from epipole.tasks.common.sightings import camera_of
+from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
 TRIED = 6  # frames in which a camera is searched for
 REACH = 1.5  # by which a told focal length may be off, either way

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.io.work.parts import Parts
-from epipole.io.work.places import ReadFolder
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array, concat, flatten
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span
@@ -28,17 +28,16 @@ from epipole.tasks.algorithms.star_identification.camera_search import (
     agrees,
     find_cameras,
 )
-from epipole.tasks.algorithms.star_identification.frames.centroids import brightest_first
-from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
+from epipole.tasks.algorithms.star_identification.centroids import brightest_first
+from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
 from epipole.tasks.calibrate.calibrate_sensors import with_optics
 from epipole.tasks.common.sightings import camera_of
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
-from epipole.tasks.identify.flatten_centroids import flatten_centroids
+from epipole.tasks.identify.frame_inputs import flatten_centroids, interpolate_sensor_states
 from epipole.tasks.identify.identify_span import states_about
 from epipole.tasks.identify.identify_stars import search_of
-from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
-from epipole.tasks.identify.tabulate_identified import barycentric_velocity
+from epipole.tasks.identify.tabulate import barycentric_velocity
 from epipole.tasks.read.order_frames import frames_between
 
 Array = npt.NDArray[np.float64]

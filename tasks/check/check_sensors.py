@@ -10,7 +10,7 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.io.work.parts import Parts
-from epipole.io.work.places import SolvedParts, ViewedParts
+from epipole.io.work.work_layout import SolvedParts, ViewedParts
 from epipole.schemas.bridge import array, concat, stack, stack_covariance, to_polars
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.rejects import Reason
@@ -29,13 +29,13 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
 )
 from epipole.tasks.algorithms.sensor_faults.suspects import judge_many_sensors
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.solve.positions.sample_sight_lines import meetings
+from epipole.tasks.solve.sample_sight_lines import meetings
 
 Array = npt.NDArray[np.float64]
 
-MOST_EPOCHS = 300  # more do not help: the offset is one constant
-MOST_LINES = 30_000  # of sight to objects, of all sensors together
-MOST_PAIRS = 100_000  # of a view and an object, of one sensor
+MAX_EPOCHS = 300  # more do not help: the offset is one constant
+MAX_LINES = 30_000  # of sight to objects, of all sensors together
+MAX_PAIRS = 100_000  # of a view and an object, of one sensor
 KEY = ["epoch", "object_id", "sensor_id"]
 KNOWN_S = 1.0  # with a larger sigma a clock counts as unknown
 
@@ -129,7 +129,7 @@ def _epochs(solved: SolvedParts, spans: Sequence[Span]) -> pl.Series:
     columns = [CLOCK_LINES.empty_table().select(["epoch"])]
     columns += [rows for span in spans for rows in solved.read(span, "lines", ["epoch"])]
     per_epoch = to_polars(pa.concat_tables(columns)).group_by("epoch").len().sort("epoch")
-    fewer = max(len(per_epoch) / MOST_EPOCHS, per_epoch["len"].sum() / MOST_LINES)
+    fewer = max(len(per_epoch) / MAX_EPOCHS, per_epoch["len"].sum() / MAX_LINES)
     return per_epoch["epoch"][:: max(math.ceil(fewer), 1)]
 
 
@@ -176,7 +176,7 @@ def _others(
     free = to_polars(views).join(own, on=["epoch", "tracklet_id"], how="anti")
     n_objects = objects.group_by("epoch").agg(n=pl.len())
     pairs = free.select("epoch").join(n_objects, on="epoch")["n"].sum()
-    fewer = epochs[:: max(-(-pairs // MOST_PAIRS), 1)]
+    fewer = epochs[:: max(-(-pairs // MAX_PAIRS), 1)]
     return to_polars(
         meetings(free.filter(pl.col("epoch").is_in(fewer.implode())), objects, on=["epoch"])
     )

@@ -3,9 +3,8 @@
 import numpy as np
 import pyarrow as pa
 
-from epipole.io.work.part_tables import IDENTIFIED
-from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import ReadFolder
+from epipole.io.work.parts import IDENTIFIED, Parts, write_part
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array, from_polars, to_polars
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span
@@ -13,8 +12,8 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_span import states_about
-from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
 PLACED = [
     *("x_km", "y_km", "z_km"),

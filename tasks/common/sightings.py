@@ -4,18 +4,24 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import polars as pl
 import pyarrow as pa
+import pyarrow.compute as pc
 
-from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.io.work.work_layout import SensorParts
+from epipole.schemas.bridge import array, concat, stack, stack_covariance, table
 from epipole.schemas.columns import OPTICS_AXES
+from epipole.schemas.settings import TrackletSettings
+from epipole.schemas.spans import Span, spans_between
+from epipole.schemas.tables import DETECTIONS
+from epipole.schemas.work_tables import TRACKLET_RUNS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
-from epipole.tasks.algorithms.geometry.direction_errors import (
-    attitude_covariance,
-    centroid_covariance,
-)
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.geometry.sky import unit_from_radec
+from epipole.tasks.algorithms.geometry.covariances import attitude_covariance, centroid_covariance
+from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion, unit_from_radec
+from epipole.tasks.algorithms.times import frame_interval_ns
+
+# -- Sightings: detections with the attitude of their frame and the position of its sensor.
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -151,3 +157,127 @@ def camera_of(cameras: pa.Table, row: int) -> Camera:
 def optics_covariance_of(cameras: pa.Table, row: int) -> Array:
     """Return the covariance (9, 9) of the optics in a row of `cameras`; 0 as the log tells them."""
     return stack_covariance(cameras.slice(row, 1), "cov_{}", OPTICS_AXES)[0]
+
+
+# -- Lone detections: those in frames that are too few, or too far apart, for a tracklet.
+#
+# They take part in the association as tracklets of one detection. Their ids are not published:
+# `tracklet_id` is null for them in a dataset.
+
+MARK = "lone:"  # sensor ids have no colon, so no other id begins like this
+
+
+def in_lone_frames(
+    frame_time_ns: npt.NDArray[np.int64], settings: TrackletSettings
+) -> npt.NDArray[np.bool_]:
+    """Return which frames of one sensor, in time order, have too few others near for a tracklet."""
+    if not len(frame_time_ns):
+        return np.zeros(0, bool)
+    coast_ns = (settings.max_missed + 1.5) * frame_interval_ns(frame_time_ns)
+    run = np.concatenate([[0], np.cumsum(np.diff(frame_time_ns) > coast_ns)]).astype(np.int64)
+    return np.asarray(np.bincount(run)[run] < settings.min_detections)
+
+
+def with_lone_detections(detections: pa.Table, lone: npt.NDArray[np.bool_]) -> pa.Table:
+    """Return the detections; each lone one gets an unpublished tracklet_id."""
+    names = array(detections, "tracklet_id").copy()
+    rows = np.flatnonzero(lone)
+    sensor, frame = array(detections, "sensor_id"), array(detections, "frame_number")
+    centroid = array(detections, "centroid")
+    for row in rows:
+        names[row] = f"{MARK}{sensor[row]}-{frame[row]}-{centroid[row]}"
+    at = detections.schema.get_field_index("tracklet_id")
+    return detections.set_column(at, detections.schema.field(at), pa.array(names, pa.string()))
+
+
+def with_lone_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
+    """Return the tracklets that have views, and a row for each lone detection that has views."""
+    tracklets = tracklets.filter(pc.is_in(tracklets["tracklet_id"], views["tracklet_id"]))
+    lone = views.filter(is_lone(views["tracklet_id"]))
+    if not lone.num_rows:
+        return tracklets
+    names, first = np.unique(array(lone, "tracklet_id").astype(str), return_index=True)
+    lone = lone.take(first)
+    n = lone.num_rows
+    rows = table(
+        TRACKLET_RUNS,
+        {
+            "tracklet_id": names,
+            "track_id": names,
+            "sensor_id": lone["sensor_id"],
+            "start_time": lone["epoch"],
+            "end_time": lone["epoch"],
+            "n_detections": np.ones(n, np.int32),
+            "rate_arcsec_s": np.zeros(n),
+            "residual_px": np.zeros(n),
+            "link_chi2": pa.nulls(n, pa.float64()),
+        },
+    )
+    return concat(TRACKLET_RUNS, [tracklets, rows])
+
+
+def with_lone_objects(detections: pa.Table, associations: pa.Table) -> pa.Table:
+    """Return the detections; lone ones that a position used are of kind ``object``.
+
+    One detection alone may be anything. A detection that several sensors agree on is an object.
+    """
+    is_lone_view = pc.and_(associations["used"], pc.is_null(associations["tracklet_id"]))
+    key = ["sensor_id", "frame_number", "centroid"]
+    lone = pl.DataFrame(associations.filter(is_lone_view).select(key)).drop_nulls().unique()
+    if not len(lone):
+        return detections
+    marked = pl.DataFrame(detections.select(key)).join(
+        lone.with_columns(is_object=True), on=key, how="left", maintain_order="left"
+    )  # fmt: skip
+    at = detections.schema.get_field_index("kind")
+    kind = pc.if_else(marked["is_object"].fill_null(False).to_arrow(), "object", detections["kind"])
+    return detections.set_column(at, detections.schema.field(at), kind)
+
+
+def is_lone(tracklet_id: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return which ids are of lone detections."""
+    return pc.starts_with(tracklet_id, MARK)
+
+
+def published_ids(tracklet_id: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Return the ids; null for those of lone detections."""
+    return pc.if_else(is_lone(tracklet_id), pa.scalar(None, pa.string()), tracklet_id)
+
+
+def only_id(tracklet_id: npt.NDArray[np.object_]) -> str | None:
+    """Return the one id in an array; None where there are several, or it is of a lone detection."""
+    ids = set(tracklet_id.tolist())
+    if len(ids) != 1:
+        return None
+    (name,) = ids
+    return None if name.startswith(MARK) else str(name)
+
+
+# -- One sensor's detections, with the names of their tracklets in the night.
+
+
+def detections_within(sensor: SensorParts, span: Span) -> pa.Table:
+    """Return a sensor's detections in a time, each from the part of the span it lies in."""
+    rows = []
+    for other in spans_between(*span):
+        if not sensor.tracked.holds(other):
+            continue
+        detections = other.of(sensor.tracked.read(other, "detections"), "time")
+        names = sensor.names.read(other, "names")
+        rows.append(with_names(span.of(detections, "time"), names))
+    return concat(DETECTIONS, rows)
+
+
+def with_names(detections: pa.Table, names: pa.Table) -> pa.Table:
+    """Return detections of a span with the names of their tracklets in the night.
+
+    `names` are the sensor's TRACKLET_NAMES of the span.
+    """
+    row = pc.index_in(detections["tracklet_id"], names["span_name"])
+    row = pc.if_else(detections["tracklet_id"].is_valid(), row, pa.scalar(None, pa.int32()))
+    if pc.any(pc.and_(row.is_null(), detections["tracklet_id"].is_valid())).as_py():
+        raise AssertionError("a detection's tracklet has no name")
+    for name in ("tracklet_id", "track_id"):
+        at = detections.schema.get_field_index(name)
+        detections = detections.set_column(at, detections.schema.field(at), names[name].take(row))
+    return detections

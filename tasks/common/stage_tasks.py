@@ -1,15 +1,86 @@
 """Tasks of a stage: their name is the stage, the name of a run is the stage and its work."""
 
-from collections.abc import Callable
+import ctypes
+import errno
+import sys
+from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import Any, TypeVar
 
-from prefect import task
+import pyarrow as pa
+from prefect import Task, task
 from prefect.cache_policies import NO_CACHE
+from prefect.client.schemas.objects import State, TaskRun
 
 from epipole.schemas.stages import Stage
-from epipole.tasks.common.memory import give_back_memory
-from epipole.tasks.common.retries import DELAYS_S, RETRIES, storage_failed
+
+# -- Memory: what a task no longer needs goes back to the system.
+
+
+def give_back_memory() -> None:
+    """Return freed memory to the system.
+
+    Allocators keep it for later. The tasks of a night would add up: each keeps what the largest
+    one needed.
+    """
+    pa.default_memory_pool().release_unused()
+    if sys.platform == "linux":
+        try:
+            ctypes.CDLL(None).malloc_trim(0)
+        except AttributeError:  # a C library other than glibc
+            return
+
+
+# -- Which failures of a task are tried again: those of storage that may be temporary.
+
+RETRIES = 3
+DELAYS_S = [2.0, 10.0, 30.0]
+
+# Errors that a second try would meet again.
+_LASTING = (
+    FileNotFoundError,
+    FileExistsError,
+    IsADirectoryError,
+    NotADirectoryError,
+    PermissionError,
+)
+_LASTING_CODES = {
+    errno.EDQUOT, errno.EFBIG, errno.EINVAL, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOSPC,
+    errno.EROFS,
+}  # fmt: skip
+
+
+def storage_failed(_task: Task[..., Any], _run: TaskRun, state: State[Any]) -> bool:
+    """Return whether a task failed because of its storage, and not of a bad log or a bug."""
+    error = state.data if isinstance(state.data, BaseException) else _error_of(state)
+    return any(_may_pass(cause) for cause in _causes(error))
+
+
+def _error_of(state: State[Any]) -> BaseException | None:
+    result = state.result(raise_on_failure=False)
+    return result if isinstance(result, BaseException) else None
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error, then the errors that caused it."""
+    while error is not None:
+        yield error
+        error = error.__cause__
+
+
+def _may_pass(error: BaseException) -> bool:
+    if isinstance(error, OSError):  # time-outs and broken connections too
+        return not isinstance(error, _LASTING) and error.errno not in _LASTING_CODES
+    client = sys.modules.get("botocore.exceptions")
+    if client is None:
+        return False
+    if isinstance(error, client.ClientError):
+        code = error.response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0)
+        return code == 429 or code >= 500
+    return isinstance(error, client.HTTPClientError | client.ConnectionError)
+
+
+# -- Tasks of a stage: their name is the stage, the name of a run is the stage and its work.
 
 F = TypeVar("F", bound=Callable[..., Any])
 

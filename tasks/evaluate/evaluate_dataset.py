@@ -12,24 +12,27 @@ import pyarrow as pa
 
 from epipole.io.simulation.truth import Truth
 from epipole.schemas.bridge import to_polars
-from epipole.schemas.simulation.report import Report
-from epipole.tasks.evaluate.match_claims import (
+from epipole.schemas.evaluation import Report
+from epipole.tasks.evaluate.matching import (
+    Measures,
+    detected_objects,
     match_claims,
     match_positions,
     match_views,
     possible_claims,
 )
-from epipole.tasks.evaluate.match_points import Measures, detected_objects
-from epipole.tasks.evaluate.measure_associations import measure_associations, measure_lost_objects
-from epipole.tasks.evaluate.measure_frames import measure_attitudes, measure_stars
-from epipole.tasks.evaluate.measure_observations import measure_observations
-from epipole.tasks.evaluate.measure_positions import (
+from epipole.tasks.evaluate.measures import (
+    measure_associations,
+    measure_attitudes,
     measure_coverage,
     measure_ids,
+    measure_lost_objects,
+    measure_observations,
     measure_positions,
+    measure_stars,
+    measure_states,
+    measure_tracks,
 )
-from epipole.tasks.evaluate.measure_states import measure_states
-from epipole.tasks.evaluate.measure_tracks import measure_tracks
 
 
 def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:

@@ -14,31 +14,31 @@ import scipy
 
 from epipole.io.caches.arrays import cached
 from epipole.schemas.bridge import array
-from epipole.schemas.catalogues.star_catalogue import STAR_CATALOGUE, label_of
-from epipole.tasks.algorithms.catalogue import star_catalogue
-from epipole.tasks.algorithms.catalogue.star_catalogue import (
+from epipole.schemas.star_lists import STAR_CATALOGUE, label_of
+from epipole.tasks.algorithms import star_catalogue
+from epipole.tasks.algorithms import times as time_scales
+from epipole.tasks.algorithms.constants import DAY_NS
+from epipole.tasks.algorithms.star_catalogue import (
     NavigationCatalogue,
     limit_for_density,
     navigation_catalogue,
     place_errors,
     places_at,
 )
-from epipole.tasks.algorithms.constants import DAY_NS
-from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView
-from epipole.tasks.algorithms.star_identification.sky import camera_sky as skies
-from epipole.tasks.algorithms.star_identification.sky import kvector, pair_table
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification import star_grid as skies
+from epipole.tasks.algorithms.star_identification import star_pairs as kvector
+from epipole.tasks.algorithms.star_identification import star_pairs as pair_table
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView
+from epipole.tasks.algorithms.star_identification.star_grid import (
     Sky,
+    SkyGrid,
     pattern_pairs,
     pattern_size,
     sky_grid,
     sky_to_limit,
 )
-from epipole.tasks.algorithms.star_identification.sky.kvector import KVector
-from epipole.tasks.algorithms.star_identification.sky.pair_table import NearStars, PairTable
-from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
-from epipole.tasks.algorithms.time import time_scales
-from epipole.tasks.algorithms.time.time_scales import earth_barycentric, julian_year
+from epipole.tasks.algorithms.star_identification.star_pairs import KVector, NearStars, PairTable
+from epipole.tasks.algorithms.times import earth_barycentric, julian_year
 
 # Stars whose place at the date is less certain than this are not used [pixels, 1-sigma].
 SURE_PX = 0.5

@@ -7,9 +7,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
-from epipole.io.work.part_tables import IDENTIFIED
-from epipole.io.work.parts import Parts, write_part
-from epipole.io.work.places import ReadFolder
+from epipole.io.work.parts import IDENTIFIED, Parts, write_part
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
@@ -17,8 +16,8 @@ from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 from epipole.tasks.read.order_frames import frames_between, states_between
 
 LOGGER = logging.getLogger(__name__)

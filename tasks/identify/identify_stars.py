@@ -9,27 +9,26 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, empty, stack
-from epipole.schemas.catalogues.star_catalogue import with_catalogue
-from epipole.schemas.methods import STAR_IDENTIFICATION, load_method
+from epipole.schemas.options import STAR_IDENTIFICATION, load_method
 from epipole.schemas.settings import Settings
+from epipole.schemas.star_lists import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC, DAY_NS, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.optics_errors import shared_attitude_covariance
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.star_identification.frames.centroids import (
+from epipole.tasks.algorithms.geometry.covariances import shared_attitude_covariance
+from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
+from epipole.tasks.algorithms.star_identification.centroids import (
     RawCentroids,
     brightest_first,
+    static_centroids,
 )
-from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
-from epipole.tasks.algorithms.star_identification.frames.frame import Search
-from epipole.tasks.algorithms.star_identification.frames.static_centroids import static_centroids
+from epipole.tasks.algorithms.star_identification.frame import Search, field_of_view
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.common.sightings import optics_covariance_of
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
-from epipole.tasks.identify.flatten_centroids import FlatCentroids, flatten_centroids
-from epipole.tasks.identify.tabulate_identified import (
+from epipole.tasks.identify.frame_inputs import FlatCentroids, flatten_centroids
+from epipole.tasks.identify.tabulate import (
     MatchedStars,
     StarAttitudes,
     barycentric_velocity,

@@ -8,13 +8,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.parts import Parts
-from epipole.io.work.places import ReadFolder
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span
 from epipole.tasks.algorithms.geometry.camera import inside
-from epipole.tasks.identify.flatten_centroids import flatten_centroids
+from epipole.tasks.identify.frame_inputs import flatten_centroids
 from epipole.tasks.identify.identify_span import Counts
 from epipole.tasks.read.order_frames import frames_between
 

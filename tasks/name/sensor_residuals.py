@@ -12,12 +12,15 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from epipole.io.datasets.night_files import read_columns, take_rows
-from epipole.schemas.catalogues.element_set import ElementSet
+from epipole.io.datasets.night_tables import read_columns, take_rows
 from epipole.schemas.columns import PLACE, VELOCITY
+from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.known_objects.matching import spread_rows
-from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
-from epipole.tasks.algorithms.known_objects.residuals import track_residuals
+from epipole.tasks.algorithms.known_objects.prediction import (
+    predict,
+    satellites_of,
+    track_residuals,
+)
 
 Array = npt.NDArray[np.float64]
 

@@ -18,8 +18,8 @@ from epipole.tasks.overlay.annotations import (
     StarSpot,
     annotations,
     image_of,
+    png,
 )
-from epipole.tasks.overlay.png import png
 from epipole.tasks.overlay.scene import objects, transform
 
 ANNOTATIONS, CALIBRATION, IMAGE = (

@@ -15,7 +15,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from epipole.schemas.columns import PLACE
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
-from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
+from epipole.tasks.algorithms.geometry.directions import quaternion_from_matrix
 from epipole.tasks.overlay.annotations import BLUE, ORANGE, _colour, _time
 
 ROOT_FRAME = "GCRF"

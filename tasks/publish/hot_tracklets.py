@@ -15,7 +15,7 @@ from epipole.schemas.rejects import Outcome, Reason, reject_rows
 from epipole.schemas.tables import DETECTIONS, REJECTS, TRACKLETS
 from epipole.schemas.work_tables import HOT_SUSPECTS, TRACKLET_RUNS
 from epipole.tasks.publish.night_parts import NightParts
-from epipole.tasks.solve.judge_tracklets import best_outcomes
+from epipole.tasks.solve.associate_block import best_outcomes
 
 UNCONFIRMED = (Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)
 

@@ -16,9 +16,8 @@ from epipole.schemas.bridge import concat, from_polars, to_polars
 from epipole.schemas.spans import Span
 from epipole.schemas.tables import ASSOCIATIONS, OBSERVATIONS
 from epipole.schemas.work_tables import SHARED_ERRORS, SIGHTINGS
-from epipole.tasks.common.lone_detections import MARK
-from epipole.tasks.publish.night_parts import NightParts
-from epipole.tasks.publish.time_slices import in_slices
+from epipole.tasks.common.sightings import MARK
+from epipole.tasks.publish.night_parts import NightParts, in_slices
 
 _KEY = ["sensor_id", "frame_number", "centroid"]
 

@@ -9,19 +9,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.datasets.night_files import write_table
+from epipole.io.datasets.night_tables import write_table
 from epipole.io.datasets.rows_by_night import in_order, rows_of_night
 from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import array, concat, conform, table
-from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, Span, spans_between
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES
-from epipole.schemas.work_tables import SOLUTIONS
-from epipole.tasks.common.lone_detections import with_lone_objects
-from epipole.tasks.common.named_detections import with_names
+from epipole.schemas.work_tables import SOLUTIONS, LogSource
+from epipole.tasks.common.sightings import with_lone_objects, with_names
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.hot_tracklets import (
     confirmed_tracklets,
@@ -29,9 +27,8 @@ from epipole.tasks.publish.hot_tracklets import (
     hot_tracklets,
     with_hot_pixels,
 )
-from epipole.tasks.publish.night_parts import NightParts
+from epipole.tasks.publish.night_parts import NightParts, in_slices
 from epipole.tasks.publish.observed_objects import observations
-from epipole.tasks.publish.time_slices import in_slices
 
 # These tables may not fit in memory as a whole: they are written in slices of time.
 BY_SENSOR = ("frames", "stars", "detections")

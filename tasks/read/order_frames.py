@@ -14,18 +14,16 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.logs.own_time import frames_left_out, stray_rejects
-from epipole.io.work.part_tables import READ_SENSOR
-from epipole.io.work.parts import read_part, write_part
-from epipole.io.work.places import ReadFolder
+from epipole.io.logs.left_out import frames_left_out, stray_rejects
+from epipole.io.work.parts import READ_SENSOR, read_part, write_part
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array, concat, conform, table, unstack_covariance
 from epipole.schemas.columns import OPTICS_AXES
-from epipole.schemas.logs.log_tables import LOG_STATES, LogSource
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
-from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX
-from epipole.tasks.algorithms.time.frame_order import (
+from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX, LOG_STATES, LogSource
+from epipole.tasks.algorithms.times import (
     DUPLICATE_FRAME,
     DUPLICATE_NUMBER,
     DUPLICATE_TIME,

@@ -4,11 +4,10 @@ import logging
 from typing import NamedTuple
 
 from epipole.io.logs.reader import read_log_pieces
-from epipole.io.work.part_tables import LOG_PIECE
-from epipole.io.work.parts import write_part
-from epipole.io.work.places import ReadFolder
-from epipole.schemas.logs.log_tables import LogSource
+from epipole.io.work.parts import LOG_PIECE, write_part
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.stages import Stage
+from epipole.schemas.work_tables import LogSource
 from epipole.tasks.common.stage_tasks import stage_task
 
 LOGGER = logging.getLogger(__name__)

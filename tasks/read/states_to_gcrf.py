@@ -8,9 +8,8 @@ import pyarrow as pa
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.schemas.bridge import array, nullable, stack, table, unstack
-from epipole.schemas.logs.log_tables import ITRF
 from epipole.schemas.settings import Settings
-from epipole.schemas.work_tables import SENSOR_STATES
+from epipole.schemas.work_tables import ITRF, SENSOR_STATES
 from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_gcrf
 
 LOGGER = logging.getLogger(__name__)

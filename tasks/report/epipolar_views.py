@@ -6,26 +6,27 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from epipole.io.datasets.night_reader import NightReader
+from epipole.io.datasets.night_tables import NightReader
 from epipole.schemas.columns import PLACE, VELOCITY
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.camera import Camera, distort, project, unproject
-from epipole.tasks.algorithms.geometry.epipolar import epipolar_angle
-from epipole.tasks.algorithms.geometry.rotations import (
+from epipole.tasks.algorithms.geometry.directions import (
+    aberrate,
     interpolate_quaternions,
     matrix_from_quaternion,
+    unit_from_radec,
 )
-from epipole.tasks.algorithms.geometry.sky import aberrate, unit_from_radec
+from epipole.tasks.algorithms.geometry.epipolar import epipolar_angle
 
 Array = npt.NDArray[np.float64]
 
-MOST_LINES = 12
-MOST_PAIRS = 3  # of sensors that are tried
+MAX_LINES = 12
+MAX_PAIRS = 3  # of sensors that are tried
 STEPS = 2000  # along a line
 POINTS = 12  # of a line that is drawn
 BEYOND = 1.05  # of the field: farther out a fitted distortion may fold the image
-MOST_OTHERS = 300
-FEWEST_SEEN = 10  # detections that tell the camera in use
+MAX_OTHERS = 300
+MIN_SEEN = 10  # detections that tell the camera in use
 MOTION_NS = 5_000_000_000  # positions so near to the epoch tell how an object moves
 AROUND_NS = 60_000_000_000  # frames so near to an epoch tell the attitude at it
 QUATERNION = ["qx", "qy", "qz", "qw"]
@@ -87,7 +88,7 @@ def read_epipolar_views(
         poses = [_pose(night, name, cameras[name], epoch_ns) for name in names]
         if poses[0] is None or poses[1] is None:
             continue
-        lines = _lines(night, shared.head(MOST_LINES), (poses[0], poses[1]), epoch_ns)
+        lines = _lines(night, shared.head(MAX_LINES), (poses[0], poses[1]), epoch_ns)
         return EpipolarViews(
             epoch_ns, *names, np.array(cameras[names[1]][:2], float), lines,
             _others(night, names[1], int(shared["frame_number_in"][0]), epoch_ns),
@@ -129,7 +130,7 @@ def _pairs(views: pl.DataFrame) -> list[tuple[pl.DataFrame, pl.DataFrame]]:
     counts = both.group_by("sensor_id", "sensor_id_in").len()
     counts = counts.sort("len", "sensor_id", "sensor_id_in", descending=[True, False, False])
     pairs = []
-    for names in counts.select("sensor_id", "sensor_id_in").head(MOST_PAIRS).iter_rows():
+    for names in counts.select("sensor_id", "sensor_id_in").head(MAX_PAIRS).iter_rows():
         first, second = (views.filter(pl.col("sensor_id") == name) for name in names)
         # The nearer sensor has the smaller error in km, so its lines are the finer ones.
         if np.mean(second["epipolar_px"].to_numpy()) > np.mean(first["epipolar_px"].to_numpy()):
@@ -159,7 +160,7 @@ def _camera_in_use(camera: Camera, seen: pl.DataFrame) -> Camera:
 
     The detections tell it: each has a place in the image and a direction.
     """
-    if len(seen) < FEWEST_SEEN:
+    if len(seen) < MIN_SEEN:
         return camera
     R = matrix_from_quaternion(seen.select(QUATERNION).to_numpy())
     ra, dec = np.radians(seen.select("ra_deg", "dec_deg").to_numpy()).T
@@ -257,4 +258,4 @@ def _in_image(line: Array, camera: Camera) -> Array:
 def _others(night: NightReader, name: str, frame: int, epoch_ns: int) -> Array:
     rows = _near(night, "detections", ["frame_number", "x_px", "y_px"], name, epoch_ns)
     own = rows.filter(pl.col("frame_number") == frame)
-    return own.select("x_px", "y_px").head(MOST_OTHERS).to_numpy()
+    return own.select("x_px", "y_px").head(MAX_OTHERS).to_numpy()

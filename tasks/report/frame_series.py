@@ -7,18 +7,63 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from epipole.io.datasets.night_reader import NightReader
-from epipole.tasks.report.time_bins import TimeBins, bins_between
+from epipole.io.datasets.night_tables import NightReader
+
+# -- Bins of time: a night is drawn in about a hundred of them, however many frames it has.
+
+Indices = npt.NDArray[np.int64]
+
+MAX_BINS = 96
+MIN_BINS = 8
+FRAMES_IN_BIN = 4  # of the busiest sensor, at least: an empty bin is then a gap
+
+
+class TimeBins(NamedTuple):
+    """Equal bins from the first to the last frame of a night."""
+
+    start_ns: int
+    end_ns: int
+    number: int
+
+    @property
+    def edges_s(self) -> npt.NDArray[np.float64]:
+        """The (number + 1,) edges, in seconds since 0 h of the first day."""
+        edges = np.linspace(0.0, (self.end_ns - self.start_ns) / 1e9, self.number + 1)
+        return seconds_of_day(np.array([self.start_ns])) + edges
+
+    def of(self, time_ns: Indices) -> Indices:
+        """Return the bin of each time; times outside belong to the first or last bin."""
+        since = (time_ns - self.start_ns) / max(self.end_ns - self.start_ns, 1)
+        return np.clip((since * self.number).astype(np.int64), 0, self.number - 1)
+
+
+def bins_between(start_ns: int, end_ns: int, frames_of_busiest: int) -> TimeBins:
+    """Return bins with a few frames each of the sensor that has most."""
+    count = int(np.clip(frames_of_busiest // FRAMES_IN_BIN, MIN_BINS, MAX_BINS))
+    return TimeBins(start_ns, end_ns + 1, count)
+
+
+def seconds_of_day(time_ns: Indices) -> npt.NDArray[np.float64]:
+    """Return the seconds since 0 h UTC of each time's day."""
+    seconds: npt.NDArray[np.float64] = (time_ns % 86_400_000_000_000) / 1e9
+    return seconds
+
+
+def clock(time_ns: int) -> str:
+    """Return the time of day, such as ``04:05:06``."""
+    return str(np.datetime64(time_ns // 1_000_000_000, "s"))[11:]
+
+
+# -- Frames over the night, by sensor: how they got their attitude, how good it is, and gaps.
 
 Array = npt.NDArray[np.float64]
-Indices = npt.NDArray[np.int64]
 
 COLUMNS = ["time", "sensor_id", "attitude_source", "status", "n_stars", "sigma_x_arcsec",
            "sigma_y_arcsec", "sigma_z_arcsec", "residual_px"]  # fmt: skip
 SOURCES = ("stars", "prior", "none")
 GAP_FRAMES = 10  # a time without frames that is this many frame intervals long is a gap
 SHORTEST_GAP_S = 5.0
-MOST_GAPS = 200
+MAX_GAPS = 200
 # Sums of a bin: squares of sigmas (across, about the boresight) and of the stars' residual.
 SUMS = ("across", "about", "residual")
 
@@ -132,8 +177,8 @@ class _SeriesSums:
         for i in np.flatnonzero(steps > longest).tolist():
             self.lost_s[k] += steps[i] / 1e9
             self.gaps.append(Gap(self.sensors[k], int(time_ns[i]), int(time_ns[i + 1])))
-        if len(self.gaps) > MOST_GAPS:
-            self.gaps = sorted(self.gaps, key=lambda gap: -gap.seconds)[:MOST_GAPS]
+        if len(self.gaps) > MAX_GAPS:
+            self.gaps = sorted(self.gaps, key=lambda gap: -gap.seconds)[:MAX_GAPS]
 
     def result(self) -> FrameSeries:
         """Return the series."""

@@ -5,14 +5,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.io.datasets.night_reader import NightReader
+from epipole.io.datasets.night_tables import NightReader
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 PAIR_BINS = np.linspace(0.0, 5.0, 26)  # edges, in sigmas
-MOST_FREEDOM = 4000  # degrees of freedom that are told apart
-FEWEST_BINS, MOST_BINS = 8, 40
+MAX_FREEDOM = 4000  # degrees of freedom that are told apart
+MIN_BINS, MAX_BINS = 8, 40
 
 
 class Chi2(NamedTuple):
@@ -67,11 +67,11 @@ def _pairs(night: NightReader) -> Chi2 | None:
 
 
 def _positions(night: NightReader) -> Chi2 | None:
-    freedom = np.zeros(MOST_FREEDOM + 1, np.int64)
+    freedom = np.zeros(MAX_FREEDOM + 1, np.int64)
     total, independent = 0.0, 0
     columns = ["n_sensors", "chi2", "independent"]
     for rows in night.pieces("positions", columns):
-        dof = np.clip(2 * rows["n_sensors"].to_numpy() - 3, 1, MOST_FREEDOM)
+        dof = np.clip(2 * rows["n_sensors"].to_numpy() - 3, 1, MAX_FREEDOM)
         freedom += np.bincount(dof, minlength=len(freedom))
         total += float(rows["chi2"].sum())
         independent += int(rows["independent"].sum())
@@ -88,8 +88,8 @@ def _states(night: NightReader) -> Chi2 | None:
     rows = night.read("states", ["chi2", "dof"])
     if not len(rows):
         return None
-    dof = np.clip(rows["dof"].to_numpy(), 1, MOST_FREEDOM)
-    freedom = np.bincount(dof, minlength=MOST_FREEDOM + 1)
+    dof = np.clip(rows["dof"].to_numpy(), 1, MAX_FREEDOM)
+    freedom = np.bincount(dof, minlength=MAX_FREEDOM + 1)
     edges = _edges(freedom)
     chi2 = rows["chi2"].to_numpy()
     counts = np.histogram(np.minimum(chi2, edges[-1]), edges)[0]
@@ -99,7 +99,7 @@ def _states(night: NightReader) -> Chi2 | None:
 def _edges(freedom: Indices) -> Array:
     """Return bins as far as nearly all chi-squares should lie."""
     dof = int(np.searchsorted(np.cumsum(freedom), 0.95 * freedom.sum()))
-    bins = int(np.clip(2 * np.sqrt(freedom.sum()), FEWEST_BINS, MOST_BINS))
+    bins = int(np.clip(2 * np.sqrt(freedom.sum()), MIN_BINS, MAX_BINS))
     return np.linspace(0.0, dof + 4.5 * np.sqrt(2.0 * max(dof, 1)), bins + 1)
 
 

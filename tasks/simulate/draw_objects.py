@@ -1,17 +1,176 @@
 """Draw the objects of a scene: their paths and how bright they are."""
 
+import difflib
+import math
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from epipole.schemas.catalogues.element_set import ElementSet
+from epipole.io.simulation.scenes import read_element_sets
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.scene import Scene, SceneTargets
-from epipole.tasks.algorithms.simulation.objects import SimulatedObjects
-from epipole.tasks.algorithms.simulation.paths import Paths, joined_paths, two_body_paths
+from epipole.schemas.scene import Orbit, Scene, SceneTargets
+from epipole.schemas.star_lists import ElementSet, nearest_sets
+from epipole.tasks.algorithms.simulation.constants import DAY_S, GM_KM3_S2, SECOND_NS
+from epipole.tasks.algorithms.simulation.element_sets import propagate
+from epipole.tasks.algorithms.simulation.paths import (
+    Paths,
+    circular_velocity,
+    elements_from_state,
+    joined_paths,
+    mean_from_true_anomaly,
+    node_times,
+    sampled_paths,
+    state_at,
+    two_body_paths,
+)
 from epipole.tasks.algorithms.simulation.sensor import random_stream
-from epipole.tasks.simulate.draw_orbits import draw_near
-from epipole.tasks.simulate.place_satellites import draw_satellites, place_satellites
+from epipole.tasks.algorithms.simulation.sources import SimulatedObjects
+
+# -- Draw the orbits of a scene: elements, positions, random ones, and objects near them.
+
+Array = npt.NDArray[np.float64]
+
+
+def draw_elements(orbit: Orbit, rng: np.random.Generator) -> Array:
+    """Return the (6,) elements of an orbit. Only a random orbit draws from `rng`."""
+    if orbit.random is not None:
+        return _random_elements(orbit.random, rng)
+    if orbit.position_km is not None:
+        r_km = np.array(orbit.position_km)
+        v = orbit.velocity_km_s
+        v_km_s = circular_velocity(r_km) if v is None else np.array(v)
+        if v_km_s @ v_km_s >= 2 * GM_KM3_S2 / np.linalg.norm(r_km):
+            raise SceneError(f"velocity_km_s {v}: faster than escape velocity")
+        return elements_from_state(r_km, v_km_s)
+    angles = np.radians([orbit.i_deg, orbit.raan_deg, orbit.argp_deg])
+    if orbit.true_anomaly_deg is not None:
+        mean = mean_from_true_anomaly(math.radians(orbit.true_anomaly_deg), orbit.e)
+    else:
+        mean = math.radians(orbit.mean_anomaly_deg or 0.0)
+    return np.array([orbit.a_km, orbit.e, *angles, mean], float)
+
+
+def _random_elements(kind: str, rng: np.random.Generator) -> Array:
+    a_low, a_high, e, tilt = {
+        "leo": (6900.0, 7600.0, 0.002, np.radians(100.0)),
+        "meo": (20000.0, 30000.0, 0.02, np.radians(65.0)),
+        "geo": (42120.0, 42210.0, 0.0005, np.radians(8.0)),
+    }[kind]
+    u = rng.random(6)
+    i = tilt * u[2] if kind != "leo" else np.radians(30.0) + (tilt - np.radians(30.0)) * u[2]
+    return np.array([a_low + (a_high - a_low) * u[0], e * u[1], i, *(2 * np.pi * u[3:])])
+
+
+def draw_near(orbit: Orbit, spread_km: float, rng: np.random.Generator) -> Array:
+    """Return the (6,) elements of a body about the place that an orbit has at the start."""
+    elements = draw_elements(orbit, rng)
+    if not spread_km:
+        return elements
+    r_km, v_km_s = state_at(elements, np.zeros(()))
+    moved = r_km + rng.standard_normal(3) * spread_km
+    # The same direction of motion, but horizontal and circular at the new position.
+    level = v_km_s - moved * (v_km_s @ moved) / (moved @ moved)
+    speed = np.linalg.norm(circular_velocity(moved))
+    return elements_from_state(moved, level / np.linalg.norm(level) * speed)
+
+
+# -- Place real satellites: choose element sets from a file, and propagate them over the scene.
+
+# [s] Light time, and the half interval that a random pointing begins early.
+_ROOM_S = 10.0
+
+
+class Satellites(NamedTuple):
+    """Element sets, and the paths that SGP4 makes of them."""
+
+    sets: list[ElementSet]
+    paths: Paths
+
+
+def place_satellites(scene: Scene, orbit: Orbit, t0_ns: int) -> Satellites:
+    """Return the satellites of an orbit with `elements`, over the whole scene.
+
+    Raises
+    ------
+    SceneError
+        Where the file has none of the satellites, their elements are too old or too new, or SGP4
+        fails. It names the satellite.
+    """
+    if orbit.elements is None:
+        raise SceneError(f"{scene.name}: an orbit without elements has no satellites")
+    middle_ns = t0_ns + round(scene.duration_s / 2 * SECOND_NS)
+    sets = nearest_sets(_chosen(read_element_sets(orbit.elements), orbit), middle_ns)
+    for element_set in sets:
+        _require_near(element_set, middle_ns, scene, orbit.elements)
+    t_s = scene_nodes(scene)
+    time_ns = t0_ns + np.rint(t_s * SECOND_NS).astype(np.int64)
+    elements = np.array([element_set.elements for element_set in sets])
+    r_km, failures = propagate(elements, time_ns)
+    if failures:
+        first = failures[0]
+        raise SceneError(
+            f"{orbit.elements}: {sets[first.satellite].label}: SGP4 fails at "
+            f"{_text(first.time_ns)}: {first.reason}; leave this satellite out"
+        )
+    return Satellites(sets, sampled_paths(t_s, r_km))
+
+
+def draw_satellites(
+    satellites: Satellites, count: int | None, rng: np.random.Generator
+) -> Satellites:
+    """Return `count` of the satellites at random, in their order; all where it is None."""
+    n = len(satellites.sets)
+    if count is None or count == n:
+        return satellites
+    if count > n:
+        raise SceneError(f"{count} satellites are wanted of {n} in the file")
+    taken = np.sort(rng.permutation(n)[:count])
+    return Satellites([satellites.sets[i] for i in taken], satellites.paths.of(*taken))
+
+
+def scene_nodes(scene: Scene) -> np.ndarray:
+    """Return the times of nodes that cover a scene and the states about it [s]."""
+    margin = max(sensor.states.margin_s for sensor in scene.sensors)
+    hold = max(sensor.pointing.hold_s or 1 / sensor.rate_hz for sensor in scene.sensors)
+    return node_times(
+        -max(margin, hold) - _ROOM_S, scene.duration_s + max(margin, 2 * hold) + _ROOM_S
+    )
+
+
+def _chosen(sets: list[ElementSet], orbit: Orbit) -> list[ElementSet]:
+    """Return the sets of the satellites that an orbit names, in the order of the names."""
+    if not orbit.satellites:
+        return sets
+    chosen: list[ElementSet] = []
+    for wanted in orbit.satellites:
+        found = [s for s in sets if s.is_called(str(wanted))]
+        if not found:
+            names = [s.name for s in sets]
+            key = str(wanted).strip().upper()
+            close = difflib.get_close_matches(key, names, n=3, cutoff=0.5)
+            hint = f"; it has {', '.join(close)}" if close else ""
+            raise SceneError(f"{orbit.elements}: has no satellite {wanted}{hint}")
+        chosen += [s for s in found if s not in chosen]
+    return chosen
+
+
+def _require_near(element_set: ElementSet, time_ns: int, scene: Scene, file: str) -> None:
+    days = abs(element_set.epoch_ns - time_ns) / SECOND_NS / DAY_S
+    if days > scene.element_age_days:
+        raise SceneError(
+            f"{file}: {element_set.label}: its elements are of {_text(element_set.epoch_ns)}, "
+            f"{days:.0f} days from the scene; give others, another start, or a larger "
+            f"element_age_days than {scene.element_age_days:g}"
+        )
+
+
+def _text(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns // SECOND_NS, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+# -- Draw the objects of a scene: their paths and how bright they are.
 
 NO_SENSOR = 1_000_000  # first index of the random streams that belong to no sensor
 

@@ -8,17 +8,49 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.scene import Scene, SceneSensor
+from epipole.schemas.scene import Scene, SceneCamera, SceneSensor
+from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.simulation.constants import ARCSEC
+from epipole.tasks.algorithms.simulation.optics import TrueOptics, hidden_by_earth
 from epipole.tasks.algorithms.simulation.paths import Paths, resting_path, two_body_paths
 from epipole.tasks.algorithms.simulation.sensor import SimulatedSensor, random_stream
-from epipole.tasks.algorithms.simulation.sightlines import hidden_by_earth
-from epipole.tasks.simulate.draw_objects import DrawnObjects
-from epipole.tasks.simulate.draw_orbits import draw_elements
-from epipole.tasks.simulate.place_satellites import Satellites, place_satellites
-from epipole.tasks.simulate.scene_optics import true_optics
+from epipole.tasks.simulate.draw_objects import (
+    DrawnObjects,
+    Satellites,
+    draw_elements,
+    place_satellites,
+)
+
+# -- The optics of a scene's sensors: those that the log reports, and the true ones.
+
+
+def sent_optics(camera: SceneCamera) -> TrueOptics:
+    """Return the optics that the log reports."""
+    if camera.focal_px is not None:
+        focal = camera.focal_px
+    else:
+        focal = camera.width / 2 / math.tan(math.radians(camera.fov_deg or 0.0) / 2)
+    cx = (camera.width - 1) / 2 if camera.cx_px is None else camera.cx_px
+    cy = (camera.height - 1) / 2 if camera.cy_px is None else camera.cy_px
+    lens = camera.k1, camera.k2, camera.p1, camera.p2, camera.k3
+    return TrueOptics(camera.width, camera.height, focal, focal, cx, cy, *lens)
+
+
+def true_optics(camera: SceneCamera) -> TrueOptics:
+    """Return the true optics, which make the image."""
+    sent, off = sent_optics(camera), camera.departure
+    return sent._replace(
+        fx_px=sent.fx_px * (1 + off.focal),
+        fy_px=sent.fy_px * (1 + off.focal),
+        **{
+            name: getattr(sent, name) + getattr(off, name)
+            for name in ("cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
+        },
+    )
+
+
+# -- Draw the sensors of a scene: orbits, pointing, optics, noise and faults.
 
 Array = npt.NDArray[np.float64]
 

@@ -12,20 +12,18 @@ import pyarrow as pa
 
 from epipole.io.simulation.sky import SkyStars, read_stars
 from epipole.schemas.bridge import table, unstack
-from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.scene import Scene, SceneSensor
+from epipole.schemas.scene import Scene, SceneSensor
+from epipole.schemas.star_lists import ElementSet
 from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_ORBITS, TRUE_POINTS
 from epipole.tasks.algorithms.simulation.constants import SECOND_NS
 from epipole.tasks.algorithms.simulation.exposures import Exposing, Exposures
-from epipole.tasks.algorithms.simulation.objects import SimulatedObjects
 from epipole.tasks.algorithms.simulation.optics import field_radius
 from epipole.tasks.algorithms.simulation.paths import END_NODES
 from epipole.tasks.algorithms.simulation.sensor import SimulatedSensor, frame_times
-from epipole.tasks.algorithms.simulation.star_field import StarField, star_field
-from epipole.tasks.simulate.draw_objects import draw_objects
+from epipole.tasks.algorithms.simulation.sources import SimulatedObjects, StarField, star_field
+from epipole.tasks.simulate.draw_objects import draw_objects, scene_nodes
 from epipole.tasks.simulate.draw_sensors import draw_sensors
-from epipole.tasks.simulate.place_satellites import scene_nodes
 
 FRAMES_AT_ONCE = 4096
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
+from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.orbits.planets import planet_directions
 from epipole.tasks.algorithms.tracking.hot_pixels import FixedPlaces, fixed_places
 from epipole.tasks.common.sightings import Frames, Sightings

@@ -10,8 +10,14 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from epipole.io.work.part_tables import NIGHT_TRACKLETS, SPAN_NAMES
-from epipole.io.work.parts import Parts, is_written, read_part, write_part
+from epipole.io.work.parts import (
+    NIGHT_TRACKLETS,
+    SPAN_NAMES,
+    Parts,
+    is_written,
+    read_part,
+    write_part,
+)
 from epipole.schemas.bridge import from_polars, to_polars
 from epipole.schemas.spans import DAY_NS, Sensor, Span
 from epipole.schemas.stages import Stage

@@ -1,16 +1,351 @@
 """Track a span: one sensor's tracklets over a span and its margins, from part to part."""
 
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.io.work.part_tables import TRACKED
-from epipole.io.work.parts import Parts, write_part
-from epipole.schemas.settings import Settings
+from epipole.io.work.parts import TRACKED, Parts, write_part
+from epipole.schemas.bridge import array, concat, empty, nullable, table
+from epipole.schemas.options import TRACK_LINKING, load_method
+from epipole.schemas.settings import Settings, TrackletSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import DETECTIONS
-from epipole.schemas.work_tables import SOLUTIONS
+from epipole.schemas.work_tables import HOT_SUSPECTS, SOLUTIONS, TRACKLET_RUNS
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.times import frame_interval_ns
+from epipole.tasks.algorithms.tracking.hot_pixels import CERTAIN, LIKELY, NOWHERE
+from epipole.tasks.algorithms.tracking.linking.chains import (
+    Fragments,
+    LinkRule,
+    Links,
+    chain_heads,
+)
+from epipole.tasks.algorithms.tracking.local_motion import directions_at
+from epipole.tasks.algorithms.tracking.runs import NONE, follow_detections
+from epipole.tasks.common.sightings import (
+    Frames,
+    Sightings,
+    camera_of,
+    image_sightings_of,
+    part_of,
+    sightings_of,
+    solved_frames,
+    unsolved_frames,
+)
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.track.build_tracklets import build_tracklets
+from epipole.tasks.track.classify_detections import (
+    at_hot_pixel,
+    at_star,
+    is_planet,
+    places_in_image,
+    sighting_sigma,
+)
+
+# -- Measure runs: the rate and residual of each track, and which of them stand still like stars.
+
+Array = npt.NDArray[np.float64]
+
+STAR_RATE_SIGMA = 4.0  # a run whose rate is smaller than this many sigmas stands still
+# rad/s: a slower run stands still, however well its rate is known. Errors of the optics of a tenth
+# of a pixel let stars drift this fast. Objects in orbit move by arcseconds per second.
+STAR_DRIFT = 0.05 * ARCSEC
+STAR_RATE_KNOWN = 1.0 * ARCSEC  # rad/s: with a larger sigma, a run is not taken for a star
+
+
+class TrackRun(NamedTuple):
+    """The sightings of one track, in order of time, and its motion."""
+
+    members: npt.NDArray[np.int64]
+    rate_rad_s: float
+    stands_still: bool
+    residual_px: float
+
+
+def measure_runs(
+    frames: Frames,
+    sightings: Sightings,
+    track: npt.NDArray[np.int64],
+    camera: Camera,
+    window_s: float,
+) -> list[TrackRun]:
+    """Return the runs of tracks, by track number.
+
+    Parameters
+    ----------
+    track : (n,) int
+        Track of each sighting; NONE where it belongs to none.
+    window_s
+        Half-width of the local motion that residuals are taken from.
+    """
+    order = np.lexsort((sightings.frame, track))
+    order = order[track[order] != NONE]
+    bounds = np.flatnonzero(np.diff(track[order], prepend=NONE, append=NONE))
+    time_s = (frames.time_ns[sightings.frame] - frames.time_ns[0]) / 1e9
+    first = np.repeat(bounds[:-1], np.diff(bounds))
+    last = np.repeat(bounds[1:], np.diff(bounds))
+    u, t = np.take(sightings.u_icrs, order, axis=0), time_s[order]
+    noise = np.take(sightings.cov_noise, order, axis=0)
+    bias = np.take(sightings.cov_bias, order, axis=0)
+    smooth, *_ = directions_at(first, last, t, 0.0, t, u, noise, bias, window_s)
+    miss = np.linalg.norm(u - smooth, axis=1)
+    variance = np.trace(noise, axis1=1, axis2=2)
+    runs = []
+    for lo, hi in itertools.pairwise(bounds):
+        members = order[lo:hi]
+        rate, sigma = _mean_rate(t[lo:hi], u[lo:hi], variance[lo:hi])
+        still = rate < max(STAR_RATE_SIGMA * sigma, STAR_DRIFT) and sigma < STAR_RATE_KNOWN
+        residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / camera.pixel_rad
+        runs.append(TrackRun(members, rate, still, residual))
+    return runs
+
+
+def _mean_rate(time_s: Array, u: Array, variance: Array) -> tuple[float, float]:
+    """Return the mean rate of a run and its 1-sigma error [rad/s].
+
+    `variance` is the trace of each direction's independent error [rad^2].
+    """
+    t = time_s - time_s.mean()
+    lever = float(np.sum(t * t))
+    slope = t @ (u - u[0]) / lever
+    sigma = np.sqrt(np.mean(variance) / lever)
+    return float(np.linalg.norm(slope)), float(sigma)
+
+
+# -- Build tracklets: runs of detections of one object in the frames of one sensor.
+
+
+class Tracked(NamedTuple):
+    """DETECTIONS with their tracklets, TRACKLET_RUNS, and HOT_SUSPECTS among them."""
+
+    detections: pa.Table
+    tracklets: pa.Table
+    suspects: pa.Table
+
+
+def build_tracklets(
+    solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
+) -> Tracked:
+    """Return one sensor's detections with tracklet_id, track_id and kind, and its tracklets.
+
+    Frames with an attitude are tracked on the sky. Frames without are tracked apart from them, in
+    the image. There stars move like objects and cannot be told from them.
+    """
+    if not detections.num_rows:
+        return Tracked(detections, empty(TRACKLET_RUNS), empty(HOT_SUSPECTS))
+    labels = _Labels(
+        np.full(detections.num_rows, "unknown", dtype=object),
+        *(np.full(detections.num_rows, None, dtype=object) for _ in range(2)),
+    )
+    parts = [
+        _label(part, labels, detections, settings)
+        for part in _parts(solutions, detections, cameras)
+    ]
+    columns = {name: detections[name] for name in DETECTIONS.names} | labels._asdict()
+    built = concat(TRACKLET_RUNS, [tracklets for tracklets, _ in parts])
+    return Tracked(
+        table(DETECTIONS, columns),
+        built.sort_by([("start_time", "ascending"), ("tracklet_id", "ascending")]),
+        concat(HOT_SUSPECTS, [suspects for _, suspects in parts]),
+    )
+
+
+class _Labels(NamedTuple):
+    """Kind and ids of each detection, filled step by step."""
+
+    kind: npt.NDArray[np.object_]
+    tracklet_id: npt.NDArray[np.object_]
+    track_id: npt.NDArray[np.object_]
+
+
+class _TrackedFrames(NamedTuple):
+    """Frames that are tracked together, and their sightings."""
+
+    frames: Frames
+    sightings: Sightings
+    camera: Camera
+    interval_s: float
+    on_sky: bool
+
+
+def _parts(
+    solutions: pa.Table, detections: pa.Table, cameras: pa.Table
+) -> Iterator[_TrackedFrames]:
+    """Yield the frames with an attitude, then the frames without."""
+    frames = solved_frames(solutions)
+    if len(frames.number):
+        camera = camera_of(cameras, int(frames.camera[0]))
+        interval_s = frame_interval_ns(frames.time_ns) / 1e9
+        yield _TrackedFrames(frames, sightings_of(frames, detections), camera, interval_s, True)
+    unsolved = unsolved_frames(solutions)
+    if len(unsolved.number):
+        camera = camera_of(cameras, int(unsolved.camera[0]))
+        # The interval of all frames: frames without an attitude may be far apart.
+        interval_s = frame_interval_ns(np.sort(array(solutions, "time"))) / 1e9
+        sightings = image_sightings_of(unsolved, detections, camera)
+        yield _TrackedFrames(unsolved, sightings, camera, interval_s, False)
+
+
+def _follow(
+    part: _TrackedFrames, sightings: Sightings, settings: TrackletSettings
+) -> npt.NDArray[np.int64]:
+    """Return the track number of each sighting; NONE where it belongs to no track."""
+    frames, camera, interval_s = part.frames, part.camera, part.interval_s
+    return follow_detections(
+        (frames.time_ns - frames.time_ns[0]) / 1e9,
+        sightings.offsets,
+        sightings.u_icrs,
+        sighting_sigma(sightings),
+        max_rate_rad_s=np.radians(settings.max_rate_deg_s),
+        # Half a frame of slack, for jitter.
+        max_coast_s=(settings.max_missed + 1.5) * interval_s,
+        max_missed=settings.max_missed,
+        min_detections=settings.min_detections,
+        gate_sigma=settings.gate_sigma,
+        field_sr=camera.width * camera.height * camera.pixel_rad**2,
+        false_alarm=settings.false_alarm,
+        false_alarm_sequence=settings.false_alarm_sequence,
+    )
+
+
+def _label(
+    part: _TrackedFrames, labels: _Labels, detections: pa.Table, settings: Settings
+) -> tuple[pa.Table, pa.Table]:
+    """Label the detections of some frames; return their tracklets, and those that may be hot."""
+    frames, sightings, camera = part.frames, part.sightings, part.camera
+    known = labels.kind == "hot_pixel"
+    places = places_in_image(frames, sightings, detections, camera)
+    hot = places.with_odds(CERTAIN) | at_hot_pixel(sightings, detections, known, camera)
+    labels.kind[sightings.row[hot]] = "hot_pixel"
+    planet = np.zeros_like(hot)
+    if part.on_sky:
+        planet = is_planet(frames, sightings, camera) & ~hot
+        labels.kind[sightings.row[planet]] = "planet"
+    kept = ~hot & ~planet
+    sightings, suspected = part_of(sightings, kept), places.with_odds(LIKELY)[kept]
+    track = _follow(part, sightings, settings.tracklets)
+    runs = measure_runs(frames, sightings, track, camera, settings.alignment.window_s)
+    if part.on_sky:
+        stars = [run for run in runs if run.stands_still]
+        runs = [run for run in runs if not run.stands_still]
+        _label_stars(labels, sightings, stars, np.flatnonzero(track == NONE))
+    # What no run holds, no other sensor can confirm.
+    held = _held(places.place[kept], runs)
+    labels.kind[sightings.row[suspected & ~held]] = "hot_pixel"
+    objects = sorted(runs, key=lambda run: int(run.members[0]))
+    return _label_objects(part, sightings, objects, labels, detections, settings, suspected)
+
+
+def _held(place: npt.NDArray[np.int64], runs: list[TrackRun]) -> npt.NDArray[np.bool_]:
+    """Return which sightings are at a place of the image that a run has a sighting at."""
+    members = np.concatenate([np.zeros(0, np.int64), *(run.members for run in runs)])
+    return np.isin(place, np.setdiff1d(place[members], [NOWHERE]))
+
+
+def _label_objects(
+    part: _TrackedFrames,
+    sightings: Sightings,
+    objects: list[TrackRun],
+    labels: _Labels,
+    detections: pa.Table,
+    settings: Settings,
+    suspected: npt.NDArray[np.bool_],
+) -> tuple[pa.Table, pa.Table]:
+    """Label the sightings of objects; return their TRACKLET_RUNS and HOT_SUSPECTS."""
+    sensor_id = str(detections["sensor_id"][0])
+    names = [_name(sensor_id, part.frames, sightings, detections, run) for run in objects]
+    links = _link(part, sightings, objects, settings)
+    heads = [names[head] for head in chain_heads(links.before)]
+    for run, name, head in zip(objects, names, heads, strict=True):
+        labels.kind[sightings.row[run.members]] = "object"
+        labels.tracklet_id[sightings.row[run.members]] = name
+        labels.track_id[sightings.row[run.members]] = head
+    at_suspect = [suspected[run.members].mean() > 0.5 for run in objects]
+    suspects = [name for name, at in zip(names, at_suspect, strict=True) if at]
+    rows = _tracklet_table(part.frames, sightings, objects, names, heads, links.chi2, sensor_id)
+    return rows, table(HOT_SUSPECTS, {"tracklet_id": suspects})
+
+
+def _label_stars(
+    labels: _Labels, sightings: Sightings, stars: list[TrackRun], single: npt.NDArray[np.int64]
+) -> None:
+    """Label runs that stand still, and single sightings at their places, as unlisted stars."""
+    for run in stars:
+        labels.kind[sightings.row[run.members]] = "star_unlisted"
+    places = np.array([sightings.u_icrs[run.members].mean(axis=0) for run in stars])
+    labels.kind[sightings.row[single[at_star(sightings, single, places)]]] = "star_unlisted"
+
+
+def _name(
+    sensor_id: str, frames: Frames, sightings: Sightings, detections: pa.Table, run: TrackRun
+) -> str:
+    """Return a tracklet's id: its sensor, and the frame and centroid of its first detection.
+
+    So the id does not depend on the rest of the night.
+    """
+    first = run.members[0]
+    centroid = detections["centroid"][int(sightings.row[first])].as_py()
+    return f"{sensor_id}-{frames.number[sightings.frame[first]]}-{centroid}"
+
+
+def _link(
+    part: _TrackedFrames, sightings: Sightings, runs: list[TrackRun], settings: Settings
+) -> Links:
+    """Return which run continues which, by the method of the settings."""
+    chosen, frames, camera = settings.tracklets, part.frames, part.camera
+    if not runs:
+        return Links(np.full(0, NONE), np.full(0, np.nan))
+    members = np.concatenate([run.members for run in runs])
+    offsets = np.cumsum([0, *(len(run.members) for run in runs)])
+    fragments = Fragments(
+        offsets.astype(np.int64),
+        (frames.time_ns[sightings.frame[members]] - frames.time_ns[0]) / 1e9,
+        sightings.u_icrs[members],
+        sighting_sigma(sightings)[members],
+    )
+    rule = LinkRule(
+        gap_s=np.inf if chosen.link_gap_s is None else chosen.link_gap_s,
+        kept=chosen.link_kept,
+        field_sr=camera.width * camera.height * camera.pixel_rad**2,
+        interval_s=part.interval_s,
+        noise_rad2_s3=chosen.link_noise_px * camera.pixel_rad**2,
+    )
+    links: Links = load_method(TRACK_LINKING, chosen.link_method)(fragments, rule)
+    return links
+
+
+def _tracklet_table(
+    frames: Frames,
+    sightings: Sightings,
+    runs: list[TrackRun],
+    names: list[str],
+    heads: list[str],
+    link_chi2: Array,
+    sensor_id: str,
+) -> pa.Table:
+    time_ns = frames.time_ns[sightings.frame]
+    return table(
+        TRACKLET_RUNS,
+        {
+            "tracklet_id": names,
+            "track_id": heads,
+            "sensor_id": [sensor_id] * len(runs),
+            "start_time": np.array([time_ns[run.members[0]] for run in runs], np.int64),
+            "end_time": np.array([time_ns[run.members[-1]] for run in runs], np.int64),
+            "n_detections": [len(run.members) for run in runs],
+            "rate_arcsec_s": [run.rate_rad_s / ARCSEC for run in runs],
+            "residual_px": [run.residual_px for run in runs],
+            "link_chi2": nullable(link_chi2),
+        },
+    )
+
+
+# -- Track a span: one sensor's tracklets over a span and its margins, from part to part.
 
 # Tracklets are followed this long before and after a span, so that neighbouring spans find the same
 # ones; and this long in addition, so that broken tracks are joined across the border.

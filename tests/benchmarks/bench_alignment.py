@@ -13,8 +13,8 @@ from night_stages import position_errors, see, solve, track
 
 from epipole.flows.simulate import simulate
 from epipole.io.simulation.scenes import read_scene
+from epipole.schemas.scene import Scene
 from epipole.schemas.settings import Settings
-from epipole.schemas.simulation.scene import Scene
 
 Array = npt.NDArray[np.float64]
 

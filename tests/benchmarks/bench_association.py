@@ -24,8 +24,8 @@ from points import PIXEL_RAD, Points, Score, judge, oracle_groups, scene
 from epipole.schemas.settings import AssociationSettings
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
-from epipole.tasks.algorithms.association.sampling.samples import Groups, Samples
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.association.samples import Groups, Samples
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 
 FALSE = (10, 100, 300, 1000)

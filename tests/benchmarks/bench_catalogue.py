@@ -25,10 +25,10 @@ from epipole.flows.simulate import simulate
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.schemas.bridge import array
+from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import validate_settings
-from epipole.schemas.simulation.scene import validate_scene
-from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView
-from epipole.tasks.catalogue.build_deep_catalogue import build_deep_catalogue
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView
+from epipole.tasks.catalogue import build_deep_catalogue
 from epipole.tasks.identify import cache_skies
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 

@@ -19,9 +19,9 @@ from star_frames import KINDS, Kind, expose, hipparcos_at_epoch, seen_stars
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
-from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
-from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
+from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView, Search
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue

@@ -19,12 +19,12 @@ from epipole.tasks.algorithms.association.epipolar_lines import (
     pair_images,
 )
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.rotations import (
+from epipole.tasks.algorithms.geometry.directions import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
+    tangent_basis,
 )
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
-from epipole.tasks.algorithms.simulation.orbits import mean_from_true_anomaly, state_at
+from epipole.tasks.algorithms.simulation.paths import mean_from_true_anomaly, state_at
 
 Array = np.ndarray
 

@@ -27,12 +27,12 @@ from scipy.stats import chi2
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, project, unproject
-from epipole.tasks.algorithms.geometry.rotations import (
+from epipole.tasks.algorithms.geometry.directions import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
-from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView, Search
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue

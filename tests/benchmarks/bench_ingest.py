@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 import zstandard
 
-from epipole.io.logs.messages.encodings.registry import ENCODINGS
+from epipole.io.logs.messages.registry import ENCODINGS
 from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import LogWriter
 

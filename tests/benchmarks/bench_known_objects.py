@@ -22,12 +22,11 @@ from scenes.aged_elements import aged
 from scenes.walker import DAY_NS, NIGHT_NS, satellites
 
 from epipole.io.catalogues.element_sets import parse_element_sets
-from epipole.schemas.catalogues.element_set import ElementSet
 from epipole.schemas.settings import Settings
+from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.known_objects.matching import Observed, spread_rows
 from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
-from epipole.tasks.name.elements_of_night import ElementsOfNight
-from epipole.tasks.name.name_known import judge_objects
+from epipole.tasks.name.known_objects import ElementsOfNight, judge_objects
 
 TOGETHER_KM = 20.0
 LISTED = 2 / 3

@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.paths import state_at
 
 Array = npt.NDArray[np.float64]
 

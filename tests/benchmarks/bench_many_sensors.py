@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from bench_association import associate
 
-from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.constants import ARCSEC, EARTH_RADIUS_KM, GM_KM3_S2
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 
 SENSORS = (8, 32, 128, 512, 2000)
 TIMES_S = np.array([2.0, 12.0, 22.0])  # instants of a window of 30 s, as a run samples it

@@ -48,7 +48,7 @@ for seconds in (cpu, wall):
 def simulate_night(log: Path, hours: float) -> None:
     """Write a log of four sensors, three objects, twenty stars and two false points per frame."""
     from epipole.flows.simulate import simulate
-    from epipole.schemas.simulation.scene import validate_scene
+    from epipole.schemas.scene import validate_scene
 
     scene = tomllib.loads((SCENES / "night.toml").read_text())
     scene["start"] = datetime.fromisoformat("2019-04-01T06:00:00+00:00")

@@ -24,8 +24,7 @@ from epipole.flows.simulate import simulate
 from epipole.io.simulation.truth import read_truth
 from epipole.schemas.bridge import to_polars
 from epipole.tasks.algorithms.evaluation import squared_normalised_errors
-from epipole.tasks.evaluate.locate_objects import locate_objects
-from epipole.tasks.evaluate.match_points import true_objects, with_truth
+from epipole.tasks.evaluate.matching import locate_objects, true_objects, with_truth
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "fit_orbit.py"
 STATE = [*(f"{a}_km" for a in "xyz"), *(f"v{a}_km_s" for a in "xyz")]

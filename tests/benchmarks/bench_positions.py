@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from epipole.tasks.algorithms.association.epipolar_lines import intersect_sights
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 
 GEO = np.array([-39359.89, 15125.76, 64.30])

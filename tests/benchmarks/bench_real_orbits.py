@@ -32,10 +32,10 @@ import numpy as np
 
 from epipole.flows.evaluate import evaluate
 from epipole.flows.simulate import simulate
-from epipole.io.simulation.element_files import read_element_sets
+from epipole.io.simulation.scenes import read_element_sets
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.scene import validate_scene
-from epipole.tasks.algorithms.simulation.element_sets.propagation import propagate
+from epipole.schemas.scene import validate_scene
+from epipole.tasks.algorithms.simulation.element_sets import propagate
 
 SECOND_NS = 1_000_000_000
 EARTH_KM = 6378.0

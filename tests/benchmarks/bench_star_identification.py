@@ -32,14 +32,14 @@ from star_frames import (
 from star_peers import Solver, cedar_solve, tetra3rs
 
 from epipole.schemas.settings import Settings
-from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
-from epipole.tasks.algorithms.geometry.rotations import (
+from epipole.tasks.algorithms.geometry.directions import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
 )
-from epipole.tasks.algorithms.star_identification.frames.centroids import SensorCentroids
-from epipole.tasks.algorithms.star_identification.frames.frame import (
+from epipole.tasks.algorithms.star_catalogue import navigation_catalogue
+from epipole.tasks.algorithms.star_identification.centroids import SensorCentroids
+from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
     Search,
@@ -50,12 +50,9 @@ from epipole.tasks.algorithms.star_identification.published import (
     match_group,
     radial_cyclic,
 )
-from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
-    Matcher,
-    solve_matches,
-)
+from epipole.tasks.algorithms.star_identification.published.common import Matcher, solve_matches
 from epipole.tasks.algorithms.star_identification.sequence import identify_sequence, no_priors
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification.star_grid import (
     Sky,
     pattern_pairs,
     pattern_size,
@@ -69,7 +66,7 @@ SHARED = Path(__file__).parents[3] / "shared" / "data" / "starid"
 RIGHT_DEG, RIGHT_ROLL_DEG, WRONG_DEG = 0.05, 0.5, 0.25
 WRONG_ROLL_DEG = 5.0  # three right stars at 2 px may leave a degree or two
 FALSE_ALARM = Settings().identification.false_alarm
-LEAST_SIGMA_PX = 0.05  # stated where there is none
+MIN_SIGMA_PX = 0.05  # stated where there is none
 PUBLISHED = {
     "four_base_stars": four_base_stars.make_matcher,
     "match_group": match_group.make_matcher,
@@ -100,12 +97,12 @@ class Ours:
 
     def frame(self, x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> FrameCentroids:
         u = unproject(self.camera, x_px, y_px)
-        sigma_rad = max(sigma_px, LEAST_SIGMA_PX) * pixel_angle(self.camera, u)
+        sigma_rad = max(sigma_px, MIN_SIGMA_PX) * pixel_angle(self.camera, u)
         return FrameCentroids(u, sigma_rad, mag, np.zeros(3), self.optics)
 
     def default(self, x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> Array | None:
         seen = self.frame(x_px, y_px, mag, sigma_px)
-        grid = next(g for s, g in self.grids.items() if s >= max(sigma_px, LEAST_SIGMA_PX))
+        grid = next(g for s, g in self.grids.items() if s >= max(sigma_px, MIN_SIGMA_PX))
         # As in a run: the odds that a frame shows stars are those of the frames before.
         how = self.how._replace(starlit=float(np.log((self.solved + 1) / (self.refused + 1))))
         found, _ = identify_lost(seen, self.sky, grid, self.pairs, how)

@@ -17,10 +17,10 @@ from star_frames import Kind, expose, hipparcos_at_epoch, seen_stars
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
-from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
+from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_cameras
-from epipole.tasks.algorithms.star_identification.frames.frame import Search
-from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
+from epipole.tasks.algorithms.star_identification.frame import Search
+from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 KINDS = (

@@ -10,7 +10,7 @@ from typing import Any
 from epipole.flows.nightly import nightly
 from epipole.flows.prefect.defaults import embedded_prefect, quiet_console
 from epipole.flows.simulate import simulate
-from epipole.schemas.simulation.scene import validate_scene
+from epipole.schemas.scene import validate_scene
 
 SCENE = Path(__file__).parents[2] / "io/simulation/built_in/four_sensor_geo.toml"
 

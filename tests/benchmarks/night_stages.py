@@ -13,27 +13,24 @@ import pyarrow.compute as pc
 
 from epipole.flows.command_line.log_info import of_sensor, sensor_ids
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
-from epipole.io.work.part_tables import VIEWED
-from epipole.io.work.parts import write_part
-from epipole.io.work.places import SolvedParts, ViewedParts
+from epipole.io.work.parts import VIEWED, write_part
+from epipole.io.work.work_layout import SolvedParts, ViewedParts
 from epipole.schemas.bridge import array, concat, stack
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span, spans_between
 from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import HOT_SUSPECTS, OBJECT_MEMBERS, SOLUTIONS, TRACKLET_RUNS
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.paths import state_at
+from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
-from epipole.tasks.solve.association.associate_block import associate_blocks, blocks_of
-from epipole.tasks.solve.association.number_objects import number_objects
-from epipole.tasks.solve.positions.gather_views import gather_views
-from epipole.tasks.solve.positions.solve_positions import Solved, solve_positions
-from epipole.tasks.solve.views.align_epochs import align_epochs
-from epipole.tasks.solve.views.tabulate_sightings import tabulate_sightings
-from epipole.tasks.solve.views.tracklet_sightings import sight_objects
-from epipole.tasks.solve.views.view_objects import view_objects
-from epipole.tasks.solve.views.view_sensors import sensor_epochs, viewed_tracklets
-from epipole.tasks.track.build_tracklets import Tracked, build_tracklets
+from epipole.tasks.solve.align_epochs import align_epochs
+from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
+from epipole.tasks.solve.number_objects import number_objects
+from epipole.tasks.solve.positions import Solved, solve_positions
+from epipole.tasks.solve.sightings import sight_objects, tabulate_sightings
+from epipole.tasks.solve.solve_piece import gather_views
+from epipole.tasks.solve.views import sensor_epochs, view_objects, viewed_tracklets
+from epipole.tasks.track.track_span import Tracked, build_tracklets
 
 Array = npt.NDArray[np.float64]
 sys.path.append(str(Path(__file__).parents[1]))  # helpers beside the tests

@@ -12,8 +12,8 @@ from optv.parameters import ControlParams, VolumeParams
 from optv.tracking_framebuf import TargetArray
 from points import CENTRE_KM, PIXEL_RAD
 
-from epipole.tasks.algorithms.association.sampling.samples import FREE, Samples
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.association.samples import FREE, Samples
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 
 PIXELS = 512
 SPAN_KM = 1000.0  # half the width of the volume

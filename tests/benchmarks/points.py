@@ -9,18 +9,18 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.direction_errors import (
+from epipole.tasks.algorithms.geometry.covariances import (
     attitude_covariance,
     centroid_covariance,
     on_tangent_plane,
 )
-from epipole.tasks.algorithms.geometry.rotations import (
+from epipole.tasks.algorithms.geometry.directions import (
     matrix_from_quaternion,
     quaternion_from_rotation_vector,
+    tangent_basis,
 )
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
 
 CENTRE_KM = np.array([-39353.5, 15130.6, 452.2])
 GEO_RADIUS_KM, RING_KM = 42164.2, 15.0

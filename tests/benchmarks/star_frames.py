@@ -8,13 +8,13 @@ import numpy.typing as npt
 
 from epipole.io.catalogues.hipparcos import HIPPARCOS_EPOCH, read_hipparcos
 from epipole.schemas.bridge import array
-from epipole.tasks.algorithms.catalogue.star_catalogue import (
+from epipole.tasks.algorithms.geometry.camera import Camera, inside, project
+from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
+from epipole.tasks.algorithms.star_catalogue import (
     NavigationCatalogue,
     navigation_catalogue,
     places_at,
 )
-from epipole.tasks.algorithms.geometry.camera import Camera, inside, project
-from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
 
 Array = npt.NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, project
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
+from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 
 pytestmark = pytest.mark.long
 

@@ -20,8 +20,8 @@ from damage.container import (
 )
 from damage.odd_values import with_value
 from damage.sound_logs import Form, messages, written
-from epipole.io.logs.messages.encodings.protobuf import varint
-from epipole.schemas.logs.messages import FRAME
+from epipole.io.logs.messages.protobuf import varint
+from epipole.schemas.log_messages import FRAME
 
 NAME = b"epipole.CentroidFrame"
 _SCHEMA = struct.pack("<HI", 1, len(NAME)) + NAME + bytes(8)

@@ -6,13 +6,13 @@ from random import Random
 from damage.container import FOOTER_BYTES, HEAD, summary_start, with_footer
 
 Bytes = bytes
-MOST_BITS, LONGEST = 20, 3000
+MAX_BITS, LONGEST = 20, 3000
 
 
 def flip_bits(chance: Random, log: Bytes) -> Bytes:
     """Return the log with one to twenty bits the other way."""
     out = bytearray(log)
-    for _ in range(chance.choice((1, 1, 1, 2, 5, MOST_BITS))):
+    for _ in range(chance.choice((1, 1, 1, 2, 5, MAX_BITS))):
         out[chance.randrange(len(out))] ^= 1 << chance.randrange(8)
     return bytes(out)
 

@@ -16,11 +16,11 @@ from damage.sound_logs import count, keys_of, sound_log
 from epipole.io.logs.reader import read_log, read_log_pieces, read_log_times
 from epipole.schemas.bridge import array, flatten
 from epipole.schemas.errors import LogError
-from epipole.schemas.logs.log_tables import LogContents
 from epipole.schemas.rejects import Reason
+from epipole.schemas.work_tables import LogContents
 
-MOST_CPU_S = 5.0
-MOST_BYTES = 1 << 30  # that a log adds to what the process has
+MAX_CPU_S = 5.0
+MAX_BYTES = 1 << 30  # that a log adds to what the process has
 PIECE_BYTES = 20_000  # so that a small log has several pieces
 
 # Rows of `rejects` that are about no lost message: the frame or state is used, or it is about the
@@ -46,9 +46,9 @@ def judge(case: Case, folder: Path) -> Verdict:
     before = forget_peak()
     outcome, fault, reasons, cpu_s = _outcome(case, path)
     peak = peak_bytes()
-    if cpu_s > MOST_CPU_S:
+    if cpu_s > MAX_CPU_S:
         outcome, fault = f"took {cpu_s:.1f} s of CPU", True
-    elif peak - before > MOST_BYTES:
+    elif peak - before > MAX_BYTES:
         outcome, fault = f"took {(peak - before) >> 20} MiB", True
     return Verdict(outcome, fault, reasons, cpu_s, peak)
 

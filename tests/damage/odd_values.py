@@ -14,9 +14,9 @@ import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 
 from damage.sound_logs import FORMS, Form, Message, messages, written
-from epipole.io.logs.messages.encodings.protobuf import varint
-from epipole.io.logs.messages.encodings.registry import encoding_named
-from epipole.schemas.logs.messages import CALIBRATION, DECLARED, FRAME, STATE
+from epipole.io.logs.messages.protobuf import varint
+from epipole.io.logs.messages.registry import encoding_named
+from epipole.schemas.log_messages import CALIBRATION, DECLARED, FRAME, STATE
 
 NAN, INF = math.nan, math.inf
 NUMBERS = (

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 from mcap.writer import CompressionType, IndexType, Writer
 from scenes.altered_logs import frame_values, state_values, table_rows
 
-from epipole.io.logs.messages.encodings.registry import encoding_named
+from epipole.io.logs.messages.registry import encoding_named
 from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import calibration_values
 from epipole.schemas.bridge import array
-from epipole.schemas.logs.log_tables import LogContents
-from epipole.schemas.logs.messages import CALIBRATION, FRAME, STATE
+from epipole.schemas.log_messages import CALIBRATION, FRAME, STATE
+from epipole.schemas.work_tables import LogContents
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "four_sensor_geo.mcap"
 SECONDS_NS = 8_000_000_000  # of the example that a log has

@@ -26,7 +26,7 @@ from epipole.schemas.errors import EpipoleError
 from epipole.schemas.settings import Settings, validate_settings
 
 TWICE = ("duplicate_frame", "duplicate_number", "duplicate_time")
-MOST_CPU_S = 120.0
+MAX_CPU_S = 120.0
 
 
 class Run(NamedTuple):
@@ -44,7 +44,7 @@ def run(log: Path, out: Path, settings: Settings) -> Run:
     began = time.process_time()
     outcome, fault = _outcome(log, out, settings)
     cpu_s, peak = time.process_time() - began, peak_bytes()
-    if cpu_s > MOST_CPU_S:
+    if cpu_s > MAX_CPU_S:
         outcome, fault = f"took {cpu_s:.0f} s of CPU", True
     return Run(outcome, fault, cpu_s, peak)
 

@@ -13,7 +13,7 @@ from damage import cases
 from damage.cases import Case
 from damage.judge import Verdict, judge, warm_up
 
-MOST_S = 30.0  # by the clock: other programs may hold the processors
+MAX_S = 30.0  # by the clock: other programs may hold the processors
 START_S = 300.0  # of a process that has to compile
 Asked = tuple[str, Any]  # the name of a function of `cases`, and its argument or arguments
 
@@ -77,7 +77,7 @@ class _Worker:
         self.pipe.send(asked)
 
     def is_late(self) -> bool:
-        return time.monotonic() - self._since > MOST_S
+        return time.monotonic() - self._since > MAX_S
 
     def answer(self, is_ready: bool) -> Answer:
         """Return the answer; without one the process is ended, and its peak of memory is 0."""

@@ -12,7 +12,7 @@ from epipole.flows import api
 from epipole.flows.simulate import simulate
 from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.truth import elements_of, read_truth
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.paths import state_at
 
 
 class Sensor(NamedTuple):

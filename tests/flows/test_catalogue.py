@@ -11,7 +11,7 @@ import pytest
 from epipole.flows.command_line.main import main
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.schemas.bridge import array
-from epipole.schemas.catalogues.star_catalogue import label_of
+from epipole.schemas.star_lists import label_of
 
 
 @pytest.fixture

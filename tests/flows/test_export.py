@@ -6,8 +6,8 @@ import polars as pl
 import pytest
 
 from epipole.flows.export import export
-from epipole.schemas.choices import Message
 from epipole.schemas.errors import DatasetError
+from epipole.schemas.options import Message
 
 NIGHT = "2019-04-01"
 

@@ -14,7 +14,7 @@ from epipole.flows.command_line.main import app
 from epipole.flows.nightly import nightly
 from epipole.flows.simulate import simulate
 from epipole.io.datasets.dataset import read_table
-from epipole.io.simulation.element_files import read_element_sets
+from epipole.io.simulation.scenes import read_element_sets
 from epipole.schemas.errors import CatalogueError
 
 pytestmark = pytest.mark.long

@@ -14,8 +14,8 @@ from prefect.task_runners import ThreadPoolTaskRunner
 from epipole.flows.night.progress import STEPS
 from epipole.flows.nightly import nightly
 from epipole.flows.simulate import simulate
+from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import Settings, WorkSettings
-from epipole.schemas.simulation.scene import validate_scene
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import TABLES
 

@@ -15,8 +15,8 @@ import pytest
 from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
-from epipole.io.remote_files import SECRETS, known_as, line_of
-from epipole.schemas.text.urls import without_secrets
+from epipole.io.paths import SECRETS, known_as, line_of
+from epipole.schemas.text import without_secrets
 
 PASSWORD, TOKEN = "pw-Zq83kd", "tok-9fJw2x"
 

@@ -12,7 +12,7 @@ from epipole.io.simulation.scenes import built_in_scenes
 from epipole.io.simulation.truth import read_truth
 from epipole.schemas.bridge import array, flatten, stack, to_polars
 from epipole.schemas.errors import SceneError
-from epipole.tasks.evaluate.locate_objects import locate_objects
+from epipole.tasks.evaluate.matching import locate_objects
 
 ARCSEC = np.pi / 648000
 

@@ -10,7 +10,7 @@ import pytest
 from epipole.flows.nightly import nightly
 from epipole.flows.simulate import simulate
 from epipole.io.datasets.dataset import read_table
-from epipole.schemas.simulation.scene import validate_scene
+from epipole.schemas.scene import validate_scene
 
 NIGHT = "2019-04-01"
 FOUR_SENSORS = Path(__file__).parents[2] / "io/simulation/built_in/four_sensor_geo.toml"

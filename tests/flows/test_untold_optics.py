@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from epipole.flows.evaluate import evaluate
 from epipole.flows.nightly import nightly
 from epipole.flows.simulate import simulate
-from epipole.schemas.simulation.scene import validate_scene
+from epipole.schemas.scene import validate_scene
 
 pytestmark = pytest.mark.long
 

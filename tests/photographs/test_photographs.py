@@ -12,9 +12,8 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_cameras
-from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
-from epipole.tasks.algorithms.star_identification.frames.frame import Search
+from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
+from epipole.tasks.algorithms.star_identification.frame import Search, field_of_view
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from epipole.schemas.catalogues.element_set import ElementSet
+from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
 
 DAY_NS = 86_400_000_000_000

@@ -3,7 +3,7 @@
 import numpy as np
 
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, propagate
 
 GEO = np.array([-39359.89, 15125.76, 64.30, -1.1030, -2.8700, 0.01])

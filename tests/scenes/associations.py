@@ -10,19 +10,18 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.io.work.part_tables import VIEWED
-from epipole.io.work.parts import Parts, write_part
+from epipole.io.work.parts import VIEWED, Parts, write_part
 from epipole.schemas.bridge import array, empty
 from epipole.schemas.settings import AssociationSettings, Settings
 from epipole.schemas.spans import SPAN_NS, Span
 from epipole.schemas.work_tables import CAMERAS, SIGHTINGS, SOLUTIONS, TRACKLET_RUNS, VIEWS
-from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
-from epipole.tasks.solve.association.associate_block import blocks_of, object_members
-from epipole.tasks.solve.association.associate_objects import associate_objects
-from epipole.tasks.solve.association.block_views import BlockViews, SensorViews
-from epipole.tasks.solve.positions.gather_views import gather_views
-from epipole.tasks.solve.views.align_epochs import EpochGrid, align_epochs
-from epipole.tasks.solve.views.view_sensors import sensor_epochs, viewed_tracklets
+from epipole.tasks.algorithms.geometry.directions import quaternion_from_matrix
+from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
+from epipole.tasks.solve.associate_block import blocks_of, object_members
+from epipole.tasks.solve.associate_objects import associate_objects
+from epipole.tasks.solve.association_input import BlockViews, SensorViews
+from epipole.tasks.solve.solve_piece import gather_views
+from epipole.tasks.solve.views import sensor_epochs, viewed_tracklets
 from scenes.tracklet_scenes import Scene
 
 START_NS = int(np.datetime64("2019-04-01T04:00:00", "ns").astype(np.int64))

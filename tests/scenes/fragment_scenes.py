@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.integrate import solve_ivp
 
 from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.paths import state_at
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -3,8 +3,8 @@
 import struct
 import zlib
 
+from epipole.io.logs.mcap.container import MAGIC
 from epipole.io.logs.mcap.records import RecordWalk
-from epipole.io.logs.mcap.summary import MAGIC
 from scenes.log_bytes import log_bytes
 
 SCHEMA = "epipole.CentroidFrame"

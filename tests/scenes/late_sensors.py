@@ -3,9 +3,9 @@
 import numpy as np
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import Lines
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.paths import state_at
 
 SIGMA = 1.0 * ARCSEC
 POSITION_KM = 0.02

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 
 
 def light_time_samples():

@@ -1,7 +1,6 @@
 """The bytes of a log that is in memory and not in a file."""
 
-from epipole.io.logs.mcap.blocks import BlockReader
-from epipole.io.logs.mcap.bytes import LogBytes
+from epipole.io.logs.mcap.bytes import BlockReader, LogBytes
 
 
 def log_bytes(data: bytes) -> LogBytes:

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from epipole.io.datasets.night_reader import NightReader
+from epipole.io.datasets.night_tables import NightReader
 from epipole.schemas.tables import TABLES
 
 NIGHT = "2019-04-01"

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from epipole.tasks.algorithms.constants import GM_KM3_S2
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import Lines
 
 POSITION_KM = 0.02

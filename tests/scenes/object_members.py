@@ -10,8 +10,8 @@ import pyarrow as pa
 from epipole.io.work.parts import Parts
 from epipole.schemas.spans import SPAN_NS, Span
 from epipole.schemas.work_tables import OBJECT_MEMBERS, SENSOR_EPOCHS, TRACKLET_RUNS, VIEWS
-from epipole.tasks.solve.association.block_views import SensorViews
-from epipole.tasks.solve.views.view_sensors import viewed_tracklets
+from epipole.tasks.solve.association_input import SensorViews
+from epipole.tasks.solve.views import viewed_tracklets
 from scenes.associations import START_NS, filled, write_views
 
 SECOND_NS = 1_000_000_000

@@ -17,10 +17,9 @@ import polars as pl
 from epipole.flows.export import export
 from epipole.io.simulation.truth import Truth, read_truth
 from epipole.schemas.bridge import to_polars
-from epipole.schemas.choices import Message
+from epipole.schemas.options import Message
 from epipole.tasks.algorithms.evaluation import squared_normalised_errors
-from epipole.tasks.evaluate.locate_objects import locate_objects
-from epipole.tasks.evaluate.match_points import true_objects, with_truth
+from epipole.tasks.evaluate.matching import locate_objects, true_objects, with_truth
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "orekit_orbits.py"
 ENOUGH_S, ENOUGH_SENSORS = 10.0, 2  # what a fit needs: less tells no velocity, or no distance

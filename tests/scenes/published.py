@@ -9,7 +9,7 @@ from epipole.io.datasets.dataset import (
     claim_nights,
     publish_folders,
 )
-from epipole.io.datasets.night_files import write_table
+from epipole.io.datasets.night_tables import write_table
 from epipole.io.datasets.rows_by_night import in_order, rows_of_night
 from epipole.schemas.bridge import empty
 from epipole.schemas.tables import TABLES

@@ -2,14 +2,11 @@
 
 import numpy as np
 
-from epipole.tasks.algorithms.catalogue.star_catalogue import NavigationCatalogue
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, project, unproject
-from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
-from epipole.tasks.algorithms.star_identification.frames.centroids import (
-    RawCentroids,
-    SensorCentroids,
-)
-from epipole.tasks.algorithms.star_identification.frames.frame import (
+from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
+from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue
+from epipole.tasks.algorithms.star_identification.centroids import RawCentroids, SensorCentroids
+from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
     Search,

@@ -5,7 +5,7 @@ import math
 from sgp4.api import WGS72, Satrec
 from sgp4.exporter import export_tle
 
-from epipole.schemas.catalogues.element_set import ElementSet
+from epipole.schemas.star_lists import ElementSet
 
 # CelesTrak, 30 May 2026.
 LINES = (

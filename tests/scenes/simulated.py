@@ -1,6 +1,6 @@
 """A small scene to simulate, with changes."""
 
-from epipole.schemas.simulation.scene import validate_scene
+from epipole.schemas.scene import validate_scene
 
 SENSOR = {
     "id": "a",

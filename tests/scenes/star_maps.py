@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.star_frames import Kind, expose, hipparcos_at_epoch, seen_stars
 
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, project, unproject
-from epipole.tasks.algorithms.geometry.sky import unit_from_radec
+from epipole.tasks.algorithms.geometry.directions import unit_from_radec
 
 SEEDS = Path(__file__).parents[3] / "shared" / "data" / "seed_star_maps.csv"
 WIDE = Kind("orbit", 20.3, 1024, 5.5)

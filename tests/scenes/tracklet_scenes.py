@@ -3,9 +3,9 @@
 import numpy as np
 
 from epipole.tasks.algorithms.association.likelihood import associate_tracklets
-from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 
 GEO = np.array([-39359.89, 15125.76, 64.30])

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from epipole.schemas.catalogues.element_set import ElementSet
+from epipole.schemas.star_lists import ElementSet
 
 NIGHT_NS = 1_780_099_200_000_000_000  # 30 May 2026, 0h
 SGP4_DAYS = 27909.0  # the same, in days since 1949 December 31

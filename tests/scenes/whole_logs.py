@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
-from epipole.io.work.places import ReadFolder
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import concat
-from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.settings import Settings
-from epipole.schemas.work_tables import EXPOSURES, SENSOR_STATES
+from epipole.schemas.work_tables import EXPOSURES, SENSOR_STATES, LogSource
 from epipole.tasks.read.order_frames import frames_between, order_logs, states_between
 from epipole.tasks.read.read_logs import read_log_into
 

@@ -1,6 +1,6 @@
 """Reasons of `rejects`: their sentences say what to correct."""
 
-from epipole.schemas.logs.messages import SENSOR_ID_RULE
+from epipole.schemas.log_messages import SENSOR_ID_RULE
 from epipole.schemas.rejects import Reason
 
 

@@ -7,7 +7,7 @@ from epipole.schemas.rejects import Reason
 
 # Rows for one reason; the last one counts the others too. Of more damage of one kind nobody reads
 # each row, and a file may have millions.
-MOST_ALIKE = 1000
+MAX_ALIKE = 1000
 
 
 class Damage(NamedTuple):
@@ -29,7 +29,7 @@ class DamageRows:
     def add(self, offset: int, time_ns: int, reason: Reason, n: int = 1) -> int:
         """Add damage; return the number of its row, which may have other damage too."""
         alike = self._alike.setdefault(reason, [])
-        if len(alike) == MOST_ALIKE:
+        if len(alike) == MAX_ALIKE:
             self.count(alike[-1], n)
         else:
             alike.append(len(self.rows))

@@ -5,9 +5,53 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from llvmlite import ir
+from numba import njit, types
+from numba.extending import intrinsic
 
-from epipole.io.logs.kernels import kernel
-from epipole.io.logs.mcap.byte_loads import load_uint16, load_uint32, load_uint64
+from epipole.io.caches.kernels import use_kernel_cache
+
+# -- How the loops over the bytes of a log are compiled.
+#
+# The same as `epipole.tasks.algorithms.kernels`, which io may not import. A test compares the
+# two.
+
+use_kernel_cache()
+
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": True}
+
+kernel = njit(**_OPTIONS)
+
+
+# -- Little-endian numbers out of bytes at any place, for compiled loops.
+
+
+def _load(bits: int, kind: Any) -> Any:
+    """Return a function of (bytes, place): one load instruction, for which numba has no function.
+
+    The bytes must reach beyond the number: no bound is checked.
+    """
+
+    @intrinsic
+    def load(typing_context, data, at):
+        def code(context, builder, signature, values):
+            array = context.make_array(signature.args[0])(context, builder, values[0])
+            place = builder.gep(array.data, [values[1]])
+            pointer = builder.bitcast(place, ir.IntType(bits).as_pointer())
+            return builder.load(pointer, align=1)
+
+        return kind(data, types.int64), code
+
+    return load
+
+
+load_uint16 = _load(16, types.uint16)
+load_int32 = _load(32, types.int32)
+load_uint32 = _load(32, types.uint32)
+load_uint64 = _load(64, types.uint64)
+
+
+# -- The places of records in a chunk or outside, found by compiled walks over the bytes.
 
 Bytes = npt.NDArray[np.uint8]
 Hashes = npt.NDArray[np.uint64]
@@ -24,7 +68,7 @@ SCHEMA_BYTES, CHANNEL_BYTES = 6, 12  # of a schema and a channel at least, with 
 INDEX_BYTES = 6  # of a message index before its entries: channel, bytes of the entries
 ENTRY_BYTES = 16  # of an entry of a message index
 # Records in one index, so that its size is bounded: 35 bytes each. Most chunks have fewer.
-MOST_RECORDS = 1 << 20
+MAX_RECORDS = 1 << 20
 
 
 class RecordIndex(NamedTuple):
@@ -45,7 +89,7 @@ class RecordIndex(NamedTuple):
 
 
 def index_records(data: Bytes, outside: bool = False) -> Iterator[RecordIndex]:
-    """Yield where the records lie, at most `MOST_RECORDS` at once.
+    """Yield where the records lie, at most `MAX_RECORDS` at once.
 
     Parameters
     ----------
@@ -57,10 +101,10 @@ def index_records(data: Bytes, outside: bool = False) -> Iterator[RecordIndex]:
     """
     at, more = 0, True
     while more:
-        n, *_ = _walk(data, at, outside, False, MOST_RECORDS, *_columns(0))
+        n, *_ = _walk(data, at, outside, False, MAX_RECORDS, *_columns(0))
         columns = _columns(n)
         _, at, n_strange, first_strange = _walk(data, at, outside, False, n, *columns)
-        more = n == MOST_RECORDS and at < len(data)
+        more = n == MAX_RECORDS and at < len(data)
         opcode, channel, time_ns, start, end = columns
         yield RecordIndex(opcode, channel, time_ns, start, end, n_strange, first_strange, at)
 

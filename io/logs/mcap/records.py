@@ -16,13 +16,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.io.logs.mcap.blocks import BLOCK_BYTES
-from epipole.io.logs.mcap.bytes import LogBytes
-from epipole.io.logs.mcap.channels import Channel, ChannelTable
-from epipole.io.logs.mcap.chunks import OpenedChunk, open_chunk, open_cut_chunk
-from epipole.io.logs.mcap.compression import ChunkError
+from epipole.io.logs.mcap.bytes import BLOCK_BYTES, LogBytes
+from epipole.io.logs.mcap.container import (
+    RECORD,
+    Channel,
+    ChannelTable,
+    ChunkError,
+    LogSummary,
+    OpenedChunk,
+    open_chunk,
+    open_cut_chunk,
+    read_summary,
+)
 from epipole.io.logs.mcap.damage_rows import Damage, DamageRows
-from epipole.io.logs.mcap.places import RUN, LogPlaces, Place
+from epipole.io.logs.mcap.record_layout import RUN, LogPlaces, Place
 from epipole.io.logs.mcap.record_scan import (
     CHUNK,
     DATA_END,
@@ -35,14 +42,13 @@ from epipole.io.logs.mcap.record_scan import (
     index_records,
     no_declarations,
 )
-from epipole.io.logs.mcap.summary import RECORD, LogSummary, read_summary
 from epipole.io.logs.mcap.undeclared import Channels, LateMessages, Undeclared
 from epipole.schemas.rejects import Reason
 
 # The uncompressed size of all chunks together may not exceed max(16 MiB, 200 x the file's size):
 # so the file bounds what they cost. Logs of frames shrink to a half or a tenth.
-MOST_EXPANSION = 200
-LEAST_UNPACKED_BYTES = 16 << 20
+MAX_EXPANSION = 200
+MIN_UNPACKED_BYTES = 16 << 20
 
 AHEAD_BYTES = 8 << 20  # of chunks that are opened while the chunk before them is decoded
 WAITING_BYTES = 2 << 10  # that a waiting chunk takes beside its records
@@ -50,7 +56,7 @@ SMALL_BYTES = 4 << 10  # a chunk of fewer is opened sooner than given to another
 
 # A summary that counts more messages per byte of the log is damaged: the best compression of
 # empty messages has about 300.
-MOST_PER_BYTE = 1000
+MAX_PER_BYTE = 1000
 
 PER_RECORD = ("opcode", "channel", "time_ns", "start", "end")  # columns of an index
 Numbers = npt.NDArray[np.int64]
@@ -117,7 +123,7 @@ class RecordWalk:
         """Yield the places; if there is a pool, it is already opening their chunks."""
         waiting: deque[tuple[Place, Future[OpenedChunk] | None]] = deque()
         ahead, unpacked = 0, 0
-        most = max(LEAST_UNPACKED_BYTES, MOST_EXPANSION * len(self.data))
+        most = max(MIN_UNPACKED_BYTES, MAX_EXPANSION * len(self.data))
         for place in places:
             opening = None
             if place.opcode == CHUNK and not place.reason:
@@ -327,7 +333,7 @@ class RecordWalk:
             for number, count in declared.items()
             if number in self._promised or self._may_be_wanted(number)
         )
-        if missing > MOST_PER_BYTE * len(self.data):
+        if missing > MAX_PER_BYTE * len(self.data):
             self._damage.add(0, 0, Reason.DAMAGED_RECORD)  # the counts themselves are damaged
         elif missing:
             self._damage.add(0, 0, Reason.MISSING_MESSAGES, missing)

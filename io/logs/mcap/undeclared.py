@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.io.logs.mcap.channels import Channel, ChannelTable
+from epipole.io.logs.mcap.container import Channel, ChannelTable
 from epipole.schemas.rejects import Reason
 
 N_CHANNELS = 1 << 16  # that a number of 16 bits can tell apart

@@ -9,18 +9,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.io.logs.damage import RejectList
+from epipole.io.logs.left_out import RejectList
 from epipole.io.logs.mcap.records import Block
-from epipole.io.logs.messages.encodings.encoding import MessageEncoding, UndecodableError
-from epipole.io.logs.messages.encodings.registry import message_encodings
-from epipole.io.logs.messages.fields import FIELD_TYPES, no_fields
+from epipole.io.logs.messages.encoding import (
+    FIELD_TYPES,
+    MessageEncoding,
+    UndecodableError,
+    no_fields,
+)
+from epipole.io.logs.messages.registry import message_encodings
 from epipole.io.logs.messages.scan import Messages
-from epipole.schemas.logs.bounds import TIME
-from epipole.schemas.logs.messages import CALIBRATION, FRAME, SENSOR_ID_PATTERN, STATE
+from epipole.schemas.log_bounds import TIME
+from epipole.schemas.log_messages import CALIBRATION, FRAME, SENSOR_ID_PATTERN, STATE
 from epipole.schemas.rejects import Reason
 
 SENSOR_ID = re.compile(SENSOR_ID_PATTERN)
-MOST_AT_ONCE = 4096  # messages decoded one at a time before the scan is tried again
+MAX_AT_ONCE = 4096  # messages decoded one at a time before the scan is tried again
 BATCH_MESSAGES = 8192  # so that the located fields of a batch stay small
 UNDECODABLE = {
     FRAME: Reason.UNDECODABLE_FRAME,
@@ -118,7 +122,7 @@ class MessageBatch:
         i, at_once = 0, 1
         while i < len(self):
             stopped = scan(i)
-            at_once = 1 if stopped > i else min(2 * at_once, MOST_AT_ONCE)
+            at_once = 1 if stopped > i else min(2 * at_once, MAX_AT_ONCE)
             i = min(stopped + at_once, len(self))
             if stopped < i:
                 judge(list(self.decoded(stopped, i)))

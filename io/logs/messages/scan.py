@@ -7,15 +7,24 @@ that are allowed (arrays in pieces, numbers one by one, big-endian CDR, JSON) an
 leaving a message out. A scan takes nothing that Python would leave out or read differently.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 
-from epipole.io.logs.kernels import kernel
-from epipole.io.logs.mcap.byte_loads import load_int32, load_uint64
-from epipole.io.logs.mcap.record_scan import Bytes
-from epipole.schemas.logs import bounds
+from epipole.io.logs.mcap.record_scan import Bytes, kernel, load_int32, load_uint64
+from epipole.schemas import log_bounds as bounds
+
+# -- The compiled loops that take most messages straight into columns.
+#
+# An encoding has located the fields of each message (see `messages.fields`). A scan takes the
+# messages one after the other as long as they are good: well formed, with every value usable. It
+# stops at the first other one. That one is decoded and judged in Python, which knows all forms
+# that are allowed (arrays in pieces, numbers one by one, big-endian CDR, JSON) and the reason
+# for leaving a message out. A scan takes nothing that Python would leave out or read
+# differently.
 
 MAX_NAMES = 1024  # sensors that a scan can tell apart; decoding has no limit
 NAME_BYTES = 63
@@ -39,7 +48,7 @@ NEAREST_KM2 = (bounds.POSITION.least * 1.0001) ** 2
 FARTHEST_KM2 = (bounds.POSITION.greatest * 0.99) ** 2
 FASTEST_KM2_S2 = (bounds.SPEED.greatest * 0.99) ** 2
 MIN_NORM2, MAX_NORM2 = 1.005 * bounds.QUATERNION.least**2, 0.995 * bounds.QUATERNION.greatest**2
-MOST_SIGMA_KM = bounds.POSITION_SIGMA.greatest
+MAX_SIGMA_KM = bounds.POSITION_SIGMA.greatest
 VAGUE_ARCSEC, ANY_ARCSEC = bounds.ATTITUDE_SIGMA.greatest, float(bounds.ARCSEC_OF_HALF_A_TURN)
 
 
@@ -262,7 +271,7 @@ def scan_states(messages, i, names, frames, rows, n):
             break
         sigma_km = np.uint64(fields[i, POSITION_SIGMA]).view(np.float64)
         sigma_arcsec = np.uint64(fields[i, ATTITUDE_SIGMA]).view(np.float64)
-        if sigma_km > MOST_SIGMA_KM or (VAGUE_ARCSEC < sigma_arcsec < ANY_ARCSEC and n_attitude):
+        if sigma_km > MAX_SIGMA_KM or (VAGUE_ARCSEC < sigma_arcsec < ANY_ARCSEC and n_attitude):
             break
         if sigma_arcsec >= ANY_ARCSEC:  # the attitude may be any
             rows.q[n] = np.nan
@@ -275,3 +284,48 @@ def scan_states(messages, i, names, frames, rows, n):
         i += 1
         n += 1
     return i, n
+
+
+# -- Names as small integers, which the compiled scans and the decoded messages share.
+
+
+class NameCodes:
+    """Codes of names, counted from 0 in the order in which the names appear."""
+
+    def __init__(self, names: Sequence[str] = ()) -> None:
+        self.table = new_names()
+        self._names: list[str] = []
+        self._codes: dict[str, int] = {}
+        for name in names:
+            self.code(name)
+
+    def names(self) -> list[str]:
+        """Return the names by code, with those that a scan has added."""
+        n = int(self.table.n[0])
+        for code in range(len(self._names), n):  # empty once the table is full
+            name = self.table.text[code, : self.table.length[code]].tobytes().decode()
+            self._codes[name] = code
+            self._names.append(name)
+        return self._names
+
+    def code(self, name: str) -> int:
+        """Return the code of a name, new or known."""
+        names = self.names()
+        code = self._codes.setdefault(name, len(names))
+        if code == len(names):
+            names.append(name)
+            self._enter(code, name.encode())
+        return code
+
+    def _enter(self, code: int, text: bytes) -> None:
+        """Add a name to the table of the scans, if there is room; they stop at a name without."""
+        if code >= MAX_NAMES or len(text) > NAME_BYTES:
+            return
+        self.table.text[code, : len(text)] = np.frombuffer(text, np.uint8)
+        self.table.length[code] = len(text)
+        self.table.n[0] = code + 1
+
+    def strings(self, codes: npt.NDArray[np.int32]) -> pa.Array:
+        """Return the names of codes as a column."""
+        dictionary = pa.array(self.names(), pa.string())
+        return pa.DictionaryArray.from_arrays(pa.array(codes), dictionary).cast(pa.string())

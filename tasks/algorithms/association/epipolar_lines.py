@@ -11,8 +11,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
-from epipole.tasks.algorithms.geometry.rotations import skew
+from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
+from epipole.tasks.algorithms.geometry.directions import skew
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

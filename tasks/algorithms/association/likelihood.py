@@ -12,31 +12,29 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.evidence.chance import chance_of
-from epipole.tasks.algorithms.association.evidence.detection import (
+from epipole.tasks.algorithms.association.chance import (
     CERTAIN_LOG_ODDS,
+    chance_of,
     detection_odds,
     estimated_detection,
     looks_of,
+    revised_odds,
+    visible_volume,
 )
-from epipole.tasks.algorithms.association.evidence.hypothesis_queue import (
+from epipole.tasks.algorithms.association.hypothesis_queue import (
     Hypothesis,
     HypothesisQueue,
     distinct,
 )
-from epipole.tasks.algorithms.association.evidence.object_density import (
-    revised_odds,
-    visible_volume,
-)
-from epipole.tasks.algorithms.association.hypotheses.field_index import cones_of, field_index
-from epipole.tasks.algorithms.association.hypotheses.growth import grow_all
-from epipole.tasks.algorithms.association.hypotheses.merge_hypotheses import best_union
-from epipole.tasks.algorithms.association.hypotheses.resolve_conflicts import resolve_conflicts
-from epipole.tasks.algorithms.association.hypotheses.search_space import SearchSpace, work_space
-from epipole.tasks.algorithms.association.hypotheses.seeds import seeds_between
-from epipole.tasks.algorithms.association.hypotheses.sensor_pairs import EveryPair, SensorPairs
-from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups, Samples
-from epipole.tasks.algorithms.association.sampling.views import views_of
+from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
+from epipole.tasks.algorithms.association.search.field_index import cones_of, field_index
+from epipole.tasks.algorithms.association.search.growth import grow_all
+from epipole.tasks.algorithms.association.search.merge_hypotheses import best_union
+from epipole.tasks.algorithms.association.search.resolve_conflicts import resolve_conflicts
+from epipole.tasks.algorithms.association.search.search_space import SearchSpace, work_space
+from epipole.tasks.algorithms.association.search.seeds import seeds_between
+from epipole.tasks.algorithms.association.search.sensor_pairs import EveryPair, SensorPairs
+from epipole.tasks.algorithms.association.views import views_of
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 
 Array = npt.NDArray[np.float64]

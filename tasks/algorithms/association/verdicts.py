@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.association.evidence.detection import CERTAIN_LOG_ODDS
-from epipole.tasks.algorithms.association.sampling.samples import FREE, Groups
+from epipole.tasks.algorithms.association.chance import CERTAIN_LOG_ODDS
+from epipole.tasks.algorithms.association.samples import FREE, Groups
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

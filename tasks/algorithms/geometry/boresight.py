@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 MAX_STEPS = 50
 CONVERGED = 1e-12  # relative change of the focal length
-MOST_CHOSEN_FROM = 60  # stars; all their triples are tried
+MAX_CHOSEN_FROM = 60  # stars; all their triples are tried
 
 
 def boresight_of_three(u_icrs: Array, distance_px: Array, focal_px: float) -> Array:
@@ -248,7 +248,7 @@ def best_three(u: Array) -> npt.NDArray[np.int64]:
     """
     if len(u) < 3:
         raise ValueError(f"expected three or more directions, got {len(u)}")
-    rows = np.array(list(combinations(range(min(len(u), MOST_CHOSEN_FROM)), 3)), np.int64)
+    rows = np.array(list(combinations(range(min(len(u), MAX_CHOSEN_FROM)), 3)), np.int64)
     a, b, c = (u[rows[:, k]] for k in range(3))
     ab, bc, ca = np.cross(a, b), np.cross(b, c), np.cross(c, a)
     volume = np.sum(a * bc, axis=1)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.camera import Camera, project
-from epipole.tasks.algorithms.geometry.optics_errors import OPTICS, image_derivatives
+from epipole.tasks.algorithms.geometry.covariances import OPTICS, image_derivatives
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -26,10 +26,10 @@ FOCAL_SHARE = 0.02
 CORNER_PX = 20.0
 # A detector of 6 mm that is set behind its lens with usual tolerances, about 30 micrometres.
 PRINCIPAL_POINT_SHARE = 0.005  # of the image's size
-LEAST_PLACE_PX = 1e-3  # of a principal point that is known
+MIN_PLACE_PX = 1e-3  # of a principal point that is known
 ITERATIONS = 15
 HUBER = 2.0  # [sigma] larger residuals have less weight
-LEAST_FRAMES, LEAST_STARS = 3, 60
+MIN_FRAMES, MIN_STARS = 3, 60
 # The principal point moves only where its sigma, with all numbers free, is below this share of its
 # prior. Otherwise it stands for a rotation of the sensor.
 TOLD_APART = 0.5
@@ -72,7 +72,7 @@ class ToldOptics(NamedTuple):
         place_px = self.principal_point_px
         if place_px is None:
             place_px = PRINCIPAL_POINT_SHARE * max(camera.width, camera.height)
-        place_px = max(place_px, LEAST_PLACE_PX)
+        place_px = max(place_px, MIN_PLACE_PX)
         return np.array([FOCAL_SHARE * f] * 2 + [place_px] * 2 + at_corner.tolist())
 
 
@@ -249,7 +249,7 @@ def _taken(images: StarImages) -> _Images | None:
     """Return the images as the fits take them, None if they are too few."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(images.frame)) + 1])
     n = len(images.frame)
-    if n < LEAST_STARS or len(starts) < LEAST_FRAMES:
+    if n < MIN_STARS or len(starts) < MIN_FRAMES:
         return None
     of_frame = np.repeat(np.arange(len(starts)), np.diff(np.append(starts, n)))
     _, of_star = np.unique(images.star, return_inverse=True)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 Array = npt.NDArray[np.float64]

@@ -12,23 +12,32 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import minimize
 from scipy.special import gammaincinv, logsumexp
 
 from epipole.tasks.algorithms.known_objects.prediction import (
     ElementErrors,
     Satellites,
+    Screen,
     along_up_across,
     is_deep_space,
     predict,
     sensitivities,
     sigmas,
 )
-from epipole.tasks.algorithms.known_objects.screening import Screen
+
+# -- Matching: the probability that an object of the night is this satellite of a catalogue.
+#
+# An object's positions are compared with a satellite's prediction at the same times. Their
+# difference has the covariance of the positions, and that of the elements' errors, which all of
+# them share. Each satellite is a hypothesis, and so is an object that is not in the catalogue:
+# any of those, or a companion of a listed one. Companions matter: satellites that share a
+# geostationary slot, and parts of one launch, are near each other.
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MOST_ROWS = 8  # positions of an object that are compared
+MAX_ROWS = 8  # positions of an object that are compared
 KEPT = 0.9999  # share of true matches that pass the chi-square test
 REACH_SIGMA = 6.0
 # Companions that are not listed: the share of satellites that have one, and how far it is, as
@@ -40,7 +49,7 @@ OTHERS_KM3 = 1e-8
 # Errors of element sets, in units of the usual ones, and the share of such sets.
 QUALITIES = ((1.0, 0.8), (2.0, 0.15), (4.0, 0.05))
 WORST = QUALITIES[-1][0]
-LEAST_NAMED = 1e-3  # probability of a satellite that an ambiguous object may be
+MIN_NAMED = 1e-3  # probability of a satellite that an ambiguous object may be
 DRAG_REACH_KM_DAY2 = 0.2  # unknown drag of a satellite that comes down soon
 DAY_NS = 86_400_000_000_000
 
@@ -241,7 +250,7 @@ def judge(found: Sequence[Candidate], least: float) -> NameVerdict:
     share = np.exp(match - total)
     best = int(np.argmax(share))
     order = np.argsort(-share, kind="stable")
-    rows = tuple(found[k].row for k in order if share[k] >= LEAST_NAMED)
+    rows = tuple(found[k].row for k in order if share[k] >= MIN_NAMED)
     if share[best] >= least:
         return NameVerdict("known", float(share[best]), found[best], rows)
     if share.sum() >= 0.5:
@@ -251,12 +260,75 @@ def judge(found: Sequence[Candidate], least: float) -> NameVerdict:
 
 
 def spread_rows(time_ns: npt.NDArray[np.int64], preferred: npt.NDArray[np.bool_]) -> Indices:
-    """Return at most `MOST_ROWS` rows that are spread over the time; preferred ones where any are.
+    """Return at most `MAX_ROWS` rows that are spread over the time; preferred ones where any are.
 
     The rows are in order of time.
     """
     rows = np.flatnonzero(preferred) if preferred.any() else np.arange(len(time_ns))
-    if len(rows) <= MOST_ROWS:
+    if len(rows) <= MAX_ROWS:
         return rows
-    wanted = np.linspace(time_ns[rows[0]], time_ns[rows[-1]], MOST_ROWS)
+    wanted = np.linspace(time_ns[rows[0]], time_ns[rows[-1]], MAX_ROWS)
     return np.unique(rows[np.searchsorted(time_ns[rows], wanted).clip(0, len(rows) - 1)])
+
+
+# -- Learning: how large the errors of published elements are, from the sure matches of a night.
+
+# What is known before: each error is right within a factor of three (1-sigma of its logarithm).
+PRIOR_SIGMA = float(np.log(3.0))
+STEP = 0.7  # of the first search
+FEWEST = 5  # matches from which anything is learnt
+
+
+def learn_errors(
+    matches: Sequence[Candidate], satellites: Sequence[object], start: ElementErrors
+) -> ElementErrors:
+    """Return the errors of elements under which the differences of sure matches are likeliest.
+
+    Parameters
+    ----------
+    matches
+        Sure matches.
+    satellites
+        Those of SGP4 that they are, in the same order.
+    start
+        What is known of the errors before.
+
+    Returns
+    -------
+    ElementErrors
+        The greatest posterior density, by the factors of: the error along at the epoch, its growth,
+        the radial and the across error. `start` where there are fewer than `FEWEST` matches.
+    """
+    if len(matches) < FEWEST:
+        return start
+
+    apart_km = np.array([match.apart_km for match in matches])
+    cov = np.array([match.cov for match in matches])
+    lever = np.array([match.lever for match in matches])
+
+    def cost(log_factors: Array) -> float:
+        errors = _scaled(start, np.exp(log_factors))
+        sigma = np.array(
+            [sigmas(s, m.age_days, errors) for s, m in zip(satellites, matches, strict=True)]
+        )
+        S = cov + (lever * sigma[:, None, :] ** 2) @ np.swapaxes(lever, 1, 2)
+        d2 = np.einsum("ni,ni->n", apart_km, np.linalg.solve(S, apart_km[:, :, None])[:, :, 0])
+        log_det = np.linalg.slogdet(S)[1]
+        return float((d2 + log_det).sum() + (log_factors**2).sum() / PRIOR_SIGMA**2)
+
+    corners = np.vstack([np.zeros(4), STEP * np.eye(4)])
+    options = {"initial_simplex": corners, "xatol": 0.01, "fatol": 0.01}
+    found = minimize(cost, np.zeros(4), method="Nelder-Mead", options=options)
+    return _scaled(start, np.exp(found.x))
+
+
+def _scaled(errors: ElementErrors, factors: Array) -> ElementErrors:
+    at_epoch, growth, radial, across = factors.tolist()
+    return ElementErrors(
+        errors.along_km * at_epoch,
+        errors.along_km_day * growth,
+        errors.radial_km * radial,
+        errors.radial_km_day * radial,
+        errors.across_km * across,
+        errors.across_km_day * across,
+    )

@@ -14,9 +14,18 @@ import numpy as np
 import numpy.typing as npt
 from sgp4.api import WGS72, Satrec, SatrecArray
 
-from epipole.tasks.algorithms.constants import GM_KM3_S2
+from epipole.tasks.algorithms.constants import GM_KM3_S2, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.orbits.reference_frames import Orientation, gcrf_from_teme
-from epipole.tasks.algorithms.time.time_scales import utc_julian_date
+from epipole.tasks.algorithms.times import utc_julian_date
+
+# -- Predictions: where the satellites of a catalogue are, by SGP4, and how well that is known.
+#
+# Published element sets have no covariance. What is known of their errors: they are a few
+# hundred metres to kilometres at the epoch, and grow mostly along the track, by about a
+# kilometre a day (Kelso 2007, Validation of SGP4 and IS-GPS-200D against GPS precision
+# ephemerides, AAS 07-127; Vallado and Cefola 2012, Two-line element sets, practice and use,
+# IAC-12-C1.6.12). `ElementErrors` has these sizes; they are a start, and are learnt from the
+# matches of a night (`learning`).
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
@@ -25,7 +34,7 @@ Satellites = Sequence[Satrec]
 DAY_S = 86400.0
 UNIX_EPOCH_JD = 2440587.5
 SGP4_EPOCH_JD = 2433281.5  # 1949 December 31, 0h
-LEAST_TILT = 1e-4  # sine of an inclination: below it the node says nothing
+MIN_TILT = 1e-4  # sine of an inclination: below it the node says nothing
 DRAG_UNKNOWN = 0.15  # share of the drag that is not known: density and area change from day to day
 # Mean motions [rad/s] below this are of periods above 225 minutes: SGP4's deep space.
 DEEP_SPACE_RAD_S = 2 * np.pi / (225 * 60)
@@ -144,7 +153,7 @@ def sensitivities(satellite: Any, time_ns: Nanoseconds, anchor: int) -> Array:
     a_km = semi_major_axis(satellite)
     ex, ey = satellite.ecco * np.cos(satellite.argpo), satellite.ecco * np.sin(satellite.argpo)
     tilt = 1.0 / a_km
-    node = tilt / max(abs(np.sin(satellite.inclo)), LEAST_TILT)
+    node = tilt / max(abs(np.sin(satellite.inclo)), MIN_TILT)
     epoch_ns = (satellite.jdsatepoch - UNIX_EPOCH_JD + satellite.jdsatepochF) * DAY_S * 1e9
     minutes = (float(time_ns[anchor]) - epoch_ns) / 60e9
     motion = 1.0 / a_km / (DAY_S / 60.0)
@@ -208,3 +217,111 @@ def along_up_across(state: Array) -> Array:
     side = np.cross(state[:3], state[3:])
     side /= np.linalg.norm(side)
     return np.array([ahead, np.cross(ahead, side), side])
+
+
+# -- Residuals: how far a direction is from a predicted object, along and across its track.
+
+
+def track_residuals(
+    directions: Array, sensor_km: Array, sensor_km_s: Array, states: Array
+) -> Array:
+    """Return observed minus predicted places at the object's distance, along and across its track.
+
+    Parameters
+    ----------
+    directions : (n, 2) float
+        Astrometric right ascension and declination [rad], GCRF; light time not removed.
+    sensor_km, sensor_km_s : (n, 3) float
+        Position and velocity of the sensor, GCRF.
+    states : (n, 6) float
+        Predicted states of the object at the same times [km, km/s], GCRF.
+
+    Returns
+    -------
+    (n, 2) float
+        [km]: along the apparent motion, and to the left of it as the sensor sees it from inside
+        the sky.
+    """
+    apart = states[:, :3] - sensor_km
+    delay_s = np.linalg.norm(apart, axis=1, keepdims=True) / SPEED_OF_LIGHT_KM_S
+    apart = apart - delay_s * states[:, 3:]  # where the light came from
+    distance = np.linalg.norm(apart, axis=1, keepdims=True)
+    predicted = apart / distance
+    ra, dec = directions.T
+    observed = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    moving = states[:, 3:] - sensor_km_s
+    moving -= np.sum(moving * predicted, axis=1, keepdims=True) * predicted
+    along = moving / np.linalg.norm(moving, axis=1, keepdims=True)
+    across = np.cross(along, predicted)
+    off = (observed - predicted) * distance
+    return np.stack([np.sum(off * along, axis=1), np.sum(off * across, axis=1)], axis=1)
+
+
+# -- Screening: the satellites of a large catalogue that may be at a place, at little cost.
+#
+# States of the whole catalogue are computed every half hour. A place is compared with the
+# planes, then the radii, then the places of two-body orbits from these states; what passes is
+# computed exactly.
+
+Indices = npt.NDArray[np.int64]
+
+NODE_NS = 1_800_000_000_000
+# What two bodies leave out in a quarter of an hour: 0.005 of the radius is twice what was found.
+ROOM = 0.005
+KEPLER_STEPS = 6
+
+
+class Screen:
+    """A catalogue whose satellites near a place and time can be asked for.
+
+    Parameters
+    ----------
+    satellites
+        n of them.
+    """
+
+    def __init__(self, satellites: Satellites) -> None:
+        self._satellites = satellites
+        self._nodes: dict[int, Array] = {}
+
+    def near(self, r_km: Array, time_ns: int, reach_km: Array) -> Indices:
+        """Return the satellites that may be within `reach_km` (n,) of a (3,) place, GCRF."""
+        node = (time_ns + NODE_NS // 2) // NODE_NS
+        if node not in self._nodes:
+            self._nodes[node] = predict(self._satellites, np.array([node * NODE_NS]))[:, 0]
+        states = self._nodes[node]
+        gate = reach_km + ROOM * np.linalg.norm(r_km)
+        found = _in_plane_and_shell(states, r_km, gate)
+        there = two_body(states[found], (time_ns - node * NODE_NS) / 1e9)
+        return found[np.linalg.norm(there - r_km, axis=1) < gate[found]]
+
+
+def _in_plane_and_shell(states: Array, r_km: Array, gate: Array) -> Indices:
+    """Return the rows of states whose orbits pass the place within the gate."""
+    r, v = states[:, :3], states[:, 3:]
+    momentum = np.cross(r, v)
+    off_plane = np.abs(momentum @ r_km) / np.linalg.norm(momentum, axis=1)
+    distance = np.linalg.norm(r, axis=1)
+    a = 1.0 / (2.0 / distance - np.sum(v * v, axis=1) / GM_KM3_S2)
+    e2 = 1.0 - np.sum(momentum * momentum, axis=1) / (GM_KM3_S2 * a)
+    e = np.sqrt(np.maximum(e2, 0.0))
+    at = np.linalg.norm(r_km)
+    in_shell = (at > a * (1 - e) - gate) & (at < a * (1 + e) + gate)
+    return np.flatnonzero((off_plane < gate) & in_shell)  # NaN: neither
+
+
+def two_body(states: Array, dt_s: float) -> Array:
+    """Return (n, 3) places of (n, 6) elliptic states after a time, for two bodies."""
+    r, v = states[:, :3], states[:, 3:]
+    distance = np.linalg.norm(r, axis=1)
+    a = 1.0 / (2.0 / distance - np.sum(v * v, axis=1) / GM_KM3_S2)
+    n = np.sqrt(GM_KM3_S2 / a**3)
+    s = np.sum(r * v, axis=1) / np.sqrt(GM_KM3_S2 * a)  # e sin E
+    c = 1.0 - distance / a  # e cos E
+    x = n * dt_s  # difference of eccentric anomalies
+    for _ in range(KEPLER_STEPS):
+        f = x - c * np.sin(x) + s * (1 - np.cos(x)) - n * dt_s
+        x = x - f / (1 - c * np.cos(x) + s * np.sin(x))
+    forward = 1 - a / distance * (1 - np.cos(x))
+    lag = dt_s - (x - np.sin(x)) / n
+    return np.asarray(forward[:, None] * r + lag[:, None] * v)

@@ -25,7 +25,7 @@ FAR_SIGMA = 10.0  # pairs whose energies differ by more are skipped
 OBLATE = 2e-3  # share of an orbit's two-body energy that varies with the oblate Earth
 KEPT = 0.9999  # share of true links that pass the chi-square test
 # The least density of objects: that of all tracked objects in low orbit.
-FEWEST_KM3 = 1e-8
+MIN_KM3 = 1e-8
 VELOCITIES_KM3_S3 = 1.0  # volume of velocity space that they fill, about
 # Neglected accelerations: Sun and Moon at geostationary height, and as a share of gravity the
 # higher harmonics.
@@ -253,7 +253,7 @@ def _log_density(apart: Array, S: Array) -> float:
     """
     size = len(S)
     apart = apart[np.isfinite(apart).all(axis=1)]
-    floor = np.log(FEWEST_KM3) - (np.log(VELOCITIES_KM3_S3) if size == 6 else 0.0)
+    floor = np.log(MIN_KM3) - (np.log(VELOCITIES_KM3_S3) if size == 6 else 0.0)
     if not len(apart):
         return float(floor)
     d2 = np.einsum("ni,ni->n", apart, np.linalg.solve(S, apart.T).T).min()

@@ -1,11 +1,16 @@
 """Object motion: velocities from positions, and what a fit of apparent motion neglects."""
 
 import itertools
+from collections import defaultdict
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbits.state_interpolation import gravity
+
+# -- Object motion: velocities from positions, and what a fit of apparent motion neglects.
 
 Array = npt.NDArray[np.float64]
 
@@ -112,3 +117,82 @@ def _derivatives(state: Array) -> tuple[Array, Array, Array, Array]:
     """Return position, velocity, acceleration by gravity, and its rate."""
     r, v = state[:, :3], state[:, 3:]
     return r, v, gravity(r), (gravity(r + v / 2) - gravity(r - v / 2))  # over one second
+
+
+# -- Independent epochs: positions of an object that share no detection.
+
+
+@kernel
+def keep_independent(offsets, used, track, first_ns, last_ns, until, apart):
+    """Clear `apart` where a group shares a detection with an earlier one that is kept.
+
+    Parameters
+    ----------
+    offsets : (g + 1,) int
+        Group k, one object at one epoch, has the views ``offsets[k]:offsets[k + 1]``; in order of
+        time.
+    used : (n,) bool
+        The view counts.
+    track : (n,) int
+        Its tracklet, from 0 on.
+    first_ns, last_ns : (n,) int
+        The first and the last detection that its direction was fitted to.
+    until : (tracklets,) int, out
+        Starts below all times: then the last detection of each tracklet that a kept group uses.
+    apart : (g,) bool, in and out
+        The groups that may be kept; then those that are.
+    """
+    for g in range(len(apart)):
+        for v in range(offsets[g], offsets[g + 1]):
+            if used[v] and not first_ns[v] > until[track[v]]:
+                apart[g] = False
+        if apart[g]:
+            for v in range(offsets[g], offsets[g + 1]):
+                if used[v]:
+                    until[track[v]] = last_ns[v]
+
+
+# -- Object identity: an object keeps its number from span to span while a tracklet continues.
+
+Indices = npt.NDArray[np.int64]
+
+
+class ObjectRegistry:
+    """Numbers for groups of tracklets, span after span.
+
+    A group gets the object that most of its tracklets belonged to last. Of two groups that
+    claim one object, the one with more of its tracklets gets it. Ties are decided by the lower
+    number, so the result depends on the order of the spans only.
+
+    Parameters
+    ----------
+    weight : (t,) float
+        What each tracklet counts, one if missing. A long tracklet is rarely of two objects, a
+        short one often.
+    """
+
+    def __init__(self, weight: npt.NDArray[np.float64] | None = None) -> None:
+        self._weight = weight
+        self._object_of: dict[int, int] = {}
+        self._count = 0
+
+    def name_groups(self, groups: Sequence[Indices]) -> list[int]:
+        """Return the object number of each group of tracklets of one span."""
+        claims = []
+        for g, members in enumerate(groups):
+            held: dict[int, float] = defaultdict(float)
+            for t in members.tolist():
+                if t in self._object_of:
+                    held[self._object_of[t]] += 1.0 if self._weight is None else self._weight[t]
+            claims += [(-weight, number, g) for number, weight in held.items()]
+        named: dict[int, int] = {}
+        for _, number, g in sorted(claims):
+            if g not in named and number not in named.values():
+                named[g] = number
+        for g, members in enumerate(groups):
+            if g not in named:
+                named[g] = self._count
+                self._count += 1
+            for t in members.tolist():
+                self._object_of[t] = named[g]
+        return [named[g] for g in range(len(groups))]

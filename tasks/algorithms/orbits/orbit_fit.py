@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, no_equations
 
@@ -22,8 +22,8 @@ LIGHT = SPEED_OF_LIGHT_KM_S
 STEP_S = 10.0  # Runge-Kutta then errs by less than 1 m over 10 minutes of a low orbit
 ITERATIONS = 20
 CONVERGED = 1e-6  # sigmas squared
-LEAST_BIAS_RAD = 5e-9  # 1 mas: keeps the prior invertible where nothing is shared
-LEAST_PLACE_KM = 1e-6
+MIN_BIAS_RAD = 5e-9  # 1 mas: keeps the prior invertible where nothing is shared
+MIN_PLACE_KM = 1e-6
 
 
 class Arcs(NamedTuple):
@@ -343,8 +343,8 @@ def prior_of(arcs: Arcs, rows: slice, sensor: Indices, n_sensors: int) -> Array:
     full = across + along[:, None, None] * arcs.u[rows][:, :, None] * arcs.u[rows][:, None, :]
     for s in np.unique(sensor).tolist():
         of_sensor = sensor == s
-        direction = full[of_sensor].mean(axis=0) + LEAST_BIAS_RAD**2 * np.eye(3)
+        direction = full[of_sensor].mean(axis=0) + MIN_BIAS_RAD**2 * np.eye(3)
         out[s, :3, :3] = np.linalg.inv(direction)
-        place = max(float(arcs.sigma_km[rows][of_sensor].mean()), LEAST_PLACE_KM)
+        place = max(float(arcs.sigma_km[rows][of_sensor].mean()), MIN_PLACE_KM)
         out[s, 3:, 3:] = np.eye(3) / place**2
     return out

@@ -8,8 +8,8 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from epipole.tasks.algorithms.constants import ARCSEC, AU_KM, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import aberrate
-from epipole.tasks.algorithms.time.time_scales import tt_julian_date
+from epipole.tasks.algorithms.geometry.directions import aberrate
+from epipole.tasks.algorithms.times import tt_julian_date
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]

@@ -16,11 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import EARTH_RATE_RAD_S
-from epipole.tasks.algorithms.time.time_scales import (
-    tai_minus_utc_s,
-    tt_julian_date,
-    utc_julian_date,
-)
+from epipole.tasks.algorithms.times import tai_minus_utc_s, tt_julian_date, utc_julian_date
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]

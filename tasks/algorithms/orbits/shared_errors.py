@@ -19,7 +19,7 @@ FREEDOM = 4.0  # degrees of freedom of the Student distribution: 1 error in 90 b
 AXES = 3
 ITERATIONS = 200
 CONVERGED = 1e-3  # relative change of the factors
-MOST_TOGETHER = 32  # sensors that are scaled at a time
+MAX_TOGETHER = 32  # sensors that are scaled at a time
 SWEEPS = 2  # over all groups of sensors, the second with the factors of the first
 
 
@@ -83,7 +83,7 @@ def scale_shared_errors(
     is 1. Expectation maximisation: e' C^-1 e is the expected one, so a sensor whose errors do not
     show keeps a factor of 1.
 
-    At most `MOST_TOGETHER` sensors are scaled at a time. The errors of the others count as
+    At most `MAX_TOGETHER` sensors are scaled at a time. The errors of the others count as
     independent from arc to arc: with so many sensors each has little weight.
 
     References
@@ -92,7 +92,7 @@ def scale_shared_errors(
     """
     n_sensors = len(prior)
     factor = np.ones((n_sensors, 2))
-    groups = np.array_split(np.arange(n_sensors), max(-(-n_sensors // MOST_TOGETHER), 1))
+    groups = np.array_split(np.arange(n_sensors), max(-(-n_sensors // MAX_TOGETHER), 1))
     for _ in range(1 if len(groups) == 1 else SWEEPS):
         absorbed = [_absorbed(sensors, of_arc, prior, factor) for sensors, of_arc in arcs]
         for group in groups:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SECOND_NS
-from epipole.tasks.algorithms.geometry.rotations import interpolate_quaternions
+from epipole.tasks.algorithms.geometry.directions import interpolate_quaternions
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import pdtrc
 
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

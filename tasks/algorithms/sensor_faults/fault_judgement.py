@@ -20,8 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2
-from epipole.tasks.algorithms.geometry.rotations import skew
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import skew, tangent_basis
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -34,7 +33,7 @@ FAULT_RAD = 600 * ARCSEC  # 1-sigma per axis of a wrong attitude
 SURE = 12.5  # log-odds from which a fault is declared: five sigma
 RARER = 5.0  # prior log-odds of a wrong clock against another fault
 DISTINCT = 5.0  # log-odds from which it is this fault and not another one
-MOST_SETS = 1100  # sets of faults that are all judged; where there are more, from small to large
+MAX_SETS = 1100  # sets of faults that are all judged; where there are more, from small to large
 OUTLIER = 20.0  # chi-square (2 degrees of freedom) of a line that is of another object
 ROUNDS = 4  # fits, each with better offsets and without outliers
 PER_SENSOR = 7  # offset, bias of position (3), bias of attitude (3)
@@ -228,7 +227,7 @@ def _explain(model: Model, sensors: Indices, has_prior_attitude: Flags) -> _Expl
 
     best: Faults = frozenset()
     judge(best)
-    if math.prod(1 + len(of_sensor) for of_sensor in kinds) <= MOST_SETS:
+    if math.prod(1 + len(of_sensor) for of_sensor in kinds) <= MAX_SETS:
         for chosen in itertools.product(*([None, *of_sensor] for of_sensor in kinds)):
             judge(frozenset(fault for fault in chosen if fault is not None))
         best = max(score, key=judge)

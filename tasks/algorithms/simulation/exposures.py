@@ -10,14 +10,19 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from epipole.tasks.algorithms.simulation.brightness import detection_probability
-from epipole.tasks.algorithms.simulation.ephemeris import (
+from epipole.tasks.algorithms.simulation.element_sets import (
     directions_to_sun,
     earth_at,
     julian_years_since,
 )
-from epipole.tasks.algorithms.simulation.objects import SimulatedObjects
-from epipole.tasks.algorithms.simulation.optics import field_radius, image_place, on_image
+from epipole.tasks.algorithms.simulation.optics import (
+    boost,
+    field_radius,
+    hidden_by_earth,
+    image_place,
+    on_image,
+    received_from,
+)
 from epipole.tasks.algorithms.simulation.sensor import (
     Attitudes,
     SimulatedSensor,
@@ -25,9 +30,10 @@ from epipole.tasks.algorithms.simulation.sensor import (
     random_stream,
     seconds_since,
 )
-from epipole.tasks.algorithms.simulation.sightlines import boost, hidden_by_earth, received_from
-from epipole.tasks.algorithms.simulation.star_field import (
+from epipole.tasks.algorithms.simulation.sources import (
+    SimulatedObjects,
     StarField,
+    detection_probability,
     star_directions,
     stars_in_cones,
 )

@@ -20,20 +20,19 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.geometry.boresight import focal_length_from_separations
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.optics_calibration import fit_radial
-from epipole.tasks.algorithms.star_identification.frames.field_of_view import field_of_view
-from epipole.tasks.algorithms.star_identification.frames.frame import (
+from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
     Search,
     Solution,
     aberrate_all,
+    field_of_view,
     identify_lost,
     identify_predicted,
 )
-from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
-from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
-from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
+from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
+from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
+from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
 
 Array = npt.NDArray[np.float64]
 
@@ -44,7 +43,7 @@ FEWEST = 6  # of a frame that is tried, and fewest stars of one that counts
 UNKNOWN_SIGMA_PX = 0.5
 # Tried changes of k1: how much longer or shorter they make the image's diagonal.
 DISTORTIONS = (0.04, -0.04, 0.08, -0.08, 0.12, -0.12)
-MOST_SHOWN = 0.8  # share of the centroids that are stars: no distortion is tried
+MAX_SHOWN = 0.8  # share of the centroids that are stars: no distortion is tried
 MORE_STARS = 1.5  # times as many as with the told camera are shown by a better one
 DISTORTED_REACH = 0.08  # of the logarithm of the focal length, with distortion
 SEARCH_S = 0.1  # of one trial, as in `Search.time_limit_s`
@@ -158,7 +157,7 @@ def _most_shown(frame: ImageFrame, told: Camera, reach: float, trials: _Trials) 
     plain = _first_shown(frame, sides, reach, trials)
     if plain is not None:
         found, sides = [plain, _with_fitted_k1(frame, plain, trials.how)], [plain.camera]
-        if any(shown.n_stars > MOST_SHOWN * len(frame.x_px) for shown in found):
+        if any(shown.n_stars > MAX_SHOWN * len(frame.x_px) for shown in found):
             return max(found, key=_n_stars)
     for share in DISTORTIONS:
         distorted = [_distorted(side, share) for side in sides]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, turn
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
-from epipole.tasks.algorithms.star_identification.frames.centroids import Rows
+from epipole.tasks.algorithms.star_identification.centroids import Rows
 from epipole.tasks.algorithms.star_identification.search.match_stars import (
     Attitude,
     Centroids,
@@ -27,7 +27,7 @@ Array = npt.NDArray[np.float64]
 RATE_SIGMA = 1e-3  # rad/s, of a sensor whose rate is unknown so far
 ACCELERATION_SIGMA = 3e-5  # rad/s^2, how unevenly a sensor turns
 WIDEST_PREDICTION = 0.02  # rad; wider ones are no better than being lost
-MOST_TURNED = 0.5  # rad, between two frames of a tracked sensor
+MAX_TURNED = 0.5  # rad, between two frames of a tracked sensor
 # Stars this far around a field are listed once and serve while the sensor turns [rad].
 MARGIN = 0.03
 TOO_FEW, NO_MATCH, NOT_SEARCHED, TIME_LIMIT = 1, 2, 3, 4  # status codes
@@ -135,7 +135,7 @@ def predict(memory, t_s, R, P):
         step = t_fix[1] - t_fix[0]
         share = dt / step
         x, y, z = _rotation_between(R_fix[0], R_fix[1])
-        if x * x + y * y + z * z > MOST_TURNED * MOST_TURNED:
+        if x * x + y * y + z * z > MAX_TURNED * MAX_TURNED:
             return False
         turn(R, share * x, share * y, share * z)
         uneven = 0.5 * ACCELERATION_SIGMA * abs(dt) * (abs(dt) + abs(step))

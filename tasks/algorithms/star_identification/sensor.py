@@ -7,19 +7,19 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.star_identification.frame_error_scale import (
-    by_quality,
-    of_other_brightness,
-)
-from epipole.tasks.algorithms.star_identification.frames.centroids import (
-    RawCentroids,
-    Solutions,
-)
-from epipole.tasks.algorithms.star_identification.frames.frame import Search, Solution
+from epipole.tasks.algorithms.star_identification.centroids import RawCentroids, Solutions
+from epipole.tasks.algorithms.star_identification.frame import Search, Solution
 from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import (
+    Known,
+    Sample,
+    Skies,
+    by_quality,
+    identify_sample,
+    of_other_brightness,
     reidentify_poor_frames,
+    sky_of,
 )
-from epipole.tasks.algorithms.star_identification.sensor_limits import (
+from epipole.tasks.algorithms.star_identification.sensor_model import (
     USELESS_SCATTER_MAG,
     faintest_star,
     is_significant,
@@ -29,15 +29,8 @@ from epipole.tasks.algorithms.star_identification.sensor_limits import (
     scale_of,
     zero_point,
 )
-from epipole.tasks.algorithms.star_identification.sensor_sample import (
-    Known,
-    Sample,
-    Skies,
-    identify_sample,
-    sky_of,
-)
 from epipole.tasks.algorithms.star_identification.sequence import Priors, identify_again
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
+from epipole.tasks.algorithms.star_identification.star_grid import Sky
 
 Array = npt.NDArray[np.float64]
 
@@ -48,10 +41,10 @@ STARS_IN_CROWD, DEEPER_IN_CROWD_MAG = 25.0, 1.5  # a field shows so many stars t
 SAMPLED = 24  # frames around these from which a sensor is learned
 # Centroids may be mostly objects or clutter: skies that are brighter by this are tried as well.
 BRIGHTER_MAG = (1.0, 2.0)
-LEAST_IN_VIEW = 5.0  # stars in a field, on average, of a sky that is worth a try
+MIN_IN_VIEW = 5.0  # stars in a field, on average, of a sky that is worth a try
 KNOWN_SCALES = (1.0, 3.0, 0.4)  # factors to try on errors that the log or the settings state
 UNKNOWN_SCALES_PX = (0.5, 1.5, 0.15)  # errors to try where none are stated
-LEAST_SPREAD_MAG = 0.15  # of brightness: a sample may scatter less than all
+MIN_SPREAD_MAG = 0.15  # of brightness: a sample may scatter less than all
 WRONG_GATE = 0.02  # a sample that misses the errors of all frames by more is corrected
 DEEPER_MAG = 2.0  # how far beyond the first guess the faintest star is searched for
 
@@ -205,7 +198,7 @@ def _learn(
     use_flux = not scatter > USELESS_SCATTER_MAG
     how = known.how
     if use_flux and not np.isnan(zero):
-        spread = min(max(1.2 * scatter, LEAST_SPREAD_MAG), USELESS_SCATTER_MAG)
+        spread = min(max(1.2 * scatter, MIN_SPREAD_MAG), USELESS_SCATTER_MAG)
         how = how._replace(zero_point_mag=zero, spread_mag=spread)
     known = known._replace(scale=scale, how=how, use_flux=use_flux, adjusted=adjusted)
     return known._replace(limit=_faintest(spots, solutions, skies, known))
@@ -262,7 +255,7 @@ def _attempts(
         if crowded and known.limit_is_open and use_flux:
             yield tried._replace(limit=known.limit + DEEPER_IN_CROWD_MAG)
         for brighter in BRIGHTER_MAG if known.limit_is_open and use_flux else ():
-            if not crowded and skies.sky(known.limit - brighter).rho * area > LEAST_IN_VIEW:
+            if not crowded and skies.sky(known.limit - brighter).rho * area > MIN_IN_VIEW:
                 yield tried._replace(limit=known.limit - brighter)
         for scale in scales[1:]:
             yield tried._replace(scale=scale)

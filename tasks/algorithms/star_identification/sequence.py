@@ -7,6 +7,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.star_identification.centroids import (
+    SensorCentroids,
+    Solutions,
+    unsolved,
+)
+from epipole.tasks.algorithms.star_identification.evidence import MatchRule
 from epipole.tasks.algorithms.star_identification.following import (
     NO_MATCH,
     NOT_SEARCHED,
@@ -18,22 +24,15 @@ from epipole.tasks.algorithms.star_identification.following import (
     new_memory,
     remember,
 )
-from epipole.tasks.algorithms.star_identification.frames.centroids import (
-    SensorCentroids,
-    Solutions,
-    unsolved,
-)
-from epipole.tasks.algorithms.star_identification.frames.frame import (
+from epipole.tasks.algorithms.star_identification.frame import (
     Search,
     Solution,
     identify_lost,
     rule_of,
 )
-from epipole.tasks.algorithms.star_identification.search.evidence import MatchRule
 from epipole.tasks.algorithms.star_identification.search.match_stars import StarPlaces
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky
-from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
-from epipole.tasks.algorithms.star_identification.sky.sky_grid import SkyGrid
+from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
+from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
 
 Array = npt.NDArray[np.float64]
 

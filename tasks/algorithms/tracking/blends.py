@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.apparent_motion import acceleration
 from epipole.tasks.algorithms.tracking.local_motion import BEND, directions_at
+from epipole.tasks.algorithms.tracking.sky_filter import acceleration
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.frame_grid import window
 from epipole.tasks.algorithms.tracking.sky_filter import (
     SIZE,
     advance,
@@ -23,6 +22,7 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
     grow,
     rate_of,
     shrink,
+    window,
 )
 
 Array = npt.NDArray[np.float64]
@@ -33,7 +33,7 @@ P_DETECTION = 0.9  # probability that an object in the field is detected in a fr
 MISSED = np.log(1.0 - P_DETECTION)
 N_RATES = 24  # classes of the rate, for which the best evidence is tabulated
 SLOWEST_RAD_S = 1e-6  # upper end of the first class
-MOST_PAIRS = 500_000  # per frame, however few frames there are
+MAX_PAIRS = 500_000  # per frame, however few frames there are
 FEW_TO_ASK = 1_000  # up to so many pairs, only the classes of rate that they have are tabulated
 FEW_PAIRS = 50_000  # up to so many, pairs that are two frames apart are tried as well
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, jerk
+from epipole.tasks.algorithms.tracking.sky_filter import acceleration, jerk
 
 Array = npt.NDArray[np.float64]
 

@@ -12,9 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.frame_grid import fill_grid, make_grids, window
 from epipole.tasks.algorithms.tracking.initiation import (
-    MOST_PAIRS,
+    MAX_PAIRS,
     NONE,
     Detections,
     RecentFrames,
@@ -27,8 +26,11 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
     begin,
     correct,
     distance2,
+    fill_grid,
     grow,
+    make_grids,
     rate_of,
+    window,
 )
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +38,7 @@ Array = npt.NDArray[np.float64]
 SLACK = 4  # a track begins within so many frames more than the fewest detections
 # About how many pairs are tried in a sequence: of denser clutter, the fastest objects are not
 # searched for. At least so many are tried per frame.
-PAIRS_OF_ALL, FEWEST_PAIRS = 20_000_000, 5_000
+PAIRS_OF_ALL, MIN_PAIRS = 20_000_000, 5_000
 # Accepted number of false tracks in a sequence. It counts every pair of detections as a test. Most
 # pairs are too fast to reach the evidence, so that 1 to 5 % of this number are measured.
 FALSE_ALARM_SEQUENCE = 1.0
@@ -257,7 +259,7 @@ def follow_detections(
         Tracks count from 0 by the frame in which they were confirmed; those of the second time
         come last.
     """
-    most_per_frame = max(PAIRS_OF_ALL / max(len(time_s), 1), FEWEST_PAIRS)
+    most_per_frame = max(PAIRS_OF_ALL / max(len(time_s), 1), MIN_PAIRS)
     rule = TrackRule(
         float(max_rate_rad_s),
         float(max_coast_s),
@@ -266,7 +268,7 @@ def follow_detections(
         float(gate_sigma) ** 2,
         float(field_sr),
         -float(np.log(false_alarm)),
-        float(min(most_per_frame, MOST_PAIRS)),
+        float(min(most_per_frame, MAX_PAIRS)),
     )
     track = _followed(time_s, offsets, u_icrs, sigma_rad, rule)
     n_frames = int(np.count_nonzero(np.diff(offsets)))

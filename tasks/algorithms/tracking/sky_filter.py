@@ -10,7 +10,72 @@ no coordinates, so no place on the sky is special.
 import numpy as np
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, jerk_of
+
+# -- How fast the apparent motion of an object can change: bounds from its apparent rate.
+#
+# Four causes change a rate. Geometry changes it by its square: an object that passes at range d
+# with speed v has the rate v / d, which changes by up to (v / d)^2. While the range changes, the
+# rate changes by twice the relative range rate times the rate. Gravity changes it by the rate
+# times g / v of a low orbit. A sensor in a low orbit changes it by its acceleration over the
+# range of a far object. Each further derivative has one more factor of the rate, of the relative
+# range rate, or of the angular rate of a low orbit.
+#
+# The relative range rate is the rate times the cotangent of the angle between the line of sight
+# and the relative velocity. So it is bounded by the rate as well: an object that is known to be
+# slow cannot bend like one nearby.
+
+LOW_ORBIT_S = 1e-3  # [1/s] angular rate of a low orbit; also g / v there
+APPROACH = 2.0  # relative range rate over apparent rate: real low orbits rarely exceed it
+APPROACH_S = 7e-3  # [1/s] largest relative range rate: 14 km/s at 2,000 km
+FAR_RAD_S2 = 2.5e-7  # [rad/s^2] a low sensor's acceleration over the range of a far object
+
+
+@kernel
+def approach(rate: float) -> float:
+    """Return how fast [1/s] the range of an object at a rate [rad/s] may change, over the range."""
+    return min(APPROACH * rate, APPROACH_S)
+
+
+@kernel
+def acceleration(rate: float) -> float:
+    """Return how fast [rad/s^2] a rate [rad/s] may change."""
+    return rate * rate + (LOW_ORBIT_S + 2 * approach(rate)) * rate + FAR_RAD_S2
+
+
+@kernel
+def jerk(rate: float) -> float:
+    """Return how fast [rad/s^3] the acceleration at a rate [rad/s] may change."""
+    return 2 * rate**3 + 6 * approach(rate) ** 2 * rate + LOW_ORBIT_S * acceleration(rate)
+
+
+@kernel
+def jerk_of(rate: float, bend: float) -> float:
+    """Return how fast [rad/s^3] an acceleration `bend` [rad/s^2] at a rate [rad/s] may change.
+
+    An object that approaches accelerates by twice its relative range rate times its rate. This
+    acceleration changes by three times the relative range rate times itself.
+    """
+    geometry = (2 + 6 * APPROACH**2) * rate**3 + LOW_ORBIT_S * acceleration(rate)
+    return geometry + 1.5 * bend * bend / max(rate, 1e-6)
+
+
+@kernel
+def cubic_span(rate: float, sigma: float) -> float:
+    """Return over how long [s] a cubic describes the motion to a standard deviation [rad].
+
+    The best cubic misses a quartic s t^4 / 24 by an eighth of its value at the ends.
+    """
+    snap = 2 * (rate + LOW_ORBIT_S + 2 * approach(rate)) * jerk(rate)
+    return float(2 * np.sqrt(np.sqrt(8 * 24 * sigma / snap)))
+
+
+# -- A filter on the sky: direction, rate and acceleration of an object along its great circle.
+#
+# Both axes share one covariance P of six elements: direction, direction-rate, rate, direction-
+# acceleration, rate-acceleration, acceleration. A new track's acceleration is uncertain by what
+# its rate allows. Between frames the covariance grows by the jerk that the rate and the
+# acceleration allow. After a few frames, predictions over half a minute are good as well. There
+# are no coordinates, so no place on the sky is special.
 
 SIZE = 6  # elements of a covariance
 
@@ -134,3 +199,109 @@ def begin(u_1, t_1, var_1, u_2, t_2, var_2, u, w, bend, P):
         w[a] *= rate / chord if chord > 0 else 0.0
         bend[a] = 0.0
     begin_covariance(abs(rate), dt, var_1, var_2, P)
+
+
+# -- Grids over the detections of the latest frames, to look up what lies near a direction.
+#
+# A frame is projected on the plane across its mean direction. That makes no distance longer, so
+# that all detections within a reach are in the cells that the reach touches. A grid is a tuple
+# of arrays, as compiled code takes them; slot k of each belongs to the frames k, k + size, ...
+
+FINEST = 128  # most cells along a side
+
+
+@kernel
+def make_grids(size, most):
+    """Return arrays for `size` frames of at most `most` detections."""
+    side = max(min(int(np.sqrt(most)), FINEST), 1)
+    axes = np.zeros((size, 2, 3))
+    shape = np.zeros((size, 4))  # lowest on both axes, cells per unit, cells along a side
+    start = np.zeros((size, side * side + 1), np.int64)
+    items = np.zeros((size, max(most, 1)), np.int64)
+    return axes, shape, start, items
+
+
+@kernel
+def _lay_axes(directions, lo, hi, axes):
+    """Set two axes across the mean direction of a frame."""
+    mean = np.zeros(3)
+    for j in range(lo, hi):
+        for a in range(3):
+            mean[a] += directions[j, a]
+    flat = 0
+    for a in range(1, 3):
+        if abs(mean[a]) < abs(mean[flat]):
+            flat = a
+    second, third = (flat + 1) % 3, (flat + 2) % 3
+    norm = np.sqrt(mean[second] ** 2 + mean[third] ** 2)
+    axes[:] = 0.0
+    if norm == 0.0:
+        axes[0, second] = 1.0
+        axes[1, flat] = 1.0
+        return
+    axes[0, second], axes[0, third] = mean[third] / norm, -mean[second] / norm
+    total = np.sqrt(norm**2 + mean[flat] ** 2)
+    axes[1, flat] = norm / total
+    axes[1, second] = -mean[second] * mean[flat] / norm / total
+    axes[1, third] = -mean[third] * mean[flat] / norm / total
+
+
+@kernel
+def _along(u, axis):
+    return u[0] * axis[0] + u[1] * axis[1] + u[2] * axis[2]
+
+
+@kernel
+def fill_grid(grids, slot, directions, lo, hi):
+    """Lay the detections lo:hi of a frame into a slot."""
+    axes, shape, start, items = grids
+    n = hi - lo
+    side = max(min(int(np.sqrt(n)), int(np.sqrt(start.shape[1] - 1))), 1)
+    start[slot, : side * side + 1] = 0
+    shape[slot, 3] = side
+    if n == 0:
+        return
+    _lay_axes(directions, lo, hi, axes[slot])
+    place = np.empty((n, 2))
+    for k in range(n):
+        place[k, 0] = _along(directions[lo + k], axes[slot, 0])
+        place[k, 1] = _along(directions[lo + k], axes[slot, 1])
+    low_0, low_1 = place[:, 0].min(), place[:, 1].min()
+    extent = max(place[:, 0].max() - low_0, place[:, 1].max() - low_1, 1e-12)
+    shape[slot, 0], shape[slot, 1], shape[slot, 2] = low_0, low_1, side / extent
+    cell = np.empty(n, np.int64)
+    for k in range(n):
+        x = min(int((place[k, 0] - low_0) * shape[slot, 2]), side - 1)
+        y = min(int((place[k, 1] - low_1) * shape[slot, 2]), side - 1)
+        cell[k] = y * side + x
+        start[slot, cell[k] + 1] += 1
+    for c in range(side * side):
+        start[slot, c + 1] += start[slot, c]
+    at = start[slot, : side * side].copy()
+    for k in range(n):
+        items[slot, at[cell[k]]] = lo + k
+        at[cell[k]] += 1
+
+
+@kernel
+def window(grids, slot, u, reach):
+    """Return the cells that a reach about a direction touches: x from, to, y from, to, side.
+
+    The cells x from .. to of a row y hold the items start[y * side + x from] to
+    start[y * side + x to + 1]. Empty (x from above x to) where nothing is near.
+    """
+    axes, shape = grids[0], grids[1]
+    side = int(shape[slot, 3])
+    scale = shape[slot, 2]
+    x = _along(u, axes[slot, 0]) - shape[slot, 0]
+    y = _along(u, axes[slot, 1]) - shape[slot, 1]
+    x_from, x_to = np.floor((x - reach) * scale), np.floor((x + reach) * scale)
+    y_from, y_to = np.floor((y - reach) * scale), np.floor((y + reach) * scale)
+    # The last cell holds its upper edge as well.
+    if x_to < 0 or y_to < 0 or x_from > side or y_from > side:
+        return 1, 0, 1, 0, side
+    last = side - 1.0
+    return (
+        int(min(max(x_from, 0.0), last)), int(min(x_to, last)),
+        int(min(max(y_from, 0.0), last)), int(min(y_to, last)), side,
+    )  # fmt: skip

@@ -8,8 +8,11 @@ from epipole.flows import api
 from epipole.flows.simulate import simulate
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import project
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
-from epipole.tasks.algorithms.geometry.sky import aberrate, tangent_basis
+from epipole.tasks.algorithms.geometry.directions import (
+    aberrate,
+    matrix_from_quaternion,
+    tangent_basis,
+)
 
 STAR = 0  # the kind of a point in the truth
 CAMERA = api.Camera(512, 512, 14666.0, 14666.0, 255.5, 255.5)

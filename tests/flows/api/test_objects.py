@@ -5,8 +5,7 @@ import pytest
 
 from epipole.flows import api
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.rotations import quaternion_from_matrix
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import quaternion_from_matrix, tangent_basis
 
 CAMERA = api.Camera(512, 512, 14666.0, 14666.0, 255.5, 255.5)
 CENTRE_KM = np.array([42164.0, 0.0, 0.0])

@@ -12,8 +12,8 @@ import yaml
 from prefect.events.schemas.automations import AutomationCore
 from typer.testing import CliRunner
 
-from epipole.flows.command_line.commands.deploy_files import FILES
 from epipole.flows.command_line.main import app
+from epipole.flows.command_line.tools import FILES
 
 ROOT = Path(__file__).parents[3]
 

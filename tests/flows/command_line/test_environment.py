@@ -69,7 +69,7 @@ def test_a_run_on_a_terminal_asks_no_host_and_shows_no_notice(looked_up, night_l
 @pytest.mark.parametrize(("set_by_user", "then"), [({}, "1"), ({"DO_NOT_TRACK": "0"}, "0")])
 def test_what_the_user_has_set_stays(set_by_user, then):
     code = (
-        "import os; from epipole.flows.command_line.environment import prepare_environment; "
+        "import os; from epipole.flows.command_line.process import prepare_environment; "
         "prepare_environment(); print(os.environ['DO_NOT_TRACK'])"
     )
     kept = {k: v for k, v in os.environ.items() if k != "DO_NOT_TRACK"} | set_by_user

@@ -7,7 +7,7 @@ import pyarrow as pa
 from scenes.associations import filled
 
 from epipole.flows.night.summary import Summary, many, summarise
-from epipole.io.datasets.night_files import write_table
+from epipole.io.datasets.night_tables import write_table
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.tables import TABLES
 

@@ -7,14 +7,13 @@ import pyarrow as pa
 import pytest
 
 from epipole.flows.night.work import Work, plan_spans
-from epipole.io.work.places import ReadFolder, WorkFolder
+from epipole.io.work.work_layout import ReadFolder, WorkFolder
 from epipole.schemas.bridge import empty
 from epipole.schemas.errors import LogError
-from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
 from epipole.schemas.tables import REJECTS
-from epipole.schemas.work_tables import CAMERAS
+from epipole.schemas.work_tables import CAMERAS, LogSource
 from epipole.tasks.read.order_frames import OrderedFrames
 
 NIGHT = "2019-04-02"

@@ -1,15 +1,21 @@
 """Artifacts of a night on Prefect's page, and a page that cannot be written."""
 
-import httpx
+import json
 
-from epipole.flows.night.progress import STEPS, step
+import httpx
+import pytest
+from prefect.client.orchestration import get_client
+from prefect.logging.handlers import APILogHandler
+
+from epipole.flows.night.progress import ROOT, STEPS, step
 from epipole.flows.night.summary import Summary
+from epipole.flows.nightly import nightly
 from epipole.flows.prefect import artifacts
-from epipole.flows.prefect.artifacts import ProgressBar, as_markdown, show_summary
+from epipole.flows.prefect.artifacts import ProgressBar, as_markdown, show_summary, shown_on_page
 from epipole.schemas.rejects import Reason
 from epipole.schemas.stages import Stage
 from epipole.tasks.report.frame_series import Gap
-from epipole.tasks.report.report_extract import PagePicture, ReportExtract
+from epipole.tasks.report.night_facts import PagePicture, ReportExtract
 
 FOUND = {
     "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
@@ -106,3 +112,69 @@ def test_names_from_a_log_are_no_markdown():
     (line,) = [line for line in page.splitlines() if "img" in line]
     assert line.startswith("- &#60;img src=x&#62;")
     assert not set(line.replace("&#", "")) & set("<>[]|#:")
+
+
+@pytest.fixture(scope="module")
+def page(prefect, night_log, tmp_path_factory):
+    """Return a function that asks Prefect's API about the run of one night."""
+    out = tmp_path_factory.mktemp("page") / "out"
+    with get_client(sync_client=True) as client:
+        state = nightly([str(night_log)], str(out), return_state=True)
+        run_id = str(state.state_details.flow_run_id)
+        APILogHandler().flush()
+
+        def ask(what: str) -> list[dict]:
+            found = []
+            while True:
+                asked = {"flow_runs": {"id": {"any_": [run_id]}}, "offset": len(found)}
+                if what == "logs":
+                    asked = {"logs": {"flow_run_id": {"any_": [run_id]}}, "offset": len(found)}
+                rows = client.request("POST", f"/{what}/filter", json=asked).json()
+                found += rows
+                if not rows:
+                    return found
+
+        yield ask
+
+
+def test_the_run_has_its_lines_of_log_with_counts(page):
+    lines = page("logs")
+    of_flow = [line["message"] for line in lines if line["task_run_id"] is None]
+    of_tasks = [line["message"] for line in lines if line["task_run_id"] is not None]
+    assert "identified 240 of 240 frames by" in "\n".join(of_flow)
+    assert "sat3: identified 60 of 60 frames" in "\n".join(of_tasks)
+
+
+def test_the_run_is_named_and_has_its_artifacts(page):
+    (run,) = page("flow_runs")
+    assert run["name"].startswith("all nights of ")
+    shown = {artifact["key"]: artifact for artifact in page("artifacts")}
+    assert set(shown) == {"progress", "night", "sensors"}
+    assert shown["progress"]["data"] == 100
+    assert shown["progress"]["description"] == "done"
+    assert "| objects | 9 |" in shown["night"]["data"]
+    sensors = json.loads(shown["sensors"]["data"])
+    assert [row["sensor"] for row in sensors] == ["sat1", "sat2", "sat3", "sat4"]
+    assert [row["frames"] for row in sensors] == [60] * 4
+    assert all(row["identified"] > 50 and row["tracks"] == 9 for row in sensors)
+    assert all(0.05 < float(row["residual px"]) < 0.5 for row in sensors)
+    assert all(0.9 < float(row["longest gap s"]) < 10 for row in sensors)
+    assert "night=2019-04-01" in shown["night"]["data"]
+    assert run["state"]["message"].startswith("9 objects, ")
+    assert "240 of 240 frames identified" in run["state"]["message"]
+
+
+def test_a_run_that_fails_says_so_and_leaves_no_handler(monkeypatch):
+    shown = []
+    monkeypatch.setattr(artifacts, "create_progress_artifact", lambda *_: "an id")
+    monkeypatch.setattr(artifacts, "update_progress_artifact", lambda *a: shown.append(a))
+    before = [*ROOT.handlers], [*STEPS.handlers], ROOT.level
+
+    @shown_on_page
+    def failing():
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        failing()
+    assert shown[-1][2] == "failed; see the log"
+    assert ([*ROOT.handlers], [*STEPS.handlers], ROOT.level) == before

@@ -26,10 +26,10 @@ from prefect.states import Completed, Failed
 from scenes.dataset_tables import contents
 from scenes.prefect_server import EPIPOLE, serving
 
-from epipole.flows.prefect.page import run_here, shown_on_page
+from epipole.flows.prefect.artifacts import run_here, shown_on_page
 from epipole.flows.prefect.runners import check_scheduler, task_runner
-from epipole.schemas.choices import Runner
 from epipole.schemas.errors import EpipoleError
+from epipole.schemas.options import Runner
 
 # What a run of which the server says something else has made all the same.
 OBJECTS = 9
@@ -207,7 +207,7 @@ def test_a_storage_of_results_that_the_server_names_is_not_used(night_log, tmp_p
 
 WAITS = """
 import os, sys, time
-from epipole.flows.command_line.environment import prepare_environment
+from epipole.flows.command_line.process import prepare_environment
 prepare_environment()
 from epipole.flows.prefect.defaults import embedded_prefect
 from prefect.client.orchestration import get_client

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.long
 
 RUN = """
 import sys, time
-from epipole.flows.command_line.environment import prepare_environment
+from epipole.flows.command_line.process import prepare_environment
 prepare_environment()
 from epipole.flows.prefect.defaults import embedded_prefect
 from epipole.schemas.errors import EpipoleError

@@ -12,8 +12,8 @@ from scenes.dataset_tables import contents
 from epipole.flows.nightly import nightly
 from epipole.flows.prefect.runners import check_scheduler, runner_asked, task_runner
 from epipole.io.work.folder import work_root
-from epipole.schemas.choices import Runner
 from epipole.schemas.errors import EpipoleError
+from epipole.schemas.options import Runner
 
 pytestmark = pytest.mark.long
 

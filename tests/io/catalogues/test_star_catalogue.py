@@ -11,8 +11,8 @@ from epipole.io.catalogues.star_catalogue import (
     read_star_catalogue,
     write_star_catalogue,
 )
-from epipole.schemas.catalogues.star_catalogue import CatalogueLabel, label_of, labelled
 from epipole.schemas.errors import CatalogueError
+from epipole.schemas.star_lists import CatalogueLabel, label_of, labelled
 
 
 @pytest.fixture(scope="module")

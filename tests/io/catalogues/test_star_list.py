@@ -9,12 +9,8 @@ import pytest
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.io.catalogues.star_list import read_star_list
 from epipole.schemas.bridge import array
-from epipole.schemas.catalogues.star_catalogue import (
-    STAR_CATALOGUE,
-    UNKNOWN_MOTION_MAS_YR,
-    label_of,
-)
 from epipole.schemas.errors import CatalogueError
+from epipole.schemas.star_lists import STAR_CATALOGUE, UNKNOWN_MOTION_MAS_YR, label_of
 
 HEADER = "star_id,ra_deg,dec_deg,magnitude"
 

@@ -20,7 +20,9 @@ from scenes.dataset_tables import (
 )
 from scenes.published import publish
 
-from epipole.io.datasets import folder_swap, local_nights, night_files
+from epipole.io.datasets import local as folder_swap
+from epipole.io.datasets import local as local_nights
+from epipole.io.datasets import night_tables as night_files
 from epipole.io.datasets.dataset import check_folder, claim_nights, publish_folders, read_table
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError

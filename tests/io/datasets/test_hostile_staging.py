@@ -14,8 +14,8 @@ from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
 from epipole.io.datasets.dataset import claim_nights, write_report
-from epipole.io.datasets.plain_files import MOST_BYTES
-from epipole.io.datasets.store_nights import store_nights
+from epipole.io.datasets.object_store import store_nights
+from epipole.io.datasets.plain_files import MAX_BYTES
 from epipole.io.work.folder import work_folder
 from epipole.schemas.errors import DatasetError
 
@@ -102,7 +102,7 @@ ATTACKS = {
 } | {
     "binary": written(b"\xff\xfe\x00\x9c{"),
     "deep": written(b"[" * 100_000),
-    "huge": written(b" " * MOST_BYTES + b"{}"),
+    "huge": written(b" " * MAX_BYTES + b"{}"),
     "a number": written(b"7"),
     "a number for a folder": written(json.dumps({NIGHT: {"folder": 7, "inode": 7}}).encode()),
     "an odd date": written(json.dumps({"2019-4-1": {"folder": "../run-0/a", "inode": 7}}).encode()),

@@ -10,7 +10,7 @@ from scenes import many_records
 KINDS = [*many_records.KINDS, "chunk indexes"]
 SLOW = {"chunks", "chunks with a wrong checksum", "messages and chunks in turn"}
 SLOWEST = "logs in sequence"
-MOST_RATIO = 8.0  # of the CPU time for four times as many; in proportion it is four
+MAX_RATIO = 8.0  # of the CPU time for four times as many; in proportion it is four
 NO_TIME_S = 0.2  # CPU times below it are noise
 ROWS_MIB = 50.0  # that the rows of `rejects` take, which are bounded by their number
 INDEX_BYTES = 150  # in memory for an index of a chunk: the summary is read as a whole
@@ -29,7 +29,7 @@ def measured(*asked):
 
 def check(kind, n, memory_mib):
     (few_s, _, _, _), (cpu_s, mib, rows, count) = measured((kind, n // 4), (kind, n))
-    assert cpu_s < MOST_RATIO * max(few_s, NO_TIME_S)
+    assert cpu_s < MAX_RATIO * max(few_s, NO_TIME_S)
     assert mib < memory_mib
     assert rows < 60_000
     return cpu_s, mib, count

@@ -11,11 +11,11 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from epipole.io.logs.mcap import records as log_records
-from epipole.io.logs.messages.encodings import protobuf
+from epipole.io.logs.messages import protobuf
 from epipole.io.logs.reader import read_log, read_log_pieces
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.errors import LogError
-from epipole.schemas.logs.messages import CENTROID_FRAME, FRAME, SENSOR_STATE, STATE
+from epipole.schemas.log_messages import CENTROID_FRAME, FRAME, SENSOR_STATE, STATE
 
 START_NS = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from epipole.io.logs.columns import frames as frame_columns
-from epipole.io.logs.damage import ROWS_ALIKE
+from epipole.io.logs.left_out import ROWS_ALIKE
 from epipole.io.logs.mcap import records as log_records
-from epipole.io.logs.messages.encodings import json_text, protobuf
-from epipole.io.logs.messages.encodings.registry import kinds_of_schemas
+from epipole.io.logs.messages import frames as frame_columns
+from epipole.io.logs.messages import json_text, protobuf
+from epipole.io.logs.messages.registry import kinds_of_schemas
 from epipole.io.logs.reader import read_log, read_log_times
 from epipole.io.logs.writer import LogWriter, calibration_values
 from epipole.schemas.bridge import array, flatten, stack
 from epipole.schemas.errors import LogError
-from epipole.schemas.logs.messages import (
+from epipole.schemas.log_messages import (
     CALIBRATION,
     CALIBRATION_NAME,
     CENTROID_FRAME,

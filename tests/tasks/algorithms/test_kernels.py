@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numba.core.errors import NumbaError
 
-from epipole.io.logs.kernels import kernel as of_logs
+from epipole.io.logs.mcap.record_scan import kernel as of_logs
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 ROOT = Path(__file__).parents[3]
@@ -60,7 +60,7 @@ def test_no_module_compiles_kernels_its_own_way():
         for path in (ROOT / folder).rglob("*.py")
         if re.search(r"\b(njit|vectorize|guvectorize|cfunc)\b", path.read_text())
     ]
-    assert sorted(compiling) == ["io/logs/kernels.py", "tasks/algorithms/kernels.py"]
+    assert sorted(compiling) == ["io/logs/mcap/record_scan.py", "tasks/algorithms/kernels.py"]
 
 
 def test_a_kernel_that_cannot_be_kept_is_used_and_said_once(monkeypatch, caplog):

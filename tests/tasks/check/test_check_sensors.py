@@ -1,8 +1,7 @@
 """Check of sensors: what was corrected and what remains; nothing from nothing."""
 
-from epipole.io.work.part_tables import SOLVED
-from epipole.io.work.parts import write_part
-from epipole.io.work.places import SolvedParts, ViewedParts
+from epipole.io.work.parts import SOLVED, write_part
+from epipole.io.work.work_layout import SolvedParts, ViewedParts
 from epipole.schemas.bridge import empty, to_polars
 from epipole.schemas.spans import SPAN_NS, Sensor, Span
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS
@@ -13,11 +12,7 @@ from epipole.tasks.check.check_sensors import (
     check_sensors,
     verdicts_of,
 )
-from epipole.tasks.solve.positions.sample_sight_lines import (
-    LineSampling,
-    moving_objects,
-    sample_sight_lines,
-)
+from epipole.tasks.solve.sample_sight_lines import LineSampling, moving_objects, sample_sight_lines
 
 LATE = SensorVerdict("a", 0.25, 0.01, "clock")
 EARLY = SensorVerdict("b", -0.5, 0.01, "clock")

@@ -6,7 +6,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from epipole.schemas.simulation.scene import validate_scene
+from epipole.schemas.scene import validate_scene
 
 pytestmark = pytest.mark.long
 

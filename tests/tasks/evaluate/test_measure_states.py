@@ -6,7 +6,7 @@ from scenes.little_night import little_state, little_truth, rows
 
 from epipole.schemas.bridge import empty
 from epipole.schemas.tables import STATES
-from epipole.tasks.evaluate.measure_states import measure_states
+from epipole.tasks.evaluate.measures import measure_states
 
 
 def matched(**true_objects):

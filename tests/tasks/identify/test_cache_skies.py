@@ -7,9 +7,9 @@ import pytest
 from scenes.random_stars import optics, random_catalogue
 
 from epipole.schemas.bridge import table
-from epipole.schemas.catalogues.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
+from epipole.schemas.star_lists import STAR_CATALOGUE, CatalogueLabel, labelled
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.sky import radec_from_unit
+from epipole.tasks.algorithms.geometry.directions import radec_from_unit
 from epipole.tasks.identify import cache_skies
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 

@@ -10,8 +10,8 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import EXPOSURES
+from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
 SETTINGS = Settings()
 

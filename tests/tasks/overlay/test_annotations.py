@@ -6,8 +6,7 @@ import zlib
 import numpy as np
 import pytest
 
-from epipole.tasks.overlay.annotations import image_of
-from epipole.tasks.overlay.png import png
+from epipole.tasks.overlay.annotations import image_of, png
 
 
 def decoded(data: bytes) -> np.ndarray:

@@ -6,9 +6,8 @@ import pyarrow as pa
 import pytest
 from scenes.associations import filled
 
-from epipole.io.work.part_tables import ASSOCIATED, NIGHT_TRACKLETS, SOLVED, TRACKED
-from epipole.io.work.parts import write_part
-from epipole.io.work.places import SensorParts, SolvedParts, WorkFolder
+from epipole.io.work.parts import ASSOCIATED, NIGHT_TRACKLETS, SOLVED, TRACKED, write_part
+from epipole.io.work.work_layout import SensorParts, SolvedParts, WorkFolder
 from epipole.schemas.bridge import empty, table
 from epipole.schemas.rejects import Outcome
 from epipole.schemas.spans import BLOCK_NS, SPAN_NS, Sensor, Span

@@ -5,11 +5,11 @@ import pyarrow as pa
 import pytest
 
 from epipole.schemas.bridge import array, concat, empty
-from epipole.schemas.logs.log_tables import LogSource
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS
 from epipole.schemas.tables import REJECTS, SOURCES, TABLES
+from epipole.schemas.work_tables import LogSource
 from epipole.tasks.publish.write_tables import (
     BY_SENSOR,
     BY_SPAN,

@@ -8,9 +8,9 @@ from scenes.whole_logs import read_whole
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.settings import Settings
+from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.identify.interpolate_sensor_states import interpolate_sensor_states
-from epipole.tasks.track.build_tracklets import build_tracklets
+from epipole.tasks.track.track_span import build_tracklets
 
 START_NS = 1_554_091_200_000_000_000
 OPTICS = {

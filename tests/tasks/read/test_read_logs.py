@@ -5,9 +5,8 @@ import logging
 import pytest
 
 from epipole.io.logs.writer import LogWriter
-from epipole.io.work.part_tables import LOG_PIECE
-from epipole.io.work.parts import read_part
-from epipole.io.work.places import ReadFolder
+from epipole.io.work.parts import LOG_PIECE, read_part
+from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.errors import LogError
 from epipole.tasks.read.read_logs import read_log_into
 

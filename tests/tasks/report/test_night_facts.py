@@ -5,8 +5,7 @@ import pytest
 from scenes.made_nights import hostile_night, reader_of
 
 from epipole.io.datasets.dataset import night_reader
-from epipole.tasks.report.needs_look import needs_look
-from epipole.tasks.report.night_facts import read_night_facts
+from epipole.tasks.report.night_facts import needs_look, read_night_facts
 
 NIGHT = "2019-04-01"
 

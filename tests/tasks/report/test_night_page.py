@@ -12,8 +12,7 @@ from epipole.io.datasets.dataset import night_reader
 from epipole.tasks.report.night_facts import read_night_facts
 
 pytest.importorskip("matplotlib")
-from epipole.tasks.report.page.extract import report_extract
-from epipole.tasks.report.page.night_page import night_page
+from epipole.tasks.report.page import night_page, report_extract
 
 NIGHT = "2019-04-01"
 HOSTILE = [

@@ -10,10 +10,9 @@ from epipole.io.logs.reader import read_log
 from epipole.io.simulation.truth import read_truth
 from epipole.schemas.errors import SceneError
 from epipole.tasks.algorithms.simulation.exposures import Exposing
-from epipole.tasks.algorithms.simulation.objects import SimulatedObjects
 from epipole.tasks.algorithms.simulation.paths import two_body_paths
 from epipole.tasks.algorithms.simulation.sensor import frame_times
-from epipole.tasks.algorithms.simulation.star_field import star_field
+from epipole.tasks.algorithms.simulation.sources import SimulatedObjects, star_field
 from epipole.tasks.simulate import simulate_scene as stage
 
 NO_OBJECTS = SimulatedObjects(two_body_paths(np.empty((0, 6))), np.empty(0), np.empty(0, bool))

@@ -4,9 +4,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from epipole.schemas.simulation.scene import validate_scene
+from epipole.schemas.scene import validate_scene
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.time.time_scales import tt_julian_date
+from epipole.tasks.algorithms.times import tt_julian_date
 
 jplephem = pytest.importorskip("jplephem")
 de421 = pytest.importorskip("de421")

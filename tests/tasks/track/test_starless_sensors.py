@@ -4,7 +4,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from epipole.schemas.simulation.scene import validate_scene
+from epipole.schemas.scene import validate_scene
 
 pytestmark = pytest.mark.long
 

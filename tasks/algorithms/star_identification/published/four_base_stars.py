@@ -17,18 +17,17 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.star_identification.frames.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frames.frame import FieldOfView, Search
-from epipole.tasks.algorithms.star_identification.published.frame_by_frame import (
+from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.published.common import (
     Matcher,
     identify_each_frame,
 )
+from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
-from epipole.tasks.algorithms.star_identification.sensor_sample import Skies
 from epipole.tasks.algorithms.star_identification.sequence import Priors
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import Sky, pattern_pairs
-from epipole.tasks.algorithms.star_identification.sky.kvector import range_of
-from epipole.tasks.algorithms.star_identification.sky.pair_table import PairTable
+from epipole.tasks.algorithms.star_identification.star_grid import Sky, pattern_pairs
+from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, range_of
 
 Array = npt.NDArray[np.float64]
 

@@ -22,25 +22,18 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
-from epipole.tasks.algorithms.star_identification.search.best_attitude import (
-    FLOOR,
-    WORTH,
-    is_clear,
-    keep,
-    no_attitude,
-)
-from epipole.tasks.algorithms.star_identification.search.companion_votes import (
-    MAG_GATE,
-    companion,
-    shown_magnitudes,
-)
 from epipole.tasks.algorithms.star_identification.search.lost_in_space import (
     matches_needed,
     mixed_order,
 )
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import (
+    FLOOR,
+    WORTH,
+    is_clear,
     judge_pair,
+    keep,
     make_scratch,
+    no_attitude,
     prepare_pair,
     try_pair,
 )
@@ -54,15 +47,20 @@ from epipole.tasks.algorithms.star_identification.search.verify_field import (
     make_places,
     odds_of_field,
 )
-from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
+from epipole.tasks.algorithms.star_identification.search.votes import (
+    MAG_GATE,
+    companion,
+    shown_magnitudes,
+)
+from epipole.tasks.algorithms.star_identification.star_pairs import TURN
 
 # Rounds: least votes that agree, and most stars of a pivot whose votes are counted closely.
 ROUNDS = ((4, 600), (3, 4000), (2, 4000))
 WORTH_ALL = 8.0  # log odds of a field with which an attitude is tried on all centroids
 SAMPLES, TIERS = 64, 4  # of a pivot's surroundings, and how finely pivots are put in order by them
-MOST_TURNS = 512  # of one star
+MAX_TURNS = 512  # of one star
 BIN_SHIFT = 8  # of a turn: 256 bins
-MOST_BINS = 4096  # of separation
+MAX_BINS = 4096  # of separation
 # In the time of a unit of work: neighbours in the sieve, votes, pairs of votes. A star takes more.
 NEIGHBOURS_PER_WORK, VOTES_PER_WORK, AGREED_PER_WORK, STAR_WORK = 3, 2, 20, 10
 
@@ -105,7 +103,7 @@ class Turns(NamedTuple):
 def _near_companions(problem, i):
     """Return the companions of pivot i within the reach of the near neighbours."""
     centroids, reach = problem.centroids, problem.pairs.near.reach
-    n, widest, kept = len(centroids.u), reach / MOST_BINS, 0
+    n, widest, kept = len(centroids.u), reach / MAX_BINS, 0
     row, angle, wide = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     chord, tolerance, magnitude, difference = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     for j in range(n):
@@ -166,7 +164,7 @@ def _turns_of(s, near, magnitude, mag_gate, companions, turns):
         c, m_other = near.chord[entry], magnitude[near.other[entry]]
         at = int(c * companions.scale)
         for q in range(companions.first[at], companions.first[at + 3]):
-            if abs(companions.chord[q] - c) > companions.tolerance[q] or n == MOST_TURNS:
+            if abs(companions.chord[q] - c) > companions.tolerance[q] or n == MAX_TURNS:
                 continue
             if _is_odd(magnitude[s], m_other, q, companions, mag_gate):
                 continue
@@ -304,8 +302,8 @@ def search_crowded(problem, R_best):
     order, level = _pivots(inside), np.zeros(problem.pairs.n_stars, np.uint8)
     stars, places = problem.stars.bands, make_places(problem.centroids.u, problem.image.box)
     turns = Turns(
-        np.empty(MOST_TURNS, np.int64), np.empty(MOST_TURNS, np.int64),
-        np.empty(MOST_TURNS, np.int64), np.empty(MOST_TURNS, np.int64),
+        np.empty(MAX_TURNS, np.int64), np.empty(MAX_TURNS, np.int64),
+        np.empty(MAX_TURNS, np.int64), np.empty(MAX_TURNS, np.int64),
         np.empty(TURN >> BIN_SHIFT, np.uint16),
     )  # fmt: skip
     for step in range(len(ROUNDS)):

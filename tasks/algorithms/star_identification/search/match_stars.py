@@ -8,12 +8,12 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.geometry.attitude import copy_matrix, refine_attitude_in, turn
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
-from epipole.tasks.algorithms.star_identification.search.evidence import (
+from epipole.tasks.algorithms.star_identification.evidence import (
     choice_lost,
     choice_predicted,
     match_evidence,
 )
-from epipole.tasks.algorithms.star_identification.sky.star_bands import find_in_cone
+from epipole.tasks.algorithms.star_identification.star_grid import find_in_cone
 
 Array = npt.NDArray[np.float64]
 
@@ -23,7 +23,7 @@ CLEARLY_BETTER = 6.0
 # Brightest centroids onto which a predicted star is shifted.
 N_NUDGED = 12
 # Distances that are compared for this, at most: about 0.2 s.
-MOST_COMPARED = 100_000_000
+MAX_COMPARED = 100_000_000
 # A match whose brightness is this far off is a coincidence [mag].
 ODD_MAG = 2.5
 
@@ -284,7 +284,7 @@ def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
 
     For predictions with an error wider than the stars are apart: their pattern, shifted as
     a whole, decides. The `N_NUDGED` brightest centroids are tried, as long as the distances
-    that are compared are fewer than `MOST_COMPARED`: a wide error in a crowded sky has no end.
+    that are compared are fewer than `MAX_COMPARED`: a wide error in a crowded sky has no end.
     """
     u, sigma = centroids.u, centroids.sigma
     n, m = len(u), len(a)
@@ -300,7 +300,7 @@ def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
             if dx * dx + dy * dy > reach2 or v[s, 2] <= 0.0:
                 continue
             compared += n * m
-            if compared > MOST_COMPARED:
+            if compared > MAX_COMPARED:
                 return
             copy_matrix(R0, trial)
             _nudge(trial, u, i, a, s)

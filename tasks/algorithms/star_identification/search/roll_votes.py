@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
-from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN
+from epipole.tasks.algorithms.star_identification.star_pairs import TURN
 
 LEVELS = 6  # so many votes are counted
-MOST_ROWS = 1024  # of separation
+MAX_ROWS = 1024  # of separation
 BINS = 128  # of a turn, in two words
 BIN = TURN // BINS
 PARTS = 4  # a neighbour's angle is known to so many parts of a bin
@@ -37,7 +37,7 @@ class Sieve(NamedTuple):
 def make_sieve(chord, tolerance, angle, wide, reach):
     """Return the companions of these separations and position angles (n,), both with tolerances,
     for separations up to `reach`; angles in parts of `TURN` (compiled)."""
-    widest = reach / MOST_ROWS
+    widest = reach / MAX_ROWS
     for q in range(len(chord)):
         widest = max(widest, 0.5 * tolerance[q])
     word = np.zeros((int(reach / widest) + 1, PARTS, 2), np.uint64)

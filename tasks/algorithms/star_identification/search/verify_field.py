@@ -15,7 +15,7 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
     MAX_BETA,
     pair_attitude,
 )
-from epipole.tasks.algorithms.star_identification.sky.star_bands import cell_at, cells_of_cone
+from epipole.tasks.algorithms.star_identification.star_grid import cell_at, cells_of_cone
 
 Array = npt.NDArray[np.float64]
 

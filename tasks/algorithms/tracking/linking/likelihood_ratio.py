@@ -12,19 +12,19 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.apparent_motion import (
-    FAR_RAD_S2,
-    LOW_ORBIT_S,
-    acceleration,
-    cubic_span,
-    jerk,
-)
 from epipole.tasks.algorithms.tracking.linking.chains import (
     Fragments,
     LinkRule,
     Links,
     choose_links,
     fill_in,
+)
+from epipole.tasks.algorithms.tracking.sky_filter import (
+    FAR_RAD_S2,
+    LOW_ORBIT_S,
+    acceleration,
+    cubic_span,
+    jerk,
 )
 
 Array = npt.NDArray[np.float64]
@@ -33,7 +33,7 @@ Indices = npt.NDArray[np.int64]
 FARTHEST_RAD = 0.5  # longest arc between fragments: a plane stands for the sky
 SEARCH_SIGMA = 6.0  # of the quick test that most pairs fail
 SLOWEST_JERK = LOW_ORBIT_S * FAR_RAD_S2  # [rad/s^3] `jerk` of an object that stands still
-MOST_PAIRS = 10_000_000  # compared: where more are possible, the longest gaps are not bridged
+MAX_PAIRS = 10_000_000  # compared: where more are possible, the longest gaps are not bridged
 
 
 class _Ends(NamedTuple):
@@ -418,7 +418,7 @@ def _longest_gap(starts: Array, ends: Array, rule: LinkRule) -> float:
     longest = float(np.cbrt(6 * np.sqrt(rule.field_sr) / SLOWEST_JERK))
     if np.isfinite(rule.gap_s):
         longest = float(rule.gap_s)
-    while _begun(starts, ends, ends + longest).sum() > MOST_PAIRS:
+    while _begun(starts, ends, ends + longest).sum() > MAX_PAIRS:
         longest *= 0.8
     return longest
 

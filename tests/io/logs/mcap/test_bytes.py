@@ -8,7 +8,7 @@ import pytest
 from scenes.log_bytes import log_bytes
 from scenes.twice import twice
 
-from epipole.io.logs.mcap import blocks as log_blocks
+from epipole.io.logs.mcap import bytes as log_blocks
 from epipole.io.logs.reader import read_log, read_log_pieces
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.errors import LogError

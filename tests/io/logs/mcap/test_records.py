@@ -24,8 +24,8 @@ from scenes.hand_made_logs import (
 )
 from scenes.log_bytes import log_bytes
 
-from epipole.io.logs.mcap.chunks import MAX_CHUNK_BYTES
-from epipole.io.logs.mcap.damage_rows import MOST_ALIKE
+from epipole.io.logs.mcap.container import MAX_CHUNK_BYTES
+from epipole.io.logs.mcap.damage_rows import MAX_ALIKE
 from epipole.io.logs.mcap.records import RecordWalk
 
 N = 40
@@ -404,8 +404,8 @@ def test_damage_without_number_is_few_rows_that_count_all_of_it():
     bad[-1] ^= 1
     found, damage = walk(hand_made(DECLARED, message(1), *[bad, strange] * 3000))
     assert found == [1]
-    assert damage.count(("damaged_record", 1)) == MOST_ALIKE - 1
-    assert len(damage) == 2 * MOST_ALIKE
+    assert damage.count(("damaged_record", 1)) == MAX_ALIKE - 1
+    assert len(damage) == 2 * MAX_ALIKE
     assert sum(n for _, n in damage) == 6000
 
 

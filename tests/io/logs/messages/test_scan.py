@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from epipole.io.logs.columns import frames as frame_columns
-from epipole.io.logs.columns import states as state_columns
-from epipole.io.logs.messages.batches import MOST_AT_ONCE
-from epipole.io.logs.messages.encodings import protobuf, ros2_cdr
-from epipole.io.logs.messages.encodings.protobuf import varint
-from epipole.io.logs.messages.encodings.registry import encoding_named
+from epipole.io.logs.messages import frames as frame_columns
+from epipole.io.logs.messages import protobuf, ros2_cdr
+from epipole.io.logs.messages import states as state_columns
+from epipole.io.logs.messages.batches import MAX_AT_ONCE
+from epipole.io.logs.messages.protobuf import varint
+from epipole.io.logs.messages.registry import encoding_named
 from epipole.io.logs.messages.scan import MAX_NAMES
 from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import array, flatten
-from epipole.schemas.logs.messages import FRAME, STATE
+from epipole.schemas.log_messages import FRAME, STATE
 
 START_NS = 1_554_091_200_000_000_000
 GOOD_FRAME = {
@@ -294,7 +294,7 @@ def test_a_scan_that_always_stops_is_tried_less_and_less_often(tmp_path, monkeyp
 
     monkeypatch.setattr(frame_columns, "scan_frames", stop)
     frame = (FRAME, protobuf.encode(FRAME, GOOD_FRAME))
-    n = 2 * MOST_AT_ONCE
+    n = 2 * MAX_AT_ONCE
     path = write_raw(tmp_path / "a.mcap", [frame] * n, chunk_size=1 << 24)
     assert read_log(path).exposures.num_rows == n
     assert len(calls) < 20

@@ -5,7 +5,7 @@ import pytest
 from scenes.light_time import light_time_samples
 from scenes.tracklet_scenes import GEO, V_GEO, Scene, judge, pairs, solve
 
-from epipole.tasks.algorithms.association.sampling.samples import Samples
+from epipole.tasks.algorithms.association.samples import Samples
 
 
 @pytest.mark.parametrize("n_sensors", [3, 4, 8])

@@ -5,7 +5,7 @@ import pytest
 from scenes.associations import associated, wrong_views
 from scenes.tracklet_scenes import Scene
 
-from epipole.tasks.algorithms.association.sampling.samples import Groups
+from epipole.tasks.algorithms.association.samples import Groups
 from epipole.tasks.algorithms.association.verdicts import Items, Verdicts
 
 EVERY_S = 6.0

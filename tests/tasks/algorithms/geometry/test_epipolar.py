@@ -4,13 +4,13 @@ import numpy as np
 from scenes.two_sensors import GEO, R_1, R_2, attitude, look
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance
+from epipole.tasks.algorithms.geometry.covariances import centroid_covariance
+from epipole.tasks.algorithms.geometry.directions import skew
 from epipole.tasks.algorithms.geometry.epipolar import (
     UncertainSight,
     epipolar_angle,
     epipolar_sigma,
 )
-from epipole.tasks.algorithms.geometry.rotations import skew
 
 
 def test_two_sights_of_one_object_have_no_epipolar_distance():

@@ -5,13 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, project, unproject
+from epipole.tasks.algorithms.geometry.covariances import OPTICS, shared_attitude_covariance
 from epipole.tasks.algorithms.geometry.optics_calibration import (
     StarImages,
     ToldOptics,
     calibrate_in_steps,
     calibrate_optics,
 )
-from epipole.tasks.algorithms.geometry.optics_errors import OPTICS, shared_attitude_covariance
 
 SENT = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)  # 16 degrees
 TRUE = SENT._replace(fx_px=3671.0, fy_px=3670.0, cx_px=513.0, cy_px=509.0, k1=-0.08, p1=3e-4)

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import (
+from epipole.tasks.algorithms.geometry.directions import (
     aberrate,
     boresight_angles,
     radec_from_unit,

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 
 METRE = 1e-3  # km

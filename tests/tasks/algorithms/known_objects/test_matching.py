@@ -5,24 +5,25 @@ import pytest
 from scenes.aged_elements import HIGH, LOW, aged
 from scenes.walker import NIGHT_NS, satellites
 
-from epipole.tasks.algorithms.known_objects.learning import FEWEST, learn_errors
 from epipole.tasks.algorithms.known_objects.matching import (
-    MOST_ROWS,
+    FEWEST,
+    MAX_ROWS,
     KnownSatellites,
     Observed,
     candidates,
     judge,
+    learn_errors,
     spread_rows,
 )
 from epipole.tasks.algorithms.known_objects.prediction import (
     HIGH_ORBIT,
     LOW_ORBIT,
     ElementErrors,
+    Screen,
     is_deep_space,
     predict,
     satellites_of,
 )
-from epipole.tasks.algorithms.known_objects.screening import Screen
 
 pytestmark = pytest.mark.long
 
@@ -140,7 +141,7 @@ def test_both_kinds_of_orbits_are_in_the_scene(scene):
 def test_rows_are_spread_over_the_time_and_preferred_ones_come_first():
     times = np.arange(1000, dtype=np.int64)
     rows = spread_rows(times, np.ones(1000, bool))
-    assert len(rows) == MOST_ROWS
+    assert len(rows) == MAX_ROWS
     assert (rows[0], rows[-1]) == (0, 999)
     preferred = times % 100 == 5
     assert preferred[spread_rows(times, preferred)].all()

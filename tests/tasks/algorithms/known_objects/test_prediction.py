@@ -9,14 +9,17 @@ from epipole.tasks.algorithms.known_objects.prediction import (
     HIGH_ORBIT,
     LOW_ORBIT,
     SENSITIVE_TO,
+    Screen,
     along_up_across,
     is_deep_space,
     predict,
     satellites_of,
     sensitivities,
     sigmas,
+    track_residuals,
+    two_body,
 )
-from epipole.tasks.algorithms.simulation.element_sets.propagation import propagate
+from epipole.tasks.algorithms.simulation.element_sets import propagate
 
 HOURS_NS = (np.arange(0.0, 24.0, 3.7) * 3600e9).astype(np.int64)
 
@@ -96,3 +99,69 @@ def test_a_geostationary_orbit_is_deep_space(elements):
     is_high = elements[:, 8] < 0.01
     assert [is_deep_space(s) for s in made] == is_high.tolist()
     assert sigmas(made[int(np.argmax(is_high))], 0.0, HIGH_ORBIT)[0] == HIGH_ORBIT.along_km
+
+
+LIGHT_KM_S = 299792.458
+
+
+def seen(state, sensor_km, moved_km):
+    """The direction to an object that is not where its state says, when its light left."""
+    from scipy.optimize import brentq
+
+    r, v = state[:3] + moved_km, state[3:]
+    delay = brentq(lambda t: np.linalg.norm(r - t * v - sensor_km) - LIGHT_KM_S * t, 0, 1)
+    u = (r - delay * v - sensor_km) / np.linalg.norm(r - delay * v - sensor_km)
+    return np.array([[np.arctan2(u[1], u[0]), np.arcsin(u[2])]])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_displaced_object_is_off_by_its_displacement(seed):
+    rng = np.random.default_rng(seed)
+    sensor, still = rng.normal(0, 7000, 3), np.zeros(3)
+    state = np.concatenate([sensor + rng.normal(0, 1000, 3), rng.normal(0, 5, 3)])
+    line = state[:3] - sensor
+    line /= np.linalg.norm(line)
+    along = state[3:] - state[3:] @ line * line
+    along /= np.linalg.norm(along)
+    for moved, wanted in ((along, (1, 0)), (np.cross(along, line), (0, 1)), (line, (0, 0))):
+        direction = seen(state, sensor, moved)
+        found = track_residuals(direction, sensor[None], still[None], state[None])[0]
+        assert found == pytest.approx(wanted, abs=5e-3)
+
+
+def test_the_track_is_that_which_the_moving_sensor_sees():
+    state, sensor = np.array([0.0, 0, 1000, 1, 0, 0]), np.zeros((1, 3))
+    moving = np.array([[1.0, -1.0, 0]])  # the object seems to move along y
+    direction = seen(state, sensor[0], np.array([0, 2.0, 0]))
+    found = track_residuals(direction, sensor, moving, state[None])[0]
+    assert found == pytest.approx([2.0, 0.0], abs=1e-2)
+
+
+def test_all_within_reach_are_found_at_any_time():
+    rng = np.random.default_rng(2)
+    made = satellites_of(np.array([each.elements for each in satellites(800, rng)]))
+    screen = Screen(made)
+    passed = 0
+    for _ in range(60):
+        time_ns = NIGHT_NS + int(rng.uniform(0, 86400e9))
+        places = predict(made, np.array([time_ns]))[:, 0, :3]
+        there = places[rng.integers(len(places))] + rng.normal(0, 60, 3)
+        reach = rng.uniform(50, 300, len(made))
+        found = screen.near(there, time_ns, reach)
+        within = np.flatnonzero(np.linalg.norm(places - there, axis=1) < reach)
+        assert set(within) <= set(found.tolist())
+        passed += len(found) - len(within)
+    assert passed < 60 * 8  # of 800 each
+
+
+def test_two_bodies_return_after_a_period():
+    state = np.array([[7000.0, 0, 0, 0, 7.8, 1.0], [26000.0, 0, 0, 1.0, 4.5, 0.3]])
+    speed2 = np.sum(state[:, 3:] ** 2, axis=1)
+    a = 1 / (2 / np.linalg.norm(state[:, :3], axis=1) - speed2 / 398600.4418)
+    for row, period in zip(state, 2 * np.pi * np.sqrt(a**3 / 398600.4418), strict=True):
+        again = two_body(row[None], float(period))[0]
+        assert np.linalg.norm(again - row[:3]) < 1e-3
+
+
+def test_a_catalogue_without_satellites_has_none_near():
+    assert len(Screen([]).near(np.array([7000.0, 0, 0]), NIGHT_NS, np.zeros(0))) == 0

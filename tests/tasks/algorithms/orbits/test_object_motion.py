@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance
-from epipole.tasks.algorithms.orbits.object_motion import neglected_motion, velocities
+from epipole.tasks.algorithms.geometry.covariances import centroid_covariance
+from epipole.tasks.algorithms.orbits.object_motion import (
+    ObjectRegistry,
+    neglected_motion,
+    velocities,
+)
 from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 
@@ -67,3 +71,37 @@ def test_a_corrected_direction_is_the_true_one(target, noise_arcsec, at):
 def test_nothing_is_neglected_at_the_instant_itself():
     off = neglected_motion(GEO[None], LOW[None], np.zeros((1, 3)))
     np.testing.assert_array_equal(off, np.zeros((1, 3)))
+
+
+def name(registry, *groups):
+    return registry.name_groups([np.array(g) for g in groups])
+
+
+def test_a_number_holds_while_one_tracklet_continues():
+    registry = ObjectRegistry()
+    assert name(registry, [1, 2], [3, 4]) == [0, 1]
+    assert name(registry, [4, 5], [2, 6]) == [1, 0]
+    assert name(registry, [6, 7]) == [0]
+
+
+def test_a_new_object_gets_a_new_number():
+    registry = ObjectRegistry()
+    name(registry, [1, 2])
+    assert name(registry, [3, 4]) == [1]
+    assert name(registry, [1, 5], [6, 7]) == [0, 2]
+
+
+def test_two_groups_never_share_a_number_and_the_larger_claim_wins():
+    registry = ObjectRegistry()
+    name(registry, [1, 2, 3])
+    assert name(registry, [1, 8], [2, 3]) == [1, 0]
+
+
+def test_no_group_is_no_trouble():
+    assert name(ObjectRegistry()) == []
+
+
+def test_long_tracklets_count_more_than_short_ones():
+    registry = ObjectRegistry(np.array([60.0, 57.0, 2.0, 3.0, 2.0]))
+    name(registry, [0, 1, 2, 3, 4])
+    assert name(registry, [2, 3, 4], [0, 1]) == [1, 0]

@@ -8,9 +8,9 @@ from astropy.time import Time
 from astropy.utils import iers
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.sky import aberrate
+from epipole.tasks.algorithms.geometry.directions import aberrate
 from epipole.tasks.algorithms.orbits.planets import NUMBERS, planet_directions
-from epipole.tasks.algorithms.time.time_scales import earth_barycentric
+from epipole.tasks.algorithms.times import earth_barycentric
 
 NAMES = ("mercury", "venus", "mars", "jupiter", "saturn", "uranus", "neptune")
 NOON = np.datetime64("2019-04-01T12:00:00", "ns").astype(np.int64)

@@ -79,7 +79,7 @@ def test_sensors_scaled_in_groups_get_about_the_factors_of_all_together(monkeypa
     arcs, truth = objects(3, worse=15.0)
     fitted = fit_orbits(arcs, truth)
     together = factors(arcs, fitted)
-    monkeypatch.setattr(shared_errors, "MOST_TOGETHER", 2)
+    monkeypatch.setattr(shared_errors, "MAX_TOGETHER", 2)
     apart = factors(arcs, fitted)
     assert together[0, 1] > 15.0
     np.testing.assert_allclose(apart, together, rtol=0.3)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry import rotations
+from epipole.tasks.algorithms.geometry import directions as rotations
 from epipole.tasks.algorithms.orbits.state_interpolation import (
     SensorStates,
     gravity,

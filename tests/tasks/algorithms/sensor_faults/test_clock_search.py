@@ -5,9 +5,9 @@ import pytest
 from scenes.late_sensors import SENSORS, orbit
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.sensor_faults.clock_search import Meetings, search_offset
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.paths import state_at
 
 SIGMA = 2.0 * ARCSEC
 PLACE_KM = 0.05

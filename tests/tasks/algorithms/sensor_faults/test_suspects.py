@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scenes.many_sensors import POSITION_KM, lines_of_many
+from scenes.tracklet_scenes import GEO, Scene, solve
 
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     CLOCK,
@@ -10,7 +11,11 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     SOUND,
     judge_sensors,
 )
-from epipole.tasks.algorithms.sensor_faults.suspects import MOST_TOGETHER, judge_many_sensors
+from epipole.tasks.algorithms.sensor_faults.suspects import (
+    MAX_TOGETHER,
+    agreement,
+    judge_many_sensors,
+)
 
 
 def judged(lines, n_sensors, judge=judge_many_sensors, guess_s=None):
@@ -29,7 +34,7 @@ def test_few_sensors_are_judged_together():
 
 
 def test_the_faults_of_many_are_those_that_all_together_have():
-    n = MOST_TOGETHER + 6
+    n = MAX_TOGETHER + 6
     lines = lines_of_many(2, n, 300, late_s={3: 0.3}, off_km={7: 1.5})
     many, together = judged(lines, n), judged(lines, n, judge_sensors)
     assert faults(many) == faults(together) == {3: CLOCK, 7: EPHEMERIS}
@@ -51,7 +56,7 @@ def test_of_a_hundred_sensors_no_sound_one_is_at_fault_and_offsets_are_honest():
 
 @pytest.mark.long
 def test_more_wrong_sensors_than_are_judged_together_are_all_found():
-    late = dict.fromkeys(range(MOST_TOGETHER + 3), 0.6)
+    late = dict.fromkeys(range(MAX_TOGETHER + 3), 0.6)
     found = judged(lines_of_many(20, 120, 400, late_s=late), 120)
     assert faults(found) == dict.fromkeys(late, CLOCK)
 
@@ -64,3 +69,43 @@ def test_a_sensor_without_lines_has_no_offset():
     found = judged(few, 40)
     assert np.isnan(found.offset_s[5])
     assert found.cause[5] == SOUND
+
+
+def turned(scene, sensor, angle_rad):
+    """Return the scene with all directions of one sensor rotated a little."""
+    axis = np.cross(GEO, [0.0, 0.0, 1.0])
+    axis /= np.linalg.norm(axis)
+    for i, s in enumerate(scene.sensor):
+        if s == sensor:
+            u = scene.u[i] + np.cross(axis, scene.u[i]) * angle_rad
+            scene.u[i] = u / np.linalg.norm(u, axis=1, keepdims=True)
+    return scene
+
+
+@pytest.mark.parametrize("wrong", [0, 3])
+def test_a_sensor_whose_attitude_is_wrong_is_found(wrong):
+    scene = turned(Scene(1, 4).objects(8, spread_km=100.0).strays(1), wrong, np.radians(0.1))
+    samples = scene.samples()
+    assert agreement(samples, solve(samples)).disagreeing().tolist() == [wrong]
+
+
+def test_sound_sensors_are_left_alone():
+    samples = Scene(2, 4).objects(8, spread_km=100.0).strays(10).samples()
+    found = agreement(samples, solve(samples))
+    assert found.disagreeing().tolist() == []
+    assert (found.joined >= 0.9 * found.looked).all()
+
+
+def test_a_sensor_without_detections_is_not_at_fault():
+    scene = Scene(3, 4).objects(8, spread_km=100.0, seen_by=[0, 1, 2])
+    samples = scene.samples()
+    found = agreement(samples, solve(samples))
+    assert found.looked[3] >= 5
+    assert found.joined[3] == 0
+    assert found.disagreeing().tolist() == []
+
+
+def test_without_groups_no_sensor_is_judged():
+    samples = Scene(4, 3).strays(3).samples()
+    found = agreement(samples, solve(samples))
+    assert found.disagreeing().tolist() == []

@@ -5,13 +5,13 @@ import pytest
 from scenes.satellites import EPOCH_NS, ISS, element_set, two_lines
 from sgp4.api import Satrec
 
-from epipole.tasks.algorithms.simulation.element_sets.propagation import propagate
-from epipole.tasks.algorithms.simulation.orbits import state_at
+from epipole.tasks.algorithms.simulation.element_sets import propagate
 from epipole.tasks.algorithms.simulation.paths import (
     joined_paths,
     node_times,
     resting_path,
     sampled_paths,
+    state_at,
     two_body_paths,
 )
 

@@ -24,20 +24,19 @@ from epipole.io.logs.reader import read_log
 from epipole.io.simulation.scenes import read_scene
 from epipole.io.simulation.sky import read_hipparcos_stars, read_stars
 from epipole.schemas.bridge import flatten, table
-from epipole.schemas.catalogues.star_catalogue import STAR_CATALOGUE, CatalogueLabel, labelled
 from epipole.schemas.errors import SceneError
-from epipole.schemas.simulation.scene import validate_scene
-from epipole.tasks.algorithms.catalogue.catalogue_join import moved
+from epipole.schemas.scene import validate_scene
+from epipole.schemas.star_lists import STAR_CATALOGUE, CatalogueLabel, labelled
 from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
-from epipole.tasks.algorithms.simulation.ephemeris import (
+from epipole.tasks.algorithms.simulation.element_sets import (
     barycentric_julian_date,
     earth_at,
     julian_years_since,
 )
-from epipole.tasks.algorithms.simulation.optics import TrueOptics, image_place
-from epipole.tasks.algorithms.simulation.orbits import elements_from_state, state_at
-from epipole.tasks.algorithms.simulation.sightlines import boost, received_from
-from epipole.tasks.algorithms.simulation.star_field import star_directions, star_field
+from epipole.tasks.algorithms.simulation.optics import TrueOptics, boost, image_place, received_from
+from epipole.tasks.algorithms.simulation.paths import elements_from_state, state_at
+from epipole.tasks.algorithms.simulation.sources import star_directions, star_field
+from epipole.tasks.algorithms.star_catalogue import moved
 from epipole.tasks.simulate.simulate_scene import expose_blocks, simulate_scene
 
 MAS = np.pi / 648e6

@@ -6,13 +6,13 @@ import pytest
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, mirrored, project, unproject
-from epipole.tasks.algorithms.geometry.rotations import canonical, matrix_from_quaternion
+from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.camera_search import (
     ImageFrame,
     agrees,
     find_cameras,
 )
-from epipole.tasks.algorithms.star_identification.frames.frame import Search
+from epipole.tasks.algorithms.star_identification.frame import Search
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 pytestmark = pytest.mark.long

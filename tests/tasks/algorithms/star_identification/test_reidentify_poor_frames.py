@@ -11,8 +11,8 @@ from scenes.random_stars import (
     random_catalogue,
 )
 
-from epipole.tasks.algorithms.star_identification.frames.centroids import unsolved
-from epipole.tasks.algorithms.star_identification.frames.frame import (
+from epipole.tasks.algorithms.star_identification.centroids import unsolved
+from epipole.tasks.algorithms.star_identification.frame import (
     FrameCentroids,
     Solution,
     identify_lost,
@@ -22,7 +22,7 @@ from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import 
     poor_frames,
     reidentify_poor_frames,
 )
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
     sky_grid,
     sky_to_limit,

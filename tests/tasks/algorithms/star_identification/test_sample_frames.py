@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scenes.random_stars import angle_between
 
-from epipole.tasks.algorithms.catalogue.star_catalogue import navigation_catalogue
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
-from epipole.tasks.algorithms.star_identification.frames.frame import (
+from epipole.tasks.algorithms.star_catalogue import navigation_catalogue
+from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
     Search,
     identify_lost,
 )
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
     pattern_size,
     sky_grid,

@@ -16,13 +16,13 @@ from scenes.random_stars import (
     random_catalogue,
 )
 
-from epipole.tasks.algorithms.catalogue.star_catalogue import limit_for_density
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, project, unproject
+from epipole.tasks.algorithms.star_catalogue import limit_for_density
 from epipole.tasks.algorithms.star_identification import sensor
-from epipole.tasks.algorithms.star_identification.frames.frame import FrameCentroids
+from epipole.tasks.algorithms.star_identification.frame import FrameCentroids
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
     pattern_size,
     sky_grid,

@@ -16,7 +16,7 @@ from epipole.tasks.algorithms.star_identification.sequence import (
     identify_sequence,
     no_priors,
 )
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
     pattern_size,
     sky_grid,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance
+from epipole.tasks.algorithms.geometry.covariances import centroid_covariance
 from epipole.tasks.algorithms.tracking.blends import (
     BIN_PX,
     SPOT_PX,

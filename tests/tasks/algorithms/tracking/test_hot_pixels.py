@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.geometry.camera import Camera
-from epipole.tasks.algorithms.geometry.rotations import multiply, quaternion_from_rotation_vector
+from epipole.tasks.algorithms.geometry.directions import multiply, quaternion_from_rotation_vector
 from epipole.tasks.algorithms.tracking.hot_pixels import CERTAIN, LIKELY, fixed_places
 
 CAMERA = Camera(512, 512, 14667.0, 14667.0, 255.5, 255.5)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.direction_errors import centroid_covariance
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
-from epipole.tasks.algorithms.tracking.apparent_motion import acceleration
+from epipole.tasks.algorithms.geometry.covariances import centroid_covariance
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.tracking.local_motion import BEND, directions_at
+from epipole.tasks.algorithms.tracking.sky_filter import acceleration
 
 
 def passing(t, speed_km_s, range_km):

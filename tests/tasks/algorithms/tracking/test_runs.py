@@ -5,7 +5,7 @@ import pytest
 from scenes.few_frames import FIELD_RAD, INTERVAL_S, few_frames, found_and_false
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.tracking.runs import follow_detections
 
 FIELD = np.radians(4.0)

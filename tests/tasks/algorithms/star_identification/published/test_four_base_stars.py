@@ -7,7 +7,7 @@ from scenes.star_maps import WIDE, orbit_maps
 from epipole.tasks.algorithms.star_identification.published.four_base_stars import (
     match_four_base_stars,
 )
-from epipole.tasks.algorithms.star_identification.sky.pair_table import build_pair_table
+from epipole.tasks.algorithms.star_identification.star_pairs import build_pair_table
 
 
 @pytest.fixture(scope="module")

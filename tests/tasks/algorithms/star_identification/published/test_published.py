@@ -14,20 +14,17 @@ from scenes.random_stars import (
 from scenes.random_stars import random_catalogue as random_sky
 from scenes.star_maps import SEEDS, contest_maps, hipparcos_at_epoch
 
-from epipole.tasks.algorithms.catalogue.star_catalogue import (
-    NavigationCatalogue,
-    navigation_catalogue,
-)
 from epipole.tasks.algorithms.geometry.camera import pixel_angle
-from epipole.tasks.algorithms.star_identification.frames.frame import FrameCentroids, identify_lost
+from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue, navigation_catalogue
+from epipole.tasks.algorithms.star_identification.frame import FrameCentroids, identify_lost
 from epipole.tasks.algorithms.star_identification.published import (
     four_base_stars,
     match_group,
     radial_cyclic,
 )
-from epipole.tasks.algorithms.star_identification.published.frame_by_frame import solve_matches
+from epipole.tasks.algorithms.star_identification.published.common import solve_matches
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
     pattern_size,
     sky_grid,

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
 
-from epipole.tasks.algorithms.star_identification.frames.frame import problem_of
+from epipole.tasks.algorithms.star_identification.frame import problem_of
 from epipole.tasks.algorithms.star_identification.search.crowded_frames import (
     _pivots,
     _shares_inside,
     search_crowded,
 )
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
     sky_grid,
     sky_to_limit,

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
 
-from epipole.tasks.algorithms.star_identification.frames.frame import (
+from epipole.tasks.algorithms.star_identification.frame import (
     identify_lost,
     problem_of,
     search_lost,
 )
-from epipole.tasks.algorithms.star_identification.search.best_attitude import (
+from epipole.tasks.algorithms.star_identification.search.lost_in_space import try_brightest
+from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import (
     is_clear,
     keep,
+    make_scratch,
     no_attitude,
 )
-from epipole.tasks.algorithms.star_identification.search.brightest_pairs import try_brightest
-from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import make_scratch
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
     pattern_size,
     sky_grid,

@@ -7,8 +7,8 @@ import pytest
 from scenes.random_stars import BETA, HOW, angle_between, frame, random_attitude, random_catalogue
 from scipy.spatial.transform import Rotation
 
-from epipole.tasks.algorithms.geometry.sky import aberrate
-from epipole.tasks.algorithms.star_identification.frames.frame import identify_predicted
+from epipole.tasks.algorithms.geometry.directions import aberrate
+from epipole.tasks.algorithms.star_identification.frame import identify_predicted
 from epipole.tasks.algorithms.star_identification.search.match_stars import (
     Centroids,
     Matches,
@@ -18,7 +18,7 @@ from epipole.tasks.algorithms.star_identification.search.match_stars import (
     match_stars,
     stars_in_cone,
 )
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import sky_to_limit
+from epipole.tasks.algorithms.star_identification.star_grid import sky_to_limit
 
 ARCSEC = np.pi / 648000
 CATALOGUE = random_catalogue()

@@ -8,7 +8,7 @@ from epipole.tasks.algorithms.star_identification.search.roll_votes import (
     count_turns,
     make_sieve,
 )
-from epipole.tasks.algorithms.star_identification.sky.pair_table import TURN, NearStars
+from epipole.tasks.algorithms.star_identification.star_pairs import TURN, NearStars
 
 REACH, TOLERANCE, WIDE = 0.1, 2e-4, 40
 

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
 
-from epipole.tasks.algorithms.star_identification.frames.frame import problem_of
+from epipole.tasks.algorithms.star_identification.frame import problem_of
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import make_scratch
 from epipole.tasks.algorithms.star_identification.search.verify_field import (
     make_places,
     odds_of_field,
 )
-from epipole.tasks.algorithms.star_identification.sky.camera_sky import (
+from epipole.tasks.algorithms.star_identification.star_grid import (
+    by_bands,
     pattern_pairs,
     sky_grid,
     sky_to_limit,
 )
-from epipole.tasks.algorithms.star_identification.sky.star_bands import by_bands
 
 CATALOGUE = random_catalogue()
 SKY = sky_to_limit(CATALOGUE, 99.0)

@@ -8,8 +8,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2 as chi_square
 
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.sky import tangent_basis
-from epipole.tasks.algorithms.tracking.apparent_motion import acceleration, jerk
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.tracking.linking.chains import (
     NONE,
     Fragments,
@@ -19,6 +18,7 @@ from epipole.tasks.algorithms.tracking.linking.chains import (
 )
 from epipole.tasks.algorithms.tracking.linking.likelihood_ratio import link_by_likelihood
 from epipole.tasks.algorithms.tracking.linking.prediction import link_by_prediction
+from epipole.tasks.algorithms.tracking.sky_filter import acceleration, jerk
 
 SIGMA = 4 * ARCSEC
 

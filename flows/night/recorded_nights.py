@@ -1,0 +1,332 @@
+"""Earlier nights: what this run, or an earlier one, has published of the nights before a night.
+
+Another program may have written them. So they are read in pieces, of which only what later nights
+need is kept, and a night that does not fit is left out.
+"""
+
+import logging
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+
+from epipole.flows.night.log_choice import FoundLogs, name_of
+from epipole.flows.night.summary import count
+from epipole.io.datasets.dataset import (
+    missing_tables,
+    night_row,
+    nights_in,
+    read_table,
+    table_pieces,
+)
+from epipole.io.datasets.night_tables import write_table
+from epipole.io.datasets.table_pieces import MAX_BYTES, within_bounds
+from epipole.io.logs.mcap.bytes import open_log
+from epipole.io.work.recipe import Recipe, digest_of, logs_key, recipe_of
+from epipole.schemas.bridge import array, concat, from_polars, table, to_polars
+from epipole.schemas.errors import DatasetError
+from epipole.schemas.settings import Settings
+from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
+from epipole.schemas.tables import NIGHTS, STATES
+from epipole.tasks.name.object_ids import VIEWS
+
+# -- The table `nights`: what a night was made from and with, and what it holds.
+
+
+def write_night_row(
+    folder: Path,
+    recipe: Recipe,
+    earlier_key: str,
+    faults: Sequence[object],
+    residuals: Sequence[object],
+) -> None:
+    """Write the table `nights` of a night whose other tables are written to `folder`.
+
+    Parameters
+    ----------
+    earlier_key
+        What the nights before were made from; see `EarlierNights.key`.
+    faults, residuals
+        Of sensors; each as text is a sentence.
+    """
+    row = {
+        **{f"{name}_key": key for name, key in recipe._asdict().items()},
+        "code_version": metadata.version("epipole"),
+        "earlier_key": earlier_key,
+        **count([folder]),
+        "faults": [str(fault) for fault in faults],
+        "residuals": [str(residual) for residual in residuals],
+    }
+    write_table(folder, "nights", [table(NIGHTS, {name: [row[name]] for name in NIGHTS.names})])
+
+
+def recipe_in(row: dict[str, Any]) -> Recipe:
+    """Return the recipe that a row of `nights` tells."""
+    return Recipe(*(row[f"{name}_key"] for name in Recipe._fields))
+
+
+def key_of(row: dict[str, Any] | None) -> str:
+    """Return a digest of what a night was made from; "unknown" where it has no row."""
+    if row is None:
+        return "unknown"
+    return digest_of([*(key or "" for key in recipe_in(row)), row["earlier_key"]])
+
+
+# -- Earlier nights: what this run, or an earlier one, has published of the nights before a night.
+#
+# Another program may have written them. So they are read in pieces, of which only what later
+# nights need is kept, and a night that does not fit is left out.
+
+LOGGER = logging.getLogger(__name__)
+
+HOUR_NS = 3_600_000_000_000
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class EarlierNights:
+    """The nights of a dataset, and those that this run has staged: these count first."""
+
+    dataset: str
+    staged: Mapping[str, Path]
+    _left_out: set[str] = field(default_factory=set)  # that cannot be read
+
+    def last_views(self, night: str) -> pa.Table:
+        """Return the `VIEWS` of the last half hour before a night, each detection once.
+
+        Objects that were followed over midnight keep their ids.
+        """
+        before = str(np.datetime64(night, "D") - 1)
+        start_ns = day_of(night) * DAY_NS
+        between_ns = (start_ns - SPAN_NS, start_ns)
+        found = self._read(before, lambda where: _views(where, before, between_ns))
+        return found or VIEWS.empty_table()
+
+    def last_states(self, night: str, settings: Settings) -> pa.Table:
+        """Return the last STATES of each object before a night.
+
+        As far back as objects are recognised.
+        """
+        start_ns = day_of(night) * DAY_NS
+        between_ns = (start_ns - round(settings.known_objects.earlier_h * HOUR_NS), start_ns)
+
+        def states(date: str) -> pa.Table | None:
+            return self._read(date, lambda where: _states(where, date, between_ns))
+
+        return concat(STATES, filter(None, map(states, self._dates(night, settings))))
+
+    def _dates(self, night: str, settings: Settings) -> list[str]:
+        """Return the nights before a night that it depends on, at least that of the day before."""
+        back_ns = max(round(settings.known_objects.earlier_h * HOUR_NS), SPAN_NS)
+        first = (day_of(night) * DAY_NS - back_ns) // DAY_NS
+        nights = {str(np.datetime64(day, "D")) for day in range(first, day_of(night))}
+        return sorted(nights.intersection([*nights_in(self.dataset), *self.staged]))
+
+    def key(self, night: str, settings: Settings) -> str:
+        """Return a digest of what the nights were made from that the other methods read."""
+        made_from = {
+            date: self._read(date, partial(night_row, night=date))
+            for date in self._dates(night, settings)
+        }
+        return digest_of(f"{date} {key_of(row)}" for date, row in made_from.items())
+
+    def _read(self, night: str, read: Callable[[str], T | None]) -> T | None:
+        """Return what is read of an earlier night; None where it cannot be read.
+
+        A damaged night does not stop the nights after it, and has one line.
+        """
+        if night in self._left_out:
+            return None
+        try:
+            return read(str(self.staged[night].parent) if night in self.staged else self.dataset)
+        except DatasetError as error:
+            LOGGER.warning("objects are not recognised from the night %s: %s", night, error)
+            self._left_out.add(night)
+            return None
+
+
+def _views(where: str, night: str, between_ns: tuple[int, int]) -> pa.Table:
+    def used(rows: pa.Table) -> pa.Table:
+        chosen = to_polars(rows).filter("used").drop_nulls("centroid")
+        return from_polars(VIEWS, chosen.unique(maintain_order=True))
+
+    pieces = table_pieces(where, "associations", night, VIEWS.names, between_ns)
+    return _kept(VIEWS, map(used, pieces), f"{where}/night={night}/associations")
+
+
+def _states(where: str, night: str, between_ns: tuple[int, int]) -> pa.Table:
+    numbers = [column.name for column in STATES if column.type == pa.float64()]
+
+    def last(rows: pa.Table) -> pa.Table:
+        finite = to_polars(rows).filter(pl.all_horizontal(pl.col(numbers).is_finite()))
+        ordered = finite.sort("epoch", maintain_order=True)
+        return from_polars(STATES, ordered.unique("object_id", keep="last", maintain_order=True))
+
+    pieces = table_pieces(where, "states", night, STATES.names, between_ns)
+    return _kept(STATES, map(last, pieces), f"{where}/night={night}/states")
+
+
+def _kept(schema: pa.Schema, pieces: Iterable[pa.Table], where: str) -> pa.Table:
+    try:
+        return concat(schema, within_bounds(pieces, MAX_BYTES))
+    except ValueError as error:
+        raise DatasetError(f"{where}: cannot be read ({error})") from error
+
+
+# -- The nights of a dataset: what each holds, and whether a run would make it otherwise today.
+
+# What differs, by the field of a `Recipe`. Logs are not held against anything.
+_DIFFERS = {
+    "settings": "other settings",
+    "star_catalogue": "another star catalogue",
+    "code": "other code",
+    "known": "another catalogue of known objects",
+}
+
+
+@dataclass(frozen=True)
+class HeldNight:
+    """A night of a dataset: its row of `nights`, empty without one, and why it is stale."""
+
+    date: str
+    row: dict[str, Any]
+    stale: list[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the night as JSON takes it."""
+        return {"night": self.date, "stale": self.stale, **self.row}
+
+
+def held_nights(dataset: str, settings: Settings, known: str | None) -> list[HeldNight]:
+    """Return the nights of a dataset in order.
+
+    Parameters
+    ----------
+    settings
+        Those that a run would have today.
+    known
+        Digest of the catalogue of known objects that a run would have. None: whatever each night
+        was made with.
+    """
+    return [_held(dataset, date, settings, known) for date in nights_in(dataset)]
+
+
+def _held(dataset: str, date: str, settings: Settings, known: str | None) -> HeldNight:
+    try:
+        missing = missing_tables(dataset, date)
+        row = night_row(dataset, date)
+    except DatasetError as error:
+        return HeldNight(date, {}, [str(error)])
+    if row is None:
+        return HeldNight(date, {}, ["an older version"])
+    made_from = recipe_in(row)
+    today = recipe_of(row["logs_key"], settings, known or row["known_key"])
+    stale = [
+        text for name, text in _DIFFERS.items() if getattr(made_from, name) != getattr(today, name)
+    ]
+    if row["earlier_key"] != EarlierNights(dataset, {}).key(date, settings):
+        stale.append("another night before")
+    return HeldNight(date, row, stale + [f"no table {name}" for name in missing])
+
+
+# -- Unchanged nights: a run would make them as they are published, from the same logs.
+
+HASHED_AT_ONCE = 2  # logs
+
+
+def unchanged_nights(
+    dataset: str, given: FoundLogs, night: str | None, settings: Settings, known: str | None
+) -> list[str]:
+    """Return the nights that a run would make; none unless all are published just as it would.
+
+    Parameters
+    ----------
+    given
+        The logs of the run.
+    night
+        The one that is asked for; None: all that the logs have frames of.
+    known
+        Digest of the catalogue of known objects.
+
+    Notes
+    -----
+    Logs are the same where their bytes are: they are read once, to be hashed, and only if their
+    names and sizes are those of the published night.
+    """
+    try:
+        rows = _rows(dataset, night)
+        made_so = {
+            date: row
+            for date, row in rows.items()
+            if recipe_in(row) == recipe_of(row["logs_key"], settings, known)
+        }
+        same = [date for date in made_so if _same_names(given, _sources(dataset, date))]
+        if not same:
+            return []
+        key = _key_of(given)
+        same = [date for date in same if made_so[date]["logs_key"] == key]
+        if not same or not _all_nights(dataset, same, night):
+            return []
+        earlier = EarlierNights(dataset, {})
+        intact = all(
+            made_so[date]["earlier_key"] == earlier.key(date, settings)
+            and not missing_tables(dataset, date)
+            for date in same
+        )
+    except (DatasetError, OSError):  # making the night again tells what is wrong with it
+        return []
+    return same if intact else []
+
+
+def _rows(dataset: str, night: str | None) -> dict[str, dict[str, Any]]:
+    """Return the row of `nights` of each published night, or of the one that is asked for."""
+    dates = [date for date in nights_in(dataset) if night in (None, date)]
+    rows = {date: night_row(dataset, date) for date in dates}
+    return {date: row for date, row in rows.items() if row is not None}
+
+
+def _sources(dataset: str, night: str) -> pa.Table:
+    return read_table(dataset, "sources", night)
+
+
+def _same_names(given: FoundLogs, sources: pa.Table) -> bool:
+    """Return whether logs may be those of a night; a second copy of a log is no source."""
+    return {name_of(path) for path in given.paths} >= set(sources["name"].to_pylist())
+
+
+def _key_of(given: FoundLogs) -> str:
+    """Return the `logs_key` of logs. Of those with the same bytes the first name counts."""
+    with ThreadPoolExecutor(HASHED_AT_ONCE, "hash logs") as pool:
+        digests = list(pool.map(_sha256, given.paths))
+    by_content: dict[str, str] = {}
+    for name, sha256 in sorted(zip(map(name_of, given.paths), digests, strict=True)):
+        by_content.setdefault(sha256, name)
+    logs = [(name, sha256) for sha256, name in by_content.items()]
+    return logs_key(logs, given.rejects["source"].to_pylist())
+
+
+def _sha256(path: str) -> str:
+    with open_log(path) as log:
+        return log.sha256()
+
+
+def _all_nights(dataset: str, same: Sequence[str], night: str | None) -> bool:
+    """Return whether no other night can have frames of the logs that made these."""
+    if night is not None:
+        return True
+    sources = _sources(dataset, same[0])
+    days = zip(
+        (array(sources, "first_time") // DAY_NS).tolist(),
+        (array(sources, "last_time") // DAY_NS).tolist(),
+        strict=True,
+    )
+    dates = {str(np.datetime64(d, "D")) for first, last in days for d in range(first, last + 1)}
+    return dates <= set(same)

@@ -1,0 +1,191 @@
+"""Orbit data messages (CCSDS 502.0-B-3): ephemerides (OEM) and single states (OPM), in GCRF."""
+
+import datetime
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import ccsds_ndm as ccsds
+import numpy as np
+import numpy.typing as npt
+
+from epipole.schemas.errors import DatasetError
+
+# -- What all messages have: times, names, a header, one place to write them.
+
+ORIGINATOR = "EPIPOLE"
+_UNSAFE = re.compile(r"[^A-Za-z0-9._+-]")
+
+
+def times(time_ns: npt.NDArray[np.int64]) -> list[str]:
+    """Return UTC times to the microsecond: more digits break readers."""
+    rounded = ((time_ns + 500) // 1000).astype("datetime64[us]")
+    return [str(t) for t in np.datetime_as_string(rounded, unit="us")]
+
+
+def now() -> str:
+    """Return the time of creation, UTC."""
+    return f"{datetime.datetime.now(datetime.UTC):%Y-%m-%dT%H:%M:%S}"
+
+
+def safe_name(text: str) -> str:
+    """Return a name for a message or a file: letters, digits and ``._+-``, the rest as ``_``."""
+    return _UNSAFE.sub("_", text) or "_"
+
+
+def write_message(path: Path, text: str) -> None:
+    """Write a message.
+
+    Raises
+    ------
+    DatasetError
+        Where the file cannot be written.
+    """
+    try:
+        path.write_text(text, encoding="ascii")
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+# -- Orbit data messages (CCSDS 502.0-B-3): ephemerides (OEM) and single states (OPM), in GCRF.
+
+Array = npt.NDArray[np.float64]
+
+_AXES = ("x", "y", "z", "x_dot", "y_dot", "z_dot")
+DEGREE = 7  # of the Hermite interpolation, where there are so many states
+
+
+class Ephemeris(NamedTuple):
+    """States of one object or sensor, sorted by time.
+
+    time_ns : (n,) int, UTC
+    state : (n, 6) float
+        Position [km] and velocity [km/s], GCRF.
+    covariance_ns : (m,) int
+        Times of the covariances, UTC.
+    covariance : (m, 6, 6) float
+    """
+
+    time_ns: npt.NDArray[np.int64]
+    state: Array
+    covariance_ns: npt.NDArray[np.int64]
+    covariance: Array
+
+
+def ephemeris_message(name: str, parts: Sequence[Ephemeris], comments: Sequence[str]) -> str:
+    """Return the OEM of one object, with a segment per part."""
+    segments = [_ephemeris_segment(name, part, comments) for part in parts]
+    return str(ccsds.Oem(_header(), segments).to_str("kvn"))
+
+
+def _ephemeris_segment(name: str, part: Ephemeris, comments: Sequence[str]) -> ccsds.OemSegment:
+    at = times(part.time_ns)
+    known = safe_name(name)
+    metadata = ccsds.OemMetadata(
+        known,
+        known,
+        at[0],
+        at[-1],
+        center_name="EARTH",
+        ref_frame="GCRF",
+        time_system="UTC",
+        interpolation="HERMITE",
+        interpolation_degree=int(min(DEGREE, max(len(at) - 1, 1))),
+        comment=list(comments),
+    )
+    states = [
+        ccsds.StateVectorAcc(epoch, *values)
+        for epoch, values in zip(at, np.round(part.state, 9).tolist(), strict=True)
+    ]
+    lower = np.tril_indices(6)
+    covariances = [
+        ccsds.OemCovarianceMatrix(epoch, matrix[lower], None, [])
+        for epoch, matrix in zip(times(part.covariance_ns), part.covariance, strict=True)
+    ]
+    return ccsds.OemSegment(metadata, ccsds.OemData(states, covariances))
+
+
+def state_message(name: str, part: Ephemeris, comments: Sequence[str]) -> str:
+    """Return the OPM of one state, with its covariance."""
+    known = safe_name(name)
+    metadata = ccsds.OpmMetadata(
+        known, known, center_name="EARTH", ref_frame="GCRF", time_system="UTC",
+        comment=list(comments),
+    )  # fmt: skip
+    (epoch,) = times(part.time_ns)
+    data = ccsds.OpmData(ccsds.StateVector(epoch, *np.round(part.state[0], 9).tolist()))
+    data.covariance_matrix = ccsds.OpmCovarianceMatrix(
+        **{
+            f"c{_AXES[i]}_{_AXES[j]}": float(part.covariance[0][i, j])
+            for i, j in zip(*np.tril_indices(6), strict=True)
+        }
+    )
+    return str(ccsds.Opm(_header(), ccsds.OpmSegment(metadata, data)).to_str("kvn"))
+
+
+def _header() -> ccsds.OdmHeader:
+    return ccsds.OdmHeader(now(), ORIGINATOR)
+
+
+# -- Tracking data messages (CCSDS 503.0-B-2): the directions of one object, a segment per sensor.
+
+
+class Directions(NamedTuple):
+    """One sensor's directions of an object, sorted by time.
+
+    time_ns : (n,) int, UTC
+    ra_deg, dec_deg : (n,) float
+        Astrometric, in the axes of EME2000: TDM names no GCRF, and readers need data for ICRF.
+    magnitude : (n,) float, NaN where unknown
+    aberration_deg : float
+        Mean angle of the aberration that was removed.
+    ephemeris : str
+        Name of the file with the sensor's ephemeris.
+    comments : sequence of str
+    """
+
+    time_ns: npt.NDArray[np.int64]
+    ra_deg: Array
+    dec_deg: Array
+    magnitude: Array
+    aberration_deg: float
+    ephemeris: str
+    comments: Sequence[str]
+
+
+def tracking_data(object_id: str, of_sensors: Mapping[str, Directions]) -> str:
+    """Return the message of one object, with a segment per sensor."""
+    segments = [_tracking_segment(object_id, sensor, seen) for sensor, seen in of_sensors.items()]
+    header = ccsds.TdmHeader(originator=ORIGINATOR, creation_date=now())
+    message = ccsds.Tdm(header=header, body=ccsds.TdmBody(segments=segments))
+    return str(message.to_str("kvn"))
+
+
+def _tracking_segment(object_id: str, sensor: str, seen: Directions) -> ccsds.TdmSegment:
+    at = times(seen.time_ns)
+    metadata = ccsds.TdmMetadata(
+        time_system="UTC",
+        start_time=at[0],
+        stop_time=at[-1],
+        participant_1=safe_name(sensor),
+        participant_2=safe_name(object_id),
+        mode="SEQUENTIAL",
+        path="2,1",
+        ephemeris_name_1=seen.ephemeris,
+        timetag_ref="RECEIVE",
+        angle_type="RADEC",
+        reference_frame="EME2000",
+        correction_aberration_yearly=0.0,
+        correction_aberration_diurnal=seen.aberration_deg,
+        corrections_applied="YES",
+        comment=list(seen.comments),
+    )
+    rows = []
+    columns = (at, seen.ra_deg.tolist(), seen.dec_deg.tolist(), seen.magnitude.tolist())
+    for epoch, ra, dec, magnitude in zip(*columns, strict=True):
+        rows.append(ccsds.TdmObservation(epoch=epoch, keyword="ANGLE_1", value=round(ra, 9)))
+        rows.append(ccsds.TdmObservation(epoch=epoch, keyword="ANGLE_2", value=round(dec, 9)))
+        if magnitude == magnitude:
+            rows.append(ccsds.TdmObservation(epoch=epoch, keyword="MAG", value=round(magnitude, 3)))
+    return ccsds.TdmSegment(metadata=metadata, data=ccsds.TdmData(observations=rows))

@@ -1,1 +1,0 @@
-"""CCSDS messages for orbit determination: tracking data, ephemerides, states; as text (KVN)."""

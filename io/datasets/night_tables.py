@@ -1,0 +1,239 @@
+"""One night of a dataset, read piece by piece: only the columns and the times that are asked for.
+
+A night may have more rows than fit in memory, so the large tables are read in pieces.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from epipole.io.datasets.table_pieces import MAX_BYTES, read_pieces, within_bounds
+from epipole.io.paths import file_system, line_of, storage_errors
+from epipole.schemas.bridge import conform, to_polars
+from epipole.schemas.errors import DatasetError
+from epipole.schemas.tables import TABLES
+
+# -- One night of a dataset, read piece by piece: only the columns and the times that are asked for.
+#
+# A night may have more rows than fit in memory, so the large tables are read in pieces.
+
+
+class NightReader:
+    """The tables of one night. A table that the night does not have is read as empty.
+
+    Its functions raise `DatasetError` where a file cannot be read, or does not hold the table.
+    """
+
+    def __init__(self, where: str, night: str, files: Callable[[str], Sequence[Any]]) -> None:
+        """`files` returns the Parquet files of a table: paths, or open files."""
+        self.where, self.night, self._files = where, night, files
+
+    @classmethod
+    def of_folder(cls, folder: Path, night: str) -> "NightReader":
+        """Return the night whose tables lie in this local folder."""
+        return cls(str(folder), night, lambda table: sorted((folder / table).glob("*.parquet")))
+
+    def read(self, table: str, columns: Sequence[str]) -> pl.DataFrame:
+        """Return all rows of a table that is small, or of few columns."""
+        with self._as_dataset_errors(table):
+            pieces = map(to_polars, within_bounds(self._pieces(table, columns), MAX_BYTES))
+            return pl.concat([self.empty(table, columns), *pieces])
+
+    def pieces(
+        self, table: str, columns: Sequence[str], between_ns: tuple[int, int] | None = None
+    ) -> Iterator[pl.DataFrame]:
+        """Yield the rows of a table, some at a time, in their order.
+
+        Parameters
+        ----------
+        between_ns
+            Only rows whose first column is a time from here to before there. Row groups of other
+            times are not read. The rows are sorted by that column.
+        """
+        with self._as_dataset_errors(table):
+            yield from map(to_polars, self._pieces(table, columns, between_ns))
+
+    def _pieces(
+        self, table: str, columns: Sequence[str], between_ns: tuple[int, int] | None = None
+    ) -> Iterator[pa.Table]:
+        schema = pa.schema([TABLES[table].field(name) for name in columns])
+        time = None if between_ns is None else columns[0]
+        for file in self._files(table):
+            yield from read_pieces(file, schema, time, between_ns or (None, None))
+
+    def count(self, table: str) -> int:
+        """Return the number of rows of a table."""
+        return sum(file.metadata.num_rows for file in self._opened(table))
+
+    def metadata(self, table: str, key: str) -> str:
+        """Return an entry of a table's metadata; '' where it has none."""
+        for file in self._opened(table):
+            found = (file.schema_arrow.metadata or {}).get(key.encode(), b"")
+            return str(found.decode("utf-8", "replace"))
+        return ""
+
+    def bounds_ns(self, table: str, column: str) -> tuple[int, int] | None:
+        """Return the first and the last time of a table that is sorted by it; None: no rows."""
+        ends: list[int] = []
+        for file in self._opened(table):
+            with self._as_dataset_errors(table):
+                full = [k for k in range(file.num_row_groups) if _rows(file, k)]
+                for group in {*full[:1], *full[-1:]}:
+                    times = file.read_row_group(group, columns=[column])[column]
+                    ends += [times[0].value, times[-1].value]
+        return (min(ends), max(ends)) if ends else None
+
+    def empty(self, table: str, columns: Sequence[str]) -> pl.DataFrame:
+        """Return columns of a table, without rows."""
+        return to_polars(TABLES[table].empty_table().select(list(columns)))
+
+    def _opened(self, table: str) -> list[pq.ParquetFile]:
+        with self._as_dataset_errors(table):
+            return [pq.ParquetFile(file) for file in self._files(table)]
+
+    @contextlib.contextmanager
+    def _as_dataset_errors(self, table: str) -> Iterator[None]:
+        try:
+            yield
+        except DatasetError:
+            raise
+        except (KeyError, pa.ArrowException, pl.exceptions.PolarsError) as error:
+            raise self._unreadable(table, error) from error
+        except storage_errors() as error:
+            raise self._unreadable(table, error) from error
+
+    def _unreadable(self, table: str, error: Exception) -> DatasetError:
+        return DatasetError(f"{self.where}/{table}: cannot be read ({line_of(error)})")
+
+
+def _rows(file: pq.ParquetFile, group: int) -> int:
+    count: int = file.metadata.row_group(group).num_rows
+    return count
+
+
+# -- Options of the Parquet files of a dataset, chosen for fast queries over years.
+
+ROWS_IN_GROUP = 1 << 17
+
+
+def part_options(schema: pa.Schema) -> dict[str, Any]:
+    """Return the options of `pyarrow.parquet.ParquetWriter` and `write_table` for a table.
+
+    Measured values hardly compress and rarely repeat. LZ4 reads them at nearly the speed of
+    memory; zstd takes twice the time and saves 8 %. A dictionary costs as much again, and more
+    for a column of distinct values such as `time`. Only names and epochs repeat, so only they
+    have a dictionary. Rows are sorted by time, so a query can skip the row groups of other times.
+    """
+    repeats = [f.name for f in schema if f.type == pa.string() or f.name == "epoch"]
+    return {"compression": "lz4", "use_dictionary": repeats}
+
+
+# -- The Parquet files of an unpublished night: one per table, written span by span.
+
+PART = "part-0.parquet"
+
+Where = Path | str  # the folder of a night, or its URL
+
+
+def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
+    """Write a table of a night from pieces that follow one another in time.
+
+    Parameters
+    ----------
+    night
+        The night's folder. The table's folder is created in it.
+    pieces
+        Each sorted. Each makes at least one row group, so that a reader can skip other times.
+
+    Returns
+    -------
+    int
+        The number of rows.
+
+    Raises
+    ------
+    DatasetError
+        Where a file cannot be written.
+    """
+    folder = night / name
+    try:
+        return _write(folder, name, pieces)
+    except OSError as error:
+        raise DatasetError(
+            f"{folder}: cannot be written ({error.strerror or error}); the dataset is unchanged"
+        ) from error
+
+
+def _write(folder: Path, name: str, pieces: Iterable[pa.Table]) -> int:
+    # It exists where a worker was killed as it wrote: the task starts again, the file anew.
+    folder.mkdir(parents=True, exist_ok=True)
+    count = 0
+    writer = None
+    for rows in pieces:
+        rows = conform(TABLES[name], rows)
+        if rows.num_rows == 0:
+            continue
+        if writer is None:  # metadata of the rows that the schema does not have are kept
+            writer = _writer(folder, rows.schema)
+        writer.write_table(rows, ROWS_IN_GROUP)
+        count += rows.num_rows
+    if writer is None:
+        writer = _writer(folder, TABLES[name])
+    writer.close()
+    return count
+
+
+def _writer(folder: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    # Arrow takes a relative path such as http:/x for a URL.
+    return pq.ParquetWriter((folder / PART).absolute(), schema, **part_options(schema))
+
+
+def read_columns(night: Where, name: str, columns: Sequence[str]) -> pa.Table:
+    """Return some columns of a table that `write_table` wrote."""
+    with _opened(night, name) as file:
+        return pq.read_table(file, columns=list(columns), partitioning=None)
+
+
+def take_rows(
+    night: Path, name: str, columns: Sequence[str], rows: npt.NDArray[np.int64]
+) -> pa.Table:
+    """Return some rows of a table that `write_table` wrote; `rows` are in order."""
+    file = pq.ParquetFile((night / name / PART).absolute())
+    start, taken = 0, []
+    for group in range(file.num_row_groups):
+        end = start + file.metadata.row_group(group).num_rows
+        own = rows[(rows >= start) & (rows < end)] - start
+        if len(own):
+            taken.append(file.read_row_group(group, columns=list(columns)).take(own))
+        start = end
+    schema = TABLES[name]
+    return pa.concat_tables(
+        [pa.schema([schema.field(column) for column in columns]).empty_table(), *taken],
+        promote_options="permissive",
+    )
+
+
+def count_rows(night: Where, name: str) -> int:
+    """Return the number of rows of a table that `write_table` wrote."""
+    with _opened(night, name) as file:
+        rows: int = pq.read_metadata(file).num_rows
+    return rows
+
+
+@contextlib.contextmanager
+def _opened(night: Where, name: str) -> Iterator[Any]:
+    """Open a table's file. Of a URL only the ranges that are read are fetched."""
+    if isinstance(night, Path):
+        yield (night / name / PART).absolute()
+        return
+    storage, path = file_system(f"{night}/{name}/{PART}")
+    storage.invalidate_cache()  # an earlier listing may be out of date
+    with storage.open(path, cache_type="readahead") as file:
+        yield file

@@ -1,1 +1,0 @@
-"""The messages of a log as columns: frames, states and calibrations."""

@@ -1,0 +1,134 @@
+"""The calibrations of a log as CAMERAS."""
+
+import math
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+import pyarrow as pa
+
+from epipole.io.logs.left_out import RejectList
+from epipole.io.logs.messages.batches import MessageBatch, fault, known_id
+from epipole.io.logs.messages.encoding import CalibrationMessage
+from epipole.schemas.bridge import table, unstack_covariance
+from epipole.schemas.columns import OPTICS_AXES
+from epipole.schemas.log_bounds import CORNER, DISTORTION, FOCAL_LENGTH, FOCAL_RATIO, IMAGE_SIDE
+from epipole.schemas.rejects import Reason
+from epipole.schemas.work_tables import CAMERAS
+
+POWERS = (2, 4, 1, 1, 6)  # of the distance, by which k1 k2 p1 p2 k3 move a place
+# The distortion is followed to so many times the distance of the corner; within its bounds it
+# moves nothing that far.
+FARTHEST_UNDISTORTED = 4.0
+FOLD_STEPS, FOLD_DIRECTIONS = 400, 32
+
+
+@dataclass
+class CameraColumns:
+    """The calibrations of a log."""
+
+    rejects: RejectList
+    _rows: list[CalibrationMessage] = field(default_factory=list)
+
+    def add(self, batch: MessageBatch) -> None:
+        """Take the valid calibrations; the others become rejects.
+
+        A calibration without a time holds from the time it was logged at.
+        """
+        for calibration, offset, log_time_ns in batch.decoded(0, len(batch)):
+            time_ns = calibration.time_ns or log_time_ns or None
+            reason = fault(time_ns, calibration.sensor_id) or _camera_fault(calibration)
+            if reason is None:
+                self._rows.append(calibration._replace(time_ns=time_ns))
+            else:
+                self.rejects.add(
+                    reason,
+                    time_ns=time_ns or 0,
+                    offset=offset,
+                    sensor_id=known_id(calibration.sensor_id),
+                )
+
+    def take(self) -> pa.Table:
+        """Return CAMERAS of the calibrations since the last call."""
+        rows, self._rows = self._rows, []
+        matrices = np.array([c.K for c in rows], float).reshape(-1, 9)
+        distortion = np.zeros((len(rows), 5))
+        for i, c in enumerate(rows):
+            distortion[i, : len(c.D)] = c.D
+        return table(
+            CAMERAS,
+            {
+                "sensor_id": [c.sensor_id for c in rows],
+                "time": np.array([c.time_ns for c in rows], np.int64),
+                "width": np.array([c.width for c in rows], np.int64),
+                "height": np.array([c.height for c in rows], np.int64),
+                "fx_px": matrices[:, 0],
+                "fy_px": matrices[:, 4],
+                "cx_px": matrices[:, 2],
+                "cy_px": matrices[:, 5],
+                **dict(zip(("k1", "k2", "p1", "p2", "k3"), distortion.T, strict=True)),
+                **unstack_covariance("cov_{}", np.zeros((len(rows), 9, 9)), OPTICS_AXES),
+            },
+        )
+
+
+def _camera_fault(calibration: CalibrationMessage) -> Reason | None:
+    sides = (calibration.width, calibration.height)
+    if any(side not in IMAGE_SIDE for side in sides):
+        return IMAGE_SIDE.reason
+    if calibration.distortion_model not in ("", "plumb_bob"):
+        return Reason.UNKNOWN_DISTORTION_MODEL
+    if len(calibration.D) not in (0, 4, 5) or not np.isfinite(calibration.D).all():
+        return Reason.BAD_DISTORTION
+    if len(calibration.K) != 9:
+        return Reason.BAD_CAMERA_MATRIX
+    # A recorder may repeat one calibration with each frame.
+    return _optics_fault(sides, tuple(calibration.K.tolist()), tuple(calibration.D.tolist()))
+
+
+@lru_cache(maxsize=256)
+def _optics_fault(
+    sides: tuple[int, int], K: tuple[float, ...], D: tuple[float, ...]
+) -> Reason | None:
+    focal = K[0], abs(K[4])
+    # The first focal length is positive: an image is mirrored by one negative length at most.
+    if any(f not in FOCAL_LENGTH for f in focal) or focal[0] / focal[1] not in FOCAL_RATIO:
+        return FOCAL_LENGTH.reason
+    # The pipeline has no camera model with skew or scale. NaN is not within the scale either.
+    zeros, scale = (K[1], K[3], K[6], K[7]), 1e-9 * K[0]
+    if not all(abs(k) <= scale for k in zeros) or not abs(K[8] - 1.0) <= 1e-9:
+        return Reason.BAD_CAMERA_MATRIX
+    far = [
+        max(abs(-0.5 - c), abs(side - 0.5 - c)) / f
+        for side, c, f in zip(sides, (K[2], K[5]), focal, strict=True)
+    ]
+    corner = math.hypot(*far)
+    if corner not in CORNER:
+        return CORNER.reason
+    if any(k * corner**power not in DISTORTION for k, power in zip(D, POWERS, strict=False)):
+        return DISTORTION.reason
+    return Reason.FOLDED_IMAGE if any(D) and _folds(D, corner) else None
+
+
+def _folds(D: tuple[float, ...], corner: float) -> bool:
+    """Return whether the distortion folds the image within the distance of its farthest corner.
+
+    Along a ray from the boresight the distorted distance must grow until it reaches that of the
+    corner, and the derivative of the distorted place must keep its sign, whatever the direction.
+    """
+    k1, k2, p1, p2, k3 = (*D, 0.0)[:5]
+    r = np.linspace(0.0, FARTHEST_UNDISTORTED * corner, FOLD_STEPS)
+    r2 = r * r
+    distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+    beyond = np.flatnonzero(distorted >= corner)
+    if len(beyond) == 0:
+        return True
+    r2 = r2[: beyond[0] + 1, None]
+    angle = np.linspace(0.0, 2 * np.pi, FOLD_DIRECTIONS, endpoint=False)
+    x, y = np.sqrt(r2) * np.cos(angle), np.sqrt(r2) * np.sin(angle)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * k1 + r2 * (4 * k2 + r2 * 6 * k3)
+    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    return bool((xx + yy <= 0).any() or (xx * yy - xy * xy <= 0).any())

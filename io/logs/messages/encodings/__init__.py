@@ -1,1 +1,0 @@
-"""The encodings of messages, a module each; `registry` lists them."""

@@ -1,0 +1,189 @@
+"""Files behind fsspec URLs, and the errors of object stores as one-line messages.
+
+A URL with a password, a token or a signature is known to the rest of the program without it: so
+none is in a message, a table, a parameter of Prefect or the name of a folder. What was cut stays in
+the environment of this process and of those that it starts, and comes back where a file is opened.
+"""
+
+import contextlib
+import errno
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from epipole.schemas.errors import LogError
+from epipole.schemas.text import without_secrets
+
+# -- Files behind fsspec URLs, and the errors of object stores as one-line messages.
+#
+# A URL with a password, a token or a signature is known to the rest of the program without it:
+# so none is in a message, a table, a parameter of Prefect or the name of a folder. What was cut
+# stays in the environment of this process and of those that it starts, and comes back where a
+# file is opened.
+
+SECRETS = "EPIPOLE_URLS"  # URLs with their secrets, a line each
+
+
+def known_as(where: str) -> str:
+    """Return a path or URL as it may be shown and stored, and keep what was cut from it."""
+    shown = without_secrets(where)
+    if shown != where and "\0" not in where:
+        kept = [url for url in _secrets() if without_secrets(url) != shown]
+        os.environ[SECRETS] = "\n".join([*kept, where.replace("\n", "%0A")])
+    return shown
+
+
+def _secrets() -> list[str]:
+    return os.environ.get(SECRETS, "").split("\n")
+
+
+def _with_secrets(where: str) -> str:
+    """Return a URL as it was given; one that was found in a folder has the folder's password."""
+    by_host = {}
+    for url in reversed(_secrets()):
+        if without_secrets(url) == where:
+            return url
+        scheme, _, rest = url.partition("://")
+        of_url, is_there, path = rest.partition("/")[0].rpartition("@")
+        if is_there:
+            by_host[scheme, path] = of_url
+    scheme, _, rest = where.partition("://")
+    known = by_host.get((scheme, rest.partition("/")[0]))
+    return where if known is None else f"{scheme}://{known}@{rest}"
+
+
+def file_system(where: str) -> tuple[Any, str]:
+    """Return the storage that a URL names, as fsspec has it, and the path in it."""
+    import fsspec
+
+    given = _with_secrets(where)
+    parts, options = urlsplit(given), {}  # raises where it is no URL, such as http://[::1
+    if parts.scheme in ("http", "https"):
+        return fsspec.filesystem(parts.scheme), given  # fsspec itself takes :: for something else
+    if parts.scheme in ("s3", "s3a") and "@" in parts.netloc:
+        options = {"key": unquote(parts.username or ""), "secret": unquote(parts.password or "")}
+        given = without_secrets(given)
+    try:
+        return fsspec.core.url_to_fs(given, **options)  # type: ignore[no-any-return]
+    except TypeError as error:  # a storage that needs more than a URL, such as reference://
+        raise ValueError(f"no storage can be opened by this URL ({line_of(error)})") from error
+
+
+def open_remote(where: str) -> tuple[int, Callable[[int, int], bytes], Callable[[], None]]:
+    """Return the size of the file behind a URL, and two functions: read a range, and check it.
+
+    The check raises where the file has changed since it was opened.
+
+    Raises
+    ------
+    LogError
+        Where the file is missing or cannot be read.
+    """
+    where = known_as(where)
+    with _as_log_errors(where):
+        storage, path = file_system(where)
+        storage.invalidate_cache()  # an earlier listing may be out of date
+        info, version = storage.info(path), storage.ukey(path)
+    if info["type"] == "directory":
+        raise LogError(
+            f"{where}: is a folder; give the logs in it by a glob pattern, such as {where}/*.mcap"
+        )
+
+    def read(start: int, end: int) -> bytes:
+        if start >= end:
+            return b""
+        with _as_log_errors(where):
+            data: bytes = storage.cat_file(path, start=start, end=end)
+        return data
+
+    def check() -> None:
+        with _as_log_errors(where):
+            storage.invalidate_cache()
+            if storage.ukey(path) != version:
+                raise LogError(f"{where}: changed while it was read; run again")
+
+    return int(info["size"]), read, check
+
+
+@contextlib.contextmanager
+def _as_log_errors(where: str) -> Iterator[None]:
+    try:
+        yield
+    except LogError:
+        raise
+    except FileNotFoundError as error:
+        raise LogError(f"{where}: no such file; check the URL") from shown_error(error)
+    except storage_errors() as error:
+        raise LogError(f"{where}: cannot be read: {line_of(error)}") from shown_error(error)
+
+
+def storage_errors() -> tuple[type[Exception], ...]:
+    """Return the errors that a store may raise. Those of its client are not all OSErrors."""
+    errors: list[Any] = [OSError, ValueError, ImportError]
+    if (http := sys.modules.get("aiohttp")) is not None:
+        errors.append(http.ClientError)
+    client = sys.modules.get("botocore.exceptions")
+    if client is not None:
+        errors += [client.BotoCoreError, client.ClientError]
+    return tuple(errors)
+
+
+def line_of(error: BaseException) -> str:
+    """Return the message of an error as one line, without the secrets of URLs in it."""
+    return without_secrets(_line(error))
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def shown_error(error: Exception) -> Exception:
+    """Return an error as the cause of another, whose message may be logged.
+
+    Where it quotes a URL with a secret, it is replaced by one of the same effect: a task is tried
+    again for it or not.
+    """
+    if line_of(error) == _line(error):
+        return error
+    lasting = (FileNotFoundError, PermissionError)
+    kind = next((kind for kind in (*lasting, OSError) if isinstance(error, kind)), ValueError)
+    return kind(line_of(error))
+
+
+# -- Names of files and folders, as people give them.
+
+LONGEST_PART, LONGEST_PATH = 255, 4095  # bytes that Linux takes
+
+
+def fault_of_name(name: str) -> str | None:
+    """Return why this cannot be the name of a file or folder. None: it can.
+
+    Tables, JSON and Prefect hold text in UTF-8. An empty name would mean the current folder.
+    """
+    if not name.strip():
+        return "the name is empty; give a path or a URL"
+    if "\0" in name:
+        return "the name has a zero character; give another one"
+    parts = [len(os.fsencode(part)) for part in name.split("/")]
+    if "://" not in name and (max(parts) > LONGEST_PART or sum(parts) + len(parts) > LONGEST_PATH):
+        return "the name is too long; give a shorter one"
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return "the name is not UTF-8; rename it"
+    return None
+
+
+def refuse_device(path: Path) -> None:
+    """Raise where a path is a pipe or a device, of which reading may never end.
+
+    Raises
+    ------
+    OSError
+        Says so.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "is a pipe or a device, not a file", str(path))

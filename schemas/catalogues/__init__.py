@@ -1,1 +1,0 @@
-"""Catalogues: stars to navigate by, and element sets of known objects."""

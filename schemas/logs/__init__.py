@@ -1,1 +1,0 @@
-"""The messages of a log, and the tables that one log gives."""

@@ -1,1 +1,0 @@
-"""The simulator: scenes, and the report of an evaluation."""

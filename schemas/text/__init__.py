@@ -1,1 +1,0 @@
-"""Text from outside: how it is shown to people, and TOML that people wrote."""

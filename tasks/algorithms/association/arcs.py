@@ -1,0 +1,328 @@
+"""Arcs: the odds of a hypothesis from several instants, tied together by one orbit.
+
+An orbit has six parameters, however many instants there are. An unrelated tracklet has four of
+its own, a position and a drift relative to the orbit; its other directions follow from these and
+are no evidence. So a chance meeting of two tracklets takes two coincidences (the miss and its
+drift), not one for each instant.
+"""
+
+import numpy as np
+
+from epipole.tasks.algorithms.association.views import PLANE, X, Y, direction, residual
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
+from epipole.tasks.algorithms.kernels import kernel
+
+J2_RE2_KM2 = J2 * EARTH_RADIUS_KM**2  # about GCRF's pole: near enough
+STEP_S = 60.0  # one Runge-Kutta step of a low orbit errs by 0.1 m
+ITERATIONS = 6
+CONVERGED = 1e-4  # sigmas squared
+RADIAL_SHARE = 0.6  # an orbiting object's 1-sigma radial velocity over that of a circular orbit
+LN_2PI = np.log(2 * np.pi)
+SLACK_SIGMA = 3.0
+
+
+@kernel
+def factor(N, b):
+    """Solve N x = b in place (Cholesky); return ln det N, NaN if N is not positive definite."""
+    n, log_det = len(b), 0.0
+    for k in range(n):
+        for j in range(k):
+            N[k, k] -= N[k, j] * N[k, j]
+        if not N[k, k] > 0.0:
+            return np.nan
+        N[k, k] = np.sqrt(N[k, k])
+        log_det += 2.0 * np.log(N[k, k])
+        for i in range(k + 1, n):
+            for j in range(k):
+                N[i, k] -= N[i, j] * N[k, j]
+            N[i, k] /= N[k, k]
+        for j in range(k):
+            b[k] -= N[k, j] * b[j]
+        b[k] /= N[k, k]
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            b[k] -= N[j, k] * b[j]
+        b[k] /= N[k, k]
+    return log_det
+
+
+@kernel
+def _derivative(y, dy):
+    """Write the time derivative of a state (6) about an oblate Earth."""
+    r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
+    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
+    flat = 1.5 * J2_RE2_KM2 / r2
+    for a in range(3):
+        dy[a] = y[3 + a]
+        dy[3 + a] = pull * y[a] * (flat * (5.0 * y[2] * y[2] / r2 - 1.0) - 1.0)
+    dy[5] -= 2.0 * pull * flat * y[2]
+
+
+@kernel
+def _propagate(y, dt_s, k):
+    """Propagate a state by dt_s in place (Runge-Kutta); `k` (5, 6) is work space."""
+    n = int(np.ceil(dt_s / STEP_S))
+    for _ in range(n):
+        h = dt_s / n
+        _derivative(y, k[0])
+        k[4] = y + h / 2 * k[0]
+        _derivative(k[4], k[1])
+        k[4] = y + h / 2 * k[1]
+        _derivative(k[4], k[2])
+        k[4] = y + h * k[2]
+        _derivative(k[4], k[3])
+        y += h / 6 * (k[0] + 2 * k[1] + 2 * k[2] + k[3])
+
+
+@kernel
+def _begin(views, x, seen_by, state):
+    """Write a first state at the first solved instant; return that instant.
+
+    It is the straight line through the points, corrected for gravity.
+    """
+    first, n, mean_t = -1, 0, 0.0
+    for m in range(len(views.time_s)):
+        if seen_by[m] >= 2:
+            if first < 0:
+                first = m
+            n += 1
+            mean_t += views.time_s[m] - views.time_s[first]
+    mean_t /= n
+    state[:] = 0.0
+    r2 = x[first, 0] ** 2 + x[first, 1] ** 2 + x[first, 2] ** 2
+    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
+    square = 0.0
+    for m in range(first, len(views.time_s)):
+        if seen_by[m] < 2:
+            continue
+        t = views.time_s[m] - views.time_s[first]
+        square += (t - mean_t) ** 2
+        for a in range(3):
+            straight = x[m, a] + 0.5 * pull * x[first, a] * t * t
+            state[a] += straight / n
+            state[3 + a] += straight * (t - mean_t)
+    for a in range(3):
+        state[3 + a] /= square
+        state[a] -= state[3 + a] * mean_t
+    return first
+
+
+@kernel
+def _normal_equations(views, members, first, state, at, k, N, rhs):
+    """Write the normal equations of the orbit; return chi-square, NaN behind a sensor.
+
+    `at` receives the states at the instants, `k` (5, 6) is work space. The partials are those
+    of motion in the gravity gradient at the first position, to the third order in time: good to
+    1 % over ten minutes of a low orbit.
+    """
+    N[:] = 0.0
+    rhs[:] = 0.0
+    part, y = np.empty(11), state.copy()
+    G, H = np.empty((2, 6)), np.empty((2, 6))
+    chi2 = 0.0
+    r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
+    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
+    for m in range(first, len(views.time_s)):
+        if m > first:
+            _propagate(y, views.time_s[m] - views.time_s[m - 1], k)
+        at[m] = y
+        t = views.time_s[m] - views.time_s[first]
+        for i in members:
+            if not views.seen[i, m]:
+                continue
+            if residual(views, i, m, y, part) == 0.0:
+                return np.nan
+            for c in range(2):
+                g = 2 + 3 * c
+                tide = part[g] * state[0] + part[g + 1] * state[1] + part[g + 2] * state[2]
+                for a in range(3):
+                    bend = pull * (3.0 * tide * state[a] / r2 - part[g + a])
+                    G[c, a] = part[g + a] + bend * t * t / 2.0
+                    G[c, 3 + a] = (part[g + a] + bend * t * t / 6.0) * t
+            g0 = part[8] * part[0] + part[9] * part[1]
+            g1 = part[9] * part[0] + part[10] * part[1]
+            chi2 += part[0] * g0 + part[1] * g1
+            for a in range(6):
+                H[0, a] = part[8] * G[0, a] + part[9] * G[1, a]
+                H[1, a] = part[9] * G[0, a] + part[10] * G[1, a]
+                rhs[a] -= G[0, a] * g0 + G[1, a] * g1
+            for a in range(6):
+                for b in range(6):
+                    N[a, b] += G[0, a] * H[0, b] + G[1, a] * H[1, b]
+    return chi2
+
+
+@kernel
+def _ends(views, i, first):
+    """Return the first and last instant, from `first` on, at which a tracklet is seen."""
+    begun, ended = -1, -1
+    for m in range(first, len(views.time_s)):
+        if views.seen[i, m]:
+            begun = m if begun < 0 else begun
+            ended = m
+    return begun, ended
+
+
+@kernel
+def _scatter(views, chance, i, begun, ended, b):
+    """Write the drift of tracklet i relative to its sensor's others; return its variance.
+
+    The variance is at least half the square of the drift: a far outlier is rare by a power law,
+    not by a Gaussian's tail.
+    """
+    s, dt = views.sensor[i], views.time_s[ended] - views.time_s[begun]
+    square, u = 0.0, np.empty(3)
+    direction(views, i, begun, u)
+    direction(views, i, ended, b)
+    for a in range(3):
+        b[a] = (b[a] - u[a]) / dt - chance.drift[s, a]
+        square += b[a] * b[a]
+    return max(chance.spread[s] ** 2, square / 2.0)
+
+
+@kernel
+def _usual_velocity(views, chance, members, first, state, prior, usual):
+    """Write mean and inverse covariance of the velocity's prior; return its log norm.
+
+    Across the line of sight objects move like the tracklets of the sensor whose tracklets
+    differ most; the norm includes how usual the first state is among these. Along the line of
+    sight they move as orbits allow.
+    """
+    radius = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
+    along = RADIAL_SHARE * np.sqrt(GM_KM3_S2 / radius)
+    across, chosen, cost, b = 0.0, members[0], 0.0, np.empty(3)
+    for i in members:
+        begun, ended = _ends(views, i, first)
+        if begun == ended:
+            continue
+        variance = _scatter(views, chance, i, begun, ended, b)
+        scatter = _range(views, i, begun, state) * np.sqrt(variance)
+        if scatter > across:
+            across, chosen = scatter, i
+            cost = 0.5 * (b[0] * b[0] + b[1] * b[1] + b[2] * b[2]) / variance
+    if across == 0.0:
+        across = along
+    u, radial = np.empty(3), 0.0
+    direction(views, chosen, _ends(views, chosen, first)[0], u)
+    for a in range(3):
+        radial += state[3 + a] * u[a]
+    for a in range(3):
+        usual[a] = state[3 + a] - radial * u[a]
+        for c in range(3):
+            prior[a, c] = u[a] * u[c] * (1.0 / along**2 - 1.0 / across**2)
+        prior[a, a] += 1.0 / across**2
+    return -1.5 * LN_2PI - np.log(along) - 2.0 * np.log(across) - cost
+
+
+@kernel
+def _range(views, i, m, x):
+    """Return the distance [km] of x from the sensor of tracklet i at instant m."""
+    total = 0.0
+    for a in range(3):
+        total += (x[a] - views.camera[views.sensor[i], m, a]) ** 2
+    return np.sqrt(total)
+
+
+@kernel
+def _unrelated_odds(views, chance, i, first, at):
+    """Return the log-likelihood of a tracklet's directions as those of an unrelated object.
+
+    It lies anywhere in the field and drifts like the sensor's other tracklets. Its position and
+    drift are relative to the orbit with the states `at`, so the curvature of the path is common
+    to both hypotheses.
+    """
+    s = views.sensor[i]
+    J, h, part = np.zeros((4, 4)), np.zeros(4), np.empty(11)
+    begun, ended = _ends(views, i, first)
+    variance, chi2, b = 1.0, 0.0, np.zeros(3)
+    if begun < ended:
+        variance = _scatter(views, chance, i, begun, ended, b)
+    for c in range(2):
+        # The residual drifts like the tracklet relative to the usual drift.
+        mean = 0.0
+        for a in range(3):
+            mean += views.camera[s, begun, PLANE + 3 * c + a] * b[a]
+        J[2 + c, 2 + c] = 1.0 / variance
+        h[2 + c] = mean / variance
+        chi2 += mean * mean / variance
+    for m in range(begun, ended + 1):
+        if not views.seen[i, m]:
+            continue
+        residual(views, i, m, at[m], part)
+        t = views.time_s[m] - views.time_s[begun]
+        g0 = part[8] * part[0] + part[9] * part[1]
+        g1 = part[9] * part[0] + part[10] * part[1]
+        chi2 += part[0] * g0 + part[1] * g1
+        for p, tp in ((0, 1.0), (2, t)):
+            h[p] += tp * g0
+            h[p + 1] += tp * g1
+            for o, to in ((0, 1.0), (2, t)):
+                J[p, o] += tp * to * part[8]
+                J[p, o + 1] += tp * to * part[9]
+                J[p + 1, o] += tp * to * part[9]
+                J[p + 1, o + 1] += tp * to * part[10]
+    solved = h.copy()
+    log_det = factor(J, solved)
+    for p in range(4):
+        chi2 -= solved[p] * h[p]
+    # The density is per area of the sky, the position one on the plane.
+    flat = 1.0 + views.sight[i, begun, X] ** 2 + views.sight[i, begun, Y] ** 2
+    prior = np.log(chance.density[s] / variance) - 1.5 * np.log(flat)
+    return prior + LN_2PI - 0.5 * log_det - 0.5 * chi2
+
+
+@kernel
+def _leaves(state, L):
+    """Return whether the orbit is hyperbolic by 3 sigma; L is the factored information."""
+    r = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
+    v2 = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
+    slope, variance = np.empty(6), 0.0
+    for a in range(3):
+        slope[a] = GM_KM3_S2 * state[a] / r**3
+        slope[3 + a] = state[3 + a]
+    for a in range(6):
+        for c in range(a):
+            slope[a] -= L[a, c] * slope[c]
+        slope[a] /= L[a, a]
+        variance += slope[a] * slope[a]
+    return 0.5 * v2 - GM_KM3_S2 / r > SLACK_SIGMA * np.sqrt(variance)
+
+
+@kernel
+def arc_odds(views, chance, members, points):
+    """Return the log-odds of one orbit against unrelated tracklets, by the directions alone.
+
+    Without the prior of the position and without misses (see `odds.score`). -inf where no orbit
+    fits, or only a hyperbolic one.
+    """
+    state, k = np.empty(6), np.empty((5, 6))
+    at = np.empty((len(views.time_s), 6))
+    N, rhs, prior, usual = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty(3)
+    first = _begin(views, points.x_km, points.seen_by, state)
+    log_prior = _usual_velocity(views, chance, members, first, state, prior, usual)
+    chi2 = log_det = gain = np.inf
+    for _ in range(ITERATIONS):
+        chi2 = _normal_equations(views, members, first, state, at, k, N, rhs)
+        for a in range(3):
+            for b in range(3):
+                N[3 + a, 3 + b] += prior[a, b]
+                rhs[3 + a] -= prior[a, b] * (state[3 + b] - usual[b])
+                chi2 += prior[a, b] * (state[3 + a] - usual[a]) * (state[3 + b] - usual[b])
+        if np.isnan(chi2):
+            return -np.inf
+        gain = 0.0
+        step = rhs.copy()
+        log_det = factor(N, step)
+        for a in range(6):
+            gain += step[a] * rhs[a]
+            state[a] += step[a]
+        if not gain < 1e12:
+            return -np.inf
+        if gain < CONVERGED:
+            break
+    if _leaves(state, N):
+        return -np.inf
+    total = log_prior + 3.0 * LN_2PI - 0.5 * log_det - 0.5 * (chi2 - gain)
+    for i in members:
+        total -= _unrelated_odds(views, chance, i, first, at)
+    return total

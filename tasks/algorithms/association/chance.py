@@ -1,0 +1,269 @@
+"""Chance: how often unrelated tracklets agree, estimated from the data."""
+
+from collections.abc import Sequence
+from itertools import chain
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.association.hypothesis_queue import Hypothesis
+from epipole.tasks.algorithms.association.odds import in_view
+from epipole.tasks.algorithms.association.samples import Samples
+from epipole.tasks.algorithms.association.views import Views
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.kernels import kernel
+
+# -- Chance: how often unrelated tracklets agree, estimated from the data.
+
+Array = npt.NDArray[np.float64]
+
+
+class Chance(NamedTuple):
+    """The tracklets of each of s sensors as a random process, estimated from the data.
+
+    density : (s,) float
+        Tracklets per steradian.
+    drift : (s, 3) float
+        Median rate of their directions [1/s].
+    spread : (s,) float
+        Spread of their rates, 1-sigma per axis [rad/s].
+    objects_in_view, objects_km3 : float
+        Largest number of objects in view, and the same per km^3.
+    detected : (s,) float
+        Probability that a sensor detects an object in its field.
+    """
+
+    density: Array
+    drift: Array
+    spread: Array
+    objects_in_view: float
+    objects_km3: float
+    detected: Array
+
+
+def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
+    """Return the estimate before anything is associated; `detected` is the same for all sensors."""
+    n_sensors = len(samples.field_sr)
+    count = np.bincount(samples.sensor, minlength=n_sensors).astype(float)
+    instants = np.maximum(samples.seen.any(axis=0).sum(), 1)
+    # A tracklet counts by its share of the instants: it is in the field at these only.
+    share = np.bincount(samples.sensor, samples.seen.sum(axis=1), minlength=n_sensors) / instants
+    density = np.maximum(share, 1.0) / samples.field_sr
+    rate = _rates(samples)
+    drift, spread = np.zeros((n_sensors, 3)), np.empty(n_sensors)
+    moving = np.flatnonzero(np.isfinite(rate[:, 0]))
+    moving = moving[np.argsort(samples.sensor[moving], kind="stable")]
+    first = np.searchsorted(samples.sensor[moving], np.arange(n_sensors + 1))
+    for s in range(n_sensors):
+        rates = rate[moving[first[s] : first[s + 1]]]
+        # One assumed tracklet at 10 arcsec/s steadies the estimate where there are few.
+        drift[s] = np.median(rates, axis=0) if len(rates) else 0.0
+        squares = np.sum((rates - drift[s]) ** 2) / 2
+        spread[s] = np.sqrt((squares + (10 * ARCSEC) ** 2) / (len(rates) + 1))
+    volume = float(np.median(samples.field_sr)) * farthest_km**3 / 3
+    objects = max(float(np.median(count)), 1.0)
+    return Chance(density, drift, spread, objects, objects / volume, np.full(n_sensors, detected))
+
+
+def _rates(samples: Samples) -> Array:
+    """Return each tracklet's mean rate [rad/s] from first to last sample; NaN with one sample."""
+    out = np.full((len(samples.sensor), 3), np.nan)
+    n_instants = samples.seen.shape[1]
+    twice = np.flatnonzero(samples.seen.sum(axis=1) > 1)
+    if len(twice):
+        a = np.argmax(samples.seen[twice], axis=1)
+        b = n_instants - 1 - np.argmax(samples.seen[twice, ::-1], axis=1)
+        dt = samples.time_s[b] - samples.time_s[a]
+        out[twice] = (samples.u[twice, b] - samples.u[twice, a]) / dt[:, None]
+    return out
+
+
+# -- Detection: the probability that a sensor detects an object in its field, from sure groups.
+
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+CERTAIN_LOG_ODDS = 8.0  # of a sure group
+# Other sensors that must detect an object: at several instants, and at a single one.
+OTHERS, OTHERS_AT_ONCE = 3, 4
+PRIOR_LOOKS = 10.0  # weight of the prior, as a number of looks
+MIN_DETECTION, MAX_DETECTION = 0.05, 0.99
+
+
+class Looks(NamedTuple):
+    """Sensors that detect an object or miss it, one row for each object and sensor.
+
+    row, sensor : (n,) int
+        The object and the sensor.
+    hit : (n,) bool
+        The sensor detects it.
+    """
+
+    row: Indices
+    sensor: Indices
+    hit: Flags
+
+
+def looks_of(views: Views, objects: Sequence[Hypothesis]) -> Looks:
+    """Return which sensors detect or miss the objects."""
+    member = np.fromiter(chain.from_iterable(h.members for h in objects), np.int64)
+    row = np.repeat(np.arange(len(objects)), [len(h.members) for h in objects])
+    # A sensor may have several fragments of an object. Members are in order, so these are in turn.
+    sensor = views.sensor[member]
+    other = np.ones(len(row), np.bool_)
+    other[1:] = (row[1:] != row[:-1]) | (sensor[1:] != sensor[:-1])
+    row, sensor = row[other], sensor[other]
+    missed_row = np.repeat(np.arange(len(objects)), [len(h.missed) for h in objects])
+    missed = np.concatenate([*(h.missed for h in objects), np.zeros(0, np.int64)])
+    return Looks(
+        np.concatenate([row, missed_row]),
+        np.concatenate([sensor, missed]),
+        np.arange(len(row) + len(missed)) < len(row),
+    )
+
+
+def detection_odds(looks: Looks, n: int, detected: Array) -> Array:
+    """Return the log-probability of the detections and misses of n objects."""
+    odds = np.log(np.where(looks.hit, detected[looks.sensor], 1 - detected[looks.sensor]))
+    return np.bincount(looks.row, odds, minlength=n).astype(float)
+
+
+def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float) -> Array:
+    """Return each sensor's probability of detection, (s,).
+
+    Each sensor is judged by the sure groups that enough other sensors detect. Such groups are
+    found whether this sensor detects them or not, so the estimate is not biased by objects that
+    are too weak to be found. Detections over looks, shrunk towards the mean of all sensors,
+    which is shrunk towards `prior`.
+    """
+    n_sensors = len(views.half_field)
+    row, sensor, hit = looks_of(views, groups)
+    others = np.bincount(row[hit], minlength=len(groups))[row] - hit
+    asked = others >= (OTHERS if len(views.time_s) > 1 else OTHERS_AT_ONCE)
+    looked = np.bincount(sensor[asked], minlength=n_sensors)
+    hits = np.bincount(sensor[asked & hit], minlength=n_sensors)
+    common = (hits.sum() + PRIOR_LOOKS * prior) / (looked.sum() + PRIOR_LOOKS)
+    return np.clip(
+        (hits + PRIOR_LOOKS * common) / (looked + PRIOR_LOOKS), MIN_DETECTION, MAX_DETECTION
+    )
+
+
+# -- Object density: how many objects there are in each altitude shell, from the sure groups.
+#
+# The search assumes that every tracklet may be an object, and the altitude prior as given. The
+# sure groups tell how many objects the space in view really holds and at which altitudes, and
+# the odds of all groups change accordingly. Empirical Bayes: the count of each shell is Poisson,
+# its rate has a gamma prior about the common rate.
+
+SIGHTS = 100  # lines of sight that sample all fields together; with more sensors, of so many
+STEPS = 24  # along a line of sight, in addition to the shells' edges
+MAX_RATE_RATIO = 10.0  # largest rate of a shell over the common rate
+PRIOR_OBJECTS = 1.0  # weight of the prior of a shell, as a number of objects
+ROUNDS = 100
+
+
+def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
+    """Return the volume [km^3] that two sensors see in each shell, times its weight, (j,).
+
+    `shells` are rows of (lowest, highest radius [km], weight). The volume is integrated along
+    sample lines of sight, at the instant of most known attitudes; zero for fewer than two.
+    """
+    ready = np.isfinite(views.place_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
+    m = int(np.argmax(ready.sum(axis=0)))
+    known = np.flatnonzero(ready[:, m])
+    out = np.zeros(len(shells))
+    if len(known) < 2:
+        return out
+    side = max(int(np.sqrt(SIGHTS / len(known))), 1)
+    camera = np.ascontiguousarray(views.camera[known, m])
+    of = max(len(known) / SIGHTS, 1.0)  # sensors that each sampled one stands for
+    known = known[(np.arange(int(len(known) / of)) * of).astype(int)]
+    middle = (np.arange(side) + 0.5) / side * 2 - 1
+    for s in known.tolist():
+        a, b = np.meshgrid(*(middle * half for half in views.half_field[s]), indexing="ij")
+        stretch = np.sqrt(1 + a * a + b * b).ravel()
+        toward = np.stack([a.ravel(), b.ravel(), np.ones(a.size)], axis=1) / stretch[:, None]
+        u = toward @ views.attitude[s, m]
+        cell_sr = np.prod(views.half_field[s]) * 4 / side**2 / stretch**3
+        rho, edges = _steps(views.place_km[s, m], u, shells, farthest_km)
+        x = views.place_km[s, m] + rho[..., None] * u[:, None]
+        count = _in_view_of(camera, x.reshape(-1, 3)).reshape(rho.shape)
+        volume = np.diff(edges**3, axis=1) / 3 * cell_sr[:, None]
+        volume = np.where(count >= 2, volume / np.maximum(count, 1), 0.0)
+        radius = np.linalg.norm(x, axis=2)
+        for j, (lowest, highest, weight) in enumerate(shells):
+            inside = (radius >= lowest) & (radius < highest)
+            out[j] += of * weight * volume[inside].sum()
+    return out
+
+
+@kernel
+def _in_view_of(camera, x):
+    """Return how many sensors see each point, (n,)."""
+    count = np.zeros(len(x), np.int64)
+    for i in range(len(x)):
+        for s in range(len(camera)):
+            count[i] += in_view(camera[s], x[i])
+    return count
+
+
+def _steps(r_km: Array, u: Array, shells: Array, farthest_km: float) -> tuple[Array, Array]:
+    """Return middles and edges [km] of steps along lines of sight, split at the shells' edges."""
+    along, r2 = u @ r_km, r_km @ r_km
+    edges = [np.tile(np.linspace(0, farthest_km, STEPS), (len(u), 1))]
+    for radius in np.unique(shells[:, :2]):
+        if 0 < radius < np.inf:
+            square = along**2 - r2 + radius**2
+            root = np.sqrt(np.maximum(square, 0))
+            edges += [np.maximum(-along - root, 0)[:, None], np.maximum(-along + root, 0)[:, None]]
+    edge = np.sort(np.clip(np.concatenate(edges, axis=1), 0, farthest_km), axis=1)
+    return (edge[:, 1:] + edge[:, :-1]) / 2, edge
+
+
+def revised_odds(
+    scores: Array, radius_km: Array, shells: Array, volume_km3: Array, chance: Chance
+) -> Array:
+    """Return the groups' log-odds once the number of objects is known.
+
+    Parameters
+    ----------
+    scores, radius_km : (g,) float
+        Log-odds of the search, and the groups' distances from the Earth's centre.
+    shells : (j, 3) float
+        Lowest, highest radius, weight.
+    volume_km3 : (j,) float
+        Volumes in view, see `visible_volume`.
+    chance
+        With the object density that the search assumed.
+
+    Notes
+    -----
+    An iteration upwards from the certain groups, to the smallest consistent numbers.
+    """
+    inside = (radius_km[:, None] >= shells[:, 0]) & (radius_km[:, None] < shells[:, 1])
+    believed = inside * shells[:, 2] + 1e-9
+    if not volume_km3.any():  # unknown: as if two sensors saw all of it
+        volume_km3 = np.full(len(shells), chance.objects_in_view / chance.objects_km3)
+    expected = chance.objects_km3 * volume_km3 + 1e-9
+    sure = (scores > CERTAIN_LOG_ODDS).astype(float)
+    revised = scores
+    for _ in range(ROUNDS):
+        factor = _shell_rates(sure, believed, expected)
+        revised = scores + np.log((believed * factor).sum(axis=1) / believed.sum(axis=1))
+        last, sure = sure, 1 / (1 + np.exp(-np.clip(revised, -50, 50)))
+        if np.abs(sure - last).max() < 1e-6:
+            break
+    return revised
+
+
+def _shell_rates(sure: Array, believed: Array, expected: Array) -> Array:
+    """Return the rate of objects in each shell over the assumed rate."""
+    common = max(sure.sum(), 0.5) / expected.sum()
+    factor = np.full(len(expected), common)
+    for _ in range(10):  # an object may belong to either of two shells that overlap
+        belongs = believed * factor
+        count = (sure[:, None] * belongs / belongs.sum(axis=1, keepdims=True)).sum(axis=0)
+        ratio = (count + PRIOR_OBJECTS) / (common * expected + PRIOR_OBJECTS)
+        factor = common * np.minimum(ratio, MAX_RATE_RATIO)
+    return factor

@@ -1,1 +1,0 @@
-"""Evidence: how much more likely one object is than unrelated tracklets."""

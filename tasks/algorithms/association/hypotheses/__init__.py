@@ -1,1 +1,0 @@
-"""Hypotheses: pairs of tracklets, and the groups that grow from them."""

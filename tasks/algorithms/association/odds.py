@@ -1,0 +1,243 @@
+"""Odds: how much more likely one object is than unrelated tracklets."""
+
+import numpy as np
+
+from epipole.tasks.algorithms.association.arcs import LN_2PI, arc_odds
+from epipole.tasks.algorithms.association.views import (
+    HALF,
+    PLANE,
+    REACH,
+    SPOT_SR,
+    TURN,
+    misfit,
+    residual,
+)
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+
+# -- Visibility: whether a sensor has a point in its field, the Earth not in between.
+
+FAINTER = 1.5  # times the range: the object is 0.9 mag fainter and may not be detected
+INSIDE = 0.98  # of half the field: nearer to its edge misses are frequent
+NEAR_SIGMA = 6.0  # a point may lie this far outside a field and still have tracklets there
+
+
+@borrowing_kernel
+def blocked(r, x, radius):
+    """Return whether the Earth, of this radius, is between r and x."""
+    dot, length2, r2 = 0.0, 0.0, 0.0
+    for a in range(3):
+        d = x[a] - r[a]
+        dot += r[a] * d
+        length2 += d * d
+        r2 += r[a] * r[a]
+    return dot < 0.0 and -dot < length2 and r2 - dot * dot / length2 < radius * radius
+
+
+@borrowing_kernel
+def sees(r, R, half_field, x):
+    """Return whether a sensor at r, with attitude R, has x in its field and in view.
+
+    False at the edge of the field, behind the Earth, and where r or R is unknown (NaN).
+    """
+    d0, d1, d2 = x[0] - r[0], x[1] - r[1], x[2] - r[2]
+    depth = R[2, 0] * d0 + R[2, 1] * d1 + R[2, 2] * d2
+    if not depth > 0.0:
+        return False
+    for a in range(2):
+        side = (R[a, 0] * d0 + R[a, 1] * d1 + R[a, 2] * d2) / depth
+        if abs(side) > INSIDE * half_field[a]:
+            return False
+    return not blocked(r, x, EARTH_RADIUS_KM)
+
+
+@kernel
+def seeing(r, R, half_field, x, out):
+    """Write for each sensor whether it has x in its field and in view, as in `sees`."""
+    for s in range(len(out)):
+        out[s] = sees(r[s], R[s], half_field[s], x)
+
+
+@borrowing_kernel
+def in_view(cam, x):
+    """Return the same as `sees`, for a row of `Views.camera`."""
+    d0, d1, d2 = x[0] - cam[0], x[1] - cam[1], x[2] - cam[2]
+    depth = cam[TURN + 6] * d0 + cam[TURN + 7] * d1 + cam[TURN + 8] * d2
+    if not depth > 0.0:
+        return False
+    for a in range(2):
+        t = TURN + 3 * a
+        if abs(cam[t] * d0 + cam[t + 1] * d1 + cam[t + 2] * d2) > INSIDE * cam[HALF + a] * depth:
+            return False
+    return not blocked(cam, x, EARTH_RADIUS_KM)
+
+
+@borrowing_kernel
+def looks_at(views, s, X, seen_by):
+    """Return whether sensor s has the points in its field at all solved instants."""
+    looked = False
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2:
+            continue
+        if not in_view(views.camera[s, m], X[m]):
+            return False
+        looked = True
+    return looked
+
+
+@borrowing_kernel
+def should_detect(views, s, points, farthest_km2):
+    """Return whether a sensor without a tracklet of the object counts as a miss.
+
+    It does where the points are in its field, and not much fainter than for the members' sensors:
+    `farthest_km2` is `farthest_range2` of these.
+    """
+    if not looks_at(views, s, points.x_km, points.seen_by):
+        return False
+    for m in range(len(views.time_s)):
+        if points.seen_by[m] >= 2:
+            return _range2(views.camera, s, m, points.x_km[m]) <= FAINTER * FAINTER * farthest_km2
+    return True
+
+
+@borrowing_kernel
+def farthest_range2(views, members, points):
+    """Return the longest squared range [km^2] from which members see the first solved point."""
+    farthest2 = 0.0
+    for m in range(len(views.time_s)):
+        if points.seen_by[m] < 2:
+            continue
+        for i in members:
+            if views.seen[i, m]:
+                range2 = _range2(views.camera, views.sensor[i], m, points.x_km[m])
+                farthest2 = max(farthest2, range2)
+        break
+    return farthest2
+
+
+@borrowing_kernel
+def _range2(cam, s, m, x):
+    """Return the squared range [km^2] from sensor s at instant m to the point x."""
+    d0, d1, d2 = x[0] - cam[s, m, 0], x[1] - cam[s, m, 1], x[2] - cam[s, m, 2]
+    return d0 * d0 + d1 * d1 + d2 * d2
+
+
+@borrowing_kernel
+def near_fields(views, points, sensors, near):
+    """Write which of the sensors may have a point in their field at any solved instant.
+
+    `near` is the list of these; returns how many they are. A fast first test: within 6 sigma of the
+    cone that holds the sensor's tracklets and field.
+    """
+    n, cam = 0, views.camera
+    X, _, P, seen_by = points
+    for s in sensors:
+        for m in range(len(views.time_s)):
+            if seen_by[m] < 2:
+                continue
+            d0, d1, d2 = X[m, 0] - cam[s, m, 0], X[m, 1] - cam[s, m, 1], X[m, 2] - cam[s, m, 2]
+            n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
+            depth, reach = n0 * d0 + n1 * d1 + n2 * d2, cam[s, m, REACH]
+            if not (reach > 0.0 and depth > 0.0):
+                continue
+            away2 = d0 * d0 + d1 * d1 + d2 * d2 - depth * depth
+            slack = NEAR_SIGMA * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
+            if away2 <= (reach * depth + slack) ** 2:
+                near[n] = s
+                n += 1
+                break
+    return n
+
+
+# -- Odds: how much more likely one object is than unrelated tracklets.
+
+
+@borrowing_kernel
+def _det3(M):
+    return (
+        M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
+        - M[0, 1] * (M[1, 0] * M[2, 2] - M[1, 2] * M[2, 0])
+        + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])
+    )
+
+
+@borrowing_kernel
+def score(space, work, members, near):
+    """Return the log-odds of "one object" against "unrelated tracklets", and the number of misses.
+
+    An unrelated tracklet may lie anywhere in its field (`chance.density`), an object anywhere in
+    view (`chance.objects_km3`, weighted by altitude with `shells`). Several instants are tied
+    together by one orbit, see `arcs`. A sensor that has the point in its field but no tracklet
+    of it counts against the object: `work.missed` lists those.
+
+    Parameters
+    ----------
+    space, work
+        `SearchSpace`, and the `WorkSpace` with the solved points.
+    near : (n,) int
+        Sensors whose field may hold the points, see `near_fields`.
+    """
+    views, chance, points = space.views, space.chance, work.points
+    m, instants = -1, 0
+    for k in range(len(views.time_s)):
+        if points.seen_by[k] >= 2:
+            m = k if m < 0 else m
+            instants += 1
+    if instants == 1:
+        total = 1.5 * LN_2PI + 0.5 * np.log(_det3(points.cov_km2[m]))
+        for i in members:
+            if views.seen[i, m]:
+                total -= np.log(chance.density[views.sensor[i]] * views.sight[i, m, SPOT_SR])
+                residual(views, i, m, points.x_km[m], work.part)
+                total -= 0.5 * misfit(work.part)
+    else:
+        total = arc_odds(views, chance, members, points)
+    total += np.log(chance.objects_km3) + _altitude_weight(points.x_km[m], space.shells)
+    detections, n_missed = _detections(space, work, members, near)
+    return total + detections, n_missed
+
+
+@borrowing_kernel
+def _detections(space, work, members, near):
+    """Return the log-probability of which sensors detect the object and which miss it.
+
+    Writes the list of those that miss it; also returns how many they are.
+    """
+    views, detected = space.views, space.chance.detected
+    total, n_missed = 0.0, 0
+    farthest2 = farthest_range2(views, members, work.points)
+    mark = next_mark(work.stamp)
+    for i in members:
+        s = views.sensor[i]
+        if work.stamp[s] != mark:
+            work.stamp[s] = mark
+            total += np.log(detected[s])
+    for s in near:
+        if work.stamp[s] != mark and should_detect(views, s, work.points, farthest2):
+            work.missed[n_missed] = s
+            n_missed += 1
+            total += np.log(1.0 - detected[s])
+    return total, n_missed
+
+
+@borrowing_kernel
+def next_mark(stamp):
+    """Return the number of a new list of sensors, see `WorkSpace.stamp`."""
+    stamp[-1] += 1
+    return stamp[-1]
+
+
+@borrowing_kernel
+def _altitude_weight(x, shells):
+    """Return the log of the object density at this radius over the mean density.
+
+    `shells` are rows of (lowest, highest radius [km], weight). Weights of overlapping shells
+    add up. Without shells the density is uniform.
+    """
+    if len(shells) == 0:
+        return 0.0
+    radius, weight = np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2), 1e-9
+    for k in range(len(shells)):
+        if shells[k, 0] <= radius < shells[k, 1]:
+            weight += shells[k, 2]
+    return np.log(weight)

@@ -1,0 +1,107 @@
+"""Samples: tracklets, or single detections, of all sensors at common instants, and their groups."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+# -- Samples: tracklets, or single detections, of all sensors at common instants, and their groups.
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+FREE = -1
+
+
+class Samples(NamedTuple):
+    """Tracklets of s sensors at k common instants: t tracklets.
+
+    sensor : (t,) int
+        Sensor of the tracklet, 0 .. s - 1.
+    start_s, end_s : (t,) float
+        First and last detection [s]. Tracklets of one sensor that overlap are different objects.
+    seen : (t, k) bool
+        The tracklet has a direction at the instant.
+    u : (t, k, 3) float
+        Directions without aberration, ICRS.
+    cov : (t, k, 2, 2) float
+        Their covariances [rad^2] on `tangent_basis(u)`.
+    sigma_km : (t, k) float
+        1-sigma errors of the sensor positions, per axis [km].
+    time_s : (k,) float
+        The instants [s].
+    sensor_km : (s, k, 3) float
+        Positions of the sensors, GCRF; NaN where unknown. A sensor must have one where a
+        tracklet of it is seen.
+    R_sensor_from_icrs : (s, k, 3, 3) float
+        Attitudes of the sensors; NaN where unknown.
+    half_field : (s, 2) float
+        Tangents of half the field's width and height.
+    rate : (t, k, 3) float or None
+        Rates of the directions [rad/s], ICRS; 0 where unknown.
+    sensor_km_s : (s, k, 3) float or None
+        Velocities of the sensors, GCRF; NaN where unknown. Without them, or without the rates,
+        light time is ignored. This is right for sensors at similar ranges.
+    """
+
+    sensor: Indices
+    start_s: Array
+    end_s: Array
+    seen: Flags
+    u: Array
+    cov: Array
+    sigma_km: Array
+    time_s: Array
+    sensor_km: Array
+    R_sensor_from_icrs: Array
+    half_field: Array
+    rate: Array | None = None
+    sensor_km_s: Array | None = None
+
+    @property
+    def field_sr(self) -> Array:
+        """Solid angle of each sensor's field, (s,)."""
+        x, y = self.half_field.T
+        return 4 * np.arcsin(np.clip(x * y / np.sqrt((1 + x * x) * (1 + y * y)), 0, 1))
+
+
+class Groups(NamedTuple):
+    """Which tracklets are one object.
+
+    group : (t,) int
+        Group of each tracklet; -1 where it belongs to none.
+    score : (g,) float
+        Log-odds of each group against its members being unrelated.
+    ambiguous : (t,) bool
+        Tracklets in no group because two groups explain them about equally well, or because
+        the group that explains them is not sure enough.
+    detected : (s,) float
+        Estimated probability that a sensor detects an object in its field; NaN if not
+        estimated.
+    """
+
+    group: Indices
+    score: Array
+    ambiguous: Flags
+    detected: Array
+
+
+# -- Points: where the object of a hypothesis is at each instant.
+
+
+class InstantPoints(NamedTuple):
+    """One point for each of k instants, solved where at least two tracklets have a direction.
+
+    x_km : (k, 3) float
+        Positions, GCRF.
+    normal, cov_km2 : (k, 3, 3) float
+        Normal equations (the upper half is filled) and their inverse, the covariance.
+    seen_by : (k,) int
+        How many tracklets have a direction at the instant. Below 2 there is no point.
+    """
+
+    x_km: Array
+    normal: Array
+    cov_km2: Array
+    seen_by: Indices

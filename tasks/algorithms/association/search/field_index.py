@@ -1,0 +1,430 @@
+"""Field index: which sensors' fields share space, by the cells that the fields sweep.
+
+Space is divided into cells whose size grows with the distance from the Earth. Each field is a
+cone; it is entered in all cells that it touches at any instant. Two fields can share a place only
+where they share a cell, so the work goes with the sensors that share a cell, not with all pairs.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.association.odds import NEAR_SIGMA, near_fields, next_mark
+from epipole.tasks.algorithms.association.search.sight_lines import BEYOND
+from epipole.tasks.algorithms.association.views import HALF, PLANE, REACH, TURN, direction
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+FEW_SENSORS = 32  # up to this many: one cell, all sensors share it
+SMALLEST_CELL = 0.05  # at the Earth's surface, over the Earth's radius
+MAX_CELLS = 400  # per sensor, on average: with more, the cells are made twice as large
+SAMPLED = 16  # sensors that are entered first, to find a size of cells
+PIECE = 0.5  # length of a piece of a cone over the size of the cells there
+EDGE_RAD, WIDEST_RAD = 1e-3, 1.5  # added to the half-angle of a cone, and the largest one
+AXIS, TANGENT = 3, 6  # columns of a cone
+OFFSET = 1 << 20  # makes the coordinates of cells positive
+
+
+class FieldIndex(NamedTuple):
+    """Which of s sensors have a part of their field in which of c cells.
+
+    first, sensor : (c + 1,), (v,) int
+        Sensors of cell q are ``sensor[first[q]:first[q + 1]]``, in increasing order.
+    own_first, own_cell : (s + 1,), (v,) int
+        Cells of sensor s are ``own_cell[own_first[s]:own_first[s + 1]]``, in increasing order.
+    size : float
+        Size of the cells, see `SMALLEST_CELL`; 0 where there is only one.
+    keys, slots : (h,) int
+        Hash table: the cell of a key, see `_slot`.
+    """
+
+    first: Indices
+    sensor: Indices
+    own_first: Indices
+    own_cell: Indices
+    size: float
+    keys: Indices
+    slots: Indices
+
+
+def field_index(cones: Array, farthest_km: float) -> FieldIndex:
+    """Return the index of the fields of all sensors that have tracklets, see `cones_of`."""
+    n = len(cones)
+    if n <= FEW_SENSORS:
+        return FieldIndex(
+            np.array([0, n]), np.arange(n), np.arange(n + 1), np.zeros(n, np.int64), 0.0,
+            np.zeros(1, np.int64), np.zeros(1, np.int64),
+        )  # fmt: skip
+    size = SMALLEST_CELL
+    for few in (cones[:: -(-n // SAMPLED)], cones):  # most sizes that are too small: by a few
+        while True:
+            room = MAX_CELLS * len(few)
+            own_first, own_cell, n_cells, keys, slots = _enter(few, farthest_km, size, room)
+            if n_cells >= 0:
+                break
+            size *= 2
+    sensor = np.repeat(np.arange(n), np.diff(own_first))
+    order = np.argsort(own_cell, kind="stable")
+    first = np.searchsorted(own_cell[order], np.arange(n_cells + 1))
+    return FieldIndex(first, sensor[order], own_first, own_cell, size, keys, slots)
+
+
+@borrowing_kernel
+def _slot(keys, key):
+    """Return where a key is in the hash table, or where it belongs (keys are positive)."""
+    mask = len(keys) - 1
+    at = (key * 0x9E3779B97F4A7C1 >> 20) & mask
+    while keys[at] != 0 and keys[at] != key:
+        at = (at + 1) & mask
+    return at
+
+
+@borrowing_kernel
+def _cells_per_km(radius_km, size):
+    """Return how many cells there are in a kilometre at a distance from the Earth's centre.
+
+    Among the cells the distance r, in Earth radii, becomes 1 + ln(r), and stays r inside the Earth.
+    This stretches by (1 + ln(r)) / r across and by less, 1 / r, along the radius.
+    """
+    r = radius_km / EARTH_RADIUS_KM
+    return ((1.0 + np.log(r)) / r if r > 1.0 else 1.0) / (EARTH_RADIUS_KM * size)
+
+
+@borrowing_kernel
+def _key(i, j, k):
+    return ((i + OFFSET) << 42) | ((j + OFFSET) << 21) | (k + OFFSET)
+
+
+class Entering(NamedTuple):
+    """Fields as they are entered in cells of a size; work arrays.
+
+    keys, slots : (h,) int
+        As in `FieldIndex`.
+    latest : (c,) int
+        The sensor that was last entered in each cell.
+    own_cell : (v,) int
+        Cells of the sensors, one after the other.
+    filled : (2,) int
+        How many entries and cells there are.
+    low, high : (3,) int
+        Lowest and highest coordinates of the cells about a ball.
+    """
+
+    size: float
+    keys: Indices
+    slots: Indices
+    latest: Indices
+    own_cell: Indices
+    filled: Indices
+    low: Indices
+    high: Indices
+
+
+@borrowing_kernel
+def ground_range(place, axis, half):
+    """Return the longest range [km] in a cone to the ground; inf if some of it passes the Earth."""
+    radius2, down = 0.0, 0.0
+    for a in range(3):
+        radius2 += place[a] * place[a]
+        down -= place[a] * axis[a]
+    radius = np.sqrt(radius2)
+    if not radius > EARTH_RADIUS_KM:
+        return np.inf
+    off = np.arccos(min(max(down / radius, -1.0), 1.0)) + half
+    if off >= np.arcsin(EARTH_RADIUS_KM / radius):
+        return np.inf
+    across = radius * np.sin(off)
+    return radius * np.cos(off) - np.sqrt(EARTH_RADIUS_KM * EARTH_RADIUS_KM - across * across)
+
+
+@kernel
+def cones_of(views):
+    """Return the cone about each field and its tracklets, (s, k, 7).
+
+    The sensor's place [km], the cone's axis, and the tangent of its half-angle: 0 without
+    tracklets. The axis is the boresight, or if it is unknown the normal of the sensor's plane.
+    """
+    n_sensors, n_instants, cam = views.camera.shape[0], len(views.time_s), views.camera
+    cones, u = np.zeros((n_sensors, n_instants, 7)), np.empty(3)
+    for s in range(n_sensors):
+        for m in range(n_instants):
+            if not cam[s, m, REACH] > 0.0:
+                continue
+            cones[s, m, :AXIS] = cam[s, m, :AXIS]
+            cones[s, m, AXIS:TANGENT] = cam[s, m, PLANE + 6 : PLANE + 9]
+            cones[s, m, TANGENT] = cam[s, m, REACH]
+            if not np.isfinite(cam[s, m, TURN + 6]):
+                continue
+            least = 1.0 / np.sqrt(1.0 + cam[s, m, HALF] ** 2 + cam[s, m, HALF + 1] ** 2)
+            for i in range(views.first[s], views.first[s + 1]):
+                if views.seen[i, m]:
+                    direction(views, i, m, u)
+                    along = 0.0
+                    for a in range(3):
+                        along += u[a] * cam[s, m, TURN + 6 + a]
+                    least = min(least, along)
+            tangent = np.tan(min(np.arccos(max(least, -1.0)) + EDGE_RAD, WIDEST_RAD))
+            if tangent < cam[s, m, REACH]:
+                cones[s, m, AXIS:TANGENT] = cam[s, m, TURN + 6 : HALF]
+                cones[s, m, TANGENT] = tangent
+    return cones
+
+
+@kernel
+def _enter(cones, farthest_km, size, room):
+    """Enter all fields in cells of a size; return the cells of the sensors and the hash table.
+
+    The number of cells is -1 if there are more than `room` entries.
+    """
+    n_sensors, n_instants = cones.shape[0], cones.shape[1]
+    table = 1
+    while table < 2 * room:
+        table *= 2
+    own_first = np.zeros(n_sensors + 1, np.int64)
+    entering = Entering(
+        size,
+        np.zeros(table, np.int64),
+        np.zeros(table, np.int64),
+        np.full(room, -1),
+        np.empty(room, np.int64),
+        np.zeros(2, np.int64),
+        np.empty(3, np.int64),
+        np.empty(3, np.int64),
+    )
+    own_cell, count = entering.own_cell, entering.filled
+    for s in range(n_sensors):
+        m = 0
+        while m < n_instants:
+            if not cones[s, m, TANGENT] > 0.0:
+                m += 1
+                continue
+            last, shift, turn, reach = _together(cones, s, m, size)
+            sweep = (s, m, shift, turn, reach)
+            if not _walk(cones, sweep, farthest_km, entering):
+                return own_first, own_cell[:0], -1, entering.keys, entering.slots
+            m = last + 1
+        own_first[s + 1] = count[0]
+        own_cell[own_first[s] : count[0]].sort()
+    return own_first, own_cell[: count[0]].copy(), count[1], entering.keys, entering.slots
+
+
+@borrowing_kernel
+def _together(cones, s, m, size):
+    """Return until which instant a field moves by less than a cell, and how far.
+
+    The shift of its place [km], the turn of its axis [rad], and its widest reach.
+    """
+    last, shift, turn, reach = m, 0.0, 0.0, cones[s, m, TANGENT]
+    for h in range(m + 1, cones.shape[1]):
+        if not cones[s, h, TANGENT] > 0.0:
+            break
+        moved2, turned2 = 0.0, 0.0
+        for a in range(3):
+            moved2 += (cones[s, h, a] - cones[s, m, a]) ** 2
+            turned2 += (cones[s, h, AXIS + a] - cones[s, m, AXIS + a]) ** 2
+        if not (np.sqrt(moved2) <= size * EARTH_RADIUS_KM and np.sqrt(turned2) <= size / 2):
+            break
+        last, shift = h, max(shift, np.sqrt(moved2))
+        turn, reach = max(turn, np.sqrt(turned2)), max(reach, cones[s, h, TANGENT])
+    return last, shift, turn, reach
+
+
+@borrowing_kernel
+def _walk(cones, sweep, farthest_km, entering):
+    """Enter one cone, piece after piece along its axis; return whether there was room.
+
+    A ball holds each piece. The walk ends beyond the farthest distance, or at the Earth.
+    """
+    s, m, shift, turn, reach = sweep
+    half = np.arctan(reach) + turn
+    ends = ground_range(cones[s, m, :AXIS], cones[s, m, AXIS:TANGENT], half)
+    ends = min(ends, (2.0 + BEYOND) * farthest_km)
+    at = 0.0
+    while True:
+        x0, x1, x2 = _along(cones, s, m, at)
+        per_km = _cells_per_km(np.sqrt(x0 * x0 + x1 * x1 + x2 * x2), entering.size)
+        length = max(PIECE / per_km, PIECE * at * min(reach, 1.0))
+        middle = at + length / 2
+        x0, x1, x2 = _along(cones, s, m, middle)
+        ball = np.hypot((at + length) * reach, length / 2) + shift + middle * turn
+        distance = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+        if distance + ball < EARTH_RADIUS_KM:
+            return True
+        if at > ends or distance - ball > (1.0 + BEYOND) * farthest_km:
+            return True
+        if not _enter_ball(cones, sweep, (x0, x1, x2), ball, entering):
+            return False
+        at += length
+
+
+@borrowing_kernel
+def _along(cones, s, m, at):
+    return (
+        cones[s, m, 0] + at * cones[s, m, AXIS],
+        cones[s, m, 1] + at * cones[s, m, AXIS + 1],
+        cones[s, m, 2] + at * cones[s, m, AXIS + 2],
+    )
+
+
+@borrowing_kernel
+def _enter_ball(cones, sweep, x, ball, entering):
+    """Enter a sensor in the cells that a ball and its cone touch; return whether there was room."""
+    size, low, high, count = entering.size, entering.low, entering.high, entering.filled
+    keys, slots, latest = entering.keys, entering.slots, entering.latest
+    distance = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    per_km, radius = _cells_per_km(distance, size), ball * _cells_per_km(distance - ball, size)
+    c0, c1, c2 = x[0] * per_km, x[1] * per_km, x[2] * per_km
+    low[0], high[0] = int(np.floor(c0 - radius)), int(np.floor(c0 + radius))
+    low[1], high[1] = int(np.floor(c1 - radius)), int(np.floor(c1 + radius))
+    low[2], high[2] = int(np.floor(c2 - radius)), int(np.floor(c2 + radius))
+    ground2 = 1.0 / (size * size)
+    for i in range(low[0], high[0] + 1):
+        d0 = max(i - c0, c0 - i - 1.0, 0.0)
+        for j in range(low[1], high[1] + 1):
+            d1 = max(j - c1, c1 - j - 1.0, 0.0)
+            for k in range(low[2], high[2] + 1):
+                d2 = max(k - c2, c2 - k - 1.0, 0.0)
+                if d0 * d0 + d1 * d1 + d2 * d2 > radius * radius:
+                    continue
+                far0, far1, far2 = max(-i, i + 1), max(-j, j + 1), max(-k, k + 1)
+                if far0 * far0 + far1 * far1 + far2 * far2 < ground2:
+                    continue  # all of the cell is inside the Earth
+                key = _key(i, j, k)
+                at = _slot(keys, key)
+                if keys[at] != 0 and latest[slots[at]] == sweep[0]:
+                    continue
+                if not _touches(cones, sweep, size, i, j, k):
+                    continue
+                if keys[at] == 0:
+                    if count[1] >= len(latest):
+                        return False
+                    keys[at], slots[at] = key, count[1]
+                    count[1] += 1
+                if count[0] >= len(entering.own_cell):
+                    return False
+                latest[slots[at]] = sweep[0]
+                entering.own_cell[count[0]] = slots[at]
+                count[0] += 1
+    return True
+
+
+@borrowing_kernel
+def _touches(cones, sweep, size, i, j, k):
+    """Return whether a cell touches a cone: its centre is within half its diagonal of the cone."""
+    s, m, shift, turn, reach = sweep
+    y0, y1, y2 = (i + 0.5) * size, (j + 0.5) * size, (k + 0.5) * size
+    f = max(np.sqrt(y0 * y0 + y1 * y1 + y2 * y2), 1e-9)
+    r = np.exp(f - 1.0) if f > 1.0 else f
+    scale = EARTH_RADIUS_KM * r / f
+    half_diagonal = 0.5 * np.sqrt(3.0) * size
+    near_km = half_diagonal * EARTH_RADIUS_KM * max(r, 1.0) * np.exp(half_diagonal)
+    d0 = y0 * scale - cones[s, m, 0]
+    d1 = y1 * scale - cones[s, m, 1]
+    d2 = y2 * scale - cones[s, m, 2]
+    along = d0 * cones[s, m, AXIS] + d1 * cones[s, m, AXIS + 1] + d2 * cones[s, m, AXIS + 2]
+    length2 = d0 * d0 + d1 * d1 + d2 * d2
+    near_km += shift + turn * np.sqrt(length2)
+    if length2 <= near_km * near_km:
+        return True
+    across = np.sqrt(max(length2 - along * along, 0.0))
+    return across - along * reach <= near_km * np.sqrt(1.0 + reach * reach)
+
+
+@borrowing_kernel
+def cell_at(index, x):
+    """Return the cell that holds the point x (3,), -1 where no field is."""
+    if index.size == 0.0:
+        return np.int64(0)
+    per_km = _cells_per_km(np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]), index.size)
+    i, j, k = np.floor(x[0] * per_km), np.floor(x[1] * per_km), np.floor(x[2] * per_km)
+    return _cell(index, int(i), int(j), int(k))
+
+
+@borrowing_kernel
+def _cell(index, i, j, k):
+    key = _key(i, j, k)
+    at = _slot(index.keys, key)
+    return index.slots[at] if index.keys[at] == key else np.int64(-1)
+
+
+@borrowing_kernel
+def cells_across(index, x, radius_km):
+    """Return the radius of a ball about x (3,) in sizes of cells."""
+    if index.size == 0.0:
+        return 0.0
+    distance = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
+    return radius_km * _cells_per_km(distance - radius_km, index.size)
+
+
+@borrowing_kernel
+def sensors_about(index, x, radius_km, stamp, mark, out, n):
+    """Add the sensors with a part of their field within a ball to `out`; return how many it has.
+
+    Sensors with ``stamp[s] == mark`` are in `out` already. The ball should not be much larger than
+    a cell.
+    """
+    if index.size == 0.0:
+        return _add_cell(index, 0, stamp, mark, out, n)
+    per_km = _cells_per_km(np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]), index.size)
+    radius = cells_across(index, x, radius_km)
+    c0, c1, c2 = x[0] * per_km, x[1] * per_km, x[2] * per_km
+    for i in range(int(np.floor(c0 - radius)), int(np.floor(c0 + radius)) + 1):
+        for j in range(int(np.floor(c1 - radius)), int(np.floor(c1 + radius)) + 1):
+            for k in range(int(np.floor(c2 - radius)), int(np.floor(c2 + radius)) + 1):
+                q = _cell(index, i, j, k)
+                if q >= 0:
+                    n = _add_cell(index, q, stamp, mark, out, n)
+    return n
+
+
+@borrowing_kernel
+def _add_cell(index, q, stamp, mark, out, n):
+    for k in range(index.first[q], index.first[q + 1]):
+        s = index.sensor[k]
+        if stamp[s] != mark:
+            stamp[s] = mark
+            out[n] = s
+            n += 1
+    return n
+
+
+@borrowing_kernel
+def sensors_sharing(index, a, b, stamp, mark, out):
+    """Write the sensors that share a cell with both a and b; return how many there are."""
+    i, j, n = index.own_first[a], index.own_first[b], 0
+    while i < index.own_first[a + 1] and j < index.own_first[b + 1]:
+        p, q = index.own_cell[i], index.own_cell[j]
+        if p == q:
+            n = _add_cell(index, p, stamp, mark, out, n)
+        i += p <= q
+        j += q <= p
+    return n
+
+
+@borrowing_kernel
+def near_points(space, work, a, b):
+    """Write `work.near`: the sensors whose field may hold the points; return how many they are.
+
+    They are looked for in the cells about the points, or where these are too uncertain, in the
+    cells that sensors a and b share.
+    """
+    index, points, n = space.fields, work.points, np.int64(0)
+    mark, known = next_mark(work.stamp), True
+    for m in range(len(points.seen_by)):
+        if points.seen_by[m] >= 2:
+            P = points.cov_km2[m]
+            error_km = NEAR_SIGMA * np.sqrt(P[0, 0] + P[1, 1] + P[2, 2])
+            known &= cells_across(index, points.x_km[m], error_km) <= 1.0  # false for NaN
+    if known:
+        for m in range(len(points.seen_by)):
+            if points.seen_by[m] >= 2:
+                x, P = points.x_km[m], points.cov_km2[m]
+                error_km = NEAR_SIGMA * np.sqrt(P[0, 0] + P[1, 1] + P[2, 2])
+                n = sensors_about(index, x, error_km, work.stamp, mark, work.nearby, n)
+    else:
+        n = np.int64(sensors_sharing(index, a, b, work.stamp, mark, work.nearby))
+    return near_fields(space.views, points, work.nearby[:n], work.near)

@@ -1,0 +1,411 @@
+"""Sensor pairs: which pairs of sensors seed, and in which order."""
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.association.search.field_index import (
+    AXIS,
+    FEW_SENSORS,
+    TANGENT,
+    FieldIndex,
+    cell_at,
+    ground_range,
+)
+from epipole.tasks.algorithms.association.search.seeds import SHORTEST_BASELINE_KM
+from epipole.tasks.algorithms.association.views import PLANE, Views, X, Y, direction
+from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+
+# -- Partners: with which others a sensor may find objects.
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a field, to see whether it meets another one
+TESTED_INSTANTS = 3
+LEADERS = 8  # sensors of a crowded cell that all others are paired with
+MAX_PARTNERS = 64  # of a sensor; half of them are leaders of crowded cells
+MAX_TESTS = 512  # of whether two fields meet, for each sensor
+
+
+def meeting_pairs(index: FieldIndex, cones: Array, farthest_km: float) -> tuple[Indices, Indices]:
+    """Return pairs of sensors whose fields meet, each once; the first has the lower number.
+
+    Up to `FEW_SENSORS` sensors: all pairs. Else those that share a cell; each sensor looks for a
+    limited number of partners. First among the leaders of its most crowded cells, the same for all
+    sensors there, so that few pairs cover the place. Then in its cells from the emptiest on, where
+    it may be one of the few that see an object.
+    """
+    n = len(cones)
+    if index.size == 0.0:
+        a, b = np.triu_indices(n, 1)
+        meet = fields_meet(cones, a, b, farthest_km)
+        return a[meet], b[meet]
+    # Leaders at random, so that they are all around: they have long baselines with some others.
+    rank = np.random.default_rng(n).permutation(n)
+    pairs = _partners(index, rank, *_tested(cones, farthest_km))
+    key = np.unique(pairs.min(axis=1) * n + pairs.max(axis=1))
+    return key // n, key % n
+
+
+def fields_meet(cones: Array, a: Indices, b: Indices, farthest_km: float) -> npt.NDArray[np.bool_]:
+    """Return whether the fields of two sensors share any place, (n,).
+
+    At some instants, the axis of sensor a's cone is stepped through. A ball about each step holds
+    the cone up to the next one. The test is whether the ball touches the cone of b. Cones end at
+    the ground. It may say yes too often, never no where the fields meet.
+
+    Parameters
+    ----------
+    cones : (s, k, 7) float
+        The fields, see `field_index.cones_of`.
+    a, b : (n,) int
+        Pairs of sensors.
+    """
+    return np.asarray(_meet_all(*_tested(cones, farthest_km), a, b))
+
+
+def _tested(cones: Array, farthest_km: float) -> tuple[Array, Array]:
+    """Return the cones at the tested instants, and the steps along them [km]."""
+    tested = np.unique(np.linspace(0, cones.shape[1] - 1, TESTED_INSTANTS).astype(int))
+    return np.ascontiguousarray(cones[:, tested]), np.geomspace(
+        NEAREST_STEP_KM, farthest_km, N_STEPS
+    )
+
+
+@kernel
+def _meet_all(cones, steps, a, b):
+    meet = np.zeros(len(a), np.bool_)
+    for k in range(len(a)):
+        meet[k] = _meet(cones, steps, a[k], b[k])
+    return meet
+
+
+@borrowing_kernel
+def _meet(cones, steps, a, b):
+    """Return whether the fields of two sensors meet, see `fields_meet`."""
+    step = steps[1] / steps[0]
+    for m in range(cones.shape[1]):
+        if not (cones[a, m, TANGENT] > 0.0 and cones[b, m, TANGENT] > 0.0):
+            continue
+        tangent, half_b = cones[a, m, TANGENT] + (step - 1) / 2, np.arctan(cones[b, m, TANGENT])
+        ends_a = ground_range(cones[a, m, :AXIS], cones[a, m, AXIS:TANGENT],
+                              np.arctan(cones[a, m, TANGENT]))  # fmt: skip
+        ends_b = ground_range(cones[b, m, :AXIS], cones[b, m, AXIS:TANGENT], half_b)
+        for rho in steps:
+            if rho > step * ends_a:
+                break
+            along, length2 = 0.0, 0.0
+            for q in range(AXIS):
+                d = cones[a, m, q] - cones[b, m, q] + rho * cones[a, m, AXIS + q]
+                along += d * cones[b, m, AXIS + q]
+                length2 += d * d
+            distance, ball = np.sqrt(length2), rho * tangent
+            if distance - ball > ends_b:
+                continue
+            if distance <= ball:
+                return True
+            off_axis = np.arccos(min(max(along / distance, -1.0), 1.0))
+            if off_axis <= half_b + np.arcsin(min(ball / distance, 1.0)):
+                return True
+    return False
+
+
+@kernel
+def _partners(index, rank, cones, steps):
+    """Return pairs of sensors, (n, 2); some of them twice."""
+    n_sensors, n_cells = len(index.own_first) - 1, len(index.first) - 1
+    leader, occupied = _leaders(index, rank), np.empty(n_cells, np.int64)
+    for q in range(n_cells):
+        occupied[q] = index.first[q + 1] - index.first[q]
+    out = np.empty((MAX_PARTNERS * n_sensors, 2), np.int64)
+    tested = np.full(n_sensors, -1)  # the sensor that was last tested with each one
+    n = 0
+    for s in range(n_sensors):
+        own = index.own_cell[index.own_first[s] : index.own_first[s + 1]]
+        order = np.argsort(occupied[own], kind="mergesort")
+        tested[s], count, tests = s, 0, 0
+        for turn in range(2 * len(own)):
+            crowded = turn < len(own)
+            q = own[order[len(own) - 1 - turn]] if crowded else own[order[turn - len(own)]]
+            if crowded and occupied[q] <= FEW_SENSORS + 1:
+                continue
+            some = leader[q] if crowded else index.sensor[index.first[q] : index.first[q + 1]]
+            most = MAX_PARTNERS // 2 if crowded else MAX_PARTNERS
+            for k in range(len(some)):
+                o = some[(k + s) % len(some)]  # other sensors begin with other partners
+                if count >= most or tests >= MAX_TESTS:
+                    break
+                if tested[o] == s:
+                    continue
+                tested[o] = s
+                tests += 1
+                if _meet(cones, steps, s, o):
+                    out[n, 0], out[n, 1] = s, o
+                    n += 1
+                    count += 1
+    return out[:n]
+
+
+@kernel
+def _leaders(index, rank):
+    """Return the sensors of the lowest rank in each crowded cell, (c, 8); -1 elsewhere."""
+    leader = np.full((len(index.first) - 1, LEADERS), -1)
+    for q in range(len(leader)):
+        if index.first[q + 1] - index.first[q] <= FEW_SENSORS + 1:
+            continue
+        for s in index.sensor[index.first[q] : index.first[q + 1]]:
+            moved = s
+            for k in range(LEADERS):
+                if leader[q, k] < 0:
+                    leader[q, k] = moved
+                    break
+                if rank[moved] < rank[leader[q, k]]:
+                    leader[q, k], moved = moved, leader[q, k]
+    return leader
+
+
+# -- Sensor pairs: which pairs of sensors seed, and in which order.
+
+Flags = npt.NDArray[np.bool_]
+
+N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its plane
+# Share of a crowded field that counts as covered by a pair: its edges are not looked at.
+MIDDLE = 0.5
+
+
+class EveryPair:
+    """All pairs of sensors whose fields meet: of few sensors, two may be all that see an object."""
+
+    def __init__(self, index: FieldIndex, cones: Array, farthest_km: float) -> None:
+        a, b = meeting_pairs(index, cones, farthest_km)
+        self._pairs = zip(a.tolist(), b.tolist(), strict=True)
+
+    def next(self, enough: float = np.inf) -> tuple[int, int] | None:
+        """Return the next pair, None after the last; a pair is never covered enough."""
+        return next(self._pairs, None)
+
+
+class SensorPairs:
+    """Pairs of sensors that may see one object, in the order in which they should seed.
+
+    Pairs with a longer baseline across the line of sight come first: they fix a point better and
+    have fewer chance partners. But every sensor takes part once before any takes part again.
+    Pairs whose fields do not meet are skipped. Where many sensors share a place, each of them is
+    paired with a few only, see `meeting_pairs`.
+    """
+
+    def __init__(self, views: Views, farthest_km: float, index: FieldIndex, cones: Array) -> None:
+        look, place, half, edges = _middle(views, N_EDGES)
+        a, b = meeting_pairs(index, cones, farthest_km)
+        baseline = place[b] - place[a]
+        known = np.linalg.norm(baseline, axis=1) > SHORTEST_BASELINE_KM  # false for NaN
+        across = np.linalg.norm(np.cross(baseline, look[a] + look[b]), axis=1) / 2
+        order = np.flatnonzero(known)[np.argsort(-across[known], kind="stable")]
+        self._a, self._b = a[order], b[order]
+        n_partners = np.bincount(np.append(a, b), minlength=len(look))
+        middle, many = (look, place, half), n_partners > FEW_SENSORS
+        few = ~many[self._a] & ~many[self._b]
+        self._points = np.full((len(order), 1 + N_EDGES, 3), np.nan)
+        self._points[:, 0] = _middle_points(middle, many, self._a, self._b, farthest_km)
+        self._points[few, 1:] = _shared_points(
+            middle, edges, self._a[few], self._b[few], farthest_km
+        )
+        self._share = np.where(few, 1.0, MIDDLE)
+        self._look, self._place, self._half = middle
+        self._waiting = np.ones(len(order), bool)
+        self._busy = np.zeros(len(look), bool)
+        # Earlier pairs that cover each point of a pair. A point that is not shared (NaN) counts as
+        # covered.
+        shared = np.isfinite(self._points[..., 0])
+        self._covered = np.where(shared, 0, np.iinfo(np.int64).max)
+        self._index = index
+        cell = _cells_of(index, self._points)
+        self._by_cell = np.argsort(cell, axis=None, kind="stable")
+        self._first = np.searchsorted(cell.ravel()[self._by_cell], np.arange(len(index.first)))
+        self._next = 0
+
+    def next(self, enough: float = np.inf) -> tuple[int, int] | None:
+        """Return the next pair, None after the last.
+
+        A pair is skipped where `enough` of the earlier pairs cover each point that it shares.
+        These are the middle of the field and, where not too many sensors share it, its edges.
+        """
+        state = (self._a, self._b, self._waiting, self._covered, self._busy)
+        k = _next_pair(*state, float(enough), self._next)
+        if k < 0:
+            self._busy[:] = False
+            k = _next_pair(*state, float(enough), 0)
+            if k < 0:
+                self._next = 0
+                return None
+        a, b = int(self._a[k]), int(self._b[k])
+        self._waiting[k] = False
+        self._busy[[a, b]] = True
+        self._next = k + 1
+        _cover(
+            self._index, a, b, (self._look, self._place, self._half), self._share, self._points,
+            self._first, self._by_cell, self._covered,
+        )  # fmt: skip
+        return a, b
+
+
+@borrowing_kernel
+def _next_pair(a, b, waiting, covered, busy, enough, begin):
+    """Return the first pair from `begin` on that should seed, its sensors not busy, or -1."""
+    for k in range(begin, len(a)):
+        if waiting[k] and not busy[a[k]] and not busy[b[k]]:
+            for c in range(covered.shape[1]):
+                if covered[k, c] < enough:
+                    return k
+    return -1
+
+
+@kernel
+def _cover(index, a, b, middle, share, points, first, by_cell, covered):
+    """Count the pair of sensors a and b for all points that both have in their field."""
+    look, place, half = middle
+    i, j, n_points = index.own_first[a], index.own_first[b], points.shape[1]
+    while i < index.own_first[a + 1] and j < index.own_first[b + 1]:
+        p, q = index.own_cell[i], index.own_cell[j]
+        if p == q:
+            for k in by_cell[first[p] : first[p + 1]]:
+                pair, c = k // n_points, k % n_points
+                x, part = points[pair, c], share[pair]
+                if _in_cone(x, look[a], place[a], part * half[a]) and _in_cone(
+                    x, look[b], place[b], part * half[b]
+                ):
+                    covered[pair, c] += 1
+        i += p <= q
+        j += q <= p
+
+
+@borrowing_kernel
+def _in_cone(x, look, place, half):
+    """Return whether a point is within an angle of a sensor's axis."""
+    along, length2 = 0.0, 0.0
+    for q in range(3):
+        d = x[q] - place[q]
+        along += d * look[q]
+        length2 += d * d
+    return along > np.cos(half) * np.sqrt(length2)
+
+
+@kernel
+def _cells_of(index, points):
+    """Return the cell of each point, -1 for NaN."""
+    out = np.full(points.shape[:2], -1)
+    for k in range(out.shape[0]):
+        for c in range(out.shape[1]):
+            if np.isfinite(points[k, c, 0]):
+                out[k, c] = cell_at(index, points[k, c])
+    return out
+
+
+@kernel
+def _middle(views, n_edges):
+    """Return each sensor's mean direction, position [km], and radius of its tracklets [rad].
+
+    And the directions of its outermost tracklets on several ways, (s, n_edges, 3); at the instant
+    of most tracklets. NaN without tracklets.
+    """
+    n = views.camera.shape[0]
+    look, place, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
+    edges, ways = np.full((n, n_edges, 3), np.nan), np.empty((n_edges, 2))
+    for e in range(n_edges):
+        ways[e] = np.cos(e * 2 * np.pi / n_edges), np.sin(e * 2 * np.pi / n_edges)
+    outermost = np.empty(n_edges, np.int64)
+    for s in range(n):
+        m, most = 0, 0
+        for h in range(len(views.time_s)):
+            count = views.seen[views.first[s] : views.first[s + 1], h].sum()
+            if count > most:
+                m, most = h, count
+        if most == 0:
+            continue
+        look[s], place[s] = views.camera[s, m, PLANE + 6 : PLANE + 9], views.camera[s, m, :3]
+        widest2, farthest = 0.0, np.full(n_edges, -np.inf)
+        for i in range(views.first[s], views.first[s + 1]):
+            if not views.seen[i, m]:
+                continue
+            x, y = views.sight[i, m, X], views.sight[i, m, Y]
+            widest2 = max(widest2, x * x + y * y)
+            for e in range(n_edges):
+                out = x * ways[e, 0] + y * ways[e, 1]
+                if out > farthest[e]:
+                    farthest[e], outermost[e] = out, i
+        for e in range(n_edges):
+            direction(views, outermost[e], m, edges[s, e])
+        half[s] = np.arctan(np.sqrt(widest2)) + 1e-3
+    return look, place, half, edges
+
+
+def _middle_points(
+    middle: tuple[Array, Array, Array], many: Flags, a: Indices, b: Indices, farthest_km: float
+) -> Array:
+    """Return a place [km] in the middle of what each pair of sensors shares, (n, 3).
+
+    The axes' closest approach. For nearly parallel axes this is at random. So if many sensors share
+    space with one of the pair, it is the closest approach of that one and its first partner, if
+    this is well in the field of the other. The pairs with the longest baselines come first.
+    """
+    look, place, half = middle
+    range_a, _, _ = _closest_approach(place[b] - place[a], look[a], look[b])
+    reach = np.where(range_a > 0, np.minimum(range_a, farthest_km), farthest_km)
+    out = place[a] + reach[:, None] * look[a]
+    sensors, first = np.unique(np.column_stack([a, b]), return_index=True)
+    best = np.full((len(look), 3), np.nan)
+    best[sensors] = out[first // 2]
+    best[~many] = np.nan
+    for one, other in ((b, a), (a, b)):
+        toward = best[one] - place[other]
+        along = np.sum(toward * look[other], axis=1)
+        cosine = np.cos(MIDDLE * half[other])
+        well_in = along > cosine * np.linalg.norm(toward, axis=1)  # false for NaN
+        out[well_in] = best[one][well_in]
+    return out
+
+
+def _shared_points(
+    middle: tuple[Array, Array, Array],
+    edges: Array,
+    a: Indices,
+    b: Indices,
+    farthest_km: float,
+) -> Array:
+    """Return (n, 8, 3): points [km] at the edges of fields a, where both fields of a pair see them.
+
+    A point lies on the line of an outermost tracklet of sensor a. It is the one that is nearest to
+    the axis of sensor b, or to an outermost tracklet of it, whichever passes most closely. NaN
+    where this is outside the field of b. `middle` and `edges` are those of `_middle`.
+    """
+    look, place, half = middle
+    best = np.full((len(a), N_EDGES), np.inf)
+    points = np.full((len(a), N_EDGES, 3), np.nan)
+    baseline = np.repeat(place[b] - place[a], N_EDGES, axis=0)
+    u = edges[a].reshape(-1, 3)
+    for towards in (*np.moveaxis(edges, 1, 0), look):
+        u_b = np.repeat(towards[b], N_EDGES, axis=0)
+        reach, beyond, miss = _closest_approach(baseline, u, u_b)
+        reach = np.minimum(reach, farthest_km)
+        with np.errstate(invalid="ignore"):
+            miss = np.where((reach > 0) & (beyond > 0), miss / reach, np.inf)
+        miss = miss.reshape(-1, N_EDGES)
+        nearer = miss < best
+        best[nearer] = miss[nearer]
+        at = place[a][:, None] + (reach[:, None] * u).reshape(-1, N_EDGES, 3)
+        points[nearer] = at[nearer]
+    toward = points - place[b][:, None]
+    along = np.einsum("npi,ni->np", toward, look[b])
+    inside = along > np.cos(half[b])[:, None] * np.linalg.norm(toward, axis=2)
+    return np.where(inside[..., None], points, np.nan)
+
+
+def _closest_approach(baseline: Array, u_a: Array, u_b: Array) -> tuple[Array, Array, Array]:
+    """Return the ranges [km] along two lines of their nearest points, and the gap [km]."""
+    cosine = np.sum(u_a * u_b, axis=1)
+    sine2 = np.maximum(1 - cosine**2, 1e-12)
+    along_a, along_b = np.sum(baseline * u_a, axis=1), np.sum(baseline * u_b, axis=1)
+    range_a = (along_a - cosine * along_b) / sine2
+    range_b = (cosine * along_a - along_b) / sine2
+    gap = baseline + range_b[:, None] * u_b - range_a[:, None] * u_a
+    return range_a, range_b, np.linalg.norm(gap, axis=1)

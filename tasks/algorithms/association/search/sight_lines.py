@@ -1,0 +1,112 @@
+"""Pairs of lines of sight: whether they meet where an object can be."""
+
+import numpy as np
+
+from epipole.tasks.algorithms.association.views import (
+    DX,
+    DY,
+    MOVES,
+    PLANE,
+    SIGMA_KM,
+    V_KM_S,
+    XX,
+    XY,
+    YY,
+    X,
+    Y,
+    direction,
+)
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.kernels import borrowing_kernel
+
+BEYOND = 0.2  # share of the farthest distance by which a point may lie beyond it
+SLACK_SIGMA = 3.0  # a point may lie this far outside the limits
+
+
+@borrowing_kernel
+def quantile(dof, sigma):
+    """Return the chi-square with `dof` degrees of freedom that is as improbable as `sigma`.
+
+    Wilson and Hilferty (1931): its cube root is close to normal.
+    """
+    a = 2.0 / (9.0 * dof)
+    return dof * (1.0 - a + sigma * np.sqrt(a)) ** 3
+
+
+@borrowing_kernel
+def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
+    """Return the squared gap of two lines of sight over its variance; NaN where impossible.
+
+    Impossible are parallel lines, and a meeting point behind a sensor or, by 3 sigma, outside
+    the limits [km from the Earth's centre]. `ui`, `uj` (3,) are work space.
+    """
+    direction(views, i, m, ui)
+    direction(views, j, m, uj)
+    ri, rj = views.camera[views.sensor[i], m], views.camera[views.sensor[j], m]
+    n0 = ui[1] * uj[2] - ui[2] * uj[1]
+    n1 = ui[2] * uj[0] - ui[0] * uj[2]
+    n2 = ui[0] * uj[1] - ui[1] * uj[0]
+    sine2 = n0 * n0 + n1 * n1 + n2 * n2
+    if sine2 < 1e-14:  # 0.02 arcsec: parallel for any sensor
+        return np.nan
+    b0, b1, b2 = rj[0] - ri[0], rj[1] - ri[1], rj[2] - ri[2]
+    along_i = b0 * ui[0] + b1 * ui[1] + b2 * ui[2]
+    along_j = b0 * uj[0] + b1 * uj[1] + b2 * uj[2]
+    cosine = ui[0] * uj[0] + ui[1] * uj[1] + ui[2] * uj[2]
+    range_i = (along_i - cosine * along_j) / sine2
+    range_j = (cosine * along_i - along_j) / sine2
+    if range_i <= 0.0 or range_j <= 0.0:
+        return np.nan
+    sine = np.sqrt(sine2)
+    radius2 = 0.0
+    for a in range(3):
+        radius2 += (ri[a] + range_i * ui[a]) ** 2
+    si, sj = views.sight[i, m, SIGMA_KM], views.sight[j, m, SIGMA_KM]
+    spread = range_i**2 * _spread(views, i, m) + range_j**2 * _spread(views, j, m)
+    slack = SLACK_SIGMA * np.sqrt(spread + 2 * (si * si + sj * sj)) / sine
+    radius = np.sqrt(radius2)
+    if radius + slack < lowest or radius - min(slack, BEYOND * farthest) > farthest:
+        return np.nan
+    variance = si * si + sj * sj
+    variance += range_i**2 * _across(views, i, m, n0 / sine, n1 / sine, n2 / sine)
+    variance += range_j**2 * _across(views, j, m, n0 / sine, n1 / sine, n2 / sine)
+    miss = (b0 * n0 + b1 * n1 + b2 * n2) / sine
+    # Light takes longer to the farther sensor, which sees the object where it was earlier.
+    if views.sight[j, m, MOVES] > 0.0:
+        speed = _speed(views, j, m, range_j, n0 / sine, n1 / sine, n2 / sine)
+    else:
+        speed = _speed(views, i, m, range_i, n0 / sine, n1 / sine, n2 / sine)
+    miss += speed * (range_j - range_i) / SPEED_OF_LIGHT_KM_S
+    return miss * miss / variance
+
+
+@borrowing_kernel
+def _speed(views, i, m, range_km, n0, n1, n2):
+    """Return the object's velocity [km/s] along a unit vector, from the rate of tracklet i.
+
+    The vector is perpendicular to the line of sight. 0 where the rate is unknown.
+    """
+    cam, see = views.camera[views.sensor[i], m], views.sight[i, m]
+    if see[MOVES] == 0.0:
+        return 0.0
+    a = cam[PLANE] * n0 + cam[PLANE + 1] * n1 + cam[PLANE + 2] * n2
+    b = cam[PLANE + 3] * n0 + cam[PLANE + 4] * n1 + cam[PLANE + 5] * n2
+    turning = (see[DX] * a + see[DY] * b) / np.sqrt(1.0 + see[X] ** 2 + see[Y] ** 2)
+    own = cam[V_KM_S] * n0 + cam[V_KM_S + 1] * n1 + cam[V_KM_S + 2] * n2
+    return own + range_km * turning
+
+
+@borrowing_kernel
+def _spread(views, i, m):
+    """Return the trace of a direction's covariance on its plane."""
+    return views.sight[i, m, XX] + views.sight[i, m, YY]
+
+
+@borrowing_kernel
+def _across(views, i, m, n0, n1, n2):
+    """Return the variance of a direction along a unit vector across it [rad^2]."""
+    cam, see = views.camera[views.sensor[i], m], views.sight[i, m]
+    a = cam[PLANE] * n0 + cam[PLANE + 1] * n1 + cam[PLANE + 2] * n2
+    b = cam[PLANE + 3] * n0 + cam[PLANE + 4] * n1 + cam[PLANE + 5] * n2
+    total = a * a * see[XX] + 2 * a * b * see[XY] + b * b * see[YY]
+    return total / (1.0 + see[X] ** 2 + see[Y] ** 2)

@@ -1,1 +1,0 @@
-"""Star catalogues: places of stars at a date, and catalogues joined."""

@@ -1,0 +1,225 @@
+"""Errors of a direction from errors of the centroid and of the attitude."""
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.geometry.camera import Camera, project, slopes, unproject
+from epipole.tasks.algorithms.geometry.directions import skew, tangent_basis
+
+# -- Errors of a direction from errors of the centroid and of the attitude.
+
+Array = npt.NDArray[np.float64]
+
+MAX_LEVERAGE = 0.8  # a direction that decides its own fit has no residual
+OUTLIER = 20.0  # variances: a product of two residuals beyond is of another object
+MIN_RESIDUALS = 20  # their variance is then known to a third
+
+
+def centroid_covariance(u_icrs: Array, sigma_rad: Array) -> Array:
+    """Return (n, 3, 3) covariances of directions with the same error on both axes.
+
+    Parameters
+    ----------
+    u_icrs : (n, 3) float
+        Unit vectors.
+    sigma_rad : (n,) float
+        1-sigma error, per axis [rad].
+    """
+    across = np.eye(3) - u_icrs[:, :, None] * u_icrs[:, None, :]
+    return across * np.square(sigma_rad)[:, None, None]
+
+
+def attitude_covariance(u_icrs: Array, cov_icrs_rad2: Array) -> Array:
+    """Return (n, 3, 3) covariances of directions due to attitude errors.
+
+    Parameters
+    ----------
+    u_icrs : (n, 3) float
+        Unit vectors.
+    cov_icrs_rad2 : (n, 3, 3) float
+        Covariance of the small rotation of their frame, about the axes of the ICRS [rad^2].
+
+    Notes
+    -----
+    A small rotation phi moves a direction by phi x u; the sign of phi does not matter.
+    """
+    across = skew(u_icrs)
+    return across @ cov_icrs_rad2 @ np.swapaxes(across, -1, -2)
+
+
+def on_tangent_plane(u_icrs: Array, cov: Array) -> Array:
+    """Return (n, 3, 3) covariances as (n, 2, 2) on `tangent_basis(u_icrs)`."""
+    basis = tangent_basis(u_icrs)
+    return basis @ cov @ np.swapaxes(basis, -1, -2)
+
+
+def scatter_beyond(
+    residual_rad: Array, sigma_rad: Array, leverage: Array, follows: npt.NDArray[np.bool_]
+) -> float:
+    """Return the variance, per axis, by which directions scatter beyond their own errors [rad^2].
+
+    So the error of a prior attitude is divided into one that changes from frame to frame and one
+    that stays: only the former scatters about a smooth motion.
+
+    Parameters
+    ----------
+    residual_rad : (n, 3) float
+        Directions minus those of the smooth motion that was fitted to them.
+    sigma_rad : (n,) float
+        1-sigma errors of the directions, per axis.
+    leverage : (n,) float
+        Weight of each direction in its own fitted one; it makes the residual smaller.
+    follows : (n,) bool
+        Whether a direction is the next one of the same object after the row before.
+
+    Returns
+    -------
+    float
+        0 where too few residuals can tell. Where neighbours correlate, because attitudes were
+        interpolated, it is the variance of independent errors with the same mean over many frames.
+
+    Notes
+    -----
+    From the median, so that detections of another object do not count: half the square of a
+    Gaussian residual on two axes is exponentially distributed, and its median is ln 2 variances.
+    """
+    telling = leverage < MAX_LEVERAGE
+    if np.count_nonzero(telling) < MIN_RESIDUALS:
+        return 0.0
+    half_square = np.sum(residual_rad[telling] ** 2, axis=1) / 2
+    variance = np.median(half_square / (1.0 - leverage[telling])) / np.log(2.0)
+    beyond = variance - np.median(sigma_rad[telling] ** 2)
+    pairs = follows & telling
+    pairs[1:] &= telling[:-1]
+    if beyond > 0.0 and np.count_nonzero(pairs) >= MIN_RESIDUALS:
+        later = np.flatnonzero(pairs)
+        product = np.sum(residual_rad[later] * residual_rad[later - 1], axis=1) / 2
+        usual = np.abs(product) < OUTLIER * variance
+        # The fit alone makes neighbours correlate by minus the weight that one has in the other.
+        beyond += 2 * max(np.mean((product + leverage[later] * variance)[usual]), 0.0)
+    return float(max(beyond, 0.0))
+
+
+# -- Errors of the optics: how they move image places, attitudes and directions.
+#
+# The optics of a sensor are the same in all its frames, and so are their errors: a bias. Wrong
+# optics turn the attitude that fits a frame's stars best. Where stars stand, attitude and optics
+# then compensate each other, and the direction of an object there is nearly right.
+
+Indices = npt.NDArray[np.int64]
+
+OPTICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
+FRAMES_AT_ONCE = 500  # a row of the derivatives has 27 numbers
+GRID = 9  # places on each side of the image that stand for a frame's stars
+
+
+def image_derivatives(camera: Camera, u: Array) -> tuple[Array, Array]:
+    """Return the derivatives of image places by the attitude and by the optics.
+
+    Parameters
+    ----------
+    u : (n, 3) float
+        Directions in the sensor frame.
+
+    Returns
+    -------
+    J_turn : (n, 2, 3) float
+        By a small rotation of the directions about the sensor axes [px/rad].
+    J_optics : (n, 2, 9) float
+        By the numbers of `OPTICS`.
+    """
+    x, y = u[:, 0] / u[:, 2], u[:, 1] / u[:, 2]
+    r2, xy2 = x * x + y * y, 2 * x * y
+    across, mixed, down = slopes(camera, x, y)
+    stretch = np.stack([across, mixed, mixed, down], axis=1).reshape(-1, 2, 2)
+    turned = np.empty((len(x), 2, 3))  # derivative of the undistorted place by the rotation vector
+    turned[:, 0] = np.stack([-x * y, 1 + x * x, -y], axis=1)
+    turned[:, 1] = np.stack([-1 - y * y, x * y, x], axis=1)
+    f = np.array([camera.fx_px, camera.fy_px])
+    px, py = project(camera, u)
+    moved = np.zeros((len(x), 2, 9))
+    moved[:, 0, 0], moved[:, 1, 1] = (px - camera.cx_px) / f[0], (py - camera.cy_px) / f[1]
+    moved[:, 0, 2] = moved[:, 1, 3] = 1.0
+    for column, power in ((4, 1), (5, 2), (8, 3)):
+        moved[:, 0, column], moved[:, 1, column] = f[0] * x * r2**power, f[1] * y * r2**power
+    moved[:, 0, 6], moved[:, 1, 6] = f[0] * xy2, f[1] * (r2 + 2 * y * y)
+    moved[:, 0, 7], moved[:, 1, 7] = f[0] * (r2 + 2 * x * x), f[1] * xy2
+    J_turn = f[:, None] * np.einsum("nij,njk->nik", stretch, turned)
+    return J_turn, moved
+
+
+def shared_attitude_covariance(
+    camera: Camera, cov_optics: Array, u: Array, sigma_rad: Array, offsets: Indices
+) -> Array:
+    """Return (f, 3, 3) covariances of attitudes due to the error of the optics [rad^2].
+
+    About the sensor axes. The error is shared by all frames of the sensor.
+
+    Parameters
+    ----------
+    cov_optics : (9, 9) float
+        Covariance of the numbers of `OPTICS`.
+    u : (n, 3) float
+        Measured directions of the stars that the attitudes were fitted to, sensor frame.
+    sigma_rad : (n,) float
+        Their 1-sigma errors, per axis.
+    offsets : (f + 1,) int
+        Frame k has the stars ``offsets[k]:offsets[k + 1]``, at least two that are not at one place.
+    """
+    cov = np.empty((len(offsets) - 1, 3, 3))
+    for first in range(0, len(cov), FRAMES_AT_ONCE):
+        some = offsets[first : first + FRAMES_AT_ONCE + 1]
+        of = slice(some[0], some[-1])
+        lever = _levers(_apparent_turns(camera, u[of]), u[of], sigma_rad[of], some[:-1] - some[0])
+        cov[first : first + len(lever)] = lever @ cov_optics @ np.swapaxes(lever, 1, 2)
+    return cov
+
+
+def shared_direction_covariance(
+    camera: Camera, cov_optics: Array, u: Array, from_stars: npt.NDArray[np.bool_]
+) -> Array:
+    """Return (n, 3, 3) covariances of directions due to the error of the optics [rad^2].
+
+    In sensor axes. The error is shared by all frames of the sensor.
+
+    Parameters
+    ----------
+    cov_optics : (9, 9) float
+        Covariance of the numbers of `OPTICS`.
+    u : (n, 3) float
+        Measured directions, sensor frame.
+    from_stars : (n,) bool
+        Whether stars gave the attitude, with the same optics. It then compensates a part of the
+        error: that of an attitude from stars all over the image.
+    """
+    side = np.linspace(0.0, camera.width - 1.0, GRID)
+    down = np.linspace(0.0, camera.height - 1.0, GRID)
+    x_px, y_px = (axis.ravel() for axis in np.meshgrid(side, down))
+    grid = unproject(camera, x_px, y_px)
+    turns = _apparent_turns(camera, grid)
+    lever = _levers(turns, grid, np.ones(len(grid)), np.zeros(1, np.int64))
+    compensated = from_stars[:, None, None] * lever
+    moved = skew(u) @ (_apparent_turns(camera, u) - compensated)
+    return moved @ cov_optics @ np.swapaxes(moved, -1, -2)
+
+
+def _apparent_turns(camera: Camera, u: Array) -> Array:
+    """Return (n, 3, 9): the rotation of each direction that moves its image as the optics do.
+
+    The least rotation: at right angles to the direction.
+    """
+    J_turn, J_optics = image_derivatives(camera, u)
+    turned = np.swapaxes(J_turn, 1, 2)
+    return turned @ np.linalg.solve(J_turn @ turned, J_optics)
+
+
+def _levers(turns: Array, u: Array, sigma_rad: Array, starts: Indices) -> Array:
+    """Return (f, 3, 9): how far the optics turn the best attitude of each frame, but for the sign.
+
+    The normal equations of `optimal_attitude`: the weighted mean of the stars' own rotations.
+    """
+    weight = 1.0 / np.square(sigma_rad)
+    across = np.eye(3) - u[:, :, None] * u[:, None, :]
+    A = np.add.reduceat(weight[:, None, None] * across, starts)
+    A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # all at one place
+    return np.linalg.solve(A, np.add.reduceat(weight[:, None, None] * turns, starts))

@@ -1,1 +1,0 @@
-"""Time: scales, the order of frames, the grid of epochs."""

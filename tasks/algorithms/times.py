@@ -1,0 +1,206 @@
+"""Time scales: Julian dates of UTC nanoseconds, for pyerfa, and Earth's barycentric motion."""
+
+from functools import cache
+
+import erfa
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.constants import AU_KM, DAY_NS, DAY_S
+
+# -- Time scales: Julian dates of UTC nanoseconds, for pyerfa, and Earth's barycentric motion.
+
+Array = npt.NDArray[np.float64]
+Nanoseconds = npt.NDArray[np.int64]
+
+UNIX_EPOCH_JD = 2440587.5
+NODE_NS = 600_000_000_000
+TT_MINUS_TAI_S = 32.184
+
+
+def utc_julian_date(time_ns: Nanoseconds) -> tuple[Array, Array]:
+    """Return the two-part UTC Julian date (whole days + 0.5, fraction) of Unix nanoseconds."""
+    day, rest = np.divmod(np.asarray(time_ns, np.int64), DAY_NS)
+    return UNIX_EPOCH_JD + day, rest / DAY_NS
+
+
+def tai_minus_utc_s(jd_utc: Array) -> Array:
+    """Return TAI-UTC [s] on UTC days, given by Julian dates.
+
+    From erfa's table. `erfa.utctai` itself would warn of every date a few years ahead, and it
+    counts a day with a leap second as 86,401 s where Unix time has 86,400 s. Before 1972 the
+    value is 10 s, the first of the table: UTC drifted then, and no log is that old.
+    """
+    days, seconds = _leap_seconds()
+    return seconds[np.maximum(np.searchsorted(days, jd_utc, side="right") - 1, 0)]
+
+
+@cache
+def _leap_seconds() -> tuple[Array, Array]:
+    """Return the Julian dates of the steps of TAI-UTC, and its values [s] from there on."""
+    steps = erfa.leap_seconds.get()
+    steps = steps[steps["year"] >= 1972]
+    jd1, jd2 = erfa.cal2jd(steps["year"], steps["month"], 1)
+    return jd1 + jd2, np.asarray(steps["tai_utc"], float)
+
+
+def tt_julian_date(time_ns: Nanoseconds) -> tuple[Array, Array]:
+    """Return the two-part Julian date in terrestrial time."""
+    day, fraction = utc_julian_date(time_ns)
+    return day, fraction + (tai_minus_utc_s(day) + TT_MINUS_TAI_S) / DAY_S
+
+
+def julian_year(time_ns: Nanoseconds) -> Array:
+    """Return the Julian epoch, such as 2019.25, in terrestrial time."""
+    jd1, jd2 = tt_julian_date(time_ns)
+    return 2000.0 + ((jd1 - 2451545.0) + jd2) / 365.25
+
+
+def earth_barycentric(time_ns: Nanoseconds) -> tuple[Array, Array]:
+    """Return Earth's barycentric position [km] and velocity [km/s], (..., 3), ICRS axes.
+
+    TT is used for TDB: they differ by less than 2 ms, which moves Earth's velocity by 1e-8 km/s.
+    """
+    _, barycentric = erfa.epv00(*tt_julian_date(time_ns))
+    return barycentric["p"] * AU_KM, barycentric["v"] * (AU_KM / DAY_S)
+
+
+def earth_velocity(time_ns: Nanoseconds) -> Array:
+    """Return Earth's barycentric velocity [km/s], (n, 3), ICRS axes, at any number of times.
+
+    Interpolated between full ten minutes, with errors of 1e-7 km/s, 50 times faster than
+    `earth_barycentric`. The result at a time does not depend on the other times.
+    """
+    time_ns = np.asarray(time_ns, np.int64)
+    node, rest = np.divmod(time_ns, NODE_NS)
+    nodes, at = np.unique(node, return_inverse=True)
+    _, before = earth_barycentric(nodes * NODE_NS)
+    _, after = earth_barycentric((nodes + 1) * NODE_NS)
+    share = (rest / NODE_NS)[:, None]
+    return (1.0 - share) * before[at] + share * after[at]
+
+
+# -- Epochs: common instants of sensors that expose at different times.
+
+MILLISECOND_NS = 1_000_000
+
+
+def frame_interval_ns(time_ns: Nanoseconds) -> int:
+    """Return the usual interval between a sensor's frames [ns]; 0 with fewer than two."""
+    steps = np.diff(np.unique(time_ns))
+    return int(np.median(steps)) if len(steps) else 0
+
+
+def epoch_interval_ns(time_ns_by_sensor: list[Nanoseconds]) -> int:
+    """Return the slowest sensor's frame interval [ns], rounded to 1 ms, at least 1 ms.
+
+    Rounding keeps the grid fixed from night to night, whatever the jitter of the exposures.
+    Without any interval it is one second.
+    """
+    slowest = max((frame_interval_ns(t) for t in time_ns_by_sensor), default=0)
+    return max(round(slowest / MILLISECOND_NS), 1) * MILLISECOND_NS if slowest else 1_000_000_000
+
+
+def instants_of(time_ns: Nanoseconds, apart_ns: int) -> Nanoseconds:
+    """Return the mean times [ns] of groups of frames, split at gaps of `apart_ns` or more.
+
+    These are the epochs of a night in which no sensor has a frame interval, hence no grid.
+    """
+    time_ns = np.unique(time_ns)
+    group = np.concatenate([[0], np.cumsum(np.diff(time_ns) >= apart_ns)]).astype(np.int64)
+    first = np.flatnonzero(np.diff(group, prepend=-1))
+    if not len(time_ns):
+        return time_ns
+    since = time_ns - time_ns[first][group]
+    return time_ns[first] + np.bincount(group, since).astype(np.int64) // np.bincount(group)
+
+
+def epoch_grid(first_ns: int, last_ns: int, interval_ns: int) -> Nanoseconds:
+    """Return all multiples of the interval since midnight UTC within [first, last], in ns.
+
+    Counting from midnight makes the grid of a night independent of its logs.
+    """
+    out = []
+    for day in range(first_ns // DAY_NS, last_ns // DAY_NS + 1):
+        midnight = day * DAY_NS
+        lo = max(first_ns - midnight + interval_ns - 1, 0) // interval_ns
+        hi = min(last_ns - midnight, DAY_NS - 1) // interval_ns
+        out.append(midnight + np.arange(lo, hi + 1, dtype=np.int64) * interval_ns)
+    return np.concatenate(out) if out else np.zeros(0, np.int64)
+
+
+def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> npt.NDArray[np.int64]:
+    """Return the index of the frame nearest to each epoch; the earlier one of a tie.
+
+    Parameters
+    ----------
+    epoch_ns : (e,) int
+        Epochs [ns].
+    time_ns : (f,) int
+        Frame times [ns], increasing, f >= 1.
+    """
+    after = np.clip(np.searchsorted(time_ns, epoch_ns), 1, max(len(time_ns) - 1, 1))
+    after = np.minimum(after, len(time_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    closer = (epoch_ns - time_ns[before]) <= (time_ns[after] - epoch_ns)
+    return np.where(closer, before, after)
+
+
+# -- The order of frames and states, and which are duplicates.
+
+Integers = npt.NDArray[np.int64]
+
+KEEP, DUPLICATE_FRAME, DUPLICATE_NUMBER, DUPLICATE_TIME = range(4)
+
+
+def order_frames(
+    sensor: Integers, time_ns: Integers, frame_number: Integers
+) -> tuple[Integers, npt.NDArray[np.int8]]:
+    """Return the order of frames by sensor, time and number, and a verdict on each.
+
+    Parameters
+    ----------
+    sensor, time_ns, frame_number : (n,) int
+        The sensor as an index. Of equal frames the first is kept.
+
+    Returns
+    -------
+    order : (n,) int
+        Indices that sort the frames.
+    verdict : (n,) int8
+        In that order. KEEP: the frame is kept. DUPLICATE_FRAME: same sensor, number and time as
+        a kept frame. DUPLICATE_NUMBER: same number as an earlier kept frame, at another time (a
+        counter that restarted, or two sensors with one id). DUPLICATE_TIME: same time as a kept
+        frame with a lower number: a sensor makes one exposure at a time.
+    """
+    order = np.lexsort((np.arange(len(sensor)), frame_number, time_ns, sensor))
+    s, t, f = sensor[order], time_ns[order], frame_number[order]
+    verdict = np.zeros(len(order), np.int8)
+    if len(order) == 0:
+        return order, verdict
+    same_time = (s[1:] == s[:-1]) & (t[1:] == t[:-1])
+    same_frame = same_time & (f[1:] == f[:-1])
+    verdict[1:][same_time] = DUPLICATE_TIME
+    verdict[1:][same_frame] = DUPLICATE_FRAME
+    # By number, in order of time: all but the first repeat the number.
+    rest = np.flatnonzero(verdict == KEEP)
+    by_number = rest[np.lexsort((rest, f[rest], s[rest]))]
+    a, b = by_number[:-1], by_number[1:]
+    verdict[b[(s[a] == s[b]) & (f[a] == f[b])]] = DUPLICATE_NUMBER
+    # A copy of a frame that is not kept has the verdict of that frame.
+    copied = np.maximum.accumulate(np.where(verdict == DUPLICATE_FRAME, 0, np.arange(len(s))))
+    copies = verdict == DUPLICATE_FRAME
+    verdict[copies] = np.where(verdict[copied] == KEEP, DUPLICATE_FRAME, verdict[copied])[copies]
+    return order, verdict
+
+
+def order_states(sensor: Integers, time_ns: Integers) -> tuple[Integers, npt.NDArray[np.bool_]]:
+    """Return the order of states by sensor and time, and which of them repeat their predecessor.
+
+    A state repeats if sensor and time are the same; the first given is kept.
+    """
+    order = np.lexsort((np.arange(len(sensor)), time_ns, sensor))
+    s, t = sensor[order], time_ns[order]
+    repeats = np.zeros(len(order), bool)
+    repeats[1:] = (s[1:] == s[:-1]) & (t[1:] == t[:-1])
+    return order, repeats

@@ -1,1 +1,0 @@
-"""Star catalogues built from published catalogues."""

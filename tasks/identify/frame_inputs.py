@@ -1,0 +1,176 @@
+"""Flatten centroids: the centroid lists of one sensor's frames as arrays, with directions."""
+
+import logging
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, flatten, nullable, stack, table, unstack
+from epipole.schemas.log_bounds import POSITION, SPEED
+from epipole.schemas.settings import SensorSettings, Settings
+from epipole.schemas.work_tables import PLACES
+from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, unproject
+from epipole.tasks.algorithms.orbits.state_interpolation import (
+    Places,
+    SensorStates,
+    interpolate_states,
+)
+
+# -- Flatten centroids: the centroid lists of one sensor's frames as arrays, with directions.
+
+Array = npt.NDArray[np.float64]
+
+
+class FlatCentroids(NamedTuple):
+    """All centroids of one sensor's frames, one after another.
+
+    Frame k has the centroids ``first[k]:first[k + 1]``. Cameras are named by their row in
+    `cameras`; -1 where a frame has none.
+    """
+
+    first: npt.NDArray[np.int64]
+    frame: npt.NDArray[np.int64]
+    x_px: Array
+    y_px: Array
+    flux: Array
+    sigma_px: Array  # NaN where unknown
+    u: Array  # sensor axes
+    pixel_rad: Array
+    in_image: npt.NDArray[np.bool_]  # of the frame's camera; false without one
+    camera_of_frame: npt.NDArray[np.int64]
+    cameras: dict[int, Camera]
+
+
+def flatten_centroids(exposures: pa.Table, cameras: pa.Table, settings: Settings) -> FlatCentroids:
+    """Return the centroids of one sensor's frames, with the valid cameras."""
+    x_px, first = flatten(exposures, "x_px")
+    y_px, _ = flatten(exposures, "y_px")
+    frame = np.repeat(np.arange(exposures.num_rows), np.diff(first))
+    sigma_px = _optional(exposures, "sigma_px", len(x_px))
+    if settings.sensors.centroid_sigma_px is not None:
+        sigma_px = np.where(np.isnan(sigma_px), settings.sensors.centroid_sigma_px, sigma_px)
+    camera_of_frame, used = _cameras_of(exposures, cameras)
+    u, pixel_rad = np.zeros((len(x_px), 3)), np.ones(len(x_px))
+    in_image = np.zeros(len(x_px), np.bool_)
+    for row, camera in used.items():
+        at = camera_of_frame[frame] == row
+        u[at] = unproject(camera, x_px[at], y_px[at])
+        pixel_rad[at] = pixel_angle(camera, u[at])
+        in_image[at] = inside(camera, x_px[at], y_px[at])
+    flux = _optional(exposures, "flux", len(x_px))
+    return FlatCentroids(
+        first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, in_image, camera_of_frame, used
+    )
+
+
+def _optional(exposures: pa.Table, name: str, n: int) -> Array:
+    """Return a list column as one array; NaN where a list is null or a value not positive."""
+    _, first = flatten(exposures, "x_px")
+    known, first_known = flatten(exposures, name)
+    values = np.full(n, np.nan)
+    values[np.repeat(np.diff(first_known) > 0, np.diff(first))] = known
+    values[~(values > 0)] = np.nan
+    return values
+
+
+def _cameras_of(
+    exposures: pa.Table, cameras: pa.Table
+) -> tuple[npt.NDArray[np.int64], dict[int, Camera]]:
+    """Return the row of `cameras` that is valid for each frame (-1: none), and those cameras."""
+    rows = np.flatnonzero(array(cameras, "sensor_id") == exposures["sensor_id"][0].as_py())
+    if len(rows) == 0:
+        return np.full(exposures.num_rows, -1), {}
+    times = array(cameras, "time")[rows]
+    rows = rows[np.argsort(times, kind="stable")]
+    newest = np.searchsorted(np.sort(times), array(exposures, "time"), side="right") - 1
+    holds = rows[np.maximum(newest, 0)]
+    used = np.unique(holds)
+    values = [cameras.select(list(Camera._fields)).slice(int(r), 1).to_pylist()[0] for r in used]
+    return holds, {int(r): Camera(**v) for r, v in zip(used, values, strict=True)}
+
+
+# -- Place sensors: position and prior attitude of each sensor at the times of its frames.
+
+LOGGER = logging.getLogger(__name__)
+
+# Earth-fixed axes turn: states of a log may be twice as fast in GCRF.
+FASTEST_KM_S, FARTHEST_KM = 2 * SPEED.greatest, 2 * POSITION.greatest
+
+
+def interpolate_sensor_states(
+    exposures: pa.Table, states: pa.Table, settings: Settings
+) -> pa.Table:
+    """Return PLACES, one row per row of `exposures`; see `interpolate_states`.
+
+    `states` are sorted by sensor and time, each time once, as `order_logs` returns them.
+    """
+    sensor, time_ns = array(exposures, "sensor_id"), array(exposures, "time")
+    state_sensor, all_states = array(states, "sensor_id"), _states(states, settings.sensors)
+    n = len(time_ns)
+    placed = Places(*(np.full((n, *width), np.nan) for width in ((3,), (3,), (), (4,), ())))
+    told = np.zeros(n, bool)
+    for name in sorted(set(sensor)):
+        frames = np.flatnonzero(sensor == name)
+        rows = np.flatnonzero(state_sensor == name)
+        columns: list[npt.NDArray[Any]] = [values[rows] for values in all_states]
+        told[frames] = _told(states.take(rows), time_ns[frames])
+        places = interpolate_states(
+            SensorStates(*columns),
+            time_ns[frames],
+            settings.sensors.state_gap_s,
+        )
+        for column, values in zip(placed, _possible(places), strict=True):
+            column[frames] = values
+    without = np.count_nonzero(np.isnan(placed.r_gcrf_km[:, 0]))
+    LOGGER.info("placed %d frames, %d have no state near in time", n - without, without)
+    by_name = {
+        **unstack("{}_km", placed.r_gcrf_km),
+        **unstack("v{}_km_s", placed.v_gcrf_km_s),
+        "position_sigma_km": np.where(told, placed.position_sigma_km, np.nan),
+        "used_position_sigma_km": placed.position_sigma_km,
+        **unstack("q{}", placed.q_sensor_from_icrs, "xyzw"),
+        "attitude_sigma_arcsec": placed.attitude_sigma,
+    }
+    key = {name: exposures[name] for name in ("sensor_id", "frame_number", "time")}
+    return table(PLACES, {**key, **{name: nullable(value) for name, value in by_name.items()}})
+
+
+def _possible(places: Places) -> Places:
+    """Return the places, without a position where the states would have the sensor too fast.
+
+    States with a clock or a position of their own tell no speed that a log would be refused for:
+    it shows between them.
+    """
+    speed = np.linalg.norm(places.v_gcrf_km_s, axis=1)
+    radius = np.linalg.norm(places.r_gcrf_km, axis=1)
+    known = (speed <= FASTEST_KM_S) & (radius <= FARTHEST_KM)
+    return places._replace(
+        r_gcrf_km=np.where(known[:, None], places.r_gcrf_km, np.nan),
+        v_gcrf_km_s=np.where(known[:, None], places.v_gcrf_km_s, np.nan),
+        position_sigma_km=np.where(known, places.position_sigma_km, np.nan),
+    )
+
+
+def _told(states: pa.Table, at_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Return whether the states of one sensor on both sides of each time tell their sigma."""
+    if not states.num_rows:
+        return np.zeros(len(at_ns), bool)
+    known = array(states, "position_sigma_km") > 0
+    right = np.minimum(np.searchsorted(array(states, "time"), at_ns), states.num_rows - 1)
+    return np.asarray(known[np.maximum(right - 1, 0)] & known[right])
+
+
+def _states(states: pa.Table, settings: SensorSettings) -> SensorStates:
+    """Return the states as arrays; an unknown sigma (0) takes the value of the settings."""
+    position_sigma_km = array(states, "position_sigma_km")
+    attitude_sigma = array(states, "attitude_sigma_arcsec")
+    return SensorStates(
+        array(states, "time"),
+        stack(states, "{}_km"),
+        stack(states, "v{}_km_s"),
+        np.where(position_sigma_km > 0, position_sigma_km, settings.position_sigma_km),
+        stack(states, "q{}", "xyzw"),
+        np.where(attitude_sigma > 0, attitude_sigma, settings.attitude_sigma_arcsec),
+    )

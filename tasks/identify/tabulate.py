@@ -1,0 +1,270 @@
+"""Tabulate identified frames: stars, attitudes and other centroids as tables."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    nullable,
+    stack,
+    table,
+    unstack,
+    unstack_covariance,
+)
+from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
+from epipole.schemas.work_tables import SOLUTIONS
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.camera import project
+from epipole.tasks.algorithms.geometry.directions import (
+    aberrate,
+    boresight_angles,
+    quaternion_from_matrix,
+    radec_from_unit,
+)
+from epipole.tasks.algorithms.photometry import flux_scale
+from epipole.tasks.algorithms.times import earth_velocity
+from epipole.tasks.identify.frame_inputs import FlatCentroids
+
+# -- Bound detections: of a sensor that reports more than can be followed, which ones are kept.
+
+Flags = npt.NDArray[np.bool_]
+
+
+def within_limit(frame: npt.NDArray[np.int64], flux: npt.NDArray[np.float64], most: int) -> Flags:
+    """Return which detections are kept, so that there are at most `most`.
+
+    The fullest frames are cut to one number, and keep their brightest. Frames with fewer keep all.
+
+    Parameters
+    ----------
+    frame : (n,) int
+        Frame of each detection, ascending.
+    flux : (n,) float
+        NaN where unknown: these are cut first, the later ones of a frame before the earlier.
+    """
+    counts = np.bincount(frame)
+    if len(frame) <= most:
+        return np.ones(len(frame), bool)
+    order = np.lexsort((-np.nan_to_num(flux, nan=-np.inf), frame))
+    rank = np.empty(len(frame), np.int64)
+    rank[order] = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.asarray(rank < _most_per_frame(counts, most))
+
+
+def _most_per_frame(counts: npt.NDArray[np.int64], most: int) -> int:
+    """Return the largest number per frame with which all frames together have at most `most`."""
+    low, high = 0, int(counts.max())
+    while low < high:
+        middle = (low + high + 1) // 2
+        if np.minimum(counts, middle).sum() <= most:
+            low = middle
+        else:
+            high = middle - 1
+    return low
+
+
+# -- Tabulate identified frames: stars, attitudes and other centroids as tables.
+
+Array = npt.NDArray[np.float64]
+
+
+class StarAttitudes(NamedTuple):
+    """The attitude of each frame; NaN where there is none."""
+
+    source: npt.NDArray[np.object_]
+    status: list[str | None]
+    R: Array  # sensor from ICRS
+    cov_arcsec2: Array  # independent in each frame, if from stars
+    shared_arcsec2: Array  # by errors that frames share: optics, an unknown velocity
+
+
+class MatchedStars(NamedTuple):
+    """Identified stars: the index of each one's centroid, and the star.
+
+    `scale` is the factor on each frame's centroid errors that the stars' residuals show, `floor_px`
+    the error that all have beside the stated ones.
+    """
+
+    at: npt.NDArray[np.int64]
+    star_id: npt.NDArray[np.int64]
+    magnitude: Array
+    u_icrs: Array
+    scale: Array
+    floor_px: float = 0.0
+
+
+def barycentric_velocity(time_ns: npt.NDArray[np.int64], places: pa.Table) -> Array:
+    """Return the sensor's barycentric velocity [km/s].
+
+    Where the sensor's geocentric velocity is unknown, it is the Earth's.
+    """
+    return earth_velocity(time_ns) + np.nan_to_num(stack(places, "v{}_km_s"))
+
+
+def _frame_key(exposures: pa.Table, frame: npt.NDArray[np.int64]) -> dict[str, Any]:
+    """Return the columns that name the frames of rows; all are of one sensor."""
+    return {
+        "sensor_id": pa.repeat(exposures["sensor_id"][0], len(frame)),
+        **{name: array(exposures, name)[frame] for name in ("frame_number", "time")},
+    }
+
+
+def stars_table(
+    exposures: pa.Table,
+    places: pa.Table,
+    c: FlatCentroids,
+    attitudes: StarAttitudes,
+    m: MatchedStars,
+) -> pa.Table:
+    """Return STARS: a row per identified star."""
+    frame = c.frame[m.at]
+    v_km_s = barycentric_velocity(array(exposures, "time"), places)
+    u = np.einsum("nij,nj->ni", attitudes.R[frame], aberrate(m.u_icrs, v_km_s[frame]))
+    dx, dy = np.full((2, len(frame)), np.nan)
+    for row, camera in c.cameras.items():
+        at = c.camera_of_frame[frame] == row
+        x, y = project(camera, u[at])
+        dx[at], dy[at] = c.x_px[m.at[at]] - x, c.y_px[m.at[at]] - y
+    return table(
+        STARS,
+        _frame_key(exposures, frame)
+        | {
+            "centroid": m.at - c.first[frame],
+            "star_id": m.star_id,
+            "magnitude": m.magnitude,
+            "x_px": c.x_px[m.at],
+            "y_px": c.y_px[m.at],
+            "dx_px": dx,
+            "dy_px": dy,
+        },
+    )
+
+
+def solutions_table(
+    exposures: pa.Table,
+    places: pa.Table,
+    c: FlatCentroids,
+    a: StarAttitudes,
+    m: MatchedStars,
+    stars: pa.Table,
+) -> pa.Table:
+    """Return SOLUTIONS: a row per frame."""
+    n = exposures.num_rows
+    frame = c.frame[m.at]
+    n_stars = np.bincount(frame, minlength=n)
+    squares = np.bincount(frame, array(stars, "dx_px") ** 2 + array(stars, "dy_px") ** 2, n)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        residual = np.where(n_stars > 0, np.sqrt(squares / (2 * n_stars)), np.nan)
+    known = a.source != "none"
+    q = np.full((n, 4), np.nan)
+    q[known] = quaternion_from_matrix(a.R[known])
+    ra, dec, roll = boresight_angles(a.R)
+    sigma = np.sqrt(np.diagonal(a.cov_arcsec2 + a.shared_arcsec2, axis1=1, axis2=2))
+    values = {
+        **unstack("q{}", q, "xyzw"),
+        **unstack("sigma_{}_arcsec", sigma),
+        **unstack_covariance("cov_att_{}_arcsec2", a.cov_arcsec2),
+        "ra_deg": np.degrees(ra),
+        "dec_deg": np.degrees(dec),
+        "roll_deg": np.degrees(roll),
+        "residual_px": residual,
+    }
+    scale = flux_scale(frame, m.star_id, m.magnitude, c.flux[m.at], n)
+    values["zero_mag"], values["zero_variance_mag2"] = scale.zero_mag, scale.zero_variance_mag2
+    kept = [
+        *("x_km", "y_km", "z_km", "vx_km_s", "vy_km_s", "vz_km_s"),
+        *("position_sigma_km", "used_position_sigma_km"),
+    ]
+    return table(
+        SOLUTIONS,
+        _frame_key(exposures, np.arange(n))
+        | {name: nullable(v) for name, v in values.items()}
+        | {name: places[name] for name in kept}
+        | {
+            "n_centroids": np.diff(c.first),
+            "n_stars": n_stars,
+            "attitude_source": a.source,
+            "status": a.status,
+            "camera": c.camera_of_frame,
+            "flux_floor_mag2": scale.floor_mag2,
+            "flux_photon_mag2": scale.photon_mag2,
+        },
+    )
+
+
+def detections_table(
+    exposures: pa.Table, c: FlatCentroids, a: StarAttitudes, m: MatchedStars, most: int
+) -> tuple[pa.Table, npt.NDArray[np.int64]]:
+    """Return DETECTIONS: each centroid in its camera's image that is no star; at most so many.
+
+    It has no direction where the frame has no attitude. The numbers of detections left out, by
+    frame, come second.
+    """
+    left = c.in_image.copy()
+    left[m.at] = False
+    at = np.flatnonzero(left)
+    kept = within_limit(c.frame[at], c.flux[at], most)
+    left_out = np.bincount(c.frame[at[~kept]], minlength=exposures.num_rows)
+    at = at[kept]
+    frame = c.frame[at]
+    u_icrs = np.einsum("nji,nj->ni", a.R[frame], c.u[at])
+    ra, dec = radec_from_unit(u_icrs)
+    sigma_px = np.where(np.isnan(c.sigma_px[at]), 1.0, np.hypot(c.sigma_px[at], m.floor_px))
+    sigma_px *= m.scale[frame]
+    rows = table(
+        DETECTIONS,
+        _frame_key(exposures, frame)
+        | {
+            "centroid": at - c.first[frame],
+            "x_px": c.x_px[at],
+            "y_px": c.y_px[at],
+            "flux": nullable(c.flux[at]),
+            "ra_deg": nullable(np.degrees(ra)),
+            "dec_deg": nullable(np.degrees(dec)),
+            "sigma_arcsec": sigma_px * c.pixel_rad[at] / ARCSEC,
+            "kind": np.full(len(at), "unknown", object),
+            "tracklet_id": pa.nulls(len(at), pa.string()),
+            "track_id": pa.nulls(len(at), pa.string()),
+        },
+    )
+    return rows, left_out
+
+
+def rejects_table(
+    exposures: pa.Table, c: FlatCentroids, left_out: npt.NDArray[np.int64]
+) -> pa.Table:
+    """Return rows of `rejects`, per log: how many centroids lie in frames without a camera or
+    outside the image, and how many detections were left out, by frame, because there were too
+    many."""
+    uncalibrated = np.where(c.camera_of_frame < 0, np.diff(c.first), 0)
+    outside = np.bincount(c.frame[~c.in_image], minlength=exposures.num_rows) - uncalibrated
+    return concat(
+        REJECTS,
+        [
+            _counted(Reason.NO_CALIBRATION, exposures, uncalibrated),
+            _counted(Reason.OUTSIDE_IMAGE, exposures, outside),
+            _counted(Reason.TOO_MANY_DETECTIONS, exposures, left_out),
+        ],
+    )
+
+
+def _counted(reason: Reason, exposures: pa.Table, counts: npt.NDArray[np.int64]) -> pa.Table:
+    """Return a row of `rejects` per log in which something of a frame was left out."""
+    sources, times = array(exposures, "source"), array(exposures, "time")
+    rows = []
+    for source in sorted(set(sources[counts > 0])):
+        at = np.flatnonzero((sources == source) & (counts > 0))
+        rows.append((source, int(times[at[0]]), int(counts[at].sum())))
+    source, time, count = zip(*rows, strict=True) if rows else ((), (), ())
+    return reject_rows(
+        reason,
+        source=list(source),
+        sensor_id=exposures["sensor_id"][0].as_py(),
+        time=list(time),
+        count=list(count),
+    )

@@ -1,0 +1,327 @@
+"""Name known objects: each object of a night, held against a catalogue and against earlier nights.
+
+The errors of the elements are learnt from the sure matches of the night, then all objects are
+judged with them.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+
+from epipole.io.catalogues.element_sets import KnownObjects
+from epipole.io.datasets.night_tables import read_columns, take_rows, write_table
+from epipole.schemas.bridge import array, concat, stack, stack_covariance, table
+from epipole.schemas.columns import PLACE, STATE_AXES, VELOCITY
+from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.settings import Settings
+from epipole.schemas.spans import DAY_NS
+from epipole.schemas.stages import Stage
+from epipole.schemas.star_lists import ElementSet, nearest_sets
+from epipole.schemas.tables import IDENTIFICATIONS, REJECTS, STATES
+from epipole.tasks.algorithms.known_objects.matching import (
+    Candidate,
+    KnownSatellites,
+    NameVerdict,
+    Observed,
+    candidates,
+    judge,
+    learn_errors,
+    spread_rows,
+)
+from epipole.tasks.algorithms.known_objects.prediction import (
+    HIGH_ORBIT,
+    LOW_ORBIT,
+    Screen,
+    is_deep_space,
+    predict,
+    satellites_of,
+)
+from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, link_by_motion
+from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.name.sensor_residuals import SensorResidual, sensor_residuals
+
+# -- Earlier nights: an unknown object is recognised by its motion as one of an earlier night.
+
+HOUR_S = 3600.0
+
+
+def recognise_objects(
+    folder: Path, objects: Sequence[str], earlier: pa.Table, settings: Settings
+) -> dict[str, str]:
+    """Return the ids that objects of a night had in an earlier one, where their motion decides.
+
+    Parameters
+    ----------
+    folder
+        The night's folder; its `states` are written.
+    objects
+        Ids of the objects to recognise. Ids that an earlier night knows already are skipped.
+    earlier
+        STATES of earlier nights.
+
+    Notes
+    -----
+    The last state of the earlier object is propagated to the first one of the night; see
+    `link_by_motion` for forces, process noise and when a link is refused.
+    """
+    gap_s = settings.known_objects.earlier_h * HOUR_S
+    if not (len(objects) and earlier.num_rows and gap_s > 0.0):
+        return {}
+    before = pl.DataFrame(earlier)
+    new = pl.DataFrame(read_columns(folder, "states", STATES.names))
+    new = new.filter(
+        pl.col("object_id").is_in(list(objects))
+        & ~pl.col("object_id").is_in(before["object_id"].unique().to_list())
+    )
+    old = before.sort("epoch").unique("object_id", keep="last").sort("object_id")
+    new = new.sort("epoch").unique("object_id", keep="first").sort("object_id")
+    if not (len(old) and len(new)):
+        return {}
+    both = pl.concat([old, new])
+    is_old = np.arange(len(both)) < len(old)
+    links, _ = link_by_motion(
+        _motions(both),
+        gap_s=gap_s,
+        log_odds=settings.states.link_log_odds,
+        allowed=is_old[:, None] & ~is_old,
+    )
+    names = both["object_id"].to_list()
+    return {names[k]: names[i] for k, i in enumerate(links.tolist()) if i >= 0}
+
+
+def _motions(states: pl.DataFrame) -> ObservedMotions:
+    """Return motions that are known at one instant each."""
+    time_ns = states["epoch"].cast(pl.Int64).to_numpy()
+    at_s = (time_ns - time_ns.min()) / 1e9
+    motion = states.select([*PLACE, *VELOCITY]).to_numpy()
+    cov = stack_covariance(states, "cov_{}", STATE_AXES)
+    return ObservedMotions(at_s, at_s, at_s, at_s, motion, motion, cov, cov)
+
+
+# -- Elements of a night: one usable element set for each object of a catalogue.
+
+
+class ElementsOfNight(NamedTuple):
+    """The element sets of a catalogue that are used in a night, each of another object."""
+
+    sha256: str
+    sets: list[ElementSet]
+
+    @property
+    def elements(self) -> np.ndarray:
+        """Mean elements, (n, 10); see `ElementSet`."""
+        return np.array([each.elements for each in self.sets]).reshape(-1, 10)
+
+
+def elements_of_night(
+    known: KnownObjects, night: str, settings: Settings
+) -> tuple[ElementsOfNight, pa.Table]:
+    """Return the elements that are used in a night, and `rejects` of those that are not.
+
+    Of each object it is the set whose epoch is nearest to the middle of the night.
+    """
+    middle_ns = int(np.datetime64(night, "ns").astype(np.int64)) + DAY_NS // 2
+    most_ns = settings.known_objects.most_days * DAY_NS
+    nearest = nearest_sets(known.sets, middle_ns)
+    recent = [each for each in nearest if abs(each.epoch_ns - middle_ns) <= most_ns]
+    made = ElementsOfNight(known.sha256, recent)
+    states = predict(satellites_of(made.elements), np.array([middle_ns]))
+    sound = np.atleast_1d(np.isfinite(states[:, 0]).all(axis=1))
+    used = [each for each, is_sound in zip(recent, sound, strict=True) if is_sound]
+    counts = {
+        Reason.BAD_ELEMENTS: len(known.faults),
+        Reason.OTHER_ELEMENTS: len(known.sets) - len(nearest),
+        Reason.OLD_ELEMENTS: len(nearest) - len(recent),
+        Reason.FAILED_ELEMENTS: len(recent) - len(used),
+    }
+    rejects = [
+        reject_rows(reason, source=known.file, time=[middle_ns - DAY_NS // 2], count=[count])
+        for reason, count in counts.items()
+        if count
+    ]
+    return made._replace(sets=used), concat(REJECTS, rejects)
+
+
+# -- Name known objects: each object of a night, held against a catalogue and against earlier
+# nights.
+#
+# The errors of the elements are learnt from the sure matches of the night, then all objects are
+# judged with them.
+
+SURE = 0.999  # probability of a match from which errors are learnt
+COVARIANCE = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
+
+
+@stage_task(Stage.NAME, "known objects")
+def name_known_objects(
+    folder: Path, known: ElementsOfNight | None, earlier: pa.Table, settings: Settings
+) -> list[SensorResidual]:
+    """Write the table `identifications` of a night whose other tables are written.
+
+    Parameters
+    ----------
+    folder
+        The night's folder.
+    known
+        None: there is no catalogue; all objects are unknown.
+    earlier
+        STATES of earlier nights.
+
+    Returns
+    -------
+    list
+        How far each sensor's detections of known objects are from their predictions.
+    """
+    observed, spans = observed_objects(folder)
+    verdicts = judge_objects(observed, known, settings) if known is not None else {}
+    verdicts = _without_rivals(verdicts, spans)
+    unnamed = [name for name in observed if _status(verdicts, name) != "known"]
+    same_as = recognise_objects(folder, unnamed, earlier, settings)
+    rows = _rows(list(observed), verdicts, known, same_as)
+    write_table(folder, "identifications", [rows])
+    if known is None:
+        return []
+    return sensor_residuals(
+        folder,
+        {n: known.sets[v.best.row] for n, v in verdicts.items() if v.status == "known" and v.best},
+    )
+
+
+def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, tuple[int, int]]]:
+    """Return some positions of each object, by id in order, and their first and last time."""
+    index = pl.DataFrame(read_columns(folder, "positions", ["object_id", "time", "independent"]))
+    chosen = []
+    for rows in index.with_row_index("row").partition_by("object_id", maintain_order=True):
+        times = rows["time"].cast(pl.Int64).to_numpy()
+        own = spread_rows(times, rows["independent"].to_numpy())
+        chosen.append(rows["row"].to_numpy()[own].astype(np.int64))
+    taken = np.sort(np.concatenate([np.zeros(0, np.int64), *chosen]))
+    columns = ["object_id", "time", *PLACE, *COVARIANCE]
+    rows = take_rows(folder, "positions", columns, taken)
+    names, time_ns = array(rows, "object_id"), array(rows, "time")
+    r_km, cov = stack(rows, "{}_km"), stack_covariance(rows, "cov_{}")
+    found = {}
+    for name in sorted(set(names.tolist())):
+        own = np.flatnonzero(names == name)
+        own = own[np.argsort(time_ns[own], kind="stable")]
+        found[name] = Observed(time_ns[own], r_km[own], cov[own])
+    spans = index.group_by("object_id").agg(
+        first=pl.col("time").min().cast(pl.Int64), last=pl.col("time").max().cast(pl.Int64)
+    )
+    return found, {name: (first, last) for name, first, last in spans.iter_rows()}
+
+
+def judge_objects(
+    observed: Mapping[str, Observed], known: ElementsOfNight, settings: Settings
+) -> dict[str, NameVerdict]:
+    """Return what each object is, with the errors of elements learnt from the sure matches."""
+    satellites = satellites_of(known.elements)
+    epoch_ns = np.array([each.epoch_ns for each in known.sets], np.int64)
+    catalogue = KnownSatellites(satellites, epoch_ns, LOW_ORBIT, HIGH_ORBIT)
+    screen = Screen(satellites)
+    first = {name: candidates(of, catalogue, screen) for name, of in observed.items()}
+    judged = [judge(found, SURE) for found in first.values()]
+    sure = [each.best for each in judged if each.status == "known" and each.best is not None]
+    learnt = _learnt(catalogue, sure)
+    least = settings.known_objects.probability
+    return {
+        name: judge(candidates(of, learnt, screen) if first[name] else [], least)
+        for name, of in observed.items()
+    }
+
+
+def _learnt(catalogue: KnownSatellites, sure: Sequence[Candidate]) -> KnownSatellites:
+    """Return the catalogue with the errors of its elements as the sure matches show them."""
+    errors = []
+    for is_deep, start in ((False, catalogue.low), (True, catalogue.high)):
+        own = [c for c in sure if is_deep_space(catalogue.satellites[c.row]) == is_deep]
+        errors.append(learn_errors(own, [catalogue.satellites[c.row] for c in own], start))
+    low, high = errors
+    return catalogue._replace(low=low, high=high)
+
+
+def _without_rivals(
+    verdicts: Mapping[str, NameVerdict], spans: Mapping[str, tuple[int, int]]
+) -> dict[str, NameVerdict]:
+    """Return the verdicts; objects that were seen at one time are not one satellite.
+
+    An object may be seen again after a gap without being recognised: two that were seen at
+    different times may have one name.
+    """
+    named: dict[int, list[str]] = {}
+    for name, verdict in verdicts.items():
+        if verdict.status == "known" and verdict.best is not None:
+            named.setdefault(verdict.best.row, []).append(name)
+    rivals = {
+        name
+        for names in named.values()
+        for name in names
+        for other in names
+        if other != name and _overlap(spans[name], spans[other])
+    }
+    return {
+        name: verdict._replace(status="ambiguous") if name in rivals else verdict
+        for name, verdict in verdicts.items()
+    }
+
+
+def _overlap(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    return one[0] <= other[1] and other[0] <= one[1]
+
+
+def _status(verdicts: Mapping[str, NameVerdict], name: str) -> str:
+    return verdicts[name].status if name in verdicts else "unknown"
+
+
+class _Names(NamedTuple):
+    """What the catalogue says of an object."""
+
+    norad_id: int | None = None
+    cospar_id: str | None = None
+    name: str | None = None
+    element_epoch: int | None = None
+
+
+def _names(verdict: NameVerdict | None, sets: Sequence[ElementSet]) -> _Names:
+    if verdict is None or verdict.best is None:
+        return _Names()
+    best = sets[verdict.best.row]
+    if verdict.status == "known":
+        return _Names(best.number, best.cospar_id or None, best.name or None, best.epoch_ns)
+    if verdict.status == "ambiguous":
+        names = " / ".join(sets[row].name or str(sets[row].number) for row in verdict.rows)
+        return _Names(name=names, element_epoch=best.epoch_ns)
+    return _Names(element_epoch=best.epoch_ns)
+
+
+def _rows(
+    objects: Sequence[str],
+    verdicts: Mapping[str, NameVerdict],
+    known: ElementsOfNight | None,
+    same_as: Mapping[str, str],
+) -> pa.Table:
+    """Return IDENTIFICATIONS: a row per object, in order of their ids."""
+    sets = known.sets if known is not None else []
+    of = [verdicts.get(name) for name in objects]
+    names = [_names(verdict, sets) for verdict in of]
+    best = [verdict.best if verdict is not None else None for verdict in of]
+    columns = {field: [getattr(each, field) for each in names] for field in _Names._fields}
+    time = IDENTIFICATIONS.field("element_epoch").type
+    columns["element_epoch"] = pa.array(columns["element_epoch"], pa.int64()).cast(time)
+    return table(
+        IDENTIFICATIONS,
+        columns
+        | {
+            "object_id": list(objects),
+            "status": [_status(verdicts, name) for name in objects],
+            "same_as": [same_as.get(name) for name in objects],
+            "distance_km": [each.distance_km if each else None for each in best],
+            "mahalanobis": [each.mahalanobis if each else None for each in best],
+            "probability": [verdict.probability if verdict else None for verdict in of],
+            "catalogue": [known.sha256 if known is not None else None] * len(objects),
+        },
+    )

@@ -1,0 +1,264 @@
+"""Pictures in the image of a sensor: a star map, residuals, epipolar lines."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from epipole.tasks.report.canvas import (
+    BLACK,
+    BLUE,
+    GREY,
+    LINES,
+    ORANGE,
+    PALE,
+    SKY,
+    VERMILLION,
+    as_image,
+    axes_of,
+    legend_below,
+    short,
+    time_axis,
+)
+from epipole.tasks.report.epipolar_views import EpipolarViews
+from epipole.tasks.report.frame_series import FrameSeries
+from epipole.tasks.report.stars import CELLS, StarMap, StarResiduals
+
+# -- Pictures in the image of a sensor: a star map, residuals, epipolar lines.
+
+Array = npt.NDArray[np.float64]
+
+IMAGE_IN = 4.1  # height of a picture of an image
+MAX_NAMES = 30
+CROWD = 60  # objects: more have smaller marks
+MIN_IN_CELL = 10
+SURE_SIGMA = 4.0
+VECTOR_SHARE = 0.06  # of the image's width: the length of a usual residual vector
+
+
+def draw_star_map(figure: Figure, frame: StarMap, size_px: Array) -> None:
+    """Draw a frame: stars with names and residual vectors, and detections that are no stars."""
+    axes = axes_of(figure)
+    x, y = frame.stars_px.T
+    area = 3.0 + 2.5 * np.clip(frame.magnitude.max(initial=0.0) - frame.magnitude, 0, 12)
+    axes.scatter(x, y, s=area, color=BLACK, linewidths=0, zorder=3, label="star, size by magnitude")
+    axes.scatter(x, y, s=area + 34, facecolors="none", edgecolors=BLUE, linewidths=0.9,
+                 label="identified")  # fmt: skip
+    scale = vector_scale(frame.residuals_px, size_px)
+    _vectors(axes, frame.stars_px, frame.residuals_px, scale, VERMILLION)
+    own, lone = frame.others_px[frame.objects], frame.others_px[~frame.objects]
+    area, width = (26.0, 1.2) if len(own) <= CROWD else (9.0, 0.7)
+    axes.scatter(own[:, 0], own[:, 1], s=area, marker="s", facecolors="none", edgecolors=ORANGE,
+                 linewidths=width, label="object (has a track)")  # fmt: skip
+    axes.scatter(
+        lone[:, 0],
+        lone[:, 1],
+        s=13,
+        marker="x",
+        color=GREY,
+        linewidths=0.8,
+        label="other detection",
+    )
+    for k, (dx, dy, how) in _label_places(frame, size_px).items():
+        axes.annotate(str(frame.star_id[k]), frame.stars_px[k], (dx, dy), fontsize=6.5,
+                      textcoords="offset points", ha=how, va="center", color=BLUE)  # fmt: skip
+    as_image(axes, size_px)
+    legend_below(figure, axes, columns=2)
+
+
+def vector_scale(residuals_px: Array, size_px: Array) -> float:
+    """Return how many times residual vectors are drawn longer: a round number."""
+    length = np.hypot(*residuals_px.T)
+    length = length[np.isfinite(length) & (length > 0)]
+    if not len(length):
+        return 1.0
+    scale = VECTOR_SHARE * float(size_px[0]) / float(np.quantile(length, 0.75))
+    power = 10.0 ** np.floor(np.log10(scale))
+    return float(max(power * max(s for s in (1, 2, 5) if s * power <= scale), 1.0))
+
+
+def _vectors(axes: Axes, places: Array, residuals: Array, scale: float, colour: str) -> None:
+    if not len(places):
+        return
+    axes.quiver(*places.T, *(scale * residuals.T), angles="xy", scale_units="xy", scale=1.0,
+                color=colour, width=0.006, headwidth=4, headlength=4.5, headaxislength=4,
+                zorder=4)  # fmt: skip
+
+
+def _label_places(frame: StarMap, size_px: Array) -> dict[int, tuple[float, float, str]]:
+    """Return offset and side of the names that have room, the brightest stars first."""
+    wide, high = 0.11 * size_px[0], 0.028 * size_px[1]
+    taken = [(x - high / 2, y, x + high / 2) for x, y in (*frame.stars_px, *frame.others_px)]
+    found: dict[int, tuple[float, float, str]] = {}
+    for k in np.argsort(frame.magnitude, kind="stable")[:MAX_NAMES].tolist():
+        x, y = frame.stars_px[k]
+        sides = (
+            (6.0, "left", x + high, x + high + wide),
+            (-6.0, "right", x - high - wide, x - high),
+        )
+        for dx, how, low, up in sides:
+            free = all(abs(y - v) > high or up < a or low > b for a, v, b in taken)
+            if free and low > 0 and up < size_px[0]:
+                taken.append((low, y, up))
+                found[k] = (dx, 0.0, how)
+                break
+    return found
+
+
+def draw_image_residuals(figure: Figure, residuals: StarResiduals, k: int) -> None:
+    """Draw a sensor's mean star residual over its image; grey where chance alone explains it."""
+    axes = axes_of(figure)
+    size = residuals.size_px[k]
+    centre = (np.arange(CELLS) + 0.5) / CELLS
+    places = np.stack(np.meshgrid(centre * size[0], centre * size[1]), axis=-1).reshape(-1, 2)
+    mean, surely = image_pattern(residuals, k)
+    held = np.isfinite(mean[:, 0])
+    scale = vector_scale(mean[held], size)
+    axes.scatter(places[held, 0], places[held, 1], s=4, color=GREY, linewidths=0)
+    for own, colour, name in ((held & ~surely, SKY, "as chance has it"),
+                              (held & surely, VERMILLION, "more than chance")):  # fmt: skip
+        _vectors(axes, places[own], mean[own], scale, colour)
+        axes.plot([], [], color=colour, linewidth=1.5, marker=">", markersize=4, label=name)
+    as_image(axes, size)
+    axes.set_title(short(residuals.sensors[k]), fontsize=8.5)
+    legend_below(figure, axes, columns=2)
+
+
+def image_pattern(residuals: StarResiduals, k: int) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Return (cells, 2) mean residuals, NaN with few stars, and which are more than chance."""
+    count = residuals.in_cell[k].ravel()
+    mean = np.where(count[:, None] >= MIN_IN_CELL, residuals.mean_px[k].reshape(-1, 2), np.nan)
+    sigma_px = residuals.sigma_px[k] / np.sqrt(np.maximum(count, 1))
+    with np.errstate(invalid="ignore"):
+        surely = np.hypot(*mean.T) > SURE_SIGMA * sigma_px
+    return mean, surely
+
+
+def draw_epipolar(figure: Figure, views: EpipolarViews) -> None:
+    """Draw the lines of one sensor's lines of sight in the image of another."""
+    axes = axes_of(figure)
+    if len(views.others_px):
+        x, y = views.others_px.T
+        axes.scatter(x, y, s=10, marker="x", color=GREY, linewidths=0.7,
+                     label="other detections")  # fmt: skip
+    for number, line in enumerate(views.lines):
+        colour, _, dashes = LINES[number % len(LINES)]
+        names = {"line": f"line of sight of {short(views.from_sensor, 12)}",
+                 "seen": f"object, seen by {short(views.in_sensor, 12)}"}  # fmt: skip
+        axes.plot(*line.line_px.T, color=colour, linestyle=dashes, linewidth=1.0,
+                  label=None if number else names["line"])  # fmt: skip
+        axes.plot(*line.seen_px, marker="o", markersize=6, markerfacecolor="none", linestyle="",
+                  markeredgecolor=colour, markeredgewidth=1.3,
+                  label=None if number else names["seen"])  # fmt: skip
+    as_image(axes, views.size_px)
+    legend_below(figure, axes, columns=2)
+
+
+# -- Pictures of sensors over the night: frames, attitude sigmas, star residuals.
+
+MAX_ROWS = 16
+MAX_LINES = len(LINES)
+ROW_IN = 0.3
+MARKERS = 6  # on a line
+# How frames got their attitude: colour, hatch, name.
+KINDS = (
+    (BLUE, "", "identified"), (ORANGE, "////", "predicted"), (VERMILLION, "xxxx", "no attitude"),
+)  # fmt: skip
+
+
+def coverage_height(series: FrameSeries) -> float:
+    """Return how high the picture of the coverage is [in]."""
+    return 0.95 + ROW_IN * min(len(series.sensors), MAX_ROWS)
+
+
+def draw_coverage(figure: Figure, series: FrameSeries) -> None:
+    """Draw a strip for each sensor: what its frames became, white where there are none."""
+    axes = axes_of(figure)
+    rows = worst_first(series)[:MAX_ROWS]
+    edges = series.bins.edges_s
+    for place, k in enumerate(rows):
+        total = series.counts[:, k].sum(axis=0)
+        usual = max(float(np.median(total[total > 0])), 1.0) if total.any() else 1.0
+        bottom = np.full(len(total), place - 0.4)
+        axes.add_patch(_frame(edges, place))
+        for (colour, hatch, name), count in zip(KINDS, series.counts[:, k], strict=True):
+            share = 0.8 * count / np.maximum(total, usual)
+            if count.any():
+                axes.stairs(bottom + share, edges, baseline=bottom, fill=True, facecolor=colour,
+                            hatch=hatch, edgecolor="white" if hatch else colour,
+                            linewidth=0.0, label=name)  # fmt: skip
+            bottom = bottom + share
+    axes.set_yticks(range(len(rows)), [short(series.sensors[k]) for k in rows])
+    axes.tick_params(axis="y", length=0)
+    axes.set(ylim=(-0.6, len(rows) - 0.4))
+    axes.spines["left"].set_visible(False)
+    time_axis(axes, edges[0], edges[-1])
+    legend_below(figure, axes, columns=3)
+
+
+def _frame(edges: Array, place: int) -> Rectangle:
+    return Rectangle((edges[0], place - 0.4), edges[-1] - edges[0], 0.8, fill=False,
+                     edgecolor=PALE, linewidth=0.6)  # fmt: skip
+
+
+def worst_first(series: FrameSeries) -> list[int]:
+    """Return the sensors: all in their order, or where they are too many, the worst ones first."""
+    if len(series.sensors) <= MAX_ROWS:
+        return list(range(len(series.sensors)))[::-1]
+    order = np.lexsort((-series.lost_s, series.identified_share))
+    return [int(k) for k in order]
+
+
+def drawn_lines(series: FrameSeries) -> list[int]:
+    """Return the sensors that have a line of their own: those with the largest residual."""
+    if len(series.sensors) <= MAX_LINES:
+        return list(range(len(series.sensors)))
+    with np.errstate(invalid="ignore"):
+        worst = np.nan_to_num(np.nanmax(np.nan_to_num(series.rms["residual"], nan=-1.0), axis=1))
+    return sorted(np.argsort(-worst, kind="stable")[:MAX_LINES].tolist())
+
+
+def draw_series(figure: Figure, series: FrameSeries, what: str, ylabel: str) -> None:
+    """Draw a line per sensor of one of `SUMS` over time."""
+    axes = axes_of(figure, ylabel=ylabel)
+    edges = series.bins.edges_s
+    middle = (edges[1:] + edges[:-1]) / 2
+    values = series.rms[what]
+    for number, k in enumerate(drawn_lines(series)):
+        colour, marker, dashes = LINES[number % MAX_LINES]
+        every = max(len(middle) // MARKERS, 1)
+        axes.plot(middle, values[k], color=colour, marker=marker, linestyle=dashes, linewidth=1.0,
+                  markersize=3.5, markevery=(number % every, every),
+                  label=short(series.sensors[k], 12))  # fmt: skip
+    time_axis(axes, edges[0], edges[-1])
+    known = values[np.isfinite(values)]
+    if len(known) and known.min() > 0 and known.max() / known.min() > 20:
+        axes.set_yscale("log")
+    elif len(known):
+        axes.set_ylim(0, 1.12 * known.max())
+    legend_below(figure, axes, columns=4)
+
+
+def draw_focal_lengths(
+    figure: Figure, nights: Sequence[str], ppm: dict[str, Sequence[float]]
+) -> None:
+    """Draw how much each sensor's focal length differs from its own median, by night [1e-6]."""
+    axes = axes_of(figure, ylabel="focal length, from its median [ppm]")
+    at = range(len(nights))
+    for number, (name, values) in enumerate(ppm.items()):
+        colour, marker, dashes = LINES[number % MAX_LINES]
+        axes.plot(at, values, color=colour, marker=marker, linestyle=dashes, linewidth=1.0,
+                  markersize=3.5, label=short(name, 12))  # fmt: skip
+    night_axis(axes, nights)
+    legend_below(figure, axes, columns=4)
+
+
+def night_axis(axes: Axes, nights: Sequence[str]) -> None:
+    """Make the x axis nights: as many dates as have room."""
+    step = max(-(-len(nights) // 5), 1)
+    at = list(range(len(nights) - 1, -1, -step))[::-1]
+    axes.set_xticks(at, [nights[k][5:] for k in at])
+    axes.set(xlim=(-0.5, len(nights) - 0.5), xlabel="night (month-day)")

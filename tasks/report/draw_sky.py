@@ -1,0 +1,215 @@
+"""Pictures of the sky: tracklets, and where the objects are."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.special import gammaln
+
+from epipole.schemas.rejects import NameStatus, Outcome
+from epipole.tasks.report.canvas import (
+    BLACK,
+    BLUE,
+    GREY,
+    INK,
+    LINES,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    axes_of,
+    legend_below,
+)
+from epipole.tasks.report.draw_sensors import night_axis
+from epipole.tasks.report.objects import NightNumbers, NightObject, SkyTracks
+from epipole.tasks.report.solved_chi2 import Chi2
+from epipole.tasks.report.stars import HISTOGRAM, StarResiduals
+
+# -- Pictures of the sky: tracklets, and where the objects are.
+
+Array = npt.NDArray[Any]
+
+_OUTCOMES = {
+    Outcome.OBJECT: (BLUE, "-", "o"),
+    Outcome.SEEN_BY_ONE: (ORANGE, "--", "s"),
+    Outcome.AMBIGUOUS: (PURPLE, "-.", "D"),
+    Outcome.DISAGREES: (VERMILLION, ":", "v"),
+    Outcome.SENSOR_LEFT_OUT: (BLACK, ":", "X"),
+    Outcome.NOT_COMPARED: (GREY, "--", "^"),
+}
+_STATUSES = {
+    NameStatus.KNOWN: (BLUE, "o"),
+    NameStatus.AMBIGUOUS: (ORANGE, "s"),
+    NameStatus.UNKNOWN: (VERMILLION, "^"),
+}
+FAR_KM = 20_000.0
+
+
+def draw_sky(figure: Figure, tracks: SkyTracks) -> None:
+    """Draw tracklets in right ascension and declination: their end has the marker."""
+    axes = axes_of(figure, "right ascension [deg]", "declination [deg]")
+    places = np.concatenate([line.radec_deg for line in tracks.lines])
+    middle = np.radians(places[:, 0])
+    centre = np.degrees(np.arctan2(np.sin(middle).mean(), np.cos(middle).mean())) % 360
+    for outcome, (colour, dashes, marker) in _OUTCOMES.items():
+        own = [line.radec_deg for line in tracks.lines if line.outcome == outcome]
+        if not own:
+            continue
+        lines = [_whole(line, centre) for line in own]
+        x, y = np.concatenate([np.vstack([line, [np.nan, np.nan]]) for line in lines]).T
+        axes.plot(x, y, color=colour, linestyle=dashes, linewidth=0.9)
+        ends = np.array([line[-1] for line in lines])
+        axes.plot(*ends.T, color=colour, linestyle="", marker=marker, markersize=3.2,
+                  label=f"{outcome} ({tracks.counts.get(outcome, 0):,})")  # fmt: skip
+    _limits(axes, places, centre)
+    legend_below(figure, axes, columns=2)
+
+
+def _whole(radec: Array, centre: float) -> Array:
+    """Return a line with right ascensions around the centre, so that it does not jump."""
+    ra = (radec[:, 0] - centre + 180.0) % 360.0 - 180.0 + centre
+    ra = np.where(ra - ra[0] > 180, ra - 360, np.where(ra - ra[0] < -180, ra + 360, ra))
+    return np.stack([ra, radec[:, 1]], axis=1)
+
+
+def _limits(axes: Axes, places: Array, centre: float) -> None:
+    ra = (places[:, 0] - centre + 180.0) % 360.0 - 180.0 + centre
+    low, high = ra.min(), ra.max()
+    margin = max(0.04 * (high - low), 0.05)
+    axes.set_xlim(high + margin, low - margin)  # east is left, as seen from inside the sphere
+    axes.locator_params(axis="x", nbins=6)
+    axes.set_xticks(ticks := axes.get_xticks(), [f"{tick % 360:g}" for tick in ticks])
+    axes.set_xlim(high + margin, low - margin)
+
+
+def draw_ring(figure: Figure, objects: Sequence[NightObject]) -> None:
+    """Draw objects near the geostationary ring: longitude and latitude, first to last place."""
+    axes = axes_of(figure, "longitude [deg east]", "latitude [deg]")
+    for status, (colour, marker) in _STATUSES.items():
+        own = [each for each in objects if each.status == status]
+        if not own:
+            continue
+        first, last = (np.array([side[:2] for side in ends]) for ends in
+                       ([o.first for o in own], [o.last for o in own]))  # fmt: skip
+        jump = np.abs(first[:, 0] - last[:, 0]) > 180
+        first[jump] = last[jump]
+        axes.plot(*np.stack([first, last]).transpose(2, 0, 1), color=colour, linewidth=0.9)
+        axes.plot(*last.T, **_mark(marker, colour), label=f"{status} ({len(own):,})")
+    axes.grid(color="#e3e7ea", linewidth=0.5)
+    axes.set_axisbelow(True)
+    legend_below(figure, axes, columns=3)
+
+
+def _mark(marker: str, colour: str) -> dict[str, Any]:
+    return {"linestyle": "", "marker": marker, "markersize": 4.5, "markerfacecolor": "none",
+            "markeredgecolor": colour, "markeredgewidth": 1.2}  # fmt: skip
+
+
+def draw_elements(figure: Figure, objects: Sequence[NightObject]) -> None:
+    """Draw eccentricity and inclination of objects over their semi-major axis."""
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for status, (colour, marker) in _STATUSES.items():
+        own = [o.elements for o in objects if o.status == status and o.elements is not None]
+        if not own:
+            continue
+        a, e, i = np.array(own).T
+        upper.plot(a, e, **_mark(marker, colour), label=f"{status} ({len(own):,})")
+        lower.plot(a, i, **_mark(marker, colour))
+    upper.set(ylabel="eccentricity")
+    lower.set(ylabel="inclination [deg]", xlabel="semi-major axis [thousand km]")
+    upper.set_ylim(bottom=0)
+    lower.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}")
+    lower.locator_params(axis="x", nbins=6)
+    for axes in (upper, lower):
+        axes.grid(color="#e3e7ea", linewidth=0.5)
+        axes.set_axisbelow(True)
+    legend_below(figure, upper, columns=3)
+
+
+def draw_trend(figure: Figure, nights: Sequence[NightNumbers]) -> None:
+    """Draw a strip of each number over the nights; the last night has the large marker."""
+    strips: tuple[tuple[str, list[float]], ...] = (
+        ("identified\n[%]", [100 * each.identified_share for each in nights]),
+        ("frames", [each.frames for each in nights]),
+        ("objects", [each.objects for each in nights]),
+        ("positions", [each.positions for each in nights]),
+        ("left out", [each.rejects for each in nights]),
+    )
+    at = np.arange(len(nights))
+    all_axes = figure.subplots(len(strips), 1, sharex=True)
+    for (name, values), axes, (colour, marker, _) in zip(strips, all_axes, LINES, strict=False):
+        axes.plot(at, values, color=colour, linewidth=1.0, marker=marker, markersize=2.8)
+        axes.plot(at[-1:], values[-1:], color=colour, marker=marker, markersize=7)
+        axes.set_ylabel(name, rotation=0, ha="right", va="center")
+        axes.set_ylim(0, 1.15 * max(max(values), 1e-9))
+        axes.locator_params(axis="y", nbins=3)
+        axes.yaxis.set_major_formatter(_number)
+    night_axis(all_axes[-1], [each.night for each in nights])
+
+
+def _number(value: float, _: object) -> str:
+    if value >= 1e6:
+        return f"{value / 1e6:g} M"
+    return f"{value / 1e3:g} k" if value >= 1e4 else f"{value:g}"
+
+
+# -- Pictures of distributions: what was found beside what should be.
+
+STEPS = 120  # of a curve
+MAX_FREEDOMS = 200  # kinds of degrees of freedom that a curve is summed of
+FOUND: dict[str, Any] = {"facecolor": SKY, "edgecolor": "white", "linewidth": 0.3}
+EXPECTED: dict[str, Any] = {"color": INK, "linewidth": 1.4}
+
+
+def draw_normal(figure: Figure, residuals: StarResiduals) -> None:
+    """Draw the normalised star residuals of all sensors, and the standard normal."""
+    counts = residuals.counts.sum(axis=0)
+    axes = axes_of(figure, "star residual / its sigma", "density")
+    _bars(axes, HISTOGRAM, counts)
+    x = np.linspace(HISTOGRAM[0], HISTOGRAM[-1], STEPS)
+    axes.plot(x, np.exp(-x * x / 2) / np.sqrt(2 * np.pi), label="standard normal", **EXPECTED)
+    _finish(figure, axes, HISTOGRAM)
+
+
+def draw_half_normal(figure: Figure, pairs: Chi2) -> None:
+    """Draw the distances of pairs from their epipolar lines, and the half normal."""
+    axes = axes_of(figure, "distance from the epipolar line / its sigma", "density")
+    _bars(axes, pairs.edges, pairs.counts)
+    x = np.linspace(0.0, pairs.edges[-1], STEPS)
+    axes.plot(x, np.exp(-x * x / 2) * np.sqrt(2 / np.pi), label="half normal", **EXPECTED)
+    _finish(figure, axes, pairs.edges)
+
+
+def draw_chi2(figure: Figure, found: Chi2, what: str) -> None:
+    """Draw chi-squares, and the sum of the chi-square distributions of their freedoms."""
+    axes = axes_of(figure, f"chi-square of {what}", "density")
+    _bars(axes, found.edges, found.counts)
+    x = np.linspace(found.edges[0] + 1e-9, found.edges[-1], STEPS)
+    kinds = np.flatnonzero(found.freedom)
+    kinds = kinds[np.argsort(-found.freedom[kinds], kind="stable")][:MAX_FREEDOMS]
+    weights = found.freedom[kinds] / found.freedom[kinds].sum()
+    density = sum(w * _chi2_density(x, int(k)) for w, k in zip(weights, kinds, strict=True))
+    axes.plot(x, density, label="chi-square distribution", **EXPECTED)
+    widths = np.diff(found.edges)
+    highest = (found.counts[1:-1] / (found.counts.sum() * widths[1:-1])).max(initial=0.0)
+    axes.set_ylim(0, 1.25 * max(highest, float(density[STEPS // 12 :].max())))
+    _finish(figure, axes, found.edges)
+
+
+def _chi2_density(x: Array, freedom: int) -> Array:
+    """Return the density of the chi-square distribution; scipy.stats takes a second to import."""
+    half = freedom / 2
+    return np.exp((half - 1) * np.log(x) - x / 2 - half * np.log(2) - gammaln(half))
+
+
+def _bars(axes: Axes, edges: Array, counts: Array) -> None:
+    density = counts / (counts.sum() * np.diff(edges))
+    axes.bar(edges[:-1], density, np.diff(edges), align="edge", label="found", **FOUND)
+
+
+def _finish(figure: Figure, axes: Axes, edges: Array) -> None:
+    axes.set_xlim(edges[0], edges[-1])
+    legend_below(figure, axes, columns=2)

@@ -1,1 +1,0 @@
-"""The pictures of the report: what was computed, drawn with matplotlib."""

@@ -1,0 +1,132 @@
+"""Sections about what was found: tracklets, epipolar lines, objects, the last nights."""
+
+from collections.abc import Sequence
+from functools import partial
+
+from epipole.schemas.rejects import NameStatus, Outcome
+from epipole.tasks.report.canvas import as_svg
+from epipole.tasks.report.draw_sensors import IMAGE_IN, draw_epipolar
+from epipole.tasks.report.draw_sky import draw_elements, draw_ring, draw_sky, draw_trend
+from epipole.tasks.report.frame_series import clock
+from epipole.tasks.report.html import Section, figure, figures, nothing, paragraph, table
+from epipole.tasks.report.night_facts import NightFacts, percent
+from epipole.tasks.report.objects import NightObject
+
+MAX_OBJECTS = 100
+PICTURE_IN = 2.8
+
+
+def sky(facts: NightFacts) -> Section:
+    """Return the section about tracklets on the sky."""
+    title, tracks = "Tracklets on the sky", facts.tracks
+    if tracks is None or not tracks.lines:
+        return Section("sky", title, nothing("The night has no tracklets."))
+    total = sum(tracks.counts.values())
+    some = f" Drawn are {len(tracks.lines):,} of {total:,}." if len(tracks.lines) < total else ""
+    picture = figure(
+        as_svg(partial(draw_sky, tracks=tracks), 3.2),
+        f"{total:,} tracklets in right ascension and declination, by what became of them.",
+        "Tracklets of all sensors; the marker is at the end. Each sensor sees an object in another "
+        "direction. Most should belong to an object where sensors look at the same region." + some,
+    )
+    sentences = {outcome.value: outcome.sentence.replace("`", "") for outcome in Outcome}
+    rows = [(name, f"{count:,}", sentences[name]) for name, count in tracks.counts.items()]
+    heading = ("outcome", "tracklets", "meaning")
+    body = figures([picture]) + table("What became of the tracklets", heading, rows)
+    return Section("sky", title, body)
+
+
+def epipolar(facts: NightFacts) -> Section:
+    """Return the section with the epipolar lines of one epoch."""
+    title, views = "Epipolar lines", facts.epipolar
+    if views is None:
+        sentence = "No object was seen by two sensors whose optics were fitted."
+        return Section("epipolar", title, nothing(sentence))
+    farthest = max((line.distance_px for line in views.lines), default=0.0)
+    picture = figure(
+        as_svg(partial(draw_epipolar, views=views), IMAGE_IN),
+        f"Image of {views.in_sensor} with {len(views.lines)} lines of sight of "
+        f"{views.from_sensor}.",
+        f"What {views.from_sensor} sees at {clock(views.epoch_ns)} UTC is a line in the image of "
+        f"{views.in_sensor}. Each ring should lie on the line of its colour; the farthest is "
+        f"{farthest:.2f} px away. Where all is well it is as far as the pair distances above say.",
+    )
+    return Section("epipolar", title, figures([picture]))
+
+
+def objects(facts: NightFacts) -> Section:
+    """Return the section about the objects."""
+    title, found = "Objects", facts.objects
+    if not found:
+        return Section("objects", title, nothing("No object has a position."))
+    ring = [each for each in found if each.near_geostationary]
+    others = [each for each in found if each.has_orbit and not each.near_geostationary]
+    pictures = []
+    if ring:
+        pictures.append(figure(
+            as_svg(partial(draw_ring, objects=ring), PICTURE_IN),
+            f"Longitude and latitude of {len(ring)} objects near the geostationary ring.",
+            "Objects near the geostationary ring: from their first to their last position, which "
+            "has the marker. A station-kept one hardly moves.",
+        ))  # fmt: skip
+    if others:
+        pictures.append(figure(
+            as_svg(partial(draw_elements, objects=others), 3.6),
+            f"Semi-major axis, eccentricity and inclination of {len(others)} objects.",
+            "The other objects, by the best state of each. From a short arc, axis and eccentricity "
+            "are uncertain: their scatter is no orbit.",
+        ))  # fmt: skip
+    return Section("objects", title, paragraph(_names(found)) + figures(pictures) + _table(found))
+
+
+def _names(found: Sequence[NightObject]) -> str:
+    counts = {status: sum(each.status == status for each in found) for status in NameStatus}
+    listed = ", ".join(f"{count:,} {status}" for status, count in counts.items() if count)
+    bare = sum(each.elements is None for each in found)
+    short = f" {bare:,} have no state: their arcs are too short." if bare else ""
+    return f"{len(found):,} objects have positions: {listed}.{short}"
+
+
+def _table(found: Sequence[NightObject]) -> str:
+    order = sorted(found, key=lambda each: (each.status == NameStatus.KNOWN, -each.positions))
+    shown = order[:MAX_OBJECTS]
+    rows = [
+        (each.object_id, each.status, each.name, f"{each.positions:,}", clock(each.first_ns),
+         clock(each.last_ns), str(each.sensors), f"{each.sigma_km:.3g}", *_place(each))
+        for each in shown
+    ]  # fmt: skip
+    caption = "Objects; unknown ones first"
+    if len(found) > len(shown):
+        caption += f", {len(shown)} of {len(found):,}"
+    heading = ("object", "status", "name", "positions", "from", "to", "sensors", "sigma km",
+               "radius km", "longitude", "latitude", "a km", "e", "i deg")  # fmt: skip
+    return table(caption, heading, rows)
+
+
+def _place(each: NightObject) -> tuple[str, ...]:
+    longitude, latitude, radius = each.last
+    place = f"{radius:,.0f}", f"{longitude:.2f}", f"{latitude:.2f}"
+    if each.elements is None:
+        return (*place, "", "", "")
+    a, e, i = each.elements
+    return *place, f"{a:,.0f}", f"{e:.4f}", f"{i:.2f}"
+
+
+def trend(facts: NightFacts) -> Section:
+    """Return the section about the last nights of the dataset."""
+    title, nights = "The last nights", facts.trend
+    if len(nights) < 2:
+        return Section("trend", title, nothing("The dataset has no earlier night."))
+    picture = figure(
+        as_svg(partial(draw_trend, nights=nights), 4.2),
+        f"Frames, share identified, objects, positions and rejects of {len(nights)} nights.",
+        "Numbers of the last nights; the large marker is this night. Steps that the sensors' "
+        "programme does not explain need a look.",
+    )
+    rows = [
+        (each.night, f"{each.frames:,}", percent(each.identified_share), f"{each.objects:,}",
+         f"{each.positions:,}", f"{each.rejects:,}")
+        for each in reversed(nights)
+    ]  # fmt: skip
+    heading = ("night", "frames", "identified", "objects", "positions", "left out")
+    return Section("trend", title, figures([picture]) + table("Nights", heading, rows))

@@ -1,1 +1,0 @@
-"""The page of the report: HTML of one file, with its sections, tables and pictures."""

@@ -1,0 +1,229 @@
+"""Star residuals of a night: against their sigma, and over the image of each sensor."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from epipole.io.datasets.night_tables import NightReader
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.report.frame_series import FrameSeries, codes
+
+# -- Star residuals of a night: against their sigma, and over the image of each sensor.
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+COLUMNS = ["time", "sensor_id", "x_px", "y_px", "dx_px", "dy_px"]
+HISTOGRAM = np.linspace(-5.0, 5.0, 51)  # edges, in sigmas
+CELLS = 8  # of the image, along each side
+SIGMA_BINS = np.geomspace(1e-3, 1e4, 701)  # edges [arcsec]
+FITTED = 3  # parameters of an attitude
+
+
+class StarResiduals(NamedTuple):
+    """The residuals of all identified stars, both axes.
+
+    counts : (sensors, bins) of `HISTOGRAM`; without any where no sigma is known
+    mean_square : (sensors,), in units of the sigma; NaN where it is not known
+    stars : (sensors,) identified stars
+    sigma_px : (sensors,) of a centroid, median
+    size_px : (sensors, 2) width and height of the image, about
+    mean_px : (sensors, cells, cells, 2) mean residual by row and column; NaN without stars
+    in_cell : (sensors, cells, cells) stars
+    """
+
+    sensors: list[str]
+    counts: Indices
+    mean_square: Array
+    stars: Indices
+    sigma_px: Array
+    size_px: Array
+    mean_px: Array
+    in_cell: Indices
+
+
+def read_star_residuals(
+    night: NightReader, sensors: list[str], calibrations: pl.DataFrame
+) -> StarResiduals | None:
+    """Return the residuals of a night's stars; None: it has no stars.
+
+    Parameters
+    ----------
+    calibrations
+        CALIBRATIONS of the night: the focal lengths turn sigmas to pixels.
+
+    Notes
+    -----
+    A star has no sigma of its own in the tables: that of the sensor's detections is used, their
+    median. The fit of the attitude takes 3 of the 2 n degrees of freedom of n stars.
+    """
+    sigma_px = _sigmas_px(night, sensors, calibrations)
+    sums = _ResidualSums(sensors, sigma_px, _sizes(night, sensors))
+    for rows in night.pieces("stars", COLUMNS):
+        sums.add(rows)
+    return sums.result() if sums.stars.sum() else None
+
+
+def _sigmas_px(night: NightReader, sensors: list[str], calibrations: pl.DataFrame) -> Array:
+    focal_px = np.full(len(sensors), np.nan)
+    for name, fx, fy in calibrations.select("sensor_id", "fx_px", "fy_px").iter_rows():
+        if name in sensors:
+            focal_px[sensors.index(name)] = np.sqrt(abs(fx * fy))
+    counts = np.zeros((len(sensors), len(SIGMA_BINS) + 1), np.int64)
+    for rows in night.pieces("detections", ["sensor_id", "sigma_arcsec"]):
+        at = np.searchsorted(SIGMA_BINS, rows["sigma_arcsec"].to_numpy())
+        np.add.at(counts, (codes(rows["sensor_id"], sensors), at), 1)
+    share = np.cumsum(counts, axis=1) / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    middle = np.argmax(share >= 0.5, axis=1)
+    centres = np.sqrt(SIGMA_BINS[1:] * SIGMA_BINS[:-1])
+    sigma_arcsec = centres[np.clip(middle - 1, 0, len(centres) - 1)]
+    found = counts.sum(axis=1) > 0
+    return np.where(found, sigma_arcsec * ARCSEC * focal_px, np.nan)
+
+
+def _sizes(night: NightReader, sensors: list[str]) -> Array:
+    """Return the largest places of stars and detections: nearly the size of the image."""
+    largest = np.ones((len(sensors), 2))
+    for table in ("stars", "detections"):
+        for rows in night.pieces(table, ["sensor_id", "x_px", "y_px"]):
+            of_sensor = rows.group_by("sensor_id").agg(pl.col("x_px", "y_px").max())
+            for name, x, y in of_sensor.iter_rows():
+                if name in sensors:
+                    k = sensors.index(name)
+                    largest[k] = np.maximum(largest[k], [x + 1.0, y + 1.0])
+    return largest
+
+
+class _ResidualSums:
+    """The sums over the pieces of the table."""
+
+    def __init__(self, sensors: list[str], sigma_px: Array, size_px: Array) -> None:
+        n = len(sensors)
+        self.sensors, self.sigma_px, self.size_px = sensors, sigma_px, size_px
+        self.counts = np.zeros((n, len(HISTOGRAM) - 1), np.int64)
+        self.squares, self.stars = np.zeros(n), np.zeros(n, np.int64)
+        self.sums = np.zeros((2, n * CELLS * CELLS))
+        self.in_cell = np.zeros(n * CELLS * CELLS, np.int64)
+
+    def add(self, rows: pl.DataFrame) -> None:
+        """Add a piece of the table."""
+        sensor = codes(rows["sensor_id"], self.sensors)
+        x, y, dx, dy = (rows[name].to_numpy() for name in COLUMNS[2:])
+        n = len(self.sensors)
+        self.stars += np.bincount(sensor, minlength=n)
+        freedom = np.sqrt(np.maximum(1 - FITTED / (2 * _stars_of_frame(rows, sensor)), 0.1))
+        for residual in (dx, dy):
+            z = residual / (self.sigma_px[sensor] * freedom)
+            known = np.isfinite(z)
+            self.squares += np.bincount(sensor[known], z[known] ** 2, n)
+            at = np.clip(np.searchsorted(HISTOGRAM, z[known]) - 1, 0, self.counts.shape[1] - 1)
+            np.add.at(self.counts, (sensor[known], at), 1)
+        column = np.clip(x / self.size_px[sensor, 0] * CELLS, 0, CELLS - 1).astype(np.int64)
+        row = np.clip(y / self.size_px[sensor, 1] * CELLS, 0, CELLS - 1).astype(np.int64)
+        cell = (sensor * CELLS + row) * CELLS + column
+        self.in_cell += np.bincount(cell, minlength=len(self.in_cell))
+        for k, residual in enumerate((dx, dy)):
+            self.sums[k] += np.bincount(cell, residual, len(self.in_cell))
+
+    def result(self) -> StarResiduals:
+        """Return the residuals."""
+        shape = (len(self.sensors), CELLS, CELLS)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.moveaxis((self.sums / self.in_cell).reshape(2, *shape), 0, -1)
+            known = np.isfinite(self.sigma_px)
+            mean_square = np.where(known, self.squares / (2 * self.stars), np.nan)
+        return StarResiduals(self.sensors, self.counts, mean_square, self.stars, self.sigma_px,
+                             self.size_px, mean, self.in_cell.reshape(shape))  # fmt: skip
+
+
+def _stars_of_frame(rows: pl.DataFrame, sensor: Indices) -> Indices:
+    """Return, for each star, how many its frame has: the rows of a frame follow one another."""
+    time_ns = rows["time"].dt.epoch("ns").to_numpy()
+    new = np.ones(len(sensor), bool)
+    new[1:] = (np.diff(time_ns) != 0) | (np.diff(sensor) != 0)
+    frame = np.cumsum(new) - 1
+    counts: Indices = np.bincount(frame)[frame]
+    return counts
+
+
+# -- One frame as a map: its stars with names, their residuals, and what is no star.
+
+SEARCHED_NS = 120_000_000_000  # of the night's middle
+MAX_OTHERS = 300
+
+
+class StarMap(NamedTuple):
+    """A frame.
+
+    star_id, magnitude : (n,)
+    stars_px, residuals_px : (n, 2) places and residuals of its stars
+    others_px : (m, 2) detections that are no stars, the brightest
+    objects : (m,) which of them belong to a track
+    """
+
+    sensor_id: str
+    frame_number: int
+    time_ns: int
+    star_id: Indices
+    magnitude: Array
+    stars_px: Array
+    residuals_px: Array
+    others_px: Array
+    objects: npt.NDArray[np.bool_]
+
+
+def read_star_map(night: NightReader, series: FrameSeries) -> StarMap | None:
+    """Return a frame near the middle of the night with as many stars as is usual for its sensor.
+
+    It is of the sensor with the most identified frames. None: no frame is identified.
+    """
+    identified = series.counts[0]
+    if not identified.sum():
+        return None
+    k = int(np.argmax(identified.sum(axis=1)))
+    held = np.flatnonzero(identified[k])
+    bin_ = int(held[np.argmin(np.abs(held - series.bins.number / 2))])
+    frame = _usual_frame(night, series, k, bin_)
+    if frame is None:
+        return None
+    number, time_ns = frame
+    own = (pl.col("sensor_id") == series.sensors[k]) & (pl.col("frame_number") == number)
+    columns = ["time", "sensor_id", "frame_number", "x_px", "y_px"]
+    stars = _rows(night, "stars", [*columns, "star_id", "magnitude", "dx_px", "dy_px"], time_ns)
+    others = _rows(night, "detections", [*columns, "flux", "track_id"], time_ns).filter(own)
+    others = others.sort("flux", descending=True, nulls_last=True, maintain_order=True)
+    others, stars = others.head(MAX_OTHERS), stars.filter(own)
+    return StarMap(
+        series.sensors[k], number, time_ns,
+        stars["star_id"].to_numpy(), stars["magnitude"].to_numpy(),
+        stars.select("x_px", "y_px").to_numpy(), stars.select("dx_px", "dy_px").to_numpy(),
+        others.select("x_px", "y_px").to_numpy(), others["track_id"].is_not_null().to_numpy(),
+    )  # fmt: skip
+
+
+def _usual_frame(
+    night: NightReader, series: FrameSeries, k: int, bin_: int
+) -> tuple[int, int] | None:
+    """Return number and time of the frame whose number of stars is nearest to the mean."""
+    length = (series.bins.end_ns - series.bins.start_ns) / series.bins.number
+    start = series.bins.start_ns + int(bin_ * length)
+    best: tuple[float, int, int] | None = None
+    columns = ["time", "sensor_id", "frame_number", "attitude_source", "n_stars"]
+    for searched in (min(int(length) + 1, SEARCHED_NS), int(length) + 2):
+        for rows in night.pieces("frames", columns, (start, start + searched)):
+            own = rows.filter(sensor_id=series.sensors[k], attitude_source="stars")
+            off = np.abs(own["n_stars"].to_numpy() - series.stars[k])
+            if len(own) and (best is None or off.min() < best[0]):
+                at = int(np.argmin(off))
+                time_ns = int(own["time"].dt.epoch("ns")[at])
+                best = float(off[at]), int(own["frame_number"][at]), time_ns
+        if best is not None:
+            return best[1:]
+    return None
+
+
+def _rows(night: NightReader, table: str, columns: list[str], time_ns: int) -> pl.DataFrame:
+    pieces = list(night.pieces(table, columns, (time_ns, time_ns + 1)))
+    return pl.concat(pieces) if pieces else night.empty(table, columns)

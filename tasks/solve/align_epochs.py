@@ -1,0 +1,106 @@
+"""Align epochs: common instants of all sensors, and the frame that each sensor has for them."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, concat, table
+from epipole.schemas.settings import AlignmentSettings, Settings
+from epipole.schemas.tables import EPOCHS
+from epipole.tasks.algorithms.times import (
+    epoch_grid,
+    epoch_interval_ns,
+    frame_interval_ns,
+    instants_of,
+    nearest_frame,
+)
+
+
+class EpochGrid(NamedTuple):
+    """The epochs of a whole night, the same for each of its spans."""
+
+    interval_ns: int
+    instants_ns: tuple[int, ...] | None  # the epochs, where no sensor has a frame interval
+
+
+def grid_of(time_ns: Sequence[npt.NDArray[np.int64]], settings: Settings) -> EpochGrid:
+    """Return a night's grid of epochs.
+
+    Parameters
+    ----------
+    time_ns
+        For each sensor, the times of the frames that can be used; see `frames_that_serve`.
+    """
+    wanted_s = settings.alignment.interval_s
+    if wanted_s is not None:
+        return EpochGrid(max(round(wanted_s * 1e9), 1), None)
+    interval_ns = epoch_interval_ns(list(time_ns))
+    if any(len(t) > 1 for t in time_ns) or not len(time_ns):
+        return EpochGrid(interval_ns, None)
+    return EpochGrid(interval_ns, tuple(instants_of(np.concatenate(time_ns), interval_ns).tolist()))
+
+
+def frames_that_serve(solutions: pa.Table) -> pa.Table:
+    """Return the frames that have an attitude and a position."""
+    return solutions.filter(
+        (pa.compute.field("attitude_source") != "none") & pa.compute.field("x_km").is_valid()
+    )
+
+
+def align_epochs(
+    solutions: pa.Table, settings: Settings, grid: EpochGrid | None = None
+) -> pa.Table:
+    """Return EPOCHS: for each epoch and sensor the nearest frame, and its distance in time.
+
+    An epoch is kept if any sensor has a frame for it. Without `grid`, these frames give it.
+    """
+    served = frames_that_serve(solutions).sort_by("time")
+    sensors = sorted(set(served["sensor_id"].to_pylist()))
+    parts = [served.filter(pa.compute.field("sensor_id") == s) for s in sensors]
+    times = [array(part, "time") for part in parts]
+    if not parts:
+        return concat(EPOCHS, [])
+    interval_ns, instants_ns = grid or grid_of(times, settings)
+    if instants_ns is None:
+        epochs = epoch_grid(
+            min(int(t[0]) for t in times) - interval_ns // 2,
+            max(int(t[-1]) for t in times) + interval_ns // 2,
+            interval_ns,
+        )
+    else:
+        epochs = np.array(instants_ns, np.int64)
+    rows = [
+        _serving(epochs, sensor, array(part, "frame_number"), t, interval_ns, settings.alignment)
+        for sensor, part, t in zip(sensors, parts, times, strict=True)
+    ]
+    return concat(EPOCHS, rows).sort_by([("epoch", "ascending"), ("sensor_id", "ascending")])
+
+
+def _serving(
+    epochs: npt.NDArray[np.int64],
+    sensor: str,
+    frame_number: npt.NDArray[np.int64],
+    time_ns: npt.NDArray[np.int64],
+    interval_ns: int,
+    settings: AlignmentSettings,
+) -> pa.Table:
+    """Return EPOCHS of one sensor."""
+    frame = nearest_frame(epochs, time_ns)
+    dt_ns = time_ns[frame] - epochs
+    if settings.max_gap_s is not None:
+        limit_ns = settings.max_gap_s * 1e9
+    else:
+        limit_ns = max(interval_ns, frame_interval_ns(time_ns)) / 2
+    near = np.abs(dt_ns) <= limit_ns
+    return table(
+        EPOCHS,
+        {
+            "epoch": epochs[near],
+            "sensor_id": np.full(int(near.sum()), sensor, dtype=object),
+            "frame_number": frame_number[frame[near]],
+            "dt_s": dt_ns[near] / 1e9,
+        },
+    )

@@ -1,0 +1,213 @@
+"""Associate blocks: the objects of each block of time, from the views of all sensors."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.io.work.parts import ASSOCIATED, Parts, write_part
+from epipole.io.work.work_layout import ViewedParts
+from epipole.schemas.bridge import array, concat, empty, from_polars, table, to_polars
+from epipole.schemas.rejects import Outcome, Reason, reject_rows
+from epipole.schemas.settings import Settings
+from epipole.schemas.spans import BLOCK_NS, Sensor, Span
+from epipole.schemas.stages import Stage
+from epipole.schemas.tables import REJECTS
+from epipole.schemas.work_tables import OBJECT_MEMBERS, TRACKLET_OUTCOMES
+from epipole.tasks.common.grouping import group_offsets
+from epipole.tasks.common.sightings import published_ids
+from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.solve.associate_objects import Associated, associate_objects
+from epipole.tasks.solve.association_input import BlockViews, SensorViews
+
+# -- Judge tracklets: the outcome of each that was compared with other sensors in a span.
+
+_RANK = {outcome.value: rank for rank, outcome in enumerate(Outcome)}
+
+
+def judge_views(associations: pa.Table) -> pa.Table:
+    """Return TRACKLET_OUTCOMES of the views of objects: used by a position, or rejected.
+
+    Lone detections, which are not published, have none.
+    """
+    used, ids = associations["used"], associations["tracklet_id"]
+    return best_outcomes(
+        [
+            outcomes(ids.filter(used), Outcome.OBJECT),
+            outcomes(ids.filter(pc.invert(used)), Outcome.DISAGREES),
+        ]
+    )
+
+
+def best_outcomes(tables: Iterable[pa.Table]) -> pa.Table:
+    """Return TRACKLET_OUTCOMES of several tables: of each tracklet the first in `Outcome`."""
+    rows = pl.concat(
+        to_polars(rows).select("tracklet_id", "outcome")
+        for rows in (empty(TRACKLET_OUTCOMES), *tables)
+    )
+    best = (
+        rows.drop_nulls("tracklet_id")
+        .with_columns(rank=pl.col("outcome").replace_strict(_RANK, return_dtype=pl.Int64))
+        .sort("tracklet_id", "rank")
+        .unique("tracklet_id", keep="first", maintain_order=True)
+    )
+    return from_polars(TRACKLET_OUTCOMES, best)
+
+
+def outcomes(tracklet_id: pa.ChunkedArray, outcome: Outcome) -> pa.Table:
+    """Return TRACKLET_OUTCOMES: one outcome for all these tracklets, lone detections excepted."""
+    ids = pc.unique(published_ids(tracklet_id)).drop_null()
+    values = pa.array([outcome.value] * len(ids), pa.string())
+    return table(TRACKLET_OUTCOMES, {"tracklet_id": ids, "outcome": values})
+
+
+# -- Associate blocks: the objects of each block of time, from the views of all sensors.
+
+
+@stage_task(Stage.SOLVE, "objects {blocks[0]}")
+def associate_blocks(
+    sensors: Sequence[Sensor],
+    viewed: ViewedParts,
+    blocks: Sequence[Span],
+    cameras: pa.Table,
+    left_out: Mapping[str, Reason],
+    settings: Settings,
+    parts: Parts,
+) -> None:
+    """Find the objects of some blocks of one span, unless the parts exist.
+
+    Parameters
+    ----------
+    sensors
+        In the order of their ids.
+    viewed
+        The parts of their views.
+    left_out
+        Sensors at fault, each with its reason; their views are not used.
+    parts
+        Where the parts go: `ASSOCIATED` of each block.
+    """
+    for block in blocks:
+        if not parts.holds(block):
+            held = [of for of in sensors if viewed[of.number].holds(block.span)]
+            views = [sensor_views(of, viewed[of.number], block.span) for of in held]
+            tables = _associate(views, block, cameras, left_out, settings)
+            write_part(parts.of(block), ASSOCIATED, tables)
+
+
+def blocks_of(span: Span, settings: Settings) -> list[Span]:
+    """Return the blocks of a span: as long as the longest evidence, or else the span."""
+    return [span] if settings.association.span_s * 1e9 > BLOCK_NS else span.blocks
+
+
+def sensor_views(sensor: Sensor, viewed: Parts, span: Span) -> SensorViews:
+    """Return the views of a sensor in a span, mapped into memory."""
+    return SensorViews(
+        sensor.number,
+        sensor.sensor_id,
+        partial(viewed.read, span, "views"),
+        viewed.read(span, "epochs"),
+        viewed.read(span, "tracklets"),
+    )
+
+
+def _associate(
+    sensors: Sequence[SensorViews],
+    block: Span,
+    cameras: pa.Table,
+    left_out: Mapping[str, Reason],
+    settings: Settings,
+) -> dict[str, pa.Table]:
+    faulty = [of for of in sensors if of.sensor_id in left_out]
+    rejects = _left_out(faulty, block, left_out)
+    views = [of for of in sensors if of.sensor_id not in left_out and of.epochs.num_rows]
+    if not any(of.tracklets.num_rows for of in views):
+        return {
+            "members": empty(OBJECT_MEMBERS),
+            "rejects": rejects,
+            "outcomes": _outcomes(faulty, Outcome.SENSOR_LEFT_OUT),
+        }
+    of_block = BlockViews(
+        views, cameras, block, settings.association.span_s, settings.alignment.window_s
+    )
+    associated = associate_objects(of_block, settings)
+    return {
+        "members": object_members(of_block, associated),
+        "rejects": concat(REJECTS, [rejects, associated.rejects]),
+        "outcomes": best_outcomes(
+            [_outcomes(faulty, Outcome.SENSOR_LEFT_OUT), *_of_items(of_block, associated)]
+        ),
+    }
+
+
+def object_members(block: BlockViews, associated: Associated) -> pa.Table:
+    """Return OBJECT_MEMBERS of a block: windows that follow one another are one row."""
+    items, number = block.items, associated.object_number
+    order = np.lexsort((items.window, items.tracklet))
+    tracklet, object_ = items.tracklet[order], number[order]
+    bounds = group_offsets(tracklet, object_)
+    first, last = bounds[:-1], bounds[1:] - 1
+    n_views = np.add.reduceat(items.n_views[order], first) if len(first) else first
+    rows = np.flatnonzero(object_[first] >= 0)
+    rows = rows[np.lexsort((tracklet[first[rows]], object_[first[rows]]))]
+    first, last, n_views = first[rows], last[rows], n_views[rows]
+    numbers = np.array([of.number for of in block.sensors])
+    of_tracklet = block.tracklets.take(tracklet[first])
+    return table(
+        OBJECT_MEMBERS,
+        {
+            "object": object_[first],
+            "sensor": numbers[items.sensor[order][first]],
+            "tracklet_id": of_tracklet["tracklet_id"],
+            "track_id": of_tracklet["track_id"],
+            "first_epoch": items.first_ns[order][first],
+            "last_epoch": items.last_ns[order][last],
+            "n_views": n_views,
+            "piece": np.zeros(len(first), np.int64),
+        },
+    )
+
+
+def _of_items(block: BlockViews, associated: Associated) -> list[pa.Table]:
+    """Return the outcomes of the tracklets of a block, objects excepted."""
+    tracklet = block.items.tracklet
+    undecided = associated.ambiguous & associated.believed
+
+    def of(rows: np.ndarray, outcome: Outcome) -> pa.Table:
+        ids = block.tracklets["tracklet_id"].take(np.unique(tracklet[rows]))
+        return outcomes(ids, outcome)
+
+    return [
+        of(np.ones(len(tracklet), bool), Outcome.SEEN_BY_ONE),
+        of(undecided, Outcome.AMBIGUOUS),
+        of(~associated.believed, Outcome.SENSOR_LEFT_OUT),
+    ]
+
+
+def _outcomes(sensors: Sequence[SensorViews], outcome: Outcome) -> pa.Table:
+    """Return one outcome for all tracklets of sensors."""
+    ids = [outcomes(of.tracklets["tracklet_id"], outcome) for of in sensors]
+    return concat(TRACKLET_OUTCOMES, ids)
+
+
+def _left_out(
+    sensors: Sequence[SensorViews], block: Span, left_out: Mapping[str, Reason]
+) -> pa.Table:
+    """Return a row of `rejects` per sensor that is left out: its views in the block."""
+    tables = [empty(REJECTS)]
+    for of in sensors:
+        epoch_ns = array(of.read_views(), "epoch")
+        epoch_ns = epoch_ns[block.holds(epoch_ns)]
+        if len(epoch_ns):
+            tables.append(
+                reject_rows(
+                    left_out[of.sensor_id],
+                    sensor_id=of.sensor_id,
+                    time=[int(epoch_ns.min())],
+                    count=[len(epoch_ns)],
+                )
+            )
+    return concat(REJECTS, tables)

@@ -1,0 +1,229 @@
+"""Associate objects: which tracklets of different sensors are one object, window by window."""
+
+import logging
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import concat
+from epipole.schemas.options import ASSOCIATION, load_method
+from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.settings import AssociationSettings, Settings
+from epipole.schemas.tables import REJECTS
+from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
+from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
+from epipole.tasks.algorithms.association.samples import Groups, Samples
+from epipole.tasks.algorithms.association.verdicts import Verdicts
+from epipole.tasks.algorithms.orbits.object_motion import ObjectRegistry
+from epipole.tasks.algorithms.sensor_faults.suspects import agreement
+from epipole.tasks.common.sightings import only_id
+from epipole.tasks.solve.association_input import BlockViews, SampledViews, even_instants
+
+# -- Associate objects: which tracklets of different sensors are one object, window by window.
+
+LOGGER = logging.getLogger(__name__)
+
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+LONGER_S = (120.0, 600.0)  # each divides a span
+
+
+class Associated(NamedTuple):
+    """The object of each item of a block, -1 for none; and rows of `rejects`.
+
+    `ambiguous` and `believed` tell of each item whether its tracklet is ambiguous, and whether
+    its sensor agreed with the others at that time.
+    """
+
+    object_number: Indices
+    ambiguous: Flags
+    believed: Flags
+    rejects: pa.Table
+
+
+def associate_objects(block: BlockViews, settings: Settings) -> Associated:
+    """Return which tracklets that two or more sensors detect are one object, in each window.
+
+    Object numbers count from 0 in the order of first appearance. An object keeps its number from
+    window to window as long as one of its tracks continues. A sensor that disagrees with all
+    others is left out.
+    """
+    items = block.items
+    verdicts = Verdicts(items)
+    believed = np.ones(len(items.window), bool)
+    windows = _windows(items.window)
+    rejects = []
+    for sampled, window in _sampled_windows(block, settings.work.most_views):
+        rows = windows[window]
+        disagreeing = _judge(block, sampled, window, rows, verdicts, settings)
+        if len(disagreeing):
+            left_out = rows[np.isin(items.sensor[rows], disagreeing)]
+            believed[left_out] = False
+            rejects.append(_reject_table(block, Reason.SENSOR_DISAGREES, left_out))
+    if settings.association.method == "likelihood":
+        _judge_again(block, verdicts, believed, settings)
+    for rows in windows:
+        ambiguous = rows[verdicts.ambiguous[rows]]
+        if len(ambiguous):
+            rejects.append(_reject_table(block, Reason.AMBIGUOUS, ambiguous))
+    _warn_of(block.sensor_id[np.unique(items.sensor[~believed])])
+    number = _numbered(block, verdicts.group, windows)
+    return Associated(number, verdicts.ambiguous, believed, concat(REJECTS, rejects))
+
+
+def _windows(window: Indices) -> list[Indices]:
+    """Return the items of each window."""
+    cuts = np.searchsorted(window, np.arange(1, window.max(initial=-1) + 1))
+    return np.split(np.arange(len(window)), cuts) if len(window) else []
+
+
+def _sampled_windows(block: BlockViews, most_views: int) -> Iterator[tuple[SampledViews, int]]:
+    """Yield each window, with the views of as many windows as may be held at the same time."""
+    n_instants = np.array([len(instants) for instants in block.instants])
+    n_items = np.bincount(block.items.window, minlength=len(n_instants))
+    first, n_windows = 0, len(n_instants)
+    while first < n_windows:
+        held = np.cumsum((n_instants * n_items)[first:])
+        last = first + max(int(np.searchsorted(held, most_views, side="right")), 1)
+        sampled = SampledViews(block, np.concatenate(block.instants[first:last]))
+        for window in range(first, min(last, n_windows)):
+            yield sampled, window
+        first = last
+
+
+def _judge(
+    block: BlockViews,
+    sampled: SampledViews,
+    window: int,
+    rows: Indices,
+    verdicts: Verdicts,
+    settings: Settings,
+) -> Indices:
+    """Enter the verdict on a window's items; return the sensors that disagree with all others.
+
+    If there are any, the other sensors are judged again without them.
+    """
+    instants = block.instants[window]
+    samples, tracklet = sampled.samples(instants, np.zeros(0, np.int64))
+    groups = _solve(block, samples, settings)
+    disagreeing = agreement(samples, groups).disagreeing()
+    if len(disagreeing):
+        rows = rows[~np.isin(block.items.sensor[rows], disagreeing)]
+        if not len(rows):
+            return disagreeing
+        samples, tracklet = sampled.samples(instants, disagreeing)
+        groups = _solve(block, samples, settings)
+    verdicts.enter(rows, tracklet, groups)
+    return disagreeing
+
+
+def _warn_of(sensors: npt.NDArray[np.str_]) -> None:
+    if len(sensors):
+        LOGGER.warning(
+            "%s: lines of sight agree with no other sensor's (wrong clock, position or "
+            "attitude?); left out at these times", ", ".join(sorted(sensors.tolist())),
+        )  # fmt: skip
+
+
+def _judge_again(
+    block: BlockViews, verdicts: Verdicts, believed: Flags, settings: Settings
+) -> None:
+    """Judge undecided tracklets again, over longer windows."""
+    judged_s = settings.association.span_s
+    for window_s in LONGER_S:
+        if not judged_s < window_s <= settings.association.longest_span_s:
+            continue
+        longer = block.items.first_ns // round(window_s * 1e9)
+        for number in np.unique(longer[believed]).tolist():
+            rows = np.flatnonzero((longer == number) & believed)
+            open_items = verdicts.open_items(rows, judged_s)
+            if len(open_items):
+                samples, tracklet = _long_samples(block, rows, number, window_s)
+                groups = _solve(block, samples, settings)
+                verdicts.reconsider(rows, open_items, tracklet, groups)
+        judged_s = window_s
+
+
+def _long_samples(
+    block: BlockViews, rows: Indices, number: int, window_s: float
+) -> tuple[Samples, Indices]:
+    """Return the samples of the items of a longer window, and their tracklets.
+
+    Sensors that were left out in a part of the window take part with their other views.
+    """
+    width_ns = round(window_s * 1e9)
+    epochs = block.epochs[block.epochs // width_ns == number]
+    instants = even_instants(epochs, block.half_width_s)
+    sampled = SampledViews(block, instants, believed_items=rows)
+    return sampled.samples(instants, np.zeros(0, np.int64))
+
+
+def _numbered(block: BlockViews, group: Indices, windows: list[Indices]) -> Indices:
+    """Return each item's object number: groups that share a track are one object."""
+    items, track = block.items, block.track
+    registry = ObjectRegistry(np.bincount(track[items.tracklet], items.n_views).astype(float))
+    number = np.full(len(group), -1)
+    for rows in windows:
+        grouped = rows[group[rows] >= 0]
+        order = grouped[np.argsort(group[grouped], kind="stable")]
+        cuts = np.flatnonzero(np.diff(group[order])) + 1
+        members = np.split(order, cuts) if len(order) else []
+        tracks = [np.unique(track[items.tracklet[of_group]]) for of_group in members]
+        for of_group, object_ in zip(members, registry.name_groups(tracks), strict=True):
+            number[of_group] = object_
+    return number
+
+
+def _solve(block: BlockViews, samples: Samples, settings: Settings) -> Groups:
+    associate = load_method(ASSOCIATION, settings.association.method)
+    groups: Groups = associate(samples, block.poses.focal_px, settings.association)
+    return groups
+
+
+def _reject_table(block: BlockViews, reason: Reason, left_out: Indices) -> pa.Table:
+    """Return a row of `rejects` per sensor: how many of its tracklets are left out in a window.
+
+    Parameters
+    ----------
+    left_out
+        Items of the window.
+    """
+    items = block.items
+    tracklet, sensor = items.tracklet[left_out], items.sensor[left_out]
+    sensors, count = np.unique(sensor, return_counts=True)
+    return reject_rows(
+        reason,
+        sensor_id=block.sensor_id[sensors],
+        tracklet_id=[only_id(block.tracklet_id[tracklet[sensor == s]]) for s in sensors],
+        time=[int(items.first_ns[left_out].min())] * len(sensors),
+        count=count,
+    )
+
+
+# -- The methods of association, called alike: samples, focal lengths and settings in, groups out.
+
+
+def associate_by_likelihood(
+    samples: Samples, focal_px: npt.NDArray[np.float64], settings: AssociationSettings
+) -> Groups:
+    """Return the groups of tracklets that are most likely one object each."""
+    return associate_tracklets(
+        samples,
+        gate_sigma=settings.gate_sigma,
+        min_altitude_km=settings.min_altitude_km,
+        max_range_km=settings.max_range_km,
+        min_log_odds=settings.min_log_odds,
+        ambiguity_log_odds=settings.ambiguity_log_odds,
+        shells=[Shell(s.lowest_km, s.highest_km, s.share) for s in settings.shells],
+    )
+
+
+def associate_by_epipolar_lines(
+    samples: Samples, focal_px: npt.NDArray[np.float64], settings: AssociationSettings
+) -> Groups:
+    """Return the groups of tracklets that lie on each other's epipolar lines [published]."""
+    return associate_by_lines(samples, focal_px, settings.threshold_px)

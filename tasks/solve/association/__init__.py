@@ -1,1 +1,0 @@
-"""Which tracklets of different sensors are one object."""

@@ -1,0 +1,409 @@
+"""Block views: the views of all sensors in a block of time, window by window.
+
+Only what tells the windows and tracklets apart is held for all views. The rest is read for the
+few instants at which tracklets are compared.
+"""
+
+import itertools
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.schemas.columns import TANGENT_AXES
+from epipole.schemas.spans import Span
+from epipole.schemas.work_tables import VIEWS
+from epipole.tasks.algorithms.association.samples import Samples
+from epipole.tasks.algorithms.association.verdicts import Items
+from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
+from epipole.tasks.common.grouping import group_offsets
+from epipole.tasks.common.sightings import camera_of
+
+# -- Choose instants: the few epochs of a window at which its tracklets are compared.
+
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+MAX_SAMPLES = 12  # instants in a window
+BLENDED = 4.0  # times the noise: what blends may add makes a view useless to tell objects apart
+
+
+def clear_views(views: pa.Table) -> Flags:
+    """Return which VIEWS tell objects apart: blends add little to their variance.
+
+    The direction of the others may be of one object or of its neighbour. A group that is found
+    without them has them as well. A tracklet that is a blend throughout is judged by its best
+    views.
+    """
+    blend = 2 * array(views, "blend_rad2")
+    noise = array(views, "cov_noise_11_rad2") + array(views, "cov_noise_22_rad2") - blend
+    shared = array(views, "cov_bias_11_rad2") + array(views, "cov_bias_22_rad2")
+    return np.asarray(blend <= BLENDED * np.maximum(noise, shared))
+
+
+def even_instants(epochs: Indices, window_s: float) -> Indices:
+    """Return a few of the epochs, evenly spaced and far enough apart to be independent.
+
+    Parameters
+    ----------
+    epochs
+        Distinct, in order [ns].
+    window_s
+        A view rests on detections within this time of its epoch: two epochs within twice this
+        time share detections.
+    """
+    if not len(epochs):
+        return epochs
+    step = 2 * window_s * 1e9
+    n = min(int(max((epochs[-1] - epochs[0]) // step, 1)), MAX_SAMPLES)
+    edges = np.linspace(epochs[0], epochs[-1], n + 1)
+    middle = (edges[1:] + edges[:-1]) / 2
+    return np.unique(epochs[np.argmin(np.abs(epochs[:, None] - middle), axis=0)])
+
+
+def with_extra_instants(even: Indices, tracklets: Iterable[Indices]) -> Indices:
+    """Return the instants of a window, with one for each tracklet without a view at these.
+
+    Parameters
+    ----------
+    tracklets
+        For each tracklet without a clear view at the even instants, in order: the epochs of its
+        clear views. It gets the middle one, unless it has a view at the instant of another.
+    """
+    chosen = set(even.tolist())
+    for epochs in tracklets:
+        if len(chosen) >= MAX_SAMPLES:
+            break
+        if len(epochs) and not chosen.intersection(epochs.tolist()):
+            chosen.add(int(epochs[len(epochs) // 2]))
+    return np.array(sorted(chosen), np.int64)
+
+
+# -- Sensor poses: where the sensors are and where they look at a few instants.
+
+Array = npt.NDArray[np.float64]
+
+NEAR_S = 2.0  # a frame within this time of an epoch gives the sensor's pose
+
+
+class Poses(NamedTuple):
+    """Poses of s sensors at k instants: attitudes (s, k, 3, 3), positions and velocities
+    (s, k, 3), GCRF; NaN where no frame is near."""
+
+    R_sensor_from_icrs: Array
+    sensor_km: Array
+    sensor_km_s: Array
+
+
+class SensorPoses:
+    """The poses of sensors at their epochs, and their fields.
+
+    Parameters
+    ----------
+    epochs
+        SENSOR_EPOCHS of each sensor, in order of time.
+    """
+
+    def __init__(self, epochs: Sequence[pa.Table], cameras: pa.Table) -> None:
+        self._frames = [_near_frames(rows) for rows in epochs]
+        half_field, focal_px = [], []
+        for rows in epochs:
+            camera = camera_of(cameras, int(array(rows, "camera")[0]) if rows.num_rows else 0)
+            half_field.append(
+                (camera.width / camera.fx_px / 2, camera.height / abs(camera.fy_px) / 2)
+            )
+            focal_px.append(camera.fx_px)
+        self.half_field = np.array(half_field, float).reshape(-1, 2)
+        self.focal_px = np.array(focal_px, float)
+
+    def at(self, instants: Indices) -> Poses:
+        """Return the poses at some epochs."""
+        n, k = len(self._frames), len(instants)
+        q, place = np.full((n, k, 4), np.nan), np.full((n, k, 3), np.nan)
+        velocity = np.full((n, k, 3), np.nan)
+        for s, frames in enumerate(self._frames):
+            if not len(frames.epoch_ns):
+                continue
+            at = np.searchsorted(frames.epoch_ns, instants)
+            at = np.minimum(at, len(frames.epoch_ns) - 1)
+            there = np.flatnonzero(frames.epoch_ns[at] == instants)
+            q[s, there], place[s, there] = frames.q[at[there]], frames.r_km[at[there]]
+            velocity[s, there] = frames.v_km_s[at[there]]
+        return Poses(matrix_from_quaternion(q), place, velocity)
+
+
+class _Frames(NamedTuple):
+    """Attitude, position and velocity of a sensor at its epochs."""
+
+    epoch_ns: Indices
+    q: Array
+    r_km: Array
+    v_km_s: Array
+
+
+def _near_frames(epochs: pa.Table) -> _Frames:
+    """Return the epochs with a frame near."""
+    near = epochs.filter(pa.array(np.abs(array(epochs, "dt_s")) < NEAR_S))
+    return _Frames(
+        array(near, "epoch"),
+        stack(near, "q{}", "xyzw"),
+        stack(near, "{}_km"),
+        stack(near, "v{}_km_s"),
+    )
+
+
+# -- Block views: the views of all sensors in a block of time, window by window.
+#
+# Only what tells the windows and tracklets apart is held for all views. The rest is read for the
+# few instants at which tracklets are compared.
+
+SAMPLED = [
+    name
+    for name in VIEWS.names
+    if name in ("epoch", "ux", "uy", "uz", "x_km", "y_km", "z_km", "position_sigma_km")
+    or name.startswith(("w", "cov_"))
+]
+
+
+class SensorViews(NamedTuple):
+    """The views of one sensor in a span: VIEWS sorted by tracklet, and tables that go with them.
+
+    `number` and `sensor_id` are the sensor's in the run, `epochs` are SENSOR_EPOCHS, `tracklets`
+    are VIEWED_TRACKLETS.
+    """
+
+    number: int
+    sensor_id: str
+    read_views: Callable[[], pa.Table]  # they stay in their file: all views are too many to hold
+    epochs: pa.Table
+    tracklets: pa.Table
+
+
+class BlockViews:
+    """The views of sensors in a block of time.
+
+    Parameters
+    ----------
+    sensors
+        In the order of their ids.
+    block
+        Views at other epochs are left out.
+    window_s, half_width_s
+        Length of a window, and half the time whose detections a view rests on [s].
+    """
+
+    def __init__(
+        self,
+        sensors: Sequence[SensorViews],
+        cameras: pa.Table,
+        block: Span,
+        window_s: float,
+        half_width_s: float,
+    ) -> None:
+        self.sensors, self.half_width_s = list(sensors), half_width_s
+        self.sensor_id = np.array([of.sensor_id for of in sensors], str)
+        self.tracklets = pa.concat_tables([of.tracklets for of in sensors]).combine_chunks()
+        ids = array(self.tracklets, "tracklet_id").astype(str)
+        order = np.argsort(ids, kind="stable")
+        self.tracklets = self.tracklets.take(order)
+        self.tracklet_id = ids[order]
+        self.sensor_of_tracklet = np.repeat(
+            np.arange(len(sensors)), [of.tracklets.num_rows for of in sensors]
+        )[order]
+        _, self.track = np.unique(
+            array(self.tracklets, "track_id").astype(str), return_inverse=True
+        )
+        self.start_ns = array(self.tracklets, "start_time")
+        self.end_ns = array(self.tracklets, "end_time")
+        self.origin_ns = block.start_ns
+        self.window_ns = max(round(window_s * 1e9), 1)
+        self.poses = SensorPoses([of.epochs for of in sensors], cameras)
+        self._place = np.argsort(order, kind="stable")  # of each tracklet, sensor by sensor
+        self._read(block)
+        self._choose_instants()
+
+    def _read(self, block: Span) -> None:
+        """Read the epochs, tracklets and clearness of the views in the block."""
+        self._rows, self._epoch_ns, self._tracklet, self._clear = [], [], [], []
+        before, parts = 0, []
+        for s, of in enumerate(self.sensors):
+            views = of.read_views()
+            epoch_ns = array(views, "epoch")
+            rows = np.flatnonzero(block.holds(epoch_ns))
+            n = of.tracklets.num_rows
+            local = np.repeat(np.arange(n), array(of.tracklets, "n_views"))[rows]
+            tracklet = self._place[before : before + n][local]
+            before += n
+            self._rows.append(rows)
+            self._epoch_ns.append(epoch_ns[rows])
+            self._tracklet.append(tracklet)
+            self._clear.append(clear_views(views)[rows])
+            parts.append(_items(epoch_ns[rows], tracklet, s, self.window_ns))
+        window, *columns = (np.concatenate(c).astype(np.int64) for c in zip(*parts, strict=True))
+        order = np.lexsort((columns[0], window))
+        self.window_number, window = np.unique(window[order], return_inverse=True)
+        self.items = Items(window, *(values[order] for values in columns))
+
+    def _choose_instants(self) -> None:
+        """Choose the instants of each window at which its tracklets are compared."""
+        epochs = np.unique(np.concatenate([np.unique(e) for e in self._epoch_ns]))
+        self.epochs = epochs
+        self._epoch = [np.searchsorted(epochs, e).astype(np.int32) for e in self._epoch_ns]
+        cuts = np.searchsorted(
+            epochs // self.window_ns, [*self.window_number, np.iinfo(np.int64).max]
+        )
+        even = [
+            even_instants(epochs[lo:hi], self.half_width_s)
+            for lo, hi in itertools.pairwise(cuts.tolist())
+        ]
+        lacking = self._lacking(np.concatenate([*even, np.zeros(0, np.int64)]))
+        self.instants = [
+            with_extra_instants(instants, (lacking[w][key] for key in sorted(lacking[w])))
+            for w, instants in enumerate(even)
+        ]
+
+    def _lacking(self, even: Indices) -> list[dict[int, Indices]]:
+        """Return, for each window, the epochs of the clear views of each tracklet that has none
+        at the even instants."""
+        lacking: list[dict[int, Indices]] = [{} for _ in self.window_number]
+        wanted = np.isin(self.epochs, even)
+        for epoch_ns, epoch, tracklet, clear in zip(
+            self._epoch_ns, self._epoch, self._tracklet, self._clear, strict=True
+        ):
+            bounds = group_offsets(epoch_ns // self.window_ns, tracklet)
+            there = wanted[epoch] & clear
+            has = np.add.reduceat(there, bounds[:-1]) > 0 if len(there) else np.zeros(0, bool)
+            for k in np.flatnonzero(~has).tolist():
+                rows = slice(bounds[k], bounds[k + 1])
+                w = np.searchsorted(self.window_number, epoch_ns[bounds[k]] // self.window_ns)
+                lacking[w][int(tracklet[bounds[k]])] = epoch_ns[rows][clear[rows]]
+        return lacking
+
+    def views_at(self, instants: Indices, items: Indices | None = None) -> tuple[pa.Table, Indices]:
+        """Return the clear views at some epochs, and the tracklet of each.
+
+        With `items`, only the views of these items.
+        """
+        tables, tracklets = [VIEWS.empty_table().select(SAMPLED)], []
+        wanted = np.isin(self.epochs, instants)
+        key = self._item_key(items) if items is not None else None
+        for s, of in enumerate(self.sensors):
+            chosen = np.flatnonzero(wanted[self._epoch[s]] & self._clear[s])
+            if key is not None:
+                chosen = chosen[np.isin(self._view_key(s, chosen), key)]
+            tables.append(of.read_views().select(SAMPLED).take(self._rows[s][chosen]))
+            tracklets.append(self._tracklet[s][chosen])
+        return pa.concat_tables(tables), np.concatenate(tracklets)
+
+    def _item_key(self, items: Indices) -> Indices:
+        return self.items.window[items] * len(self.tracklet_id) + self.items.tracklet[items]
+
+    def _view_key(self, sensor: int, rows: Indices) -> Indices:
+        window = np.searchsorted(self.window_number, self._epoch_ns[sensor][rows] // self.window_ns)
+        return np.asarray(window * len(self.tracklet_id) + self._tracklet[sensor][rows])
+
+
+def _items(
+    epoch_ns: Indices, tracklet: Indices, sensor: int, window_ns: int
+) -> tuple[Indices, ...]:
+    """Return the columns of ITEMS of one sensor, whose views are sorted by tracklet and epoch."""
+    window = epoch_ns // window_ns
+    bounds = group_offsets(window, tracklet)
+    first, last = bounds[:-1], bounds[1:] - 1
+    return (
+        window[first],
+        tracklet[first],
+        np.full(len(first), sensor),
+        epoch_ns[first],
+        epoch_ns[last],
+        np.diff(bounds),
+    )
+
+
+# -- Sample views: the views of a block at a few instants, as arrays for the association.
+
+
+class SampledViews:
+    """Clear views of some windows at their instants, and samples of them for the association."""
+
+    def __init__(
+        self, block: BlockViews, instants: Indices, believed_items: Indices | None = None
+    ) -> None:
+        """Read the views of a block at some epochs: of all items, or of those believed."""
+        views, tracklet = block.views_at(instants, believed_items)
+        order = np.lexsort((tracklet, array(views, "epoch")))
+        views, self.tracklet = views.take(order), tracklet[order]
+        self.block = block
+        self.epoch_ns = array(views, "epoch")
+        self.u, self.r_km = stack(views, "u{}"), stack(views, "{}_km")
+        self.w_rad_s = stack(views, "w{}_rad_s")
+        self.noise = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
+        self.bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES)
+        self.sigma_km = array(views, "position_sigma_km")
+
+    def samples(self, instants: Indices, skipped: Indices) -> tuple[Samples, Indices]:
+        """Return the samples of the tracklets at some epochs, and the tracklets' numbers.
+
+        Views of the sensors `skipped` are left out.
+        """
+        rows = np.flatnonzero(np.isin(self.epoch_ns, instants))
+        if len(skipped):
+            rows = rows[~np.isin(self.block.sensor_of_tracklet[self.tracklet[rows]], skipped)]
+        tracklet, item = np.unique(self.tracklet[rows], return_inverse=True)
+        at = np.searchsorted(instants, self.epoch_ns[rows])
+        t, k = len(tracklet), len(instants)
+        seen, u = np.zeros((t, k), bool), np.tile([0.0, 0.0, 1.0], (t, k, 1))
+        cov, sigma_km = np.tile(np.eye(2), (t, k, 1, 1)), np.ones((t, k))
+        rate = np.zeros((t, k, 3))
+        seen[item, at] = True
+        u[item, at], rate[item, at] = self.u[rows], self.w_rad_s[rows]
+        # The common error is one for all k samples. With k times its variance in each of them,
+        # they count together as one.
+        n_samples = seen.sum(axis=1)[item].astype(float)
+        repeated = _repeated(seen, instants / 1e9, self.block.half_width_s)[item, at]
+        cov[item, at] = (
+            repeated[:, None, None] * self.noise[rows] + n_samples[:, None, None] * self.bias[rows]
+        )
+        sigma_km[item, at] = np.sqrt(n_samples) * self.sigma_km[rows]
+        poses = self.block.poses.at(instants)
+        sensor_km = poses.sensor_km.copy()
+        sensor = self.block.sensor_of_tracklet[tracklet].astype(np.int64)
+        sensor_km[sensor[item], at] = self.r_km[rows]
+        start_ns, end_ns, origin = self.block.start_ns, self.block.end_ns, self.block.origin_ns
+        return Samples(
+            sensor=sensor,
+            start_s=(start_ns[tracklet] - origin) / 1e9,
+            end_s=(end_ns[tracklet] - origin) / 1e9,
+            seen=seen,
+            u=u,
+            cov=cov,
+            sigma_km=sigma_km,
+            time_s=(instants - origin) / 1e9,
+            sensor_km=sensor_km,
+            R_sensor_from_icrs=poses.R_sensor_from_icrs,
+            half_field=self.block.poses.half_field,
+            rate=rate,
+            sensor_km_s=poses.sensor_km_s,
+        ), tracklet
+
+
+def _repeated(seen: npt.NDArray[np.bool_], time_s: Array, window_s: float) -> Array:
+    """Return how many samples of its tracklet each sample repeats, itself included, (t, k).
+
+    Samples nearer than twice the half-window share detections, and with them their errors. With
+    the noise so many times larger, they count together as what is independent.
+
+    Parameters
+    ----------
+    seen : (t, k) bool
+        Whether tracklet t has a sample at instant k.
+    time_s : (k,) float
+        The instants [s].
+    """
+    apart = np.abs(time_s[:, None] - time_s[None, :])
+    shared = np.maximum(1 - apart / max(2 * window_s, 1e-9), 0.0)
+    np.fill_diagonal(shared, 1.0)
+    return seen.astype(float) @ shared

@@ -1,0 +1,158 @@
+"""Pair views: how far the views of an object at an epoch lie from each other's epipolar lines."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, table
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import ASSOCIATIONS, PAIRS
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.directions import apparent_places, tangent_basis
+from epipole.tasks.algorithms.geometry.epipolar import (
+    UncertainSight,
+    epipolar_angle,
+    epipolar_rms,
+    epipolar_sigma,
+)
+from epipole.tasks.common.sightings import published_ids
+
+# -- Views grouped by object and epoch, and the solution of each group.
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class ViewGroups(NamedTuple):
+    """Views grouped by epoch and object, and the solution of each group."""
+
+    views: pa.Table
+    offsets: Indices
+    object_id: npt.NDArray[np.object_]
+    epoch_ns: Indices
+    u: Array
+    r_km: Array
+    cov: Array
+    x_km: Array
+    cov_km2: Array
+    chi2: Array
+    used: npt.NDArray[np.bool_]
+    mean_range_km: Array
+    velocity_km_s: Array
+    independent: npt.NDArray[np.bool_]
+
+    @property
+    def apparent_km(self) -> Array:
+        """Where each view's sensor sees the object: its light left at a time of its own."""
+        group = self.group
+        light_s = self.mean_range_km / SPEED_OF_LIGHT_KM_S
+        return apparent_places(
+            self.x_km[group], self.velocity_km_s[group], light_s[group], self.r_km
+        )
+
+    @property
+    def group(self) -> Indices:
+        """Group of each view."""
+        return np.repeat(np.arange(len(self.epoch_ns)), np.diff(self.offsets))
+
+
+# -- Pair views: how far the views of an object at an epoch lie from each other's epipolar lines.
+
+MAX_OTHERS = 8  # views to which a view's epipolar distance is taken, those of the least error
+
+
+def association_table(groups: ViewGroups) -> pa.Table:
+    """Return ASSOCIATIONS: a row per view."""
+    views = groups.views
+    ranked = np.lexsort((_position_error(groups), groups.group))
+    angle = epipolar_rms(groups.offsets, ranked, MAX_OTHERS, _seen_together(groups), groups.u)
+    shared = ("epoch", "sensor_id", "frame_number", "centroid", "x_px", "y_px")
+    return table(
+        ASSOCIATIONS,
+        {name: views[name] for name in shared}
+        | {
+            "tracklet_id": published_ids(views["tracklet_id"]),
+            "object_id": groups.object_id[groups.group],
+            "epipolar_px": angle / array(views, "pixel_rad"),
+            "used": groups.used,
+        },
+    )
+
+
+def pair_table(groups: ViewGroups, settings: Settings) -> pa.Table:
+    """Return PAIRS: used views that both have a centroid, the reference view first.
+
+    The reference view is the one of the least position error.
+    """
+    has_centroid = groups.views["centroid"].is_valid().to_numpy() & groups.used
+    if settings.positions.all_pairs:
+        first, second = _every_two(groups.group, has_centroid)
+    else:
+        first, second = _with_reference(groups, has_centroid)
+    epipolar_px, mahalanobis = _distances(groups, first, second)
+    columns = {
+        "epoch": groups.epoch_ns[groups.group[first]],
+        "epipolar_px": epipolar_px,
+        "mahalanobis": mahalanobis,
+    }
+    for side, rows in (("1", first), ("2", second)):
+        for name in ("sensor_id", "frame_number", "centroid"):
+            columns[f"{name}_{side}"] = groups.views[name].take(rows)
+    return table(PAIRS, columns)
+
+
+def _seen_together(groups: ViewGroups) -> Array:
+    """Return the places of the sensors, each moved as if all saw the object at one place: the
+    light to a farther one left earlier."""
+    return groups.r_km + np.nan_to_num(groups.x_km[groups.group] - groups.apparent_km)
+
+
+def _position_error(groups: ViewGroups) -> Array:
+    """Return the square of the error that each view alone leaves at the object [km^2]."""
+    across = np.trace(groups.cov, axis1=1, axis2=2) / 2
+    away_km = np.linalg.norm(groups.x_km[groups.group] - groups.r_km, axis=1)
+    return across * away_km**2 + array(groups.views, "position_sigma_km") ** 2
+
+
+def _with_reference(
+    groups: ViewGroups, candidates: npt.NDArray[np.bool_]
+) -> tuple[Indices, Indices]:
+    """Return each candidate's reference view, and the candidate."""
+    error = np.where(candidates, _position_error(groups), np.inf)
+    order = np.lexsort((error, groups.group))
+    reference = order[groups.offsets[:-1]][groups.group]
+    second = np.flatnonzero(candidates & (reference != np.arange(len(reference))))
+    return reference[second], second
+
+
+def _every_two(group: Indices, candidates: npt.NDArray[np.bool_]) -> tuple[Indices, Indices]:
+    """Return every two candidates of a group; their number grows with the square of the views."""
+    rows = np.flatnonzero(candidates)
+    pairs = [np.zeros((0, 2), np.int64)]
+    apart = 1
+    while apart < len(rows):
+        same = np.flatnonzero(group[rows[apart:]] == group[rows[:-apart]])
+        if not len(same):
+            break
+        pairs.append(np.column_stack([rows[same], rows[same + apart]]))
+        apart += 1
+    first, second = np.concatenate(pairs).T
+    order = np.lexsort((second, first))
+    return first[order], second[order]
+
+
+def _distances(groups: ViewGroups, first: Indices, second: Indices) -> tuple[Array, Array]:
+    """Return how far each second view lies from the first one's epipolar line: in px, in sigmas."""
+    r, u = _seen_together(groups), groups.u
+    angle = np.abs(epipolar_angle(r[first], u[first], r[second], u[second]))
+    basis = tangent_basis(u)
+    cov = np.swapaxes(basis, -1, -2) @ groups.cov @ basis
+    sigma_km = array(groups.views, "position_sigma_km")
+    sigma = epipolar_sigma(
+        UncertainSight(r[first], u[first], cov[first], sigma_km[first]),
+        UncertainSight(r[second], u[second], cov[second], sigma_km[second]),
+        groups.x_km[groups.group[first]],
+    )
+    return angle / array(groups.views, "pixel_rad")[second], angle / sigma

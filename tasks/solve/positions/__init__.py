@@ -1,1 +1,0 @@
-"""Where the objects are: positions, states, and the lines of sight that judge the sensors."""

@@ -1,0 +1,109 @@
+"""Keep lines: the lines of sight to objects, and the objects, that the check of sensors needs."""
+
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, conform, from_polars, stack, to_polars
+from epipole.schemas.columns import PLACE, VELOCITY
+from epipole.schemas.spans import DAY_NS
+from epipole.schemas.work_tables import CLAIMED_VIEWS, CLOCK_LINES, MOVING_OBJECTS
+from epipole.tasks.algorithms.geometry.directions import apparent_places
+from epipole.tasks.algorithms.orbits.object_motion import velocities
+from epipole.tasks.solve.positions import VELOCITY_WINDOW_S
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class LineSampling(NamedTuple):
+    """Which lines of sight are kept: at epochs that are multiples of a time since midnight, one in
+    so many of these."""
+
+    every_ns: int
+    one_in: int = 1
+
+
+def moving_objects(positions: pa.Table, every_ns: int) -> pa.Table:
+    """Return MOVING_OBJECTS: the positions at epochs that are multiples of a time since
+    midnight, with velocities from the positions near them."""
+    rows = to_polars(positions).sort("object_id", "epoch")
+    size = rows.group_by("object_id", maintain_order=True).len()["len"].to_numpy()
+    offsets = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
+    time_ns = rows["epoch"].cast(pl.Int64).to_numpy()
+    time_s = (time_ns - (time_ns.min() if len(time_ns) else 0)) / 1e9
+    v, _ = velocities(offsets, time_s, rows.select(PLACE).to_numpy(), VELOCITY_WINDOW_S)
+    light_ns = pl.col("epoch").cast(pl.Int64) - pl.col("time").cast(pl.Int64)
+    rows = rows.with_columns(
+        *[pl.Series(name, v[:, k]) for k, name in enumerate(VELOCITY)], light_s=light_ns / 1e9
+    )
+    kept = rows.filter(pl.Series(time_ns % DAY_NS % every_ns == 0, dtype=pl.Boolean))
+    return from_polars(MOVING_OBJECTS, kept.select(MOVING_OBJECTS.names))
+
+
+def claimed_views(views: pa.Table, objects: pa.Table) -> pa.Table:
+    """Return CLAIMED_VIEWS: the views of objects at the epochs of MOVING_OBJECTS."""
+    return conform(CLAIMED_VIEWS, views.take(_at_epochs(views, objects)))
+
+
+def sample_sight_lines(
+    views: pa.Table, associations: pa.Table, objects: pa.Table, kept: LineSampling
+) -> pa.Table:
+    """Return CLOCK_LINES: views of objects at the epochs of MOVING_OBJECTS.
+
+    Where only some are kept, each object loses other sensors at each epoch, and each sensor other
+    objects: a sensor is judged by many epochs, because all lines of a frame share the error of its
+    attitude.
+
+    Parameters
+    ----------
+    views, associations
+        VIEWS of objects, and ASSOCIATIONS, row by row the same.
+    """
+    rows = _at_epochs(associations, objects)
+    rows = rows[_turn(associations.take(rows), kept) == 0]
+    seen = to_polars(views.take(rows)).with_columns(
+        object_id=pl.Series(associations["object_id"].take(rows).to_pylist(), dtype=pl.String)
+    )
+    return meetings(seen, to_polars(objects), on=["epoch", "object_id"])
+
+
+def _at_epochs(rows: pa.Table, objects: pa.Table) -> Indices:
+    """Return the rows at the epochs of MOVING_OBJECTS."""
+    epochs = np.unique(array(objects, "epoch"))
+    return np.flatnonzero(np.isin(array(rows, "epoch"), epochs))
+
+
+def _turn(associations: pa.Table, kept: LineSampling) -> Indices:
+    """Return a number below `one_in` of each view, evenly spread over sensors and objects."""
+    numbers = []
+    for name in ("sensor_id", "object_id"):
+        values = associations[name].combine_chunks().dictionary_encode()
+        of_value = [zlib.crc32(value.encode()) for value in values.dictionary.to_pylist()]
+        numbers.append(np.array(of_value, np.int64)[values.indices.to_numpy()])
+    epoch = array(associations, "epoch") // kept.every_ns
+    return np.asarray((numbers[0] + numbers[1] + epoch) % kept.one_in)
+
+
+def meetings(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Table:
+    """Return CLOCK_LINES: each view with the objects that are equal in the columns `on`.
+
+    Each object is put where its light left for the sensor of the row.
+    """
+    rows = (
+        views.rename({name: f"sensor_{name}" for name in PLACE})
+        .drop_nulls([f"sensor_{name}" for name in VELOCITY])
+        .join(objects, on=on, maintain_order="left")
+    )
+    x_km = apparent_places(
+        stack(rows, "{}_km"),
+        stack(rows, "v{}_km_s"),
+        rows["light_s"].to_numpy(),
+        stack(rows, "sensor_{}_km"),
+    )
+    rows = rows.with_columns(pl.Series(name, x_km[:, k]) for k, name in enumerate(PLACE))
+    return from_polars(CLOCK_LINES, rows.select(CLOCK_LINES.names))

@@ -1,0 +1,290 @@
+"""Tracklet sightings: one sensor's detections by tracklet, with honest errors.
+
+Two errors are told by the detections together: which part of a prior attitude's error changes from
+frame to frame, and what the light of a neighbour may add to a centroid.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.schemas.bridge import array, empty, nullable, table, unstack
+from epipole.schemas.settings import Settings
+from epipole.schemas.work_tables import SIGHTINGS
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.geometry.covariances import (
+    centroid_covariance,
+    scatter_beyond,
+    shared_direction_covariance,
+)
+from epipole.tasks.algorithms.geometry.directions import (
+    aberrate,
+    east_north,
+    matrix_from_quaternion,
+    radec_from_unit,
+)
+from epipole.tasks.algorithms.photometry import FluxScale
+from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_variance, of_neighbour
+from epipole.tasks.algorithms.tracking.local_motion import directions_at
+from epipole.tasks.common.grouping import factorize, group_offsets
+from epipole.tasks.common.sightings import (
+    Frames,
+    camera_of,
+    in_lone_frames,
+    optics_covariance_of,
+    sightings_of,
+    solved_frames,
+    with_lone_detections,
+)
+
+# -- Tracklet sightings: one sensor's detections by tracklet, with honest errors.
+#
+# Two errors are told by the detections together: which part of a prior attitude's error changes
+# from frame to frame, and what the light of a neighbour may add to a centroid.
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class TrackletSightings(NamedTuple):
+    """Sightings sorted by tracklet, then frame.
+
+    Tracklet k has the rows ``bounds[k]:bounds[k + 1]``, and the id ``name[k]``. `blend_rad2` is a
+    part of `cov_bias`: what the light of a neighbour may add, per axis.
+    """
+
+    frame: Indices
+    centroid: Indices
+    u_icrs: Array
+    cov_noise: Array
+    cov_bias: Array
+    blend_rad2: Array
+    flux: Array
+    bounds: Indices
+    name: npt.NDArray[np.object_]
+
+    @property
+    def tracklet(self) -> Indices:
+        """Tracklet of each row."""
+        return np.repeat(np.arange(len(self.name)), np.diff(self.bounds))
+
+
+class Sighted(NamedTuple):
+    """The sightings of one sensor, its frames and its optics."""
+
+    frames: Frames
+    tracklets: TrackletSightings
+    camera: Camera
+    cov_optics: Array
+
+
+def sight_objects(
+    solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
+) -> Sighted | None:
+    """Return the sightings of one sensor's detections that have a tracklet and a direction.
+
+    A detection in a lone frame is a tracklet of one detection. None where there are none.
+    """
+    frames = solved_frames(solutions)
+    detections = _with_lone(frames, detections, settings)
+    # Detections without a direction were tracked in the image alone.
+    placed = pa.compute.field("tracklet_id").is_valid() & pa.compute.field("ra_deg").is_valid()
+    tracked = detections.filter(placed)
+    if not tracked.num_rows:
+        return None
+    row = int(frames.camera[0])
+    camera = camera_of(cameras, row)
+    tracklets = _with_split_prior(_by_tracklet(frames, tracked), frames, settings)
+    tracklets = _with_blends(tracklets, frames, camera)
+    return Sighted(frames, tracklets, camera, optics_covariance_of(cameras, row))
+
+
+def optics_covariance(
+    sighted: Sighted, R: Array, u_sensor: Array, from_stars: npt.NDArray[np.bool_]
+) -> Array:
+    """Return (n, 3, 3) covariances of directions, ICRS, due to the error of fitted optics [rad^2].
+
+    It is shared by all frames; 0 where the optics are those of the log.
+
+    Parameters
+    ----------
+    R : (n, 3, 3) float
+        Attitudes, sensor from ICRS.
+    u_sensor : (n, 3) float
+        Measured directions, sensor axes.
+    from_stars : (n,) bool
+        Whether stars gave the attitude.
+    """
+    if not sighted.cov_optics.any():
+        return np.zeros_like(R)
+    shared = shared_direction_covariance(sighted.camera, sighted.cov_optics, u_sensor, from_stars)
+    return np.asarray(np.swapaxes(R, 1, 2) @ shared @ R)
+
+
+def _with_lone(frames: Frames, detections: pa.Table, settings: Settings) -> pa.Table:
+    """Return the detections; unknown ones in lone frames get the id of a tracklet of their own."""
+    lone_frames = frames.number[in_lone_frames(frames.time_ns, settings.tracklets)]
+    if not len(lone_frames):
+        return detections
+    unknown = array(detections, "kind") == "unknown"
+    lone = unknown & np.isin(array(detections, "frame_number"), lone_frames)
+    return with_lone_detections(detections, lone)
+
+
+def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
+    sightings = sightings_of(frames, tracked)
+    rank, names = factorize(tracked, "tracklet_id")
+    rank = rank[sightings.row]
+    order = np.lexsort((sightings.frame, rank))
+    bounds = group_offsets(rank[order])
+    return TrackletSightings(
+        sightings.frame[order],
+        array(tracked, "centroid")[sightings.row[order]],
+        sightings.u_icrs[order],
+        sightings.cov_noise[order],
+        sightings.cov_bias[order],
+        np.zeros(len(order)),
+        array(tracked, "flux").astype(float)[sightings.row[order]],
+        bounds,
+        names[rank[order[bounds[:-1]]]].astype(object),
+    )
+
+
+def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -> TrackletSightings:
+    """Return the sightings with the errors that the light of neighbours may add.
+
+    Those of a neighbour alone are left out.
+    """
+    time_s = (frames.time_ns - frames.time_ns[0]) / 1e9
+    tracked = TrackedSpots(
+        tracklets.bounds,
+        time_s[tracklets.frame],
+        tracklets.u_icrs,
+        tracklets.cov_noise,
+        tracklets.flux,
+    )
+    variance = blend_variance(tracked, time_s, camera.pixel_rad)
+    cov_bias = tracklets.cov_bias + centroid_covariance(tracklets.u_icrs, np.sqrt(variance))
+    own = ~of_neighbour(tracked, variance)
+    left = np.concatenate([[0], np.cumsum(own)])
+    return TrackletSightings(
+        tracklets.frame[own],
+        tracklets.centroid[own],
+        tracklets.u_icrs[own],
+        tracklets.cov_noise[own],
+        cov_bias[own],
+        variance[own],
+        tracklets.flux[own],
+        left[tracklets.bounds],
+        tracklets.name,
+    )
+
+
+def _with_split_prior(
+    tracklets: TrackletSightings, frames: Frames, settings: Settings
+) -> TrackletSightings:
+    """Return the sightings with each prior attitude's error divided as the detections show it.
+
+    What changes from frame to frame scatters about the smooth motion of objects: it is noise. The
+    rest of the stated variance is the bias that all frames share. It is not less than the error of
+    the division.
+    """
+    prior = np.flatnonzero(~frames.from_stars[tracklets.frame])
+    if not len(prior):
+        return tracklets
+    v = np.nan_to_num(frames.v_gcrf_km_s)
+    u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
+    own = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[prior] / 2
+    tracklet = tracklets.tracklet[prior]
+    time_s = (frames.time_ns[tracklets.frame] - frames.time_ns[0]) / 1e9
+    fit = directions_at(
+        tracklets.bounds[tracklet],
+        tracklets.bounds[tracklet + 1],
+        time_s[prior],
+        0.0,
+        time_s,
+        u,
+        tracklets.cov_noise,
+        tracklets.cov_bias,
+        settings.alignment.window_s,
+    )
+    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / own
+    follows = np.append(False, (np.diff(tracklet) == 0) & (np.diff(prior) == 1))
+    scatter = scatter_beyond(u[prior] - fit.u, np.sqrt(own), leverage, follows)
+    stated = np.trace(tracklets.cov_bias, axis1=1, axis2=2)[prior] / 2
+    share = scatter / np.maximum(stated, 1e-30)
+    n_frames = len(np.unique(tracklets.frame[prior]))
+    stays = np.maximum(1.0 - share, share / np.sqrt(n_frames))
+    noise, bias = tracklets.cov_noise.copy(), tracklets.cov_bias.copy()
+    noise[prior] += share[:, None, None] * bias[prior]
+    bias[prior] *= stays[:, None, None]
+    return tracklets._replace(cov_noise=noise, cov_bias=bias)
+
+
+# -- Tabulate sightings: each detection of a tracklet as an observation, its object still unknown.
+
+
+def tabulate_sightings(sighted: Sighted | None) -> pa.Table:
+    """Return SIGHTINGS of one sensor, sorted by time; of frames whose sensor has a position."""
+    if sighted is None:
+        return empty(SIGHTINGS)
+    frames, tracklets = sighted.frames, sighted.tracklets
+    frame = tracklets.frame
+    v_km_s = frames.v_gcrf_km_s[frame]
+    u = aberrate(tracklets.u_icrs, -np.nan_to_num(v_km_s))
+    ra, dec = radec_from_unit(u)
+    cov_blend = centroid_covariance(u, np.sqrt(tracklets.blend_rad2))
+    noise = _on_sky(u, tracklets.cov_noise + cov_blend)
+    R = matrix_from_quaternion(frames.q_sensor_from_icrs[frame])
+    u_sensor = np.einsum("nij,nj->ni", R, tracklets.u_icrs)
+    by_optics = optics_covariance(sighted, R, u_sensor, frames.from_stars[frame])
+    shared = _on_sky(u, tracklets.cov_bias - cov_blend + by_optics)
+    sigma = np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
+    r_km = frames.r_gcrf_km[frame]
+    magnitude, magnitude_sigma = _magnitudes(sighted)
+    columns = {
+        "time": frames.time_ns[frame],
+        "sensor_id": array(frames.table, "sensor_id")[frame],
+        "frame_number": frames.number[frame],
+        "centroid": tracklets.centroid,
+        "ra_deg": np.degrees(ra),
+        "dec_deg": np.degrees(dec),
+        "sigma_ra_arcsec": sigma[:, 0] / ARCSEC,
+        "sigma_dec_arcsec": sigma[:, 1] / ARCSEC,
+        "correlation": noise[:, 0, 1] / (sigma[:, 0] * sigma[:, 1]),
+        "bias_sigma_arcsec": np.sqrt(np.maximum(np.trace(shared, axis1=1, axis2=2) / 2, 0.0))
+        / ARCSEC,
+        **unstack("{}_km", r_km),
+        "position_sigma_km": frames.position_sigma_km[frame],
+        "tracklet_id": tracklets.name[tracklets.tracklet],
+    }
+    kept = np.flatnonzero(np.isfinite(r_km[:, 0]))
+    kept = kept[np.argsort(frames.time_ns[frame[kept]], kind="stable")]
+    maybe = {
+        "magnitude": magnitude,
+        "magnitude_sigma": magnitude_sigma,
+        **unstack("v{}_km_s", v_km_s),
+    }
+    return table(
+        SIGHTINGS,
+        {name: values[kept] for name, values in columns.items()}
+        | {name: nullable(values[kept]) for name, values in maybe.items()},
+    )
+
+
+def _on_sky(u: Array, cov: Array) -> Array:
+    """Return (n, 3, 3) covariances as (n, 2, 2), east and north."""
+    basis = east_north(u)
+    return basis @ cov @ np.swapaxes(basis, 1, 2)
+
+
+def _magnitudes(sighted: Sighted) -> tuple[Array, Array]:
+    frames, tracklets = sighted.frames, sighted.tracklets
+    of_frames = (
+        array(frames.table, name).astype(float)[tracklets.frame]
+        for name in ("zero_mag", "zero_variance_mag2", "flux_floor_mag2", "flux_photon_mag2")
+    )
+    return FluxScale(*of_frames).magnitudes(tracklets.flux)

@@ -1,0 +1,279 @@
+"""Solve a piece: the positions and states of some objects of a span, part to part.
+
+Margins before and after the span are solved too, so that the velocities at its first and last
+epochs rest on as much as all others. Rows of the margins are not kept: they belong to the
+neighbouring spans.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+import pyarrow as pa
+
+from epipole.io.work.parts import JUDGED, SOLVED, is_written, read_part, write_part
+from epipole.io.work.work_layout import SolvedParts, ViewedParts
+from epipole.schemas.bridge import array, concat, to_polars
+from epipole.schemas.settings import Settings
+from epipole.schemas.spans import DAY_NS, Span, spans_between
+from epipole.schemas.stages import Stage
+from epipole.schemas.tables import REJECTS
+from epipole.schemas.work_tables import VIEWS
+from epipole.tasks.common.grouping import group_offsets
+from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.solve.associate_block import judge_views
+from epipole.tasks.solve.positions import solve_positions
+from epipole.tasks.solve.sample_sight_lines import (
+    LineSampling,
+    claimed_views,
+    moving_objects,
+    sample_sight_lines,
+)
+from epipole.tasks.solve.states import (
+    fit_states,
+    judge_errors,
+    refuse_misfits,
+    with_larger_errors,
+    with_stated_errors,
+)
+
+# -- Gather views: all views of some objects, from the parts of all sensors.
+
+Indices = npt.NDArray[np.int64]
+
+
+def gather_views(
+    viewed: ViewedParts, members: pa.Table, time: Span, every_ns: int = 1
+) -> tuple[pa.Table, Indices]:
+    """Return the VIEWS of objects in a time, and the number of the object of each.
+
+    Parameters
+    ----------
+    viewed
+        The parts of the views of the sensors.
+    members
+        OBJECT_MEMBERS of the objects.
+    every_ns
+        Only epochs that are multiples of this time since midnight.
+
+    Notes
+    -----
+    Two fragments of a track in one sensor may both have a view of an object at an epoch. Only one
+    counts: the one with a centroid in the frame, or else the first. Views at epochs at which no
+    second sensor has one are left out.
+    """
+    tables, numbers, sensors = [], [], []
+    for sensor, own in to_polars(members).group_by("sensor", maintain_order=True):
+        for span in spans_between(*time):
+            if not viewed[int(sensor[0])].holds(span):
+                continue
+            parts = viewed[int(sensor[0])]
+            views = parts.read(span, "views")
+            rows, number = _rows(views, parts.read(span, "tracklets"), own, time)
+            kept = array(views, "epoch")[rows] % DAY_NS % every_ns == 0
+            rows, number = rows[kept], number[kept]
+            tables.append(views.take(rows))
+            numbers.append(number)
+            sensors.append(np.full(len(number), sensor[0]))
+    views = concat(VIEWS, tables)
+    number, sensor_number = (
+        np.concatenate([*parts, np.zeros(0, np.int64)]) for parts in (numbers, sensors)
+    )
+    kept = _seen_by_two(views, number, sensor_number)
+    return views.take(kept), number[kept]
+
+
+def _rows(
+    views: pa.Table, tracklets: pa.Table, members: pl.DataFrame, time: Span
+) -> tuple[Indices, Indices]:
+    """Return the rows of one sensor's views that are of objects, and the objects."""
+    epoch_ns = array(views, "epoch")
+    first = dict(zip(tracklets["tracklet_id"].to_pylist(), array(tracklets, "first_view").tolist(),
+                     strict=True))  # fmt: skip
+    n_views = array(tracklets, "n_views")
+    count = dict(zip(first, n_views.tolist(), strict=True))
+    rows, numbers = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for name, number, start_ns, end_ns in _asked(members, time):
+        if name not in first:
+            continue
+        begin, end = first[name], first[name] + count[name]
+        lo = begin + int(np.searchsorted(epoch_ns[begin:end], start_ns))
+        hi = max(begin + int(np.searchsorted(epoch_ns[begin:end], end_ns, side="right")), lo)
+        rows.append(np.arange(lo, hi))
+        numbers.append(np.full(hi - lo, number))
+    return np.concatenate(rows), np.concatenate(numbers)
+
+
+def _asked(members: pl.DataFrame, time: Span) -> Iterator[tuple[str, int, int, int]]:
+    """Yield tracklet, object, first and last epoch of each member within a time."""
+    columns = members.select(
+        "tracklet_id",
+        "object",
+        pl.col("first_epoch").cast(pl.Int64).clip(lower_bound=time.start_ns),
+        pl.col("last_epoch").cast(pl.Int64).clip(upper_bound=time.end_ns - 1),
+    )
+    yield from columns.iter_rows()
+
+
+def _seen_by_two(views: pa.Table, number: Indices, sensor: Indices) -> Indices:
+    """Return the rows of views, one per sensor, of objects that two sensors see at the epoch; in
+    the order of epochs, objects and sensors."""
+    missed = ~views["centroid"].is_valid().to_numpy()
+    epoch_ns = array(views, "epoch")
+    order = np.lexsort((missed, sensor, number, epoch_ns))
+    order = order[group_offsets(epoch_ns[order], number[order], sensor[order])[:-1]]
+    count = np.diff(group_offsets(epoch_ns[order], number[order]))
+    return order[np.repeat(count, count) >= 2]
+
+
+# -- Solve a piece: the positions and states of some objects of a span, part to part.
+#
+# Margins before and after the span are solved too, so that the velocities at its first and last
+# epochs rest on as much as all others. Rows of the margins are not kept: they belong to the
+# neighbouring spans.
+
+
+class Piece(NamedTuple):
+    """Some objects of a span: the piece's number, and of how many."""
+
+    span: Span
+    number: int
+    of: int
+
+    def __str__(self) -> str:
+        """Return the times of day, and which piece of how many."""
+        return f"{self.span}" + (f" {self.number + 1}/{self.of}" if self.of > 1 else "")
+
+
+@stage_task(Stage.SOLVE, "{piece}")
+def solve_piece(
+    viewed: ViewedParts,
+    piece: Piece,
+    margin_ns: int,
+    kept: LineSampling,
+    settings: Settings,
+    solved: SolvedParts,
+) -> int:
+    """Write the positions and states of some objects, `SOLVED`, unless the part exists.
+
+    Parameters
+    ----------
+    viewed
+        The parts of the views of the sensors.
+    kept
+        Lines of sight that are kept for the check of the sensors.
+    solved
+        `objects` and `errors` are read; the part goes to `piece`.
+
+    Returns
+    -------
+    int
+        Number of positions.
+    """
+    part = solved.piece(piece.span, piece.number)
+    if not is_written(part):
+        write_part(part, SOLVED, _solve(viewed, piece, margin_ns, kept, settings, solved))
+    return read_part(part, "positions").num_rows
+
+
+def _solve(
+    viewed: ViewedParts,
+    piece: Piece,
+    margin_ns: int,
+    kept: LineSampling,
+    settings: Settings,
+    solved: SolvedParts,
+) -> dict[str, pa.Table]:
+    span = piece.span
+    members = solved.objects.read(span, "members").filter(pa.compute.field("piece") == piece.number)
+    views, number = gather_views(viewed, members, span.widened(margin_ns))
+    errors = solved.errors.read(span, "errors")
+    found = solve_positions(with_larger_errors(views, errors), number, settings, span)
+    states, misfits = refuse_misfits(
+        fit_states(found.views, found.associations, found.positions, settings)
+    )
+    objects = moving_objects(found.positions, kept.every_ns)
+    return {
+        "associations": found.associations,
+        "positions": found.positions,
+        "pairs": found.pairs,
+        "states": states,
+        "rejects": concat(REJECTS, [found.rejects, misfits]),
+        "outcomes": judge_views(found.associations),
+        # The check of the sensors holds the lines against the errors that the sensors state.
+        "lines": sample_sight_lines(
+            with_stated_errors(found.views, errors), found.associations, objects, kept
+        ),
+        "claims": claimed_views(found.views, objects),
+        "objects": objects,
+    }
+
+
+# -- Judge a span: the sensors whose shared errors are larger than stated, part to part.
+
+ENOUGH = 8  # objects that show the errors of a sensor
+
+
+@stage_task(Stage.SOLVE, "errors {span}")
+def judge_span(
+    viewed: ViewedParts,
+    span: Span,
+    margin_ns: int,
+    every_ns: int,
+    most_views: int,
+    settings: Settings,
+    solved: SolvedParts,
+) -> None:
+    """Write SHARED_ERRORS of a span, `JUDGED`, unless the part exists.
+
+    Parameters
+    ----------
+    viewed
+        The parts of the views of the sensors.
+    every_ns, most_views
+        Only epochs that are multiples of this time since midnight are solved, and objects with so
+        many views at most, all epochs counted.
+    solved
+        `objects` is read, `errors` gets the part.
+    """
+    if solved.errors.holds(span):
+        return
+    members = telling_objects(solved.objects.read(span, "members"), most_views)
+    views, number = gather_views(viewed, members, span.widened(margin_ns), every_ns)
+    found = solve_positions(views, number, settings, span)
+    errors = judge_errors(views, found.associations, found.positions, settings)
+    write_part(solved.errors.of(span), JUDGED, {"errors": errors})
+
+
+def telling_objects(members: pa.Table, most_views: int) -> pa.Table:
+    """Return the OBJECT_MEMBERS of objects with so many views together, at most.
+
+    Where these are not all, each sensor gets some: those with few objects first, each its longest.
+    """
+    rows = to_polars(members)
+    if rows["n_views"].sum() <= most_views:
+        return members
+    size = dict(rows.group_by("object").agg(pl.col("n_views").sum()).iter_rows())
+    seen = (
+        rows.group_by("sensor", "object")
+        .agg(pl.col("n_views").sum())
+        .with_columns(objects=pl.len().over("sensor"))
+        .sort("objects", "sensor", "n_views", "object", descending=[False, False, True, False])
+    )
+    of_sensor: dict[int, list[int]] = {}
+    for sensor, object_ in seen.select("sensor", "object").iter_rows():
+        of_sensor.setdefault(sensor, []).append(object_)
+    sees = {o: set(s) for o, s in seen.group_by("object").agg(pl.col("sensor")).iter_rows()}
+    chosen: set[int] = set()
+    held = 0
+    for sensor, objects in of_sensor.items():
+        for object_ in objects:
+            enough = sum(sensor in sees[one] for one in chosen) >= ENOUGH
+            if enough or (chosen and held + size[object_] > most_views):
+                break
+            if object_ not in chosen:
+                chosen.add(object_)
+                held += size[object_]
+    return members.filter(pa.array(np.isin(rows["object"].to_numpy(), sorted(chosen))))

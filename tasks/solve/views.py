@@ -1,0 +1,262 @@
+"""View objects: the directions of one sensor's tracklets at the epochs."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from epipole.io.work.parts import VIEWED, read_part, write_part
+from epipole.io.work.work_layout import SensorParts
+from epipole.schemas.bridge import array, empty, nullable, stack, table, unstack, unstack_covariance
+from epipole.schemas.columns import TANGENT_AXES
+from epipole.schemas.settings import Settings
+from epipole.schemas.spans import Span
+from epipole.schemas.stages import Stage
+from epipole.schemas.work_tables import SENSOR_EPOCHS, SOLUTIONS, VIEWED_TRACKLETS, VIEWS
+from epipole.tasks.algorithms.constants import GM_KM3_S2
+from epipole.tasks.algorithms.geometry.camera import project
+from epipole.tasks.algorithms.geometry.covariances import on_tangent_plane
+from epipole.tasks.algorithms.geometry.directions import (
+    aberrate,
+    interpolate_quaternions,
+    matrix_from_quaternion,
+)
+from epipole.tasks.algorithms.tracking.local_motion import directions_at
+from epipole.tasks.common.grouping import group_offsets
+from epipole.tasks.common.sightings import (
+    Frames,
+    detections_within,
+    solved_frames,
+    with_lone_tracklets,
+)
+from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
+from epipole.tasks.solve.sightings import (
+    Sighted,
+    TrackletSightings,
+    optics_covariance,
+    sight_objects,
+    tabulate_sightings,
+)
+
+# -- View objects: the directions of one sensor's tracklets at the epochs.
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+def view_objects(epochs: pa.Table, sighted: Sighted | None, settings: Settings) -> pa.Table:
+    """Return VIEWS of one sensor: each tracklet at each epoch that it covers, in this order.
+
+    A detection in a lone frame is a tracklet of one detection, at an unknown rate.
+
+    A tracklet covers the epochs between its ends, and those beyond them that are no farther away
+    than an epoch may be from its frame. The aberration by the sensor's geocentric velocity is
+    removed from each detection before the motion is fitted.
+    """
+    if sighted is None or not epochs.num_rows:
+        return empty(VIEWS)
+    query = _queries(sighted.tracklets, epochs, sighted.frames)
+    return _view_table(sighted, query, epochs, settings)
+
+
+class _EpochQueries(NamedTuple):
+    """What is asked for: each tracklet at each epoch that it covers."""
+
+    tracklet: Indices
+    row: Indices  # of `epochs`
+    frame: Indices  # that serves the epoch
+
+
+def frames_of(epochs: pa.Table, frames: Frames) -> Indices:
+    """Return the row in `frames` of the frame that serves each epoch."""
+    by_number = np.argsort(frames.number, kind="stable")
+    return by_number[
+        np.searchsorted(frames.number[by_number], array(epochs, "frame_number"))
+    ].astype(np.int64)
+
+
+def _queries(tracklets: TrackletSightings, epochs: pa.Table, frames: Frames) -> _EpochQueries:
+    """Return each epoch that a tracklet covers, by tracklet."""
+    epoch_ns, bounds = array(epochs, "epoch"), tracklets.bounds
+    time_ns = frames.time_ns[tracklets.frame]
+    beyond_ns = int(np.abs(array(epochs, "dt_s")).max() * 1e9) + 1
+    first = np.searchsorted(epoch_ns, time_ns[bounds[:-1]] - beyond_ns)
+    last = np.searchsorted(epoch_ns, time_ns[bounds[1:] - 1] + beyond_ns, side="right")
+    count = last - first
+    tracklet = np.repeat(np.arange(len(count)), count)
+    start = np.cumsum(count) - count
+    row = np.arange(count.sum()) - np.repeat(start - first, count)
+    return _EpochQueries(tracklet, row, frames_of(epochs, frames)[row])
+
+
+def _view_table(
+    sighted: Sighted, query: _EpochQueries, epochs: pa.Table, settings: Settings
+) -> pa.Table:
+    frames, tracklets, camera = sighted.frames, sighted.tracklets, sighted.camera
+    tracklet, row, served = query
+    origin = frames.time_ns[0]
+    bounds = tracklets.bounds
+    v = np.nan_to_num(frames.v_gcrf_km_s)
+    u_still = aberrate(tracklets.u_icrs, -v[tracklets.frame])
+    at_s = (array(epochs, "epoch")[row] - origin) / 1e9
+    motion = directions_at(
+        bounds[tracklet],
+        bounds[tracklet + 1],
+        at_s,
+        np.radians(settings.tracklets.max_rate_deg_s) / 3,  # the fastest is a 3-sigma rate
+        (frames.time_ns[tracklets.frame] - origin) / 1e9,
+        u_still,
+        tracklets.cov_noise,
+        tracklets.cov_bias,
+        settings.alignment.window_s,
+    )
+    centroid, missed = _centroids(tracklets, query)
+    q = interpolate_quaternions((frames.time_ns - origin) / 1e9, frames.q_sensor_from_icrs, at_s)
+    u, fitted = motion.u, motion.fitted
+    R = matrix_from_quaternion(q)
+    u_sensor = np.einsum("nij,nj->ni", R, aberrate(u, v[served]))
+    x_px, y_px = project(camera, u_sensor)
+    r_km, v_km_s = _carried(frames, served, array(epochs, "dt_s")[row])
+    cov_noise, cov_bias = (on_tangent_plane(u, cov) for cov in motion[2:4])
+    cov_noise, cov_bias, blend_rad2 = _without_blends(tracklet, cov_noise, cov_bias)
+    if sighted.cov_optics.any():
+        by_optics = optics_covariance(sighted, R, u_sensor, frames.from_stars[served])
+        cov_bias = cov_bias + on_tangent_plane(u, by_optics)
+    kept = np.isfinite(x_px) & np.isfinite(r_km[:, 0])
+    columns = {
+        "epoch": array(epochs, "epoch")[row],
+        "sensor_id": array(epochs, "sensor_id")[row],
+        "frame_number": frames.number[served],
+        "tracklet_id": tracklets.name[tracklet],
+        "x_px": x_px,
+        "y_px": y_px,
+        **unstack("u{}", u),
+        **unstack("w{}_rad_s", motion.w),
+        **unstack_covariance("cov_noise_{}_rad2", cov_noise, TANGENT_AXES),
+        **unstack_covariance("cov_bias_{}_rad2", cov_bias, TANGENT_AXES),
+        "blend_rad2": blend_rad2,
+        "first_fitted": frames.time_ns[tracklets.frame[fitted[:, 0]]],
+        "last_fitted": frames.time_ns[tracklets.frame[fitted[:, 1] - 1]],
+        **unstack("moment_{}", motion.moments, "123"),
+        "unmodelled_rad2": motion.unmodelled,
+        **unstack("{}_km", r_km),
+        "position_sigma_km": frames.position_sigma_km[served],
+        "pixel_rad": np.full(len(row), camera.pixel_rad),
+    }
+    columns = {key: values[kept] for key, values in columns.items()}
+    velocity = unstack("sensor_v{}_km_s", v_km_s[kept])
+    columns |= {name: nullable(values) for name, values in velocity.items()}
+    columns["centroid"] = pa.array(centroid[kept], mask=missed[kept])
+    return table(VIEWS, columns)
+
+
+def _without_blends(
+    tracklet: Indices, cov_noise: Array, cov_bias: Array
+) -> tuple[Array, Array, Array]:
+    """Return the covariances of noise and bias, and what some views have more bias than others.
+
+    What all views of a tracklet have is common to them. What blends add to some of them is not: it
+    becomes a part of their noise, with this variance per axis.
+    """
+    shared = np.trace(cov_bias, axis1=1, axis2=2)
+    least = np.full(int(tracklet.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(least, tracklet, shared)
+    stays = (least[tracklet] / np.where(shared > 0.0, shared, np.inf))[:, None, None]
+    more = (1 - stays) * cov_bias
+    return cov_noise + more, stays * cov_bias, np.trace(more, axis1=1, axis2=2) / 2
+
+
+def _centroids(
+    tracklets: TrackletSightings, query: _EpochQueries
+) -> tuple[Indices, npt.NDArray[np.bool_]]:
+    """Return each query's centroid in the frame that serves, and which queries have none."""
+    n_frames = max(int(tracklets.frame.max()), int(query.frame.max(initial=0))) + 1
+    key = tracklets.tracklet * n_frames + tracklets.frame  # increasing
+    wanted = query.tracklet * n_frames + query.frame
+    at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+    return tracklets.centroid[at], key[at] != wanted
+
+
+def _carried(frames: Frames, served: Indices, dt_s: Array) -> tuple[Array, Array]:
+    """Return the sensor's positions and velocities at the epochs, from those at their frames.
+
+    Gravity is included: in one second it bends an orbit by 4 m.
+    """
+    r, v = frames.r_gcrf_km[served], frames.v_gcrf_km_s[served]
+    back = -dt_s[:, None]  # dt is frame minus epoch
+    gravity = -GM_KM3_S2 * r / np.linalg.norm(r, axis=1, keepdims=True) ** 3
+    return r + np.nan_to_num(v) * back + gravity * back**2 / 2, v + gravity * back
+
+
+# -- View sensors: the directions of sensors' tracklets at the epochs of a span, part to part.
+
+MIN_FRAMES = 6  # beyond the ends of a span: the motion at an epoch is fitted to these too
+
+
+@stage_task(Stage.SOLVE, "views {span}")
+def view_sensors(
+    sensors: Sequence[SensorParts],
+    span: Span,
+    grid: EpochGrid,
+    cameras: pa.Table,
+    settings: Settings,
+) -> int:
+    """Write the views of some sensors in a span, `VIEWED`, unless the parts exist.
+
+    Returns
+    -------
+    int
+        Number of views.
+    """
+    count = 0
+    for sensor in sensors:
+        if not sensor.viewed.holds(span):
+            tables = _view(sensor, span, grid, cameras, settings)
+            write_part(sensor.viewed.of(span), VIEWED, tables)
+        count += sensor.viewed.read(span, "views").num_rows
+    return count
+
+
+def _view(
+    sensor: SensorParts, span: Span, grid: EpochGrid, cameras: pa.Table, settings: Settings
+) -> dict[str, pa.Table]:
+    margin_ns = round(2e9 * settings.alignment.window_s) + MIN_FRAMES * grid.interval_ns
+    wide = span.widened(margin_ns)
+    solutions = sensor.identified.rows_within(wide, SOLUTIONS, "solutions")
+    epochs = span.of(align_epochs(solutions, settings, grid), "epoch")
+    sighted = sight_objects(solutions, detections_within(sensor, wide), cameras, settings)
+    views = view_objects(epochs, sighted, settings)
+    tracklets = read_part(sensor.names.of_night(), "tracklets")
+    return {
+        "epochs": sensor_epochs(epochs, solutions),
+        "views": views,
+        "sightings": span.of(tabulate_sightings(sighted), "time"),
+        "tracklets": viewed_tracklets(tracklets, views),
+    }
+
+
+def sensor_epochs(epochs: pa.Table, solutions: pa.Table) -> pa.Table:
+    """Return SENSOR_EPOCHS: EPOCHS of one sensor with the states of their frames."""
+    frames = solved_frames(solutions)
+    row = frames_of(epochs, frames) if epochs.num_rows else np.zeros(0, np.int64)
+    state = {name: frames.table[name].take(row) for name in ("vx_km_s", "vy_km_s", "vz_km_s")}
+    return table(
+        SENSOR_EPOCHS,
+        {name: epochs[name] for name in epochs.column_names}
+        | unstack("q{}", frames.q_sensor_from_icrs[row], "xyzw")
+        | unstack("{}_km", stack(frames.table, "{}_km")[row])
+        | state
+        | {"camera": frames.camera[row]},
+    )
+
+
+def viewed_tracklets(tracklets: pa.Table, views: pa.Table) -> pa.Table:
+    """Return VIEWED_TRACKLETS of one sensor, in the order of the ids, as the views are."""
+    bounds = group_offsets(array(views, "tracklet_id"))
+    rows = with_lone_tracklets(tracklets, views.take(bounds[:-1])).sort_by("tracklet_id")
+    columns = {name: rows[name] for name in rows.column_names}
+    where = {"first_view": bounds[:-1], "n_views": np.diff(bounds)}
+    return table(VIEWED_TRACKLETS, columns | where)

@@ -1,0 +1,132 @@
+"""The catalogue of known objects: bad records are told and skipped, an empty file is refused."""
+
+import hashlib
+import json
+
+import pytest
+from scenes.satellites import LINES, two_lines
+from sgp4.api import Satrec
+from sgp4.exporter import export_omm
+
+from epipole.io.catalogues.element_sets import read_known_objects
+from epipole.schemas.errors import CatalogueError
+
+GOOD = "\n".join(["ISS (ZARYA)", *LINES])
+
+
+def write(path, text):
+    path.write_text(text)
+    return str(path)
+
+
+def test_a_catalogue_has_its_sets_and_the_digest_of_its_bytes(tmp_path):
+    where = write(tmp_path / "a.tle", GOOD)
+    known = read_known_objects(where)
+    (found,) = known.sets
+    assert (found.name, found.number, found.cospar_id) == ("ISS (ZARYA)", 25544, "1998-067A")
+    assert known.faults == []
+    assert known.sha256 == hashlib.sha256(GOOD.encode()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        (LINES[0] + "\n" + GOOD, "expected line 2"),
+        (GOOD + "\n" + LINES[1], "line 2 of the elements without line 1"),
+        (GOOD + "\n" + LINES[0][:-1] + "9\n" + LINES[1], "its checksum is 9"),
+        (GOOD + "\n" + LINES[0] + "\n" + two_lines("2", 13.0)[1], "line 1 is of 25544"),
+        (GOOD + "\n" + LINES[0], "ends after line 1"),
+    ],
+)
+def test_one_bad_record_is_told_and_the_others_are_read(text, what, tmp_path):
+    known = read_known_objects(write(tmp_path / "a.tle", text))
+    assert [each.number for each in known.sets] == [25544]
+    (fault,) = known.faults
+    assert what in str(fault)
+    assert str(fault).startswith("line ")
+
+
+def omm(**changed):
+    return export_omm(Satrec.twoline2rv(*LINES), "ISS (ZARYA)") | changed
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"MEAN_MOTION": "fast"}, {"MEAN_MOTION": "0"}, {"MEAN_MOTION": "nan"},
+        {"ECCENTRICITY": 1.5}, {"EPOCH": "yesterday"}, {"NORAD_CAT_ID": None},
+        {"MEAN_ELEMENT_THEORY": "DSST"}, {"MEAN_MOTION": "9" * 400},
+    ],
+)  # fmt: skip
+def test_one_bad_message_is_told_and_the_others_are_read(bad, tmp_path):
+    text = json.dumps([omm(**bad), omm(), 5])
+    known = read_known_objects(write(tmp_path / "a.json", text))
+    assert [each.number for each in known.sets] == [25544]
+    assert [fault.where for fault in known.faults] == ["message 1", "message 3"]
+
+
+def test_what_the_orbit_does_not_need_may_be_anything(tmp_path):
+    odd = omm(
+        CLASSIFICATION_TYPE="", REV_AT_EPOCH="many", EPHEMERIS_TYPE="\u00e9", OBJECT_ID="\ud55c"
+    )
+    known = read_known_objects(write(tmp_path / "a.json", json.dumps([odd])))
+    assert [(each.number, each.cospar_id) for each in known.sets] == [(25544, "\ud55c")]
+
+
+def test_a_letter_that_is_no_text_costs_nothing_but_itself(tmp_path):
+    (tmp_path / "a.tle").write_bytes(GOOD.encode().replace(b"ZARYA", b"Z\xffRYA"))
+    (found,) = read_known_objects(str(tmp_path / "a.tle")).sets
+    assert found.name == "ISS (Z\N{REPLACEMENT CHARACTER}RYA)"
+
+
+def test_numbers_may_have_more_than_five_digits(tmp_path):
+    text = json.dumps([omm(NORAD_CAT_ID=123456), omm(NORAD_CAT_ID="987654321")])
+    known = read_known_objects(write(tmp_path / "a.json", text))
+    assert [each.number for each in known.sets] == [123456, 987654321]
+
+
+def test_a_catalogue_of_two_forms_has_those_of_the_first(tmp_path):
+    table = omm()
+    text = ",".join(table) + "\n" + ",".join(str(v) for v in table.values()) + "\n" + GOOD
+    known = read_known_objects(write(tmp_path / "a.csv", text))
+    assert [each.number for each in known.sets] == [25544]
+    assert len(known.faults) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("", "has no element sets; give"),
+        ("a\nb\n", "has no element sets; give"),
+        ("[]", "has no element sets; give"),
+        ("[" * 100_000, "not JSON"),
+        ("{", "not JSON"),
+        ("<a>", "not an OMM in XML"),
+        (LINES[0], r"has no element sets \(line 1: the file ends after line 1"),
+    ],
+)
+def test_a_file_without_element_sets_is_refused_in_one_line(text, what, tmp_path):
+    with pytest.raises(CatalogueError, match=what) as caught:
+        read_known_objects(write(tmp_path / "a.file", text))
+    assert "\n" not in str(caught.value)
+    assert "OMM in CSV, JSON or XML" in str(caught.value)
+
+
+def test_what_is_no_file_is_refused(tmp_path):
+    with pytest.raises(CatalogueError, match="no such file"):
+        read_known_objects(str(tmp_path / "none.tle"))
+    with pytest.raises(CatalogueError, match="is no file"):
+        read_known_objects(str(tmp_path))
+    (tmp_path / "a.bin").write_bytes(b"\xff\xfe\x00\xd8")
+    with pytest.raises(CatalogueError, match="has no element sets"):
+        read_known_objects(str(tmp_path / "a.bin"))
+
+
+def test_a_catalogue_behind_a_url_is_read(tmp_path):
+    import fsspec
+
+    with fsspec.open("memory://catalogue.tle", "w") as file:
+        file.write(GOOD)
+    assert [each.number for each in read_known_objects("memory://catalogue.tle").sets] == [25544]
+    with pytest.raises(CatalogueError, match="no such file"):
+        read_known_objects("memory://none.tle")

@@ -1,0 +1,35 @@
+"""Unfinished work: that of stopped runs, never that of a run that goes on."""
+
+from epipole.io.datasets.dataset import claim_nights
+from epipole.io.work.folder import clear_unfinished, unfinished_work
+
+NIGHT, NEXT = "2019-04-01", "2019-04-02"
+
+
+def leave_work(dataset, night, key="0123456789abcdef", size=5):
+    folder = dataset / ".staging" / f"work-{night}-{key}"
+    folder.mkdir(parents=True)
+    (folder / "part").write_bytes(b"x" * size)
+    return folder
+
+
+def test_work_is_counted_by_night(tmp_path):
+    leave_work(tmp_path, NIGHT)
+    leave_work(tmp_path, NIGHT, "f" * 16, size=2)
+    leave_work(tmp_path, NEXT)
+    found = [(each.night, each.size) for each in unfinished_work(str(tmp_path))]
+    assert found == [(NIGHT, 7), (NEXT, 5)]
+
+
+def test_work_of_a_run_that_goes_on_is_left_alone(tmp_path):
+    mine, left = leave_work(tmp_path, NIGHT), leave_work(tmp_path, NEXT)
+    with claim_nights(str(tmp_path), [NIGHT]):
+        assert [each.night for each in clear_unfinished(str(tmp_path))] == [NEXT]
+        assert mine.exists()
+        assert not left.exists()
+
+
+def test_a_dataset_without_work_has_none(tmp_path):
+    assert unfinished_work(str(tmp_path / "none")) == []
+    assert clear_unfinished(str(tmp_path / "none")) == []
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,148 @@
+"""One frame and its field."""
+
+import numpy as np
+import pytest
+from scenes.random_stars import (
+    BETA,
+    CAMERA,
+    HOW,
+    angle_between,
+    frame,
+    optics,
+    random_attitude,
+    random_catalogue,
+)
+
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.directions import aberrate
+from epipole.tasks.algorithms.star_identification.frame import (
+    N_PATTERN,
+    N_SEARCHED,
+    aberrate_all,
+    identify_lost,
+    identify_predicted,
+    search_lost,
+    thinned,
+)
+from epipole.tasks.algorithms.star_identification.star_grid import (
+    pattern_pairs,
+    sky_grid,
+    sky_to_limit,
+)
+
+CATALOGUE = random_catalogue()
+
+
+def test_aberration_is_the_one_of_sky():
+    got = aberrate_all(CATALOGUE.u_icrs, BETA)
+    np.testing.assert_allclose(
+        got, aberrate(CATALOGUE.u_icrs, BETA * SPEED_OF_LIGHT_KM_S), atol=1e-15
+    )
+
+
+def test_the_solid_angle_is_that_of_the_image():
+    side = 2 * np.arctan(512 / 3660)
+    assert optics(CAMERA).solid_angle_sr == pytest.approx(side**2, rel=0.03)
+
+
+def test_only_the_brightest_centroids_are_searched():
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    seen, _ = frame(CATALOGUE, random_attitude(0), 0)
+    rng = np.random.default_rng(0)
+    more = frame(CATALOGUE, random_attitude(0), 0, n_false=3000)[0]
+    # 3,000 false centroids, all fainter than the stars: most of them are not used.
+    n = len(seen.u)
+    crowded = more._replace(
+        u=np.concatenate([seen.u, more.u[rng.permutation(len(more.u))[:3000]]]),
+        sigma_rad=np.concatenate([seen.sigma_rad, np.full(3000, seen.sigma_rad[0])]),
+        instrumental_mag=np.concatenate([seen.instrumental_mag, np.full(3000, -13.0)]),
+    )
+    assert n < N_SEARCHED
+    assert search_lost(crowded, sky, grid, pairs, HOW).is_clear
+
+
+def test_few_stars_among_many_other_centroids_are_found():
+    """Some 37 stars among 500 false points of the same brightness."""
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    found = {True: 0, False: 0}
+    for seed in range(8):
+        R = random_attitude(seed)
+        seen = frame(CATALOGUE, R, seed, n_false=500)[0]
+        for crowded in found:
+            verdict = search_lost(seen, sky, grid, pairs, HOW._replace(crowded=crowded))
+            if verdict.is_clear:
+                assert angle_between(verdict.R_sensor_from_icrs, R) < 1e-3
+                found[crowded] += 1
+    assert found[True] >= 7
+    assert found[False] <= 2
+
+
+def test_many_centroids_without_any_star_are_refused():
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    for seed in range(8):
+        seen = frame(CATALOGUE, random_attitude(seed), seed, n_false=300, missing=1.0)[0]
+        assert not search_lost(seen, sky, grid, pairs, HOW).is_clear
+
+
+def test_odds_of_stars_lower_the_threshold_of_a_search_within_limits():
+    least = HOW.least_lost
+    assert HOW._replace(starlit=2.0).least_lost == pytest.approx(least - 2.0)
+    assert HOW._replace(starlit=-3.0).least_lost == least
+    assert HOW._replace(starlit=9.0).least_lost == HOW._replace(starlit=6.0).least_lost
+
+
+def test_a_frame_that_is_no_crowd_has_the_same_solution_in_one_call():
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    solved = 0
+    for seed in range(12):
+        seen = frame(CATALOGUE, random_attitude(seed), seed, n_false=3, missing=0.1 * seed)[0]
+        if not 3 <= len(seen.u) <= N_PATTERN:
+            continue
+        found, _ = identify_lost(seen, sky, grid, pairs, HOW)
+        verdict = search_lost(seen, sky, grid, pairs, HOW)
+        if not verdict.is_clear:
+            assert found is None
+            continue
+        near = np.eye(3) * (2 * np.sort(seen.sigma_rad)[len(seen.u) // 2]) ** 2
+        R = verdict.R_sensor_from_icrs
+        for one, other in zip(
+            found, identify_predicted(seen, sky, R, near, HOW, lost=True), strict=True
+        ):
+            np.testing.assert_array_equal(one, other)
+        solved += 1
+    assert solved > 4
+
+
+BOX = np.array([-0.1, 0.1, -0.1, 0.1])
+
+
+def directions(x, y):
+    u = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return u / np.linalg.norm(u, axis=-1, keepdims=True)
+
+
+def test_of_a_cluster_the_brightest_few_are_kept_and_all_that_is_elsewhere():
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-0.1, 0.1, (2, 30))
+    cluster = rng.normal(0.0625, 0.003, (2, 200))
+    mixed = rng.permutation(230)
+    u = directions(np.append(x, cluster[0]), np.append(y, cluster[1]))[mixed]
+    kept = thinned(u, BOX)
+    assert np.isin(np.flatnonzero(mixed < 30), kept).mean() > 0.9
+    assert (mixed[kept] >= 30).sum() <= 16
+    first_of_cluster = np.flatnonzero(mixed >= 30)[0]
+    assert first_of_cluster in kept
+
+
+def test_a_crowd_that_is_everywhere_is_no_cluster():
+    u = directions(*np.random.default_rng(1).uniform(-0.1, 0.1, (2, 900)))
+    assert len(thinned(u, BOX)) == 900
+
+
+def test_few_none_and_those_outside_are_kept():
+    assert len(thinned(np.empty((0, 3)), BOX)) == 0
+    assert thinned(directions(np.array([0.0, 5.0]), np.array([0.0, -9.0])), BOX).tolist() == [0, 1]

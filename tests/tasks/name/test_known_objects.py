@@ -1,0 +1,172 @@
+"""The table `identifications` of a night: names, rivals, and objects of earlier nights."""
+
+import numpy as np
+import polars as pl
+import pytest
+from scenes.associations import filled
+from scenes.walker import NIGHT_NS, satellites
+
+from epipole.io.datasets.night_tables import PART, write_table
+from epipole.schemas.columns import PLACE, STATE_AXES, VELOCITY, upper_triangle
+from epipole.schemas.settings import KnownObjectSettings, Settings
+from epipole.schemas.tables import OBSERVATIONS, POSITIONS, STATES
+from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
+from epipole.tasks.name.known_objects import ElementsOfNight, name_known_objects
+
+SIGMA_KM = 0.1
+DAY_NS = 86_400_000_000_000
+
+
+def path(each, times):
+    """States along an orbit; velocities are derivatives, for SGP4's own lack some terms."""
+    satellite = satellites_of(np.array([each.elements]))
+    at, before, after = (predict(satellite, times + dt)[0] for dt in (0, -(10**8), 10**8))
+    at[:, 3:] = (after - before)[:, :3] / 0.2
+    return at
+
+
+def seconds(start_s, count=6, step_s=20.0):
+    return NIGHT_NS + ((start_s + step_s * np.arange(count)) * 1e9).astype(np.int64)
+
+
+def positions(rng, seen):
+    """Positions of objects: name -> (elements, times)."""
+    parts = [pl.DataFrame(filled(POSITIONS, 0, {}))]
+    for name, (each, times) in seen.items():
+        r_km = path(each, times)[:, :3] + rng.normal(0, SIGMA_KM, (len(times), 3))
+        rows = {"epoch": times, "time": times, "object_id": [name] * len(times)}
+        rows |= dict(zip(PLACE, r_km.T, strict=True))
+        rows |= {f"cov_{a}{a}": np.full(len(times), SIGMA_KM**2) for a in "xyz"}
+        parts.append(pl.DataFrame(filled(POSITIONS, len(times), rows)))
+    return pl.concat(parts).sort("epoch").to_arrow().cast(POSITIONS)
+
+
+def observations(seen, sensors):
+    """Directions to objects from resting sensors, each (name, place, how late its clock is [s])."""
+    parts = [pl.DataFrame(filled(OBSERVATIONS, 0, {}))]
+    for name, (each, times) in seen.items():
+        for sensor, place, late_s in sensors:
+            state = path(each, times - round(late_s * 1e9))
+            apart = state[:, :3] - place
+            delay = np.linalg.norm(apart, axis=1, keepdims=True) / 299792.458
+            apart = apart - delay * state[:, 3:]
+            ra = np.degrees(np.arctan2(apart[:, 1], apart[:, 0]))
+            dec = np.degrees(np.arcsin(apart[:, 2] / np.linalg.norm(apart, axis=1)))
+            rows = {"time": times, "object_id": [name] * len(times), "ra_deg": ra, "dec_deg": dec,
+                    "sensor_id": [sensor] * len(times)}  # fmt: skip
+            rows |= {k: np.full(len(times), v) for k, v in zip(PLACE, place, strict=True)}
+            parts.append(pl.DataFrame(filled(OBSERVATIONS, len(times), rows)))
+    return pl.concat(parts).to_arrow().cast(OBSERVATIONS)
+
+
+def states(seen, sigma_km=0.05, sigma_km_s=1e-5):
+    """One state of each object, at its first time."""
+    variance = np.diag([sigma_km**2] * 3 + [sigma_km_s**2] * 3)
+    rows = {"epoch": [], "object_id": []} | {name: [] for name in (*PLACE, *VELOCITY)}
+    for name, (each, times) in seen.items():
+        rows["epoch"].append(times[0])
+        rows["object_id"].append(name)
+        for column, value in zip((*PLACE, *VELOCITY), path(each, times[:1])[0], strict=True):
+            rows[column].append(value)
+    for (a, b), (i, j) in zip(
+        upper_triangle(STATE_AXES), zip(*np.triu_indices(6), strict=True), strict=True
+    ):
+        rows[f"cov_{a}{b}"] = [variance[i, j]] * len(seen)
+    return filled(STATES, len(seen), rows)
+
+
+@pytest.fixture
+def named(tmp_path):
+    """Return a function that names the objects of a night, and returns the table's rows."""
+
+    def name(seen, known, *, earlier=None, sensors=(), settings=None):
+        tables = {"positions": positions(np.random.default_rng(1), seen), "states": states(seen),
+                  "observations": observations(seen, sensors)}  # fmt: skip
+        for table, rows in tables.items():
+            write_table(tmp_path, table, [rows])
+        before = states(earlier) if earlier else STATES.empty_table()
+        settings = settings or Settings()
+        residuals = name_known_objects.fn(tmp_path, known, before, settings)
+        return pl.read_parquet(tmp_path / "identifications" / PART), residuals
+
+    return name
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    return satellites(30, np.random.default_rng(20))
+
+
+def test_each_object_has_a_row_with_its_name(named, fleet):
+    seen = {f"o{k:02d}": (fleet[k], seconds(3600 * k)) for k in range(12)}
+    rows, _ = named(seen, ElementsOfNight("digest", fleet[:8]))
+    assert rows["object_id"].to_list() == sorted(seen)
+    assert rows["status"].to_list() == ["known"] * 8 + ["unknown"] * 4
+    assert rows["norad_id"].to_list() == [100_000 + k for k in range(8)] + [None] * 4
+    assert rows["name"].to_list()[:9] == [f"SAT {k}" for k in range(8)] + [None]
+    assert rows["cospar_id"][3] == "2020-003A"
+    assert (rows["probability"] > 0.99).all()
+    assert (rows["catalogue"] == "digest").all()
+    assert rows["distance_km"].to_numpy()[:8].max() < 1.0
+    assert rows["element_epoch"].cast(pl.Int64)[2] == fleet[2].epoch_ns
+
+
+def test_without_a_catalogue_all_objects_are_unknown(named, fleet):
+    rows, residuals = named({"o": (fleet[0], seconds(10))}, None)
+    assert rows["status"].to_list() == ["unknown"]
+    assert rows["probability"].to_list() == [None]
+    assert rows["catalogue"].to_list() == [None]
+    assert residuals == []
+
+
+def test_a_night_without_objects_has_no_rows(named, fleet):
+    rows, residuals = named({}, ElementsOfNight("digest", fleet))
+    assert len(rows) == 0
+    assert residuals == []
+
+
+def test_two_objects_at_one_time_are_not_one_satellite(named, fleet):
+    seen = {"a": (fleet[0], seconds(10)), "b": (fleet[0], seconds(20))}
+    rows, _ = named(seen, ElementsOfNight("digest", fleet))
+    assert rows["status"].to_list() == ["ambiguous", "ambiguous"]
+    assert rows["norad_id"].to_list() == [None, None]
+    assert rows["name"].to_list() == ["SAT 0", "SAT 0"]
+
+
+def test_one_satellite_that_is_seen_twice_has_its_name_twice(named, fleet):
+    seen = {"a": (fleet[0], seconds(10)), "b": (fleet[0], seconds(40_000))}
+    rows, _ = named(seen, ElementsOfNight("digest", fleet))
+    assert rows["norad_id"].to_list() == [100_000, 100_000]
+
+
+def test_an_unknown_object_is_recognised_as_one_of_an_earlier_night(named, fleet):
+    high = [each for each in fleet if each.elements[8] < 0.01][:3]
+    before = {f"old{k}": (each, seconds(-20_000)) for k, each in enumerate(high)}
+    seen = {f"new{k}": (each, seconds(1000)) for k, each in enumerate(high[1:], start=1)}
+    rows, _ = named(seen, None, earlier=before)
+    assert rows["same_as"].to_list() == ["old1", "old2"]
+    off = Settings(known_objects=KnownObjectSettings(earlier_h=0.0))
+    rows, _ = named(seen, None, earlier=before, settings=off)
+    assert rows["same_as"].to_list() == [None, None]
+
+
+def test_known_objects_and_those_that_kept_their_id_are_not_asked(named, fleet):
+    high = [each for each in fleet if each.elements[8] < 0.01][:2]
+    before = {"old": (high[0], seconds(-20_000)), "kept": (high[1], seconds(-20_000))}
+    seen = {"new": (high[0], seconds(1000)), "kept": (high[1], seconds(1000))}
+    rows, _ = named(seen, ElementsOfNight("digest", high[:1]), earlier=before)
+    assert rows["status"].to_list() == ["unknown", "known"]
+    assert rows["same_as"].to_list() == [None, None]
+
+
+def test_a_late_clock_shows_in_the_residuals_of_its_sensor(named, fleet):
+    low = [each for each in fleet if each.elements[8] > 0.04][:10]
+    seen = {f"o{k}": (each, seconds(2000 * k)) for k, each in enumerate(low)}
+    sensors = [("a", np.zeros(3), 0.0), ("b", np.zeros(3), 0.5)]
+    _, residuals = named(seen, ElementsOfNight("digest", low), sensors=sensors)
+    sound, late = residuals
+    assert (sound.sensor_id, sound.objects) == ("a", len(low))
+    assert abs(sound.along_km) < 0.01
+    assert late.along_km == pytest.approx(-3.7, abs=0.2)  # half a second of 7.4 km/s
+    assert abs(late.across_km) < 0.05
+    assert "b: along -3." in str(late)

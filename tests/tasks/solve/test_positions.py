@@ -1,0 +1,175 @@
+"""Solve positions: which rows share no detection, and honest errors of them all together."""
+
+import itertools
+
+import numpy as np
+from scenes.associations import filled
+
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    stack,
+    stack_covariance,
+    unstack,
+    unstack_covariance,
+)
+from epipole.schemas.columns import TANGENT_AXES
+from epipole.schemas.settings import PositionSettings, Settings
+from epipole.schemas.spans import Span
+from epipole.schemas.work_tables import VIEWS
+from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.covariances import centroid_covariance, on_tangent_plane
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
+from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
+from epipole.tasks.algorithms.tracking.local_motion import directions_at
+from epipole.tasks.solve.positions import solve_positions
+
+T0 = 1_554_091_200_000_000_000
+SECOND_NS = 1_000_000_000
+PLACE_KM = np.array([42164.0, 0.0, 0.0])
+SENSORS_KM = np.array([[7000.0, 0.0, 0.0], [0.0, 7000.0, 0.0]])
+PHASE_NS = np.array([0, 400_000_000])  # of each sensor's frames, which come every second
+
+
+def night(n_epochs, half_s):
+    """Views of one object by two sensors, every second, and the frames that each is fitted to."""
+    epoch, sensor = (a.ravel() for a in np.meshgrid(np.arange(n_epochs), [0, 1], indexing="ij"))
+    u = PLACE_KM - SENSORS_KM[sensor]
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    first = np.maximum(epoch - half_s, 0) * SECOND_NS + PHASE_NS[sensor]
+    last = (epoch + half_s) * SECOND_NS - PHASE_NS[sensor]
+    last = (last - PHASE_NS[sensor]) // SECOND_NS * SECOND_NS + PHASE_NS[sensor]
+    views = filled(VIEWS, len(epoch), {
+        "epoch": T0 + epoch * SECOND_NS, "sensor_id": np.array(["a", "b"])[sensor],
+        "tracklet_id": np.array(["a-1", "b-1"])[sensor],
+        "first_fitted": T0 + first, "last_fitted": T0 + last,
+        **{f"u{a}": u[:, i] for i, a in enumerate("xyz")},
+        **{f"{a}_km": SENSORS_KM[sensor, i] for i, a in enumerate("xyz")},
+        **{f"cov_noise_{ab}_rad2": np.full(len(u), v) for ab, v in (("11", 1e-10), ("22", 1e-10))},
+        "position_sigma_km": np.full(len(u), 0.02), "pixel_rad": np.full(len(u), 1e-4),
+    })  # fmt: skip
+    return views, np.zeros(len(epoch), np.int64)
+
+
+def detections_of(views, positions, independent=True):
+    """The detections of each position that is independent, or of each that is not."""
+    kept = array(positions, "epoch")[array(positions, "independent") == independent]
+    epoch, sensor = array(views, "epoch"), array(views, "sensor_id")
+    first, last = array(views, "first_fitted"), array(views, "last_fitted")
+    return [
+        {
+            (sensor[i], t)
+            for i in np.flatnonzero(epoch == at)
+            for t in range(first[i], last[i] + 1, SECOND_NS)
+        }
+        for at in kept
+    ]
+
+
+def test_independent_positions_share_no_detection_and_all_others_share_one():
+    views, number = night(61, 6)
+    positions = solve_positions(views, number, Settings()).positions
+    used = detections_of(views, positions)
+    assert all(a.isdisjoint(b) for a, b in itertools.combinations(used, 2))
+    assert array(positions, "independent").sum() == len(used) == 5  # 0 to 6 s, 7 to 19 s, ...
+    others = detections_of(views, positions, independent=False)
+    assert all(any(a & b for b in used) for a in others)
+
+
+def test_independent_positions_of_neighbouring_spans_share_no_detection():
+    views, number = night(121, 6)
+    used = []
+    for half in (0, 1):
+        span = Span(T0 + half * 60 * SECOND_NS, T0 + (half + 1) * 60 * SECOND_NS)
+        used += detections_of(views, solve_positions(views, number, Settings(), span).positions)
+    assert all(a.isdisjoint(b) for a, b in itertools.combinations(used, 2))
+    assert len(used) == 9  # five, and from 60 s on four
+
+
+def turning(seed, spread_arcsec):
+    """Views of a geostationary object from three low sensors, fitted to 13 noisy detections each.
+
+    Its true positions are returned too.
+    """
+    rng = np.random.default_rng(seed)
+    at, t = np.arange(-52.0, 53.0, 13.0), np.arange(-58.0, 59.0)
+    target = np.array([36000.0, 21900.0, 0.0, -1.6, 2.63, 0.0])
+    tables = []
+    for k in range(3):
+        angle = rng.uniform(0, 2 * np.pi)
+        side = np.array([0.6 * np.sin(angle), -np.sin(angle), np.cos(angle)])
+        side /= np.linalg.norm(side)
+        sensor = np.concatenate([7000 * side, 7.5 * np.cross(side, [0.8, 0.6, 0.0])])
+        r_km, delay_s = trajectory(sensor, t)[0][:, :3], 0.0
+        for _ in range(3):
+            u = trajectory(target, t - delay_s)[0][:, :3] - r_km
+            delay_s = np.linalg.norm(u, axis=1) / SPEED_OF_LIGHT_KM_S
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        noise = centroid_covariance(u, np.full(len(u), spread_arcsec * ARCSEC))
+        u = u + np.einsum("ni,nij->nj", rng.normal(size=(len(u), 2)), tangent_basis(u)) * (
+            spread_arcsec * ARCSEC
+        )
+        u /= np.linalg.norm(u, axis=1, keepdims=True)
+        ends = np.zeros(len(at), int), np.full(len(at), len(t))
+        fit = directions_at(*ends, at, 0.01, t, u, noise, 0 * noise, 6.0)
+        here = trajectory(sensor, at)[0]
+        cov = on_tangent_plane(fit.u, fit.cov_noise)
+        epoch = T0 + np.round(at * 1e9).astype(np.int64)
+        tables.append(filled(VIEWS, len(at), {
+            "epoch": epoch, "sensor_id": [f"s{k}"] * len(at), "tracklet_id": [f"s{k}"] * len(at),
+            "first_fitted": epoch, "last_fitted": epoch, "unmodelled_rad2": fit.unmodelled,
+            "blend_rad2": np.zeros(len(epoch)),
+            **unstack("u{}", fit.u), **unstack("moment_{}", fit.moments, "123"),
+            **unstack_covariance("cov_noise_{}_rad2", cov, TANGENT_AXES),
+            **unstack("{}_km", here[:, :3]), **unstack("sensor_v{}_km_s", here[:, 3:]),
+            "position_sigma_km": np.full(len(at), 1e-4), "pixel_rad": np.full(len(at), 1e-4),
+        }))  # fmt: skip
+    return concat(VIEWS, tables), lambda s: trajectory(target, s)[0][:, :3]
+
+
+def test_what_the_fits_of_directions_neglect_does_not_add_up():
+    """A low sensor bends towards the Earth in every fit, so the error would be one of all rows."""
+    mean_off, square = [], []
+    for seed in range(40):
+        views, true = turning(seed, 1.5)
+        positions = solve_positions(views, np.zeros(views.num_rows, int), Settings()).positions
+        at = (array(positions, "time") - T0) / 1e9
+        off, cov = stack(positions, "{}_km") - true(at), stack_covariance(positions, "cov_{}")
+        square.append(np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov), off)) / 3)
+        mean = off.mean(axis=0)
+        mean_off.append(mean @ np.linalg.solve(cov.mean(axis=0) / len(off), mean) / 3)
+    assert abs(np.mean(square) - 1) < 0.13
+    assert abs(np.mean(mean_off) - 1) < 0.39  # three sigma of 40 trials with three axes
+
+
+def views_of_five(miss=None):
+    """Views of one object at one epoch by five sensors; the fourth has the smallest error."""
+    angle = np.linspace(-1.2, 1.2, 5)
+    r = 7000.0 * np.column_stack([np.cos(angle), np.sin(angle), 0.3 * angle])
+    u = PLACE_KM - r
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    variance = np.array([4.0, 4.0, 4.0, 1.0, 2.0]) * 1e-10
+    return filled(VIEWS, 5, {
+        "epoch": np.full(5, T0), "sensor_id": list("abcde"), "frame_number": np.arange(5),
+        "tracklet_id": [f"{s}-1" for s in "abcde"],
+        "centroid": [None if s == miss else 7 for s in "abcde"],
+        "first_fitted": np.full(5, T0), "last_fitted": np.full(5, T0),
+        **unstack("u{}", u), **unstack("{}_km", r),
+        **{f"cov_noise_{ab}_rad2": variance for ab in ("11", "22")},
+        "position_sigma_km": np.full(5, 0.02), "pixel_rad": np.full(5, 1e-4),
+    }), np.zeros(5, np.int64)  # fmt: skip
+
+
+def test_pairs_are_each_view_with_the_one_of_the_least_error():
+    pairs = solve_positions(*views_of_five(), Settings()).pairs
+    assert pairs["sensor_id_1"].to_pylist() == ["d"] * 4
+    assert sorted(pairs["sensor_id_2"].to_pylist()) == ["a", "b", "c", "e"]
+    missed = solve_positions(*views_of_five(miss="d"), Settings()).pairs
+    assert missed["sensor_id_1"].to_pylist() == ["e"] * 3
+
+
+def test_all_pairs_are_a_setting():
+    settings = Settings(positions=PositionSettings(all_pairs=True))
+    pairs = solve_positions(*views_of_five(), settings).pairs
+    rows = zip(pairs["sensor_id_1"].to_pylist(), pairs["sensor_id_2"].to_pylist(), strict=True)
+    assert sorted(rows) == list(itertools.combinations("abcde", 2))

@@ -1,0 +1,50 @@
+"""Sensor poses: where the sensors are and look, where a frame is near; else unknown."""
+
+import numpy as np
+from scenes.associations import START_NS, WIDTH, sensor_views, tables
+from scenes.tracklet_scenes import FIELD, Scene
+
+from epipole.schemas.settings import AlignmentSettings, Settings
+from epipole.tasks.solve.association_input import SensorPoses
+
+SECOND_NS = 1_000_000_000
+TIMES = np.arange(0.0, 120.0, 2.0)
+
+
+def poses_of(of, **alignment) -> SensorPoses:
+    settings = Settings(alignment=AlignmentSettings(**alignment))
+    return SensorPoses([one.epochs for one in sensor_views(of, settings)], of.cameras)
+
+
+def test_poses_are_those_of_the_frames():
+    scene = Scene(3, 3, times=TIMES).objects(2)
+    poses = poses_of(tables(scene))
+    here = poses.at(START_NS + np.array([10, 100]) * SECOND_NS)
+    at = np.searchsorted(TIMES, [10.0, 100.0])
+    np.testing.assert_allclose(here.sensor_km, scene.r[:, at], atol=1e-9)
+    true = scene.samples().R_sensor_from_icrs[:, at]
+    np.testing.assert_allclose(here.R_sensor_from_icrs, true, atol=1e-12)
+    assert (here.sensor_km_s == 0.0).all()
+    np.testing.assert_allclose(poses.half_field, np.tan(FIELD / 2))
+    np.testing.assert_allclose(poses.focal_px, WIDTH / 2 / np.tan(FIELD / 2))
+
+
+def test_a_sensor_whose_frame_is_far_from_an_instant_has_no_pose_there():
+    of = tables(Scene(3, 3, times=TIMES).objects(2))
+    late = (of.solutions["frame_number"].to_numpy() >= 30) & (
+        np.array(of.solutions["sensor_id"]) == "sat1"
+    )  # its last frame is at 58 s
+    poses = poses_of(of._replace(solutions=of.solutions.filter(~late)), max_gap_s=100.0)
+    here = poses.at(START_NS + np.array([10, 58, 60, 62, 100]) * SECOND_NS)
+    known = np.isfinite(here.R_sensor_from_icrs).all(axis=(2, 3))
+    assert known.tolist() == [[True] * 5, [True, True, False, False, False], [True] * 5]
+    assert (np.isfinite(here.sensor_km).all(axis=2) == known).all()
+
+
+def test_a_sensor_without_epochs_has_no_pose():
+    of = tables(Scene(3, 3, times=TIMES).objects(2))
+    epochs = [one.epochs for one in sensor_views(of)]
+    epochs[1] = epochs[1].slice(0, 0)
+    here = SensorPoses(epochs, of.cameras).at(START_NS + np.array([10, 100]) * SECOND_NS)
+    known = np.isfinite(here.sensor_km).all(axis=(1, 2))
+    assert known.tolist() == [True, False, True]

@@ -1,0 +1,125 @@
+"""Sightings as observations: covariances of the sky's axes, what is shared, what is unknown."""
+
+import numpy as np
+import pytest
+from scenes.associations import filled
+from scenes.cameras import cameras_of
+from scipy.spatial.transform import Rotation
+
+from epipole.schemas.bridge import array, unstack, unstack_covariance
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import DETECTIONS
+from epipole.schemas.work_tables import SOLUTIONS
+from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.camera import Camera, unproject
+from epipole.tasks.algorithms.geometry.directions import radec_from_unit
+from epipole.tasks.solve.sightings import sight_objects, tabulate_sightings
+
+T0 = 1_554_091_200_000_000_000
+N = 40
+CAMERA = Camera(1024, 1024, 3000.0, 3000.0, 511.5, 511.5)
+CENTROID = 2.0  # [arcsec]
+COV_ATT = np.array([[9.0, 2.0, 5.0], [2.0, 4.0, -3.0], [5.0, -3.0, 400.0]])  # [arcsec^2], sensor
+ATTITUDE = Rotation.from_euler("zyx", [0.3, -0.9, 1.1])  # sensor from ICRS
+PLACE_PX = (820.0, 130.0)
+V_KM_S = np.array([3.0, -6.0, 2.5])
+
+
+def sighted(source="stars", *, tracklet="t", flux=np.nan, cov_optics=None, **changed):
+    """Observations of an object that stands at one place of the image."""
+    u_sensor = unproject(CAMERA, *(np.full(N, p) for p in PLACE_PX))
+    ra, dec = radec_from_unit(ATTITUDE.inv().apply(u_sensor))
+    key = {
+        "sensor_id": ["s"] * N, "frame_number": np.arange(N),
+        "time": T0 + np.arange(N) * 1_000_000_000,
+    }  # fmt: skip
+    solutions = filled(SOLUTIONS, N, key | unstack("q{}", np.tile(ATTITUDE.as_quat(), (N, 1)),
+                                                   "xyzw")
+        | unstack_covariance("cov_att_{}_arcsec2", np.tile(COV_ATT, (N, 1, 1)))
+        | unstack("{}_km", np.tile([7000.0, 0.0, 0.0], (N, 1)))
+        | unstack("v{}_km_s", np.tile(V_KM_S, (N, 1)))
+        | {"attitude_source": [source] * N, "used_position_sigma_km": np.full(N, 0.02)}
+        | changed
+    )  # fmt: skip
+    detections = filled(DETECTIONS, N, key | {
+        "centroid": np.zeros(N, np.int32), "ra_deg": np.degrees(ra), "dec_deg": np.degrees(dec),
+        "sigma_arcsec": np.full(N, CENTROID), "kind": ["object"] * N,
+        "tracklet_id": [tracklet] * N, "track_id": [tracklet] * N, "flux": np.full(N, flux),
+    })  # fmt: skip
+    cameras = cameras_of({"s": CAMERA}, cov_optics)
+    return tabulate_sightings(sight_objects(solutions, detections, cameras, Settings()))
+
+
+def moved(seed, n=40_000):
+    """East and north errors of the direction under random turns of the attitude [arcsec]."""
+    rng = np.random.default_rng(seed)
+    turns = rng.multivariate_normal(np.zeros(3), COV_ATT * ARCSEC**2, n)
+    u_sensor = unproject(CAMERA, np.array([PLACE_PX[0]]), np.array([PLACE_PX[1]]))[0]
+    u = ATTITUDE.inv().apply(Rotation.from_rotvec(turns).apply(u_sensor))
+    ra, dec = radec_from_unit(u)
+    true_ra, true_dec = radec_from_unit(ATTITUDE.inv().apply(u_sensor))
+    off = np.stack([(ra - true_ra) * np.cos(true_dec), dec - true_dec], axis=1) / ARCSEC
+    return off + rng.normal(size=off.shape) * CENTROID
+
+
+def test_the_error_of_stars_attitudes_is_each_frames_own_in_east_and_north():
+    rows, cov = sighted(), np.cov(moved(1).T)
+    sigma = np.sqrt(np.diag(cov))
+    assert array(rows, "sigma_ra_arcsec") == pytest.approx(np.full(N, sigma[0]), rel=0.02)
+    assert array(rows, "sigma_dec_arcsec") == pytest.approx(np.full(N, sigma[1]), rel=0.02)
+    correlation = cov[0, 1] / (sigma[0] * sigma[1])
+    assert array(rows, "correlation") == pytest.approx(np.full(N, correlation), abs=0.02)
+    assert array(rows, "bias_sigma_arcsec") == pytest.approx(np.zeros(N), abs=1e-6)
+
+
+def test_the_error_of_a_prior_attitude_is_shared():
+    rows = sighted("prior")
+    assert array(rows, "sigma_ra_arcsec") == pytest.approx(np.full(N, CENTROID), rel=0.02)
+    variance = np.trace(np.cov(moved(2).T)) / 2 - CENTROID**2
+    assert array(rows, "bias_sigma_arcsec") == pytest.approx(np.full(N, variance**0.5), rel=0.02)
+
+
+def test_fitted_optics_are_shared():
+    principal_point = np.zeros((9, 9))
+    principal_point[2, 2] = principal_point[3, 3] = 4.0  # [px^2]
+    told = array(sighted("prior"), "bias_sigma_arcsec")
+    fitted = array(sighted("prior", cov_optics=principal_point), "bias_sigma_arcsec")
+    pixel_arcsec = 1 / 3000 / ARCSEC
+    assert np.sqrt(fitted**2 - told**2) == pytest.approx(np.full(N, 2 * pixel_arcsec), rel=0.05)
+
+
+def test_the_sensors_aberration_is_removed():
+    rows = sighted()
+    apparent = ATTITUDE.inv().apply(unproject(CAMERA, *(np.array([p]) for p in PLACE_PX)))[0]
+    # To the first order: the source moves towards the velocity.
+    still = apparent - (V_KM_S - apparent * (apparent @ V_KM_S)) / SPEED_OF_LIGHT_KM_S
+    ra, dec = radec_from_unit(still / np.linalg.norm(still))
+    assert array(rows, "ra_deg")[0] == pytest.approx(np.degrees(ra), abs=1e-7)
+    assert array(rows, "dec_deg")[0] == pytest.approx(np.degrees(dec), abs=1e-7)
+
+
+def test_magnitudes_are_by_the_frames_zero_point():
+    per_frame = {
+        "zero_mag": np.full(N, 25.0), "zero_variance_mag2": np.full(N, 0.03**2),
+        "flux_floor_mag2": np.full(N, 0.04**2), "flux_photon_mag2": np.full(N, 1e4 * 0.05**2),
+    }  # fmt: skip
+    rows = sighted(flux=1e4, **per_frame)
+    assert array(rows, "magnitude") == pytest.approx(np.full(N, 15.0))
+    assert array(rows, "magnitude_sigma") == pytest.approx(np.full(N, np.sqrt(0.005)))
+    assert sighted(**per_frame)["magnitude"].null_count == N  # no flux
+    unknown = {"zero_mag": [None] * N, "zero_variance_mag2": [None] * N}
+    assert sighted(flux=1e4, **unknown)["magnitude"].null_count == N
+
+
+def test_frames_without_a_position_have_no_rows_and_without_a_velocity_nulls():
+    unknown = np.arange(N) < 10
+    rows = sighted(x_km=np.where(unknown, np.nan, 7000.0))
+    assert array(rows, "frame_number").tolist() == list(range(10, N))
+    nothing = {f"v{a}_km_s": [None] * N for a in "xyz"}
+    rows = sighted(**nothing)
+    assert rows["vx_km_s"].null_count == N
+    assert np.isfinite(array(rows, "ra_deg")).all()
+
+
+def test_without_tracklets_there_are_no_rows():
+    assert sighted(tracklet=None).num_rows == 0
