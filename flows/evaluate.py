@@ -15,8 +15,8 @@ from epipole.schemas.evaluation import Report
 from epipole.tasks.evaluate.evaluate_dataset import evaluate_dataset
 
 TABLES = (
-    *("frames", "stars", "detections", "epochs"),
-    *("associations", "positions", "observations", "states"),
+    *("frames", "stars", "tracklets", "detections", "epochs", "associations"),
+    *("positions", "observations", "states", "identifications"),
 )
 
 

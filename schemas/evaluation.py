@@ -22,7 +22,9 @@ class Report:
     A view is one sensor's part in a claim. A claim is an object that the dataset reports at an
     epoch; its true object is the one that most of its views show, at least two. A claim without a
     true object is a ghost. A possible claim is a true object at an epoch in which at least two
-    frames show it. NEES is the squared error, normalised by the covariance.
+    frames of sensors without a fault show it. A passage is an object in one sensor, in at least
+    five frames, without a gap of more than two seconds. NEES is the squared error, normalised by
+    the covariance.
     """
 
     frames: int | None = _measure(
@@ -103,7 +105,16 @@ class Report:
     )
 
     positions: int | None = _measure(
-        "positions", "of true objects", definition="Positions of claims that have a true object."
+        "positions",
+        "of true objects",
+        definition="Positions of claims that have a true object, which is never blended with "
+        "another one.",
+    )
+    positions_blended: int | None = _measure(
+        "positions",
+        "of blended objects",
+        definition="Positions of true objects that share a centroid with another object in some "
+        "frame: their errors are not measured.",
     )
     positions_of_ghosts: int | None = _measure(
         "positions", "of ghosts", definition="Positions of claims without a true object."
@@ -297,6 +308,80 @@ class Report:
         "tracks per object and sensor",
         "number",
         definition="Mean number of tracks of an object in a sensor.",
+    )
+
+    passages: int | None = _measure(
+        "passages",
+        "passages",
+        definition="Objects in one sensor in at least five frames, without a gap above 2 s.",
+    )
+    passages_tracked: float | None = _measure(
+        "passages",
+        "with a tracklet",
+        "share",
+        definition="Passages of which one tracklet has at least half of the detections.",
+    )
+    passages_fast: int | None = _measure(
+        "passages",
+        "above 2 deg/s",
+        definition="Passages whose direction changes by more than 2 degrees per second.",
+    )
+    passages_fast_tracked: float | None = _measure(
+        "passages",
+        "of these with a tracklet",
+        "share",
+        definition="Fast passages of which one tracklet has at least half of the detections.",
+    )
+    passages_observed: float | None = _measure(
+        "passages",
+        "with observations",
+        "share",
+        definition="Passages of which at least half of the detections are observations.",
+    )
+    detections_observed: float | None = _measure(
+        "passages",
+        "detections that are observations",
+        "share",
+        definition="Rows of observations in passages, as a share of the passages' detections.",
+    )
+    passage_pairs: int | None = _measure(
+        "passages",
+        "pairs of satellites",
+        definition="Pairs of passages of one object through sensors of different satellites, both "
+        "with a tracklet.",
+    )
+    passages_joined: float | None = _measure(
+        "passages",
+        "of these joined",
+        "share",
+        definition="Pairs whose tracklets have the same object_id.",
+    )
+
+    tracklets: int | None = _measure(
+        "tracklets", "tracklets", definition="Different tracklets of the table detections."
+    )
+    tracklets_false: int | None = _measure(
+        "tracklets",
+        "that are no object",
+        definition="Tracklets of which no object has at least half of the detections.",
+    )
+    joined_wrong: int | None = _measure(
+        "tracklets",
+        "of another object than their id",
+        definition="Tracklets whose object is not the one that most tracklets of their object_id "
+        "show.",
+    )
+    named_right: float | None = _measure(
+        "tracklets",
+        "named rightly",
+        "share",
+        definition="Tracklets whose identification is the true catalogue number, as a share of "
+        "those that show an object.",
+    )
+    named_wrong: int | None = _measure(
+        "tracklets",
+        "named wrongly",
+        definition="Tracklets whose identification is another catalogue number.",
     )
 
     def as_dict(self) -> dict[str, Any]:

@@ -320,6 +320,12 @@ TRUE_POINTS = schema(
             null=True,
             doc="V as the sensor should see it; null where the truth does not tell.",
         ),
+        column(
+            "also",
+            I64,
+            null=True,
+            doc="Index of a second object whose light is in the same centroid; null or -1: none.",
+        ),
     ],
 )
 

@@ -24,7 +24,6 @@ SMALL = {
     "tasks/name": "a stage",
     "tasks/read": "a stage",
     "tasks/track": "a stage",
-    "tasks/evaluate": "a flow's tasks",
     "tasks/overlay": "a flow's tasks",
     "tasks/simulate": "a flow's tasks: the pipeline may not read it",
     "tasks/common": "what several stages share",

@@ -15,7 +15,9 @@ from epipole.schemas.bridge import to_polars
 from epipole.schemas.evaluation import Report
 from epipole.tasks.evaluate.matching import (
     Measures,
+    blended_objects,
     detected_objects,
+    faulty_sensors,
     match_claims,
     match_positions,
     match_views,
@@ -33,6 +35,7 @@ from epipole.tasks.evaluate.measures import (
     measure_states,
     measure_tracks,
 )
+from epipole.tasks.evaluate.passages import measure_passages
 
 
 def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:
@@ -41,8 +44,8 @@ def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:
     Parameters
     ----------
     tables
-        `frames`, `stars`, `detections`, `epochs`, `associations`, `positions`, `observations` and
-        `states` of the nights of the truth.
+        `frames`, `stars`, `tracklets`, `detections`, `epochs`, `associations`, `positions`,
+        `observations`, `states` and `identifications` of the nights of the truth.
     truth
         The truth of all logs of these nights.
 
@@ -65,15 +68,18 @@ def _measure_objects(
     epochs = to_polars(tables["epochs"])
     views = match_views(to_polars(tables["associations"]), detections, points)
     claims = match_claims(views)
-    possible = possible_claims(points, epochs)
+    possible = possible_claims(points, epochs, faulty_sensors(truth))
+    blended = blended_objects(points)
     matched = match_positions(tables["positions"], claims)
     measures = measure_associations(views, claims, possible, epochs)
     measures |= measure_lost_objects(possible, claims)
-    measures |= measure_positions(tables["positions"], matched, truth)
-    measures |= measure_coverage(measures["positions"], truth, to_polars(truth.frames), points)
+    measures |= measure_positions(tables["positions"], matched, truth, blended)
+    n_positions = measures["positions"] + measures["positions_blended"]
+    measures |= measure_coverage(n_positions, truth, to_polars(truth.frames), points)
     measures |= measure_ids(matched)
-    measures |= measure_observations(tables["observations"], points, matched, truth)
-    measures |= measure_states(tables["states"], matched, truth)
+    measures |= measure_observations(tables["observations"], points, matched, truth, blended)
+    measures |= measure_states(tables["states"], matched, truth, blended)
+    measures |= measure_passages(tables, points, truth)
     return measures | measure_tracks(detections, points)
 
 

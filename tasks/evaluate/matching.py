@@ -1,5 +1,6 @@
 """Match claims with the truth: the true object of each object reported at an epoch."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,48 @@ def match_views(
         true_object=pl.when("has_centroid").then("by_centroid").otherwise(by_tracklet)
     )
     # Views with a centroid come first: they decide where two true objects have as many views.
-    return views.sort("has_centroid", descending=True, maintain_order=True)
+    return _with_hidden_objects(views.sort("has_centroid", descending=True, maintain_order=True))
+
+
+def _with_hidden_objects(views: pl.DataFrame) -> pl.DataFrame:
+    """Let a centroid with the light of two objects show the one that its claim is of."""
+    hidden = views.filter(pl.col("has_centroid") & (pl.col("also") >= 0))
+    if not hidden.height:
+        return views
+    either = pl.concat(
+        [views.select("claim", "true_object"), hidden.select("claim", true_object="also")]
+    )
+    n_claims = int(integers(views, "claim").max()) + 1
+    most = majority(integers(either, "claim"), integers(either, "true_object"), n_claims)
+    of_claim = pl.Series(most.value[integers(views, "claim")], dtype=pl.Int64)
+    is_hidden = pl.col("has_centroid") & (pl.col("also") == of_claim) & (of_claim >= 0)
+    return views.with_columns(
+        true_object=pl.when(is_hidden.fill_null(False)).then(of_claim).otherwise("true_object")
+    )
+
+
+def blended_objects(points: pl.DataFrame) -> list[int]:
+    """Return the objects that share a centroid with another object in some frame.
+
+    Such a centroid is the centre of both lights: the errors of these objects are not measured.
+    """
+    blended = points.filter(pl.col("also") >= 0)
+    of_objects = blended.filter(pl.col("kind") == OBJECT)["source"]
+    return sorted({*of_objects.to_list(), *blended["also"].to_list()})
+
+
+def faulty_sensors(truth: Truth) -> list[str]:
+    """Return the sensors whose clock, ephemeris or prior attitude the truth calls wrong.
+
+    What they show may be found, but is not expected to be.
+    """
+    return [
+        sensor["id"]
+        for sensor in truth.scenario["sensors"]
+        if sensor.get("clock_s")
+        or any(sensor.get("pos_off_km") or [0])
+        or sensor.get("prior_bias_vec_arcsec") is not None
+    ]
 
 
 def _match_tracklets(detections: pl.DataFrame) -> pl.DataFrame:
@@ -105,9 +147,15 @@ def match_claims(views: pl.DataFrame) -> pl.DataFrame:
     return claims.with_columns(true_object=pl.Series(of_claim, dtype=pl.Int64))
 
 
-def possible_claims(points: pl.DataFrame, epochs: pl.DataFrame) -> pl.DataFrame:
-    """Return `epoch`, `true_object` and `n_views` where two frames or more show the object."""
-    shown = points.filter(pl.col("kind") == OBJECT).join(epochs, on=FRAME, how="inner")
+def possible_claims(
+    points: pl.DataFrame, epochs: pl.DataFrame, faulty: Sequence[str] = ()
+) -> pl.DataFrame:
+    """Return `epoch`, `true_object` and `n_views` where two frames or more show the object.
+
+    Frames of `faulty` sensors are not counted.
+    """
+    sound = epochs.filter(~pl.col("sensor_id").is_in(list(faulty)))
+    shown = points.filter(pl.col("kind") == OBJECT).join(sound, on=FRAME, how="inner")
     n_views = shown.group_by("epoch", true_object="source").agg(n_views=pl.len())
     return n_views.filter(pl.col("n_views") >= MIN_VIEWS)
 

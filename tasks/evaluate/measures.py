@@ -1,5 +1,7 @@
 """Measure positions: errors, whether covariances agree with them, and what ids stand for."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import polars as pl
 import pyarrow as pa
@@ -25,6 +27,7 @@ from epipole.tasks.evaluate.matching import (
     Array,
     Indices,
     Measures,
+    faulty_sensors,
     integers,
     locate_objects,
     share,
@@ -38,7 +41,9 @@ POSITION_CHI2_99 = 11.345  # 99 % of the chi-square of 3 degrees of freedom
 POSITION_AXES = 3
 
 
-def measure_positions(positions: pa.Table, matched: pl.DataFrame, truth: Truth) -> Measures:
+def measure_positions(
+    positions: pa.Table, matched: pl.DataFrame, truth: Truth, blended: Sequence[int] = ()
+) -> Measures:
     """Return the number and the errors of positions of true objects.
 
     Parameters
@@ -47,10 +52,17 @@ def measure_positions(positions: pa.Table, matched: pl.DataFrame, truth: Truth) 
         POSITIONS.
     matched
         The rows of `match_positions`, in the same order.
+    blended
+        Objects whose errors are not measured: `blended_objects`.
     """
     of_object = integers(matched, "true_object")
-    real = of_object >= 0
-    counts = {"positions": int(real.sum()), "positions_of_ghosts": int((~real).sum())}
+    is_blended = np.isin(of_object, blended)
+    real = (of_object >= 0) & ~is_blended
+    counts = {
+        "positions": int(real.sum()),
+        "positions_blended": int(is_blended.sum()),
+        "positions_of_ghosts": int((of_object < 0).sum()),
+    }
     if not real.any():
         return counts | {"nees_in_99": 0.0}
     positions, of_object = positions.filter(pa.array(real)), of_object[real]
@@ -95,11 +107,13 @@ def measure_coverage(n: int, truth: Truth, frames: pl.DataFrame, points: pl.Data
     """Return the number `n` of positions as a share of the possible ones.
 
     A position is possible per object and frame interval of the slowest sensor, if two sensors
-    see the object in it.
+    without a fault see the object in it.
     """
     rate_hz = min(sensor["rate_hz"] for sensor in truth.scenario["sensors"])
     since_ns = pl.col("t_ns") - int(truth.scenario["t0_ns"])
-    shown = points.filter(pl.col("kind") == OBJECT).join(frames.select(*FRAME, "t_ns"), on=FRAME)
+    is_sound = ~pl.col("sensor_id").is_in(faulty_sensors(truth))
+    shown = points.filter((pl.col("kind") == OBJECT) & is_sound)
+    shown = shown.join(frames.select(*FRAME, "t_ns"), on=FRAME)
     shown = shown.with_columns(interval=(since_ns * (rate_hz / 1e9)).floor())
     n_sensors = shown.group_by("interval", "source").agg(n=pl.col("sensor_id").n_unique())
     return {"positions_per_truth": share(n, n_sensors.filter(pl.col("n") >= 2).height)}
@@ -212,7 +226,11 @@ LIGHT_ITERATIONS = 3  # the object moves by a ten-thousandth of the way of its l
 
 
 def measure_observations(
-    observations: pa.Table, points: pl.DataFrame, matched: pl.DataFrame, truth: Truth
+    observations: pa.Table,
+    points: pl.DataFrame,
+    matched: pl.DataFrame,
+    truth: Truth,
+    blended: Sequence[int] = (),
 ) -> Measures:
     """Return the number and the errors of the observations of true objects.
 
@@ -226,6 +244,8 @@ def measure_observations(
         The centroids of the truth.
     matched
         The rows of `match_positions`: observations are expected of objects with a position.
+    blended
+        Objects whose errors are not measured: `blended_objects`.
     """
     rows = to_polars(observations.select(["object_id", *POINT]))
     shown = true_objects(with_truth(rows, points))
@@ -239,6 +259,7 @@ def measure_observations(
         "observations_of_others": int(np.sum(~right)),
         "observation_recall": share(float(np.sum(right)), expected.height),
     }
+    right &= ~np.isin(shown, blended)
     if not right.any():
         return measures
     seen, of_object = observations.filter(pa.array(right)), shown[right]
@@ -297,7 +318,9 @@ STATE_CHI2_99 = 16.81  # 99 % of the chi-square of 6 degrees of freedom
 STATE_COMPONENTS = 6
 
 
-def measure_states(states: pa.Table, matched: pl.DataFrame, truth: Truth) -> Measures:
+def measure_states(
+    states: pa.Table, matched: pl.DataFrame, truth: Truth, blended: Sequence[int] = ()
+) -> Measures:
     """Return the number and the errors of states of true objects.
 
     The true object of a state is the one that most positions of its id are of. A state whose id
@@ -309,9 +332,12 @@ def measure_states(states: pa.Table, matched: pl.DataFrame, truth: Truth) -> Mea
         STATES.
     matched
         The rows of `match_positions`.
+    blended
+        Objects whose errors are not measured: `blended_objects`.
     """
     of_state = _objects_of_ids(to_polars(states.select(["object_id"])), matched)
-    real = of_state >= 0
+    n_of_nothing = int((of_state < 0).sum())
+    real = (of_state >= 0) & ~np.isin(of_state, blended)
     if not real.any():
         return {"states": 0}
     states, of_state = states.filter(pa.array(real)), of_state[real]
@@ -319,7 +345,7 @@ def measure_states(states: pa.Table, matched: pl.DataFrame, truth: Truth) -> Mea
     nees = squared_normalised_errors(error, stack_covariance(states, "cov_{}", STATE_AXES))
     return {
         "states": len(nees),
-        "states_of_nothing": int((~real).sum()),
+        "states_of_nothing": n_of_nothing,
         "states_nees_mean": float(np.mean(nees)) / STATE_COMPONENTS,
         "states_nees_median": float(np.median(nees)),
         "states_nees_max": float(nees.max()),

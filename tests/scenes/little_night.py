@@ -9,6 +9,7 @@ from epipole.schemas.tables import (
     DETECTIONS,
     EPOCHS,
     FRAMES,
+    IDENTIFICATIONS,
     OBSERVATIONS,
     POSITIONS,
     STARS,
@@ -96,6 +97,7 @@ def little_dataset():
         "positions": rows(POSITIONS, *positions),
         "observations": rows(OBSERVATIONS, *observations),
         "states": rows(STATES, little_state("o1", x_km=1.0), little_state("o2")),
+        "identifications": rows(IDENTIFICATIONS),
     }
 
 
