@@ -10,14 +10,14 @@ import pytest
 
 START = """
 import logging, os, signal, sys, time
-from epipole.flows.command_line import stopping
-stopping.stop_by_signals()
+from epipole.flows.command_line import process
+process.stop_by_signals()
 def signalled():
     os.kill(os.getpid(), signal.{by})
 """
 
 LIBRARY = """
-with stopping.stopped_in_one_line():
+with process.stopped_in_one_line():
     try:
         signalled()
         time.sleep(60)
@@ -26,14 +26,14 @@ with stopping.stopped_in_one_line():
 """
 
 IMPORT = """
-with stopping.stopped_in_one_line():
+with process.stopped_in_one_line():
     import signalled_in
     print("imported")
     time.sleep(60)
 """
 
 TWICE = """
-with stopping.stopped_in_one_line():
+with process.stopped_in_one_line():
     try:
         signalled()
         time.sleep(60)
@@ -48,7 +48,7 @@ PREFECT = """
 from epipole.flows.prefect.defaults import quiet_console
 from prefect.logging import get_logger
 quiet_console()
-with stopping.stopped_in_one_line():
+with process.stopped_in_one_line():
     try:
         signalled()
         time.sleep(60)
@@ -59,8 +59,8 @@ with stopping.stopped_in_one_line():
 """
 
 WAITS = """
-stopping._PATIENCE_S = 0.2
-with stopping.stopped_in_one_line():
+process._PATIENCE_S = 0.2
+with process.stopped_in_one_line():
     try:
         signalled()
         time.sleep(60)
@@ -105,7 +105,7 @@ def test_a_wait_that_does_not_end_is_ended(tmp_path):
 
 
 def test_an_error_without_a_signal_stays(tmp_path):
-    code, _, err = run("with stopping.stopped_in_one_line(): 1 / 0", tmp_path)
+    code, _, err = run("with process.stopped_in_one_line(): 1 / 0", tmp_path)
     assert code == 1
     assert "ZeroDivisionError" in err
 

@@ -99,7 +99,7 @@ def test_afterwards_logging_is_as_before(capsys):
 
 
 def test_a_line_is_one_line_and_a_warning_is_shown_once(capfd):
-    log = logging.getLogger("epipole.flows.here")
+    log = logging.getLogger("epipole.flows.run_here")
     with shown(quiet=False, verbose=False):
         log.info("sensor \x1b[2J\nof a log")
         for _ in range(2):

@@ -20,8 +20,7 @@ from scenes.dataset_tables import (
 )
 from scenes.published import publish
 
-from epipole.io.datasets import local as folder_swap
-from epipole.io.datasets import local as local_nights
+from epipole.io.datasets import local
 from epipole.io.datasets import night_tables as night_files
 from epipole.io.datasets.dataset import check_folder, claim_nights, publish_folders, read_table
 from epipole.schemas.columns import TIME
@@ -149,15 +148,15 @@ def test_a_failure_at_the_second_night_takes_the_first_back(
     publish(tmp_path, night_tables(OVER_MIDNIGHT), [NIGHT])
     before = contents(tmp_path)
     if not exchange_supported:
-        monkeypatch.setattr(folder_swap, "exchange", lambda *_: False)
-    put_in_place = local_nights.put_in_place
+        monkeypatch.setattr(local, "exchange", lambda *_: False)
+    put_in_place = local.put_in_place
 
     def fails_at_second(new, target, old):
         if target.name == f"night={NEXT_NIGHT}":
             _disk_full()
         put_in_place(new, target, old)
 
-    monkeypatch.setattr(local_nights, "put_in_place", fails_at_second)
+    monkeypatch.setattr(local, "put_in_place", fails_at_second)
     with pytest.raises(DatasetError):
         publish(tmp_path, night_tables(OVER_MIDNIGHT, seed=9), [NIGHT, NEXT_NIGHT])
     assert contents(tmp_path) == before
@@ -173,13 +172,13 @@ def test_what_could_not_be_published_is_still_staged_for_another_try(
     new = contents(tmp_path / "new")
     sources = night_tables(OVER_MIDNIGHT)["sources"]
     if not exchange_supported:
-        monkeypatch.setattr(folder_swap, "exchange", lambda *_: False)
+        monkeypatch.setattr(local, "exchange", lambda *_: False)
     with claim_nights(out, nights) as work:
         for night in nights:
             shutil.copytree(tmp_path / "new" / f"night={night}", work / f"night={night}")
         staged = {night: work / f"night={night}" for night in nights}
         with monkeypatch.context() as patch:
-            patch.setattr(local_nights, "sync", _disk_full)
+            patch.setattr(local, "sync", _disk_full)
             with pytest.raises(DatasetError):
                 publish_folders(out, staged, sources)
         assert contents(work) == new | {"claim": (work / "claim").read_bytes()}
@@ -188,7 +187,7 @@ def test_what_could_not_be_published_is_still_staged_for_another_try(
 
 
 def test_without_exchange_two_renames_do(tmp_path, monkeypatch):
-    monkeypatch.setattr(folder_swap, "exchange", lambda *_: False)
+    monkeypatch.setattr(local, "exchange", lambda *_: False)
     publish(tmp_path, night_tables(TIMES), [NIGHT])
     publish(tmp_path, night_tables(TIMES[:5]), [NIGHT])
     assert read_table(tmp_path, "frames", NIGHT).num_rows == 5

@@ -109,7 +109,7 @@ KILLED = """
 import os, pathlib, signal, sys
 from scenes.dataset_tables import NEXT_NIGHT, NIGHT, OVER_MIDNIGHT, night_tables
 from scenes.published import publish
-from epipole.io.datasets import folder_swap
+from epipole.io.datasets import local
 
 left = int(sys.argv[2])
 
@@ -124,7 +124,7 @@ def counted(work):
 
 pathlib.Path.rename = counted(pathlib.Path.rename)
 supported = sys.argv[3] == "exchange"
-folder_swap.exchange = counted(folder_swap.exchange) if supported else lambda *_: False
+local.exchange = counted(local.exchange) if supported else lambda *_: False
 publish(sys.argv[1], night_tables(OVER_MIDNIGHT, seed=9), [NIGHT, NEXT_NIGHT])
 """
 
