@@ -1,4 +1,4 @@
-"""Orbit data messages (CCSDS 502.0-B-3): ephemerides (OEM) and single states (OPM), in GCRF."""
+"""CCSDS messages for orbit determination: OEM and OPM (502.0-B-3), TDM (503.0-B-2); in GCRF."""
 
 import datetime
 import re
@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from epipole.schemas.errors import DatasetError
 
-# -- What all messages have: times, names, a header, one place to write them.
+# Times, names and headers of all messages.
 
 ORIGINATOR = "EPIPOLE"
 _UNSAFE = re.compile(r"[^A-Za-z0-9._+-]")
@@ -48,7 +48,7 @@ def write_message(path: Path, text: str) -> None:
         raise DatasetError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-# -- Orbit data messages (CCSDS 502.0-B-3): ephemerides (OEM) and single states (OPM), in GCRF.
+# Ephemerides (OEM) and single states (OPM).
 
 Array = npt.NDArray[np.float64]
 
@@ -128,7 +128,7 @@ def _header() -> ccsds.OdmHeader:
     return ccsds.OdmHeader(now(), ORIGINATOR)
 
 
-# -- Tracking data messages (CCSDS 503.0-B-2): the directions of one object, a segment per sensor.
+# Tracking data (TDM): the directions of one object, a segment per sensor.
 
 
 class Directions(NamedTuple):

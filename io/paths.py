@@ -1,4 +1,4 @@
-"""Files behind fsspec URLs, and the errors of object stores as one-line messages.
+"""Paths and URLs: names that people give, files behind URLs, and errors of stores in one line.
 
 A URL with a password, a token or a signature is known to the rest of the program without it: so
 none is in a message, a table, a parameter of Prefect or the name of a folder. What was cut stays in
@@ -17,12 +17,7 @@ from urllib.parse import unquote, urlsplit
 from epipole.schemas.errors import LogError
 from epipole.schemas.text import without_secrets
 
-# -- Files behind fsspec URLs, and the errors of object stores as one-line messages.
-#
-# A URL with a password, a token or a signature is known to the rest of the program without it:
-# so none is in a message, a table, a parameter of Prefect or the name of a folder. What was cut
-# stays in the environment of this process and of those that it starts, and comes back where a
-# file is opened.
+# Files behind URLs (fsspec).
 
 SECRETS = "EPIPOLE_URLS"  # URLs with their secrets, a line each
 
@@ -153,7 +148,7 @@ def shown_error(error: Exception) -> Exception:
     return kind(line_of(error))
 
 
-# -- Names of files and folders, as people give them.
+# Names of files and folders.
 
 LONGEST_PART, LONGEST_PATH = 255, 4095  # bytes that Linux takes
 

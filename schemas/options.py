@@ -1,18 +1,14 @@
-"""The methods that settings choose among: one line for each, its name and "module:function".
+"""What settings and commands choose among: star catalogues, methods, runners, kinds of messages.
 
-Methods of one registry have one call signature, which the registry's comment names. Settings accept
-the names that stand here. A method's module is imported when it is used.
+A registry has one line for each choice: its name and "module:function". Functions of one registry
+have one call signature, which the registry's comment states. Settings accept these names. A module
+is imported when it is used.
 """
 
 from collections.abc import Mapping
 from enum import StrEnum
 from importlib import import_module
 from typing import Any
-
-# -- The methods that settings choose among: one line for each, its name and "module:function".
-#
-# Methods of one registry have one call signature, which the registry's comment names. Settings
-# accept the names that stand here. A method's module is imported when it is used.
 
 _STARS = "epipole.tasks.algorithms.star_identification"
 _LINKING = "epipole.tasks.algorithms.tracking.linking"
@@ -46,7 +42,7 @@ def load_method(registry: Mapping[str, str], name: str) -> Any:
     return getattr(import_module(module), function)
 
 
-# -- Choices that commands offer: what runs the tasks, which message is written.
+# Choices of commands.
 
 
 class Runner(StrEnum):

@@ -13,7 +13,7 @@ from epipole.schemas.errors import SceneError
 from epipole.schemas.settings import Group
 from epipole.schemas.text import toml_values
 
-# -- The orbits of a scene: what their parameters are, and what must hold of them.
+# Orbits: parameters and their bounds.
 
 Vector = tuple[float, float, float]
 
@@ -71,10 +71,7 @@ class Orbit(Group):
         return self
 
 
-# -- A simulation scene: sensors, objects and noise, from a TOML file.
-#
-# A scene may leave values to chance (``count``, ``random`` orbits, the spread of objects). They
-# are then drawn with the scene's seed.
+# The scene.
 
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,62}$"
 

@@ -1,4 +1,4 @@
-"""The table of a star catalogue. `epipole catalog build` writes it and a run reads it."""
+"""Catalogues: the table of stars with its label, and the elements of a satellite."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -7,7 +7,7 @@ import pyarrow as pa
 
 from epipole.schemas.columns import column, schema
 
-# -- The table of a star catalogue. `epipole catalog build` writes it and a run reads it.
+# Stars: `epipole catalog build` writes the table, and a run reads it.
 
 _F64 = pa.float64()
 
@@ -81,7 +81,7 @@ def _with_words(stars: pa.Table, words: dict[str, str]) -> pa.Table:
     return stars.replace_schema_metadata((stars.schema.metadata or {}) | encoded)
 
 
-# -- A published element set: the mean elements of a satellite for SGP4.
+# Satellites: the mean elements of a published set, for SGP4.
 
 
 class ElementSet(NamedTuple):

@@ -1,17 +1,12 @@
-"""Text from outside, such as a name in a log or of a file, as it is shown to people.
+"""Text from outside: names in logs and of files, TOML, URLs. It is escaped where it is shown.
 
-It may have any content: line ends, commands to the terminal, HTML, links. It is escaped where it
-is shown; tables keep it as it is.
+A name may have any content: line ends, commands to the terminal, HTML, links. Tables keep it
+unchanged.
 """
 
 import re
 import tomllib
 from typing import Any
-
-# -- Text from outside, such as a name in a log or of a file, as it is shown to people.
-#
-# It may have any content: line ends, commands to the terminal, HTML, links. It is escaped where
-# it is shown; tables keep it as it is.
 
 LONGEST_LINE = 1000
 # What Markdown, or the HTML in it, could take for more than text.
@@ -33,7 +28,7 @@ def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode("ascii")
 
 
-# -- TOML texts: every text that is no TOML is a ValueError.
+# TOML: invalid text is a ValueError.
 
 DEEPEST = 50  # levels of tables and lists; no file of ours has more than four
 _TOO_DEEP = "brackets or dotted keys are nested too deep"
@@ -71,7 +66,7 @@ def _inside(value: Any) -> list[Any]:
     return [inner for inner in inside if isinstance(inner, dict | list)]
 
 
-# -- URLs without their secrets, as they are shown and stored.
+# URLs without their secrets, as they are shown and stored.
 
 _USER = re.compile(r"(?<=://)[^/?#\n]*@")
 # A query or a fragment, with its end in a sentence. A glob such as night-?.mcap is none.

@@ -1,4 +1,4 @@
-"""Tables that pass from stage to stage and are not published."""
+"""Tables that pass from task to task and are not published."""
 
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from epipole.schemas.tables import (
     TRACKLETS,
 )
 
-# -- Tables that pass from stage to stage and are not published.
+# From stage to stage.
 
 
 def _floats() -> pa.DataType:
@@ -401,7 +401,7 @@ MOVING_OBJECTS = schema(
 )
 
 
-# -- The content of one log, before its states are converted to GCRF.
+# The content of one log, before its states are converted to GCRF.
 
 GCRF, EME2000, TEME, ITRF = "GCRF", "EME2000", "TEME", "ITRF"
 STATE_FRAMES = (GCRF, EME2000, TEME, ITRF)

@@ -1,4 +1,4 @@
-"""Directions of one object by sensor, and the sensors' ephemerides, from the tables of a night."""
+"""Tables of a night for CCSDS messages: directions of an object by sensor, and ephemerides."""
 
 from collections.abc import Mapping
 
@@ -13,7 +13,7 @@ from epipole.tasks.algorithms.geometry.directions import radec_from_unit, unit_f
 from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 from epipole.tasks.algorithms.orbits.reference_frames import EME2000_FROM_GCRF
 
-# -- Directions of one object by sensor, and the sensors' ephemerides, from the tables of a night.
+# Directions of one object, and the ephemerides of the sensors.
 
 
 def directions(observations: pl.DataFrame, ephemerides: Mapping[str, str]) -> dict[str, Directions]:
@@ -74,7 +74,7 @@ def sensor_ephemeris(frames: pl.DataFrame) -> Ephemeris:
     )
 
 
-# -- Ephemerides of one object: each of its states, moved through the arc that it was fitted to.
+# Ephemerides of one object: each state, moved through the arc that it was fitted to.
 
 HALF_ARC_S = 300.0  # a state is of an arc of ten minutes at most
 STEPS = 60  # of an arc, at least

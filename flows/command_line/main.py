@@ -15,16 +15,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 import typer.core
 
-from epipole.flows.command_line import nights, run, simulate
-from epipole.flows.command_line import tools as calibrate
-from epipole.flows.command_line import tools as catalog
-from epipole.flows.command_line import tools as deploy_files
-from epipole.flows.command_line import tools as evaluate
-from epipole.flows.command_line import tools as export
-from epipole.flows.command_line import tools as info
-from epipole.flows.command_line import tools as overlay
-from epipole.flows.command_line import tools as report
-from epipole.flows.command_line import tools as settings
+from epipole.flows.command_line import nights, run, simulate, tools
 from epipole.flows.command_line.options import help_text
 from epipole.flows.command_line.process import (
     prepare_environment,
@@ -127,15 +118,15 @@ def _options(
 app.command(help=help_text(run.run))(run.run)  # shows by itself what it compiles
 for command in (
     nights.nights,
-    info.info,
-    calibrate.calibrate,
+    tools.info,
+    tools.calibrate,
     simulate.simulate,
-    evaluate.evaluate,
-    export.export,
-    overlay.overlay,
-    report.report,
-    settings.settings,
-    deploy_files.deploy_files,
+    tools.evaluate,
+    tools.export,
+    tools.overlay,
+    tools.report,
+    tools.settings,
+    tools.deploy_files,
 ):
     app.command(help=help_text(command))(tells_compiling(command))
-app.add_typer(catalog.app, name="catalog")
+app.add_typer(tools.app, name="catalog")

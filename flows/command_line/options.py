@@ -1,4 +1,4 @@
-"""What several commands take, and its checks."""
+"""What commands share: arguments, checks of what they take, and output."""
 
 import inspect
 import json
@@ -10,7 +10,7 @@ import typer
 from epipole.schemas.dates import FIRST_YEAR, LAST_YEAR, is_night
 from epipole.schemas.text import as_line
 
-# -- What several commands take, and its checks.
+# Arguments, and their checks.
 
 Logs = Annotated[
     list[str], typer.Argument(metavar="LOG", help="MCAP files, folders, glob patterns or URLs.")
@@ -27,7 +27,7 @@ def check_night(night: str | None, option: str = "--night") -> None:
         )
 
 
-# -- What commands print on standard output: lines, or JSON; and their help.
+# Output: lines or JSON; help texts.
 
 
 def print_lines(lines: Iterable[str], to_errors: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a command ends with one line, and clears up what it has begun."""
+"""The process of a command: how it stops, what it says first, and its environment."""
 
 import contextlib
 import logging
@@ -15,7 +15,7 @@ from typing import NoReturn, ParamSpec
 
 from epipole.io.caches.private_folders import private_folder
 
-# -- Ctrl-C and SIGTERM: a command ends with one line, and clears up what it has begun.
+# Ctrl-C and SIGTERM.
 
 # What a command says that ends by a signal. SIGTERM comes from schedulers.
 _SAYS = {signal.SIGINT: "interrupted", signal.SIGTERM: "stopped"}
@@ -86,7 +86,7 @@ def _exit_code() -> int:
     return 128 + _stopped_by[0]
 
 
-# -- A line of a command that has to compile first: once after an install, or for a rare method.
+# The line that says that kernels are compiled first.
 
 P = ParamSpec("P")
 
@@ -111,7 +111,7 @@ def tells_compiling(command: Callable[P, None]) -> Callable[P, None]:
     return called
 
 
-# -- The environment of a command, made fit before Prefect is imported: it reads it only then.
+# The environment: Prefect reads it when it is imported.
 
 
 def prepare_environment() -> None:

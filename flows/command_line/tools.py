@@ -1,4 +1,8 @@
-"""`epipole report`: a night as a page with pictures."""
+"""The commands beside `run`, `simulate` and `nights`: one function each, by its name.
+
+Each function is a command: typer makes the options from its signature and the help from its
+docstring. What a command needs is imported when it runs, so that `--help` stays fast.
+"""
 
 import os
 import sys
@@ -19,8 +23,6 @@ from epipole.flows.command_line.options import (
 from epipole.flows.prefect.server_process import new_secret
 from epipole.schemas.errors import EpipoleError
 from epipole.schemas.options import Message
-
-# -- `epipole report`: a night as a page with pictures.
 
 
 def report(
@@ -44,9 +46,6 @@ def report(
         print_json({"file": str(out), "bytes": size})
     else:
         print_lines([f"file    {out}", f"size    {size / 1e3:,.0f} kB"])
-
-
-# -- `epipole calibrate`: the cameras of sensors.
 
 
 def calibrate(
@@ -84,14 +83,13 @@ def calibrate(
         sys.exit(1)
 
 
-# -- `epipole catalog build`: star catalogues.
-
+# `epipole catalog` has one command so far, `build`.
 app = typer.Typer(help="Build a star catalogue for star identification.", no_args_is_help=True)
 
 
 @app.callback()
 def _catalog() -> None:
-    """Make `build` a subcommand, though it is the only one."""
+    """Make `build` a subcommand; typer would drop the name of a single command."""
 
 
 def build(
@@ -141,9 +139,7 @@ def build(
 app.command(help=help_text(build))(build)
 
 
-# -- `epipole deploy-files`: what an operator needs to run it every night.
-
-# Each file, and what it is for.
+# The files of `epipole deploy-files`, and what each is for.
 FILES = {
     "prefect.env": "settings of Prefect with a new secret; readable by you only",
     "prefect.yaml": "the deployment, for `prefect deploy --all`",
@@ -192,9 +188,6 @@ def _write(file: Path, text: str, secret: str) -> None:
         opened.write(text.replace(_SECRET, secret))
 
 
-# -- `epipole evaluate`: a dataset against its truth.
-
-
 def evaluate(
     dataset: Annotated[
         str,
@@ -217,9 +210,6 @@ def evaluate(
         print_json(report.as_dict())
     else:
         show(report)
-
-
-# -- `epipole export`: CCSDS messages.
 
 
 def export(
@@ -252,9 +242,6 @@ def export(
         print_json({"folder": str(out), "files": files})
     else:
         print_lines([f"folder  {out}", f"files   {len(files)}: {files[0]} to {files[-1]}"])
-
-
-# -- `epipole overlay`: a night drawn over its logs.
 
 
 def overlay(
@@ -297,18 +284,12 @@ def overlay(
         print_lines([f"        {made.without_rows:,} frames of the logs are not in the dataset"])
 
 
-# -- `epipole settings`: all settings.
-
-
 def settings() -> None:
     """Print all settings with their defaults, as TOML for `epipole run --settings`."""
     from epipole.io.settings_file import settings_text
     from epipole.schemas.settings import Settings
 
     typer.echo(settings_text(Settings()), nl=False)
-
-
-# -- `epipole info`: what is in logs.
 
 
 def info(logs: Logs, as_json: AsJson = False) -> None:

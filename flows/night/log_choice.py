@@ -1,4 +1,4 @@
-"""The choice of logs: those of a night, out of all in a folder."""
+"""Which logs a run reads, and which night it makes of them."""
 
 import datetime
 import logging
@@ -17,7 +17,7 @@ from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
 from epipole.schemas.text import as_line
 
-# -- The choice of logs: those of a night, out of all in a folder.
+# Logs that may have frames of a night.
 
 LOGGER = logging.getLogger(__name__)
 
@@ -129,7 +129,7 @@ def _date(time_ns: int) -> str:
     )
 
 
-# -- The night that a run is asked for; Prefect checks it before it creates a run.
+# The night that a run is asked for; Prefect checks it before it creates a run.
 
 YESTERDAY = "yesterday"
 LONGEST_NAME = 60  # of a log in a run's name

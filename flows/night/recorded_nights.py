@@ -1,7 +1,9 @@
-"""Earlier nights: what this run, or an earlier one, has published of the nights before a night.
+"""The published nights of a dataset: what a run reads of them, and whether they are up to date.
 
-Another program may have written them. So they are read in pieces, of which only what later nights
-need is kept, and a night that does not fit is left out.
+Each night says in its table `nights` what it was made from. A run takes objects over from the
+nights before, and skips a night that it would make unchanged. Another program may have written
+these nights: they are read in pieces, only what is needed is kept, and a night that does not fit is
+skipped.
 """
 
 import logging
@@ -37,7 +39,7 @@ from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.tables import NIGHTS, STATES
 from epipole.tasks.name.object_ids import VIEWS
 
-# -- The table `nights`: what a night was made from and with, and what it holds.
+# The table `nights`: what a night was made from, with which settings, and what it has.
 
 
 def write_night_row(
@@ -79,10 +81,7 @@ def key_of(row: dict[str, Any] | None) -> str:
     return digest_of([*(key or "" for key in recipe_in(row)), row["earlier_key"]])
 
 
-# -- Earlier nights: what this run, or an earlier one, has published of the nights before a night.
-#
-# Another program may have written them. So they are read in pieces, of which only what later
-# nights need is kept, and a night that does not fit is left out.
+# What a run reads of the nights before.
 
 LOGGER = logging.getLogger(__name__)
 
@@ -181,7 +180,7 @@ def _kept(schema: pa.Schema, pieces: Iterable[pa.Table], where: str) -> pa.Table
         raise DatasetError(f"{where}: cannot be read ({error})") from error
 
 
-# -- The nights of a dataset: what each holds, and whether a run would make it otherwise today.
+# Which nights are out of date.
 
 # What differs, by the field of a `Recipe`. Logs are not held against anything.
 _DIFFERS = {
@@ -237,7 +236,7 @@ def _held(dataset: str, date: str, settings: Settings, known: str | None) -> Hel
     return HeldNight(date, row, stale + [f"no table {name}" for name in missing])
 
 
-# -- Unchanged nights: a run would make them as they are published, from the same logs.
+# Unchanged nights: a run would make them as they are, from the same logs.
 
 HASHED_AT_ONCE = 2  # logs
 

@@ -1,4 +1,4 @@
-"""Artifacts of a night on Prefect's page: its progress and its results.
+"""What Prefect's page shows of a run: artifacts, tags and logs; and what its caller gets.
 
 A page that cannot be written is a warning, never an error.
 """
@@ -34,9 +34,7 @@ from epipole.schemas.rejects import Reason
 from epipole.schemas.text import as_line, as_markdown_text
 from epipole.tasks.report.night_facts import ReportExtract
 
-# -- Artifacts of a night on Prefect's page: its progress and its results.
-#
-# A page that cannot be written is a warning, never an error.
+# Artifacts: progress and results.
 
 LOGGER = logging.getLogger(__name__)
 
@@ -167,7 +165,7 @@ def _table(heading: str, counts: dict[str, int]) -> list[str]:
     return [f"| {heading} | count |", "|---|---:|", *rows]
 
 
-# -- What Prefect's page shows of a run besides its tasks, and what the run's caller gets of it.
+# The rest of the page, and the result of the flow.
 
 P = ParamSpec("P")
 

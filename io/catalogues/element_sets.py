@@ -1,4 +1,4 @@
-"""Files of published element sets: two-line elements, and CCSDS OMM in JSON, CSV or XML."""
+"""Catalogues of known objects: files of two-line elements, or of CCSDS OMM in JSON, CSV or XML."""
 
 import csv
 import hashlib
@@ -18,7 +18,7 @@ from epipole.io.paths import known_as, open_remote
 from epipole.schemas.errors import CatalogueError, LogError
 from epipole.schemas.star_lists import ElementSet
 
-# -- Files of published element sets: two-line elements, and CCSDS OMM in JSON, CSV or XML.
+# Records of a file.
 
 _UNIX_EPOCH_JD = 2440587.5
 _SGP4_EPOCH_JD = 2433281.5  # 1949 December 31, 0h
@@ -199,7 +199,7 @@ def _element_set(title: str, number: int, cospar_id: str, satellite: Any) -> Ele
     return ElementSet(title, number, epoch_ns, elements, cospar_id)
 
 
-# -- The catalogue of known objects: a file of element sets, and its digest.
+# The file, and its digest.
 
 ADVICE = "give two-line elements, or OMM in CSV, JSON or XML"
 

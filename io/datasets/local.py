@@ -38,7 +38,7 @@ from epipole.io.datasets.plain_files import entered, opened, read_small, refuse_
 from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
 
-# -- Folders replaced in one step: a reader sees the old or the new folder, never a mixture.
+# Folders replaced in one step: a reader sees the old or the new folder, never a mixture.
 
 AT_FDCWD = -100
 RENAME_EXCHANGE = 2
@@ -117,22 +117,7 @@ def sync(path: Path) -> None:
         os.close(handle)
 
 
-# -- Nights in a local folder: claimed by a lock, put in place by a rename, recovered after a kill.
-#
-# Unfinished work lies in ``DATASET/.staging``:
-#
-# - ``lock``: held briefly by a run that changes the staging folder or puts nights in place; -
-# ``run-*/``: the folder of one run. Its file ``claim`` is locked as long as the run lives, and
-# names the nights that the run works on; - ``swap-*/``: nights that are being replaced, and the
-# file ``commit.json``, which publishes all nights of a run at once: if the run is killed between
-# two renames, the next run or reader finishes them.
-#
-# Other files in it are left alone. Whoever may write to the dataset may have written these files
-# too. So a commit is finished only where it names dates, and folders of runs in the staging
-# folder, and where none of these is a link.
-#
-# The kernel releases a lock when its process ends, however it ends. So a claim that can be
-# locked belongs to a run that has ended, and the next run removes its folder.
+# Nights of a dataset.
 
 LOGGER = logging.getLogger(__name__)
 

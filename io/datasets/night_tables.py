@@ -1,6 +1,7 @@
-"""One night of a dataset, read piece by piece: only the columns and the times that are asked for.
+"""The Parquet files of one night: written span by span, read piece by piece.
 
-A night may have more rows than fit in memory, so the large tables are read in pieces.
+A night may have more rows than fit in memory. So its large tables are read in pieces, and only the
+columns and times that are asked for.
 """
 
 import contextlib
@@ -20,9 +21,7 @@ from epipole.schemas.bridge import conform, to_polars
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
-# -- One night of a dataset, read piece by piece: only the columns and the times that are asked for.
-#
-# A night may have more rows than fit in memory, so the large tables are read in pieces.
+# Reading.
 
 
 class NightReader:
@@ -118,7 +117,7 @@ def _rows(file: pq.ParquetFile, group: int) -> int:
     return count
 
 
-# -- Options of the Parquet files of a dataset, chosen for fast queries over years.
+# Options of the files, chosen for fast queries over years.
 
 ROWS_IN_GROUP = 1 << 17
 
@@ -135,7 +134,7 @@ def part_options(schema: pa.Schema) -> dict[str, Any]:
     return {"compression": "lz4", "use_dictionary": repeats}
 
 
-# -- The Parquet files of an unpublished night: one per table, written span by span.
+# Writing a night that is not published yet: one file per table.
 
 PART = "part-0.parquet"
 

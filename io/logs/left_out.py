@@ -1,4 +1,4 @@
-"""What reading a log leaves out, collected until it becomes rows of `rejects`."""
+"""What reading a log leaves out, and the frames whose times are far from all others."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from epipole.schemas.log_bounds import FAR_FROM_LOG_NS
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS
 
-# -- What reading a log leaves out, collected until it becomes rows of `rejects`.
+# Rows of `rejects`, collected.
 
 ROWS_ALIKE = 100  # a log of which everything is damaged does not need a row per message
 # Of one log, so that it cannot fill the memory: a row takes about half a kilobyte until it is
@@ -76,9 +76,7 @@ class RejectList:
         )
 
 
-# -- The time that a log is about: where most of its frames are. Frames far from it are strays.
-#
-# One frame with a wrong clock would else be a night of its own.
+# Strays: one frame with a wrong clock would make a night of its own.
 
 Nanoseconds = npt.NDArray[np.int64]
 

@@ -1,4 +1,4 @@
-"""Logs out: frames, states and calibrations to an MCAP file."""
+"""Writing MCAP files: logs of sensors, and files for viewers."""
 
 import errno
 import importlib
@@ -18,7 +18,7 @@ from epipole.io.logs.messages.protobuf import add_file
 from epipole.io.logs.messages.registry import encoding_named
 from epipole.schemas.log_messages import CALIBRATION, FRAME, STATE
 
-# -- An MCAP file that is written: channels, messages, and its name when it is complete.
+# The container: channels, messages, and the file's name when it is complete.
 
 COMPRESSIONS = {
     "zstd": CompressionType.ZSTD,
@@ -115,7 +115,7 @@ class McapFile:
         return channel
 
 
-# -- Logs out: frames, states and calibrations to an MCAP file.
+# Logs: frames, states and calibrations.
 
 _TOPICS = {FRAME: "centroids", STATE: "state", CALIBRATION: "calibration"}
 Numbers = npt.ArrayLike
@@ -273,7 +273,7 @@ def calibration_values(sensor_id: str, time_ns: int, camera: Values) -> dict[str
     }
 
 
-# -- An MCAP file for viewers: messages of foxglove's public schemas, as protobuf.
+# Files for viewers: foxglove's public schemas, as protobuf.
 
 PREFIX = "foxglove."
 

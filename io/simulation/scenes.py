@@ -1,4 +1,4 @@
-"""Simulation scenes: built-in ones and TOML files."""
+"""The files of a simulation scene: built-in or TOML, with the element sets that it names."""
 
 import os
 from pathlib import Path
@@ -10,7 +10,7 @@ from epipole.schemas.errors import CatalogueError, SceneError
 from epipole.schemas.scene import Scene, scene_values, validate_scene
 from epipole.schemas.star_lists import ElementSet
 
-# -- Simulation scenes: built-in ones and TOML files.
+# Scenes.
 
 _BUILT_IN = Path(__file__).parent / "built_in"
 
@@ -56,7 +56,7 @@ def _beside(values: Any, folder: Path) -> Any:
     return values
 
 
-# -- Element sets for scenes: of a file that comes with the package, or of one on the disk.
+# Element sets: from the package, or from a file.
 
 
 def built_in_element_files() -> list[str]:

@@ -19,11 +19,6 @@ from epipole.io.datasets.plain_files import refuse_link
 from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
 
-# -- The work folder of a night. If the run is killed, the next run reuses its finished parts.
-#
-# Its name has a digest of everything that its parts depend on (see `epipole.io.work.recipe`). So
-# no part in it can be out of date.
-
 NAME = "work"
 
 
@@ -66,7 +61,7 @@ def work_root(dataset: str) -> Path:
     return root / hashlib.sha256(dataset.encode()).hexdigest()[:12]
 
 
-# -- Unfinished work: what stopped runs have left for the next run of their night.
+# Unfinished work of stopped runs.
 
 
 class Unfinished(NamedTuple):

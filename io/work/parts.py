@@ -49,9 +49,8 @@ from epipole.schemas.work_tables import (
     VIEWS,
 )
 
-# -- The tables of each kind of part, by name; `write_part` refuses any other.
-#
-# Tables may add metadata to a declared schema, such as the catalogue of `stars`.
+# The tables of each kind of part, by name; `write_part` refuses any other. A table may have more
+# metadata than its schema, such as the catalogue of `stars`.
 
 PartTables = Mapping[str, pa.Schema]
 
@@ -122,11 +121,6 @@ def check_tables(part: str, declared: PartTables, tables: Mapping[str, pa.Table]
 def _columns(schema: pa.Schema) -> str:
     return ", ".join(str(field.remove_metadata()) for field in schema)
 
-
-# -- Parts: the tables that one task leaves in the work folder for others, as Arrow files.
-#
-# A part appears by one rename, complete or not at all. So any task that finds a part can use it:
-# a later task, another worker on the same storage, or the next run after this one was killed.
 
 CLOCK_NS = 10_000_000_000  # the largest correction of a clock
 

@@ -1,4 +1,4 @@
-"""Text ranks: numbers in place of the texts of a column."""
+"""Rows in groups: integers for the texts of a column, and runs of equal rows."""
 
 from typing import Any, NamedTuple
 
@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-# -- Text ranks: numbers in place of the texts of a column.
+# Factorized columns.
 
 
 class Factorized(NamedTuple):
@@ -27,7 +27,7 @@ def factorize(values: pa.Table, name: str) -> Factorized:
     return Factorized(rank[encoded.indices.fill_null(len(order)).to_numpy()], texts[order])
 
 
-# -- Runs of rows that are equal in some columns.
+# Runs of equal rows.
 
 
 def group_offsets(*keys: npt.NDArray[Any]) -> npt.NDArray[np.int64]:

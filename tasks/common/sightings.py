@@ -21,7 +21,7 @@ from epipole.tasks.algorithms.geometry.covariances import attitude_covariance, c
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion, unit_from_radec
 from epipole.tasks.algorithms.times import frame_interval_ns
 
-# -- Sightings: detections with the attitude of their frame and the position of its sensor.
+# Sightings of tracklets.
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -159,10 +159,8 @@ def optics_covariance_of(cameras: pa.Table, row: int) -> Array:
     return stack_covariance(cameras.slice(row, 1), "cov_{}", OPTICS_AXES)[0]
 
 
-# -- Lone detections: those in frames that are too few, or too far apart, for a tracklet.
-#
-# They take part in the association as tracklets of one detection. Their ids are not published:
-# `tracklet_id` is null for them in a dataset.
+# Lone detections: too few frames, or too far apart, for a tracklet. Association takes each as a
+# tracklet of one detection. Their ids are not published: `tracklet_id` is null in a dataset.
 
 MARK = "lone:"  # sensor ids have no colon, so no other id begins like this
 
@@ -253,7 +251,7 @@ def only_id(tracklet_id: npt.NDArray[np.object_]) -> str | None:
     return None if name.startswith(MARK) else str(name)
 
 
-# -- One sensor's detections, with the names of their tracklets in the night.
+# Detections of one sensor, with the names of their tracklets in the night.
 
 
 def detections_within(sensor: SensorParts, span: Span) -> pa.Table:

@@ -1,4 +1,4 @@
-"""Tasks of a stage: their name is the stage, the name of a run is the stage and its work."""
+"""The decorator of the stages' tasks: names, retries, and memory that goes back to the system."""
 
 import ctypes
 import errno
@@ -14,7 +14,7 @@ from prefect.client.schemas.objects import State, TaskRun
 
 from epipole.schemas.stages import Stage
 
-# -- Memory: what a task no longer needs goes back to the system.
+# Memory.
 
 
 def give_back_memory() -> None:
@@ -31,7 +31,7 @@ def give_back_memory() -> None:
             return
 
 
-# -- Which failures of a task are tried again: those of storage that may be temporary.
+# Retries: after failures of storage that may be temporary.
 
 RETRIES = 3
 DELAYS_S = [2.0, 10.0, 30.0]
@@ -80,7 +80,7 @@ def _may_pass(error: BaseException) -> bool:
     return isinstance(error, client.HTTPClientError | client.ConnectionError)
 
 
-# -- Tasks of a stage: their name is the stage, the name of a run is the stage and its work.
+# The decorator: a task is named by its stage, a task run by the stage and its work.
 
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -1,4 +1,4 @@
-"""Match claims with the truth: the true object of each object reported at an epoch."""
+"""Match a dataset with the truth: centroids, objects at each epoch, positions of true objects."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +13,7 @@ from epipole.schemas.bridge import array, stack, to_polars
 from epipole.tasks.algorithms.evaluation import SampledOrbits, interpolate_orbits, majority
 from epipole.tasks.algorithms.simulation.paths import state_at
 
-# -- Match centroids with the truth: which star or which object each of them shows.
+# Centroids: which star or object each shows.
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -55,7 +55,7 @@ def share(part: float, whole: float) -> float:
     return part / max(whole, 1)
 
 
-# -- Match claims with the truth: the true object of each object reported at an epoch.
+# Objects: the true object of each one that the dataset reports at an epoch.
 
 MIN_VIEWS = 2  # of one true object; with fewer a claim is a ghost
 
@@ -170,7 +170,7 @@ def match_positions(positions: pa.Table, claims: pl.DataFrame) -> pl.DataFrame:
     return rows.select(*CLAIM, pl.col("true_object").fill_null(-1))
 
 
-# -- Locate true objects: their positions and velocities at given times.
+# Positions and velocities of true objects.
 
 
 def locate_objects(truth: Truth, objects: Indices, time_ns: Indices) -> tuple[Array, Array]:

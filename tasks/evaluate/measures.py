@@ -1,4 +1,9 @@
-"""Measure positions: errors, whether covariances agree with them, and what ids stand for."""
+"""The measures of `epipole evaluate`, in the order of its report.
+
+Each function returns some measures by name; `schemas/evaluation.py` defines the names. Where a
+dataset states sigmas, squared errors are divided by the variances (NEES): per axis their mean is 1
+if the sigmas are right.
+"""
 
 from collections.abc import Sequence
 
@@ -35,10 +40,129 @@ from epipole.tasks.evaluate.matching import (
     with_truth,
 )
 
-# -- Measure positions: errors, whether covariances agree with them, and what ids stand for.
+TRACK = ["sensor_id", "track_id"]
 
-POSITION_CHI2_99 = 11.345  # 99 % of the chi-square of 3 degrees of freedom
-POSITION_AXES = 3
+# Larger errors of an attitude are those of a wrong identification.
+WRONG_CROSS_ARCSEC, WRONG_ROLL_ARCSEC = 360.0, 1800.0
+MIN_POSSIBLE_EPOCHS = 10  # an object possible at fewer epochs is not counted as lost
+LOST_SHARE = 0.5  # found at a smaller share of its possible epochs: lost
+POSITION_AXES, DIRECTION_AXES, STATE_COMPONENTS = 3, 2, 6
+# 99 % of the chi-square of 3 and of 6 degrees of freedom.
+POSITION_CHI2_99, STATE_CHI2_99 = 11.345, 16.81
+LIGHT_ITERATIONS = 3  # an object moves 1e-4 of the path of its light: each iteration gains 4 digits
+
+
+def measure_stars(stars: pl.DataFrame, points: pl.DataFrame) -> Measures:
+    """Return how many identified stars are right, and how many of the true stars they are."""
+    identified = with_truth(stars.select(*POINT, "star_id"), points)
+    is_right = (pl.col("kind") == STAR) & (pl.col("source") == pl.col("star_id"))
+    n_right = identified.filter(is_right).height
+    n_true = points.filter(pl.col("kind") == STAR).height
+    return {
+        "stars_claimed": stars.height,
+        "star_precision": share(n_right, stars.height),
+        "star_recall": share(n_right, n_true),
+    }
+
+
+def measure_attitudes(frames: pl.DataFrame, true_frames: pl.DataFrame) -> Measures:
+    """Return how many true frames have an attitude from stars, and the errors of these attitudes.
+
+    A frame that the dataset has more than once is measured by its first row.
+    """
+    once = frames.unique(FRAME, keep="first", maintain_order=True)
+    solved = once.filter(pl.col("attitude_source") == "stars").join(
+        true_frames, on=FRAME, how="inner", suffix="_true"
+    )
+    counts = {
+        "frames": frames.height,
+        "frames_duplicated": frames.height - once.height,
+        "frames_solved": share(solved.height, true_frames.height),
+    }
+    return counts | (_attitude_errors(solved) if solved.height else {})
+
+
+def _attitude_errors(solved: pl.DataFrame) -> Measures:
+    names = ["qx", "qy", "qz", "qw"]
+    q_found = solved.select(names).to_numpy()
+    q_true = solved.select([f"{name}_true" for name in names]).to_numpy()
+    cross, roll = (np.abs(angle) / ARCSEC for angle in attitude_errors(q_found, q_true))
+    wrong = (cross > WRONG_CROSS_ARCSEC) | (roll > WRONG_ROLL_ARCSEC)
+    return {
+        "att_cross_arcsec_median": float(np.median(cross)),
+        "att_cross_arcsec_p99": float(np.quantile(cross, 0.99)),
+        "att_roll_arcsec_median": float(np.median(roll)),
+        "att_wrong": int(np.sum(wrong)),
+    }
+
+
+def measure_tracks(detections: pl.DataFrame, points: pl.DataFrame) -> Measures:
+    """Return purity and completeness of the tracks; nothing where no detection has a track.
+
+    The object of a track is the one that most of its detections show. `detections` are those of
+    `detected_objects`.
+    """
+    tracked = detections.drop_nulls("track_id")
+    if not tracked.height:
+        return {}
+    tracks = tracked.select(TRACK).unique(maintain_order=True).with_row_index("number")
+    tracked = tracked.join(tracks, on=TRACK, how="left", maintain_order="left")
+    most = majority(integers(tracked, "number"), true_objects(tracked), tracks.height)
+    n_right = int(most.votes.sum())
+    of_track = tracks.select("sensor_id", true_object=pl.Series(most.value))
+    of_track = of_track.filter(pl.col("true_object") >= 0)
+    n_tracks = of_track.group_by("sensor_id", "true_object").len()["len"]
+    return {
+        "tracks": tracks.height,
+        "track_purity": share(n_right, tracked.height),
+        "track_completeness": share(n_right, points.filter(pl.col("kind") == OBJECT).height),
+        "tracks_per_target": float(np.mean(n_tracks.to_numpy())) if len(n_tracks) else None,
+    }
+
+
+def measure_associations(
+    views: pl.DataFrame, claims: pl.DataFrame, possible: pl.DataFrame, epochs: pl.DataFrame
+) -> Measures:
+    """Return how many pairs of views and how many claims are right.
+
+    A pair is two views of one claim that have centroids. The possible pairs are all pairs of
+    centroids of one object in the frames of one epoch.
+    """
+    with_centroid = views.filter("has_centroid")
+    n_pairs, n_right = pairs_within(
+        integers(with_centroid, "claim"), integers(with_centroid, "true_object"), claims.height
+    )
+    n_views = integers(possible, "n_views")
+    n_possible = int(np.sum(n_views * (n_views - 1) // 2))
+    return {
+        "epochs": epochs["epoch"].n_unique(),
+        "groups": claims.height,
+        "pair_precision": share(n_right, n_pairs),
+        "pair_recall": share(n_right, n_possible),
+        "object_recall": share(_found(possible, claims).height, possible.height),
+        "ghosts": claims.filter(pl.col("true_object") < 0).height,
+    }
+
+
+def measure_lost_objects(possible: pl.DataFrame, claims: pl.DataFrame) -> Measures:
+    """Return how many objects two frames show at ten epochs or more, and how many were lost.
+
+    An object is lost where the dataset has it at less than half of these epochs.
+    """
+    n_found = _found(possible, claims).group_by("true_object").agg(n_found=pl.len())
+    objects = possible.group_by("true_object").agg(n_possible=pl.len())
+    objects = objects.filter(pl.col("n_possible") >= MIN_POSSIBLE_EPOCHS)
+    objects = objects.join(n_found, on="true_object", how="left")
+    is_lost = pl.col("n_found").fill_null(0) < LOST_SHARE * pl.col("n_possible")
+    return {
+        "objects_seen_by_two": objects.height,
+        "objects_lost": objects.filter(is_lost).height,
+    }
+
+
+def _found(possible: pl.DataFrame, claims: pl.DataFrame) -> pl.DataFrame:
+    """Return the possible claims that the dataset has."""
+    return possible.join(claims, on=["epoch", "true_object"], how="semi")
 
 
 def measure_positions(
@@ -117,112 +241,6 @@ def measure_coverage(n: int, truth: Truth, frames: pl.DataFrame, points: pl.Data
     shown = shown.with_columns(interval=(since_ns * (rate_hz / 1e9)).floor())
     n_sensors = shown.group_by("interval", "source").agg(n=pl.col("sensor_id").n_unique())
     return {"positions_per_truth": share(n, n_sensors.filter(pl.col("n") >= 2).height)}
-
-
-# -- Measure claims: pairs, ghosts, true objects that were found, and those that were lost.
-
-LONG_EPOCHS = 10  # an object possible at fewer epochs is not counted as lost
-LOST_SHARE = 0.5  # found at a smaller share of its possible epochs: lost
-
-
-def measure_associations(
-    views: pl.DataFrame, claims: pl.DataFrame, possible: pl.DataFrame, epochs: pl.DataFrame
-) -> Measures:
-    """Return how many pairs of views and how many claims are right.
-
-    A pair is two views of one claim that have centroids. The possible pairs are all pairs of
-    centroids of one object in the frames of one epoch.
-    """
-    with_centroid = views.filter("has_centroid")
-    n_pairs, n_right = pairs_within(
-        integers(with_centroid, "claim"), integers(with_centroid, "true_object"), claims.height
-    )
-    n_views = integers(possible, "n_views")
-    n_possible = int(np.sum(n_views * (n_views - 1) // 2))
-    return {
-        "epochs": epochs["epoch"].n_unique(),
-        "groups": claims.height,
-        "pair_precision": share(n_right, n_pairs),
-        "pair_recall": share(n_right, n_possible),
-        "object_recall": share(_found(possible, claims).height, possible.height),
-        "ghosts": claims.filter(pl.col("true_object") < 0).height,
-    }
-
-
-def measure_lost_objects(possible: pl.DataFrame, claims: pl.DataFrame) -> Measures:
-    """Return how many objects two frames show at ten epochs or more, and how many were lost.
-
-    An object is lost where the dataset has it at less than half of these epochs.
-    """
-    n_found = _found(possible, claims).group_by("true_object").agg(n_found=pl.len())
-    objects = possible.group_by("true_object").agg(n_possible=pl.len())
-    objects = objects.filter(pl.col("n_possible") >= LONG_EPOCHS)
-    objects = objects.join(n_found, on="true_object", how="left")
-    is_lost = pl.col("n_found").fill_null(0) < LOST_SHARE * pl.col("n_possible")
-    return {
-        "objects_seen_by_two": objects.height,
-        "objects_lost": objects.filter(is_lost).height,
-    }
-
-
-def _found(possible: pl.DataFrame, claims: pl.DataFrame) -> pl.DataFrame:
-    """Return the possible claims that the dataset has."""
-    return possible.join(claims, on=["epoch", "true_object"], how="semi")
-
-
-# -- Measure stars and attitudes against the truth.
-
-WRONG_CROSS_ARCSEC, WRONG_ROLL_ARCSEC = 360.0, 1800.0
-
-
-def measure_stars(stars: pl.DataFrame, points: pl.DataFrame) -> Measures:
-    """Return how many identified stars are right, and how many of the true stars they are."""
-    identified = with_truth(stars.select(*POINT, "star_id"), points)
-    is_right = (pl.col("kind") == STAR) & (pl.col("source") == pl.col("star_id"))
-    n_right = identified.filter(is_right).height
-    n_true = points.filter(pl.col("kind") == STAR).height
-    return {
-        "stars_claimed": stars.height,
-        "star_precision": share(n_right, stars.height),
-        "star_recall": share(n_right, n_true),
-    }
-
-
-def measure_attitudes(frames: pl.DataFrame, true_frames: pl.DataFrame) -> Measures:
-    """Return how many true frames have an attitude from stars, and the errors of these attitudes.
-
-    A frame that the dataset has more than once is measured by its first row.
-    """
-    once = frames.unique(FRAME, keep="first", maintain_order=True)
-    solved = once.filter(pl.col("attitude_source") == "stars").join(
-        true_frames, on=FRAME, how="inner", suffix="_true"
-    )
-    counts = {
-        "frames": frames.height,
-        "frames_duplicated": frames.height - once.height,
-        "frames_solved": share(solved.height, true_frames.height),
-    }
-    return counts | (_attitude_errors(solved) if solved.height else {})
-
-
-def _attitude_errors(solved: pl.DataFrame) -> Measures:
-    names = ["qx", "qy", "qz", "qw"]
-    q_found = solved.select(names).to_numpy()
-    q_true = solved.select([f"{name}_true" for name in names]).to_numpy()
-    cross, roll = (np.abs(angle) / ARCSEC for angle in attitude_errors(q_found, q_true))
-    wrong = (cross > WRONG_CROSS_ARCSEC) | (roll > WRONG_ROLL_ARCSEC)
-    return {
-        "att_cross_arcsec_median": float(np.median(cross)),
-        "att_cross_arcsec_p99": float(np.quantile(cross, 0.99)),
-        "att_roll_arcsec_median": float(np.median(roll)),
-        "att_wrong": int(np.sum(wrong)),
-    }
-
-
-# -- Measure observations: whose they are, and whether their errors agree with their sigmas.
-
-DIRECTION_AXES = 2
-LIGHT_ITERATIONS = 3  # the object moves by a ten-thousandth of the way of its light
 
 
 def measure_observations(
@@ -312,12 +330,6 @@ def _lines(seen: pa.Table, of_object: Indices, truth: Truth) -> Array:
     return np.asarray(r_km - from_km)
 
 
-# -- Measure states: errors, and whether their covariances agree with them.
-
-STATE_CHI2_99 = 16.81  # 99 % of the chi-square of 6 degrees of freedom
-STATE_COMPONENTS = 6
-
-
 def measure_states(
     states: pa.Table, matched: pl.DataFrame, truth: Truth, blended: Sequence[int] = ()
 ) -> Measures:
@@ -369,32 +381,3 @@ def _state_errors(states: pa.Table, of_state: Indices, truth: Truth) -> Array:
     """Return position and velocity minus the truth, (n, 6) [km and km/s]."""
     r_km, v_km_s = locate_objects(truth, of_state, array(states, "epoch"))
     return np.hstack([stack(states, "{}_km") - r_km, stack(states, "v{}_km_s") - v_km_s])
-
-
-# -- Measure tracks: whether each is of one object, and whether each object has one.
-
-TRACK = ["sensor_id", "track_id"]
-
-
-def measure_tracks(detections: pl.DataFrame, points: pl.DataFrame) -> Measures:
-    """Return purity and completeness of the tracks; nothing where no detection has a track.
-
-    The object of a track is the one that most of its detections show. `detections` are those of
-    `detected_objects`.
-    """
-    tracked = detections.drop_nulls("track_id")
-    if not tracked.height:
-        return {}
-    tracks = tracked.select(TRACK).unique(maintain_order=True).with_row_index("number")
-    tracked = tracked.join(tracks, on=TRACK, how="left", maintain_order="left")
-    most = majority(integers(tracked, "number"), true_objects(tracked), tracks.height)
-    n_right = int(most.votes.sum())
-    of_track = tracks.select("sensor_id", true_object=pl.Series(most.value))
-    of_track = of_track.filter(pl.col("true_object") >= 0)
-    n_tracks = of_track.group_by("sensor_id", "true_object").len()["len"]
-    return {
-        "tracks": tracks.height,
-        "track_purity": share(n_right, tracked.height),
-        "track_completeness": share(n_right, points.filter(pl.col("kind") == OBJECT).height),
-        "tracks_per_target": float(np.mean(n_tracks.to_numpy())) if len(n_tracks) else None,
-    }

@@ -1,6 +1,6 @@
-"""Name known objects: each object of a night, held against a catalogue and against earlier nights.
+"""Name known objects: compare each object of a night with a catalogue and with earlier nights.
 
-The errors of the elements are learnt from the sure matches of the night, then all objects are
+The errors of the elements are learnt from the certain matches of the night. Then all objects are
 judged with them.
 """
 
@@ -44,7 +44,7 @@ from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, link
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.name.sensor_residuals import SensorResidual, sensor_residuals
 
-# -- Earlier nights: an unknown object is recognised by its motion as one of an earlier night.
+# Objects of earlier nights, recognised by their motion.
 
 HOUR_S = 3600.0
 
@@ -102,7 +102,7 @@ def _motions(states: pl.DataFrame) -> ObservedMotions:
     return ObservedMotions(at_s, at_s, at_s, at_s, motion, motion, cov, cov)
 
 
-# -- Elements of a night: one usable element set for each object of a catalogue.
+# Elements: one usable set for each object of a catalogue.
 
 
 class ElementsOfNight(NamedTuple):
@@ -146,11 +146,7 @@ def elements_of_night(
     return made._replace(sets=used), concat(REJECTS, rejects)
 
 
-# -- Name known objects: each object of a night, held against a catalogue and against earlier
-# nights.
-#
-# The errors of the elements are learnt from the sure matches of the night, then all objects are
-# judged with them.
+# The judgement of all objects.
 
 SURE = 0.999  # probability of a match from which errors are learnt
 COVARIANCE = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]

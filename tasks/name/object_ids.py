@@ -1,4 +1,4 @@
-"""Link objects: an object that is detected again after a gap gets its earlier id."""
+"""Object ids: one for each object of the night, kept through gaps and over midnight."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
@@ -19,7 +19,7 @@ from epipole.schemas.tables import ASSOCIATIONS
 from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, chains, link_by_motion
 from epipole.tasks.common.stage_tasks import stage_task
 
-# -- Link objects: an object that is detected again after a gap gets its earlier id.
+# Objects that are detected again after a gap keep their earlier id.
 
 Array = npt.NDArray[np.float64]
 
@@ -101,11 +101,9 @@ def _seconds(ends: pl.DataFrame, name: str, origin: object) -> Array:
     return (ends[name] - origin).cast(pl.Duration("ns")).cast(pl.Int64).to_numpy() / 1e9
 
 
-# -- Followed objects: those that were followed over midnight, and so keep the id of the night
-# before.
-#
-# A night is solved with half an hour of the night before. An object there is the same as one of
-# the published night before, if they share detections.
+# Objects that are followed over midnight keep their id. A night is solved with half an hour of the
+# night before. An object there and one of the published night before are the same if they share
+# detections.
 
 _DETECTION = ["sensor_id", "frame_number", "centroid"]
 VIEWS = pa.schema([ASSOCIATIONS.field(name) for name in ("object_id", *_DETECTION, "used")])
@@ -143,7 +141,7 @@ def _detections(views: pa.Table) -> pl.DataFrame:
     return used.select("object_id", *_DETECTION).unique(maintain_order=True)
 
 
-# -- Name objects: one id in the night for each object of the spans that has a position in it.
+# One id in the night for each object of the spans that has a position in it.
 
 Names = dict[str, dict[str, str]]  # by the folder of a span: old name, new name
 

@@ -17,13 +17,6 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.TextAnnotation_pb2 import TextAnnotation
 
-# -- What is known of each centroid, as annotations that a viewer draws over the image.
-#
-# Shapes and colours both differ (Okabe and Ito's colours, which colour-blind people tell apart):
-# a star is a blue ring, a detection of an object an orange square, another detection a reddish
-# cross. The origin of annotations is the corner of the first pixel, ours its middle: half a
-# pixel is added.
-
 BLUE, ORANGE, RED = (0.337, 0.706, 0.914), (0.902, 0.624, 0.0), (0.835, 0.369, 0.0)
 BLACK = (0.0, 0.0, 0.0)  # behind words: images of the sky are dark
 HALF_PX = 0.5
@@ -148,7 +141,7 @@ def image_of(shape: tuple[int, int], places: np.ndarray) -> np.ndarray:
     return image
 
 
-# -- Grey images as PNG (ISO/IEC 15948), with the compression of the standard library.
+# Grey images as PNG (ISO/IEC 15948), compressed by the standard library.
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 

@@ -1,4 +1,4 @@
-"""What the tables of a night are made from."""
+"""Publish nights: the parts that their tables are made from, in slices of time."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
 from epipole.tasks.common.stage_tasks import stage_task
 
-# -- What the tables of a night are made from.
+# Parts.
 
 
 class NightParts(NamedTuple):
@@ -35,7 +35,7 @@ class NightParts(NamedTuple):
     whole: Mapping[str, pa.Table]
 
 
-# -- Publish nights: the staged tables become the dataset's, all at once.
+# Publication: the staged tables become the dataset's, all at once.
 
 
 @stage_task(Stage.PUBLISH, "all nights", retried=True)
@@ -46,7 +46,7 @@ def publish_nights(
     publish_folders(dataset, staged, sources, replace)
 
 
-# -- Time slices: a span's rows from many parts, merged in times short enough to hold.
+# Slices of time: rows of a span from many parts, merged in slices that fit in memory.
 
 MAX_ROWS = 200_000  # in a slice, about
 ROWS_OF_TABLE = 600  # with many tables a slice has more rows: each table is opened for each slice

@@ -1,4 +1,4 @@
-"""Pictures in the image of a sensor: a star map, residuals, epipolar lines."""
+"""Pictures of sensors: one frame, residuals, epipolar lines; and their night in curves."""
 
 from collections.abc import Sequence
 
@@ -27,7 +27,7 @@ from epipole.tasks.report.epipolar_views import EpipolarViews
 from epipole.tasks.report.frame_series import FrameSeries
 from epipole.tasks.report.stars import CELLS, StarMap, StarResiduals
 
-# -- Pictures in the image of a sensor: a star map, residuals, epipolar lines.
+# In the image of a sensor.
 
 Array = npt.NDArray[np.float64]
 
@@ -157,7 +157,7 @@ def draw_epipolar(figure: Figure, views: EpipolarViews) -> None:
     legend_below(figure, axes, columns=2)
 
 
-# -- Pictures of sensors over the night: frames, attitude sigmas, star residuals.
+# Over the night: frames, attitude sigmas, star residuals.
 
 MAX_ROWS = 16
 MAX_LINES = len(LINES)

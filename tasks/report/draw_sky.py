@@ -1,4 +1,4 @@
-"""Pictures of the sky: tracklets, and where the objects are."""
+"""Pictures of the sky and of distributions: tracklets, objects; found against expected."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -28,7 +28,7 @@ from epipole.tasks.report.objects import NightNumbers, NightObject, SkyTracks
 from epipole.tasks.report.solved_chi2 import Chi2
 from epipole.tasks.report.stars import HISTOGRAM, StarResiduals
 
-# -- Pictures of the sky: tracklets, and where the objects are.
+# The sky.
 
 Array = npt.NDArray[Any]
 
@@ -156,7 +156,7 @@ def _number(value: float, _: object) -> str:
     return f"{value / 1e3:g} k" if value >= 1e4 else f"{value:g}"
 
 
-# -- Pictures of distributions: what was found beside what should be.
+# Distributions.
 
 STEPS = 120  # of a curve
 MAX_FREEDOMS = 200  # kinds of degrees of freedom that a curve is summed of

@@ -9,7 +9,7 @@ import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
 
-# -- Bins of time: a night is drawn in about a hundred of them, however many frames it has.
+# Bins of time: about a hundred per night, however many frames it has.
 
 Indices = npt.NDArray[np.int64]
 
@@ -54,7 +54,7 @@ def clock(time_ns: int) -> str:
     return str(np.datetime64(time_ns // 1_000_000_000, "s"))[11:]
 
 
-# -- Frames over the night, by sensor: how they got their attitude, how good it is, and gaps.
+# Frames in these bins.
 
 Array = npt.NDArray[np.float64]
 

@@ -1,4 +1,7 @@
-"""All that the report says of a night, computed from its tables."""
+"""What the report says of a night: its numbers, what was left out, and what needs a look.
+
+`read_night_facts` computes all of it from the tables; the page and Prefect's page only show it.
+"""
 
 from collections.abc import Iterator, Sequence
 from statistics import median
@@ -23,7 +26,7 @@ from epipole.tasks.report.objects import (
 from epipole.tasks.report.solved_chi2 import SolvedChi2, read_solved_chi2
 from epipole.tasks.report.stars import StarMap, StarResiduals, read_star_map, read_star_residuals
 
-# -- What was left out of a night, by stage, reason and sensor.
+# What was left out, by stage, reason and sensor.
 
 ORDER = [stage.value for stage in Stage]
 
@@ -62,7 +65,7 @@ def _place(stage: str) -> int:
     return ORDER.index(stage) if stage in ORDER else len(ORDER)
 
 
-# -- All that the report says of a night, computed from its tables.
+# All facts of a night.
 
 _CALIBRATIONS = ["sensor_id", *OPTICS, "sigma_fx_px", "sigma_fy_px", "n_stars", "residual_px"]
 
@@ -140,7 +143,7 @@ def read_night_facts(
     )
 
 
-# -- What of a night needs a look, as sentences; none where all is well.
+# What needs a look, as sentences; none where all is well.
 
 MIN_IDENTIFIED = 0.9  # share of a sensor's frames
 LONGEST_LOST = 0.02  # share of the night
@@ -260,7 +263,7 @@ def duration(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min"
 
 
-# -- What Prefect's page shows of a report: the most telling pictures, and the gaps of sensors.
+# What Prefect's page shows: the most telling pictures, and the gaps of sensors.
 
 
 class PagePicture(NamedTuple):

@@ -1,4 +1,4 @@
-"""Objects of a night: where they are, how they move, and what is known of their names."""
+"""Objects of a night, their tracklets on the sky, and the numbers of the last nights."""
 
 import logging
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ from epipole.schemas.rejects import NameStatus, Outcome
 from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.times import utc_julian_date
 
-# -- Objects of a night: where they are, how they move, and what is known of their names.
+# Objects: where they are, how they move, and what is known of their names.
 
 Array = npt.NDArray[np.float64]
 
@@ -137,7 +137,7 @@ def elements_of(r_km: Array, v_km_s: Array) -> Array:
     return np.stack([a, np.linalg.norm(e, axis=-1), i], axis=-1)
 
 
-# -- Tracklets on the sky: some of each outcome, as lines.
+# Tracklets on the sky: some of each outcome, as lines.
 
 MAX_DRAWN = 240
 POINTS = 6  # of a line, about
@@ -197,7 +197,7 @@ def _thinned(places: Array) -> Array:
     return places[at]
 
 
-# -- The last nights of a dataset: a few numbers of each.
+# The last nights of the dataset: a few numbers of each.
 
 LOGGER = logging.getLogger(__name__)
 

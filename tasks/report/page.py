@@ -1,4 +1,4 @@
-"""The page of a night: its head, and all sections in their order."""
+"""The page of a night, and its extract for Prefect's page."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -27,7 +27,7 @@ from epipole.tasks.report.sensor_sections import (
     star_map,
 )
 
-# -- The page of a night: its head, and all sections in their order.
+# The page: its head, and all sections in order.
 
 TEMPLATE = Path(__file__).with_name("page.html")
 MAX_LOOKS = 12
@@ -136,7 +136,7 @@ def _many(count: int, what: str) -> str:
     return f"{count:,} {what}" + ("" if count == 1 else "s")
 
 
-# -- The extract of a report for Prefect's page.
+# The extract.
 
 PICTURE_IN = 2.6
 LARGEST = 45_000  # bytes of one picture

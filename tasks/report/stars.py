@@ -1,4 +1,4 @@
-"""Star residuals of a night: against their sigma, and over the image of each sensor."""
+"""Stars of a night: residuals against their sigma and over the image, and a map of one frame."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from epipole.io.datasets.night_tables import NightReader
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.report.frame_series import FrameSeries, codes
 
-# -- Star residuals of a night: against their sigma, and over the image of each sensor.
+# Residuals.
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -148,7 +148,7 @@ def _stars_of_frame(rows: pl.DataFrame, sensor: Indices) -> Indices:
     return counts
 
 
-# -- One frame as a map: its stars with names, their residuals, and what is no star.
+# The map of a frame: stars with names, residuals, and detections.
 
 SEARCHED_NS = 120_000_000_000  # of the night's middle
 MAX_OTHERS = 300

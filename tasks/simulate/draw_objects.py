@@ -1,4 +1,4 @@
-"""Draw the objects of a scene: their paths and how bright they are."""
+"""Draw the objects of a scene: orbits, real satellites, and how bright they are."""
 
 import difflib
 import math
@@ -28,7 +28,7 @@ from epipole.tasks.algorithms.simulation.paths import (
 from epipole.tasks.algorithms.simulation.sensor import random_stream
 from epipole.tasks.algorithms.simulation.sources import SimulatedObjects
 
-# -- Draw the orbits of a scene: elements, positions, random ones, and objects near them.
+# Orbits: elements, positions, random ones, and objects near them.
 
 Array = npt.NDArray[np.float64]
 
@@ -76,7 +76,7 @@ def draw_near(orbit: Orbit, spread_km: float, rng: np.random.Generator) -> Array
     return elements_from_state(moved, level / np.linalg.norm(level) * speed)
 
 
-# -- Place real satellites: choose element sets from a file, and propagate them over the scene.
+# Real satellites: element sets from a file, propagated over the scene.
 
 # [s] Light time, and the half interval that a random pointing begins early.
 _ROOM_S = 10.0
@@ -170,7 +170,7 @@ def _text(time_ns: int) -> str:
     return datetime.fromtimestamp(time_ns // SECOND_NS, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-# -- Draw the objects of a scene: their paths and how bright they are.
+# Objects.
 
 NO_SENSOR = 1_000_000  # first index of the random streams that belong to no sensor
 

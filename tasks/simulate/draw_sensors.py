@@ -22,7 +22,7 @@ from epipole.tasks.simulate.draw_objects import (
     place_satellites,
 )
 
-# -- The optics of a scene's sensors: those that the log reports, and the true ones.
+# Optics: as the log reports them, and the true ones.
 
 
 def sent_optics(camera: SceneCamera) -> TrueOptics:
@@ -50,7 +50,7 @@ def true_optics(camera: SceneCamera) -> TrueOptics:
     )
 
 
-# -- Draw the sensors of a scene: orbits, pointing, optics, noise and faults.
+# Sensors.
 
 Array = npt.NDArray[np.float64]
 

@@ -1,4 +1,8 @@
-"""Track a span: one sensor's tracklets over a span and its margins, from part to part."""
+"""Track a span: one sensor's tracklets over a span and its margins, from part to part.
+
+`track_span` at the end reads the parts, finds runs of detections, measures them and writes
+tracklets.
+"""
 
 import itertools
 from collections.abc import Iterator
@@ -47,7 +51,7 @@ from epipole.tasks.track.classify_detections import (
     sighting_sigma,
 )
 
-# -- Measure runs: the rate and residual of each track, and which of them stand still like stars.
+# Measurement of runs: rates, residuals, and which of them stand still like stars.
 
 Array = npt.NDArray[np.float64]
 
@@ -117,7 +121,7 @@ def _mean_rate(time_s: Array, u: Array, variance: Array) -> tuple[float, float]:
     return float(np.linalg.norm(slope)), float(sigma)
 
 
-# -- Build tracklets: runs of detections of one object in the frames of one sensor.
+# Tracklets: runs of detections of one object in the frames of one sensor.
 
 
 class Tracked(NamedTuple):
@@ -345,7 +349,7 @@ def _tracklet_table(
     )
 
 
-# -- Track a span: one sensor's tracklets over a span and its margins, from part to part.
+# From part to part.
 
 # Tracklets are followed this long before and after a span, so that neighbouring spans find the same
 # ones; and this long in addition, so that broken tracks are joined across the border.

@@ -1,4 +1,4 @@
-"""The bytes of a log, wherever it is kept.
+"""The bytes of a log: of a file, or of a URL of which each block is fetched once.
 
 A file is read, not mapped: if another program cuts a mapped file short, the process that reads it
 is killed without a message.
@@ -16,7 +16,7 @@ from typing import Protocol, Self
 from epipole.io.paths import known_as, open_remote
 from epipole.schemas.errors import LogError
 
-# -- A remote log, fetched in blocks. Each block is fetched once, and a few are kept.
+# Remote logs.
 
 BLOCK_BYTES = 4 << 20
 AHEAD = 2  # blocks that are fetched while the block before them is read
@@ -126,10 +126,7 @@ class _BlockHash:
         self._worker.shutdown(cancel_futures=True)
 
 
-# -- The bytes of a log, wherever it is kept.
-#
-# A file is read, not mapped: if another program cuts a mapped file short, the process that reads
-# it is killed without a message.
+# Logs of both kinds.
 
 HASHED_BYTES = 1 << 20  # of a file that are hashed at once
 NEAR_BYTES = 1 << 16  # read at once for a small range: the next range mostly follows it

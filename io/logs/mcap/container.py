@@ -1,4 +1,8 @@
-"""Chunks of a log: their heads and their records, checked before they are used."""
+"""The parts of an MCAP file beside its messages: chunks, declarations of channels, the summary.
+
+All of them are checked before they are used: sizes, checksums, bounds. A part that cannot be used
+raises `ChunkError` with the reason.
+"""
 
 import contextlib
 import struct
@@ -24,7 +28,7 @@ from epipole.io.logs.mcap.record_scan import (
 )
 from epipole.schemas.rejects import Reason
 
-# -- Chunks of a log to plain bytes, never more bytes than the chunk declares.
+# Decompression, never to more bytes than the chunk declares.
 
 
 class ChunkError(Exception):
@@ -79,7 +83,7 @@ def decompress_part(data: memoryview, compression: str, size: int) -> bytes:
     return bytes(data[:size]) if compression == "" else b""
 
 
-# -- The schemas and channels that a log declares, in chunks, outside them and in its summary.
+# Schemas and channels, as records and the summary declare them.
 
 
 class Channel(NamedTuple):
@@ -182,7 +186,7 @@ def string(data: Any, at: int, end: int) -> tuple[str, int]:
     return bytes(data[at + 4 : at + 4 + length]).decode(), at + 4 + length
 
 
-# -- The summary at the end of a log: its channels, its chunks and how many messages it has.
+# The summary: channels, chunks, and the number of messages.
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")  # opcode, length
@@ -277,7 +281,7 @@ def _is_foreign(opcode: int) -> bool:
     return opcode not in OF_SUMMARY and opcode < PRIVATE
 
 
-# -- Chunks of a log: their heads and their records, checked before they are used.
+# Chunks: heads and records.
 
 # A chunk has a few MiB. A chunk that declares more than this is damaged or an attack.
 MAX_CHUNK_BYTES = 256 << 20

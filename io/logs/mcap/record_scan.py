@@ -1,4 +1,4 @@
-"""The places of records in a chunk or outside, found by compiled walks over the bytes."""
+"""The segments of records in a chunk or outside, found by compiled loops over the bytes."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -11,10 +11,7 @@ from numba.extending import intrinsic
 
 from epipole.io.caches.kernels import use_kernel_cache
 
-# -- How the loops over the bytes of a log are compiled.
-#
-# The same as `epipole.tasks.algorithms.kernels`, which io may not import. A test compares the
-# two.
+# Compilation, as in `epipole.tasks.algorithms.kernels`: io may not import it, a test compares both.
 
 use_kernel_cache()
 
@@ -23,7 +20,7 @@ _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"
 kernel = njit(**_OPTIONS)
 
 
-# -- Little-endian numbers out of bytes at any place, for compiled loops.
+# Little-endian numbers at any offset.
 
 
 def _load(bits: int, kind: Any) -> Any:
@@ -51,7 +48,7 @@ load_uint32 = _load(32, types.uint32)
 load_uint64 = _load(64, types.uint64)
 
 
-# -- The places of records in a chunk or outside, found by compiled walks over the bytes.
+# Records.
 
 Bytes = npt.NDArray[np.uint8]
 Hashes = npt.NDArray[np.uint64]

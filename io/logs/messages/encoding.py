@@ -1,4 +1,4 @@
-"""What an encoding of messages is: all that reading and writing logs need to know of it."""
+"""What an encoding of messages has to define: decoded messages, functions, and field segments."""
 
 import struct
 from collections.abc import Callable, Mapping
@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from epipole.schemas.log_messages import DECLARED, FRAME, STATE, MessageType
 
-# -- Decoded messages: the same plain values, whatever encoding they came in.
+# Decoded messages: the same plain values in every encoding.
 
 Array = npt.NDArray[np.floating]
 
@@ -69,7 +69,7 @@ def valid_time_ns(seconds: int, nanos: int) -> int | None:
     return seconds * SECOND_NS + nanos or None
 
 
-# -- What an encoding of messages is: all that reading and writing logs need to know of it.
+# The definition of an encoding.
 
 # Fields by name. A calibration has timestamp, frame_id, width, height, distortion_model, D, K,
 # R and P; the other kinds have the fields that `epipole.schemas.log_messages` declares.
@@ -124,15 +124,12 @@ class MessageEncoding:
             raise UndecodableError(f"{type(error).__name__}: {error}") from error
 
 
-# -- Where the fields of messages lie in the bytes of a chunk, as the compiled scans take it.
+# Located fields: where the fields of messages are in the bytes of a chunk.
 #
-# An encoding may bring a compiled loop that finds them (`MessageEncoding.locate`). It fills one
-# row of integers per message:
-#
-# - column 0 is 1 where the message is well formed and has a valid time, else 0; - columns ``2
-# f`` and ``2 f + 1`` belong to the field with number ``f``: the time [ns], the integer or the
-# bits of the double; or the place and the length of the text or array. A field that was not sent
-# is 0 in both.
+# An encoding may have a compiled loop that finds them (`MessageEncoding.locate`). It fills one row
+# of integers per message. Column 0 is 1 where the message is well formed and has a valid time, else
+# 0. Columns 2 f and 2 f + 1 are of field number f: the time [ns], the integer or the bits of the
+# double; or the offset and the length of the text or array; 0 and 0 where the field was not sent.
 
 Integers = npt.NDArray[np.int64]
 

@@ -17,15 +17,6 @@ import pyarrow as pa
 from epipole.io.logs.mcap.record_scan import Bytes, kernel, load_int32, load_uint64
 from epipole.schemas import log_bounds as bounds
 
-# -- The compiled loops that take most messages straight into columns.
-#
-# An encoding has located the fields of each message (see `messages.fields`). A scan takes the
-# messages one after the other as long as they are good: well formed, with every value usable. It
-# stops at the first other one. That one is decoded and judged in Python, which knows all forms
-# that are allowed (arrays in pieces, numbers one by one, big-endian CDR, JSON) and the reason
-# for leaving a message out. A scan takes nothing that Python would leave out or read
-# differently.
-
 MAX_NAMES = 1024  # sensors that a scan can tell apart; decoding has no limit
 NAME_BYTES = 63
 NAN_BITS, NO_SIGN = np.int32(0x7FC00000), np.int32(0x7FFFFFFF)  # of a float32
@@ -286,7 +277,7 @@ def scan_states(messages, i, names, frames, rows, n):
     return i, n
 
 
-# -- Names as small integers, which the compiled scans and the decoded messages share.
+# Names as small integers, shared by the compiled loops and by decoded messages.
 
 
 class NameCodes:

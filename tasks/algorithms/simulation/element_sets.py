@@ -1,4 +1,4 @@
-"""Positions of satellites by SGP4, the theory that published element sets are made for."""
+"""Positions of satellites from published element sets by SGP4, turned from TEME to GCRF."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from epipole.tasks.algorithms.simulation.constants import (
     UNIX_EPOCH_JD,
 )
 
-# -- Time scales, and the Earth's barycentric position and velocity, quickly for many times.
+# Time scales, and the Earth's barycentric position and velocity, for many times at once.
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
@@ -93,7 +93,7 @@ def directions_to_sun(time_ns: Nanoseconds) -> Array:
     return to_sun / np.linalg.norm(to_sun, axis=1, keepdims=True)
 
 
-# -- TEME, the frame of SGP4, in GCRF: by the equinox, where the pipeline goes by the CIO.
+# TEME to GCRF by the equinox; the pipeline goes by the CIO, so the two can be compared.
 
 
 def utc_julian_date(time_ns: Nanoseconds) -> tuple[Array, Array]:
@@ -128,7 +128,7 @@ def teme_from_gcrf(time_ns: Nanoseconds) -> Array:
     return teme_from_true @ true_from_gcrf
 
 
-# -- Positions of satellites by SGP4, the theory that published element sets are made for.
+# SGP4.
 
 SGP4_EPOCH_JD = 2433281.5  # 1949 December 31, 0h: SGP4 counts days from it
 # The arguments of `sgp4init`, in its order and units [days, rad, rad/min and 1 / Earth radii].

@@ -1,4 +1,4 @@
-"""The true camera: image places of directions in the sensor frame."""
+"""The true lines of sight and the true camera: where an object appears in the image."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM, LIGHT_KM_S
 
-# -- The true camera: image places of directions in the sensor frame.
+# The camera: directions in the sensor frame to pixel positions.
 
 Array = npt.NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def field_radius(optics: TrueOptics) -> float:
     return float(np.arctan(np.max(np.hypot(x, y)))) * 1.01 + 1e-4
 
 
-# -- Lines of sight: light time, aberration, and the Earth in between.
+# Lines of sight: light time, aberration, and the Earth in between.
 
 
 def boost(n: Array, v_km_s: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Paths of bodies: two-body orbits, and positions sampled at even times with cubics between."""
+"""Paths of bodies: two-body orbits, or sampled positions with cubics between them."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.simulation.constants import GM_KM3_S2
 
-# -- Two-body orbits about the Earth.
+# Two-body orbits about the Earth.
 
 Array = npt.NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def elements_from_state(r_km: Array, v_km_s: Array) -> Array:
     return np.array([a, e, i, raan, argp, mean])
 
 
-# -- Paths of bodies: two-body orbits, and positions sampled at even times with cubics between.
+# Sampled paths.
 
 Indices = npt.NDArray[np.int64]
 

@@ -1,4 +1,4 @@
-"""A simulated sensor: times of exposure, attitudes, and the states that it reports."""
+"""A simulated sensor: pointing, times of exposure, attitudes, and the states that it reports."""
 
 import zlib
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from epipole.tasks.algorithms.simulation.constants import EARTH_RADIUS_KM, SECON
 from epipole.tasks.algorithms.simulation.optics import TrueOptics, hidden_by_earth
 from epipole.tasks.algorithms.simulation.paths import Paths
 
-# -- Pointing: attitudes that track an object, stay fixed, spin or jump.
+# Pointing: attitudes that track an object, stay fixed, spin or jump.
 
 Array = npt.NDArray[np.float64]
 
@@ -80,7 +80,7 @@ def random_attitudes(
     return Rotation.from_quat(q)
 
 
-# -- A simulated sensor: times of exposure, attitudes, and the states that it reports.
+# Exposures and reported states.
 
 Nanoseconds = npt.NDArray[np.int64]
 

@@ -1,4 +1,4 @@
-"""Star field: a catalogue sorted into zones of declination, and directions of its stars."""
+"""What shines in the simulated sky: stars, and objects with their magnitudes."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ from epipole.tasks.algorithms.simulation.constants import (
 )
 from epipole.tasks.algorithms.simulation.paths import Paths
 
-# -- Star field: a catalogue sorted into zones of declination, and directions of its stars.
+# Stars, in zones of declination.
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -134,7 +134,7 @@ def star_directions(
     return u / np.linalg.norm(u, axis=1, keepdims=True)
 
 
-# -- How bright objects are, and which of them a sensor detects.
+# Magnitudes of objects, and which of them a sensor detects.
 
 STANDARD_RANGE_KM = 1000.0
 
@@ -185,7 +185,7 @@ def detection_probability(magnitude: Array, limit: float, fade: float) -> Array:
     return ndtr((limit - magnitude) / fade)
 
 
-# -- The objects of a scene: where they are, and how bright they seem.
+# Objects.
 
 
 @dataclass(frozen=True)
