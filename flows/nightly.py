@@ -36,8 +36,8 @@ from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import (
     check_folder,
     check_sources,
-    claim_nights,
-    night_place,
+    lock_nights,
+    night_location,
 )
 from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.paths import known_as
@@ -102,9 +102,9 @@ def nightly(
     known_key = catalogue.sha256 if catalogue else None
     if not again and (same := unchanged_nights(out, given, night, settings, known_key)):
         LOGGER.info("unchanged: %s", ", ".join(same))
-        return summarise(out, {date: night_place(out, date) for date in same}, unchanged=True)
-    # Claims are held by `with`: a signal that came while an ExitStack takes one would leave it.
-    with claim_nights(out, [night] if night else []) as run:
+        return summarise(out, {date: night_location(out, date) for date in same}, unchanged=True)
+    # Locks are released by `with`: a signal while an ExitStack takes one would leave it locked.
+    with lock_nights(out, [night] if night else []) as run:
         frames = read(given.paths, ReadFolder(run), settings)
 
         nights = nights_of(np.concatenate([np.empty(0, np.int64), *frames.time_ns]))
@@ -121,7 +121,7 @@ def nightly(
             known_key,
         )
         staged: dict[str, Path] = {}
-        with claim_nights(out, [] if night else chosen) as staging, ExitStack() as kept:
+        with lock_nights(out, [] if night else chosen) as staging, ExitStack() as kept:
             for date in chosen:
                 if len(chosen) > 1:
                     LOGGER.info("night %s", date)

@@ -17,7 +17,7 @@ from epipole.flows.prefect.server_process import Launched, launch
 from epipole.io.caches.kernel_warm_up import compile_beside, compile_kernels, compiling_told
 from epipole.io.catalogues.element_sets import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
-from epipole.io.datasets.dataset import check_folder, night_place
+from epipole.io.datasets.dataset import check_folder, night_location
 from epipole.io.logs.listing import list_logs
 from epipole.io.settings_file import read_settings
 from epipole.schemas.errors import EpipoleError, NoFramesError
@@ -132,7 +132,7 @@ class Nights:
             return None
         given = find_logs(self._logs, night)
         same = unchanged_nights(self._out, given, night, self._settings, self._known_key)
-        places = {date: night_place(self._out, date) for date in same}
+        places = {date: night_location(self._out, date) for date in same}
         return summarise(self._out, places, unchanged=True) if same else None
 
     def _start(self, started: contextlib.ExitStack) -> Callable[[str | None], Summary]:

@@ -1,41 +1,34 @@
 """Datasets: one folder per night, with one folder per table, published night by night.
 
 The layout is ``DATASET/night=YYYY-MM-DD/<table>/part-0.parquet``. A dataset is a local folder
-(`local_nights`: a night is put in place by one rename) or lies behind an fsspec URL such as
-``s3://bucket/dataset`` (`store_nights`: nights are committed by one object). A reader never sees
+(`local`: a night is put in place by one rename) or it is behind an fsspec URL such as
+``s3://bucket/dataset`` (`object_store`: nights are committed by one object). A reader never sees
 half a night. A run that fails or is killed leaves the dataset unchanged.
 """
 
 import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 import pyarrow as pa
 
-from epipole.io.caches.private_folders import temporary_folder
-from epipole.io.datasets import local as local_nights
-from epipole.io.datasets.local import STAGING, sync
+from epipole.io.datasets.local import REPORTS
+from epipole.io.datasets.lock_record import STAGING
 from epipole.io.datasets.night_tables import NightReader
-from epipole.io.datasets.object_store import StoreNights, store_nights
-from epipole.io.datasets.plain_files import refuse_link
+from epipole.io.datasets.storage import NightStorage, Where, night_storage, reading
 from epipole.io.datasets.table_pieces import Between, read_pieces
-from epipole.io.paths import fault_of_name, known_as, line_of, shown_error, storage_errors
+from epipole.io.paths import fault_of_name, line_of
 from epipole.schemas.bridge import conform
-from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.spans import Span
 from epipole.schemas.tables import TABLES
 
-REPORTS = "reports"  # beside the nights, never in them: readers scan night=*
-
-Where = Path | str
-
 
 def check_folder(dataset: Where) -> None:
-    """Raise unless this is a dataset, or a place where a dataset can be created.
+    """Raise unless this is a dataset, or a dataset can be created here.
 
     Raises
     ------
@@ -44,19 +37,10 @@ def check_folder(dataset: Where) -> None:
     """
     if (fault := fault_of_name(str(dataset))) is not None:
         raise DatasetError(f"dataset {dataset}: {fault}")
-    if (store := _store(dataset)) is not None:
-        with _reading(dataset):
-            names = store.names()
-    else:
-        try:
-            folder = _folder(dataset)
-            if folder.exists() and not folder.is_dir():
-                raise DatasetError(f"{dataset}: is a file, not a folder; give another folder")
-            names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
-        except OSError as error:
-            raise DatasetError(f"{dataset}: {error.strerror}; give another folder") from error
-    own = (STAGING, REPORTS)
-    if names and not any(name in own or name.startswith("night=") for name in names):
+    storage = night_storage(dataset)
+    with reading(dataset, storage.errors):
+        names = storage.names()
+    if names and not any(n in (STAGING, REPORTS) or n.startswith("night=") for n in names):
         raise DatasetError(
             f"{dataset}: holds other files and no dataset (no night=... folder); "
             "give an empty folder or a dataset"
@@ -72,22 +56,18 @@ def require_dataset(dataset: Where) -> None:
         As `check_folder`, and where the folder is missing.
     """
     check_folder(dataset)
-    store = _store(dataset)
-    if not (_folder(dataset).is_dir() if store is None else store.names()):
+    if not night_storage(dataset).exists():
         raise DatasetError(f"{dataset}: no such folder; check the path")
 
 
 def nights_in(dataset: Where) -> list[str]:
     """Return the nights of a dataset, ``YYYY-MM-DD``, in order. A missing dataset has none.
 
-    A folder whose name has no such date is no night.
+    Folders whose names have no such date are skipped.
     """
-    if (store := _store(dataset)) is not None:
-        with _reading(dataset):
-            return store.nights()
-    local_nights.recover(_folder(dataset))
-    folders = [path for path in _folder(dataset).glob("night=*") if path.is_dir()]
-    return sorted(filter(is_night, (path.name.removeprefix("night=") for path in folders)))
+    storage = night_storage(dataset)
+    with reading(dataset, storage.errors):
+        return storage.nights()
 
 
 def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, replace: bool) -> None:
@@ -162,12 +142,9 @@ def table_pieces(
     if between_ns is not None:
         time = "epoch" if "epoch" in TABLES[table].names else "time"
     wanted = schema if time is None or time in columns else schema.append(TABLES[table].field(time))
-    if (store := _store(dataset)) is not None:
-        with _reading(dataset):
-            parts: Sequence[Any] = [pa.BufferReader(part) for part in store.read(night, table)]
-    else:
-        local_nights.recover(_folder(dataset))
-        parts = sorted((_folder(dataset).absolute() / f"night={night}" / table).glob("*.parquet"))
+    storage = night_storage(dataset)
+    with reading(dataset, storage.errors):
+        parts = storage.files(night, table)
     try:
         for part in parts:
             for rows in read_pieces(part, wanted, time, between_ns or (None, None)):
@@ -205,30 +182,34 @@ def night_row(dataset: Where, night: str) -> dict[str, Any] | None:
 
 def missing_tables(dataset: Where, night: str) -> list[str]:
     """Return the tables that a night has no file of: made by an older version, or damaged."""
-    if (store := _store(dataset)) is not None:
-        with _reading(dataset):
-            held = store.tables(night)
-    else:
-        local_nights.recover(_folder(dataset))
-        files = (_folder(dataset) / f"night={night}").glob("*/*.parquet")
-        held = {file.parent.name for file in files}
-    return [name for name in TABLES if name not in held]
+    storage = night_storage(dataset)
+    with reading(dataset, storage.errors):
+        present = storage.tables(night)
+    return [name for name in TABLES if name not in present]
 
 
-def night_place(dataset: Where, night: str) -> Where:
+def night_location(dataset: Where, night: str) -> Where:
     """Return the folder of a night; of a dataset in a store, its URL."""
-    folder = dataset_folder(dataset)
-    name = f"night={night}"
-    return f"{str(dataset).rstrip('/')}/{name}" if folder is None else folder / name
+    return night_storage(dataset).location(night)
+
+
+def dataset_folder(dataset: Where) -> Path | None:
+    """Return the local folder of a dataset. None: it is in an object store."""
+    return night_storage(dataset).folder
+
+
+def locked_nights(dataset: Where) -> set[str]:
+    """Return the nights that living runs have locked."""
+    storage = night_storage(dataset)
+    with reading(dataset, storage.errors):
+        return storage.locked_nights()
 
 
 def night_reader(dataset: Where, night: str) -> NightReader:
     """Return a published night, to be read piece by piece."""
-    where = f"{dataset}/night={night}"
-    if (store := _store(dataset)) is not None:
-        return NightReader(where, night, lambda table: store.opened(night, table))
-    local_nights.recover(_folder(dataset))
-    return NightReader.of_folder(_folder(dataset) / f"night={night}", night)
+    storage = night_storage(dataset)
+    files = partial(storage.open_files, night)
+    return NightReader(str(storage.location(night)), night, files)
 
 
 def write_report(dataset: Where, night: str, text: str, staging: Path) -> None:
@@ -237,27 +218,21 @@ def write_report(dataset: Where, night: str, text: str, staging: Path) -> None:
     Parameters
     ----------
     staging
-        The folder of this run; see `claim_nights`.
+        The folder of this run; see `lock_nights`.
 
     Raises
     ------
     DatasetError
         Where it cannot be written.
     """
-    with _writing(dataset):
-        if (store := _store(dataset)) is not None:
-            store.write(f"{REPORTS}/{night}.html", text.encode())
-            return
-        staged, folder = staging / f"{night}.html", _folder(dataset) / REPORTS
-        staged.write_text(text, encoding="utf-8")
-        refuse_link(folder)
-        folder.mkdir(exist_ok=True)
-        staged.replace(folder / staged.name)
+    storage = night_storage(dataset)
+    with _writing(dataset, storage):
+        storage.write_report(night, text, staging)
 
 
 @contextlib.contextmanager
-def claim_nights(dataset: Where, nights: Sequence[str]) -> Iterator[Path]:
-    """Reserve these nights for this run: no other run can work on them.
+def lock_nights(dataset: Where, nights: Sequence[str]) -> Iterator[Path]:
+    """Lock these nights for this run: no other run can work on them.
 
     Yields
     ------
@@ -273,13 +248,10 @@ def claim_nights(dataset: Where, nights: Sequence[str]) -> Iterator[Path]:
         its host and its start), the folder is not a dataset, or it cannot be written.
     """
     check_folder(dataset)
-    with contextlib.ExitStack() as held:
-        with _writing(dataset):
-            if (store := _store(dataset)) is not None:
-                held.enter_context(store.claims.claim(nights))
-                work = held.enter_context(temporary_folder("night"))
-            else:
-                work = held.enter_context(local_nights.claim(_folder(dataset), nights))
+    storage = night_storage(dataset)
+    with contextlib.ExitStack() as stack:
+        with _writing(dataset, storage):
+            work = stack.enter_context(storage.lock_nights(nights))
         yield work
 
 
@@ -292,7 +264,7 @@ def publish_folders(
     ----------
     staged
         For each night, ``YYYY-MM-DD``, a folder with every table: ``<table>/*.parquet``. It lies
-        on the dataset's file system (see `claim_nights`) and is moved from there.
+        on the dataset's file system (see `lock_nights`) and is moved from there.
     sources
         The logs that the nights were made from.
     replace
@@ -312,19 +284,9 @@ def publish_folders(
     for folder in staged.values():
         _require_whole(folder)
     nights = list(staged)
-    with _writing(dataset):
-        if (store := _store(dataset)) is not None:
-            with store.claims.claim(store.claims.missing(nights)):
-                store.recover()
-                check_sources(dataset, nights, sources, replace)
-                store.publish(staged)
-            return
-        for folder in staged.values():
-            for path in [*folder.rglob("*"), folder]:
-                sync(path)
-        with local_nights.alone(_folder(dataset)):
-            check_sources(dataset, nights, sources, replace)
-            local_nights.put_all_in_place(_folder(dataset), staged)
+    storage = night_storage(dataset)
+    with _writing(dataset, storage):
+        storage.publish(staged, check=lambda: check_sources(dataset, nights, sources, replace))
 
 
 def _require_whole(folder: Path) -> None:
@@ -333,33 +295,14 @@ def _require_whole(folder: Path) -> None:
         raise ValueError(f"{folder}: is not a whole night: {', '.join(missing)} missing")
 
 
-def _store(dataset: Where) -> StoreNights | None:
-    """Return the object store that a URL names. None: the dataset is a local folder."""
-    where = str(dataset)
-    if "://" not in where or where.startswith("file://"):
-        return None
-    with _reading(dataset):
-        return store_nights(known_as(where))
-
-
-def dataset_folder(dataset: Where) -> Path | None:
-    """Return the local folder of a dataset. None: it lies in an object store."""
-    return _folder(dataset) if _store(dataset) is None else None
-
-
-def _folder(dataset: Where) -> Path:
-    return Path(unquote(urlsplit(str(dataset)).path)) if "://" in str(dataset) else Path(dataset)
-
-
 @contextlib.contextmanager
-def _writing(dataset: Where) -> Iterator[None]:
+def _writing(dataset: Where, storage: NightStorage) -> Iterator[None]:
     """Turn errors of writing into `DatasetError`."""
-    kinds = (OSError,) if _store(dataset) is None else storage_errors()
     try:
         yield
     except DatasetError:
         raise
-    except kinds as error:
+    except storage.errors() as error:
         reason = getattr(error, "strerror", None) or line_of(error)
         where = getattr(error, "filename", None)
         if where is not None and STAGING in Path(os.fsdecode(where)).parts:
@@ -367,13 +310,3 @@ def _writing(dataset: Where) -> Iterator[None]:
         raise DatasetError(
             f"{dataset}: cannot be written ({reason}); the dataset is unchanged"
         ) from error
-
-
-@contextlib.contextmanager
-def _reading(dataset: Where) -> Iterator[None]:
-    try:
-        yield
-    except DatasetError:
-        raise
-    except storage_errors() as error:
-        raise DatasetError(f"{dataset}: cannot be read: {line_of(error)}") from shown_error(error)

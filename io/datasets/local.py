@@ -1,8 +1,8 @@
-"""Nights in a local folder: claimed by a lock, put in place by a rename, recovered after a kill.
+"""Nights in a local folder: locked by a file, put in place by a rename, recovered after a kill.
 
-Unfinished work lies in ``DATASET/.staging``:
+Unfinished work is in ``DATASET/.staging``:
 
-- ``lock``: held briefly by a run that changes the staging folder or puts nights in place;
+- ``lock``: taken briefly by a run that changes the staging folder or puts nights in place;
 - ``run-*/``: the folder of one run. Its file ``claim`` is locked as long as the run lives, and
   names the nights that the run works on;
 - ``swap-*/``: nights that are being replaced, and the file ``commit.json``, which publishes all
@@ -13,8 +13,8 @@ Other files in it are left alone. Whoever may write to the dataset may have writ
 too. So a commit is finished only where it names dates, and folders of runs in the staging folder,
 and where none of these is a link.
 
-The kernel releases a lock when its process ends, however it ends. So a claim that can be locked
-belongs to a run that has ended, and the next run removes its folder.
+The kernel releases a lock when its process ends, however it ends. So where the file of a run can be
+locked, the run has ended, and the next run removes its folder.
 """
 
 import contextlib
@@ -29,11 +29,11 @@ import shutil
 import stat
 import threading
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from epipole.io.datasets.lock_record import Holder
+from epipole.io.datasets.lock_record import STAGING, LockRecord
 from epipole.io.datasets.plain_files import entered, opened, read_small, refuse_link
 from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
@@ -121,52 +121,115 @@ def sync(path: Path) -> None:
 
 LOGGER = logging.getLogger(__name__)
 
-STAGING = ".staging"
-CLAIM = "claim"
+LOCK = "claim"  # the file in the folder of a run; earlier versions give it this name too
 COMMIT = "commit.json"
+REPORTS = "reports"  # beside the nights, never in them: readers scan night=*
 
 # A folder in the folder of a run, as a commit names it from `swap-*`.
 _STAGED = re.compile(r"\.\./(run-[\w-]+)/([\w=-]+)", re.ASCII)
 
 
-@contextlib.contextmanager
-def claim(dataset: Path, nights: Sequence[str]) -> Iterator[Path]:
-    """Reserve these nights, and yield a folder for this run on the dataset's file system.
+class LocalNights:
+    """The nights of a dataset in a local folder; see `NightStorage` for the methods."""
 
-    Raises
-    ------
-    DatasetError
-        Where a living run has claimed one of them. The message names the run.
-    OSError
-        Where the folder cannot be written.
-    """
-    made = not dataset.exists()
-    run = dataset / STAGING / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-    try:
-        dataset.mkdir(parents=True, exist_ok=True)
-        with contextlib.ExitStack() as held:
-            with _locked(dataset) as staging:
-                _clear(dataset, staging)
-                for other in _folders(staging, "run-*"):
-                    claimed = other / CLAIM
-                    Holder.read(read_small(claimed), claimed).refuse(dataset, nights)
-                run.mkdir()
-                file = held.enter_context((run / CLAIM).open("w"))
-                fcntl.flock(file, fcntl.LOCK_EX)
-                file.write(Holder.of(nights).text())
-                file.flush()
-            yield run
-    finally:  # of the claim too: Ctrl-C may come between any two of its steps
-        _release(dataset, run)
-        if made:
-            with contextlib.suppress(OSError):  # not empty if nights were published
-                dataset.rmdir()
+    def __init__(self, folder: Path, dataset: str) -> None:
+        """`dataset` is the name of the folder in messages."""
+        self.folder, self._dataset = folder, dataset
+
+    def errors(self) -> tuple[type[Exception], ...]:
+        """Return the errors of a file system."""
+        return (OSError,)
+
+    def names(self) -> list[str]:
+        """Return the names at the top of the dataset."""
+        try:
+            if self.folder.exists() and not self.folder.is_dir():
+                raise DatasetError(f"{self._dataset}: is a file, not a folder; give another folder")
+            return [entry.name for entry in self.folder.iterdir()] if self.folder.is_dir() else []
+        except OSError as error:
+            raise DatasetError(f"{self._dataset}: {error.strerror}; give another folder") from error
+
+    def exists(self) -> bool:
+        """Return whether the folder exists; it may be empty."""
+        return self.folder.is_dir()
+
+    def nights(self) -> list[str]:
+        """Return the published nights, in order."""
+        recover(self.folder)
+        folders = [path for path in self.folder.glob("night=*") if path.is_dir()]
+        return sorted(filter(is_night, (path.name.removeprefix("night=") for path in folders)))
+
+    def tables(self, night: str) -> set[str]:
+        """Return the names of the tables that a night has files of."""
+        recover(self.folder)
+        return {file.parent.name for file in self._night(night).glob("*/*.parquet")}
+
+    def files(self, night: str, table: str) -> list[Path]:
+        """Return the files of a table of a night, in order."""
+        recover(self.folder)
+        return sorted((self._night(night).absolute() / table).glob("*.parquet"))
+
+    def open_files(self, night: str, table: str) -> list[Path]:
+        """Return the same: of a file only what is needed is read anyway."""
+        return self.files(night, table)
+
+    def location(self, night: str) -> Path:
+        """Return the folder of a night."""
+        return self._night(night)
+
+    def _night(self, night: str) -> Path:
+        return self.folder / f"night={night}"
+
+    def write_report(self, night: str, text: str, staging: Path) -> None:
+        """Write a report by one rename from the folder of a run."""
+        staged, folder = staging / f"{night}.html", self.folder / REPORTS
+        staged.write_text(text, encoding="utf-8")
+        refuse_link(folder)
+        folder.mkdir(exist_ok=True)
+        staged.replace(folder / staged.name)
+
+    @contextlib.contextmanager
+    def lock_nights(self, nights: Sequence[str]) -> Iterator[Path]:
+        """Lock these nights, and yield a folder for this run on the dataset's file system."""
+        made = not self.folder.exists()
+        run = self.folder / STAGING / f"run-{os.getpid()}-{uuid.uuid4().hex[:8]}"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with contextlib.ExitStack() as stack:
+                with _locked(self.folder) as staging:
+                    _clear(self.folder, staging)
+                    for other in _folders(staging, "run-*"):
+                        _read_lock(other).refuse(self._dataset, nights)
+                    run.mkdir()
+                    file = stack.enter_context((run / LOCK).open("w"))
+                    fcntl.flock(file, fcntl.LOCK_EX)
+                    file.write(LockRecord.of(nights).text())
+                    file.flush()
+                yield run
+        finally:  # of the lock too: Ctrl-C may come between any two of its steps
+            _release(self.folder, run)
+            if made:
+                with contextlib.suppress(OSError):  # not empty if nights were published
+                    self.folder.rmdir()
+
+    def locked_nights(self) -> set[str]:
+        """Return the nights that living runs have locked."""
+        living = filter(_is_alive, _folders(self.folder / STAGING, "run-*"))
+        return {night for run in living for night in _read_lock(run).nights}
+
+    def publish(self, staged: Mapping[str, Path], check: Callable[[], None]) -> None:
+        """Put the nights in place, each by one rename: all or none."""
+        for folder in staged.values():
+            for path in [*folder.rglob("*"), folder]:
+                sync(path)
+        with _locked(self.folder) as staging:  # waits while another run publishes
+            _clear(self.folder, staging)
+            check()
+            _put_all_in_place(self.folder, staged)
 
 
-def claimed_nights(dataset: Path) -> set[str]:
-    """Return the nights that living runs have claimed."""
-    claims = [run / CLAIM for run in _folders(dataset / STAGING, "run-*") if _is_alive(run)]
-    return {night for file in claims for night in Holder.read(read_small(file), file).nights}
+def _read_lock(run: Path) -> LockRecord:
+    return LockRecord.read(read_small(run / LOCK), run / LOCK)
 
 
 def _release(dataset: Path, run: Path) -> None:
@@ -178,11 +241,11 @@ def _release(dataset: Path, run: Path) -> None:
         shutil.rmtree(gone, ignore_errors=True)
 
 
-def put_all_in_place(dataset: Path, staged: Mapping[str, Path]) -> None:
+def _put_all_in_place(dataset: Path, staged: Mapping[str, Path]) -> None:
     """Make these folders the nights of a dataset, each by one rename: all or none.
 
-    The folders lie in the folder of a run; see `claim`. Must be called inside `alone`. Where this
-    process is killed once the commit is written, `alone` and `recover` finish it.
+    The folders are in the folder of a run; the caller has locked the staging folder. Where this
+    process is killed once the commit is written, the next run or reader finishes it.
 
     Raises
     ------
@@ -253,7 +316,7 @@ def _read_commit(commit: Path) -> list[_Move]:
 
 
 def recover(dataset: Path) -> None:
-    """Finish what a killed run has committed; a reader that may not write reads what is there.
+    """Finish what a killed run has committed, if this process may write to the dataset.
 
     Nothing else is changed, and a line says that it was done.
     """
@@ -274,7 +337,7 @@ def _finish(dataset: Path, swap: Path) -> None:
     try:
         moves = _read_commit(swap / COMMIT)
     except FileNotFoundError:
-        return  # killed before it had published anything
+        return  # killed before it published anything
     for move in moves:
         refuse_link(dataset / f"night={move.night}")
         with contextlib.suppress(FileNotFoundError):  # moved before: its run's folder may be gone
@@ -308,21 +371,14 @@ def _inode(path: Path) -> int | None:
 
 
 @contextlib.contextmanager
-def alone(dataset: Path) -> Iterator[None]:
-    """Wait until no other run publishes here, and keep others out. Clear what killed runs left."""
-    with _locked(dataset) as staging:
-        _clear(dataset, staging)
-        yield
-
-
-@contextlib.contextmanager
 def _locked(dataset: Path) -> Iterator[Path]:
+    """Yield the staging folder, locked: waits while another run changes or publishes something."""
     staging = dataset / STAGING
     path = staging / "lock"
-    with contextlib.ExitStack() as held:
-        _let_go(path)
+    with contextlib.ExitStack() as stack:
+        _close_lock_file(path)
         while True:
-            refuse_link(staging)  # what is behind it is not ours to change
+            refuse_link(staging)  # nothing outside the dataset may be changed
             refuse_link(path)
             with contextlib.suppress(FileNotFoundError):  # its last holder has just removed it
                 try:
@@ -333,13 +389,13 @@ def _locked(dataset: Path) -> Iterator[Path]:
                     raise
                 with entered(dataset, STAGING) as folder:
                     descriptor = opened(folder / path.name, os.O_RDWR | os.O_CREAT)
-                lock = held.enter_context(open(descriptor, "w"))
-                _HELD[path, threading.get_ident()] = lock
+                lock = stack.enter_context(open(descriptor, "w"))
+                _LOCK_FILES[path, threading.get_ident()] = lock
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 if path.exists() and os.path.samestat(os.fstat(lock.fileno()), path.stat()):
                     break
                 lock.close()
-        held.callback(_unlock, staging, path)
+        stack.callback(_unlock, staging, path)
         yield staging
 
 
@@ -351,15 +407,15 @@ def _unlock(staging: Path, path: Path) -> None:
 
 
 # The open lock files of this process, by path and thread.
-_HELD: dict[tuple[Path, int], IO[str]] = {}
+_LOCK_FILES: dict[tuple[Path, int], IO[str]] = {}
 
 
-def _let_go(path: Path) -> None:
+def _close_lock_file(path: Path) -> None:
     """Close this thread's lock file if it is still open: else the thread would wait for itself.
 
     Ctrl-C may come between two steps of taking the lock; the exception then keeps the file open.
     """
-    left = _HELD.pop((path, threading.get_ident()), None)
+    left = _LOCK_FILES.pop((path, threading.get_ident()), None)
     if left is not None:
         left.close()
 
@@ -373,8 +429,8 @@ def _clear(dataset: Path, staging: Path) -> None:
         _finish(dataset, swap)
         for old in swap.glob("old-night=*"):
             target = dataset / old.name.removeprefix("old-")
-            is_one = is_night(target.name.removeprefix("night=")) and not old.is_symlink()
-            if is_one and _inode(target) is None:
+            is_valid = is_night(target.name.removeprefix("night=")) and not old.is_symlink()
+            if is_valid and _inode(target) is None:
                 old.rename(target)
         shutil.rmtree(swap)
     for run in _folders(staging, "run-*"):
@@ -383,16 +439,16 @@ def _clear(dataset: Path, staging: Path) -> None:
 
 
 def _folders(staging: Path, pattern: str) -> list[Path]:
-    """Return the folders in the staging folder; files and links there are not ours."""
+    """Return the folders in the staging folder; files and links in it are ignored."""
     return [path for path in staging.glob(pattern) if path.is_dir() and not path.is_symlink()]
 
 
 def _is_alive(run: Path) -> bool:
     try:
-        with open(opened(run / CLAIM, os.O_RDWR), "r+") as file:
+        with open(opened(run / LOCK, os.O_RDWR), "r+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     except FileNotFoundError:
-        return False  # killed before it wrote its claim
+        return False  # killed before it wrote its lock
     return False

@@ -1,4 +1,4 @@
-"""The content of a claim: which run works on which nights of a dataset."""
+"""Locks of nights: which run works on which nights of a dataset, as a line of JSON."""
 
 import json
 import os
@@ -13,47 +13,49 @@ from typing import Self
 from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
 
+STAGING = ".staging"  # the folder of a dataset that has locks and unfinished work
+
 
 @dataclass(frozen=True)
-class Holder:
-    """A run, and the nights that it has claimed."""
+class LockRecord:
+    """A run, and the nights that it has locked."""
 
     nights: list[str]
     host: str
     pid: int
     since: str
     machine: str  # where process numbers are unique; empty: unknown
-    token: str  # unique to the claim
+    token: str  # unique to the lock
 
     @classmethod
     def of(cls, nights: Sequence[str]) -> Self:
-        """Return a holder for this process, from now on."""
+        """Return the record of this process, from now on."""
         since = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         host, token = socket.gethostname(), uuid.uuid4().hex
         return cls(sorted(nights), host, os.getpid(), since, _machine(), token)
 
     @classmethod
     def read(cls, text: str | bytes, where: object) -> Self:
-        """Return the holder that `text` wrote; `where` names the file in messages.
+        """Return the record that `text` wrote; `where` names the file in messages.
 
         Raises
         ------
         DatasetError
-            Where it is no claim.
+            Where it is not the record of a lock.
         """
         try:
-            holder = cls(**json.loads(text))
-            words = (holder.host, holder.since, holder.machine, holder.token)
-            if not all(isinstance(word, str) for word in words) or type(holder.pid) is not int:
+            record = cls(**json.loads(text))
+            words = (record.host, record.since, record.machine, record.token)
+            if not all(isinstance(word, str) for word in words) or type(record.pid) is not int:
                 raise TypeError
-            if not isinstance(holder.nights, list) or not all(map(is_night, holder.nights)):
+            if not isinstance(record.nights, list) or not all(map(is_night, record.nights)):
                 raise TypeError
         except (TypeError, ValueError, RecursionError) as error:
-            raise DatasetError(f"{where}: is not a claim of a run; remove it") from error
-        return holder
+            raise DatasetError(f"{where}: is not the lock of a run; remove it") from error
+        return record
 
     def text(self) -> str:
-        """Return the holder as a line of JSON."""
+        """Return the record as a line of JSON."""
         return json.dumps(asdict(self)) + "\n"
 
     def is_gone(self) -> bool:
@@ -69,7 +71,7 @@ class Holder:
         return False
 
     def refuse(self, dataset: object, nights: Sequence[str]) -> None:
-        """Raise where this holder has claimed one of these nights.
+        """Raise where its run has locked one of these nights.
 
         Raises
         ------

@@ -2,7 +2,7 @@
 
 1. Every file of the nights is written to ``.staging/run-<token>/``.
 2. ``.staging/commit-<token>.json`` is written by one PUT. This publishes all nights of the run:
-   from now on `read` takes the staged files.
+   from now on readers take the staged files.
 3. The store copies the files to ``night=YYYY-MM-DD/<table>/``; each copy is atomic, and `sources`
    comes last. Other files of the old night are removed.
 4. The commit is removed, then the staged files.
@@ -17,7 +17,7 @@ import contextlib
 import json
 import re
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -25,50 +25,52 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from epipole.io.datasets.lock_record import Holder
+import pyarrow as pa
+
+from epipole.io.caches.private_folders import temporary_folder
+from epipole.io.datasets.local import REPORTS
+from epipole.io.datasets.lock_record import STAGING, LockRecord
 from epipole.io.paths import file_system, line_of, storage_errors
 from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
 
-# -- Claims of nights in an object store: objects that a run renews.
+# Locks of nights: objects that a run renews.
 #
-# ``.staging/claim-night=YYYY-MM-DD.json`` is created only if it does not exist (on S3 by ``If-
-# None-Match: *``). Its run renews it every minute. A claim that was not renewed for `LEASE_S`
-# belongs to a run that has ended, and may be taken over. If that run was a process of this
-# machine that has ended, this is known at once. The machine's clock must agree with the store's
-# to about a minute.
+# ``.staging/claim-night=YYYY-MM-DD.json`` is created only if it does not exist (on S3 by
+# ``If-None-Match: *``). Its run renews it every minute. A lock that was not renewed for `LEASE_S`
+# belongs to a run that has ended, and may be taken over. If that run was a process of this machine,
+# its end is known at once. The clocks of machine and store must agree to about a minute.
 
-STAGING = ".staging"
 RENEWED_EVERY_S = 60.0
 LEASE_S = 300.0
 
 
-class StoreClaims:
-    """The claims of one dataset, and those of them that this process holds."""
+class StoreLocks:
+    """The locks of one dataset, and those of them that this process has."""
 
     def __init__(self, storage: Any, root: str, dataset: str) -> None:
         self._storage, self._root, self._dataset = storage, root, dataset
-        self._held: dict[str, Holder] = {}
+        self._locked: dict[str, LockRecord] = {}
 
     @contextlib.contextmanager
-    def claim(self, nights: Sequence[str]) -> Iterator[None]:
-        """Reserve these nights for this run.
+    def lock(self, nights: Sequence[str]) -> Iterator[None]:
+        """Lock these nights for this run.
 
         Raises
         ------
         DatasetError
-            Where a living run has claimed one of them. The message names the run.
+            Where a living run has locked one of them. The message names the run.
         """
-        holder, ended = Holder.of(nights), threading.Event()
+        record, ended = LockRecord.of(nights), threading.Event()
         taken: list[str] = []
         renewing = threading.Thread(
-            target=self._renew, args=(holder, taken, ended), name="renew claims", daemon=True
+            target=self._renew, args=(record, taken, ended), name="renew locks", daemon=True
         )
         try:
-            for night in holder.nights:
-                self._take(night, holder)
+            for night in record.nights:
+                self._take(night, record)
                 taken.append(night)
-                self._held[night] = holder
+                self._locked[night] = record
             if taken:
                 renewing.start()
             yield
@@ -77,54 +79,63 @@ class StoreClaims:
             if renewing.ident is not None:
                 renewing.join()
             for night in taken:
-                self._held.pop(night, None)
+                self._locked.pop(night, None)
                 with contextlib.suppress(*storage_errors()):  # else the next run takes it over
-                    if self._is_held(night, holder):
+                    if self._has_lock(night, record):
                         self._storage.rm_file(self._path(night))
 
     def missing(self, nights: Sequence[str]) -> list[str]:
-        """Return the nights among these that this process has not claimed."""
-        return [night for night in nights if night not in self._held]
+        """Return the nights among these that this process has not locked."""
+        return [night for night in nights if night not in self._locked]
 
     def verify(self, nights: Sequence[str]) -> None:
-        """Raise unless this process still holds the claims of these nights.
+        """Raise unless this process still has the locks of these nights.
 
         Raises
         ------
         DatasetError
-            Where another run has taken over a claim that was not renewed in time.
+            Where another run has taken over a lock that was not renewed in time.
         """
         for night in nights:
-            if not self._is_held(night, self._held[night]):
+            if not self._has_lock(night, self._locked[night]):
                 raise DatasetError(
                     f"{self._dataset}/night={night}: another run has taken it over, because this "
-                    "run did not renew its claim in time; run again"
+                    "run did not renew its lock in time; run again"
                 )
 
     def alive(self) -> set[str]:
-        """Return the tokens of the living runs, and remove the claims of runs that have ended."""
+        """Return the tokens of the living runs, and remove the locks of runs that have ended."""
         tokens = set()
-        for path in self._storage.glob(f"{self._root}/{STAGING}/claim-*.json"):
-            holder = self._read(path)
-            if holder is not None and self._is_dead(path, holder):
+        for path, record in self._records():
+            if self._is_dead(path, record):
                 with contextlib.suppress(FileNotFoundError):
                     self._storage.rm_file(path)
-            elif holder is not None:
-                tokens.add(holder.token)
+            else:
+                tokens.add(record.token)
         return tokens
 
+    def nights(self) -> set[str]:
+        """Return the nights that living runs have locked."""
+        living = [r for path, r in self._records() if not self._is_dead(path, r)]
+        return {night for record in living for night in record.nights}
+
+    def _records(self) -> Iterator[tuple[str, LockRecord]]:
+        for path in self._storage.glob(f"{self._root}/{STAGING}/claim-*.json"):
+            if (record := self._read(path)) is not None:
+                yield path, record
+
     def token(self, night: str) -> str:
-        """Return the token of a claim that this process holds."""
-        return self._held[night].token
+        """Return the token of a lock that this process has."""
+        return self._locked[night].token
 
     def _path(self, night: str) -> str:
         return f"{self._root}/{STAGING}/claim-night={night}.json"
 
-    def _take(self, night: str, holder: Holder) -> None:
+    def _take(self, night: str, record: LockRecord) -> None:
         path = self._path(night)
         for _ in range(2):
             try:
-                self._storage.pipe_file(path, holder.text().encode(), mode="create")
+                self._storage.pipe_file(path, record.text().encode(), mode="create")
                 return
             except FileExistsError:
                 other = self._read(path)
@@ -133,20 +144,20 @@ class StoreClaims:
                     other.refuse(self._dataset, [night])
                 with contextlib.suppress(FileNotFoundError):
                     self._storage.rm_file(path)
-        raise DatasetError(f"{self._dataset}/night={night}: another run has just claimed it")
+        raise DatasetError(f"{self._dataset}/night={night}: another run has just locked it")
 
-    def _read(self, path: str) -> Holder | None:
+    def _read(self, path: str) -> LockRecord | None:
         try:
-            return Holder.read(self._storage.cat_file(path), path)
+            return LockRecord.read(self._storage.cat_file(path), path)
         except FileNotFoundError:
             return None
 
-    def _is_held(self, night: str, holder: Holder) -> bool:
+    def _has_lock(self, night: str, record: LockRecord) -> bool:
         current = self._read(self._path(night))
-        return current is not None and current.token == holder.token
+        return current is not None and current.token == record.token
 
-    def _is_dead(self, path: str, holder: Holder) -> bool:
-        if holder.is_gone():
+    def _is_dead(self, path: str, record: LockRecord) -> bool:
+        if record.is_gone():
             return True
         self._storage.invalidate_cache()
         try:
@@ -157,27 +168,15 @@ class StoreClaims:
             modified = modified.replace(tzinfo=UTC)
         return (datetime.now(UTC) - modified).total_seconds() > LEASE_S
 
-    def _renew(self, holder: Holder, nights: list[str], ended: threading.Event) -> None:
+    def _renew(self, record: LockRecord, nights: list[str], ended: threading.Event) -> None:
         while not ended.wait(RENEWED_EVERY_S):
             for night in nights:
                 with contextlib.suppress(*storage_errors()):  # tried again before the lease ends
-                    if self._is_held(night, holder):
-                        self._storage.pipe_file(self._path(night), holder.text().encode())
+                    if self._has_lock(night, record):
+                        self._storage.pipe_file(self._path(night), record.text().encode())
 
 
-# -- Nights in an object store, which has no rename: staged, committed by one object, copied.
-#
-# 1. Every file of the nights is written to ``.staging/run-<token>/``. 2.
-# ``.staging/commit-<token>.json`` is written by one PUT. This publishes all nights of the run:
-# from now on `read` takes the staged files. 3. The store copies the files to ``night=YYYY-MM-
-# DD/<table>/``; each copy is atomic, and `sources` comes last. Other files of the old night are
-# removed. 4. The commit is removed, then the staged files.
-#
-# A run that is killed before step 2 has published nothing. A run that is killed later has
-# published everything, and the next run on the night finishes step 3. A reader that lists the
-# objects by a glob pattern always gets whole tables. During step 3, a fraction of a second, some
-# tables are of the old night and some of the new one. A new night is complete when it has
-# `sources`.
+# Nights of a dataset.
 
 REQUESTS = 8  # at the same time
 LAST = "sources"  # the table that completes a night
@@ -192,16 +191,22 @@ class Commit:
     """Nights that are published, but whose files are not all in place yet."""
 
     path: str
-    staged: str  # the folder of the run, which holds night=.../<table>/*.parquet
+    staged: str  # the folder of the run: night=.../<table>/*.parquet in it
     files: dict[str, list[str]]  # by night, <table>/<part>.parquet
 
 
 class StoreNights:
-    """The nights of one dataset in an object store."""
+    """The nights of one dataset in an object store; see `NightStorage` for the methods."""
+
+    folder = None
 
     def __init__(self, storage: Any, root: str, dataset: str) -> None:
         self._storage, self._root, self._dataset = storage, root, dataset
-        self.claims = StoreClaims(storage, root, dataset)
+        self.locks = StoreLocks(storage, root, dataset)
+
+    def errors(self) -> tuple[type[Exception], ...]:
+        """Return the errors of the store's client."""
+        return storage_errors()
 
     def names(self) -> list[str]:
         """Return the names at the top of the dataset; see `require_bucket`."""
@@ -228,18 +233,22 @@ class StoreNights:
                 f"{self._dataset}: there is no bucket {bucket}; create it, or check the name"
             )
 
+    def exists(self) -> bool:
+        """Return whether the dataset has any object: a store has no empty folders."""
+        return bool(self.names())
+
     def nights(self) -> list[str]:
-        """Return the nights that are published, in order."""
+        """Return the published nights, in order."""
         in_place = {n.removeprefix("night=") for n in self.names() if n.startswith("night=")}
         in_place = set(filter(is_night, in_place))
         return sorted(in_place.union(*(commit.files for commit in self._commits())))
 
-    def read(self, night: str, table: str) -> list[bytes]:
-        """Return the files of a table of a night, in order; none where the night is missing."""
+    def files(self, night: str, table: str) -> list[pa.BufferReader]:
+        """Return the files of a table of a night, in order, as they were at one time."""
         for _ in range(3):
             with contextlib.suppress(FileNotFoundError):  # put in place or replaced meanwhile
                 paths = self._paths(night, table)
-                return [bytes(self._storage.cat_file(path)) for path in paths]
+                return [pa.BufferReader(bytes(self._storage.cat_file(path))) for path in paths]
         self.require_bucket()
         raise DatasetError(f"{self._dataset}/night={night}: is being replaced; try again")
 
@@ -251,24 +260,45 @@ class StoreNights:
         paths = self._storage.glob(f"{self._root}/night={night}/*/*.parquet")
         return {path.rsplit("/", 2)[1] for path in paths}
 
-    def opened(self, night: str, table: str) -> list[Any]:
-        """Return the files of a table of a night, open: only what is asked for is fetched."""
+    def open_files(self, night: str, table: str) -> list[Any]:
+        """Return the files of a table of a night, open: only what is read is fetched."""
         return [self._storage.open(path, "rb") for path in self._paths(night, table)]
 
-    def write(self, name: str, data: bytes) -> None:
-        """Write one object at the top of the dataset, or in a folder there."""
-        self._storage.pipe_file(f"{self._root}/{name}", data)
+    def location(self, night: str) -> str:
+        """Return the URL of a night."""
+        return f"{self._dataset}/night={night}"
 
-    def publish(self, staged: Mapping[str, Path]) -> None:
-        """Publish these nights, which this process has claimed: all or none.
+    def write_report(self, night: str, text: str, staging: Path) -> None:
+        """Write a report as one object; the staging folder is not needed."""
+        self._storage.pipe_file(f"{self._root}/{REPORTS}/{night}.html", text.encode())
+
+    @contextlib.contextmanager
+    def lock_nights(self, nights: Sequence[str]) -> Iterator[Path]:
+        """Lock these nights, and yield a temporary folder of this machine."""
+        with self.locks.lock(nights), temporary_folder("night") as work:
+            yield work
+
+    def locked_nights(self) -> set[str]:
+        """Return the nights that living runs have locked."""
+        return self.locks.nights()
+
+    def publish(self, staged: Mapping[str, Path], check: Callable[[], None]) -> None:
+        """Lock the nights that are not locked yet, and put all in place: all or none.
 
         Raises
         ------
         DatasetError
-            Where a claim was lost meanwhile.
+            Where a lock was lost meanwhile.
         """
+        with self.locks.lock(self.locks.missing(list(staged))):
+            self.recover()
+            check()
+            self._commit(staged)
+
+    def _commit(self, staged: Mapping[str, Path]) -> None:
+        """Upload the files, publish them by one object, and copy them into place."""
         nights = list(staged)
-        token = self.claims.token(nights[0])
+        token = self.locks.token(nights[0])
         run = f"{self._root}/{STAGING}/run-{token}"
         files = {
             night: sorted(str(p.relative_to(folder)) for p in folder.glob("*/*.parquet"))
@@ -282,7 +312,7 @@ class StoreNights:
         ]
         try:
             self._each(self._storage.put_file, moves)
-            self.claims.verify(nights)
+            self.locks.verify(nights)
             text = json.dumps({"staged": f"run-{token}", "files": files})
             self._storage.pipe_file(commit.path, text.encode())
         except BaseException:
@@ -298,18 +328,18 @@ class StoreNights:
             ) from error
 
     def recover(self) -> None:
-        """Finish the commits of killed runs, except on nights that another run has claimed.
+        """Finish the commits of killed runs, except on nights that another run has locked.
 
-        The caller has claimed its own nights, so no living run has commits of them.
+        The caller has locked its nights, so no living run has commits of them.
         """
         for commit in self._commits():
-            others = self.claims.missing(list(commit.files))
-            with contextlib.suppress(DatasetError), self.claims.claim(others):
-                self._finish(commit)  # else the run that claimed them will
-        # A run claims, then stages, then commits. So a staged folder that is listed first, and then
-        # has neither a claim nor a commit, belongs to a run that has ended.
+            others = self.locks.missing(list(commit.files))
+            with contextlib.suppress(DatasetError), self.locks.lock(others):
+                self._finish(commit)  # else the run that locked them will
+        # A run locks, then stages, then commits. So a staged folder that is listed first, and then
+        # has neither a lock nor a commit, belongs to a run that has ended.
         runs = [entry.rstrip("/") for entry in self._ls(f"{self._root}/{STAGING}")]
-        used = {f"run-{token}" for token in self.claims.alive()}
+        used = {f"run-{token}" for token in self.locks.alive()}
         used |= {commit.staged.rpartition("/")[2] for commit in self._commits()}
         for run in runs:
             name = run.rpartition("/")[2]
@@ -369,16 +399,16 @@ def _parsed(path: str, staging: str, text: bytes) -> Commit:
     Raises
     ------
     DatasetError
-        Where it is none of a run: it may name nothing outside the folder of a run and of nights.
+        Where it names something outside the folder of a run and the folders of nights.
     """
     try:
         commit = json.loads(text)
         staged, files = commit["staged"], commit["files"]
-        is_one = _RUN.fullmatch(staged) and all(
+        is_valid = _RUN.fullmatch(staged) and all(
             is_night(night) and isinstance(names, list) and all(map(_FILE.fullmatch, names))
             for night, names in files.items()
         )
-        if not is_one:
+        if not is_valid:
             raise ValueError(staged)
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise DatasetError(f"{path}: is not a commit of a run; remove it") from error
@@ -386,7 +416,7 @@ def _parsed(path: str, staging: str, text: bytes) -> Commit:
 
 
 def store_nights(dataset: str) -> StoreNights:
-    """Return the nights behind a URL; the same object each time, as it holds the claims."""
+    """Return the nights behind a URL; the same object each time, as it has the locks."""
     return _store_nights(dataset.rstrip("/"))
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from epipole.schemas.errors import DatasetError
 
-# Of a claim or a commit. One of ten years of nights has less than 1 MB.
+# Limit of a lock or a commit: ten years of nights take less than 1 MB.
 MAX_BYTES = 4 << 20
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -45,7 +45,7 @@ def entered(folder: Path, *below: str) -> Iterator[Path]:
 
 
 def opened(file: Path, flags: int = os.O_RDONLY) -> int:
-    """Return a handle of a file, which may be no link, pipe or device.
+    """Return a handle of a regular file: links, pipes and devices are refused.
 
     Raises
     ------
@@ -59,11 +59,11 @@ def opened(file: Path, flags: int = os.O_RDONLY) -> int:
     if stat.S_ISREG(os.fstat(handle).st_mode):
         return handle
     os.close(handle)
-    raise DatasetError(f"{file}: is no file; remove it")
+    raise DatasetError(f"{file}: is not a regular file; remove it")
 
 
 def read_small(file: Path) -> bytes:
-    """Return the content of a claim or a commit, which is small; errors are those of `opened`."""
+    """Return the content of a lock or a commit, which is small; errors are those of `opened`."""
     with open(opened(file), "rb") as opened_file:
         content = opened_file.read(MAX_BYTES + 1)
     if len(content) > MAX_BYTES:

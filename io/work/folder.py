@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from epipole.io.caches.arrays import cache_folder
 from epipole.io.caches.private_folders import fault_of, private_folder
-from epipole.io.datasets.dataset import claim_nights, dataset_folder
-from epipole.io.datasets.local import STAGING, claimed_nights
+from epipole.io.datasets.dataset import dataset_folder, lock_nights, locked_nights
+from epipole.io.datasets.lock_record import STAGING
 from epipole.io.datasets.plain_files import refuse_link
 from epipole.schemas.dates import is_night
 from epipole.schemas.errors import DatasetError
@@ -27,7 +27,7 @@ def work_folder(root: Path, night: str, key: str) -> Iterator[Path]:
     """Yield the folder for a night and this key. It is removed when the work succeeds.
 
     Folders of the same night under another key are removed: they were made from other logs,
-    settings or code. The caller has claimed the night. A folder that is a link is refused with
+    settings or code. The caller has locked the night. A folder that is a link is refused with
     a `DatasetError`.
     """
     name = f"{NAME}-{night}"
@@ -73,15 +73,14 @@ class Unfinished(NamedTuple):
 
 
 def unfinished_work(dataset: str) -> list[Unfinished]:
-    """Return the work that stopped runs have left, by night; not that of runs that go on."""
-    local = dataset_folder(dataset)
-    held = claimed_nights(local) if local is not None else set()
+    """Return the work that stopped runs have left, by night; that of living runs is skipped."""
     by_night: dict[str, list[Path]] = {}
     for folder in sorted(work_root(dataset).glob(f"{NAME}-*")):
         night = folder.name.removeprefix(f"{NAME}-")[: len("YYYY-MM-DD")]
-        is_work = is_night(night) and folder.is_dir() and not folder.is_symlink()
-        if is_work and night not in held:
+        if is_night(night) and folder.is_dir() and not folder.is_symlink():
             by_night.setdefault(night, []).append(folder)
+    for night in locked_nights(dataset) if by_night else ():
+        by_night.pop(night, None)
     return [Unfinished(night, sum(map(_size, f)), f) for night, f in by_night.items()]
 
 
@@ -93,10 +92,10 @@ def clear_unfinished(dataset: str) -> list[Unfinished]:
     removed = []
     for unfinished in unfinished_work(dataset):
         try:
-            with claim_nights(dataset, [unfinished.night]):
+            with lock_nights(dataset, [unfinished.night]):
                 for folder in unfinished.folders:
                     shutil.rmtree(folder, ignore_errors=True)
-        except DatasetError:  # a run has claimed it meanwhile
+        except DatasetError:  # a run has locked it meanwhile
             continue
         removed.append(unfinished)
     return removed

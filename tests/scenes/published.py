@@ -6,7 +6,7 @@ import pyarrow as pa
 
 from epipole.io.datasets.dataset import (
     Where,
-    claim_nights,
+    lock_nights,
     publish_folders,
 )
 from epipole.io.datasets.night_tables import write_table
@@ -22,7 +22,7 @@ def publish(
 
     Rows of other nights are not written. Errors are those of `publish_folders`.
     """
-    with claim_nights(dataset, []) as work:
+    with lock_nights(dataset, []) as work:
         staged = {night: work / f"night={night}" for night in nights}
         for night, folder in staged.items():
             for name, schema in TABLES.items():

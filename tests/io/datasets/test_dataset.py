@@ -22,7 +22,7 @@ from scenes.published import publish
 
 from epipole.io.datasets import local
 from epipole.io.datasets import night_tables as night_files
-from epipole.io.datasets.dataset import check_folder, claim_nights, publish_folders, read_table
+from epipole.io.datasets.dataset import check_folder, lock_nights, publish_folders, read_table
 from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
@@ -173,12 +173,12 @@ def test_what_could_not_be_published_is_still_staged_for_another_try(
     sources = night_tables(OVER_MIDNIGHT)["sources"]
     if not exchange_supported:
         monkeypatch.setattr(local, "exchange", lambda *_: False)
-    with claim_nights(out, nights) as work:
+    with lock_nights(out, nights) as work:
         for night in nights:
             shutil.copytree(tmp_path / "new" / f"night={night}", work / f"night={night}")
         staged = {night: work / f"night={night}" for night in nights}
         with monkeypatch.context() as patch:
-            patch.setattr(local, "sync", _disk_full)
+            patch.setattr(local, "sync", lambda path: _disk_full() if path == out else None)
             with pytest.raises(DatasetError):
                 publish_folders(out, staged, sources)
         assert contents(work) == new | {"claim": (work / "claim").read_bytes()}

@@ -13,7 +13,7 @@ from scenes.published import publish
 from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
-from epipole.io.datasets.dataset import claim_nights, write_report
+from epipole.io.datasets.dataset import lock_nights, write_report
 from epipole.io.datasets.object_store import store_nights
 from epipole.io.datasets.plain_files import MAX_BYTES
 from epipole.io.work.folder import work_folder
@@ -144,16 +144,16 @@ def test_what_a_reader_finishes_it_says_and_leaves_the_rest(dataset, caplog):
         {"host": 7}, {"token": ["a"]}, {"since": {}},
     ],
 )  # fmt: skip
-def test_a_claim_of_odd_content_is_named(change, dataset):
-    claim = {"nights": [], "host": "", "pid": 1, "since": "", "machine": "", "token": ""} | change
-    (dataset / ".staging" / "run-0" / "claim").write_text(json.dumps(claim))
-    with (dataset / ".staging" / "run-0" / "claim").open() as held:
-        fcntl.flock(held, fcntl.LOCK_EX)
+def test_a_lock_of_odd_content_is_named(change, dataset):
+    record = {"nights": [], "host": "", "pid": 1, "since": "", "machine": "", "token": ""} | change
+    (dataset / ".staging" / "run-0" / "claim").write_text(json.dumps(record))
+    with (dataset / ".staging" / "run-0" / "claim").open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
         with (
-            pytest.raises(DatasetError, match=r"claim: is not a claim of a run; remove it"),
-            claim_nights(dataset, [NIGHT]),
+            pytest.raises(DatasetError, match=r"claim: is not the lock of a run; remove it"),
+            lock_nights(dataset, [NIGHT]),
         ):
-            pytest.fail("an odd claim")
+            pytest.fail("an odd lock")
 
 
 def test_a_work_folder_or_reports_that_are_links_are_not_written_to(dataset):

@@ -19,10 +19,9 @@ from scenes.twice import twice
 from epipole.flows.evaluate import evaluate
 from epipole.flows.night.recorded_nights import held_nights
 from epipole.flows.nightly import nightly
-from epipole.io.datasets import dataset
-from epipole.io.datasets import object_store as store_claims
-from epipole.io.datasets.dataset import claim_nights
-from epipole.io.datasets.lock_record import Holder
+from epipole.io.datasets import dataset, object_store
+from epipole.io.datasets.dataset import lock_nights
+from epipole.io.datasets.lock_record import LockRecord
 from epipole.io.datasets.object_store import store_nights
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.settings import Settings
@@ -94,13 +93,13 @@ def test_a_run_without_a_recorded_log_is_refused(s3, out):
     publish(out, night_tables(TIMES, ("a",)), [NIGHT], replace=True)
 
 
-def test_what_is_no_dataset_is_refused(s3, out):
+def test_a_folder_of_other_files_or_without_a_bucket_is_refused(s3, out):
     s3.pipe_file(f"{out}/holiday.jpg", b"")
     with pytest.raises(DatasetError, match="holds other files and no dataset"):
         check_folder(out)
     with (
         pytest.raises(DatasetError, match="there is no bucket no-such-bucket; create it"),
-        claim_nights("s3://no-such-bucket/ds", [NIGHT]),
+        lock_nights("s3://no-such-bucket/ds", [NIGHT]),
     ):
         pytest.fail("no bucket")
 
@@ -220,45 +219,45 @@ def test_a_store_that_refuses_a_write_ends_in_one_line_and_no_half_night(
     assert [p for p in s3.find(out) if "/.staging/" in p] == []
 
 
-def test_a_second_run_of_a_night_is_refused_and_told_of_the_first(s3, out):
-    with claim_nights(out, [NIGHT, NEXT_NIGHT]):
-        other = Holder(["2019-04-05"], "far", 7, "2026-01-01T00:00:00Z", "", "t")
+def test_a_second_run_of_a_night_is_refused_and_names_the_first(s3, out):
+    with lock_nights(out, [NIGHT, NEXT_NIGHT]):
+        other = LockRecord(["2019-04-05"], "far", 7, "2026-01-01T00:00:00Z", "", "t")
         s3.pipe_file(f"{out}/.staging/claim-night=2019-04-05.json", other.text().encode())
         with (
             pytest.raises(DatasetError, match=r"2019-04-05: process 7 on far has worked on it"),
-            claim_nights(out, ["2019-04-05"]),
+            lock_nights(out, ["2019-04-05"]),
         ):
             pytest.fail("two runs of one night")
         with (
             pytest.raises(DatasetError, match=rf"process {os.getpid()} on"),
-            claim_nights(out, [NEXT_NIGHT]),
+            lock_nights(out, [NEXT_NIGHT]),
         ):
             pytest.fail("two runs of one night")
-    with claim_nights(out, [NIGHT]):
+    with lock_nights(out, [NIGHT]):
         pass
 
 
-def test_a_claim_that_is_not_renewed_is_taken_over_and_its_run_cannot_publish(s3, out, monkeypatch):
-    monkeypatch.setattr(store_claims, "LEASE_S", 0.5)
-    with claim_nights(out, [NIGHT]) as work:
+def test_a_lock_that_is_not_renewed_is_taken_over_and_its_run_cannot_publish(s3, out, monkeypatch):
+    monkeypatch.setattr(object_store, "LEASE_S", 0.5)
+    with lock_nights(out, [NIGHT]) as work:
         assert work.is_dir()
         time.sleep(1.1)
-        other = store_claims.StoreClaims(s3, store_nights(out)._root, out)
+        other = object_store.StoreLocks(s3, store_nights(out)._root, out)
         with (
-            other.claim([NIGHT]),
+            other.lock([NIGHT]),
             pytest.raises(DatasetError, match="another run has taken it over"),
         ):
             publish(out, night_tables(TIMES), [NIGHT])
     assert nights_in(out) == []
 
 
-def test_a_claim_is_renewed_while_its_run_works(s3, out, monkeypatch):
-    monkeypatch.setattr(store_claims, "RENEWED_EVERY_S", 0.2)
-    monkeypatch.setattr(store_claims, "LEASE_S", 3.0)
-    with claim_nights(out, [NIGHT]):
+def test_a_lock_is_renewed_while_its_run_works(s3, out, monkeypatch):
+    monkeypatch.setattr(object_store, "RENEWED_EVERY_S", 0.2)
+    monkeypatch.setattr(object_store, "LEASE_S", 3.0)
+    with lock_nights(out, [NIGHT]):
         time.sleep(4.0)
-        other = store_claims.StoreClaims(s3, store_nights(out)._root, out)
-        with pytest.raises(DatasetError, match="has worked on"), other.claim([NIGHT]):
+        other = object_store.StoreLocks(s3, store_nights(out)._root, out)
+        with pytest.raises(DatasetError, match="has worked on"), other.lock([NIGHT]):
             pytest.fail("it was taken over")
 
 
@@ -316,11 +315,11 @@ def test_a_missing_bucket_is_named_by_readers_too(s3):
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        (f"claim-night={NIGHT}.json", "is not a claim of a run; remove it"),
+        (f"claim-night={NIGHT}.json", "is not the lock of a run; remove it"),
         ("commit-stray.json", "is not a commit of a run; remove it"),
     ],
 )
-def test_a_stray_file_among_the_claims_is_named(name, says, s3, out):
+def test_a_stray_file_among_the_locks_is_named(name, says, s3, out):
     publish(out, night_tables(TIMES), [NIGHT])
     s3.pipe_file(f"{out}/.staging/{name}", b"[]")
     with pytest.raises(DatasetError, match=f"{name}: {says}"):

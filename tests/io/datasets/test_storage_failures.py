@@ -13,7 +13,7 @@ import pytest
 from scenes.dataset_tables import NIGHT, TIMES, contents, night_tables
 from scenes.published import publish
 
-from epipole.io.datasets.dataset import claim_nights, read_table
+from epipole.io.datasets.dataset import lock_nights, read_table
 from epipole.io.logs.reader import read_log
 from epipole.schemas.errors import DatasetError, LogError
 
@@ -105,9 +105,9 @@ def read_only(tmp_path):
 def test_a_read_only_dataset_is_refused_before_any_work(read_only):
     with (
         pytest.raises(DatasetError, match="cannot be written"),
-        claim_nights(read_only, [NIGHT]),
+        lock_nights(read_only, [NIGHT]),
     ):
-        pytest.fail("it was claimed")
+        pytest.fail("it was locked")
     assert read_table(read_only, "frames", NIGHT).num_rows == len(TIMES)
 
 
@@ -115,9 +115,9 @@ def test_a_read_only_dataset_is_refused_before_any_work(read_only):
 def test_a_folder_in_which_nothing_can_be_made_is_refused_before_any_work():
     with (
         pytest.raises(DatasetError, match="/proc/epipole: cannot be written"),
-        claim_nights("/proc/epipole", [NIGHT]),
+        lock_nights("/proc/epipole", [NIGHT]),
     ):
-        pytest.fail("it was claimed")
+        pytest.fail("it was locked")
 
 
 @pytest.mark.skipif(not os.path.exists("/proc/self/mem"), reason="asks Linux for such a file")

@@ -1,6 +1,6 @@
 """Unfinished work: that of stopped runs, never that of a run that goes on."""
 
-from epipole.io.datasets.dataset import claim_nights
+from epipole.io.datasets.dataset import lock_nights
 from epipole.io.work.folder import clear_unfinished, unfinished_work
 
 NIGHT, NEXT = "2019-04-01", "2019-04-02"
@@ -23,7 +23,7 @@ def test_work_is_counted_by_night(tmp_path):
 
 def test_work_of_a_run_that_goes_on_is_left_alone(tmp_path):
     mine, left = leave_work(tmp_path, NIGHT), leave_work(tmp_path, NEXT)
-    with claim_nights(str(tmp_path), [NIGHT]):
+    with lock_nights(str(tmp_path), [NIGHT]):
         assert [each.night for each in clear_unfinished(str(tmp_path))] == [NEXT]
         assert mine.exists()
         assert not left.exists()
