@@ -7,17 +7,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from epipole.io.catalogues.hipparcos import NAME as HIPPARCOS
-from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.io.catalogues.star_catalogue import write_star_catalogue
 from epipole.io.catalogues.star_list import read_star_list
 from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import array
 from epipole.schemas.errors import CatalogueError
+from epipole.schemas.options import STAR_CATALOGUES, load_function
 from epipole.schemas.star_lists import UNKNOWN_MOTION_MAS_YR, label_of
-from epipole.tasks.catalogue import build_deep_catalogue
-
-DEEP = "deep"
 
 
 @dataclass(frozen=True)
@@ -65,7 +61,7 @@ def build_catalogue(
     Parameters
     ----------
     source
-        "hipparcos", "deep" (Gaia DR3 with Hipparcos' motions), or a CSV or Parquet file of stars.
+        A name in `STAR_CATALOGUES`, or a CSV or Parquet file of stars.
     out
         The file to write. An existing file is replaced.
     epoch, name
@@ -80,13 +76,11 @@ def build_catalogue(
     """
     if (fault := fault_of_name(out.name)) is not None:
         raise CatalogueError(f"file {out}: {fault}")
-    if source in (HIPPARCOS, DEEP) and (epoch is not None or name is not None):
+    if source in STAR_CATALOGUES and (epoch is not None or name is not None):
         raise CatalogueError(f"{source} has its own epoch and name; leave these options out")
     ignored: list[str] = []
-    if source == HIPPARCOS:
-        stars = read_hipparcos()
-    elif source == DEEP:
-        stars = build_deep_catalogue()
+    if source in STAR_CATALOGUES:
+        stars = load_function(STAR_CATALOGUES[source].read)()
     else:
         stars, ignored = _of_user(source, epoch, name)
     if magnitude_limit is not None:
@@ -100,12 +94,11 @@ def build_catalogue(
 def _of_user(source: str, epoch: float | None, name: str | None) -> tuple[pa.Table, list[str]]:
     if not Path(source).is_file():
         raise CatalogueError(
-            f"{source}: no such file; give {HIPPARCOS}, {DEEP}, or a CSV or Parquet file"
+            f"{source}: no such file; give {', '.join(STAR_CATALOGUES)}, or a CSV or Parquet file"
         )
-    if (name or Path(source).stem) == HIPPARCOS:
-        raise CatalogueError(
-            f"{source}: the name {HIPPARCOS} is reserved; give another with --name"
-        )
+    name = name or Path(source).stem
+    if name in STAR_CATALOGUES:
+        raise CatalogueError(f"{source}: the name {name} is reserved; give another with --name")
     return read_star_list(Path(source), epoch, name)
 
 

@@ -19,6 +19,7 @@ from epipole.io.logs.reader import read_log_pieces
 from epipole.io.logs.writer import ViewerFile
 from epipole.schemas.bridge import array, to_polars
 from epipole.schemas.errors import DatasetError, LogError, NoFramesError
+from epipole.schemas.options import star_ids
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
 from epipole.tasks.overlay.messages import (
     OBJECTS,
@@ -34,7 +35,6 @@ from epipole.tasks.overlay.messages import (
 )
 from epipole.tasks.overlay.scene import earth
 
-HIPPARCOS = "hipparcos"  # its stars are named by their number in it
 SHOWN_EPOCHS = 3  # an object is shown as long, if no later epoch has it
 
 
@@ -128,7 +128,7 @@ def _of_night(
     sensors = sorted(set(told.frames["sensor_id"]))
     times_ns = told.frames["time"].dt.timestamp("ns").to_numpy()
     row = night_row(dataset, night)
-    named = row is not None and row["star_catalogue_key"].startswith(HIPPARCOS)
+    ids = "" if row is None else star_ids(row["star_catalogue_key"].partition(" ")[0])
     shapes = camera_shapes(told.cameras) if images else {}
     positions = array(read_table(dataset, "positions", night, ["epoch"]), "epoch")
     apart_ns = np.diff(np.unique(positions))
@@ -143,7 +143,7 @@ def _of_night(
     for span in of_night:
         tables = _tables(dataset, night, span, sensors)
         messages = [
-            *frame_messages(tables, "HIP " if named else "", shapes),
+            *frame_messages(tables, f"{ids} " if ids else "", shapes),
             *epoch_messages(tables, lifetime_ns),
         ]
         lines = list(log_messages(to_polars(read_table(dataset, "rejects", night, during=span))))

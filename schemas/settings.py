@@ -10,8 +10,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from epipole.schemas.errors import SettingsError
 from epipole.schemas.log_bounds import ATTITUDE_SIGMA, POSITION_SIGMA
-from epipole.schemas.options import ASSOCIATION, STAR_IDENTIFICATION, TRACK_LINKING
+from epipole.schemas.options import (
+    ASSOCIATION,
+    DEFAULT_CATALOGUE,
+    STAR_CATALOGUES,
+    STAR_IDENTIFICATION,
+    TRACK_LINKING,
+)
 from epipole.schemas.text import as_line, toml_values
+
+_BUILT_IN = ", ".join(f'"{name}"' for name, source in STAR_CATALOGUES.items() if source.for_runs)
 
 if TYPE_CHECKING:
     StarMethod = str
@@ -86,9 +94,9 @@ class IdentificationSettings(Group):
         "ones, for comparison.",
     )
     catalogue: str = Field(
-        "hipparcos",
+        DEFAULT_CATALOGUE,
         min_length=1,
-        description='Stars: "hipparcos", or the path of a file of `epipole catalog build`.',
+        description=f"Stars: {_BUILT_IN}, or the path of a file of `epipole catalog build`.",
     )
     magnitude_limit: float | None = Field(
         None,

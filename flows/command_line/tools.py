@@ -22,7 +22,7 @@ from epipole.flows.command_line.options import (
 )
 from epipole.flows.prefect.server_process import new_secret
 from epipole.schemas.errors import EpipoleError
-from epipole.schemas.options import Message
+from epipole.schemas.options import STAR_CATALOGUES, Message
 
 
 def report(
@@ -96,7 +96,8 @@ def build(
     source: Annotated[
         str,
         typer.Argument(
-            metavar="SOURCE", help="hipparcos, deep, or a CSV or Parquet file of stars."
+            metavar="SOURCE",
+            help=f"{', '.join(STAR_CATALOGUES)}, or a CSV or Parquet file of stars.",
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Parquet file to write.")],
@@ -117,11 +118,6 @@ def build(
 ) -> None:
     """Write a star catalogue for the setting identification.catalogue.
 
-    hipparcos: what a run uses by default, complete to magnitude 7.3
-
-    deep: Gaia DR3 to G 10 with the motions of Hipparcos, for fields below 5 degrees.
-    Needs the extra "deep" of epipole. Its data are share-alike (CC BY-SA 3.0).
-
     A file needs the columns star_id (whole numbers), ra_deg, dec_deg (ICRS) and
     magnitude (V). It may have pm_ra_mas_yr (times cos dec), pm_dec_mas_yr,
     parallax_mas, sigma_mas, pm_sigma_mas_yr (1-sigma per axis) and variable
@@ -136,7 +132,8 @@ def build(
         print_lines(built.lines())
 
 
-app.command(help=help_text(build))(build)
+_SOURCES = [f"{name}: {source.sentence}" for name, source in STAR_CATALOGUES.items()]
+app.command(help="\n\n".join([help_text(build), *_SOURCES]))(build)
 
 
 # The files of `epipole deploy-files`, and what each is for.

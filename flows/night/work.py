@@ -11,7 +11,7 @@ from epipole.io.work.parts import Parts
 from epipole.io.work.work_layout import ReadFolder, SensorParts, WorkFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
-from epipole.schemas.rejects import OF_CALIBRATIONS, Reason, reject_rows
+from epipole.schemas.rejects import Reason, Trait, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span, day_of
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.check.check_sensors import SensorVerdict
@@ -92,7 +92,8 @@ def plan_spans(frames: OrderedFrames, night: str) -> tuple[Spans, pa.Table]:
 def _why_not(rejects: pa.Table) -> str:
     """Return what is wrong with the calibrations that there are, or what to record."""
     found = set(rejects["reason"].to_pylist())
-    sentences = [f"{reason}: {reason.sentence}" for reason in OF_CALIBRATIONS if reason in found]
+    invalid = [reason for reason in Reason.having(Trait.INVALID_CALIBRATION) if reason in found]
+    sentences = [f"{reason}: {reason.sentence}" for reason in invalid]
     if sentences:
         return "those in the log are invalid: " + " ".join(sentences)
     return "record foxglove.CameraCalibration with the sensor's id as frame_id"

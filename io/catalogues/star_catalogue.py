@@ -1,4 +1,4 @@
-"""The star catalogue of a run: Hipparcos-2, or a file written by `epipole catalog build`."""
+"""The star catalogue of a run: one of `STAR_CATALOGUES`, or a file of `epipole catalog build`."""
 
 import os
 import tempfile
@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from epipole.io.catalogues import hipparcos
 from epipole.schemas.bridge import array, conform
 from epipole.schemas.errors import CatalogueError
+from epipole.schemas.options import DEFAULT_CATALOGUE, catalogue_of_runs, load_function
 from epipole.schemas.star_lists import STAR_CATALOGUE, CatalogueLabel, label_of, labelled
 
 BUILD = "make it with `epipole catalog build`"
@@ -23,15 +23,15 @@ def read_star_catalogue(which: str) -> pa.Table:
     Parameters
     ----------
     which
-        "hipparcos", or the path of a catalogue file.
+        A name in `STAR_CATALOGUES`, or the path of a catalogue file.
 
     Raises
     ------
     CatalogueError
         Where the file is missing, or is not a catalogue.
     """
-    if which == hipparcos.NAME:
-        return _hipparcos()
+    if (source := catalogue_of_runs(which)) is not None:
+        return _read_once(source.read)
     label = _label(which)
     try:
         stars = conform(STAR_CATALOGUE, pq.read_table(which, partitioning=None))
@@ -47,22 +47,22 @@ def read_star_catalogue(which: str) -> pa.Table:
 
 
 @cache
-def _hipparcos() -> pa.Table:
-    """Return the catalogue of the package, which never changes; every task asks for it."""
-    return hipparcos.read_hipparcos()
+def _read_once(read: str) -> pa.Table:
+    """Return the catalogue of a data package, which never changes; every task asks for it."""
+    return load_function(read)()
 
 
 def check_star_catalogue(which: str) -> None:
     """Raise where `read_star_catalogue` would find no catalogue file; its stars are not read."""
-    if which != hipparcos.NAME:
+    if catalogue_of_runs(which) is None:
         _label(which)
 
 
 def _label(which: str) -> CatalogueLabel:
     if not Path(which).is_file():
         raise CatalogueError(
-            f'{which}: no such catalogue file; set identification.catalogue to "{hipparcos.NAME}" '
-            "or to the path of a catalogue file"
+            f"{which}: no such catalogue file; set identification.catalogue to "
+            f'"{DEFAULT_CATALOGUE}" or to the path of a catalogue file'
         )
     try:
         return label_of(pq.read_schema(which))

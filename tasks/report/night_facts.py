@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
-from epipole.schemas.rejects import Reason
+from epipole.schemas.rejects import Reason, Trait
 from epipole.schemas.stages import Stage
 from epipole.tasks.report.epipolar_views import OPTICS, EpipolarViews, read_epipolar_views
 from epipole.tasks.report.frame_series import FrameSeries, Gap, read_frame_series
@@ -152,8 +152,6 @@ LOWEST, HIGHEST = 0.7, 1.4
 FEWEST = 30  # values that share no detection: with fewer, chance alone goes beyond the bounds
 MIN_NIGHTS = 5
 DROP = 0.7  # of the median of the nights before
-# More than one message of these is a log that was not stored as it was recorded.
-HARMLESS = (Reason.NO_MCAP, Reason.DUPLICATE_FRAME, Reason.DUPLICATE_STATE)
 MAX_SENTENCES = 12
 
 
@@ -164,8 +162,9 @@ def needs_look(facts: NightFacts) -> list[str]:
 
 
 def _faults(facts: NightFacts) -> Iterator[str]:
+    faults = {reason.value for reason in Reason.having(Trait.SENSOR_FAULT)}
     for row in facts.left_out:
-        if row.stage == Stage.CHECK or row.reason == Reason.SENSOR_DISAGREES:
+        if row.reason in faults:
             yield f"{row.sensor_id or 'A sensor'} is at fault ({row.reason}): {row.sentence}"
 
 
@@ -222,7 +221,7 @@ def _off(mean_square: float) -> str:
 
 
 def _damage(facts: NightFacts) -> Iterator[str]:
-    harmless = {reason.value for reason in HARMLESS}
+    harmless = {reason.value for reason in Reason.having(Trait.HARMLESS)}
     read = [row for row in facts.left_out if row.stage == Stage.READ]
     counts: dict[str, int] = {}
     for row in read:

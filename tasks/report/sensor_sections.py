@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from epipole.io.catalogues.hipparcos import NAME as HIPPARCOS
+from epipole.schemas.options import star_ids
 from epipole.schemas.rejects import FrameStatus
 from epipole.tasks.report.canvas import as_svg
 from epipole.tasks.report.draw_sensors import (
@@ -230,7 +230,8 @@ def star_map(facts: NightFacts) -> Section:
         return Section("frame", title, nothing("No frame is identified."))
     size = facts.size_px(frame.sensor_id)
     scale = vector_scale(frame.residuals_px, size)
-    names = "HIP numbers" if facts.star_catalogue == HIPPARCOS else "numbers in the catalogue"
+    ids = star_ids(facts.star_catalogue)
+    names = f"{ids} numbers" if ids else "numbers in the catalogue"
     picture = figure(
         as_svg(partial(draw_star_map, frame=frame, size_px=size), IMAGE_IN),
         f"Star map of frame {frame.frame_number} of {frame.sensor_id}: {len(frame.star_id)} stars, "

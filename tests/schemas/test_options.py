@@ -5,7 +5,14 @@ import inspect
 import pytest
 
 from epipole.schemas.errors import SettingsError
-from epipole.schemas.options import ASSOCIATION, STAR_IDENTIFICATION, TRACK_LINKING, load_method
+from epipole.schemas.options import (
+    ASSOCIATION,
+    STAR_CATALOGUES,
+    STAR_IDENTIFICATION,
+    TRACK_LINKING,
+    load_function,
+    load_method,
+)
 from epipole.schemas.settings import Settings, validate_settings
 
 REGISTRIES = {
@@ -19,6 +26,12 @@ REGISTRIES = {
 def test_every_entry_is_a_function_and_all_of_a_registry_are_called_alike(registry):
     functions = [load_method(registry, name) for name in registry]
     assert len({len(inspect.signature(function).parameters) for function in functions}) == 1
+
+
+@pytest.mark.parametrize("source", STAR_CATALOGUES.values(), ids=STAR_CATALOGUES)
+def test_every_star_catalogue_is_a_function_that_is_called_without_arguments(source):
+    parameters = inspect.signature(load_function(source.read)).parameters.values()
+    assert all(parameter.default is not parameter.empty for parameter in parameters)
 
 
 @pytest.mark.parametrize("setting", REGISTRIES)

@@ -11,7 +11,9 @@ from epipole.io.catalogues.star_catalogue import (
     read_star_catalogue,
     write_star_catalogue,
 )
+from epipole.io.work.recipe import star_catalogue_key
 from epipole.schemas.errors import CatalogueError
+from epipole.schemas.options import STAR_CATALOGUES
 from epipole.schemas.star_lists import CatalogueLabel, label_of, labelled
 
 
@@ -26,6 +28,19 @@ def test_hipparcos_needs_no_file_and_says_what_it_is():
     assert stars.num_rows == 117_955
     assert label_of(stars.schema)[:2] == ("hipparcos", 1991.25)
     check_star_catalogue("hipparcos")
+
+
+def read_few():
+    """Return ten stars of a catalogue that a test registers."""
+    return labelled(read_hipparcos().slice(0, 10), CatalogueLabel("registered", 1991.25, "a test"))
+
+
+def test_a_second_catalogue_is_one_line_of_the_registry(monkeypatch):
+    source = STAR_CATALOGUES["hipparcos"]._replace(read=f"{__name__}:read_few", package="numpy")
+    monkeypatch.setitem(STAR_CATALOGUES, "registered", source)
+    check_star_catalogue("registered")
+    assert read_star_catalogue("registered").num_rows == 10
+    assert star_catalogue_key("registered") == f"registered {np.__version__}"
 
 
 def test_a_catalogue_comes_back_as_it_was_written(few, tmp_path):
