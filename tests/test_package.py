@@ -13,9 +13,12 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("build", reason="build is of the extra dev")
+pytest.importorskip("build", reason="build is of the group dev")
+pytest.importorskip("setuptools_scm", reason="setuptools-scm is of the group dev")
 
 ROOT = Path(__file__).parents[1]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PROJECT = PYPROJECT["project"]
 LEFT_OUT = shutil.ignore_patterns(
     ".git", ".venv", "build", "dist", "out", "*.egg-info", "__pycache__", ".*_cache", ".hypothesis"
 )
@@ -25,7 +28,7 @@ LEFT_OUT = shutil.ignore_patterns(
 def tree(tmp_path_factory) -> Path:
     """Return a copy of the repository: to build leaves files in it."""
     if int(importlib.metadata.version("setuptools").partition(".")[0]) < 77:
-        pytest.skip("setuptools 77 or later is of the extra dev")
+        pytest.skip("setuptools 77 or later is of the group dev")
     return Path(shutil.copytree(ROOT, tmp_path_factory.mktemp("tree") / "tree", ignore=LEFT_OUT))
 
 
@@ -48,7 +51,8 @@ def test_the_source_distribution_has_the_whole_repository(tree, dist):
     folders = (".ci", "docs", "examples", "tests", "schemas", "io", "tasks", "flows")
     files = [p for folder in folders for p in (tree / folder).rglob("*") if p.is_file()]
     files += [*tree.glob("*.md"), *tree.glob("*.toml"), *tree.glob("*.yaml"), tree / "LICENSE"]
-    wanted = {p.relative_to(tree).as_posix() for p in (*files, tree / "constraints.txt")}
+    files += [tree / "CITATION.cff", tree / "constraints.txt"]
+    wanted = {p.relative_to(tree).as_posix() for p in files}
     assert wanted - packed(dist) == set()
     for name in ("examples/four_sensor_geo.mcap", "docs/first_night.md", "tests/conftest.py"):
         assert name in packed(dist)
@@ -84,15 +88,38 @@ def test_an_index_shows_the_readme_without_dead_links(dist):
 
 def test_the_metadata_are_complete(dist):
     found = metadata(dist)
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert found["Author"] in (ROOT / "LICENSE").read_text()
     assert found["License-Expression"] == "MIT"
-    assert found.get_all("Classifier") == project["classifiers"]
-    assert found["Version"] == importlib.metadata.version("epipole")
+    assert found.get_all("Classifier") == PROJECT["classifiers"]
+
+
+def test_a_tree_without_git_has_the_fallback_version(tree, dist):
+    fallback = PYPROJECT["tool"]["setuptools_scm"]["fallback_version"]
+    of_tree = tree / "PKG-INFO"  # this copy may be of a source distribution
+    wanted = Parser().parsestr(of_tree.read_text())["Version"] if of_tree.exists() else fallback
+    assert metadata(dist)["Version"] == wanted
+    assert (dist / f"epipole-{wanted}.tar.gz").exists()
+
+
+def test_a_checkout_has_the_version_of_its_tag(tmp_path):
+    if shutil.which("git") is None:
+        pytest.skip("git is not installed")
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    git = ("git", "-C", tmp_path, "-c", "user.name=a", "-c", "user.email=a@b")
+    for command in (("init", "-q"), ("add", "."), ("commit", "-qm", "All"), ("tag", "v2.3.4")):
+        subprocess.run([*git, *command], check=True, capture_output=True)
+    command = [sys.executable, "-m", "setuptools_scm"]
+    said = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+    assert said.strip() == "2.3.4"
+
+
+def test_the_group_test_is_the_extra_test():
+    """The README's second command takes the extra: groups need a newer pip."""
+    assert PYPROJECT["dependency-groups"]["test"] == PROJECT["optional-dependencies"]["test"]
 
 
 def test_twine_finds_nothing_wrong(dist):
-    pytest.importorskip("twine", reason="twine is of no extra: it is needed to upload only")
+    pytest.importorskip("twine", reason="twine is of no group: it is needed to upload only")
     files = [*dist.glob("*.tar.gz"), *dist.glob("*.whl")]
     command = [sys.executable, "-m", "twine", "check", "--strict", *files]
     subprocess.run(command, check=True, capture_output=True)

@@ -5,7 +5,7 @@ tables: points, openptv, floor, scale, tracklets.
 
 Points: F1 over the objects that at least three sensors detect. A group is right if it holds at
 least three points of its object and no other point. OpenPTV runs on the same points if `optv` is
-installed (the extra ``bench``). Times are CPU times.
+installed (the group ``bench``). Times are CPU times.
 """
 
 import argparse
@@ -84,7 +84,7 @@ def openptv_table(seeds: int, false: list[int]) -> None:
     try:
         from openptv import associate_by_openptv
     except ImportError:
-        print("\nOpenPTV: not installed (pip install '.[bench]')")
+        print("\nOpenPTV: not installed (pip install --group bench)")
         return
     print("\nOpenPTV, groups in all four sensors or in three: F1 % (median ms) by band, px")
     for n_false in false:

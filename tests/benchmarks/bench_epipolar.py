@@ -3,7 +3,7 @@
 Huang, Zhang, Feng: Space target synchronization association method under distributed star sensor,
 doi 10.19650/j.cnki.cjsi.J1905157. Threshold against errors, ambiguity with 100 random points,
 positions of GEO1 and GEO5. ``python tests/benchmarks/bench_epipolar.py
-[--scenes N] [--out DIR]``; with --out it draws pictures (needs matplotlib: the extra `bench`).
+[--scenes N] [--out DIR]``; with --out it draws pictures (needs matplotlib: the group `bench`).
 """
 
 import argparse

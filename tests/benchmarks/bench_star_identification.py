@@ -7,7 +7,7 @@ three cameras, from ../shared/data/starid where it is there, else made here; wit
 frames a camera are made from Hipparcos. Every solver gets the same frames, one by one, and
 is told the camera and the centroid error. Right: boresight within 0.05 degrees and roll
 within 0.5; wrong: an answer whose boresight is more than 0.25 degrees off, or its roll 5.
-Public tools: `pip install '.[bench]'`.
+Public tools: `pip install --group bench`.
 """
 
 import argparse

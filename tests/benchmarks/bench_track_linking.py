@@ -2,7 +2,7 @@
 
     python tests/benchmarks/bench_track_linking.py [--rivals]
 
-The rivals (`pip install '.[bench]'`) get the same fragments, in pixels of one tangent plane.
+The rivals (`pip install --group bench`) get the same fragments, in pixels of one tangent plane.
 """
 
 import argparse

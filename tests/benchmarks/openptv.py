@@ -1,4 +1,4 @@
-"""OpenPTV's correspondences on the benchmark's points (`optv`, with the extra ``bench``).
+"""OpenPTV's correspondences on the benchmark's points (`optv`, with the group ``bench``).
 
 OpenPTV has the objects about the origin and the cameras at +z: a rotation about the middle of the
 scene gives that. Its cameras look along -z with y up. Its "glass" gets the refractive index of

@@ -115,5 +115,5 @@ def test_a_tiny_round_ends(name, play, tmp_path, capsys):
 
 @pytest.mark.parametrize(("name", "package"), WITH_PACKAGES)
 def test_a_tiny_round_with_other_packages_ends(name, package, play):
-    pytest.importorskip(package, reason=f"{package} is of an extra")
+    pytest.importorskip(package, reason=f"{package} is of an extra or a group")
     play(name, WITH_PACKAGES[name, package])

@@ -15,7 +15,7 @@ from epipole.flows import api
 pytestmark = pytest.mark.long
 
 for package in ("sphinx", "furo", "myst_parser", "numpydoc", "matplotlib"):
-    pytest.importorskip(package, reason=f"{package} is of the extra docs")
+    pytest.importorskip(package, reason=f"{package} is of the group docs")
 
 BUILD = ROOT / "docs" / "site" / "build.py"
 OUTSIDE = ("http://", "https://", "mailto:", "data:")

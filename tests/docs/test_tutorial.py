@@ -28,7 +28,7 @@ class Sensor(NamedTuple):
 
 
 def test_the_tutorial_prints_what_it_says(example, monkeypatch):
-    pytest.importorskip("matplotlib", reason="matplotlib is of the extra docs")
+    pytest.importorskip("matplotlib", reason="matplotlib is of the group docs")
     monkeypatch.setenv("MPLBACKEND", "agg")
     said = (ROOT / TUTORIAL).read_text()
     assert with_outputs(said, example) == said, "`.ci/generate pages` writes it again"
