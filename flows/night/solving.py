@@ -98,7 +98,7 @@ def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
         rows = [work.identified[sensor].read(span, "solutions", columns) for span in spans]
         serving = [array(frames_that_serve(part), "time") for part in rows]
         times.append(np.concatenate([np.zeros(0, np.int64), *serving]))
-    return grid_of(times, settings)
+    return grid_of(times, settings.alignment)
 
 
 def _view(night: _Night) -> dict[Span, int]:
@@ -110,7 +110,8 @@ def _view(night: _Night) -> dict[Span, int]:
     ]
     futures = [
         view_sensors.submit(
-            [sensors[sensor] for sensor in group], span, night.grid, work.cameras, settings,
+            [sensors[sensor] for sensor in group], span, night.grid, work.cameras,
+            settings.tracklets, settings.alignment,
         )
         for span, group in groups
     ]  # fmt: skip
@@ -144,13 +145,14 @@ def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str
     """Find the objects, a task per block, or per span where a task may hold all its views."""
     futures = []
     for span in night.spans:
-        blocks = blocks_of(span, night.settings)
+        blocks = blocks_of(span, night.settings.association)
         together = n_views[span] <= night.settings.work.most_views
         for of_task in [blocks] if together else [[block] for block in blocks]:
             futures.append(
                 associate_blocks.submit(
                     night.sensors, night.viewed, of_task, night.work.cameras, left_out,
-                    night.settings, night.solved.blocks,
+                    night.settings.association, night.settings.alignment.window_s,
+                    night.settings.work.most_views, night.solved.blocks,
                 )
             )  # fmt: skip
     results(Stage.SOLVE, futures, (1, STEPS))
@@ -159,14 +161,17 @@ def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str
 def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     """Solve the objects, a task per piece; return the number of positions."""
     spans, settings, solved = night.spans, night.settings, night.solved
-    numbered = number_objects.submit(spans, night.margin_ns, settings, solved)
+    numbered = number_objects.submit(
+        spans, night.margin_ns, settings.association, settings.work.most_views, solved
+    )
     (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
     viewed, margin_ns = night.viewed, night.margin_ns
     most_views = MAX_JUDGED * night.epochs_apart
     full = [span for span, count in zip(spans, counts, strict=True) if count]
     judged = [
         judge_span.submit(
-            viewed, span, margin_ns, night.apart_ns, most_views, settings, solved,
+            viewed, span, margin_ns, night.apart_ns, most_views, settings.positions,
+            settings.states, solved,
         )
         for span in full
     ]  # fmt: skip
@@ -178,7 +183,8 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     ]
     futures = [
         solve_piece.submit(
-            viewed, piece, margin_ns, _kept_lines(night, n_views[piece.span]), settings, solved,
+            viewed, piece, margin_ns, _kept_lines(night, n_views[piece.span]),
+            settings.positions, settings.states, solved,
         )
         for piece in pieces
     ]  # fmt: skip

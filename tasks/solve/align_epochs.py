@@ -8,7 +8,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, concat, table
-from epipole.schemas.settings import AlignmentSettings, Settings
+from epipole.schemas.settings import AlignmentSettings
 from epipole.schemas.tables import EPOCHS
 from epipole.tasks.algorithms.times import (
     epoch_grid,
@@ -26,7 +26,7 @@ class EpochGrid(NamedTuple):
     instants_ns: tuple[int, ...] | None  # the epochs, where no sensor has a frame interval
 
 
-def grid_of(time_ns: Sequence[npt.NDArray[np.int64]], settings: Settings) -> EpochGrid:
+def grid_of(time_ns: Sequence[npt.NDArray[np.int64]], settings: AlignmentSettings) -> EpochGrid:
     """Return a night's grid of epochs.
 
     Parameters
@@ -34,7 +34,7 @@ def grid_of(time_ns: Sequence[npt.NDArray[np.int64]], settings: Settings) -> Epo
     time_ns
         For each sensor, the times of the frames that can be used; see `frames_that_serve`.
     """
-    wanted_s = settings.alignment.interval_s
+    wanted_s = settings.interval_s
     if wanted_s is not None:
         return EpochGrid(max(round(wanted_s * 1e9), 1), None)
     interval_ns = epoch_interval_ns(list(time_ns))
@@ -51,7 +51,7 @@ def frames_that_serve(solutions: pa.Table) -> pa.Table:
 
 
 def align_epochs(
-    solutions: pa.Table, settings: Settings, grid: EpochGrid | None = None
+    solutions: pa.Table, settings: AlignmentSettings, grid: EpochGrid | None = None
 ) -> pa.Table:
     """Return EPOCHS: for each epoch and sensor the nearest frame, and its distance in time.
 
@@ -73,7 +73,7 @@ def align_epochs(
     else:
         epochs = np.array(instants_ns, np.int64)
     rows = [
-        _serving(epochs, sensor, array(part, "frame_number"), t, interval_ns, settings.alignment)
+        _serving(epochs, sensor, array(part, "frame_number"), t, interval_ns, settings)
         for sensor, part, t in zip(sensors, parts, times, strict=True)
     ]
     return concat(EPOCHS, rows).sort_by([("epoch", "ascending"), ("sensor_id", "ascending")])

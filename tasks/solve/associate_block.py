@@ -1,4 +1,4 @@
-"""Associate blocks: the objects of each block of time, from the views of all sensors."""
+"""Associate blocks: the objects of each block of time, and the outcome of each tracklet."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -12,7 +12,7 @@ from epipole.io.work.parts import ASSOCIATED, Parts, write_part
 from epipole.io.work.work_layout import ViewedParts
 from epipole.schemas.bridge import array, concat, empty, from_polars, table, to_polars
 from epipole.schemas.rejects import Outcome, Reason, reject_rows
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import AssociationSettings
 from epipole.schemas.spans import BLOCK_NS, Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
@@ -22,8 +22,6 @@ from epipole.tasks.common.sightings import published_ids
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.associate_objects import Associated, associate_objects
 from epipole.tasks.solve.association_input import BlockViews, SensorViews
-
-# -- Judge tracklets: the outcome of each that was compared with other sensors in a span.
 
 _RANK = {outcome.value: rank for rank, outcome in enumerate(Outcome)}
 
@@ -64,9 +62,6 @@ def outcomes(tracklet_id: pa.ChunkedArray, outcome: Outcome) -> pa.Table:
     return table(TRACKLET_OUTCOMES, {"tracklet_id": ids, "outcome": values})
 
 
-# -- Associate blocks: the objects of each block of time, from the views of all sensors.
-
-
 @stage_task(Stage.SOLVE, "objects {blocks[0]}")
 def associate_blocks(
     sensors: Sequence[Sensor],
@@ -74,7 +69,9 @@ def associate_blocks(
     blocks: Sequence[Span],
     cameras: pa.Table,
     left_out: Mapping[str, Reason],
-    settings: Settings,
+    settings: AssociationSettings,
+    half_width_s: float,
+    most_views: int,
     parts: Parts,
 ) -> None:
     """Find the objects of some blocks of one span, unless the parts exist.
@@ -87,20 +84,34 @@ def associate_blocks(
         The parts of their views.
     left_out
         Sensors at fault, each with its reason; their views are not used.
+    half_width_s
+        Time on each side of an epoch in which the direction of a view was fitted.
+    most_views
+        Views that one task may hold.
     parts
         Where the parts go: `ASSOCIATED` of each block.
     """
     for block in blocks:
         if not parts.holds(block):
-            held = [of for of in sensors if viewed[of.number].holds(block.span)]
-            views = [sensor_views(of, viewed[of.number], block.span) for of in held]
-            tables = _associate(views, block, cameras, left_out, settings)
-            write_part(parts.of(block), ASSOCIATED, tables)
+            views = [
+                sensor_views(of, viewed[of.number], block.span)
+                for of in sensors
+                if viewed[of.number].holds(block.span)
+            ]
+            taking_part = [
+                of for of in views if of.sensor_id not in left_out and of.epochs.num_rows
+            ]
+            of_block = None
+            if any(of.tracklets.num_rows for of in taking_part):
+                of_block = BlockViews(taking_part, cameras, block, settings.span_s, half_width_s)
+            tables = _associate(of_block, settings, most_views)
+            faulty = [of for of in views if of.sensor_id in left_out]
+            write_part(parts.of(block), ASSOCIATED, _with_faulty(tables, faulty, block, left_out))
 
 
-def blocks_of(span: Span, settings: Settings) -> list[Span]:
+def blocks_of(span: Span, settings: AssociationSettings) -> list[Span]:
     """Return the blocks of a span: as long as the longest evidence, or else the span."""
-    return [span] if settings.association.span_s * 1e9 > BLOCK_NS else span.blocks
+    return [span] if settings.span_s * 1e9 > BLOCK_NS else span.blocks
 
 
 def sensor_views(sensor: Sensor, viewed: Parts, span: Span) -> SensorViews:
@@ -115,31 +126,32 @@ def sensor_views(sensor: Sensor, viewed: Parts, span: Span) -> SensorViews:
 
 
 def _associate(
-    sensors: Sequence[SensorViews],
-    block: Span,
-    cameras: pa.Table,
-    left_out: Mapping[str, Reason],
-    settings: Settings,
+    block: BlockViews | None, settings: AssociationSettings, most_views: int
 ) -> dict[str, pa.Table]:
-    faulty = [of for of in sensors if of.sensor_id in left_out]
-    rejects = _left_out(faulty, block, left_out)
-    views = [of for of in sensors if of.sensor_id not in left_out and of.epochs.num_rows]
-    if not any(of.tracklets.num_rows for of in views):
-        return {
-            "members": empty(OBJECT_MEMBERS),
-            "rejects": rejects,
-            "outcomes": _outcomes(faulty, Outcome.SENSOR_LEFT_OUT),
-        }
-    of_block = BlockViews(
-        views, cameras, block, settings.association.span_s, settings.alignment.window_s
-    )
-    associated = associate_objects(of_block, settings)
+    """Return the tables of a block; None: there is nothing to associate."""
+    if block is None:
+        schemas = {"members": OBJECT_MEMBERS, "rejects": REJECTS, "outcomes": TRACKLET_OUTCOMES}
+        return {name: empty(schema) for name, schema in schemas.items()}
+    associated = associate_objects(block, settings, most_views)
     return {
-        "members": object_members(of_block, associated),
-        "rejects": concat(REJECTS, [rejects, associated.rejects]),
-        "outcomes": best_outcomes(
-            [_outcomes(faulty, Outcome.SENSOR_LEFT_OUT), *_of_items(of_block, associated)]
-        ),
+        "members": object_members(block, associated),
+        "rejects": associated.rejects,
+        "outcomes": best_outcomes(_of_items(block, associated)),
+    }
+
+
+def _with_faulty(
+    tables: Mapping[str, pa.Table],
+    faulty: Sequence[SensorViews],
+    block: Span,
+    left_out: Mapping[str, Reason],
+) -> dict[str, pa.Table]:
+    """Return the tables of a block with what is said of the sensors at fault."""
+    outcomes_of_faulty = _outcomes(faulty, Outcome.SENSOR_LEFT_OUT)
+    return {
+        "members": tables["members"],
+        "rejects": concat(REJECTS, [_left_out(faulty, block, left_out), tables["rejects"]]),
+        "outcomes": best_outcomes([outcomes_of_faulty, tables["outcomes"]]),
     }
 
 

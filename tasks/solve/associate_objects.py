@@ -11,7 +11,7 @@ import pyarrow as pa
 from epipole.schemas.bridge import concat
 from epipole.schemas.options import ASSOCIATION, load_method
 from epipole.schemas.rejects import Reason, reject_rows
-from epipole.schemas.settings import AssociationSettings, Settings
+from epipole.schemas.settings import AssociationSettings
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
@@ -45,26 +45,33 @@ class Associated(NamedTuple):
     rejects: pa.Table
 
 
-def associate_objects(block: BlockViews, settings: Settings) -> Associated:
+def associate_objects(
+    block: BlockViews, settings: AssociationSettings, most_views: int
+) -> Associated:
     """Return which tracklets that two or more sensors detect are one object, in each window.
 
     Object numbers count from 0 in the order of first appearance. An object keeps its number from
     window to window as long as one of its tracks continues. A sensor that disagrees with all
     others is left out.
+
+    Parameters
+    ----------
+    most_views
+        Views that are sampled at the same time, a limit of memory.
     """
     items = block.items
     verdicts = Verdicts(items)
     believed = np.ones(len(items.window), bool)
     windows = _windows(items.window)
     rejects = []
-    for sampled, window in _sampled_windows(block, settings.work.most_views):
+    for sampled, window in _sampled_windows(block, most_views):
         rows = windows[window]
         disagreeing = _judge(block, sampled, window, rows, verdicts, settings)
         if len(disagreeing):
             left_out = rows[np.isin(items.sensor[rows], disagreeing)]
             believed[left_out] = False
             rejects.append(_reject_table(block, Reason.SENSOR_DISAGREES, left_out))
-    if settings.association.method == "likelihood":
+    if settings.method == "likelihood":
         _judge_again(block, verdicts, believed, settings)
     for rows in windows:
         ambiguous = rows[verdicts.ambiguous[rows]]
@@ -101,7 +108,7 @@ def _judge(
     window: int,
     rows: Indices,
     verdicts: Verdicts,
-    settings: Settings,
+    settings: AssociationSettings,
 ) -> Indices:
     """Enter the verdict on a window's items; return the sensors that disagree with all others.
 
@@ -130,12 +137,12 @@ def _warn_of(sensors: npt.NDArray[np.str_]) -> None:
 
 
 def _judge_again(
-    block: BlockViews, verdicts: Verdicts, believed: Flags, settings: Settings
+    block: BlockViews, verdicts: Verdicts, believed: Flags, settings: AssociationSettings
 ) -> None:
     """Judge undecided tracklets again, over longer windows."""
-    judged_s = settings.association.span_s
+    judged_s = settings.span_s
     for window_s in LONGER_S:
-        if not judged_s < window_s <= settings.association.longest_span_s:
+        if not judged_s < window_s <= settings.longest_span_s:
             continue
         longer = block.items.first_ns // round(window_s * 1e9)
         for number in np.unique(longer[believed]).tolist():
@@ -178,9 +185,9 @@ def _numbered(block: BlockViews, group: Indices, windows: list[Indices]) -> Indi
     return number
 
 
-def _solve(block: BlockViews, samples: Samples, settings: Settings) -> Groups:
-    associate = load_method(ASSOCIATION, settings.association.method)
-    groups: Groups = associate(samples, block.poses.focal_px, settings.association)
+def _solve(block: BlockViews, samples: Samples, settings: AssociationSettings) -> Groups:
+    associate = load_method(ASSOCIATION, settings.method)
+    groups: Groups = associate(samples, block.poses.focal_px, settings)
     return groups
 
 

@@ -14,7 +14,7 @@ import pyarrow as pa
 from epipole.io.work.parts import NUMBERED, Parts, write_part
 from epipole.io.work.work_layout import SolvedParts
 from epipole.schemas.bridge import from_polars, to_polars
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import AssociationSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import OBJECT_MEMBERS
@@ -27,7 +27,11 @@ Indices = npt.NDArray[np.int64]
 
 @stage_task(Stage.SOLVE, "numbers of objects")
 def number_objects(
-    spans: Sequence[Span], margin_ns: int, settings: Settings, solved: SolvedParts
+    spans: Sequence[Span],
+    margin_ns: int,
+    settings: AssociationSettings,
+    most_views: int,
+    solved: SolvedParts,
 ) -> list[int]:
     """Number the objects of all blocks, unless the parts exist; return each span's pieces.
 
@@ -37,6 +41,8 @@ def number_objects(
         In order.
     margin_ns
         The motion of an object at the ends of a span needs its views in this time beyond them.
+    most_views
+        Views that one task may hold.
     solved
         `blocks` is read, `objects` gets a part for each span.
 
@@ -49,7 +55,7 @@ def number_objects(
         for k, span in enumerate(spans):
             near = [numbered[j] for j in (k - 1, k, k + 1) if 0 <= j < len(spans)]
             rows = _within(pl.concat(near), span.widened(margin_ns))
-            members = from_polars(OBJECT_MEMBERS, _in_pieces(rows, span, settings))
+            members = from_polars(OBJECT_MEMBERS, _in_pieces(rows, span, most_views))
             write_part(solved.objects.of(span), NUMBERED, {"members": members})
     return [_pieces(solved.objects.read(span, "members", ["piece"])) for span in spans]
 
@@ -58,7 +64,9 @@ def _pieces(members: pa.Table) -> int:
     return int(members["piece"].to_numpy().max(initial=-1)) + 1
 
 
-def _number(spans: Sequence[Span], settings: Settings, blocks: Parts) -> list[pl.DataFrame]:
+def _number(
+    spans: Sequence[Span], settings: AssociationSettings, blocks: Parts
+) -> list[pl.DataFrame]:
     """Return the members of each span's objects, with the numbers of the night."""
     registry = ObjectRegistry()
     track_number: dict[str, int] = {}
@@ -96,14 +104,14 @@ def _within(members: pl.DataFrame, time: Span) -> pl.DataFrame:
     return members.filter((last >= time.start_ns) & (first < time.end_ns))
 
 
-def _in_pieces(members: pl.DataFrame, span: Span, settings: Settings) -> pl.DataFrame:
+def _in_pieces(members: pl.DataFrame, span: Span, most_views: int) -> pl.DataFrame:
     """Return the members of the objects in a span, each object in a piece."""
     inside = _within(members, span)
     size = inside.group_by("object").agg(pl.col("n_views").sum()).sort("object")
     piece, held = [], 0
     number = 0
     for n_views in size["n_views"].to_list():
-        if held and held + n_views > settings.work.most_views:
+        if held and held + n_views > most_views:
             number, held = number + 1, 0
         held += n_views
         piece.append(number)

@@ -1,16 +1,12 @@
 """Pair views: how far the views of an object at an epoch lie from each other's epipolar lines."""
 
-from typing import NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, table
-from epipole.schemas.settings import Settings
+from epipole.schemas.bridge import table
 from epipole.schemas.tables import ASSOCIATIONS, PAIRS
-from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.directions import apparent_places, tangent_basis
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.geometry.epipolar import (
     UncertainSight,
     epipolar_angle,
@@ -18,76 +14,39 @@ from epipole.tasks.algorithms.geometry.epipolar import (
     epipolar_sigma,
 )
 from epipole.tasks.common.sightings import published_ids
-
-# -- Views grouped by object and epoch, and the solution of each group.
+from epipole.tasks.solve.view_groups import ViewGroups
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
-
-
-class ViewGroups(NamedTuple):
-    """Views grouped by epoch and object, and the solution of each group."""
-
-    views: pa.Table
-    offsets: Indices
-    object_id: npt.NDArray[np.object_]
-    epoch_ns: Indices
-    u: Array
-    r_km: Array
-    cov: Array
-    x_km: Array
-    cov_km2: Array
-    chi2: Array
-    used: npt.NDArray[np.bool_]
-    mean_range_km: Array
-    velocity_km_s: Array
-    independent: npt.NDArray[np.bool_]
-
-    @property
-    def apparent_km(self) -> Array:
-        """Where each view's sensor sees the object: its light left at a time of its own."""
-        group = self.group
-        light_s = self.mean_range_km / SPEED_OF_LIGHT_KM_S
-        return apparent_places(
-            self.x_km[group], self.velocity_km_s[group], light_s[group], self.r_km
-        )
-
-    @property
-    def group(self) -> Indices:
-        """Group of each view."""
-        return np.repeat(np.arange(len(self.epoch_ns)), np.diff(self.offsets))
-
-
-# -- Pair views: how far the views of an object at an epoch lie from each other's epipolar lines.
 
 MAX_OTHERS = 8  # views to which a view's epipolar distance is taken, those of the least error
 
 
 def association_table(groups: ViewGroups) -> pa.Table:
     """Return ASSOCIATIONS: a row per view."""
-    views = groups.views
+    views, labels = groups.views, groups.views.labels
     ranked = np.lexsort((_position_error(groups), groups.group))
-    angle = epipolar_rms(groups.offsets, ranked, MAX_OTHERS, _seen_together(groups), groups.u)
+    angle = epipolar_rms(groups.offsets, ranked, MAX_OTHERS, _seen_together(groups), views.u)
     shared = ("epoch", "sensor_id", "frame_number", "centroid", "x_px", "y_px")
     return table(
         ASSOCIATIONS,
-        {name: views[name] for name in shared}
+        {name: labels[name] for name in shared}
         | {
-            "tracklet_id": published_ids(views["tracklet_id"]),
+            "tracklet_id": published_ids(labels["tracklet_id"]),
             "object_id": groups.object_id[groups.group],
-            "epipolar_px": angle / array(views, "pixel_rad"),
+            "epipolar_px": angle / views.pixel_rad,
             "used": groups.used,
         },
     )
 
 
-def pair_table(groups: ViewGroups, settings: Settings) -> pa.Table:
+def pair_table(groups: ViewGroups, all_pairs: bool) -> pa.Table:
     """Return PAIRS: used views that both have a centroid, the reference view first.
 
-    The reference view is the one of the least position error.
+    The reference view is the one of the least position error. With `all_pairs`, every two views.
     """
-    has_centroid = groups.views["centroid"].is_valid().to_numpy() & groups.used
-    if settings.positions.all_pairs:
+    has_centroid = groups.views.labels["centroid"].is_valid().to_numpy() & groups.used
+    if all_pairs:
         first, second = _every_two(groups.group, has_centroid)
     else:
         first, second = _with_reference(groups, has_centroid)
@@ -99,21 +58,22 @@ def pair_table(groups: ViewGroups, settings: Settings) -> pa.Table:
     }
     for side, rows in (("1", first), ("2", second)):
         for name in ("sensor_id", "frame_number", "centroid"):
-            columns[f"{name}_{side}"] = groups.views[name].take(rows)
+            columns[f"{name}_{side}"] = groups.views.labels[name].take(rows)
     return table(PAIRS, columns)
 
 
 def _seen_together(groups: ViewGroups) -> Array:
-    """Return the places of the sensors, each moved as if all saw the object at one place: the
-    light to a farther one left earlier."""
-    return groups.r_km + np.nan_to_num(groups.x_km[groups.group] - groups.apparent_km)
+    """Return the positions of the sensors, each moved as if all saw the object at one position:
+    the light to a farther one left earlier."""
+    return groups.views.r_km + np.nan_to_num(groups.x_km[groups.group] - groups.apparent_km)
 
 
 def _position_error(groups: ViewGroups) -> Array:
     """Return the square of the error that each view alone leaves at the object [km^2]."""
-    across = np.trace(groups.cov, axis1=1, axis2=2) / 2
-    away_km = np.linalg.norm(groups.x_km[groups.group] - groups.r_km, axis=1)
-    return across * away_km**2 + array(groups.views, "position_sigma_km") ** 2
+    views = groups.views
+    across = np.trace(views.cov_noise + views.cov_bias, axis1=1, axis2=2) / 2
+    away_km = np.linalg.norm(groups.x_km[groups.group] - views.r_km, axis=1)
+    return across * away_km**2 + views.sigma_km**2
 
 
 def _with_reference(
@@ -145,14 +105,15 @@ def _every_two(group: Indices, candidates: npt.NDArray[np.bool_]) -> tuple[Indic
 
 def _distances(groups: ViewGroups, first: Indices, second: Indices) -> tuple[Array, Array]:
     """Return how far each second view lies from the first one's epipolar line: in px, in sigmas."""
-    r, u = _seen_together(groups), groups.u
+    views = groups.views
+    r, u = _seen_together(groups), views.u
     angle = np.abs(epipolar_angle(r[first], u[first], r[second], u[second]))
     basis = tangent_basis(u)
-    cov = np.swapaxes(basis, -1, -2) @ groups.cov @ basis
-    sigma_km = array(groups.views, "position_sigma_km")
+    cov = np.swapaxes(basis, -1, -2) @ (views.cov_noise + views.cov_bias) @ basis
+    sigma_km = views.sigma_km
     sigma = epipolar_sigma(
         UncertainSight(r[first], u[first], cov[first], sigma_km[first]),
         UncertainSight(r[second], u[second], cov[second], sigma_km[second]),
         groups.x_km[groups.group[first]],
     )
-    return angle / array(groups.views, "pixel_rad")[second], angle / sigma
+    return angle / views.pixel_rad[second], angle / sigma

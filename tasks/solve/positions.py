@@ -1,26 +1,13 @@
 """Solve positions: each object at each epoch, by weighted least squares over all its views."""
 
-from typing import NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.schemas.bridge import (
-    array,
-    concat,
-    stack,
-    stack_covariance,
-    table,
-    unstack,
-    unstack_covariance,
-)
-from epipole.schemas.columns import TANGENT_AXES
+from epipole.schemas.bridge import array, concat, table, unstack, unstack_covariance
 from epipole.schemas.rejects import Reason, reject_rows
-from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
 from epipole.schemas.tables import POSITIONS, REJECTS
-from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.triangulation import triangulate
 from epipole.tasks.algorithms.orbits.object_motion import (
@@ -28,9 +15,9 @@ from epipole.tasks.algorithms.orbits.object_motion import (
     neglected_motion,
     velocities,
 )
-from epipole.tasks.common.grouping import factorize, group_offsets
+from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import only_id
-from epipole.tasks.solve.pairs import ViewGroups, association_table, pair_table
+from epipole.tasks.solve.view_groups import ObjectViews, ViewGroups
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -38,82 +25,67 @@ Indices = npt.NDArray[np.int64]
 VELOCITY_WINDOW_S = 30.0  # positions within this time give an object's velocity
 
 
-class Solved(NamedTuple):
-    """Tables ASSOCIATIONS, PAIRS, POSITIONS and REJECTS.
-
-    `views` are VIEWS of the objects. Where an object's motion is known, their directions are
-    corrected for the motion that their fits neglected.
-    """
-
-    associations: pa.Table
-    pairs: pa.Table
-    positions: pa.Table
-    rejects: pa.Table
-    views: pa.Table
-
-
 def solve_positions(
-    views: pa.Table, object_number: Indices, settings: Settings, span: Span | None = None
-) -> Solved:
+    views: ObjectViews, reject_sigma: float, span: Span | None = None
+) -> ViewGroups:
     """Return the positions, with covariances, of objects that two or more sensors detect.
 
     They are solved twice. The first solution gives the velocities, which are needed because the
     light time to near and far sensors differs, and for the motion that the fits of the directions
-    neglected. With `span`, only its epochs are returned.
+    neglected.
+
+    Parameters
+    ----------
+    reject_sigma
+        A view farther from the position than this is rejected, see `triangulate`.
+    span
+        Only its epochs are returned. Default: all.
     """
-    groups = _solve(views, object_number, settings)
+    groups = _solve(views, reject_sigma)
     if span is not None:
-        groups = _within(groups, span)
-    groups = groups._replace(independent=_independent(groups, span))
-    return Solved(
-        association_table(groups),
-        pair_table(groups, settings),
-        _position_table(groups),
-        _reject_table(groups),
-        groups.views,
+        groups = groups.within(span.holds(groups.epoch_ns))
+    return groups._replace(independent=_independent(groups, span))
+
+
+def _solve(views: ObjectViews, reject_sigma: float) -> ViewGroups:
+    row = np.lexsort((views.sensor, views.object_number, views.epoch_ns))
+    if not np.array_equal(row, np.arange(len(row))):
+        views = views.take(row)
+    offsets = group_offsets(views.epoch_ns, views.object_number)
+    start = offsets[:-1]
+    epoch_ns, number = views.epoch_ns[start], views.object_number[start]
+    group = np.repeat(np.arange(len(start)), np.diff(offsets))
+    velocity = np.zeros((len(start), 3))
+    for last in (False, True):
+        cov = views.cov_noise + views.cov_bias
+        x_km, cov_km2, chi2, used, mean_range = triangulate(
+            offsets, views.r_km, views.u, cov, views.sigma_km, velocity, reject_sigma
+        )
+        velocity, spread_s = _velocities(epoch_ns, number, x_km)
+        if not last:
+            sigma = np.sqrt(np.trace(cov_km2, axis1=1, axis2=2) / 3)
+            state = np.hstack([x_km, velocity])[group]
+            views = with_neglected_motion(views, state, sigma[group], spread_s[group])
+    return ViewGroups(
+        views=views,
+        row=row,
+        offsets=offsets,
+        object_id=object_names(epoch_ns, number),
+        epoch_ns=epoch_ns,
+        x_km=x_km,
+        cov_km2=cov_km2,
+        velocity_km_s=velocity,
+        chi2=chi2,
+        mean_range_km=mean_range,
+        used=used,
+        independent=np.zeros(len(start), bool),
     )
 
 
-def _solve(views: pa.Table, object_number: Indices, settings: Settings) -> ViewGroups:
-    views, number = _in_order(views, object_number)
-    epoch_ns = array(views, "epoch")
-    offsets = group_offsets(epoch_ns, number)
-    r_km, sigma_km = stack(views, "{}_km"), array(views, "position_sigma_km")
-    start = offsets[:-1]
-    velocity = np.zeros((len(start), 3))
-    for last in (False, True):
-        u, cov = stack(views, "u{}"), _direction_covariance(views)
-        x_km, cov_km2, chi2, used, mean_range = triangulate(
-            offsets, r_km, u, cov, sigma_km, velocity, settings.positions.reject_sigma
-        )
-        velocity, spread_s = _velocities(epoch_ns[start], number[start], x_km)
-        if not last:
-            group = np.repeat(np.arange(len(start)), np.diff(offsets))
-            sigma = np.sqrt(np.trace(cov_km2, axis1=1, axis2=2) / 3)
-            views = with_neglected_motion(
-                views,
-                np.hstack([x_km, velocity])[group],
-                sigma[group],
-                spread_s[group],
-            )
-    return ViewGroups(
-        views, offsets, object_names(epoch_ns[start], number[start]), epoch_ns[start], u, r_km, cov,
-        x_km, cov_km2, chi2, used, mean_range, velocity, np.zeros(len(start), bool),
-    )  # fmt: skip
-
-
-def _in_order(views: pa.Table, number: Indices) -> tuple[pa.Table, Indices]:
-    """Return the views in the order of epochs, objects and sensors."""
-    order = np.lexsort((factorize(views, "sensor_id").rank, number, array(views, "epoch")))
-    if np.array_equal(order, np.arange(len(order))):
-        return views, number
-    return views.take(order), number[order]
-
-
 def with_neglected_motion(
-    views: pa.Table, state: Array, sigma_km: Array, spread_s: Array
-) -> pa.Table:
-    """Return VIEWS with directions corrected for the motion that their fits neglected.
+    views: ObjectViews, state: Array, sigma_km: Array, spread_s: Array
+) -> ObjectViews:
+    """Return views with directions corrected for the motion that their fits neglected.
 
     Parameters
     ----------
@@ -127,8 +99,8 @@ def with_neglected_motion(
     The error of the correction takes the place of the variance of the neglected motion. A view
     for which it is not smaller stays as it is.
     """
-    sensor = np.hstack([stack(views, "{}_km"), stack(views, "sensor_v{}_km_s")])
-    moments, neglected = stack(views, "moment_{}", "123"), array(views, "unmodelled_rad2")
+    sensor = np.hstack([views.r_km, views.v_km_s])
+    moments, neglected = views.moments, views.unmodelled
     off = neglected_motion(state, sensor, moments)
     reach = np.linalg.norm(state[:, :3] - sensor[:, :3], axis=1)
     speed = np.linalg.norm(state[:, 3:] - sensor[:, 3:], axis=1)
@@ -139,42 +111,11 @@ def with_neglected_motion(
         error = np.hypot(error, np.linalg.norm(off, axis=1) * sigma_km / reach)
     known = error**2 < neglected
     off[~known] = 0.0
-    u = stack(views, "u{}") - off
+    u = views.u - off
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     less = np.where(known, neglected - error**2, 0.0)
-    cov = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
-    cov = cov - less[:, None, None] * np.eye(2)
-    columns = {
-        **unstack("u{}", u),
-        **unstack_covariance("cov_noise_{}_rad2", cov, TANGENT_AXES),
-        "unmodelled_rad2": neglected - less,
-    }
-    return table(VIEWS, {**{name: views[name] for name in VIEWS.names}, **columns})
-
-
-def _within(groups: ViewGroups, span: Span) -> ViewGroups:
-    """Return the groups whose epoch lies in a span."""
-    kept = span.holds(groups.epoch_ns)
-    if kept.all():
-        return groups
-    rows = np.flatnonzero(kept[groups.group])
-    size = np.diff(groups.offsets)[kept]
-    return ViewGroups(
-        views=groups.views.take(rows),
-        offsets=np.concatenate([[0], np.cumsum(size)]).astype(np.int64),
-        object_id=groups.object_id[kept],
-        epoch_ns=groups.epoch_ns[kept],
-        u=groups.u[rows],
-        r_km=groups.r_km[rows],
-        cov=groups.cov[rows],
-        x_km=groups.x_km[kept],
-        cov_km2=groups.cov_km2[kept],
-        chi2=groups.chi2[kept],
-        used=groups.used[rows],
-        mean_range_km=groups.mean_range_km[kept],
-        velocity_km_s=groups.velocity_km_s[kept],
-        independent=groups.independent[kept],
-    )
+    cov = views.cov_noise - less[:, None, None] * np.eye(2)
+    return views._replace(u=u, cov_noise=cov, unmodelled=neglected - less)
 
 
 def _independent(groups: ViewGroups, span: Span | None) -> npt.NDArray[np.bool_]:
@@ -183,16 +124,13 @@ def _independent(groups: ViewGroups, span: Span | None) -> npt.NDArray[np.bool_]
 
     Where a detection lies outside the span, the neighbouring span may use it: not such a group.
     """
-    first_ns, last_ns = array(groups.views, "first_fitted"), array(groups.views, "last_fitted")
-    apart = np.isfinite(groups.chi2)
+    views, apart = groups.views, groups.solved
     if span is not None:
-        outside = ~(span.holds(first_ns) & span.holds(last_ns))
+        outside = ~(span.holds(views.first_ns) & span.holds(views.last_ns))
         apart[groups.group[outside & groups.used]] = False
-    track, names = factorize(groups.views, "tracklet_id")
-    until = np.full(len(names), np.iinfo(np.int64).min)
-    # Copies: to numba a read-only array is another type.
+    until = np.full(int(views.tracklet.max(initial=-1)) + 1, np.iinfo(np.int64).min)
     keep_independent(
-        groups.offsets, groups.used, track, first_ns.copy(), last_ns.copy(), until, apart
+        groups.offsets, groups.used, views.tracklet, views.first_ns, views.last_ns, until, apart
     )
     return apart
 
@@ -212,14 +150,6 @@ def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
     return names
 
 
-def _direction_covariance(views: pa.Table) -> Array:
-    noise, bias = (
-        stack_covariance(views, f"cov_{which}_{{}}_rad2", TANGENT_AXES)
-        for which in ("noise", "bias")
-    )
-    return noise + bias
-
-
 def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> tuple[Array, Array]:
     order = np.lexsort((epoch_ns, number))
     cuts = np.flatnonzero(np.diff(number[order])) + 1
@@ -231,8 +161,9 @@ def _velocities(epoch_ns: Indices, number: Indices, x_km: Array) -> tuple[Array,
     return v_km_s, spread_s
 
 
-def _position_table(groups: ViewGroups) -> pa.Table:
-    solved = np.isfinite(groups.chi2)
+def position_table(groups: ViewGroups) -> pa.Table:
+    """Return POSITIONS of the groups that have one."""
+    solved = groups.solved
     n_used = np.bincount(groups.group, groups.used, minlength=len(solved)).astype(np.int32)
     light_ns = np.nan_to_num(groups.mean_range_km / SPEED_OF_LIGHT_KM_S * 1e9)
     columns = {
@@ -252,35 +183,34 @@ def _position_table(groups: ViewGroups) -> pa.Table:
 
 def _residual_px(groups: ViewGroups) -> Array:
     """Return the rms image distance of each group's used views from its position."""
-    sight = groups.apparent_km - groups.r_km
+    sight = groups.apparent_km - groups.views.r_km
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-    pixel = array(groups.views, "pixel_rad")
-    square = np.where(groups.used, np.sum((sight - groups.u) ** 2, axis=1) / pixel**2, 0.0)
+    off = np.sum((sight - groups.views.u) ** 2, axis=1) / groups.views.pixel_rad**2
+    square = np.where(groups.used, off, 0.0)
     size = len(groups.epoch_ns)
     count = np.maximum(np.bincount(groups.group, groups.used, minlength=size), 1)
     return np.sqrt(np.bincount(groups.group, square, minlength=size) / count)
 
 
-def _reject_table(groups: ViewGroups) -> pa.Table:
+def reject_table(groups: ViewGroups) -> pa.Table:
     """Return a row of `rejects` per sensor and reason, with the number of views."""
-    unsolved = ~np.isfinite(groups.chi2)[groups.group]
+    unsolved = ~groups.solved[groups.group]
     which = {
         Reason.VIEW_REJECTED: ~groups.used & ~unsolved,
         Reason.NO_POSITION: unsolved,
     }
-    sensor, names = factorize(groups.views, "sensor_id")
-    tracklet_id = array(groups.views, "tracklet_id")
-    epoch_ns = array(groups.views, "epoch")
+    views = groups.views
+    tracklet_id = array(views.labels, "tracklet_id")
     tables = []
     for reason, left_out in which.items():
-        for k in np.unique(sensor[left_out]):
-            rows = left_out & (sensor == k)
+        for k in np.unique(views.sensor[left_out]):
+            rows = left_out & (views.sensor == k)
             tables.append(
                 reject_rows(
                     reason,
-                    sensor_id=str(names[k]),
+                    sensor_id=str(views.sensor_ids[k]),
                     tracklet_id=only_id(tracklet_id[rows]),
-                    time=[int(epoch_ns[rows].min())],
+                    time=[int(views.epoch_ns[rows].min())],
                     count=[int(rows.sum())],
                 )
             )

@@ -1,20 +1,30 @@
 """Keep lines: the lines of sight to objects, and the objects, that the check of sensors needs."""
 
 import zlib
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, conform, from_polars, stack, to_polars
-from epipole.schemas.columns import PLACE, VELOCITY
+from epipole.schemas.bridge import (
+    array,
+    conform,
+    from_polars,
+    nullable,
+    stack,
+    to_polars,
+    unstack,
+    unstack_covariance,
+)
+from epipole.schemas.columns import PLACE, TANGENT_AXES, VELOCITY
 from epipole.schemas.spans import DAY_NS
 from epipole.schemas.work_tables import CLAIMED_VIEWS, CLOCK_LINES, MOVING_OBJECTS
 from epipole.tasks.algorithms.geometry.directions import apparent_places
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.solve.positions import VELOCITY_WINDOW_S
+from epipole.tasks.solve.view_groups import ObjectViews, ViewGroups
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -45,48 +55,58 @@ def moving_objects(positions: pa.Table, every_ns: int) -> pa.Table:
     return from_polars(MOVING_OBJECTS, kept.select(MOVING_OBJECTS.names))
 
 
-def claimed_views(views: pa.Table, objects: pa.Table) -> pa.Table:
+def claimed_views(views: ObjectViews, objects: pa.Table) -> pa.Table:
     """Return CLAIMED_VIEWS: the views of objects at the epochs of MOVING_OBJECTS."""
-    return conform(CLAIMED_VIEWS, views.take(_at_epochs(views, objects)))
+    return conform(CLAIMED_VIEWS, views.labels.take(_at_epochs(views, objects)))
 
 
-def sample_sight_lines(
-    views: pa.Table, associations: pa.Table, objects: pa.Table, kept: LineSampling
-) -> pa.Table:
+def sample_sight_lines(groups: ViewGroups, objects: pa.Table, kept: LineSampling) -> pa.Table:
     """Return CLOCK_LINES: views of objects at the epochs of MOVING_OBJECTS.
 
     Where only some are kept, each object loses other sensors at each epoch, and each sensor other
     objects: a sensor is judged by many epochs, because all lines of a frame share the error of its
     attitude.
-
-    Parameters
-    ----------
-    views, associations
-        VIEWS of objects, and ASSOCIATIONS, row by row the same.
     """
-    rows = _at_epochs(associations, objects)
-    rows = rows[_turn(associations.take(rows), kept) == 0]
-    seen = to_polars(views.take(rows)).with_columns(
-        object_id=pl.Series(associations["object_id"].take(rows).to_pylist(), dtype=pl.String)
+    rows = _at_epochs(groups.views, objects)
+    rows = rows[_turn(groups, rows, kept) == 0]
+    object_id = groups.object_id[groups.group[rows]].tolist()
+    seen = _packed(groups.views.take(rows)).with_columns(
+        object_id=pl.Series(object_id, dtype=pl.String)
     )
     return meetings(seen, to_polars(objects), on=["epoch", "object_id"])
 
 
-def _at_epochs(rows: pa.Table, objects: pa.Table) -> Indices:
+def _packed(views: ObjectViews) -> pl.DataFrame:
+    """Return views as the columns of VIEWS that CLOCK_LINES has."""
+    columns: dict[str, Any] = {
+        **unstack("u{}", views.u),
+        **unstack_covariance("cov_noise_{}_rad2", views.cov_noise, TANGENT_AXES),
+        **unstack_covariance("cov_bias_{}_rad2", views.cov_bias, TANGENT_AXES),
+        **unstack("{}_km", views.r_km),
+        "position_sigma_km": views.sigma_km,
+    }
+    velocity = unstack("sensor_v{}_km_s", views.v_km_s)
+    packed = pa.table(columns | {name: nullable(values) for name, values in velocity.items()})
+    return to_polars(views.labels).hstack(to_polars(packed))
+
+
+def _at_epochs(views: ObjectViews, objects: pa.Table) -> Indices:
     """Return the rows at the epochs of MOVING_OBJECTS."""
-    epochs = np.unique(array(objects, "epoch"))
-    return np.flatnonzero(np.isin(array(rows, "epoch"), epochs))
+    return np.flatnonzero(np.isin(views.epoch_ns, np.unique(array(objects, "epoch"))))
 
 
-def _turn(associations: pa.Table, kept: LineSampling) -> Indices:
+def _turn(groups: ViewGroups, rows: Indices, kept: LineSampling) -> Indices:
     """Return a number below `one_in` of each view, evenly spread over sensors and objects."""
-    numbers = []
-    for name in ("sensor_id", "object_id"):
-        values = associations[name].combine_chunks().dictionary_encode()
-        of_value = [zlib.crc32(value.encode()) for value in values.dictionary.to_pylist()]
-        numbers.append(np.array(of_value, np.int64)[values.indices.to_numpy()])
-    epoch = array(associations, "epoch") // kept.every_ns
+    sensors = groups.views.sensor_ids[groups.views.sensor[rows]]
+    numbers = [_checksums(sensors), _checksums(groups.object_id[groups.group[rows]])]
+    epoch = groups.views.epoch_ns[rows] // kept.every_ns
     return np.asarray((numbers[0] + numbers[1] + epoch) % kept.one_in)
+
+
+def _checksums(texts: npt.NDArray[Any]) -> Indices:
+    """Return the CRC-32 of each text."""
+    distinct, which = np.unique(texts.astype(np.str_), return_inverse=True)
+    return np.array([zlib.crc32(text.encode()) for text in distinct.tolist()], np.int64)[which]
 
 
 def meetings(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Table:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, empty, nullable, table, unstack
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import TrackletSettings
 from epipole.schemas.work_tables import SIGHTINGS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
@@ -82,11 +82,20 @@ class Sighted(NamedTuple):
 
 
 def sight_objects(
-    solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
+    solutions: pa.Table,
+    detections: pa.Table,
+    cameras: pa.Table,
+    settings: TrackletSettings,
+    half_width_s: float,
 ) -> Sighted | None:
     """Return the sightings of one sensor's detections that have a tracklet and a direction.
 
     A detection in a lone frame is a tracklet of one detection. None where there are none.
+
+    Parameters
+    ----------
+    half_width_s
+        Time on each side of a detection in which its apparent motion is fitted.
     """
     frames = solved_frames(solutions)
     detections = _with_lone(frames, detections, settings)
@@ -97,7 +106,7 @@ def sight_objects(
         return None
     row = int(frames.camera[0])
     camera = camera_of(cameras, row)
-    tracklets = _with_split_prior(_by_tracklet(frames, tracked), frames, settings)
+    tracklets = _with_split_prior(_by_tracklet(frames, tracked), frames, half_width_s)
     tracklets = _with_blends(tracklets, frames, camera)
     return Sighted(frames, tracklets, camera, optics_covariance_of(cameras, row))
 
@@ -124,9 +133,9 @@ def optics_covariance(
     return np.asarray(np.swapaxes(R, 1, 2) @ shared @ R)
 
 
-def _with_lone(frames: Frames, detections: pa.Table, settings: Settings) -> pa.Table:
+def _with_lone(frames: Frames, detections: pa.Table, settings: TrackletSettings) -> pa.Table:
     """Return the detections; unknown ones in lone frames get the id of a tracklet of their own."""
-    lone_frames = frames.number[in_lone_frames(frames.time_ns, settings.tracklets)]
+    lone_frames = frames.number[in_lone_frames(frames.time_ns, settings)]
     if not len(lone_frames):
         return detections
     unknown = array(detections, "kind") == "unknown"
@@ -184,7 +193,7 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
 
 
 def _with_split_prior(
-    tracklets: TrackletSightings, frames: Frames, settings: Settings
+    tracklets: TrackletSightings, frames: Frames, half_width_s: float
 ) -> TrackletSightings:
     """Return the sightings with each prior attitude's error divided as the detections show it.
 
@@ -209,7 +218,7 @@ def _with_split_prior(
         u,
         tracklets.cov_noise,
         tracklets.cov_bias,
-        settings.alignment.window_s,
+        half_width_s,
     )
     leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / own
     follows = np.append(False, (np.diff(tracklet) == 0) & (np.diff(prior) == 1))

@@ -16,7 +16,7 @@ import pyarrow as pa
 from epipole.io.work.parts import JUDGED, SOLVED, is_written, read_part, write_part
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
 from epipole.schemas.bridge import array, concat, to_polars
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import PositionSettings, StateSettings
 from epipole.schemas.spans import DAY_NS, Span, spans_between
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
@@ -24,22 +24,21 @@ from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.associate_block import judge_views
-from epipole.tasks.solve.positions import solve_positions
+from epipole.tasks.solve.pairs import association_table, pair_table
+from epipole.tasks.solve.positions import position_table, reject_table, solve_positions
 from epipole.tasks.solve.sample_sight_lines import (
     LineSampling,
     claimed_views,
     moving_objects,
     sample_sight_lines,
 )
-from epipole.tasks.solve.states import (
-    fit_states,
-    judge_errors,
-    refuse_misfits,
+from epipole.tasks.solve.states import fit_states, judge_errors, refuse_misfits
+from epipole.tasks.solve.view_groups import (
+    ViewGroups,
+    unpack_views,
     with_larger_errors,
     with_stated_errors,
 )
-
-# -- Gather views: all views of some objects, from the parts of all sensors.
 
 Indices = npt.NDArray[np.int64]
 
@@ -128,13 +127,6 @@ def _seen_by_two(views: pa.Table, number: Indices, sensor: Indices) -> Indices:
     return order[np.repeat(count, count) >= 2]
 
 
-# -- Solve a piece: the positions and states of some objects of a span, part to part.
-#
-# Margins before and after the span are solved too, so that the velocities at its first and last
-# epochs rest on as much as all others. Rows of the margins are not kept: they belong to the
-# neighbouring spans.
-
-
 class Piece(NamedTuple):
     """Some objects of a span: the piece's number, and of how many."""
 
@@ -153,7 +145,8 @@ def solve_piece(
     piece: Piece,
     margin_ns: int,
     kept: LineSampling,
-    settings: Settings,
+    positions: PositionSettings,
+    states: StateSettings,
     solved: SolvedParts,
 ) -> int:
     """Write the positions and states of some objects, `SOLVED`, unless the part exists.
@@ -174,44 +167,42 @@ def solve_piece(
     """
     part = solved.piece(piece.span, piece.number)
     if not is_written(part):
-        write_part(part, SOLVED, _solve(viewed, piece, margin_ns, kept, settings, solved))
+        members = solved.objects.read(piece.span, "members")
+        members = members.filter(pa.compute.field("piece") == piece.number)
+        views = unpack_views(*gather_views(viewed, members, piece.span.widened(margin_ns)))
+        errors = solved.errors.read(piece.span, "errors")
+        groups = solve_positions(
+            with_larger_errors(views, errors), positions.reject_sigma, piece.span
+        )
+        write_part(part, SOLVED, _tables(groups, errors, kept, positions.all_pairs, states))
     return read_part(part, "positions").num_rows
 
 
-def _solve(
-    viewed: ViewedParts,
-    piece: Piece,
-    margin_ns: int,
+def _tables(
+    groups: ViewGroups,
+    errors: pa.Table,
     kept: LineSampling,
-    settings: Settings,
-    solved: SolvedParts,
+    all_pairs: bool,
+    states: StateSettings,
 ) -> dict[str, pa.Table]:
-    span = piece.span
-    members = solved.objects.read(span, "members").filter(pa.compute.field("piece") == piece.number)
-    views, number = gather_views(viewed, members, span.widened(margin_ns))
-    errors = solved.errors.read(span, "errors")
-    found = solve_positions(with_larger_errors(views, errors), number, settings, span)
-    states, misfits = refuse_misfits(
-        fit_states(found.views, found.associations, found.positions, settings)
-    )
-    objects = moving_objects(found.positions, kept.every_ns)
+    """Return the tables of a solved piece."""
+    positions, associations = position_table(groups), association_table(groups)
+    fitting, misfits = refuse_misfits(fit_states(groups, states))
+    objects = moving_objects(positions, kept.every_ns)
+    # The check of the sensors holds the lines against the errors that the sensors state.
+    stated = groups._replace(views=with_stated_errors(groups.views, errors))
     return {
-        "associations": found.associations,
-        "positions": found.positions,
-        "pairs": found.pairs,
-        "states": states,
-        "rejects": concat(REJECTS, [found.rejects, misfits]),
-        "outcomes": judge_views(found.associations),
-        # The check of the sensors holds the lines against the errors that the sensors state.
-        "lines": sample_sight_lines(
-            with_stated_errors(found.views, errors), found.associations, objects, kept
-        ),
-        "claims": claimed_views(found.views, objects),
+        "associations": associations,
+        "positions": positions,
+        "pairs": pair_table(groups, all_pairs),
+        "states": fitting,
+        "rejects": concat(REJECTS, [reject_table(groups), misfits]),
+        "outcomes": judge_views(associations),
+        "lines": sample_sight_lines(stated, objects, kept),
+        "claims": claimed_views(groups.views, objects),
         "objects": objects,
     }
 
-
-# -- Judge a span: the sensors whose shared errors are larger than stated, part to part.
 
 ENOUGH = 8  # objects that show the errors of a sensor
 
@@ -223,7 +214,8 @@ def judge_span(
     margin_ns: int,
     every_ns: int,
     most_views: int,
-    settings: Settings,
+    positions: PositionSettings,
+    states: StateSettings,
     solved: SolvedParts,
 ) -> None:
     """Write SHARED_ERRORS of a span, `JUDGED`, unless the part exists.
@@ -241,10 +233,12 @@ def judge_span(
     if solved.errors.holds(span):
         return
     members = telling_objects(solved.objects.read(span, "members"), most_views)
-    views, number = gather_views(viewed, members, span.widened(margin_ns), every_ns)
-    found = solve_positions(views, number, settings, span)
-    errors = judge_errors(views, found.associations, found.positions, settings)
-    write_part(solved.errors.of(span), JUDGED, {"errors": errors})
+    gathered = gather_views(viewed, members, span.widened(margin_ns), every_ns)
+    views = unpack_views(*gathered)
+    groups = solve_positions(views, positions.reject_sigma, span)
+    # Directions as they were fitted: what the fits neglect is part of the noise of each.
+    fitted = groups._replace(views=views.take(groups.row))
+    write_part(solved.errors.of(span), JUDGED, {"errors": judge_errors(fitted, states)})
 
 
 def telling_objects(members: pa.Table, most_views: int) -> pa.Table:

@@ -1,4 +1,4 @@
-"""View objects: the directions of one sensor's tracklets at the epochs."""
+"""Views: the directions of a sensor's tracklets at the epochs, part to part."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from epipole.io.work.parts import VIEWED, read_part, write_part
 from epipole.io.work.work_layout import SensorParts
 from epipole.schemas.bridge import array, empty, nullable, stack, table, unstack, unstack_covariance
 from epipole.schemas.columns import TANGENT_AXES
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import AlignmentSettings, TrackletSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import SENSOR_EPOCHS, SOLUTIONS, VIEWED_TRACKLETS, VIEWS
@@ -41,13 +41,13 @@ from epipole.tasks.solve.sightings import (
     tabulate_sightings,
 )
 
-# -- View objects: the directions of one sensor's tracklets at the epochs.
-
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 
-def view_objects(epochs: pa.Table, sighted: Sighted | None, settings: Settings) -> pa.Table:
+def view_objects(
+    epochs: pa.Table, sighted: Sighted | None, max_rate_deg_s: float, half_width_s: float
+) -> pa.Table:
     """Return VIEWS of one sensor: each tracklet at each epoch that it covers, in this order.
 
     A detection in a lone frame is a tracklet of one detection, at an unknown rate.
@@ -55,11 +55,18 @@ def view_objects(epochs: pa.Table, sighted: Sighted | None, settings: Settings) 
     A tracklet covers the epochs between its ends, and those beyond them that are no farther away
     than an epoch may be from its frame. The aberration by the sensor's geocentric velocity is
     removed from each detection before the motion is fitted.
+
+    Parameters
+    ----------
+    max_rate_deg_s
+        Fastest apparent motion, the prior of a rate that is unknown.
+    half_width_s
+        Time on each side of an epoch in which the motion is fitted.
     """
     if sighted is None or not epochs.num_rows:
         return empty(VIEWS)
     query = _queries(sighted.tracklets, epochs, sighted.frames)
-    return _view_table(sighted, query, epochs, settings)
+    return _view_table(sighted, query, epochs, max_rate_deg_s, half_width_s)
 
 
 class _EpochQueries(NamedTuple):
@@ -93,7 +100,11 @@ def _queries(tracklets: TrackletSightings, epochs: pa.Table, frames: Frames) -> 
 
 
 def _view_table(
-    sighted: Sighted, query: _EpochQueries, epochs: pa.Table, settings: Settings
+    sighted: Sighted,
+    query: _EpochQueries,
+    epochs: pa.Table,
+    max_rate_deg_s: float,
+    half_width_s: float,
 ) -> pa.Table:
     frames, tracklets, camera = sighted.frames, sighted.tracklets, sighted.camera
     tracklet, row, served = query
@@ -106,12 +117,12 @@ def _view_table(
         bounds[tracklet],
         bounds[tracklet + 1],
         at_s,
-        np.radians(settings.tracklets.max_rate_deg_s) / 3,  # the fastest is a 3-sigma rate
+        np.radians(max_rate_deg_s) / 3,  # the fastest is a 3-sigma rate
         (frames.time_ns[tracklets.frame] - origin) / 1e9,
         u_still,
         tracklets.cov_noise,
         tracklets.cov_bias,
-        settings.alignment.window_s,
+        half_width_s,
     )
     centroid, missed = _centroids(tracklets, query)
     q = interpolate_quaternions((frames.time_ns - origin) / 1e9, frames.q_sensor_from_icrs, at_s)
@@ -191,8 +202,6 @@ def _carried(frames: Frames, served: Indices, dt_s: Array) -> tuple[Array, Array
     return r + np.nan_to_num(v) * back + gravity * back**2 / 2, v + gravity * back
 
 
-# -- View sensors: the directions of sensors' tracklets at the epochs of a span, part to part.
-
 MIN_FRAMES = 6  # beyond the ends of a span: the motion at an epoch is fitted to these too
 
 
@@ -202,7 +211,8 @@ def view_sensors(
     span: Span,
     grid: EpochGrid,
     cameras: pa.Table,
-    settings: Settings,
+    tracklets: TrackletSettings,
+    alignment: AlignmentSettings,
 ) -> int:
     """Write the views of some sensors in a span, `VIEWED`, unless the parts exist.
 
@@ -214,27 +224,34 @@ def view_sensors(
     count = 0
     for sensor in sensors:
         if not sensor.viewed.holds(span):
-            tables = _view(sensor, span, grid, cameras, settings)
+            tables = _view(sensor, span, grid, cameras, tracklets, alignment)
             write_part(sensor.viewed.of(span), VIEWED, tables)
         count += sensor.viewed.read(span, "views").num_rows
     return count
 
 
 def _view(
-    sensor: SensorParts, span: Span, grid: EpochGrid, cameras: pa.Table, settings: Settings
+    sensor: SensorParts,
+    span: Span,
+    grid: EpochGrid,
+    cameras: pa.Table,
+    tracklets: TrackletSettings,
+    alignment: AlignmentSettings,
 ) -> dict[str, pa.Table]:
-    margin_ns = round(2e9 * settings.alignment.window_s) + MIN_FRAMES * grid.interval_ns
+    margin_ns = round(2e9 * alignment.window_s) + MIN_FRAMES * grid.interval_ns
     wide = span.widened(margin_ns)
     solutions = sensor.identified.rows_within(wide, SOLUTIONS, "solutions")
-    epochs = span.of(align_epochs(solutions, settings, grid), "epoch")
-    sighted = sight_objects(solutions, detections_within(sensor, wide), cameras, settings)
-    views = view_objects(epochs, sighted, settings)
-    tracklets = read_part(sensor.names.of_night(), "tracklets")
+    epochs = span.of(align_epochs(solutions, alignment, grid), "epoch")
+    half_width_s = alignment.window_s
+    detections = detections_within(sensor, wide)
+    sighted = sight_objects(solutions, detections, cameras, tracklets, half_width_s)
+    views = view_objects(epochs, sighted, tracklets.max_rate_deg_s, half_width_s)
+    named = read_part(sensor.names.of_night(), "tracklets")
     return {
         "epochs": sensor_epochs(epochs, solutions),
         "views": views,
         "sightings": span.of(tabulate_sightings(sighted), "time"),
-        "tracklets": viewed_tracklets(tracklets, views),
+        "tracklets": viewed_tracklets(named, views),
     }
 
 

@@ -15,6 +15,7 @@ from epipole.flows.simulate import simulate
 from epipole.io.simulation.scenes import read_scene
 from epipole.schemas.scene import Scene
 from epipole.schemas.settings import Settings
+from epipole.tasks.solve.positions import position_table
 
 Array = npt.NDArray[np.float64]
 
@@ -47,7 +48,7 @@ def errors_of(scene: Scene, seed: int) -> Array:
         simulate(scene, log, seed=seed)
         night = see(log, settings)
         solved = solve(night, track(night, settings), settings)
-        return position_errors(log, solved.positions)
+        return position_errors(log, position_table(solved))
 
 
 def main() -> None:

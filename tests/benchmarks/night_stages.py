@@ -26,9 +26,10 @@ from epipole.tasks.identify.identify_stars import identify_stars
 from epipole.tasks.solve.align_epochs import align_epochs
 from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.number_objects import number_objects
-from epipole.tasks.solve.positions import Solved, solve_positions
+from epipole.tasks.solve.positions import solve_positions
 from epipole.tasks.solve.sightings import sight_objects, tabulate_sightings
 from epipole.tasks.solve.solve_piece import gather_views
+from epipole.tasks.solve.view_groups import ViewGroups, unpack_views
 from epipole.tasks.solve.views import sensor_epochs, view_objects, viewed_tracklets
 from epipole.tasks.track.track_span import Tracked, build_tracklets
 
@@ -86,35 +87,42 @@ def track(seen: IdentifiedLog, settings: Settings) -> Tracked:
     )
 
 
-def solve(seen: IdentifiedLog, tracked: Tracked, settings: Settings) -> Solved:
+def solve(seen: IdentifiedLog, tracked: Tracked, settings: Settings) -> ViewGroups:
     """Align, associate and triangulate: as the flow does, but all positions at once."""
     with tempfile.TemporaryDirectory() as folder:
         viewed = ViewedParts(Path(folder) / "views")
         sensors = _view(viewed, seen, tracked, settings)
-        spans = spans_between(*_ends(align_epochs(seen.solutions, settings)))
+        spans = spans_between(*_ends(align_epochs(seen.solutions, settings.alignment)))
         solved = SolvedParts(Path(folder))
         for span in spans:
-            blocks = blocks_of(span, settings)
-            associate_blocks.fn(sensors, viewed, blocks, seen.cameras, {}, settings, solved.blocks)
-        number_objects.fn(spans, 0, settings, solved)
+            blocks = blocks_of(span, settings.association)
+            associate_blocks.fn(
+                sensors, viewed, blocks, seen.cameras, {}, settings.association,
+                settings.alignment.window_s, settings.work.most_views, solved.blocks,
+            )  # fmt: skip
+        number_objects.fn(spans, 0, settings.association, settings.work.most_views, solved)
         members = [solved.objects.read(span, "members") for span in spans]
         time = Span(spans[0].start_ns, spans[-1].end_ns)
-        views, number = gather_views(viewed, concat(OBJECT_MEMBERS, members), time)
-    return solve_positions(views, number, settings)
+        views = unpack_views(*gather_views(viewed, concat(OBJECT_MEMBERS, members), time))
+    return solve_positions(views, settings.positions.reject_sigma)
 
 
 def _view(
     viewed: ViewedParts, seen: IdentifiedLog, tracked: Tracked, settings: Settings
 ) -> list[Sensor]:
     """Write the views of all sensors, a part per sensor and span."""
-    epochs = align_epochs(seen.solutions, settings)
+    epochs = align_epochs(seen.solutions, settings.alignment)
     sensors = [Sensor(k, name) for k, name in enumerate(sorted(sensor_ids(epochs)))]
     for sensor in sensors:
         solutions = of_sensor(seen.solutions, sensor.sensor_id)
         own = of_sensor(epochs, sensor.sensor_id)
         detections = of_sensor(tracked.detections, sensor.sensor_id)
-        sighted = sight_objects(solutions, detections, seen.cameras, settings)
-        views = view_objects(own, sighted, settings)
+        sighted = sight_objects(
+            solutions, detections, seen.cameras, settings.tracklets, settings.alignment.window_s
+        )
+        views = view_objects(
+            own, sighted, settings.tracklets.max_rate_deg_s, settings.alignment.window_s
+        )
         sightings = tabulate_sightings(sighted)
         tracklets = of_sensor(tracked.tracklets, sensor.sensor_id)
         for span in spans_between(*_ends(own)):

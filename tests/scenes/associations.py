@@ -128,7 +128,7 @@ def sensor_views(of: SceneTables, settings: Settings | None = None) -> list[Sens
         views = of.views.filter(of_sensor).sort_by(
             [("tracklet_id", "ascending"), ("epoch", "ascending")]
         )
-        epochs = align_epochs(solutions, settings or Settings(), grid)
+        epochs = align_epochs(solutions, (settings or Settings()).alignment, grid)
         tracklets = viewed_tracklets(of.tracklets.filter(of_sensor), views)
         out.append(
             SensorViews(
@@ -141,7 +141,7 @@ def sensor_views(of: SceneTables, settings: Settings | None = None) -> list[Sens
 def block_of(of: SceneTables, settings: Settings | None = None) -> BlockViews:
     """Return the views of a scene, which lies in one block."""
     settings = settings or Settings()
-    block = blocks_of(SPAN, settings)[0]
+    block = blocks_of(SPAN, settings.association)[0]
     assert block.holds(array(of.views, "epoch")).all()
     window_s, half_width_s = settings.association.span_s, settings.alignment.window_s
     return BlockViews(sensor_views(of, settings), of.cameras, block, window_s, half_width_s)
@@ -161,7 +161,7 @@ def associated(scene: Scene, names=None, **changes) -> Found:
     """Return the objects of a scene, with the views that positions are solved from."""
     settings = Settings(association=AssociationSettings(**changes))
     block = block_of(tables(scene, names), settings)
-    found = associate_objects(block, settings)
+    found = associate_objects(block, settings.association, settings.work.most_views)
     members = object_members(block, found)
     with tempfile.TemporaryDirectory() as folder:
         viewed = write_views(Path(folder), block.sensors, SPAN)

@@ -1,10 +1,12 @@
 """Check of sensors: what was corrected and what remains; nothing from nothing."""
 
+import numpy as np
+
 from epipole.io.work.parts import SOLVED, write_part
 from epipole.io.work.work_layout import SolvedParts, ViewedParts
 from epipole.schemas.bridge import empty, to_polars
 from epipole.schemas.spans import SPAN_NS, Sensor, Span
-from epipole.schemas.tables import ASSOCIATIONS, POSITIONS
+from epipole.schemas.tables import POSITIONS
 from epipole.schemas.work_tables import CLOCK_LINES, VIEWS
 from epipole.tasks.check.check_sensors import (
     SensorVerdict,
@@ -12,7 +14,9 @@ from epipole.tasks.check.check_sensors import (
     check_sensors,
     verdicts_of,
 )
+from epipole.tasks.solve.positions import solve_positions
 from epipole.tasks.solve.sample_sight_lines import LineSampling, moving_objects, sample_sight_lines
+from epipole.tasks.solve.view_groups import unpack_views
 
 LATE = SensorVerdict("a", 0.25, 0.01, "clock")
 EARLY = SensorVerdict("b", -0.5, 0.01, "clock")
@@ -29,7 +33,9 @@ def test_an_offset_is_the_correction_and_what_remains_of_it():
 
 def test_without_views_no_clock_is_known():
     objects = moving_objects(empty(POSITIONS), 13_000_000_000)
-    lines = sample_sight_lines(empty(VIEWS), empty(ASSOCIATIONS), objects, LineSampling(1))
+    views = unpack_views(empty(VIEWS), np.zeros(0, np.int64))
+    groups = solve_positions(views, reject_sigma=5.0)
+    lines = sample_sight_lines(groups, objects, LineSampling(1))
     assert lines.equals(empty(CLOCK_LINES))
     assert verdicts_of(to_polars(lines)) == []
     assert verdicts_of(to_polars(lines), {"a": 0.5}) == []

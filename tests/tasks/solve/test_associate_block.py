@@ -25,7 +25,7 @@ from epipole.tasks.solve.associate_block import (
 from epipole.tasks.solve.associate_objects import associate_objects
 
 SETTINGS = Settings()
-BLOCKS = blocks_of(SPAN, SETTINGS)
+BLOCKS = blocks_of(SPAN, SETTINGS.association)
 TIMES = np.array([5.0, 17.0, 29.0, 605.0, 617.0])  # in two blocks
 
 
@@ -35,8 +35,11 @@ def found_by(folder, of, left_out, settings=SETTINGS, blocks=None) -> Parts:
     viewed = write_views(folder / "views", sensors, SPAN)
     named = [Sensor(one.number, one.sensor_id) for one in sensors]
     parts = Parts(folder / "blocks")
-    blocks = blocks or blocks_of(SPAN, settings)
-    associate_blocks.fn(named, viewed, blocks, of.cameras, left_out, settings, parts)
+    blocks = blocks or blocks_of(SPAN, settings.association)
+    associate_blocks.fn(
+        named, viewed, blocks, of.cameras, left_out, settings.association,
+        settings.alignment.window_s, settings.work.most_views, parts,
+    )  # fmt: skip
     return parts
 
 
@@ -148,7 +151,7 @@ def test_evidence_longer_than_a_block_is_summed_over_the_span(tmp_path):
 def test_members_are_the_tracklets_of_each_object_with_their_times():
     scene = Scene(11, 3, times=np.arange(0.0, 120.0, 6.0)).objects(2, spread_km=300.0).strays(2)
     block = block_of(tables(scene))
-    found = associate_objects(block, SETTINGS)
+    found = associate_objects(block, SETTINGS.association, SETTINGS.work.most_views)
     members = to_polars(object_members(block, found))
     assert members.columns == OBJECT_MEMBERS.names
     of_objects = [k for k, who in enumerate(scene.who) if who >= 0]
@@ -173,7 +176,7 @@ def test_a_tracklet_that_is_of_no_object_for_a_while_has_two_members():
     """Seen by its own sensor only between two passes of another one, it is of no object there."""
     scene = Scene(11, 2, times=np.arange(0.0, 120.0, 6.0)).objects(1, spread_km=300.0)
     block = block_of(tables(scene))
-    found = associate_objects(block, SETTINGS)
+    found = associate_objects(block, SETTINGS.association, SETTINGS.work.most_views)
     assert (found.object_number == 0).all()
     number = np.where(block.items.window == 1, -1, found.object_number)
     members = to_polars(object_members(block, found._replace(object_number=number)))

@@ -29,12 +29,14 @@ def member(number, name, first, last, n_views=10, sensor=None):
 def numbered(tmp_path, blocks, settings=None, spans=SPANS[:2]) -> tuple[SolvedParts, list[int]]:
     """Number objects of blocks, given by their number in the run; the others are empty."""
     settings, solved = settings or Settings(), SolvedParts(tmp_path)
-    every = [block for span in spans for block in blocks_of(span, settings)]
+    every = [block for span in spans for block in blocks_of(span, settings.association)]
     for k, block in enumerate(every):
         tables = {name: empty(schema) for name, schema in ASSOCIATED.items()}
         tables["members"] = members(*blocks[k]) if k in blocks else empty(OBJECT_MEMBERS)
         write_part(solved.blocks.of(block), ASSOCIATED, tables)
-    return solved, number_objects.fn(spans, MARGIN_NS, settings, solved)
+    return solved, number_objects.fn(
+        spans, MARGIN_NS, settings.association, settings.work.most_views, solved
+    )
 
 
 def numbers(solved: SolvedParts, span: Span) -> dict[str, int]:
@@ -70,7 +72,7 @@ def test_objects_without_a_common_track_are_two(tmp_path):
 
 def test_longer_evidence_than_a_block_makes_a_span_one_block(tmp_path):
     settings = Settings(association=AssociationSettings(span_s=900.0))
-    assert blocks_of(SPANS[0], settings) == [SPANS[0]]
+    assert blocks_of(SPANS[0], settings.association) == [SPANS[0]]
     solved, pieces = numbered(
         tmp_path, {1: [member(0, "a", 1800, 3000), member(0, "b", 1800, 3000)]}, settings
     )
@@ -79,7 +81,7 @@ def test_longer_evidence_than_a_block_makes_a_span_one_block(tmp_path):
 
 
 def test_blocks_divide_a_span():
-    blocks = blocks_of(SPANS[0], Settings())
+    blocks = blocks_of(SPANS[0], AssociationSettings())
     assert [block.start_ns for block in blocks] == [
         SPANS[0].start_ns + k * BLOCK_NS for k in range(3)
     ]
@@ -156,7 +158,12 @@ def test_the_order_of_the_rows_of_a_block_does_not_matter(tmp_path):
 def test_parts_that_exist_are_not_made_again(tmp_path):
     solved, pieces = numbered(tmp_path, many_objects(1))
     before = {p: p.stat().st_ino for p in tmp_path.glob("objects/*/*")}
-    assert number_objects.fn(SPANS[:2], MARGIN_NS, Settings(), solved) == pieces
+    assert (
+        number_objects.fn(
+            SPANS[:2], MARGIN_NS, AssociationSettings(), WorkSettings().most_views, solved
+        )
+        == pieces
+    )
     assert {p: p.stat().st_ino for p in tmp_path.glob("objects/*/*")} == before
 
 

@@ -14,7 +14,7 @@ from epipole.schemas.bridge import (
     unstack_covariance,
 )
 from epipole.schemas.columns import TANGENT_AXES
-from epipole.schemas.settings import PositionSettings, Settings
+from epipole.schemas.settings import PositionSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
@@ -22,7 +22,9 @@ from epipole.tasks.algorithms.geometry.covariances import centroid_covariance, o
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
-from epipole.tasks.solve.positions import solve_positions
+from epipole.tasks.solve.pairs import pair_table
+from epipole.tasks.solve.positions import position_table, solve_positions
+from epipole.tasks.solve.view_groups import unpack_views
 
 T0 = 1_554_091_200_000_000_000
 SECOND_NS = 1_000_000_000
@@ -51,6 +53,10 @@ def night(n_epochs, half_s):
     return views, np.zeros(len(epoch), np.int64)
 
 
+def solved(views, number, span=None):
+    return solve_positions(unpack_views(views, number), PositionSettings().reject_sigma, span)
+
+
 def detections_of(views, positions, independent=True):
     """The detections of each position that is independent, or of each that is not."""
     kept = array(positions, "epoch")[array(positions, "independent") == independent]
@@ -68,7 +74,7 @@ def detections_of(views, positions, independent=True):
 
 def test_independent_positions_share_no_detection_and_all_others_share_one():
     views, number = night(61, 6)
-    positions = solve_positions(views, number, Settings()).positions
+    positions = position_table(solved(views, number))
     used = detections_of(views, positions)
     assert all(a.isdisjoint(b) for a, b in itertools.combinations(used, 2))
     assert array(positions, "independent").sum() == len(used) == 5  # 0 to 6 s, 7 to 19 s, ...
@@ -81,7 +87,7 @@ def test_independent_positions_of_neighbouring_spans_share_no_detection():
     used = []
     for half in (0, 1):
         span = Span(T0 + half * 60 * SECOND_NS, T0 + (half + 1) * 60 * SECOND_NS)
-        used += detections_of(views, solve_positions(views, number, Settings(), span).positions)
+        used += detections_of(views, position_table(solved(views, number, span)))
     assert all(a.isdisjoint(b) for a, b in itertools.combinations(used, 2))
     assert len(used) == 9  # five, and from 60 s on four
 
@@ -132,7 +138,7 @@ def test_what_the_fits_of_directions_neglect_does_not_add_up():
     mean_off, square = [], []
     for seed in range(40):
         views, true = turning(seed, 1.5)
-        positions = solve_positions(views, np.zeros(views.num_rows, int), Settings()).positions
+        positions = position_table(solved(views, np.zeros(views.num_rows, int)))
         at = (array(positions, "time") - T0) / 1e9
         off, cov = stack(positions, "{}_km") - true(at), stack_covariance(positions, "cov_{}")
         square.append(np.mean(np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov), off)) / 3)
@@ -161,15 +167,14 @@ def views_of_five(miss=None):
 
 
 def test_pairs_are_each_view_with_the_one_of_the_least_error():
-    pairs = solve_positions(*views_of_five(), Settings()).pairs
+    pairs = pair_table(solved(*views_of_five()), all_pairs=False)
     assert pairs["sensor_id_1"].to_pylist() == ["d"] * 4
     assert sorted(pairs["sensor_id_2"].to_pylist()) == ["a", "b", "c", "e"]
-    missed = solve_positions(*views_of_five(miss="d"), Settings()).pairs
+    missed = pair_table(solved(*views_of_five(miss="d")), all_pairs=False)
     assert missed["sensor_id_1"].to_pylist() == ["e"] * 3
 
 
-def test_all_pairs_are_a_setting():
-    settings = Settings(positions=PositionSettings(all_pairs=True))
-    pairs = solve_positions(*views_of_five(), settings).pairs
+def test_all_pairs_are_every_two_views():
+    pairs = pair_table(solved(*views_of_five()), all_pairs=True)
     rows = zip(pairs["sensor_id_1"].to_pylist(), pairs["sensor_id_2"].to_pylist(), strict=True)
     assert sorted(rows) == list(itertools.combinations("abcde", 2))

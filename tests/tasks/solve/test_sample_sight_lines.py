@@ -8,14 +8,16 @@ import pytest
 from scenes.associations import START_NS, filled
 
 from epipole.schemas.bridge import to_polars
-from epipole.schemas.tables import ASSOCIATIONS, POSITIONS
+from epipole.schemas.tables import POSITIONS
 from epipole.schemas.work_tables import VIEWS
+from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.solve.sample_sight_lines import (
     LineSampling,
     claimed_views,
     moving_objects,
     sample_sight_lines,
 )
+from epipole.tasks.solve.view_groups import ViewGroups, unpack_views
 
 EVERY_NS = 10_000_000_000
 N_EPOCHS, N_OBJECTS, N_SENSORS = 20, 12, 30
@@ -28,11 +30,16 @@ def kept_lines():
     seen = list(itertools.product(epochs.tolist(), range(N_OBJECTS), range(N_SENSORS)))
     epoch, number, sensor = (list(column) for column in zip(*seen, strict=True))
     shared = {"epoch": epoch, "sensor_id": [f"sat{s}" for s in sensor]}
-    names = [f"20190401-{k + 1:05d}" for k in number]
     views = filled(VIEWS, len(seen), shared | {
         **{f"sensor_v{a}_km_s": np.ones(len(seen)) for a in "xyz"}, "ux": np.ones(len(seen)),
     })  # fmt: skip
-    associations = filled(ASSOCIATIONS, len(seen), shared | {"object_id": names})
+    unpacked = unpack_views(views, np.array(number))
+    offsets = group_offsets(unpacked.epoch_ns, unpacked.object_number)
+    ids = [f"20190401-{k + 1:05d}" for k in unpacked.object_number[offsets[:-1]]]
+    groups = ViewGroups(**dict.fromkeys(ViewGroups._fields))._replace(
+        views=unpacked, offsets=offsets, epoch_ns=unpacked.epoch_ns[offsets[:-1]],
+        object_id=np.array(ids, object),
+    )  # fmt: skip
     each = list(itertools.product(epochs.tolist(), range(N_OBJECTS)))
     positions = filled(POSITIONS, len(each), {
         "epoch": [t for t, _ in each], "time": [t for t, _ in each],
@@ -43,8 +50,8 @@ def kept_lines():
     def kept(one_in: int) -> pl.DataFrame:
         choice = LineSampling(EVERY_NS, one_in)
         objects = moving_objects(positions, choice.every_ns)
-        assert claimed_views(views, objects).num_rows == len(seen) // 2  # whatever is kept
-        return to_polars(sample_sight_lines(views, associations, objects, choice))
+        assert claimed_views(unpacked, objects).num_rows == len(seen) // 2  # whatever is kept
+        return to_polars(sample_sight_lines(groups, objects, choice))
 
     return kept
 

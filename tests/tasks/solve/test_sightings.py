@@ -7,7 +7,7 @@ from scenes.cameras import cameras_of
 from scipy.spatial.transform import Rotation
 
 from epipole.schemas.bridge import array, unstack, unstack_covariance
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import AlignmentSettings, TrackletSettings
 from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
@@ -23,6 +23,9 @@ COV_ATT = np.array([[9.0, 2.0, 5.0], [2.0, 4.0, -3.0], [5.0, -3.0, 400.0]])  # [
 ATTITUDE = Rotation.from_euler("zyx", [0.3, -0.9, 1.1])  # sensor from ICRS
 PLACE_PX = (820.0, 130.0)
 V_KM_S = np.array([3.0, -6.0, 2.5])
+
+
+HALF_WIDTH_S = AlignmentSettings().window_s
 
 
 def sighted(source="stars", *, tracklet="t", flux=np.nan, cov_optics=None, **changed):
@@ -47,7 +50,9 @@ def sighted(source="stars", *, tracklet="t", flux=np.nan, cov_optics=None, **cha
         "tracklet_id": [tracklet] * N, "track_id": [tracklet] * N, "flux": np.full(N, flux),
     })  # fmt: skip
     cameras = cameras_of({"s": CAMERA}, cov_optics)
-    return tabulate_sightings(sight_objects(solutions, detections, cameras, Settings()))
+    return tabulate_sightings(
+        sight_objects(solutions, detections, cameras, TrackletSettings(), HALF_WIDTH_S)
+    )
 
 
 def moved(seed, n=40_000):

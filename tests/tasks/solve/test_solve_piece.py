@@ -46,7 +46,9 @@ def piece_of(folder, block, errors, piece=0, count=1):
     """Solve a piece of the objects of a scene, with these errors of sensors."""
     settings, solved = Settings(), SolvedParts(folder)
     viewed = write_views(folder / "views", block.sensors, SPAN)
-    members = object_members(block, associate_objects(block, settings))
+    members = object_members(
+        block, associate_objects(block, settings.association, settings.work.most_views)
+    )
     numbers = members["object"] if count > 1 else pa.array(np.zeros(members.num_rows, np.int64))
     at = members.schema.get_field_index("piece")
     members = members.set_column(at, members.schema.field(at), numbers)
@@ -54,7 +56,13 @@ def piece_of(folder, block, errors, piece=0, count=1):
     write_part(solved.errors.of(SPAN), JUDGED, {"errors": errors})
     made = Piece(SPAN, piece, count)
     n_positions = solve_piece.fn(
-        viewed, made, 30_000_000_000, LineSampling(EVERY_NS), settings, solved
+        viewed,
+        made,
+        30_000_000_000,
+        LineSampling(EVERY_NS),
+        settings.positions,
+        settings.states,
+        solved,
     )
     part = solved.piece(SPAN, piece)
     assert read_part(part, "positions").num_rows == n_positions

@@ -7,7 +7,7 @@ from scenes.cameras import cameras_of
 
 from epipole.schemas.bridge import array, stack, stack_covariance, unstack
 from epipole.schemas.columns import TANGENT_AXES
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import AlignmentSettings, TrackletSettings
 from epipole.schemas.tables import DETECTIONS, EPOCHS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.constants import ARCSEC
@@ -28,6 +28,9 @@ PIXEL = 1 / 3000  # [rad]
 CAMERA = Camera(1024, 1024, 1 / PIXEL, 1 / PIXEL, 511.5, 511.5)
 RATE = 40 * ARCSEC  # [rad/s]
 APART_S = 13  # epochs so far apart share no detection
+
+
+HALF_WIDTH_S = AlignmentSettings().window_s
 
 
 def views_of_priors(seed, white, constant):
@@ -76,8 +79,8 @@ def views_of(seen, source, flux, cov_optics=None):
     })  # fmt: skip
     epochs = filled(EPOCHS, N_FRAMES, key | {"epoch": time, "dt_s": np.zeros(N_FRAMES)})
     camera = cameras_of({"s": CAMERA}, cov_optics)
-    sighted = sight_objects(solutions, detections, camera, Settings())
-    views = view_objects(epochs, sighted, Settings())
+    sighted = sight_objects(solutions, detections, camera, TrackletSettings(), HALF_WIDTH_S)
+    views = view_objects(epochs, sighted, TrackletSettings().max_rate_deg_s, HALF_WIDTH_S)
     return views.sort_by([("tracklet_id", "ascending"), ("epoch", "ascending")])
 
 

@@ -1,0 +1,200 @@
+"""Views as arrays: the views of objects, and their groups by epoch and object.
+
+The table VIEWS is unpacked once, when the views of a piece have been gathered. Everything that
+solves a piece computes on these arrays; what it publishes is packed into tables once.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.schemas.bridge import array, stack, stack_covariance
+from epipole.schemas.columns import TANGENT_AXES
+from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.geometry.directions import apparent_places
+from epipole.tasks.common.grouping import factorize
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+# Columns of VIEWS that are only passed on.
+LABELS = ("epoch", "sensor_id", "frame_number", "tracklet_id", "centroid", "x_px", "y_px")
+
+
+class ObjectViews(NamedTuple):
+    """Views of objects, row by row the same; see VIEWS for the frames.
+
+    labels : table
+        The columns `LABELS`.
+    epoch_ns, object_number : (n,) int
+        Epochs [ns since 1970], and the objects.
+    sensor, tracklet : (n,) int
+        Ranks of the ids.
+    sensor_ids : (s,) str
+        The ids of the ranks, in order.
+    first_ns, last_ns : (n,) int
+        First and last detection that the direction was fitted to.
+    u, cov_noise, cov_bias : (n, 3), (n, 2, 2), (n, 2, 2) float
+        Directions, ICRS, and the covariances on their tangent planes [rad^2].
+    moments, unmodelled : (n, 3), (n,) float
+        Moments of the fitted times [s, s^2, s^3], and the neglected motion [rad^2].
+    r_km, v_km_s, sigma_km : (n, 3), (n, 3), (n,) float
+        Positions and velocities of the sensors, GCRF, and 1-sigma of a position per axis.
+    pixel_rad : (n,) float
+        Angle a pixel spans.
+    """
+
+    labels: pa.Table
+    epoch_ns: Indices
+    object_number: Indices
+    sensor: Indices
+    sensor_ids: npt.NDArray[np.str_]
+    tracklet: Indices
+    first_ns: Indices
+    last_ns: Indices
+    u: Array
+    cov_noise: Array
+    cov_bias: Array
+    moments: Array
+    unmodelled: Array
+    r_km: Array
+    v_km_s: Array
+    sigma_km: Array
+    pixel_rad: Array
+
+    def take(self, rows: Indices) -> "ObjectViews":
+        """Return these rows."""
+        whole = self._asdict()
+        ids = whole.pop("sensor_ids")
+        labels = whole.pop("labels").take(rows)
+        return ObjectViews(
+            labels=labels, sensor_ids=ids, **{name: values[rows] for name, values in whole.items()}
+        )
+
+
+def unpack_views(views: pa.Table, object_number: Indices) -> ObjectViews:
+    """Return VIEWS as arrays, each with the number of its object."""
+    sensor, sensor_ids = factorize(views, "sensor_id")
+    return ObjectViews(
+        labels=views.select(LABELS),
+        epoch_ns=array(views, "epoch").copy(),
+        object_number=object_number,
+        sensor=sensor,
+        sensor_ids=sensor_ids,
+        tracklet=factorize(views, "tracklet_id").rank,
+        first_ns=array(views, "first_fitted").copy(),
+        last_ns=array(views, "last_fitted").copy(),
+        u=stack(views, "u{}"),
+        cov_noise=stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES),
+        cov_bias=stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES),
+        moments=stack(views, "moment_{}", "123"),
+        unmodelled=array(views, "unmodelled_rad2").copy(),
+        r_km=stack(views, "{}_km"),
+        v_km_s=stack(views, "sensor_v{}_km_s"),
+        sigma_km=array(views, "position_sigma_km").copy(),
+        pixel_rad=array(views, "pixel_rad").copy(),
+    )
+
+
+def with_larger_errors(views: ObjectViews, errors: pa.Table) -> ObjectViews:
+    """Return views with the shared errors of some sensors as large as SHARED_ERRORS say."""
+    return _scaled(views, errors, 1.0)
+
+
+def with_stated_errors(views: ObjectViews, errors: pa.Table) -> ObjectViews:
+    """Return views with the shared errors that the sensors state: undo `with_larger_errors`."""
+    return _scaled(views, errors, -1.0)
+
+
+def _scaled(views: ObjectViews, errors: pa.Table, power: float) -> ObjectViews:
+    if not errors.num_rows:
+        return views
+    row = pc.index_in(pa.array(views.sensor_ids), errors["sensor_id"].combine_chunks())
+    direction, place = (
+        pc.fill_null(errors[name].take(row), 1.0).to_numpy()[views.sensor] ** power
+        for name in ("direction", "place")
+    )
+    return views._replace(
+        cov_bias=views.cov_bias * direction[:, None, None],
+        sigma_km=views.sigma_km * np.sqrt(place),
+    )
+
+
+class ViewGroups(NamedTuple):
+    """Views grouped by epoch and object, and the solution of each of the g groups.
+
+    views : ObjectViews
+        In the order of the groups. Where an object's motion is known, their directions are
+        corrected for the motion that their fits neglected.
+    row : (n,) int
+        Where each view was in the views that were solved.
+    offsets : (g + 1,) int
+        Group k has the views ``offsets[k]:offsets[k + 1]``.
+    object_id, epoch_ns : (g,) str, (g,) int
+        Object and epoch of each group.
+    x_km, cov_km2, velocity_km_s : (g, 3), (g, 3, 3), (g, 3) float
+        Positions at the epoch minus the mean light time, GCRF; NaN where there is no solution.
+    chi2, mean_range_km : (g,) float
+        Of the solution; NaN where there is none.
+    used : (n,) bool
+        The view takes part in the solution.
+    independent : (g,) bool
+        Groups of which no two share a detection.
+    """
+
+    views: ObjectViews
+    row: Indices
+    offsets: Indices
+    object_id: npt.NDArray[np.object_]
+    epoch_ns: Indices
+    x_km: Array
+    cov_km2: Array
+    velocity_km_s: Array
+    chi2: Array
+    mean_range_km: Array
+    used: Flags
+    independent: Flags
+
+    @property
+    def group(self) -> Indices:
+        """Group of each view."""
+        return np.repeat(np.arange(len(self.epoch_ns)), np.diff(self.offsets))
+
+    @property
+    def solved(self) -> Flags:
+        """The groups that have a position."""
+        return np.isfinite(self.chi2)
+
+    @property
+    def apparent_km(self) -> Array:
+        """Where the sensor of each view sees the object: light from it left at another time."""
+        group = self.group
+        light_s = self.mean_range_km / SPEED_OF_LIGHT_KM_S
+        return apparent_places(
+            self.x_km[group], self.velocity_km_s[group], light_s[group], self.views.r_km
+        )
+
+    def within(self, epochs: Flags) -> "ViewGroups":
+        """Return the groups with these epochs, (g,) bool."""
+        if epochs.all():
+            return self
+        rows = np.flatnonzero(epochs[self.group])
+        size = np.diff(self.offsets)[epochs]
+        return ViewGroups(
+            views=self.views.take(rows),
+            row=self.row[rows],
+            offsets=np.concatenate([[0], np.cumsum(size)]).astype(np.int64),
+            object_id=self.object_id[epochs],
+            epoch_ns=self.epoch_ns[epochs],
+            x_km=self.x_km[epochs],
+            cov_km2=self.cov_km2[epochs],
+            velocity_km_s=self.velocity_km_s[epochs],
+            chi2=self.chi2[epochs],
+            mean_range_km=self.mean_range_km[epochs],
+            used=self.used[rows],
+            independent=self.independent[epochs],
+        )
