@@ -27,6 +27,7 @@ TINY = {
     "clocks": "--offsets 0.1",
     "crowded_frames": "--cameras b --false 40 --cluster 0 --frames 2",
     "epipolar": "--scenes 2",
+    "example": "--rounds 1 --cached",
     "false_alarms": "followed alone --frames 20 --points 3 9 --every 3",
     "identity": "--gaps 120 --seeds 1",
     "ingest": "--frames 400 --runs 1",

@@ -1,0 +1,235 @@
+"""The tables of BENCHMARKS.md: every benchmark of the plan is run, and its output put in its part.
+
+    .ci/generate benchmarks [NAME ...] [--list]
+
+A part stands between two marks, as in the other pages (`docs/generated.py`). What is run takes an
+hour on two cores, one benchmark after the other. Results are kept in build/benchmarks: a round that
+was stopped goes on where it stopped, as long as the commit is the same. With names, only these are
+run. A part without a result stays as it is.
+"""
+
+import argparse
+import contextlib
+import datetime
+import json
+import os
+import platform
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "BENCHMARKS.md"
+RESULTS = ROOT / "build" / "benchmarks"
+MACHINE = "machine"  # the part that says when, where and with what all was measured
+
+sys.path.append(str(ROOT / "docs"))
+from generated import part, with_part  # noqa: E402
+
+
+class Benchmark(NamedTuple):
+    """One part of the page: a script of this folder, its arguments, and its longest time.
+
+    In the arguments, {folder} is an empty folder.
+    """
+
+    script: str
+    arguments: str = ""
+    max_minutes: float = 5.0
+
+    @property
+    def command(self) -> str:
+        """The command as the page shows it."""
+        return f"python tests/benchmarks/bench_{self.script}.py {self.arguments}".rstrip().format(
+            folder="FOLDER"
+        )
+
+
+class Result(NamedTuple):
+    """What a benchmark printed, and when and from which commit and machine."""
+
+    output: str
+    seconds: float
+    date: str
+    commit: str
+    machine: str
+
+
+GREAT_BEAR = "tests/photographs/great_bear.csv --width 5184 --height 3456 --field 25.9 --year 2011"
+# By the name of the part, in the order of the page.
+PLAN = {
+    "example": Benchmark("example", "--rounds 3", 10),
+    "night": Benchmark("night", "--shares 16 1", 10),
+    "scaling": Benchmark("scaling", "--sensors 32 128", 12),
+    "ingest": Benchmark("ingest", "--frames 100000 --runs 5"),
+    "ingest_json": Benchmark("ingest", "--frames 20000 --runs 5 --encoding json"),
+    "queries": Benchmark("queries", "--nights 365 --runs 5", 8),
+    "simulation": Benchmark("simulation", "--hours 1"),
+    "page": Benchmark("page", "--rounds 5"),
+    "star_identification": Benchmark("star_identification", "--made 1800 --seed 82 --no-peers", 15),
+    "crowded_frames": Benchmark("crowded_frames", "--frames 36 --seed 94", 10),
+    "unlike_frames": Benchmark("unlike_frames", "--cameras b --frames 60 --seed 602", 8),
+    "unknown_cameras": Benchmark("unknown_cameras", "--frames 20 --told 0.95", 10),
+    "false_alarms": Benchmark("false_alarms", "searched --seconds 240 --seed 403", 8),
+    "untold_optics": Benchmark(
+        "untold_optics", "--sensors 6 --frames 40 --fields 8 20 --place drawn --seed 23", 10
+    ),
+    "photographs": Benchmark("photographs", f"{GREAT_BEAR} --reach 6.5 --step 0.5"),
+    "catalogue": Benchmark("catalogue", "build --repeats 3"),
+    "tracking": Benchmark("tracking", "--false 10 100 1000 --repeats 1", 8),
+    "tracking_few": Benchmark("tracking", "--few --seeds 200"),
+    "track_linking": Benchmark("track_linking", "--seeds 4 --first 300", 8),
+    "association": Benchmark("association", "points --seeds 10 --false 100 300 1000", 10),
+    "many_sensors": Benchmark("association", "scale --seeds 2", 5),
+    "tracklets": Benchmark("association", "tracklets --seeds 5", 8),
+    "positions": Benchmark("positions", "--positions 3000"),
+    "alignment": Benchmark("alignment", "--seeds 3", 6),
+    "clocks": Benchmark("clocks", "--offsets 0 0.02 0.05 0.2 0.5 1", 6),
+    "identity": Benchmark("identity", "--gaps 120 900 1800 --seeds 1 2", 6),
+    "epipolar": Benchmark("epipolar", "--scenes 100", 8),
+    "orbit_fits": Benchmark("orbit_fits", "--seeds 4", 8),
+    "orekit_orbits": Benchmark("orekit_orbits"),
+    "known_objects": Benchmark("known_objects", "--objects 300 --ages 3 10", 8),
+    "real_orbits": Benchmark("real_orbits", "--scenes 4 --seed 71 --out {folder}", 12),
+}
+
+
+def commit() -> str:
+    """Return the commit of the working tree, and whether its files differ from it."""
+    git = ("git", "-C", str(ROOT))
+    name = subprocess.run(
+        [*git, "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True
+    )
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", ".", ":!BENCHMARKS.md"])
+    return name.stdout.strip() + (" with changes" if changed.returncode else "")
+
+
+def machine() -> str:
+    """Return what the figures depend on: cores, memory, system, Python."""
+    gib = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    python = f"Python {platform.python_version()}"
+    return f"{os.cpu_count()} cores, {gib:.0f} GiB, {platform.system()}, {python}"
+
+
+def run(benchmark: Benchmark) -> Result:
+    """Run a benchmark in a process of its own.
+
+    Raises
+    ------
+    RuntimeError
+        If it fails or takes too long; the message is the end of what it said.
+    """
+    script = Path(__file__).with_name(f"bench_{benchmark.script}.py")
+    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as errors:
+        arguments = benchmark.arguments.format(folder=f"{folder}/out").split()
+        process = subprocess.Popen(
+            [sys.executable, str(script), *arguments],
+            cwd=ROOT, env=os.environ | {"PREFECT_HOME": f"{folder}/prefect"}, text=True,
+            stdout=subprocess.PIPE, stderr=errors, start_new_session=True,
+        )  # fmt: skip
+        start = time.monotonic()
+        try:
+            output, _ = process.communicate(timeout=60 * benchmark.max_minutes)
+        except BaseException as stopped:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            if isinstance(stopped, subprocess.TimeoutExpired):
+                raise RuntimeError(f"not done after {benchmark.max_minutes:g} minutes") from None
+            raise
+        if process.returncode:
+            errors.seek(0)
+            raise RuntimeError(errors.read().strip()[-800:])
+    today = datetime.datetime.now(datetime.UTC).date().isoformat()
+    return Result(output, time.monotonic() - start, today, commit(), machine())
+
+
+def as_markdown(output: str) -> str:
+    """Return what a benchmark printed: its tables as they are, all else between fences."""
+    blocks: list[tuple[bool, list[str]]] = []
+    for line in filter(str.strip, output.splitlines()):
+        is_row = line.startswith("|")
+        if not blocks or blocks[-1][0] != is_row:
+            blocks.append((is_row, []))
+        blocks[-1][1].append(line.rstrip())
+    texts = []
+    for is_table, lines in blocks:
+        if not is_table:
+            lines = ["```text", *lines, "```"]
+        elif len(lines) > 1 and not re.fullmatch(r"[|\-: ]+", lines[1]):
+            lines.insert(1, "|" + "---|" * (lines[0].count("|") - 1))
+        texts.append("\n".join(lines) + "\n")
+    return "\n".join(texts)
+
+
+def part_of(benchmark: Benchmark, result: Result, *, alone: bool) -> str:
+    """Return the text of a part; with `alone` also its date, commit and machine."""
+    of_its_own = f" {result.date}, commit {result.commit}; {result.machine}." if alone else ""
+    head = f"`{benchmark.command}` ({result.seconds:.0f} s).{of_its_own}"
+    return f"{head}\n\n{as_markdown(result.output)}"
+
+
+def kept_results() -> dict[str, Result]:
+    """Return the results in build/benchmarks by the name of their part."""
+    files = ((name, RESULTS / f"{name}.json") for name in PLAN)
+    return {name: Result(**json.loads(f.read_text())) for name, f in files if f.exists()}
+
+
+def write_page(results: dict[str, Result]) -> None:
+    """Put all results in their parts."""
+    text = PAGE.read_text()
+    origins = {(result.date, result.commit, result.machine) for result in results.values()}
+    whole = len({origin[1:] for origin in origins}) == 1 and set(results) == set(PLAN)
+    if whole:
+        date, which, where = max(origins)
+        minutes = sum(result.seconds for result in results.values()) / 60
+        said = f"All tables: {date}, commit {which}; {where}; {minutes:.0f} minutes.\n"
+    else:
+        said = "Not all tables are of one commit yet: each says its date and commit.\n"
+    text = with_part(text, MACHINE, said)
+    for name, result in results.items():
+        content = part_of(PLAN[name], result, alone=not whole)
+        text = with_part(text, name, content)
+    PAGE.write_text(text)
+
+
+def main() -> int:
+    """Run what was asked for and write the page; return 1 if a benchmark failed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("names", nargs="*", metavar="NAME", help="parts; without: all")
+    parser.add_argument("--list", action="store_true", help="print names and commands only")
+    chosen = parser.parse_args()
+    if unknown := set(chosen.names) - set(PLAN):
+        parser.error(f"no such part: {', '.join(sorted(unknown))}")
+    if chosen.list:
+        print("\n".join(f"{name:20} {b.command}" for name, b in PLAN.items()))
+        return 0
+    for name in PLAN:
+        part(PAGE.read_text(), name)  # a missing part is an error before the hour, not after it
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    failed, here, kept = [], commit(), kept_results()
+    for name in chosen.names or PLAN:
+        if not chosen.names and name in kept and kept[name].commit == here:
+            continue
+        print(f"{name}: {PLAN[name].command}", flush=True)
+        try:
+            result = run(PLAN[name])
+        except RuntimeError as error:
+            failed.append(name)
+            print(f"  failed: {error}", flush=True)
+            continue
+        (RESULTS / f"{name}.json").write_text(json.dumps(result._asdict(), indent=1) + "\n")
+        print(f"  {result.seconds:.0f} s", flush=True)
+    write_page(kept_results())
+    if failed:
+        print(f"failed, and left as they stand in the page: {', '.join(failed)}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
