@@ -125,6 +125,7 @@ def run(benchmark: Benchmark) -> Result:
         If it fails or takes too long; the message is the end of what it said.
     """
     script = Path(__file__).with_name(f"bench_{benchmark.script}.py")
+    today, here = datetime.datetime.now(datetime.UTC).date().isoformat(), commit()
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+") as errors:
         arguments = benchmark.arguments.format(folder=f"{folder}/out").split()
         process = subprocess.Popen(
@@ -145,8 +146,7 @@ def run(benchmark: Benchmark) -> Result:
         if process.returncode:
             errors.seek(0)
             raise RuntimeError(errors.read().strip()[-800:])
-    today = datetime.datetime.now(datetime.UTC).date().isoformat()
-    return Result(output, time.monotonic() - start, today, commit(), machine())
+    return Result(output, time.monotonic() - start, today, here, machine())
 
 
 def as_markdown(output: str) -> str:
