@@ -1,4 +1,9 @@
-"""The navigation catalogue: directions and magnitudes of the stars at a date, for a camera."""
+"""Star catalogues: the stars at a date for a camera, and Gaia joined with Hipparcos.
+
+`navigation_catalogue` makes the list that stars are identified with. `join` and
+`johnson_v_of_gaia` prepare its source: Gaia with V magnitudes, and the bright stars of Hipparcos
+that Gaia lacks.
+"""
 
 from typing import NamedTuple
 
@@ -9,11 +14,21 @@ from scipy.spatial import cKDTree
 from epipole.tasks.algorithms.constants import ARCSEC, AU_KM
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit, unit_from_radec
 
-# -- The navigation catalogue: directions and magnitudes of the stars at a date, for a camera.
-
 Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int64]
 
 MAS = np.pi / 648_000_000.0  # rad
+# Stars within this are the same: 99.9 % of Hipparcos' places at 2016 are within 0.7" of Gaia's.
+SAME_ARCSEC = 1.0
+# A Hipparcos star is missing from Gaia if no Gaia star of similar brightness is this near (as
+# there is for a double that one of the catalogues resolves) and it is brighter than this.
+NEAR_ARCSEC = 3.0
+LIKE_MAG = 1.5
+SURELY_LISTED_MAG = 9.0
+# Where Hipparcos is brighter by more, its magnitude is used: the relation below fails for the
+# reddest variables, and of some doubles Gaia lists the faint star only.
+MORE_LIGHT_MAG = 1.0
+COLOURS = (-0.5, 5.0)  # BP-RP to which the relation holds
 
 
 class NavigationCatalogue(NamedTuple):
@@ -116,21 +131,7 @@ def limit_for_density(magnitude: Array, stars_per_sr: float) -> float:
     return float(magnitude[n - 1])
 
 
-# -- Gaia joined with Hipparcos: V magnitudes, motions, and the bright stars that Gaia lacks.
-
-Rows = npt.NDArray[np.int64]
-
-# Stars within this are the same: 99.9 % of Hipparcos' places at 2016 are within 0.7" of Gaia's.
-SAME_ARCSEC = 1.0
-# A Hipparcos star is missing from Gaia if no Gaia star of similar brightness is this near (as
-# there is for a double that one of the catalogues resolves) and it is brighter than this.
-NEAR_ARCSEC = 3.0
-LIKE_MAG = 1.5
-SURELY_LISTED_MAG = 9.0
-# Where Hipparcos is brighter by more, its magnitude is used: the relation below fails for the
-# reddest variables, and of some doubles Gaia lists the faint star only.
-MORE_LIGHT_MAG = 1.0
-COLOURS = (-0.5, 5.0)  # BP-RP to which the relation holds
+# Gaia and Hipparcos
 
 
 class Joined(NamedTuple):

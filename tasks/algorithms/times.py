@@ -1,4 +1,4 @@
-"""Time scales: Julian dates of UTC nanoseconds, for pyerfa, and Earth's barycentric motion."""
+"""Times: time scales for pyerfa, epochs of all sensors, and the order of frames and states."""
 
 from functools import cache
 
@@ -8,14 +8,15 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import AU_KM, DAY_NS, DAY_S
 
-# -- Time scales: Julian dates of UTC nanoseconds, for pyerfa, and Earth's barycentric motion.
-
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
+Integers = npt.NDArray[np.int64]
 
 UNIX_EPOCH_JD = 2440587.5
 NODE_NS = 600_000_000_000
 TT_MINUS_TAI_S = 32.184
+MILLISECOND_NS = 1_000_000
+KEEP, DUPLICATE_FRAME, DUPLICATE_NUMBER, DUPLICATE_TIME = range(4)
 
 
 def utc_julian_date(time_ns: Nanoseconds) -> tuple[Array, Array]:
@@ -80,9 +81,7 @@ def earth_velocity(time_ns: Nanoseconds) -> Array:
     return (1.0 - share) * before[at] + share * after[at]
 
 
-# -- Epochs: common instants of sensors that expose at different times.
-
-MILLISECOND_NS = 1_000_000
+# Epochs
 
 
 def frame_interval_ns(time_ns: Nanoseconds) -> int:
@@ -146,11 +145,7 @@ def nearest_frame(epoch_ns: Nanoseconds, time_ns: Nanoseconds) -> npt.NDArray[np
     return np.where(closer, before, after)
 
 
-# -- The order of frames and states, and which are duplicates.
-
-Integers = npt.NDArray[np.int64]
-
-KEEP, DUPLICATE_FRAME, DUPLICATE_NUMBER, DUPLICATE_TIME = range(4)
+# Order and duplicates
 
 
 def order_frames(

@@ -1,4 +1,11 @@
-"""Associate blocks: the objects of each block of time, and the outcome of each tracklet."""
+"""Associate blocks: the objects of each block of time, and the outcome of each tracklet.
+
+1. The views of all sensors in a block are read.
+2. Views of each window of time are associated (`associate_objects`).
+3. Each tracklet without an object gets an outcome: ambiguous, seen by one sensor, or of a sensor
+   that is left out.
+4. Members of objects, outcomes and rejects are written as parts.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial

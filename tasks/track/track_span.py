@@ -1,7 +1,14 @@
-"""Track a span: one sensor's tracklets over a span and its margins, from part to part.
+"""Track a span: one sensor's tracklets over a span and its margins.
 
-`track_span` at the end reads the parts, finds runs of detections, measures them and writes
-tracklets.
+`track_span` reads the parts of a span and its margins and calls `build_tracklets`. For the frames
+with an attitude, and apart from them for the others, that does these steps (`_label`):
+
+1. Hot pixels and planets are labelled and set aside.
+2. The other detections are followed from frame to frame: each run becomes a track (`_follow`).
+3. Rate and residual of each track are measured (`measure_runs`). Tracks that stand still are stars.
+4. Suspected hot pixels that belong to no track are labelled as such.
+5. The remaining tracks are objects: broken ones are linked, named, and written as tracklets
+   (`_label_objects`).
 """
 
 import itertools

@@ -1,4 +1,17 @@
-"""Chance: how often unrelated tracklets agree, estimated from the data."""
+"""How unrelated tracklets behave and how many objects there are, estimated from the data.
+
+The odds of a hypothesis need three estimates, in the order in which a search makes them:
+
+1. `chance_of`, before anything is associated: density and motion of each sensor's tracklets.
+2. `estimated_detection`, from certain groups: each sensor's probability of detection.
+3. `revised_odds`, from all groups: the number of objects in each altitude shell, and with it the
+   groups' final log-odds.
+
+The third one is empirical Bayes. The search assumes that every tracklet may be an object, and the
+altitude prior as stated. The certain groups show how many objects the visible volume really holds
+and at which altitudes. The count of each shell is Poisson; its rate has a gamma prior about the
+rate common to all shells.
+"""
 
 from collections.abc import Sequence
 from itertools import chain
@@ -14,13 +27,23 @@ from epipole.tasks.algorithms.association.views import Views
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.kernels import kernel
 
-# -- Chance: how often unrelated tracklets agree, estimated from the data.
-
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+CERTAIN_LOG_ODDS = 8.0  # log-odds from which a group is certain
+# Minimum number of other sensors that detect an object: with several instants, with a single one.
+OTHERS, OTHERS_AT_ONCE = 3, 4
+PRIOR_LOOKS = 10.0  # weight of the prior, as a number of detections and misses
+MIN_DETECTION, MAX_DETECTION = 0.05, 0.99
+SIGHTS = 100  # lines of sight that sample all fields; beyond 100 sensors, one in each of 100 fields
+STEPS = 24  # along a line of sight, in addition to the shells' edges
+MAX_RATE_RATIO = 10.0  # maximum rate of a shell over the common rate
+PRIOR_OBJECTS = 1.0  # weight of the prior of a shell, as a number of objects
+ROUNDS = 100  # maximum number of iterations of `revised_odds`
 
 
 class Chance(NamedTuple):
-    """The tracklets of each of s sensors as a random process, estimated from the data.
+    """Tracklets of each of s sensors as a random process.
 
     density : (s,) float
         Tracklets per steradian.
@@ -43,7 +66,7 @@ class Chance(NamedTuple):
 
 
 def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
-    """Return the estimate before anything is associated; `detected` is the same for all sensors."""
+    """Return the first estimate, with one probability of detection for all sensors."""
     n_sensors = len(samples.field_sr)
     count = np.bincount(samples.sensor, minlength=n_sensors).astype(float)
     instants = np.maximum(samples.seen.any(axis=0).sum(), 1)
@@ -57,7 +80,7 @@ def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
     first = np.searchsorted(samples.sensor[moving], np.arange(n_sensors + 1))
     for s in range(n_sensors):
         rates = rate[moving[first[s] : first[s + 1]]]
-        # One assumed tracklet at 10 arcsec/s steadies the estimate where there are few.
+        # A prior: the spread of one tracklet at 10 arcsec/s.
         drift[s] = np.median(rates, axis=0) if len(rates) else 0.0
         squares = np.sum((rates - drift[s]) ** 2) / 2
         spread[s] = np.sqrt((squares + (10 * ARCSEC) ** 2) / (len(rates) + 1))
@@ -79,20 +102,11 @@ def _rates(samples: Samples) -> Array:
     return out
 
 
-# -- Detection: the probability that a sensor detects an object in its field, from sure groups.
-
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-
-CERTAIN_LOG_ODDS = 8.0  # of a sure group
-# Other sensors that must detect an object: at several instants, and at a single one.
-OTHERS, OTHERS_AT_ONCE = 3, 4
-PRIOR_LOOKS = 10.0  # weight of the prior, as a number of looks
-MIN_DETECTION, MAX_DETECTION = 0.05, 0.99
+# Probability of detection
 
 
 class Looks(NamedTuple):
-    """Sensors that detect an object or miss it, one row for each object and sensor.
+    """Detections and misses: a row for each object and each sensor that has it in its field.
 
     row, sensor : (n,) int
         The object and the sensor.
@@ -132,10 +146,10 @@ def detection_odds(looks: Looks, n: int, detected: Array) -> Array:
 def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float) -> Array:
     """Return each sensor's probability of detection, (s,).
 
-    Each sensor is judged by the sure groups that enough other sensors detect. Such groups are
-    found whether this sensor detects them or not, so the estimate is not biased by objects that
-    are too weak to be found. Detections over looks, shrunk towards the mean of all sensors,
-    which is shrunk towards `prior`.
+    A sensor is judged by those groups that enough other sensors detect. They are found whether
+    this sensor detects them or not, so objects too faint to be found do not bias the estimate.
+    The share of detections is shrunk towards the mean of all sensors, which itself is shrunk
+    towards `prior`.
     """
     n_sensors = len(views.half_field)
     row, sensor, hit = looks_of(views, groups)
@@ -149,25 +163,15 @@ def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float
     )
 
 
-# -- Object density: how many objects there are in each altitude shell, from the sure groups.
-#
-# The search assumes that every tracklet may be an object, and the altitude prior as given. The
-# sure groups tell how many objects the space in view really holds and at which altitudes, and
-# the odds of all groups change accordingly. Empirical Bayes: the count of each shell is Poisson,
-# its rate has a gamma prior about the common rate.
-
-SIGHTS = 100  # lines of sight that sample all fields together; with more sensors, of so many
-STEPS = 24  # along a line of sight, in addition to the shells' edges
-MAX_RATE_RATIO = 10.0  # largest rate of a shell over the common rate
-PRIOR_OBJECTS = 1.0  # weight of the prior of a shell, as a number of objects
-ROUNDS = 100
+# Number of objects
 
 
 def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
-    """Return the volume [km^3] that two sensors see in each shell, times its weight, (j,).
+    """Return the volume [km^3] that at least two sensors see in each shell, times its weight, (j,).
 
     `shells` are rows of (lowest, highest radius [km], weight). The volume is integrated along
-    sample lines of sight, at the instant of most known attitudes; zero for fewer than two.
+    sample lines of sight, at the instant at which most sensors have a known attitude. Zero if
+    fewer than two sensors have one.
     """
     ready = np.isfinite(views.place_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
     m = int(np.argmax(ready.sum(axis=0)))
@@ -177,7 +181,7 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
         return out
     side = max(int(np.sqrt(SIGHTS / len(known))), 1)
     camera = np.ascontiguousarray(views.camera[known, m])
-    of = max(len(known) / SIGHTS, 1.0)  # sensors that each sampled one stands for
+    of = max(len(known) / SIGHTS, 1.0)  # each sampled sensor stands for this many
     known = known[(np.arange(int(len(known) / of)) * of).astype(int)]
     middle = (np.arange(side) + 0.5) / side * 2 - 1
     for s in known.tolist():
@@ -200,7 +204,7 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
 
 @kernel
 def _in_view_of(camera, x):
-    """Return how many sensors see each point, (n,)."""
+    """Return how many sensors, rows of `camera` (s, 33), see each point x (n, 3) [km], (n,)."""
     count = np.zeros(len(x), np.int64)
     for i in range(len(x)):
         for s in range(len(camera)):
@@ -239,7 +243,8 @@ def revised_odds(
 
     Notes
     -----
-    An iteration upwards from the certain groups, to the smallest consistent numbers.
+    The iteration starts from the certain groups and adds others, so it ends at the smallest
+    numbers of objects that are consistent.
     """
     inside = (radius_km[:, None] >= shells[:, 0]) & (radius_km[:, None] < shells[:, 1])
     believed = inside * shells[:, 2] + 1e-9

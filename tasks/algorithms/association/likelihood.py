@@ -1,9 +1,21 @@
-"""Association by likelihood: which tracklets are one object, the likeliest hypothesis first.
+"""Association of a window by likelihood: which tracklets are one object.
 
-Two tracklets of two sensors begin a hypothesis where their lines of sight meet, within their
-errors, above the Earth. Tracklets of other sensors join it where its points explain them. A
-hypothesis is weighed against "all of these are unrelated", and the likeliest are taken first.
-What two hypotheses explain about equally well is not decided: it is ambiguous.
+`associate_tracklets` prepares the search and `_Search.run` does it:
+
+1. Samples are sorted by sensor and projected onto planes (`views`), and the behaviour of unrelated
+   tracklets is estimated (`chance`).
+2. Pairs of sensors are taken in order, the longest baselines first (`search.sensor_pairs`).
+3. Two tracklets of a pair are a seed where their lines of sight meet, within their errors, above
+   the Earth (`search.seeds`).
+4. Tracklets of other sensors join a seed where its points explain them (`search.growth`). The
+   result is a hypothesis. Its score is the log-odds against "all of these are unrelated" (`odds`).
+   With many sensors, clear hypotheses become groups at once.
+5. After the pairs, the probabilities of detection are estimated. If these are lower than assumed,
+   more pairs are needed: back to 2.
+6. The remaining hypotheses become groups, the likeliest first (`_Search.take`). Two that follow
+   each other in time may be merged. What two explain about equally well is ambiguous.
+7. A tracklet goes to the group that clearly explains it best (`search.resolve_conflicts`).
+8. Groups that are doubtful, now that the number of objects is known, are withdrawn.
 """
 
 from collections.abc import Iterable

@@ -1,4 +1,10 @@
-"""Odds: how much more likely one object is than unrelated tracklets."""
+"""Odds of a hypothesis: how much likelier one object is than unrelated tracklets.
+
+`score` adds three terms: the directions, which fit one point at a single instant or one orbit
+through several (`arcs`); the prior density of objects at that altitude; and which sensors detect
+the object or miss it. A sensor counts as a miss only where the object is in its field and the
+Earth is not in between.
+"""
 
 import numpy as np
 
@@ -14,8 +20,6 @@ from epipole.tasks.algorithms.association.views import (
 )
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
-
-# -- Visibility: whether a sensor has a point in its field, the Earth not in between.
 
 FAINTER = 1.5  # times the range: the object is 0.9 mag fainter and may not be detected
 INSIDE = 0.98  # of half the field: nearer to its edge misses are frequent
@@ -149,7 +153,7 @@ def near_fields(views, points, sensors, near):
     return n
 
 
-# -- Odds: how much more likely one object is than unrelated tracklets.
+# Odds
 
 
 @borrowing_kernel

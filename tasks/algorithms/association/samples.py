@@ -1,11 +1,12 @@
-"""Samples: tracklets, or single detections, of all sensors at common instants, and their groups."""
+"""Input and output of association: samples of tracklets at common instants, and their groups.
+
+A sample is the direction of a tracklet, or of a single detection, at one instant.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-
-# -- Samples: tracklets, or single detections, of all sensors at common instants, and their groups.
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -87,9 +88,6 @@ class Groups(NamedTuple):
     detected: Array
 
 
-# -- Points: where the object of a hypothesis is at each instant.
-
-
 class InstantPoints(NamedTuple):
     """One point for each of k instants, solved where at least two tracklets have a direction.
 
@@ -98,7 +96,7 @@ class InstantPoints(NamedTuple):
     normal, cov_km2 : (k, 3, 3) float
         Normal equations (the upper half is filled) and their inverse, the covariance.
     seen_by : (k,) int
-        How many tracklets have a direction at the instant. Below 2 there is no point.
+        Number of tracklets with a direction at the instant. Below 2 the point is undefined.
     """
 
     x_km: Array

@@ -1,4 +1,10 @@
-"""Errors of a direction from errors of the centroid and of the attitude."""
+"""Covariances of directions: from the centroid, the attitude, and the optics.
+
+Errors of centroids change from frame to frame. Those of the optics are the same in all frames of a
+sensor: a bias. Wrong optics turn the attitude that fits a frame's stars best. Where the stars are,
+attitude and optics then compensate each other, and the direction of an object there is nearly
+right.
+"""
 
 import numpy as np
 import numpy.typing as npt
@@ -6,13 +12,15 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.geometry.camera import Camera, project, slopes, unproject
 from epipole.tasks.algorithms.geometry.directions import skew, tangent_basis
 
-# -- Errors of a direction from errors of the centroid and of the attitude.
-
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 MAX_LEVERAGE = 0.8  # a direction that decides its own fit has no residual
 OUTLIER = 20.0  # variances: a product of two residuals beyond is of another object
 MIN_RESIDUALS = 20  # their variance is then known to a third
+OPTICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
+FRAMES_AT_ONCE = 500  # a row of the derivatives has 27 numbers
+GRID = 9  # places on each side of the image that stand for a frame's stars
 
 
 def centroid_covariance(u_icrs: Array, sigma_rad: Array) -> Array:
@@ -100,17 +108,7 @@ def scatter_beyond(
     return float(max(beyond, 0.0))
 
 
-# -- Errors of the optics: how they move image places, attitudes and directions.
-#
-# The optics of a sensor are the same in all its frames, and so are their errors: a bias. Wrong
-# optics turn the attitude that fits a frame's stars best. Where stars stand, attitude and optics
-# then compensate each other, and the direction of an object there is nearly right.
-
-Indices = npt.NDArray[np.int64]
-
-OPTICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-FRAMES_AT_ONCE = 500  # a row of the derivatives has 27 numbers
-GRID = 9  # places on each side of the image that stand for a frame's stars
+# Optics
 
 
 def image_derivatives(camera: Camera, u: Array) -> tuple[Array, Array]:

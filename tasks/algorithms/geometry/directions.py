@@ -1,16 +1,13 @@
-"""Rotations: unit quaternions (x, y, z, w), scalar last, and matrices.
+"""Rotations, directions on the sky, and light time.
 
-``q_b_from_a`` converts the components of a vector in frame a to those in frame b.
+Quaternions are unit quaternions (x, y, z, w), scalar last. ``q_b_from_a`` converts the components
+of a vector in frame a to those in frame b.
 """
 
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-
-# -- Rotations: unit quaternions (x, y, z, w), scalar last, and matrices.
-#
-# ``q_b_from_a`` converts the components of a vector in frame a to those in frame b.
 
 Array = npt.NDArray[np.float64]
 
@@ -118,7 +115,7 @@ def interpolate_quaternions(times: Array, q: Array, at: Array) -> Array:
     return canonical(multiply(quaternion_from_rotation_vector(turn * share[:, None]), q[i]))
 
 
-# -- Directions on the sky: spherical coordinates, tangent planes, aberration, boresight angles.
+# Directions
 
 
 def unit_from_radec(ra: Array, dec: Array) -> Array:
@@ -185,7 +182,7 @@ def boresight_angles(R_sensor_from_icrs: Array) -> tuple[Array, Array, Array]:
     return ra, dec, roll % (2 * np.pi)
 
 
-# -- Light time: sensors at different ranges see an object at places of different times.
+# Light time
 
 
 def apparent_places(x_km: Array, v_km_s: Array, light_s: Array, r_km: Array) -> Array:

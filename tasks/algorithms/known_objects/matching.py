@@ -1,10 +1,12 @@
-"""Matching: the probability that an object of the night is this satellite of a catalogue.
+"""Matching: the probability that an object of the night is a given satellite of a catalogue.
 
 An object's positions are compared with a satellite's prediction at the same times. Their
-difference has the covariance of the positions, and that of the elements' errors, which all of
-them share. Each satellite is a hypothesis, and so is an object that is not in the catalogue: any
-of those, or a companion of a listed one. Companions matter: satellites that share a geostationary
-slot, and parts of one launch, are near each other.
+difference has the covariance of the positions, and that of the elements' errors, which all rows
+share. Each satellite is a hypothesis. So is an object that the catalogue does not have: an
+unrelated one, or a companion of a listed one. Companions matter: satellites that share a
+geostationary slot, and parts of one launch, are near each other.
+
+`learn_errors` estimates the size of the elements' errors from the certain matches of a night.
 """
 
 from collections.abc import Sequence
@@ -26,14 +28,6 @@ from epipole.tasks.algorithms.known_objects.prediction import (
     sigmas,
 )
 
-# -- Matching: the probability that an object of the night is this satellite of a catalogue.
-#
-# An object's positions are compared with a satellite's prediction at the same times. Their
-# difference has the covariance of the positions, and that of the elements' errors, which all of
-# them share. Each satellite is a hypothesis, and so is an object that is not in the catalogue:
-# any of those, or a companion of a listed one. Companions matter: satellites that share a
-# geostationary slot, and parts of one launch, are near each other.
-
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -52,6 +46,10 @@ WORST = QUALITIES[-1][0]
 MIN_NAMED = 1e-3  # probability of a satellite that an ambiguous object may be
 DRAG_REACH_KM_DAY2 = 0.2  # unknown drag of a satellite that comes down soon
 DAY_NS = 86_400_000_000_000
+# What is known before: each error is right within a factor of three (1-sigma of its logarithm).
+PRIOR_SIGMA = float(np.log(3.0))
+STEP = 0.7  # of the first search
+FEWEST = 5  # matches from which anything is learnt
 
 
 class Observed(NamedTuple):
@@ -271,12 +269,7 @@ def spread_rows(time_ns: npt.NDArray[np.int64], preferred: npt.NDArray[np.bool_]
     return np.unique(rows[np.searchsorted(time_ns[rows], wanted).clip(0, len(rows) - 1)])
 
 
-# -- Learning: how large the errors of published elements are, from the sure matches of a night.
-
-# What is known before: each error is right within a factor of three (1-sigma of its logarithm).
-PRIOR_SIGMA = float(np.log(3.0))
-STEP = 0.7  # of the first search
-FEWEST = 5  # matches from which anything is learnt
+# Errors of elements, learnt from matches
 
 
 def learn_errors(

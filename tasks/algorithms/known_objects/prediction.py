@@ -1,10 +1,14 @@
-"""Predictions: where the satellites of a catalogue are, by SGP4, and how well that is known.
+"""Predictions of catalogued satellites by SGP4, their errors, and a fast search for nearby ones.
 
-Published element sets have no covariance. What is known of their errors: they are a few hundred
-metres to kilometres at the epoch, and grow mostly along the track, by about a kilometre a day
-(Kelso 2007, Validation of SGP4 and IS-GPS-200D against GPS precision ephemerides, AAS 07-127;
-Vallado and Cefola 2012, Two-line element sets, practice and use, IAC-12-C1.6.12). `ElementErrors`
-has these sizes; they are a start, and are learnt from the matches of a night (`learning`).
+Published element sets have no covariance. Their errors are a few hundred metres to kilometres at
+the epoch, and grow mostly along the track, by about a kilometre a day (Kelso 2007, Validation of
+SGP4 and IS-GPS-200D against GPS precision ephemerides, AAS 07-127; Vallado and Cefola 2012,
+Two-line element sets, practice and use, IAC-12-C1.6.12). `ElementErrors` starts with these sizes;
+`matching.learn_errors` improves them from the matches of a night.
+
+`Screen` finds the satellites near a position without SGP4: it keeps states of the whole catalogue
+at every half hour and compares orbit planes, radii, and positions of two-body orbits. Those that
+pass are then predicted exactly.
 """
 
 from collections.abc import Sequence
@@ -18,18 +22,10 @@ from epipole.tasks.algorithms.constants import GM_KM3_S2, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.orbits.reference_frames import Orientation, gcrf_from_teme
 from epipole.tasks.algorithms.times import utc_julian_date
 
-# -- Predictions: where the satellites of a catalogue are, by SGP4, and how well that is known.
-#
-# Published element sets have no covariance. What is known of their errors: they are a few
-# hundred metres to kilometres at the epoch, and grow mostly along the track, by about a
-# kilometre a day (Kelso 2007, Validation of SGP4 and IS-GPS-200D against GPS precision
-# ephemerides, AAS 07-127; Vallado and Cefola 2012, Two-line element sets, practice and use,
-# IAC-12-C1.6.12). `ElementErrors` has these sizes; they are a start, and are learnt from the
-# matches of a night (`learning`).
-
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 Satellites = Sequence[Satrec]
+Indices = npt.NDArray[np.int64]
 
 DAY_S = 86400.0
 UNIX_EPOCH_JD = 2440587.5
@@ -38,6 +34,14 @@ MIN_TILT = 1e-4  # sine of an inclination: below it the node says nothing
 DRAG_UNKNOWN = 0.15  # share of the drag that is not known: density and area change from day to day
 # Mean motions [rad/s] below this are of periods above 225 minutes: SGP4's deep space.
 DEEP_SPACE_RAD_S = 2 * np.pi / (225 * 60)
+# What the errors of elements do: ahead along the track [km], the eccentricity as a vector, times
+# the semi-major axis [km], the pole of the orbit plane [km at the semi-major axis], and a drift
+# along the track [km/day].
+SENSITIVE_TO = ("along", "radial", "radial", "across", "across", "drift")
+NODE_NS = 1_800_000_000_000
+# What two bodies leave out in a quarter of an hour: 0.005 of the radius is twice what was found.
+ROOM = 0.005
+KEPLER_STEPS = 6
 
 
 class ElementErrors(NamedTuple):
@@ -124,12 +128,6 @@ def sigmas(satellite: Any, age_days: float, errors: ElementErrors) -> Array:
     across = np.hypot(errors.across_km, errors.across_km_day * age_days)
     drift = np.hypot(errors.along_km_day, 2 * drag_km / max(abs(age_days), 1.0))
     return np.array([along, radial, radial, across, across, drift])
-
-
-# What the errors of elements do: ahead along the track [km], the eccentricity as a vector, times
-# the semi-major axis [km], the pole of the orbit plane [km at the semi-major axis], and a drift
-# along the track [km/day].
-SENSITIVE_TO = ("along", "radial", "radial", "across", "across", "drift")
 
 
 def sensitivities(satellite: Any, time_ns: Nanoseconds, anchor: int) -> Array:
@@ -219,7 +217,7 @@ def along_up_across(state: Array) -> Array:
     return np.array([ahead, np.cross(ahead, side), side])
 
 
-# -- Residuals: how far a direction is from a predicted object, along and across its track.
+# Residuals
 
 
 def track_residuals(
@@ -257,18 +255,7 @@ def track_residuals(
     return np.stack([np.sum(off * along, axis=1), np.sum(off * across, axis=1)], axis=1)
 
 
-# -- Screening: the satellites of a large catalogue that may be at a place, at little cost.
-#
-# States of the whole catalogue are computed every half hour. A place is compared with the
-# planes, then the radii, then the places of two-body orbits from these states; what passes is
-# computed exactly.
-
-Indices = npt.NDArray[np.int64]
-
-NODE_NS = 1_800_000_000_000
-# What two bodies leave out in a quarter of an hour: 0.005 of the radius is twice what was found.
-ROOM = 0.005
-KEPLER_STEPS = 6
+# Screening
 
 
 class Screen:

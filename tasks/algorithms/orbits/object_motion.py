@@ -1,4 +1,10 @@
-"""Object motion: velocities from positions, and what a fit of apparent motion neglects."""
+"""Motion of objects from span to span: velocities, independent positions, and object numbers.
+
+- `velocities` and `neglected_motion`: velocities from positions, and the part of the motion that a
+  fit of directions neglects.
+- `keep_independent`: positions of an object that share no detection.
+- `ObjectRegistry`: an object keeps its number from span to span while one of its tracklets lasts.
+"""
 
 import itertools
 from collections import defaultdict
@@ -10,9 +16,8 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbits.state_interpolation import gravity
 
-# -- Object motion: velocities from positions, and what a fit of apparent motion neglects.
-
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 
 def velocities(
@@ -119,9 +124,6 @@ def _derivatives(state: Array) -> tuple[Array, Array, Array, Array]:
     return r, v, gravity(r), (gravity(r + v / 2) - gravity(r - v / 2))  # over one second
 
 
-# -- Independent epochs: positions of an object that share no detection.
-
-
 @kernel
 def keep_independent(offsets, used, track, first_ns, last_ns, until, apart):
     """Clear `apart` where a group shares a detection with an earlier one that is kept.
@@ -150,11 +152,6 @@ def keep_independent(offsets, used, track, first_ns, last_ns, until, apart):
             for v in range(offsets[g], offsets[g + 1]):
                 if used[v]:
                     until[track[v]] = last_ns[v]
-
-
-# -- Object identity: an object keeps its number from span to span while a tracklet continues.
-
-Indices = npt.NDArray[np.int64]
 
 
 class ObjectRegistry:

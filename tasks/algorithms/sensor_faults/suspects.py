@@ -1,8 +1,12 @@
-"""Suspects: of many sensors, those that may be at fault are judged together, the others alone.
+"""Faults among many sensors: which are judged together, and which join no object at all.
 
-All sensors together cost the cube of their number. But one wrong sensor hardly moves the positions
-that many others determine. So each sensor is first judged as if all others were sound, from sums
-over its lines of sight. The most suspicious are then judged together, with all their faults.
+Judging all sensors together costs the cube of their number. But one wrong sensor hardly moves the
+positions that many others determine. So each sensor is first judged as if all others were sound,
+from sums over its lines of sight. Only the most suspicious are then judged together, with all
+their faults (`judge_many_sensors`).
+
+A fault may be so large that none of a sensor's tracklets join an object, although objects of the
+other sensors are in its field. `agreement` finds these sensors.
 """
 
 from typing import NamedTuple
@@ -29,18 +33,14 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     whitened,
 )
 
-# -- Suspects: of many sensors, those that may be at fault are judged together, the others alone.
-#
-# All sensors together cost the cube of their number. But one wrong sensor hardly moves the
-# positions that many others determine. So each sensor is first judged as if all others were
-# sound, from sums over its lines of sight. The most suspicious are then judged together, with
-# all their faults.
-
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MAX_TOGETHER = 24  # sensors that are judged together
 MAX_ROUNDS = 4  # each judges the next suspects, without those found at fault
+MIN_OBJECTS = 3  # objects in its field from which a sensor is judged
+AGREES = 0.3  # least share of them that a sound sensor joins
+STRAYS = 0.5  # tracklets without an object per object in the field, of a sensor at fault
 
 
 def judge_many_sensors(
@@ -182,15 +182,7 @@ def _enter_judged(found: JudgedSensors, judged: JudgedSensors, together: Indices
     return newly
 
 
-# -- Agreement: a sensor that has the others' objects in its field but joins none is at fault.
-#
-# A wrong clock, position or attitude moves all of a sensor's lines of sight. Its tracklets then
-# join no object, although objects of the other sensors are in its field and it has enough
-# tracklets.
-
-MIN_OBJECTS = 3  # objects in its field from which a sensor is judged
-AGREES = 0.3  # least share of them that a sound sensor joins
-STRAYS = 0.5  # tracklets without an object per object in the field, of a sensor at fault
+# Agreement
 
 
 class Agreement(NamedTuple):

@@ -1,4 +1,15 @@
-"""Hot pixels: detections that stay at a place of the image while the sky moves through it."""
+"""Hot pixels: detections that stay at one pixel position while the sky moves through the image.
+
+`fixed_places` finds the positions that half of the frames show, and the odds that each is a hot
+pixel. It is one for certain if it stays through a repointing, or a fast turn, that no object can
+follow. Otherwise the centroids are the evidence (`log_ratio`), because a sensor that follows an
+object keeps its light at one position too:
+
+- Light scatters by the centroid error and drifts, as the sensor follows it imperfectly. It falls
+  anywhere on a pixel, and near the middle of the field.
+- A hot pixel has another scatter, mostly a small one, and does not drift. It lies at the centre of
+  a pixel, anywhere in the field.
+"""
 
 from typing import NamedTuple
 
@@ -10,14 +21,9 @@ from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.tracking.sky_filter import acceleration
 
-# -- The odds that a fixed place of the image is a hot pixel, and not light that the sensor follows.
-#
-# Light scatters by the centroid error, and drifts as far as the sensor follows it badly. It
-# falls anywhere on a pixel, and near the middle of the field. A hot pixel scatters by an error
-# of its own, mostly a small one. It does not drift, it stands on the middle of a pixel, and it
-# may be anywhere in the field.
-
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 SCALES = np.geomspace(0.01, 3.0, 200)  # of a place's scatter, over what its sigmas say
 TOLD_WITHIN = np.log(1.5)  # 1-sigma of ln of that scale for light: sigmas are told so well
@@ -29,6 +35,16 @@ HELD_ON_MIDDLE = 0.1  # share of followed objects that the sensor holds on the m
 AT_CENTRE = 0.5  # share of followed objects that are near the principal point
 CENTRE = 0.1  # 1-sigma of their distance from it, in widths of the field
 UNKNOWN = 0.5  # places of each kind that are added to those counted: Jeffreys' prior
+SHARE = 0.5  # least share of the frames, and of the pointings, that show a hot pixel
+FEWEST = 5  # frames
+MIN_STILL = 10  # frames, where only its centroids are evidence
+NOWHERE = -1
+CERTAIN = np.log(1e4)  # from these odds on it is a hot pixel, whatever other sensors see
+LIKELY = np.log(10.0)  # from these odds on it is one, unless another sensor sees an object there
+REPOINTED_PX = 20.0  # least motion of the sky through the image at a repointing
+BOUND = 10.0  # times the bound on apparent motion: no object follows a repointing
+FAST_TURN_RAD_S = 3e-3  # three times a low orbit's: no object is seen to keep it up
+HALF_TURN_RAD = np.pi
 
 
 class FixedPlace(NamedTuple):
@@ -128,21 +144,7 @@ def _nearness(place: FixedPlace, camera: Camera) -> float:
     return float(np.log(1 - AT_CENTRE + AT_CENTRE * area * near))
 
 
-# -- Hot pixels: detections that stay at a place of the image while the sky moves through it.
-
-Indices = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-
-SHARE = 0.5  # least share of the frames, and of the pointings, that show a hot pixel
-FEWEST = 5  # frames
-MIN_STILL = 10  # frames, where only its centroids are evidence
-NOWHERE = -1
-CERTAIN = np.log(1e4)  # from these odds on it is a hot pixel, whatever other sensors see
-LIKELY = np.log(10.0)  # from these odds on it is one, unless another sensor sees an object there
-REPOINTED_PX = 20.0  # least motion of the sky through the image at a repointing
-BOUND = 10.0  # times the bound on apparent motion: no object follows a repointing
-FAST_TURN_RAD_S = 3e-3  # three times a low orbit's: no object is seen to keep it up
-HALF_TURN_RAD = np.pi
+# Fixed positions
 
 
 class FixedPlaces(NamedTuple):

@@ -1,9 +1,13 @@
-"""Track initiation: detections that no track has claimed begin one where chance is ruled out.
+"""Track initiation: detections without a track begin one where chance is ruled out.
 
-Pairs of a detection in the newest frame and one in the two frames before it are followed back in
-time. Each further detection adds to the evidence: the more, the better its place was predicted and
-the fewer false alarms there are. A pair's rate limits the evidence that it can reach. Pairs that
-cannot reach enough are not followed. These are most pairs in dense frames, and no track is lost.
+1. Pairs are formed of a free detection in the newest frame and one in either of the two frames
+   before it (`_try_pairs`).
+2. Each pair is followed back in time (`_chain_back`). Every further detection adds to the evidence:
+   the more precise the prediction and the lower the density of false alarms, the more it adds.
+3. The strongest chains become tracks (`new_tracks`).
+
+The rate of a pair limits the evidence that its chain can reach (`_best_evidence`). Pairs that
+cannot reach enough are skipped. In dense frames these are most pairs; no track is lost.
 """
 
 from typing import NamedTuple
@@ -31,11 +35,11 @@ Indices = npt.NDArray[np.int64]
 NONE = -1
 P_DETECTION = 0.9  # probability that an object in the field is detected in a frame
 MISSED = np.log(1.0 - P_DETECTION)
-N_RATES = 24  # classes of the rate, for which the best evidence is tabulated
-SLOWEST_RAD_S = 1e-6  # upper end of the first class
-MAX_PAIRS = 500_000  # per frame, however few frames there are
-FEW_TO_ASK = 1_000  # up to so many pairs, only the classes of rate that they have are tabulated
-FEW_PAIRS = 50_000  # up to so many, pairs that are two frames apart are tried as well
+N_RATES = 24  # classes of rate for which the maximum evidence is tabulated
+SLOWEST_RAD_S = 1e-6  # upper end of the slowest class of rate [rad/s]
+MAX_PAIRS = 500_000  # limit per frame, even in a short sequence
+FEW_TO_ASK = 1_000  # up to this many pairs, only the classes of rate that occur are tabulated
+FEW_PAIRS = 50_000  # up to this many, pairs that are two frames apart are tried as well
 
 
 class Detections(NamedTuple):
@@ -43,7 +47,7 @@ class Detections(NamedTuple):
 
     times, offsets : (f,) float, (f + 1,) int64, of frames
     frame_of, directions, variances : (n,) int64, (n, 3), (n,) float, of detections
-    track : (n,) int64, the track of each detection, NONE while it has none; kernels write it
+    track : (n,) int64, the track of each detection, NONE while it is free; kernels write it
     """
 
     times: Array
@@ -55,10 +59,10 @@ class Detections(NamedTuple):
 
 
 class RecentFrames(NamedTuple):
-    """The newest frames, frame f in slot f modulo their number.
+    """The newest frames: frame f is in slot f modulo the number of slots.
 
-    grids : see `frame_grid.make_grids`
-    smallest, largest : (slots,) float, of the variances in each frame
+    grids : see `sky_filter.make_grids`
+    smallest, largest : (slots,) float, minimum and maximum variance of each frame's detections
     """
 
     grids: tuple[Array, Array, Indices, Indices]
@@ -67,15 +71,15 @@ class RecentFrames(NamedTuple):
 
 
 class TrackRule(NamedTuple):
-    """What makes a track, and what ends one.
+    """When a track begins and ends.
 
-    max_rate : fastest motion [rad/s]
-    max_coast, max_missed : longest time [s], and most frames in a row, without a detection
-    need : fewest detections that begin a track
-    gate2 : squared distance in sigmas within which a detection continues a track
-    field_sr : solid angle of the field
-    enough : evidence (ln) beyond the number of pairs tried that begins a track
-    most_pairs : per frame; where more are possible, the fastest objects are not searched for
+    max_rate : maximum rate [rad/s]
+    max_coast, max_missed : maximum time [s] and number of successive frames without a detection
+    need : minimum number of detections of a new track
+    gate2 : maximum chi-square at which a detection continues a track
+    field_sr : solid angle of the field [sr]
+    enough : log-evidence that a new track must have beyond the log of the number of pairs
+    most_pairs : maximum number of pairs per frame; beyond it, fast objects are not searched for
     """
 
     max_rate: float
@@ -91,7 +95,7 @@ class TrackRule(NamedTuple):
 class _Pair(NamedTuple):
     """Detection j of frame f and detection i of the earlier frame g.
 
-    chord2, dt : squared chord between them, and time between the frames
+    chord2, dt : squared chord between them [rad^2], and time between the frames [s]
     """
 
     f: int
@@ -103,11 +107,11 @@ class _Pair(NamedTuple):
 
 
 class _Evidence(NamedTuple):
-    """What pairs of two frames are judged by.
+    """How the pairs of two frames are judged.
 
     density : (depth,) float, free detections per steradian in the newest frame and those before
-    best : (N_RATES, k) float, the evidence that can still be added, see `_best_evidence`
-    tries : ln of the number of pairs that chance has
+    best : (N_RATES, k) float, the evidence that earlier frames can still add, see `_best_evidence`
+    tries : ln of the number of pairs, each of which may be one by chance
     """
 
     density: Array
@@ -118,7 +122,7 @@ class _Evidence(NamedTuple):
 class _Chains(NamedTuple):
     """The strongest chain of each detection of the newest frame.
 
-    held, strength : (n,) int64 and float, number of detections and evidence
+    held, strength : (n,) int64 and float, number of detections (0: no chain) and log-evidence
     members : (n, longest) int64, detections, newest first
     """
 
@@ -128,9 +132,11 @@ class _Chains(NamedTuple):
 
 
 class _ChainScratch(NamedTuple):
-    """Room for one chain: the filter's state, a predicted direction, detections.
+    """Work space for one chain.
 
-    u, w, bend, P : see `sky_filter`
+    u, w, bend, P : (3,), (3,), (3,), (SIZE,) float, state of the filter, see `sky_filter`
+    ahead : (3,) float, a predicted direction
+    members : (longest,) int64, detections, newest first
     """
 
     u: Array
@@ -143,8 +149,10 @@ class _ChainScratch(NamedTuple):
 
 @kernel
 def _free_density(f, depth, detections, field_sr):
-    """Return free detections per steradian in frame f and the frames before it; at least one
-    detection is counted in each."""
+    """Return free detections per steradian in frame f and up to depth - 1 frames before it.
+
+    Newest first. A frame without free detections counts as one with one.
+    """
     offsets = detections.offsets
     out = np.empty(min(depth, f + 1))
     for back in range(len(out)):
@@ -157,7 +165,7 @@ def _free_density(f, depth, detections, field_sr):
 
 @kernel
 def _class_rates(max_rate):
-    """Return the lower ends of the classes of rate, and the end of the last."""
+    """Return the bounds of the classes of rate [rad/s], (N_RATES + 1,)."""
     out = np.zeros(N_RATES + 1)
     top = max(max_rate, 2 * SLOWEST_RAD_S)
     for c in range(1, N_RATES + 1):
@@ -167,13 +175,11 @@ def _class_rates(max_rate):
 
 @kernel
 def _best_evidence(f, g, times, density, variance, class_rates, asked):
-    """Return the most evidence that frames before g can still add, (N_RATES, frames + 1).
+    """Return the maximum log-evidence that frames before g can still add, (N_RATES, frames + 1).
 
-    Only for the classes of rate that are asked for; none in the others.
-
-    Row c is for a class of rate, column k for the frames g - 1 - k and before. Predictions are best
-    for a chain without a miss, and for the slowest of a class, which bends least. So no chain of
-    the class can gain more.
+    Row c is for a class of rate, column k for the frames g - 1 - k and earlier. It is an upper
+    bound: it assumes a chain without a miss, and the lowest rate of the class, which is predicted
+    best. Rows of classes that are not `asked` (N_RATES,) for are zero.
     """
     n_back = len(density) - (f - g) - 1
     out = np.zeros((N_RATES, n_back + 1))
@@ -201,7 +207,10 @@ def _best_evidence(f, g, times, density, variance, class_rates, asked):
 
 @kernel
 def _nearest_free(u, variance, detections, recent, slot, gate2):
-    """Return the free detection of a frame that is nearest to u in sigmas, and its chi-square."""
+    """Return the free detection of a frame nearest to u, by chi-square, and that chi-square.
+
+    NONE and `gate2` if no free detection is within the gate. `variance` [rad^2] is that of u.
+    """
     directions, variances, track = detections.directions, detections.variances, detections.track
     start, items = recent.grids[2], recent.grids[3]
     reach = np.sqrt(gate2 * (variance + recent.largest[slot]))
@@ -222,10 +231,10 @@ def _nearest_free(u, variance, detections, recent, slot, gate2):
 
 @kernel
 def _foretell(u_f, u_g, chord2, ratio, out):
-    """Write the direction that the great circle from u_f over u_g reaches after `ratio` steps.
+    """Write to `out` (3,) the direction beyond u_g on the great circle from u_f through u_g.
 
-    Series instead of trigonometric functions, for steps of some degrees. Where something is found
-    there, the exact chain is followed.
+    It is `ratio` times as far from u_g as u_f is. Series stand for trigonometric functions: good
+    for some degrees, and only for a first test.
     """
     angle2 = chord2 * (1 + chord2 / 12)
     x2 = ratio * ratio * angle2
@@ -238,11 +247,11 @@ def _foretell(u_f, u_g, chord2, ratio, out):
 
 @kernel
 def _chain_back(pair, detections, recent, rule, density, best, wanted, room):
-    """Follow a pair back in time; return the number of its detections and its evidence.
+    """Follow a pair back in time; return the number of detections and the log-evidence.
 
-    Writes the detections, newest first, to `room.members`. The evidence is the log likelihood
-    ratio of one moving object against false alarms of that density, for all detections but the
-    first two. Where it can no longer reach what is wanted, the chain is given up.
+    Writes the detections, newest first, to `room.members`. The evidence is the log-likelihood
+    ratio of one moving object against false alarms, over all detections but the first two. The
+    number is 0 if the evidence can no longer reach `wanted`.
     """
     f, j, g, i = pair.f, pair.j, pair.g, pair.i
     times, directions, variances = detections.times, detections.directions, detections.variances
@@ -252,7 +261,9 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, room):
     )
     room.members[0], room.members[1] = j, i
     n, evidence, at = 2, (f - g - 1) * MISSED, times[g]
-    waiting = 0.0  # misses before the oldest detection so far: the object may have entered there
+    # Misses beyond the oldest detection count only if an older one follows: the object may have
+    # entered the field there.
+    waiting = 0.0
     for k in range(len(best) - 1):
         if max(evidence, evidence + waiting + best[k]) < wanted:
             return 0, evidence
@@ -282,8 +293,10 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, room):
 
 @kernel
 def _fastest(best, class_rates, wanted, dt, pairs_sr, rule):
-    """Return the highest rate to search for: chains can reach the evidence wanted, and the pairs
-    are not too many."""
+    """Return the maximum rate to search for [rad/s].
+
+    Up to it, chains can reach the evidence `wanted`, and the number of pairs is within the limit.
+    """
     top = 0.0
     for c in range(N_RATES):
         if best[c, 0] >= wanted:
@@ -303,7 +316,7 @@ def _class_of(rate, max_rate):
 
 @kernel
 def _asked_rates(f, g, detections, density, rule):
-    """Return which classes of rate the pairs of two frames may have: all where they are many."""
+    """Return the classes of rate of the pairs of two frames, (N_RATES,) bool; all if many pairs."""
     offsets, track = detections.offsets, detections.track
     out = np.zeros(N_RATES, np.bool_)
     if density[0] * density[f - g] * rule.field_sr**2 > FEW_TO_ASK:
@@ -324,7 +337,10 @@ def _asked_rates(f, g, detections, density, rule):
 
 @kernel
 def _may_chain(pair, detections, recent, rule, room):
-    """Return whether the frame before a pair has a detection where the pair leads; quickly."""
+    """Return whether the frame before g has a free detection near the pair's prediction.
+
+    A fast test that may pass too many pairs.
+    """
     j, g, i, chord2, dt = pair.j, pair.g, pair.i, pair.chord2, pair.dt
     directions, variances, P = detections.directions, detections.variances, room.P
     dt_back = detections.times[g] - detections.times[g - 1]
@@ -338,14 +354,14 @@ def _may_chain(pair, detections, recent, rule, room):
 
 @kernel
 def _try_pair(pair, detections, recent, rule, evidence, chains, room):
-    """Follow a pair back; keep its chain where it is the strongest of its detection."""
+    """Follow a pair back; keep its chain if it is the strongest of detection j."""
     f, g, times = pair.f, pair.g, detections.times
     row = pair.j - detections.offsets[f]
     best = evidence.best[_class_of(np.sqrt(pair.chord2) / pair.dt, rule.max_rate)]
     wanted = evidence.tries + max(rule.enough, chains.strength[row])
     if best[0] + (f - g - 1) * MISSED < wanted:
         return
-    # Most pairs lead nowhere. Where a pair cannot afford a miss, one look ahead settles that.
+    # Most pairs are by chance. If a miss would rule a pair out, the next frame decides it quickly.
     if (
         (f - g) * MISSED + best[min(1, len(best) - 1)] < wanted
         and times[g] > times[g - 1]
@@ -360,7 +376,7 @@ def _try_pair(pair, detections, recent, rule, evidence, chains, room):
 
 @kernel
 def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
-    """Follow all pairs within reach; keep the strongest chain of each detection of frame f."""
+    """Follow all pairs within `reach` [rad]; keep the strongest chain of each detection of f."""
     directions, track = detections.directions, detections.track
     room = _ChainScratch(
         np.empty(3),
@@ -389,7 +405,10 @@ def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
 
 @kernel
 def _useful_depth(best, wanted):
-    """Return how many frames back a chain is followed: enough for the slowest, with one miss."""
+    """Return how many frames back a chain is followed.
+
+    In these, the slowest object reaches the evidence `wanted` even with one miss.
+    """
     n_back = best.shape[1] - 1
     for k in range(1, n_back):
         last = best[0, k - 1] - best[0, k]
@@ -416,7 +435,7 @@ def _strongest_chains(f, depth, detections, recent, rule):
         asked = _asked_rates(f, g, detections, density, rule)
         if not asked.any():
             continue
-        asked[0] = True  # tells how far back a chain is followed
+        asked[0] = True  # `_useful_depth` needs the slowest class
         best = _best_evidence(f, g, times, density, variance, class_rates, asked)
         n_back = max(_useful_depth(best, wanted), min(depth - (f - g) - 1, best.shape[1] - 1))
         for c in range(N_RATES):
@@ -433,12 +452,18 @@ def _strongest_chains(f, depth, detections, recent, rule):
 
 @kernel
 def new_tracks(f, depth, n_tracks, detections, recent, rule):
-    """Begin tracks that end in frame f from detections that no track has claimed.
+    """Begin tracks from free detections, such that each ends in frame f.
 
-    A chain begins a track if it has `rule.need` detections and more evidence than chance reaches
-    in so many pairs. The strongest come first, and a detection serves once. Returns the rows of
-    frame f that begin a track, in the order of the tracks' numbers, and for all rows the counts of
-    detections and the chains. Fills in `detections.track`.
+    A chain becomes a track if it has at least `rule.need` detections and more evidence than
+    chance gives one of that many pairs. The strongest come first; each detection is used once.
+    Writes `detections.track`, numbered from `n_tracks`.
+
+    Returns
+    -------
+    begun : (b,) int64
+        Rows of frame f that begin a track, in the order of the track numbers.
+    held, members : (n,) int64, (n, longest) int64
+        Chains of all rows, see `_Chains`.
     """
     track = detections.track
     chains = _strongest_chains(f, depth, detections, recent, rule)

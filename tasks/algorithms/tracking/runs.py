@@ -1,9 +1,16 @@
-"""Tracking: detections of one sensor, frame after frame, become runs of one object.
+"""Tracking of one sensor: detections, frame after frame, become runs of one object.
 
-Everything happens on the sky, after attitude, so that the sensor's own turning is gone. In each
-frame, live tracks claim the detections that they fit, the nearest in sigmas first. Two tracks
-exchange their detections where both together then fit better. The other detections may begin new
-tracks.
+Everything happens on the sky, with attitudes applied, so the sensor's own turning is removed. For
+each frame, `_follow` does these steps:
+
+1. The frame's detections are sorted into a grid (`_lay_frame`).
+2. Tracks with too many misses end.
+3. The others are predicted, and take the detections within their gates, the smallest chi-square
+   first (`_claim`).
+4. Two tracks exchange detections where both together then fit better (`_exchange`).
+5. Detections that are still free may begin tracks (`initiation.new_tracks`).
+
+A short sequence is then followed once more, with what is left and a weaker demand on evidence.
 """
 
 from typing import NamedTuple
@@ -59,153 +66,6 @@ class _Tracks(NamedTuple):
     P: Array
     at: Array
     missed: npt.NDArray[np.int64]
-
-
-@kernel
-def _state_of(members, detections, u, w, bend, P):
-    """Filter a new track's detections, newest first in `members`, into its state at the newest."""
-    times, frame_of = detections.times, detections.frame_of
-    directions, variances = detections.directions, detections.variances
-    last = len(members) - 1
-    first, second = members[last], members[last - 1]
-    begin(
-        directions[first], times[frame_of[first]], variances[first],
-        directions[second], times[frame_of[second]], variances[second], u, w, bend, P,
-    )  # fmt: skip
-    for m in range(last - 2, -1, -1):
-        dt = times[frame_of[members[m]]] - times[frame_of[members[m + 1]]]
-        grow(P, rate_of(w), rate_of(bend), dt)
-        advance(u, w, bend, dt)
-        correct(u, w, bend, P, directions[members[m]], variances[members[m]])
-
-
-@kernel
-def _candidates(live, tracks, detections, recent, slot, gate2):
-    """Return all (track, detection, chi-square) within the gate."""
-    start, items = recent.grids[2], recent.grids[3]
-    directions, variances = detections.directions, detections.variances
-    room, count = 4 * len(live) + 16, 0
-    track, detection = np.empty(room, np.int64), np.empty(room, np.int64)
-    chi2 = np.empty(room)
-    for m in live:
-        variance = tracks.P[m, 0]
-        reach = np.sqrt(gate2 * (variance + recent.largest[slot]))
-        x_from, x_to, y_from, y_to, side = window(recent.grids, slot, tracks.u[m], reach)
-        if x_from > x_to:
-            continue
-        for y in range(y_from, y_to + 1):
-            for k in range(start[slot, y * side + x_from], start[slot, y * side + x_to + 1]):
-                j = items[slot, k]
-                miss = distance2(directions[j], tracks.u[m]) / (variance + variances[j])
-                if miss >= gate2:
-                    continue
-                if count == room:
-                    track = np.concatenate((track, np.empty(room, np.int64)))
-                    detection = np.concatenate((detection, np.empty(room, np.int64)))
-                    chi2 = np.concatenate((chi2, np.empty(room)))
-                    room *= 2
-                track[count], detection[count], chi2[count] = m, j, miss
-                count += 1
-    return track[:count], detection[:count], chi2[:count]
-
-
-@kernel
-def _claim(f, live, tracks, detections, recent, gate2):
-    """Move the live tracks to frame f, give them its detections and correct them."""
-    u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
-    time, slot = detections.times[f], f % len(recent.largest)
-    for m in live:
-        dt = time - tracks.at[m]
-        grow(P[m], rate_of(w[m]), rate_of(bend[m]), dt)
-        advance(u[m], w[m], bend[m], dt)
-        tracks.at[m] = time
-        tracks.missed[m] += 1
-    track, detection, chi2 = _candidates(live, tracks, detections, recent, slot, gate2)
-    row = np.searchsorted(live, track)
-    claimed = np.full(len(live), NONE)
-    for p in np.argsort(chi2, kind="mergesort"):
-        q, j = row[p], detection[p]
-        if claimed[q] == NONE and detections.track[j] == NONE:
-            claimed[q] = j
-            detections.track[j] = track[p]
-    _exchange(live, tracks, detections, (row, detection, chi2), claimed, gate2)
-    for q in range(len(live)):
-        m, j = live[q], claimed[q]
-        if j == NONE:
-            continue
-        tracks.missed[m] = 0
-        correct(u[m], w[m], bend[m], P[m], detections.directions[j], detections.variances[j])
-
-
-@kernel
-def _exchange(live, tracks, detections, candidates, claimed, gate2):
-    """Exchange the detections of two tracks where both together then fit better.
-
-    Predictions of neighbours may all be off to one side. Then the nearest detection is often the
-    neighbour's. `candidates` are row in `live`, detection and chi-square; `claimed` (len(live),)
-    the detection of each live track. Changes `claimed` and `detections.track`.
-    """
-    row, detection, chi2 = candidates
-    for p in range(len(row)):
-        q, k = row[p], detection[p]
-        j, other = claimed[q], detections.track[k]
-        if j in (NONE, k) or other == NONE:
-            continue
-        now = _chi2(tracks, live[q], detections, j) + _chi2(tracks, other, detections, k)
-        back = _chi2(tracks, other, detections, j)
-        if back < gate2 and chi2[p] + back < now:
-            claimed[q], claimed[np.searchsorted(live, other)] = k, j
-            detections.track[k], detections.track[j] = live[q], other
-
-
-@kernel
-def _chi2(tracks, m, detections, j):
-    """Return the squared distance, in sigmas, of detection j from the prediction of track m."""
-    variance = tracks.P[m, 0] + detections.variances[j]
-    return distance2(detections.directions[j], tracks.u[m]) / variance
-
-
-@kernel
-def _lay_frame(f, detections, recent):
-    """Lay the detections of frame f into its slot."""
-    lo, hi, slot = detections.offsets[f], detections.offsets[f + 1], f % len(recent.largest)
-    fill_grid(recent.grids, slot, detections.directions, lo, hi)
-    recent.smallest[slot] = detections.variances[lo:hi].min() if hi > lo else np.inf
-    recent.largest[slot] = detections.variances[lo:hi].max() if hi > lo else 0.0
-
-
-@kernel
-def _follow(detections, most, rule):
-    """Fill in the tracks of all detections, of which there are at most `most` in a frame."""
-    times, room = detections.times, len(detections.track) // max(rule.need, 1) + 1
-    tracks = _Tracks(
-        np.empty((room, 3)),
-        np.empty((room, 3)),
-        np.empty((room, 3)),
-        np.empty((room, SIZE)),
-        np.empty(room),
-        np.zeros(room, np.int64),
-    )
-    live = np.empty(0, np.int64)
-    # Not the literal 0: `new_tracks` would be compiled for that type as well.
-    n_tracks, n_slots = len(live), rule.need + DEEPEST + 1
-    recent = RecentFrames(make_grids(n_slots, most), np.full(n_slots, np.inf), np.zeros(n_slots))
-    for f in range(len(times)):
-        _lay_frame(f, detections, recent)
-        # A track with too many misses has ended.
-        live = live[
-            (tracks.missed[live] <= rule.max_missed)
-            & (times[f] - tracks.at[live] <= rule.max_coast)
-        ]
-        _claim(f, live, tracks, detections, recent, rule.gate2)
-        begun, held, chains = new_tracks(f, rule.need + SLACK, n_tracks, detections, recent, rule)
-        for row in begun:
-            members = chains[row, : held[row]]
-            u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
-            _state_of(members, detections, u[n_tracks], w[n_tracks], bend[n_tracks], P[n_tracks])
-            tracks.at[n_tracks], tracks.missed[n_tracks] = times[f], 0
-            n_tracks += 1
-        live = np.concatenate((live, np.arange(n_tracks - len(begun), n_tracks)))
 
 
 def follow_detections(
@@ -307,3 +167,150 @@ def _followed(
     )
     _follow(detections, int(n_in.max(initial=0)), rule)
     return detections.track
+
+
+@kernel
+def _follow(detections, most, rule):
+    """Fill in the tracks of all detections, of which there are at most `most` in a frame."""
+    times, room = detections.times, len(detections.track) // max(rule.need, 1) + 1
+    tracks = _Tracks(
+        np.empty((room, 3)),
+        np.empty((room, 3)),
+        np.empty((room, 3)),
+        np.empty((room, SIZE)),
+        np.empty(room),
+        np.zeros(room, np.int64),
+    )
+    live = np.empty(0, np.int64)
+    # Not the literal 0: `new_tracks` would be compiled for that type as well.
+    n_tracks, n_slots = len(live), rule.need + DEEPEST + 1
+    recent = RecentFrames(make_grids(n_slots, most), np.full(n_slots, np.inf), np.zeros(n_slots))
+    for f in range(len(times)):
+        _lay_frame(f, detections, recent)
+        # A track with too many misses has ended.
+        live = live[
+            (tracks.missed[live] <= rule.max_missed)
+            & (times[f] - tracks.at[live] <= rule.max_coast)
+        ]
+        _claim(f, live, tracks, detections, recent, rule.gate2)
+        begun, held, chains = new_tracks(f, rule.need + SLACK, n_tracks, detections, recent, rule)
+        for row in begun:
+            members = chains[row, : held[row]]
+            u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
+            _state_of(members, detections, u[n_tracks], w[n_tracks], bend[n_tracks], P[n_tracks])
+            tracks.at[n_tracks], tracks.missed[n_tracks] = times[f], 0
+            n_tracks += 1
+        live = np.concatenate((live, np.arange(n_tracks - len(begun), n_tracks)))
+
+
+@kernel
+def _lay_frame(f, detections, recent):
+    """Lay the detections of frame f into its slot."""
+    lo, hi, slot = detections.offsets[f], detections.offsets[f + 1], f % len(recent.largest)
+    fill_grid(recent.grids, slot, detections.directions, lo, hi)
+    recent.smallest[slot] = detections.variances[lo:hi].min() if hi > lo else np.inf
+    recent.largest[slot] = detections.variances[lo:hi].max() if hi > lo else 0.0
+
+
+@kernel
+def _claim(f, live, tracks, detections, recent, gate2):
+    """Move the live tracks to frame f, give them its detections and correct them."""
+    u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
+    time, slot = detections.times[f], f % len(recent.largest)
+    for m in live:
+        dt = time - tracks.at[m]
+        grow(P[m], rate_of(w[m]), rate_of(bend[m]), dt)
+        advance(u[m], w[m], bend[m], dt)
+        tracks.at[m] = time
+        tracks.missed[m] += 1
+    track, detection, chi2 = _candidates(live, tracks, detections, recent, slot, gate2)
+    row = np.searchsorted(live, track)
+    claimed = np.full(len(live), NONE)
+    for p in np.argsort(chi2, kind="mergesort"):
+        q, j = row[p], detection[p]
+        if claimed[q] == NONE and detections.track[j] == NONE:
+            claimed[q] = j
+            detections.track[j] = track[p]
+    _exchange(live, tracks, detections, (row, detection, chi2), claimed, gate2)
+    for q in range(len(live)):
+        m, j = live[q], claimed[q]
+        if j == NONE:
+            continue
+        tracks.missed[m] = 0
+        correct(u[m], w[m], bend[m], P[m], detections.directions[j], detections.variances[j])
+
+
+@kernel
+def _candidates(live, tracks, detections, recent, slot, gate2):
+    """Return all (track, detection, chi-square) within the gate."""
+    start, items = recent.grids[2], recent.grids[3]
+    directions, variances = detections.directions, detections.variances
+    room, count = 4 * len(live) + 16, 0
+    track, detection = np.empty(room, np.int64), np.empty(room, np.int64)
+    chi2 = np.empty(room)
+    for m in live:
+        variance = tracks.P[m, 0]
+        reach = np.sqrt(gate2 * (variance + recent.largest[slot]))
+        x_from, x_to, y_from, y_to, side = window(recent.grids, slot, tracks.u[m], reach)
+        if x_from > x_to:
+            continue
+        for y in range(y_from, y_to + 1):
+            for k in range(start[slot, y * side + x_from], start[slot, y * side + x_to + 1]):
+                j = items[slot, k]
+                miss = distance2(directions[j], tracks.u[m]) / (variance + variances[j])
+                if miss >= gate2:
+                    continue
+                if count == room:
+                    track = np.concatenate((track, np.empty(room, np.int64)))
+                    detection = np.concatenate((detection, np.empty(room, np.int64)))
+                    chi2 = np.concatenate((chi2, np.empty(room)))
+                    room *= 2
+                track[count], detection[count], chi2[count] = m, j, miss
+                count += 1
+    return track[:count], detection[:count], chi2[:count]
+
+
+@kernel
+def _exchange(live, tracks, detections, candidates, claimed, gate2):
+    """Exchange the detections of two tracks where both together then fit better.
+
+    Predictions of neighbours may all be off to one side. Then the nearest detection is often the
+    neighbour's. `candidates` are row in `live`, detection and chi-square; `claimed` (len(live),)
+    the detection of each live track. Changes `claimed` and `detections.track`.
+    """
+    row, detection, chi2 = candidates
+    for p in range(len(row)):
+        q, k = row[p], detection[p]
+        j, other = claimed[q], detections.track[k]
+        if j in (NONE, k) or other == NONE:
+            continue
+        now = _chi2(tracks, live[q], detections, j) + _chi2(tracks, other, detections, k)
+        back = _chi2(tracks, other, detections, j)
+        if back < gate2 and chi2[p] + back < now:
+            claimed[q], claimed[np.searchsorted(live, other)] = k, j
+            detections.track[k], detections.track[j] = live[q], other
+
+
+@kernel
+def _chi2(tracks, m, detections, j):
+    """Return the squared distance, in sigmas, of detection j from the prediction of track m."""
+    variance = tracks.P[m, 0] + detections.variances[j]
+    return distance2(detections.directions[j], tracks.u[m]) / variance
+
+
+@kernel
+def _state_of(members, detections, u, w, bend, P):
+    """Filter a new track's detections, newest first in `members`, into its state at the newest."""
+    times, frame_of = detections.times, detections.frame_of
+    directions, variances = detections.directions, detections.variances
+    last = len(members) - 1
+    first, second = members[last], members[last - 1]
+    begin(
+        directions[first], times[frame_of[first]], variances[first],
+        directions[second], times[frame_of[second]], variances[second], u, w, bend, P,
+    )  # fmt: skip
+    for m in range(last - 2, -1, -1):
+        dt = times[frame_of[members[m]]] - times[frame_of[members[m + 1]]]
+        grow(P, rate_of(w), rate_of(bend), dt)
+        advance(u, w, bend, dt)
+        correct(u, w, bend, P, directions[members[m]], variances[members[m]])

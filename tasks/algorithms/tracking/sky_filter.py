@@ -1,17 +1,18 @@
-"""A filter on the sky: direction, rate and acceleration of an object along its great circle.
+"""Motion of an object on the sky: its bounds, a filter for it, and a grid to look up detections.
 
-Both axes share one covariance P of six elements: direction, direction-rate, rate,
-direction-acceleration, rate-acceleration, acceleration. A new track's acceleration is uncertain by
-what its rate allows. Between frames the covariance grows by the jerk that the rate and the
-acceleration allow. After a few frames, predictions over half a minute are good as well. There are
-no coordinates, so no place on the sky is special.
+The state is a direction, its rate, and its acceleration along the great circle. Both axes across
+the direction share one covariance P of six elements: direction, direction-rate, rate,
+direction-acceleration, rate-acceleration, acceleration. The acceleration of a new track is
+uncertain by what its rate allows. Between frames the covariance grows by the jerk that rate and
+acceleration allow. After a few frames, predictions over half a minute are good as well. No
+coordinates are used, so all directions are treated alike.
 """
 
 import numpy as np
 
 from epipole.tasks.algorithms.kernels import kernel
 
-# -- How fast the apparent motion of an object can change: bounds from its apparent rate.
+# Bounds on apparent motion, from the apparent rate
 #
 # Four causes change a rate. Geometry changes it by its square: an object that passes at range d
 # with speed v has the rate v / d, which changes by up to (v / d)^2. While the range changes, the
@@ -69,13 +70,7 @@ def cubic_span(rate: float, sigma: float) -> float:
     return float(2 * np.sqrt(np.sqrt(8 * 24 * sigma / snap)))
 
 
-# -- A filter on the sky: direction, rate and acceleration of an object along its great circle.
-#
-# Both axes share one covariance P of six elements: direction, direction-rate, rate, direction-
-# acceleration, rate-acceleration, acceleration. A new track's acceleration is uncertain by what
-# its rate allows. Between frames the covariance grows by the jerk that the rate and the
-# acceleration allow. After a few frames, predictions over half a minute are good as well. There
-# are no coordinates, so no place on the sky is special.
+# Filter
 
 SIZE = 6  # elements of a covariance
 
@@ -201,11 +196,11 @@ def begin(u_1, t_1, var_1, u_2, t_2, var_2, u, w, bend, P):
     begin_covariance(abs(rate), dt, var_1, var_2, P)
 
 
-# -- Grids over the detections of the latest frames, to look up what lies near a direction.
+# Grid of the detections of recent frames
 #
-# A frame is projected on the plane across its mean direction. That makes no distance longer, so
-# that all detections within a reach are in the cells that the reach touches. A grid is a tuple
-# of arrays, as compiled code takes them; slot k of each belongs to the frames k, k + size, ...
+# A frame is projected on the plane across its mean direction. That lengthens no distance, so all
+# detections within a distance are in the cells that this distance touches. A grid is a tuple of
+# arrays, as compiled code takes them. Slot k of each belongs to the frames k, k + size, ...
 
 FINEST = 128  # most cells along a side
 

@@ -1,4 +1,12 @@
-"""Candidates: the tracklet of a sensor that the points of a hypothesis explain best."""
+"""Candidates: the tracklet of a sensor that the points of a hypothesis explain best.
+
+`best_of_sensor` is the inner loop of the search:
+
+1. The points are projected onto the sensor's plane, with their covariance (`_predict`).
+2. Only grid cells within the gate are searched (`_gate`, `_window`).
+3. Each free tracklet there is weighed: what it adds to the log-odds (`_fit`).
+4. One that overlaps in time with a tracklet that the hypothesis has already is skipped.
+"""
 
 import numpy as np
 
@@ -27,85 +35,6 @@ from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel
 # stretch of the plane, the delay of `later_s` [s], and how far the sensor's own motion moves the
 # coordinates in that time.
 A0, A1, H00, H01, H11, DEPTH, STRETCH, LATER, OWN0, OWN1 = range(10)
-
-
-@borrowing_kernel
-def _predict(views, s, points, predicted):
-    """Write where sensor s should see the points, with covariance; DEPTH 0 or less: behind it."""
-    x, _, P, seen_by = points
-    cam = views.camera  # element by element, see `views.residual`
-    for m in range(len(views.time_s)):
-        if seen_by[m] < 2:
-            continue
-        d0, d1, d2 = x[m, 0] - cam[s, m, 0], x[m, 1] - cam[s, m, 1], x[m, 2] - cam[s, m, 2]
-        n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
-        depth = n0 * d0 + n1 * d1 + n2 * d2
-        predicted[m, DEPTH] = depth
-        if not depth > 0.0:
-            continue
-        p0, p1, p2 = cam[s, m, PLANE], cam[s, m, PLANE + 1], cam[s, m, PLANE + 2]
-        q0, q1, q2 = cam[s, m, PLANE + 3], cam[s, m, PLANE + 4], cam[s, m, PLANE + 5]
-        a0 = (p0 * d0 + p1 * d1 + p2 * d2) / depth
-        a1 = (q0 * d0 + q1 * d1 + q2 * d2) / depth
-        p0, p1, p2 = (p0 - a0 * n0) / depth, (p1 - a0 * n1) / depth, (p2 - a0 * n2) / depth
-        q0, q1, q2 = (q0 - a1 * n0) / depth, (q1 - a1 * n1) / depth, (q2 - a1 * n2) / depth
-        t0 = P[m, 0, 0] * p0 + P[m, 0, 1] * p1 + P[m, 0, 2] * p2
-        t1 = P[m, 1, 0] * p0 + P[m, 1, 1] * p1 + P[m, 1, 2] * p2
-        t2 = P[m, 2, 0] * p0 + P[m, 2, 1] * p1 + P[m, 2, 2] * p2
-        predicted[m, A0], predicted[m, A1] = a0, a1
-        predicted[m, H00] = p0 * t0 + p1 * t1 + p2 * t2
-        predicted[m, H01] = q0 * t0 + q1 * t1 + q2 * t2
-        t0 = P[m, 0, 0] * q0 + P[m, 0, 1] * q1 + P[m, 0, 2] * q2
-        t1 = P[m, 1, 0] * q0 + P[m, 1, 1] * q1 + P[m, 1, 2] * q2
-        t2 = P[m, 2, 0] * q0 + P[m, 2, 1] * q1 + P[m, 2, 2] * q2
-        predicted[m, H11] = q0 * t0 + q1 * t1 + q2 * t2
-        predicted[m, STRETCH] = 1.0 + a0 * a0 + a1 * a1
-        later = later_s(d0, d1, d2, x[m])
-        v0, v1, v2 = cam[s, m, V_KM_S], cam[s, m, V_KM_S + 1], cam[s, m, V_KM_S + 2]
-        predicted[m, LATER] = later
-        predicted[m, OWN0] = later * (p0 * v0 + p1 * v1 + p2 * v2)
-        predicted[m, OWN1] = later * (q0 * v0 + q1 * v1 + q2 * v2)
-
-
-@borrowing_kernel
-def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
-    """Return what tracklet c adds to the log-odds; -inf where it does not fit the points.
-
-    The log-likelihood of its directions as views of the points, minus that as an unrelated
-    tracklet. After the first shared instant, an unrelated tracklet is uncertain only by how
-    differently the tracklets of the sensor move.
-    """
-    gain, total, n, begun_at, see = 0.0, 0.0, 0, 0.0, views.sight
-    largest = quantile(2 * len(views.time_s), gate_sigma)
-    for m in range(len(views.time_s)):
-        if seen_by[m] < 2 or not views.seen[c, m]:
-            continue
-        depth = predicted[m, DEPTH]
-        if not depth > 0.0:
-            return -np.inf
-        x0, x1 = see[c, m, X], see[c, m, Y]
-        later, moves = predicted[m, LATER], see[c, m, MOVES]
-        e0 = predicted[m, A0] - x0 - moves * predicted[m, OWN0] - later * see[c, m, DX]
-        e1 = predicted[m, A1] - x1 - moves * predicted[m, OWN1] - later * see[c, m, DY]
-        extra = (see[c, m, SIGMA_KM] / depth) ** 2
-        c00 = see[c, m, XX] + extra * (1.0 + x0 * x0) + predicted[m, H00]
-        c01 = see[c, m, XY] + extra * x0 * x1 + predicted[m, H01]
-        c11 = see[c, m, YY] + extra * (1.0 + x1 * x1) + predicted[m, H11]
-        det = c00 * c11 - c01 * c01
-        chi2 = (e0 * e0 * c11 - 2 * e0 * e1 * c01 + e1 * e1 * c00) / det
-        total += chi2
-        if total > largest:  # most candidates end here, before any logarithm
-            return -np.inf
-        stretch = predicted[m, STRETCH]
-        spot = 2 * np.pi * np.sqrt(det / (stretch * stretch * stretch))
-        if n == 0:
-            gain += np.log(chance.detected[s] / (chance.density[s] * spot)) - 0.5 * chi2
-            begun_at = views.time_s[m]
-        else:
-            room = np.pi * (chance.spread[s] * (views.time_s[m] - begun_at)) ** 2
-            gain += np.log1p(room / spot) - 0.5 * chi2
-        n += 1
-    return gain if n > 0 and total <= quantile(2 * n, gate_sigma) else -np.inf
 
 
 @inlined_kernel
@@ -154,6 +83,44 @@ def best_of_sensor(space, work, s, own, least):
 
 
 @borrowing_kernel
+def _predict(views, s, points, predicted):
+    """Write where sensor s should see the points, with covariance; DEPTH 0 or less: behind it."""
+    x, _, P, seen_by = points
+    cam = views.camera  # element by element, see `views.residual`
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2:
+            continue
+        d0, d1, d2 = x[m, 0] - cam[s, m, 0], x[m, 1] - cam[s, m, 1], x[m, 2] - cam[s, m, 2]
+        n0, n1, n2 = cam[s, m, PLANE + 6], cam[s, m, PLANE + 7], cam[s, m, PLANE + 8]
+        depth = n0 * d0 + n1 * d1 + n2 * d2
+        predicted[m, DEPTH] = depth
+        if not depth > 0.0:
+            continue
+        p0, p1, p2 = cam[s, m, PLANE], cam[s, m, PLANE + 1], cam[s, m, PLANE + 2]
+        q0, q1, q2 = cam[s, m, PLANE + 3], cam[s, m, PLANE + 4], cam[s, m, PLANE + 5]
+        a0 = (p0 * d0 + p1 * d1 + p2 * d2) / depth
+        a1 = (q0 * d0 + q1 * d1 + q2 * d2) / depth
+        p0, p1, p2 = (p0 - a0 * n0) / depth, (p1 - a0 * n1) / depth, (p2 - a0 * n2) / depth
+        q0, q1, q2 = (q0 - a1 * n0) / depth, (q1 - a1 * n1) / depth, (q2 - a1 * n2) / depth
+        t0 = P[m, 0, 0] * p0 + P[m, 0, 1] * p1 + P[m, 0, 2] * p2
+        t1 = P[m, 1, 0] * p0 + P[m, 1, 1] * p1 + P[m, 1, 2] * p2
+        t2 = P[m, 2, 0] * p0 + P[m, 2, 1] * p1 + P[m, 2, 2] * p2
+        predicted[m, A0], predicted[m, A1] = a0, a1
+        predicted[m, H00] = p0 * t0 + p1 * t1 + p2 * t2
+        predicted[m, H01] = q0 * t0 + q1 * t1 + q2 * t2
+        t0 = P[m, 0, 0] * q0 + P[m, 0, 1] * q1 + P[m, 0, 2] * q2
+        t1 = P[m, 1, 0] * q0 + P[m, 1, 1] * q1 + P[m, 1, 2] * q2
+        t2 = P[m, 2, 0] * q0 + P[m, 2, 1] * q1 + P[m, 2, 2] * q2
+        predicted[m, H11] = q0 * t0 + q1 * t1 + q2 * t2
+        predicted[m, STRETCH] = 1.0 + a0 * a0 + a1 * a1
+        later = later_s(d0, d1, d2, x[m])
+        v0, v1, v2 = cam[s, m, V_KM_S], cam[s, m, V_KM_S + 1], cam[s, m, V_KM_S + 2]
+        predicted[m, LATER] = later
+        predicted[m, OWN0] = later * (p0 * v0 + p1 * v1 + p2 * v2)
+        predicted[m, OWN1] = later * (q0 * v0 + q1 * v1 + q2 * v2)
+
+
+@borrowing_kernel
 def _gate(views, s, m, predicted, gate_sigma):
     """Return how far a tracklet may be from the prediction, along both coordinates."""
     cam = views.camera
@@ -177,6 +144,78 @@ def _window(views, s, m, predicted, reach0, reach1):
     lo1 = max(int(np.floor((here - reach1) * cam[s, m, SCALE + 1])), 0)
     hi1 = min(int(np.floor((here + reach1) * cam[s, m, SCALE + 1])), side - 1)
     return (lo0, hi0, lo1, hi1) if hi1 >= lo1 else (0, -1, 0, -1)
+
+
+@borrowing_kernel
+def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
+    """Return what tracklet c adds to the log-odds; -inf where it does not fit the points.
+
+    The log-likelihood of its directions as views of the points, minus that as an unrelated
+    tracklet. After the first shared instant, an unrelated tracklet is uncertain only by how
+    differently the tracklets of the sensor move.
+    """
+    gain, total, n, begun_at, see = 0.0, 0.0, 0, 0.0, views.sight
+    largest = quantile(2 * len(views.time_s), gate_sigma)
+    for m in range(len(views.time_s)):
+        if seen_by[m] < 2 or not views.seen[c, m]:
+            continue
+        depth = predicted[m, DEPTH]
+        if not depth > 0.0:
+            return -np.inf
+        x0, x1 = see[c, m, X], see[c, m, Y]
+        later, moves = predicted[m, LATER], see[c, m, MOVES]
+        e0 = predicted[m, A0] - x0 - moves * predicted[m, OWN0] - later * see[c, m, DX]
+        e1 = predicted[m, A1] - x1 - moves * predicted[m, OWN1] - later * see[c, m, DY]
+        extra = (see[c, m, SIGMA_KM] / depth) ** 2
+        c00 = see[c, m, XX] + extra * (1.0 + x0 * x0) + predicted[m, H00]
+        c01 = see[c, m, XY] + extra * x0 * x1 + predicted[m, H01]
+        c11 = see[c, m, YY] + extra * (1.0 + x1 * x1) + predicted[m, H11]
+        det = c00 * c11 - c01 * c01
+        chi2 = (e0 * e0 * c11 - 2 * e0 * e1 * c01 + e1 * e1 * c00) / det
+        total += chi2
+        if total > largest:  # most candidates end here, before any logarithm
+            return -np.inf
+        stretch = predicted[m, STRETCH]
+        spot = 2 * np.pi * np.sqrt(det / (stretch * stretch * stretch))
+        if n == 0:
+            gain += np.log(chance.detected[s] / (chance.density[s] * spot)) - 0.5 * chi2
+            begun_at = views.time_s[m]
+        else:
+            room = np.pi * (chance.spread[s] * (views.time_s[m] - begun_at)) ** 2
+            gain += np.log1p(room / spot) - 0.5 * chi2
+        n += 1
+    return gain if n > 0 and total <= quantile(2 * n, gate_sigma) else -np.inf
+
+
+@borrowing_kernel
+def _shared_before(views, c, m, seen_by):
+    """Return whether tracklet c shares an instant before m with the points."""
+    shared = False
+    for earlier in range(m):
+        shared |= seen_by[earlier] >= 2 and views.seen[c, earlier]
+    return shared
+
+
+@borrowing_kernel
+def _clashes(views, c, own):
+    """Return whether c is one of these tracklets of its sensor, or overlaps in time with one."""
+    for o in own:
+        if o == c or (views.start_s[c] <= views.end_s[o] and views.start_s[o] <= views.end_s[c]):
+            return True
+    return False
+
+
+@borrowing_kernel
+def fills(views, c, seen_by):
+    """Return whether c overlaps with any other tracklet of its sensor that the points may have."""
+    first, last = -1, -1
+    for m in range(len(seen_by)):
+        if seen_by[m] >= 2:
+            first = m if first < 0 else first
+            last = m
+    if first < 0 or not views.bounded[views.sensor[c]]:
+        return False
+    return views.seen[c, first] and views.seen[c, last]
 
 
 @borrowing_kernel
@@ -210,34 +249,3 @@ def odds_of_view(space, work, s, c):
     _predict(space.views, s, work.points, work.predicted)
     seen_by = work.points.seen_by
     return _fit(space.views, space.chance, s, c, seen_by, work.predicted, np.inf)
-
-
-@borrowing_kernel
-def _shared_before(views, c, m, seen_by):
-    """Return whether tracklet c shares an instant before m with the points."""
-    shared = False
-    for earlier in range(m):
-        shared |= seen_by[earlier] >= 2 and views.seen[c, earlier]
-    return shared
-
-
-@borrowing_kernel
-def _clashes(views, c, own):
-    """Return whether c is one of these tracklets of its sensor, or overlaps in time with one."""
-    for o in own:
-        if o == c or (views.start_s[c] <= views.end_s[o] and views.start_s[o] <= views.end_s[c]):
-            return True
-    return False
-
-
-@borrowing_kernel
-def fills(views, c, seen_by):
-    """Return whether c overlaps with any other tracklet of its sensor that the points may have."""
-    first, last = -1, -1
-    for m in range(len(seen_by)):
-        if seen_by[m] >= 2:
-            first = m if first < 0 else first
-            last = m
-    if first < 0 or not views.bounded[views.sensor[c]]:
-        return False
-    return views.seen[c, first] and views.seen[c, last]

@@ -1,4 +1,15 @@
-"""Growth: two tracklets become a hypothesis as tracklets of other sensors join them."""
+"""Growth: a seed of two tracklets becomes a hypothesis as tracklets of other sensors join it.
+
+For each seed, `grow_all` goes through these steps (2 to 5 are `_grow`):
+
+1. The sensors that share space with both sensors of the seed are looked up.
+2. The seed's points are solved, and the sensors that may see them are listed (`_begin`).
+3. Sensor after sensor, the tracklet that adds most to the odds joins (`_join_sensor`). The seed is
+   given up as soon as the other sensors are clearly against it.
+4. Members that do not fit are dropped, the worst first (`_settle`).
+5. The first members were chosen by inaccurate points: they are chosen again (`_review`).
+6. The hypothesis is scored, and taken at once if it is clear (`_clear_of_doubt`).
+"""
 
 from typing import NamedTuple
 
@@ -123,44 +134,6 @@ def grow_all(space, work, seeds, clear, least):
     )  # fmt: skip
 
 
-@kernel
-def _more(values, n):
-    """Return an array twice as long with the same first n rows."""
-    out = np.empty((2 * len(values), *values.shape[1:]), values.dtype)
-    out[:n] = values[:n]
-    return out
-
-
-@kernel
-def _room(values, n, more):
-    """Return the array, or a longer one with the same first n values and room for more."""
-    while n + more > len(values):
-        values = _more(values, n)
-    return values
-
-
-@borrowing_kernel
-def _clear_of_doubt(space, work, members, n_missed, value, clear):
-    """Return whether a hypothesis may be taken at once.
-
-    It has many views, and of the sensors that have it in their field about as many detect it
-    as usual. A mixture of two objects' tracklets fits in some of the sensors only.
-    """
-    if not (value > clear and len(members) >= WELL_KNOWN):
-        return False
-    views, detected = space.views, space.chance.detected
-    has, usual, mark = 0, 0.0, next_mark(work.stamp)
-    for i in members:
-        s = views.sensor[i]
-        if work.stamp[s] != mark:
-            work.stamp[s] = mark
-            has += 1
-            usual += detected[s]
-    for s in work.missed[:n_missed]:
-        usual += detected[s]
-    return has >= COMPLETE * usual
-
-
 @borrowing_kernel
 def _grow(space, work, members, nearby):
     """Grow the first two members; return the size and the number of sensors in `work.near`.
@@ -260,6 +233,43 @@ def _join_sensor(space, work, s, members, n, evidence):
 
 
 @borrowing_kernel
+def _settle(space, work, members, n):
+    """Solve, and drop the members that fit worst until all fit; return the size.
+
+    The seed's tracklets may be dropped too. One is dropped at a time, of many a share: so the work
+    goes with their number. 0 where fewer than two are left.
+    """
+    views, part = space.views, work.part
+    X, _, _, seen_by = work.points
+    while n >= 2:
+        chi2, dof = solve(views, members[:n], work.points, part)
+        if dof > 0 and chi2 <= quantile(dof, space.gate_sigma):
+            return n
+        if n == 2:
+            break
+        for q in range(n):
+            total, shared = 0.0, 1e-9
+            for m in range(len(views.time_s)):
+                if seen_by[m] < 2 or not views.seen[members[q], m]:
+                    continue
+                if residual(views, members[q], m, X[m], part) == 0.0:
+                    total = np.inf
+                total += misfit(part)
+                shared += 1
+            work.misfit[q] = total / shared
+        for _ in range(1 + n // DROPPED_TOGETHER):
+            worst = 0
+            for q in range(n):
+                worst = q if work.misfit[q] > work.misfit[worst] else worst
+            for q in range(worst, n - 1):
+                members[q], work.misfit[q] = members[q + 1], work.misfit[q + 1]
+            n -= 1
+        if np.isnan(chi2):
+            seen_by[:] = 0  # such points are no start
+    return np.int64(0)
+
+
+@borrowing_kernel
 def _review(space, work, members, n, early):
     """Choose the early members again, now that the points are well known; return the size.
 
@@ -321,37 +331,38 @@ def _speaks(space, work, i):
 
 
 @borrowing_kernel
-def _settle(space, work, members, n):
-    """Solve, and drop the members that fit worst until all fit; return the size.
+def _clear_of_doubt(space, work, members, n_missed, value, clear):
+    """Return whether a hypothesis may be taken at once.
 
-    The seed's tracklets may be dropped too. One is dropped at a time, of many a share: so the work
-    goes with their number. 0 where fewer than two are left.
+    It has many views, and of the sensors that have it in their field about as many detect it
+    as usual. A mixture of two objects' tracklets fits in some of the sensors only.
     """
-    views, part = space.views, work.part
-    X, _, _, seen_by = work.points
-    while n >= 2:
-        chi2, dof = solve(views, members[:n], work.points, part)
-        if dof > 0 and chi2 <= quantile(dof, space.gate_sigma):
-            return n
-        if n == 2:
-            break
-        for q in range(n):
-            total, shared = 0.0, 1e-9
-            for m in range(len(views.time_s)):
-                if seen_by[m] < 2 or not views.seen[members[q], m]:
-                    continue
-                if residual(views, members[q], m, X[m], part) == 0.0:
-                    total = np.inf
-                total += misfit(part)
-                shared += 1
-            work.misfit[q] = total / shared
-        for _ in range(1 + n // DROPPED_TOGETHER):
-            worst = 0
-            for q in range(n):
-                worst = q if work.misfit[q] > work.misfit[worst] else worst
-            for q in range(worst, n - 1):
-                members[q], work.misfit[q] = members[q + 1], work.misfit[q + 1]
-            n -= 1
-        if np.isnan(chi2):
-            seen_by[:] = 0  # such points are no start
-    return np.int64(0)
+    if not (value > clear and len(members) >= WELL_KNOWN):
+        return False
+    views, detected = space.views, space.chance.detected
+    has, usual, mark = 0, 0.0, next_mark(work.stamp)
+    for i in members:
+        s = views.sensor[i]
+        if work.stamp[s] != mark:
+            work.stamp[s] = mark
+            has += 1
+            usual += detected[s]
+    for s in work.missed[:n_missed]:
+        usual += detected[s]
+    return has >= COMPLETE * usual
+
+
+@kernel
+def _more(values, n):
+    """Return an array twice as long with the same first n rows."""
+    out = np.empty((2 * len(values), *values.shape[1:]), values.dtype)
+    out[:n] = values[:n]
+    return out
+
+
+@kernel
+def _room(values, n, more):
+    """Return the array, or a longer one with the same first n values and room for more."""
+    while n + more > len(values):
+        values = _more(values, n)
+    return values

@@ -1,4 +1,8 @@
-"""Search space: the input that all hypotheses of a search share, and their work arrays."""
+"""Search space: what all hypotheses of a search share, and the work arrays of one hypothesis.
+
+`likelihood` makes a `SearchSpace` for each window; the kernels of `growth`, `candidates`,
+`merge_hypotheses` and `resolve_conflicts` take it with a `WorkSpace`.
+"""
 
 from typing import NamedTuple
 

@@ -1,4 +1,10 @@
-"""Sensor pairs: which pairs of sensors seed, and in which order."""
+"""Sensor pairs: which pairs of sensors provide seeds, and in which order.
+
+1. `meeting_pairs` finds the sensors whose fields overlap. In crowded space each sensor is paired
+   with a limited number of others.
+2. `SensorPairs` puts the longest baselines first, and skips a pair where earlier pairs cover all
+   the space that it shares. With few sensors, `EveryPair` takes all of them.
+"""
 
 import numpy as np
 import numpy.typing as npt
@@ -15,16 +21,18 @@ from epipole.tasks.algorithms.association.search.seeds import SHORTEST_BASELINE_
 from epipole.tasks.algorithms.association.views import PLANE, Views, X, Y, direction
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
-# -- Partners: with which others a sensor may find objects.
-
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a field, to see whether it meets another one
 TESTED_INSTANTS = 3
 LEADERS = 8  # sensors of a crowded cell that all others are paired with
 MAX_PARTNERS = 64  # of a sensor; half of them are leaders of crowded cells
 MAX_TESTS = 512  # of whether two fields meet, for each sensor
+N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its plane
+# Share of a crowded field that counts as covered by a pair: its edges are not looked at.
+MIDDLE = 0.5
 
 
 def meeting_pairs(index: FieldIndex, cones: Array, farthest_km: float) -> tuple[Indices, Indices]:
@@ -164,13 +172,7 @@ def _leaders(index, rank):
     return leader
 
 
-# -- Sensor pairs: which pairs of sensors seed, and in which order.
-
-Flags = npt.NDArray[np.bool_]
-
-N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its plane
-# Share of a crowded field that counts as covered by a pair: its edges are not looked at.
-MIDDLE = 0.5
+# Order of the pairs
 
 
 class EveryPair:
