@@ -1,4 +1,4 @@
-"""The tables of BENCHMARKS.md: every benchmark of the plan is run, and its output put in its part.
+"""The tables of BENCHMARKS.md, and the README's: each benchmark is run, its output put in its part.
 
     .ci/generate benchmarks [NAME ...] [--list]
 
@@ -25,6 +25,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "BENCHMARKS.md"
+README = ROOT / "README.md"
 RESULTS = ROOT / "build" / "benchmarks"
 MACHINE = "machine"  # the part that says when, where and with what all was measured
 
@@ -61,8 +62,10 @@ class Result(NamedTuple):
 
 
 GREAT_BEAR = "tests/photographs/great_bear.csv --width 5184 --height 3456 --field 25.9 --year 2011"
+OF_README = "scenes"  # the part that stands there
 # By the name of the part, in the order of the page.
 PLAN = {
+    OF_README: Benchmark("scenes", "", 12),
     "example": Benchmark("example", "--rounds 3", 10),
     "night": Benchmark("night", "--shares 16 1", 10),
     "scaling": Benchmark("scaling", "--sensors 32 128", 12),
@@ -193,8 +196,12 @@ def write_page(results: dict[str, Result]) -> None:
         said = "Not all tables are of one commit yet: each says its date and commit.\n"
     text = with_part(text, MACHINE, said)
     for name, result in results.items():
-        content = part_of(PLAN[name], result, alone=not whole)
-        text = with_part(text, name, content)
+        if name == OF_README:
+            content = part_of(PLAN[name], result, alone=True)
+            README.write_text(with_part(README.read_text(), name, content))
+        else:
+            content = part_of(PLAN[name], result, alone=not whole)
+            text = with_part(text, name, content)
     PAGE.write_text(text)
 
 
@@ -210,7 +217,8 @@ def main() -> int:
         print("\n".join(f"{name:20} {b.command}" for name, b in PLAN.items()))
         return 0
     for name in PLAN:
-        part(PAGE.read_text(), name)  # a missing part is an error before the hour, not after it
+        # A missing part is an error before the hour, not after it.
+        part((README if name == OF_README else PAGE).read_text(), name)
     RESULTS.mkdir(parents=True, exist_ok=True)
     failed, here, kept = [], commit(), kept_results()
     for name in chosen.names or PLAN:

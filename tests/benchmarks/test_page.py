@@ -8,7 +8,19 @@ import pytest
 
 sys.path.append(str(Path(__file__).parent))
 
-from page import MACHINE, PAGE, PLAN, Benchmark, Result, as_markdown, part_of, run, write_page
+from page import (
+    MACHINE,
+    OF_README,
+    PAGE,
+    PLAN,
+    README,
+    Benchmark,
+    Result,
+    as_markdown,
+    part_of,
+    run,
+    write_page,
+)
 
 MAX_WORDS = 4000
 
@@ -19,7 +31,8 @@ def result(output="| a |\n|---|\n| 1 |\n", commit="abc"):
 
 def test_the_page_has_a_part_for_each_benchmark_of_the_plan_in_its_order():
     marks = re.findall(r"<!-- (?!end of )(\w+) -->", PAGE.read_text())
-    assert marks == [MACHINE, *PLAN]
+    assert marks == [MACHINE, *(name for name in PLAN if name != OF_README)]
+    assert f"<!-- {OF_README} -->" in README.read_text()
 
 
 def test_the_plan_names_scripts_that_exist():
@@ -54,6 +67,9 @@ def copy(tmp_path, monkeypatch):
     page = tmp_path / "BENCHMARKS.md"
     page.write_text(PAGE.read_text())
     monkeypatch.setattr("page.PAGE", page)
+    readme = tmp_path / "README.md"
+    readme.write_text(README.read_text())
+    monkeypatch.setattr("page.README", readme)
     return page
 
 

@@ -42,6 +42,7 @@ TINY = {
     "queries": "--nights 10 --rows 1000 --runs 1",
     "real_orbits": f"{ORBITS} --first 4 --scenes 1 --out {{folder}}",
     "scaling": "--sensors 2 --hours 0.01 --objects 5",
+    "scenes": "--scenes lost_in_space",
     "simulation": "--hours 0.1 --sensors 2",
     "star_identification": "--made 3 --cameras c --tracked 200",
     "track_linking": "--seeds 1",
