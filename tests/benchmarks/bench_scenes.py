@@ -34,7 +34,7 @@ MEASURES = {
 def figure(name: str, value: float | None) -> str:
     """Return a measure as text: counts as they are, errors in km, shares in percent."""
     if value is None:
-        return "–"
+        return "-"
     if isinstance(value, int):
         return f"{value:,}"
     if "km" in name:
@@ -62,7 +62,7 @@ def main() -> None:
     print(f"| | {' | '.join(chosen.scenes)} |\n|---|{'---|' * len(reports)}")
     for label, names in MEASURES.items():
         cells = [" / ".join(figure(n, getattr(report, n)) for n in names) for report in reports]
-        cells = ["" if set(cell) <= set("–/ ") else cell for cell in cells]
+        cells = ["" if set(cell) <= set("-/ ") else cell for cell in cells]
         print(f"| {label} | {' | '.join(cells)} |")
 
 
