@@ -122,7 +122,7 @@ def lines(report: CameraReport) -> list[str]:
         out += [f"  principal point  {_values(report, names[0])}",
                 f"  distortion       {_values(report, names[1])}"]  # fmt: skip
     else:
-        out.append("  distortion       as told; 60 stars in 3 frames are needed to fit it")
+        out.append("  distortion       as stated; 60 stars in 3 frames are needed to fit it")
     if report.is_mirrored:
         out.append(
             "  mirrored         rows count upward (y up): the second focal length of K is < 0"
@@ -132,9 +132,9 @@ def lines(report: CameraReport) -> list[str]:
 
 
 def _not_found(report: CameraReport) -> list[str]:
-    told = report.told
+    stated = report.told
     narrow, wide = (
-        told._replace(fx_px=told.fx_px * factor).field_deg[0]
+        stated._replace(fx_px=stated.fx_px * factor).field_deg[0]
         for factor in (report.reach, 1 / report.reach)
     )
     return [
@@ -158,14 +158,14 @@ def _image(report: CameraReport) -> str:
 
 
 def _focal(report: CameraReport) -> str:
-    c, told = report.camera, report.told
+    c, stated = report.camera, report.told
     assert c is not None
     sigma = f" +- {report.sigma['fx_px']:.2f}" if report.sigma else ""
     text = f"{c.fx_px:.2f}{sigma} px, a field of {c.field_deg[0]:.2f} deg along the columns"
     if not report.is_told:
         return text
-    percent = 100 * (c.fx_px / told.fx_px - 1)
-    return f"{text}; {percent:+.2f} % of {told.fx_px:.2f}"
+    percent = 100 * (c.fx_px / stated.fx_px - 1)
+    return f"{text}; {percent:+.2f} % of {stated.fx_px:.2f}"
 
 
 def _values(report: CameraReport, names: tuple[str, ...]) -> str:

@@ -77,7 +77,7 @@ def build_catalogue(
     if (fault := fault_of_name(out.name)) is not None:
         raise CatalogueError(f"file {out}: {fault}")
     if source in STAR_CATALOGUES and (epoch is not None or name is not None):
-        raise CatalogueError(f"{source} has its own epoch and name; leave these options out")
+        raise CatalogueError(f"{source} has an epoch and a name; leave these options out")
     ignored: list[str] = []
     if source in STAR_CATALOGUES:
         stars = load_function(STAR_CATALOGUES[source].read)()

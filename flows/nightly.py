@@ -166,8 +166,8 @@ def make_night(
     """
     spans, uncalibrated = plan_spans(frames, night)
     work = identify(frames, spans, folder, settings)
-    work, told = find_cameras(work, settings)
-    work, calibrations = calibrate(work, told, settings)
+    work, stated = find_cameras(work, settings)
+    work, calibrations = calibrate(work, stated, settings)
     while True:
         track(work, night, settings)
         solved = solve(work, settings)

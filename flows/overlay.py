@@ -35,7 +35,7 @@ from epipole.tasks.overlay.messages import (
 )
 from epipole.tasks.overlay.scene import earth
 
-SHOWN_EPOCHS = 3  # an object is shown as long, if no later epoch has it
+LIFETIME_EPOCHS = 3  # an object is shown as long, if no later epoch has it
 
 
 @dataclass(frozen=True)
@@ -85,54 +85,56 @@ def overlay(
         Where the dataset has no night of the logs, or the file cannot be written.
     """
     paths = [path for where in logs for path in list_logs(where)[0]]
-    told = _Logs(paths)
-    nights = [date for date in nights_in(dataset) if date in told.nights and night in (None, date)]
+    given = _Logs(paths)
+    nights = [date for date in nights_in(dataset) if date in given.nights and night in (None, date)]
     if not nights:
-        asked = night or ", ".join(told.nights)
+        asked = night or ", ".join(given.nights)
         raise NoFramesError(f"{dataset}: has no night of these logs ({asked}); run them first")
     counts = {"frames": 0, "epochs": 0, "log_lines": 0}
     try:
         with ViewerFile(out) as file:
             for date in nights:
-                _calibrations(file, told, date)
-                for message in _of_night(dataset, date, told, images, counts):
+                _calibrations(file, given, date)
+                for message in _of_night(dataset, date, given, images, counts):
                     file.message(message.topic, message.schema, message.time_ns, message.data)
     except OSError as error:
         raise DatasetError(f"{out}: cannot be written: {error.strerror}; give another") from error
-    asked_frames = told.frames.filter(pl.col("time").dt.date().cast(pl.String).is_in(nights))
+    asked_frames = given.frames.filter(pl.col("time").dt.date().cast(pl.String).is_in(nights))
     return Overlay(
         str(out), nights, **counts, without_rows=max(len(asked_frames) - counts["frames"], 0)
     )
 
 
-def _calibrations(file: ViewerFile, told: _Logs, night: str) -> None:
+def _calibrations(file: ViewerFile, given: _Logs, night: str) -> None:
     """Write the calibrations of a night; the first of a sensor holds from its first frame."""
     start_ns = day_of(night) * DAY_NS
     first_ns = dict(
-        told.frames.group_by("sensor_id")
+        given.frames.group_by("sensor_id")
         .agg(pl.col("time").min().dt.timestamp("ns"))
         .sort("sensor_id")
         .iter_rows()
     )
-    rows = to_polars(told.cameras).sort("sensor_id", "time").unique(maintain_order=True)
-    for (sensor,), own in rows.partition_by("sensor_id", as_dict=True, maintain_order=True).items():
-        times_ns = own["time"].dt.timestamp("ns").to_list()
-        for number, row in enumerate(own.iter_rows(named=True)):
+    rows = to_polars(given.cameras).sort("sensor_id", "time").unique(maintain_order=True)
+    for (sensor,), cameras in rows.partition_by(
+        "sensor_id", as_dict=True, maintain_order=True
+    ).items():
+        times_ns = cameras["time"].dt.timestamp("ns").to_list()
+        for number, row in enumerate(cameras.iter_rows(named=True)):
             since_ns = times_ns[number] if number else first_ns.get(sensor, times_ns[0])
             file.calibration(str(sensor), max(since_ns, start_ns), row)
 
 
 def _of_night(
-    dataset: str, night: str, told: _Logs, images: bool, counts: dict[str, int]
+    dataset: str, night: str, given: _Logs, images: bool, counts: dict[str, int]
 ) -> Iterator[ViewerMessage]:
-    sensors = sorted(set(told.frames["sensor_id"]))
-    times_ns = told.frames["time"].dt.timestamp("ns").to_numpy()
+    sensors = sorted(set(given.frames["sensor_id"]))
+    times_ns = given.frames["time"].dt.timestamp("ns").to_numpy()
     row = night_row(dataset, night)
     ids = "" if row is None else star_ids(row["star_catalogue_key"].partition(" ")[0])
-    shapes = camera_shapes(told.cameras) if images else {}
+    shapes = camera_shapes(given.cameras) if images else {}
     positions = array(read_table(dataset, "positions", night, ["epoch"]), "epoch")
     apart_ns = np.diff(np.unique(positions))
-    lifetime_ns = SHOWN_EPOCHS * int(np.median(apart_ns)) if len(apart_ns) else SPAN_NS
+    lifetime_ns = LIFETIME_EPOCHS * int(np.median(apart_ns)) if len(apart_ns) else SPAN_NS
     day = day_of(night)
     spans = [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in np.unique(times_ns // SPAN_NS).tolist()]
     of_night = [span for span in spans if span.start_ns // DAY_NS == day]

@@ -125,17 +125,17 @@ def scenario(simulation: Simulation) -> dict[str, Any]:
         "t0_ns": simulation.t0_ns,
         "duration_s": simulation.scene.duration_s,
         "seed": simulation.scene.seed,
-        "sensors": [_told_sensor(simulation, k) for k in range(len(simulation.sensors))],
-        "targets": [_told_object(simulation, k) for k in range(len(simulation.objects))],
+        "sensors": [_describe_sensor(simulation, k) for k in range(len(simulation.sensors))],
+        "targets": [_describe_object(simulation, k) for k in range(len(simulation.objects))],
         "scene": simulation.scene.model_dump(mode="json"),
     }
 
 
-def _told_sensor(simulation: Simulation, k: int) -> dict[str, Any]:
+def _describe_sensor(simulation: Simulation, k: int) -> dict[str, Any]:
     s, faults = simulation.sensors[k], simulation.groups[k].faults
-    told = {
+    described = {
         "id": s.sensor_id,
-        **_told_path(s.path, simulation.sensor_sets[k]),
+        **_describe_path(s.path, simulation.sensor_sets[k]),
         "rate_hz": s.rate_hz,
         "phase": s.phase,
         "mag_limit": s.magnitude_limit,
@@ -143,28 +143,28 @@ def _told_sensor(simulation: Simulation, k: int) -> dict[str, Any]:
         "camera": dict(s.optics._asdict()),
     }
     if simulation.groups[k].clock_offset_s:
-        told["clock_s"] = simulation.groups[k].clock_offset_s
+        described["clock_s"] = simulation.groups[k].clock_offset_s
     if s.position_offset_km.any():
-        told |= {
+        described |= {
             "pos_off_km": s.position_offset_km.tolist(),
             "pos_off_told": faults.position_told,
         }
     if s.prior_offset.any():
-        told |= {
+        described |= {
             "prior_bias_vec_arcsec": (s.prior_offset / ARCSEC).tolist(),
             "prior_bias_told": faults.prior_told,
         }
-    return told
+    return described
 
 
-def _told_object(simulation: Simulation, k: int) -> dict[str, Any]:
+def _describe_object(simulation: Simulation, k: int) -> dict[str, Any]:
     objects = simulation.objects
     key = "standard_mag" if objects.is_standard[k] else "mag"
-    path = _told_path(objects.paths.of(k), simulation.object_sets[k])
+    path = _describe_path(objects.paths.of(k), simulation.object_sets[k])
     return path | {key: float(objects.magnitude[k])}
 
 
-def _told_path(path: Paths, element_set: ElementSet | None) -> dict[str, Any]:
+def _describe_path(path: Paths, element_set: ElementSet | None) -> dict[str, Any]:
     """Return the elements of a path, or the satellite whose element set it follows."""
     if element_set is None:
         return {"elements": path.elements[0].tolist()}
@@ -289,12 +289,12 @@ class _States:
         r_km, v_km_s = s.path.at(seconds_since(s.t0_ns, times))
         believed = self._beliefs.attitude(self._attitudes.at(times, r_km, v_km_s))
         q = None if believed is None else believed.as_quat()
-        place = self._beliefs.position(r_km)
+        position_km = self._beliefs.position(r_km)
         sigma_km = self._beliefs.position_sigma_km
         sigma_q = self._beliefs.attitude_sigma / ARCSEC
         for i, at in enumerate(times.tolist()):
             values: dict[str, Any] = {
-                "position_km": place[i],
+                "position_km": position_km[i],
                 "velocity_km_s": v_km_s[i] if self._settings.send_velocity else None,
                 "position_sigma_km": sigma_km,
                 "attitude_xyzw": None if q is None else q[i],

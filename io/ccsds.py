@@ -53,7 +53,7 @@ def write_message(path: Path, text: str) -> None:
 Array = npt.NDArray[np.float64]
 
 _AXES = ("x", "y", "z", "x_dot", "y_dot", "z_dot")
-DEGREE = 7  # of the Hermite interpolation, where there are so many states
+DEGREE = 7  # of the Hermite interpolation, if there are enough states
 
 
 class Ephemeris(NamedTuple):

@@ -7,7 +7,7 @@ import pyarrow as pa
 TIME = pa.timestamp("ns", tz="UTC")
 
 STATE_AXES = ("x", "y", "z", "vx", "vy", "vz")  # of a position and velocity
-PLACE = ["x_km", "y_km", "z_km"]  # of an object
+POSITION = ["x_km", "y_km", "z_km"]  # of an object
 VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 OPTICS_AXES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # numbers of a camera
 TANGENT_AXES = ("1", "2")  # of the plane at right angles to a direction
@@ -53,7 +53,7 @@ def axes(
     """Return one float64 column per axis: ``axes("{}_km")`` gives x_km, y_km, z_km.
 
     Three columns, not a list: a filter on them is three times faster, and each axis has Parquet
-    statistics of its own.
+    statistics.
     """
     return [
         column(

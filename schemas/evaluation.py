@@ -19,12 +19,12 @@ class Report:
     axes. Position errors are in kilometres, GCRF, against the true position at the time of the
     estimate.
 
-    A view is one sensor's part in a claim. A claim is an object that the dataset reports at an
-    epoch; its true object is the one that most of its views show, at least two. A claim without a
-    true object is a ghost. A possible claim is a true object at an epoch in which at least two
-    frames of sensors without a fault show it. A passage is an object in one sensor, in at least
-    five frames, without a gap of more than two seconds. NEES is the squared error, normalised by
-    the covariance.
+    An estimate is an object that the dataset reports at an epoch, and a view is one sensor's part
+    in it. The true object of an estimate is the one that most of its views show, at least two. An
+    estimate without a true object is a ghost. A possible estimate is a true object at an epoch in
+    which at least two frames of sensors without a fault show it. A passage is an object in one
+    sensor, in at least five frames, without a gap of more than two seconds. NEES is the squared
+    error, normalised by the covariance.
     """
 
     frames: int | None = _measure(
@@ -40,7 +40,9 @@ class Report:
         definition="Frames with an attitude from stars, as a share of the true frames.",
     )
 
-    stars_claimed: int | None = _measure("stars", "claimed", definition="Rows of the table stars.")
+    stars_claimed: int | None = _measure(
+        "stars", "identified", definition="Rows of the table stars."
+    )
     star_precision: float | None = _measure(
         "stars", "precision", "share", definition="Identified stars whose number is the true one."
     )
@@ -79,13 +81,13 @@ class Report:
         "associations", "epochs", definition="Different epochs of the table epochs."
     )
     groups: int | None = _measure(
-        "associations", "objects reported at epochs", definition="Claims."
+        "associations", "objects reported at epochs", definition="Estimates."
     )
     pair_precision: float | None = _measure(
         "associations",
         "pair precision",
         "share",
-        definition="Pairs of views in one claim that show one true object; views without a "
+        definition="Pairs of views in one estimate that show one true object; views without a "
         "centroid are skipped.",
     )
     pair_recall: float | None = _measure(
@@ -98,16 +100,16 @@ class Report:
         "associations",
         "object recall",
         "share",
-        definition="Possible claims that the dataset has, as a share of all possible ones.",
+        definition="Possible estimates that the dataset has, as a share of all possible ones.",
     )
     ghosts: int | None = _measure(
-        "associations", "ghosts", definition="Claims without a true object."
+        "associations", "ghosts", definition="Estimates without a true object."
     )
 
     positions: int | None = _measure(
         "positions",
         "of true objects",
-        definition="Positions of claims that have a true object, which is never blended with "
+        definition="Positions of estimates that have a true object, which is never blended with "
         "another one.",
     )
     positions_blended: int | None = _measure(
@@ -117,7 +119,7 @@ class Report:
         "frame: their errors are not measured.",
     )
     positions_of_ghosts: int | None = _measure(
-        "positions", "of ghosts", definition="Positions of claims without a true object."
+        "positions", "of ghosts", definition="Positions of estimates without a true object."
     )
     positions_per_truth: float | None = _measure(
         "positions",
@@ -178,12 +180,12 @@ class Report:
     objects_seen_by_two: int | None = _measure(
         "objects",
         "possible at ten epochs or more",
-        definition="True objects with ten possible claims or more.",
+        definition="True objects with at least ten possible estimates.",
     )
     objects_lost: int | None = _measure(
         "objects",
         "of these lost",
-        definition="Those of which the dataset has less than half of the possible claims.",
+        definition="Those of which the dataset has less than half of the possible estimates.",
     )
     ids_per_target: float | None = _measure(
         "objects", "ids per object", "number", definition="Mean number of ids of a true object."

@@ -57,7 +57,7 @@ EXPOSURE = Bound(
     Reason.BAD_EXPOSURE,
     "0 is unknown. Beyond the bounds the frame is used as if the exposure time were unknown.",
 )
-PLACE = Bound(
+CENTROID_POSITION = Bound(
     "x_px, y_px", -1e6, 1e6, "px", Reason.BAD_CENTROID, "Ten times the largest image, both ways."
 )
 FLUX = Bound(
@@ -151,7 +151,7 @@ DISTORTION = Bound(
 )
 
 BOUNDS = {
-    "frame": (TIME, FRAME_NUMBER, EXPOSURE, PLACE, FLUX, CENTROID_SIGMA),
+    "frame": (TIME, FRAME_NUMBER, EXPOSURE, CENTROID_POSITION, FLUX, CENTROID_SIGMA),
     "state": (TIME, POSITION, SPEED, POSITION_SIGMA, QUATERNION, ATTITUDE_SIGMA),
     "calibration": (TIME, IMAGE_SIDE, FOCAL_LENGTH, FOCAL_RATIO, CORNER, DISTORTION),
 }

@@ -124,7 +124,7 @@ class Pointing(Group):
         description="track: the object of the scene to follow instead, by its number or name.",
     )
     place_km: Vector | None = Field(
-        None, description="track: the GCRF place to follow instead; it does not move."
+        None, description="track: the GCRF position to follow instead; it does not move."
     )
     up: Vector = Field(
         (0.0, 0.0, 1.0),
@@ -135,7 +135,7 @@ class Pointing(Group):
     )
     azimuth_deg: float = Field(
         0.0,
-        description="body: boresight in the sensor's own orbital frame, from along the motion "
+        description="body: boresight in the orbital frame of the sensor, from along the motion "
         "towards across (the orbit's normal). Away from the Earth is up in the image.",
     )
     elevation_deg: float = Field(
@@ -222,10 +222,10 @@ class SceneStates(Group):
 
 
 class SceneFaults(Group):
-    """Errors of a sensor that are constant, and whether its log tells of them.
+    """Errors of a sensor that are constant, and whether its log states them.
 
-    An offset that is told is part of the sigma in the states. One that is not told is beyond what
-    the sigma says. See `clock_offset_s` for the clock, for which a log has no sigma.
+    A stated offset is part of the sigma in the states. Other offsets are not in the sigma. See
+    `clock_offset_s` for the clock, for which a log has no sigma.
     """
 
     position_offset_km: float | Vector = Field(
@@ -256,8 +256,8 @@ class SceneSensor(Group):
     orbit: Orbit
     in_view: bool = Field(
         False,
-        description="Take only random orbits or satellites from which the tracked object or place "
-        "is always visible.",
+        description="Take only random orbits or satellites from which the tracked object or "
+        "position is always visible.",
     )
     camera: SceneCamera
     pointing: Pointing

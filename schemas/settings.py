@@ -114,7 +114,7 @@ class IdentificationSettings(Group):
         3.7,
         gt=0,
         le=MAX_SIGMA,
-        description="Largest distance of a centroid from the predicted place of its star.",
+        description="Largest distance of a centroid from the predicted position of its star.",
     )
     false_alarm: float = Field(
         1e-5,
@@ -156,7 +156,9 @@ class TrackletSettings(Group):
         le=1000,
         description="Most frames in a row in which a tracklet may have no detection.",
     )
-    min_detections: int = Field(3, ge=2, le=1000, description="Fewest detections of a tracklet.")
+    min_detections: int = Field(
+        3, ge=2, le=1000, description="Minimum number of detections of a tracklet."
+    )
     false_alarm: float = Field(
         1e-4, gt=0, lt=1, description="Accepted number of false tracklets per frame."
     )
@@ -165,8 +167,8 @@ class TrackletSettings(Group):
         gt=0,
         le=1000,
         description="Accepted number of false tracklets in a sequence of at most 24 frames (with "
-        "the default `min_detections`): what no tracklet claimed is followed again with it. It "
-        "counts every pair of detections as a test; 1 to 5 % of it are measured.",
+        "the default `min_detections`): detections that are in no tracklet are followed again with "
+        "it. Every pair of detections counts as a test; 1 to 5 % of it are measured.",
     )
     most_detections: int = Field(
         500_000,
@@ -323,7 +325,8 @@ class StateSettings(Group):
         3,
         ge=2,
         le=1000,
-        description="Fewest independent epochs of an arc. A state from only two cannot be checked.",
+        description="Minimum number of independent epochs of an arc. A state from only two cannot "
+        "be checked.",
     )
     link_gap_s: float = Field(
         7200.0,
@@ -342,7 +345,7 @@ class StateSettings(Group):
 
 
 class KnownObjectSettings(Group):
-    """Objects held against a catalogue of known ones, and against earlier nights."""
+    """Objects compared with a catalogue of known ones, and with earlier nights."""
 
     probability: float = Field(
         0.99, gt=0.5, lt=1, description="Least probability of a name that is given to an object."

@@ -21,7 +21,7 @@ STAR_CATALOGUE = schema(
         column("pm_ra_mas_yr", _F64, unit="mas/yr", doc="Proper motion times cos(dec)."),
         column("pm_dec_mas_yr", _F64, unit="mas/yr", doc="Proper motion."),
         column("parallax_mas", _F64, unit="mas", doc="Parallax; 0 where unknown."),
-        column("sigma_mas", _F64, unit="mas", doc="1-sigma per axis of the place at the epoch."),
+        column("sigma_mas", _F64, unit="mas", doc="1-sigma per axis of the position at the epoch."),
         column("pm_sigma_mas_yr", _F64, unit="mas/yr", doc="1-sigma per axis of the motion."),
         column("magnitude", _F64, unit="mag", doc="V magnitude."),
         column("variable", pa.bool_(), doc="Flagged as variable by the catalogue."),

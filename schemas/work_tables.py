@@ -46,7 +46,7 @@ EXPOSURES = schema(
         column("flux", _floats(), null=True, doc="Linear, any unit; null where unknown."),
         column("sigma_px", _floats(), unit="px", null=True, doc="1-sigma; null where unknown."),
         column("source", pa.string(), doc="Log file."),
-        column("offset", I64, null=True, unit="byte", doc="Place in the log."),
+        column("offset", I64, null=True, unit="byte", doc="Offset in the log."),
     ],
 )
 
@@ -88,7 +88,7 @@ CAMERAS = schema(
         *covariance(
             "cov_{}",
             unit="products of the units of both numbers",
-            doc="Covariance of the optics; 0 as the log tells them.",
+            doc="Covariance of the optics; 0 for those of the log.",
             names=OPTICS_AXES,
         ),
     ],
@@ -99,11 +99,11 @@ USED_SIGMA = column(
     F64,
     unit="km",
     null=True,
-    doc="1-sigma per axis; that of the settings where the log tells none.",
+    doc="1-sigma per axis; that of the settings where the log states none.",
 )
 
-PLACES = schema(
-    "places",
+SENSOR_STATES_AT_FRAMES = schema(
+    "sensor_states_at_frames",
     "One row per frame, in the order of exposures: the state interpolated to the frame's time.",
     [
         *FRAME_KEY,
@@ -111,7 +111,7 @@ PLACES = schema(
             "{}_km", unit="km", frame="GCRF", null=True, doc="Position; null where no state is near"
         ),
         *axes("v{}_km_s", unit="km/s", frame="GCRF", null=True, doc="Velocity"),
-        column("position_sigma_km", F64, unit="km", null=True, doc="Told 1-sigma per axis."),
+        column("position_sigma_km", F64, unit="km", null=True, doc="Stated 1-sigma per axis."),
         USED_SIGMA,
         *[
             column(
@@ -181,7 +181,7 @@ VIEWS = schema(
         column("frame_number", I64, doc="The nearest frame."),
         id_column("tracklet_id", doc="Tracklet whose motion gives the direction."),
         column("centroid", pa.int32(), null=True, doc="Centroid in that frame; null: a miss."),
-        *axes("{}_px", unit="px", frame="image", doc="Place at the epoch", names="xy"),
+        *axes("{}_px", unit="px", frame="image", doc="Pixel position at the epoch", names="xy"),
         *axes("u{}", unit="", frame="ICRS", doc="Direction, aberration removed"),
         *axes("w{}_rad_s", unit="rad/s", frame="ICRS", doc="Rate of the direction; 0: unknown"),
         *covariance(
@@ -287,7 +287,7 @@ SHARED_ERRORS = schema(
     [
         SENSOR_ID,
         column("direction", F64, doc="Of the error of its directions."),
-        column("place", F64, doc="Of the error of its position."),
+        column("position", F64, doc="Of the error of its position."),
     ],
 )
 
@@ -318,7 +318,7 @@ TRUE_POINTS = schema(
             F64,
             unit="mag",
             null=True,
-            doc="V as the sensor should see it; null where the truth does not tell.",
+            doc="V as the sensor should see it; null where unknown.",
         ),
         column(
             "also",
@@ -381,8 +381,8 @@ CLOCK_LINES = schema(
     ],
 )
 
-CLAIMED_VIEWS = schema(
-    "claimed_views",
+OBJECT_VIEWS = schema(
+    "object_views",
     "One row per view of an object, at the epochs of `clock_lines`, also where no line was kept.",
     [VIEWS.field(name) for name in ("epoch", "sensor_id", "tracklet_id")],
 )

@@ -29,7 +29,7 @@ def floats(
     try:
         out = np.asarray(values, float)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name}: is no array of numbers ({error})") from error
+        raise ValueError(f"{name}: not an array of numbers ({error})") from error
     given = out.shape
     if repeat and out.ndim < len(shape):
         out = out[(None,) * (len(shape) - out.ndim)]
@@ -51,7 +51,7 @@ def time_ns(time: Time) -> int:
     Raises
     ------
     ValueError
-        Where it is no time.
+        Where it is not a time.
     """
     try:
         if isinstance(time, int | np.integer) and not isinstance(time, bool):
@@ -66,4 +66,4 @@ def time_ns(time: Time) -> int:
             return int(time.astype("datetime64[ns]").astype(np.int64))
     except ValueError as error:
         raise ValueError(f"time: {error}") from error
-    raise ValueError(f"time: {time!r} is no time; give a datetime, or nanoseconds since 1970")
+    raise ValueError(f"time: {time!r} is not a time; give a datetime, or nanoseconds since 1970")

@@ -1,4 +1,4 @@
-"""One frame: its stars and attitude, and the directions of what is no star."""
+"""One frame: its stars and attitude, and the directions of the other detections."""
 
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from epipole.schemas.bridge import (
 )
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.settings import Settings
-from epipole.schemas.work_tables import CAMERAS, EXPOSURES, PLACES
+from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES_AT_FRAMES
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.covariances import (
@@ -47,7 +47,7 @@ class IdentifiedFrame(NamedTuple):
     source : str
         Where the attitude comes from: "stars", "prior" or "none".
     status : str or None
-        Why there is no attitude from stars, as in the table `frames`; None where there is one.
+        Why there is no attitude from stars, as in the table `frames`; None if it has one.
     residual_px : float
         Rms of the star residuals per axis [px]; NaN without stars.
     """
@@ -88,7 +88,7 @@ def identify_frame(
     sigma_px : float or (n,) float, optional
         1-sigma errors of the centroids per axis [px]. None: estimated from the stars.
     velocity_km_s : (3,) float, optional
-        Velocity of the sensor, GCRF. None: the Earth's own; the attitude is then off by the
+        Velocity of the sensor, GCRF. None: that of the Earth; the attitude is then off by the
         aberration, up to 5 arcsec in a low orbit. Its covariance has that error: 3 arcsec about
         each axis across the boresight.
     prior_xyzw : (4,) float, optional
@@ -101,12 +101,12 @@ def identify_frame(
     Returns
     -------
     IdentifiedFrame
-        Where the sky cannot be told, `status` says why; it is no error.
+        Where the sky is not found, `status` says why; no error is raised.
 
     Raises
     ------
     ValueError
-        Where arrays differ in length, or a value is no number.
+        Where arrays differ in length, or a value is not a number.
 
     Notes
     -----
@@ -140,21 +140,23 @@ def identify_frame(
         flux=[None if flux is None else floats("flux", flux, n)],
         sigma_px=[None if sigma_px is None else floats("sigma_px", sigma_px, n, repeat=True)],
     )
-    place = unstack("v{}_km_s", floats("velocity_km_s", velocity_km_s, 3, default=np.nan)[None])
+    state = unstack("v{}_km_s", floats("velocity_km_s", velocity_km_s, 3, default=np.nan)[None])
     q = floats("prior_xyzw", prior_xyzw, 4, default=np.nan)
     if prior_xyzw is not None and not 0.99 < np.linalg.norm(q) < 1.01:
         raise ValueError(
             f"prior_xyzw: has length {np.linalg.norm(q):.3g}, expected a unit quaternion"
         )
-    place |= unstack("q{}", q[None], "xyzw")
-    place["attitude_sigma_arcsec"] = np.array([prior_sigma_arcsec or np.nan], float)
-    places = _one_row(PLACES, at_ns, **{name: nullable(v) for name, v in place.items()})
+    state |= unstack("q{}", q[None], "xyzw")
+    state["attitude_sigma_arcsec"] = np.array([prior_sigma_arcsec or np.nan], float)
+    states = _one_row(
+        SENSOR_STATES_AT_FRAMES, at_ns, **{name: nullable(v) for name, v in state.items()}
+    )
     covariance = unstack_covariance("cov_{}", np.zeros((1, 9, 9)), OPTICS_AXES)
     optics = {name: [value] for name, value in Camera(*camera)._asdict().items()}
     cameras = _one_row(CAMERAS, at_ns, **optics, **covariance)
     settings = settings or Settings()
     catalogue = read_star_catalogue(settings.identification.catalogue)
-    made = identify_stars(exposures, places, cameras, catalogue, settings)
+    made = identify_stars(exposures, states, cameras, catalogue, settings)
     star_id = np.full(n, -1, np.int64)
     star_id[array(made.stars, "centroid")] = array(made.stars, "star_id")
     row = made.solutions
@@ -196,7 +198,7 @@ def view_frame(
     Parameters
     ----------
     x_px, y_px : (n,) float
-        Image places of the detections [px].
+        Pixel positions of the detections [px].
     camera : Camera
         The sensor's optics.
     attitude_xyzw : (4,) float
@@ -213,7 +215,7 @@ def view_frame(
     Returns
     -------
     View
-        With the sensor's place, attitude and camera.
+        With the sensor's position, attitude and camera.
 
     Raises
     ------

@@ -126,7 +126,7 @@ def write_log(
     ------
     ValueError
         Where a column is missing, unknown, of the wrong type, or null where it may not be; where
-        the lists of a frame differ in length; where a sensor's id is none that a reader takes;
+        the lists of a frame differ in length; where a sensor's id is invalid;
         where the encoding is unknown.
 
     Notes

@@ -20,7 +20,7 @@ Indices = npt.NDArray[np.int64]
 class View(NamedTuple):
     """What one sensor sees at one instant: n directions.
 
-    `view_frame` makes it from image places. It may be made by hand as well; `triangulate` then
+    `view_frame` makes it from pixel positions. It may be made by hand as well; `triangulate` then
     needs the first three only.
 
     Attributes
@@ -55,7 +55,7 @@ class FoundObjects(NamedTuple):
     Attributes
     ----------
     objects : list of (n,) int
-        For each view, the object of each direction: 0, 1, ...; -1 where it has none.
+        For each view, the object of each direction: 0, 1, ...; -1 if unknown.
     log_odds : (g,) float
         Of each object, against its directions being unrelated (ln).
     ambiguous : list of (n,) bool
@@ -113,7 +113,7 @@ def associate(views: Sequence[View], settings: Settings | None = None) -> FoundO
     Notes
     -----
     A run sums the evidence of many instants. One instant says less: of two sensors, two objects
-    in one epipolar plane cannot be told apart and are ambiguous. Light time is ignored, which is
+    in one epipolar plane cannot be distinguished and are ambiguous. Light time is ignored, which is
     right for sensors at similar ranges.
 
     Examples
@@ -125,13 +125,13 @@ def associate(views: Sequence[View], settings: Settings | None = None) -> FoundO
     >>> objects_km = np.array([[42164.0, 0.0, 0.0], [42150.0, 300.0, 100.0]])
     >>> camera = api.Camera(512, 512, 14666.0, 14666.0, 255.5, 255.5)
     >>> looks_along_x = [0.5, 0.5, 0.5, 0.5]  # the boresight is the x axis of the ICRS
-    >>> places_km = np.array([[7000.0, 0, 0], [0, 7000.0, 0], [0, 0, 7000.0]])
+    >>> sensors_km = np.array([[7000.0, 0, 0], [0, 7000.0, 0], [0, 0, 7000.0]])
     >>> views = []
-    >>> for place, order in zip(places_km, ([0, 1], [1, 0], [0, 1])):
-    ...     line = objects_km[order] - place
+    >>> for sensor_km, order in zip(sensors_km, ([0, 1], [1, 0], [0, 1])):
+    ...     line = objects_km[order] - sensor_km
     ...     u = line / np.linalg.norm(line, axis=1, keepdims=True)
     ...     cov = (1 / 206265) ** 2 * np.eye(2)  # 1 arcsec
-    ...     views.append(api.View(u, cov, place, 0.01, looks_along_x, camera))
+    ...     views.append(api.View(u, cov, sensor_km, 0.01, looks_along_x, camera))
     >>> found = api.associate(views)
     >>> [view.tolist() for view in found.objects]
     [[0, 1], [1, 0], [0, 1]]
@@ -210,10 +210,10 @@ def triangulate(
     >>> from epipole.flows import api
     >>> there_km = np.array([42164.0, 0.0, 0.0])
     >>> views = []
-    >>> for place in ([0.0, 7000.0, 0.0], [0.0, -7000.0, 0.0]):
-    ...     line = there_km - place
+    >>> for sensor_km in ([0.0, 7000.0, 0.0], [0.0, -7000.0, 0.0]):
+    ...     line = there_km - sensor_km
     ...     u = line / np.linalg.norm(line)
-    ...     views.append(api.View([u], (1 / 206265) ** 2 * np.eye(2), place, 0.0))
+    ...     views.append(api.View([u], (1 / 206265) ** 2 * np.eye(2), sensor_km, 0.0))
     >>> found = api.triangulate(views)
     >>> found.r_gcrf_km[0].round(3).tolist()
     [42164.0, 0.0, 0.0]

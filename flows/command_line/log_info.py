@@ -52,8 +52,8 @@ def _sensor(name: str, exposures: pa.Table, states: pa.Table, cameras: pa.Table)
     frames, states = of_sensor(exposures, name), of_sensor(states, name)
     time_ns = np.sort(array(frames, "time"))
     interval_ns = float(np.median(np.diff(time_ns))) if len(time_ns) > 1 else None
-    told = of_sensor(cameras, name)
-    camera = camera_of(told, 0) if told.num_rows else None
+    stated = of_sensor(cameras, name)
+    camera = camera_of(stated, 0) if stated.num_rows else None
     centroids, _ = flatten(frames, "x_px")
     return {
         "sensor_id": name,

@@ -19,7 +19,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard out
 
 
 def check_night(night: str | None, option: str = "--night") -> None:
-    """Raise unless a night is a date; None is no night."""
+    """Raise unless a night is a date or None."""
     if night is not None and not is_night(night):
         raise typer.BadParameter(
             f"{night!r} is not a date such as 2019-04-01, of the years {FIRST_YEAR} to {LAST_YEAR}",

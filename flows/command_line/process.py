@@ -50,7 +50,7 @@ def stopped_in_one_line() -> Iterator[None]:
 def _stop(by: int, frame: FrameType | None) -> None:
     if _stopped_by:
         return
-    if _imports(frame):  # an exception would leave the lock of the import held, for ever
+    if _imports(frame):  # an exception would leave the import locked for ever
         threading.Timer(_SOON_S, os.kill, (os.getpid(), by)).start()
         return
     _stopped_by.append(signal.Signals(by))
@@ -96,7 +96,7 @@ def tells_compiling(command: Callable[P, None]) -> Callable[P, None]:
 
     @wraps(command)
     def called(*args: P.args, **kwargs: P.kwargs) -> None:
-        from epipole.io.caches.kernel_warm_up import compiling_told
+        from epipole.io.caches.kernel_warm_up import report_compiling
 
         said: list[int] = []
 
@@ -105,7 +105,7 @@ def tells_compiling(command: Callable[P, None]) -> Callable[P, None]:
                 said.append(new)
                 print("compiling; only the first time", file=sys.stderr, flush=True)
 
-        with compiling_told(say):
+        with report_compiling(say):
             command(*args, **kwargs)
 
     return called

@@ -104,10 +104,10 @@ def run(
 
 def _early_server(out: str, night: str | None, again: bool) -> Launched | None:
     """Launch Prefect's server at once where it is needed for sure: its start takes longest."""
-    held = f"night={night or '*'}"
+    pattern = f"night={night or '*'}"
     if "PREFECT_API_URL" in os.environ or "://" in out:
         return None
-    return launch({}) if again or not any(Path(out).glob(held)) else None
+    return launch({}) if again or not any(Path(out).glob(pattern)) else None
 
 
 def _dates(night: str | None, to: str | None) -> Sequence[str | None]:
@@ -134,16 +134,16 @@ def _print_one(ended: "Ended", quiet: bool, as_json: bool) -> None:
 
 def _print_each(all_ended: Iterable["Ended"], quiet: bool, as_json: bool) -> bool:
     """Print how each night ended as soon as it has; return whether any has failed."""
-    told = []
+    printed = []
     for ended in all_ended:
-        told.append(ended)
+        printed.append(ended)
         if not (quiet or as_json):
             print_lines([f"{ended.night}  {ended.line()}"])
         elif ended.error is not None:
             print_lines([f"epipole: {ended.night}: {ended.error}"], to_errors=True)
     if as_json:
-        print_json([ended.as_dict() for ended in told])
+        print_json([ended.as_dict() for ended in printed])
     elif not quiet:
-        counts = Counter(ended.outcome for ended in told)
+        counts = Counter(ended.outcome for ended in printed)
         print_lines([", ".join(f"{n} {outcome}" for outcome, n in counts.items()) or "no night"])
-    return any(ended.error is not None for ended in told)
+    return any(ended.error is not None for ended in printed)

@@ -11,10 +11,10 @@ from typing import Any
 from epipole.flows.command_line.terminal import shown
 from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.progress import compile_step, prepare
-from epipole.flows.night.recorded_nights import held_nights, unchanged_nights
+from epipole.flows.night.recorded_nights import published_nights, unchanged_nights
 from epipole.flows.night.summary import Summary, summarise
 from epipole.flows.prefect.server_process import Launched, launch
-from epipole.io.caches.kernel_warm_up import compile_beside, compile_kernels, compiling_told
+from epipole.io.caches.kernel_warm_up import compile_beside, compile_kernels, report_compiling
 from epipole.io.catalogues.element_sets import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder, night_location
@@ -44,7 +44,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class Ended:
-    """How the run of a night ended: with a summary, or with the reason that there is none."""
+    """How the run of a night ended: with a summary, or with the reason why it failed."""
 
     night: str | None
     summary: Summary | None
@@ -123,8 +123,8 @@ class Nights:
 
     def stale(self) -> list[str]:
         """Return the published nights that a run with these settings would make otherwise."""
-        held = held_nights(self._out, self._settings, self._known_key)
-        return [night.date for night in held if night.stale]
+        nights = published_nights(self._out, self._settings, self._known_key)
+        return [night.date for night in nights if night.stale]
 
     def _unchanged(self, night: str | None) -> Summary | None:
         """Return the summary of what need not be made again. This needs no Prefect."""
@@ -132,14 +132,14 @@ class Nights:
             return None
         given = find_logs(self._logs, night)
         same = unchanged_nights(self._out, given, night, self._settings, self._known_key)
-        places = {date: night_location(self._out, date) for date in same}
-        return summarise(self._out, places, unchanged=True) if same else None
+        locations = {date: night_location(self._out, date) for date in same}
+        return summarise(self._out, locations, unchanged=True) if same else None
 
     def _start(self, started: contextlib.ExitStack) -> Callable[[str | None], Summary]:
         """Start Prefect, and return what makes a night."""
         options = self._options
         is_first = started.enter_context(compile_beside())
-        started.enter_context(compiling_told(compile_step, is_first))
+        started.enter_context(report_compiling(compile_step, is_first))
         prepare("start Prefect")
         early = self._early or launch({})  # it imports Prefect while this process does
         self._early = None

@@ -20,7 +20,7 @@ from rich.progress import (
 from epipole.flows.night.progress import COMPILE, ROOT, STEPS, with_safe_text
 from epipole.schemas.text import as_line
 
-TOLD_EVERY_S = 30.0  # progress, where there is no terminal
+LINE_EVERY_S = 30.0  # progress, where there is no terminal
 
 
 @contextlib.contextmanager
@@ -88,25 +88,25 @@ class PlainLines(logging.StreamHandler):  # type: ignore[type-arg]
 
     def __init__(self) -> None:
         super().__init__()
-        self._told_s = time.monotonic()
+        self._written_s = time.monotonic()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a line; a step of the progress only if nothing was written for a while."""
         now_s = time.monotonic()
         counts = vars(record)
         if record.name == STEPS.name:
-            if now_s - self._told_s < TOLD_EVERY_S or not counts["done"]:
+            if now_s - self._written_s < LINE_EVERY_S or not counts["done"]:
                 return
             if counts["stage"] != COMPILE and counts["done"] == counts["total"]:
                 return  # the line of the stage follows
-        self._told_s = now_s
+        self._written_s = now_s
         super().emit(record)
 
 
 class StageDisplay(logging.Handler):
     """A bar for the stage that runs, below the lines of the stages that have ended.
 
-    While kernels are compiled, they have a bar of their own.
+    While kernels are compiled, they have their bar.
     """
 
     def __init__(self, stack: contextlib.ExitStack) -> None:

@@ -259,7 +259,7 @@ def overlay(
     """Draw a night over its logs, as an MCAP file for Foxglove and viewers like it.
 
     Stars ringed and named, objects with their ids, calibrations, sensors and objects in
-    space with their lines of sight, and what was left out, at the frames' own times.
+    space with their lines of sight, and what was left out, at the times of the frames.
     Open it together with the log.
     """
     from epipole.flows.overlay import overlay as write

@@ -35,7 +35,7 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     -------
     work
         With the cameras that were found.
-    told
+    stated
         CAMERAS as the log tells them, but mirrored where the images are.
     """
     mode = settings.identification.calibrate
@@ -62,21 +62,21 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     if mode == "report" or not found:
         return work, work.cameras
     names = {finding.sensor_id for finding in found}
-    told = _with_cameras(work.cameras, [f.cameras(work.cameras, f.as_told) for f in found], names)
+    stated = _with_cameras(work.cameras, [f.cameras(work.cameras, f.as_told) for f in found], names)
     cameras = [f.cameras(work.cameras, f.camera) for f in found if f.camera]
-    return _identify_again(work, cameras, names, 0, settings), told
+    return _identify_again(work, cameras, names, 0, settings), stated
 
 
-def calibrate(work: Work, told: pa.Table, settings: Settings) -> tuple[Work, pa.Table]:
+def calibrate(work: Work, stated: pa.Table, settings: Settings) -> tuple[Work, pa.Table]:
     """Fit each sensor's optics to its stars; identify again the sensors whose optics differ.
 
-    `told` are the cameras of `find_cameras`. Optics with which a sensor identifies half of its
+    `stated` are the cameras of `find_cameras`. Optics with which a sensor identifies half of its
     frames or fewer were fitted to wrong stars: they are not used, and are no calibration.
     """
     mode = settings.identification.calibrate
     calibrations, misled = CALIBRATIONS.empty_table(), set[str]()
     for number in range(1, 1 + {"off": 0, "report": 1, "use": MAX_CALIBRATIONS}[mode]):
-        fits = _fit_sensors(work, told, misled, settings)
+        fits = _fit_sensors(work, stated, misled, settings)
         calibrations = concat(CALIBRATIONS, [fit.calibrations for fit in fits])
         departed = {name for fit in fits for name in fit.departed}
         if mode == "report" or not departed:
@@ -93,12 +93,14 @@ def calibrate(work: Work, told: pa.Table, settings: Settings) -> tuple[Work, pa.
     )
 
 
-def _fit_sensors(work: Work, told: pa.Table, but: set[str], settings: Settings) -> list[Calibrated]:
+def _fit_sensors(
+    work: Work, stated: pa.Table, but: set[str], settings: Settings
+) -> list[Calibrated]:
     """Fit the optics of each sensor but these to its stars."""
-    spans = {sensor: own for sensor, own in work.spans.items() if sensor.sensor_id not in but}
+    spans = {sensor: spans for sensor, spans in work.spans.items() if sensor.sensor_id not in but}
     futures = [
         calibrate_sensor.submit(
-            sensor, work.identified[sensor], of_sensor, work.cameras, told,
+            sensor, work.identified[sensor], of_sensor, work.cameras, stated,
             settings.sensors.principal_point_sigma_px,
         )
         for sensor, of_sensor in spans.items()

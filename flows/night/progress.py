@@ -17,7 +17,7 @@ ROOT = logging.getLogger("epipole")
 STEPS = logging.getLogger("epipole.steps")
 STEPS.propagate = False
 STEPS.setLevel(logging.INFO)
-COMPILE = "compile"  # no stage: goes on beside the first ones
+COMPILE = "compile"  # not a stage: runs beside the first ones
 
 # The share of each stage in the run time of a night (%), measured on half an hour of four sensors
 # at 5 Hz.

@@ -182,7 +182,7 @@ def _kept(schema: pa.Schema, pieces: Iterable[pa.Table], where: str) -> pa.Table
 
 # Which nights are out of date.
 
-# What differs, by the field of a `Recipe`. Logs are not held against anything.
+# What differs, by the field of a `Recipe`. Logs are not compared.
 _DIFFERS = {
     "settings": "other settings",
     "star_catalogue": "another star catalogue",
@@ -192,7 +192,7 @@ _DIFFERS = {
 
 
 @dataclass(frozen=True)
-class HeldNight:
+class PublishedNight:
     """A night of a dataset: its row of `nights`, empty without one, and why it is stale."""
 
     date: str
@@ -204,7 +204,7 @@ class HeldNight:
         return {"night": self.date, "stale": self.stale, **self.row}
 
 
-def held_nights(dataset: str, settings: Settings, known: str | None) -> list[HeldNight]:
+def published_nights(dataset: str, settings: Settings, known: str | None) -> list[PublishedNight]:
     """Return the nights of a dataset in order.
 
     Parameters
@@ -215,17 +215,17 @@ def held_nights(dataset: str, settings: Settings, known: str | None) -> list[Hel
         Digest of the catalogue of known objects that a run would have. None: whatever each night
         was made with.
     """
-    return [_held(dataset, date, settings, known) for date in nights_in(dataset)]
+    return [_published(dataset, date, settings, known) for date in nights_in(dataset)]
 
 
-def _held(dataset: str, date: str, settings: Settings, known: str | None) -> HeldNight:
+def _published(dataset: str, date: str, settings: Settings, known: str | None) -> PublishedNight:
     try:
         missing = missing_tables(dataset, date)
         row = night_row(dataset, date)
     except DatasetError as error:
-        return HeldNight(date, {}, [str(error)])
+        return PublishedNight(date, {}, [str(error)])
     if row is None:
-        return HeldNight(date, {}, ["an older version"])
+        return PublishedNight(date, {}, ["an older version"])
     made_from = recipe_in(row)
     today = recipe_of(row["logs_key"], settings, known or row["known_key"])
     stale = [
@@ -233,7 +233,7 @@ def _held(dataset: str, date: str, settings: Settings, known: str | None) -> Hel
     ]
     if row["earlier_key"] != EarlierNights(dataset, {}).key(date, settings):
         stale.append("another night before")
-    return HeldNight(date, row, stale + [f"no table {name}" for name in missing])
+    return PublishedNight(date, row, stale + [f"no table {name}" for name in missing])
 
 
 # Unchanged nights: a run would make them as they are, from the same logs.
@@ -297,7 +297,7 @@ def _sources(dataset: str, night: str) -> pa.Table:
 
 
 def _same_names(given: FoundLogs, sources: pa.Table) -> bool:
-    """Return whether logs may be those of a night; a second copy of a log is no source."""
+    """Return whether logs may be those of a night; a second copy of a log is not in the sources."""
     return {name_of(path) for path in given.paths} >= set(sources["name"].to_pylist())
 
 

@@ -34,8 +34,8 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], staging: Path) ->
     try:
         nights = nights_in(summary.dataset)
         for night in summary.nights:
-            own = staged[night] if staged[night].is_dir() else None
-            text, extract = _page_and_extract(night_facts(summary.dataset, night, nights, own))
+            folder = staged[night] if staged[night].is_dir() else None
+            text, extract = _page_and_extract(night_facts(summary.dataset, night, nights, folder))
             write_report(summary.dataset, night, text, staging)
             extracts.append(extract)
     except ReportError as error:
@@ -47,7 +47,7 @@ def with_reports(summary: Summary, staged: Mapping[str, Path], staging: Path) ->
 
 def load_drawing() -> None:
     """Import what draws reports, which takes a while."""
-    with contextlib.suppress(ReportError):  # it is told when a report is to be drawn
+    with contextlib.suppress(ReportError):  # it is reported when a report is to be drawn
         _drawing()
 
 
@@ -61,11 +61,13 @@ def night_facts(
     nights
         All nights of the dataset, in order: those before this one are its trend.
     folder
-        Where the night's tables lie too, on this machine.
+        A local folder that has the night's tables too.
     """
     before = [each for each in nights if each < night][-(MAX_NIGHTS - 1) :]
-    own = night_reader(dataset, night) if folder is None else NightReader.of_folder(folder, night)
-    return read_night_facts(own, dataset, [night_reader(dataset, each) for each in before])
+    reader = (
+        night_reader(dataset, night) if folder is None else NightReader.of_folder(folder, night)
+    )
+    return read_night_facts(reader, dataset, [night_reader(dataset, each) for each in before])
 
 
 def _page_and_extract(facts: NightFacts) -> tuple[str, ReportExtract]:

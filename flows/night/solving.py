@@ -123,26 +123,26 @@ def _view(night: _Night) -> dict[Span, int]:
 
 
 def _sensor_groups(
-    work: Work, sensors: Mapping[Sensor, SensorParts], span: Span, most: int
+    work: Work, sensors: Mapping[Sensor, SensorParts], span: Span, limit: int
 ) -> list[list[Sensor]]:
-    """Return the sensors with frames in a span, or near it, in groups of so many detections."""
+    """Return the sensors with frames in or near a span, in groups of about `limit` detections."""
     near = set(spans_between(*span.widened(1)))
     groups: list[list[Sensor]] = []
-    held = most
+    n_detections = limit
     for sensor, parts in sensors.items():
         if near.isdisjoint(work.spans[sensor]):
             continue
-        if held >= most:
+        if n_detections >= limit:
             groups.append([])
-            held = 0
+            n_detections = 0
         groups[-1].append(sensor)
         if parts.tracked.holds(span):
-            held += parts.tracked.read(span, "detections", ["time"]).num_rows
+            n_detections += parts.tracked.read(span, "detections", ["time"]).num_rows
     return groups
 
 
 def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str, Reason]) -> None:
-    """Find the objects, a task per block, or per span where a task may hold all its views."""
+    """Find the objects, a task per block, or per span where its views fit into one task."""
     futures = []
     for span in night.spans:
         blocks = blocks_of(span, night.settings.association)

@@ -63,15 +63,15 @@ MAX_CORRECTIONS = 2
 def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> OrderedFrames:
     """Read the logs, a task per log, and order their frames and states."""
     futures = [read_log_into.submit(folder, k, log) for k, log in enumerate(logs)]
-    held = results(Stage.READ, futures)
-    frames = order_logs(folder, held, settings)
+    logs = results(Stage.READ, futures)
+    frames = order_logs(folder, logs, settings)
     count = sum(len(time_ns) for time_ns in frames.time_ns)
     LOGGER.info("read %s of %s", many(count, "frame"), many(len(frames.sources), "log"))
     return frames
 
 
 def identify(frames: OrderedFrames, spans: Spans, folder: WorkFolder, settings: Settings) -> Work:
-    """Place sensors, identify stars and solve attitudes, a task per sensor and span."""
+    """Interpolate sensor states, identify stars and solve attitudes, a task per sensor and span."""
     where = {sensor: folder.identified(sensor) for sensor in spans}
     work = Work(frames.folder, folder, spans, frames.cameras, where)
     counts = identify_spans(Stage.IDENTIFY, work, settings)
@@ -106,9 +106,9 @@ def _outside_images(
     """Yield the sensors that have too many centroids outside the image of their calibration."""
     by_span = dict(zip(work.by_span(), counts, strict=True))
     for sensor, spans in work.spans.items():
-        own = [(span, by_span[sensor, span]) for span in spans]
+        of_sensor = [(span, by_span[sensor, span]) for span in spans]
         found = judge_image_size(
-            work.frames, sensor, work.identified[sensor], own, work.cameras, settings
+            work.frames, sensor, work.identified[sensor], of_sensor, work.cameras, settings
         )
         if found is not None:
             yield found
@@ -306,8 +306,8 @@ def write_night(
     """
     spans = work.all_spans()
     sensors = list(work.sensor_parts().values())
-    own = spans_of_night(spans, night)
-    parts = NightParts(night, own, spans, sensors, solved, names, whole)
+    of_night = spans_of_night(spans, night)
+    parts = NightParts(night, of_night, spans, sensors, solved, names, whole)
     futures = [write_tables.submit(tables, folder, parts) for tables in SHARES]
     results(Stage.PUBLISH, futures)
 
@@ -344,7 +344,7 @@ def name_known(
 
 
 def publish(destination: Destination, sources: pa.Table) -> Summary:
-    """Put all nights in place, and return what they hold."""
+    """Publish all nights, and return their summary."""
     summary = summarise(destination.dataset, destination.staged)
     publish_nights(destination.dataset, destination.staged, sources, destination.replace)
     return summary

@@ -165,9 +165,9 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
     """Return the summary of nights, by the folder or URL of each."""
     folders = list(nights.values())
     tables, counts = _tables(folders), count(folders)
-    counts.pop("left_out")  # told by reason
+    counts.pop("left_out")  # given by reason
     frames = tables["frames"]
-    told = {
+    rows = {
         night: read_columns(folder, "nights", ["faults", "residuals"]).to_pylist()[0]
         for night, folder in nights.items()
     }
@@ -177,8 +177,8 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
         **counts,
         names=_names(tables["identifications"]),
         rejects=by_reason(tables["rejects"]),
-        faults=_by_night({night: row["faults"] for night, row in told.items()}),
-        residuals=_by_night({night: row["residuals"] for night, row in told.items()}),
+        faults=_by_night({night: row["faults"] for night, row in rows.items()}),
+        residuals=_by_night({night: row["residuals"] for night, row in rows.items()}),
         unchanged=unchanged,
         by_sensor=[
             _of_sensor(frames.filter(pc.field("sensor_id") == name), tables["tracklets"], name)
@@ -196,9 +196,9 @@ def _tables(folders: Sequence[Where]) -> dict[str, pa.Table]:
 
 
 def _names(identifications: pa.Table) -> dict[str, int]:
-    """Return the objects by status; none where there is no catalogue."""
-    held = identifications.filter(pc.is_valid(identifications["catalogue"]))["status"]
-    counts = dict(zip(*(c.to_pylist() for c in pc.value_counts(held).flatten()), strict=True))
+    """Return the objects by status; empty without a catalogue."""
+    statuses = identifications.filter(pc.is_valid(identifications["catalogue"]))["status"]
+    counts = dict(zip(*(c.to_pylist() for c in pc.value_counts(statuses).flatten()), strict=True))
     return {status.value: counts[status] for status in NameStatus if status in counts}
 
 

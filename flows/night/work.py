@@ -1,4 +1,4 @@
-"""The work of a night: its sensors, their spans with frames, and the places of their parts."""
+"""The work of a night: its sensors, their spans with frames, and where their parts are."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -75,10 +75,10 @@ def plan_spans(frames: OrderedFrames, night: str) -> tuple[Spans, pa.Table]:
         wanted = _wanted(np.unique(time_ns // SPAN_NS), day)
         if wanted and sensor_id in calibrated:
             spans[Sensor(number, sensor_id)] = wanted
-        elif len(own := time_ns[time_ns // DAY_NS == day]):
+        elif len(of_day := time_ns[time_ns // DAY_NS == day]):
             rejects.append(
                 reject_rows(
-                    Reason.NO_CALIBRATION, sensor_id=sensor_id, time=own[:1], count=[len(own)]
+                    Reason.NO_CALIBRATION, sensor_id=sensor_id, time=of_day[:1], count=[len(of_day)]
                 )
             )
     if not spans:

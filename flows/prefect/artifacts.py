@@ -115,7 +115,7 @@ def as_markdown(summary: Summary) -> str:
     if summary.unchanged:
         lines += ["Nothing has changed since it was made, so it was not made again.", ""]
     # No link: browsers open neither files nor buckets from a page.
-    lines += ["Tables:", "", *(f"- {as_markdown_text(place)}" for place in _places(summary))]
+    lines += ["Tables:", "", *(f"- {as_markdown_text(path)}" for path in _table_paths(summary))]
     if summary.faults:
         lines += [
             "",
@@ -156,7 +156,7 @@ def _extract(extract: ReportExtract) -> list[str]:
     return lines
 
 
-def _places(summary: Summary) -> list[str]:
+def _table_paths(summary: Summary) -> list[str]:
     return [f"{summary.dataset.rstrip('/')}/night={night}" for night in summary.nights]
 
 
@@ -203,7 +203,7 @@ def _ended(how: Summary | BaseException) -> None:
 def run_here(flow: Flow[P, Any], *args: P.args, **kwargs: P.kwargs) -> Summary:
     """Run a flow that is `shown_on_page`, and return its summary as this process made it.
 
-    Prefect's own call takes the result out of the last state, and the server may answer with a
+    Prefect's function takes the result out of the last state, and the server may answer with a
     state of someone else's, whose result is a pickle file: code that would run here.
 
     Raises

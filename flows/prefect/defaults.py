@@ -2,7 +2,7 @@
 
 The command line starts Prefect's API inside the run. Its server also runs schedules, automations
 and telemetry, which a single run does not need. They compete for the SQLite file ("database is
-locked"), so they are off. A user's own settings, profile or server take precedence.
+locked"), so they are off. The user's settings, profile or server take precedence.
 """
 
 import contextlib
@@ -114,7 +114,7 @@ def _is_of_prefect(handler: logging.Handler) -> bool:
 
 def _is_worth_showing(record: logging.LogRecord) -> bool:
     if record.levelno <= logging.root.manager.disable:
-        return False  # after a signal: Prefect's own loggers do not look
+        return False  # after a signal: the loggers of Prefect do not look
     return record.levelno == logging.WARNING or (
         record.levelno > logging.WARNING and record.name not in _RUN_LOGGERS
     )

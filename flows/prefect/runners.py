@@ -86,8 +86,8 @@ async def _kind_of(address: str) -> str:
 
     arguments = Security().get_connection_args("client")
     async with rpc(address, timeout=ANSWERS_WITHIN_S, connection_args=arguments) as process:
-        told: dict[str, str] = await process.identity()
-    return told["type"]
+        identity: dict[str, str] = await process.identity()
+    return identity["type"]
 
 
 def _no_scheduler(address: str, why: str) -> EpipoleError:

@@ -1,7 +1,8 @@
 """The process of the embedded Prefect server.
 
 It takes seconds to import Prefect's server. So the process can be launched before the run has
-imported Prefect itself, and waits to be told to serve: only then is it known whether it is needed.
+imported Prefect itself. It waits for the command to serve: only then is it known whether it is
+needed.
 This module imports nothing but the standard library when the run imports it.
 """
 
@@ -27,7 +28,7 @@ _EMBEDDED = {
     "PREFECT__SERVER_FINAL": "1",
 }
 _SERVE = b"serve\n"
-SECRET_VARIABLE = "PREFECT_SERVER_API_AUTH_STRING"  # the server's part; a client has its own
+SECRET_VARIABLE = "PREFECT_SERVER_API_AUTH_STRING"  # of the server; a client has another one
 
 # Services that only a permanent server needs.
 _SERVICES = (
@@ -84,7 +85,7 @@ class Launched(NamedTuple):
 
 
 def new_secret() -> str:
-    """Return a user and a password for a server: 256 bits, and an end that is no secret.
+    """Return a user and a password for a server: 256 bits, and a public end.
 
     A server of Prefect's that gets a message of its protocol twice writes the message's last 25
     characters to its log, as pydantic shows them: those of the password.
@@ -104,7 +105,7 @@ def launch(environment: Mapping[str, str], before: Launched | None = None) -> La
     """
     if before is None:
         listener = socket.socket()
-        listener.bind((HOST, 0))  # held from now on: no other server can get this port
+        listener.bind((HOST, 0))  # from now on no other server can get this port
         secret = new_secret()
     else:
         listener, secret = before.listener, before.secret
@@ -124,7 +125,7 @@ def launch(environment: Mapping[str, str], before: Launched | None = None) -> La
 
 def main() -> None:
     """Serve Prefect's API on the socket that the run has opened, once the run says so."""
-    gc.disable()  # while libraries are imported there is no garbage
+    gc.disable()  # importing libraries leaves no garbage
     from prefect.settings import temporary_settings
 
     with temporary_settings(set_defaults=DEFAULTS):

@@ -61,7 +61,7 @@ def _folder_asked() -> Path | None:
 
 
 def cached(key: str, make: Callable[[], Arrays]) -> Arrays:
-    """Return the arrays of a key from the cache; if it has none, make them and keep them.
+    """Return the arrays of a key from the cache; if missing, make and keep them.
 
     Parameters
     ----------

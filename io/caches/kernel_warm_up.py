@@ -44,12 +44,12 @@ def compile_beside() -> Iterator[bool]:
 
 
 @contextlib.contextmanager
-def compiling_told(told: Callable[[int, int], None], is_first: bool = False) -> Iterator[None]:
-    """Tell how many functions are compiled, as long as this lasts.
+def report_compiling(report: Callable[[int, int], None], is_first: bool = False) -> Iterator[None]:
+    """Report how many functions are compiled, as long as this lasts.
 
     Parameters
     ----------
-    told
+    report
         Called with the number of new files in the kernel folder, and with how many a first run
         makes; this is 0 in a later run, where nobody knows how many more it needs.
     """
@@ -62,7 +62,7 @@ def compiling_told(told: Callable[[int, int], None], is_first: bool = False) -> 
             # The folder is known as soon as the first module with kernels is imported.
             before = _count() if before is None else before
             if new := (_count() or 0) - (before or 0):
-                told(new, max(FILES_OF_A_RUN, new) if is_first else 0)
+                report(new, max(FILES_OF_A_RUN, new) if is_first else 0)
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()

@@ -28,7 +28,7 @@ _MEAN = ("bstar", "ndot", "nddot", "ecco", "argpo", "inclo", "mo", "no_kozai", "
 
 
 class Fault(NamedTuple):
-    """A record that is no element set: where it is in the file, and what is wrong."""
+    """A record that is not a valid element set: where it is in the file, and what is wrong."""
 
     where: str
     what: str
@@ -39,7 +39,7 @@ class Fault(NamedTuple):
 
 
 def parse_element_sets(data: bytes) -> tuple[list[ElementSet], list[Fault]]:
-    """Return the element sets of a file, in its order, and the records that are none.
+    """Return the element sets of a file, in its order, and the invalid records.
 
     The content shows which form it has: lines of two-line elements with or without names before
     them ("0 " before a name is left away, lines that begin with # are comments), or OMM with the
@@ -48,7 +48,7 @@ def parse_element_sets(data: bytes) -> tuple[list[ElementSet], list[Fault]]:
     Raises
     ------
     CatalogueError
-        Where the whole is no JSON or no XML.
+        Where it is neither valid JSON nor valid XML.
     """
     text = data.decode("utf-8-sig", "replace")  # a damaged letter costs its record at most
     found = list(_parsed(text, data))
@@ -205,7 +205,7 @@ ADVICE = "give two-line elements, or OMM in CSV, JSON or XML"
 
 
 class KnownObjects(NamedTuple):
-    """The element sets of a file, in its order, and its records that are none."""
+    """The element sets of a file, in its order, and its invalid records."""
 
     file: str  # its name, without folders
     sha256: str
@@ -242,7 +242,7 @@ def _bytes_of(where: str) -> bytes:
             raise CatalogueError(str(error)) from error
     path = Path(where)
     if not path.is_file():
-        what = "is no file" if path.exists() else "no such file"
+        what = "not a regular file" if path.exists() else "no such file"
         raise CatalogueError(f"{where}: {what}; {ADVICE}")
     try:
         return path.read_bytes()

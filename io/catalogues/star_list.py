@@ -22,7 +22,7 @@ from epipole.schemas.star_lists import (
 
 REQUIRED = ("star_id", "ra_deg", "dec_deg", "magnitude")
 MOTION = ("pm_ra_mas_yr", "pm_dec_mas_yr")
-SHOWN = 5  # invalid rows that a message names
+MAX_NAMED = 5  # invalid rows that a message names
 EPOCHS = (1850.0, 2150.0)
 
 # Least and greatest value. The fastest star moves 10.4" per year, and the nearest has a parallax of
@@ -112,7 +112,7 @@ class _Faults:
     def raise_if_any(self) -> None:
         if not self._found:
             return
-        first = [self._found[row] for row in sorted(self._found)[:SHOWN]]
+        first = [self._found[row] for row in sorted(self._found)[:MAX_NAMED]]
         more = len(self._found) - len(first)
         raise CatalogueError(
             f"{self.path}: {len(self._found)} of {self.read.height} rows are invalid; "

@@ -61,7 +61,7 @@ def require_dataset(dataset: Where) -> None:
 
 
 def nights_in(dataset: Where) -> list[str]:
-    """Return the nights of a dataset, ``YYYY-MM-DD``, in order. A missing dataset has none.
+    """Return the nights of a dataset, ``YYYY-MM-DD``, in order. A missing dataset has no nights.
 
     Folders whose names have no such date are skipped.
     """
@@ -162,7 +162,7 @@ def _schema(table: str, columns: Sequence[str]) -> pa.Schema:
 
 
 def night_row(dataset: Where, night: str) -> dict[str, Any] | None:
-    """Return the row of a night in its table `nights`; None where it has none.
+    """Return the row of a night in its table `nights`; None if missing.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def night_reader(dataset: Where, night: str) -> NightReader:
 
 
 def write_report(dataset: Where, night: str, text: str, staging: Path) -> None:
-    """Write the report of a night into the dataset, in the place of an earlier one.
+    """Write the report of a night into the dataset, or replace an earlier one.
 
     Parameters
     ----------

@@ -72,7 +72,7 @@ class NightReader:
         return sum(file.metadata.num_rows for file in self._opened(table))
 
     def metadata(self, table: str, key: str) -> str:
-        """Return an entry of a table's metadata; '' where it has none."""
+        """Return an entry of a table's metadata; '' if missing."""
         for file in self._opened(table):
             found = (file.schema_arrow.metadata or {}).get(key.encode(), b"")
             return str(found.decode("utf-8", "replace"))
@@ -208,9 +208,9 @@ def take_rows(
     start, taken = 0, []
     for group in range(file.num_row_groups):
         end = start + file.metadata.row_group(group).num_rows
-        own = rows[(rows >= start) & (rows < end)] - start
-        if len(own):
-            taken.append(file.read_row_group(group, columns=list(columns)).take(own))
+        inside = rows[(rows >= start) & (rows < end)] - start
+        if len(inside):
+            taken.append(file.read_row_group(group, columns=list(columns)).take(inside))
         start = end
     schema = TABLES[name]
     return pa.concat_tables(

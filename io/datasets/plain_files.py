@@ -1,6 +1,6 @@
 """Files and folders that others may have written: read and entered without following links.
 
-Whoever may write to a dataset could put a link where a run has its own files. What is behind it
+Whoever may write to a dataset could put a link where a run keeps its files. What is behind it
 would be read, moved or overwritten with the rights of the run. A handle stays with what was
 opened, whatever is put under its name later.
 """

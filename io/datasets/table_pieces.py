@@ -43,14 +43,14 @@ def read_pieces(
         Where the file is damaged, does not have this schema, or a piece is too large.
     """
     metadata = pq.read_metadata(file)
-    held = [name for name in schema.names if name in metadata.schema.to_arrow_schema().names]
-    texts = [name for name in held if schema.field(name).type == pa.string()]
+    present = [name for name in schema.names if name in metadata.schema.to_arrow_schema().names]
+    texts = [name for name in present if schema.field(name).type == pa.string()]
     parquet = pq.ParquetFile(file, metadata=metadata, read_dictionary=texts)
     groups = _groups(parquet, time, between_ns)
     _check_lists(parquet, groups, [f.name for f in schema if pa.types.is_list(f.type)])
-    if len(held) < len(schema):
+    if len(present) < len(schema):
         conform(schema, parquet.schema_arrow.empty_table())  # names those that are missing
-    for batch in parquet.iter_batches(ROWS_IN_PIECE, groups, columns=held) if groups else ():
+    for batch in parquet.iter_batches(ROWS_IN_PIECE, groups, columns=present) if groups else ():
         _check_texts(batch)
         rows = conform(schema, pa.Table.from_batches([batch]))
         rows.validate(full=True)  # invalid UTF-8 would end in an error where it is shown

@@ -56,14 +56,14 @@ class RejectList:
         else:
             self._rows[last] = (*self._rows[last][:-1], self._rows[last][-1] + count)
 
-    def table(self, own_ns: tuple[int, int] | None) -> pa.Table:
-        """Return the rows of `rejects`; `own_ns`: the log's first and last time.
+    def table(self, range_ns: tuple[int, int] | None) -> pa.Table:
+        """Return the rows of `rejects`; `range_ns`: the log's time range.
 
-        A row gets the time of the first frame if its own is unknown, or a day or more outside
+        A row gets the time of the first frame if its time is unknown, or a day or more outside
         the log, which only damage can explain. Else no night that is made would have the row.
-        Of a log without a time of its own, the night is chosen when those of the run are known.
+        Of a log without any valid time, the night is chosen when those of the run are known.
         """
-        first_ns, last_ns = own_ns or (0, 0)
+        first_ns, last_ns = range_ns or (0, 0)
         near_ns = range(first_ns - DAY_NS + 1, last_ns + DAY_NS)
         rows = self._rows
         return reject_rows(
@@ -76,12 +76,12 @@ class RejectList:
         )
 
 
-# Strays: one frame with a wrong clock would make a night of its own.
+# Strays: one frame with a wrong clock would make a night of its inside.
 
 Nanoseconds = npt.NDArray[np.int64]
 
 
-def own_range(times: Sequence[Nanoseconds]) -> tuple[int, int] | None:
+def log_time_range(times: Sequence[Nanoseconds]) -> tuple[int, int] | None:
     """Return the first and last of the times near their median; None where there are none.
 
     Unset clocks read early, so take the upper median.
@@ -115,7 +115,7 @@ def frames_left_out(frames: pa.Table, reason: Reason) -> pa.Table:
 
 
 def without_strays(exposures: pa.Table, first_ns: int, last_ns: int) -> tuple[pa.Table, pa.Table]:
-    """Return the frames of a log within its own time, and those that are strays."""
+    """Return the frames of a log within its time range, and those that are strays."""
     time_ns = array(exposures, "time")
-    own = pa.array((time_ns >= first_ns) & (time_ns <= last_ns))
-    return exposures.filter(own), exposures.filter(pa.compute.invert(own))
+    inside = pa.array((time_ns >= first_ns) & (time_ns <= last_ns))
+    return exposures.filter(inside), exposures.filter(pa.compute.invert(inside))

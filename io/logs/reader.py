@@ -2,8 +2,8 @@
 
 Channels are chosen by the name of their schema. Their messages may be in any registered
 encoding, and one log may mix encodings. Damage does not stop the reading: what cannot be used
-becomes a row of `rejects`. A log without frames is none the less part of its night: its states
-may be those of another log's frames.
+becomes a row of `rejects`. A log without frames is part of its night too: its states may
+be those of another log's frames.
 """
 
 import logging
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.io.logs.left_out import RejectList, own_range, stray_rejects, without_strays
+from epipole.io.logs.left_out import RejectList, log_time_range, stray_rejects, without_strays
 from epipole.io.logs.mcap.bytes import LogBytes, open_log
 from epipole.io.logs.mcap.container import MAGIC, Channel, ChannelTable, read_summary
 from epipole.io.logs.mcap.records import Block, RecordWalk
@@ -56,7 +56,7 @@ def read_log(path: str | os.PathLike[str]) -> LogContents:
     -------
     LogContents
         Exposures, states (each in its own reference frame), cameras, rejects and the row of
-        `sources`. The offset of a row is the place of its message's chunk in the file.
+        `sources`. The offset of a row is that of its message's chunk in the file.
 
     Raises
     ------
@@ -71,8 +71,8 @@ def read_log(path: str | os.PathLike[str]) -> LogContents:
     source = pieces[-1].source
     assert source is not None  # the last piece has it
     if source.first_time_ns is not None and source.last_time_ns is not None:
-        own = source.first_time_ns, source.last_time_ns
-        exposures, strays = without_strays(exposures, *own)
+        time_range = source.first_time_ns, source.last_time_ns
+        exposures, strays = without_strays(exposures, *time_range)
         rejects = pa.concat_tables([rejects, stray_rejects(strays)])
     return LogContents(exposures, states, cameras, rejects, source)
 
@@ -84,7 +84,7 @@ def read_log_pieces(
 
     A piece has about `piece_bytes` of frames and states, at most one chunk of the log more. Each
     message comes once, in the order of the file. There is at least one piece. The last one has
-    the rejects and the source, which tells the log's own time: frames outside it are strays.
+    the rejects and the source, with the log's time range: frames outside it are strays.
     """
     where = known_as(os.fspath(path))
     with _open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
@@ -175,10 +175,10 @@ class _Reading:
                 ", ".join(message_encodings()),
             )  # fmt: skip
             self.rejects.add(Reason.UNKNOWN_ENCODING, time_ns=0, count=count)
-        own = own_range(self._frames_ns) or own_range(self._states_ns)
-        first, last = own or (None, None)
+        time_range = log_time_range(self._frames_ns) or log_time_range(self._states_ns)
+        first, last = time_range or (None, None)
         source = LogSource(self._name, len(self._data), self._data.sha256(), first, last)
-        return piece._replace(rejects=self.rejects.table(own), source=source)
+        return piece._replace(rejects=self.rejects.table(time_range), source=source)
 
     def in_known_encodings(self, block: Block) -> Block:
         """Return the messages of the channels whose encoding is registered; count the others."""

@@ -61,7 +61,9 @@ class McapFile:
         if compression not in COMPRESSIONS:
             raise ValueError(f"compression {compression!r}: not one of {', '.join(COMPRESSIONS)}")
         self._path = Path(path)
-        if self._path.is_dir():  # told before all is written; an empty name is the current folder
+        if (
+            self._path.is_dir()
+        ):  # refused before all is written; an empty name is the current folder
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         self._partial = self._path.with_name(self._path.name + ".partial")
         self._file = self._partial.open("wb")

@@ -29,7 +29,6 @@ from epipole.schemas.tables import (
 )
 from epipole.schemas.work_tables import (
     CAMERAS,
-    CLAIMED_VIEWS,
     CLOCK_LINES,
     EXPOSURES,
     FRAME_INDEX,
@@ -37,6 +36,7 @@ from epipole.schemas.work_tables import (
     LOG_STATES,
     MOVING_OBJECTS,
     OBJECT_MEMBERS,
+    OBJECT_VIEWS,
     SENSOR_EPOCHS,
     SENSOR_STATES,
     SHARED_ERRORS,
@@ -95,7 +95,7 @@ SOLVED: Final[PartTables] = {
     "rejects": REJECTS,
     "outcomes": TRACKLET_OUTCOMES,
     "lines": CLOCK_LINES,
-    "claims": CLAIMED_VIEWS,
+    "object_views": OBJECT_VIEWS,
     "objects": MOVING_OBJECTS,
 }
 

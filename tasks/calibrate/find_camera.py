@@ -236,7 +236,10 @@ def skies_at(time_ns: int, settings: Settings) -> Callable[[float], Skies]:
 
 
 def image_frames(exposures: pa.Table, places: pa.Table, settings: Settings) -> list[ImageFrame]:
-    """Return the centroids of each frame, brightest first; `places` are PLACES of `exposures`."""
+    """Return the centroids of each frame, brightest first.
+
+    `places` are SENSOR_STATES_AT_FRAMES of `exposures`.
+    """
     x_px, first = flatten(exposures, "x_px")
     c = flatten_centroids(exposures, CAMERAS.empty_table(), settings)
     at = brightest_first(first, c.flux)
@@ -255,7 +258,7 @@ def image_frames(exposures: pa.Table, places: pa.Table, settings: Settings) -> l
 def _placed(
     frames: ReadFolder, sensor: Sensor, time_ns: int, settings: Settings
 ) -> tuple[pa.Table, pa.Table]:
-    """Return EXPOSURES of one frame, and its PLACES."""
+    """Return EXPOSURES of one frame, and its SENSOR_STATES_AT_FRAMES."""
     instant = Span(time_ns, time_ns + 1)
     exposures = concat(EXPOSURES, [frames_between(frames, sensor.number, *instant)])
     return exposures, interpolate_sensor_states(

@@ -16,7 +16,7 @@ from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.rejects import Reason
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
-from epipole.schemas.work_tables import CLAIMED_VIEWS, CLOCK_LINES, VIEWS
+from epipole.schemas.work_tables import CLOCK_LINES, OBJECT_VIEWS, VIEWS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.sensor_faults.clock_search import Meetings, search_offset
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
@@ -112,8 +112,8 @@ def check_sensors(
     if not len(epochs):
         return []
     lines, objects = (_of_objects(solved, spans, name, epochs) for name in ("lines", "objects"))
-    claims = _at(solved, spans, "claims", epochs).partition_by("sensor_id", as_dict=True)
-    nothing = pl.DataFrame(CLAIMED_VIEWS.empty_table())
+    claims = _at(solved, spans, "object_views", epochs).partition_by("sensor_id", as_dict=True)
+    nothing = pl.DataFrame(OBJECT_VIEWS.empty_table())
     first_guess, of_objects = {}, [lines]
     for number, name in sensors:
         own = claims.get((name,), nothing)
@@ -164,7 +164,7 @@ def _others(
     Parameters
     ----------
     own
-        CLAIMED_VIEWS of the sensor.
+        OBJECT_VIEWS of the sensor.
     """
     epochs = objects["epoch"].unique().sort()
     tables = [viewed.read(span, "views") for span in spans if viewed.holds(span)]

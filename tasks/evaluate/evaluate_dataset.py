@@ -18,10 +18,10 @@ from epipole.tasks.evaluate.matching import (
     blended_objects,
     detected_objects,
     faulty_sensors,
-    match_claims,
+    match_estimates,
     match_positions,
     match_views,
-    possible_claims,
+    possible_estimates,
 )
 from epipole.tasks.evaluate.measures import (
     measure_associations,
@@ -51,7 +51,7 @@ def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:
 
     Notes
     -----
-    A claim is an object that the dataset reports at an epoch. `Report` defines each measure.
+    An estimate is an object that the dataset reports at an epoch. `Report` defines each measure.
     """
     points = to_polars(truth.points)
     measures = measure_stars(to_polars(tables["stars"]), points)
@@ -67,12 +67,12 @@ def _measure_objects(
     detections = detected_objects(to_polars(tables["detections"]), points)
     epochs = to_polars(tables["epochs"])
     views = match_views(to_polars(tables["associations"]), detections, points)
-    claims = match_claims(views)
-    possible = possible_claims(points, epochs, faulty_sensors(truth))
+    estimates = match_estimates(views)
+    possible = possible_estimates(points, epochs, faulty_sensors(truth))
     blended = blended_objects(points)
-    matched = match_positions(tables["positions"], claims)
-    measures = measure_associations(views, claims, possible, epochs)
-    measures |= measure_lost_objects(possible, claims)
+    matched = match_positions(tables["positions"], estimates)
+    measures = measure_associations(views, estimates, possible, epochs)
+    measures |= measure_lost_objects(possible, estimates)
     measures |= measure_positions(tables["positions"], matched, truth, blended)
     n_positions = measures["positions"] + measures["positions_blended"]
     measures |= measure_coverage(n_positions, truth, to_polars(truth.frames), points)

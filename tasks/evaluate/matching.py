@@ -21,7 +21,7 @@ Measures = dict[str, Any]  # by their names in `Report`
 
 FRAME = ["sensor_id", "frame_number"]
 POINT = [*FRAME, "centroid"]
-CLAIM = ["epoch", "object_id"]
+ESTIMATE = ["epoch", "object_id"]
 STAR, OBJECT = 0, 1  # values of `kind` in the truth
 
 
@@ -57,20 +57,20 @@ def share(part: float, whole: float) -> float:
 
 # Objects: the true object of each one that the dataset reports at an epoch.
 
-MIN_VIEWS = 2  # of one true object; with fewer a claim is a ghost
+MIN_VIEWS = 2  # of one true object; with fewer an estimate is a ghost
 
 
 def match_views(
     associations: pl.DataFrame, detections: pl.DataFrame, points: pl.DataFrame
 ) -> pl.DataFrame:
-    """Return the used views: `claim` numbers the claims, `true_object` is what the view shows.
+    """Return the used views: `estimate` numbers the estimates, `true_object` is what a view shows.
 
     A view without a centroid (a miss) shows what most detections of its tracklet show.
     `true_object` is -1 where that is no object. `detections` are those of `detected_objects`.
     """
     views = with_truth(associations.filter(pl.col("used")), points)
     views = views.with_columns(
-        claim=pl.struct(CLAIM).rank("dense").cast(pl.Int64) - 1,
+        estimate=pl.struct(ESTIMATE).rank("dense").cast(pl.Int64) - 1,
         has_centroid=pl.col("centroid").is_not_null(),
         by_centroid=pl.Series(true_objects(views), dtype=pl.Int64),
     )
@@ -86,19 +86,19 @@ def match_views(
 
 
 def _with_hidden_objects(views: pl.DataFrame) -> pl.DataFrame:
-    """Let a centroid with the light of two objects show the one that its claim is of."""
+    """Let a centroid with the light of two objects show the one that its estimate is of."""
     hidden = views.filter(pl.col("has_centroid") & (pl.col("also") >= 0))
     if not hidden.height:
         return views
     either = pl.concat(
-        [views.select("claim", "true_object"), hidden.select("claim", true_object="also")]
+        [views.select("estimate", "true_object"), hidden.select("estimate", true_object="also")]
     )
-    n_claims = int(integers(views, "claim").max()) + 1
-    most = majority(integers(either, "claim"), integers(either, "true_object"), n_claims)
-    of_claim = pl.Series(most.value[integers(views, "claim")], dtype=pl.Int64)
-    is_hidden = pl.col("has_centroid") & (pl.col("also") == of_claim) & (of_claim >= 0)
+    n_estimates = int(integers(views, "estimate").max()) + 1
+    most = majority(integers(either, "estimate"), integers(either, "true_object"), n_estimates)
+    of_estimate = pl.Series(most.value[integers(views, "estimate")], dtype=pl.Int64)
+    is_hidden = pl.col("has_centroid") & (pl.col("also") == of_estimate) & (of_estimate >= 0)
     return views.with_columns(
-        true_object=pl.when(is_hidden.fill_null(False)).then(of_claim).otherwise("true_object")
+        true_object=pl.when(is_hidden.fill_null(False)).then(of_estimate).otherwise("true_object")
     )
 
 
@@ -135,19 +135,19 @@ def _match_tracklets(detections: pl.DataFrame) -> pl.DataFrame:
     return tracklets.select("tracklet_id", by_tracklet=pl.Series(most.value))
 
 
-def match_claims(views: pl.DataFrame) -> pl.DataFrame:
-    """Return the claims in the order of their numbers, each with its `true_object`.
+def match_estimates(views: pl.DataFrame) -> pl.DataFrame:
+    """Return the estimates in the order of their numbers, each with its `true_object`.
 
-    `true_object` is the one that most views of the claim show; -1 (a ghost) where fewer than two
+    `true_object` is the one that most views of the estimate show; -1 (a ghost) where fewer than two
     views show it.
     """
-    claims = views.select(*CLAIM, "claim").unique("claim").sort("claim")
-    most = majority(integers(views, "claim"), integers(views, "true_object"), claims.height)
-    of_claim = np.where(most.votes >= MIN_VIEWS, most.value, -1)
-    return claims.with_columns(true_object=pl.Series(of_claim, dtype=pl.Int64))
+    estimates = views.select(*ESTIMATE, "estimate").unique("estimate").sort("estimate")
+    most = majority(integers(views, "estimate"), integers(views, "true_object"), estimates.height)
+    of_estimate = np.where(most.votes >= MIN_VIEWS, most.value, -1)
+    return estimates.with_columns(true_object=pl.Series(of_estimate, dtype=pl.Int64))
 
 
-def possible_claims(
+def possible_estimates(
     points: pl.DataFrame, epochs: pl.DataFrame, faulty: Sequence[str] = ()
 ) -> pl.DataFrame:
     """Return `epoch`, `true_object` and `n_views` where two frames or more show the object.
@@ -160,14 +160,14 @@ def possible_claims(
     return n_views.filter(pl.col("n_views") >= MIN_VIEWS)
 
 
-def match_positions(positions: pa.Table, claims: pl.DataFrame) -> pl.DataFrame:
+def match_positions(positions: pa.Table, estimates: pl.DataFrame) -> pl.DataFrame:
     """Return `epoch`, `object_id` and `true_object` of each position, in the order of the rows.
 
-    `true_object` is -1 where the claim of the position is a ghost or missing.
+    `true_object` is -1 where the estimate of the position is a ghost or missing.
     """
-    rows = to_polars(positions.select(CLAIM))
-    rows = rows.join(claims, on=CLAIM, how="left", maintain_order="left")
-    return rows.select(*CLAIM, pl.col("true_object").fill_null(-1))
+    rows = to_polars(positions.select(ESTIMATE))
+    rows = rows.join(estimates, on=ESTIMATE, how="left", maintain_order="left")
+    return rows.select(*ESTIMATE, pl.col("true_object").fill_null(-1))
 
 
 # Positions and velocities of true objects.

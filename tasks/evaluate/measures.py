@@ -121,35 +121,37 @@ def measure_tracks(detections: pl.DataFrame, points: pl.DataFrame) -> Measures:
 
 
 def measure_associations(
-    views: pl.DataFrame, claims: pl.DataFrame, possible: pl.DataFrame, epochs: pl.DataFrame
+    views: pl.DataFrame, estimates: pl.DataFrame, possible: pl.DataFrame, epochs: pl.DataFrame
 ) -> Measures:
-    """Return how many pairs of views and how many claims are right.
+    """Return how many pairs of views and how many estimates are right.
 
-    A pair is two views of one claim that have centroids. The possible pairs are all pairs of
+    A pair is two views of one estimate that have centroids. The possible pairs are all pairs of
     centroids of one object in the frames of one epoch.
     """
     with_centroid = views.filter("has_centroid")
     n_pairs, n_right = pairs_within(
-        integers(with_centroid, "claim"), integers(with_centroid, "true_object"), claims.height
+        integers(with_centroid, "estimate"),
+        integers(with_centroid, "true_object"),
+        estimates.height,
     )
     n_views = integers(possible, "n_views")
     n_possible = int(np.sum(n_views * (n_views - 1) // 2))
     return {
         "epochs": epochs["epoch"].n_unique(),
-        "groups": claims.height,
+        "groups": estimates.height,
         "pair_precision": share(n_right, n_pairs),
         "pair_recall": share(n_right, n_possible),
-        "object_recall": share(_found(possible, claims).height, possible.height),
-        "ghosts": claims.filter(pl.col("true_object") < 0).height,
+        "object_recall": share(_found(possible, estimates).height, possible.height),
+        "ghosts": estimates.filter(pl.col("true_object") < 0).height,
     }
 
 
-def measure_lost_objects(possible: pl.DataFrame, claims: pl.DataFrame) -> Measures:
+def measure_lost_objects(possible: pl.DataFrame, estimates: pl.DataFrame) -> Measures:
     """Return how many objects two frames show at ten epochs or more, and how many were lost.
 
     An object is lost where the dataset has it at less than half of these epochs.
     """
-    n_found = _found(possible, claims).group_by("true_object").agg(n_found=pl.len())
+    n_found = _found(possible, estimates).group_by("true_object").agg(n_found=pl.len())
     objects = possible.group_by("true_object").agg(n_possible=pl.len())
     objects = objects.filter(pl.col("n_possible") >= MIN_POSSIBLE_EPOCHS)
     objects = objects.join(n_found, on="true_object", how="left")
@@ -160,9 +162,9 @@ def measure_lost_objects(possible: pl.DataFrame, claims: pl.DataFrame) -> Measur
     }
 
 
-def _found(possible: pl.DataFrame, claims: pl.DataFrame) -> pl.DataFrame:
-    """Return the possible claims that the dataset has."""
-    return possible.join(claims, on=["epoch", "true_object"], how="semi")
+def _found(possible: pl.DataFrame, estimates: pl.DataFrame) -> pl.DataFrame:
+    """Return the possible estimates that the dataset has."""
+    return possible.join(estimates, on=["epoch", "true_object"], how="semi")
 
 
 def measure_positions(

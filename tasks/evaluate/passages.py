@@ -1,7 +1,7 @@
 """Measure passages: what becomes of each passage of an object through the field of a sensor.
 
-Most passages of a constellation are seen by one sensor only, so that neither claims nor positions
-tell how many are found.
+Most passages of a constellation are seen by one sensor only, so neither estimates nor positions
+show how many are found.
 """
 
 import itertools

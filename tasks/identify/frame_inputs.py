@@ -10,7 +10,7 @@ import pyarrow as pa
 from epipole.schemas.bridge import array, flatten, nullable, stack, table, unstack
 from epipole.schemas.log_bounds import POSITION, SPEED
 from epipole.schemas.settings import SensorSettings, Settings
-from epipole.schemas.work_tables import PLACES
+from epipole.schemas.work_tables import SENSOR_STATES_AT_FRAMES
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, unproject
 from epipole.tasks.algorithms.orbits.state_interpolation import (
     Places,
@@ -102,7 +102,7 @@ FASTEST_KM_S, FARTHEST_KM = 2 * SPEED.greatest, 2 * POSITION.greatest
 def interpolate_sensor_states(
     exposures: pa.Table, states: pa.Table, settings: Settings
 ) -> pa.Table:
-    """Return PLACES, one row per row of `exposures`; see `interpolate_states`.
+    """Return SENSOR_STATES_AT_FRAMES, one row per row of `exposures`; see `interpolate_states`.
 
     `states` are sorted by sensor and time, each time once, as `order_logs` returns them.
     """
@@ -134,7 +134,10 @@ def interpolate_sensor_states(
         "attitude_sigma_arcsec": placed.attitude_sigma,
     }
     key = {name: exposures[name] for name in ("sensor_id", "frame_number", "time")}
-    return table(PLACES, {**key, **{name: nullable(value) for name, value in by_name.items()}})
+    return table(
+        SENSOR_STATES_AT_FRAMES,
+        {**key, **{name: nullable(value) for name, value in by_name.items()}},
+    )
 
 
 def _possible(places: Places) -> Places:

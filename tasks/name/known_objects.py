@@ -15,7 +15,7 @@ import pyarrow as pa
 from epipole.io.catalogues.element_sets import KnownObjects
 from epipole.io.datasets.night_tables import read_columns, take_rows, write_table
 from epipole.schemas.bridge import array, concat, stack, stack_covariance, table
-from epipole.schemas.columns import PLACE, STATE_AXES, VELOCITY
+from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS
@@ -97,7 +97,7 @@ def _motions(states: pl.DataFrame) -> ObservedMotions:
     """Return motions that are known at one instant each."""
     time_ns = states["epoch"].cast(pl.Int64).to_numpy()
     at_s = (time_ns - time_ns.min()) / 1e9
-    motion = states.select([*PLACE, *VELOCITY]).to_numpy()
+    motion = states.select([*POSITION, *VELOCITY]).to_numpy()
     cov = stack_covariance(states, "cov_{}", STATE_AXES)
     return ObservedMotions(at_s, at_s, at_s, at_s, motion, motion, cov, cov)
 
@@ -163,7 +163,7 @@ def name_known_objects(
     folder
         The night's folder.
     known
-        None: there is no catalogue; all objects are unknown.
+        None: without a catalogue; all objects are unknown.
     earlier
         STATES of earlier nights.
 
@@ -193,18 +193,18 @@ def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, tuple
     chosen = []
     for rows in index.with_row_index("row").partition_by("object_id", maintain_order=True):
         times = rows["time"].cast(pl.Int64).to_numpy()
-        own = spread_rows(times, rows["independent"].to_numpy())
-        chosen.append(rows["row"].to_numpy()[own].astype(np.int64))
+        spread = spread_rows(times, rows["independent"].to_numpy())
+        chosen.append(rows["row"].to_numpy()[spread].astype(np.int64))
     taken = np.sort(np.concatenate([np.zeros(0, np.int64), *chosen]))
-    columns = ["object_id", "time", *PLACE, *COVARIANCE]
+    columns = ["object_id", "time", *POSITION, *COVARIANCE]
     rows = take_rows(folder, "positions", columns, taken)
     names, time_ns = array(rows, "object_id"), array(rows, "time")
     r_km, cov = stack(rows, "{}_km"), stack_covariance(rows, "cov_{}")
     found = {}
     for name in sorted(set(names.tolist())):
-        own = np.flatnonzero(names == name)
-        own = own[np.argsort(time_ns[own], kind="stable")]
-        found[name] = Observed(time_ns[own], r_km[own], cov[own])
+        of_name = np.flatnonzero(names == name)
+        of_name = of_name[np.argsort(time_ns[of_name], kind="stable")]
+        found[name] = Observed(time_ns[of_name], r_km[of_name], cov[of_name])
     spans = index.group_by("object_id").agg(
         first=pl.col("time").min().cast(pl.Int64), last=pl.col("time").max().cast(pl.Int64)
     )
@@ -234,8 +234,8 @@ def _learnt(catalogue: KnownSatellites, sure: Sequence[Candidate]) -> KnownSatel
     """Return the catalogue with the errors of its elements as the sure matches show them."""
     errors = []
     for is_deep, start in ((False, catalogue.low), (True, catalogue.high)):
-        own = [c for c in sure if is_deep_space(catalogue.satellites[c.row]) == is_deep]
-        errors.append(learn_errors(own, [catalogue.satellites[c.row] for c in own], start))
+        of_kind = [c for c in sure if is_deep_space(catalogue.satellites[c.row]) == is_deep]
+        errors.append(learn_errors(of_kind, [catalogue.satellites[c.row] for c in of_kind], start))
     low, high = errors
     return catalogue._replace(low=low, high=high)
 

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 
 from epipole.io.work.work_layout import SolvedParts
 from epipole.schemas.bridge import concat, stack_covariance, to_polars
-from epipole.schemas.columns import PLACE, STATE_AXES, VELOCITY
+from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
@@ -39,7 +39,10 @@ def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> d
     origin = ends["first"].min()
     seen = ObservedMotions(
         *(_seconds(ends, name, origin) for name in ("first", "last", "head_epoch", "tail_epoch")),
-        *(ends.select(_named(side, [*PLACE, *VELOCITY])).to_numpy() for side in ("head", "tail")),
+        *(
+            ends.select(_named(side, [*POSITION, *VELOCITY])).to_numpy()
+            for side in ("head", "tail")
+        ),
         *(stack_covariance(ends, f"{side}_cov_{{}}", STATE_AXES) for side in ("head", "tail")),
     )
     before, _ = link_by_motion(
@@ -72,7 +75,7 @@ def _ends(positions: pl.DataFrame, states: pl.DataFrame) -> pl.DataFrame:
     The motion is that of the first or last state. Without a state it is only the position.
     """
     keys = ["object_id", "epoch"]
-    position = positions.sort(keys).select(*keys, *PLACE, pl.col("^cov_.*$"))
+    position = positions.sort(keys).select(*keys, *POSITION, pl.col("^cov_.*$"))
     missing = [name for name in states.columns if name not in position.columns]
     position = position.with_columns(
         pl.lit(None, pl.Float64).alias(name)
@@ -109,12 +112,12 @@ _DETECTION = ["sensor_id", "frame_number", "centroid"]
 VIEWS = pa.schema([ASSOCIATIONS.field(name) for name in ("object_id", *_DETECTION, "used")])
 
 
-def followed_objects(own: Iterable[pa.Table], published: pa.Table) -> dict[str, str]:
+def followed_objects(solved: Iterable[pa.Table], published: pa.Table) -> dict[str, str]:
     """Return the ids of the night before, by this night's names of the same objects.
 
     Parameters
     ----------
-    own
+    solved
         `VIEWS` before midnight, of this night's solution.
     published
         `VIEWS` of the night before, as published. Views of other times do no harm.
@@ -124,14 +127,14 @@ def followed_objects(own: Iterable[pa.Table], published: pa.Table) -> dict[str, 
     The object that shares most detections gets the id, if more than half of its detections that
     have an id have this one. No two objects get one id.
     """
-    mine, theirs = _detections(concat(VIEWS, own)), _detections(published)
-    shared = mine.join(theirs.rename({"object_id": "id"}), on=_DETECTION)
+    ours, theirs = _detections(concat(VIEWS, solved)), _detections(published)
+    shared = ours.join(theirs.rename({"object_id": "id"}), on=_DETECTION)
     counts = shared.group_by("object_id", "id").len()
     counts = counts.with_columns(share=pl.col("len") / pl.col("len").sum().over("object_id"))
-    claims = counts.filter(pl.col("share") > 0.5).sort(
+    matches = counts.filter(pl.col("share") > 0.5).sort(
         "len", "id", "object_id", descending=[True, False, False]
     )
-    first = claims.unique("id", keep="first", maintain_order=True)
+    first = matches.unique("id", keep="first", maintain_order=True)
     return dict(zip(first["object_id"], first["id"], strict=True))
 
 

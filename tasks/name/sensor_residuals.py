@@ -13,7 +13,7 @@ import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import read_columns, take_rows
-from epipole.schemas.columns import PLACE, VELOCITY
+from epipole.schemas.columns import POSITION, VELOCITY
 from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.known_objects.matching import spread_rows
 from epipole.tasks.algorithms.known_objects.prediction import (
@@ -29,7 +29,7 @@ AXES = ("along", "across")
 
 @dataclass(frozen=True)
 class SensorResidual:
-    """Observed minus predicted place of a sensor's known objects, at their distance [km].
+    """Observed minus predicted position of a sensor's known objects, at their distance [km].
 
     Mean and scatter are over the objects, each by the mean of its detections.
     """
@@ -65,9 +65,9 @@ def sensor_residuals(folder: Path, known: Mapping[str, ElementSet]) -> list[Sens
     chosen = [np.zeros(0, np.int64)]
     for rows in index.partition_by("sensor_id", "object_id", maintain_order=True):
         times = rows["time"].cast(pl.Int64).to_numpy()
-        own = spread_rows(times, np.ones(len(times), bool))
-        chosen.append(rows["row"].to_numpy()[own].astype(np.int64))
-    columns += ["ra_deg", "dec_deg", *PLACE, *VELOCITY]
+        spread = spread_rows(times, np.ones(len(times), bool))
+        chosen.append(rows["row"].to_numpy()[spread].astype(np.int64))
+    columns += ["ra_deg", "dec_deg", *POSITION, *VELOCITY]
     seen = pl.DataFrame(take_rows(folder, "observations", columns, np.sort(np.concatenate(chosen))))
     residuals = [
         _with_residuals(rows, known[rows["object_id"][0]])
@@ -88,7 +88,7 @@ def _with_residuals(seen: pl.DataFrame, elements: ElementSet) -> pl.DataFrame:
     states = predict(satellites, seen["time"].cast(pl.Int64).to_numpy())[0]
     residuals = track_residuals(
         np.radians(seen.select("ra_deg", "dec_deg").to_numpy()),
-        seen.select(PLACE).to_numpy(),
+        seen.select(POSITION).to_numpy(),
         np.nan_to_num(seen.select(VELOCITY).to_numpy().astype(float)),
         states,
     )

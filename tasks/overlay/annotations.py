@@ -33,7 +33,7 @@ class StarSpot(NamedTuple):
 
 
 class DetectedSpot(NamedTuple):
-    """A centroid that is no star [px], and the object that it shows, if any."""
+    """A centroid that is not a star [px], and the object that it shows, if any."""
 
     x_px: float
     y_px: float
@@ -54,9 +54,9 @@ def annotations(
         x, y = star.x_px + HALF_PX, star.y_px + HALF_PX
         circle = message.circles.add()
         circle.CopyFrom(ring)
-        _place(circle.position, x, y)
-        place = x + RING_PX / 2, y - RING_PX / 2
-        _text(message, word, place, f"{star_names}{star.star_id}")
+        _set_point(circle.position, x, y)
+        corner = x + RING_PX / 2, y - RING_PX / 2
+        _text(message, word, corner, f"{star_names}{star.star_id}")
     square, word = _lines(time_ns, PointsAnnotation.LINE_LOOP, ORANGE), _word(time_ns, ORANGE)
     cross, kind = _lines(time_ns, PointsAnnotation.LINE_LIST, RED), _word(time_ns, RED)
     for spot in sorted(detections, key=lambda spot: spot.object_id is None):
@@ -101,21 +101,21 @@ def _word(time_ns: int, colour: tuple[float, ...]) -> Any:
     return word
 
 
-def _points(message: Any, like: Any, places: Sequence[tuple[float, float]]) -> None:
+def _points(message: Any, like: Any, points: Sequence[tuple[float, float]]) -> None:
     lines = message.points.add()
     lines.CopyFrom(like)
-    for x, y in places:
+    for x, y in points:
         lines.points.add(x=x, y=y)
 
 
-def _text(message: Any, like: Any, place: tuple[float, float], text: str) -> None:
+def _text(message: Any, like: Any, corner: tuple[float, float], text: str) -> None:
     label = message.texts.add()
     label.CopyFrom(like)
     label.text = text
-    _place(label.position, *place)
+    _set_point(label.position, *corner)
 
 
-def _place(point: Any, x: float, y: float) -> None:
+def _set_point(point: Any, x: float, y: float) -> None:
     point.x, point.y = x, y
 
 
@@ -128,10 +128,10 @@ def _time(stamp: Any, time_ns: int) -> None:
     stamp.seconds, stamp.nanos = divmod(int(time_ns), 1_000_000_000)
 
 
-def image_of(shape: tuple[int, int], places: np.ndarray) -> np.ndarray:
-    """Return a grey image (rows, columns) with a spot of 3 x 3 px at each of (n, 2) places."""
+def image_of(shape: tuple[int, int], points: np.ndarray) -> np.ndarray:
+    """Return a grey image (rows, columns) with a spot of 3 x 3 px at each of (n, 2) points."""
     image = np.zeros(shape, np.uint8)
-    centre = np.round(places).astype(int)
+    centre = np.round(points).astype(int)
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
             x, y = centre[:, 0] + dx, centre[:, 1] + dy

@@ -10,7 +10,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.Log_pb2 import Log
 
 from epipole.schemas.bridge import to_polars
-from epipole.schemas.columns import PLACE
+from epipole.schemas.columns import POSITION
 from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.overlay.annotations import (
@@ -61,11 +61,11 @@ def frame_messages(
     detections = _of_frames(tables.detections, DetectedSpot)
     for row in _timed(tables.frames, "time").iter_rows(named=True):
         sensor, number, time_ns = row["sensor_id"], row["frame_number"], row["time_ns"]
-        own = stars.get((sensor, number), []), detections.get((sensor, number), [])
-        data = annotations(time_ns, *own, star_names)
+        marks = stars.get((sensor, number), []), detections.get((sensor, number), [])
+        data = annotations(time_ns, *marks, star_names)
         yield ViewerMessage(time_ns, f"/{sensor}/annotations", ANNOTATIONS, data)
         if sensor in shapes:
-            data = _image(time_ns, sensor, shapes[sensor], [*own[0], *own[1]])
+            data = _image(time_ns, sensor, shapes[sensor], [*marks[0], *marks[1]])
             yield ViewerMessage(time_ns, f"/{sensor}/image", IMAGE, data)
         if row["qw"] is not None and row["x_km"] is not None:
             yield ViewerMessage(time_ns, TRANSFORMS, TRANSFORM, transform(time_ns, sensor, row))
@@ -88,19 +88,21 @@ def _image(
 ) -> bytes:
     message: Any = CompressedImage(frame_id=sensor, format="png")
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
-    places = np.array([spot[:2] for spot in spots], float).reshape(-1, 2)
-    message.data = png(image_of(shape, places))
+    points = np.array([spot[:2] for spot in spots], float).reshape(-1, 2)
+    message.data = png(image_of(shape, points))
     data: bytes = message.SerializeToString(deterministic=True)
     return data
 
 
 def epoch_messages(tables: SpanTables, lifetime_ns: int) -> Iterator[ViewerMessage]:
     """Yield the objects of each epoch, with the lines of sight to them."""
-    places = tables.frames.select("sensor_id", "frame_number", *PLACE)
-    lines = tables.associations.join(places, on=["sensor_id", "frame_number"], how="inner")
-    lines = lines.drop_nulls(PLACE).group_by("epoch", "object_id", maintain_order=True).agg(PLACE)
+    sensors = tables.frames.select("sensor_id", "frame_number", *POSITION)
+    lines = tables.associations.join(sensors, on=["sensor_id", "frame_number"], how="inner")
+    lines = (
+        lines.drop_nulls(POSITION).group_by("epoch", "object_id", maintain_order=True).agg(POSITION)
+    )
     seen_from: dict[Any, dict[str, list[tuple[float, ...]]]] = defaultdict(dict)
-    for epoch, name, *km in lines.select("epoch", "object_id", *PLACE).iter_rows():
+    for epoch, name, *km in lines.select("epoch", "object_id", *POSITION).iter_rows():
         seen_from[epoch][name] = list(zip(*km, strict=True))
     for (epoch,), positions in (
         _timed(tables.positions, "epoch")

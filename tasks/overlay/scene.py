@@ -13,7 +13,7 @@ import polars as pl
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from epipole.schemas.columns import PLACE
+from epipole.schemas.columns import POSITION
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.geometry.directions import quaternion_from_matrix
 from epipole.tasks.overlay.annotations import BLUE, ORANGE, _colour, _time
@@ -29,7 +29,7 @@ def transform(time_ns: int, sensor_id: str, row: dict[str, Any]) -> bytes:
     """Return where a sensor is and how it is turned, from a row of FRAMES with an attitude."""
     message: Any = FrameTransform(parent_frame_id=ROOT_FRAME, child_frame_id=sensor_id)
     _time(message.timestamp, time_ns)
-    _vector(message.translation, [row[name] for name in PLACE])
+    _vector(message.translation, [row[name] for name in POSITION])
     # The quaternion of FRAMES turns GCRF into the sensor; a transform is the way back.
     turn = message.rotation
     turn.x, turn.y, turn.z, turn.w = -row["qx"], -row["qy"], -row["qz"], row["qw"]
@@ -60,7 +60,7 @@ def objects(
     positions
         POSITIONS of the epoch.
     seen_from
-        The places [km] of the sensors that see each object.
+        The positions [km] of the sensors that see each object.
     lifetime_ns
         How long they are shown, if no later message has them.
     """
@@ -68,19 +68,19 @@ def objects(
     for row in positions.iter_rows(named=True):
         entity = _entity(message, time_ns, row["object_id"])
         entity.lifetime.seconds, entity.lifetime.nanos = divmod(lifetime_ns, 1_000_000_000)
-        place = [row[name] for name in PLACE]
-        _sphere(entity, place, [SEEN_KM] * 3, ORANGE, 0.9)
+        position = [row[name] for name in POSITION]
+        _sphere(entity, position, [SEEN_KM] * 3, ORANGE, 0.9)
         _ellipsoid(entity, row)
         label = entity.texts.add(text=row["object_id"], font_size=14.0, billboard=True)
         label.scale_invariant = True
-        _vector(label.pose.position, place)
+        _vector(label.pose.position, position)
         label.pose.orientation.w = 1.0
         _colour(label.color, ORANGE)
         sight = entity.lines.add(type=2, thickness=1.0, scale_invariant=True)  # pairs of points
         sight.pose.orientation.w = 1.0
         for sensor_km in seen_from.get(row["object_id"], ()):
             _vector(sight.points.add(), sensor_km)
-            _vector(sight.points.add(), place)
+            _vector(sight.points.add(), position)
         _colour(sight.color, BLUE, 0.6)
     data: bytes = message.SerializeToString(deterministic=True)
     return data
@@ -96,19 +96,19 @@ def _ellipsoid(entity: Any, row: dict[str, Any]) -> None:
     upper = [row[f"cov_{axes}"] for axes in ("xx", "xy", "xz", "yy", "yz", "zz")]
     xx, xy, xz, yy, yz, zz = upper
     values, vectors = np.linalg.eigh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-    if np.linalg.det(vectors) < 0:  # a reflection is no rotation
+    if np.linalg.det(vectors) < 0:  # a reflection: a rotation has determinant 1
         vectors[:, 0] = -vectors[:, 0]
     axes_km = 2 * SIGMAS * np.sqrt(np.maximum(values, 0))
-    ball = _sphere(entity, [row[name] for name in PLACE], axes_km, ORANGE, 0.3)
+    ball = _sphere(entity, [row[name] for name in POSITION], axes_km, ORANGE, 0.3)
     turn = ball.pose.orientation
     turn.x, turn.y, turn.z, turn.w = quaternion_from_matrix(vectors).tolist()
 
 
 def _sphere(
-    entity: Any, place_km: Any, axes_km: Any, colour: tuple[float, ...], opacity: float
+    entity: Any, position_km: Any, axes_km: Any, colour: tuple[float, ...], opacity: float
 ) -> Any:
     ball = entity.spheres.add()
-    _vector(ball.pose.position, place_km)
+    _vector(ball.pose.position, position_km)
     _size(ball, axes_km)
     _colour(ball.color, colour, opacity)
     return ball

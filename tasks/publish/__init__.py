@@ -1,1 +1,1 @@
-"""Stage `publish`: the tables of each night, put in place at once."""
+"""Stage `publish`: the tables of each night, published at once."""

@@ -42,7 +42,7 @@ class NightParts(NamedTuple):
 def publish_nights(
     dataset: str, staged: Mapping[str, Path], sources: pa.Table, replace: bool
 ) -> None:
-    """Put the staged nights in place in the dataset; see `publish_folders`."""
+    """Publish the staged nights in the dataset; see `publish_folders`."""
     publish_folders(dataset, staged, sources, replace)
 
 
@@ -60,8 +60,8 @@ def in_slices(
     Parameters
     ----------
     tables
-        What reads each table: it is read again for each slice, so that all of a span is never
-        held. In any order of time; rows outside the span are left out.
+        What reads each table: it is read again for each slice, so that a span is never
+        in memory as a whole. In any order of time; rows outside the span are left out.
     column
         The time of the rows.
 

@@ -26,8 +26,8 @@ def observations(parts: NightParts) -> Iterator[pa.Table]:
     """Yield OBSERVATIONS, sorted by time, sensor and centroid, some time of a span each."""
     runs = object_runs(parts)
     for span in parts.spans:
-        held = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
-        tables = [partial(viewed.read, span, "sightings") for viewed in held]
+        viewed_parts = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
+        tables = [partial(viewed.read, span, "sightings") for viewed in viewed_parts]
         errors = _shared_errors(parts, span)
         for rows in in_slices(tables, span, "time"):
             seen = of_objects(to_polars(concat(SIGHTINGS, rows)), runs)
@@ -69,9 +69,9 @@ def runs_of_views(views: pl.DataFrame) -> pl.DataFrame:
     lone = pl.format("{}{}-{}-{}", pl.lit(MARK), *_KEY)
     views = views.with_columns(pl.col("tracklet_id").fill_null(lone)).drop_nulls("tracklet_id")
     views = views.sort("tracklet_id", "epoch", "object_id")
-    told = pl.struct("tracklet_id", "object_id", "used")
+    member = pl.struct("tracklet_id", "object_id", "used")
     return (
-        views.group_by(told.rle_id().alias("run"), maintain_order=True)
+        views.group_by(member.rle_id().alias("run"), maintain_order=True)
         .agg(
             pl.col("tracklet_id", "object_id", "used").first(),
             pl.col("epoch").first().alias("first"),
@@ -89,11 +89,11 @@ def of_objects(sightings: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
     to_last = (before["time"] - before["last"]).dt.total_nanoseconds()
     to_first = (after["first"] - after["time"]).dt.total_nanoseconds()
     is_before = to_first.is_null() | (to_last.is_not_null() & (to_last <= to_first))
-    told = [
+    added = [
         before[name].zip_with(is_before.fill_null(True), after[name]).alias(name)
         for name in ("object_id", "used")
     ]
-    return rows.with_columns(told).filter(pl.col("used").fill_null(False)).sort("row")
+    return rows.with_columns(added).filter(pl.col("used").fill_null(False)).sort("row")
 
 
 def _asof(
@@ -119,5 +119,5 @@ def with_shared_errors(rows: pl.DataFrame, errors: pl.DataFrame) -> pl.DataFrame
     )
     return rows.with_columns(
         pl.col("bias_sigma_arcsec") * factors["direction"].fill_null(1.0).sqrt(),
-        pl.col("position_sigma_km") * factors["place"].fill_null(1.0).sqrt(),
+        pl.col("position_sigma_km") * factors["position"].fill_null(1.0).sqrt(),
     )

@@ -96,12 +96,12 @@ def _detections(parts: NightParts) -> Iterator[list[pa.Table]]:
     hot = hot_tracklets(parts)["tracklet_id"]
     for span in parts.spans:
         lone = lone_views(parts, span)
-        held = [of for of in parts.sensors if of.tracked.holds(span)]
-        tables = [partial(of.tracked.read, span, "detections") for of in held]
+        with_rows = [of for of in parts.sensors if of.tracked.holds(span)]
+        tables = [partial(of.tracked.read, span, "detections") for of in with_rows]
         for rows in in_slices(tables, span, "time"):
             named = [
                 with_names(of_sensor, of.names.read(span, "names"))
-                for of, of_sensor in zip(held, rows, strict=True)
+                for of, of_sensor in zip(with_rows, rows, strict=True)
                 if of_sensor.num_rows
             ]
             together = with_lone_objects(concat(TABLES["detections"], named), lone)
@@ -127,8 +127,8 @@ def lone_views(parts: NightParts, span: Span) -> pa.Table:
 def _of_spans(name: str, parts: NightParts) -> Iterator[pa.Table]:
     for span in parts.spans:
         if name == "epochs":
-            held = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
-            tables = [partial(viewed.read, span, name) for viewed in held]
+            with_rows = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
+            tables = [partial(viewed.read, span, name) for viewed in with_rows]
         else:
             tables = [partial(read_part, piece, name) for piece in parts.solved.pieces(span)]
         names = parts.names.get(span.folder, {})

@@ -49,7 +49,7 @@ class OrderedFrames(NamedTuple):
     """The frames of a run: where they lie, and in memory only their times and small tables."""
 
     folder: ReadFolder
-    sensors: list[str]  # sorted; a sensor's number is its place here
+    sensors: list[str]  # sorted; a sensor's number is its index here
     time_ns: list[Indices]  # of each sensor's frames
     cameras: pa.Table
     sources: list[LogSource]
@@ -82,7 +82,7 @@ def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) 
         rejects.append(repeats)
         write_part(folder.sensor(number), READ_SENSOR, {"index": index, "states": states})
         time_ns.append(array(index, "time"))
-    cameras = with_uncertain_places(
+    cameras = with_uncertain_principal_points(
         _sorted_cameras(_piece_tables(pieces, "cameras", CAMERAS)),
         settings.sensors.principal_point_sigma_px or 0.0,
     )
@@ -131,20 +131,20 @@ def _distinct(logs: Sequence[ReadLog]) -> list[ReadLog]:
 def _keys(pieces: Mapping[tuple[int, int], Path]) -> pa.Table:
     """Return a row per frame of all pieces: its key, its log, its piece and its row."""
     names = ["sensor_id", "frame_number", "time", "source"]
-    places = ("log", "piece", "row")
+    located = ("log", "piece", "row")
     schema = pa.schema(
-        [EXPOSURES.field(name) for name in names] + [FRAME_INDEX.field(name) for name in places]
+        [EXPOSURES.field(name) for name in names] + [FRAME_INDEX.field(name) for name in located]
     )
     rows = [schema.empty_table()]
     for (log, piece), part in pieces.items():
         keys = read_part(part, "exposures", names)
         n = keys.num_rows
-        place = (
+        located_columns = (
             pa.array(np.full(n, log, np.int32)),
             pa.array(np.full(n, piece, np.int32)),
             pa.array(np.arange(n)),
         )
-        rows.append(pa.Table.from_arrays([*keys.columns, *place], schema=schema))
+        rows.append(pa.Table.from_arrays([*keys.columns, *located_columns], schema=schema))
     return pa.concat_tables(rows)
 
 
@@ -164,19 +164,19 @@ def _piece_tables(pieces: Mapping[tuple[int, int], Path], name: str, schema: pa.
 
 
 def _without_strays(keys: pa.Table, logs: Sequence[ReadLog]) -> tuple[pa.Table, pa.Table]:
-    """Return the keys of frames within their log's own time, and those of strays."""
+    """Return the keys of frames within the time range of their log, and those of strays."""
     most = max((log.number for log in logs), default=-1) + 1
     first, last = np.zeros(most, np.int64), np.zeros(most, np.int64)
     for log in logs:
         first[log.number] = log.source.first_time_ns or 0
         last[log.number] = log.source.last_time_ns or 0
     log_of, time_ns = array(keys, "log"), array(keys, "time")
-    own = (time_ns >= first[log_of]) & (time_ns <= last[log_of])
-    return keys.filter(pa.array(own)), keys.filter(pa.array(~own))
+    inside = (time_ns >= first[log_of]) & (time_ns <= last[log_of])
+    return keys.filter(pa.array(inside)), keys.filter(pa.array(~inside))
 
 
 def _dated(sources: Sequence[LogSource], time_ns: Indices) -> list[LogSource]:
-    """Return the sources; one without a time of its own is part of the whole run."""
+    """Return the sources; one without any time is part of the whole run."""
     if not len(time_ns):
         return list(sources)
     first, last = int(time_ns.min()), int(time_ns.max())
@@ -211,9 +211,11 @@ def _sorted_cameras(cameras: pa.Table) -> pa.Table:
     return conform(CAMERAS, unique.sort_by([(name, "ascending") for name in CAMERAS.names]))
 
 
-def with_uncertain_places(cameras: pa.Table, sigma_px: float) -> pa.Table:
+def with_uncertain_principal_points(cameras: pa.Table, sigma_px: float) -> pa.Table:
     """Return CAMERAS with principal points that have this 1-sigma error per axis."""
-    place = np.isin(OPTICS_AXES, ["cx", "cy"])
-    cov = np.broadcast_to(np.diag(place * sigma_px**2), (cameras.num_rows, len(place), len(place)))
+    is_centre = np.isin(OPTICS_AXES, ["cx", "cy"])
+    cov = np.broadcast_to(
+        np.diag(is_centre * sigma_px**2), (cameras.num_rows, len(is_centre), len(is_centre))
+    )
     columns = unstack_covariance("cov_{}", cov, OPTICS_AXES)
     return table(CAMERAS, {name: cameras[name] for name in CAMERAS.names} | columns)

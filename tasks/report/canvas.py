@@ -33,7 +33,7 @@ except ImportError as error:
         "the report needs matplotlib; python -m pip install 'epipole[report]'"
     ) from error
 
-# Okabe and Ito (2008), Color Universal Design: told apart by people with any colour vision.
+# Okabe and Ito (2008), Color Universal Design: distinct for people with any colour vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 INK, GREY, PALE = "#1f2933", "#66717c", "#d5dade"
@@ -89,7 +89,7 @@ def as_svg(draw: Draw, height_in: float, width_in: float = WIDTH_IN) -> str:
         FigureCanvasSVG(figure).print_svg(out, metadata=_NO_TIMES)
     text: str = out.getvalue().decode()
     text = _METADATA.sub("", text[text.index("<svg") :])
-    text = _ATTRIBUTE.sub(lambda own: _LONG_NUMBER.sub(_rounded, own[0]), text)
+    text = _ATTRIBUTE.sub(lambda match: _LONG_NUMBER.sub(_rounded, match[0]), text)
     text = _LINE_START.sub("\n", text)
     return text.replace("'DejaVu Sans'", "'DejaVu Sans', Verdana, sans-serif")
 

@@ -49,10 +49,12 @@ def draw_star_map(figure: Figure, frame: StarMap, size_px: Array) -> None:
                  label="identified")  # fmt: skip
     scale = vector_scale(frame.residuals_px, size_px)
     _vectors(axes, frame.stars_px, frame.residuals_px, scale, VERMILLION)
-    own, lone = frame.others_px[frame.objects], frame.others_px[~frame.objects]
-    area, width = (26.0, 1.2) if len(own) <= CROWD else (9.0, 0.7)
-    axes.scatter(own[:, 0], own[:, 1], s=area, marker="s", facecolors="none", edgecolors=ORANGE,
-                 linewidths=width, label="object (has a track)")  # fmt: skip
+    tracked, lone = frame.others_px[frame.objects], frame.others_px[~frame.objects]
+    area, width = (26.0, 1.2) if len(tracked) <= CROWD else (9.0, 0.7)
+    axes.scatter(
+        tracked[:, 0], tracked[:, 1], s=area, marker="s", facecolors="none", edgecolors=ORANGE,
+        linewidths=width, label="object (has a track)",
+    )  # fmt: skip
     axes.scatter(
         lone[:, 0],
         lone[:, 1],
@@ -62,7 +64,7 @@ def draw_star_map(figure: Figure, frame: StarMap, size_px: Array) -> None:
         linewidths=0.8,
         label="other detection",
     )
-    for k, (dx, dy, how) in _label_places(frame, size_px).items():
+    for k, (dx, dy, how) in _label_positions(frame, size_px).items():
         axes.annotate(str(frame.star_id[k]), frame.stars_px[k], (dx, dy), fontsize=6.5,
                       textcoords="offset points", ha=how, va="center", color=BLUE)  # fmt: skip
     as_image(axes, size_px)
@@ -80,15 +82,15 @@ def vector_scale(residuals_px: Array, size_px: Array) -> float:
     return float(max(power * max(s for s in (1, 2, 5) if s * power <= scale), 1.0))
 
 
-def _vectors(axes: Axes, places: Array, residuals: Array, scale: float, colour: str) -> None:
-    if not len(places):
+def _vectors(axes: Axes, points: Array, residuals: Array, scale: float, colour: str) -> None:
+    if not len(points):
         return
-    axes.quiver(*places.T, *(scale * residuals.T), angles="xy", scale_units="xy", scale=1.0,
+    axes.quiver(*points.T, *(scale * residuals.T), angles="xy", scale_units="xy", scale=1.0,
                 color=colour, width=0.006, headwidth=4, headlength=4.5, headaxislength=4,
                 zorder=4)  # fmt: skip
 
 
-def _label_places(frame: StarMap, size_px: Array) -> dict[int, tuple[float, float, str]]:
+def _label_positions(frame: StarMap, size_px: Array) -> dict[int, tuple[float, float, str]]:
     """Return offset and side of the names that have room, the brightest stars first."""
     wide, high = 0.11 * size_px[0], 0.028 * size_px[1]
     taken = [(x - high / 2, y, x + high / 2) for x, y in (*frame.stars_px, *frame.others_px)]
@@ -113,14 +115,14 @@ def draw_image_residuals(figure: Figure, residuals: StarResiduals, k: int) -> No
     axes = axes_of(figure)
     size = residuals.size_px[k]
     centre = (np.arange(CELLS) + 0.5) / CELLS
-    places = np.stack(np.meshgrid(centre * size[0], centre * size[1]), axis=-1).reshape(-1, 2)
+    points = np.stack(np.meshgrid(centre * size[0], centre * size[1]), axis=-1).reshape(-1, 2)
     mean, surely = image_pattern(residuals, k)
-    held = np.isfinite(mean[:, 0])
-    scale = vector_scale(mean[held], size)
-    axes.scatter(places[held, 0], places[held, 1], s=4, color=GREY, linewidths=0)
-    for own, colour, name in ((held & ~surely, SKY, "as chance has it"),
-                              (held & surely, VERMILLION, "more than chance")):  # fmt: skip
-        _vectors(axes, places[own], mean[own], scale, colour)
+    finite = np.isfinite(mean[:, 0])
+    scale = vector_scale(mean[finite], size)
+    axes.scatter(points[finite, 0], points[finite, 1], s=4, color=GREY, linewidths=0)
+    for chosen, colour, name in ((finite & ~surely, SKY, "within the noise"),
+                                  (finite & surely, VERMILLION, "above the noise")):  # fmt: skip
+        _vectors(axes, points[chosen], mean[chosen], scale, colour)
         axes.plot([], [], color=colour, linewidth=1.5, marker=">", markersize=4, label=name)
     as_image(axes, size)
     axes.set_title(short(residuals.sensors[k]), fontsize=8.5)
@@ -179,11 +181,11 @@ def draw_coverage(figure: Figure, series: FrameSeries) -> None:
     axes = axes_of(figure)
     rows = worst_first(series)[:MAX_ROWS]
     edges = series.bins.edges_s
-    for place, k in enumerate(rows):
+    for row, k in enumerate(rows):
         total = series.counts[:, k].sum(axis=0)
         usual = max(float(np.median(total[total > 0])), 1.0) if total.any() else 1.0
-        bottom = np.full(len(total), place - 0.4)
-        axes.add_patch(_frame(edges, place))
+        bottom = np.full(len(total), row - 0.4)
+        axes.add_patch(_frame(edges, row))
         for (colour, hatch, name), count in zip(KINDS, series.counts[:, k], strict=True):
             share = 0.8 * count / np.maximum(total, usual)
             if count.any():
@@ -199,8 +201,8 @@ def draw_coverage(figure: Figure, series: FrameSeries) -> None:
     legend_below(figure, axes, columns=3)
 
 
-def _frame(edges: Array, place: int) -> Rectangle:
-    return Rectangle((edges[0], place - 0.4), edges[-1] - edges[0], 0.8, fill=False,
+def _frame(edges: Array, row: int) -> Rectangle:
+    return Rectangle((edges[0], row - 0.4), edges[-1] - edges[0], 0.8, fill=False,
                      edgecolor=PALE, linewidth=0.6)  # fmt: skip
 
 
@@ -213,7 +215,7 @@ def worst_first(series: FrameSeries) -> list[int]:
 
 
 def drawn_lines(series: FrameSeries) -> list[int]:
-    """Return the sensors that have a line of their own: those with the largest residual."""
+    """Return the sensors that get a line: those with the largest residual."""
     if len(series.sensors) <= MAX_LINES:
         return list(range(len(series.sensors)))
     with np.errstate(invalid="ignore"):
@@ -245,7 +247,7 @@ def draw_series(figure: Figure, series: FrameSeries, what: str, ylabel: str) -> 
 def draw_focal_lengths(
     figure: Figure, nights: Sequence[str], ppm: dict[str, Sequence[float]]
 ) -> None:
-    """Draw how much each sensor's focal length differs from its own median, by night [1e-6]."""
+    """Draw how much each sensor's focal length differs from its median, by night [1e-6]."""
     axes = axes_of(figure, ylabel="focal length, from its median [ppm]")
     at = range(len(nights))
     for number, (name, values) in enumerate(ppm.items()):

@@ -51,20 +51,20 @@ FAR_KM = 20_000.0
 def draw_sky(figure: Figure, tracks: SkyTracks) -> None:
     """Draw tracklets in right ascension and declination: their end has the marker."""
     axes = axes_of(figure, "right ascension [deg]", "declination [deg]")
-    places = np.concatenate([line.radec_deg for line in tracks.lines])
-    middle = np.radians(places[:, 0])
+    radec_deg = np.concatenate([line.radec_deg for line in tracks.lines])
+    middle = np.radians(radec_deg[:, 0])
     centre = np.degrees(np.arctan2(np.sin(middle).mean(), np.cos(middle).mean())) % 360
     for outcome, (colour, dashes, marker) in _OUTCOMES.items():
-        own = [line.radec_deg for line in tracks.lines if line.outcome == outcome]
-        if not own:
+        of_outcome = [line.radec_deg for line in tracks.lines if line.outcome == outcome]
+        if not of_outcome:
             continue
-        lines = [_whole(line, centre) for line in own]
+        lines = [_whole(line, centre) for line in of_outcome]
         x, y = np.concatenate([np.vstack([line, [np.nan, np.nan]]) for line in lines]).T
         axes.plot(x, y, color=colour, linestyle=dashes, linewidth=0.9)
         ends = np.array([line[-1] for line in lines])
         axes.plot(*ends.T, color=colour, linestyle="", marker=marker, markersize=3.2,
                   label=f"{outcome} ({tracks.counts.get(outcome, 0):,})")  # fmt: skip
-    _limits(axes, places, centre)
+    _limits(axes, radec_deg, centre)
     legend_below(figure, axes, columns=2)
 
 
@@ -75,8 +75,8 @@ def _whole(radec: Array, centre: float) -> Array:
     return np.stack([ra, radec[:, 1]], axis=1)
 
 
-def _limits(axes: Axes, places: Array, centre: float) -> None:
-    ra = (places[:, 0] - centre + 180.0) % 360.0 - 180.0 + centre
+def _limits(axes: Axes, radec_deg: Array, centre: float) -> None:
+    ra = (radec_deg[:, 0] - centre + 180.0) % 360.0 - 180.0 + centre
     low, high = ra.min(), ra.max()
     margin = max(0.04 * (high - low), 0.05)
     axes.set_xlim(high + margin, low - margin)  # east is left, as seen from inside the sphere
@@ -86,18 +86,18 @@ def _limits(axes: Axes, places: Array, centre: float) -> None:
 
 
 def draw_ring(figure: Figure, objects: Sequence[NightObject]) -> None:
-    """Draw objects near the geostationary ring: longitude and latitude, first to last place."""
+    """Draw objects near the geostationary ring: longitude and latitude, first to last position."""
     axes = axes_of(figure, "longitude [deg east]", "latitude [deg]")
     for status, (colour, marker) in _STATUSES.items():
-        own = [each for each in objects if each.status == status]
-        if not own:
+        of_status = [each for each in objects if each.status == status]
+        if not of_status:
             continue
         first, last = (np.array([side[:2] for side in ends]) for ends in
-                       ([o.first for o in own], [o.last for o in own]))  # fmt: skip
+                       ([o.first for o in of_status], [o.last for o in of_status]))  # fmt: skip
         jump = np.abs(first[:, 0] - last[:, 0]) > 180
         first[jump] = last[jump]
         axes.plot(*np.stack([first, last]).transpose(2, 0, 1), color=colour, linewidth=0.9)
-        axes.plot(*last.T, **_mark(marker, colour), label=f"{status} ({len(own):,})")
+        axes.plot(*last.T, **_mark(marker, colour), label=f"{status} ({len(of_status):,})")
     axes.grid(color="#e3e7ea", linewidth=0.5)
     axes.set_axisbelow(True)
     legend_below(figure, axes, columns=3)
@@ -112,11 +112,11 @@ def draw_elements(figure: Figure, objects: Sequence[NightObject]) -> None:
     """Draw eccentricity and inclination of objects over their semi-major axis."""
     upper, lower = figure.subplots(2, 1, sharex=True)
     for status, (colour, marker) in _STATUSES.items():
-        own = [o.elements for o in objects if o.status == status and o.elements is not None]
-        if not own:
+        of_status = [o.elements for o in objects if o.status == status and o.elements is not None]
+        if not of_status:
             continue
-        a, e, i = np.array(own).T
-        upper.plot(a, e, **_mark(marker, colour), label=f"{status} ({len(own):,})")
+        a, e, i = np.array(of_status).T
+        upper.plot(a, e, **_mark(marker, colour), label=f"{status} ({len(of_status):,})")
         lower.plot(a, i, **_mark(marker, colour))
     upper.set(ylabel="eccentricity")
     lower.set(ylabel="inclination [deg]", xlabel="semi-major axis [thousand km]")

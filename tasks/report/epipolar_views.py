@@ -7,7 +7,7 @@ import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
-from epipole.schemas.columns import PLACE, VELOCITY
+from epipole.schemas.columns import POSITION, VELOCITY
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.camera import Camera, distort, project, unproject
 from epipole.tasks.algorithms.geometry.directions import (
@@ -141,15 +141,17 @@ def _pairs(views: pl.DataFrame) -> list[tuple[pl.DataFrame, pl.DataFrame]]:
 
 def _pose(night: NightReader, name: str, camera: Camera, epoch_ns: int) -> _Pose | None:
     """Return where the sensor was and how it stood at the epoch; None: its frames do not tell."""
-    rows = _near(night, "frames", ["frame_number", *QUATERNION, *PLACE, *VELOCITY], name, epoch_ns)
-    rows = rows.drop_nulls([*QUATERNION, *PLACE])
+    rows = _near(
+        night, "frames", ["frame_number", *QUATERNION, *POSITION, *VELOCITY], name, epoch_ns
+    )
+    rows = rows.drop_nulls([*QUATERNION, *POSITION])
     if not len(rows):
         return None
     since_s = (rows["time"].dt.epoch("ns").to_numpy() - epoch_ns) / 1e9
     q = interpolate_quaternions(since_s, rows.select(QUATERNION).to_numpy(), np.zeros(1))
     at = int(np.argmin(np.abs(since_s)))
     v_km_s = np.nan_to_num(rows.select(VELOCITY).to_numpy()[at].astype(float))
-    r_km = rows.select(PLACE).to_numpy()[at] - since_s[at] * v_km_s
+    r_km = rows.select(POSITION).to_numpy()[at] - since_s[at] * v_km_s
     seen = _near(night, "detections", ["frame_number", *SEEN], name, epoch_ns).drop_nulls()
     seen = seen.join(rows.select("frame_number", *QUATERNION), on="frame_number")
     return _Pose(_camera_in_use(camera, seen), matrix_from_quaternion(q)[0], r_km, v_km_s)
@@ -158,7 +160,7 @@ def _pose(night: NightReader, name: str, camera: Camera, epoch_ns: int) -> _Pose
 def _camera_in_use(camera: Camera, seen: pl.DataFrame) -> Camera:
     """Return the camera that the attitudes go with: it is not always the fitted one.
 
-    The detections tell it: each has a place in the image and a direction.
+    The detections show it: each has a pixel position and a direction.
     """
     if len(seen) < MIN_SEEN:
         return camera
@@ -177,8 +179,8 @@ def _near(
     """Return the rows of a sensor that are near to an epoch."""
     columns = ["time", "sensor_id", *columns]
     between = epoch_ns - AROUND_NS, epoch_ns + AROUND_NS
-    own = pl.col("sensor_id") == name
-    pieces = [rows.filter(own) for rows in night.pieces(table, columns, between)]
+    is_sensor = pl.col("sensor_id") == name
+    pieces = [rows.filter(is_sensor) for rows in night.pieces(table, columns, between)]
     return pl.concat([night.empty(table, columns), *pieces])
 
 
@@ -206,23 +208,23 @@ def _lines(
 def _seen_together(
     night: NightReader, names: list[str], poses: tuple[_Pose, _Pose], epoch_ns: int
 ) -> list[Array]:
-    """Return (n, 3) positions of each sensor, moved as if both saw an object at one place.
+    """Return (n, 3) positions of each sensor, moved as if both saw an object at one position.
 
     The light to the farther sensor left earlier, when a low object was elsewhere by some pixels.
     """
-    columns = ["epoch", "time", "object_id", *PLACE]
+    columns = ["epoch", "time", "object_id", *POSITION]
     between = epoch_ns - MOTION_NS, epoch_ns + MOTION_NS
     pieces = night.pieces("positions", columns, between)
     rows = pl.concat([night.empty("positions", columns), *pieces])
     moved = [np.tile(pose.r_km, (len(names), 1)) for pose in poses]
     for k, name in enumerate(names):
-        own = rows.filter(pl.col("object_id") == name)
-        time_s = (own["time"].dt.epoch("ns").to_numpy() - epoch_ns) / 1e9
-        if len(own) < 2:
+        track = rows.filter(pl.col("object_id") == name)
+        time_s = (track["time"].dt.epoch("ns").to_numpy() - epoch_ns) / 1e9
+        if len(track) < 2:
             continue
-        x_km = own.select(PLACE).to_numpy()
+        x_km = track.select(POSITION).to_numpy()
         v_km_s = (x_km[-1] - x_km[0]) / (time_s[-1] - time_s[0])
-        at = int(np.argmin(np.abs(own["epoch"].dt.epoch("ns").to_numpy() - epoch_ns)))
+        at = int(np.argmin(np.abs(track["epoch"].dt.epoch("ns").to_numpy() - epoch_ns)))
         for pose, r_km in zip(poses, moved, strict=True):
             light_s = np.linalg.norm(x_km[at] - pose.r_km) / SPEED_OF_LIGHT_KM_S
             r_km[k] += v_km_s * (light_s + time_s[at])
@@ -230,7 +232,7 @@ def _seen_together(
 
 
 def _geometric(pose: _Pose, px: Array) -> Array:
-    """Return the directions (ICRS) of places in the image, with the aberration taken off."""
+    """Return the directions (ICRS) of pixel positions, aberration removed."""
     apparent = unproject(pose.camera, px[:, 0], px[:, 1]) @ pose.R_sensor_from_icrs
     return aberrate(apparent, -pose.v_km_s)
 
@@ -257,5 +259,5 @@ def _in_image(line: Array, camera: Camera) -> Array:
 
 def _others(night: NightReader, name: str, frame: int, epoch_ns: int) -> Array:
     rows = _near(night, "detections", ["frame_number", "x_px", "y_px"], name, epoch_ns)
-    own = rows.filter(pl.col("frame_number") == frame)
-    return own.select("x_px", "y_px").head(MAX_OTHERS).to_numpy()
+    in_frame = rows.filter(pl.col("frame_number") == frame)
+    return in_frame.select("x_px", "y_px").head(MAX_OTHERS).to_numpy()

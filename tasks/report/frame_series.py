@@ -116,7 +116,7 @@ class FrameSeries:
 
 
 def read_frame_series(night: NightReader) -> FrameSeries | None:
-    """Return the frames of a night; None: it has none."""
+    """Return the frames of a night; None without frames."""
     ends = night.bounds_ns("frames", "time")
     if ends is None:
         return None
@@ -191,6 +191,6 @@ class _SeriesSums:
 
 
 def codes(names: pl.Series, known: list[str]) -> Indices:
-    """Return the place of each name in a list of names; those that it lacks get its last place."""
-    places = names.cast(pl.Enum(known), strict=False).to_physical().fill_null(len(known) - 1)
-    return places.to_numpy().astype(np.int64)
+    """Return the index of each name in a list; names that are not in it get its last index."""
+    index = names.cast(pl.Enum(known), strict=False).to_physical().fill_null(len(known) - 1)
+    return index.to_numpy().astype(np.int64)

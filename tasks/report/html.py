@@ -32,7 +32,7 @@ def paragraph(sentence: str, kind: str = "") -> str:
 
 
 def nothing(sentence: str) -> str:
-    """Return what stands in the place of a picture without data."""
+    """Return the text for a picture without data."""
     return paragraph(sentence, "nothing")
 
 

@@ -32,7 +32,7 @@ ORDER = [stage.value for stage in Stage]
 
 
 class LeftOut(NamedTuple):
-    """What was left out for one reason, of one sensor; '' where it is of none or of several."""
+    """What was left out for one reason, of one sensor; '' if unknown or several."""
 
     stage: str
     reason: str
@@ -58,10 +58,10 @@ def read_left_out(night: NightReader) -> list[LeftOut]:
     counts = pl.concat(pieces).with_columns(pl.col("sensor_id").fill_null(""))
     sums = counts.group_by(key).agg(pl.col("count").sum())
     rows = [LeftOut(*row) for row in sums.select(*key, "count").iter_rows()]
-    return sorted(rows, key=lambda row: (_place(row.stage), -row.number, row.reason, row.sensor_id))
+    return sorted(rows, key=lambda row: (_rank(row.stage), -row.number, row.reason, row.sensor_id))
 
 
-def _place(stage: str) -> int:
+def _rank(stage: str) -> int:
     return ORDER.index(stage) if stage in ORDER else len(ORDER)
 
 
@@ -149,7 +149,7 @@ MIN_IDENTIFIED = 0.9  # share of a sensor's frames
 LONGEST_LOST = 0.02  # share of the night
 # A mean square over what it should be: sigmas are a fifth too large, or too small.
 LOWEST, HIGHEST = 0.7, 1.4
-FEWEST = 30  # values that share no detection: with fewer, chance alone goes beyond the bounds
+MIN_VALUES = 30  # independent values: with fewer, noise alone exceeds the bounds
 MIN_NIGHTS = 5
 DROP = 0.7  # of the median of the nights before
 MAX_SENTENCES = 12
@@ -202,11 +202,11 @@ def _sigmas(facts: NightFacts) -> Iterator[str]:
     if facts.residuals is not None:
         for name, square, stars in zip(facts.residuals.sensors, facts.residuals.mean_square,
                                        facts.residuals.stars, strict=True):  # fmt: skip
-            if np.isfinite(square) and stars >= FEWEST and not holds(square):
+            if np.isfinite(square) and stars >= MIN_VALUES and not holds(square):
                 yield f"{name}: star residuals are {_off(square)} than their sigma says."
     for what, chi2 in (("pair distances", facts.chi2.pairs), ("positions", facts.chi2.positions),
                        ("states", facts.chi2.states)):  # fmt: skip
-        if chi2 is not None and chi2.independent >= FEWEST and not holds(chi2.mean):
+        if chi2 is not None and chi2.independent >= MIN_VALUES and not holds(chi2.mean):
             yield f"Sigmas of {what} do not hold: the residuals are {_off(chi2.mean)}."
 
 

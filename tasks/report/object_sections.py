@@ -74,7 +74,7 @@ def objects(facts: NightFacts) -> Section:
             as_svg(partial(draw_elements, objects=others), 3.6),
             f"Semi-major axis, eccentricity and inclination of {len(others)} objects.",
             "The other objects, by the best state of each. From a short arc, axis and eccentricity "
-            "are uncertain: their scatter is no orbit.",
+            "are uncertain: their scatter is not that of orbits.",
         ))  # fmt: skip
     return Section("objects", title, paragraph(_names(found)) + figures(pictures) + _table(found))
 
@@ -92,7 +92,7 @@ def _table(found: Sequence[NightObject]) -> str:
     shown = order[:MAX_OBJECTS]
     rows = [
         (each.object_id, each.status, each.name, f"{each.positions:,}", clock(each.first_ns),
-         clock(each.last_ns), str(each.sensors), f"{each.sigma_km:.3g}", *_place(each))
+         clock(each.last_ns), str(each.sensors), f"{each.sigma_km:.3g}", *_geography(each))
         for each in shown
     ]  # fmt: skip
     caption = "Objects; unknown ones first"
@@ -103,13 +103,13 @@ def _table(found: Sequence[NightObject]) -> str:
     return table(caption, heading, rows)
 
 
-def _place(each: NightObject) -> tuple[str, ...]:
+def _geography(each: NightObject) -> tuple[str, ...]:
     longitude, latitude, radius = each.last
-    place = f"{radius:,.0f}", f"{longitude:.2f}", f"{latitude:.2f}"
+    geography = f"{radius:,.0f}", f"{longitude:.2f}", f"{latitude:.2f}"
     if each.elements is None:
-        return (*place, "", "", "")
+        return (*geography, "", "", "")
     a, e, i = each.elements
-    return *place, f"{a:,.0f}", f"{e:.4f}", f"{i:.2f}"
+    return *geography, f"{a:,.0f}", f"{e:.4f}", f"{i:.2f}"
 
 
 def trend(facts: NightFacts) -> Section:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
-from epipole.schemas.columns import PLACE, VELOCITY
+from epipole.schemas.columns import POSITION, VELOCITY
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.rejects import NameStatus, Outcome
 from epipole.tasks.algorithms.constants import GM_KM3_S2
@@ -47,7 +47,7 @@ class NightObject(NamedTuple):
 
     @property
     def near_geostationary(self) -> bool:
-        """Whether it is near the geostationary ring, by its place."""
+        """Whether it is near the geostationary ring, by its position."""
         _, latitude, radius = self.last
         return abs(radius - GEOSTATIONARY_KM) < NEAR_KM and abs(latitude) < LARGEST_LATITUDE_DEG
 
@@ -59,12 +59,12 @@ class NightObject(NamedTuple):
 
 def read_objects(night: NightReader) -> list[NightObject]:
     """Return the objects of a night, in the order of their ids."""
-    columns = ["object_id", "time", *PLACE, "cov_xx", "cov_yy", "cov_zz", "n_sensors"]
+    columns = ["object_id", "time", *POSITION, "cov_xx", "cov_yy", "cov_zz", "n_sensors"]
     variance = (pl.col("cov_xx") + pl.col("cov_yy") + pl.col("cov_zz")) / 3
     sums = [
         rows.group_by("object_id", maintain_order=True).agg(
             positions=pl.len(), sensors=pl.col("n_sensors").max(), variance=variance.sum(),
-            first=pl.struct("time", *PLACE).first(), last=pl.struct("time", *PLACE).last(),
+            first=pl.struct("time", *POSITION).first(), last=pl.struct("time", *POSITION).last(),
         )
         for rows in night.pieces("positions", columns)
     ]  # fmt: skip
@@ -105,22 +105,22 @@ def _ends(rows: pl.DataFrame) -> tuple[list[tuple[float, float, float]], list[in
     UT1 is taken to be UTC: less than 0.004 degrees.
     """
     time_ns = rows["time"].dt.epoch("ns").to_numpy()
-    r = rows.select(PLACE).to_numpy()
+    r = rows.select(POSITION).to_numpy()
     radius = np.linalg.norm(r, axis=1)
     latitude = np.degrees(np.arcsin(r[:, 2] / radius))
     ra = np.arctan2(r[:, 1], r[:, 0])
     longitude = np.degrees(ra - erfa.era00(*utc_julian_date(time_ns)))
     longitude = (longitude + 180.0) % 360.0 - 180.0
-    places = zip(longitude.tolist(), latitude.tolist(), radius.tolist(), strict=True)
-    return list(places), time_ns.tolist()
+    geodetic = zip(longitude.tolist(), latitude.tolist(), radius.tolist(), strict=True)
+    return list(geodetic), time_ns.tolist()
 
 
 def _elements(night: NightReader) -> dict[str, tuple[float, float, float]]:
     """Return a, e, i of the state of each object that has the most views."""
-    rows = night.read("states", ["object_id", "n_views", *PLACE, *VELOCITY])
+    rows = night.read("states", ["object_id", "n_views", *POSITION, *VELOCITY])
     rows = rows.sort("n_views", descending=True, maintain_order=True)
     rows = rows.unique("object_id", keep="first", maintain_order=True)
-    shape = elements_of(rows.select(PLACE).to_numpy(), rows.select(VELOCITY).to_numpy())
+    shape = elements_of(rows.select(POSITION).to_numpy(), rows.select(VELOCITY).to_numpy())
     return dict(zip(rows["object_id"].to_list(), map(tuple, shape.tolist()), strict=True))
 
 
@@ -158,7 +158,7 @@ class SkyTracks(NamedTuple):
 
 
 def read_sky_tracks(night: NightReader) -> SkyTracks | None:
-    """Return the tracklets of a night; None: it has none. Of many, every so manieth is drawn."""
+    """Return the tracklets of a night; None without tracklets. Of many, every n-th is drawn."""
     columns = ["tracklet_id", "outcome", "n_detections"]
     drawn: list[pl.DataFrame] = [night.empty("tracklets", columns)]
     counts: dict[str, int] = {}
@@ -172,29 +172,31 @@ def read_sky_tracks(night: NightReader) -> SkyTracks | None:
     if not counts:
         return None
     chosen = pl.concat(drawn)
-    places = _places(night, chosen)
+    directions = _directions(night, chosen)
     lines = [
-        SkyTrack(outcome, places[name]) for name, outcome, _ in chosen.iter_rows() if name in places
+        SkyTrack(outcome, directions[name])
+        for name, outcome, _ in chosen.iter_rows()
+        if name in directions
     ]
     order = [outcome.value for outcome in Outcome]
     known = {outcome: counts[outcome] for outcome in order if outcome in counts}
     return SkyTracks(known, lines)
 
 
-def _places(night: NightReader, chosen: pl.DataFrame) -> dict[str, Array]:
+def _directions(night: NightReader, chosen: pl.DataFrame) -> dict[str, Array]:
     names = chosen["tracklet_id"].implode()
     found: dict[str, list[Array]] = {}
     columns = ["tracklet_id", "ra_deg", "dec_deg"]
     for rows in night.pieces("detections", columns):
-        own = rows.filter(pl.col("tracklet_id").is_in(names)).drop_nulls()
-        for (name,), of_track in own.group_by("tracklet_id", maintain_order=True):
+        chosen_rows = rows.filter(pl.col("tracklet_id").is_in(names)).drop_nulls()
+        for (name,), of_track in chosen_rows.group_by("tracklet_id", maintain_order=True):
             found.setdefault(str(name), []).append(of_track.select(columns[1:]).to_numpy())
     return {name: _thinned(np.concatenate(pieces)) for name, pieces in found.items()}
 
 
-def _thinned(places: Array) -> Array:
-    at = np.unique(np.linspace(0, len(places) - 1, POINTS).astype(int))
-    return places[at]
+def _thinned(directions: Array) -> Array:
+    at = np.unique(np.linspace(0, len(directions) - 1, POINTS).astype(int))
+    return directions[at]
 
 
 # The last nights of the dataset: a few numbers of each.

@@ -252,7 +252,7 @@ def image_residuals(facts: NightFacts) -> Section:
     how = (
         "Mean star residual in each part of the image. Arrows should point in all directions, and "
         "few should be more than chance explains; a swirl, or all outwards, is an error of the "
-        "optics. One star that stays in a part shows the error of its catalogue place."
+        "optics. One star that stays in a part shows the error of its catalogue position."
     )
     some = ""
     if len(pictures) < len(residuals.sensors):

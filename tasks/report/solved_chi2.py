@@ -11,7 +11,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 PAIR_BINS = np.linspace(0.0, 5.0, 26)  # edges, in sigmas
-MAX_FREEDOM = 4000  # degrees of freedom that are told apart
+MAX_FREEDOM = 4000  # degrees of freedom with a bin each
 MIN_BINS, MAX_BINS = 8, 40
 
 

@@ -56,7 +56,7 @@ def read_star_residuals(
 
     Notes
     -----
-    A star has no sigma of its own in the tables: that of the sensor's detections is used, their
+    A star has no sigma in the tables: that of the sensor's detections is used, their
     median. The fit of the attitude takes 3 of the 2 n degrees of freedom of n stars.
     """
     sigma_px = _sigmas_px(night, sensors, calibrations)
@@ -84,7 +84,7 @@ def _sigmas_px(night: NightReader, sensors: list[str], calibrations: pl.DataFram
 
 
 def _sizes(night: NightReader, sensors: list[str]) -> Array:
-    """Return the largest places of stars and detections: nearly the size of the image."""
+    """Return the largest pixel positions of stars and detections: nearly the size of the image."""
     largest = np.ones((len(sensors), 2))
     for table in ("stars", "detections"):
         for rows in night.pieces(table, ["sensor_id", "x_px", "y_px"]):
@@ -158,7 +158,7 @@ class StarMap(NamedTuple):
     """A frame.
 
     star_id, magnitude : (n,)
-    stars_px, residuals_px : (n, 2) places and residuals of its stars
+    stars_px, residuals_px : (n, 2) pixel positions and residuals of its stars
     others_px : (m, 2) detections that are no stars, the brightest
     objects : (m,) which of them belong to a track
     """
@@ -183,18 +183,18 @@ def read_star_map(night: NightReader, series: FrameSeries) -> StarMap | None:
     if not identified.sum():
         return None
     k = int(np.argmax(identified.sum(axis=1)))
-    held = np.flatnonzero(identified[k])
-    bin_ = int(held[np.argmin(np.abs(held - series.bins.number / 2))])
+    candidates = np.flatnonzero(identified[k])
+    bin_ = int(candidates[np.argmin(np.abs(candidates - series.bins.number / 2))])
     frame = _usual_frame(night, series, k, bin_)
     if frame is None:
         return None
     number, time_ns = frame
-    own = (pl.col("sensor_id") == series.sensors[k]) & (pl.col("frame_number") == number)
+    in_frame = (pl.col("sensor_id") == series.sensors[k]) & (pl.col("frame_number") == number)
     columns = ["time", "sensor_id", "frame_number", "x_px", "y_px"]
     stars = _rows(night, "stars", [*columns, "star_id", "magnitude", "dx_px", "dy_px"], time_ns)
-    others = _rows(night, "detections", [*columns, "flux", "track_id"], time_ns).filter(own)
+    others = _rows(night, "detections", [*columns, "flux", "track_id"], time_ns).filter(in_frame)
     others = others.sort("flux", descending=True, nulls_last=True, maintain_order=True)
-    others, stars = others.head(MAX_OTHERS), stars.filter(own)
+    others, stars = others.head(MAX_OTHERS), stars.filter(in_frame)
     return StarMap(
         series.sensors[k], number, time_ns,
         stars["star_id"].to_numpy(), stars["magnitude"].to_numpy(),
@@ -213,12 +213,12 @@ def _usual_frame(
     columns = ["time", "sensor_id", "frame_number", "attitude_source", "n_stars"]
     for searched in (min(int(length) + 1, SEARCHED_NS), int(length) + 2):
         for rows in night.pieces("frames", columns, (start, start + searched)):
-            own = rows.filter(sensor_id=series.sensors[k], attitude_source="stars")
-            off = np.abs(own["n_stars"].to_numpy() - series.stars[k])
-            if len(own) and (best is None or off.min() < best[0]):
+            frames = rows.filter(sensor_id=series.sensors[k], attitude_source="stars")
+            off = np.abs(frames["n_stars"].to_numpy() - series.stars[k])
+            if len(frames) and (best is None or off.min() < best[0]):
                 at = int(np.argmin(off))
-                time_ns = int(own["time"].dt.epoch("ns")[at])
-                best = float(off[at]), int(own["frame_number"][at]), time_ns
+                time_ns = int(frames["time"].dt.epoch("ns")[at])
+                best = float(off[at]), int(frames["frame_number"][at]), time_ns
         if best is not None:
             return best[1:]
     return None

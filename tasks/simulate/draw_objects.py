@@ -64,7 +64,7 @@ def _random_elements(kind: str, rng: np.random.Generator) -> Array:
 
 
 def draw_near(orbit: Orbit, spread_km: float, rng: np.random.Generator) -> Array:
-    """Return the (6,) elements of a body about the place that an orbit has at the start."""
+    """Return the (6,) elements of a body about the position of an orbit at the start."""
     elements = draw_elements(orbit, rng)
     if not spread_km:
         return elements
@@ -89,13 +89,13 @@ class Satellites(NamedTuple):
     paths: Paths
 
 
-def place_satellites(scene: Scene, orbit: Orbit, t0_ns: int) -> Satellites:
+def propagate_satellites(scene: Scene, orbit: Orbit, t0_ns: int) -> Satellites:
     """Return the satellites of an orbit with `elements`, over the whole scene.
 
     Raises
     ------
     SceneError
-        Where the file has none of the satellites, their elements are too old or too new, or SGP4
+        Where the file lacks the satellites, their elements are too old or too new, or SGP4
         fails. It names the satellite.
     """
     if orbit.elements is None:
@@ -218,7 +218,7 @@ def _drawn(
     scene: Scene, group: SceneTargets, t0_ns: int, rng: np.random.Generator
 ) -> tuple[Paths, list[ElementSet | None]]:
     if group.orbit.elements is not None:
-        found = draw_satellites(place_satellites(scene, group.orbit, t0_ns), group.count, rng)
+        found = draw_satellites(propagate_satellites(scene, group.orbit, t0_ns), group.count, rng)
         return found.paths, list(found.sets)
     count = 1 if group.count is None else group.count
     made = [draw_near(group.orbit, group.spread_km, rng) for _ in range(count)]

@@ -19,7 +19,7 @@ from epipole.tasks.simulate.draw_objects import (
     DrawnObjects,
     Satellites,
     draw_elements,
-    place_satellites,
+    propagate_satellites,
 )
 
 # Optics: as the log reports them, and the true ones.
@@ -94,8 +94,8 @@ def _near_orbits(
 def _on_satellites(
     scene: Scene, group: SceneSensor, t0_ns: int, objects: DrawnObjects, first: int
 ) -> Iterator[DrawnSensor]:
-    """Yield the sensors of a group, each on a satellite of its own."""
-    satellites = place_satellites(scene, group.orbit, t0_ns)
+    """Yield the sensors of a group, each on another satellite."""
+    satellites = propagate_satellites(scene, group.orbit, t0_ns)
     order = np.arange(len(satellites.sets))
     if group.count is not None and group.count < len(order):
         order = random_stream(scene.seed, first, "satellites").permutation(order)
@@ -148,7 +148,7 @@ def _followed(
             )
         return objects.objects.paths.of(pointing.target)
     if pointing.orbit is not None and pointing.orbit.elements is not None:
-        found = place_satellites(scene, pointing.orbit, t0_ns)
+        found = propagate_satellites(scene, pointing.orbit, t0_ns)
         if len(found.sets) > 1:
             raise SceneError(
                 f"{scene.name}: sensor {group.id} tracks {len(found.sets)} satellites of "

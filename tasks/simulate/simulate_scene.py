@@ -110,7 +110,7 @@ def true_tables(sensor_id: str, exposed: Exposures) -> tuple[pa.Table, pa.Table]
             "kind": exposed.kind,
             "source": exposed.source,
             "magnitude": exposed.magnitude,
-            "also": pa.nulls(len(first), pa.int64()),  # each source has a centroid of its own
+            "also": pa.nulls(len(first), pa.int64()),  # no two sources share a centroid
         },
     )
     return frames, points

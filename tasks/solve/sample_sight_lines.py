@@ -18,9 +18,9 @@ from epipole.schemas.bridge import (
     unstack,
     unstack_covariance,
 )
-from epipole.schemas.columns import PLACE, TANGENT_AXES, VELOCITY
+from epipole.schemas.columns import POSITION, TANGENT_AXES, VELOCITY
 from epipole.schemas.spans import DAY_NS
-from epipole.schemas.work_tables import CLAIMED_VIEWS, CLOCK_LINES, MOVING_OBJECTS
+from epipole.schemas.work_tables import CLOCK_LINES, MOVING_OBJECTS, OBJECT_VIEWS
 from epipole.tasks.algorithms.geometry.directions import apparent_places
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.solve.positions import VELOCITY_WINDOW_S
@@ -46,7 +46,7 @@ def moving_objects(positions: pa.Table, every_ns: int) -> pa.Table:
     offsets = np.concatenate([[0], np.cumsum(size)]).astype(np.int64)
     time_ns = rows["epoch"].cast(pl.Int64).to_numpy()
     time_s = (time_ns - (time_ns.min() if len(time_ns) else 0)) / 1e9
-    v, _ = velocities(offsets, time_s, rows.select(PLACE).to_numpy(), VELOCITY_WINDOW_S)
+    v, _ = velocities(offsets, time_s, rows.select(POSITION).to_numpy(), VELOCITY_WINDOW_S)
     light_ns = pl.col("epoch").cast(pl.Int64) - pl.col("time").cast(pl.Int64)
     rows = rows.with_columns(
         *[pl.Series(name, v[:, k]) for k, name in enumerate(VELOCITY)], light_s=light_ns / 1e9
@@ -55,9 +55,9 @@ def moving_objects(positions: pa.Table, every_ns: int) -> pa.Table:
     return from_polars(MOVING_OBJECTS, kept.select(MOVING_OBJECTS.names))
 
 
-def claimed_views(views: ObjectViews, objects: pa.Table) -> pa.Table:
-    """Return CLAIMED_VIEWS: the views of objects at the epochs of MOVING_OBJECTS."""
-    return conform(CLAIMED_VIEWS, views.labels.take(_at_epochs(views, objects)))
+def object_views(views: ObjectViews, objects: pa.Table) -> pa.Table:
+    """Return OBJECT_VIEWS: the views of objects at the epochs of MOVING_OBJECTS."""
+    return conform(OBJECT_VIEWS, views.labels.take(_at_epochs(views, objects)))
 
 
 def sample_sight_lines(groups: ViewGroups, objects: pa.Table, kept: LineSampling) -> pa.Table:
@@ -115,7 +115,7 @@ def meetings(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Ta
     Each object is put where its light left for the sensor of the row.
     """
     rows = (
-        views.rename({name: f"sensor_{name}" for name in PLACE})
+        views.rename({name: f"sensor_{name}" for name in POSITION})
         .drop_nulls([f"sensor_{name}" for name in VELOCITY])
         .join(objects, on=on, maintain_order="left")
     )
@@ -125,5 +125,5 @@ def meetings(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Ta
         rows["light_s"].to_numpy(),
         stack(rows, "sensor_{}_km"),
     )
-    rows = rows.with_columns(pl.Series(name, x_km[:, k]) for k, name in enumerate(PLACE))
+    rows = rows.with_columns(pl.Series(name, x_km[:, k]) for k, name in enumerate(POSITION))
     return from_polars(CLOCK_LINES, rows.select(CLOCK_LINES.names))

@@ -28,8 +28,8 @@ from epipole.tasks.solve.pairs import association_table, pair_table
 from epipole.tasks.solve.positions import position_table, reject_table, solve_positions
 from epipole.tasks.solve.sample_sight_lines import (
     LineSampling,
-    claimed_views,
     moving_objects,
+    object_views,
     sample_sight_lines,
 )
 from epipole.tasks.solve.states import fit_states, judge_errors, refuse_misfits
@@ -199,7 +199,7 @@ def _tables(
         "rejects": concat(REJECTS, [reject_table(groups), misfits]),
         "outcomes": judge_views(associations),
         "lines": sample_sight_lines(stated, objects, kept),
-        "claims": claimed_views(groups.views, objects),
+        "object_views": object_views(groups.views, objects),
         "objects": objects,
     }
 

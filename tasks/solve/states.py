@@ -66,7 +66,7 @@ def judge_errors(groups: ViewGroups, settings: StateSettings) -> pa.Table:
         {
             "sensor_id": sensor_ids[larger].tolist(),
             "direction": factor[larger, 0],
-            "place": factor[larger, 1],
+            "position": factor[larger, 1],
         },
     )
 

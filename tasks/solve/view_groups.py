@@ -116,7 +116,7 @@ def _scaled(views: ObjectViews, errors: pa.Table, power: float) -> ObjectViews:
     row = pc.index_in(pa.array(views.sensor_ids), errors["sensor_id"].combine_chunks())
     direction, place = (
         pc.fill_null(errors[name].take(row), 1.0).to_numpy()[views.sensor] ** power
-        for name in ("direction", "place")
+        for name in ("direction", "position")
     )
     return views._replace(
         cov_bias=views.cov_bias * direction[:, None, None],

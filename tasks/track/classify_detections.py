@@ -22,7 +22,7 @@ GATE_SIGMA = 4.0  # largest distance of a detection from a known hot pixel, plan
 def places_in_image(
     frames: Frames, sightings: Sightings, detections: pa.Table, camera: Camera
 ) -> FixedPlaces:
-    """Return the places of the image that sightings stay at, and how likely each is a hot pixel."""
+    """Return the pixel positions that sightings stay at, and how likely each is a hot pixel."""
     sigma_px = array(detections, "sigma_arcsec")[sightings.row] * ARCSEC / camera.pixel_rad
     return fixed_places(
         sightings.frame,
@@ -37,10 +37,10 @@ def places_in_image(
 
 def at_hot_pixel(sightings: Sightings, detections: pa.Table, known: Flags, camera: Camera) -> Flags:
     """Return which sightings stand where hot pixels do; `known` has these among all detections."""
-    place_px = np.column_stack([array(detections, "x_px"), array(detections, "y_px")])
+    position_px = np.column_stack([array(detections, "x_px"), array(detections, "y_px")])
     if not known.any() or not len(sightings.row):
         return np.zeros(len(sightings.row), bool)
-    off_px, _ = cKDTree(place_px[known]).query(place_px[sightings.row])
+    off_px, _ = cKDTree(position_px[known]).query(position_px[sightings.row])
     sigma_px = array(detections, "sigma_arcsec")[sightings.row] * ARCSEC / camera.pixel_rad
     return np.asarray(off_px < GATE_SIGMA * sigma_px)
 

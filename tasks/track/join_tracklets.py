@@ -78,15 +78,15 @@ def _join(sensor: Sensor, tracked: Parts, spans: Sequence[Span], night: str, par
         linked.append(_links(part, numbers).with_columns(span=pl.lit(k, pl.Int64)))
         summed.append(_summed(rows.filter("inside"), part).with_columns(span=pl.lit(k, pl.Int64)))
         before = rows.select(*KEY, "number")
-    own = _of_night(pl.concat(summed), spans, night)
-    _write(spans, parts, pl.concat(linked), own, sensor.sensor_id)
+    of_night = _of_night(pl.concat(summed), spans, night)
+    _write(spans, parts, pl.concat(linked), of_night, sensor.sensor_id)
 
 
 def _of_night(summed: pl.DataFrame, spans: Sequence[Span], night: str) -> pl.DataFrame:
     """Return the rows without those outside the night, where the tracklet has others."""
     start_ns = int(np.datetime64(night, "ns").astype(np.int64))
-    own = [k for k, span in enumerate(spans) if start_ns <= span.start_ns < start_ns + DAY_NS]
-    inside = pl.col("span").is_in(own)
+    of_day = [k for k, span in enumerate(spans) if start_ns <= span.start_ns < start_ns + DAY_NS]
+    inside = pl.col("span").is_in(of_day)
     return summed.filter(inside | ~inside.any().over("number"))
 
 
@@ -223,14 +223,14 @@ def _before(night: pl.DataFrame) -> tuple[np.ndarray, list[float | None]]:
     before = np.full(len(night), -1)
     chi2: list[float | None] = [None] * len(night)
     taken: set[int] = set()
-    claims = [
-        (claim, row, row_of[after])
-        for row, (claim, after) in enumerate(night.select("link_chi2", "after").iter_rows())
-        if claim is not None and after in row_of
+    candidates = [
+        (link_chi2, row, row_of[after])
+        for row, (link_chi2, after) in enumerate(night.select("link_chi2", "after").iter_rows())
+        if link_chi2 is not None and after in row_of
     ]
     end_ns, start_ns = night["end_ns"].to_list(), night["start_ns"].to_list()
-    for claim, row, after in sorted(claims):
+    for link_chi2, row, after in sorted(candidates):
         if after not in taken and end_ns[after] < start_ns[row]:
             taken.add(after)
-            before[row], chi2[row] = after, claim
+            before[row], chi2[row] = after, link_chi2
     return before, chi2

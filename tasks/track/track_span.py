@@ -145,7 +145,7 @@ def build_tracklets(
     """Return one sensor's detections with tracklet_id, track_id and kind, and its tracklets.
 
     Frames with an attitude are tracked on the sky. Frames without are tracked apart from them, in
-    the image. There stars move like objects and cannot be told from them.
+    the image. There stars move like objects and cannot be distinguished from them.
     """
     if not detections.num_rows:
         return Tracked(detections, empty(TRACKLET_RUNS), empty(HOT_SUSPECTS))
@@ -246,14 +246,14 @@ def _label(
         runs = [run for run in runs if not run.stands_still]
         _label_stars(labels, sightings, stars, np.flatnonzero(track == NONE))
     # What no run holds, no other sensor can confirm.
-    held = _held(places.place[kept], runs)
-    labels.kind[sightings.row[suspected & ~held]] = "hot_pixel"
+    in_runs = _in_runs(places.place[kept], runs)
+    labels.kind[sightings.row[suspected & ~in_runs]] = "hot_pixel"
     objects = sorted(runs, key=lambda run: int(run.members[0]))
     return _label_objects(part, sightings, objects, labels, detections, settings, suspected)
 
 
-def _held(place: npt.NDArray[np.int64], runs: list[TrackRun]) -> npt.NDArray[np.bool_]:
-    """Return which sightings are at a place of the image that a run has a sighting at."""
+def _in_runs(place: npt.NDArray[np.int64], runs: list[TrackRun]) -> npt.NDArray[np.bool_]:
+    """Return which sightings are at a pixel position that a run has a sighting at."""
     members = np.concatenate([np.zeros(0, np.int64), *(run.members for run in runs)])
     return np.isin(place, np.setdiff1d(place[members], [NOWHERE]))
 
@@ -285,11 +285,11 @@ def _label_objects(
 def _label_stars(
     labels: _Labels, sightings: Sightings, stars: list[TrackRun], single: npt.NDArray[np.int64]
 ) -> None:
-    """Label runs that stand still, and single sightings at their places, as unlisted stars."""
+    """Label runs that stand still, and single sightings at their positions, as unlisted stars."""
     for run in stars:
         labels.kind[sightings.row[run.members]] = "star_unlisted"
-    places = np.array([sightings.u_icrs[run.members].mean(axis=0) for run in stars])
-    labels.kind[sightings.row[single[at_star(sightings, single, places)]]] = "star_unlisted"
+    directions = np.array([sightings.u_icrs[run.members].mean(axis=0) for run in stars])
+    labels.kind[sightings.row[single[at_star(sightings, single, directions)]]] = "star_unlisted"
 
 
 def _name(

@@ -57,7 +57,7 @@ def test_a_list_of_ones_own_is_built_and_told_as_json(epipole, tmp_path):
     ("arguments", "said"),
     [
         ("none.csv", "none.csv: no such file; give hipparcos, deep, or"),
-        ("hipparcos --epoch 2000", "hipparcos has its own epoch and name"),
+        ("hipparcos --epoch 2000", "hipparcos has an epoch and a name"),
         ("hipparcos --limit -5", "no star of magnitude -5.0 or brighter"),
         (
             "mine.csv --epoch 2000",

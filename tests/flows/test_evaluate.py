@@ -151,7 +151,7 @@ def test_the_command_line_prints_a_table_or_json(night_log, night_dataset):
     arguments = ["evaluate", str(night_dataset), "--truth", f"{night_log}.truth"]
     printed = CliRunner().invoke(app, arguments)
     assert printed.exit_code == 0
-    assert re.search(r"stars +claimed +[\d,]+\n +precision +[\d.]+%\n", printed.output)
+    assert re.search(r"stars +identified +[\d,]+\n +precision +[\d.]+%\n", printed.output)
     as_json = CliRunner().invoke(app, [*arguments, "--json"])
     assert json.loads(as_json.output) == evaluate(night_dataset, night_log).as_dict()
 

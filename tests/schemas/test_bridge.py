@@ -32,7 +32,7 @@ from epipole.schemas.columns import (
     time_column,
 )
 
-PLACES = schema(
+SENSOR_STATES_AT_FRAMES = schema(
     "places",
     "One row per place.",
     [
@@ -52,7 +52,7 @@ def symmetric(n, k):
 def places(n=3):
     vectors = np.arange(3.0 * n).reshape(n, 3)
     columns = unstack("{}_km", vectors) | unstack_covariance("cov_{}", symmetric(n, 3))
-    return table(PLACES, columns | {"time": NS + np.arange(n)}), vectors
+    return table(SENSOR_STATES_AT_FRAMES, columns | {"time": NS + np.arange(n)}), vectors
 
 
 @pytest.mark.parametrize("carried", [lambda rows: rows, to_polars])
@@ -86,7 +86,7 @@ def test_arrays_from_arrow_and_from_polars_have_the_same_layout():
 def test_null_components_are_nan(carried):
     rows, vectors = places()
     missing = nullable(vectors[:, 1], np.array([True, False, True]))
-    rows = rows.set_column(2, PLACES.field("y_km"), missing)
+    rows = rows.set_column(2, SENSOR_STATES_AT_FRAMES.field("y_km"), missing)
     there = stack(carried(rows), "{}_km")
     assert np.isnan(there[1, 1])
     assert np.isfinite(there).sum() == there.size - 1
@@ -95,8 +95,8 @@ def test_null_components_are_nan(carried):
 def test_a_table_comes_back_from_polars_with_its_schema_and_its_nanoseconds():
     rows, _ = places()
     frame = to_polars(rows).with_columns(other=pl.lit(1))
-    back = from_polars(PLACES, frame)
-    assert back.schema.equals(PLACES, check_metadata=True)
+    back = from_polars(SENSOR_STATES_AT_FRAMES, frame)
+    assert back.schema.equals(SENSOR_STATES_AT_FRAMES, check_metadata=True)
     assert back.equals(rows)
     assert array(back, "time").tolist() == [NS, NS + 1, NS + 2]
 
@@ -104,10 +104,10 @@ def test_a_table_comes_back_from_polars_with_its_schema_and_its_nanoseconds():
 def test_a_frame_without_a_column_or_with_a_null_is_refused():
     frame = to_polars(places()[0])
     with pytest.raises(ValueError, match=r"table places: missing columns \['x_km'\]"):
-        from_polars(PLACES, frame.drop("x_km"))
+        from_polars(SENSOR_STATES_AT_FRAMES, frame.drop("x_km"))
     null = frame.with_columns(cov_xy=pl.lit(None, pl.Float64))
     with pytest.raises(ValueError, match="column cov_xy has 3 nulls; it may have none"):
-        from_polars(PLACES, null)
+        from_polars(SENSOR_STATES_AT_FRAMES, null)
 
 
 def test_a_table_of_unknown_mistyped_or_uneven_columns_is_refused():
@@ -124,10 +124,13 @@ def test_a_table_of_unknown_mistyped_or_uneven_columns_is_refused():
 def test_metadata_beside_the_schemas_are_kept():
     rows, _ = places()
     labelled = rows.replace_schema_metadata({"catalogue": "hipparcos", "table": "other"})
-    for kept in (conform(PLACES, labelled), concat(PLACES, [labelled])):
+    for kept in (
+        conform(SENSOR_STATES_AT_FRAMES, labelled),
+        concat(SENSOR_STATES_AT_FRAMES, [labelled]),
+    ):
         assert kept.schema.metadata[b"catalogue"] == b"hipparcos"
         assert kept.schema.metadata[b"table"] == b"places"
-    assert concat(PLACES, []).equals(empty(PLACES))
+    assert concat(SENSOR_STATES_AT_FRAMES, []).equals(empty(SENSOR_STATES_AT_FRAMES))
 
 
 def test_lists_come_back_flat():

@@ -26,8 +26,8 @@ KEPT = 4  # blocks in memory at most: those ahead and the latest
 class BlockReader:
     """Reads ranges of a remote file; for one thread at a time.
 
-    Before `stream`, each read fetches its own range, which suits scattered reads. After it, blocks
-    are fetched ahead, and the SHA-256 is computed from them.
+    Before `stream`, each read fetches exactly its range, which suits scattered reads. After it,
+    blocks are fetched ahead, and the SHA-256 is computed from them.
     """
 
     def __init__(

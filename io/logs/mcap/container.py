@@ -179,7 +179,7 @@ class ChannelTable:
 
 
 def string(data: Any, at: int, end: int) -> tuple[str, int]:
-    """Return an MCAP string and the place after it; raise ChunkError where it passes `end`."""
+    """Return an MCAP string and the offset after it; raise ChunkError where it passes `end`."""
     (length,) = struct.unpack_from("<I", data, at)
     if at + 4 + length > end:
         raise ChunkError(Reason.DAMAGED_CHUNK)

@@ -1,8 +1,8 @@
-"""Where the records of an MCAP file lie, found by their lengths, in a damaged file too.
+"""The segments of an MCAP file: where its records are, found by their lengths, even if damaged.
 
-The data section is walked from its start. Where a length is damaged, the walk goes on at the
-next chunk that the summary lists, if there is one: the summary may be damaged too. Records may be
-longer than their fields; what is behind the fields is skipped.
+The data section is walked from its start. Where a length is damaged, the walk continues at the next
+chunk that the summary lists, if there is one: the summary may be damaged too. Records may be longer
+than their fields; what is behind the fields is skipped.
 """
 
 from collections.abc import Iterator
@@ -41,15 +41,15 @@ from epipole.io.logs.mcap.record_scan import (
 )
 from epipole.schemas.rejects import Reason
 
-RUN = -1  # the opcode of a place with many records outside chunks
+RUN = -1  # the opcode of a segment with many records outside chunks
 RUN_BYTES = 4 << 20  # of records outside chunks that are walked at once
 # How many are tried first: chunks and other records may take turns, and what is read for a run is
 # read again behind it.
 MIN_RUN_BYTES = NEAR_BYTES // 4
 
 
-class Place(NamedTuple):
-    """A stretch of the data section: a record, a run of records, or damage with a reason."""
+class Segment(NamedTuple):
+    """A part of the data section: a record, a run of records, or damage with a reason."""
 
     opcode: int
     at: int
@@ -63,15 +63,15 @@ class Place(NamedTuple):
 
 
 @dataclass
-class LogPlaces:
-    """The places in the data section of one log, in the order of the file."""
+class LogSegments:
+    """The segments in the data section of one log, in the order of the file."""
 
     data: LogBytes
     summary: LogSummary
     _next_listed: int = 0  # the first chunk that the summary lists and the walk has not passed
     _run_bytes: int = MIN_RUN_BYTES
 
-    def __iter__(self) -> Iterator[Place]:
+    def __iter__(self) -> Iterator[Segment]:
         data, end, at = self.data, len(self.data), len(MAGIC)
         self._next_listed = 0
         while at + RECORD.size <= end:
@@ -87,12 +87,12 @@ class LogPlaces:
                     if opcode == CHUNK:
                         cut = data.view(at, min(end, at + MAX_RECORD_BYTES))
                         size = 0 if head is None else head.size
-                        yield Place(CHUNK, at, end, data=cut, size=size, cut=True)
+                        yield Segment(CHUNK, at, end, data=cut, size=size, cut=True)
                     break
-                yield Place(opcode, at, skipped_to, Reason.DAMAGED_RECORD)
+                yield Segment(opcode, at, skipped_to, Reason.DAMAGED_RECORD)
                 at = skipped_to
             elif opcode == DATA_END and (behind := self._behind(at, after)) is not None:
-                yield Place(
+                yield Segment(
                     DATA_END, at, after, data=data.view(at, min(after, at + DATA_END_BYTES))
                 )
                 if behind.reason is not None:
@@ -101,28 +101,30 @@ class LogPlaces:
                     return
                 at = behind.after
             else:
-                place = self._place(opcode, at, after, limit, head)
-                yield place
-                at = place.after
-        yield Place(0, at, end, Reason.TRUNCATED)
+                segment = self._segment(opcode, at, after, limit, head)
+                yield segment
+                at = segment.after
+        yield Segment(0, at, end, Reason.TRUNCATED)
 
-    def _place(self, opcode: int, at: int, after: int, limit: int, head: ChunkHead | None) -> Place:
+    def _segment(
+        self, opcode: int, at: int, after: int, limit: int, head: ChunkHead | None
+    ) -> Segment:
         """Return the record from `at` to `after`; mostly together with those that follow."""
         if opcode == CHUNK:
             if after - at > MAX_RECORD_BYTES:
-                return Place(CHUNK, at, after, Reason.CHUNK_TOO_LARGE)
+                return Segment(CHUNK, at, after, Reason.CHUNK_TOO_LARGE)
             size, chunk_end = (0, after) if head is None else (head.size, min(head.end, after))
-            return Place(CHUNK, at, after, None, self.data.view(at, chunk_end), size)
+            return Segment(CHUNK, at, after, None, self.data.view(at, chunk_end), size)
         if opcode == MESSAGE_INDEX:
             window = self.data.view(at, min(at + MIN_RUN_BYTES, limit))
             *counted, walked = index_counts(np.frombuffer(window, np.uint8), limit - at)
             if walked:
-                return Place(opcode, at, at + walked, counted=(counted[0], counted[1]))
+                return Segment(opcode, at, at + walked, counted=(counted[0], counted[1]))
         if opcode == HEADER and self.data.view(at - len(MAGIC), at) == MAGIC:
-            return Place(opcode, at, after)
+            return Segment(opcode, at, after)
         return self._run(opcode, at, after, limit)
 
-    def _run(self, opcode: int, at: int, after: int, limit: int) -> Place:
+    def _run(self, opcode: int, at: int, after: int, limit: int) -> Segment:
         """Return the record from `at` to `after`, and those that follow to a chunk or its index."""
         if after - at <= self._run_bytes or (
             opcode in (SCHEMA, CHANNEL, MESSAGE) and after - at <= MAX_RECORD_BYTES
@@ -132,30 +134,30 @@ class LogPlaces:
             is_long = walked > self._run_bytes // 2
             self._run_bytes = min(4 * self._run_bytes, RUN_BYTES) if is_long else MIN_RUN_BYTES
             if walked:
-                return Place(RUN, at, at + walked, None, window[:walked], walked)
+                return Segment(RUN, at, at + walked, None, window[:walked], walked)
         is_skipped = opcode >= PRIVATE or opcode in (ATTACHMENT, METADATA)
-        return Place(opcode, at, after, None if is_skipped else Reason.DAMAGED_RECORD)
+        return Segment(opcode, at, after, None if is_skipped else Reason.DAMAGED_RECORD)
 
-    def _behind(self, at: int, after: int) -> Place | None:
+    def _behind(self, at: int, after: int) -> Segment | None:
         """Return what lies behind the log that a record at `at` ends; None where it ends none."""
         size = len(self.data)
         if at == self.summary.data_end:
-            return Place(0, size, size)
+            return Segment(0, size, size)
         end = end_of_log(self.data, after)
         if end is None:
             return None
         begins = end + len(MAGIC)
         if begins <= size and self.data.view(end, begins) == MAGIC:
-            return Place(0, end, begins, Reason.LOG_BEHIND_LOG)
+            return Segment(0, end, begins, Reason.LOG_BEHIND_LOG)
         if self.summary.data_end is not None:
             return None
         if end == size:
-            return Place(0, size, size)
+            return Segment(0, size, size)
         reason = Reason.TRUNCATED if end > size else Reason.DAMAGED_RECORD
-        return Place(0, min(end, size), size, reason)
+        return Segment(0, min(end, size), size, reason)
 
     def _next_chunk(self, at: int, after: int) -> int | None:
-        """Return the first place after `at` where the summary lists a chunk.
+        """Return the first offset after `at` where the summary lists a chunk.
 
         One within the record from `at` to `after` counts only if a chunk begins there.
         """
@@ -179,7 +181,7 @@ class LogPlaces:
         )
 
     def _is_padded(self, head: ChunkHead, after: int, limit: int) -> bool:
-        """Return whether a chunk's record goes on behind its fields, to where a record begins."""
+        """Return whether a chunk's record is longer than its fields, and a record follows it."""
         return (
             head.end < after <= limit
             and self._begins_record(after, limit)

@@ -24,7 +24,7 @@ kernel = njit(**_OPTIONS)
 
 
 def _load(bits: int, kind: Any) -> Any:
-    """Return a function of (bytes, place): one load instruction, for which numba has no function.
+    """Return a function of (bytes, offset): one load instruction, which numba has no function for.
 
     The bytes must reach beyond the number: no bound is checked.
     """
@@ -33,8 +33,8 @@ def _load(bits: int, kind: Any) -> Any:
     def load(typing_context, data, at):
         def code(context, builder, signature, values):
             array = context.make_array(signature.args[0])(context, builder, values[0])
-            place = builder.gep(array.data, [values[1]])
-            pointer = builder.bitcast(place, ir.IntType(bits).as_pointer())
+            address = builder.gep(array.data, [values[1]])
+            pointer = builder.bitcast(address, ir.IntType(bits).as_pointer())
             return builder.load(pointer, align=1)
 
         return kind(data, types.int64), code
@@ -118,7 +118,7 @@ def _columns(n: int) -> list[npt.NDArray[Any]]:
 
 @kernel
 def _ends_run(data, kind, after):
-    """Return whether a record outside chunks is none of those that may stand in a run."""
+    """Return whether a record outside chunks ends a run of records."""
     if kind == DATA_END and after < len(data):
         # Where no summary follows, it ends nothing.
         return data[after] >= PRIVATE or data[after] == FOOTER or data[after] in OF_SUMMARY

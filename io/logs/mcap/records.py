@@ -29,7 +29,7 @@ from epipole.io.logs.mcap.container import (
     read_summary,
 )
 from epipole.io.logs.mcap.damage_rows import Damage, DamageRows
-from epipole.io.logs.mcap.record_layout import RUN, LogPlaces, Place
+from epipole.io.logs.mcap.record_layout import RUN, LogSegments, Segment
 from epipole.io.logs.mcap.record_scan import (
     CHUNK,
     DATA_END,
@@ -71,7 +71,7 @@ class Block(NamedTuple):
     time_ns: npt.NDArray[np.uint64]  # when it was logged
     start: Numbers
     end: Numbers
-    offset: Numbers  # place in the file of its chunk; outside chunks, of the message
+    offset: Numbers  # in the file, of its chunk; outside chunks, of the message
 
 
 @dataclass
@@ -95,7 +95,7 @@ class RecordWalk:
 
     def __post_init__(self) -> None:
         self._channels = ChannelTable(self.wanted, ChannelTable(self.wanted))
-        self._places = LogPlaces(self.data, self._summary)
+        self._segments = LogSegments(self.data, self._summary)
 
     @property
     def damage(self) -> list[Damage]:
@@ -105,36 +105,36 @@ class RecordWalk:
     def blocks(self) -> Iterator[Block]:
         """Yield the wanted messages in the order of the file; late declared ones come last."""
         in_summary = ChannelTable(self.wanted)
-        self._places.summary = self._summary = read_summary(self.data, in_summary)
+        self._segments.summary = self._summary = read_summary(self.data, in_summary)
         self._channels.summary = in_summary
         self._promised = frozenset(filter(in_summary.find, self._summary.declared))
         self._unchecked = self._summary.data_end is None
         self.data.stream()
-        for place, opening in self._opened_ahead(self._places):
-            yield from self._walk_place(place, opening)
+        for segment, opening in self._opened_ahead(self._segments):
+            yield from self._read_segment(segment, opening)
         self._end_log()
         self._report_missing()
         if (late := self._undeclared.late()) is not None:
             yield from self._walk_again(late)
 
     def _opened_ahead(
-        self, places: Iterable[Place]
-    ) -> Iterator[tuple[Place, Future[OpenedChunk] | None]]:
-        """Yield the places; if there is a pool, it is already opening their chunks."""
-        waiting: deque[tuple[Place, Future[OpenedChunk] | None]] = deque()
+        self, segments: Iterable[Segment]
+    ) -> Iterator[tuple[Segment, Future[OpenedChunk] | None]]:
+        """Yield the segments; if there is a pool, it is already opening their chunks."""
+        waiting: deque[tuple[Segment, Future[OpenedChunk] | None]] = deque()
         ahead, unpacked = 0, 0
         most = max(MIN_UNPACKED_BYTES, MAX_EXPANSION * len(self.data))
-        for place in places:
+        for segment in segments:
             opening = None
-            if place.opcode == CHUNK and not place.reason:
-                if unpacked + place.size > most:
-                    place = Place(CHUNK, place.at, place.after, Reason.CHUNK_TOO_LARGE)
-                unpacked += place.size
-            is_whole_chunk = place.opcode == CHUNK and not (place.reason or place.cut)
-            if self.pool is not None and is_whole_chunk and _cost(place) > SMALL_BYTES:
-                opening = self.pool.submit(open_chunk, place.data)
-            waiting.append((place, opening))
-            ahead += _cost(place)
+            if segment.opcode == CHUNK and not segment.reason:
+                if unpacked + segment.size > most:
+                    segment = Segment(CHUNK, segment.at, segment.after, Reason.CHUNK_TOO_LARGE)
+                unpacked += segment.size
+            is_whole_chunk = segment.opcode == CHUNK and not (segment.reason or segment.cut)
+            if self.pool is not None and is_whole_chunk and _cost(segment) > SMALL_BYTES:
+                opening = self.pool.submit(open_chunk, segment.data)
+            waiting.append((segment, opening))
+            ahead += _cost(segment)
             while waiting and (ahead > AHEAD_BYTES or waiting[0][1] is None):
                 ahead -= _cost(waiting[0][0])
                 yield waiting.popleft()
@@ -142,31 +142,33 @@ class RecordWalk:
 
     # What is in the file
 
-    def _walk_place(self, place: Place, opening: Future[OpenedChunk] | None) -> Iterator[Block]:
-        if place.counted is None:
+    def _read_segment(
+        self, segment: Segment, opening: Future[OpenedChunk] | None
+    ) -> Iterator[Block]:
+        if segment.counted is None:
             self._in_chunk = {}  # only indexes that follow a chunk at once are about it
-        if place.reason == Reason.LOG_BEHIND_LOG:
+        if segment.reason == Reason.LOG_BEHIND_LOG:
             self._end_log()
-            self._log_start = place.at
+            self._log_start = segment.at
             self._channels.forget()
             self._declared = no_declarations()
-        if place.reason:
-            row = self._damage.add(place.at, 0, place.reason)
-            if place.opcode == CHUNK:
+        if segment.reason:
+            row = self._damage.add(segment.at, 0, segment.reason)
+            if segment.opcode == CHUNK:
                 self._lost_chunk, self._n_lost = row, 0
-        elif place.opcode == CHUNK:
-            yield from self._walk_chunk(place, _open(place, opening))
-        elif place.counted is not None:
-            self._count_lost(place.at, *place.counted)
-        elif place.opcode == RUN:
-            yield from self._walk_run(place)
-        elif place.opcode == DATA_END:
-            self._check_data_section(place)
+        elif segment.opcode == CHUNK:
+            yield from self._walk_chunk(segment, _open(segment, opening))
+        elif segment.counted is not None:
+            self._count_lost(segment.at, *segment.counted)
+        elif segment.opcode == RUN:
+            yield from self._walk_run(segment)
+        elif segment.opcode == DATA_END:
+            self._check_data_section(segment)
 
-    def _walk_chunk(self, place: Place, opened: OpenedChunk) -> Iterator[Block]:
+    def _walk_chunk(self, segment: Segment, opened: OpenedChunk) -> Iterator[Block]:
         """Yield the messages of a chunk."""
         self._lost_chunk = None
-        at, start_ns = place.at, opened.start_ns
+        at, start_ns = segment.at, opened.start_ns
         if opened.reason:
             self._lost_chunk, self._n_lost = self._damage.add(at, start_ns, opened.reason), 0
             return
@@ -174,41 +176,41 @@ class RecordWalk:
         data, n_strange, walked = _bytes(opened.records), 0, 0
         self._in_chunk = {}
         for index in index_records(data):
-            yield from self._walk_index(data, index, _offsets(place, index), start_ns)
+            yield from self._walk_index(data, index, _offsets(segment, index), start_ns)
             counts = np.bincount(index.channel[index.opcode == MESSAGE])
             for number in np.flatnonzero(counts).tolist():
                 self._in_chunk[number] = self._in_chunk.get(number, 0) + int(counts[number])
             n_strange, walked = n_strange + index.n_strange, index.walked
         if n_strange:
             self._damage.add(at, start_ns, Reason.DAMAGED_RECORD, n_strange)
-        if walked < len(data) and not place.cut:
+        if walked < len(data) and not segment.cut:
             self._damage.add(at, start_ns, Reason.DAMAGED_CHUNK)
 
-    def _walk_run(self, place: Place) -> Iterator[Block]:
+    def _walk_run(self, segment: Segment) -> Iterator[Block]:
         """Yield the messages of a run of records outside chunks."""
-        data = _bytes(place.data)
+        data = _bytes(segment.data)
         for index in index_records(data, outside=True):
             self._unchecked |= MESSAGE in index.opcode
             if index.n_strange:
-                at = place.at + index.first_strange
+                at = segment.at + index.first_strange
                 self._damage.add(at, 0, Reason.DAMAGED_RECORD, index.n_strange)
-            yield from self._walk_index(data, index, _offsets(place, index), 0)
+            yield from self._walk_index(data, index, _offsets(segment, index), 0)
 
-    def _check_data_section(self, place: Place) -> None:
+    def _check_data_section(self, segment: Segment) -> None:
         """Compare the data section with the checksum at its end, if no other checksum covers it.
 
         This reads the log again. A wrong checksum does not say which message is damaged: those
         whose values are valid have been used.
         """
-        expected = int.from_bytes(place.data[RECORD.size :], "little")
+        expected = int.from_bytes(segment.data[RECORD.size :], "little")
         if expected and self._unchecked:
             checksum = 0
-            for low in range(self._log_start, place.at, BLOCK_BYTES):
+            for low in range(self._log_start, segment.at, BLOCK_BYTES):
                 checksum = zlib.crc32(
-                    self.data.view(low, min(low + BLOCK_BYTES, place.at)), checksum
+                    self.data.view(low, min(low + BLOCK_BYTES, segment.at)), checksum
                 )
             if checksum != expected:
-                self._damage.add(place.at, 0, Reason.BAD_DATA_CHECKSUM)
+                self._damage.add(segment.at, 0, Reason.BAD_DATA_CHECKSUM)
 
     def _walk_index(
         self, data: Bytes, index: RecordIndex, offset: Numbers, start_ns: int
@@ -287,19 +289,19 @@ class RecordWalk:
     def _walk_again(self, late: LateMessages) -> Iterator[Block]:
         """Yield the messages that come before their declarations; no damage is reported again."""
         n_logs = 0
-        for place, opening in self._opened_ahead(self._places):
+        for segment, opening in self._opened_ahead(self._segments):
             if not late:
                 return
-            if place.reason == Reason.LOG_BEHIND_LOG:
+            if segment.reason == Reason.LOG_BEHIND_LOG:
                 n_logs += 1
                 late.begin_log(n_logs)
-            elif not place.reason and place.opcode in (CHUNK, RUN):
-                data = _bytes(_open(place, opening).records)
-                for index in index_records(data, outside=place.opcode == RUN):
+            elif not segment.reason and segment.opcode in (CHUNK, RUN):
+                data = _bytes(_open(segment, opening).records)
+                for index in index_records(data, outside=segment.opcode == RUN):
                     messages = np.flatnonzero(index.opcode == MESSAGE)
                     chosen = messages[late.take(index.channel[messages])]
                     columns = [getattr(index, name)[chosen] for name in PER_RECORD[1:]]
-                    columns.append(_offsets(place, index)[chosen])
+                    columns.append(_offsets(segment, index)[chosen])
                     yield Block(data, late.channels, *columns)
 
     # What is missing in it
@@ -339,25 +341,25 @@ class RecordWalk:
             self._damage.add(0, 0, Reason.MISSING_MESSAGES, missing)
 
 
-def _cost(place: Place) -> int:
-    """Return about how many bytes a place takes while it waits, and when it is opened."""
-    return place.size + len(place.data) + WAITING_BYTES
+def _cost(segment: Segment) -> int:
+    """Return about how many bytes a segment takes while it waits, and when it is opened."""
+    return segment.size + len(segment.data) + WAITING_BYTES
 
 
-def _open(place: Place, opening: Future[OpenedChunk] | None) -> OpenedChunk:
+def _open(segment: Segment, opening: Future[OpenedChunk] | None) -> OpenedChunk:
     """Return the records of a chunk, or of a run of records outside chunks."""
     if opening is not None:
         return opening.result()
-    if place.opcode == CHUNK:
-        return open_cut_chunk(place.data) if place.cut else open_chunk(place.data)
-    return OpenedChunk(0, place.data)
+    if segment.opcode == CHUNK:
+        return open_cut_chunk(segment.data) if segment.cut else open_chunk(segment.data)
+    return OpenedChunk(0, segment.data)
 
 
-def _offsets(place: Place, index: RecordIndex) -> Numbers:
+def _offsets(segment: Segment, index: RecordIndex) -> Numbers:
     """Return where in the file the records lie; those of a chunk lie where the chunk does."""
-    if place.opcode == CHUNK:
-        return np.full(len(index.start), place.at)
-    offset = place.at + index.start - RECORD.size
+    if segment.opcode == CHUNK:
+        return np.full(len(index.start), segment.at)
+    offset = segment.at + index.start - RECORD.size
     offset[index.opcode == MESSAGE] -= MESSAGE_BYTES
     return offset
 

@@ -45,7 +45,7 @@ class Undeclared:
     _n_logs: int = 0  # that have ended
 
     def add(self, number: int, n: int, offset: int, time_ns: int) -> None:
-        """Count messages of a channel; the place and time are those of the first one."""
+        """Count messages of a channel; the offset and time are those of the first one."""
         before = self._waiting.get(number, Waiting(0, offset, time_ns))
         self._waiting[number] = before._replace(n=before.n + n)
 

@@ -53,7 +53,7 @@ def known_id(sensor_id: str) -> str | None:
 
 
 class Received(NamedTuple):
-    """A decoded message, its place in the log and when it was logged."""
+    """A decoded message, its offset in the log, and when it was logged."""
 
     message: Any
     offset: int
@@ -87,7 +87,7 @@ class MessageBatch:
 
     @cached_property
     def offset(self) -> Indices:
-        """The place in the log of each message."""
+        """The offset in the log of each message."""
         return self.block.offset[self.chosen]
 
     @cached_property

@@ -16,9 +16,9 @@ from epipole.schemas.log_bounds import CORNER, DISTORTION, FOCAL_LENGTH, FOCAL_R
 from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import CAMERAS
 
-POWERS = (2, 4, 1, 1, 6)  # of the distance, by which k1 k2 p1 p2 k3 move a place
-# The distortion is followed to so many times the distance of the corner; within its bounds it
-# moves nothing that far.
+POWERS = (2, 4, 1, 1, 6)  # of the distance, by which k1 k2 p1 p2 k3 move an image position
+# Limit of the search, in distances of the corner. Within its bounds the distortion moves nothing
+# that far.
 FARTHEST_UNDISTORTED = 4.0
 FOLD_STEPS, FOLD_DIRECTIONS = 400, 32
 
@@ -114,7 +114,7 @@ def _folds(D: tuple[float, ...], corner: float) -> bool:
     """Return whether the distortion folds the image within the distance of its farthest corner.
 
     Along a ray from the boresight the distorted distance must grow until it reaches that of the
-    corner, and the derivative of the distorted place must keep its sign, whatever the direction.
+    corner, and the derivative of the distorted position must keep its sign, whatever the direction.
     """
     k1, k2, p1, p2, k3 = (*D, 0.0)[:5]
     r = np.linspace(0.0, FARTHEST_UNDISTORTED * corner, FOLD_STEPS)

@@ -142,10 +142,10 @@ _ARRAYS = {"float": FLOATS, "double": DOUBLES}
 def _field_types(message: MessageType) -> Integers:
     """Return the type of each field of a message, by its number."""
     types = np.full(len(message.members) + 1, UNKNOWN, np.int64)
-    for place, member in enumerate(message.members, start=1):
-        if member.number != place:
-            raise ValueError(f"{message.name}: {member.name} must be field {place}")
-        types[place] = _ARRAYS[member.type] if member.repeated else _SCALARS[member.type]
+    for number, member in enumerate(message.members, start=1):
+        if member.number != number:
+            raise ValueError(f"{message.name}: {member.name} must be field {number}")
+        types[number] = _ARRAYS[member.type] if member.repeated else _SCALARS[member.type]
     return types
 
 

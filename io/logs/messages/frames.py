@@ -12,7 +12,14 @@ from epipole.io.logs.messages.batches import MessageBatch, Received, fault, know
 from epipole.io.logs.messages.encoding import FrameMessage
 from epipole.io.logs.messages.scan import FrameRows, NameCodes, scan_frames
 from epipole.schemas.bridge import table
-from epipole.schemas.log_bounds import CENTROID_SIGMA, EXPOSURE, FLUX, FRAME_NUMBER, PLACE, Bound
+from epipole.schemas.log_bounds import (
+    CENTROID_POSITION,
+    CENTROID_SIGMA,
+    EXPOSURE,
+    FLUX,
+    FRAME_NUMBER,
+    Bound,
+)
 from epipole.schemas.rejects import Reason
 from epipole.schemas.work_tables import EXPOSURES
 
@@ -155,11 +162,13 @@ class FrameColumns:
         flux, has_flux = _joined_or_nan([f.flux for f in frames], lengths)
         with np.errstate(invalid="ignore"):
             not_finite = _any(~(np.isfinite(x) & np.isfinite(y)), lengths)
-            bad_place = _any(~(_within(PLACE, x) & _within(PLACE, y)), lengths)
+            bad_position = _any(
+                ~(_within(CENTROID_POSITION, x) & _within(CENTROID_POSITION, y)), lengths
+            )
             bad_sigma = _any(~_within(CENTROID_SIGMA, sigma), lengths) & has_sigma
             flux[~_within(FLUX, flux)] = np.nan
-        keep = ~(bad_place | bad_sigma)
-        bad_number = np.where(bad_place, Reason.BAD_CENTROID, Reason.BAD_SIGMA)
+        keep = ~(bad_position | bad_sigma)
+        bad_number = np.where(bad_position, Reason.BAD_CENTROID, Reason.BAD_SIGMA)
         reasons = np.where(not_finite, Reason.NAN, bad_number)
         for i in np.flatnonzero(~keep).tolist():
             self._leave_out(received[i], Reason(reasons[i]))

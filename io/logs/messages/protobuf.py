@@ -274,7 +274,7 @@ def _calibration(data: bytes) -> CalibrationMessage:
 
 @kernel
 def _load_varint(data, at, end):
-    """Return a varint and the place after it, which is -1 where the varint is invalid.
+    """Return a varint and the offset after it, which is -1 where the varint is invalid.
 
     Only nine of the ten bytes that a varint may have are read: a number that needs the tenth is
     negative, or too large for any field here.
@@ -348,7 +348,7 @@ def _locate_fields(data, at, end, types, fields, i):
             if at < 0 or (kind != UNKNOWN and kind != INTEGER):
                 return False
             if kind == INTEGER:
-                fields[i, 2 * number] = np.int64(value)  # below 2**63: nine bytes hold no more
+                fields[i, 2 * number] = np.int64(value)  # below 2**63: nine bytes are the maximum
         elif wire == 1 or wire == 5:
             width = 8 if wire == 1 else 4
             if end - at < width or (kind != UNKNOWN and (kind != DOUBLE or wire == 5)):

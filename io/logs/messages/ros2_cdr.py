@@ -1,4 +1,4 @@
-"""Messages as ROS 2 writes them: CDR, each number aligned to its own size."""
+"""Messages as ROS 2 writes them: CDR, each number aligned to its size."""
 
 import struct
 from collections.abc import Callable

@@ -32,7 +32,7 @@ def _bits(value: float) -> np.int32:
 # one place.
 EARLIEST_NS, LATEST_NS = int(bounds.TIME.least), int(bounds.TIME.greatest)
 LONGEST_S = bounds.EXPOSURE.greatest
-FARTHEST_BITS = _bits(bounds.PLACE.greatest)
+FARTHEST_BITS = _bits(bounds.CENTROID_POSITION.greatest)
 FLUX_BITS = _bits(bounds.FLUX.least), _bits(bounds.FLUX.greatest)
 SIGMA_BITS = _bits(bounds.CENTROID_SIGMA.least), _bits(bounds.CENTROID_SIGMA.greatest)
 NEAREST_KM2 = (bounds.POSITION.least * 1.0001) ** 2
@@ -153,7 +153,7 @@ def _sensor(data, at, n, names, channel):
 
 
 @kernel
-def _copy_places(data, at, bits, low, n):
+def _copy_positions(data, at, bits, low, n):
     """Copy the bits of `n` float32 from byte `at` on; return whether all are within bounds."""
     to, bad = np.uint64(low), np.int32(0)  # unsigned: numba need not check for negative indices
     for k in range(n):
@@ -204,8 +204,8 @@ def scan_frames(messages, i, names, rows, n):
         exposed_s = np.uint64(fields[i, EXPOSURE]).view(np.float64)
         if not (EARLIEST_NS <= fields[i, TIME] <= LATEST_NS and 0 <= exposed_s <= LONGEST_S):
             break
-        good = _copy_places(data, fields[i, X], x_bits, low, size)
-        good &= _copy_places(data, fields[i, Y], y_bits, low, size)
+        good = _copy_positions(data, fields[i, X], x_bits, low, size)
+        good &= _copy_positions(data, fields[i, Y], y_bits, low, size)
         good &= _copy_positive(data, fields[i, SIGMA], n_sigma, SIGMA_BITS, sigma_bits, low, size)
         if not good:
             break

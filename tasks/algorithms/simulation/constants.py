@@ -1,6 +1,6 @@
 """The simulator's physical constants, each with its source.
 
-The pipeline has its own (`algorithms/constants`). The simulator imports none of them: an error
+The pipeline's are in `algorithms/constants`. The simulator imports none of them: an error
 in one of the two would otherwise be in the truth too, and no test could see it.
 """
 

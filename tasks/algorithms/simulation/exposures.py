@@ -19,7 +19,7 @@ from epipole.tasks.algorithms.simulation.optics import (
     boost,
     field_radius,
     hidden_by_earth,
-    image_place,
+    image_position,
     on_image,
     received_from,
 )
@@ -207,7 +207,7 @@ class Exposing:
         in_sensor = np.einsum("nij,nj->ni", R, u)
         ok = in_sensor[:, 2] > np.cos(self._radius)
         x, y = np.full(len(u), np.nan), np.full(len(u), np.nan)
-        x[ok], y[ok] = image_place(self.sensor.optics, in_sensor[ok])
+        x[ok], y[ok] = image_position(self.sensor.optics, in_sensor[ok])
         return x, y, ok
 
     def _close_stars(self) -> tuple[Indices, Indices]:

@@ -40,7 +40,7 @@ def bend(optics: TrueOptics, x: Array, y: Array) -> tuple[Array, Array]:
     )
 
 
-def image_place(optics: TrueOptics, u: Array) -> tuple[Array, Array]:
+def image_position(optics: TrueOptics, u: Array) -> tuple[Array, Array]:
     """Return columns and rows [px] of (n, 3) sensor-frame directions with z > 0."""
     x, y = bend(optics, u[:, 0] / u[:, 2], u[:, 1] / u[:, 2])
     return optics.fx_px * x + optics.cx_px, optics.fy_px * y + optics.cy_px

@@ -10,7 +10,7 @@ from epipole.io.caches import kernel_warm_up
 from epipole.io.caches.kernel_warm_up import (
     compile_beside,
     compile_kernels,
-    compiling_told,
+    report_compiling,
 )
 from epipole.io.caches.kernels import new_kernel_folder, only_one
 
@@ -132,7 +132,7 @@ def test_what_is_compiled_is_counted_from_the_files_that_appear(folder, monkeypa
 
     def counted(is_first: bool) -> list[tuple[int, int]]:
         told = []
-        with compiling_told(lambda *count: told.append(count), is_first):
+        with report_compiling(lambda *count: told.append(count), is_first):
             (folder / "some").mkdir(exist_ok=True)
             (folder / "some" / f"{len(list(folder.glob('*/*')))}.nbi").touch()
             while not told:
@@ -145,5 +145,5 @@ def test_what_is_compiled_is_counted_from_the_files_that_appear(folder, monkeypa
 
 def test_a_run_that_compiles_nothing_tells_nothing(folder, monkeypatch):
     monkeypatch.setattr(kernel_warm_up, "LOOKED_EVERY_S", 0.01)
-    with compiling_told(lambda *_: pytest.fail("nothing was compiled"), False):
+    with report_compiling(lambda *_: pytest.fail("nothing was compiled"), False):
         time.sleep(0.05)

@@ -17,7 +17,7 @@ from scenes.published import publish as publish_once
 from scenes.twice import twice
 
 from epipole.flows.evaluate import evaluate
-from epipole.flows.night.recorded_nights import held_nights
+from epipole.flows.night.recorded_nights import published_nights
 from epipole.flows.nightly import nightly
 from epipole.io.datasets import dataset, object_store
 from epipole.io.datasets.dataset import lock_nights
@@ -290,7 +290,7 @@ def test_a_run_reads_from_a_bucket_and_publishes_to_one(s3, out, prefect, night_
     for name in sorted(set(TABLES) - {"sources", "nights"}):  # these tell the log's name
         assert read_table(out, name, NIGHT).equals(read_table(night_dataset, name, NIGHT)), name
     for _ in range(2):
-        assert [night.stale for night in held_nights(out, Settings(), None)] == [[]]
+        assert [night.stale for night in published_nights(out, Settings(), None)] == [[]]
     assert evaluate(out, night_log).as_dict() == evaluate(night_dataset, night_log).as_dict()
     others = [path for path in s3.find(out) if "/night=" not in path]
     assert [path.rpartition("/ds/")[2] for path in others] == [f"reports/{NIGHT}.html"]

@@ -11,7 +11,7 @@ from epipole.schemas.tables import STARS
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, project
 from epipole.tasks.calibrate.calibrate_sensors import calibrate_sensors
-from epipole.tasks.read.order_frames import with_uncertain_places
+from epipole.tasks.read.order_frames import with_uncertain_principal_points
 
 SENT = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)
 TRUE = SENT._replace(fx_px=3671.0, fy_px=3671.0, k1=-0.08)
@@ -93,7 +93,7 @@ def place_sigma(found):
 def test_a_principal_point_is_as_uncertain_as_the_settings_say(sigma_px):
     """Where the stars do not contradict the log, too. In 16 degrees they hardly say more."""
     stars = concat(STARS, [stars_of("a", TRUE), stars_of("b", SENT)])
-    told = with_uncertain_places(cameras("a", "b"), sigma_px)
+    told = with_uncertain_principal_points(cameras("a", "b"), sigma_px)
     found = calibrate_sensors(stars, told, told, sigma_px)
     assert found.departed == ["a", "b"]
     np.testing.assert_array_less(0.5 * sigma_px, place_sigma(found))
@@ -103,7 +103,7 @@ def test_a_principal_point_is_as_uncertain_as_the_settings_say(sigma_px):
 
 
 def test_a_principal_point_that_is_known_stays_and_has_no_error():
-    told = with_uncertain_places(cameras("a"), 0.0)
+    told = with_uncertain_principal_points(cameras("a"), 0.0)
     found = calibrate_sensors(stars_of("a", TRUE), told, told, 0.0)
     assert found.departed == ["a"]
     assert array(found.cameras, "cx_px")[0] == SENT.cx_px

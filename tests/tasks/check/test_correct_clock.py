@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 
 from epipole.schemas.bridge import array, table
-from epipole.schemas.work_tables import PLACES, SOLUTIONS
+from epipole.schemas.work_tables import SENSOR_STATES_AT_FRAMES, SOLUTIONS
 from epipole.tasks.check.check_sensors import SensorVerdict
 from epipole.tasks.check.correct_clock import at_places, at_true_times
 
@@ -28,14 +28,14 @@ def frames(schema, **columns):
 
 def test_frames_of_wrong_clocks_are_put_at_their_true_times():
     for clock, shift_s in ((LATE, -0.25), (EARLY, 0.5)):
-        moved = at_true_times(frames(PLACES), clock)
+        moved = at_true_times(frames(SENSOR_STATES_AT_FRAMES), clock)
         expected = (np.array([0, 1] * 3) + shift_s) * 1e9
         np.testing.assert_array_equal(array(moved, "time"), expected)
-        assert moved.schema.equals(PLACES)
+        assert moved.schema.equals(SENSOR_STATES_AT_FRAMES)
 
 
 def test_places_are_taken_by_frame_whatever_their_order():
-    places = frames(PLACES, **{f"{a}_km": np.arange(6.0) for a in "xyz"})
+    places = frames(SENSOR_STATES_AT_FRAMES, **{f"{a}_km": np.arange(6.0) for a in "xyz"})
     solutions = frames(SOLUTIONS, x_km=np.full(6, 7.0))
     moved = at_places(solutions, places.take([5, 3, 1, 0, 2, 4]))
     assert moved["x_km"].to_pylist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]

@@ -1,4 +1,4 @@
-"""True objects of views and of claims."""
+"""True objects of views and of estimates."""
 
 import dataclasses
 
@@ -14,18 +14,18 @@ from epipole.tasks.algorithms.simulation.paths import state_at
 from epipole.tasks.evaluate.matching import (
     detected_objects,
     locate_objects,
-    match_claims,
+    match_estimates,
     match_positions,
     match_views,
-    possible_claims,
+    possible_estimates,
 )
 
 POINTS = to_polars(little_truth().points)
 
 
-def claims_of(views, detections):
+def estimates_of(views, detections):
     detections = detected_objects(to_polars(rows(DETECTIONS, *detections)), POINTS)
-    return match_claims(match_views(to_polars(rows(ASSOCIATIONS, *views)), detections, POINTS))
+    return match_estimates(match_views(to_polars(rows(ASSOCIATIONS, *views)), detections, POINTS))
 
 
 def view(object_id="o1", sensor_id="a", centroid=None, **other):
@@ -39,38 +39,38 @@ def detection(centroid, kind="object"):
 def test_a_missed_view_shows_what_most_detections_of_its_tracklet_show():
     views = [view(tracklet_id="a1"), view(sensor_id="b", centroid=1)]
     on_object = [detection(1), detection(0), detection(2, kind="unknown")]
-    assert claims_of(views, on_object)["true_object"].to_list() == [0]
+    assert estimates_of(views, on_object)["true_object"].to_list() == [0]
     on_star = [detection(0)]
-    assert claims_of(views, on_star)["true_object"].to_list() == [-1]
+    assert estimates_of(views, on_star)["true_object"].to_list() == [-1]
 
 
 def test_views_with_a_centroid_decide_between_two_objects_with_as_many_views():
     missed = [view(tracklet_id="a1")] * 2
     views = [*missed, view(sensor_id="b", centroid=2), view(sensor_id="a", centroid=2)]
-    assert claims_of(views, [detection(1)])["true_object"].to_list() == [1]
+    assert estimates_of(views, [detection(1)])["true_object"].to_list() == [1]
 
 
-def test_a_claim_is_a_ghost_without_two_used_views_of_one_object():
+def test_an_estimate_is_a_ghost_without_two_used_views_of_one_object():
     both = [view(sensor_id=s, centroid=1) for s in "ab"]
-    assert claims_of(both, [])["true_object"].to_list() == [0]
+    assert estimates_of(both, [])["true_object"].to_list() == [0]
     unused = [both[0], both[1] | {"used": False}]
-    assert claims_of(unused, [])["true_object"].to_list() == [-1]
+    assert estimates_of(unused, [])["true_object"].to_list() == [-1]
     different = [both[0], view(sensor_id="b", centroid=2)]
-    assert claims_of(different, [])["true_object"].to_list() == [-1]
+    assert estimates_of(different, [])["true_object"].to_list() == [-1]
 
 
-def test_possible_claims_are_objects_that_two_frames_of_an_epoch_show():
+def test_possible_estimates_are_objects_that_two_frames_of_an_epoch_show():
     epochs = to_polars(little_dataset()["epochs"])
-    possible = possible_claims(POINTS, epochs)
+    possible = possible_estimates(POINTS, epochs)
     assert sorted(possible.select("true_object", "n_views").rows()) == [(0, 2), (1, 2)]
-    assert possible_claims(POINTS, epochs.head(1)).height == 0
+    assert possible_estimates(POINTS, epochs.head(1)).height == 0
 
 
-def test_positions_have_the_object_of_their_claim_and_keep_their_order():
-    claims = pl.DataFrame({"object_id": ["o1", "o2"], "true_object": [7, -1]})
-    claims = claims.with_columns(epoch=pl.lit(T0_NS).cast(pl.Datetime("ns", "UTC")))
+def test_positions_have_the_object_of_their_estimate_and_keep_their_order():
+    estimates = pl.DataFrame({"object_id": ["o1", "o2"], "true_object": [7, -1]})
+    estimates = estimates.with_columns(epoch=pl.lit(T0_NS).cast(pl.Datetime("ns", "UTC")))
     positions = rows(POSITIONS, *[{"object_id": o} for o in ("o3", "o1", "o2", "o1")])
-    assert match_positions(positions, claims)["true_object"].to_list() == [-1, 7, -1, 7]
+    assert match_positions(positions, estimates)["true_object"].to_list() == [-1, 7, -1, 7]
 
 
 METRE, MM_S = 1e-3, 1e-6  # in km and km/s

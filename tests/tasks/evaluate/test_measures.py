@@ -54,12 +54,12 @@ def objects(n_epochs):
     [(10, 5, 1, 0), (10, 4, 1, 1), (10, 0, 1, 1), (9, 0, 0, 0), (11, 5, 1, 1)],
 )
 def test_an_object_is_lost_below_half_of_ten_or_more_epochs(n_possible, n_found, counted, lost):
-    possible, claims = objects({3: n_possible, 4: 20}), objects({3: n_found, 4: 20})
-    found = measure_lost_objects(possible, claims)
+    possible, estimates = objects({3: n_possible, 4: 20}), objects({3: n_found, 4: 20})
+    found = measure_lost_objects(possible, estimates)
     assert found == {"objects_seen_by_two": 1 + counted, "objects_lost": lost}
 
 
-def test_claims_at_other_epochs_and_second_claims_of_an_epoch_do_not_count():
+def test_estimates_at_other_epochs_and_second_estimates_of_an_epoch_do_not_count():
     possible = objects({0: 10})
     elsewhere = objects({0: 10}).with_columns(pl.col("epoch") + 6)
     assert measure_lost_objects(possible, elsewhere)["objects_lost"] == 1

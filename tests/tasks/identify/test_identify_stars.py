@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from epipole.io.catalogues.hipparcos import HIPPARCOS_EPOCH, read_hipparcos
 from epipole.schemas.bridge import array, stack, stack_covariance, table
 from epipole.schemas.settings import Settings
-from epipole.schemas.work_tables import EXPOSURES, PLACES
+from epipole.schemas.work_tables import EXPOSURES, SENSOR_STATES_AT_FRAMES
 from epipole.tasks.algorithms.geometry.camera import inside, project
 from epipole.tasks.algorithms.geometry.directions import aberrate, canonical
 from epipole.tasks.algorithms.star_catalogue import navigation_catalogue, places_at
@@ -97,7 +97,7 @@ class Log:
         n = len(self.q)
         prior = [None] * n if q is None else None
         return table(
-            PLACES,
+            SENSOR_STATES_AT_FRAMES,
             self.key
             | {f"{a}_km": [7000.0] * n for a in "xyz"}
             | {f"v{a}_km_s": [V_KM_S[i]] * n for i, a in enumerate("xyz")}

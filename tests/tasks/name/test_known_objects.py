@@ -7,7 +7,7 @@ from scenes.associations import filled
 from scenes.walker import NIGHT_NS, satellites
 
 from epipole.io.datasets.night_tables import PART, write_table
-from epipole.schemas.columns import PLACE, STATE_AXES, VELOCITY, upper_triangle
+from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY, upper_triangle
 from epipole.schemas.settings import KnownObjectSettings, Settings
 from epipole.schemas.tables import OBSERVATIONS, POSITIONS, STATES
 from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
@@ -35,7 +35,7 @@ def positions(rng, seen):
     for name, (each, times) in seen.items():
         r_km = path(each, times)[:, :3] + rng.normal(0, SIGMA_KM, (len(times), 3))
         rows = {"epoch": times, "time": times, "object_id": [name] * len(times)}
-        rows |= dict(zip(PLACE, r_km.T, strict=True))
+        rows |= dict(zip(POSITION, r_km.T, strict=True))
         rows |= {f"cov_{a}{a}": np.full(len(times), SIGMA_KM**2) for a in "xyz"}
         parts.append(pl.DataFrame(filled(POSITIONS, len(times), rows)))
     return pl.concat(parts).sort("epoch").to_arrow().cast(POSITIONS)
@@ -54,7 +54,7 @@ def observations(seen, sensors):
             dec = np.degrees(np.arcsin(apart[:, 2] / np.linalg.norm(apart, axis=1)))
             rows = {"time": times, "object_id": [name] * len(times), "ra_deg": ra, "dec_deg": dec,
                     "sensor_id": [sensor] * len(times)}  # fmt: skip
-            rows |= {k: np.full(len(times), v) for k, v in zip(PLACE, place, strict=True)}
+            rows |= {k: np.full(len(times), v) for k, v in zip(POSITION, place, strict=True)}
             parts.append(pl.DataFrame(filled(OBSERVATIONS, len(times), rows)))
     return pl.concat(parts).to_arrow().cast(OBSERVATIONS)
 
@@ -62,11 +62,11 @@ def observations(seen, sensors):
 def states(seen, sigma_km=0.05, sigma_km_s=1e-5):
     """One state of each object, at its first time."""
     variance = np.diag([sigma_km**2] * 3 + [sigma_km_s**2] * 3)
-    rows = {"epoch": [], "object_id": []} | {name: [] for name in (*PLACE, *VELOCITY)}
+    rows = {"epoch": [], "object_id": []} | {name: [] for name in (*POSITION, *VELOCITY)}
     for name, (each, times) in seen.items():
         rows["epoch"].append(times[0])
         rows["object_id"].append(name)
-        for column, value in zip((*PLACE, *VELOCITY), path(each, times[:1])[0], strict=True):
+        for column, value in zip((*POSITION, *VELOCITY), path(each, times[:1])[0], strict=True):
             rows[column].append(value)
     for (a, b), (i, j) in zip(
         upper_triangle(STATE_AXES), zip(*np.triu_indices(6), strict=True), strict=True

@@ -18,7 +18,7 @@ OPTICS = {
     "cy_px": 511.5, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k3": 0.0,
 }  # fmt: skip
 SETTINGS = Settings()
-PLACES = np.array([[200.0, 300.0], [500.0, 600.0], [800.0, 350.0]])
+SENSOR_STATES_AT_FRAMES = np.array([[200.0, 300.0], [500.0, 600.0], [800.0, 350.0]])
 SPEEDS = np.array([[1.5, 0.7], [-1.1, 0.9], [0.6, -1.3]])  # px per frame
 SIGMA = 0.15
 
@@ -27,7 +27,7 @@ def frame(number, at_s=None, strays=0):
     """A frame of three objects in uniform motion: number, time [s] and places."""
     at_s = float(number) if at_s is None else at_s
     rng = np.random.default_rng(number)
-    place = PLACES + SPEEDS * (at_s % 600) + rng.normal(size=(3, 2)) * SIGMA
+    place = SENSOR_STATES_AT_FRAMES + SPEEDS * (at_s % 600) + rng.normal(size=(3, 2)) * SIGMA
     return number, at_s, np.concatenate([place, rng.uniform(0, 1023, (strays, 2))])
 
 

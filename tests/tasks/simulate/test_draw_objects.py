@@ -7,7 +7,7 @@ from scenes.simulated import scene_of
 
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Orbit
-from epipole.tasks.simulate.draw_objects import draw_satellites, place_satellites, scene_nodes
+from epipole.tasks.simulate.draw_objects import draw_satellites, propagate_satellites, scene_nodes
 from epipole.tasks.simulate.simulate_scene import expose_blocks, simulate_scene
 
 START = "2026-05-30T12:00:00Z"
@@ -26,7 +26,7 @@ def file(tmp_path):
 
 def placed(file, *satellites, **scene):
     scene = scene_of(start=START, **scene)
-    return place_satellites(scene, Orbit(elements=file, satellites=list(satellites)), T0_NS)
+    return propagate_satellites(scene, Orbit(elements=file, satellites=list(satellites)), T0_NS)
 
 
 def test_satellites_are_chosen_by_name_or_number_and_else_all(file):
@@ -45,8 +45,8 @@ def test_elements_far_from_the_scene_are_refused_and_named(file):
     orbit = Orbit(elements=file, satellites=[12])
     t0_ns = T0_NS - 20 * 86400 * 10**9
     with pytest.raises(SceneError, match=r"BETA 1 \(12\): its elements are of 2026-05-30T12:00"):
-        place_satellites(scene_of(), orbit, t0_ns)
-    assert place_satellites(scene_of(element_age_days=21.0), orbit, t0_ns).sets[0].number == 12
+        propagate_satellites(scene_of(), orbit, t0_ns)
+    assert propagate_satellites(scene_of(element_age_days=21.0), orbit, t0_ns).sets[0].number == 12
 
 
 def test_a_satellite_that_decays_is_named(tmp_path):

@@ -13,8 +13,8 @@ from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.solve.sample_sight_lines import (
     LineSampling,
-    claimed_views,
     moving_objects,
+    object_views,
     sample_sight_lines,
 )
 from epipole.tasks.solve.view_groups import ViewGroups, unpack_views
@@ -50,7 +50,7 @@ def kept_lines():
     def kept(one_in: int) -> pl.DataFrame:
         choice = LineSampling(EVERY_NS, one_in)
         objects = moving_objects(positions, choice.every_ns)
-        assert claimed_views(unpacked, objects).num_rows == len(seen) // 2  # whatever is kept
+        assert object_views(unpacked, objects).num_rows == len(seen) // 2  # whatever is kept
         return to_polars(sample_sight_lines(groups, objects, choice))
 
     return kept

@@ -70,7 +70,7 @@ def piece_of(folder, block, errors, piece=0, count=1):
 
 
 def larger(place: float) -> pa.Table:
-    return table(SHARED_ERRORS, {"sensor_id": ["sat1"], "direction": [1.0], "place": [place]})
+    return table(SHARED_ERRORS, {"sensor_id": ["sat1"], "direction": [1.0], "position": [place]})
 
 
 def test_positions_have_the_larger_errors_of_their_sensors(tmp_path, block):

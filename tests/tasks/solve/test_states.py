@@ -171,9 +171,9 @@ def test_no_views_stay_no_views():
 def test_only_sensors_whose_errors_are_larger_have_a_row():
     errors = judge_errors(objects(worse=150.0), SETTINGS)
     rows = {row["sensor_id"]: row for row in errors.to_pylist()}
-    assert all(max(row["direction"], row["place"]) > 1.0 for row in rows.values())
-    assert all(min(row["direction"], row["place"]) >= 1.0 for row in rows.values())
-    assert rows["s0"]["place"] > 9.0  # of the variance: three sigma
+    assert all(max(row["direction"], row["position"]) > 1.0 for row in rows.values())
+    assert all(min(row["direction"], row["position"]) >= 1.0 for row in rows.values())
+    assert rows["s0"]["position"] > 9.0  # of the variance: three sigma
 
 
 def test_views_have_the_larger_errors_of_their_sensors():
@@ -181,7 +181,8 @@ def test_views_have_the_larger_errors_of_their_sensors():
     bias = np.tile([[3e-10, 1e-10], [1e-10, 2e-10]], (len(views.sensor), 1, 1))
     views = views._replace(cov_bias=bias)
     errors = table(
-        SHARED_ERRORS, {"sensor_id": ["s3", "absent"], "direction": [4.0, 2.0], "place": [9.0, 2.0]}
+        SHARED_ERRORS,
+        {"sensor_id": ["s3", "absent"], "direction": [4.0, 2.0], "position": [9.0, 2.0]},
     )
     wider = with_larger_errors(views, errors)
     of_sensor = views.sensor == 3

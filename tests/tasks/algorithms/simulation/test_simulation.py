@@ -33,7 +33,12 @@ from epipole.tasks.algorithms.simulation.element_sets import (
     earth_at,
     julian_years_since,
 )
-from epipole.tasks.algorithms.simulation.optics import TrueOptics, boost, image_place, received_from
+from epipole.tasks.algorithms.simulation.optics import (
+    TrueOptics,
+    boost,
+    image_position,
+    received_from,
+)
 from epipole.tasks.algorithms.simulation.paths import elements_from_state, state_at
 from epipole.tasks.algorithms.simulation.sources import star_directions, star_field
 from epipole.tasks.algorithms.star_catalogue import moved
@@ -307,7 +312,7 @@ def test_it_reproduces_the_logs_of_another_simulator_to_their_noise(name):
             partial(state_at, of), t_s[~is_star], r_km[~is_star], earth_km_s[~is_star]
         )
     u = boost(d / np.linalg.norm(d, axis=1, keepdims=True), earth_km_s + v_km_s)
-    x, y = image_place(optics, q.apply(u))
+    x, y = image_position(optics, q.apply(u))
     off = np.stack([spots["column"].to_numpy() - x, spots["row"].to_numpy() - y], axis=1) / sigma_px
     blended = np.isin(source, list(close_to_others(stars, 4 / optics.fx_px))) & is_star
     for kind in (is_star & ~blended, ~is_star):

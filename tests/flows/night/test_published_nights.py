@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from epipole.flows.command_line.main import app
-from epipole.flows.night.recorded_nights import held_nights
+from epipole.flows.night.recorded_nights import published_nights
 from epipole.io.work import recipe
 from epipole.schemas.settings import Settings, validate_settings
 
@@ -21,12 +21,12 @@ def dataset(night_dataset, tmp_path):
 
 
 def stale(dataset, settings=None, known=None) -> dict[str, list[str]]:
-    held = held_nights(str(dataset), settings or Settings(), known)
+    held = published_nights(str(dataset), settings or Settings(), known)
     return {night.date: night.stale for night in held}
 
 
 def test_a_night_just_made_is_not_stale_and_tells_what_it_holds(night_dataset):
-    (night,) = held_nights(str(night_dataset), Settings(), None)
+    (night,) = published_nights(str(night_dataset), Settings(), None)
     assert night.stale == []
     assert (night.row["logs"], night.row["sensors"], night.row["objects"]) == (1, 4, 9)
     assert night.row["frames"] == night.row["identified"] == 240
