@@ -51,7 +51,7 @@ class Overlay:
 
 
 class _Logs:
-    """What the logs tell: calibrations, and the times of the frames of each sensor."""
+    """What the logs have: calibrations, and the times of the frames of each sensor."""
 
     def __init__(self, paths: Sequence[str]) -> None:
         cameras, exposures = [], []

@@ -55,7 +55,7 @@ def file_system(where: str) -> tuple[Any, str]:
     import fsspec
 
     given = _with_secrets(where)
-    parts, options = urlsplit(given), {}  # raises where it is no URL, such as http://[::1
+    parts, options = urlsplit(given), {}  # raises for an invalid URL, such as http://[::1
     if parts.scheme in ("http", "https"):
         return fsspec.filesystem(parts.scheme), given  # fsspec itself takes :: for something else
     if parts.scheme in ("s3", "s3a") and "@" in parts.netloc:

@@ -35,7 +35,7 @@ def read_settings(path: Path) -> Settings:
 
 
 def merged_settings(file: str | None, given: Settings) -> Settings:
-    """Return the settings of a file, and in place of some those that were given.
+    """Return the settings of a file, with those that were given instead of some.
 
     Where both leave a setting out, it keeps its default.
 

@@ -103,7 +103,7 @@ def table_name(schema: pa.Schema) -> str:
 def array(values: pa.Table, name: str) -> npt.NDArray[Any]:
     """Return a column as a NumPy array.
 
-    Times are int64 nanoseconds, null floats NaN, strings objects (null is None).
+    Times are int64 nanoseconds, null floats NaN, strings objects (null becomes None).
     """
     column = values.column(name)
     if column.type == TIME:
@@ -114,7 +114,7 @@ def array(values: pa.Table, name: str) -> npt.NDArray[Any]:
 def rows_of(values: pa.Table) -> list[dict[str, Any]]:
     """Return the rows of a small table as mappings; times are nanoseconds since 1970.
 
-    Arrow itself refuses to return a time that is no whole number of microseconds.
+    Arrow itself refuses to return a time that is not a whole number of microseconds.
     """
     for k, field in enumerate(values.schema):
         if pa.types.is_timestamp(field.type):

@@ -14,7 +14,7 @@ def _measure(group: str, label: str, style: str = "count", *, definition: str) -
 class Report:
     """The measures of an evaluation, each with its definition in the metadata of its field.
 
-    A measure is None where there was nothing to measure, or where it is infinite because a
+    A measure is missing (None) if there was nothing to measure, or if it is infinite because a
     covariance is invalid. Shares are 0 to 1. Attitude errors are in arcseconds about the sensor
     axes. Position errors are in kilometres, GCRF, against the true position at the time of the
     estimate.

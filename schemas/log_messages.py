@@ -2,7 +2,7 @@
 
 A log has three kinds of message. Frames and states are declared here. Calibrations are public
 messages: `foxglove.CameraCalibration`, or `sensor_msgs/msg/CameraInfo` in ROS 2. The name of a
-channel's schema tells the kind of its messages. The topic does not matter.
+channel's schema gives the kind of its messages. The topic does not matter.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""One thread per task: the libraries of linear algebra start none of their own.
+"""One thread per task: the libraries of linear algebra start no threads.
 
 Tasks run in parallel, and their matrices are small. Threads within a task wait for each other more
 than they compute: on two cores the check of the sensors took fifteen times the CPU. The last bits

@@ -24,7 +24,7 @@ class Trait(Flag):
     HARMLESS = auto()  # normal in a night; others are logs that were not stored as recorded
     INVALID_CALIBRATION = auto()  # a calibration of a log is not used
     SENSOR_FAULT = auto()  # a sensor is at fault and left out
-    SUMMED = auto()  # summed over a night's spans: one row per span would tell nothing more
+    SUMMED = auto()  # summed over a night's spans: one row per span would add nothing
 
 
 class Reason(StrEnum):
@@ -254,7 +254,8 @@ class Reason(StrEnum):
     OUTSIDE_IMAGE = (
         "outside_image",
         Stage.IDENTIFY,
-        "Centroids outside the image that the calibration states.",
+        "Centroids outside the image that the calibration states; if they are many, its width or "
+        "height is wrong.",
     )
     TOO_MANY_DETECTIONS = (
         "too_many_detections",

@@ -47,7 +47,7 @@ class Group(BaseModel):
 
 
 class SensorSettings(Group):
-    """Values that are used where a log has none."""
+    """Values that are used where a log lacks them."""
 
     attitude_sigma_arcsec: float = Field(
         60.0,

@@ -87,14 +87,14 @@ def _with_words(stars: pa.Table, words: dict[str, str]) -> pa.Table:
 class ElementSet(NamedTuple):
     """The mean elements of one satellite at their epoch, of WGS 72."""
 
-    name: str  # empty where the file has none
+    name: str  # empty if missing
     number: int  # of the satellite catalogue
     epoch_ns: int  # UTC since 1970
     # The arguments of `sgp4init`, in its order: days since 1949 December 31 0h UTC, 1 / Earth
     # radii, rad/min^2 (half the first derivative), rad/min^3 (a sixth of the second), and angles
     # in rad; the mean motion in rad/min.
     elements: tuple[float, ...]
-    cospar_id: str = ""  # such as 1998-067A; empty where the file has none
+    cospar_id: str = ""  # such as 1998-067A; empty if missing
 
     @property
     def label(self) -> str:

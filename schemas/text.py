@@ -69,12 +69,12 @@ def _inside(value: Any) -> list[Any]:
 # URLs without their secrets, as they are shown and stored.
 
 _USER = re.compile(r"(?<=://)[^/?#\n]*@")
-# A query or a fragment, with its end in a sentence. A glob such as night-?.mcap is none.
+# A query or a fragment, with its end in a sentence. A glob such as night-?.mcap has no query.
 _QUERY = re.compile(r"(://[^\s'\"<>?#]*)[?#]([^\s'\"<>]*=[^\s'\"<>]*|[\w%~+/-]{16,})")
 _ENDS = ".,:;)]}"
 
 # Parameters of a query whose values say which file it is. Of all others the values are cut: a
-# signature, a token and when they become void have a name of their own in each store.
+# signature, a token and when they become void have another name in each store.
 _PLAIN = {"file", "filename", "path", "name", "version", "versionid"}
 
 

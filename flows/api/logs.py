@@ -27,11 +27,11 @@ class LogTables(NamedTuple):
     frames : polars.DataFrame
         One row per frame: `sensor_id`, `frame_number`, `time` (middle of the exposure, UTC),
         `exposure_s`, and the lists `x_px`, `y_px`, `flux`, `sigma_px` of its centroids. The last
-        two are null where the log has none.
+        two are null if missing.
     states : polars.DataFrame
         One row per state of a sensor: `sensor_id`, `time`, position `x_km`, `y_km`, `z_km` and
         velocity `vx_km_s`, `vy_km_s`, `vz_km_s` (GCRF), `position_sigma_km` (0: unknown), the
-        prior attitude `qx`, `qy`, `qz`, `qw` (sensor from ICRS, null where there is none) and
+        prior attitude `qx`, `qy`, `qz`, `qw` (sensor from ICRS, null if missing) and
         `attitude_sigma_arcsec` (0: unknown).
     cameras : polars.DataFrame
         One row per calibration: `sensor_id`, `time` (from when on it holds), and the fields of

@@ -36,7 +36,8 @@ def stop_by_signals() -> None:
 def stopped_in_one_line() -> Iterator[None]:
     """Turn any exception after a signal into one line and the shell's exit code.
 
-    A library may turn the signal's exception into its own, as pydantic does where it serialises.
+    A library may replace the signal's exception by another one, as pydantic does where it
+    serialises.
     """
     try:
         yield
@@ -57,7 +58,7 @@ def _stop(by: int, frame: FrameType | None) -> None:
     watch = threading.Timer(_PATIENCE_S, _end)
     watch.daemon = True
     watch.start()
-    logging.disable()  # from here on, libraries could only tell that they are being stopped
+    logging.disable()  # from here on, libraries could only report that they are being stopped
     raise KeyboardInterrupt
 
 

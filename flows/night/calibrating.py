@@ -36,7 +36,7 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     work
         With the cameras that were found.
     stated
-        CAMERAS as the log tells them, but mirrored where the images are.
+        CAMERAS as the log states them, but mirrored where the images are.
     """
     mode = settings.identification.calibrate
     if mode == "off":

@@ -1,4 +1,4 @@
-"""Progress of a run: what its stages tell to a terminal and to Prefect's page.
+"""Progress of a run: what its stages report to a terminal and to Prefect's page.
 
 Stages log what they did. Their progress goes to a separate logger, `STEPS`, which moves the bars
 and prints nothing. So the stages do not depend on terminals or pages.

@@ -70,7 +70,7 @@ def write_night_row(
 
 
 def recipe_in(row: dict[str, Any]) -> Recipe:
-    """Return the recipe that a row of `nights` tells."""
+    """Return the recipe in a row of `nights`."""
     return Recipe(*(row[f"{name}_key"] for name in Recipe._fields))
 
 
@@ -280,7 +280,7 @@ def unchanged_nights(
             and not missing_tables(dataset, date)
             for date in same
         )
-    except (DatasetError, OSError):  # making the night again tells what is wrong with it
+    except (DatasetError, OSError):  # making the night again shows what is wrong with it
         return []
     return same if intact else []
 

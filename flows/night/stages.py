@@ -6,7 +6,7 @@ rows of a night do not depend on which worker made which part, or when.
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,7 +34,6 @@ from epipole.tasks.check.check_sensors import (
 )
 from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.identify.identify_span import Counts, identify_span
-from epipole.tasks.identify.judge_image_sizes import OutsideImage, judge_image_size
 from epipole.tasks.name.known_objects import ElementsOfNight, elements_of_night, name_known_objects
 from epipole.tasks.name.object_ids import (
     VIEWS,
@@ -74,17 +73,12 @@ def identify(frames: OrderedFrames, spans: Spans, folder: WorkFolder, settings: 
     """Interpolate sensor states, identify stars and solve attitudes, a task per sensor and span."""
     where = {sensor: folder.identified(sensor) for sensor in spans}
     work = Work(frames.folder, folder, spans, frames.cameras, where)
-    counts = identify_spans(Stage.IDENTIFY, work, settings)
-    for outside in _outside_images(work, counts, settings):
-        LOGGER.warning("%s", outside)
+    identify_spans(Stage.IDENTIFY, work, settings)
     return work
 
 
-def identify_spans(stage: Stage, work: Work, settings: Settings) -> list[Counts]:
-    """Identify the frames of all spans of `work`; the parts go to `work.identified`.
-
-    The counts of the parts are in the order of `work.by_span()`.
-    """
+def identify_spans(stage: Stage, work: Work, settings: Settings) -> None:
+    """Identify the frames of all spans of `work`; the parts go to `work.identified`."""
     futures = [
         identify_span.submit(
             work.frames, sensor, span, work.cameras, settings, work.identified[sensor],
@@ -97,21 +91,6 @@ def identify_spans(stage: Stage, work: Work, settings: Settings) -> list[Counts]
     )
     LOGGER.info("identified %s of %s by %s", f"{by_stars:,}", many(frames, "frame"),
                 many(stars, "star"))  # fmt: skip
-    return counts
-
-
-def _outside_images(
-    work: Work, counts: Sequence[Counts], settings: Settings
-) -> Iterator[OutsideImage]:
-    """Yield the sensors that have too many centroids outside the image of their calibration."""
-    by_span = dict(zip(work.by_span(), counts, strict=True))
-    for sensor, spans in work.spans.items():
-        of_sensor = [(span, by_span[sensor, span]) for span in spans]
-        found = judge_image_size(
-            work.frames, sensor, work.identified[sensor], of_sensor, work.cameras, settings
-        )
-        if found is not None:
-            yield found
 
 
 def track(work: Work, night: str, settings: Settings) -> None:

@@ -30,7 +30,7 @@ def cache_folder() -> Path | None:
 
     EPIPOLE_CACHE names the folder ("off": no cache). Otherwise it is ``epipole`` in the cache
     folder of the user, by the XDG base directory specification. Where that folder cannot be
-    written or trusted, a warning says so, and a private temporary folder takes its place for this
+    written or trusted, a warning says so, and a private temporary folder is used instead for this
     process and those that it starts.
     """
     if os.environ.get("EPIPOLE_CACHE") == OFF:

@@ -3,8 +3,8 @@
 By default numba keeps a kernel beside its source file and checks only that file. It does not notice
 a change in a function of another file that the kernel calls. After an upgrade it may also find
 signatures with classes that no longer exist. With a digest of all code in the folder's name,
-neither can happen. numba also tells kernels by the path of their source file: of two environments
-with the same code each compiles its own, so each has its folder.
+neither can happen. numba also identifies kernels by the path of their source file: two environments
+with the same code each compile their kernels, so each has its folder.
 """
 
 import contextlib

@@ -11,7 +11,7 @@ Unfinished work is in ``DATASET/.staging``:
 
 Other files in it are left alone. Whoever may write to the dataset may have written these files
 too. So a commit is finished only where it names dates, and folders of runs in the staging folder,
-and where none of these is a link.
+and only if no link is among these.
 
 The kernel releases a lock when its process ends, however it ends. So where the file of a run can be
 locked, the run has ended, and the next run removes its folder.

@@ -55,7 +55,7 @@ def read_log(path: str | os.PathLike[str]) -> LogContents:
     Returns
     -------
     LogContents
-        Exposures, states (each in its own reference frame), cameras, rejects and the row of
+        Exposures, states (each in its reference frame), cameras, rejects and the row of
         `sources`. The offset of a row is that of its message's chunk in the file.
 
     Raises
@@ -103,7 +103,7 @@ def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
     """Return when a log's first and last message were logged, without reading them.
 
     UTC nanoseconds since 1970, of the recorder's clock: not the times of frames. None where
-    the log has no valid summary, because it was never closed. Only `read_log` can tell then.
+    the log has no valid summary, because it was never closed. Only `read_log` finds them then.
 
     Raises
     ------

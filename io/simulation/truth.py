@@ -138,7 +138,7 @@ def _require_orbits(folder: Path, truth: Truth) -> None:
 def _read(path: Path, schema: pa.Schema) -> pa.Table:
     try:
         rows = pq.read_table(path, partitioning=None)
-        for field in schema:  # another program's truth may not tell all
+        for field in schema:  # another program's truth may not have all
             if field.nullable and field.name not in rows.column_names:
                 rows = rows.append_column(field, pa.nulls(rows.num_rows, field.type))
         return conform(schema, rows)

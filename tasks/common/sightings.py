@@ -155,7 +155,7 @@ def camera_of(cameras: pa.Table, row: int) -> Camera:
 
 
 def optics_covariance_of(cameras: pa.Table, row: int) -> Array:
-    """Return the covariance (9, 9) of the optics in a row of `cameras`; 0 as the log tells them."""
+    """Return the covariance (9, 9) of the optics in a row of `cameras`; 0 for those of the log."""
     return stack_covariance(cameras.slice(row, 1), "cov_{}", OPTICS_AXES)[0]
 
 

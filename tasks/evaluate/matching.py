@@ -66,7 +66,7 @@ def match_views(
     """Return the used views: `estimate` numbers the estimates, `true_object` is what a view shows.
 
     A view without a centroid (a miss) shows what most detections of its tracklet show.
-    `true_object` is -1 where that is no object. `detections` are those of `detected_objects`.
+    `true_object` is -1 where that is not an object. `detections` are those of `detected_objects`.
     """
     views = with_truth(associations.filter(pl.col("used")), points)
     views = views.with_columns(

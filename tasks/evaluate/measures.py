@@ -290,7 +290,7 @@ def measure_observations(
 
 
 def _magnitudes(seen: pa.Table, of_object: Indices, points: pl.DataFrame) -> Measures:
-    """Return the errors of magnitudes, where the truth tells them."""
+    """Return the errors of magnitudes, where the truth has them."""
     rows = to_polars(seen.select([*POINT, "magnitude", "magnitude_sigma"]))
     true = points.select(*POINT, true="magnitude")
     rows = rows.join(true, on=POINT, how="left", maintain_order="left")
@@ -369,7 +369,7 @@ def measure_states(
 
 
 def _objects_of_ids(states: pl.DataFrame, matched: pl.DataFrame) -> Indices:
-    """Return the true object of each state's `object_id`, -1 where the id has none."""
+    """Return the true object of each state's `object_id`, -1 if unknown."""
     real = matched.filter(pl.col("true_object") >= 0)
     ids = real.select("object_id").unique(maintain_order=True).with_row_index("number")
     number = real.join(ids, on="object_id", how="left", maintain_order="left")

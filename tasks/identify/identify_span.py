@@ -26,14 +26,11 @@ BRIDGED_NS = 300_000_000_000  # states this far outside a span help to place its
 
 
 class Counts(NamedTuple):
-    """Counts of a part; `by_stars` are frames with an attitude from stars, `outside` centroids
-    outside the image."""
+    """Counts of a part; `by_stars` are frames with an attitude from stars."""
 
     frames: int
     by_stars: int
     stars: int
-    centroids: int
-    outside: int
 
 
 @stage_task(Stage.IDENTIFY, "{sensor} {span}")
@@ -67,15 +64,11 @@ def identify_span(
 
 def _counts(parts: Parts, span: Span) -> Counts:
     """Return the counts of a part that is written."""
-    solutions = parts.read(span, "solutions", ["attitude_source", "n_centroids"])
-    rejects = parts.read(span, "rejects", ["reason", "count"])
-    outside = rejects.filter(pc.field("reason") == Reason.OUTSIDE_IMAGE.value)
+    solutions = parts.read(span, "solutions", ["attitude_source"])
     return Counts(
         solutions.num_rows,
         pc.sum(pc.equal(solutions["attitude_source"], "stars")).as_py() or 0,
         parts.read(span, "stars").num_rows,
-        pc.sum(solutions["n_centroids"]).as_py() or 0,
-        pc.sum(outside["count"]).as_py() or 0,
     )
 
 

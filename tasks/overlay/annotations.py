@@ -1,7 +1,7 @@
 """What is known of each centroid, as annotations that a viewer draws over the image.
 
-Shapes and colours both differ (Okabe and Ito's colours, which colour-blind people tell apart): a
-star is a blue ring, a detection of an object an orange square, another detection a reddish cross.
+Shapes and colours both differ (Okabe and Ito's colours, for people with any colour vision): a star
+is a blue ring, a detection of an object an orange square, another detection a reddish cross.
 The origin of annotations is the corner of the first pixel, ours its middle: half a pixel is added.
 """
 

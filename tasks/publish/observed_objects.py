@@ -35,7 +35,7 @@ def observations(parts: NightParts) -> Iterator[pa.Table]:
 
 
 def object_runs(parts: NightParts) -> pl.DataFrame:
-    """Return the epochs of each tracklet that follow each other and tell the same.
+    """Return the epochs of each tracklet that follow each other and are equal.
 
     Returns
     -------

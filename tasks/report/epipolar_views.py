@@ -26,9 +26,9 @@ STEPS = 2000  # along a line
 POINTS = 12  # of a line that is drawn
 BEYOND = 1.05  # of the field: farther out a fitted distortion may fold the image
 MAX_OTHERS = 300
-MIN_SEEN = 10  # detections that tell the camera in use
-MOTION_NS = 5_000_000_000  # positions so near to the epoch tell how an object moves
-AROUND_NS = 60_000_000_000  # frames so near to an epoch tell the attitude at it
+MIN_SEEN = 10  # detections that show the camera in use
+MOTION_NS = 5_000_000_000  # positions so near to the epoch show how an object moves
+AROUND_NS = 60_000_000_000  # frames so near to an epoch give the attitude at it
 QUATERNION = ["qx", "qy", "qz", "qw"]
 SEEN = ["x_px", "y_px", "ra_deg", "dec_deg"]
 OPTICS = ["fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3"]
@@ -140,7 +140,7 @@ def _pairs(views: pl.DataFrame) -> list[tuple[pl.DataFrame, pl.DataFrame]]:
 
 
 def _pose(night: NightReader, name: str, camera: Camera, epoch_ns: int) -> _Pose | None:
-    """Return where the sensor was and how it stood at the epoch; None: its frames do not tell."""
+    """Return where the sensor was and how it stood at the epoch; None: unknown from its frames."""
     rows = _near(
         night, "frames", ["frame_number", *QUATERNION, *POSITION, *VELOCITY], name, epoch_ns
     )

@@ -120,7 +120,7 @@ def propagate_satellites(scene: Scene, orbit: Orbit, t0_ns: int) -> Satellites:
 def draw_satellites(
     satellites: Satellites, count: int | None, rng: np.random.Generator
 ) -> Satellites:
-    """Return `count` of the satellites at random, in their order; all where it is None."""
+    """Return `count` of the satellites at random, in their order; all for None."""
     n = len(satellites.sets)
     if count is None or count == n:
         return satellites

@@ -19,7 +19,7 @@ Flags = npt.NDArray[np.bool_]
 GATE_SIGMA = 4.0  # largest distance of a detection from a known hot pixel, planet or star
 
 
-def places_in_image(
+def static_positions(
     frames: Frames, sightings: Sightings, detections: pa.Table, camera: Camera
 ) -> FixedPlaces:
     """Return the pixel positions that sightings stay at, and how likely each is a hot pixel."""

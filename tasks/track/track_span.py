@@ -54,8 +54,8 @@ from epipole.tasks.track.classify_detections import (
     at_hot_pixel,
     at_star,
     is_planet,
-    places_in_image,
     sighting_sigma,
+    static_positions,
 )
 
 # Measurement of runs: rates, residuals, and which of them stand still like stars.
@@ -230,15 +230,15 @@ def _label(
     """Label the detections of some frames; return their tracklets, and those that may be hot."""
     frames, sightings, camera = part.frames, part.sightings, part.camera
     known = labels.kind == "hot_pixel"
-    places = places_in_image(frames, sightings, detections, camera)
-    hot = places.with_odds(CERTAIN) | at_hot_pixel(sightings, detections, known, camera)
+    fixed = static_positions(frames, sightings, detections, camera)
+    hot = fixed.with_odds(CERTAIN) | at_hot_pixel(sightings, detections, known, camera)
     labels.kind[sightings.row[hot]] = "hot_pixel"
     planet = np.zeros_like(hot)
     if part.on_sky:
         planet = is_planet(frames, sightings, camera) & ~hot
         labels.kind[sightings.row[planet]] = "planet"
     kept = ~hot & ~planet
-    sightings, suspected = part_of(sightings, kept), places.with_odds(LIKELY)[kept]
+    sightings, suspected = part_of(sightings, kept), fixed.with_odds(LIKELY)[kept]
     track = _follow(part, sightings, settings.tracklets)
     runs = measure_runs(frames, sightings, track, camera, settings.alignment.window_s)
     if part.on_sky:
@@ -246,16 +246,16 @@ def _label(
         runs = [run for run in runs if not run.stands_still]
         _label_stars(labels, sightings, stars, np.flatnonzero(track == NONE))
     # What no run holds, no other sensor can confirm.
-    in_runs = _in_runs(places.place[kept], runs)
+    in_runs = _in_runs(fixed.place[kept], runs)
     labels.kind[sightings.row[suspected & ~in_runs]] = "hot_pixel"
     objects = sorted(runs, key=lambda run: int(run.members[0]))
     return _label_objects(part, sightings, objects, labels, detections, settings, suspected)
 
 
-def _in_runs(place: npt.NDArray[np.int64], runs: list[TrackRun]) -> npt.NDArray[np.bool_]:
+def _in_runs(position: npt.NDArray[np.int64], runs: list[TrackRun]) -> npt.NDArray[np.bool_]:
     """Return which sightings are at a pixel position that a run has a sighting at."""
     members = np.concatenate([np.zeros(0, np.int64), *(run.members for run in runs)])
-    return np.isin(place, np.setdiff1d(place[members], [NOWHERE]))
+    return np.isin(position, np.setdiff1d(position[members], [NOWHERE]))
 
 
 def _label_objects(

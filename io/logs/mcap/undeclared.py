@@ -14,7 +14,7 @@ import numpy.typing as npt
 from epipole.io.logs.mcap.container import Channel, ChannelTable
 from epipole.schemas.rejects import Reason
 
-N_CHANNELS = 1 << 16  # that a number of 16 bits can tell apart
+N_CHANNELS = 1 << 16  # with distinct numbers of 16 bits
 Channels = npt.NDArray[np.uint16]
 
 

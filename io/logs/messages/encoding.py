@@ -19,7 +19,7 @@ MAX_SECONDS = 9_223_372_035  # whole seconds that fit into 64 bits of nanosecond
 
 
 class FrameMessage(NamedTuple):
-    """A CentroidFrame; `time_ns` is None where the message has no valid time."""
+    """A CentroidFrame; `time_ns`: None without a valid time."""
 
     time_ns: int | None
     sensor_id: str
@@ -32,7 +32,7 @@ class FrameMessage(NamedTuple):
 
 
 class StateMessage(NamedTuple):
-    """A SensorState; `time_ns` is None where the message has no valid time."""
+    """A SensorState; `time_ns`: None without a valid time."""
 
     time_ns: int | None
     sensor_id: str

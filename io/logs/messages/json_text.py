@@ -109,7 +109,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 def decode(kind: str, data: bytes) -> DecodedMessage:
     """Return the message that a JSON object holds; raise ValueError and the like if it does not.
 
-    Field names may be those of protobuf's own JSON mapping too: ``xPx`` for ``x_px``.
+    Field names may also be those of protobuf's JSON mapping: ``xPx`` for ``x_px``.
     """
     values = _object(data)
     if kind == CALIBRATION:

@@ -1,7 +1,7 @@
 """Messages as protobuf.
 
 They are encoded field by field and not through a message object. A packed array is then the
-array's own bytes, and a frame takes a few microseconds.
+array's bytes, and a frame takes a few microseconds.
 """
 
 import struct

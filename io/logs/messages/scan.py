@@ -5,6 +5,9 @@ messages one after the other as long as they are good: well formed, with every v
 stops at the first other one. That one is decoded and judged in Python, which knows all forms
 that are allowed (arrays in pieces, numbers one by one, big-endian CDR, JSON) and the reason for
 leaving a message out. A scan takes nothing that Python would leave out or read differently.
+
+Measured (2026-11-25, two shared cores): 172,800 states in protobuf take 0.07 s of CPU, without
+their scan 1.7 s; in CDR 0.08 s and 2.5 s. To compile it takes 0.9 s, once after an install.
 """
 
 from collections.abc import Sequence
@@ -17,7 +20,7 @@ import pyarrow as pa
 from epipole.io.logs.mcap.record_scan import Bytes, kernel, load_int32, load_uint64
 from epipole.schemas import log_bounds as bounds
 
-MAX_NAMES = 1024  # sensors that a scan can tell apart; decoding has no limit
+MAX_NAMES = 1024  # sensors that a scan can distinguish; decoding has no limit
 NAME_BYTES = 63
 NAN_BITS, NO_SIGN = np.int32(0x7FC00000), np.int32(0x7FFFFFFF)  # of a float32
 
@@ -29,7 +32,7 @@ def _bits(value: float) -> np.int32:
 
 # Limits within which a scan takes a message. Those of lengths, which are squared here, are
 # narrower than the declared ones by more than rounding, so that a state near a limit is judged in
-# one place.
+# one function.
 EARLIEST_NS, LATEST_NS = int(bounds.TIME.least), int(bounds.TIME.greatest)
 LONGEST_S = bounds.EXPOSURE.greatest
 FARTHEST_BITS = _bits(bounds.CENTROID_POSITION.greatest)

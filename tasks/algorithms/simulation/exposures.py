@@ -45,7 +45,7 @@ STAR, TARGET, FALSE = 0, 1, 2
 MERGE_PX = 2.0  # stars closer than this are one spot
 FLUX_AT_ZERO = 1e6  # of magnitude 0, arbitrary units
 ABERRATION_ROOM = 1.5e-3  # [rad] aberration is 1.3e-4, proper motion in 30 years at most 1.5e-3
-OWN_BODY_KM = 0.1  # nearer is the satellite that carries the sensor, or is docked to it
+SATELLITE_RADIUS_KM = 0.1  # nearer is the satellite that carries the sensor, or is docked to it
 TARGETS_AT_ONCE = 500_000  # pairs of a frame and a target, to bound the memory
 
 
@@ -175,7 +175,7 @@ class Exposing:
         distance_km = np.linalg.norm(d, axis=1)
         # In the light time d changes by less than 2e-4 of itself.
         near = along >= distance_km * np.cos(self._radius + ABERRATION_ROOM)
-        near &= distance_km > OWN_BODY_KM
+        near &= distance_km > SATELLITE_RADIUS_KM
         return frame[near], target[near]
 
     def _detected(self, spots: TrueSpots) -> TrueSpots:
@@ -191,16 +191,16 @@ class Exposing:
     def _false_spots(self, n_frames: int) -> TrueSpots:
         s, streams = self.sensor, self._streams
         n = streams["false count"].poisson(s.false_points, n_frames)
-        place = streams["false place"].random((int(n.sum()), 2))
-        magnitude = _random_magnitudes(streams["false light"], len(place), s.magnitude_limit)
+        x_y = streams["false place"].random((int(n.sum()), 2))
+        magnitude = _random_magnitudes(streams["false light"], len(x_y), s.magnitude_limit)
         hot, hot_magnitude = self._hot
         frame = np.arange(n_frames)
         frame = np.concatenate([np.repeat(frame, n), np.repeat(frame, len(hot))])
         size = np.array([s.optics.width, s.optics.height])
-        place = np.concatenate([place * size - 0.5, np.tile(hot, (n_frames, 1))])
+        x_y = np.concatenate([x_y * size - 0.5, np.tile(hot, (n_frames, 1))])
         magnitude = np.concatenate([magnitude, np.tile(hot_magnitude, n_frames)])
         kind = np.full(len(frame), FALSE, np.int8)
-        return TrueSpots(frame, place[:, 0], place[:, 1], magnitude, kind, np.full(len(frame), -1))
+        return TrueSpots(frame, x_y[:, 0], x_y[:, 1], magnitude, kind, np.full(len(frame), -1))
 
     def _image(self, u: Array, R: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
         """Return columns and rows [px], and which directions are within the camera's cone."""
@@ -215,7 +215,7 @@ class Exposing:
         # A lens stretches by a few per cent at most, proper motion by some arcseconds.
         optics = self.sensor.optics
         radius = 1.2 * MERGE_PX / min(optics.fx_px, optics.fy_px) + 3e-4
-        pairs = cKDTree(self.stars.place).query_pairs(radius, output_type="ndarray")
+        pairs = cKDTree(self.stars.u_icrs).query_pairs(radius, output_type="ndarray")
         pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
         return pairs[:, 0], pairs[:, 1]
 
@@ -253,8 +253,8 @@ class Exposing:
     def _hot_pixels(self) -> tuple[Array, Array]:
         s = self.sensor
         rng = random_stream(s.seed, s.index, "hot pixels")
-        place = rng.integers(0, [s.optics.width, s.optics.height], (s.hot_pixels, 2))
-        return place.astype(float), _random_magnitudes(rng, s.hot_pixels, s.magnitude_limit)
+        x_y = rng.integers(0, [s.optics.width, s.optics.height], (s.hot_pixels, 2))
+        return x_y.astype(float), _random_magnitudes(rng, s.hot_pixels, s.magnitude_limit)
 
     def _measure(
         self,

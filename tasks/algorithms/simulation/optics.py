@@ -47,7 +47,7 @@ def image_position(optics: TrueOptics, u: Array) -> tuple[Array, Array]:
 
 
 def on_image(optics: TrueOptics, x_px: Array, y_px: Array) -> npt.NDArray[np.bool_]:
-    """Return which places are on the image; a pixel extends half a pixel about its centre."""
+    """Return which positions are on the image; a pixel extends half a pixel about its centre."""
     return (np.abs(x_px - (optics.width - 1) / 2) < optics.width / 2) & (
         np.abs(y_px - (optics.height - 1) / 2) < optics.height / 2
     )

@@ -177,7 +177,7 @@ def two_body_paths(elements: Array) -> Paths:
 
 
 def sampled_paths(t_s: Array, r_km: Array) -> Paths:
-    """Return the paths through places at even times, see `node_times`.
+    """Return the paths through positions at even times, see `node_times`.
 
     The velocities at the nodes are central differences of fourth order: within 1e-8 km/s of the
     derivative for a low orbit.
@@ -197,7 +197,7 @@ def sampled_paths(t_s: Array, r_km: Array) -> Paths:
 
 
 def resting_path(r_km: Array) -> Paths:
-    """Return the path of a body that stays at a GCRF place (3,)."""
+    """Return the path of a body that stays at a GCRF position (3,)."""
     r_km = np.tile(r_km, (1, 2, 1))
     return Paths(np.full((1, 6), np.nan), np.zeros(1, int), Nodes(0.0, r_km, np.zeros_like(r_km)))
 

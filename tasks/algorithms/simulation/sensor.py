@@ -31,7 +31,7 @@ def look_along(z: Array, up: Array, roll_rad: float = 0.0) -> Rotation:
 def body_fixed(
     r_km: Array, v_km_s: Array, azimuth_rad: float, elevation_rad: float, roll_rad: float
 ) -> Rotation:
-    """Return attitudes, sensor from ICRS, that are fixed to the sensor's own orbital frame.
+    """Return attitudes, sensor from ICRS, that are fixed to the orbital frame of the sensor.
 
     The frame is radial (away from the Earth), across (the orbit's normal) and along, which
     completes it. Up in the image is radial; where the boresight is within a thousandth of a
@@ -145,7 +145,7 @@ class SimulatedSensor:
 def random_stream(seed: int, index: int, purpose: str) -> np.random.Generator:
     """Return the stream of random numbers of a sensor (or group) for one purpose.
 
-    Each purpose has its own stream, so that switching on one effect does not change the others.
+    Each purpose has another stream, so that switching on one effect does not change the others.
     """
     return np.random.default_rng([seed, index, zlib.crc32(purpose.encode())])
 
@@ -179,14 +179,14 @@ class Attitudes:
 
     def __init__(self, sensor: SimulatedSensor) -> None:
         self.sensor = sensor
-        self._held = Rotation.identity(1)
+        self._random = Rotation.identity(1)
         if sensor.mode == "random":
             n = int(np.ceil(sensor.duration_s / sensor.hold_s)) + 2
             # One more hold on either side, for the states beyond the ends.
             middle: Array = (np.arange(n, dtype=float) - 0.5) * sensor.hold_s
             r_km, _ = sensor.path.at(middle)
             rng = random_stream(sensor.seed, sensor.index, "attitudes")
-            self._held = random_attitudes(rng, r_km, sensor.clearance)
+            self._random = random_attitudes(rng, r_km, sensor.clearance)
 
     def at(self, time_ns: Nanoseconds, r_km: Array, v_km_s: Array) -> Rotation:
         """Return attitudes, sensor from ICRS, at times with sensor states (n, 3) GCRF."""
@@ -194,7 +194,7 @@ class Attitudes:
         t_s = seconds_since(s.t0_ns, time_ns)
         if s.mode == "random":
             hold = np.floor((t_s * s.rate_hz - s.phase + 0.5) / (s.hold_s * s.rate_hz)).astype(int)
-            return self._held[np.clip(hold + 1, 0, len(self._held) - 1)]
+            return self._random[np.clip(hold + 1, 0, len(self._random) - 1)]
         if s.followed is not None:
             followed_km, _ = s.followed.at(t_s)
             return look_along(followed_km - r_km, s.up, s.roll)
@@ -239,10 +239,10 @@ class Beliefs:
 
     @property
     def position_sigma_km(self) -> float:
-        """Return the reported sigma per axis of positions. An offset counts where it is told."""
+        """Return the reported sigma per axis of positions. An offset counts if it is stated."""
         s = self.sensor
-        told = _per_axis(s.position_offset_km) if s.position_told else 0.0
-        return float(np.hypot(np.hypot(s.position_noise_km, s.position_bias_km), told))
+        stated = _per_axis(s.position_offset_km) if s.position_told else 0.0
+        return float(np.hypot(np.hypot(s.position_noise_km, s.position_bias_km), stated))
 
     @property
     def attitude_sigma(self) -> float:
@@ -250,8 +250,8 @@ class Beliefs:
         s = self.sensor
         if s.prior_noise is None:
             return 0.0
-        told = _per_axis(s.prior_offset) if s.prior_told else 0.0
-        return float(np.hypot(np.hypot(s.prior_noise, s.prior_bias), told))
+        stated = _per_axis(s.prior_offset) if s.prior_told else 0.0
+        return float(np.hypot(np.hypot(s.prior_noise, s.prior_bias), stated))
 
     def position(self, r_km: Array) -> Array:
         """Return reported positions for true ones; call in order of time."""

@@ -30,7 +30,7 @@ class StarField:
 
     star_id: Indices
     magnitude: Array
-    place: Array  # (n, 3) unit vectors at the epoch
+    u_icrs: Array  # (n, 3) unit vectors at the epoch
     motion: Array  # (n, 3) rad per Julian year
     parallax: Array  # rad
     epoch: float  # Julian year
@@ -66,7 +66,7 @@ def star_field(
     return StarField(
         star_id=star_id[order],
         magnitude=magnitude[order],
-        place=np.stack([cos_d * cos_a, cos_d * sin_a, sin_d], axis=1),
+        u_icrs=np.stack([cos_d * cos_a, cos_d * sin_a, sin_d], axis=1),
         motion=motion * MILLIARCSEC,
         # A negative parallax is an error of measurement.
         parallax=np.maximum(parallax_mas[order], 0.0) * MILLIARCSEC,
@@ -79,7 +79,7 @@ def star_field(
 def stars_in_cones(field: StarField, u: Array, radius_rad: float) -> tuple[Indices, Indices]:
     """Return the pairs (cone, star) of all stars in cones about (n, 3) directions.
 
-    Places are those of the catalogue. Proper motion, parallax and aberration move all but a few
+    Directions are those of the catalogue. Proper motion, parallax and aberration move all but a few
     stars by less than 0.02 degrees: add a margin to the radius.
     """
     dec = np.arcsin(np.clip(u[:, 2], -1, 1))
@@ -103,7 +103,7 @@ def stars_in_cones(field: StarField, u: Array, radius_rad: float) -> tuple[Indic
     n = np.maximum(last - first, 0)
     star = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n) + np.repeat(first, n)
     cone = np.repeat(np.arange(len(u)), n.reshape(len(u), -1).sum(axis=1))
-    near = np.einsum("ij,ij->i", field.place[star], u[cone]) >= np.cos(radius_rad)
+    near = np.einsum("ij,ij->i", field.u_icrs[star], u[cone]) >= np.cos(radius_rad)
     return cone[near], star[near]
 
 
@@ -126,7 +126,7 @@ def star_directions(
     ESA SP-1200 (1997), The Hipparcos and Tycho Catalogues, volume 1, section 1.2.8. Radial
     velocities are neglected.
     """
-    u0 = field.place[star]
+    u0 = field.u_icrs[star]
     # Catalogue epochs are of light at the barycentre; the sensor gets it earlier or later.
     ahead_s = np.einsum("ij,ij->i", u0, r_barycentric_km) / LIGHT_KM_S
     u = u0 + field.motion[star] * (years + ahead_s / JULIAN_YEAR_S)[:, None]
@@ -166,7 +166,7 @@ def lambert_dimming(u_to_sun: Array, u_to_object: Array) -> Array:
 
 
 def in_earth_shadow(r_km: Array, u_to_sun: Array) -> npt.NDArray[np.bool_]:
-    """Return which places (n, 3) are in the Earth's shadow, taken as a cylinder."""
+    """Return which positions (n, 3) are in the Earth's shadow, taken as a cylinder."""
     along = np.einsum("ij,ij->i", r_km, u_to_sun)
     off2 = np.einsum("ij,ij->i", r_km, r_km) - along * along
     return (along < 0) & (off2 < EARTH_RADIUS_KM**2)

@@ -37,7 +37,7 @@ def test_a_wrong_shape_is_one_clear_error():
         floats("y_px", [1, 2, 3], 4)
     with pytest.raises(ValueError, match=r"^u: has shape \(2, 2\), expected \(n, 3\)$"):
         floats("u", np.zeros((2, 2)), "n", 3)
-    with pytest.raises(ValueError, match=r"^u: is no array of numbers"):
+    with pytest.raises(ValueError, match=r"^u: not an array of numbers"):
         floats("u", ["a"], "n")
 
 

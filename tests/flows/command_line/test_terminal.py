@@ -64,7 +64,7 @@ def test_a_long_stage_tells_its_progress_without_a_terminal_now_and_then(capsys,
     with shown(quiet=False, verbose=False):
         step(Stage.TRACK, 1, 4)
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(terminal, "TOLD_EVERY_S", 0.0)
+    monkeypatch.setattr(terminal, "LINE_EVERY_S", 0.0)
     with shown(quiet=False, verbose=False):
         for k in range(5):
             step(Stage.TRACK, k, 4)

@@ -115,7 +115,7 @@ def test_a_file_without_element_sets_is_refused_in_one_line(text, what, tmp_path
 def test_what_is_no_file_is_refused(tmp_path):
     with pytest.raises(CatalogueError, match="no such file"):
         read_known_objects(str(tmp_path / "none.tle"))
-    with pytest.raises(CatalogueError, match="is no file"):
+    with pytest.raises(CatalogueError, match="not a regular file"):
         read_known_objects(str(tmp_path))
     (tmp_path / "a.bin").write_bytes(b"\xff\xfe\x00\xd8")
     with pytest.raises(CatalogueError, match="has no element sets"):

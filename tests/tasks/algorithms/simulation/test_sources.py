@@ -26,7 +26,7 @@ def test_stars_in_cones_are_those_that_a_search_of_all_stars_finds(radius_deg):
     u = rng.normal(size=(40, 3))
     u = np.concatenate([u / np.linalg.norm(u, axis=1)[:, None], np.eye(3), -np.eye(3)])
     cone, star = stars_in_cones(field, u, np.radians(radius_deg))
-    expected = np.argwhere(u @ field.place.T >= np.cos(np.radians(radius_deg)))
+    expected = np.argwhere(u @ field.u_icrs.T >= np.cos(np.radians(radius_deg)))
     order = np.lexsort((star, cone))
     np.testing.assert_array_equal(np.stack([cone, star], axis=1)[order], expected)
 
