@@ -31,7 +31,7 @@ PIXEL = axes(
     "{}_px",
     unit="px",
     frame="image",
-    doc="Pixel position; (0, 0) is the middle of the top-left pixel",
+    doc="Place in the image; (0, 0) is the middle of the top-left pixel",
     names="xy",
 )
 EPOCH = time_column("epoch", doc="Common instant at which the sensors are compared, UTC.")
@@ -109,9 +109,7 @@ STARS = schema(
         column("star_id", I64, doc="Number in the catalogue that the table's metadata names."),
         column("magnitude", F64, unit="mag", doc="V magnitude in the catalogue."),
         *PIXEL,
-        *axes(
-            "d{}_px", unit="px", frame="image", doc="Measured minus predicted position", names="xy"
-        ),
+        *axes("d{}_px", unit="px", frame="image", doc="Measured minus predicted place", names="xy"),
     ],
 )
 
@@ -215,7 +213,7 @@ ASSOCIATIONS = schema(
         id_column(
             "tracklet_id", null=True, doc="Null for a detection that belongs to no tracklet."
         ),
-        *axes("{}_px", unit="px", frame="image", doc="Pixel position at the epoch", names="xy"),
+        *axes("{}_px", unit="px", frame="image", doc="Place at the epoch", names="xy"),
         column(
             "epipolar_px",
             F64,
@@ -358,7 +356,7 @@ STATES = schema(
 
 IDENTIFICATIONS = schema(
     "identifications",
-    "One row per object of the night, compared with a catalogue of known ones.",
+    "One row per object of the night, held against a catalogue of known ones.",
     [
         OBJECT_ID,
         column("status", pa.string(), doc="A `NameStatus`: known, ambiguous or unknown."),
@@ -388,11 +386,7 @@ IDENTIFICATIONS = schema(
             "nearest one that it is not.",
         ),
         column(
-            "distance_km",
-            F64,
-            unit="km",
-            null=True,
-            doc="Distance of the object from its predicted position.",
+            "distance_km", F64, unit="km", null=True, doc="Distance of the object from its place."
         ),
         column(
             "mahalanobis",
@@ -529,7 +523,7 @@ REJECTS = schema(
             null=True,
             doc="Log file; null where it is about none, or more than one.",
         ),
-        column("offset", I64, unit="byte", null=True, doc="Offset in the log."),
+        column("offset", I64, unit="byte", null=True, doc="Place in the log."),
         id_column("sensor_id", null=True, doc="Null where unknown, or more than one."),
         id_column("tracklet_id", null=True, doc="Null where it is not about one tracklet."),
         time_column(

@@ -70,7 +70,7 @@ WAITING: dict[str, set[str]] = {
     "tasks/calibrate": {"by chance", "is none", "own", "place", "told"},
     "tasks/check": {"claim", "is none", "own", "place"},
     "tasks/identify": {"is no", "is none", "own", "place", "so many", "told"},
-    "tasks/solve": {"claim", "held", "is none", "own", "place", "so many", "told"},
+    "tasks/solve": {"held", "is none", "own", "place", "so many", "told"},
 }
 # In text, with the uses that are allowed; in names, as words between underscores or capitals.
 TEXTS = {
