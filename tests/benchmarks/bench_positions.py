@@ -76,7 +76,7 @@ def synthetic(n_positions: int) -> None:
         truth = np.array([t[2] for t in trials])
         offsets = np.arange(n_positions + 1) * n
         cov = np.tile(np.eye(2) * variance, (len(r), 1, 1))
-        x, P, _, used, _ = triangulate(
+        x, P, _, used, *_ = triangulate(
             offsets, r, u, cov, np.full(len(r), PLACE_KM), np.tile(V_GEO, (n_positions, 1)), 4.0
         )
         off = x - truth
