@@ -112,10 +112,10 @@ def bounds() -> str:
     rows = []
     for kind, of_kind in BOUNDS.items():
         for b in of_kind:
-            low, high = ("1972", "2100") if b is TIME else (f"{b.least:g}", f"{b.greatest:g}")
+            low, high = ("1972", "2100") if b is TIME else (f"{b.minimum:g}", f"{b.maximum:g}")
             reason = f"`{b.reason}`" if b.reason else ""
             rows.append((kind, f"`{b.field}`", low, high, b.unit, reason, b.why))
-    head = ("message", "field", "least", "greatest", "unit", "reason", "why")
+    head = ("message", "field", "minimum", "maximum", "unit", "reason", "why")
     return _markdown(head, rows)
 
 

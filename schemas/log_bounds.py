@@ -1,7 +1,7 @@
 """The bounds of every value in a log: what lies beyond is damage, and no kernel meets it.
 
-They are wide: a value beyond them is impossible, not unlikely. `io.logs.columns` holds each
-message against them; the compiled scans take their limits from here too.
+They are wide: a value beyond them is impossible, not unlikely. `io.logs.messages` compares each
+message with them; the compiled scans take their limits from here too.
 """
 
 import math
@@ -13,17 +13,17 @@ from epipole.schemas.rejects import Reason
 
 @dataclass(frozen=True)
 class Bound:
-    """The least and greatest value of a field; of a vector, of its length."""
+    """The minimum and maximum of a field; of a vector, of its length."""
 
     field: str
-    least: float
-    greatest: float
+    minimum: float
+    maximum: float
     unit: str
     reason: Reason | None  # of the row in `rejects`; None: the value becomes unknown
     why: str
 
     def __contains__(self, value: float) -> bool:
-        return self.least <= value <= self.greatest  # false for NaN
+        return self.minimum <= value <= self.maximum  # false for NaN
 
 
 def _ns(year: int) -> int:
@@ -97,7 +97,7 @@ POSITION_SIGMA = Bound(
     1000.0,
     "km",
     Reason.BAD_POSITION_SIGMA,
-    "0, negative and NaN are unknown. A position of larger error is no position.",
+    "0, negative and NaN are unknown. A position with a larger error is of no use.",
 )
 QUATERNION = Bound(
     "attitude_xyzw",
@@ -113,8 +113,8 @@ ATTITUDE_SIGMA = Bound(
     2 * 3600.0,
     "arcsec",
     Reason.VAGUE_ATTITUDE,
-    "0, negative and NaN are unknown. A prior of larger error is no help: the stars are searched "
-    "without it. From 180 degrees on it says that the attitude is unknown, which is no reject.",
+    "0, negative and NaN are unknown. A prior with a larger error does not help: the stars are "
+    "searched without it. From 180 degrees on the attitude is unknown, which is not a reject.",
 )
 
 # Of a calibration.
@@ -130,7 +130,12 @@ FOCAL_LENGTH = Bound(
     "Of both focal lengths, without sign: the second is negative where rows count upward.",
 )
 FOCAL_RATIO = Bound(
-    "K", 0.1, 10.0, "", Reason.BAD_CAMERA_MATRIX, "Of the two focal lengths: pixels are no strips."
+    "K",
+    0.1,
+    10.0,
+    "",
+    Reason.BAD_CAMERA_MATRIX,
+    "Of the two focal lengths: pixels are nearly square.",
 )
 CORNER = Bound(
     "K",

@@ -187,17 +187,17 @@ class Reason(StrEnum):
     BAD_POSITION_SIGMA = (
         "bad_position_sigma",
         Stage.READ,
-        "The state's position_sigma_km is above 1,000 km, which is no position.",
+        "The state's position_sigma_km is above 1,000 km: the position is of no use.",
     )
     BAD_ATTITUDE = (
         "bad_attitude",
         Stage.READ,
-        "The state's attitude_xyzw is no unit quaternion; its position is used.",
+        "The state's attitude_xyzw is not a unit quaternion; its position is used.",
     )
     VAGUE_ATTITUDE = (
         "vague_attitude",
         Stage.READ,
-        "The state's attitude_sigma_arcsec is above 2 degrees, which is no help; its position is "
+        "The state's attitude_sigma_arcsec is above 2 degrees, too vague to help; its position is "
         "used.",
     )
     DUPLICATE_STATE = (
@@ -216,7 +216,7 @@ class Reason(StrEnum):
     BAD_CAMERA_MATRIX = (
         "bad_camera_matrix",
         Stage.READ,
-        "The calibration's K is no camera matrix without skew, or is out of bounds.",
+        "The calibration's K is not a camera matrix without skew, or is out of bounds.",
         Trait.INVALID_CALIBRATION,
     )
     BAD_DISTORTION = (
@@ -327,7 +327,7 @@ class Reason(StrEnum):
     BAD_ELEMENTS = (
         "bad_elements",
         Stage.NAME,
-        "A record of the catalogue of known objects is no element set.",
+        "A record of the catalogue of known objects is not a valid element set.",
     )
     OTHER_ELEMENTS = (
         "other_elements",
@@ -376,7 +376,7 @@ class NameStatus(Declared):
 
     KNOWN = "known", "It is one satellite of the catalogue."
     AMBIGUOUS = "ambiguous", "It may be one of several satellites, or none; it has no name."
-    UNKNOWN = "unknown", "It is none of the catalogue, or there is no catalogue."
+    UNKNOWN = "unknown", "It is not in the catalogue, or there is no catalogue."
 
 
 class FrameStatus(Declared):

@@ -52,13 +52,13 @@ class SensorSettings(Group):
     attitude_sigma_arcsec: float = Field(
         60.0,
         gt=0,
-        le=ATTITUDE_SIGMA.greatest,
+        le=ATTITUDE_SIGMA.maximum,
         description="1-sigma of a prior attitude that has no sigma in the log.",
     )
     position_sigma_km: float = Field(
         0.05,
         gt=0,
-        le=POSITION_SIGMA.greatest,
+        le=POSITION_SIGMA.maximum,
         description="1-sigma of a position that has no sigma in the log.",
     )
     centroid_sigma_px: float | None = Field(

@@ -1,4 +1,4 @@
-"""Solve the objects of a night, step by step, each step as tasks that one worker can hold.
+"""Solve the objects of a night, step by step, in tasks that fit into the memory of a worker.
 
 The views of each sensor; the objects of each block of time; their numbers in the night; sensors
 whose errors are larger than stated; the positions and states of the objects, piece by piece. What
@@ -104,9 +104,11 @@ def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
 def _view(night: _Night) -> dict[Span, int]:
     """View the tracklets of all sensors, some of them a task; return the views of each span."""
     work, settings = night.work, night.settings
-    sensors, most = work.sensor_parts(), settings.work.most_views // VIEWS_AT_ONCE
+    sensors, limit = work.sensor_parts(), settings.work.most_views // VIEWS_AT_ONCE
     groups = [
-        (span, group) for span in night.spans for group in _sensor_groups(work, sensors, span, most)
+        (span, group)
+        for span in night.spans
+        for group in _sensor_groups(work, sensors, span, limit)
     ]
     futures = [
         view_sensors.submit(
@@ -166,11 +168,11 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     )
     (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
     viewed, margin_ns = night.viewed, night.margin_ns
-    most_views = MAX_JUDGED * night.epochs_apart
+    max_views = MAX_JUDGED * night.epochs_apart
     full = [span for span, count in zip(spans, counts, strict=True) if count]
     judged = [
         judge_span.submit(
-            viewed, span, margin_ns, night.apart_ns, most_views, settings.positions,
+            viewed, span, margin_ns, night.apart_ns, max_views, settings.positions,
             settings.states, solved,
         )
         for span in full

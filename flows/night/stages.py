@@ -139,7 +139,7 @@ def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     step(Stage.CHECK, 0, 1)
     viewed, spans = work.folder.viewed(work.round), work.all_spans()
     verdicts: list[SensorVerdict] = check_sensors(solved, viewed, list(work.spans), spans)
-    tell_verdicts(verdicts)
+    log_verdicts(verdicts)
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
     late = [verdict for verdict in faulty if verdict.is_late]
     work = work._replace(verdicts=tuple(as_in_the_logs(work.verdicts, verdicts)))
@@ -149,7 +149,7 @@ def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     return Checked(work, again=False, left_out=_taking_part(work, solved, faulty))
 
 
-def tell_verdicts(verdicts: Sequence[SensorVerdict]) -> None:
+def log_verdicts(verdicts: Sequence[SensorVerdict]) -> None:
     """Log one line for all sound sensors, and a warning for each that is at fault."""
     sound = [verdict for verdict in verdicts if not verdict.is_faulty]
     if sound:
@@ -247,11 +247,11 @@ def name(
     ]
     followed = followed_objects(views, before)
     names = name_objects(linked, spans_of_night(spans, night), night, followed)
-    _tell_names(names, followed, len(first))
+    _log_names(names, followed, len(first))
     return names
 
 
-def _tell_names(names: Names, followed: Mapping[str, str], linked: int) -> None:
+def _log_names(names: Names, followed: Mapping[str, str], linked: int) -> None:
     ids = {new for of_span in names.values() for new in of_span.values()}
     LOGGER.info("named %s", many(len(ids), "object"))
     if known := ids.intersection(followed.values()):

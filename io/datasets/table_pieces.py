@@ -57,7 +57,7 @@ def read_pieces(
         yield rows if time is None else rows.filter(_chosen(rows[time], between_ns))
 
 
-def within_bounds(pieces: Iterable[pa.Table], most_bytes: int) -> Iterator[pa.Table]:
+def within_bounds(pieces: Iterable[pa.Table], max_bytes: int) -> Iterator[pa.Table]:
     """Yield the pieces.
 
     Raises
@@ -68,8 +68,8 @@ def within_bounds(pieces: Iterable[pa.Table], most_bytes: int) -> Iterator[pa.Ta
     total = 0
     for piece in pieces:
         total += piece.nbytes
-        if total > most_bytes:
-            raise ValueError(f"its rows unpack to more than {most_bytes >> 20:,} MiB")
+        if total > max_bytes:
+            raise ValueError(f"its rows unpack to more than {max_bytes >> 20:,} MiB")
         yield piece
 
 

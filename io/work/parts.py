@@ -163,7 +163,7 @@ def write_part(
         with contextlib.suppress(OSError):  # another worker was first, with the same rows
             making.rename(part)
         if not part.is_dir():
-            raise OSError(None, "cannot be put in place", str(part))
+            raise OSError(None, "cannot be renamed to its name", str(part))
     except OSError as error:
         raise DatasetError(
             f"{part}: cannot be written ({error.strerror or error}); nothing was changed"

@@ -96,7 +96,7 @@ def _cameras_of(
 LOGGER = logging.getLogger(__name__)
 
 # Earth-fixed axes turn: states of a log may be twice as fast in GCRF.
-FASTEST_KM_S, FARTHEST_KM = 2 * SPEED.greatest, 2 * POSITION.greatest
+FASTEST_KM_S, FARTHEST_KM = 2 * SPEED.maximum, 2 * POSITION.maximum
 
 
 def interpolate_sensor_states(

@@ -71,8 +71,8 @@ def in_slices(
     """
     times = [array(read(), column).copy() for read in tables]
     orders = [None if (np.diff(t) >= 0).all() else np.argsort(t, kind="stable") for t in times]
-    most = max(MAX_ROWS, ROWS_OF_TABLE * len(tables))
-    count = max(-(-sum(len(t) for t in times) // most), 1)
+    limit = max(MAX_ROWS, ROWS_OF_TABLE * len(tables))
+    count = max(-(-sum(len(t) for t in times) // limit), 1)
     edges = np.linspace(span.start_ns, span.end_ns, count + 1).astype(np.int64)
     cuts = [
         np.searchsorted(t if order is None else t[order], edges)

@@ -46,7 +46,7 @@ _DUPLICATES = {
 
 
 class OrderedFrames(NamedTuple):
-    """The frames of a run: where they lie, and in memory only their times and small tables."""
+    """The frames of a run: where they are, and in memory only their times and small tables."""
 
     folder: ReadFolder
     sensors: list[str]  # sorted; a sensor's number is its index here
@@ -165,8 +165,8 @@ def _piece_tables(pieces: Mapping[tuple[int, int], Path], name: str, schema: pa.
 
 def _without_strays(keys: pa.Table, logs: Sequence[ReadLog]) -> tuple[pa.Table, pa.Table]:
     """Return the keys of frames within the time range of their log, and those of strays."""
-    most = max((log.number for log in logs), default=-1) + 1
-    first, last = np.zeros(most, np.int64), np.zeros(most, np.int64)
+    n_logs = max((log.number for log in logs), default=-1) + 1
+    first, last = np.zeros(n_logs, np.int64), np.zeros(n_logs, np.int64)
     for log in logs:
         first[log.number] = log.source.first_time_ns or 0
         last[log.number] = log.source.last_time_ns or 0

@@ -24,17 +24,17 @@ def main() -> int:
     if options.keep:
         options.keep.write_bytes(cases.case(options.first).log)
     began, found = time.monotonic(), collections.Counter[tuple[str, str, str]]()
-    most_cpu_s, most_bytes = 0.0, 0
+    most_cpu_s, max_bytes = 0.0, 0
     for answer in judged(_asked(options), options.processes):
         verdict = answer.verdict
         outcome = "FAULT" if verdict.fault else verdict.outcome
         found[GROUPS[answer.asked[0]], answer.promise, outcome] += 1
         most_cpu_s = max(most_cpu_s, verdict.cpu_s)
-        most_bytes = max(most_bytes, verdict.peak_bytes)
+        max_bytes = max(max_bytes, verdict.peak_bytes)
         if verdict.fault:
             print(fault_line(answer), flush=True)
     print(table(found))
-    print(f"most CPU for one log {most_cpu_s:.1f} s, most memory {most_bytes >> 20} MiB, "
+    print(f"most CPU for one log {most_cpu_s:.1f} s, most memory {max_bytes >> 20} MiB, "
           f"{time.monotonic() - began:.0f} s in all")  # fmt: skip
     return int(any(outcome == "FAULT" for *_, outcome in found))
 

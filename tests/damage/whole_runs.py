@@ -105,21 +105,21 @@ def main() -> int:
     if options.settings:
         asked += [("settings", run_of_setting, extreme) for extreme in odd_settings.extremes()]
     found = collections.Counter[tuple[str, str]]()
-    most_cpu_s, most_bytes = (0.0, ""), (0, "")
+    most_cpu_s, max_bytes = (0.0, ""), (0, "")
     quiet_console()
     with embedded_prefect():
         for what, do, arguments in asked:
             with tempfile.TemporaryDirectory() as folder:
                 came = do(*arguments, Path(folder))
             most_cpu_s = max(most_cpu_s, (came.cpu_s, f"{what} {arguments}"))
-            most_bytes = max(most_bytes, (came.peak_bytes, f"{what} {arguments}"))
+            max_bytes = max(max_bytes, (came.peak_bytes, f"{what} {arguments}"))
             found[what, "FAULT" if came.fault else came.outcome] += 1
             if came.fault:
                 print(f"{what} {arguments}: {came.outcome}", flush=True)
     for key, n in sorted(found.items()):
         print(f"| {' | '.join(key)} | {n:,} |")
     print(f"most CPU for one run {most_cpu_s[0]:.1f} s ({most_cpu_s[1]})")
-    print(f"most memory {most_bytes[0] >> 20} MiB ({most_bytes[1]})")
+    print(f"most memory {max_bytes[0] >> 20} MiB ({max_bytes[1]})")
     return int(any(outcome == "FAULT" for _, outcome in found))
 
 

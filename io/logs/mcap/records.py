@@ -123,11 +123,11 @@ class RecordWalk:
         """Yield the segments; if there is a pool, it is already opening their chunks."""
         waiting: deque[tuple[Segment, Future[OpenedChunk] | None]] = deque()
         ahead, unpacked = 0, 0
-        most = max(MIN_UNPACKED_BYTES, MAX_EXPANSION * len(self.data))
+        limit = max(MIN_UNPACKED_BYTES, MAX_EXPANSION * len(self.data))
         for segment in segments:
             opening = None
             if segment.opcode == CHUNK and not segment.reason:
-                if unpacked + segment.size > most:
+                if unpacked + segment.size > limit:
                     segment = Segment(CHUNK, segment.at, segment.after, Reason.CHUNK_TOO_LARGE)
                 unpacked += segment.size
             is_whole_chunk = segment.opcode == CHUNK and not (segment.reason or segment.cut)

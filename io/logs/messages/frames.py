@@ -214,8 +214,8 @@ def _frame_fault(frame: FrameMessage) -> Reason | None:
 
 def _within(bound: Bound, values: Floats) -> Bools:
     """Return which values lie within a bound, as float32 like the values; false for NaN."""
-    least, greatest = np.float32(bound.least), np.float32(bound.greatest)
-    return np.asarray((values >= least) & (values <= greatest))
+    minimum, maximum = np.float32(bound.minimum), np.float32(bound.maximum)
+    return np.asarray((values >= minimum) & (values <= maximum))
 
 
 def _joined(arrays: Sequence[npt.NDArray[np.floating]]) -> Floats:

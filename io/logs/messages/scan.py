@@ -33,17 +33,17 @@ def _bits(value: float) -> np.int32:
 # Limits within which a scan takes a message. Those of lengths, which are squared here, are
 # narrower than the declared ones by more than rounding, so that a state near a limit is judged in
 # one function.
-EARLIEST_NS, LATEST_NS = int(bounds.TIME.least), int(bounds.TIME.greatest)
-LONGEST_S = bounds.EXPOSURE.greatest
-FARTHEST_BITS = _bits(bounds.CENTROID_POSITION.greatest)
-FLUX_BITS = _bits(bounds.FLUX.least), _bits(bounds.FLUX.greatest)
-SIGMA_BITS = _bits(bounds.CENTROID_SIGMA.least), _bits(bounds.CENTROID_SIGMA.greatest)
-NEAREST_KM2 = (bounds.POSITION.least * 1.0001) ** 2
-FARTHEST_KM2 = (bounds.POSITION.greatest * 0.99) ** 2
-FASTEST_KM2_S2 = (bounds.SPEED.greatest * 0.99) ** 2
-MIN_NORM2, MAX_NORM2 = 1.005 * bounds.QUATERNION.least**2, 0.995 * bounds.QUATERNION.greatest**2
-MAX_SIGMA_KM = bounds.POSITION_SIGMA.greatest
-VAGUE_ARCSEC, ANY_ARCSEC = bounds.ATTITUDE_SIGMA.greatest, float(bounds.ARCSEC_OF_HALF_A_TURN)
+EARLIEST_NS, LATEST_NS = int(bounds.TIME.minimum), int(bounds.TIME.maximum)
+LONGEST_S = bounds.EXPOSURE.maximum
+FARTHEST_BITS = _bits(bounds.CENTROID_POSITION.maximum)
+FLUX_BITS = _bits(bounds.FLUX.minimum), _bits(bounds.FLUX.maximum)
+SIGMA_BITS = _bits(bounds.CENTROID_SIGMA.minimum), _bits(bounds.CENTROID_SIGMA.maximum)
+NEAREST_KM2 = (bounds.POSITION.minimum * 1.0001) ** 2
+FARTHEST_KM2 = (bounds.POSITION.maximum * 0.99) ** 2
+FASTEST_KM2_S2 = (bounds.SPEED.maximum * 0.99) ** 2
+MIN_NORM2, MAX_NORM2 = 1.005 * bounds.QUATERNION.minimum**2, 0.995 * bounds.QUATERNION.maximum**2
+MAX_SIGMA_KM = bounds.POSITION_SIGMA.maximum
+VAGUE_ARCSEC, ANY_ARCSEC = bounds.ATTITUDE_SIGMA.maximum, float(bounds.ARCSEC_OF_HALF_A_TURN)
 
 
 # Columns of `fields`: where a field of a CentroidFrame begins, and of a SensorState.

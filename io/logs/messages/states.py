@@ -139,14 +139,14 @@ def _state_fault(state: StateMessage) -> Reason | None:
         return Reason.UNKNOWN_FRAME
     # The length is finite only if every component is finite.
     radius_km = math.hypot(*state.position_km)
-    if len(state.position_km) != 3 or not radius_km <= POSITION.greatest:
+    if len(state.position_km) != 3 or not radius_km <= POSITION.maximum:
         return POSITION.reason
     velocity = state.velocity_km_s
     if len(velocity) not in (0, 3) or math.hypot(*velocity) not in SPEED:
         return SPEED.reason
-    if state.position_sigma_km > POSITION_SIGMA.greatest:
+    if state.position_sigma_km > POSITION_SIGMA.maximum:
         return POSITION_SIGMA.reason
-    return Reason.INSIDE_EARTH if radius_km < POSITION.least else None
+    return Reason.INSIDE_EARTH if radius_km < POSITION.minimum else None
 
 
 def _is_without_attitude(state: StateMessage) -> bool:
@@ -158,4 +158,4 @@ def _attitude_fault(state: StateMessage) -> Reason | None:
     q = state.attitude_xyzw
     if len(q) != 4 or math.hypot(*q) not in QUATERNION:
         return QUATERNION.reason
-    return ATTITUDE_SIGMA.reason if state.attitude_sigma_arcsec > ATTITUDE_SIGMA.greatest else None
+    return ATTITUDE_SIGMA.reason if state.attitude_sigma_arcsec > ATTITUDE_SIGMA.maximum else None

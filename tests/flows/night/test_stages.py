@@ -2,7 +2,7 @@
 
 import logging
 
-from epipole.flows.night.stages import tell_verdicts
+from epipole.flows.night.stages import log_verdicts
 from epipole.tasks.check.check_sensors import SensorVerdict
 
 RIGHT = [SensorVerdict("a", -0.017, 0.029), SensorVerdict("b", 0.004, 0.007)]
@@ -11,7 +11,7 @@ WRONG = SensorVerdict("c", 0.25, 0.01, "clock")
 
 def lines(clocks, caplog):
     with caplog.at_level(logging.INFO):
-        tell_verdicts(clocks)
+        log_verdicts(clocks)
     return [(record.levelname, record.getMessage()) for record in caplog.records]
 
 
