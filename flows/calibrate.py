@@ -15,7 +15,7 @@ from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import EXPOSURES
-from epipole.tasks.algorithms.star_identification.sensor import spread
+from epipole.tasks.algorithms.star_identification.sensor import evenly_spaced
 from epipole.tasks.calibrate.calibrate_unknown import (
     CameraReport,
     calibrate_unknown,
@@ -67,7 +67,7 @@ def _of_sensor(
     frames: OrderedFrames, number: int, field_deg: float | None, settings: Settings
 ) -> CameraReport:
     time_ns = frames.time_ns[number]
-    rows = spread(len(time_ns), MAX_FRAMES)
+    rows = evenly_spaced(len(time_ns), MAX_FRAMES)
     parts = [frames_between(frames.folder, number, t, t + 1) for t in time_ns[rows].tolist()]
     exposures: pa.Table = concat(EXPOSURES, parts).combine_chunks()
     states = states_between(frames.folder, number, *ALL_TIME)
@@ -100,7 +100,7 @@ def as_dict(report: CameraReport) -> dict[str, Any]:
         "identified": report.n_identified,
         "stars": report.n_stars,
         "residual_px": None if math.isnan(report.residual_px) else report.residual_px,
-        "told": report.told._asdict() if report.is_told else None,
+        "told": report.nominal._asdict() if report.has_calibration else None,
         "sigma": report.sigma,
         "calibration": calibration_message(report) if found else None,
     }
@@ -132,9 +132,9 @@ def lines(report: CameraReport) -> list[str]:
 
 
 def _not_found(report: CameraReport) -> list[str]:
-    stated = report.told
+    nominal = report.nominal
     narrow, wide = (
-        stated._replace(fx_px=stated.fx_px * factor).field_deg[0]
+        nominal._replace(fx_px=nominal.fx_px * factor).field_deg[0]
         for factor in (report.reach, 1 / report.reach)
     )
     return [
@@ -149,23 +149,23 @@ def _residual(report: CameraReport) -> str:
 
 
 def _image(report: CameraReport) -> str:
-    size = f"{report.told.width} x {report.told.height} px"
+    size = f"{report.nominal.width} x {report.nominal.height} px"
     return (
         size
-        if report.image_is_told
+        if report.has_image_size
         else f"{size}, as far as centroids reach: no calibration in the log"
     )
 
 
 def _focal(report: CameraReport) -> str:
-    c, stated = report.camera, report.told
+    c, nominal = report.camera, report.nominal
     assert c is not None
     sigma = f" +- {report.sigma['fx_px']:.2f}" if report.sigma else ""
     text = f"{c.fx_px:.2f}{sigma} px, a field of {c.field_deg[0]:.2f} deg along the columns"
-    if not report.is_told:
+    if not report.has_calibration:
         return text
-    percent = 100 * (c.fx_px / stated.fx_px - 1)
-    return f"{text}; {percent:+.2f} % of {stated.fx_px:.2f}"
+    percent = 100 * (c.fx_px / nominal.fx_px - 1)
+    return f"{text}; {percent:+.2f} % of {nominal.fx_px:.2f}"
 
 
 def _values(report: CameraReport, names: tuple[str, ...]) -> str:

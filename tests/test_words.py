@@ -29,11 +29,8 @@ WAITING = (
     "tasks/algorithms/photometry.py",
     "tasks/algorithms/sensor_faults",
     "tasks/algorithms/star_catalogue.py",
-    "tasks/algorithms/star_identification",
     "tasks/algorithms/tracking",
-    "tasks/calibrate",
     "tasks/check",
-    "tasks/identify",
     "tasks/solve",
 )
 # In text, with the uses that are allowed; in names, as words between underscores or capitals.

@@ -28,8 +28,9 @@ SECTIONS = {
     ),
     "Concepts": (
         "docs/conventions.md", "docs/glossary.md", "docs/methods/identification.md",
-        "docs/methods/optics.md", "docs/methods/tracking.md", "docs/methods/association.md",
-        "docs/methods/positions.md", "docs/methods/sensors.md", "docs/methods/boresight.md",
+        "docs/methods/passes.md", "docs/methods/optics.md", "docs/methods/tracking.md",
+        "docs/methods/association.md", "docs/methods/positions.md", "docs/methods/sensors.md",
+        "docs/methods/boresight.md",
     ),
     "How good": ("docs/limits.md", "docs/damage.md", "BENCHMARKS.md"),
     "Project": ("docs/README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"),

@@ -19,7 +19,11 @@ from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensor
-from epipole.tasks.calibrate.find_camera import CameraFinding, find_sensor_camera, refuses
+from epipole.tasks.calibrate.find_camera import (
+    CameraFinding,
+    contradicts_camera,
+    find_sensor_camera,
+)
 
 LOGGER = logging.getLogger(__name__)
 
@@ -44,7 +48,7 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     spans = {
         sensor: of_sensor
         for sensor, of_sensor in work.spans.items()
-        if refuses(sensor, work.identified[sensor], of_sensor, work.cameras)
+        if contradicts_camera(sensor, work.identified[sensor], of_sensor, work.cameras)
     }
     futures = [
         find_sensor_camera.submit(
@@ -62,7 +66,7 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     if mode == "report" or not found:
         return work, work.cameras
     names = {finding.sensor_id for finding in found}
-    stated = _with_cameras(work.cameras, [f.cameras(work.cameras, f.as_told) for f in found], names)
+    stated = _with_cameras(work.cameras, [f.cameras(work.cameras, f.nominal) for f in found], names)
     cameras = [f.cameras(work.cameras, f.camera) for f in found if f.camera]
     return _identify_again(work, cameras, names, 0, settings), stated
 

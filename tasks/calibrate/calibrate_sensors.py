@@ -1,4 +1,8 @@
-"""Calibrate sensors: fit the optics of each to its stars of the night."""
+"""Calibrate sensors: fit the optics of each to its stars of the night.
+
+The stars are a sample of whole frames, evenly over the night. Optics that certainly differ from the
+log's calibration are named in `Calibrated.departed`: the sensor is identified again with them.
+"""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -23,9 +27,9 @@ from epipole.tasks.algorithms.geometry.camera import (
 )
 from epipole.tasks.algorithms.geometry.covariances import OPTICS
 from epipole.tasks.algorithms.geometry.optics_calibration import (
+    NominalOptics,
     OpticsFit,
     StarImages,
-    ToldOptics,
     calibrate_in_steps,
     calibrate_optics,
 )
@@ -35,18 +39,18 @@ from epipole.tasks.common.stage_tasks import stage_task
 Array = npt.NDArray[np.float64]
 LOGGER = logging.getLogger(__name__)
 
-MAX_STARS = 20_000  # with more, the sigmas would be smaller than the errors of the model
-# The optics differ if chi-square falls by this much. By chance it falls by 9, and by more where the
-# errors of centroids are not normal.
-REAL_GAIN = 60.0
+MAX_STARS = 20_000  # of a fit; with more, sigmas would be below the errors of the model
+# The optics differ if chi-square falls by more than this. With right optics it falls by 9, and by
+# more where the errors of centroids are not normal.
+MIN_GAIN = 60.0
 
 
 class Calibrated(NamedTuple):
     """Fitted optics.
 
-    `calibrations` is CALIBRATIONS, a row per sensor with enough stars. `cameras` is CAMERAS, with
-    the fitted optics and their covariance for the sensors in `departed`: theirs certainly differ
-    from the calibration.
+    calibrations : CALIBRATIONS, a row per sensor with enough stars
+    cameras : CAMERAS, with the fitted optics and their covariance for the sensors in `departed`
+    departed : sensors whose optics certainly differ from their calibration
     """
 
     calibrations: pa.Table
@@ -60,7 +64,7 @@ def calibrate_sensor(
     identified: Parts,
     spans: Sequence[Span],
     cameras: pa.Table,
-    told: pa.Table,
+    nominal: pa.Table,
     principal_point_px: float | None,
 ) -> Calibrated:
     """Fit one sensor's optics to its stars of all spans.
@@ -69,19 +73,21 @@ def calibrate_sensor(
     ----------
     identified
         The parts of the sensor, with the stars.
-    cameras, told, principal_point_px
+    cameras, nominal, principal_point_px
         As in `calibrate_sensors`.
     """
-    own = pc.field("sensor_id") == sensor.sensor_id
-    stars = _spread(identified, spans)
-    return calibrate_sensors(stars, cameras.filter(own), told.filter(own), principal_point_px)
+    of_sensor = pc.field("sensor_id") == sensor.sensor_id
+    stars = _sampled_stars(identified, spans)
+    return calibrate_sensors(
+        stars, cameras.filter(of_sensor), nominal.filter(of_sensor), principal_point_px
+    )
 
 
-def _spread(identified: Parts, spans: Sequence[Span]) -> pa.Table:
-    """Return the stars of frames that are evenly spread over the night, about `MAX_STARS`."""
+def _sampled_stars(identified: Parts, spans: Sequence[Span]) -> pa.Table:
+    """Return the stars of some frames, evenly over the night, about `MAX_STARS`."""
     parts = [identified.read(span, "stars") for span in spans]
     total = sum(part.num_rows for part in parts)
-    # A tenth fewer, because frames have different numbers of stars.
+    # A tenth fewer than the maximum, because frames have different numbers of stars.
     step = 1 if total <= MAX_STARS else -(-total * 10 // (MAX_STARS * 9))
     return concat(STARS, [_every(part, step) for part in parts])
 
@@ -96,7 +102,7 @@ def _every(stars: pa.Table, step: int) -> pa.Table:
 
 
 def calibrate_sensors(
-    stars: pa.Table, cameras: pa.Table, told: pa.Table, principal_point_px: float | None = None
+    stars: pa.Table, cameras: pa.Table, nominal: pa.Table, principal_point_px: float | None = None
 ) -> Calibrated:
     """Return the optics that fit the stars.
 
@@ -104,19 +110,19 @@ def calibrate_sensors(
     ----------
     stars
         STARS; those of a sensor are in order of time.
-    cameras, told
-        CAMERAS that the stars were identified with, and those of the log.
+    cameras, nominal
+        CAMERAS with which the stars were identified, and those of the log.
     principal_point_px
-        1-sigma error of the principal points of the log, per axis; None: unknown, and 0 where the
-        stars do not contradict the log.
+        1-sigma error of the log's principal points, per axis; None: unknown, and taken as 0 where
+        the stars do not contradict the log.
     """
     rows, changed = [], {}
-    logged = _single(told)
+    logged = _single(nominal)
     for name, optics in _single(cameras).items():
         images = _images(stars.filter(pc.field("sensor_id") == name), optics.camera)
-        own = logged.get(name, optics)
-        present = _Present(optics.camera, optics.cov != own.cov)
-        fitted = _fit(ToldOptics(own.camera, principal_point_px), present, images)
+        logged_optics = logged.get(name, optics)
+        present = _Present(optics.camera, optics.cov != logged_optics.cov)
+        fitted = _fit(NominalOptics(logged_optics.camera, principal_point_px), present, images)
         if fitted is None:
             continue
         fit, departs = fitted
@@ -144,7 +150,7 @@ class _Optics(NamedTuple):
 
 class _Present(NamedTuple):
     camera: Camera
-    is_fitted: bool  # as the covariance says, which is not that of the log
+    is_fitted: bool  # its covariance is not that of the log
 
 
 def _single(cameras: pa.Table) -> dict[str, _Optics]:
@@ -171,31 +177,33 @@ def _images(stars: pa.Table, camera: Camera) -> StarImages:
     return StarImages(x, y, u_sensor, number[kept], array(stars, "star_id")[kept])
 
 
-def _fit(given: ToldOptics, present: _Present, images: StarImages) -> tuple[OpticsFit, bool] | None:
+def _fit(
+    given: NominalOptics, present: _Present, images: StarImages
+) -> tuple[OpticsFit, bool] | None:
     """Return the optics, and whether frames must be identified again with them.
 
-    Optics that the log tells wrong, or whose principal point is said to be uncertain, are fitted in
-    steps; then what they leave uncertain must reach the frames once, however near the present
-    optics are.
+    Optics are fitted in steps if they differ from those of the log, or if the settings state an
+    uncertain principal point. Then the covariance of the fit must reach the frames once, however
+    near the present optics are.
     """
     if present.camera.fy_px < 0:
         return _fit_upward(given, present, images)
     free = calibrate_optics(given, images, present.camera)
     if free is None:
         return None
-    as_told = present.camera == given.camera and not present.is_fitted
-    if as_told and free.gain <= REAL_GAIN and not given.principal_point_px:
+    as_logged = present.camera == given.camera and not present.is_fitted
+    if as_logged and free.gain <= MIN_GAIN and not given.principal_point_px:
         return free, False
     fit = calibrate_in_steps(given, images, free, present.camera)
-    return fit, not present.is_fitted or fit.gain > REAL_GAIN
+    return fit, not present.is_fitted or fit.gain > MIN_GAIN
 
 
 def _fit_upward(
-    given: ToldOptics, present: _Present, images: StarImages
+    given: NominalOptics, present: _Present, images: StarImages
 ) -> tuple[OpticsFit, bool] | None:
     """Return what `_fit` does for rows that count upward: fitted as rows that count down."""
-    told, _ = flip_rows(given.camera, images.y_px)
-    given = given._replace(camera=told)
+    nominal, _ = flip_rows(given.camera, images.y_px)
+    given = given._replace(camera=nominal)
     camera, y_px = flip_rows(present.camera, images.y_px)
     fitted = _fit(given, present._replace(camera=camera), images._replace(y_px=y_px))
     if fitted is None:

@@ -1,4 +1,7 @@
-"""Calibrate an unknown camera: one sensor's optics from a few of its frames, told or not."""
+"""Calibrate a camera about which little is known, from a few frames of one sensor.
+
+The camera is searched for in some frames (`find_camera`), then fitted to the stars of all.
+"""
 
 from typing import Any, NamedTuple
 
@@ -12,26 +15,28 @@ from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
-from epipole.tasks.algorithms.star_identification.camera_search import FEWEST
+from epipole.tasks.algorithms.star_identification.camera_search import MIN_CENTROIDS
 from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensors
 from epipole.tasks.calibrate.find_camera import find_agreed_camera, image_frames, skies_at
 from epipole.tasks.common.sightings import camera_of
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_stars import identify_stars
 
-TRIED = 6  # frames in which a camera is searched for
-REACH = 1.5  # by which a told focal length may be off, either way
-NARROWEST_DEG, WIDEST_DEG = 2.0, 60.0  # fields of an unknown focal length
-NEAR = 1.001  # a guessed focal length is wrong: optics are fitted in steps
-ROUNDS = 3  # with better optics more stars take part
+TRIED = 6  # frames in which the camera is searched for
+REACH = 1.5  # factor by which a stated focal length may be off, either way
+MIN_FIELD_DEG, MAX_FIELD_DEG = 2.0, 60.0  # that are tried if the field is unknown
+# The fit starts from a focal length that differs by this factor from the one found, as from a wrong
+# calibration: so optics are fitted in steps.
+OFF_NOMINAL = 1.001
+ROUNDS = 3  # of identification and fit: with better optics more stars take part
 
 
 class CameraReport(NamedTuple):
     """What is known of a sensor's camera after calibration.
 
-    told : the log's; a guess where `is_told` is false
-    image_is_told : the size of the image is the log's
-    reach : by which factor other focal lengths than the told one were tried
+    nominal : the camera of the log; a guess unless `has_calibration`
+    reach : factor by which focal lengths around the nominal one were tried
+    has_image_size : the size of the image is that of the log
     camera : the one found, None where the frames show no stars
     sigma : by the names of the optics; empty with too few stars for a fit
     n_frames, n_identified, n_stars : frames looked at, identified, and their stars
@@ -39,10 +44,10 @@ class CameraReport(NamedTuple):
     """
 
     sensor_id: str
-    told: Camera
+    nominal: Camera
     reach: float
-    is_told: bool
-    image_is_told: bool
+    has_calibration: bool
+    has_image_size: bool
     camera: Camera | None
     sigma: dict[str, float]
     n_frames: int
@@ -52,8 +57,8 @@ class CameraReport(NamedTuple):
 
     @property
     def is_mirrored(self) -> bool:
-        """Whether the rows count the other way than told."""
-        return self.camera is not None and (self.camera.fy_px < 0) != (self.told.fy_px < 0)
+        """Whether the rows count the other way than in the nominal camera."""
+        return self.camera is not None and (self.camera.fy_px < 0) != (self.nominal.fy_px < 0)
 
 
 def calibrate_unknown(
@@ -75,21 +80,21 @@ def calibrate_unknown(
         Field of view along the columns, about; None: as the calibration says, else unknown.
     """
     sensor_id = exposures["sensor_id"][0].as_py()
-    told, reach = _told(exposures, cameras, field_deg)
-    places = interpolate_sensor_states(exposures, states, settings)
-    found = _search(exposures, places, told, reach, settings)
-    is_told = cameras.num_rows > 0 and field_deg is None
+    nominal, reach = _start(exposures, cameras, field_deg)
+    frame_states = interpolate_sensor_states(exposures, states, settings)
+    found = _search(exposures, frame_states, nominal, reach, settings)
+    has_calibration = cameras.num_rows > 0 and field_deg is None
     nothing = CameraReport(
-        sensor_id, told, reach, is_told, cameras.num_rows > 0, None, {}, exposures.num_rows, 0, 0,
-        np.nan,
+        sensor_id, nominal, reach, has_calibration, cameras.num_rows > 0, None, {},
+        exposures.num_rows, 0, 0, np.nan,
     )  # fmt: skip
     if found is None:
         return nothing
     start = nothing._replace(camera=found)
-    return _fitted(start, exposures, places, settings)
+    return _fitted(start, exposures, frame_states, settings)
 
 
-def _told(exposures: pa.Table, cameras: pa.Table, field_deg: float | None) -> tuple[Camera, float]:
+def _start(exposures: pa.Table, cameras: pa.Table, field_deg: float | None) -> tuple[Camera, float]:
     """Return the camera to start from, and by which factor its focal length may be off."""
     if cameras.num_rows:
         camera = camera_of(cameras, 0)
@@ -99,7 +104,7 @@ def _told(exposures: pa.Table, cameras: pa.Table, field_deg: float | None) -> tu
     else:
         width, height = (_side_px(exposures, name) for name in ("x_px", "y_px"))
         camera = Camera(width, height, 1.0, 1.0, (width - 1) / 2, (height - 1) / 2)
-    narrow, wide = np.tan(np.radians([NARROWEST_DEG, WIDEST_DEG]) / 2)
+    narrow, wide = np.tan(np.radians([MIN_FIELD_DEG, MAX_FIELD_DEG]) / 2)
     half = np.sqrt(narrow * wide) if field_deg is None else np.tan(np.radians(field_deg) / 2)
     f = float(camera.width / 2 / half)
     reach = float(np.sqrt(wide / narrow)) if field_deg is None else REACH
@@ -113,23 +118,23 @@ def _side_px(exposures: pa.Table, name: str) -> int:
 
 
 def _search(
-    exposures: pa.Table, places: pa.Table, told: Camera, reach: float, settings: Settings
+    exposures: pa.Table, frame_states: pa.Table, nominal: Camera, reach: float, settings: Settings
 ) -> Camera | None:
     counts = np.diff(flatten(exposures, "x_px")[1])
-    rows = np.flatnonzero(counts >= FEWEST)
+    rows = np.flatnonzero(counts >= MIN_CENTROIDS)
     if not len(rows):
         return None
     # Not those with most centroids: these may be mostly clutter.
     rows = rows[np.argsort(np.abs(counts[rows] - np.median(counts[rows])), kind="stable")]
     rows = np.sort(rows[:TRIED])
-    images = image_frames(exposures.take(rows), places.take(rows), settings)
+    images = image_frames(exposures.take(rows), frame_states.take(rows), settings)
     skies = skies_at(int(array(exposures, "time")[rows[0]]), settings)
-    found = find_agreed_camera(images, told, reach, skies, settings)
+    found = find_agreed_camera(images, nominal, reach, skies, settings)
     return found and found.camera
 
 
 def _as_table(report: CameraReport, camera: Camera) -> pa.Table:
-    """Return CAMERAS of the sensor, as a log would tell this camera."""
+    """Return CAMERAS of the sensor, as if its log had this camera."""
     key = {"sensor_id": [report.sensor_id], "time": [0]}
     values = {name: [value] for name, value in camera._asdict().items()}
     cov = unstack_covariance("cov_{}", np.zeros((1, 9, 9)), OPTICS_AXES)
@@ -137,25 +142,25 @@ def _as_table(report: CameraReport, camera: Camera) -> pa.Table:
 
 
 def _given(report: CameraReport) -> Camera:
-    """Return the camera that the fit starts from: the told one, or one near that found."""
-    if report.is_told:
-        return mirrored(report.told) if report.is_mirrored else report.told
+    """Return the camera that the fit starts from: the nominal one, or one near the camera found."""
+    if report.has_calibration:
+        return mirrored(report.nominal) if report.is_mirrored else report.nominal
     assert report.camera is not None
-    f = report.camera.fx_px * NEAR
+    f = report.camera.fx_px * OFF_NOMINAL
     return report.camera._replace(fx_px=f, fy_px=f * np.sign(report.camera.fy_px))
 
 
 def _fitted(
-    report: CameraReport, exposures: pa.Table, places: pa.Table, settings: Settings
+    report: CameraReport, exposures: pa.Table, frame_states: pa.Table, settings: Settings
 ) -> CameraReport:
     """Return the report with the camera fitted to the stars of all frames."""
     catalogue = read_star_catalogue(settings.identification.catalogue)
     assert report.camera is not None
-    cameras, told = _as_table(report, report.camera), _as_table(report, _given(report))
+    cameras, nominal = _as_table(report, report.camera), _as_table(report, _given(report))
     for _ in range(ROUNDS):
-        identified = identify_stars(exposures, places, cameras, catalogue, settings)
+        identified = identify_stars(exposures, frame_states, cameras, catalogue, settings)
         fit: Calibrated = calibrate_sensors(
-            identified.stars, cameras, told, settings.sensors.principal_point_sigma_px
+            identified.stars, cameras, nominal, settings.sensors.principal_point_sigma_px
         )
         cameras = fit.cameras
         if not fit.departed:

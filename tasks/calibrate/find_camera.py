@@ -1,5 +1,10 @@
-"""Find a camera: focal length, handedness and distortion of a sensor that its calibration does not
-fit."""
+"""Find the camera of a sensor whose calibration does not fit its stars.
+
+`contradicts_camera` says for which sensors that is so: few frames are identified, or stars lie far
+from their predicted positions, or all in one part of the image. `find_sensor_camera` then searches
+three frames for focal length, direction of the rows and distortion (`camera_search`); another frame
+has to agree. A `CameraFinding` says what differs from the log's calibration.
+"""
 
 import logging
 from collections.abc import Callable, Sequence
@@ -22,21 +27,21 @@ from epipole.schemas.work_tables import CAMERAS, EXPOSURES
 from epipole.tasks.algorithms.constants import DAY_NS, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
 from epipole.tasks.algorithms.star_identification.camera_search import (
-    FEWEST,
+    MIN_CENTROIDS,
     FoundCamera,
     ImageFrame,
-    agrees,
+    agreeing_camera,
     find_cameras,
 )
 from epipole.tasks.algorithms.star_identification.centroids import brightest_first
-from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
+from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.calibrate.calibrate_sensors import with_optics
 from epipole.tasks.common.sightings import camera_of
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 from epipole.tasks.identify.frame_inputs import flatten_centroids, interpolate_sensor_states
 from epipole.tasks.identify.identify_span import states_about
-from epipole.tasks.identify.identify_stars import search_of
+from epipole.tasks.identify.identify_stars import match_settings
 from epipole.tasks.identify.tabulate import barycentric_velocity
 from epipole.tasks.read.order_frames import frames_between
 
@@ -44,39 +49,41 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 LOGGER = logging.getLogger(__name__)
 
-# Search for the camera of a sensor if at most FEW of its frames were identified. Warn that none was
-# found only if at most HARDLY_ANY were.
-FEW, HARDLY_ANY = 0.5, 0.05
-# The stars of a frame, if optics are right, are all over the image: their variance is that of even
-# places. With strong distortion, dense clusters of stars match alone.
-ONE_PLACE = 0.1
-# If optics are wrong, stars lie farther from their places than any sensor's centroids do [px], and
-# more centroids than this share are no stars.
-FAR_PX, UNMATCHED = 1.0, 0.2
-REACH = 1.11  # in a run: focal lengths from 10 % shorter to 11 % longer than told
+# The camera is searched for if at most this share of the frames was identified. That none was found
+# is a warning only if at most the second share was.
+MAX_IDENTIFIED, MAX_IDENTIFIED_TO_WARN = 0.5, 0.05
+# With right optics, a frame's stars are all over the image: their variance is that of an even
+# distribution, 1/12 per axis in units of the image's sides. With strong distortion, dense clusters
+# of stars match alone: the variance is below this share of it.
+CLUSTERED_VARIANCE = 0.1
+# With wrong optics, stars lie farther from their predicted positions than any sensor's centroids do
+# [px], and more than this share of the centroids is unmatched.
+LARGE_RESIDUAL_PX, MANY_UNMATCHED = 1.0, 0.2
+REACH = 1.11  # focal lengths from 10 % shorter to 11 % longer than the nominal one are tried
 TRIED = 3  # frames
-RICH = 0.75  # of the frames have no more centroids than those that are tried
+RICH = 0.75  # quantile of the number of centroids, of the frames that are tried
 
 
 class CameraFinding(NamedTuple):
-    """The camera of a sensor that `refuses` its frames.
+    """The camera of a sensor whose frames contradict its calibration.
 
-    `camera` is None where none was found; `told` is that of the log.
+    logged : the camera of the log
+    camera : the one found, None without one
     """
 
     sensor_id: str
-    told: Camera
+    logged: Camera
     camera: Camera | None
 
     @property
-    def as_told(self) -> Camera:
-        """The camera that the log tells, mirrored where the image is."""
+    def nominal(self) -> Camera:
+        """The camera of the log, mirrored where the image is."""
         upward = self.camera is not None and self.camera.fy_px < 0
-        return mirrored(self.told) if upward != (self.told.fy_px < 0) else self.told
+        return mirrored(self.logged) if upward != (self.logged.fy_px < 0) else self.logged
 
-    def cameras(self, told: pa.Table, camera: Camera) -> pa.Table:
+    def cameras(self, nominal: pa.Table, camera: Camera) -> pa.Table:
         """Return the sensor's rows of CAMERAS with this camera."""
-        of_sensor = told.filter(pc.field("sensor_id") == self.sensor_id)
+        of_sensor = nominal.filter(pc.field("sensor_id") == self.sensor_id)
         return with_optics(of_sensor, {self.sensor_id: camera._asdict()})
 
     def __str__(self) -> str:
@@ -88,52 +95,56 @@ class CameraFinding(NamedTuple):
                 "than told, with distortion and with rows counted upward either"
             )
         parts = []
-        if (camera.fy_px < 0) != (self.told.fy_px < 0):
+        if (camera.fy_px < 0) != (self.logged.fy_px < 0):
             parts.append("the image is mirrored (y up?)")
-        moved_px = (camera.k1 - self.told.k1) * camera.fx_px * np.tan(camera.half_diagonal_rad) ** 3
+        moved_px = (
+            (camera.k1 - self.logged.k1) * camera.fx_px * np.tan(camera.half_diagonal_rad) ** 3
+        )
         if abs(moved_px) >= 1.0:
             parts.append(
                 f"distortion moves its corners by some {abs(moved_px):.0f} px more than told "
-                f"(k1 about {camera.k1:.2g}, not {self.told.k1:.2g})"
+                f"(k1 about {camera.k1:.2g}, not {self.logged.k1:.2g})"
             )
-        percent = 100 * (camera.fx_px / self.told.fx_px - 1)
+        percent = 100 * (camera.fx_px / self.logged.fx_px - 1)
         if abs(percent) >= 0.1:
             size = "longer" if percent > 0 else "shorter"
             parts.append(
                 f"the focal length is {abs(percent):.1f} % {size} than told "
-                f"({camera.fx_px:.1f} px, not {self.told.fx_px:.1f})"
+                f"({camera.fx_px:.1f} px, not {self.logged.fx_px:.1f})"
             )
         return f"{name}: {' and '.join(parts) or 'its stars were found in a second search'}"
 
 
-def refuses(sensor: Sensor, identified: Parts, spans: Sequence[Span], cameras: pa.Table) -> bool:
+def contradicts_camera(
+    sensor: Sensor, identified: Parts, spans: Sequence[Span], cameras: pa.Table
+) -> bool:
     """Return whether a sensor's stars contradict its camera.
 
-    Few frames could be identified of those that have enough centroids, or the stars of a frame are
-    far from their places, or all at one place of the image.
+    Few of the frames with enough centroids were identified, or stars are far from their predicted
+    positions, or all in one part of the image.
     """
     rows = _solutions(identified, spans)
-    tried = pc.sum(pc.greater_equal(rows["n_centroids"], FEWEST)).as_py() or 0
+    tried = pc.sum(pc.greater_equal(rows["n_centroids"], MIN_CENTROIDS)).as_py() or 0
     solved = rows.filter(pc.field("attitude_source") == "stars")
     camera = _only_camera(cameras, sensor.sensor_id)
-    if (tried > 0 and solved.num_rows <= FEW * tried) or far_off(solved):
+    if (tried > 0 and solved.num_rows <= MAX_IDENTIFIED * tried) or residuals_are_large(solved):
         return True
-    return camera is not None and at_one_place(_stars(identified, spans), camera)
+    return camera is not None and stars_are_clustered(_stars(identified, spans), camera)
 
 
-def far_off(solved: pa.Table) -> bool:
-    """Return whether the stars of identified frames lie far from their places, and many centroids
-    are no stars."""
+def residuals_are_large(solved: pa.Table) -> bool:
+    """Return whether stars of identified frames lie far from their predicted positions, and many
+    centroids are unmatched."""
     if not solved.num_rows:
         return False
     shown = array(solved, "n_stars") / array(solved, "n_centroids")
-    return bool(np.median(array(solved, "residual_px")) > FAR_PX) and bool(
-        np.median(shown) < 1 - UNMATCHED
+    return bool(np.median(array(solved, "residual_px")) > LARGE_RESIDUAL_PX) and bool(
+        np.median(shown) < 1 - MANY_UNMATCHED
     )
 
 
-def at_one_place(stars: pa.Table, camera: Camera) -> bool:
-    """Return whether half of the frames or more have all their stars at one place of the image."""
+def stars_are_clustered(stars: pa.Table, camera: Camera) -> bool:
+    """Return whether all stars of the typical frame are in one part of the image."""
     frame = array(stars, "frame_number")
     starts = np.flatnonzero(np.diff(frame, prepend=frame[:1] - 1))
     n = np.diff(np.append(starts, len(frame)))
@@ -142,14 +153,14 @@ def at_one_place(stars: pa.Table, camera: Camera) -> bool:
     of_frame = np.repeat(np.arange(len(n)), n)
     variance = np.zeros(len(n))
     for name, side in (("x_px", camera.width), ("y_px", camera.height)):
-        place = array(stars, name) / side
-        off = place - (np.add.reduceat(place, starts) / n)[of_frame]
+        position = array(stars, name) / side
+        off = position - (np.add.reduceat(position, starts) / n)[of_frame]
         variance += np.add.reduceat(off**2, starts) / np.maximum(n - 1, 1)
-    return bool(np.median(variance[n > 1]) < ONE_PLACE * 2 / 12)
+    return bool(np.median(variance[n > 1]) < CLUSTERED_VARIANCE * 2 / 12)
 
 
 def _stars(identified: Parts, spans: Sequence[Span]) -> pa.Table:
-    """Return the stars of the first span that has some: a part is enough."""
+    """Return the stars of the first span that has any: one part is enough."""
     columns = ["frame_number", "x_px", "y_px"]
     for span in spans:
         stars = identified.read(span, "stars", columns)
@@ -172,15 +183,15 @@ def find_sensor_camera(
     cameras: pa.Table,
     settings: Settings,
 ) -> CameraFinding | None:
-    """Return what can be found of the camera of a sensor that `refuses` its frames.
+    """Return what can be found of the camera of a sensor whose frames contradict its calibration.
 
     None if the sensor has several calibrations or too few centroids, or if it identifies some
-    frames with its own camera and no other camera matches clearly more stars.
+    frames with its nominal camera and no other camera matches clearly more stars.
     """
     camera = _only_camera(cameras, sensor.sensor_id)
-    tried = _solutions(identified, spans).filter(pc.field("n_centroids") >= FEWEST)
+    tried = _solutions(identified, spans).filter(pc.field("n_centroids") >= MIN_CENTROIDS)
     solved = tried.filter(pc.field("attitude_source") == "stars")
-    some = solved.num_rows > HARDLY_ANY * tried.num_rows
+    some = solved.num_rows > MAX_IDENTIFIED_TO_WARN * tried.num_rows
     tried = solved if some else tried  # the others may show the Earth
     if camera is None or not tried.num_rows:
         return None
@@ -188,7 +199,7 @@ def find_sensor_camera(
     images = [
         image._replace(n_stars=n_stars)
         for t, n_stars in zip(array(tried, "time"), array(tried, "n_stars"), strict=True)
-        for image in image_frames(*_placed(frames, sensor, int(t), settings), settings)
+        for image in image_frames(*_frame_with_state(frames, sensor, int(t), settings), settings)
     ]
     skies_of = skies_at(int(array(tried, "time")[0]), settings)
     found = find_agreed_camera(images, camera, REACH, skies_of, settings)
@@ -198,10 +209,10 @@ def find_sensor_camera(
 
 
 def rich_frames(n_centroids: Array) -> Indices:
-    """Return a row of each of `TRIED` parts of the night, of a frame with many centroids; the
-    middle part comes first.
+    """Return the rows of `TRIED` frames with many centroids, one of each part of the night.
 
-    Not of the frame with most, which may be clutter. There is at least one frame.
+    The middle part comes first. The frame with most centroids is not taken: these may be clutter.
+    n_centroids : (n,), of at least one frame, in order of time
     """
     parts = np.array_split(np.arange(len(n_centroids)), min(TRIED, len(n_centroids)))
     rows = []
@@ -213,17 +224,19 @@ def rich_frames(n_centroids: Array) -> Indices:
 
 def find_agreed_camera(
     frames: Sequence[ImageFrame],
-    told: Camera,
+    nominal: Camera,
     reach: float,
     skies_of: Callable[[float], Skies],
     settings: Settings,
 ) -> FoundCamera | None:
-    """Return the camera of the first frame that another one agrees with; a single frame needs no
+    """Return the first frame's camera that another frame agrees with; the only frame needs no
     other."""
-    how = search_of(settings)
-    for found in find_cameras(frames, told, reach, skies_of, how):
+    matching = match_settings(settings)
+    for found in find_cameras(frames, nominal, reach, skies_of, matching):
         others = [frame for k, frame in enumerate(frames) if k != found.frame]
-        if not others or any(agrees(frame, found.camera, skies_of, how) for frame in others):
+        if not others or any(
+            agreeing_camera(frame, found.camera, skies_of, matching) for frame in others
+        ):
             return found
     return None
 
@@ -235,16 +248,18 @@ def skies_at(time_ns: int, settings: Settings) -> Callable[[float], Skies]:
     return lambda pixel_rad: CachedSkies(catalogue, time_ns // DAY_NS, pixel_rad, rule.merge_px)
 
 
-def image_frames(exposures: pa.Table, places: pa.Table, settings: Settings) -> list[ImageFrame]:
+def image_frames(
+    exposures: pa.Table, frame_states: pa.Table, settings: Settings
+) -> list[ImageFrame]:
     """Return the centroids of each frame, brightest first.
 
-    `places` are SENSOR_STATES_AT_FRAMES of `exposures`.
+    `frame_states` are SENSOR_STATES_AT_FRAMES of `exposures`.
     """
     x_px, first = flatten(exposures, "x_px")
     c = flatten_centroids(exposures, CAMERAS.empty_table(), settings)
     at = brightest_first(first, c.flux)
     magnitude = -2.5 * np.log10(c.flux[at])
-    beta = barycentric_velocity(array(exposures, "time"), places) / SPEED_OF_LIGHT_KM_S
+    beta = barycentric_velocity(array(exposures, "time"), frame_states) / SPEED_OF_LIGHT_KM_S
     x, y, sigma_px = x_px[at], c.y_px[at], c.sigma_px[at]
     frames = []
     for k in range(exposures.num_rows):
@@ -255,7 +270,7 @@ def image_frames(exposures: pa.Table, places: pa.Table, settings: Settings) -> l
     return frames
 
 
-def _placed(
+def _frame_with_state(
     frames: ReadFolder, sensor: Sensor, time_ns: int, settings: Settings
 ) -> tuple[pa.Table, pa.Table]:
     """Return EXPOSURES of one frame, and its SENSOR_STATES_AT_FRAMES."""
@@ -267,7 +282,7 @@ def _placed(
 
 
 def _only_camera(cameras: pa.Table, sensor_id: str) -> Camera | None:
-    """Return the camera of a sensor, None where it has several."""
+    """Return the camera of a sensor, None if it has several or none."""
     rows = cameras.filter(pc.field("sensor_id") == sensor_id)
     different = {camera_of(rows, k) for k in range(rows.num_rows)}
     return different.pop() if len(different) == 1 else None

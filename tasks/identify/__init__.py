@@ -1,1 +1,1 @@
-"""Stage `identify`: stars, attitudes, and what is no star."""
+"""Stage `identify`: stars, attitudes, and detections."""

@@ -40,7 +40,7 @@ from epipole.tasks.algorithms.star_identification.star_grid import (
 from epipole.tasks.algorithms.star_identification.star_pairs import KVector, NearStars, PairTable
 from epipole.tasks.algorithms.times import earth_barycentric, julian_year
 
-# Stars whose place at the date is less certain than this are not used [pixels, 1-sigma].
+# Stars whose position at the date is less certain than this are not used [pixels, 1-sigma].
 SURE_PX = 0.5
 
 # The code that makes the arrays on disk: if it changes, they are made again.

@@ -1,4 +1,8 @@
-"""Flatten centroids: the centroid lists of one sensor's frames as arrays, with directions."""
+"""The inputs of identification: one sensor's centroids as arrays, and its state at each frame.
+
+`flatten_centroids` puts the centroid lists of all frames one after another, with their directions.
+`interpolate_sensor_states` returns position, velocity and prior attitude at the times of frames.
+"""
 
 import logging
 from typing import Any, NamedTuple
@@ -18,16 +22,15 @@ from epipole.tasks.algorithms.orbits.state_interpolation import (
     interpolate_states,
 )
 
-# -- Flatten centroids: the centroid lists of one sensor's frames as arrays, with directions.
-
 Array = npt.NDArray[np.float64]
+LOGGER = logging.getLogger(__name__)
 
 
 class FlatCentroids(NamedTuple):
     """All centroids of one sensor's frames, one after another.
 
     Frame k has the centroids ``first[k]:first[k + 1]``. Cameras are named by their row in
-    `cameras`; -1 where a frame has none.
+    `cameras`; -1 where a frame's camera is unknown.
     """
 
     first: npt.NDArray[np.int64]
@@ -78,7 +81,7 @@ def _optional(exposures: pa.Table, name: str, n: int) -> Array:
 def _cameras_of(
     exposures: pa.Table, cameras: pa.Table
 ) -> tuple[npt.NDArray[np.int64], dict[int, Camera]]:
-    """Return the row of `cameras` that is valid for each frame (-1: none), and those cameras."""
+    """Return the row of `cameras` that is valid for each frame (-1: unknown), and these cameras."""
     rows = np.flatnonzero(array(cameras, "sensor_id") == exposures["sensor_id"][0].as_py())
     if len(rows) == 0:
         return np.full(exposures.num_rows, -1), {}
@@ -91,12 +94,10 @@ def _cameras_of(
     return holds, {int(r): Camera(**v) for r, v in zip(used, values, strict=True)}
 
 
-# -- Place sensors: position and prior attitude of each sensor at the times of its frames.
+# -- States.
 
-LOGGER = logging.getLogger(__name__)
-
-# Earth-fixed axes turn: states of a log may be twice as fast in GCRF.
-FASTEST_KM_S, FARTHEST_KM = 2 * SPEED.maximum, 2 * POSITION.maximum
+# Bounds in GCRF. Earth-fixed axes turn, so states of a log may be twice as fast there.
+MAX_SPEED_KM_S, MAX_RADIUS_KM = 2 * SPEED.maximum, 2 * POSITION.maximum
 
 
 def interpolate_sensor_states(
@@ -109,29 +110,29 @@ def interpolate_sensor_states(
     sensor, time_ns = array(exposures, "sensor_id"), array(exposures, "time")
     state_sensor, all_states = array(states, "sensor_id"), _states(states, settings.sensors)
     n = len(time_ns)
-    placed = Places(*(np.full((n, *width), np.nan) for width in ((3,), (3,), (), (4,), ())))
-    told = np.zeros(n, bool)
+    at_frames = Places(*(np.full((n, *width), np.nan) for width in ((3,), (3,), (), (4,), ())))
+    stated = np.zeros(n, bool)
     for name in sorted(set(sensor)):
         frames = np.flatnonzero(sensor == name)
         rows = np.flatnonzero(state_sensor == name)
         columns: list[npt.NDArray[Any]] = [values[rows] for values in all_states]
-        told[frames] = _told(states.take(rows), time_ns[frames])
-        places = interpolate_states(
+        stated[frames] = _states_sigma(states.take(rows), time_ns[frames])
+        found = interpolate_states(
             SensorStates(*columns),
             time_ns[frames],
             settings.sensors.state_gap_s,
         )
-        for column, values in zip(placed, _possible(places), strict=True):
+        for column, values in zip(at_frames, _possible(found), strict=True):
             column[frames] = values
-    without = np.count_nonzero(np.isnan(placed.r_gcrf_km[:, 0]))
+    without = np.count_nonzero(np.isnan(at_frames.r_gcrf_km[:, 0]))
     LOGGER.info("placed %d frames, %d have no state near in time", n - without, without)
     by_name = {
-        **unstack("{}_km", placed.r_gcrf_km),
-        **unstack("v{}_km_s", placed.v_gcrf_km_s),
-        "position_sigma_km": np.where(told, placed.position_sigma_km, np.nan),
-        "used_position_sigma_km": placed.position_sigma_km,
-        **unstack("q{}", placed.q_sensor_from_icrs, "xyzw"),
-        "attitude_sigma_arcsec": placed.attitude_sigma,
+        **unstack("{}_km", at_frames.r_gcrf_km),
+        **unstack("v{}_km_s", at_frames.v_gcrf_km_s),
+        "position_sigma_km": np.where(stated, at_frames.position_sigma_km, np.nan),
+        "used_position_sigma_km": at_frames.position_sigma_km,
+        **unstack("q{}", at_frames.q_sensor_from_icrs, "xyzw"),
+        "attitude_sigma_arcsec": at_frames.attitude_sigma,
     }
     key = {name: exposures[name] for name in ("sensor_id", "frame_number", "time")}
     return table(
@@ -140,24 +141,24 @@ def interpolate_sensor_states(
     )
 
 
-def _possible(places: Places) -> Places:
-    """Return the places, without a position where the states would have the sensor too fast.
+def _possible(found: Places) -> Places:
+    """Return the states, without a position where the sensor would be too fast or too far away.
 
-    States with a clock or a position of their own tell no speed that a log would be refused for:
-    it shows between them.
+    A wrong clock or position shows only between two states: neither states a speed for which a log
+    would be refused.
     """
-    speed = np.linalg.norm(places.v_gcrf_km_s, axis=1)
-    radius = np.linalg.norm(places.r_gcrf_km, axis=1)
-    known = (speed <= FASTEST_KM_S) & (radius <= FARTHEST_KM)
-    return places._replace(
-        r_gcrf_km=np.where(known[:, None], places.r_gcrf_km, np.nan),
-        v_gcrf_km_s=np.where(known[:, None], places.v_gcrf_km_s, np.nan),
-        position_sigma_km=np.where(known, places.position_sigma_km, np.nan),
+    speed = np.linalg.norm(found.v_gcrf_km_s, axis=1)
+    radius = np.linalg.norm(found.r_gcrf_km, axis=1)
+    known = (speed <= MAX_SPEED_KM_S) & (radius <= MAX_RADIUS_KM)
+    return found._replace(
+        r_gcrf_km=np.where(known[:, None], found.r_gcrf_km, np.nan),
+        v_gcrf_km_s=np.where(known[:, None], found.v_gcrf_km_s, np.nan),
+        position_sigma_km=np.where(known, found.position_sigma_km, np.nan),
     )
 
 
-def _told(states: pa.Table, at_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Return whether the states of one sensor on both sides of each time tell their sigma."""
+def _states_sigma(states: pa.Table, at_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Return whether the states of one sensor on both sides of each time state their sigma."""
     if not states.num_rows:
         return np.zeros(len(at_ns), bool)
     known = array(states, "position_sigma_km") > 0

@@ -22,7 +22,7 @@ from epipole.tasks.read.order_frames import frames_between, states_between
 
 LOGGER = logging.getLogger(__name__)
 
-BRIDGED_NS = 300_000_000_000  # states this far outside a span help to place its frames
+BRIDGED_NS = 300_000_000_000  # states this far outside a span are interpolated to its frames
 
 
 class Counts(NamedTuple):
@@ -42,7 +42,7 @@ def identify_span(
     settings: Settings,
     parts: Parts,
 ) -> Counts:
-    """Place one sensor's frames of a span and identify them, unless the part exists.
+    """Identify one sensor's frames of a span, unless the part exists.
 
     Parameters
     ----------
@@ -54,10 +54,10 @@ def identify_span(
     if not parts.holds(span):
         exposures = frames_between(frames, sensor.number, *span)
         states = states_about(frames, sensor, span, settings)
-        places = interpolate_sensor_states(exposures, states, settings)
+        frame_states = interpolate_sensor_states(exposures, states, settings)
         catalogue = read_star_catalogue(settings.identification.catalogue)
-        identified = identify_stars(exposures, places, cameras, catalogue, settings)
-        rejects = concat(REJECTS, [identified.rejects, _unplaced(places)])
+        identified = identify_stars(exposures, frame_states, cameras, catalogue, settings)
+        rejects = concat(REJECTS, [identified.rejects, _without_state(frame_states)])
         write_part(parts.of(span), IDENTIFIED, {**identified._asdict(), "rejects": rejects})
     return _counts(parts, span)
 
@@ -73,18 +73,18 @@ def _counts(parts: Parts, span: Span) -> Counts:
 
 
 def states_about(frames: ReadFolder, sensor: Sensor, span: Span, settings: Settings) -> pa.Table:
-    """Return the states of a sensor that are needed to place its frames of a span."""
+    """Return the states of a sensor that are needed for its frames of a span."""
     reach_ns = BRIDGED_NS + round(settings.sensors.state_gap_s * 1e9)
     return states_between(frames, sensor.number, *span.widened(reach_ns))
 
 
-def _unplaced(places: pa.Table) -> pa.Table:
+def _without_state(frame_states: pa.Table) -> pa.Table:
     """Return a row of `rejects` for the frames that have no state near in time."""
-    unplaced = places.filter(pc.is_null(places["x_km"]))
-    first = unplaced.slice(0, 1)
+    without = frame_states.filter(pc.is_null(frame_states["x_km"]))
+    first = without.slice(0, 1)
     return reject_rows(
         Reason.NO_STATE,
         sensor_id=first["sensor_id"],
         time=first["time"],
-        count=[unplaced.num_rows] * first.num_rows,
+        count=[without.num_rows] * first.num_rows,
     )

@@ -22,7 +22,7 @@ from epipole.tasks.algorithms.star_identification.centroids import (
     brightest_first,
     static_centroids,
 )
-from epipole.tasks.algorithms.star_identification.frame import Search, field_of_view
+from epipole.tasks.algorithms.star_identification.frame import MatchSettings, field_of_view
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.common.sightings import optics_covariance_of
@@ -61,7 +61,7 @@ class IdentifiedTables(NamedTuple):
 
 def identify_stars(
     exposures: pa.Table,
-    places: pa.Table,
+    frame_states: pa.Table,
     cameras: pa.Table,
     catalogue: pa.Table,
     settings: Settings,
@@ -70,19 +70,19 @@ def identify_stars(
     if exposures.num_rows == 0:
         return IdentifiedTables(empty(SOLUTIONS), empty(STARS), empty(DETECTIONS), empty(REJECTS))
     order = np.argsort(array(exposures, "time"), kind="stable")
-    exposures, places = exposures.take(order), places.take(order)
+    exposures, frame_states = exposures.take(order), frame_states.take(order)
     centroids = flatten_centroids(exposures, cameras, settings)
-    found, rows = _identify(exposures, places, centroids, catalogue, settings)
-    attitudes = _attitudes(places, found, settings)
+    found, rows = _identify(exposures, frame_states, centroids, catalogue, settings)
+    attitudes = _attitudes(frame_states, found, settings)
     matches = _matches(found, rows, centroids)
     attitudes = _with_optics(attitudes, centroids, matches, cameras)
-    attitudes = _with_unknown_velocity(attitudes, places)
-    stars = stars_table(exposures, places, centroids, attitudes, matches)
+    attitudes = _with_unknown_velocity(attitudes, frame_states)
+    stars = stars_table(exposures, frame_states, centroids, attitudes, matches)
     stars = with_catalogue(stars, catalogue.schema)
     most = settings.tracklets.most_detections
     detections, left_out = detections_table(exposures, centroids, attitudes, matches, most)
     result = IdentifiedTables(
-        solutions_table(exposures, places, centroids, attitudes, matches, stars),
+        solutions_table(exposures, frame_states, centroids, attitudes, matches, stars),
         stars,
         detections,
         rejects_table(exposures, centroids, left_out),
@@ -96,7 +96,11 @@ def identify_stars(
 
 
 def _identify(
-    exposures: pa.Table, places: pa.Table, c: FlatCentroids, catalogue: pa.Table, settings: Settings
+    exposures: pa.Table,
+    frame_states: pa.Table,
+    c: FlatCentroids,
+    catalogue: pa.Table,
+    settings: Settings,
 ) -> tuple[IdentifiedSensor | None, npt.NDArray[np.int64]]:
     """Return the identified stars, and the centroids that took part: brightest first in each
     frame."""
@@ -109,13 +113,13 @@ def _identify(
     rule = settings.identification
     skies = CachedSkies(Catalogue(catalogue), day, pixel_rad, rule.merge_px)
     identify = load_method(STAR_IDENTIFICATION, rule.method)
-    t_s, priors = (time_ns - time_ns[0]) / 1e9, _priors(places, settings)
-    beta = barycentric_velocity(time_ns, places) / SPEED_OF_LIGHT_KM_S
+    t_s, priors = (time_ns - time_ns[0]) / 1e9, _priors(frame_states, settings)
+    beta = barycentric_velocity(time_ns, frame_states) / SPEED_OF_LIGHT_KM_S
     best, taken = None, rows
     for kept in _selections(c):
         part = rows[kept[rows]]
-        spots = _spots(c, part, kept, beta)
-        found = identify(t_s, spots, priors, skies, rule.magnitude_limit, search_of(settings))
+        raw = _raw_centroids(c, part, kept, beta)
+        found = identify(t_s, raw, priors, skies, rule.magnitude_limit, match_settings(settings))
         if best is None or found.solutions.solved.sum() > best.solutions.solved.sum():
             best, taken = found, part
         if best.solutions.solved.mean() > IDENTIFIES:
@@ -123,10 +127,10 @@ def _identify(
     return best, taken
 
 
-def search_of(settings: Settings) -> Search:
+def match_settings(settings: Settings) -> MatchSettings:
     """Return how frames are judged, before anything is known of their sensor."""
     rule = settings.identification
-    return Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
+    return MatchSettings(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
 
 
 def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
@@ -141,7 +145,7 @@ def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
     yield c.in_image
 
 
-def _spots(
+def _raw_centroids(
     c: FlatCentroids, rows: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], beta: Array
 ) -> RawCentroids:
     """Return these centroids, which are those kept in another order."""
@@ -158,22 +162,22 @@ def _spots(
     )
 
 
-def _priors(places: pa.Table, settings: Settings) -> Priors:
-    q, sigma = stack(places, "q{}", "xyzw"), _prior_sigma(places, settings) * ARCSEC
+def _priors(frame_states: pa.Table, settings: Settings) -> Priors:
+    q, sigma = stack(frame_states, "q{}", "xyzw"), _prior_sigma(frame_states, settings) * ARCSEC
     return Priors(matrix_from_quaternion(q), np.where(np.isfinite(q[:, 3]), sigma, np.nan))
 
 
-def _prior_sigma(places: pa.Table, settings: Settings) -> Array:
-    sigma = array(places, "attitude_sigma_arcsec").astype(float)
+def _prior_sigma(frame_states: pa.Table, settings: Settings) -> Array:
+    sigma = array(frame_states, "attitude_sigma_arcsec").astype(float)
     return np.where(sigma > 0, sigma, settings.sensors.attitude_sigma_arcsec)
 
 
 def _attitudes(
-    places: pa.Table, found: IdentifiedSensor | None, settings: Settings
+    frame_states: pa.Table, found: IdentifiedSensor | None, settings: Settings
 ) -> StarAttitudes:
     """Return the attitude from stars where there is one, else the prior, unchanged."""
-    n = places.num_rows
-    q, sigma = stack(places, "q{}", "xyzw"), _prior_sigma(places, settings)
+    n = frame_states.num_rows
+    q, sigma = stack(frame_states, "q{}", "xyzw"), _prior_sigma(frame_states, settings)
     R = matrix_from_quaternion(q)
     cov = np.eye(3) * (sigma**2)[:, None, None]
     source = np.where(np.isfinite(q[:, 3]), "prior", "none").astype(object)
@@ -206,14 +210,14 @@ def _with_optics(
     return a._replace(shared_arcsec2=shared)
 
 
-def _with_unknown_velocity(a: StarAttitudes, places: pa.Table) -> StarAttitudes:
+def _with_unknown_velocity(a: StarAttitudes, frame_states: pa.Table) -> StarAttitudes:
     """Return the attitudes with the errors that those from stars have where the sensor's velocity
     is unknown.
 
     Its aberration moves all stars of a small field alike: a turn across the boresight. About the
     boresight the field does not turn.
     """
-    unknown = (a.source == "stars") & np.isnan(stack(places, "v{}_km_s")).any(axis=1)
+    unknown = (a.source == "stars") & np.isnan(stack(frame_states, "v{}_km_s")).any(axis=1)
     sigma_arcsec = LOW_ORBIT_KM_S / np.sqrt(3) / SPEED_OF_LIGHT_KM_S / ARCSEC  # per axis
     across = np.diag([1.0, 1.0, 0.0]) * sigma_arcsec**2
     return a._replace(shared_arcsec2=a.shared_arcsec2 + unknown[:, None, None] * across)

@@ -1,4 +1,8 @@
-"""Tabulate identified frames: stars, attitudes and other centroids as tables."""
+"""Identified frames as tables: solutions, stars, detections, rejects.
+
+Detections are the centroids that are no star. If a sensor reports more than can be followed, the
+fullest frames keep their brightest (`within_limit`).
+"""
 
 from typing import Any, NamedTuple
 
@@ -30,9 +34,11 @@ from epipole.tasks.algorithms.photometry import flux_scale
 from epipole.tasks.algorithms.times import earth_velocity
 from epipole.tasks.identify.frame_inputs import FlatCentroids
 
-# -- Bound detections: of a sensor that reports more than can be followed, which ones are kept.
-
+Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+
+
+# -- The limit of detections.
 
 
 def within_limit(frame: npt.NDArray[np.int64], flux: npt.NDArray[np.float64], most: int) -> Flags:
@@ -68,13 +74,11 @@ def _most_per_frame(counts: npt.NDArray[np.int64], most: int) -> int:
     return low
 
 
-# -- Tabulate identified frames: stars, attitudes and other centroids as tables.
-
-Array = npt.NDArray[np.float64]
+# -- The tables.
 
 
 class StarAttitudes(NamedTuple):
-    """The attitude of each frame; NaN where there is none."""
+    """The attitude of each frame; NaN where it is unknown."""
 
     source: npt.NDArray[np.object_]
     status: list[str | None]
@@ -87,7 +91,7 @@ class MatchedStars(NamedTuple):
     """Identified stars: the index of each one's centroid, and the star.
 
     `scale` is the factor on each frame's centroid errors that the stars' residuals show, `floor_px`
-    the error that all have beside the stated ones.
+    the error that is added in quadrature to the stated ones.
     """
 
     at: npt.NDArray[np.int64]
@@ -98,16 +102,16 @@ class MatchedStars(NamedTuple):
     floor_px: float = 0.0
 
 
-def barycentric_velocity(time_ns: npt.NDArray[np.int64], places: pa.Table) -> Array:
+def barycentric_velocity(time_ns: npt.NDArray[np.int64], frame_states: pa.Table) -> Array:
     """Return the sensor's barycentric velocity [km/s].
 
     Where the sensor's geocentric velocity is unknown, it is the Earth's.
     """
-    return earth_velocity(time_ns) + np.nan_to_num(stack(places, "v{}_km_s"))
+    return earth_velocity(time_ns) + np.nan_to_num(stack(frame_states, "v{}_km_s"))
 
 
 def _frame_key(exposures: pa.Table, frame: npt.NDArray[np.int64]) -> dict[str, Any]:
-    """Return the columns that name the frames of rows; all are of one sensor."""
+    """Return the key columns of rows of one sensor, by the frame of each."""
     return {
         "sensor_id": pa.repeat(exposures["sensor_id"][0], len(frame)),
         **{name: array(exposures, name)[frame] for name in ("frame_number", "time")},
@@ -116,14 +120,14 @@ def _frame_key(exposures: pa.Table, frame: npt.NDArray[np.int64]) -> dict[str, A
 
 def stars_table(
     exposures: pa.Table,
-    places: pa.Table,
+    frame_states: pa.Table,
     c: FlatCentroids,
     attitudes: StarAttitudes,
     m: MatchedStars,
 ) -> pa.Table:
     """Return STARS: a row per identified star."""
     frame = c.frame[m.at]
-    v_km_s = barycentric_velocity(array(exposures, "time"), places)
+    v_km_s = barycentric_velocity(array(exposures, "time"), frame_states)
     u = np.einsum("nij,nj->ni", attitudes.R[frame], aberrate(m.u_icrs, v_km_s[frame]))
     dx, dy = np.full((2, len(frame)), np.nan)
     for row, camera in c.cameras.items():
@@ -147,7 +151,7 @@ def stars_table(
 
 def solutions_table(
     exposures: pa.Table,
-    places: pa.Table,
+    frame_states: pa.Table,
     c: FlatCentroids,
     a: StarAttitudes,
     m: MatchedStars,
@@ -184,7 +188,7 @@ def solutions_table(
         SOLUTIONS,
         _frame_key(exposures, np.arange(n))
         | {name: nullable(v) for name, v in values.items()}
-        | {name: places[name] for name in kept}
+        | {name: frame_states[name] for name in kept}
         | {
             "n_centroids": np.diff(c.first),
             "n_stars": n_stars,
@@ -200,10 +204,10 @@ def solutions_table(
 def detections_table(
     exposures: pa.Table, c: FlatCentroids, a: StarAttitudes, m: MatchedStars, most: int
 ) -> tuple[pa.Table, npt.NDArray[np.int64]]:
-    """Return DETECTIONS: each centroid in its camera's image that is no star; at most so many.
+    """Return DETECTIONS, a row per centroid in the image that is not a star, and the number
+    of detections left out of each frame, (F,). There are at most `most` rows.
 
-    It has no direction where the frame has no attitude. The numbers of detections left out, by
-    frame, come second.
+    A detection's direction is missing where the frame's attitude is unknown.
     """
     left = c.in_image.copy()
     left[m.at] = False
@@ -238,9 +242,11 @@ def detections_table(
 def rejects_table(
     exposures: pa.Table, c: FlatCentroids, left_out: npt.NDArray[np.int64]
 ) -> pa.Table:
-    """Return rows of `rejects`, per log: how many centroids lie in frames without a camera or
-    outside the image, and how many detections were left out, by frame, because there were too
-    many."""
+    """Return rows of `rejects`, per log and reason.
+
+    They count centroids in frames without a camera, centroids outside the image, and detections
+    beyond the limit; `left_out` are the latter by frame.
+    """
     uncalibrated = np.where(c.camera_of_frame < 0, np.diff(c.first), 0)
     outside = np.bincount(c.frame[~c.in_image], minlength=exposures.num_rows) - uncalibrated
     return concat(

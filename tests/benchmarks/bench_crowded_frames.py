@@ -21,7 +21,7 @@ from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView, MatchSettings
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -68,13 +68,13 @@ def measure(kind: Kind, n_false: int, n_cluster: int, n: int, flux: bool, rng: R
     catalogue = Catalogue(read_hipparcos())
     skies = CachedSkies(catalogue, DAY, kind.camera.pixel_rad, 2.0)
     rule = Settings().identification
-    how = Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
+    matching = MatchSettings(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
     seen = seen_stars(hipparcos_at_epoch(kind.magnitude_limit + 1.0), kind)
     R = matrix_from_quaternion(canonical(rng.normal(size=(n, 4))))
     shots, stars = zip(*[shot(kind, seen, one, n_false, n_cluster, rng) for one in R], strict=True)
-    spots = centroids(kind, list(shots), flux)
+    raw = centroids(kind, list(shots), flux)
     start = time.process_time()
-    found = identify_sensor(np.arange(n) * APART_S, spots, no_priors(n), skies, None, how)
+    found = identify_sensor(np.arange(n) * APART_S, raw, no_priors(n), skies, None, matching)
     ms = 1e3 * (time.process_time() - start) / n
     answers = [s and s.R_sensor_from_icrs for s in found.solutions.each()]
     right, wrong = np.array([judge(a, b) for a, b in zip(answers, R, strict=True)]).T

@@ -32,7 +32,7 @@ from epipole.tasks.algorithms.geometry.directions import (
     quaternion_from_rotation_vector,
 )
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView, MatchSettings
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -153,7 +153,7 @@ class Shooter:
 
 
 def run_sensor(
-    way: str, of: Drawn, every: int, catalogue: Catalogue, how: Search, rng: Rng
+    way: str, of: Drawn, every: int, catalogue: Catalogue, matching: MatchSettings, rng: Rng
 ) -> tuple[int, int]:
     """Return how many of a sensor's frames without stars were tried, and false attitudes."""
     shooter = Shooter(of, catalogue, rng)
@@ -173,21 +173,23 @@ def run_sensor(
             matrix_from_quaternion(off) @ R, np.where(starless & (way == "followed"), np.nan, sigma)
         )
     if way == "followed":
-        how = how._replace(time_limit_s=1e-6, crowded=False)
+        matching = matching._replace(time_limit_s=1e-6, crowded=False)
     t_s = np.arange(n) * APART_S[way]
-    found = identify_sensor(t_s, shooter.centroids(frames), priors, shooter.skies, None, how)
+    found = identify_sensor(t_s, shooter.centroids(frames), priors, shooter.skies, None, matching)
     tried = starless & np.array([way == "followed" or s in TRIED for s in found.status])
     return int(tried.sum()), int((tried & found.solutions.solved).sum())
 
 
-def count(chosen: argparse.Namespace, way: str, catalogue: Catalogue, how: Search) -> None:
+def count(
+    chosen: argparse.Namespace, way: str, catalogue: Catalogue, matching: MatchSettings
+) -> None:
     """Print the table of a way."""
     counts: dict[str, Any] = defaultdict(lambda: np.zeros(3, int))
     rng, started = np.random.default_rng([chosen.seed, WAYS.index(way)]), time.process_time()
     try:
         while counts["all"][1] < chosen.frames and time.process_time() - started < chosen.seconds:
             of = draw(rng, chosen.points)
-            found = run_sensor(way, of, chosen.every, catalogue, how, rng)
+            found = run_sensor(way, of, chosen.every, catalogue, matching, rng)
             for kind in of.kinds():
                 counts[kind] += 1, *found
     except KeyboardInterrupt:
@@ -223,9 +225,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     chosen = parser.parse_args()
     catalogue = Catalogue(read_hipparcos())
-    how = Search(rule.gate_sigma, -np.log(chosen.false_alarm), rule.time_limit_s, np.nan)
+    matching = MatchSettings(
+        rule.gate_sigma, -np.log(chosen.false_alarm), rule.time_limit_s, np.nan
+    )
     for way in chosen.ways:
-        count(chosen, way, catalogue, how)
+        count(chosen, way, catalogue, matching)
 
 
 def _natural(kind: str) -> tuple[int, str]:

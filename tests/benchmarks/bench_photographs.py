@@ -24,14 +24,14 @@ from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.directions import boresight_angles
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frame import Search, field_of_view
+from epipole.tasks.algorithms.star_identification.frame import MatchSettings, field_of_view
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor, identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 Array = npt.NDArray[np.float64]
 DEFAULT = Settings().identification
-HOW = Search(DEFAULT.gate_sigma, -np.log(DEFAULT.false_alarm), DEFAULT.time_limit_s, np.nan)
+HOW = MatchSettings(DEFAULT.gate_sigma, -np.log(DEFAULT.false_alarm), DEFAULT.time_limit_s, np.nan)
 
 
 def read_list(path: Path) -> tuple[Array, Array, npt.NDArray[np.int64]]:
@@ -49,12 +49,12 @@ def identify(
     unknown = np.full(len(x_px), np.nan)
     u = unproject(camera, x_px, y_px)
     optics = field_of_view(camera)
-    spots = RawCentroids(
+    raw = RawCentroids(
         np.array([0, len(u)]), u, pixel_angle(camera, u), unknown, unknown, np.zeros((1, 3)),
         [optics], np.zeros(1, np.int64),
     )  # fmt: skip
     skies = CachedSkies(catalogue, day, camera.pixel_rad, 2.0)
-    return identify_sensor(np.zeros(1), spots, no_priors(1), skies, None, HOW)
+    return identify_sensor(np.zeros(1), raw, no_priors(1), skies, None, HOW)
 
 
 def main() -> None:

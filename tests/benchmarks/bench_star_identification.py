@@ -42,7 +42,7 @@ from epipole.tasks.algorithms.star_identification.centroids import SensorCentroi
 from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
-    Search,
+    MatchSettings,
     identify_lost,
 )
 from epipole.tasks.algorithms.star_identification.published import (
@@ -85,13 +85,13 @@ class Ours:
         self.optics = FieldOfView(self.camera.half_diagonal_rad, box, self.camera.pixel_rad)
         merged = navigation_catalogue(*frames.stars, MERGED_PX * self.camera.pixel_rad)
         self.sky: Sky = sky_to_limit(merged, kind.magnitude_limit)
-        self.how = Search(3.7, -np.log(false_alarm), 0.5, np.nan)
+        self.matching = MatchSettings(3.7, -np.log(false_alarm), 0.5, np.nan)
         self.solved, self.refused = 0, 0
         n = pattern_size(self.sky, self.optics.solid_angle_sr)
         self.pairs = pattern_pairs(self.sky.catalogue.u_icrs[:n], 2 * self.optics.half_diagonal_rad)
         sigmas = [2.0 ** (k / 2) for k in range(-9, 4)]
         self.grids = {
-            s: sky_grid(self.sky, 2.5 * self.how.gate_sigma * s * self.optics.pixel_rad)
+            s: sky_grid(self.sky, 2.5 * self.matching.gate_sigma * s * self.optics.pixel_rad)
             for s in sigmas
         }
 
@@ -104,8 +104,10 @@ class Ours:
         seen = self.frame(x_px, y_px, mag, sigma_px)
         grid = next(g for s, g in self.grids.items() if s >= max(sigma_px, MIN_SIGMA_PX))
         # As in a run: the odds that a frame shows stars are those of the frames before.
-        how = self.how._replace(starlit=float(np.log((self.solved + 1) / (self.refused + 1))))
-        found, _ = identify_lost(seen, self.sky, grid, self.pairs, how)
+        matching = self.matching._replace(
+            starlit=float(np.log((self.solved + 1) / (self.refused + 1)))
+        )
+        found, _ = identify_lost(seen, self.sky, grid, self.pairs, matching)
         self.solved, self.refused = self.solved + bool(found), self.refused + (not found)
         return found and found.R_sensor_from_icrs
 
@@ -121,7 +123,7 @@ class Ours:
         def solve(x_px: Array, y_px: Array, mag: Array, sigma_px: float) -> Array | None:
             seen = self.frame(x_px, y_px, mag, sigma_px)
             star = match(seen.u, seen.sigma_rad)
-            found = solve_matches(seen, self.sky, star, self.how.gate_sigma)
+            found = solve_matches(seen, self.sky, star, self.matching.gate_sigma)
             return found and found.R_sensor_from_icrs
 
         return solve
@@ -209,12 +211,12 @@ def tracking_us(frames: Frames, n_frames: int) -> tuple[float, float]:
         np.concatenate([f.instrumental_mag for f in each]), np.zeros((n_frames, 3)),
         [ours.optics], np.zeros(n_frames, np.int64),
     )  # fmt: skip
-    how, t_s = ours.how._replace(zero_point_mag=0.0), np.arange(n_frames) * 1.0
+    matching, t_s = ours.matching._replace(zero_point_mag=0.0), np.arange(n_frames) * 1.0
     grid, none = next(iter(ours.grids.values())), no_priors(n_frames)
     spent = []
     for _ in range(4):
         start = time.process_time()
-        found, _ = identify_sequence(t_s, flat, none, ours.sky, grid, lambda: ours.pairs, how)
+        found, _ = identify_sequence(t_s, flat, none, ours.sky, grid, lambda: ours.pairs, matching)
         spent.append(time.process_time() - start)
         if not found.solved.all():
             raise RuntimeError(f"{np.sum(~found.solved)} frames were lost")

@@ -19,8 +19,8 @@ from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
 from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_cameras
-from epipole.tasks.algorithms.star_identification.frame import Search
-from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
+from epipole.tasks.algorithms.star_identification.frame import MatchSettings
+from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 
 KINDS = (
@@ -32,7 +32,7 @@ KINDS = (
     Kind("40", 40.0, 2048, 5.0),
 )
 DAY = int(np.datetime64("2024-01-01").astype(int))
-HOW = Search(3.7, -np.log(1e-5), 0.5, np.nan)  # the defaults of a run
+HOW = MatchSettings(3.7, -np.log(1e-5), 0.5, np.nan)  # the defaults of a run
 CATALOGUE = Catalogue(read_hipparcos())
 
 

@@ -31,7 +31,7 @@ from epipole.tasks.algorithms.geometry.directions import (
     quaternion_from_rotation_vector,
 )
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView, MatchSettings
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import Priors, no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -171,9 +171,9 @@ def measure(kind: Kind, scene: Scene, stated: str) -> list[str]:
     """Return rows of the table, one for each centroid error."""
     skies = CachedSkies(Catalogue(read_hipparcos()), DAY, kind.camera.pixel_rad, 2.0)
     rule, n = Settings().identification, len(scene.shots)
-    how = Search(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
-    t_s, spots = np.arange(n) * APART_S, centroids(kind, scene.shots, stated)
-    found = identify_sensor(t_s, spots, scene.priors, skies, None, how).solutions
+    matching = MatchSettings(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
+    t_s, raw = np.arange(n) * APART_S, centroids(kind, scene.shots, stated)
+    found = identify_sensor(t_s, raw, scene.priors, skies, None, matching).solutions
     answers = [found.R_sensor_from_icrs[k] if found.solved[k] else None for k in range(n)]
     wrong = np.array([judge(a, b)[1] for a, b in zip(answers, scene.R, strict=True)])
     rows = []

@@ -13,7 +13,7 @@ from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.geometry.camera import Camera, pixel_angle, unproject
 from epipole.tasks.algorithms.star_identification.camera_search import ImageFrame, find_cameras
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frame import Search, field_of_view
+from epipole.tasks.algorithms.star_identification.frame import MatchSettings, field_of_view
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -21,7 +21,7 @@ from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
 WIDTH, HEIGHT = 5184, 3456
 F_PX = 50.0 / 22.3 * WIDTH  # a 50 mm lens before 22.3 mm of silicon, by name
 TOLD = Camera(WIDTH, HEIGHT, F_PX, F_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
-HOW = Search(3.7, -np.log(1e-5), 0.5, np.nan)
+HOW = MatchSettings(3.7, -np.log(1e-5), 0.5, np.nan)
 DAY = 15_156  # 2011-07-01: the year is a guess
 EXCHANGED = {66189: 66198}
 PHOTOGRAPHS = ("great_bear", "cassiopeia")
@@ -66,11 +66,11 @@ def camera_of(x_px, y_px, skies_of):
 def numbers(x_px, y_px, camera, skies_of):
     """Return the Hipparcos number of each place, 0 where none was found."""
     u, unknown = unproject(camera, x_px, y_px), np.full(len(x_px), np.nan)
-    spots = RawCentroids(
+    raw = RawCentroids(
         np.array([0, len(u)]), u, pixel_angle(camera, u), unknown, unknown, np.zeros((1, 3)),
         [field_of_view(camera)], np.zeros(1, np.int64),
     )  # fmt: skip
-    found = identify_sensor(np.zeros(1), spots, no_priors(1), skies_of(camera.pixel_rad), None, HOW)
+    found = identify_sensor(np.zeros(1), raw, no_priors(1), skies_of(camera.pixel_rad), None, HOW)
     star = found.solutions.star
     return np.where(star >= 0, found.sky.catalogue.star_id[star], 0)
 

@@ -9,13 +9,13 @@ from epipole.tasks.algorithms.star_identification.centroids import RawCentroids,
 from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
-    Search,
+    MatchSettings,
     aberrate_all,
 )
 
 CAMERA = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)  # 16 degrees
 BETA = np.array([0.6e-4, -0.7e-4, 0.3e-4])  # aberration as of the Earth's motion
-HOW = Search(3.7, np.log(1e6), 0.5, np.nan)
+MATCHING = MatchSettings(3.7, np.log(1e6), 0.5, np.nan)
 
 
 def random_catalogue(n=6000, seed=0):
@@ -73,7 +73,7 @@ def join(frames):
     )  # fmt: skip
 
 
-def join_spots(frames, sigma_px, pixel_rad):
+def join_centroids(frames, sigma_px, pixel_rad):
     """Return frames in flat arrays, with these (n,) errors and pixel sizes of their centroids."""
     flat = join(frames)
     return RawCentroids(

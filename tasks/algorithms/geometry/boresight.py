@@ -1,7 +1,7 @@
 """Boresight and focal length from a few identified stars, by hand and without an attitude.
 
 The pipeline finds whole attitudes (`attitude`) and calibrates from thousands of stars
-(`optics_calibration`). Where the focal length that a log tells is wrong, it starts from
+(`optics_calibration`). Where the focal length of a log is wrong, it starts from
 `focal_length_from_separations`. The rest is for a single image with three or more stars whose
 names are known. The page ``docs/methods/boresight.md`` has the equations and an example.
 
@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-MAX_STEPS = 50
+MAX_STEPS = 50  # of Newton's or Gauss-Newton's method; convergence takes some five
 CONVERGED = 1e-12  # relative change of the focal length
 MAX_CHOSEN_FROM = 60  # stars; all their triples are tried
 
@@ -74,7 +74,7 @@ def boresight_covariance(
     u_icrs, distance_px, focal_px
         As in `boresight_of_three`.
     sigma_px : float
-        1-sigma error of an image place, per axis. The focal length is taken as exact.
+        1-sigma error of a pixel position, per axis. The focal length is taken as exact.
 
     Returns
     -------
@@ -160,7 +160,7 @@ def focal_length_from_separations(x_px: Array, u_icrs: Array, focal_px: float) -
     Parameters
     ----------
     x_px : (n, 2) float
-        Image places relative to the principal point, distortion removed. n >= 2.
+        Pixel positions relative to the principal point, distortion removed. n >= 2.
     u_icrs : (n, 3) float
         Apparent unit vectors to the stars.
     focal_px : float
@@ -174,7 +174,7 @@ def focal_length_from_separations(x_px: Array, u_icrs: Array, focal_px: float) -
     Raises
     ------
     ValueError
-        With fewer than two stars, or another number of places than of stars.
+        With fewer than two stars, or another number of positions than of stars.
 
     Examples
     --------
@@ -185,7 +185,9 @@ def focal_length_from_separations(x_px: Array, u_icrs: Array, focal_px: float) -
     2000.0
     """
     if len(x_px) != len(u_icrs) or len(x_px) < 2:
-        raise ValueError(f"expected two or more stars, got {len(x_px)} places, {len(u_icrs)} stars")
+        raise ValueError(
+            f"expected two or more stars, got {len(x_px)} positions, {len(u_icrs)} stars"
+        )
     i, j = np.triu_indices(len(x_px), 1)
     wanted = _angle(u_icrs[i], u_icrs[j])
     product = np.sum(x_px[i] * x_px[j], axis=1)

@@ -42,7 +42,7 @@ class Camera(NamedTuple):
 
     @property
     def distorts(self) -> bool:
-        """Whether there is any distortion."""
+        """Whether any distortion coefficient differs from 0."""
         return any((self.k1, self.k2, self.p1, self.p2, self.k3))
 
     @property
@@ -74,7 +74,7 @@ def mirrored(camera: Camera) -> Camera:
 
 
 def flip_rows(camera: Camera, y_px: Array) -> tuple[Camera, Array]:
-    """Return the same camera and image places (n,) with the image's rows counted the other way."""
+    """Return the same camera and pixel rows (n,) with the image's rows counted the other way."""
     last = camera.height - 1
     return camera._replace(fy_px=-camera.fy_px, cy_px=last - camera.cy_px), last - y_px
 
@@ -130,7 +130,7 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
 
 
 def unproject(camera: Camera, x_px: Array, y_px: Array) -> Array:
-    """Return (n, 3) unit vectors in the sensor frame of image places [px]."""
+    """Return (n, 3) unit vectors in the sensor frame of pixel positions (n,)."""
     x, y = undistort(
         camera, (x_px - camera.cx_px) / camera.fx_px, (y_px - camera.cy_px) / camera.fy_px
     )
@@ -139,14 +139,14 @@ def unproject(camera: Camera, x_px: Array, y_px: Array) -> Array:
 
 
 def project(camera: Camera, u: Array) -> tuple[Array, Array]:
-    """Return the image places [px] of (n, 3) sensor-frame directions; NaN behind the camera."""
+    """Return the pixel positions of (n, 3) sensor-frame directions; NaN behind the camera."""
     z = np.where(u[..., 2] > 0, u[..., 2], np.nan)
     x, y = distort(camera, u[..., 0] / z, u[..., 1] / z)
     return camera.cx_px + camera.fx_px * x, camera.cy_px + camera.fy_px * y
 
 
 def inside(camera: Camera, x_px: Array, y_px: Array) -> npt.NDArray[np.bool_]:
-    """Return which places [px] lie on the image; false for NaN."""
+    """Return which pixel positions lie on the image; false for NaN."""
     return (
         (x_px >= -0.5) & (x_px < camera.width - 0.5) & (y_px >= -0.5) & (y_px < camera.height - 0.5)
     )

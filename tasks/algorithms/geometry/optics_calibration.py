@@ -22,17 +22,17 @@ Indices = npt.NDArray[np.int64]
 # 1-sigma prior about the given calibration. It only matters for what the stars do not determine:
 # in a narrow field a shift of the principal point equals a rotation of the sensor, and the
 # higher terms of the distortion are negligible.
-FOCAL_SHARE = 0.02
-CORNER_PX = 20.0
+FOCAL_SHARE = 0.02  # of the focal length
+CORNER_PX = 20.0  # by which a term of the distortion moves the corners of the image
 # A detector of 6 mm that is set behind its lens with usual tolerances, about 30 micrometres.
 PRINCIPAL_POINT_SHARE = 0.005  # of the image's size
-MIN_PLACE_PX = 1e-3  # of a principal point that is known
-ITERATIONS = 15
+MIN_PRINCIPAL_POINT_PX = 1e-3  # of a principal point that is stated as exact
+MAX_ITERATIONS = 15
 HUBER = 2.0  # [sigma] larger residuals have less weight
-MIN_FRAMES, MIN_STARS = 3, 60
+MIN_FRAMES, MIN_STARS = 3, 60  # of a fit
 # The principal point moves only where its sigma, with all numbers free, is below this share of its
 # prior. Otherwise it stands for a rotation of the sensor.
-TOLD_APART = 0.5
+MAX_SIGMA_SHARE = 0.5
 
 
 def _direction(**weights: float) -> Array:
@@ -54,7 +54,7 @@ TANGENTIAL = np.hstack([_direction(p1=1.0), _direction(p2=1.0)])
 PRINCIPAL_POINT = np.hstack([_direction(cx_px=1.0), _direction(cy_px=1.0)])
 
 
-class ToldOptics(NamedTuple):
+class NominalOptics(NamedTuple):
     """The calibration of a log: the prior of the fits.
 
     principal_point_px : its 1-sigma error per axis; None: as of an assembled camera
@@ -69,18 +69,18 @@ class ToldOptics(NamedTuple):
         camera = self.camera
         f, r = np.sqrt(camera.fx_px * abs(camera.fy_px)), np.tan(camera.half_diagonal_rad)
         at_corner = CORNER_PX / f / np.array([r**3, r**5, r**2, r**2, r**7])
-        place_px = self.principal_point_px
-        if place_px is None:
-            place_px = PRINCIPAL_POINT_SHARE * max(camera.width, camera.height)
-        place_px = max(place_px, MIN_PLACE_PX)
-        return np.array([FOCAL_SHARE * f] * 2 + [place_px] * 2 + at_corner.tolist())
+        point_px = self.principal_point_px
+        if point_px is None:
+            point_px = PRINCIPAL_POINT_SHARE * max(camera.width, camera.height)
+        point_px = max(point_px, MIN_PRINCIPAL_POINT_PX)
+        return np.array([FOCAL_SHARE * f] * 2 + [point_px] * 2 + at_corner.tolist())
 
 
 class StarImages(NamedTuple):
     """Images of identified stars, frame by frame.
 
     x_px, y_px : (n,) float
-        Measured image places.
+        Measured pixel positions.
     u_sensor : (n, 3) float
         Catalogue directions in the sensor frame. The attitudes may come from wrong optics: a
         rotation of each frame is fitted too.
@@ -104,7 +104,7 @@ class OpticsFit(NamedTuple):
     residual_px : robust rms of the image residuals, per axis
     gain : decrease of chi-square from the present optics, with free attitudes in both; at most
         the squared distance of the optics in units of `cov`; about 9 by chance
-    n_independent : number of independent images that would tell the optics as well
+    n_independent : number of independent images that would determine the optics as well
     """
 
     camera: Camera
@@ -142,7 +142,7 @@ class _Choice(NamedTuple):
 
 
 def calibrate_optics(
-    given: ToldOptics, images: StarImages, present: Camera | None = None
+    given: NominalOptics, images: StarImages, present: Camera | None = None
 ) -> OpticsFit | None:
     """Return the optics that fit identified stars best, None with too few stars.
 
@@ -174,7 +174,7 @@ def calibrate_optics(
 
 
 def calibrate_in_steps(
-    given: ToldOptics, images: StarImages, free: OpticsFit, present: Camera | None = None
+    given: NominalOptics, images: StarImages, free: OpticsFit, present: Camera | None = None
 ) -> OpticsFit:
     """Return optics that differ from the given ones only in what the stars demand.
 
@@ -212,7 +212,7 @@ def calibrate_in_steps(
         start = _fit(given, given.camera, taken, fixed.u, NOTHING, sigma)
     radial = _extended(given, taken, _Choice(start, NOTHING), STEPS, price)
     best = _extended(given, taken, radial, [TANGENTIAL], price)
-    if _told_apart(free.cov, given.sigma):
+    if _determines_principal_point(free.cov, given.sigma):
         # Tangential terms may only stand for the principal point, so it is also tried before them.
         before = _extended(given, taken, radial, [PRINCIPAL_POINT, TANGENTIAL], price)
         after = _extended(given, taken, best, [PRINCIPAL_POINT], price)
@@ -234,7 +234,7 @@ def fit_radial(camera: Camera, x_px: Array, y_px: Array, u_sensor: Array) -> Cam
     camera
         To start from; the prior of the fit.
     x_px, y_px : (n,) float
-        Measured image places of at least 4 stars.
+        Measured pixel positions of at least 4 stars.
     u_sensor : (n, 3) float
         Their catalogue directions in the sensor frame; a rotation of all is fitted too.
     """
@@ -242,7 +242,7 @@ def fit_radial(camera: Camera, x_px: Array, y_px: Array, u_sensor: Array) -> Cam
     images = _Images(np.stack([x_px, y_px], axis=1), frame[:1], frame, frame)
     focal = _direction(fx_px=1.0, fy_px=np.sign(camera.fy_px))  # < 0: rows that count upward
     basis = np.hstack([focal, _direction(k1=1.0)])
-    return _fit(ToldOptics(camera), camera, images, u_sensor, basis).camera
+    return _fit(NominalOptics(camera), camera, images, u_sensor, basis).camera
 
 
 def _taken(images: StarImages) -> _Images | None:
@@ -256,11 +256,11 @@ def _taken(images: StarImages) -> _Images | None:
     return _Images(np.stack([images.x_px, images.y_px], axis=1), starts, of_frame, of_star)
 
 
-def _told_apart(cov: Array, scale: Array) -> bool:
-    """Return whether the stars tell the principal point from a rotation of the sensor."""
+def _determines_principal_point(cov: Array, scale: Array) -> bool:
+    """Return whether the stars distinguish the principal point from a rotation of the sensor."""
     place = [OPTICS.index("cx_px"), OPTICS.index("cy_px")]
     worst = np.linalg.eigvalsh(cov[np.ix_(place, place)])[-1]
-    return bool(np.sqrt(worst) < TOLD_APART * scale[place[0]])
+    return bool(np.sqrt(worst) < MAX_SIGMA_SHARE * scale[place[0]])
 
 
 def _gain(fixed: _Fit, fit: _Fit, cov: Array, sigma_px: float) -> float:
@@ -271,7 +271,7 @@ def _gain(fixed: _Fit, fit: _Fit, cov: Array, sigma_px: float) -> float:
 
 
 def _extended(
-    given: ToldOptics, images: _Images, choice: _Choice, steps: Sequence[Array], price: float
+    given: NominalOptics, images: _Images, choice: _Choice, steps: Sequence[Array], price: float
 ) -> _Choice:
     """Return the choice with those of the steps that the stars demand, each after the other."""
     for step in steps:
@@ -285,11 +285,11 @@ def _extended(
     return choice
 
 
-def _criterion(given: ToldOptics, choice: _Choice, price: float) -> float:
+def _criterion(given: NominalOptics, choice: _Choice, price: float) -> float:
     return _cost(given, choice.fit) + price * choice.basis.shape[1]
 
 
-def _cost(given: ToldOptics, fit: _Fit) -> float:
+def _cost(given: NominalOptics, fit: _Fit) -> float:
     """Return chi-square, with the prior's part."""
     prior = (_values(fit.camera) - _values(given.camera)) / given.sigma
     return _huber_cost(fit.residual / fit.sigma_px) + float(prior @ prior)
@@ -309,7 +309,7 @@ def _with_shared_errors(fit: _Fit, of_star: Indices) -> Array:
 
 
 def _fit(
-    given: ToldOptics,
+    given: NominalOptics,
     camera: Camera,
     images: _Images,
     u: Array,
@@ -325,9 +325,9 @@ def _fit(
     sigma_px
         Error of the images, per axis, if it is known; 0: that of the residuals.
     """
-    scale, told, k = given.sigma, _values(given.camera), basis.shape[1]
+    scale, nominal, k = given.sigma, _values(given.camera), basis.shape[1]
     used = _degrees_of_freedom(images, basis)
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         r, J_turn, J_optics = _linearise(camera, images.xy, u)
         sigma = max(sigma_px, _robust_sigma(r, used))  # far from the stars all weigh alike
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12)) / sigma**2
@@ -343,7 +343,7 @@ def _fit(
         C = np.einsum("nai,na,naj->ij", J_optics, weight, J_optics) + np.eye(k)
         C -= np.einsum("fki,fkj->ij", B, lever)
         c = np.einsum("nai,na->i", J_optics, weight * r)
-        c -= basis.T @ ((_values(camera) - told) / scale)
+        c -= basis.T @ ((_values(camera) - nominal) / scale)
         cov = np.linalg.inv(C)
         step = cov @ (c - np.einsum("fki,fk->i", B, turn))
         turn = turn - lever @ step
@@ -355,7 +355,7 @@ def _fit(
         if still and np.abs(turn).max() < 1e-3 * sigma * camera.pixel_rad:
             break
     r, _, _ = _linearise(camera, images.xy, u)
-    moved = basis.T @ ((_values(camera) - told) / scale)
+    moved = basis.T @ ((_values(camera) - nominal) / scale)
     return _Fit(camera, u, moved, cov, r, sigma_px or _robust_sigma(r, used), score)
 
 

@@ -1,14 +1,14 @@
-"""Camera search: the focal length of a camera, which way its rows count, and its distortion, from
-single frames.
+"""Camera search: focal length, direction of rows and distortion of a camera, from single frames.
 
-For a sensor that identifies nothing with the calibration it came with. Focal lengths are tried in
-steps, those nearest to the told one first, each with rows that count down and up. Every trial is a
-search lost in space, with errors that allow for half a step; the verdict pays for the number of
-trials. The focal length then follows from the separations of the stars found.
+For a sensor that identifies nothing with its nominal calibration.
 
-With strong distortion, another focal length fits a ring of the image, or a cluster of stars fits
-alone. So where many centroids are left over, k1 is fitted to the stars that were found, then other
-values of k1 are tried, and the camera that shows most stars is taken.
+1. Focal lengths are tried in steps, the nearest to the nominal one first, each with rows that count
+   down and up. A trial is a search lost in space with errors that allow for half a step; its
+   threshold pays for the number of trials.
+2. The focal length then follows from the separations of the matched stars.
+3. With strong distortion, another focal length fits a ring of the image, or a cluster of stars fits
+   alone. So where many centroids stay unmatched, k1 is fitted to the matched stars, then other
+   values of k1 are tried, and the camera that matches most stars is taken.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -23,32 +23,32 @@ from epipole.tasks.algorithms.geometry.optics_calibration import fit_radial
 from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
-    Search,
+    MatchSettings,
     Solution,
     aberrate_all,
     field_of_view,
     identify_lost,
     identify_predicted,
 )
-from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
+from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
 
 Array = npt.NDArray[np.float64]
 
 STEP = 0.01  # of the logarithm of the focal length
-BLOCK = 0.2  # trials within this share a sky: its depth and its pairs hardly depend on them
+BLOCK = 0.2  # of the logarithm: trials of a block share a sky, whose depth and pairs hardly change
 BRIGHTEST = 40  # centroids of a frame that take part
-FEWEST = 6  # of a frame that is tried, and fewest stars of one that counts
-UNKNOWN_SIGMA_PX = 0.5
-# Tried changes of k1: how much longer or shorter they make the image's diagonal.
+MIN_CENTROIDS = 6  # of a frame that is tried; also the minimum of matched stars
+UNKNOWN_SIGMA_PX = 0.5  # error of centroids whose log states none
+# Changes of k1 that are tried: relative change of the image's diagonal.
 DISTORTIONS = (0.04, -0.04, 0.08, -0.08, 0.12, -0.12)
-MAX_SHOWN = 0.8  # share of the centroids that are stars: no distortion is tried
-MORE_STARS = 1.5  # times as many as with the told camera are shown by a better one
-DISTORTED_REACH = 0.08  # of the logarithm of the focal length, with distortion
-SEARCH_S = 0.1  # of one trial, as in `Search.time_limit_s`
-AROUND = 8  # steps on both sides of a trial that shows stars
-REFINED = 4  # times: better focal lengths let more stars match
+ENOUGH_MATCHED = 0.8  # share of the centroids; with more matched, no distortion is tried
+MORE_STARS = 1.5  # stars matched by a better camera over those identified with the nominal one
+DISTORTED_REACH = 0.08  # of the logarithm of the focal length, in trials with distortion
+TRIAL_TIME_LIMIT_S = 0.1  # of one trial, as `MatchSettings.time_limit_s`
+STEPS_AROUND = 8  # on both sides of the focal length of a trial that matches stars
+MAX_REFINEMENTS = 4  # with a better focal length, more stars match
 
 
 class ImageFrame(NamedTuple):
@@ -56,7 +56,7 @@ class ImageFrame(NamedTuple):
 
     x_px, y_px, sigma_px, instrumental_mag : (n,) float; the last two are NaN where unknown
     beta : (3,) float, the sensor's barycentric velocity over that of light, ICRS axes
-    n_stars : identified with the told camera
+    n_stars : number identified with the nominal camera
     """
 
     x_px: Array
@@ -68,11 +68,11 @@ class ImageFrame(NamedTuple):
 
 
 class FoundCamera(NamedTuple):
-    """A camera with which a frame shows stars.
+    """A camera with which stars of a frame are matched.
 
-    camera : the told one with another focal length or k1, or mirrored
-    n_stars : identified in the frame
-    frame : which one, a row of those that were given
+    camera : the nominal one with another focal length or k1, or mirrored
+    n_stars : number of matched stars
+    frame : row of the frame among those that were given
     """
 
     camera: Camera
@@ -80,8 +80,8 @@ class FoundCamera(NamedTuple):
     frame: int
 
 
-class _Sky(NamedTuple):
-    """What trials of a block share."""
+class _BlockSky(NamedTuple):
+    """The sky of a block of trials."""
 
     sky: Sky
     grid: SkyGrid
@@ -89,47 +89,47 @@ class _Sky(NamedTuple):
 
 
 class _Trials(NamedTuple):
-    """What all trials share."""
+    """What all trials share: a source of skies for the angle of a pixel [rad], and settings."""
 
     skies_of: Callable[[float], Skies]
-    how: Search
+    matching: MatchSettings
 
 
-class _Shown(NamedTuple):
-    """A camera, and the stars that a frame shows with it."""
+class _Match(NamedTuple):
+    """A camera, and the stars of a frame that are matched with it."""
 
     camera: Camera
     solution: Solution
-    sky: _Sky
+    sky: _BlockSky
 
     @property
     def n_stars(self) -> int:
         return int(np.sum(self.solution.star >= 0))
 
 
-def _n_stars(shown: _Shown) -> int:
-    return shown.n_stars
+def _n_stars(match: _Match) -> int:
+    return match.n_stars
 
 
 def find_cameras(
     frames: Sequence[ImageFrame],
-    told: Camera,
+    nominal: Camera,
     reach: float,
     skies_of: Callable[[float], Skies],
-    how: Search,
+    matching: MatchSettings,
 ) -> Iterator[FoundCamera]:
-    """Yield the camera with which each frame shows most stars, for the frames that show some.
+    """Yield the camera that matches most stars of a frame, for each frame with one.
 
-    A frame's stars must be more than those that are identified with the told camera.
+    It must match clearly more stars than are identified with the nominal camera.
 
     Parameters
     ----------
     frames
-        Tried one after the other.
-    told
-        Its focal lengths are scaled together, and its k1 is changed; the rest is taken as it is.
+        Searched one after the other.
+    nominal
+        Its focal lengths are scaled together, and its k1 is changed; the rest is kept.
     reach : float
-        Largest factor, and the inverse of the smallest, by which focal lengths are tried.
+        Largest factor on the focal lengths that is tried; the smallest is its inverse.
     skies_of
         Skies for a pixel of this angle [rad].
     how
@@ -137,79 +137,79 @@ def find_cameras(
     """
     reach = float(np.log(reach))
     n_trials = 2 * (_n_trials(reach) + len(DISTORTIONS) * _n_trials(min(reach, DISTORTED_REACH)))
-    how = how._replace(
-        threshold=how.threshold + np.log(n_trials * max(len(frames), 1)),
-        time_limit_s=SEARCH_S,
+    matching = matching._replace(
+        threshold=matching.threshold + np.log(n_trials * max(len(frames), 1)),
+        time_limit_s=TRIAL_TIME_LIMIT_S,
         crowded=False,
     )
     for k, frame in enumerate(frames):
         kept = _brightest(frame)
-        if len(kept.x_px) < FEWEST:
+        if len(kept.x_px) < MIN_CENTROIDS:
             continue
-        found = _most_shown(kept, told, reach, _Trials(skies_of, how))
+        found = _best_match(kept, nominal, reach, _Trials(skies_of, matching))
         if found is not None and found.n_stars >= MORE_STARS * frame.n_stars:
             yield FoundCamera(found.camera, found.n_stars, k)
 
 
-def _most_shown(frame: ImageFrame, told: Camera, reach: float, trials: _Trials) -> _Shown | None:
-    """Return the camera that shows most stars, the one with fewest changes of these."""
-    found, sides = [], [told, mirrored(told)]
-    plain = _first_shown(frame, sides, reach, trials)
+def _best_match(frame: ImageFrame, nominal: Camera, reach: float, trials: _Trials) -> _Match | None:
+    """Return the camera that matches most stars; of equal ones the one with least changes."""
+    found, sides = [], [nominal, mirrored(nominal)]
+    plain = _first_match(frame, sides, reach, trials)
     if plain is not None:
-        found, sides = [plain, _with_fitted_k1(frame, plain, trials.how)], [plain.camera]
-        if any(shown.n_stars > MAX_SHOWN * len(frame.x_px) for shown in found):
+        found, sides = [plain, _with_fitted_k1(frame, plain, trials.matching)], [plain.camera]
+        if any(match.n_stars > ENOUGH_MATCHED * len(frame.x_px) for match in found):
             return max(found, key=_n_stars)
     for share in DISTORTIONS:
         distorted = [_distorted(side, share) for side in sides]
-        shown = _first_shown(frame, distorted, min(reach, DISTORTED_REACH), trials)
-        if shown is not None:
-            found.append(_with_fitted_k1(frame, shown, trials.how))
+        match = _first_match(frame, distorted, min(reach, DISTORTED_REACH), trials)
+        if match is not None:
+            found.append(_with_fitted_k1(frame, match, trials.matching))
     return max(found, key=_n_stars, default=None)
 
 
-def _first_shown(
+def _first_match(
     frame: ImageFrame, sides: Sequence[Camera], reach: float, trials: _Trials
-) -> _Shown | None:
-    """Return the camera with the first focal length that shows stars.
+) -> _Match | None:
+    """Return the camera with the first focal length that matches stars.
 
-    `sides` are cameras whose rows count down or up.
+    `sides` are the nominal camera with rows that count down and up.
     """
     for block in _blocks(reach):
         ratios = list(block)
         shared = _shared_sky(frame, sides[0], ratios, trials.skies_of)
         for ratio in ratios:
             for side in sides:
-                found = _try(frame, _scaled(side, ratio), shared, trials.how)
+                found = _try(frame, _scaled(side, ratio), shared, trials.matching)
                 if found is not None:
                     return found
     return None
 
 
-def _with_fitted_k1(frame: ImageFrame, shown: _Shown, how: Search) -> _Shown:
-    """Return the camera with k1 and focal length fitted to the stars, if it shows no fewer then."""
-    best = shown
-    for _ in range(REFINED):
-        seen = shown.solution.star >= 0
-        stars = shown.sky.sky.catalogue.u_icrs[shown.solution.star[seen]]
-        u = aberrate_all(stars, frame.beta) @ shown.solution.R_sensor_from_icrs.T
-        camera = fit_radial(shown.camera, frame.x_px[seen], frame.y_px[seen], u)
-        solution = _near(frame, camera, shown.solution, shown.sky, how)
+def _with_fitted_k1(frame: ImageFrame, match: _Match, matching: MatchSettings) -> _Match:
+    """Return the match with k1 and focal length fitted to its stars, if it has no fewer then."""
+    best = match
+    for _ in range(MAX_REFINEMENTS):
+        seen = match.solution.star >= 0
+        stars = match.sky.sky.catalogue.u_icrs[match.solution.star[seen]]
+        u = aberrate_all(stars, frame.beta) @ match.solution.R_sensor_from_icrs.T
+        camera = fit_radial(match.camera, frame.x_px[seen], frame.y_px[seen], u)
+        solution = _near(frame, camera, match.solution, match.sky, matching)
         if solution is None:
             break
-        shown = shown._replace(camera=camera, solution=solution)
-        best = max(shown, best, key=_n_stars)
+        match = match._replace(camera=camera, solution=solution)
+        best = max(match, best, key=_n_stars)
     return best
 
 
-def agrees(
-    frame: ImageFrame, camera: Camera, skies_of: Callable[[float], Skies], how: Search
+def agreeing_camera(
+    frame: ImageFrame, camera: Camera, skies_of: Callable[[float], Skies], matching: MatchSettings
 ) -> FoundCamera | None:
-    """Return the camera as this frame shows it, within a step of `camera`, or None."""
-    how = how._replace(time_limit_s=SEARCH_S, crowded=False)
+    """Return the camera that matches this frame within a step of `camera`, None without a match."""
+    matching = matching._replace(time_limit_s=TRIAL_TIME_LIMIT_S, crowded=False)
     kept = _brightest(frame)
-    if len(kept.x_px) < FEWEST:
+    if len(kept.x_px) < MIN_CENTROIDS:
         return None
-    found = _try(kept, camera, _shared_sky(kept, camera, [1.0], skies_of), how)
+    found = _try(kept, camera, _shared_sky(kept, camera, [1.0], skies_of), matching)
     return None if found is None else FoundCamera(found.camera, found.n_stars, 0)
 
 
@@ -244,17 +244,17 @@ def _brightest(frame: ImageFrame) -> ImageFrame:
 
 
 def _shared_sky(
-    frame: ImageFrame, told: Camera, ratios: Sequence[float],
+    frame: ImageFrame, nominal: Camera, ratios: Sequence[float],
     skies_of: Callable[[float], Skies],
-) -> _Sky:  # fmt: skip
+) -> _BlockSky:  # fmt: skip
     """Return the sky, its grid and its pairs for all of these focal lengths."""
-    wide, narrow = (field_of_view(_scaled(told, end(ratios))) for end in (min, max))
-    middle = _scaled(told, float(np.median(ratios)))
+    wide, narrow = (field_of_view(_scaled(nominal, end(ratios))) for end in (min, max))
+    middle = _scaled(nominal, float(np.median(ratios)))
     skies = skies_of(middle.pixel_rad)
     limit = skies.limit_for(1.2 * len(frame.x_px) / field_of_view(middle).solid_angle_sr)
     optics = FieldOfView(wide.half_diagonal_rad, narrow.box, middle.pixel_rad)
     radius = 9.0 * float(np.median(_sigma_px(frame, middle))) * wide.pixel_rad
-    return _Sky(skies.sky(limit), skies.grid(limit, radius), skies.pairs(limit, optics))
+    return _BlockSky(skies.sky(limit), skies.grid(limit, radius), skies.pairs(limit, optics))
 
 
 def _sigma_px(frame: ImageFrame, camera: Camera) -> Array:
@@ -264,35 +264,41 @@ def _sigma_px(frame: ImageFrame, camera: Camera) -> Array:
     return np.hypot(sigma, STEP / np.sqrt(12.0) * r)
 
 
-def _try(frame: ImageFrame, camera: Camera, shared: _Sky, how: Search) -> _Shown | None:
-    """Return the camera with a better focal length, and the stars that the frame shows."""
-    solution = identify_lost(_seen_by(frame, camera), *shared, how)[0]
+def _try(
+    frame: ImageFrame, camera: Camera, shared: _BlockSky, matching: MatchSettings
+) -> _Match | None:
+    """Return the camera with a refined focal length, and its match."""
+    solution = identify_lost(_seen_by(frame, camera), *shared, matching)[0]
     if solution is None:
         return None
     # In dense fields, the middle of the image may fit with a focal length that is steps off.
-    around = [_scaled(camera, float(np.exp(k * STEP))) for k in range(-AROUND, AROUND + 1)]
-    near = [(c, _near(frame, c, solution, shared, how)) for c in around]
+    around = [
+        _scaled(camera, float(np.exp(k * STEP))) for k in range(-STEPS_AROUND, STEPS_AROUND + 1)
+    ]
+    near = [(c, _near(frame, c, solution, shared, matching)) for c in around]
     camera, solution = max(near, key=lambda pair: -np.inf if pair[1] is None else pair[1].evidence)
-    for _ in range(REFINED):
-        if solution is None or np.sum(solution.star >= 0) < FEWEST:
+    for _ in range(MAX_REFINEMENTS):
+        if solution is None or np.sum(solution.star >= 0) < MIN_CENTROIDS:
             return None
         f, before = _focal_length(frame, camera, solution, shared.sky), solution.star
         if not np.isfinite(f):
             return None
         camera = _scaled(camera, f / camera.fx_px)
-        solution = _near(frame, camera, solution, shared, how)
+        solution = _near(frame, camera, solution, shared, matching)
         if solution is not None and np.array_equal(solution.star, before):
             break
-    return None if solution is None else _Shown(camera, solution, shared)
+    return None if solution is None else _Match(camera, solution, shared)
 
 
 def _near(
-    frame: ImageFrame, camera: Camera, known: Solution, shared: _Sky, how: Search
+    frame: ImageFrame, camera: Camera, known: Solution, shared: _BlockSky, matching: MatchSettings
 ) -> Solution | None:
-    """Return the solution with this camera near one that is known."""
+    """Return the solution with this camera near a known solution."""
     centroids = _seen_by(frame, camera)
     near = np.eye(3) * (2.0 * float(np.median(centroids.sigma_rad))) ** 2
-    return identify_predicted(centroids, shared.sky, known.R_sensor_from_icrs, near, how, lost=True)
+    return identify_predicted(
+        centroids, shared.sky, known.R_sensor_from_icrs, near, matching, lost=True
+    )
 
 
 def _seen_by(frame: ImageFrame, camera: Camera) -> FrameCentroids:
@@ -305,6 +311,6 @@ def _focal_length(frame: ImageFrame, camera: Camera, solution: Solution, sky: Sk
     """Return the focal length with which the stars are as far apart as on the sky."""
     seen = solution.star >= 0
     u = unproject(camera, frame.x_px[seen], frame.y_px[seen])
-    places = camera.fx_px * u[:, :2] / u[:, 2:]
+    positions = camera.fx_px * u[:, :2] / u[:, 2:]
     stars = aberrate_all(sky.catalogue.u_icrs[solution.star[seen]], frame.beta)
-    return focal_length_from_separations(places, stars, camera.fx_px)
+    return focal_length_from_separations(positions, stars, camera.fx_px)

@@ -1,4 +1,8 @@
-"""All frames of one sensor in flat arrays: frame k has the centroids first[k]:first[k + 1]."""
+"""All frames of one sensor in flat arrays, and centroids that stay at one pixel.
+
+Frame k has the centroids first[k]:first[k + 1]. `RawCentroids` have errors in pixels as stated,
+`SensorCentroids` in radians as assumed; `Solutions` say which star each centroid is.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,8 +13,6 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.frame import FieldOfView, FrameCentroids, Solution
 
-# -- All frames of one sensor in flat arrays: frame k has the centroids first[k]:first[k + 1].
-
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
@@ -19,7 +21,7 @@ class SensorCentroids(NamedTuple):
     """Frames in order of time, centroids brightest first.
 
     first : (F + 1,) int64
-    u, sigma_rad, instrumental_mag : (N, 3), (N,), (N,) float, as in `frame.FrameCentroidsCentroids`
+    u, sigma_rad, instrumental_mag : (N, 3), (N,), (N,) float, as in `frame.FrameCentroids`
     beta : (F, 3) float
     optics, optics_of : the cameras, and (F,) int64, which camera took each frame
     """
@@ -181,8 +183,8 @@ def brightest_first(first, flux):
 
 # -- Centroids that stay at one pixel: hot pixels, where the sky moves over the image.
 
-# A centroid stays if a pixel shows one in so many frames at least, and in this share of all.
-MIN_FRAMES, SHARE = 4, 0.3
+# Least number of frames, and least share of all frames, with a centroid at a pixel that is static.
+MIN_STATIC_FRAMES, MIN_STATIC_SHARE = 4, 0.3
 
 
 def static_centroids(
@@ -190,21 +192,24 @@ def static_centroids(
 ) -> npt.NDArray[np.bool_]:
     """Return which centroids of a sensor's frames lie where many of its frames have one.
 
-    So do stars where the sensor stares at one place of the sky: the caller decides.
+    Stars do so too where the sensor stares at one direction: the caller decides.
 
     Parameters
     ----------
     first : (F + 1,) int64
         Frame k has the centroids first[k]:first[k + 1].
     x_px, y_px : (N,) float
-        Places; one that is not finite does not stay.
+        Pixel positions; one that is not finite is not static.
     """
     n_frames = len(first) - 1
-    least = max(MIN_FRAMES, int(np.ceil(SHARE * n_frames)))
+    least = max(MIN_STATIC_FRAMES, int(np.ceil(MIN_STATIC_SHARE * n_frames)))
     frame = np.repeat(np.arange(n_frames), np.diff(first))
     stays = np.zeros(len(x_px), np.bool_)
     at = np.flatnonzero(np.isfinite(x_px) & np.isfinite(y_px))
-    for shift in (0.0, 0.5):  # a place on the border of two pixels lies in the middle of another
+    for shift in (
+        0.0,
+        0.5,
+    ):  # a position at the border of two pixels is in the middle of a shifted one
         cell = _cells(x_px[at] + shift, y_px[at] + shift)
         once = np.unique(cell * n_frames + frame[at]) // n_frames
         cells, frames = np.unique(once, return_counts=True)

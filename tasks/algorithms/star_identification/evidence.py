@@ -1,14 +1,13 @@
-"""The verdict: how much better stars explain a frame than chance does.
+"""The log evidence of an attitude: how much better stars explain a frame than chance does.
 
-The log evidence of an attitude is the log of the ratio of two probabilities of the
-centroids' places: with stars at the places that the attitude predicts, and with every centroid
-anywhere in the image. Its parts:
+It is the logarithm of the ratio of two probabilities of the centroids' positions: with stars where
+the attitude predicts them, and with each centroid anywhere in the image. Its parts:
 
 - a match adds ln(A / (2 pi s^2)) - d^2 / (2 s^2), s the centroid's sigma, d its distance
   from the star, A the solid angle of the image; with brightness also
   ln(g(difference) / h(magnitude)), h the magnitudes of the catalogue;
-- it is unknown which k of n centroids are which of the m stars in view, and what share of
-  these the sensor detects (`log_ways`);
+- it is unknown which k of n centroids are which of the m stars in view, and what share of these
+  the sensor detects (`log_ways`);
 - the attitude was chosen among all: the share of the prior's volume that the data leave. Lost in
   space, that is sqrt(det 2 pi P) / (8 pi^2).
 
@@ -27,12 +26,12 @@ from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 Array = npt.NDArray[np.float64]
 
-BIN_MAG = 0.25  # of the histogram of magnitudes
+BIN_MAG = 0.25  # of the histogram of magnitudes, of `N_BINS` bins from `FIRST_MAG` on
 FIRST_MAG = -2.0
 N_BINS = 72
-TYPICAL_SPREAD_MAG = 0.4  # of a sensor's magnitudes about V, colours included; until it is learned
-OUTLIER_SHARE = 0.15  # variables, blends, odd colours
-MAG_RANGE = 6.0
+TYPICAL_SCATTER_MAG = 0.4  # of a sensor's magnitudes about V, with colours; until it is learned
+OUTLIER_SHARE = 0.15  # of stars with another brightness: variables, blends, odd colours
+MAG_RANGE = 6.0  # over which the brightness of such stars is even
 # Stars per field over their mean: the sky is uneven.
 DENSITIES = (0.6, 1.0, 1.4)
 # Of the attitudes that chance gives, a search reports this share (ln) at most: others that come
@@ -43,19 +42,19 @@ REPORTED = -1.5
 class MatchRule(NamedTuple):
     """How matches are weighed.
 
-    gate : a star lies within this many sigma of its place
+    gate : a centroid is within this of its star's predicted position [sigma]
     log_density : (N_BINS,) float, ln density of the catalogue's magnitudes
-    zero_point, spread : star minus instrumental magnitude [mag], NaN while not known, and its
+    zero_point, scatter : star minus instrumental magnitude [mag], NaN while unknown, and its
         1-sigma scatter
-    least, enough : log evidence that an attitude needs, and with which no other is tried
+    min_evidence, clear_evidence : log evidence that an attitude needs, and that ends a search
     """
 
     gate: float
     log_density: Array
     zero_point: float
-    spread: float
-    least: float
-    enough: float
+    scatter: float
+    min_evidence: float
+    clear_evidence: float
 
 
 def log_magnitude_density(magnitude: Array) -> Array:
@@ -66,11 +65,12 @@ def log_magnitude_density(magnitude: Array) -> Array:
 
 
 @borrowing_kernel
-def log_brightness_ratio(difference, magnitude, log_density, spread):
-    """Return ln(g / h) of a match with this difference of magnitudes; spread 1-sigma (compiled)."""
-    z = difference / spread
+def log_brightness_ratio(difference, magnitude, log_density, scatter):
+    """Return ln(g / h) of a match, by its difference of magnitudes and 1-sigma scatter [mag]
+    (compiled)."""
+    z = difference / scatter
     g = OUTLIER_SHARE / MAG_RANGE
-    g += (1.0 - OUTLIER_SHARE) * math.exp(-0.5 * z * z) / (spread * 2.5066282746310002)
+    g += (1.0 - OUTLIER_SHARE) * math.exp(-0.5 * z * z) / (scatter * 2.5066282746310002)
     i = min(max(int((magnitude - FIRST_MAG) / BIN_MAG), 0), N_BINS - 1)
     return math.log(g) - log_density[i]
 
@@ -96,8 +96,8 @@ def median_zero_point(star_of, instrumental, magnitude):
 def log_ways(n, matches, in_view):
     """Return -ln of the prior probability that these matches, and no others, exist (compiled).
 
-    That is, that these k of the n centroids are these k of the stars in view, before places are
-    known. The share p of the stars in view that the sensor detects has the prior 4 p^3, as most
+    That is, that these k of the n centroids are these k of the stars in view, before positions
+    are known. The share p of the stars in view that the sensor detects has the prior 4 p^3, as most
     sensors detect most stars to their limit. The number f of false centroids has the prior
     1 / (f + 1), the same for every order of magnitude.
     """
@@ -113,7 +113,7 @@ def log_ways(n, matches, in_view):
 @kernel
 def chance_margin(matches, n, in_view):
     """Return how far chance stays below Markov's bound: lost in space, it reaches a log evidence x
-    with so many matches in a starless frame with a probability below exp(-(x + margin)).
+    with this number of matches in a starless frame with a probability below exp(-(x + margin)).
 
     Over such frames, the mean of exp(evidence), summed over all attitudes and sets of k matches, is
     the prior probability of k matches: that of `log_ways`, here over fields whose stars are Poisson
@@ -139,7 +139,7 @@ def chance_margin(matches, n, in_view):
 @borrowing_kernel
 def _more_than(k, mean):
     """Return the probability that a Poisson variable is more than k."""
-    if mean > k + 1.0:  # the sum of the others converges, and the result is no small difference
+    if mean > k + 1.0:  # the sum of the others converges, and the result does not cancel
         term = total = math.exp(-mean)
         for j in range(1, k + 1):
             term *= mean / j
@@ -174,29 +174,29 @@ def match_evidence(star_of, chi2_of, sigma, instrumental, magnitude, rule, in_vi
         if star_of[k] >= 0:
             matches += 1
             total += math.log(area / (2.0 * math.pi * sigma[k] * sigma[k])) - 0.5 * chi2_of[k]
-    density, zero, spread = rule.log_density, rule.zero_point, rule.spread
+    density, zero, scatter = rule.log_density, rule.zero_point, rule.scatter
     if math.isnan(zero):
         zero = median_zero_point(star_of, instrumental, magnitude)
         if not math.isnan(zero):
-            tight = _brightness(star_of, instrumental, magnitude, density, zero, 0.5 * spread)
-            loose = _brightness(star_of, instrumental, magnitude, density, zero, spread)
+            tight = _brightness(star_of, instrumental, magnitude, density, zero, 0.5 * scatter)
+            loose = _brightness(star_of, instrumental, magnitude, density, zero, scatter)
             more = max(tight, loose)
             total += more + math.log(0.5 * (math.exp(tight - more) + math.exp(loose - more)))
             total -= 3.0  # one more number chosen from the data: ln(range / its error)
     else:
-        total += _brightness(star_of, instrumental, magnitude, density, zero, spread)
+        total += _brightness(star_of, instrumental, magnitude, density, zero, scatter)
     return total - log_ways(len(star_of), matches, in_view), matches
 
 
 @borrowing_kernel
-def _brightness(star_of, instrumental, magnitude, log_density, zero, spread):
+def _brightness(star_of, instrumental, magnitude, log_density, zero, scatter):
     """Return ln of how much better stars explain the matches' brightness than chance does."""
     total = 0.0
     for k in range(len(star_of)):
         s = star_of[k]
         if s >= 0 and not math.isnan(instrumental[k]):
             difference = magnitude[s] - instrumental[k] - zero
-            total += log_brightness_ratio(difference, magnitude[s], log_density, spread)
+            total += log_brightness_ratio(difference, magnitude[s], log_density, scatter)
     return total
 
 

@@ -16,7 +16,7 @@ from epipole.tasks.algorithms.star_identification.search.match_stars import (
     Attitude,
     Centroids,
     Matches,
-    StarPlaces,
+    StarDirections,
     aberrated,
     solve_predicted,
     stars_in_cone,
@@ -24,10 +24,10 @@ from epipole.tasks.algorithms.star_identification.search.match_stars import (
 
 Array = npt.NDArray[np.float64]
 
-RATE_SIGMA = 1e-3  # rad/s, of a sensor whose rate is unknown so far
-ACCELERATION_SIGMA = 3e-5  # rad/s^2, how unevenly a sensor turns
-WIDEST_PREDICTION = 0.02  # rad; wider ones are no better than being lost
-MAX_TURNED = 0.5  # rad, between two frames of a tracked sensor
+RATE_SIGMA = 1e-3  # [rad/s] of a sensor whose rate is unknown so far; the Earth turns it by 7e-5
+ACCELERATION_SIGMA = 3e-5  # [rad/s^2] how unevenly a sensor turns
+MAX_PREDICTION_SIGMA = 0.02  # [rad] a frame with a wider prediction is searched
+MAX_TURNED = 0.5  # [rad] between two frames of a followed sensor
 # Stars this far around a field are listed once and serve while the sensor turns [rad].
 MARGIN = 0.03
 TOO_FEW, NO_MATCH, NOT_SEARCHED, TIME_LIMIT = 1, 2, 3, 4  # status codes
@@ -38,8 +38,8 @@ class Memory(NamedTuple):
 
     t_s, R, P : (2,), (2, 3, 3), (2, 3, 3): times, attitudes and covariances of the last two
         identified frames, the later one last
-    held : (3,) int64: how many of these there are; 1 where the last prior of an identified frame
-        was confirmed; how many more frames are not searched
+    counters : (3,) int64: number of these frames, 0 to 2; 1 where the last prior of an identified
+        frame was confirmed; number of further frames that are not searched
     near, cone : (stars,) int64 and (5,): the stars around a field; how many, the direction
         (3 numbers) and the radius [rad] of the cone that holds them
     """
@@ -47,7 +47,7 @@ class Memory(NamedTuple):
     t_s: Array
     R: Array
     P: Array
-    held: Rows
+    counters: Rows
     near: Rows
     cone: Array
 
@@ -68,7 +68,7 @@ class FrameArrays(NamedTuple):
     """A sensor's frames as the kernels take them; F frames, N centroids, C cameras.
 
     t_s : (F,) float, times
-    first, u, sigma, instrumental, beta : as in `CentroidFrames`
+    first, u, sigma, instrumental, beta : as in `SensorCentroids`
     camera : (F,) int64, row of the camera that took the frame
     box, half_diagonal : (C, 4), (C,) float, as in `FieldOfView`
     """
@@ -85,7 +85,10 @@ class FrameArrays(NamedTuple):
 
 
 class FrameRange(NamedTuple):
-    """The frames start, start + step, ... before stop; whether lost ones are to be searched."""
+    """The frames start, start + step, ... before stop, in this order.
+
+    searches : frames that cannot be followed are to be searched
+    """
 
     start: int
     stop: int
@@ -94,7 +97,7 @@ class FrameRange(NamedTuple):
 
 
 class _FieldScratch(NamedTuple):
-    """Room for one frame: predicted attitude and covariance; stars of its field.
+    """Work space of one frame: predicted attitude and covariance, stars of its field.
 
     R, P : (3, 3), (3, 3)
     u, magnitude, row : (stars, 3), (stars,), (stars,) int64; apparent directions, magnitudes
@@ -116,20 +119,20 @@ def remember(memory, t_s, R, P):
     copy_matrix(memory.P[1], memory.P[0])
     copy_matrix(R, memory.R[1])
     copy_matrix(P, memory.P[1])
-    memory.held[0] = min(memory.held[0] + 1, 2)
+    memory.counters[0] = min(memory.counters[0] + 1, 2)
 
 
 @borrowing_kernel
 def predict(memory, t_s, R, P):
     """Write attitude and covariance at t_s, extrapolated from the last one or two; return
     whether the prediction is precise enough to be used (compiled)."""
-    t_fix, R_fix, P_fix, held = memory.t_s, memory.R, memory.P, memory.held
-    if held[0] == 0:
+    t_fix, R_fix, P_fix, n_fixes = memory.t_s, memory.R, memory.P, memory.counters[0]
+    if n_fixes == 0:
         return False
     dt = t_s - t_fix[1]
     copy_matrix(R_fix[1], R)
     copy_matrix(P_fix[1], P)
-    if held[0] == 1:
+    if n_fixes == 1:
         more = (RATE_SIGMA * dt) ** 2
     else:
         step = t_fix[1] - t_fix[0]
@@ -145,7 +148,7 @@ def predict(memory, t_s, R, P):
                 P[i, j] = (1 + share) ** 2 * P_fix[1, i, j] + share**2 * P_fix[0, i, j]
     for i in range(3):
         P[i, i] += more
-    return P[0, 0] + P[1, 1] <= 2 * WIDEST_PREDICTION**2
+    return P[0, 0] + P[1, 1] <= 2 * MAX_PREDICTION_SIGMA**2
 
 
 @kernel
@@ -162,13 +165,13 @@ def _rotation_between(A, B):
     sine = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     angle = math.atan2(sine, 0.5 * (trace - 1.0))
     f = angle / sine if sine > 1e-12 else 1.0
-    if sine <= 1e-12 and trace < 0.0:  # half a turn about an axis that is not worth finding
+    if sine <= 1e-12 and trace < 0.0:  # half a turn: its axis is not needed
         return math.pi, 0.0, 0.0
     return f * v[0], f * v[1], f * v[2]
 
 
 @borrowing_kernel
-def _field_stars(R, reach, beta, stars, memory, room):
+def _field_stars(R, reach, beta, stars, memory, scratch):
     """Write the apparent directions, magnitudes and rows of the stars within `reach` of the
     boresight; return how many."""
     near, cone = memory.near, memory.cone
@@ -183,63 +186,63 @@ def _field_stars(R, reach, beta, stars, memory, room):
         s = near[m]
         x, y, z = stars.u[s, 0], stars.u[s, 1], stars.u[s, 2]
         if R[2, 0] * x + R[2, 1] * y + R[2, 2] * z > c:
-            aberrated(x, y, z, beta, room.u[n])
-            room.magnitude[n], room.row[n] = stars.magnitude[s], s
+            aberrated(x, y, z, beta, scratch.u[n])
+            scratch.magnitude[n], scratch.row[n] = stars.magnitude[s], s
             n += 1
     return n
 
 
 @inlined_kernel
-def _solve_near(k, frames, stars, rule, memory, room, solutions):
+def _solve_near(k, frames, stars, rule, memory, scratch, solutions):
     """Identify frame k near the attitude in `room`; return whether its stars confirm it."""
     camera = frames.camera[k]
     reach = frames.half_diagonal[camera] + 1e-4
-    reach += 4.0 * math.sqrt(max(room.P[0, 0], room.P[1, 1]))
-    n = _field_stars(room.R, min(reach, 1.5), frames.beta[k], stars, memory, room)
+    reach += 4.0 * math.sqrt(max(scratch.P[0, 0], scratch.P[1, 1]))
+    n = _field_stars(scratch.R, min(reach, 1.5), frames.beta[k], stars, memory, scratch)
     if n < 3:
         return False
     lo, hi = frames.first[k], frames.first[k + 1]
     solution = Attitude(solutions.R_sensor_from_icrs[k], solutions.cov_rad2[k])
     matches = Matches(solutions.star[lo:hi], solutions.chi2[lo:hi])
     evidence = solve_predicted(
-        Attitude(room.R, room.P),
+        Attitude(scratch.R, scratch.P),
         False,
         Centroids(frames.u[lo:hi], frames.sigma[lo:hi], frames.instrumental[lo:hi], frames.beta[k]),
-        StarPlaces(room.u[:n], room.magnitude[:n]),
+        StarDirections(scratch.u[:n], scratch.magnitude[:n]),
         frames.box[camera],
         rule,
         solution,
         matches,
     )
-    if not evidence > rule.least:
+    if not evidence > rule.min_evidence:
         return False
     solutions.solved[k], solutions.evidence[k] = True, evidence
     for m in range(hi - lo):
         if matches.star[m] >= 0:
-            matches.star[m] = room.row[matches.star[m]]
+            matches.star[m] = scratch.row[matches.star[m]]
     remember(memory, frames.t_s[k], solution.R, solution.P)
-    memory.held[2] = 0
+    memory.counters[2] = 0
     return True
 
 
 @inlined_kernel
-def _identify_next(k, frames, priors, stars, rule, memory, room, solutions):
+def _identify_next(k, frames, priors, stars, rule, memory, scratch, solutions):
     """Identify frame k from the frames before it, or from its prior; return whether it was."""
     for attempt in range(2):
         if attempt == 0:
-            if not predict(memory, frames.t_s[k], room.R, room.P):
+            if not predict(memory, frames.t_s[k], scratch.R, scratch.P):
                 continue
         else:
             sigma = priors.sigma_rad[k]
             if math.isnan(sigma):
                 break
-            copy_matrix(priors.R_sensor_from_icrs[k], room.R)
-            room.P[:] = 0.0
+            copy_matrix(priors.R_sensor_from_icrs[k], scratch.R)
+            scratch.P[:] = 0.0
             for i in range(3):
-                room.P[i, i] = sigma * sigma
-        if _solve_near(k, frames, stars, rule, memory, room, solutions):
+                scratch.P[i, i] = sigma * sigma
+        if _solve_near(k, frames, stars, rule, memory, scratch, solutions):
             if attempt == 1:
-                memory.held[1] = 1
+                memory.counters[1] = 1
             return True
     return False
 
@@ -253,17 +256,17 @@ def _clear(k, first, solutions):
 
 
 @kernel
-def follow(walk, frames, priors, stars, rule, memory, solutions, status):
+def follow(frame_range, frames, priors, stars, rule, memory, solutions, status):
     """Identify frames from the attitudes before them; return the first frame whose sky has to
     be searched, or `walk.stop` (compiled).
 
     Parameters
     ----------
     walk, frames : FrameRange, FrameArrays
-        The frames, and which of them to go through in which order.
+        Which frames, in which order; and the frames.
     priors : Priors
         Attitudes that came with the log.
-    stars : StarPlaces
+    stars : StarDirections
         The sky's stars.
     rule : MatchRule
         How matches are weighed.
@@ -276,24 +279,24 @@ def follow(walk, frames, priors, stars, rule, memory, solutions, status):
         TIME_LIMIT are not searched again.
     """
     n = len(stars.u)
-    room = _FieldScratch(
+    scratch = _FieldScratch(
         np.empty((3, 3)), np.empty((3, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int64)
     )
-    k = walk.start
-    while k != walk.stop:
+    k = frame_range.start
+    while k != frame_range.stop:
         if solutions.solved[k]:
             R, P = solutions.R_sensor_from_icrs[k], solutions.cov_rad2[k]
             remember(memory, frames.t_s[k], R, P)
         elif frames.first[k + 1] - frames.first[k] < 3:
             status[k] = TOO_FEW
-        elif _identify_next(k, frames, priors, stars, rule, memory, room, solutions):
+        elif _identify_next(k, frames, priors, stars, rule, memory, scratch, solutions):
             status[k] = 0
         else:
             _clear(k, frames.first, solutions)
             if status[k] != NO_MATCH and status[k] != TIME_LIMIT:
-                if walk.searches and memory.held[2] == 0:
+                if frame_range.searches and memory.counters[2] == 0:
                     return k
-                memory.held[2] = max(memory.held[2] - 1, 0)
+                memory.counters[2] = max(memory.counters[2] - 1, 0)
                 status[k] = NOT_SEARCHED
-        k += walk.step
+        k += frame_range.step
     return k

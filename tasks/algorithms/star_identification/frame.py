@@ -1,4 +1,9 @@
-"""One frame: its centroids, its solution near a prediction, and its search lost in space."""
+"""One frame: its centroids, its solution near a predicted attitude, and its search lost in space.
+
+`identify_predicted` matches the stars of the field that a prediction gives. `identify_lost` first
+searches the whole sky for the attitude: without clusters of centroids, then with the brightest
+ones, and where that fails with all, as a frame of which most centroids are no stars.
+"""
 
 import math
 from typing import NamedTuple
@@ -9,7 +14,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.geometry.camera import Camera, undistort
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.evidence import (
-    TYPICAL_SPREAD_MAG,
+    TYPICAL_SCATTER_MAG,
     MatchRule,
     chance_margin,
 )
@@ -31,52 +36,21 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
 
-# -- Clusters of false centroids: a reflection, a bright object's halo, a damaged part of the chip.
-
+Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
-CELLS = 8  # along each side of the image
-# A cell may hold so many centroids, or so many times as many as the median cell.
-FEW, TIMES = 4, 3
-
-
-def thinned(u: npt.NDArray[np.float64], box: npt.NDArray[np.float64]) -> Rows:
-    """Return the rows of centroids without most of those of crowded cells.
-
-    Parameters
-    ----------
-    u : (n, 3) float
-        Directions in the sensor frame, brightest first: the brightest of a cell are kept.
-    box : (4,) float
-        x0, x1, y0, y1 of the image in normalised coordinates.
-    """
-    at = (u[:, :2] / u[:, 2:] - box[[0, 2]]) / (box[[1, 3]] - box[[0, 2]])
-    row, column = np.clip(CELLS * at, 0, CELLS - 1).astype(np.int64).T
-    cell = row * CELLS + column
-    count = np.bincount(cell, minlength=CELLS * CELLS)
-    order = np.argsort(cell, kind="stable")
-    rank = np.empty(len(cell), np.int64)
-    rank[order] = np.arange(len(cell)) - (np.cumsum(count) - count)[cell[order]]
-    return np.flatnonzero(rank < max(FEW, TIMES * np.median(count)))
-
-
-# -- One frame: its centroids, its solution near a prediction, and its search lost in space.
-
-Array = npt.NDArray[np.float64]
-
-# Lost in space, this is taken off the threshold at most: see `chance_margin`.
+# Maximum that is taken off the threshold of a search lost in space, by `chance_margin`.
 LOST_MARGIN = 6.0
-# The best attitude must be this much (in log) more probable than any other.
-CLEAR_LEAD = 7.0
-# Prior odds (ln) that a frame has enough stars to be identified: at most 99 in 100 frames do.
-MAX_STARLIT = 4.6
-# Brightest centroids that are used in a search of the whole sky, that are paired, and that each
-# hypothesis is tried on; where half of them are stars.
+CLEAR_LEAD = 7.0  # log evidence by which the best attitude must exceed any other
+MAX_STARLIT = 4.6  # prior odds (ln) that a frame has enough stars: at most 99 in 100 frames do
+# Numbers of brightest centroids that are used in a search of the whole sky, that are paired, and
+# that each hypothesis is tried on; and the share of them that are stars, a prior.
 N_SEARCHED, N_PATTERN, N_TRIED, STAR_SHARE = 200, 40, 64, 0.5
-# The same where that fails, for frames of which most centroids are no stars: all are paired.
+# The same for frames of which most centroids are no stars: all are paired; prior number of stars.
 N_CROWDED, MIN_STARS = 1024, 8.0
-CLUSTERED = 0.75  # of the centroids are left without clusters: then these are searched first
-CROWDED_TIMES = 10.0  # as long as another search: hardly any pivot is a star
+# Centroids without clusters are searched first where they are fewer than this share of all.
+CLUSTERED = 0.75
+CROWDED_TIMES = 10.0  # the time limit of a search of a crowd over that of another one
 
 
 class FieldOfView(NamedTuple):
@@ -130,41 +104,41 @@ class Solution(NamedTuple):
     evidence: float
 
 
-class Search(NamedTuple):
-    """How a frame is judged.
+class MatchSettings(NamedTuple):
+    """How stars are matched in a frame, and how its attitude is judged.
 
-    gate_sigma : a centroid lies within this of its star's place
-    threshold : least log evidence, ln(1 / false alarm probability)
+    gate_sigma : a centroid is within this of its star's predicted position [sigma]
+    threshold : minimum log evidence, ln(1 / false alarm probability)
     time_limit_s : CPU time of one search lost in space
     zero_point_mag : star minus instrumental magnitude; NaN while unknown
-    spread_mag : its scatter, 1-sigma
-    starlit : prior odds (ln) that a frame has enough stars to be identified, as the sensor's other
-        frames show; of an unknown sensor even ones
-    crowded : where a search fails, the frame is searched again as one that shows few stars among
-        many other centroids
+    scatter_mag : 1-sigma scatter of that
+    starlit : prior odds (ln) that a frame has enough stars to be identified, from the sensor's
+        other frames; 0 for an unknown sensor
+    crowded : where a search fails, the frame is searched again as one with few stars among many
+        other centroids
     """
 
     gate_sigma: float
     threshold: float
     time_limit_s: float
     zero_point_mag: float
-    spread_mag: float = TYPICAL_SPREAD_MAG
+    scatter_mag: float = TYPICAL_SCATTER_MAG
     crowded: bool = True
     starlit: float = 0.0
 
     @property
-    def least_lost(self) -> float:
-        """Least log evidence of an attitude that was searched lost in space."""
+    def min_evidence_lost(self) -> float:
+        """Minimum log evidence of an attitude that was searched lost in space."""
         return self.threshold - LOST_MARGIN - min(max(self.starlit, 0.0), MAX_STARLIT)
 
 
 class Verdict(NamedTuple):
-    """The result of a search.
+    """The result of a search of the whole sky.
 
     is_clear : the attitude is beyond doubt
     R_sensor_from_icrs : (3, 3), of the best hypothesis
     evidence, runner_up : log evidence of the best and of the best different attitude
-    exhausted : the search ended because its bound was reached
+    exhausted : the search ended because it reached its time limit
     """
 
     is_clear: bool
@@ -174,16 +148,21 @@ class Verdict(NamedTuple):
     exhausted: bool
 
 
-def rule_of(how: Search, sky: Sky) -> MatchRule:
+def rule_of(matching: MatchSettings, sky: Sky) -> MatchRule:
     """Return the rule for matches as the kernels take it."""
     return MatchRule(
-        how.gate_sigma, sky.log_density, how.zero_point_mag, how.spread_mag, how.threshold,
-        how.threshold + CLEAR_LEAD,
+        matching.gate_sigma, sky.log_density, matching.zero_point_mag, matching.scatter_mag,
+        matching.threshold, matching.threshold + CLEAR_LEAD,
     )  # fmt: skip
 
 
 def identify_predicted(
-    frame: FrameCentroids, sky: Sky, R0: Array, P0: Array, how: Search, lost: bool = False
+    frame: FrameCentroids,
+    sky: Sky,
+    R0: Array,
+    P0: Array,
+    matching: MatchSettings,
+    lost: bool = False,
 ) -> Solution | None:
     """Return the solution near a predicted attitude, None where the stars do not confirm one.
 
@@ -205,24 +184,26 @@ def identify_predicted(
     R, P = np.empty((3, 3)), np.empty((3, 3))
     star, chi2 = np.full(n, -1, np.int64), np.zeros(n)
     evidence = solve_predicted(
-        Attitude(R0, P0), lost, Centroids(*frame[:4]), seen, frame.optics.box, rule_of(how, sky),
-        Attitude(R, P), Matches(star, chi2),
+        Attitude(R0, P0), lost, Centroids(*frame[:4]), seen, frame.optics.box,
+        rule_of(matching, sky), Attitude(R, P), Matches(star, chi2),
     )  # fmt: skip
     in_view = sky.rho * frame.optics.solid_angle_sr
-    if not evidence > (_least_of_lost(star, evidence, in_view, how) if lost else how.threshold):
+    if not evidence > (
+        _least_of_lost(star, evidence, in_view, matching) if lost else matching.threshold
+    ):
         return None
     return Solution(R, P, np.where(star >= 0, row[star], -1), chi2, evidence)
 
 
 def _least_of_lost(
-    star: npt.NDArray[np.int64], evidence: float, in_view: float, how: Search
+    star: npt.NDArray[np.int64], evidence: float, in_view: float, matching: MatchSettings
 ) -> float:
-    """Return the least evidence of an attitude with these matches that was searched lost in
+    """Return the minimum log evidence of an attitude with these matches that was searched lost in
     space."""
-    if not evidence > how.least_lost:
-        return how.threshold
+    if not evidence > matching.min_evidence_lost:
+        return matching.threshold
     margin = chance_margin(np.count_nonzero(star >= 0), len(star), in_view)
-    return float(how.least_lost + LOST_MARGIN - min(margin, LOST_MARGIN))
+    return float(matching.min_evidence_lost + LOST_MARGIN - min(margin, LOST_MARGIN))
 
 
 def aberrate_all(u_icrs: Array, beta: Array) -> Array:
@@ -235,23 +216,25 @@ def aberrate_all(u_icrs: Array, beta: Array) -> Array:
 
 
 def search_lost(
-    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search
+    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, matching: MatchSettings
 ) -> Verdict:
     """Search the whole sky for the frame's attitude; see `lost_in_space.search`."""
     # Centroids far outside any image have no direction.
     at = np.flatnonzero(np.isfinite(frame.u[:, 0]))
     if len(at) > N_PATTERN:
-        spread = at[thinned(frame.u[at], frame.optics.box)]
-        if len(spread) < CLUSTERED * len(at):
+        unclustered = at[without_clusters(frame.u[at], frame.optics.box)]
+        if len(unclustered) < CLUSTERED * len(at):
             verdict = _search(
-                some_centroids(frame, spread[:N_SEARCHED]), sky, grid, pairs, how, False
+                some_centroids(frame, unclustered[:N_SEARCHED]), sky, grid, pairs, matching, False
             )
             if verdict.is_clear:
                 return verdict
-    verdict = _search(some_centroids(frame, at[:N_SEARCHED]), sky, grid, pairs, how, crowded=False)
-    if verdict.is_clear or not how.crowded or len(at) <= N_PATTERN:
+    verdict = _search(
+        some_centroids(frame, at[:N_SEARCHED]), sky, grid, pairs, matching, crowded=False
+    )
+    if verdict.is_clear or not matching.crowded or len(at) <= N_PATTERN:
         return verdict
-    return _search(some_centroids(frame, at[:N_CROWDED]), sky, grid, pairs, how, crowded=True)
+    return _search(some_centroids(frame, at[:N_CROWDED]), sky, grid, pairs, matching, crowded=True)
 
 
 def some_centroids(frame: FrameCentroids, at: npt.NDArray[np.int64]) -> FrameCentroids:
@@ -262,24 +245,34 @@ def some_centroids(frame: FrameCentroids, at: npt.NDArray[np.int64]) -> FrameCen
 
 
 def _search(
-    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search, crowded: bool
+    frame: FrameCentroids,
+    sky: Sky,
+    grid: SkyGrid,
+    pairs: PairTable,
+    matching: MatchSettings,
+    crowded: bool,
 ) -> Verdict:
     if len(frame.u) < 3:
         return Verdict(False, np.eye(3), -np.inf, -np.inf, False)
-    R, least = np.zeros((3, 3)), how.least_lost
-    problem = problem_of(frame, sky, grid, pairs, how, crowded)
+    R, least = np.zeros((3, 3)), matching.min_evidence_lost
+    problem = problem_of(frame, sky, grid, pairs, matching, crowded)
     best, runner_up, work = search_crowded(problem, R) if crowded else search(problem, R)
     is_clear = best > least and best - runner_up > CLEAR_LEAD
     return Verdict(is_clear, R, best, runner_up, work > problem.limits.budget)
 
 
 def problem_of(
-    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search, crowded: bool
+    frame: FrameCentroids,
+    sky: Sky,
+    grid: SkyGrid,
+    pairs: PairTable,
+    matching: MatchSettings,
+    crowded: bool,
 ) -> Problem:
     """Return a frame whose attitude is searched for over the whole sky, as the kernels take it."""
-    n, least, area = len(frame.u), how.least_lost, frame.optics.solid_angle_sr
+    n, least, area = len(frame.u), matching.min_evidence_lost, frame.optics.solid_angle_sr
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * _middle(frame.sigma_rad))
-    budget = how.time_limit_s * WORK_PER_S
+    budget = matching.time_limit_s * WORK_PER_S
     if crowded:
         share = min(MIN_STARS / n, STAR_SHARE)
         limits = SearchLimits(min_chord, n, n, share, CROWDED_TIMES * budget)
@@ -290,7 +283,9 @@ def problem_of(
         Stars(sky.catalogue.u_icrs, sky.catalogue.magnitude, grid, sky.bands),
         pairs,
         Image(frame.optics.box, area, sky.rho * area),
-        rule_of(how, sky)._replace(least=least, enough=least + CLEAR_LEAD + 2.0),
+        rule_of(matching, sky)._replace(
+            min_evidence=least, clear_evidence=least + CLEAR_LEAD + 2.0
+        ),
         limits,
     )
 
@@ -308,7 +303,7 @@ def _search_and_solve(problem, reach, R_found, solution, matches):
     solution, which is written as by `solve_predicted` (compiled).
     """
     best, runner_up, work = search(problem, R_found)
-    if not (best > problem.rule.least and best - runner_up > CLEAR_LEAD):
+    if not (best > problem.rule.min_evidence and best - runner_up > CLEAR_LEAD):
         return best, runner_up, work, -1e9
     centroids = problem.centroids
     sigma = 2.0 * np.sort(centroids.sigma)[len(centroids.sigma) // 2]
@@ -327,10 +322,10 @@ def _search_and_solve(problem, reach, R_found, solution, matches):
 
 
 def _identify_few(
-    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search
+    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, matching: MatchSettings
 ) -> tuple[Solution | None, bool]:
-    """Return the same as `identify_lost` for a frame that is no crowd."""
-    problem = problem_of(frame, sky, grid, pairs, how, crowded=False)
+    """Return the same as `identify_lost` for a frame that is not crowded."""
+    problem = problem_of(frame, sky, grid, pairs, matching, crowded=False)
     n = len(frame.u)
     R, P = np.empty((3, 3)), np.empty((3, 3))
     star, chi2 = np.full(n, -1, np.int64), np.zeros(n)
@@ -338,30 +333,59 @@ def _identify_few(
     best, runner_up, work, evidence = _search_and_solve(
         problem, reach, np.zeros((3, 3)), Attitude(R, P), Matches(star, chi2)
     )
-    if not (best > how.least_lost and best - runner_up > CLEAR_LEAD):
+    if not (best > matching.min_evidence_lost and best - runner_up > CLEAR_LEAD):
         return None, work > problem.limits.budget
-    if not evidence > _least_of_lost(star, evidence, problem.image.in_view, how):
+    if not evidence > _least_of_lost(star, evidence, problem.image.in_view, matching):
         return None, False
     return Solution(R, P, star, chi2, evidence), False
 
 
 def identify_lost(
-    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, how: Search
+    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, matching: MatchSettings
 ) -> tuple[Solution | None, bool]:
     """Return the solution without a prior, None where no attitude is beyond doubt, and whether the
     search reached its time limit."""
     if 3 <= len(frame.u) <= N_PATTERN and np.isfinite(frame.u).all():
-        return _identify_few(frame, sky, grid, pairs, how)
-    verdict = search_lost(frame, sky, grid, pairs, how)
+        return _identify_few(frame, sky, grid, pairs, matching)
+    verdict = search_lost(frame, sky, grid, pairs, matching)
     if not verdict.is_clear:
         return None, verdict.exhausted
     near = np.eye(3) * (2.0 * _middle(frame.sigma_rad)) ** 2
-    return identify_predicted(frame, sky, verdict.R_sensor_from_icrs, near, how, lost=True), False
+    return identify_predicted(
+        frame, sky, verdict.R_sensor_from_icrs, near, matching, lost=True
+    ), False
 
 
-# -- The field of view of a camera, with its distortion.
+# -- Clusters of false centroids: a reflection, a bright object's halo, a damaged part of the chip.
 
-EDGE_POINTS = 9  # of each edge of the image
+CLUSTER_CELLS = 8  # along each side of the image
+# A cell keeps this number of centroids, or this many times the number in the median cell.
+MIN_PER_CELL, TIMES_MEDIAN = 4, 3
+
+
+def without_clusters(u: npt.NDArray[np.float64], box: npt.NDArray[np.float64]) -> Rows:
+    """Return the rows of centroids without most of those in crowded cells of the image.
+
+    Parameters
+    ----------
+    u : (n, 3) float
+        Directions in the sensor frame, brightest first: the brightest of a cell are kept.
+    box : (4,) float
+        x0, x1, y0, y1 of the image in normalised coordinates.
+    """
+    at = (u[:, :2] / u[:, 2:] - box[[0, 2]]) / (box[[1, 3]] - box[[0, 2]])
+    row, column = np.clip(CLUSTER_CELLS * at, 0, CLUSTER_CELLS - 1).astype(np.int64).T
+    cell = row * CLUSTER_CELLS + column
+    count = np.bincount(cell, minlength=CLUSTER_CELLS * CLUSTER_CELLS)
+    order = np.argsort(cell, kind="stable")
+    rank = np.empty(len(cell), np.int64)
+    rank[order] = np.arange(len(cell)) - (np.cumsum(count) - count)[cell[order]]
+    return np.flatnonzero(rank < max(MIN_PER_CELL, TIMES_MEDIAN * np.median(count)))
+
+
+# -- The field of view of a camera.
+
+EDGE_POINTS = 9  # of each edge of the image, at which the distortion is taken
 
 
 def field_of_view(camera: Camera) -> FieldOfView:

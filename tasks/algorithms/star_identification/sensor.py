@@ -1,5 +1,22 @@
-"""All frames of one sensor over a span: its errors and its faintest star are learned from a sample,
-then every frame is identified."""
+"""Star identification of one sensor: eight passes over its frames of a span.
+
+What the passes learn of the sensor is a `SensorModel`: its centroid error, its faintest star, the
+zero point of its brightness.
+
+1. Probe (`_probe`): some scattered frames are searched, with one assumption after the other, until
+   any is identified.
+2. Sample (`_learn_around`): the model is learned from frames around the identified ones.
+3. All frames (`identify_sample`): followed from frame to frame, searched where that fails.
+4. All frames again (`_identify_again`): only if the probe failed and pass 3 identified some. The
+   model is learned from these.
+5. True errors (`_with_true_scale`): the centroid error that the residuals of all frames show.
+6. Other brightness (`of_other_brightness`): unidentified frames, with an unknown zero point.
+7. Poor frames (`reidentify_poor_frames`): frames of which unusually few centroids are stars.
+8. Error of each frame (`by_quality`): from the residuals of each; unidentified frames are searched
+   as better and as worse ones.
+
+docs/methods/passes.md says what each pass costs and what is lost without it.
+"""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -8,45 +25,54 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids, Solutions
-from epipole.tasks.algorithms.star_identification.frame import Search, Solution
+from epipole.tasks.algorithms.star_identification.frame import MatchSettings, Solution
 from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import (
-    Known,
-    Sample,
-    Skies,
     by_quality,
-    identify_sample,
     of_other_brightness,
     reidentify_poor_frames,
-    sky_of,
 )
 from epipole.tasks.algorithms.star_identification.sensor_model import (
-    USELESS_SCATTER_MAG,
-    faintest_star,
+    SensorModel,
+    Skies,
     is_significant,
+    learn,
     likeliest_floor,
     rematch,
-    residual_scale,
     scale_of,
-    zero_point,
 )
-from epipole.tasks.algorithms.star_identification.sequence import Priors, identify_again
+from epipole.tasks.algorithms.star_identification.sequence import (
+    FrameSample,
+    Priors,
+    identify_again,
+    identify_sample,
+    sky_of,
+)
 from epipole.tasks.algorithms.star_identification.star_grid import Sky
 
 Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int64]
+Statuses = list[str | None]
 
-# Frames, scattered over all, which are searched until any is identified; more where a frame has so
-# many centroids that most are no stars.
+MIN_CENTROIDS = 4  # of a frame that takes part in the probe and the sample
+# Frames of the probe; more where frames are crowded: the typical frame has more than `CROWDED`
+# centroids, so most are no stars.
 PROBED, PROBED_CROWDED, CROWDED = 5, 8, 100
-STARS_IN_CROWD, DEEPER_IN_CROWD_MAG = 25.0, 1.5  # a field shows so many stars there, or deeper ones
-SAMPLED = 24  # frames around these from which a sensor is learned
-# Centroids may be mostly objects or clutter: skies that are brighter by this are tried as well.
-BRIGHTER_MAG = (1.0, 2.0)
-MIN_IN_VIEW = 5.0  # stars in a field, on average, of a sky that is worth a try
-KNOWN_SCALES = (1.0, 3.0, 0.4)  # factors to try on errors that the log or the settings state
-UNKNOWN_SCALES_PX = (0.5, 1.5, 0.15)  # errors to try where none are stated
-MIN_SPREAD_MAG = 0.15  # of brightness: a sample may scatter less than all
-WRONG_GATE = 0.02  # a sample that misses the errors of all frames by more is corrected
-DEEPER_MAG = 2.0  # how far beyond the first guess the faintest star is searched for
+# The number of stars in a crowded field is unknown: the first number is assumed, then a sky that is
+# deeper by the second.
+STARS_IN_CROWD, DEEPER_IN_CROWD_MAG = 25.0, 1.5
+SAMPLED = (
+    24  # frames from which the model is learned; 12 and 48 do as well (docs/methods/passes.md)
+)
+# First guess of the stars in a field, per centroid: the sensor misses some. And without any frame.
+STARS_PER_CENTROID, ASSUMED_IN_VIEW = 1.2, 10.0
+# Centroids may be mostly objects or clutter: skies that end earlier by this are tried as well, if
+# they still have `MIN_IN_VIEW` stars per field on average.
+BRIGHTER_MAG, MIN_IN_VIEW = (1.0, 2.0), 5.0
+# Centroid errors that are tried: factors on stated ones, or pixels where none are stated.
+KNOWN_SCALES, UNKNOWN_SCALES_PX = (1.0, 3.0, 0.4), (0.5, 1.5, 0.15)
+# Relative error of the learned centroid error above which all frames are matched again. With half
+# or twice of it the same frames are identified, and squared errors over covariance change by 0.03.
+WRONG_GATE = 0.02
 
 
 class IdentifiedSensor(NamedTuple):
@@ -54,247 +80,270 @@ class IdentifiedSensor(NamedTuple):
 
     solutions, status : of each frame, see `identify_sequence`
     sky : the solutions' stars are rows of its catalogue
-    sigma_scale : (F,) float, factor on the centroid errors as stated, or on 1 px where none are
-    sigma_floor_px : the error that all have beside the stated ones, before that factor
+    sigma_scale : (F,) float, factor on the stated centroid errors; pixels where none are stated
+    sigma_floor_px : error added in quadrature to the stated ones, before that factor
     """
 
     solutions: Solutions
-    status: list[str | None]
+    status: Statuses
     sky: Sky
     sigma_scale: Array
     sigma_floor_px: float = 0.0
 
 
+class _Probe(NamedTuple):
+    """The probed frames.
+
+    rows : (n,) int64, which frames
+    solutions : of these
+    usable : (m,) int64, all frames with enough centroids
+    """
+
+    rows: Rows
+    solutions: list[Solution | None]
+    usable: Rows
+
+    @property
+    def failed(self) -> bool:
+        """Whether no frame was identified."""
+        return not any(self.solutions)
+
+
 def identify_sensor(
     t_s: Array,
-    spots: RawCentroids,
+    centroids: RawCentroids,
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,
-    how: Search,
+    matching: MatchSettings,
 ) -> IdentifiedSensor:
-    """Identify the stars of a sensor's frames, which are in order of time.
+    """Identify the stars of a sensor's frames.
 
-    Errors that are not stated are estimated from the residuals. Stated errors are scaled where
-    residuals contradict them beyond doubt, so that reported sigmas are true; both frame by frame
-    where frames differ.
+    Centroid errors that are not stated are estimated from the residuals. Stated errors are scaled
+    where residuals contradict them beyond doubt. Both are done frame by frame where frames differ.
+
+    Parameters
+    ----------
+    t_s : (F,) float
+        Times of the frames [s], ascending.
+    centroids, priors
+        Of the F frames.
+    magnitude_limit
+        Faintest star that the sensor detects; None: it is learned.
+    matching
+        How frames are judged before anything is known of the sensor.
     """
-    spots, stated = _fill_sigmas(spots)
-    usable = np.flatnonzero(spots.counts >= 4)
-    density = 1.2 * float(np.median(spots.counts[usable])) if len(usable) else 10.0
-    crowded = density > 1.2 * CROWDED
-    limit = magnitude_limit
-    if limit is None:  # of a crowd, nobody knows how many are stars
-        in_view = STARS_IN_CROWD if crowded else density
-        limit = skies.limit_for(in_view / spots.optics[0].solid_angle_sr)
-    known = Known(1.0, limit, magnitude_limit is None, how, True, not stated)
-    whole = Sample(t_s, spots, priors)
-    rows = usable[scattered(len(usable), PROBED_CROWDED if crowded else PROBED)]
-    known, probed = _first_scale(
-        whole.take(rows), skies, known, KNOWN_SCALES if stated else UNKNOWN_SCALES_PX, crowded
-    )
-    hopeless = not any(probed)
-    floor_px = 0.0
-    if not hopeless:
+    centroids, stated = _fill_sigmas(centroids)
+    frames, floor_px = FrameSample(t_s, centroids, priors), 0.0
+    model, probe = _probe(frames, skies, magnitude_limit, matching, stated)
+    if not probe.failed:
         if stated:
-            floor_px = likeliest_floor(
-                whole.take(rows).spots, probed, skies.sky(known.limit), known.how, known.scale
-            )
-            spots = spots.with_floor(floor_px)
-            whole = whole._replace(spots=spots)
-            known = known._replace(scale=1.0 if floor_px else known.scale)
-        known, whole = _learn_around(rows, probed, usable, whole, skies, known)
-    solutions, status = identify_sample(whole, skies, known, hopeless)
-    if hopeless and solutions.solved.any():  # the probe was poor: learn from the others
-        solved = np.flatnonzero(solutions.solved)
-        rows = solved[spread(len(solved), SAMPLED)]
-        sampled = [solutions.frame(i) for i in rows]
-        known = _learn(whole.take(rows).spots, sampled, skies, known)
-        solutions, status = identify_sample(whole.anchored(rows, sampled), skies, known)
-    solutions, status, known = _with_true_scale(whole, solutions, status, skies, known)
-    if solutions.solved.any():
-        solutions = of_other_brightness(whole, solutions, skies, known)
+            frames, model, floor_px = _with_floor(frames, probe, skies, model)
+        frames, model = _learn_around(frames, probe, skies, model)
+    solutions, status = identify_sample(frames, skies, model, hopeless=probe.failed)
+    if probe.failed and solutions.solved.any():
+        solutions, status, model = _identify_again(frames, solutions, skies, model)
+    solutions, status, model = _with_true_scale(frames, solutions, status, skies, model)
+    solutions = of_other_brightness(frames, solutions, skies, model)
     quality = reidentify_poor_frames(
-        spots.frames(known.scale, known.use_flux),
-        solutions,
-        sky_of(spots, skies, known),
-        known.how,
+        frames.scaled(model), solutions, sky_of(frames.centroids, skies, model), model.matching
     )
-    solutions, quality = by_quality(whole, solutions, quality, skies, known)
-    status = [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
+    solutions, quality = by_quality(frames, solutions, quality, skies, model)
     return IdentifiedSensor(
-        solutions, status, skies.sky(known.limit), known.scale * quality, floor_px
-    )
+        solutions, _open_status(status, solutions), skies.sky(model.limit), model.scale * quality,
+        floor_px,
+    )  # fmt: skip
 
 
-def _with_true_scale(
-    whole: Sample, solutions: Solutions, status: list[str | None], skies: Skies, known: Known
-) -> tuple[Solutions, list[str | None], Known]:
-    """Return the solutions with the errors that the residuals of all frames show."""
-    spots = whole.spots
-    residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
-    if known.adjusted and abs(residuals.scale - 1) > WRONG_GATE:
-        known = known._replace(scale=known.scale * residuals.scale)
-        sky, frames = skies.sky(known.limit), spots.frames(known.scale, known.use_flux)
-        again = identify_again(whole.t_s, frames, solutions, sky, known.how)
-        if again.solved[solutions.solved].all():
-            solutions = again
-            status = [None if solved else s for s, solved in zip(status, again.solved, strict=True)]
-            residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
-        else:
-            solutions, residuals = (
-                solutions.rescaled(residuals.scale),
-                residuals._replace(scale=1.0),
-            )
-    if residuals.dof > 0 and (known.adjusted or is_significant(residuals)):
-        known = known._replace(scale=known.scale * residuals.scale)
-        solutions = solutions.rescaled(residuals.scale)
-    return solutions, status, known
+def _fill_sigmas(centroids: RawCentroids) -> tuple[RawCentroids, bool]:
+    """Return the centroids with the median for missing sigmas, and whether any sigma is stated."""
+    sigma_px = centroids.sigma_px
+    if not np.isfinite(sigma_px).any():
+        return centroids, False
+    middle = float(np.nanmedian(sigma_px))
+    return centroids._replace(sigma_px=np.where(np.isnan(sigma_px), middle, sigma_px)), True
 
 
-def spread(n: int, wanted: int) -> npt.NDArray[np.int64]:
-    """Return so many rows of n, spread evenly."""
-    return np.unique(np.linspace(0, max(n - 1, 0), wanted).astype(np.int64))[:n]
+def _open_status(status: Statuses, solutions: Solutions) -> Statuses:
+    """Return the status of each frame, None where it is solved by now."""
+    return [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
 
 
-def scattered(n: int, wanted: int) -> npt.NDArray[np.int64]:
-    """Return so many rows of n, all over but in no period: every third frame may show the Earth."""
+# -- Pass 1: the probe.
+
+
+def _probe(
+    frames: FrameSample,
+    skies: Skies,
+    magnitude_limit: float | None,
+    matching: MatchSettings,
+    stated: bool,
+) -> tuple[SensorModel, _Probe]:
+    """Return a first model, with which some of the probed frames are identified, and these."""
+    centroids = frames.centroids
+    usable = np.flatnonzero(centroids.counts >= MIN_CENTROIDS)
+    typical = float(np.median(centroids.counts[usable])) if len(usable) else 0.0
+    crowded = typical > CROWDED
+    limit = magnitude_limit
+    if limit is None:
+        in_view = STARS_IN_CROWD if crowded else STARS_PER_CENTROID * typical or ASSUMED_IN_VIEW
+        limit = skies.limit_for(in_view / centroids.optics[0].solid_angle_sr)
+    model = SensorModel(1.0, limit, magnitude_limit is None, matching, True, not stated)
+    rows = usable[aperiodic_rows(len(usable), PROBED_CROWDED if crowded else PROBED)]
+    scales = KNOWN_SCALES if stated else UNKNOWN_SCALES_PX
+    model, solutions = _first_scale(frames.take(rows), skies, model, scales, crowded)
+    return model, _Probe(rows, solutions, usable)
+
+
+def aperiodic_rows(n: int, wanted: int) -> Rows:
+    """Return `wanted` of n rows, all over but in no period: every third frame may show the Earth.
+
+    They are multiples of the golden ratio, modulo 1.
+    """
     golden = 0.5 * (np.sqrt(5.0) - 1.0)
     return np.unique((np.arange(wanted) * golden % 1.0 * n).astype(np.int64))[:n]
 
 
-def _around(n: int, rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Return `SAMPLED` rows of n in runs around these: followed, they need no search."""
-    length = min(-(-SAMPLED // len(rows)), n)
-    start = np.clip(rows - length // 2, 0, n - length)
-    return np.unique(start[:, None] + np.arange(length))
-
-
-def _fill_sigmas(spots: RawCentroids) -> tuple[RawCentroids, bool]:
-    """Return the centroids with the median for missing sigmas, and whether any sigma is stated."""
-    if not np.isfinite(spots.sigma_px).any():
-        return spots, False
-    middle = float(np.nanmedian(spots.sigma_px))
-    return spots._replace(sigma_px=np.where(np.isnan(spots.sigma_px), middle, spots.sigma_px)), True
-
-
-def _learn(
-    spots: RawCentroids, solutions: list[Solution | None], skies: Skies, known: Known
-) -> Known:
-    """Return what is known, with errors, zero point and faintest star from solved frames."""
-    if not any(solutions):
-        return known
-    sky, scale, adjusted = skies.sky(known.limit), known.scale, known.adjusted
-    for _ in range(12):  # too narrow a gate cuts residuals off: it takes more than a few steps
-        residuals = residual_scale(solutions)
-        adjusted |= is_significant(residuals)
-        if residuals.dof < 10 or not adjusted or abs(residuals.scale - 1) < 0.01:
-            break
-        again = rematch(spots.frames(scale * residuals.scale).each(), solutions, sky, known.how)
-        if not any(again):
-            break
-        scale, solutions = scale * residuals.scale, again
-    zero, scatter = zero_point(spots.frames(scale).each(), solutions, sky)
-    use_flux = not scatter > USELESS_SCATTER_MAG
-    how = known.how
-    if use_flux and not np.isnan(zero):
-        spread = min(max(1.2 * scatter, MIN_SPREAD_MAG), USELESS_SCATTER_MAG)
-        how = how._replace(zero_point_mag=zero, spread_mag=spread)
-    known = known._replace(scale=scale, how=how, use_flux=use_flux, adjusted=adjusted)
-    return known._replace(limit=_faintest(spots, solutions, skies, known))
-
-
-def _faintest(
-    spots: RawCentroids, solutions: list[Solution | None], skies: Skies, known: Known
-) -> float:
-    """Return the magnitude of the faintest star that the sensor detects, or that settings state."""
-    if not known.limit_is_open:
-        return known.limit
-    frames = spots.frames(known.scale, known.use_flux).each()
-    sky, deep = skies.sky(known.limit), skies.sky(known.limit + DEEPER_MAG)
-    matched = [sky.catalogue.magnitude[s.star[s.star >= 0]] for s in solutions if s is not None]
-    least = float(np.floor(4 * np.median(np.concatenate(matched))) / 4)
-    deeper = rematch(frames, solutions, deep, known.how)
-    return faintest_star(frames, deeper, deep, known.how.gate_sigma, least)
-
-
 def _first_scale(
-    probe: Sample, skies: Skies, known: Known, scales: tuple[float, ...], crowded: bool
-) -> tuple[Known, list[Solution | None]]:
-    """Return what is known, with a scale of errors that identifies frames, and the solutions."""
-    attempts = list(_attempts(probe.spots, skies, known, scales, crowded))
+    probe: FrameSample, skies: Skies, model: SensorModel, scales: tuple[float, ...], crowded: bool
+) -> tuple[SensorModel, list[Solution | None]]:
+    """Return the model with a centroid error that identifies frames, and the solutions."""
+    attempts = list(_attempts(probe.centroids, skies, model, scales, crowded))
+    matching = model.matching
     # Each further attempt is one more chance of a false alarm.
-    least = known.how.threshold + np.log(max(len(attempts) - 1, 1))
-    quick = known.how._replace(
-        time_limit_s=known.how.time_limit_s / 4, threshold=least, crowded=False
+    threshold = matching.threshold + np.log(max(len(attempts) - 1, 1))
+    quick = matching._replace(
+        time_limit_s=matching.time_limit_s / 4, threshold=threshold, crowded=False
     )
-    thorough = known.how._replace(threshold=least)
+    thorough = matching._replace(threshold=threshold)
     for tried in attempts:
-        # In a crowd, nothing less finds stars: as many as expected, or more.
+        # In a crowd only a thorough search finds stars, with the first error and either depth.
         in_crowd = crowded and tried.scale == scales[0] and tried.use_flux
-        how = thorough if in_crowd else quick
-        found = identify_sample(probe, skies, tried._replace(how=how))[0].each()
+        attempt = tried._replace(matching=thorough if in_crowd else quick)
+        found = identify_sample(probe, skies, attempt)[0].each()
         if any(found):
-            return _likeliest_scale(probe.spots, found, skies, tried, scales)
-    return known._replace(scale=scales[0]), [None] * len(probe.t_s)
+            return _likeliest_scale(probe.centroids, found, skies, tried, scales)
+    return model._replace(scale=scales[0]), [None] * len(probe.t_s)
 
 
 def _attempts(
     probe: RawCentroids,
     skies: Skies,
-    known: Known,
+    model: SensorModel,
     scales: tuple[float, ...],
     crowded: bool,
-) -> Iterator[Known]:
-    """Yield what may be assumed of a sensor, the likeliest first."""
+) -> Iterator[SensorModel]:
+    """Yield models to try, the likeliest first."""
     flux = bool(np.isfinite(probe.instrumental_mag).any())
     area = probe.optics[0].solid_angle_sr
     for use_flux in [True, False] if flux else [True]:  # it may be unrelated to brightness
-        tried = known._replace(scale=scales[0], use_flux=use_flux)
+        tried = model._replace(scale=scales[0], use_flux=use_flux)
         yield tried
-        if crowded and known.limit_is_open and use_flux:
-            yield tried._replace(limit=known.limit + DEEPER_IN_CROWD_MAG)
-        for brighter in BRIGHTER_MAG if known.limit_is_open and use_flux else ():
-            if not crowded and skies.sky(known.limit - brighter).rho * area > MIN_IN_VIEW:
-                yield tried._replace(limit=known.limit - brighter)
+        if crowded and model.limit_is_open and use_flux:
+            yield tried._replace(limit=model.limit + DEEPER_IN_CROWD_MAG)
+        for brighter in BRIGHTER_MAG if model.limit_is_open and use_flux else ():
+            if not crowded and skies.sky(model.limit - brighter).rho * area > MIN_IN_VIEW:
+                yield tried._replace(limit=model.limit - brighter)
         for scale in scales[1:]:
             yield tried._replace(scale=scale)
 
 
 def _likeliest_scale(
-    spots: RawCentroids,
+    centroids: RawCentroids,
     solutions: list[Solution | None],
     skies: Skies,
-    known: Known,
+    model: SensorModel,
     scales: tuple[float, ...],
-) -> tuple[Known, list[Solution | None]]:
-    """Return what is known, with the scale of errors that explains solved frames best, and the
+) -> tuple[SensorModel, list[Solution | None]]:
+    """Return the model with the centroid error that explains solved frames best, and their
     solutions with it."""
-    best, most, chosen = known, -np.inf, solutions
-    for scale in (known.scale, *scales):
-        frames = spots.frames(scale, known.use_flux).each()
-        again = rematch(frames, solutions, skies.sky(known.limit), known.how)
+    best, most, chosen = model, -np.inf, solutions
+    for scale in (model.scale, *scales):
+        frames = centroids.frames(scale, model.use_flux).each()
+        again = rematch(frames, solutions, skies.sky(model.limit), model.matching)
         evidence = sum(s.evidence for s in again if s is not None)
         if any(again) and evidence > most:
-            best, most, chosen = known._replace(scale=scale), evidence, again
+            best, most, chosen = model._replace(scale=scale), evidence, again
     return best, chosen
 
 
+# -- Pass 2: the sample.
+
+
+def _with_floor(
+    frames: FrameSample, probe: _Probe, skies: Skies, model: SensorModel
+) -> tuple[FrameSample, SensorModel, float]:
+    """Return the frames with an error added in quadrature to the stated ones, the model, and that
+    error [px]; 0 where none is needed."""
+    floor_px = likeliest_floor(
+        frames.take(probe.rows).centroids, probe.solutions, skies.sky(model.limit), model.matching,
+        model.scale,
+    )  # fmt: skip
+    frames = frames._replace(centroids=frames.centroids.with_floor(floor_px))
+    return frames, model._replace(scale=1.0 if floor_px else model.scale), floor_px
+
+
 def _learn_around(
-    rows: npt.NDArray[np.int64],
-    solutions: list[Solution | None],
-    usable: npt.NDArray[np.int64],
-    whole: Sample,
-    skies: Skies,
-    known: Known,
-) -> tuple[Known, Sample]:
-    """Return what is known, learned from the frames around solved ones, and all frames with
-    these as anchors."""
-    # With the errors, zero point and faintest star of the solved ones, more can be followed.
-    known = _learn(whole.take(rows).spots, solutions, skies, known)
-    solved = np.array([s is not None for s in solutions])
-    near = usable[_around(len(usable), np.searchsorted(usable, rows[solved]))]
-    anchored = whole.anchored(rows, solutions)
-    sampled = identify_sample(anchored.take(near), skies, known)[0].each()
-    known = _learn(whole.take(near).spots, sampled, skies, known)
-    return known, whole.anchored(near, sampled) if any(sampled) else anchored
+    frames: FrameSample, probe: _Probe, skies: Skies, model: SensorModel
+) -> tuple[FrameSample, SensorModel]:
+    """Return all frames with the sample's solutions as anchors, and the model that was learned."""
+    # With the errors, zero point and faintest star of the probed frames, more can be followed.
+    model = learn(frames.take(probe.rows).centroids, probe.solutions, skies, model)
+    solved = np.array([s is not None for s in probe.solutions])
+    at = np.searchsorted(probe.usable, probe.rows[solved])
+    near = probe.usable[_runs_around(len(probe.usable), at)]
+    anchored = frames.anchored(probe.rows, probe.solutions)
+    sampled = identify_sample(anchored.take(near), skies, model)[0].each()
+    model = learn(frames.take(near).centroids, sampled, skies, model)
+    return frames.anchored(near, sampled) if any(sampled) else anchored, model
+
+
+def _runs_around(n: int, rows: Rows) -> Rows:
+    """Return about `SAMPLED` of n rows in runs around these: they are followed, not searched."""
+    length = min(-(-SAMPLED // len(rows)), n)
+    start = np.clip(rows - length // 2, 0, n - length)
+    return np.unique(start[:, None] + np.arange(length))
+
+
+# -- Pass 4: all frames again.
+
+
+def _identify_again(
+    frames: FrameSample, solutions: Solutions, skies: Skies, model: SensorModel
+) -> tuple[Solutions, Statuses, SensorModel]:
+    """Return the solutions with a model that is learned from those there are, and the model."""
+    solved = np.flatnonzero(solutions.solved)
+    rows = solved[evenly_spaced(len(solved), SAMPLED)]
+    sampled = [solutions.frame(i) for i in rows]
+    model = learn(frames.take(rows).centroids, sampled, skies, model)
+    return *identify_sample(frames.anchored(rows, sampled), skies, model), model
+
+
+def evenly_spaced(n: int, wanted: int) -> Rows:
+    """Return `wanted` of n rows, evenly spaced; all where there are fewer."""
+    return np.unique(np.linspace(0, max(n - 1, 0), wanted).astype(np.int64))[:n]
+
+
+# -- Pass 5: the true errors.
+
+
+def _with_true_scale(
+    frames: FrameSample, solutions: Solutions, status: Statuses, skies: Skies, model: SensorModel
+) -> tuple[Solutions, Statuses, SensorModel]:
+    """Return the solutions and the model with the centroid error that all residuals show."""
+    residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
+    if model.adjusted and abs(residuals.scale - 1) > WRONG_GATE:
+        model = model._replace(scale=model.scale * residuals.scale)
+        again = identify_again(
+            frames.t_s, frames.scaled(model), solutions, skies.sky(model.limit), model.matching
+        )
+        if again.solved[solutions.solved].all():
+            solutions, status = again, _open_status(status, again)
+            residuals = scale_of(solutions.star, solutions.chi2, int(solutions.solved.sum()))
+        else:
+            solutions = solutions.rescaled(residuals.scale)
+            residuals = residuals._replace(scale=1.0)
+    if residuals.dof > 0 and (model.adjusted or is_significant(residuals)):
+        model = model._replace(scale=model.scale * residuals.scale)
+        solutions = solutions.rescaled(residuals.scale)
+    return solutions, status, model

@@ -1,6 +1,11 @@
-"""What a sensor's stars tell about it: centroid error, faintest star, zero point of brightness."""
+"""The model of a sensor, learned from its identified frames.
 
-from typing import NamedTuple
+The stars of identified frames tell the sensor's centroid error (the residuals against the stated
+errors), the zero point of its brightness, and its faintest star; `learn` puts them into a
+`SensorModel`. `frame_scales` tells the centroid error of each frame by itself.
+"""
+
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -9,27 +14,73 @@ from scipy.special import polygamma, psi
 
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
 from epipole.tasks.algorithms.star_identification.frame import (
+    FieldOfView,
     FrameCentroids,
-    Search,
+    MatchSettings,
     Solution,
     identify_predicted,
 )
-from epipole.tasks.algorithms.star_identification.star_grid import Sky
-
-# -- What a sensor's stars tell about it: centroid error, faintest star, zero point of brightness.
+from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
+from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
 
 Array = npt.NDArray[np.float64]
 
-# Flux that scatters more than this about the catalogue is not used [mag].
-USELESS_SCATTER_MAG = 1.0
-MAGNITUDE_STEP = 0.25
-# Errors beside stated ones that are tried, over the median of these, which must differ by this
-# share; and the log evidence that proves one.
-FLOORS, UNLIKE, CLEARLY = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 8.0), 0.2, 12.0
+USELESS_SCATTER_MAG = 1.0  # flux that scatters more about the catalogue is not used
+MIN_SCATTER_MAG = 0.15  # assumed of brightness: a sample may scatter less than all frames
+MAGNITUDE_STEP = 0.25  # in which the faintest star is searched for
+DEEPER_MAG = 2.0  # how far beyond the first guess it is searched for
+MIN_FLUXES = 8  # matches with a flux from which a zero point is taken
+# Floors that are tried, as factors on the median of the stated errors.
+FLOORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 8.0)
+# They are tried only if the stated errors differ: their 10 % and 90 % quantiles, by this share of
+# the median. A floor is added if it gains this much log evidence.
+MIN_ERROR_RANGE, MIN_FLOOR_GAIN = 0.2, 12.0
+# `learn` rescales the errors until they change by less than this share, or this often: too narrow a
+# gate cuts residuals off, so that each step corrects only a part.
+SETTLED_SCALE, MAX_RESCALINGS = 0.01, 12
+MIN_LEARN_DOF = 10  # degrees of freedom of residuals from which errors are rescaled
+
+
+class Skies(Protocol):
+    """The source of skies; it may cache them, as sensors share them."""
+
+    def limit_for(self, stars_per_sr: float) -> float:
+        """Return the magnitude limit with this mean density."""
+
+    def sky(self, limit: float) -> Sky:
+        """Return the sky to a magnitude."""
+
+    def grid(self, limit: float, radius_rad: float) -> SkyGrid:
+        """Return its grid."""
+
+    def pairs(self, limit: float, optics: FieldOfView) -> PairTable:
+        """Return its pattern pairs for a camera."""
+
+
+class SensorModel(NamedTuple):
+    """What has been learned of a sensor.
+
+    scale : factor on the stated centroid errors; pixels where none are stated
+    limit : magnitude of the faintest star that is searched for
+    limit_is_open : the settings do not give it
+    matching : how frames are judged, with the zero point of brightness and its scatter
+    use_flux : brightness is compared
+    adjusted : centroid errors are not the stated ones, or none are stated
+    """
+
+    scale: float
+    limit: float
+    limit_is_open: bool
+    matching: MatchSettings
+    use_flux: bool
+    adjusted: bool
+
+
+# -- Centroid error.
 
 
 class Scale(NamedTuple):
-    """Residuals over stated errors: their rms, and its degrees of freedom."""
+    """Rms of residuals over stated errors, per axis, and its degrees of freedom."""
 
     scale: float
     dof: int
@@ -54,8 +105,11 @@ def scale_of(star: npt.NDArray[np.int64], chi2: Array, n_solved: int) -> Scale:
 
 
 def is_significant(residuals: Scale) -> bool:
-    """Tell whether residuals contradict the stated errors, by 5 % and by three sigma."""
+    """Return whether residuals contradict the stated errors, by 5 % and by three sigma."""
     return abs(residuals.scale - 1) > max(0.05, 3 / np.sqrt(2 * max(residuals.dof, 1)))
+
+
+# -- Brightness.
 
 
 def zero_point(
@@ -71,14 +125,20 @@ def zero_point(
             )
     known = np.concatenate(differences) if differences else np.empty(0)
     known = known[np.isfinite(known)]
-    if len(known) < 8:
+    if len(known) < MIN_FLUXES:
         return np.nan, np.nan
     middle = float(np.median(known))
     return middle, 1.4826 * float(np.median(np.abs(known - middle)))
 
 
+# -- Errors beside the stated ones.
+
+
 def rematch(
-    frames: list[FrameCentroids], solutions: list[Solution | None], sky: Sky, how: Search
+    frames: list[FrameCentroids],
+    solutions: list[Solution | None],
+    sky: Sky,
+    matching: MatchSettings,
 ) -> list[Solution | None]:
     """Return the frames identified again near known attitudes, as with other errors or a deeper
     sky."""
@@ -88,12 +148,18 @@ def rematch(
             out.append(None)
             continue
         near = solution.cov_rad2 + np.eye(3) * float(np.median(frame.sigma_rad)) ** 2
-        out.append(identify_predicted(frame, sky, solution.R_sensor_from_icrs, near, how, True))
+        out.append(
+            identify_predicted(frame, sky, solution.R_sensor_from_icrs, near, matching, True)
+        )
     return out
 
 
 def likeliest_floor(
-    spots: RawCentroids, solutions: list[Solution | None], sky: Sky, how: Search, scale: float
+    centroids: RawCentroids,
+    solutions: list[Solution | None],
+    sky: Sky,
+    matching: MatchSettings,
+    scale: float,
 ) -> float:
     """Return the error [px] to add in quadrature to the stated sigmas.
 
@@ -104,22 +170,27 @@ def likeliest_floor(
 
     Parameters
     ----------
-    spots
-        The frames, with stated errors.
+    centroids
+        Of the frames, with stated errors.
     solutions, sky, scale
         Of these frames, with the stated errors times `scale`. With a floor, these are not scaled.
     """
-    known = spots.sigma_px[np.isfinite(spots.sigma_px)]
-    if not len(known) or np.ptp(np.quantile(known, [0.1, 0.9])) < UNLIKE * np.median(known):
+    known = centroids.sigma_px[np.isfinite(centroids.sigma_px)]
+    if not len(known) or np.ptp(np.quantile(known, [0.1, 0.9])) < MIN_ERROR_RANGE * np.median(
+        known
+    ):
         return 0.0
     floors_px = np.concatenate([[0.0], np.multiply(FLOORS, np.median(known))])
     evidence = []
     for floor_px in floors_px:
-        frames = spots.with_floor(floor_px).frames(1.0 if floor_px else scale).each()
-        again = rematch(frames, solutions, sky, how)
+        frames = centroids.with_floor(floor_px).frames(1.0 if floor_px else scale).each()
+        again = rematch(frames, solutions, sky, matching)
         evidence.append(sum(s.evidence for s in again if s is not None))
     best = int(np.argmax(evidence))
-    return float(floors_px[best]) if evidence[best] > evidence[0] + CLEARLY else 0.0
+    return float(floors_px[best]) if evidence[best] > evidence[0] + MIN_FLOOR_GAIN else 0.0
+
+
+# -- Faintest star.
 
 
 def faintest_star(
@@ -127,23 +198,23 @@ def faintest_star(
     solutions: list[Solution | None],
     deep: Sky,
     gate_sigma: float,
-    least: float,
+    start: float,
 ) -> float:
     """Return the magnitude to which matches stand out from chance.
 
-    `solutions` are of the deep sky. In steps of a quarter magnitude, the sensor detects the stars
-    of a step if more than a tenth of those in view are matched, and three times as many as by
-    chance.
+    `solutions` are of the `deep` sky. Stars are counted in steps of a quarter magnitude. The sensor
+    detects those of a step if more than a tenth of the stars in view are matched, and more than
+    three times as many as expected of false matches.
 
     Parameters
     ----------
-    least
-        The magnitude to start at: brighter stars are needed for identification in any case.
+    start
+        Magnitude to start at: brighter stars are needed for identification in any case.
     """
-    edges = np.arange(least, deep.catalogue.magnitude[-1] + MAGNITUDE_STEP, MAGNITUDE_STEP)
+    edges = np.arange(start, deep.catalogue.magnitude[-1] + MAGNITUDE_STEP, MAGNITUDE_STEP)
     if len(edges) < 2:
-        return least
-    in_view, matched, by_chance = np.zeros((3, len(edges) - 1))
+        return start
+    in_view, matched, expected_false = np.zeros((3, len(edges) - 1))
     for frame, solution in zip(frames, solutions, strict=True):
         if solution is None:
             continue
@@ -158,9 +229,9 @@ def faintest_star(
         in_view += n
         matched += np.histogram(deep.catalogue.magnitude[star], edges)[0]
         disc = np.pi * gate_sigma**2 * np.median(frame.sigma_rad) ** 2
-        by_chance += n * (len(frame.u) - len(star)) * disc / frame.optics.solid_angle_sr
-    good = (matched > 0.1 * in_view) & (matched > 3 * by_chance)
-    # A step without a star in a narrow field is skipped. One with few stars may fail by chance.
+        expected_false += n * (len(frame.u) - len(star)) * disc / frame.optics.solid_angle_sr
+    good = (matched > 0.1 * in_view) & (matched > 3 * expected_false)
+    # A step without a star in a narrow field is skipped. One with few stars may fail accidentally.
     last, poor = -1, 0
     for i in np.flatnonzero(in_view):
         poor = 0 if good[i] else poor + 1
@@ -171,21 +242,69 @@ def faintest_star(
     return float(edges[last + 1])
 
 
-# -- How good the centroids of each frame are, where a log does not say: from the stars' residuals.
+# -- All of it.
+
+
+def learn(
+    centroids: RawCentroids, solutions: list[Solution | None], skies: Skies, model: SensorModel
+) -> SensorModel:
+    """Return the model with centroid error, zero point and faintest star from solved frames."""
+    if not any(solutions):
+        return model
+    sky, scale, adjusted = skies.sky(model.limit), model.scale, model.adjusted
+    for _ in range(MAX_RESCALINGS):
+        residuals = residual_scale(solutions)
+        adjusted |= is_significant(residuals)
+        settled = abs(residuals.scale - 1) < SETTLED_SCALE
+        if residuals.dof < MIN_LEARN_DOF or not adjusted or settled:
+            break
+        frames = centroids.frames(scale * residuals.scale).each()
+        again = rematch(frames, solutions, sky, model.matching)
+        if not any(again):
+            break
+        scale, solutions = scale * residuals.scale, again
+    zero, scatter = zero_point(centroids.frames(scale).each(), solutions, sky)
+    use_flux = not scatter > USELESS_SCATTER_MAG
+    matching = model.matching
+    if use_flux and not np.isnan(zero):
+        # The scatter is that of the sample; all frames may scatter by a fifth more.
+        scatter = min(max(1.2 * scatter, MIN_SCATTER_MAG), USELESS_SCATTER_MAG)
+        matching = matching._replace(zero_point_mag=zero, scatter_mag=scatter)
+    model = model._replace(scale=scale, matching=matching, use_flux=use_flux, adjusted=adjusted)
+    return model._replace(limit=_learned_limit(centroids, solutions, skies, model))
+
+
+def _learned_limit(
+    centroids: RawCentroids, solutions: list[Solution | None], skies: Skies, model: SensorModel
+) -> float:
+    """Return the magnitude of the faintest star that the sensor detects, or that settings give."""
+    if not model.limit_is_open:
+        return model.limit
+    frames = centroids.frames(model.scale, model.use_flux).each()
+    sky, deep = skies.sky(model.limit), skies.sky(model.limit + DEEPER_MAG)
+    matched = [sky.catalogue.magnitude[s.star[s.star >= 0]] for s in solutions if s is not None]
+    start = float(np.floor(4 * np.median(np.concatenate(matched))) / 4)
+    deeper = rematch(frames, solutions, deep, model.matching)
+    return faintest_star(frames, deeper, deep, model.matching.gate_sigma, start)
+
+
+# -- Centroid error of each frame.
 #
 # Frames of one sensor may differ: it turns faster, the image is blurred, exposures change. A
 # frame's residuals say so, but with few stars the estimate is noisy. So each frame's variance is
 # shrunk towards the sensor's mean (empirical Bayes: Smyth, Statistical Applications in Genetics
 # and Molecular Biology 3, 2004, article 3, sections 4 and 6.2).
 
-MIN_FRAMES = 10  # of which the scatter is known
-SIGNIFICANT = 4.0  # sigma by which residuals of frames differ more than chance makes them
-MIN_SCALE = 0.02  # of a frame: rounding is not measured
-ALIKE_DOF = 200.0  # frames that are worth so many residuals to each other are alike
+MIN_FRAMES = 10  # from which the scatter between frames is estimated
+SIGNIFICANT = 4.0  # [sigma] by which the scatter between frames exceeds that of chance
+MIN_SCALE = 0.02  # lowest error of a frame over the sensor's: residuals may be rounded to 0
+# Frames do not differ if the others tell a frame's error as well as this number of residuals of
+# its stars would.
+MAX_PRIOR_DOF = 200.0
 
 
 def frame_scales(square_sum: Array, dof: npt.NDArray[np.int64]) -> Array:
-    """Return each frame's rms of residuals per axis; the same for all where they are alike.
+    """Return each frame's rms of residuals per axis; one for all where frames do not differ.
 
     Parameters
     ----------
@@ -199,28 +318,32 @@ def frame_scales(square_sum: Array, dof: npt.NDArray[np.int64]) -> Array:
     -------
     (F,) float. Frames without an attitude get the sensor's scale.
     """
-    told = dof > 0
-    if not told.any():
+    has_attitude = dof > 0
+    if not has_attitude.any():
         return np.ones(len(dof))
-    common = np.full(len(dof), np.sqrt(square_sum[told].sum() / dof[told].sum()))
-    if told.sum() < MIN_FRAMES:
+    common = np.full(len(dof), np.sqrt(square_sum[has_attitude].sum() / dof[has_attitude].sum()))
+    if has_attitude.sum() < MIN_FRAMES:
         return common
-    half = dof[told] / 2.0
-    variance = np.maximum(square_sum[told] / dof[told], (MIN_SCALE * common[0]) ** 2)
+    half = dof[has_attitude] / 2.0
+    variance = np.maximum(
+        square_sum[has_attitude] / dof[has_attitude], (MIN_SCALE * common[0]) ** 2
+    )
     log_variance = np.log(variance) - psi(half) + np.log(half)  # without the bias of few stars
-    by_chance = polygamma(1, half)
+    sampling = polygamma(1, half)
     middle = log_variance.mean()
-    excess = float(np.mean((log_variance - middle) ** 2 - by_chance))
-    # Of the square of a log chi-square variable, the variance has the fourth cumulant as well.
-    spread = np.sqrt(np.mean(2.0 * by_chance**2 + polygamma(3, half)) / len(half))
-    if excess < SIGNIFICANT * spread:
+    excess = float(np.mean((log_variance - middle) ** 2 - sampling))
+    # The variance of a squared log chi-square variable includes its fourth cumulant.
+    excess_sigma = np.sqrt(np.mean(2.0 * sampling**2 + polygamma(3, half)) / len(half))
+    if excess < SIGNIFICANT * excess_sigma:
         return common
     prior_dof = _inverse_trigamma(excess)
-    if prior_dof > ALIKE_DOF:
+    if prior_dof > MAX_PRIOR_DOF:
         return common
     prior = np.exp(middle + psi(prior_dof / 2.0) - np.log(prior_dof / 2.0))
     scales = np.full(len(dof), np.exp(0.5 * middle))
-    scales[told] = np.sqrt((prior_dof * prior + square_sum[told]) / (prior_dof + dof[told]))
+    scales[has_attitude] = np.sqrt(
+        (prior_dof * prior + square_sum[has_attitude]) / (prior_dof + dof[has_attitude])
+    )
     return scales
 
 

@@ -1,13 +1,19 @@
-"""A sensor's frames in order: followed from frame to frame, searched lost in space where that
-fails."""
+"""A sensor's frames in order: followed from frame to frame, searched where that fails.
+
+`identify_sample` identifies some or all frames with a sensor's model. It prepares the sky and calls
+`identify_sequence`, which goes forward in time, then backward for the frames that failed.
+`identify_again` matches frames near solutions they have, as with other errors.
+"""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.star_identification.centroids import (
+    RawCentroids,
     SensorCentroids,
     Solutions,
     unsolved,
@@ -25,21 +31,26 @@ from epipole.tasks.algorithms.star_identification.following import (
     remember,
 )
 from epipole.tasks.algorithms.star_identification.frame import (
-    Search,
+    MatchSettings,
     Solution,
     identify_lost,
     rule_of,
 )
-from epipole.tasks.algorithms.star_identification.search.match_stars import StarPlaces
+from epipole.tasks.algorithms.star_identification.search.match_stars import StarDirections
+from epipole.tasks.algorithms.star_identification.sensor_model import SensorModel, Skies
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
 
 Array = npt.NDArray[np.float64]
 
 # Where searches keep failing: after PATIENCE of them, back off exponentially to at most
-# max(32, n / 32) skipped frames of the n since the last success. The backward pass retries them.
-PATIENCE, HOPELESS = 6, 1  # `HOPELESS` more than patience, where searches have failed before
-MAX_SKIPPED, SKIPPED_SHARE = 32, 1 / 32
+# max(MAX_SKIPPED, n SKIPPED_SHARE) skipped frames of the n since the last success. The backward
+# pass retries them. With a hopeless sensor, the first failure counts as PATIENCE + 2 of them.
+PATIENCE, MAX_SKIPPED, SKIPPED_SHARE = 6, 32, 1 / 32
+MAX_BACKOFF_LOG2 = 20  # keeps the power of two an integer of usual size
+PRIOR_SIGMAS = (
+    3.0  # an earlier solution had other errors, another sky: it is a prior this much wider
+)
 NO_CENTROIDS = 5
 STATUS = {
     TOO_FEW: "too_few_stars",
@@ -62,8 +73,86 @@ class Priors(NamedTuple):
 
 
 def no_priors(n: int) -> Priors:
-    """Return priors of n frames that have none: all NaN."""
+    """Return the priors of n frames without any: all NaN."""
     return Priors(np.full((n, 3, 3), np.nan), np.full(n, np.nan))
+
+
+class SensorSky(NamedTuple):
+    """The sky of a sensor: its stars, their grid, and a source of their pairs."""
+
+    sky: Sky
+    grid: SkyGrid
+    pairs: Callable[[], PairTable]
+
+
+class FrameSample(NamedTuple):
+    """Some or all of a sensor's frames.
+
+    t_s : (F,) float, times [s], ascending
+    centroids, priors : of the F frames
+    anchors : some priors are earlier solutions
+    """
+
+    t_s: Array
+    centroids: RawCentroids
+    priors: Priors
+    anchors: bool = False
+
+    def take(self, rows: npt.NDArray[np.int64]) -> "FrameSample":
+        """Return the frames of these rows."""
+        priors = Priors(self.priors.R_sensor_from_icrs[rows], self.priors.sigma_rad[rows])
+        return FrameSample(self.t_s[rows], self.centroids.take(rows), priors, self.anchors)
+
+    def scaled(self, model: SensorModel) -> SensorCentroids:
+        """Return the centroids with the errors of the sensor's model."""
+        return self.centroids.frames(model.scale, model.use_flux)
+
+    def anchored(
+        self, rows: npt.NDArray[np.int64], solutions: list[Solution | None]
+    ) -> "FrameSample":
+        """Return the frames with these solutions as priors, where the log gives none."""
+        R, sigma = self.priors.R_sensor_from_icrs.copy(), self.priors.sigma_rad.copy()
+        for row, solution in zip(rows, solutions, strict=True):
+            if solution is not None and np.isnan(self.priors.sigma_rad[row]):
+                R[row] = solution.R_sensor_from_icrs
+                sigma[row] = PRIOR_SIGMAS * np.sqrt(np.trace(solution.cov_rad2) / 3.0)
+        return self._replace(priors=Priors(R, sigma), anchors=True)
+
+    def of_quality(self, quality: Array) -> "FrameSample":
+        """Return the frames with these factors on their errors."""
+        centroids = self.centroids
+        stated = np.where(np.isnan(centroids.sigma_px), 1.0, centroids.sigma_px)
+        scaled = centroids._replace(sigma_px=stated * np.repeat(quality, centroids.counts))
+        return self._replace(centroids=scaled)
+
+
+def identify_sample(
+    sample: FrameSample, skies: Skies, model: SensorModel, hopeless: bool = False
+) -> tuple[Solutions, list[str | None]]:
+    """Return the frames' solutions and status, identified with a sensor's model.
+
+    `hopeless` : searches of this sensor have failed before, see `identify_sequence`.
+    """
+    if not len(sample.t_s):
+        return unsolved(sample.centroids.first), []
+    return identify_sequence(
+        sample.t_s, sample.scaled(model), sample.priors, *sky_of(sample.centroids, skies, model),
+        model.matching, sample.anchors, hopeless,
+    )  # fmt: skip
+
+
+def sky_of(centroids: RawCentroids, skies: Skies, model: SensorModel) -> SensorSky:
+    """Return the sky to the faintest star of the sensor's model, as searches take it."""
+    radius = _grid_radius(centroids.frames(model.scale), model.matching)
+    pairs = partial(skies.pairs, model.limit, centroids.optics[0])
+    return SensorSky(skies.sky(model.limit), skies.grid(model.limit, radius), pairs)
+
+
+def _grid_radius(frames: SensorCentroids, matching: MatchSettings) -> float:
+    """Return the widest look-up [rad], in powers of sqrt(2) so that sensors share grids."""
+    sigma = frames.sigma_rad
+    widest = 2.5 * matching.gate_sigma * float(np.median(sigma)) if len(sigma) else 1e-3
+    return float(min(2.0 ** (np.ceil(2 * np.log2(widest)) / 2), 0.1))
 
 
 def identify_sequence(
@@ -73,7 +162,7 @@ def identify_sequence(
     sky: Sky,
     grid: SkyGrid,
     pairs: Callable[[], PairTable],
-    how: Search,
+    matching: MatchSettings,
     anchored: bool = False,
     hopeless: bool = False,
 ) -> tuple[Solutions, list[str | None]]:
@@ -85,7 +174,8 @@ def identify_sequence(
     Parameters
     ----------
     anchored
-        Some priors are solutions: the others are followed from these, both ways, before any search.
+        Some priors are earlier solutions: the other frames are followed from these, both ways,
+        before any search.
     hopeless
         Searches have failed before: frames are skipped from the first failure on.
 
@@ -98,16 +188,16 @@ def identify_sequence(
     """
     n = len(frames.beta)
     solutions, status = unsolved(frames.first), np.zeros(n, np.int8)
-    arrays, rule = _arrays(t_s, frames), rule_of(how, sky)
-    stars = StarPlaces(sky.catalogue.u_icrs, sky.catalogue.magnitude)
+    arrays, rule = _arrays(t_s, frames), rule_of(matching, sky)
+    stars = StarDirections(sky.catalogue.u_icrs, sky.catalogue.magnitude)
     sequence = _Sequence(frames, arrays, stars, rule, solutions, status)
     forth, back, none = FrameRange(0, n, 1, False), FrameRange(n - 1, -1, -1, False), no_priors(n)
 
     def search(k: int, failures: int, step: int) -> tuple[Solution | None, bool]:
         # Crowded frames take long: where the stars' brightness is unknown, ever fewer are tried.
-        often = not np.isnan(how.zero_point_mag)
-        tried = how._replace(
-            crowded=how.crowded and (often or failures.bit_count() <= 1),
+        often = not np.isnan(matching.zero_point_mag)
+        tried = matching._replace(
+            crowded=matching.crowded and (often or failures.bit_count() <= 1),
             starlit=sequence.starlit(k, step),
         )
         return identify_lost(frames.frame(k), sky, grid, pairs(), tried)
@@ -117,12 +207,12 @@ def identify_sequence(
         sequence.follow(back, none)
     if not solutions.solved.all():
         hopeless &= n > MAX_SKIPPED
-        sequence.go(forth, priors, search, PATIENCE + HOPELESS if hopeless else 0)
+        sequence.follow_and_search(forth, priors, search, PATIENCE + 1 if hopeless else 0)
     if solutions.solved.any() and not solutions.solved.all():
         # Backward, without priors: those were tried on the way forward. What lies behind a slew
         # and was skipped is searched.
         before = solutions.solved.sum()
-        sequence.go(back, none, search, 0)
+        sequence.follow_and_search(back, none, search, 0)
         if solutions.solved.sum() > before:
             sequence.follow(forth, none)
     status[np.diff(frames.first) == 0] = NO_CENTROIDS
@@ -130,7 +220,7 @@ def identify_sequence(
 
 
 def identify_again(
-    t_s: Array, frames: SensorCentroids, solutions: Solutions, sky: Sky, how: Search
+    t_s: Array, frames: SensorCentroids, solutions: Solutions, sky: Sky, matching: MatchSettings
 ) -> Solutions:
     """Return the frames identified again near their solutions, as with other errors.
 
@@ -138,62 +228,64 @@ def identify_again(
     """
     n = len(frames.beta)
     again, status = unsolved(frames.first), np.zeros(n, np.int8)
-    stars = StarPlaces(sky.catalogue.u_icrs, sky.catalogue.magnitude)
-    sequence = _Sequence(frames, _arrays(t_s, frames), stars, rule_of(how, sky), again, status)
-    # Errors were other ones: an attitude may be off by more than its covariance says.
-    sigma = 3.0 * np.sqrt(np.trace(solutions.cov_rad2, axis1=1, axis2=2) / 3.0)
+    stars = StarDirections(sky.catalogue.u_icrs, sky.catalogue.magnitude)
+    sequence = _Sequence(frames, _arrays(t_s, frames), stars, rule_of(matching, sky), again, status)
+    sigma = PRIOR_SIGMAS * np.sqrt(np.trace(solutions.cov_rad2, axis1=1, axis2=2) / 3.0)
     sequence.follow(FrameRange(0, n, 1, False), Priors(solutions.R_sensor_from_icrs, sigma))
     return again
 
 
 class _Sequence(NamedTuple):
-    """Frames on the way through them; solutions and status are changed."""
+    """A pass through the frames; solutions and status are changed."""
 
     frames: SensorCentroids
     arrays: FrameArrays
-    stars: StarPlaces
+    stars: StarDirections
     rule: MatchRule
     solutions: Solutions
     status: npt.NDArray[np.int8]
 
-    def follow(self, walk: FrameRange, priors: Priors) -> None:
-        """Identify frames from those before them, on one walk, without a search."""
+    def follow(self, frame_range: FrameRange, priors: Priors) -> None:
+        """Identify frames from those before them, without a search."""
         memory = new_memory(len(self.stars.u))
-        follow(walk, self.arrays, priors, self.stars, self.rule, memory, self.solutions,
+        follow(frame_range, self.arrays, priors, self.stars, self.rule, memory, self.solutions,
                self.status)  # fmt: skip
 
-    def go(
+    def follow_and_search(
         self,
-        walk: FrameRange,
+        frame_range: FrameRange,
         priors: Priors,
         search: Callable[[int, int, int], tuple[Solution | None, bool]],
         failures: int,
     ) -> None:
-        """The same, but frames that fail are searched; so many searches have failed before."""
-        memory, k = new_memory(len(self.stars.u)), walk.start
+        """Identify frames from those before them; frames that fail are searched.
+
+        `failures` : number of searches that have failed before
+        """
+        memory, k = new_memory(len(self.stars.u)), frame_range.start
         while True:
-            k = int(follow(walk._replace(start=k, searches=True), self.arrays, priors, self.stars,
-                           self.rule, memory, self.solutions, self.status))  # fmt: skip
-            if k == walk.stop:
+            k = int(follow(frame_range._replace(start=k, searches=True), self.arrays, priors,
+                           self.stars, self.rule, memory, self.solutions, self.status))  # fmt: skip
+            if k == frame_range.stop:
                 return
-            solution, cut_short = search(k, failures, walk.step)
-            trusted = bool(memory.held[1]) and not np.isnan(priors.sigma_rad[k])
+            solution, cut_short = search(k, failures, frame_range.step)
+            trusted = bool(memory.counters[1]) and not np.isnan(priors.sigma_rad[k])
             if solution is None:
-                # Where priors were confirmed, a frame mostly fails because it shows few stars.
+                # Where priors were confirmed, most frames fail because they show few stars.
                 failures = max(failures + 1, PATIENCE + 1 if trusted else 0)
-                memory.held[2] = _skipped(failures, self._refused(k, walk.step))
+                memory.counters[2] = _skipped(failures, self._refused(k, frame_range.step))
                 self.status[k] = TIME_LIMIT if cut_short else NO_MATCH
             else:
-                failures, memory.held[1] = 0, 0  # it contradicts a prior that the frame has
+                failures, memory.counters[1] = 0, 0  # the frame's prior, if any, was wrong
                 self.status[k] = 0
                 self.solutions.enter(k, solution)
                 remember(memory, self.arrays.t_s[k], solution.R_sensor_from_icrs, solution.cov_rad2)
-            k += walk.step
+            k += frame_range.step
 
     def starlit(self, k: int, step: int) -> float:
-        """Return the odds (ln) that frame k shows stars, from those before it on this walk.
+        """Return the prior odds (ln) that frame k shows stars, from those before it in this pass.
 
-        With them, chance identifies the stated share of all frames, more of those without stars.
+        With them, the false alarm probability holds over all frames together.
         """
         before = slice(0, k) if step > 0 else slice(k + 1, None)
         status, solved = self.status[before], self.solutions.solved[before]
@@ -201,23 +293,22 @@ class _Sequence(NamedTuple):
         return float(np.log((solved.sum() + 1) / (refused.sum() + 1)))
 
     def _refused(self, k: int, step: int) -> int:
-        """Return how many frames before k, on this walk, are not solved."""
+        """Return the number of frames between k and the last solved one before it in this pass."""
         before = self.solutions.solved[:k][::-1] if step > 0 else self.solutions.solved[k + 1 :]
         solved = np.flatnonzero(before)
         return int(solved[0]) if len(solved) else len(before)
 
 
 def _skipped(failures: int, frames: int) -> int:
-    """Return how many frames are not searched after so many failures over so many frames.
+    """Return how many frames are skipped after this many failed searches over this many frames.
 
-    A sensor without stars takes bounded time. One that can be identified again is, however
-    long it could not: from some frame on, or for a while that is longer than this. The number
-    changes all the time: what shows stars may come back in a period.
+    So a sensor without stars takes bounded time, and one that shows stars again is found again,
+    however long it did not. The number varies, because stars may return periodically.
     """
     if failures <= PATIENCE:
         return 0
     most = max(MAX_SKIPPED, int(SKIPPED_SHARE * frames))
-    return min(2 ** min(failures - PATIENCE, 20), most - failures % 3)
+    return min(2 ** min(failures - PATIENCE, MAX_BACKOFF_LOG2), most - failures % 3)
 
 
 def _arrays(t_s: Array, frames: SensorCentroids) -> FrameArrays:

@@ -1,4 +1,9 @@
-"""A grid over the sky: finds the catalogue stars near a direction in constant time."""
+"""Catalogue stars by their direction: the star nearest to a direction, or all stars in a cone.
+
+A `SkyGrid` has small cells and answers the first question in constant time: hypotheses of an
+attitude ask it millions of times. `StarBands` have large cells of equal area and answer the second.
+A `Sky` is the catalogue to a magnitude limit with what look-ups in it need.
+"""
 
 import math
 from typing import Any, NamedTuple
@@ -11,7 +16,7 @@ from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue
 from epipole.tasks.algorithms.star_identification.evidence import log_magnitude_density
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, build_pair_table
 
-# -- A grid over the sky: finds the catalogue stars near a direction in constant time.
+# -- The star nearest to a direction.
 
 
 class SkyGrid(NamedTuple):
@@ -85,7 +90,7 @@ def cell_of(x, y, z, n):
 
 @borrowing_kernel
 def nearest_star(x, y, z, radius, u_icrs, first, star, n_face):
-    """Return the star nearest to a unit vector within `radius` [rad], -1 if there is none, and the
+    """Return the star nearest to a unit vector within `radius` [rad], -1 without one, and the
     squared chord to it (compiled)."""
     cell = cell_of(x, y, z, n_face)
     best, best_d2 = -1, radius * radius
@@ -98,8 +103,9 @@ def nearest_star(x, y, z, radius, u_icrs, first, star, n_face):
     return best, best_d2
 
 
-# -- All stars in a cone: cells of the sky by z and azimuth, which all have the same area.
+# -- All stars in a cone.
 
+# Cells of z and of azimuth. With 2048 cells a field of 8 degrees reaches into some six.
 BANDS, SECTORS = 32, 64
 
 
@@ -117,8 +123,10 @@ class StarBands(NamedTuple):
 
 
 class ConeCells(NamedTuple):
-    """The cells of a cone: of the bands low .. high, so many sectors from `left` on; a sector may
-    be negative or beyond the last, and is counted round."""
+    """The cells of a cone: in each band low .. high, `n_sectors` sectors from `left` on.
+
+    Sectors below 0 or beyond the last one are counted round.
+    """
 
     low: int
     high: int
@@ -181,7 +189,7 @@ def find_in_cone(stars, x, y, z, cosine, at):
     return n
 
 
-# -- The sky as one camera needs it: stars to a limit, their grid, their pairs.
+# -- The sky to a magnitude limit.
 
 # Mean number of bright stars in a field whose pairs are tabled: enough that sparse fields have
 # several, and few enough that not many pairs share a separation.

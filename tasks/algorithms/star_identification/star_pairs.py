@@ -1,4 +1,8 @@
-"""All pairs of bright catalogue stars below a separation, sorted by it."""
+"""Pairs of bright catalogue stars by separation, and the index that finds a range of separations.
+
+`build_pair_table` lists all pairs below a separation in ascending order. A `KVector` over the
+separations finds those in a range in constant time, whatever the length of the table.
+"""
 
 from typing import NamedTuple
 
@@ -8,9 +12,15 @@ from scipy.spatial import cKDTree
 
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 
-# -- K-vector: range search in a sorted vector in constant time, whatever its length.
-
 Array = npt.NDArray[np.float64]
+
+TURN = 1 << 16  # a full turn in units of a stored position angle: differences wrap by themselves
+# The reach of `NearStars` over the longest separation. A square field's stars lie within this of a
+# third of its other stars.
+NEAR_SHARE = 0.24
+
+
+# -- Ranges in a sorted vector.
 
 
 class KVector(NamedTuple):
@@ -84,13 +94,7 @@ def range_of(index, low, high):
     return first, last
 
 
-# -- All pairs of bright catalogue stars below a separation, sorted by it.
-
-# A position angle is stored in this many parts of a turn, so that differences wrap by themselves.
-TURN = 1 << 16
-
-
-NEAR_SHARE = 0.24  # of the longest separation: a third of a square field's stars are so near
+# -- The pairs.
 
 
 class NearStars(NamedTuple):

@@ -8,7 +8,12 @@ from scenes.cameras import cameras_of
 from epipole.schemas.bridge import array
 from epipole.schemas.work_tables import CAMERAS
 from epipole.tasks.algorithms.geometry.camera import Camera, mirrored
-from epipole.tasks.calibrate.find_camera import CameraFinding, at_one_place, far_off, rich_frames
+from epipole.tasks.calibrate.find_camera import (
+    CameraFinding,
+    residuals_are_large,
+    rich_frames,
+    stars_are_clustered,
+)
 
 TOLD = Camera(1024, 1024, 3660.0, 3660.0, 511.5, 511.5)
 TIME = 1_554_091_200_630_490_482  # not a whole number of microseconds
@@ -45,7 +50,7 @@ def test_stars_all_over_the_image_are_told_from_clusters(size_px, is_one):
     frame = np.repeat(np.arange(30), 6)
     corner = rng.uniform(0, 1023 - size_px, (30, 2))[frame]
     x, y = (corner + rng.uniform(0, size_px, (180, 2))).T
-    assert at_one_place(stars(x, y, frame), TOLD) == is_one
+    assert stars_are_clustered(stars(x, y, frame), TOLD) == is_one
 
 
 @pytest.mark.parametrize(
@@ -57,8 +62,8 @@ def test_stars_that_are_few_and_far_from_their_places_contradict_a_camera(
 ):
     """Many false points alone do not, nor does a sensor with large errors."""
     solved = {"n_centroids": [25] * 9, "n_stars": [n_stars] * 9, "residual_px": [residual_px] * 9}
-    assert far_off(pa.table(solved)) == is_far
-    assert not far_off(pa.table(solved).slice(0, 0))
+    assert residuals_are_large(pa.table(solved)) == is_far
+    assert not residuals_are_large(pa.table(solved).slice(0, 0))
 
 
 def test_few_frames_with_a_cluster_say_nothing():
@@ -66,9 +71,9 @@ def test_few_frames_with_a_cluster_say_nothing():
     frame = np.repeat(np.arange(10), 5)
     x, y = rng.uniform(0, 1023, (2, 50))
     x[:15], y[:15] = 500 + 0.05 * x[:15], 500 + 0.05 * y[:15]
-    assert not at_one_place(stars(x, y, frame), TOLD)
-    assert not at_one_place(stars(*np.empty((2, 0)), []), TOLD)
-    assert not at_one_place(stars(np.array([3.0]), np.array([4.0]), [7]), TOLD)
+    assert not stars_are_clustered(stars(x, y, frame), TOLD)
+    assert not stars_are_clustered(stars(*np.empty((2, 0)), []), TOLD)
+    assert not stars_are_clustered(stars(np.array([3.0]), np.array([4.0]), [7]), TOLD)
 
 
 def test_the_rows_of_the_sensor_get_its_camera_and_keep_their_time():
@@ -78,7 +83,7 @@ def test_the_rows_of_the_sensor_get_its_camera_and_keep_their_time():
     )
     finding = CameraFinding("b", TOLD, mirrored(TOLD))
     found = finding.cameras(told, finding.camera)
-    assert finding.as_told == mirrored(TOLD)
+    assert finding.nominal == mirrored(TOLD)
     assert found["sensor_id"].to_pylist() == ["b"]
     assert array(found, "fy_px").tolist() == [-TOLD.fy_px]
     assert array(found, "time").tolist() == [TIME]

@@ -74,7 +74,7 @@ class Log:
             self.ids.append(np.concatenate([star_id[near], np.full(n_false, -1)])[order])
         self.key = {"sensor_id": ["s"] * n, "frame_number": np.arange(n), "time": time}
         self.exposures = self.make_exposures(x_px, y_px, fluxes if flux else None, stated)
-        self.places = self.make_places()
+        self.places = self.make_centroid_cells()
         self.cameras = cameras_of({"s": DISTORTED})
 
     def make_exposures(self, x_px, y_px, flux=None, stated=None):
@@ -93,7 +93,7 @@ class Log:
             },
         )
 
-    def make_places(self, q=None, sigma_arcsec=None):
+    def make_centroid_cells(self, q=None, sigma_arcsec=None):
         n = len(self.q)
         prior = [None] * n if q is None else None
         return table(
@@ -248,7 +248,7 @@ def test_without_stars_the_prior_is_used_unchanged(sky, log, catalogue):
     rng = np.random.default_rng(3)
     x = [rng.uniform(0, 1023, 6) for _ in range(40)]
     exposures = log.make_exposures(x, x[::-1])
-    places = log.make_places(log.q, 25.0)
+    places = log.make_centroid_cells(log.q, 25.0)
     found = log.run(catalogue, exposures=exposures, places=places)
     assert found.solutions["attitude_source"].to_pylist() == ["prior"] * 40
     assert set(found.solutions["status"].to_pylist()) == {"no_match", "not_searched"}

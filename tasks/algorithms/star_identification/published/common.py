@@ -1,4 +1,10 @@
-"""Matches that agree with each other: separations in the image equal those in the catalogue."""
+"""What the published methods share: matches that agree, and a sensor's frames, each by itself.
+
+A method says which star each centroid is. `agreeing_candidates` keeps those of its matches whose
+separations in the image equal those in the catalogue. `identify_each_frame` computes the attitude
+of each frame from its matches, without those that lie too far off: no evidence is weighed, no
+frame is followed, no prior is used.
+"""
 
 from collections.abc import Callable
 
@@ -10,16 +16,14 @@ from epipole.tasks.algorithms.star_identification.centroids import RawCentroids,
 from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
-    Search,
+    MatchSettings,
     Solution,
     aberrate_all,
 )
-from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
+from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import MAX_BETA
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
-from epipole.tasks.algorithms.star_identification.sensor_model import scale_of
+from epipole.tasks.algorithms.star_identification.sensor_model import Skies, scale_of
 from epipole.tasks.algorithms.star_identification.star_grid import Sky
-
-# -- Matches that agree with each other: separations in the image equal those in the catalogue.
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
@@ -54,7 +58,7 @@ def agreeing_candidates(
     Returns
     -------
     (n,) int64
-        Each centroid's star, -1 where it has none; all -1 with fewer than three matches.
+        Each centroid's star, -1 without a match; all -1 with fewer than three matches.
     """
     matched = np.full(len(u), -1, np.int64)
     if len(centroid) < 3:
@@ -82,8 +86,7 @@ def _agree(
 ) -> npt.NDArray[np.bool_]:
     measured, listed = chords(u)[np.ix_(centroid, centroid)], chords(star_u[star])
     variance = sigma_rad[centroid] ** 2
-    # Aberration stretches by v / c at most.
-    tolerance = gate_sigma * np.sqrt(variance[:, None] + variance) + 1.1e-4 * measured
+    tolerance = gate_sigma * np.sqrt(variance[:, None] + variance) + MAX_BETA * measured
     other = (centroid[:, None] != centroid) & (star[:, None] != star)
     return other & (np.abs(measured - listed) < tolerance)
 
@@ -104,14 +107,10 @@ def _same_hand(u: Array, s: Array) -> bool:
     return bool(np.linalg.det(u.T @ s) > 0.0)
 
 
-# -- A sensor's frames by a published method: each frame alone, lost in space.
-#
-# A method says which star each centroid is. The attitude is the optimal one of all matches,
-# without those that are out of place. There is no verdict by likelihood, no tracking and no
-# prior.
+# -- A sensor's frames, each by itself.
 
 # Takes (n, 3) directions, brightest first, and (n,) sigmas [rad]; returns (n,) rows of the sky's
-# catalogue, -1 where a centroid is no star.
+# catalogue, -1 where a centroid is not identified.
 Matcher = Callable[[Array, Array], Rows]
 
 ASSUMED_SIGMA_PX = 0.5  # of centroids without sigma; the published maps have it
@@ -120,7 +119,7 @@ ASSUMED_SIGMA_PX = 0.5  # of centroids without sigma; the published maps have it
 def solve_matches(
     frame: FrameCentroids, sky: Sky, star: npt.NDArray[np.int64], gate_sigma: float
 ) -> Solution | None:
-    """Return the attitude of a frame's matches; None where fewer than three are in place."""
+    """Return the attitude of a frame's matches; None where fewer than three agree with it."""
     star = star.copy()
     for _ in range(3):  # one wrong match bends the first attitude
         at = np.flatnonzero(star >= 0)
@@ -140,10 +139,10 @@ def solve_matches(
 
 def identify_each_frame(
     make_matcher: Callable[[Sky, FieldOfView], Matcher],
-    spots: RawCentroids,
+    centroids: RawCentroids,
     skies: Skies,
     magnitude_limit: float | None,
-    how: Search,
+    matching: MatchSettings,
 ) -> IdentifiedSensor:
     """Identify the stars of a sensor's frames, each frame alone.
 
@@ -156,19 +155,19 @@ def identify_each_frame(
     make_matcher
         Prepares a method for a camera and its sky.
     """
-    counts = spots.counts
+    counts = centroids.counts
     usable = counts[counts >= 4]
     if magnitude_limit is None:
         density = float(np.median(usable)) if len(usable) else 10.0
-        magnitude_limit = skies.limit_for(density / spots.optics[0].solid_angle_sr)
+        magnitude_limit = skies.limit_for(density / centroids.optics[0].solid_angle_sr)
     sky = skies.sky(magnitude_limit)
-    stated = bool(np.isfinite(spots.sigma_px).any())
-    match = make_matcher(sky, spots.optics[0])
-    assumed = np.where(np.isnan(spots.sigma_px), ASSUMED_SIGMA_PX, spots.sigma_px)
-    frames, solutions = spots._replace(sigma_px=assumed).frames(1.0), unsolved(spots.first)
+    stated = bool(np.isfinite(centroids.sigma_px).any())
+    match = make_matcher(sky, centroids.optics[0])
+    assumed = np.where(np.isnan(centroids.sigma_px), ASSUMED_SIGMA_PX, centroids.sigma_px)
+    frames, solutions = centroids._replace(sigma_px=assumed).frames(1.0), unsolved(centroids.first)
     for k in range(len(counts)):
         frame = frames.frame(k)
-        solution = solve_matches(frame, sky, match(frame.u, frame.sigma_rad), how.gate_sigma)
+        solution = solve_matches(frame, sky, match(frame.u, frame.sigma_rad), matching.gate_sigma)
         if solution is not None:
             solutions.enter(k, solution)
     status = [_status(n, s) for n, s in zip(counts, solutions.solved, strict=True)]

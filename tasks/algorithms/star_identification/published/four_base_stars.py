@@ -18,13 +18,13 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView, MatchSettings
 from epipole.tasks.algorithms.star_identification.published.common import (
     Matcher,
     identify_each_frame,
 )
-from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
+from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, pattern_pairs
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, range_of
@@ -69,13 +69,13 @@ def identify_by_four_base_stars(
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,
-    how: Search,
+    matching: MatchSettings,
 ) -> IdentifiedSensor:
     """Identify the stars of a sensor's frames by four base stars.
 
     Parameters and result as `sensor.identify_sensor`; times and priors are not used.
     """
-    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, how)
+    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, matching)
 
 
 def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
@@ -106,10 +106,10 @@ def _same_hand(u, p, s_u, s):
 
 
 @kernel
-def _common_partners(pairs, low, high, counter):
-    """Return the partners of the stars that stand in all three sets of pairs.
+def _common_neighbours(pairs, low, high, counter):
+    """Return the neighbours of the stars that stand in all three sets of pairs.
 
-    Set k = 1 .. 3 holds the pairs low[k]:high[k]. Returned are the star, its partner, and where
+    Set k = 1 .. 3 holds the pairs low[k]:high[k]. Returned are the star, its neighbour, and where
     the rows of each set begin. `counter` is zero, and zero again afterwards.
     """
     pair_a, pair_b = pairs.first, pairs.second
@@ -122,7 +122,7 @@ def _common_partners(pairs, low, high, counter):
     n_total = 0
     for k in range(1, 4):
         n_total += 2 * (high[k] - low[k])
-    first, partner = np.empty(n_total, np.int64), np.empty(n_total, np.int64)
+    first, neighbour = np.empty(n_total, np.int64), np.empty(n_total, np.int64)
     bound = np.zeros(5, np.int64)
     n = 0
     for k in range(1, 4):
@@ -130,17 +130,17 @@ def _common_partners(pairs, low, high, counter):
         for i in range(low[k], high[k]):
             a, b = pair_a[i], pair_b[i]
             if counter[a] == 3:
-                first[n], partner[n] = a, b
+                first[n], neighbour[n] = a, b
                 n += 1
             if counter[b] == 3:
-                first[n], partner[n] = b, a
+                first[n], neighbour[n] = b, a
                 n += 1
     bound[4] = n
     for k in range(1, 4):
         for i in range(low[k], high[k]):
             counter[pair_a[i]] = 0
             counter[pair_b[i]] = 0
-    return first, partner, bound
+    return first, neighbour, bound
 
 
 @kernel
@@ -152,7 +152,7 @@ def _identities(u, sigma, p, star_u, pairs, counter, out):
         c = _chord(u, p[0], u, p[k])
         t = _tolerance(sigma, p[0], p[k], c)
         low[k], high[k] = range_of(pairs.chord, c - t, c + t)
-    first, partner, bound = _common_partners(pairs, low, high, counter)
+    first, neighbour, bound = _common_neighbours(pairs, low, high, counter)
     count = 0
     c23, c24, c34 = _chord(u, p[1], u, p[2]), _chord(u, p[1], u, p[3]), _chord(u, p[2], u, p[3])
     t23, t24, t34 = (
@@ -164,13 +164,13 @@ def _identities(u, sigma, p, star_u, pairs, counter, out):
     four = np.argsort(first[bound[3] : bound[4]]) + bound[3]
     first3, first4 = first[three], first[four]
     for i in range(bound[1], bound[2]):
-        s1, s2 = first[i], partner[i]
+        s1, s2 = first[i], neighbour[i]
         for j in range(np.searchsorted(first3, s1), np.searchsorted(first3, s1 + 1)):
-            s3 = partner[three[j]]
+            s3 = neighbour[three[j]]
             if s3 == s2 or abs(_chord(star_u, s2, star_u, s3) - c23) > t23:
                 continue
             for k in range(np.searchsorted(first4, s1), np.searchsorted(first4, s1 + 1)):
-                s4 = partner[four[k]]
+                s4 = neighbour[four[k]]
                 if s4 in (s2, s3) or abs(_chord(star_u, s2, star_u, s4) - c24) > t24:
                     continue
                 if abs(_chord(star_u, s3, star_u, s4) - c34) > t34:
@@ -263,7 +263,7 @@ def _match(u, sigma, star_u, pairs, star):
                         if further > best:
                             best = further
                             star[:] = trial
-                    # Four that match by chance have no further matches, unless n = 4.
+                    # Four false matches have no further matches, unless n = 4.
                     if best >= min(n - 4, 1) and not draw:
                         return
                     star[:] = -1

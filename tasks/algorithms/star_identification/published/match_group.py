@@ -1,6 +1,6 @@
 """Improved match group: a state counter per catalogue star, and the triangle check [published].
 
-Star identification in celestial navigation, 16th "Huawei Cup" graduate modelling contest
+Star identification in celestial navigation, 16th "Huawei Cup" graduate modelling competition
 (2019). Each centroid in turn is the main star; its separations from the others, smallest
 first, are looked up in the pair table, in bins of 0.01 degrees; the state of a catalogue
 star rises by one for each pair set that holds it. The star with the highest state is the
@@ -18,14 +18,14 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView, MatchSettings
 from epipole.tasks.algorithms.star_identification.published.common import (
     Matcher,
     agreeing_candidates,
     identify_each_frame,
 )
-from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
+from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, pattern_pairs
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, range_of
@@ -34,7 +34,7 @@ Array = npt.NDArray[np.float64]
 
 BIN_RAD = math.radians(0.01)
 PAIR_GATE = 2.5  # sigma; of a separation
-N_PARTNERS = 24  # nearest centroids whose separations from the main star are looked up
+N_NEIGHBOURS = 24  # nearest centroids whose separations from the main star are looked up
 N_CENTROIDS = 48  # brightest centroids that are used
 
 
@@ -64,13 +64,13 @@ def identify_by_match_group(
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,
-    how: Search,
+    matching: MatchSettings,
 ) -> IdentifiedSensor:
     """Identify the stars of a sensor's frames by the improved match group.
 
     Parameters and result as `sensor.identify_sensor`; times and priors are not used.
     """
-    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, how)
+    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, matching)
 
 
 def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
@@ -97,30 +97,30 @@ def _bins(u, sigma, i, j):
 
 
 @kernel
-def _triangles(u, sigma, star_u, pairs, partners_in_order, s, set_low, set_high):
-    """Return how many triangles of the main star with two partners that follow each other in
+def _triangles(u, sigma, star_u, pairs, neighbours_in_order, s, set_low, set_high):
+    """Return how many triangles of the main star with two neighbours that follow each other in
     order are triangles of the catalogue too, if the main star is s."""
-    pair_a, pair_b, order = pairs.first, pairs.second, partners_in_order
+    pair_a, pair_b, order = pairs.first, pairs.second, neighbours_in_order
     total = 0
     before = np.empty(0, np.int64)
     for k in range(len(order)):
-        partners = np.empty(set_high[k] - set_low[k], np.int64)
+        neighbours = np.empty(set_high[k] - set_low[k], np.int64)
         n = 0
         for i in range(set_low[k], set_high[k]):
             if pair_a[i] == s:
-                partners[n] = pair_b[i]
+                neighbours[n] = pair_b[i]
                 n += 1
             elif pair_b[i] == s:
-                partners[n] = pair_a[i]
+                neighbours[n] = pair_a[i]
                 n += 1
         if k > 0:
             low, high = _bins(u, sigma, order[k - 1], order[k])
             closed = False
             for a in before:
-                for b in partners[:n]:
+                for b in neighbours[:n]:
                     closed = closed or (a != b and low <= _chord(star_u, a, star_u, b) <= high)
             total += closed
-        before = partners[:n]
+        before = neighbours[:n]
     return total
 
 
@@ -136,7 +136,7 @@ def _match(u, sigma, star_u, pairs, star):
         for k in range(n):
             separation[k] = _chord(u, main, u, k) if k != main else 1e9
         order = np.argsort(separation)
-        used = min(n - 1, N_PARTNERS)
+        used = min(n - 1, N_NEIGHBOURS)
         for k in range(used):
             low, high = _bins(u, sigma, main, order[k])
             set_low[k], set_high[k] = range_of(pairs.chord, low, high)

@@ -1,6 +1,6 @@
 """Radial companions and cyclic features with compensation codes [published].
 
-Star identification in celestial navigation, 16th "Huawei Cup" graduate modelling contest
+Star identification in celestial navigation, 16th "Huawei Cup" graduate modelling competition
 (2019). Three bit vectors describe the surroundings of a star: the rings in which it has
 neighbours, the separations of its neighbours from each other, and the eight sectors in
 which they lie. Near a bin's edge, an image sets the bits on both sides, so that noise does not
@@ -22,14 +22,14 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
-from epipole.tasks.algorithms.star_identification.frame import FieldOfView, Search
+from epipole.tasks.algorithms.star_identification.frame import FieldOfView, MatchSettings
 from epipole.tasks.algorithms.star_identification.published.common import (
     Matcher,
     agreeing_candidates,
     identify_each_frame,
 )
-from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import Skies
 from epipole.tasks.algorithms.star_identification.sensor import IdentifiedSensor
+from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.sequence import Priors
 from epipole.tasks.algorithms.star_identification.star_grid import Sky
 
@@ -84,13 +84,13 @@ def identify_by_radial_cyclic(
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,
-    how: Search,
+    matching: MatchSettings,
 ) -> IdentifiedSensor:
     """Identify the stars of a sensor's frames by radial companions and cyclic features.
 
     Parameters and result as `sensor.identify_sensor`; times and priors are not used.
     """
-    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, how)
+    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, matching)
 
 
 def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:
@@ -137,7 +137,7 @@ def _features(u: Array, radius_rad: float, compensated: bool) -> tuple[Bits, Bit
         i, j = np.triu_indices(len(others), 1)
         between = _angle(u[others[i]] - u[others[j]])
         _set_bits(companion[k], between / (2 * width), compensated)
-        _set_bits(cyclic[k], _sector_places(u[k], u[others]), compensated, around=True)
+        _set_bits(cyclic[k], _sector_positions(u[k], u[others]), compensated, around=True)
     return radial, companion, cyclic
 
 
@@ -145,7 +145,7 @@ def _angle(difference: Array) -> Array:
     return 2 * np.arcsin(np.minimum(0.5 * np.linalg.norm(difference, axis=-1), 1.0))
 
 
-def _sector_places(centre: Array, neighbours: Array) -> Array:
+def _sector_positions(centre: Array, neighbours: Array) -> Array:
     """Return angles around the centre in sectors, from the first side of the smallest gap."""
     east = np.cross([0.0, 0.0, 1.0] if abs(centre[2]) < 0.9 else [1.0, 0.0, 0.0], centre)
     east /= np.linalg.norm(east)
@@ -156,10 +156,10 @@ def _sector_places(centre: Array, neighbours: Array) -> Array:
     return ((angle - start) % (2 * np.pi)) * (N_SECTORS / (2 * np.pi))
 
 
-def _set_bits(bits: Bits, place: Array, compensated: bool, around: bool = False) -> None:
+def _set_bits(bits: Bits, position: Array, compensated: bool, around: bool = False) -> None:
     n = len(bits)
-    whole = np.floor(place).astype(np.int64)
-    part = place - whole
+    whole = np.floor(position).astype(np.int64)
+    part = position - whole
     wanted = [whole]
     if compensated:
         wanted += [whole[part < COMPENSATED] - 1, whole[part > 1 - COMPENSATED] + 1]

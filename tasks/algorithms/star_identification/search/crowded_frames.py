@@ -1,18 +1,18 @@
 """Lost in space in a crowd: few stars among hundreds of other centroids.
 
-Of hundreds of centroids hardly any pivot is a star, so that many have to be asked, each quickly.
-The companions of a pivot are its near ones only: of these, nearly as large a share are stars, and
-the sky has fewer pairs that are so close.
+Few pivots of a crowd are stars. Therefore many are tried, each quickly. Only its near companions
+vote: among these the share of stars is as large as among all, and the sky has fewer pairs with so
+small a separation. For each pivot:
 
-1. Pivots in the middle of the image come first: there, all neighbours of a star are in the image.
-2. Star after star is taken for the pivot. Where a companion has the separation of one of the star's
-   neighbours, it says how the image is turned. `roll_votes` counts coarsely how many agree; where
-   a star has many neighbours, a share of them must.
-3. Of stars with enough votes these are counted to their own tolerance.
-4. Where enough agree, the farthest of them gives the attitude, with which the other stars of the
-   field are looked up among the centroids (`verify_field`): some twenty look-ups, where all
-   centroids would be a thousand.
-5. What is left is tried on all centroids, as in `lost_in_space`.
+1. Each star that the pivot may be has near neighbours on the sky. A companion with the separation
+   of a neighbour votes for the roll that puts it there. `roll_votes` counts coarsely how many votes
+   agree on a roll; for a star with many neighbours, a share of them must.
+2. The votes for the stars that reach enough are counted again, each to its tolerance.
+3. If enough agree, the one with the farthest neighbour gives the attitude. The stars of its field
+   are looked up among the centroids (`verify_field`): some twenty look-ups, not a thousand.
+4. What passes is tried on all centroids, as in `lost_in_space`.
+
+Pivots in the middle of the image come first: all neighbours of a star there are in the image.
 """
 
 import math
@@ -27,8 +27,8 @@ from epipole.tasks.algorithms.star_identification.search.lost_in_space import (
     mixed_order,
 )
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import (
-    FLOOR,
-    WORTH,
+    DROP_LOG_ODDS,
+    REFINE_LOG_ODDS,
     is_clear,
     judge_pair,
     keep,
@@ -38,30 +38,32 @@ from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import 
     try_pair,
 )
 from epipole.tasks.algorithms.star_identification.search.roll_votes import (
-    LEVELS,
-    count_turns,
-    make_sieve,
+    MAX_COUNTED,
+    count_roll_votes,
+    make_roll_table,
 )
 from epipole.tasks.algorithms.star_identification.search.verify_field import (
-    SHOWN,
-    make_places,
-    odds_of_field,
+    DETECTED_SHARE,
+    field_log_odds,
+    make_centroid_cells,
 )
 from epipole.tasks.algorithms.star_identification.search.votes import (
     MAG_GATE,
     companion,
-    shown_magnitudes,
+    implied_magnitudes,
 )
 from epipole.tasks.algorithms.star_identification.star_pairs import TURN
 
-# Rounds: least votes that agree, and most stars of a pivot whose votes are counted closely.
+# Rounds: minimum of votes that agree; maximum of a pivot's stars whose votes are counted closely.
 ROUNDS = ((4, 600), (3, 4000), (2, 4000))
-WORTH_ALL = 8.0  # log odds of a field with which an attitude is tried on all centroids
-SAMPLES, TIERS = 64, 4  # of a pivot's surroundings, and how finely pivots are put in order by them
-MAX_TURNS = 512  # of one star
-BIN_SHIFT = 8  # of a turn: 256 bins
+MIN_FIELD_LOG_ODDS = 8.0  # from `field_log_odds`, to try an attitude on all centroids
+DISC_SAMPLES = 64  # points at which a pivot's surroundings are sampled
+PIVOT_TIERS = 4  # pivots are put in order by quarters of their surroundings in the image
+MAX_VOTES = 512  # for one star; further ones are left out
+BIN_SHIFT = 8  # of the 16 bits of a roll, those below its bin: 256 bins
 MAX_BINS = 4096  # of separation
-# In the time of a unit of work: neighbours in the sieve, votes, pairs of votes. A star takes more.
+# Number of look-ups in the roll table, of votes, and of pairs of votes in a unit of work; and the
+# units of work of a star beside these.
 NEIGHBOURS_PER_WORK, VOTES_PER_WORK, AGREED_PER_WORK, STAR_WORK = 3, 2, 20, 10
 
 
@@ -71,10 +73,10 @@ class Companions(NamedTuple):
     row : (n,) int64, centroids
     chord, tolerance : (n,) float
     angle, wide : (n,) int64, position angle about the pivot and its tolerance, in parts of `TURN`
-    magnitude, difference : (n,) float, see `companion_votes.shown_magnitudes`
-    first : (bins + 4,) int64; whatever is within a tolerance of the separation c lies in the rows
+    magnitude, difference : (n,) float, implied, see `votes.implied_magnitudes`
+    first : (bins + 4,) int64; the companions within a tolerance of the separation c are in the rows
         first[k]:first[k + 3], k = floor(c scale)
-    scale : float
+    scale : float, bins per unit of separation
     """
 
     row: npt.NDArray[np.int64]
@@ -88,20 +90,25 @@ class Companions(NamedTuple):
     scale: float
 
 
-class Turns(NamedTuple):
-    """What one star's neighbours say of the turn: companion, neighbour's row, turn, tolerance; and
-    the votes of each bin."""
+class RollVotes(NamedTuple):
+    """Votes for the roll of the image, if the pivot is one star.
+
+    row : (MAX_VOTES,) int64, the companion
+    entry : (MAX_VOTES,) int64, the neighbour, a row of `NearStars`
+    roll, wide : (MAX_VOTES,) int64, the roll and its tolerance, in parts of `TURN`
+    in_bin : (bins,) uint16, number of votes in each bin of roll
+    """
 
     row: npt.NDArray[np.int64]
     entry: npt.NDArray[np.int64]
-    turn: npt.NDArray[np.int64]
+    roll: npt.NDArray[np.int64]
     wide: npt.NDArray[np.int64]
-    votes: npt.NDArray[np.uint16]
+    in_bin: npt.NDArray[np.uint16]
 
 
 @kernel
 def _near_companions(problem, i):
-    """Return the companions of pivot i within the reach of the near neighbours."""
+    """Return the `Companions` of pivot i within the reach of the near neighbours."""
     centroids, reach = problem.centroids, problem.pairs.near.reach
     n, widest, kept = len(centroids.u), reach / MAX_BINS, 0
     row, angle, wide = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
@@ -113,7 +120,7 @@ def _near_companions(problem, i):
         if c == 0.0 or c > reach:
             continue
         row[kept], chord[kept], tolerance[kept], angle[kept], wide[kept] = j, c, t, a, w
-        _, magnitude[kept], difference[kept] = shown_magnitudes(problem, i, j)
+        _, magnitude[kept], difference[kept] = implied_magnitudes(problem, i, j)
         widest, kept = max(widest, t), kept + 1
     order = np.argsort(chord[:kept])
     chord = chord[:kept][order]
@@ -127,100 +134,103 @@ def _near_companions(problem, i):
 
 @kernel
 def _shares_inside(u, box, reach):
-    """Return for each pivot which share of its surroundings is in the image."""
+    """Return (n,) the share of each pivot's surroundings that is in the image.
+
+    u : (n, 3), directions. box : (4,), x0, x1, y0, y1 of the image in normalised coordinates.
+    reach : radius of the surroundings [rad].
+    """
     inside = np.zeros(len(u))
-    for k in range(SAMPLES):
+    for k in range(DISC_SAMPLES):
         # Evenly over the disc: Vogel's spiral (1979).
-        r, turn = reach * math.sqrt((k + 0.5) / SAMPLES), 2.399963 * k
+        r, turn = reach * math.sqrt((k + 0.5) / DISC_SAMPLES), 2.399963 * k
         dx, dy = r * math.cos(turn), r * math.sin(turn)
         for i in range(len(u)):
             x, y = u[i, 0] / u[i, 2] + dx, u[i, 1] / u[i, 2] + dy
             inside[i] += (box[0] < x < box[1]) & (box[2] < y < box[3])
-    return inside / SAMPLES
+    return inside / DISC_SAMPLES
 
 
 @kernel
 def _pivots(inside):
-    """Return the pivots, those in the middle of the image first: there, all neighbours are seen."""
+    """Return the order of the pivots, those with most of their surroundings in the image first."""
     order = mixed_order(len(inside))
-    return order[np.argsort(-np.floor(TIERS * inside[order]), kind="mergesort")]
+    return order[np.argsort(-np.floor(PIVOT_TIERS * inside[order]), kind="mergesort")]
 
 
 @borrowing_kernel
-def _is_odd(m_s, m_other, q, companions, mag_gate):
-    """Tell whether the brightness of companion q contradicts a pivot and a neighbour of these
-    magnitudes. Comparisons with NaN are false."""
+def _contradicts(m_s, m_other, q, companions, mag_gate):
+    """Return whether companion q is too bright or too faint for a neighbour of magnitude m_other of
+    a star of magnitude m_s. Comparisons with NaN are false."""
     odd = abs(m_s - m_other - companions.difference[q]) > 1.414 * mag_gate
     return odd | (abs(m_other - companions.magnitude[q]) > mag_gate)
 
 
 @borrowing_kernel
-def _turns_of(s, near, magnitude, mag_gate, companions, turns):
-    """Write what the neighbours of star s say of the turn; return how many, the bin with most
-    votes, and these."""
+def _roll_votes_of(s, near, magnitude, mag_gate, companions, votes):
+    """Write the votes of star s to `votes`; return their number, the fullest bin, and its votes."""
     n, best, most = 0, 0, 0
-    turns.votes[:] = 0
+    votes.in_bin[:] = 0
     for entry in range(near.first[s], near.first[s + 1]):
         c, m_other = near.chord[entry], magnitude[near.other[entry]]
         at = int(c * companions.scale)
         for q in range(companions.first[at], companions.first[at + 3]):
-            if abs(companions.chord[q] - c) > companions.tolerance[q] or n == MAX_TURNS:
+            if abs(companions.chord[q] - c) > companions.tolerance[q] or n == MAX_VOTES:
                 continue
-            if _is_odd(magnitude[s], m_other, q, companions, mag_gate):
+            if _contradicts(magnitude[s], m_other, q, companions, mag_gate):
                 continue
-            turn, wide = int(near.turn[entry]) - companions.angle[q], companions.wide[q]
-            turns.row[n], turns.entry[n] = companions.row[q], entry
-            turns.turn[n], turns.wide[n] = turn, wide
+            roll, wide = int(near.turn[entry]) - companions.angle[q], companions.wide[q]
+            votes.row[n], votes.entry[n] = companions.row[q], entry
+            votes.roll[n], votes.wide[n] = roll, wide
             n += 1
-            for k in range((turn - wide) >> BIN_SHIFT, ((turn + wide) >> BIN_SHIFT) + 1):
-                at_bin = k & (len(turns.votes) - 1)
-                turns.votes[at_bin] += np.uint16(1)
-                if turns.votes[at_bin] > most:
-                    best, most = at_bin, int(turns.votes[at_bin])
+            for k in range((roll - wide) >> BIN_SHIFT, ((roll + wide) >> BIN_SHIFT) + 1):
+                at_bin = k & (len(votes.in_bin) - 1)
+                votes.in_bin[at_bin] += np.uint16(1)
+                if votes.in_bin[at_bin] > most:
+                    best, most = at_bin, int(votes.in_bin[at_bin])
     return n, best, most
 
 
 @borrowing_kernel
-def _touches(k, at_bin, turns):
-    """Tell whether turn k touches a bin."""
-    first = (turns.turn[k] - turns.wide[k]) >> BIN_SHIFT
-    last = (turns.turn[k] + turns.wide[k]) >> BIN_SHIFT
-    return ((at_bin - first) & (len(turns.votes) - 1)) <= last - first
+def _touches(k, at_bin, votes):
+    """Return whether the tolerance of vote k touches a bin."""
+    first = (votes.roll[k] - votes.wide[k]) >> BIN_SHIFT
+    last = (votes.roll[k] + votes.wide[k]) >> BIN_SHIFT
+    return ((at_bin - first) & (len(votes.in_bin) - 1)) <= last - first
 
 
 @borrowing_kernel
-def _agree(k, m, turns):
-    """Tell whether two turns agree."""
-    off = (turns.turn[k] - turns.turn[m]) & (TURN - 1)
-    return min(off, TURN - off) <= turns.wide[k] + turns.wide[m]
+def _agree(k, m, votes):
+    """Return whether two votes agree on the roll within their tolerances."""
+    off = (votes.roll[k] - votes.roll[m]) & (TURN - 1)
+    return min(off, TURN - off) <= votes.wide[k] + votes.wide[m]
 
 
 @borrowing_kernel
-def _most_agreed(n, at_bin, turns):
-    """Return which of the first n turns that touch a bin agrees with most others, and with how many
-    and itself."""
+def _vote_with_most_agreeing(n, at_bin, votes):
+    """Return which of the first n votes that touch a bin agrees with most votes, and with how many,
+    itself included."""
     best, most = 0, 0
     for k in range(n):
-        if not _touches(k, at_bin, turns):
+        if not _touches(k, at_bin, votes):
             continue
         agreed = 0
         for m in range(n):
-            agreed += _agree(k, m, turns)
+            agreed += _agree(k, m, votes)
         if agreed > most:
             best, most = k, agreed
     return best, most
 
 
 @borrowing_kernel
-def _widest_agreed(n, k, near, turns):
-    """Return the turn with the farthest neighbour of those of the first n that agree with turn k,
-    and with how many it agrees: it says best how the image is turned."""
+def _farthest_agreeing_vote(n, k, near, votes):
+    """Return which of the first n votes that agree with vote k has the farthest neighbour, and with
+    how many it agrees: it tells the roll best."""
     best, agreed = k, 0
     for m in range(n):
-        if _agree(k, m, turns) and near.chord[turns.entry[m]] > near.chord[turns.entry[best]]:
+        if _agree(k, m, votes) and near.chord[votes.entry[m]] > near.chord[votes.entry[best]]:
             best = m
     for m in range(n):
-        agreed += _agree(best, m, turns)
+        agreed += _agree(best, m, votes)
     return best, agreed
 
 
@@ -234,52 +244,56 @@ def _stars_like(m_i, magnitude, n_stars, mag_gate):
 
 
 @kernel
-def _try_star(problem, i, s, j, other, c, room, best):
-    """Try star s for pivot i, and another star for centroid j; return the work."""
-    n, n_checked = len(problem.centroids.u), len(room.gain)
-    order = prepare_pair(problem, i, j, c, room)
+def _try_star(problem, i, s, j, other, c, scratch, best):
+    """Try star s for pivot i and star `other` for centroid j, c apart; return the work done."""
+    n, n_checked = len(problem.centroids.u), len(scratch.gain)
+    order = prepare_pair(problem, i, j, c, scratch)
     log_miss = math.log(1.0 - problem.limits.star_share)
-    odds = try_pair(problem.stars, s, other, c, order, log_miss, FLOOR, room)
-    if odds < WORTH:
+    odds = try_pair(problem.stars, s, other, c, order, log_miss, DROP_LOG_ODDS, scratch)
+    if odds < REFINE_LOG_ODDS:
         return 2 * n_checked
-    keep(judge_pair(problem, i, s, j, other, best.evidence[1], room), problem, room, best)
+    keep(judge_pair(problem, i, s, j, other, best.evidence[1], scratch), problem, scratch, best)
     return 2 * n_checked + 20 * n
 
 
 @kernel
-def _try_pivot(problem, i, inside, step, stars, places, level, turns, room, best):
-    """Try the stars that most turns agree on for pivot i, of whose surroundings this share is in
-    the image; return the work done."""
+def _try_pivot(problem, i, inside, step, stars, cells, n_agreeing, votes, scratch, best):
+    """Try the stars with most agreeing votes for pivot i; return the work done.
+
+    `inside` : share of the pivot's surroundings that is in the image
+    """
     near, magnitude = problem.pairs.near, problem.stars.magnitude
-    mag_gate = MAG_GATE * problem.rule.spread
+    mag_gate = MAG_GATE * problem.rule.scatter
     companions = _near_companions(problem, i)
     m_i = problem.centroids.instrumental[i] + problem.rule.zero_point
     start, stop = _stars_like(m_i, magnitude, problem.pairs.n_stars, mag_gate)
-    sieve = make_sieve(
+    roll_table = make_roll_table(
         companions.chord, companions.tolerance, companions.angle, companions.wide, near.reach
     )
-    least = count_turns(near, start, stop, sieve, SHOWN * inside, *ROUNDS[step], level)
+    min_votes = count_roll_votes(
+        near, start, stop, roll_table, DETECTED_SHARE * inside, *ROUNDS[step], n_agreeing
+    )
     work = 5 * len(problem.centroids.u)
     work += (near.first[stop] - near.first[start]) // NEIGHBOURS_PER_WORK
-    for s in range(start, stop if least <= LEVELS else start):
-        if level[s] < least:
+    for s in range(start, stop if min_votes <= MAX_COUNTED else start):
+        if n_agreeing[s] < min_votes:
             continue
-        n, at_bin, most = _turns_of(s, near, magnitude, mag_gate, companions, turns)
+        n, at_bin, most = _roll_votes_of(s, near, magnitude, mag_gate, companions, votes)
         work += STAR_WORK + n // VOTES_PER_WORK
-        if most < least:
+        if most < min_votes:
             continue
         work += most * n // AGREED_PER_WORK
-        k, agreed = _most_agreed(n, at_bin, turns)
-        if agreed < least:
+        k, agreed = _vote_with_most_agreeing(n, at_bin, votes)
+        if agreed < min_votes:
             continue
-        k, agreed = _widest_agreed(n, k, near, turns)
-        if agreed < least:
+        k, agreed = _farthest_agreeing_vote(n, k, near, votes)
+        if agreed < min_votes:
             continue
-        j, other, c = turns.row[k], near.other[turns.entry[k]], near.chord[turns.entry[k]]
-        odds, looked = odds_of_field(problem, i, s, j, other, c, stars, places, room)
+        j, other, c = votes.row[k], near.other[votes.entry[k]], near.chord[votes.entry[k]]
+        odds, looked = field_log_odds(problem, i, s, j, other, c, stars, cells, scratch)
         work += looked
-        if odds > WORTH_ALL:
-            work += _try_star(problem, i, s, j, other, c, room, best)
+        if odds > MIN_FIELD_LOG_ODDS:
+            work += _try_star(problem, i, s, j, other, c, scratch, best)
             if is_clear(best, problem.rule):
                 break
     return work
@@ -292,25 +306,27 @@ def search_crowded(problem, R_best):
     Parameters and result are those of `lost_in_space.search`.
     """
     n = len(problem.centroids.u)
-    room = make_scratch(n, n)
+    scratch = make_scratch(n, n)
     best = no_attitude(R_best)
     top, work = best.evidence, 0
     needed = matches_needed(problem)
     if needed > n:
         return top[0], top[1], work
     inside = _shares_inside(problem.centroids.u, problem.image.box, problem.pairs.near.reach)
-    order, level = _pivots(inside), np.zeros(problem.pairs.n_stars, np.uint8)
-    stars, places = problem.stars.bands, make_places(problem.centroids.u, problem.image.box)
-    turns = Turns(
-        np.empty(MAX_TURNS, np.int64), np.empty(MAX_TURNS, np.int64),
-        np.empty(MAX_TURNS, np.int64), np.empty(MAX_TURNS, np.int64),
+    order, n_agreeing = _pivots(inside), np.zeros(problem.pairs.n_stars, np.uint8)
+    stars, cells = problem.stars.bands, make_centroid_cells(problem.centroids.u, problem.image.box)
+    votes = RollVotes(
+        np.empty(MAX_VOTES, np.int64), np.empty(MAX_VOTES, np.int64),
+        np.empty(MAX_VOTES, np.int64), np.empty(MAX_VOTES, np.int64),
         np.empty(TURN >> BIN_SHIFT, np.uint16),
     )  # fmt: skip
     for step in range(len(ROUNDS)):
-        # With so many pivots, one is among the matches of any attitude that has enough.
+        # With this number of pivots, one is among the matches of any attitude that has enough.
         for p in range(n - needed + 1):
             i = order[p]
-            work += _try_pivot(problem, i, inside[i], step, stars, places, level, turns, room, best)
+            work += _try_pivot(
+                problem, i, inside[i], step, stars, cells, n_agreeing, votes, scratch, best
+            )
             if work > problem.limits.budget or is_clear(best, problem.rule):
                 return top[0], top[1], work
     return top[0], top[1], work

@@ -1,4 +1,8 @@
-"""Stars of a known field: which centroid is which star, given nearly the right attitude."""
+"""Stars of a known field: which centroid is which star, given nearly the right attitude.
+
+`solve_predicted` matches stars and refines the attitude in turn (`settle`). Where the prediction's
+error is wider than the stars are apart, their pattern is first moved as a whole (`best_nudge`).
+"""
 
 import math
 from typing import NamedTuple
@@ -20,12 +24,9 @@ Array = npt.NDArray[np.float64]
 # A centroid between two stars, or a star between two centroids, is matched with the nearer one if
 # that is so much better in chi-square (odds 20:1), and with neither otherwise.
 CLEARLY_BETTER = 6.0
-# Brightest centroids onto which a predicted star is shifted.
-N_NUDGED = 12
-# Distances that are compared for this, at most: about 0.2 s.
-MAX_COMPARED = 100_000_000
-# A match whose brightness is this far off is a coincidence [mag].
-ODD_MAG = 2.5
+N_NUDGED = 12  # brightest centroids onto which a predicted star is moved
+MAX_COMPARED = 100_000_000  # distances that are compared for this, at most: about 0.2 s
+MAX_MAG_ERROR = 2.5  # a match whose brightness is farther off is a coincidence
 
 
 class Centroids(NamedTuple):
@@ -42,7 +43,7 @@ class Centroids(NamedTuple):
     beta: Array
 
 
-class StarPlaces(NamedTuple):
+class StarDirections(NamedTuple):
     """Directions (m, 3) and magnitudes (m,) of stars."""
 
     u: Array
@@ -121,7 +122,7 @@ def stars_about(bands, magnitude, R, radius, beta):
     for k, m in enumerate(at):
         row[k] = bands.row[m]
         aberrated(bands.u[m, 0], bands.u[m, 1], bands.u[m, 2], beta, u[k])
-    return StarPlaces(u, magnitude[row]), row
+    return StarDirections(u, magnitude[row]), row
 
 
 @borrowing_kernel
@@ -209,7 +210,7 @@ def _drop_odd(star_of, instrumental, magnitude, zero_point):
         return
     for k in range(len(star_of)):
         s = star_of[k]
-        if s >= 0 and abs(magnitude[s] - instrumental[k] - zero_point) > ODD_MAG:
+        if s >= 0 and abs(magnitude[s] - instrumental[k] - zero_point) > MAX_MAG_ERROR:
             star_of[k] = -1
 
 
@@ -221,7 +222,7 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
     place; its covariance P and the matches are written. Returns 0 where there is no attitude.
     """
     n, m = len(centroids.u), len(stars.u)
-    room = _SettleScratch(
+    scratch = _SettleScratch(
         np.empty((m, 3)),
         np.empty(n),
         np.full(n, -2, np.int64),
@@ -229,14 +230,14 @@ def settle(R, P, s_xy, s_z, centroids, stars, rule, matches):
         np.empty(m, np.bool_),
         np.empty((3, 3)),
     )
-    return _settle_in(room, R, P, s_xy, s_z, centroids, stars, rule, matches)
+    return _settle_in(scratch, R, P, s_xy, s_z, centroids, stars, rule, matches)
 
 
 @borrowing_kernel
-def _settle_in(room, R, P, s_xy, s_z, centroids, stars, rule, matches):
+def _settle_in(scratch, R, P, s_xy, s_z, centroids, stars, rule, matches):
     """Do what `settle` does, in the given work space."""
     u, sigma = centroids.u, centroids.sigma
-    v, radius, before, owner, contested, A = room
+    v, radius, before, owner, contested, A = scratch
     n = len(u)
     for step in range(8):
         turn_stars(R, stars.u, v)
@@ -279,12 +280,22 @@ def _nudge(R, u, k, a, s):
 
 @kernel
 def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
-    """Write to R the attitude near R0, moved so that one star falls on one centroid, that
-    brings most other stars onto centroids (compiled).
+    """Write to R the best of the attitudes near R0 that put a star on a centroid (compiled).
 
-    For predictions with an error wider than the stars are apart: their pattern, shifted as
-    a whole, decides. The `N_NUDGED` brightest centroids are tried, as long as the distances
-    that are compared are fewer than `MAX_COMPARED`: a wide error in a crowded sky has no end.
+    The best one brings most other centroids near stars. For predictions with an error wider than
+    the stars are apart. The `N_NUDGED` brightest centroids are tried, until `MAX_COMPARED`
+    distances have been compared.
+
+    Parameters
+    ----------
+    R0, R : (3, 3)
+        Prediction, sensor from ICRS; R is written.
+    s_xy, s_z : float
+        Its errors across and about the boresight [rad].
+    a : (m, 3)
+        Apparent directions of the stars, ICRS axes.
+    gate : float
+        How far a star is moved at most, in sigmas.
     """
     u, sigma = centroids.u, centroids.sigma
     n, m = len(u), len(a)
@@ -333,14 +344,14 @@ def solve_predicted(predicted, lost, centroids, stars, box, rule, solution, matc
         look, and the evidence is charged with every attitude there is.
     centroids : Centroids
         The frame's centroids.
-    stars : StarPlaces
+    stars : StarDirections
         The stars around the field: apparent directions, ICRS axes.
     box : (4,)
         The image in normalised coordinates: x0, x1, y0, y1.
     rule : MatchRule
         How matches are weighed.
     solution, matches : Attitude, Matches, out
-        Of no use where the evidence is -1e9.
+        Not written where the evidence is -1e9.
     """
     R0, P0 = predicted.R, predicted.P
     s_xy, s_z = math.sqrt(0.5 * (P0[0, 0] + P0[1, 1])), math.sqrt(P0[2, 2])
@@ -369,6 +380,6 @@ def solve_predicted(predicted, lost, centroids, stars, box, rule, solution, matc
                 copy_matrix(P, solution.P)
                 for k in range(n):
                     matches.star[k], matches.chi2[k] = tried.star[k], tried.chi2[k]
-        if best > rule.enough or lost:
+        if best > rule.clear_evidence or lost:
             break
     return best

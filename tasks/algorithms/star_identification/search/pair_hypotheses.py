@@ -1,4 +1,10 @@
-"""A pair of centroids taken for a pair of stars: its attitude, tried on all other centroids."""
+"""A pair of centroids taken for a pair of stars: its attitude, verified on all other centroids.
+
+`prepare_pair` is called once for a pair of centroids, `try_pair` for each pair of stars it may be.
+Hypotheses that pass are refined with all their matches and weighed by their log evidence
+(`judge_pair`). `keep` remembers the best attitude of a search, and the best that differs from it;
+`is_clear` says when the search may end.
+"""
 
 import math
 from typing import NamedTuple
@@ -24,16 +30,19 @@ from epipole.tasks.algorithms.star_identification.star_grid import (
 )
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
 
-# -- A pair of centroids taken for a pair of stars: its attitude, tried on all other centroids.
-
 Array = npt.NDArray[np.float64]
 
-MAX_BETA = 1.1e-4  # of an observer near the Earth
+# Fastest observer near the Earth over the speed of light: 29.8 km/s of the Earth and some 3 km/s
+# beside it. Aberration changes a separation by at most this share.
+MAX_BETA = 1.1e-4
 
 
 class Stars(NamedTuple):
-    """The catalogue: directions, magnitudes, the grid for look-ups of places, and the stars by
-    cells for those of fields."""
+    """The catalogue.
+
+    u, magnitude : (m, 3), (m,) float, directions and magnitudes
+    grid, bands : for look-ups of the star nearest to a direction, and of all stars of a field
+    """
 
     u: Array
     magnitude: Array
@@ -58,10 +67,10 @@ class SearchLimits(NamedTuple):
     """Bounds of a search.
 
     min_chord : closest centroids that are paired [rad]
-    n_pattern : how many of the brightest centroids are paired
-    n_tried : on how many of the brightest centroids each hypothesis is tried
-    star_share : what share of the centroids are stars, before anything is known
-    budget : most work, see `WORK_PER_S`
+    n_pattern : number of brightest centroids that are paired
+    n_tried : number of brightest centroids that each hypothesis is tried on
+    star_share : share of the centroids that are stars, a prior
+    budget : maximum of work, see `WORK_PER_S`
     """
 
     min_chord: float
@@ -83,7 +92,7 @@ class Problem(NamedTuple):
 
 
 class PairScratch(NamedTuple):
-    """Room for one pair of centroids and one hypothesis.
+    """Work space of one pair of centroids and one hypothesis.
 
     E, F, R, P : (3, 3): frames of the pair in the image and in the sky, attitude, covariance
     t : (n_checked, 3), the centroids in E
@@ -142,14 +151,14 @@ def _basis(a, b, c, F):
 
 
 @kernel
-def prepare_pair(problem, i, j, c, room):
+def prepare_pair(problem, i, j, c, scratch):
     """Fill the scratch for centroids i and j, c apart; return in which order the others are to
     be looked up (compiled)."""
-    u, sigma, t = problem.centroids.u, problem.centroids.sigma, room.t
+    u, sigma, t = problem.centroids.u, problem.centroids.sigma, scratch.t
     image, gate, grid_radius = problem.image, problem.rule.gate, problem.stars.grid.radius_rad
     share = problem.limits.star_share
     noise2 = sigma[i] * sigma[i] + sigma[j] * sigma[j]
-    E, fall, gain = room.E, room.fall, room.gain
+    E, fall, gain = scratch.E, scratch.fall, scratch.gain
     _basis(u[i], u[j], c, E)
     for k in range(len(gain)):
         for m in range(3):
@@ -163,73 +172,73 @@ def prepare_pair(problem, i, j, c, room):
         gain[k] = math.log(share * image.area * fall[k] / (math.pi * image.in_view))
         # Farther away, a hit would be worth less than a miss.
         near = min(gate * gate, 2.0 * max(gain[k] - math.log(1.0 - share), 0.0))
-        room.radius[k] = min(math.sqrt(near * s2), grid_radius)
+        scratch.radius[k] = min(math.sqrt(near * s2), grid_radius)
     # The pair itself comes first and is cut off. The nearest follow: the pair predicts their
-    # places best. Not by brightness: false centroids may be the brightest.
+    # positions best. Not by brightness: false centroids may be the brightest.
     fall[i] = fall[j] = np.inf
     return np.argsort(-fall)[2:].copy()
 
 
 @borrowing_kernel
-def try_pair(stars, a, b, c, order, log_miss, floor, room):
+def try_pair(stars, a, b, c, order, log_miss, floor, scratch):
     """Return the log odds of the attitude that puts stars a and b on the pair's centroids,
     by all other centroids (compiled).
 
     A sequential probability ratio test (Wald 1945): it stops as soon as the odds are below
     `floor`. A centroid without a star adds `log_miss`. Writes F and row_of of the scratch.
     """
-    F, t = room.F, room.t
+    F, t = scratch.F, scratch.t
     _basis(stars.u[a], stars.u[b], c, F)
     odds = 0.0
     for k in order:
-        room.row_of[k], d2 = nearest_star(
+        scratch.row_of[k], d2 = nearest_star(
             t[k, 0] * F[0, 0] + t[k, 1] * F[1, 0] + t[k, 2] * F[2, 0],
             t[k, 0] * F[0, 1] + t[k, 1] * F[1, 1] + t[k, 2] * F[2, 1],
             t[k, 0] * F[0, 2] + t[k, 1] * F[1, 2] + t[k, 2] * F[2, 2],
-            room.radius[k],
+            scratch.radius[k],
             stars.u,
             stars.grid.first,
             stars.grid.star,
             stars.grid.n_face,
         )
-        odds += room.gain[k] - room.fall[k] * d2 if room.row_of[k] >= 0 else log_miss
+        odds += scratch.gain[k] - scratch.fall[k] * d2 if scratch.row_of[k] >= 0 else log_miss
         if odds < floor:
             break
     return odds
 
 
 @borrowing_kernel
-def _attitude(room):
+def _attitude(scratch):
     """Write to R of the scratch the attitude that turns F to E."""
-    E, F, R = room.E, room.F, room.R
+    E, F, R = scratch.E, scratch.F, scratch.R
     for r in range(3):
         for m in range(3):
             R[r, m] = E[0, r] * F[0, m] + E[1, r] * F[1, m] + E[2, r] * F[2, m]
 
 
 @borrowing_kernel
-def pair_attitude(u_i, u_j, star_i, star_j, c, room):
+def pair_attitude(u_i, u_j, star_i, star_j, c, scratch):
     """Write to R of the scratch the attitude that puts two stars, c apart, on two centroids
     (compiled)."""
     apart2 = (u_i[0] - u_j[0]) ** 2 + (u_i[1] - u_j[1]) ** 2 + (u_i[2] - u_j[2]) ** 2
-    _basis(u_i, u_j, math.sqrt(apart2), room.E)
-    _basis(star_i, star_j, c, room.F)
-    _attitude(room)
+    _basis(u_i, u_j, math.sqrt(apart2), scratch.E)
+    _basis(star_i, star_j, c, scratch.F)
+    _attitude(scratch)
 
 
 @borrowing_kernel
-def judge_pair(problem, i, a, j, b, beaten, room):
+def judge_pair(problem, i, a, j, b, beaten, scratch):
     """Return the log evidence of the attitude tried last, refined with its matches (compiled).
 
-    Where it is not above `beaten`, the number returned is only known to be not above it
-    either. Writes the attitude to R of the scratch.
+    An evidence of `beaten` or less is not computed exactly: the number returned is then an upper
+    bound, also `beaten` or less. Writes the attitude to R of the scratch.
     """
-    row_of = room.row_of
+    row_of = scratch.row_of
     row_of[i], row_of[j] = a, b
-    for k in range(len(room.gain), len(row_of)):
+    for k in range(len(scratch.gain), len(row_of)):
         row_of[k] = -1
-    _attitude(room)
-    return _judge(problem, beaten, room.R, room.P, row_of)
+    _attitude(scratch)
+    return _judge(problem, beaten, scratch.R, scratch.P, row_of)
 
 
 @borrowing_kernel
@@ -324,12 +333,12 @@ def _judge(problem, beaten, R, P, row_of):
     return evidence + log_ways(n, matches, float(matches)) - log_ways(n, matches, in_view)
 
 
-# -- The best attitude that a search has found so far, and when it is beyond doubt.
+# -- The best attitude of a search.
 
 # Attitudes closer than this are the same one [rad, about 0.3 degrees].
 SAME_ATTITUDE = 5e-3
-# Log odds at which a hypothesis is dropped, and with which it is refined.
-FLOOR, WORTH = -6.0, 2.0
+# Log odds below which a hypothesis is dropped, and from which it is refined.
+DROP_LOG_ODDS, REFINE_LOG_ODDS = -6.0, 2.0
 # A search goes on where more than half of the matches are this near to each other, in sides of the
 # image: in a cluster of stars, a wrong attitude may match many of them, and little else.
 CLUSTER = 0.1
@@ -339,7 +348,7 @@ class Best(NamedTuple):
     """The best attitude so far.
 
     evidence : (2,) float, log evidence of the best, and of the best that is another attitude
-    clustered : (1,) bool, most matches of the best are in one place
+    clustered : (1,) bool, most matches of the best are in one part of the image
     R : (3, 3) float
     """
 
@@ -355,9 +364,9 @@ def no_attitude(R):
 
 
 @borrowing_kernel
-def keep(evidence, problem, room, best):
-    """Enter the attitude judged last where it is the best, or the best other one."""
-    top, R = best.evidence, room.R
+def keep(evidence, problem, scratch, best):
+    """Enter the attitude judged last if it is the best, or the best that differs from the best."""
+    top, R = best.evidence, scratch.R
     if evidence <= top[1]:
         return
     gap2 = 0.0
@@ -369,7 +378,7 @@ def keep(evidence, problem, room, best):
         if not same:
             top[1] = top[0]
         top[0] = evidence
-        best.clustered[0] = _is_clustered(problem.centroids.u, room.row_of, problem.image.box)
+        best.clustered[0] = _is_clustered(problem.centroids.u, scratch.row_of, problem.image.box)
         copy_matrix(R, best.R)
     elif not same:
         top[1] = evidence
@@ -377,7 +386,7 @@ def keep(evidence, problem, room, best):
 
 @borrowing_kernel
 def _is_clustered(u, row_of, box):
-    """Tell whether more than half of the matches are near one of them."""
+    """Return whether more than half of the matches are near one of them."""
     near = CLUSTER * max(box[1] - box[0], box[3] - box[2])
     matches = 0
     for star in row_of:
@@ -396,6 +405,10 @@ def _is_clustered(u, row_of, box):
 
 @borrowing_kernel
 def is_clear(best, rule):
-    """Tell whether the best attitude is beyond doubt."""
+    """Return whether the best attitude is beyond doubt (compiled)."""
     top = best.evidence
-    return not best.clustered[0] and top[0] > rule.enough and top[0] - top[1] > rule.enough
+    return (
+        not best.clustered[0]
+        and top[0] > rule.clear_evidence
+        and top[0] - top[1] > rule.clear_evidence
+    )

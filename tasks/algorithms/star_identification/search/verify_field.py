@@ -1,7 +1,7 @@
-"""Whether the stars of a field are among its centroids: a look-up for each star.
+"""Verify a field: are the stars that an attitude puts into the image among the centroids?
 
-In a crowd, the stars that an attitude puts into the image are far fewer than the centroids. Both
-are kept by cells: the centroids by those of the image, the stars by those of the sky.
+In a crowd these stars are far fewer than the centroids, so each star is looked up, not each
+centroid. Centroids are kept by cells of the image, stars by cells of the sky.
 """
 
 import math
@@ -20,9 +20,9 @@ from epipole.tasks.algorithms.star_identification.star_grid import cell_at, cell
 Array = npt.NDArray[np.float64]
 
 CELLS = 32  # along each side of the image
-SHOWN = 0.4  # of the stars in an image, at least, are among the centroids
-GATE = 3.0  # of a star's place, in sigmas
-LOOK_UPS = 100  # work beside that of one for each star near the boresight
+DETECTED_SHARE = 0.4  # of the stars in an image that are among the centroids, at least
+GATE = 3.0  # [sigma] of a star's predicted position
+LOOK_UPS = 100  # units of work of a field, beside one per star
 
 
 class CentroidCells(NamedTuple):
@@ -40,8 +40,13 @@ class CentroidCells(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """A pair of centroids: its middle x, y, squared error [rad^2], chord, and how much of the image
-    is near a centroid, per squared error."""
+    """A pair of centroids.
+
+    x, y : its middle, normalised image coordinates
+    noise2 : mean of the squared errors of both [rad^2]
+    c : chord between them
+    density : share of the image within the gate of a centroid, per squared error [1/rad^2]
+    """
 
     x: float
     y: float
@@ -56,8 +61,11 @@ def _cell(v, corner, per_cell):
 
 
 @kernel
-def make_places(u, box):
-    """Return centroids (n, 3) by cells of the image (compiled)."""
+def make_centroid_cells(u, box):
+    """Return the centroids by cells of the image (compiled).
+
+    u : (n, 3), directions. box : (4,), x0, x1, y0, y1 of the image in normalised coordinates.
+    """
     n = len(u)
     corner = np.array([box[0], box[2]])
     per_cell = CELLS / np.array([box[1] - box[0], box[3] - box[2]])
@@ -71,53 +79,60 @@ def make_places(u, box):
 
 
 @borrowing_kernel
-def _is_shown(x, y, radius, places):
-    """Tell whether a centroid is within this of a place."""
-    corner, per_cell = places.corner, places.per_cell
+def _has_centroid(x, y, radius, cells):
+    """Return whether a centroid is within a radius of x, y, in normalised image coordinates."""
+    corner, per_cell = cells.corner, cells.per_cell
     left = _cell(x - radius, corner[0], per_cell[0])
     right = _cell(x + radius, corner[0], per_cell[0])
     bottom = _cell(y - radius, corner[1], per_cell[1])
     for row in range(bottom, _cell(y + radius, corner[1], per_cell[1]) + 1):
-        for k in range(places.first[CELLS * row + left], places.first[CELLS * row + right + 1]):
-            dx, dy = places.xy[k, 0] - x, places.xy[k, 1] - y
+        for k in range(cells.first[CELLS * row + left], cells.first[CELLS * row + right + 1]):
+            dx, dy = cells.xy[k, 0] - x, cells.xy[k, 1] - y
             if dx * dx + dy * dy < radius * radius:
                 return True
     return False
 
 
 @borrowing_kernel
-def odds_of_field(problem, i, s, j, other, c, stars, places, room):
-    """Return the log odds that the image shows the field in which centroids i and j are these
-    stars, c apart, and the work done (compiled). Writes E, F and R of the scratch.
+def field_log_odds(problem, i, s, j, other, c, stars, cells, scratch):
+    """Return the log odds that centroids i and j are the stars s and `other`, and the work done
+    (compiled).
 
-    Each star of the field beside the two is shown or not; chance shows the share of the image that
-    is near a centroid. `stars` are those of `by_bands`.
+    If they are, a star of the field has a centroid with the probability `DETECTED_SHARE`; if not,
+    with that of the share of the image that is near a centroid. Writes E, F and R of the scratch.
+
+    Parameters
+    ----------
+    c : float
+        Chord between the two stars.
+    stars, cells : StarBands, CentroidCells
+        All stars, and the frame's centroids.
     """
-    u, sigma, box, R = problem.centroids.u, problem.centroids.sigma, problem.image.box, room.R
-    pair_attitude(u[i], u[j], problem.stars.u[s], problem.stars.u[other], c, room)
+    u, sigma, box, R = problem.centroids.u, problem.centroids.sigma, problem.image.box, scratch.R
+    pair_attitude(u[i], u[j], problem.stars.u[s], problem.stars.u[other], c, scratch)
     x = 0.5 * (u[i, 0] / u[i, 2] + u[j, 0] / u[j, 2])
     y = 0.5 * (u[i, 1] / u[i, 2] + u[j, 1] / u[j, 2])
     noise2 = 0.5 * (sigma[i] * sigma[i] + sigma[j] * sigma[j])
     pair = Pair(x, y, noise2, c, math.pi * GATE * GATE * len(u) / problem.image.area)
     least = 1.0 / math.sqrt(1.0 + max(-box[0], box[1]) ** 2 + max(-box[2], box[3]) ** 2)
-    # The pair itself is shown however it is chosen.
-    odds = -2.0 * math.log(SHOWN / min(pair.density * 2.0 * noise2, 0.5 * SHOWN))
+    # The two stars of the pair have centroids in any case: they tell nothing.
+    odds = -2.0 * math.log(DETECTED_SHARE / min(pair.density * 2.0 * noise2, 0.5 * DETECTED_SHARE))
     x, y, z = R[2, 0], R[2, 1], R[2, 2]
-    cells, ratio, looked = cells_of_cone(x, y, z, least), 1.0, 0
-    for band in range(cells.low, cells.high + 1):
-        for sector in range(cells.left, cells.left + cells.n_sectors):
+    cone, ratio, looked = cells_of_cone(x, y, z, least), 1.0, 0
+    for band in range(cone.low, cone.high + 1):
+        for sector in range(cone.left, cone.left + cone.n_sectors):
             cell = cell_at(band, sector)
             for k in range(stars.first[cell], stars.first[cell + 1]):
                 depth = x * stars.u[k, 0] + y * stars.u[k, 1] + z * stars.u[k, 2]
                 if depth > least:
-                    ratio *= _ratio_of_star(stars.u[k], depth, R, box, pair, places)
+                    ratio *= _ratio_of_star(stars.u[k], depth, R, box, pair, cells)
                     looked += 1
     return odds + math.log(ratio), LOOK_UPS + looked
 
 
 @borrowing_kernel
-def _ratio_of_star(star, z, R, box, pair, places):
-    """Return the likelihood ratio of one star, z along the boresight: 1 outside the image."""
+def _ratio_of_star(star, z, R, box, pair, cells):
+    """Return the likelihood ratio of one star, 1 outside the image; z is along the boresight."""
     x = (R[0, 0] * star[0] + R[0, 1] * star[1] + R[0, 2] * star[2]) / z
     y = (R[1, 0] * star[0] + R[1, 1] * star[1] + R[1, 2] * star[2]) / z
     if not (box[0] < x < box[1] and box[2] < y < box[3]):
@@ -125,8 +140,8 @@ def _ratio_of_star(star, z, R, box, pair, places):
     d2 = (x - pair.x) ** 2 + (y - pair.y) ** 2
     s2 = pair.noise2 * (1.5 + 2.0 * d2 / (pair.c * pair.c)) + MAX_BETA * MAX_BETA * d2
     chance = pair.density * s2
-    if chance > 0.5 * SHOWN:  # it tells nothing
+    if chance > 0.5 * DETECTED_SHARE:  # with or without a centroid, it tells nothing
         return 1.0
-    if _is_shown(x, y, GATE * math.sqrt(s2), places):
-        return SHOWN / chance
-    return (1.0 - SHOWN) / (1.0 - chance)
+    if _has_centroid(x, y, GATE * math.sqrt(s2), cells):
+        return DETECTED_SHARE / chance
+    return (1.0 - DETECTED_SHARE) / (1.0 - chance)

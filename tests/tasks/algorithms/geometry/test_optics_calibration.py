@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, project, unproject
 from epipole.tasks.algorithms.geometry.covariances import OPTICS, shared_attitude_covariance
 from epipole.tasks.algorithms.geometry.optics_calibration import (
+    NominalOptics,
     StarImages,
-    ToldOptics,
     calibrate_in_steps,
     calibrate_optics,
 )
@@ -58,7 +58,7 @@ def same_stars_drifting(camera, seed, off_px, n_frames=200, n_stars=40):
 
 
 def test_optics_come_back_without_noise():
-    fit = calibrate_optics(ToldOptics(SENT), stars(TRUE, sigma_px=0.0))
+    fit = calibrate_optics(NominalOptics(SENT), stars(TRUE, sigma_px=0.0))
     got_x, got_y = project(fit.camera, np.array([[0.12, 0.11, 1.0]]))
     true_x, true_y = project(TRUE, np.array([[0.12, 0.11, 1.0]]))
     assert fit.residual_px < 2e-3
@@ -69,7 +69,7 @@ def test_optics_come_back_without_noise():
 def test_errors_over_sigmas_are_standard_normal():
     z = []
     for seed in range(40):
-        fit = calibrate_optics(ToldOptics(SENT), stars(TRUE, seed))
+        fit = calibrate_optics(NominalOptics(SENT), stars(TRUE, seed))
         sigma = np.sqrt(np.diagonal(fit.cov))
         z.append(
             [
@@ -84,22 +84,22 @@ def test_errors_over_sigmas_are_standard_normal():
 
 
 def test_a_few_wrong_stars_change_little():
-    fit = calibrate_optics(ToldOptics(SENT), stars(TRUE, wrong=0.03))
+    fit = calibrate_optics(NominalOptics(SENT), stars(TRUE, wrong=0.03))
     sigma = np.sqrt(np.diagonal(fit.cov))
     assert abs(fit.camera.fx_px - TRUE.fx_px) < 4 * sigma[0]
     assert fit.residual_px == pytest.approx(0.15, rel=0.1)
 
 
 def test_the_gain_shows_a_departure():
-    assert calibrate_optics(ToldOptics(TRUE), stars(TRUE)).gain < 40
-    assert calibrate_optics(ToldOptics(SENT), stars(TRUE)).gain > 1000
+    assert calibrate_optics(NominalOptics(TRUE), stars(TRUE)).gain < 40
+    assert calibrate_optics(NominalOptics(SENT), stars(TRUE)).gain > 1000
 
 
 @pytest.mark.long
 def test_catalogue_errors_are_no_departure():
     z, gains = [], []
     for seed in range(20):
-        fit = calibrate_optics(ToldOptics(TRUE), same_stars_drifting(TRUE, seed, off_px=0.1))
+        fit = calibrate_optics(NominalOptics(TRUE), same_stars_drifting(TRUE, seed, off_px=0.1))
         off = np.array([getattr(fit.camera, n) - getattr(TRUE, n) for n in OPTICS[:2]])
         z.append(off / np.sqrt(np.diagonal(fit.cov)[:2]))
         gains.append(fit.gain)
@@ -108,11 +108,11 @@ def test_catalogue_errors_are_no_departure():
 
 
 def test_too_few_stars_give_none():
-    assert calibrate_optics(ToldOptics(SENT), stars(TRUE, n_frames=2)) is None
+    assert calibrate_optics(NominalOptics(SENT), stars(TRUE, n_frames=2)) is None
     none, nothing = np.empty(0), np.empty(0, int)
     assert (
         calibrate_optics(
-            ToldOptics(SENT), StarImages(none, none, np.empty((0, 3)), nothing, nothing)
+            NominalOptics(SENT), StarImages(none, none, np.empty((0, 3)), nothing, nothing)
         )
         is None
     )
@@ -122,7 +122,7 @@ def test_stars_all_at_one_place_do_no_harm():
     u = np.tile([0.01, 0.02, 1.0], (100, 1))
     x, y = project(SENT, u)
     fit = calibrate_optics(
-        ToldOptics(SENT),
+        NominalOptics(SENT),
         StarImages(x, y, u / np.linalg.norm(u[0]), np.arange(100) // 10, np.arange(100) % 10),
     )
     assert np.all(np.isfinite(fit.cov))
@@ -139,8 +139,8 @@ def sensor(field_deg, seed=0, **departure):
 
 
 def in_steps(sent, images):
-    free = calibrate_optics(ToldOptics(sent), images)
-    return calibrate_in_steps(ToldOptics(sent), images, free)
+    free = calibrate_optics(NominalOptics(sent), images)
+    return calibrate_in_steps(NominalOptics(sent), images, free)
 
 
 def attitude_errors(fit, images, n_frames):

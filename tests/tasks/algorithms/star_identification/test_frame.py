@@ -5,7 +5,7 @@ import pytest
 from scenes.random_stars import (
     BETA,
     CAMERA,
-    HOW,
+    MATCHING,
     angle_between,
     frame,
     optics,
@@ -22,7 +22,7 @@ from epipole.tasks.algorithms.star_identification.frame import (
     identify_lost,
     identify_predicted,
     search_lost,
-    thinned,
+    without_clusters,
 )
 from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
@@ -59,7 +59,7 @@ def test_only_the_brightest_centroids_are_searched():
         instrumental_mag=np.concatenate([seen.instrumental_mag, np.full(3000, -13.0)]),
     )
     assert n < N_SEARCHED
-    assert search_lost(crowded, sky, grid, pairs, HOW).is_clear
+    assert search_lost(crowded, sky, grid, pairs, MATCHING).is_clear
 
 
 def test_few_stars_among_many_other_centroids_are_found():
@@ -71,7 +71,7 @@ def test_few_stars_among_many_other_centroids_are_found():
         R = random_attitude(seed)
         seen = frame(CATALOGUE, R, seed, n_false=500)[0]
         for crowded in found:
-            verdict = search_lost(seen, sky, grid, pairs, HOW._replace(crowded=crowded))
+            verdict = search_lost(seen, sky, grid, pairs, MATCHING._replace(crowded=crowded))
             if verdict.is_clear:
                 assert angle_between(verdict.R_sensor_from_icrs, R) < 1e-3
                 found[crowded] += 1
@@ -84,14 +84,17 @@ def test_many_centroids_without_any_star_are_refused():
     grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
     for seed in range(8):
         seen = frame(CATALOGUE, random_attitude(seed), seed, n_false=300, missing=1.0)[0]
-        assert not search_lost(seen, sky, grid, pairs, HOW).is_clear
+        assert not search_lost(seen, sky, grid, pairs, MATCHING).is_clear
 
 
 def test_odds_of_stars_lower_the_threshold_of_a_search_within_limits():
-    least = HOW.least_lost
-    assert HOW._replace(starlit=2.0).least_lost == pytest.approx(least - 2.0)
-    assert HOW._replace(starlit=-3.0).least_lost == least
-    assert HOW._replace(starlit=9.0).least_lost == HOW._replace(starlit=6.0).least_lost
+    least = MATCHING.min_evidence_lost
+    assert MATCHING._replace(starlit=2.0).min_evidence_lost == pytest.approx(least - 2.0)
+    assert MATCHING._replace(starlit=-3.0).min_evidence_lost == least
+    assert (
+        MATCHING._replace(starlit=9.0).min_evidence_lost
+        == MATCHING._replace(starlit=6.0).min_evidence_lost
+    )
 
 
 def test_a_frame_that_is_no_crowd_has_the_same_solution_in_one_call():
@@ -102,15 +105,15 @@ def test_a_frame_that_is_no_crowd_has_the_same_solution_in_one_call():
         seen = frame(CATALOGUE, random_attitude(seed), seed, n_false=3, missing=0.1 * seed)[0]
         if not 3 <= len(seen.u) <= N_PATTERN:
             continue
-        found, _ = identify_lost(seen, sky, grid, pairs, HOW)
-        verdict = search_lost(seen, sky, grid, pairs, HOW)
+        found, _ = identify_lost(seen, sky, grid, pairs, MATCHING)
+        verdict = search_lost(seen, sky, grid, pairs, MATCHING)
         if not verdict.is_clear:
             assert found is None
             continue
         near = np.eye(3) * (2 * np.sort(seen.sigma_rad)[len(seen.u) // 2]) ** 2
         R = verdict.R_sensor_from_icrs
         for one, other in zip(
-            found, identify_predicted(seen, sky, R, near, HOW, lost=True), strict=True
+            found, identify_predicted(seen, sky, R, near, MATCHING, lost=True), strict=True
         ):
             np.testing.assert_array_equal(one, other)
         solved += 1
@@ -131,7 +134,7 @@ def test_of_a_cluster_the_brightest_few_are_kept_and_all_that_is_elsewhere():
     cluster = rng.normal(0.0625, 0.003, (2, 200))
     mixed = rng.permutation(230)
     u = directions(np.append(x, cluster[0]), np.append(y, cluster[1]))[mixed]
-    kept = thinned(u, BOX)
+    kept = without_clusters(u, BOX)
     assert np.isin(np.flatnonzero(mixed < 30), kept).mean() > 0.9
     assert (mixed[kept] >= 30).sum() <= 16
     first_of_cluster = np.flatnonzero(mixed >= 30)[0]
@@ -140,9 +143,11 @@ def test_of_a_cluster_the_brightest_few_are_kept_and_all_that_is_elsewhere():
 
 def test_a_crowd_that_is_everywhere_is_no_cluster():
     u = directions(*np.random.default_rng(1).uniform(-0.1, 0.1, (2, 900)))
-    assert len(thinned(u, BOX)) == 900
+    assert len(without_clusters(u, BOX)) == 900
 
 
 def test_few_none_and_those_outside_are_kept():
-    assert len(thinned(np.empty((0, 3)), BOX)) == 0
-    assert thinned(directions(np.array([0.0, 5.0]), np.array([0.0, -9.0])), BOX).tolist() == [0, 1]
+    assert len(without_clusters(np.empty((0, 3)), BOX)) == 0
+    assert without_clusters(
+        directions(np.array([0.0, 5.0]), np.array([0.0, -9.0])), BOX
+    ).tolist() == [0, 1]

@@ -2,7 +2,7 @@
 
 import numpy as np
 from scenes.random_stars import (
-    HOW,
+    MATCHING,
     angle_between,
     frame,
     join,
@@ -18,10 +18,10 @@ from epipole.tasks.algorithms.star_identification.frame import (
     identify_lost,
 )
 from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import (
-    SensorSky,
     poor_frames,
     reidentify_poor_frames,
 )
+from epipole.tasks.algorithms.star_identification.sequence import SensorSky
 from epipole.tasks.algorithms.star_identification.star_grid import (
     pattern_pairs,
     sky_grid,
@@ -37,7 +37,7 @@ WHERE = SensorSky(SKY, GRID, lambda: PAIRS)
 
 
 def searched(seen):
-    return identify_lost(seen, SKY, GRID, PAIRS, HOW)[0]
+    return identify_lost(seen, SKY, GRID, PAIRS, MATCHING)[0]
 
 
 def solved_frames(frames):
@@ -65,7 +65,7 @@ def test_spots_that_stay_from_the_frame_before_are_not_taken_for_its_sky():
     star[stayed] = before.star[:5]
     solutions.enter(3, Solution(before.R_sensor_from_icrs, before.cov_rad2, star, chi2, 30.0))
     assert poor_frames(solutions).tolist() == [3]
-    factors = reidentify_poor_frames(join(frames), solutions, WHERE, HOW)
+    factors = reidentify_poor_frames(join(frames), solutions, WHERE, MATCHING)
     assert angle_between(solutions.R_sensor_from_icrs[3], random_attitude(3)) < 1e-3
     assert np.sum(solutions.frame(3).star >= 0) > 10
     assert (factors == 1.0).all()
@@ -81,7 +81,7 @@ def test_a_frame_with_larger_errors_gets_all_its_stars_and_their_errors():
     star[:4] = right.star[:4]
     solutions = solved_frames([*frames[:5], shaken, *frames[6:]])
     solutions.enter(5, right._replace(star=star, chi2=chi2))
-    factors = reidentify_poor_frames(join(frames), solutions, WHERE, HOW)
+    factors = reidentify_poor_frames(join(frames), solutions, WHERE, MATCHING)
     assert np.sum(solutions.frame(5).star >= 0) > 0.8 * np.sum(true >= 0)
     assert 2.5 < factors[5] < 6.0
 
@@ -90,7 +90,7 @@ def test_frames_like_the_others_and_few_frames_are_left_alone():
     frames = [frame(CATALOGUE, random_attitude(k), k, SIGMA_PX)[0] for k in range(8)]
     solutions = solved_frames(frames)
     before = solutions.R_sensor_from_icrs.copy()
-    assert (reidentify_poor_frames(join(frames), solutions, WHERE, HOW) == 1.0).all()
+    assert (reidentify_poor_frames(join(frames), solutions, WHERE, MATCHING) == 1.0).all()
     np.testing.assert_array_equal(solutions.R_sensor_from_icrs, before)
     assert len(poor_frames(solved_frames(frames[:3]))) == 0
     assert len(poor_frames(unsolved(np.zeros(1, np.int64)))) == 0

@@ -11,7 +11,7 @@ from epipole.tasks.algorithms.star_catalogue import navigation_catalogue
 from epipole.tasks.algorithms.star_identification.frame import (
     FieldOfView,
     FrameCentroids,
-    Search,
+    MatchSettings,
     identify_lost,
 )
 from epipole.tasks.algorithms.star_identification.star_grid import (
@@ -22,8 +22,9 @@ from epipole.tasks.algorithms.star_identification.star_grid import (
 )
 
 FRAMES = Path(__file__).parents[5] / "shared" / "data" / "starid"
-HOW = Search(3.7, np.log(1e5), 0.5, np.nan)
-CALIBRATED = Search(3.7, np.log(1e5), 0.5, 0.0, 0.25)  # brightness as the sensor's stars show it
+MATCHING = MatchSettings(3.7, np.log(1e5), 0.5, np.nan)
+# Brightness as the sensor's stars show it.
+CALIBRATED = MatchSettings(3.7, np.log(1e5), 0.5, 0.0, 0.25)
 
 
 class Sample:
@@ -52,7 +53,7 @@ class Sample:
         return FrameCentroids(u, sigma, d["mag"][rows].astype(float), np.zeros(3), self.optics)
 
 
-def answers(name, how):
+def answers(name, matching):
     """Return how many of the sample frames get a right answer and how many a wrong one. Right:
     boresight within 0.05 and roll within 0.5 degrees. Wrong: boresight off by 0.25 degrees."""
     sample, right, wrong, grids = Sample(name), 0, 0, {}
@@ -62,7 +63,7 @@ def answers(name, how):
         key = round(np.log2(radius), 1)
         if key not in grids:
             grids[key] = sky_grid(sample.sky, 1.05 * radius)
-        found, _ = identify_lost(seen, sample.sky, grids[key], sample.pairs, how)
+        found, _ = identify_lost(seen, sample.sky, grids[key], sample.pairs, matching)
         if found is None:
             continue
         R = found.R_sensor_from_icrs
@@ -75,19 +76,19 @@ def answers(name, how):
 
 @pytest.mark.skipif(not FRAMES.is_dir(), reason="the shared sample frames are not here")
 @pytest.mark.parametrize(
-    ("name", "how", "least_right"),
+    ("name", "matching", "least_right"),
     [
         ("a_fov20", CALIBRATED, 1.0),
         # 178 are solved with their true stars. A false-alarm probability that holds costs three;
         # two answers are right but more than 0.05 degrees off.
         ("b_fov12", CALIBRATED, 0.96),
         ("c_fov08", CALIBRATED, 1.0),
-        ("a_fov20", HOW, 0.998),
-        ("b_fov12", HOW, 0.96),
-        ("c_fov08", HOW, 0.998),
+        ("a_fov20", MATCHING, 0.998),
+        ("b_fov12", MATCHING, 0.96),
+        ("c_fov08", MATCHING, 0.998),
     ],
 )
-def test_sample_frames_are_right_or_refused(name, how, least_right):
-    right, wrong = answers(name, how)
+def test_sample_frames_are_right_or_refused(name, matching, least_right):
+    right, wrong = answers(name, matching)
     assert wrong == 0
     assert right >= least_right * 180

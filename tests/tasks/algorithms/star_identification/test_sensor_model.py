@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes.random_stars import HOW, frame, random_attitude, random_catalogue
+from scenes.random_stars import MATCHING, frame, random_attitude, random_catalogue
 
 from epipole.tasks.algorithms.star_identification.frame import identify_predicted
 from epipole.tasks.algorithms.star_identification.sensor_model import (
@@ -21,13 +21,14 @@ DEEP = sky_to_limit(CATALOGUE, 99.0)
 SEEN_TO = 5.5
 
 
-def _frames(n=20, **how):
+def _frames(n=20, **matching):
     """Return frames of a sensor that sees to SEEN_TO, and their solutions."""
     seen = sky_to_limit(CATALOGUE, SEEN_TO).catalogue
-    frames = [frame(seen, random_attitude(k), k, **how)[0] for k in range(n)]
+    frames = [frame(seen, random_attitude(k), k, **matching)[0] for k in range(n)]
     near = np.eye(3) * 1e-8
     return frames, [
-        identify_predicted(f, DEEP, random_attitude(k), near, HOW) for k, f in enumerate(frames)
+        identify_predicted(f, DEEP, random_attitude(k), near, MATCHING)
+        for k, f in enumerate(frames)
     ]
 
 
@@ -46,7 +47,7 @@ def test_a_scale_is_significant_only_with_enough_stars_behind_it():
 def test_errors_claimed_too_small_show_in_the_scale_after_rematching():
     frames, solutions = _frames(sigma_px=0.4)
     half = [f._replace(sigma_rad=f.sigma_rad / 1.5) for f in frames]
-    found = residual_scale(rematch(half, solutions, DEEP, HOW))
+    found = residual_scale(rematch(half, solutions, DEEP, MATCHING))
     assert 1.3 < found.scale < 1.55
 
 
@@ -72,7 +73,7 @@ def test_nothing_solved_tells_nothing():
     frames, _ = _frames(2)
     assert residual_scale([None, None]) == Scale(1.0, 0)
     assert np.isnan(zero_point(frames, [None, None], DEEP)).all()
-    assert rematch(frames, [None, None], DEEP, HOW) == [None, None]
+    assert rematch(frames, [None, None], DEEP, MATCHING) == [None, None]
     assert faintest_star(frames, [None, None], DEEP, 3.7, 4.0) == 4.0
 
 

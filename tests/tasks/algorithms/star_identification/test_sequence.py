@@ -2,7 +2,14 @@
 
 import numpy as np
 import pytest
-from scenes.random_stars import HOW, angle_between, frame, join, random_attitude, random_catalogue
+from scenes.random_stars import (
+    MATCHING,
+    angle_between,
+    frame,
+    join,
+    random_attitude,
+    random_catalogue,
+)
 from scipy.spatial.transform import Rotation
 
 from epipole.tasks.algorithms.star_identification.following import (
@@ -52,7 +59,7 @@ def _identify(frames, priors=None, t_s=None, pairs=_pairs):
     n = len(frames)
     t_s = np.arange(n) * 1.0 if t_s is None else t_s
     priors = no_priors(n) if priors is None else priors
-    found, status = identify_sequence(t_s, join(frames), priors, SKY, GRID, pairs, HOW)
+    found, status = identify_sequence(t_s, join(frames), priors, SKY, GRID, pairs, MATCHING)
     return found.each(), status
 
 
@@ -235,7 +242,7 @@ def test_a_sensor_that_failed_before_is_searched_rarely_from_the_start():
     dark = frame(CATALOGUE, random_attitude(0), 0, n_false=6, missing=1.0)[0]
     frames = join([dark] * 200)
     _, status = identify_sequence(
-        np.arange(200.0), frames, no_priors(200), SKY, GRID, _pairs, HOW, hopeless=True
+        np.arange(200.0), frames, no_priors(200), SKY, GRID, _pairs, MATCHING, hopeless=True
     )
     assert 5 <= status.count("no_match") <= 10
 
@@ -250,7 +257,7 @@ def test_frames_are_followed_from_anchors_both_ways_without_a_search():
         raise AssertionError("searched the whole sky")
 
     found, status = identify_sequence(
-        np.arange(30.0), join(frames), anchors, SKY, GRID, never, HOW, anchored=True
+        np.arange(30.0), join(frames), anchors, SKY, GRID, never, MATCHING, anchored=True
     )
     assert status == [None] * 30
     assert found.solved.all()

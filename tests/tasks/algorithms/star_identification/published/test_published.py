@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scenes.random_stars import (
     CAMERA,
-    HOW,
+    MATCHING,
     angle_between,
     frame,
-    join_spots,
+    join_centroids,
     optics,
     random_attitude,
 )
@@ -66,7 +66,7 @@ def solved(maps, skies, method):
     for number, (kind, u, sigma_rad, star_id, R) in maps.items():
         sky, seen = skies[number], as_frame(kind, u, sigma_rad)
         star = method.make_matcher(sky, seen.optics)(u, sigma_rad)
-        solution = solve_matches(seen, sky, star, HOW.gate_sigma)
+        solution = solve_matches(seen, sky, star, MATCHING.gate_sigma)
         if solution is None:
             continue
         found = solution.star >= 0
@@ -102,7 +102,7 @@ def by_default(maps, skies, number):
     sky, seen = skies[number], as_frame(kind, u, sigma_rad)
     stars = sky.catalogue.u_icrs[: pattern_size(sky, seen.optics.solid_angle_sr)]
     pairs = pattern_pairs(stars, 2 * kind.camera.half_diagonal_rad)
-    return identify_lost(seen, sky, sky_grid(sky, 0.01), pairs, HOW)[0]
+    return identify_lost(seen, sky, sky_grid(sky, 0.01), pairs, MATCHING)[0]
 
 
 def assert_right(map_, sky, solution):
@@ -146,15 +146,15 @@ class OneSky:
         return self.whole
 
 
-def spots(frames, camera):
+def centroids(frames, camera):
     pixel_rad = [pixel_angle(camera, f.u) for f in frames]
     sigma_px = [f.sigma_rad / p for f, p in zip(frames, pixel_rad, strict=True)]
-    return join_spots(frames, sigma_px, pixel_rad)
+    return join_centroids(frames, sigma_px, pixel_rad)
 
 
 def identify(method, frames, catalogue):
     n = len(frames.counts)
-    return method(np.arange(n) * 1.0, frames, no_priors(n), OneSky(catalogue), None, HOW)
+    return method(np.arange(n) * 1.0, frames, no_priors(n), OneSky(catalogue), None, MATCHING)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -164,7 +164,7 @@ def test_frames_get_their_attitude_and_a_status(method):
     empty = frames[0]._replace(
         u=np.empty((0, 3)), sigma_rad=np.empty(0), instrumental_mag=np.empty(0)
     )
-    found = identify(method, spots([*frames, empty], CAMERA), catalogue)
+    found = identify(method, centroids([*frames, empty], CAMERA), catalogue)
     off = [
         angle_between(s.R_sensor_from_icrs, random_attitude(k))
         for k, s in enumerate(found.solutions.each())
@@ -180,7 +180,7 @@ def test_frames_get_their_attitude_and_a_status(method):
 def test_errors_that_are_not_stated_follow_from_the_residuals(method):
     catalogue = random_sky(3000)
     frames = [frame(catalogue, random_attitude(k), k, sigma_px=0.3)[0] for k in range(12)]
-    given = spots(frames, CAMERA)
+    given = centroids(frames, CAMERA)
     unknown = given._replace(sigma_px=np.full(len(given.u), np.nan))
     found = identify(method, unknown, catalogue)
     assert 0.25 < found.sigma_scale.min() <= found.sigma_scale.max() < 0.35
@@ -190,7 +190,7 @@ def test_errors_that_are_not_stated_follow_from_the_residuals(method):
 def test_centroids_all_on_one_spot_are_refused(method):
     catalogue = random_sky(3000)
     seen = frame(catalogue, random_attitude(0), 0)[0]
-    spot = spots([seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0))], CAMERA)
+    spot = centroids([seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0))], CAMERA)
     found = identify(method, spot, catalogue)
     assert not found.solutions.solved.any()
     assert found.status == ["no_match"]

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
+from scenes.random_stars import MATCHING, angle_between, frame, random_attitude, random_catalogue
 
 from epipole.tasks.algorithms.star_identification.frame import problem_of
 from epipole.tasks.algorithms.star_identification.search.crowded_frames import (
@@ -25,9 +25,9 @@ def tables():
     return sky_grid(SKY, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
 
 
-def searched(seen, tables, how=HOW):
+def searched(seen, tables, matching=MATCHING):
     """Return attitude, evidence and work over its bound."""
-    problem, R = problem_of(seen, SKY, *tables, how, crowded=True), np.zeros((3, 3))
+    problem, R = problem_of(seen, SKY, *tables, matching, crowded=True), np.zeros((3, 3))
     evidence, _, work = search_crowded(problem, R)
     return R, evidence, work / problem.limits.budget
 
@@ -39,8 +39,8 @@ def test_stars_among_a_thousand_points_are_found(zero_point, flux, tables):
     for seed in range(6):
         R = random_attitude(seed)
         seen = frame(CATALOGUE, R, seed, n_false=950, flux=flux)[0]
-        got, evidence, work = searched(seen, tables, HOW._replace(zero_point_mag=zero_point))
-        found += evidence > HOW.threshold and angle_between(got, R) < 1e-3
+        got, evidence, work = searched(seen, tables, MATCHING._replace(zero_point_mag=zero_point))
+        found += evidence > MATCHING.threshold and angle_between(got, R) < 1e-3
         assert work < 1.1
     assert found >= 5
 
@@ -51,15 +51,15 @@ def test_few_stars_are_found_in_later_rounds(tables):
     for seed in range(6):
         R = random_attitude(seed)
         seen = frame(CATALOGUE, R, seed, n_false=500, missing=0.5)[0]
-        got, evidence, _ = searched(seen, tables, HOW._replace(zero_point_mag=20.0))
-        found += evidence > HOW.threshold and angle_between(got, R) < 1e-3
+        got, evidence, _ = searched(seen, tables, MATCHING._replace(zero_point_mag=20.0))
+        found += evidence > MATCHING.threshold and angle_between(got, R) < 1e-3
     assert found >= 4
 
 
 def test_a_crowd_without_stars_has_no_evidence(tables):
     for seed in range(4):
         crowd = frame(CATALOGUE, random_attitude(seed), seed, 0.3, 700, 1.0)[0]
-        assert searched(crowd, tables)[1] < HOW.threshold - 10
+        assert searched(crowd, tables)[1] < MATCHING.threshold - 10
 
 
 def test_pivots_with_all_their_surroundings_in_the_image_come_first():
@@ -75,7 +75,7 @@ def test_pivots_with_all_their_surroundings_in_the_image_come_first():
 
 def test_the_same_answer_comes_again_and_ends_at_the_bound(tables):
     seen = frame(CATALOGUE, random_attitude(3), 3, n_false=800, missing=0.8)[0]
-    first, second = (searched(seen, tables, HOW._replace(time_limit_s=0.01)) for _ in range(2))
+    first, second = (searched(seen, tables, MATCHING._replace(time_limit_s=0.01)) for _ in range(2))
     np.testing.assert_array_equal(first[0], second[0])
     assert first[1:] == second[1:]
     assert 1 < first[2] < 2

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
+from scenes.random_stars import MATCHING, angle_between, frame, random_attitude, random_catalogue
 
 from epipole.tasks.algorithms.star_identification.frame import (
     identify_lost,
@@ -48,7 +48,7 @@ def test_any_attitude_is_found(sigma_px, n_false, missing, flux, grid, pairs):
     for seed in range(20):
         R = random_attitude(seed)
         seen, true = frame(CATALOGUE, R, seed, sigma_px, n_false, missing, flux)
-        found, _ = identify_lost(seen, SKY, grid, pairs, HOW)
+        found, _ = identify_lost(seen, SKY, grid, pairs, MATCHING)
         assert found is not None
         assert angle_between(found.R_sensor_from_icrs, R) < 1200 * ARCSEC * sigma_px
         claimed = found.star >= 0
@@ -58,7 +58,7 @@ def test_any_attitude_is_found(sigma_px, n_false, missing, flux, grid, pairs):
 def by_the_brightest(seen, grid, pairs):
     """Return whether pairs of the brightest centroids give a clear attitude, which, and the
     work."""
-    problem = problem_of(seen, SKY, grid, pairs, HOW, crowded=False)
+    problem = problem_of(seen, SKY, grid, pairs, MATCHING, crowded=False)
     best, n = no_attitude(np.zeros((3, 3))), len(seen.u)
     work = try_brightest(problem, make_scratch(n, min(n, 64)), best)
     return is_clear(best, problem.rule), best.R, work
@@ -83,7 +83,7 @@ def test_without_brightness_no_pair_is_tried_for_being_bright(grid, pairs):
 def test_a_search_goes_on_where_most_matches_are_in_one_place(grid, pairs):
     """In a cluster of stars, a wrong attitude may match many of them, and little else."""
     seen, _ = frame(CATALOGUE, random_attitude(0), 0, 0.3)
-    problem = problem_of(seen, SKY, grid, pairs, HOW, crowded=False)
+    problem = problem_of(seen, SKY, grid, pairs, MATCHING, crowded=False)
     n = len(seen.u)
     by_distance = np.argsort(np.linalg.norm(seen.u - seen.u[0], axis=1))
     side = problem.image.box[1] - problem.image.box[0]
@@ -100,20 +100,20 @@ def test_frames_without_stars_are_refused(grid, pairs):
     rng = np.random.default_rng(0)
     for seed in range(20):
         seen, _ = frame(CATALOGUE, random_attitude(seed), seed, 0.5, int(rng.integers(3, 15)), 1.0)
-        found, _ = identify_lost(seen, SKY, grid, pairs, HOW)
+        found, _ = identify_lost(seen, SKY, grid, pairs, MATCHING)
         assert found is None
 
 
 def test_the_search_gives_the_same_bits_again(grid, pairs):
     seen, _ = frame(CATALOGUE, random_attitude(5), 5, 1.0, 10, 0.2)
-    first, second = (search_lost(seen, SKY, grid, pairs, HOW) for _ in range(2))
+    first, second = (search_lost(seen, SKY, grid, pairs, MATCHING) for _ in range(2))
     assert first.evidence == second.evidence
     np.testing.assert_array_equal(first.R_sensor_from_icrs, second.R_sensor_from_icrs)
 
 
 def test_a_search_ends_when_its_bound_is_reached(grid, pairs):
     seen, _ = frame(CATALOGUE, random_attitude(0), 0, 1.0, 60, 1.0)
-    verdict = search_lost(seen, SKY, grid, pairs, HOW._replace(time_limit_s=1e-3))
+    verdict = search_lost(seen, SKY, grid, pairs, MATCHING._replace(time_limit_s=1e-3))
     assert verdict.exhausted
     assert not verdict.is_clear
 
@@ -121,7 +121,7 @@ def test_a_search_ends_when_its_bound_is_reached(grid, pairs):
 def test_centroids_all_on_one_spot_are_refused(grid, pairs):
     seen, _ = frame(CATALOGUE, random_attitude(0), 0)
     spot = seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0))
-    assert identify_lost(spot, SKY, grid, pairs, HOW) == (None, False)
+    assert identify_lost(spot, SKY, grid, pairs, MATCHING) == (None, False)
 
 
 def test_a_handful_of_centroids_is_never_answered_wrongly(grid, pairs):
@@ -131,25 +131,25 @@ def test_a_handful_of_centroids_is_never_answered_wrongly(grid, pairs):
         few = seen._replace(
             u=seen.u[:4], sigma_rad=seen.sigma_rad[:4], instrumental_mag=seen.instrumental_mag[:4]
         )
-        found, _ = identify_lost(few, SKY, grid, pairs, HOW)
+        found, _ = identify_lost(few, SKY, grid, pairs, MATCHING)
         assert found is None or angle_between(found.R_sensor_from_icrs, R) < 0.01
 
 
 def test_a_place_that_is_none_is_left_aside(grid, pairs):
     seen, _ = frame(CATALOGUE, random_attitude(3), 3)
     seen.u[[1, 4]] = np.nan
-    found, _ = identify_lost(seen, SKY, grid, pairs, HOW)
+    found, _ = identify_lost(seen, SKY, grid, pairs, MATCHING)
     assert angle_between(found.R_sensor_from_icrs, random_attitude(3)) < 1200 * ARCSEC
     assert np.all(found.star[[1, 4]] == -1)
     seen.u[:] = np.nan
-    assert identify_lost(seen, SKY, grid, pairs, HOW) == (None, False)
+    assert identify_lost(seen, SKY, grid, pairs, MATCHING) == (None, False)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("sigma_px", [0.05, 0.5, 4.0])
 def test_thousands_of_false_centroids_end_without_an_answer(sigma_px, grid, pairs):
     crowd, _ = frame(CATALOGUE, random_attitude(0), 0, sigma_px, 4000, 1.0)
-    found, _ = identify_lost(crowd, SKY, grid, pairs, HOW)
+    found, _ = identify_lost(crowd, SKY, grid, pairs, MATCHING)
     assert found is None
 
 
@@ -157,7 +157,7 @@ def test_the_work_of_a_search_is_bounded_by_the_time_it_is_given(grid, pairs):
     # The benchmark measures the time of a unit of work: tests assert no time.
     crowd, _ = frame(CATALOGUE, random_attitude(0), 0, 4.0, 100, 1.0)
     exhausted = [
-        search_lost(crowd, SKY, grid, pairs, HOW._replace(time_limit_s=t)).exhausted
+        search_lost(crowd, SKY, grid, pairs, MATCHING._replace(time_limit_s=t)).exhausted
         for t in (1e-3, 1e3)
     ]
     assert exhausted == [True, False]

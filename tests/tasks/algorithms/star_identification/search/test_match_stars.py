@@ -4,7 +4,14 @@ import time
 
 import numpy as np
 import pytest
-from scenes.random_stars import BETA, HOW, angle_between, frame, random_attitude, random_catalogue
+from scenes.random_stars import (
+    BETA,
+    MATCHING,
+    angle_between,
+    frame,
+    random_attitude,
+    random_catalogue,
+)
 from scipy.spatial.transform import Rotation
 
 from epipole.tasks.algorithms.geometry.directions import aberrate
@@ -79,7 +86,9 @@ def test_a_prediction_is_refined_to_the_truth_however_wide(sigma_arcsec):
     for seed in range(15):
         R = random_attitude(seed)
         seen, true = frame(CATALOGUE, R, seed, n_false=15, missing=0.1)
-        found = identify_predicted(seen, SKY, *_prediction(R, sigma_arcsec * ARCSEC, seed), HOW)
+        found = identify_predicted(
+            seen, SKY, *_prediction(R, sigma_arcsec * ARCSEC, seed), MATCHING
+        )
         assert found is not None
         assert angle_between(found.R_sensor_from_icrs, R) < 200 * ARCSEC
         claimed = found.star >= 0
@@ -91,7 +100,10 @@ def test_a_wrong_prediction_is_not_believed():
     for seed in range(30):
         seen, _ = frame(CATALOGUE, random_attitude(seed), seed, n_false=15)
         elsewhere = random_attitude(seed + 1000)
-        assert identify_predicted(seen, SKY, elsewhere, np.eye(3) * (60 * ARCSEC) ** 2, HOW) is None
+        assert (
+            identify_predicted(seen, SKY, elsewhere, np.eye(3) * (60 * ARCSEC) ** 2, MATCHING)
+            is None
+        )
 
 
 def test_errors_of_the_attitude_are_honest():
@@ -100,7 +112,7 @@ def test_errors_of_the_attitude_are_honest():
     for seed in range(600):
         R = random_attitude(seed)
         seen, _ = frame(CATALOGUE, R, seed, n_false=3)
-        found = identify_predicted(seen, SKY, R, np.eye(3) * (30 * ARCSEC) ** 2, HOW)
+        found = identify_predicted(seen, SKY, R, np.eye(3) * (30 * ARCSEC) ** 2, MATCHING)
         phi = Rotation.from_matrix(R @ found.R_sensor_from_icrs.T).as_rotvec()
         normalised.append(phi / np.sqrt(np.diag(found.cov_rad2)))
         nees.append(phi @ np.linalg.solve(found.cov_rad2, phi))
@@ -114,13 +126,13 @@ def test_two_centroids_are_too_few():
     two = seen._replace(
         u=seen.u[:2], sigma_rad=seen.sigma_rad[:2], instrumental_mag=seen.instrumental_mag[:2]
     )
-    assert identify_predicted(two, SKY, random_attitude(0), np.eye(3) * 1e-8, HOW) is None
+    assert identify_predicted(two, SKY, random_attitude(0), np.eye(3) * 1e-8, MATCHING) is None
 
 
 def test_centroids_all_on_one_spot_give_no_attitude():
     seen, _ = frame(CATALOGUE, random_attitude(0), 0)
     spot = seen._replace(u=np.repeat(seen.u[:1], len(seen.u), axis=0))
-    assert identify_predicted(spot, SKY, random_attitude(0), np.eye(3) * 1e-8, HOW) is None
+    assert identify_predicted(spot, SKY, random_attitude(0), np.eye(3) * 1e-8, MATCHING) is None
 
 
 def test_the_search_of_a_wide_prediction_ends_in_a_crowded_sky():

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from epipole.tasks.algorithms.star_identification.search.roll_votes import (
-    LEVELS,
-    count_turns,
-    make_sieve,
+    MAX_COUNTED,
+    count_roll_votes,
+    make_roll_table,
 )
 from epipole.tasks.algorithms.star_identification.star_pairs import TURN, NearStars
 
@@ -14,7 +14,7 @@ REACH, TOLERANCE, WIDE = 0.1, 2e-4, 40
 
 
 def neighbours(rng, counts):
-    """Return the near neighbours of stars that have so many."""
+    """Return the near neighbours of stars, by the number that each has."""
     n = int(np.sum(counts))
     return NearStars(
         np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), np.zeros(n, np.int32),
@@ -22,12 +22,12 @@ def neighbours(rng, counts):
     )  # fmt: skip
 
 
-def levels(near, chord, angle, least=1, most_stars=10_000, share=0.0):
+def levels(near, chord, angle, min_votes=1, max_stars=10_000, share=0.0):
     """Return the votes of each star, and how many are enough."""
     n, stars = len(chord), len(near.first) - 1
     level = np.zeros(stars, np.uint8)
-    sieve = make_sieve(chord, np.full(n, TOLERANCE), angle, np.full(n, WIDE), REACH)
-    enough = count_turns(near, 0, stars, sieve, share, least, most_stars, level)
+    table = make_roll_table(chord, np.full(n, TOLERANCE), angle, np.full(n, WIDE), REACH)
+    enough = count_roll_votes(near, 0, stars, table, share, min_votes, max_stars, level)
     return level, enough
 
 
@@ -39,7 +39,7 @@ def test_all_neighbours_that_are_shown_agree(shown, turned):
     chord = near.chord[:shown] + rng.uniform(-1, 1, shown) * TOLERANCE
     angle = (near.turn[:shown].astype(np.int64) - turned + rng.integers(-WIDE, WIDE, shown)) % TURN
     level, _ = levels(near, np.minimum(chord, REACH), angle)
-    assert level[0] == min(shown, LEVELS)
+    assert level[0] == min(shown, MAX_COUNTED)
 
 
 def test_no_neighbour_agrees_more_often_than_within_a_bin():
@@ -55,7 +55,7 @@ def test_no_neighbour_agrees_more_often_than_within_a_bin():
         turn = (near.turn[mine].astype(np.int64)[entry] - angle[q]) % TURN
         off = np.abs((turn[:, None] - turn + TURN // 2) % TURN - TURN // 2) <= 1300
         least = max((len(set(entry[row])) for row in off), default=0)
-        assert level[s] <= min(least, LEVELS)
+        assert level[s] <= min(least, MAX_COUNTED)
 
 
 def test_more_votes_are_asked_for_where_too_many_stars_have_enough():
@@ -65,7 +65,7 @@ def test_more_votes_are_asked_for_where_too_many_stars_have_enough():
     level, enough = levels(near, chord, angle, 2, 40)
     assert np.sum(level >= enough) <= 40 < np.sum(level >= enough - 1)
     assert levels(near, chord, angle, 5, 400)[1] == 5
-    assert levels(near, chord, angle, 2, -1)[1] == LEVELS + 1
+    assert levels(near, chord, angle, 2, -1)[1] == MAX_COUNTED + 1
 
 
 def test_of_many_neighbours_a_share_has_to_agree():
@@ -80,6 +80,6 @@ def test_of_many_neighbours_a_share_has_to_agree():
 
 def test_more_votes_than_are_counted_are_enough_for_any_share():
     near = neighbours(np.random.default_rng(4), [40])
-    shown = LEVELS + 1
+    shown = MAX_COUNTED + 1
     level, _ = levels(near, near.chord[:shown], near.turn[:shown].astype(np.int64), share=0.5)
-    assert level[0] == LEVELS
+    assert level[0] == MAX_COUNTED

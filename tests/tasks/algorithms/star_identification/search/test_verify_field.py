@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from scenes.random_stars import HOW, angle_between, frame, random_attitude, random_catalogue
+from scenes.random_stars import MATCHING, angle_between, frame, random_attitude, random_catalogue
 
 from epipole.tasks.algorithms.star_identification.frame import problem_of
 from epipole.tasks.algorithms.star_identification.search.pair_hypotheses import make_scratch
 from epipole.tasks.algorithms.star_identification.search.verify_field import (
-    make_places,
-    odds_of_field,
+    field_log_odds,
+    make_centroid_cells,
 )
 from epipole.tasks.algorithms.star_identification.star_grid import (
     by_bands,
@@ -30,9 +30,9 @@ def tables():
 def odds(problem, i, j, s, other):
     """Return the log odds, the work and the attitude."""
     room = make_scratch(len(problem.centroids.u), 3)
-    places = make_places(problem.centroids.u, problem.image.box)
+    places = make_centroid_cells(problem.centroids.u, problem.image.box)
     c = np.linalg.norm(SKY.catalogue.u_icrs[s] - SKY.catalogue.u_icrs[other])
-    found, work = odds_of_field(problem, i, s, j, other, c, STARS, places, room)
+    found, work = field_log_odds(problem, i, s, j, other, c, STARS, places, room)
     return found, work, room.R.copy()
 
 
@@ -41,7 +41,7 @@ def test_the_true_stars_of_a_pair_are_told_from_others(tables):
     for seed in range(20):
         R = random_attitude(seed)
         seen, row = frame(CATALOGUE, R, seed, n_false=500)
-        problem = problem_of(seen, SKY, *tables, HOW, crowded=True)
+        problem = problem_of(seen, SKY, *tables, MATCHING, crowded=True)
         apart = np.linalg.norm(seen.u[:, None] - seen.u, axis=2)
         stars = (row >= 0)[:, None] & (row >= 0) & (apart > 0.05) & (apart < 0.12)
         i, j = np.argwhere(stars)[0]
@@ -62,5 +62,5 @@ def test_a_pair_alone_is_no_evidence(tables):
     stars = np.flatnonzero(row >= 0)
     two = seen._replace(**{k: getattr(seen, k)[stars[:2]] for k in ("u", "sigma_rad")})
     two = two._replace(instrumental_mag=seen.instrumental_mag[stars[:2]])
-    problem = problem_of(two, SKY, *tables, HOW, crowded=True)
+    problem = problem_of(two, SKY, *tables, MATCHING, crowded=True)
     assert odds(problem, 0, 1, *row[stars[:2]])[0] < 0
