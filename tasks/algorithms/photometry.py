@@ -14,13 +14,13 @@ from scipy.optimize import nnls
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-FEWEST = 20  # values that tell a variance
-OF_A_BIN = 25  # values; at least, where the variance depends on the flux
+MIN_VALUES = 20  # minimum number of residuals for an estimate of the variance
+MIN_PER_BIN = 25  # minimum number of residuals per bin of flux
 MAX_BINS = 8
-UNTOLD_MAG2 = 0.3**2  # of a star, where too few stars tell: colours and variable stars
+UNKNOWN_STAR_MAG2 = 0.3**2  # variance of a star with too few residuals: colours, variable stars
 MIN_MAG2 = 1e-8
-CLIPPED = 3.5  # sigmas: stars beyond are variable, blended or wrong in the catalogue
-LEFT = 1e-6  # of their weight
+CLIP_SIGMA = 3.5  # sigmas: stars beyond are variable, blended or wrong in the catalogue
+REJECTED_WEIGHT = 1e-6  # share of their weight that stars beyond `CLIP_SIGMA` keep
 ITERATIONS = 3  # of zero points and the variance about them
 MAX_SHARE = 0.8  # of a star image in the means that are taken from it
 MAX_IMAGES = 5000  # of stars that are measured again and again: they tell the variance well
@@ -73,44 +73,48 @@ def flux_scale(
     zero = _medians(frame, offset, n_frames)
     # The expected flux: a star that is too bright by far must not stand among the bright ones.
     flux = 10 ** (-0.4 * (magnitude - zero[frame]))
-    of_star = (UNTOLD_MAG2, 0.0)
+    of_star = (UNKNOWN_STAR_MAG2, 0.0)
     for _ in range(ITERATIONS):
         residual = offset - zero[frame]
         of_star = _variance_by_flux(*_with_others(residual, flux, count[frame]))
         weight = 1.0 / _variance(of_star, flux)
-        weight[np.abs(residual) > CLIPPED / np.sqrt(weight)] *= LEFT  # it counts where it is alone
+        # Not zero: a rejected star still counts in a frame that has no other.
+        weight[np.abs(residual) > CLIP_SIGMA / np.sqrt(weight)] *= REJECTED_WEIGHT
         total = np.bincount(frame, weight, n_frames)
         with np.errstate(invalid="ignore", divide="ignore"):
             zero, variance = np.bincount(frame, weight * offset, n_frames) / total, 1.0 / total
     zero[count == 0] = variance[count == 0] = np.nan
-    own = _own_variance(frame, star, offset, flux, n_frames) or of_star
-    return FluxScale(zero, variance, *(np.full(n_frames, value) for value in own))
+    of_fluxes = _repeat_variance(frame, star, offset, flux, n_frames) or of_star
+    return FluxScale(zero, variance, *(np.full(n_frames, value) for value in of_fluxes))
 
 
-def _own_variance(
+def _repeat_variance(
     frame: Indices, star: Indices, offset: Array, flux: Array, n_frames: int
 ) -> tuple[float, float] | None:
-    """Return the variance of a measured flux: what is left when each star has an offset of its
-    own, and each frame. None where too few stars are measured often."""
+    """Return the variance of a measured flux, from stars that are measured again and again.
+
+    It is the scatter about an offset of each star and one of each frame. None if too few stars
+    are measured often.
+    """
     some = frame <= np.sort(frame)[: MAX_IMAGES + 1].max(initial=-1)  # whole frames
     frame, offset, flux = frame[some], offset[some], flux[some]
     _, star = np.unique(star[some], return_inverse=True)
     often = (np.bincount(star)[star] > 1) & (np.bincount(frame, minlength=n_frames)[frame] > 1)
     frame, star, offset, flux = frame[often], star[often], offset[often], flux[often]
-    if len(offset) - len(np.unique(star)) - len(np.unique(frame)) < FEWEST:
+    if len(offset) - len(np.unique(star)) - len(np.unique(frame)) < MIN_VALUES:
         return None
     model = (1.0, 0.0)  # equal weights first
     for _ in range(ITERATIONS):
         weight = 1.0 / _variance(model, flux)
-        total = [np.maximum(np.bincount(group, weight), LEFT) for group in (frame, star)]
+        total = [np.maximum(np.bincount(group, weight), REJECTED_WEIGHT) for group in (frame, star)]
         residual = offset
         for _ in range(SWEEPS):
             for group, of_group in zip((frame, star), total, strict=True):
                 mean = np.bincount(group, weight * residual) / of_group
                 residual = residual - mean[group]
-        own_share = weight / total[0][frame] + weight / total[1][star]
-        free = own_share < MAX_SHARE
-        residual = residual[free] / np.sqrt(1.0 - own_share[free])
+        share = weight / total[0][frame] + weight / total[1][star]
+        free = share < MAX_SHARE
+        residual = residual[free] / np.sqrt(1.0 - share[free])
         model = _variance_by_flux(residual, flux[free])
     return model
 
@@ -135,9 +139,9 @@ def _medians(group: Indices, value: Array, n: int) -> Array:
 
 def _variance_by_flux(residual: Array, flux: Array) -> tuple[float, float]:
     """Return (floor, photon) of the variance ``floor + photon / flux``, from medians by flux."""
-    if len(residual) < FEWEST:
-        return UNTOLD_MAG2, 0.0
-    n_bins = int(np.clip(len(residual) // OF_A_BIN, 1, MAX_BINS))
+    if len(residual) < MIN_VALUES:
+        return UNKNOWN_STAR_MAG2, 0.0
+    n_bins = int(np.clip(len(residual) // MIN_PER_BIN, 1, MAX_BINS))
     order = np.argsort(flux, kind="stable")
     of_bin = np.array_split(order, n_bins)
     variance = np.array([(GAUSSIAN * np.median(np.abs(residual[b]))) ** 2 for b in of_bin])

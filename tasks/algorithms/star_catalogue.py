@@ -44,7 +44,7 @@ class NavigationCatalogue(NamedTuple):
     magnitude: Array
 
 
-def places_at(
+def star_directions(
     ra: Array,
     dec: Array,
     parallax_mas: Array,
@@ -82,7 +82,7 @@ def places_at(
     return place / np.linalg.norm(place, axis=1, keepdims=True)
 
 
-def place_errors(sigma_mas: Array, pm_sigma_mas_yr: Array, years: float) -> Array:
+def star_sigmas(sigma_mas: Array, pm_sigma_mas_yr: Array, years: float) -> Array:
     """Return 1-sigma errors, per axis [rad], of places `years` after the catalogue's epoch."""
     return np.hypot(sigma_mas, pm_sigma_mas_yr * years) * MAS
 

@@ -22,8 +22,8 @@ from epipole.tasks.algorithms.star_catalogue import (
     NavigationCatalogue,
     limit_for_density,
     navigation_catalogue,
-    place_errors,
-    places_at,
+    star_directions,
+    star_sigmas,
 )
 from epipole.tasks.algorithms.star_identification import star_grid as skies
 from epipole.tasks.algorithms.star_identification import star_pairs as kvector
@@ -123,7 +123,7 @@ def _make_navigation(
     time_ns = np.array(day * DAY_NS + DAY_NS // 2, np.int64)
     r_earth_km, _ = earth_barycentric(time_ns)
     years = float(julian_year(time_ns)) - catalogue.epoch
-    u = places_at(
+    u = star_directions(
         np.radians(array(stars, "ra_deg")),
         np.radians(array(stars, "dec_deg")),
         array(stars, "parallax_mas"),
@@ -132,7 +132,7 @@ def _make_navigation(
         years,
         r_earth_km,
     )
-    error = place_errors(array(stars, "sigma_mas"), array(stars, "pm_sigma_mas_yr"), years)
+    error = star_sigmas(array(stars, "sigma_mas"), array(stars, "pm_sigma_mas_yr"), years)
     sure = error <= SURE_PX * pixel_rad
     star_id, magnitude = array(stars, "star_id"), array(stars, "magnitude")
     return navigation_catalogue(star_id[sure], u[sure], magnitude[sure], merge_px * pixel_rad)

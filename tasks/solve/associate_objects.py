@@ -16,7 +16,7 @@ from epipole.schemas.tables import REJECTS
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
 from epipole.tasks.algorithms.association.samples import Groups, Samples
-from epipole.tasks.algorithms.association.verdicts import Verdicts
+from epipole.tasks.algorithms.association.window_groups import WindowGroups
 from epipole.tasks.algorithms.orbits.object_motion import ObjectRegistry
 from epipole.tasks.algorithms.sensor_faults.suspects import agreement
 from epipole.tasks.common.sightings import only_id
@@ -60,7 +60,7 @@ def associate_objects(
         Views that are sampled at the same time, a limit of memory.
     """
     items = block.items
-    verdicts = Verdicts(items)
+    verdicts = WindowGroups(items)
     believed = np.ones(len(items.window), bool)
     windows = _windows(items.window)
     rejects = []
@@ -107,7 +107,7 @@ def _judge(
     sampled: SampledViews,
     window: int,
     rows: Indices,
-    verdicts: Verdicts,
+    verdicts: WindowGroups,
     settings: AssociationSettings,
 ) -> Indices:
     """Enter the verdict on a window's items; return the sensors that disagree with all others.
@@ -137,7 +137,7 @@ def _warn_of(sensors: npt.NDArray[np.str_]) -> None:
 
 
 def _judge_again(
-    block: BlockViews, verdicts: Verdicts, believed: Flags, settings: AssociationSettings
+    block: BlockViews, verdicts: WindowGroups, believed: Flags, settings: AssociationSettings
 ) -> None:
     """Judge undecided tracklets again, over longer windows."""
     judged_s = settings.span_s

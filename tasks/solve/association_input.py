@@ -17,7 +17,7 @@ from epipole.schemas.columns import TANGENT_AXES
 from epipole.schemas.spans import Span
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.algorithms.association.samples import Samples
-from epipole.tasks.algorithms.association.verdicts import Items
+from epipole.tasks.algorithms.association.window_groups import Items
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import camera_of

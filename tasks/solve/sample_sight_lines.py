@@ -21,7 +21,7 @@ from epipole.schemas.bridge import (
 from epipole.schemas.columns import POSITION, TANGENT_AXES, VELOCITY
 from epipole.schemas.spans import DAY_NS
 from epipole.schemas.work_tables import CLOCK_LINES, MOVING_OBJECTS, OBJECT_VIEWS
-from epipole.tasks.algorithms.geometry.directions import apparent_places
+from epipole.tasks.algorithms.geometry.directions import apparent_positions
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.solve.positions import VELOCITY_WINDOW_S
 from epipole.tasks.solve.view_groups import ObjectViews, ViewGroups
@@ -119,7 +119,7 @@ def meetings(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Ta
         .drop_nulls([f"sensor_{name}" for name in VELOCITY])
         .join(objects, on=on, maintain_order="left")
     )
-    x_km = apparent_places(
+    x_km = apparent_positions(
         stack(rows, "{}_km"),
         stack(rows, "v{}_km_s"),
         rows["light_s"].to_numpy(),

@@ -27,7 +27,7 @@ from epipole.tasks.algorithms.geometry.directions import (
     radec_from_unit,
 )
 from epipole.tasks.algorithms.photometry import FluxScale
-from epipole.tasks.algorithms.tracking.blends import TrackedSpots, blend_variance, of_neighbour
+from epipole.tasks.algorithms.tracking.blends import TrackedDetections, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.grouping import factorize, group_offsets
 from epipole.tasks.common.sightings import (
@@ -168,7 +168,7 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
     Those of a neighbour alone are left out.
     """
     time_s = (frames.time_ns - frames.time_ns[0]) / 1e9
-    tracked = TrackedSpots(
+    tracked = TrackedDetections(
         tracklets.bounds,
         time_s[tracklets.frame],
         tracklets.u_icrs,

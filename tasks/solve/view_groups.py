@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from epipole.schemas.bridge import array, stack, stack_covariance
 from epipole.schemas.columns import TANGENT_AXES
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
-from epipole.tasks.algorithms.geometry.directions import apparent_places
+from epipole.tasks.algorithms.geometry.directions import apparent_positions
 from epipole.tasks.common.grouping import factorize
 
 Array = npt.NDArray[np.float64]
@@ -174,7 +174,7 @@ class ViewGroups(NamedTuple):
         """Where the sensor of each view sees the object: light from it left at another time."""
         group = self.group
         light_s = self.mean_range_km / SPEED_OF_LIGHT_KM_S
-        return apparent_places(
+        return apparent_positions(
             self.x_km[group], self.velocity_km_s[group], light_s[group], self.views.r_km
         )
 

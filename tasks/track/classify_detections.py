@@ -10,7 +10,7 @@ from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.orbits.planets import planet_directions
-from epipole.tasks.algorithms.tracking.hot_pixels import FixedPlaces, fixed_places
+from epipole.tasks.algorithms.tracking.hot_pixels import FixedPositions, fixed_positions
 from epipole.tasks.common.sightings import Frames, Sightings
 
 Array = npt.NDArray[np.float64]
@@ -21,10 +21,10 @@ GATE_SIGMA = 4.0  # largest distance of a detection from a known hot pixel, plan
 
 def static_positions(
     frames: Frames, sightings: Sightings, detections: pa.Table, camera: Camera
-) -> FixedPlaces:
+) -> FixedPositions:
     """Return the pixel positions that sightings stay at, and how likely each is a hot pixel."""
     sigma_px = array(detections, "sigma_arcsec")[sightings.row] * ARCSEC / camera.pixel_rad
-    return fixed_places(
+    return fixed_positions(
         sightings.frame,
         array(detections, "x_px")[sightings.row],
         array(detections, "y_px")[sightings.row],

@@ -246,7 +246,7 @@ def _label(
         runs = [run for run in runs if not run.stands_still]
         _label_stars(labels, sightings, stars, np.flatnonzero(track == NONE))
     # What no run holds, no other sensor can confirm.
-    in_runs = _in_runs(fixed.place[kept], runs)
+    in_runs = _in_runs(fixed.position[kept], runs)
     labels.kind[sightings.row[suspected & ~in_runs]] = "hot_pixel"
     objects = sorted(runs, key=lambda run: int(run.members[0]))
     return _label_objects(part, sightings, objects, labels, detections, settings, suspected)

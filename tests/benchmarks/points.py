@@ -28,7 +28,7 @@ FIELD_RAD = np.radians(2.0)
 PIXEL_RAD = FIELD_RAD / 512
 CENTROID_PX = 0.16
 ATTITUDE_RAD = np.array([1.0, 1.0, 8.0]) * ARCSEC
-DETECTED = 0.95
+PRIOR_DETECTION = 0.95
 
 
 class Points(NamedTuple):
@@ -66,7 +66,7 @@ def scene(
     for s in range(n_sensors):
         boresight = (CENTRE_KM - r[s]) / np.linalg.norm(CENTRE_KM - r[s])
         R = np.vstack([tangent_basis(boresight), boresight])
-        seen = np.flatnonzero(rng.random(n_objects) < DETECTED)
+        seen = np.flatnonzero(rng.random(n_objects) < PRIOR_DETECTION)
         toward = (x[seen] - r[s]) @ R.T
         place = toward[:, :2] / toward[:, 2:]
         inside = (np.abs(place) < FIELD_RAD / 2).all(axis=1)
@@ -122,7 +122,7 @@ def oracle_groups(points: Points, least: float, lead: float) -> npt.NDArray[np.i
         weight = np.linalg.inv(s.cov[rows, 0])
         spot = 2 * np.pi * np.sqrt(np.linalg.det(s.cov[rows, 0]))
         clutter = len(rows) / FIELD_RAD**2
-        odds = np.log(DETECTED / (1 - DETECTED) / (clutter * spot))
+        odds = np.log(PRIOR_DETECTION / (1 - PRIOR_DETECTION) / (clutter * spot))
         odds = odds - np.einsum("nta,tab,ntb->nt", e, weight, e) / 2
         odds[toward @ s.u[rows, 0].mean(axis=0) < 0] = -np.inf
         order = np.argsort(-odds, axis=1)[:, :2]

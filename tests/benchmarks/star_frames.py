@@ -13,7 +13,7 @@ from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_
 from epipole.tasks.algorithms.star_catalogue import (
     NavigationCatalogue,
     navigation_catalogue,
-    places_at,
+    star_directions,
 )
 
 Array = npt.NDArray[np.float64]
@@ -88,7 +88,7 @@ def hipparcos_at_epoch(limit: float) -> NavigationCatalogue:
     table = read_hipparcos()
     places = [np.radians(array(table, name)) for name in ("ra_deg", "dec_deg")]
     motions = [array(table, name) for name in ("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")]
-    u = places_at(*places, *motions, EPOCH - HIPPARCOS_EPOCH, np.zeros(3))
+    u = star_directions(*places, *motions, EPOCH - HIPPARCOS_EPOCH, np.zeros(3))
     kept = array(table, "magnitude") <= limit
     return navigation_catalogue(
         array(table, "star_id")[kept], u[kept], array(table, "magnitude")[kept], 0.0

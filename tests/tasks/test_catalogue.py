@@ -9,7 +9,7 @@ from epipole.schemas.bridge import array
 from epipole.schemas.star_lists import UNKNOWN_MOTION_MAS_YR, label_of
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.directions import unit_from_radec
-from epipole.tasks.algorithms.star_catalogue import places_at
+from epipole.tasks.algorithms.star_catalogue import star_directions
 
 THETA_AURIGAE, POLARIS, BARNARD = 28380, 11767, 87937
 
@@ -37,7 +37,7 @@ def _hipparcos_at(year, hip):
     names = ("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")
     ra, dec = (np.radians(array(stars, n)[row]) for n in ("ra_deg", "dec_deg"))
     motions = [array(stars, n)[row] for n in names]
-    return places_at(ra, dec, *motions, year - 1991.25, np.zeros(3))[0]
+    return star_directions(ra, dec, *motions, year - 1991.25, np.zeros(3))[0]
 
 
 def test_every_star_is_there_once_and_the_label_says_what_and_under_which_licence(gaia, deep):
@@ -86,7 +86,7 @@ def test_places_and_brightness_agree_with_hipparcos_moved_to_the_epoch(deep):
     hipparcos = read_hipparcos()
     names = ("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr")
     ra, dec = (np.radians(array(hipparcos, n)) for n in ("ra_deg", "dec_deg"))
-    moved = places_at(ra, dec, *[array(hipparcos, n) for n in names], 24.75, np.zeros(3))
+    moved = star_directions(ra, dec, *[array(hipparcos, n) for n in names], 24.75, np.zeros(3))
     same = [np.argmax(moved @ _place(deep, row)) for row in known]
     off = np.array(
         [np.linalg.norm(moved[i] - _place(deep, k)) for i, k in zip(same, known, strict=True)]

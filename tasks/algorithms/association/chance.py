@@ -173,7 +173,7 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
     sample lines of sight, at the instant at which most sensors have a known attitude. Zero if
     fewer than two sensors have one.
     """
-    ready = np.isfinite(views.place_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
+    ready = np.isfinite(views.position_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
     m = int(np.argmax(ready.sum(axis=0)))
     known = np.flatnonzero(ready[:, m])
     out = np.zeros(len(shells))
@@ -190,8 +190,8 @@ def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
         toward = np.stack([a.ravel(), b.ravel(), np.ones(a.size)], axis=1) / stretch[:, None]
         u = toward @ views.attitude[s, m]
         cell_sr = np.prod(views.half_field[s]) * 4 / side**2 / stretch**3
-        rho, edges = _steps(views.place_km[s, m], u, shells, farthest_km)
-        x = views.place_km[s, m] + rho[..., None] * u[:, None]
+        rho, edges = _steps(views.position_km[s, m], u, shells, farthest_km)
+        x = views.position_km[s, m] + rho[..., None] * u[:, None]
         count = _in_view_of(camera, x.reshape(-1, 3)).reshape(rho.shape)
         volume = np.diff(edges**3, axis=1) / 3 * cell_sr[:, None]
         volume = np.where(count >= 2, volume / np.maximum(count, 1), 0.0)

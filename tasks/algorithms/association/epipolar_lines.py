@@ -136,12 +136,12 @@ def view_table(n_points: Sequence[int], pairs: Pairs) -> Indices:
     rows: list[dict[int, int]] = []
     rows_of: dict[tuple[int, int], list[int]] = {}
     for image, count in enumerate(n_points):
-        partners: list[set[int]] = [set() for _ in range(count)]
+        rows_before: list[set[int]] = [set() for _ in range(count)]
         for earlier in range(image):
             for i, j in pairs.get((earlier, image), np.zeros((0, 2), np.int64)).tolist():
-                partners[j].update(rows_of[earlier, i])
+                rows_before[j].update(rows_of[earlier, i])
         for point in range(count):
-            for k in sorted(partners[point]):
+            for k in sorted(rows_before[point]):
                 if image not in rows[k] and all(
                     (member, point) in paired.get((other, image), set())
                     for other, member in rows[k].items()
@@ -239,10 +239,10 @@ def _vote(
     known = np.flatnonzero(np.isfinite(R).all(axis=(1, 2)) & np.isfinite(r).all(axis=1))
     shown, images = [], []
     for s in known:
-        place = samples.u[of_sensor[s], m] @ R[s].T
-        visible = np.flatnonzero(samples.seen[of_sensor[s], m] & (place[:, 2] > 0))
+        u_sensor = samples.u[of_sensor[s], m] @ R[s].T
+        visible = np.flatnonzero(samples.seen[of_sensor[s], m] & (u_sensor[:, 2] > 0))
         shown.append(visible)
-        images.append(focal_px[s] * place[visible, :2] / place[visible, 2:])
+        images.append(focal_px[s] * u_sensor[visible, :2] / u_sensor[visible, 2:])
     M = np.zeros((len(known), 3, 3))
     M[:, 0, 0] = M[:, 1, 1] = focal_px[known]
     M[:, 2, 2] = 1.0

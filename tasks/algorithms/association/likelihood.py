@@ -41,7 +41,7 @@ from epipole.tasks.algorithms.association.hypothesis_queue import (
 from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.search.field_index import cones_of, field_index
 from epipole.tasks.algorithms.association.search.growth import grow_all
-from epipole.tasks.algorithms.association.search.merge_hypotheses import best_union
+from epipole.tasks.algorithms.association.search.merge_hypotheses import best_merger
 from epipole.tasks.algorithms.association.search.resolve_conflicts import resolve_conflicts
 from epipole.tasks.algorithms.association.search.search_space import SearchSpace, work_space
 from epipole.tasks.algorithms.association.search.seeds import seeds_between
@@ -52,13 +52,13 @@ from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-DETECTED = 0.9  # probability of detection before the data are known
-FEW_SENSORS = 6  # up to this many, every pair of sensors seeds, so two views are enough
-SEED_SIGMA = 2.5  # with more sensors: another pair seeds the objects that this gate rejects
+PRIOR_DETECTION = 0.9  # probability of detection before the data are known
+FEW_SENSORS = 6  # up to this many, every pair of sensors provides seeds
+SEED_SIGMA = 2.5  # with more sensors: the gate of seeds; another pair seeds what it rejects
 UNSEEDED = 0.01  # with more sensors: expected number of objects without a seed
 CLEAR_LOG_ODDS = 15.0  # with more sensors: such a group is taken before the next pair seeds
-WORTH_A_LOOK = -3.0  # log-odds of a group that is kept until the number of objects is known
-BEYOND_DOUBT = 20.0  # log-odds that no number of objects makes doubtful
+MIN_KEPT_LOG_ODDS = -3.0  # minimum log-odds of a hypothesis before the number of objects is known
+DOUBTLESS_LOG_ODDS = 20.0  # log-odds above which the number of objects cannot make a group doubtful
 
 
 class Shell(NamedTuple):
@@ -90,7 +90,7 @@ def associate_tracklets(
     min_altitude_km, max_range_km
         Objects are sought between this altitude and this distance from the Earth's centre.
     min_log_odds
-        A group is reported if its log-odds (natural) against chance are at least this.
+        A group is reported if its log-odds (natural) against chance are at min_score this.
     ambiguity_log_odds
         Neither of two contradicting groups is reported if their log-odds differ by less.
     shells
@@ -109,7 +109,7 @@ def associate_tracklets(
     cones = cones_of(views)
     space = SearchSpace(
         views=views,
-        chance=chance_of(samples, max_range_km, DETECTED),
+        chance=chance_of(samples, max_range_km, PRIOR_DETECTION),
         taken=np.zeros(len(order), np.bool_),
         shells=_weights(shells, max_range_km).astype(float),
         lowest_km=float(EARTH_RADIUS_KM + min_altitude_km),
@@ -140,7 +140,7 @@ class _Search:
     """The hypotheses over one set of samples, and the groups that are accepted.
 
     `order` gives the sample of each tracklet of the search space; `margin` is the difference in
-    log-odds below which two hypotheses contest each other.
+    log-odds below which two contradicting hypotheses are both doubtful.
     """
 
     def __init__(self, space: SearchSpace, order: Indices, margin: float) -> None:
@@ -159,7 +159,7 @@ class _Search:
                 pair = pairs.next(self._enough_pairs())
             # Where sensors miss more than was assumed, more pairs are needed.
             waiting = self._learn_detection(waiting)
-        self.take(waiting, WORTH_A_LOOK)
+        self.take(waiting, MIN_KEPT_LOG_ODDS)
         nothing_taken = self.space._replace(taken=np.zeros_like(self.space.taken))
         x_km = np.array([h.x_km for h in self.groups]).reshape(-1, 3)
         resolve_conflicts(nothing_taken, self.work, self.group, x_km)
@@ -169,7 +169,7 @@ class _Search:
         return Groups(group, scores, ambiguous & (group == FREE), self.space.chance.detected)
 
     def _enough_pairs(self) -> float:
-        """Return how many pairs must cover a place, so that few objects there have no seed.
+        """Return how many pairs must cover a point, so that few objects there lack a seed.
 
         A pair misses an object where either sensor does.
         """
@@ -193,8 +193,8 @@ class _Search:
         """
         if not len(seeds):
             return [], []
-        least = WORTH_A_LOOK - self.margin
-        grown = grow_all(self.space, self.work, seeds, float(clear), least)
+        min_score = MIN_KEPT_LOG_ODDS - self.margin
+        grown = grow_all(self.space, self.work, seeds, float(clear), min_score)
         member, first, skip = (
             values.tolist() for values in (grown.member, grown.first_member, grown.first_missed)
         )
@@ -224,7 +224,7 @@ class _Search:
                 used.update(h.members)
                 sure.append(h)
         believed = self.space.chance.detected
-        detected = estimated_detection(self.space.views, [*self.groups, *sure], DETECTED)
+        detected = estimated_detection(self.space.views, [*self.groups, *sure], PRIOR_DETECTION)
         self.space = self.space._replace(chance=self.space.chance._replace(detected=detected))
         self.groups = self._with_detection(self.groups, believed, detected)
         return self._with_detection(waiting, believed, detected)
@@ -245,24 +245,26 @@ class _Search:
         self.groups.append(h)
 
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
-        """Accept hypotheses, the likeliest first; members that a rival contests are ambiguous."""
+        """Accept hypotheses, the likeliest first; members that a rival also has are ambiguous."""
         taken = self.space.taken
         # What a clear group took tracklets from is usually nothing without them: grow it again.
         stale = [h for h in hypotheses if taken[list(h.members)].any()]
         afresh, _ = self.grow(np.array([h.seed for h in stale], np.int64).reshape(-1, 2))
         gone = set(map(id, stale))
-        pool = HypothesisQueue([h for h in hypotheses if id(h) not in gone] + afresh)
-        while (best := pool.pop()) is not None and best.score >= min_log_odds:
+        queue = HypothesisQueue([h for h in hypotheses if id(h) not in gone] + afresh)
+        while (best := queue.pop()) is not None and best.score >= min_log_odds:
             if taken[list(best.members)].any():
                 if not taken[list(best.seed)].any():
                     for again in self.grow(np.array([best.seed]))[0]:
-                        pool.push(again)
+                        queue.push(again)
                 continue
-            if (union := best_union(self.space, self.work, best, pool.sharing(best))) is not None:
-                pool.push(best)
-                pool.push(union)
+            if (
+                merged := best_merger(self.space, self.work, best, queue.sharing(best))
+            ) is not None:
+                queue.push(best)
+                queue.push(merged)
                 continue
-            rivals = pool.rivals(best, self.margin, self.group != FREE)
+            rivals = queue.rivals(best, self.margin, self.group != FREE)
             kept = set(best.members).intersection(*(h.members for h in rivals))
             sensors = {int(self.space.views.sensor[i]) for i in kept}
             # The rest of a group that lost most of its views is no object by itself.
@@ -290,7 +292,7 @@ class _Search:
     def _revised(self) -> Array:
         """Return the groups' log-odds with the number of objects that they tell of."""
         space, scores = self.space, np.array([h.score for h in self.groups])
-        if not len(scores) or scores.min() > BEYOND_DOUBT:
+        if not len(scores) or scores.min() > DOUBTLESS_LOG_ODDS:
             return scores
         anywhere = np.array([[0.0, np.inf, 1.0]])
         shells = space.shells if len(space.shells) else anywhere

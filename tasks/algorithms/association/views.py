@@ -67,7 +67,7 @@ class Views(NamedTuple):
     bounded: Flags
 
     @property
-    def place_km(self) -> Array:
+    def position_km(self) -> Array:
         """Positions of the sensors [km], (s, k, 3)."""
         return self.camera[..., R_KM:PLANE]
 
@@ -95,7 +95,7 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
     first = np.searchsorted(sensor, np.arange(n_sensors + 1)).astype(np.int64)
     seen, u = np.ascontiguousarray(samples.seen), np.ascontiguousarray(samples.u, float)
     plane = _planes(first, order, seen, u)
-    _sort_by_place(first, order, seen, u, plane)
+    _sort_by_position(first, order, seen, u, plane)
     camera = np.zeros((n_sensors, n_instants, N_CAMERA))
     camera[..., R_KM:PLANE] = samples.sensor_km
     camera[..., PLANE:TURN] = plane.reshape(n_sensors, n_instants, 9)
@@ -180,13 +180,17 @@ def _planes(first, order, seen, u):
 
 
 @kernel
-def _sort_by_place(first, order, seen, u, plane):
+def _sort_by_position(first, order, seen, u, plane):
     """Sort the tracklets of each sensor by cells of its plane at the first instant they are seen.
 
     A hypothesis looks at the few tracklets near its points: these lie side by side in memory.
     """
     n_instants = seen.shape[1]
-    cell, place, sorted_ = np.empty(len(order), np.int64), np.empty((len(order), 2)), order.copy()
+    cell, position, sorted_ = (
+        np.empty(len(order), np.int64),
+        np.empty((len(order), 2)),
+        order.copy(),
+    )
     low, high = np.empty(2), np.empty(2)
     for s in range(len(first) - 1):
         lo, hi = first[s], first[s + 1]
@@ -199,14 +203,14 @@ def _sort_by_place(first, order, seen, u, plane):
                 here = 0.0
                 for b in range(3):
                     here += plane[s, m, a, b] * u[i, m, b]
-                place[k, a] = here if np.isfinite(here) else 0.0
-                low[a], high[a] = min(low[a], place[k, a]), max(high[a], place[k, a])
+                position[k, a] = here if np.isfinite(here) else 0.0
+                low[a], high[a] = min(low[a], position[k, a]), max(high[a], position[k, a])
         side = int(np.sqrt(hi - lo))
         start = np.zeros(side * side + 1, np.int64)
         for k in range(lo, hi):
             q = 0
             for a in range(2):
-                share = (place[k, a] - low[a]) / max(high[a] - low[a], 1e-12)
+                share = (position[k, a] - low[a]) / max(high[a] - low[a], 1e-12)
                 q = q * side + min(int(share * side), side - 1)
             cell[k] = q
             start[q + 1] += 1
@@ -373,8 +377,8 @@ def residual(views, i, m, x, part):
         p0, p1, p2 = cam[s, m, q], cam[s, m, q + 1], cam[s, m, q + 2]
         here = (p0 * d0 + p1 * d1 + p2 * d2) / depth
         p0, p1, p2 = (p0 - here * n0) / depth, (p1 - here * n1) / depth, (p2 - here * n2) / depth
-        own = moves * (p0 * v0 + p1 * v1 + p2 * v2) + see[i, m, DX + a]
-        part[a] = here - see[i, m, X + a] - later * own
+        motion = moves * (p0 * v0 + p1 * v1 + p2 * v2) + see[i, m, DX + a]
+        part[a] = here - see[i, m, X + a] - later * motion
         part[2 + 3 * a], part[3 + 3 * a], part[4 + 3 * a] = p0, p1, p2
     # The error of the sensor's position, across the line of sight.
     extra, x0, x1 = (see[i, m, SIGMA_KM] / depth) ** 2, see[i, m, X], see[i, m, Y]

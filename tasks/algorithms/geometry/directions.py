@@ -185,7 +185,7 @@ def boresight_angles(R_sensor_from_icrs: Array) -> tuple[Array, Array, Array]:
 # Light time
 
 
-def apparent_places(x_km: Array, v_km_s: Array, light_s: Array, r_km: Array) -> Array:
+def apparent_positions(x_km: Array, v_km_s: Array, light_s: Array, r_km: Array) -> Array:
     """Return the places that sensors see at an epoch: where objects were when their light left.
 
     Parameters

@@ -32,7 +32,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MAX_ROWS = 8  # positions of an object that are compared
-KEPT = 0.9999  # share of true matches that pass the chi-square test
+KEPT_SHARE = 0.9999  # share of true matches that pass the chi-square test
 REACH_SIGMA = 6.0
 # Companions that are not listed: the share of satellites that have one, and how far it is, as
 # errors of elements would put it there: in one slot, and in one plane.
@@ -48,8 +48,8 @@ DRAG_REACH_KM_DAY2 = 0.2  # unknown drag of a satellite that comes down soon
 DAY_NS = 86_400_000_000_000
 # What is known before: each error is right within a factor of three (1-sigma of its logarithm).
 PRIOR_SIGMA = float(np.log(3.0))
-STEP = 0.7  # of the first search
-FEWEST = 5  # matches from which anything is learnt
+SIMPLEX_STEP = 0.7  # first step of the search, in ln of a factor: a factor of two
+MIN_MATCHES = 5  # minimum number of matches to learn from
 
 
 class Observed(NamedTuple):
@@ -170,14 +170,17 @@ def _candidate(
     H = sensitivities(catalogue.satellites[row], observed.time_ns, k)
     lever = axes @ H[k]
     H = H.reshape(-1, 6)
-    own = _spread(H, sigma)
+    from_elements = _spread(H, sigma)
     # Errors that all rows share count once: m rows tell as much as one, and the motion.
     noise = _block_diagonal(observed.cov * len(observed.cov))
     z = apart.ravel()
-    match, fits = _log_mixture(z, noise, own)
+    match, fits = _log_mixture(z, noise, from_elements)
     at_anchor, fits_there = _log_mixture(here, P, _spread(lever, sigma))
     companion = logsumexp(
-        [_log_normal(z, noise + own + _spread(H, np.array(far)))[0] for _, far in COMPANIONS],
+        [
+            _log_normal(z, noise + from_elements + _spread(H, np.array(far)))[0]
+            for _, far in COMPANIONS
+        ],
         b=[share for share, _ in COMPANIONS],
     )
     age = (time_ns - int(catalogue.epoch_ns[row])) / DAY_NS
@@ -200,12 +203,12 @@ def _block_diagonal(blocks: Array) -> Array:
     return out.reshape(3 * m, 3 * m)
 
 
-def _log_mixture(z: Array, noise: Array, own: Array) -> tuple[float, bool]:
+def _log_mixture(z: Array, noise: Array, from_elements: Array) -> tuple[float, bool]:
     """Return the log-density of a difference, and whether it fits.
 
     Catalogues are uneven: the errors of some element sets are several times the usual ones.
     """
-    terms = [_log_normal(z, noise + factor**2 * own) for factor, _ in QUALITIES]
+    terms = [_log_normal(z, noise + factor**2 * from_elements) for factor, _ in QUALITIES]
     density = logsumexp([term for term, _ in terms], b=[share for _, share in QUALITIES])
     return float(density), min(d2 for _, d2 in terms) < _quantile(len(z))
 
@@ -219,7 +222,7 @@ def _log_normal(z: Array, S: Array) -> tuple[float, float]:
 
 
 def _quantile(size: int) -> float:
-    return float(2 * gammaincinv(size / 2, KEPT))  # chi-square
+    return float(2 * gammaincinv(size / 2, KEPT_SHARE))  # chi-square
 
 
 class NameVerdict(NamedTuple):
@@ -237,8 +240,11 @@ class NameVerdict(NamedTuple):
     rows: tuple[int, ...] = ()
 
 
-def judge(found: Sequence[Candidate], least: float) -> NameVerdict:
-    """Return what an object is, by its candidates; `least` is the least probability of a name."""
+def judge(found: Sequence[Candidate], min_probability: float) -> NameVerdict:
+    """Return what an object is, by its candidates.
+
+    `min_probability` is the minimum probability of a name.
+    """
     if not found:
         return NameVerdict("unknown", 1.0, None)
     match = np.array([each.log_match if each.fits else -np.inf for each in found])
@@ -249,7 +255,7 @@ def judge(found: Sequence[Candidate], least: float) -> NameVerdict:
     best = int(np.argmax(share))
     order = np.argsort(-share, kind="stable")
     rows = tuple(found[k].row for k in order if share[k] >= MIN_NAMED)
-    if share[best] >= least:
+    if share[best] >= min_probability:
         return NameVerdict("known", float(share[best]), found[best], rows)
     if share.sum() >= 0.5:
         return NameVerdict("ambiguous", float(share.sum()), found[best], rows)
@@ -290,9 +296,9 @@ def learn_errors(
     -------
     ElementErrors
         The greatest posterior density, by the factors of: the error along at the epoch, its growth,
-        the radial and the across error. `start` where there are fewer than `FEWEST` matches.
+        the radial and the across error. `start` where there are fewer than `MIN_MATCHES` matches.
     """
-    if len(matches) < FEWEST:
+    if len(matches) < MIN_MATCHES:
         return start
 
     apart_km = np.array([match.apart_km for match in matches])
@@ -309,7 +315,7 @@ def learn_errors(
         log_det = np.linalg.slogdet(S)[1]
         return float((d2 + log_det).sum() + (log_factors**2).sum() / PRIOR_SIGMA**2)
 
-    corners = np.vstack([np.zeros(4), STEP * np.eye(4)])
+    corners = np.vstack([np.zeros(4), SIMPLEX_STEP * np.eye(4)])
     options = {"initial_simplex": corners, "xatol": 0.01, "fatol": 0.01}
     found = minimize(cost, np.zeros(4), method="Nelder-Mead", options=options)
     return _scaled(start, np.exp(found.x))

@@ -185,10 +185,10 @@ def _gains(motions: ObservedMotions, pairs: _CandidatePairs) -> Array:
     gain = np.full(len(pairs.later), -np.inf)
     order = np.argsort(pairs.later, kind="stable")
     cuts = np.flatnonzero(np.diff(pairs.later[order])) + 1
-    for own in np.split(order, cuts) if len(order) else []:
-        present = _present(motions, int(pairs.later[own[0]]))
-        past = pairs.earlier[own]
-        for k in own:
+    for same_later in np.split(order, cuts) if len(order) else []:
+        present = _present(motions, int(pairs.later[same_later[0]]))
+        past = pairs.earlier[same_later]
+        for k in same_later:
             i, size = pairs.earlier[k], 6 if np.isfinite(pairs.apart[k]).all() else 3
             S, d = pairs.cov[k, :size, :size], pairs.apart[k, :size]
             d2 = float(d @ np.linalg.solve(S, d))
@@ -198,7 +198,7 @@ def _gains(motions: ObservedMotions, pairs: _CandidatePairs) -> Array:
             distinct = (motions.first_s[past] <= motions.last_s[i]) & (
                 motions.last_s[past] >= motions.first_s[i]
             )
-            others = np.concatenate([pairs.apart[own[distinct & (past != i)]], present])
+            others = np.concatenate([pairs.apart[same_later[distinct & (past != i)]], present])
             density = _log_density(others[:, :size], S)
             gain[k] = -d2 / 2 - np.linalg.slogdet(2 * np.pi * S)[1] / 2 - density
     return gain

@@ -16,12 +16,12 @@ from epipole.tasks.algorithms.geometry.directions import tangent_basis
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-LARGEST_S = 5.0  # offset that is searched
+MAX_OFFSET_S = 5.0  # maximum clock offset that is searched for
 MEETS_SIGMA = 4.0  # largest miss of a line and its object at the best offset
 QUARTER_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 SAME_SIGMA = 3.0  # offsets that differ by less are the same
-FAR = 1e9  # [sigma] miss of an object behind the sensor
-FEWEST = 3  # objects that must agree on an offset
+FAR_SIGMA = 1e9  # [sigma] miss of an object behind the sensor
+MIN_OBJECTS = 3  # minimum number of objects that agree on an offset
 FALSE_ALARM = 1e-4  # accepted probability that the offsets agree by chance
 
 
@@ -75,8 +75,8 @@ def search_offset(meetings: Meetings) -> Match | None:
     miss, rate = _passes(meetings)
     along, sigma = _mean_offset(miss, rate, which, len(pairs))
     aside, sigma_aside = _mean_offset(miss, rate @ QUARTER_TURN, which, len(pairs))
-    meets = (np.abs(aside) < MEETS_SIGMA * sigma_aside) & (np.abs(along) < LARGEST_S)
-    wrong = (np.abs(along) < MEETS_SIGMA * sigma) & (np.abs(aside) < LARGEST_S) & ~meets
+    meets = (np.abs(aside) < MEETS_SIGMA * sigma_aside) & (np.abs(along) < MAX_OFFSET_S)
+    wrong = (np.abs(along) < MEETS_SIGMA * sigma) & (np.abs(aside) < MAX_OFFSET_S) & ~meets
     good = np.flatnonzero(meets)
     best = _surest(pairs[good], along[good], sigma[good], int(wrong.sum()))
     if best is None:
@@ -93,14 +93,14 @@ def _passes(m: Meetings) -> tuple[Array, Array]:
     away = m.x_km - m.r_km
     reach = np.linalg.norm(away, axis=1)
     basis = tangent_basis(m.u) / reach[:, None, None]
-    place_cov = m.cov_km2 + (m.sigma_km**2)[:, None, None] * np.eye(3)
-    cov = m.cov + basis @ place_cov @ np.swapaxes(basis, -1, -2)
+    position_cov = m.cov_km2 + (m.sigma_km**2)[:, None, None] * np.eye(3)
+    cov = m.cov + basis @ position_cov @ np.swapaxes(basis, -1, -2)
     across = np.linalg.inv(np.linalg.cholesky(cov)) @ basis
     miss = np.einsum("nij,nj->ni", across, -away)
     ahead = np.einsum("ni,ni->n", m.u, away) > 0.5 * reach
     # With a late time stamp an object lags by its motion.
     rate = np.einsum("nij,nj->ni", across, m.v_sensor_km_s - m.v_km_s)
-    return np.where(ahead[:, None], miss, FAR), rate
+    return np.where(ahead[:, None], miss, FAR_SIGMA), rate
 
 
 def _mean_offset(miss: Array, rate: Array, which: Indices, n: int) -> tuple[Array, Array]:
@@ -124,9 +124,9 @@ def _surest(pairs: Indices, offset: Array, sigma: Array, n_aside: int) -> float 
         window = SAME_SIGMA * np.hypot(sigma, sigma[k])
         near = np.flatnonzero(np.abs(offset - offset[k]) < window)
         agree = min(len(np.unique(pairs[near, 0])), len(np.unique(pairs[near, 1])))
-        if agree < FEWEST:
+        if agree < MIN_OBJECTS:
             continue
-        chance = (n_aside + 1) * min(float(np.mean(window)) / LARGEST_S, 1.0)
+        chance = (n_aside + 1) * min(float(np.mean(window)) / MAX_OFFSET_S, 1.0)
         with np.errstate(divide="ignore"):  # log of 0: no chance at all
             odds = float(
                 np.log(pdtrc(agree - 2, chance))

@@ -30,11 +30,11 @@ PRIOR_S = 10.0  # 1-sigma prior of the offset of a wrong clock
 SOUND_S = 1e-3  # 1-sigma of the offset of a right clock
 FAULT_KM = 10.0  # 1-sigma per axis of a wrong ephemeris
 FAULT_RAD = 600 * ARCSEC  # 1-sigma per axis of a wrong attitude
-SURE = 12.5  # log-odds from which a fault is declared: five sigma
-RARER = 5.0  # prior log-odds of a wrong clock against another fault
-DISTINCT = 5.0  # log-odds from which it is this fault and not another one
+MIN_LOG_ODDS = 12.5  # log-odds from which a fault is declared: five sigma
+CLOCK_PRIOR_LOG_ODDS = 5.0  # prior log-odds of a wrong clock against another fault
+DISTINCT_LOG_ODDS = 5.0  # log-odds from which it is this fault and not another one
 MAX_SETS = 1100  # sets of faults that are all judged; where there are more, from small to large
-OUTLIER = 20.0  # chi-square (2 degrees of freedom) of a line that is of another object
+OUTLIER_CHI2 = 20.0  # chi-square (2 degrees of freedom) of a line that is of another object
 ROUNDS = 4  # fits, each with better offsets and without outliers
 PER_SENSOR = 7  # offset, bias of position (3), bias of attitude (3)
 SOUND, CLOCK, EPHEMERIS, ATTITUDE, DISAGREES = "", "clock", "ephemeris", "attitude", "disagrees"
@@ -134,7 +134,7 @@ def judge_sensors(
         wrong = np.array([(s, CLOCK) in explained.faults for s in range(n_sensors)])
         unknowns = model.estimate(explained.faults)[0]
         step_s = unknowns[::PER_SENSOR][wrong] * PRIOR_S
-        good = _chi2(about, kept, spread, unknowns) < OUTLIER
+        good = _chi2(about, kept, spread, unknowns) < OUTLIER_CHI2
         guess[wrong] += step_s
         if (good == kept).all() and (np.abs(step_s) < 1e-4).all():
             break
@@ -222,7 +222,9 @@ def _explain(model: Model, sensors: Indices, has_prior_attitude: Flags) -> _Expl
     def judge(faults: Faults) -> float:
         if faults not in score:
             rarer = sum(kind != CLOCK for _, kind in faults)
-            score[faults] = model.evidence(faults) - SURE * len(faults) - RARER * rarer
+            score[faults] = (
+                model.evidence(faults) - MIN_LOG_ODDS * len(faults) - CLOCK_PRIOR_LOG_ODDS * rarer
+            )
         return score[faults]
 
     best: Faults = frozenset()
@@ -237,7 +239,7 @@ def _explain(model: Model, sensors: Indices, has_prior_attitude: Flags) -> _Expl
             if better == best:
                 break
             best = better
-    good = [faults for faults, value in score.items() if value > score[best] - DISTINCT]
+    good = [faults for faults, value in score.items() if value > score[best] - DISTINCT_LOG_ODDS]
     sure = best.intersection(*good)
     at_fault = {s for s, _ in best}.intersection(*({s for s, _ in faults} for faults in good))
     return _Explanation(sure, sorted(at_fault - {s for s, _ in sure}), len(good) == 1)
@@ -354,10 +356,10 @@ def whitened(lines: Lines, spread: Array) -> tuple[Array, Array, Array]:
     reach = np.linalg.norm(away, axis=1)
     predicted = away / reach[:, None]
     root = np.linalg.inv(np.linalg.cholesky(lines.cov))
-    by_place = root @ basis / reach[:, None, None]
-    rate = np.einsum("nij,nj->ni", by_place, lines.v_km_s - lines.v_sensor_km_s)
+    by_position = root @ basis / reach[:, None, None]
+    rate = np.einsum("nij,nj->ni", by_position, lines.v_km_s - lines.v_sensor_km_s)
     by_turn = root @ basis @ -skew(lines.u)
-    by_sensor = np.concatenate([-rate[:, :, None], by_place, by_turn], axis=2)
+    by_sensor = np.concatenate([-rate[:, :, None], by_position, by_turn], axis=2)
     per_line = np.vstack([spread.reshape(-1, PER_SENSOR), np.ones(PER_SENSOR)])[lines.sensor]
     misses = np.einsum("nij,nj->ni", root @ basis, lines.u - predicted)
-    return by_place, by_sensor * per_line[:, None, :], misses
+    return by_position, by_sensor * per_line[:, None, :], misses

@@ -39,8 +39,8 @@ Indices = npt.NDArray[np.int64]
 MAX_TOGETHER = 24  # sensors that are judged together
 MAX_ROUNDS = 4  # each judges the next suspects, without those found at fault
 MIN_OBJECTS = 3  # objects in its field from which a sensor is judged
-AGREES = 0.3  # least share of them that a sound sensor joins
-STRAYS = 0.5  # tracklets without an object per object in the field, of a sensor at fault
+MIN_JOINED_SHARE = 0.3  # minimum share of them that a sound sensor joins
+MIN_STRAYS = 0.5  # minimum of tracklets without object per object in the field, if at fault
 
 
 def judge_many_sensors(
@@ -130,12 +130,12 @@ def _sums_alone(anonymous: Lines, sensor: Indices, guess_s: Array, spread: Array
     inverse = np.zeros_like(normal)
     inverse[several] = np.linalg.pinv(normal[several], hermitian=True)
     rows = several[group]
-    by_place = np.einsum("nik,nkl->nil", to_position, inverse[group])
-    left = misses - np.einsum("nil,nl->ni", by_place, pull[group])
-    own = np.eye(2) - np.einsum("nil,njl->nij", by_place, to_position)
+    by_position = np.einsum("nik,nkl->nil", to_position, inverse[group])
+    left = misses - np.einsum("nil,nl->ni", by_position, pull[group])
+    reduced = np.eye(2) - np.einsum("nil,njl->nij", by_position, to_position)
     n_sensors = len(guess_s)
     out = _Sums(np.zeros((n_sensors, PER_SENSOR, PER_SENSOR)), np.zeros((n_sensors, PER_SENSOR)))
-    weighted = np.einsum("nij,njk->nik", own, to_sensor)
+    weighted = np.einsum("nij,njk->nik", reduced, to_sensor)
     np.add.at(out.normal, sensor[rows], np.einsum("nik,nil->nkl", to_sensor, weighted)[rows])
     np.add.at(out.right, sensor[rows], np.einsum("nik,ni->nk", to_sensor, left)[rows])
     return out
@@ -204,8 +204,8 @@ class Agreement(NamedTuple):
         """Return the sensors that detect but disagree: they should be left out."""
         return np.flatnonzero(
             (self.looked >= MIN_OBJECTS)
-            & (self.joined < AGREES * self.looked)
-            & (self.free >= STRAYS * self.looked)
+            & (self.joined < MIN_JOINED_SHARE * self.looked)
+            & (self.free >= MIN_STRAYS * self.looked)
         )
 
 
@@ -220,11 +220,11 @@ def agreement(samples: Samples, groups: Groups) -> Agreement:
     half_field = np.array(samples.half_field, float)
     in_field = np.zeros(n_sensors, bool)
     for g in np.flatnonzero(np.isfinite(points[:, 0])).tolist():
-        place, attitude = (
+        position, attitude = (
             np.ascontiguousarray(values[:, instant[g]])
             for values in (samples.sensor_km, samples.R_sensor_from_icrs)
         )
-        seeing(place, attitude, half_field, points[g], in_field)
+        seeing(position, attitude, half_field, points[g], in_field)
         others = has[g].sum() - has[g] >= 2
         looked += others & (in_field | (has[g] > 0))
         joined += others & (has[g] > 0)

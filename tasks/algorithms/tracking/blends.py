@@ -1,6 +1,6 @@
 """Blends: detections that may hold the light of a second object of the same sensor.
 
-Two spots closer than about a spot's diameter give one centroid. It lies between the two, and it
+Two images closer than about their diameter give one centroid. It lies between the two, and it
 stays there while they pass: for a slow object up to half a minute. So the error is common to
 all these detections, and no average removes it. The other object's tracklet has a gap there, or
 it has ended or not yet begun. Carried over that time, it tells which detections are concerned, and
@@ -20,16 +20,18 @@ from epipole.tasks.algorithms.tracking.sky_filter import acceleration
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-SPOT_PX = 2.5  # spots closer than this may be one centroid, where the data do not tell
-BIN_PX = 0.25
-RESOLVED = 0.25  # share of the pairs expected at a separation below which spots are not resolved
-ENOUGH = 100  # pairs of detections to tell this from
+BLEND_PX = 2.5  # separation below which two images blend, if there are too few pairs to measure it
+BIN_PX = 0.25  # width of the bins of separation
+RESOLVED_SHARE = 0.25  # images blend where less than this share of the expected pairs is found
+MIN_PAIRS = 100  # minimum number of pairs of detections for that measurement
 CARRIED_S = 60.0  # longest time over which a tracklet is carried beyond its ends
-OWN_LIGHT = 0.5  # of its usual flux: a fainter spot among blends is the neighbour's alone
-BESIDE = 3  # detections that each of two tracklets has while the other lives: two objects
+MIN_FLUX_SHARE = 0.5  # share of the usual flux below which a blend is the neighbour alone
+MIN_COEXISTING = (
+    3  # minimum number of detections of either tracklet in the time of both: two objects
+)
 
 
-class TrackedSpots(NamedTuple):
+class TrackedDetections(NamedTuple):
     """The detections of one sensor's t tracklets, n in all, by tracklet and then by time.
 
     bounds : (t + 1,) int
@@ -51,7 +53,7 @@ class TrackedSpots(NamedTuple):
     flux: Array
 
 
-class _SpotEnds(NamedTuple):
+class _TrackletEnds(NamedTuple):
     """Each tracklet's first (0) and last (1) detection: time, direction, rate, variance.
 
     The arrays are (t, 2), (t, 2, 3), (t, 2, 3), (t, 2); `reach` (t,) is how long [s] the
@@ -66,7 +68,7 @@ class _SpotEnds(NamedTuple):
     flux: Array
 
 
-def blend_variance(tracked: TrackedSpots, frame_s: Array, pixel_rad: float) -> Array:
+def blend_variance(tracked: TrackedDetections, frame_s: Array, pixel_rad: float) -> Array:
     """Return the variance per axis [rad^2] that blends may add to each detection, (n,).
 
     Parameters
@@ -85,13 +87,13 @@ def blend_variance(tracked: TrackedSpots, frame_s: Array, pixel_rad: float) -> A
     by_frame = np.argsort(tracked.time_s, kind="stable")
     starts = np.searchsorted(tracked.time_s[by_frame], np.append(frame_s, np.inf))
     tracklet = np.repeat(np.arange(len(tracked.bounds) - 1), np.diff(tracked.bounds))
-    n_bins = 2 * round(SPOT_PX / BIN_PX)
+    n_bins = 2 * round(BLEND_PX / BIN_PX)
     pairs = _separations(u, by_frame, starts, BIN_PX * pixel_rad, n_bins)
     spot, frame_s = resolved_px(pairs) * pixel_rad, np.ascontiguousarray(frame_s, float)
     ends, out = _ends_of(tracked), np.zeros(len(tracked.time_s))
     for _ in range(2):
         # Blends are brighter. Once they are known, so are the fluxes of the objects.
-        ends = ends._replace(flux=_own_flux(tracked, out > 0))
+        ends = ends._replace(flux=_usual_flux(tracked, out > 0))
         out[:] = 0.0
         _enter_blends(
             tracked.time_s, u, tracklet, by_frame, starts, tracked.bounds, frame_s, ends, spot, out
@@ -99,7 +101,7 @@ def blend_variance(tracked: TrackedSpots, frame_s: Array, pixel_rad: float) -> A
     return out
 
 
-def of_neighbour(tracked: TrackedSpots, variance: Array) -> npt.NDArray[np.bool_]:
+def of_neighbour(tracked: TrackedDetections, variance: Array) -> npt.NDArray[np.bool_]:
     """Return which detections are too faint to hold their tracklet's object, (n,).
 
     A blend is brighter than either object. Where detections may be blends by their `variance`
@@ -107,8 +109,8 @@ def of_neighbour(tracked: TrackedSpots, variance: Array) -> npt.NDArray[np.bool_
     neighbour.
     """
     blended = variance > 0
-    usual = np.repeat(_own_flux(tracked, blended), np.diff(tracked.bounds))
-    return np.asarray(blended & (tracked.flux < OWN_LIGHT * usual))
+    usual = np.repeat(_usual_flux(tracked, blended), np.diff(tracked.bounds))
+    return np.asarray(blended & (tracked.flux < MIN_FLUX_SHARE * usual))
 
 
 def resolved_px(pairs: Indices) -> float:
@@ -127,12 +129,12 @@ def resolved_px(pairs: Indices) -> float:
     below = np.concatenate([[0], np.cumsum(pairs)])
     for bins in range(len(pairs) // 2, 0, -1):
         expected = (below[2 * bins] - below[bins]) / 3
-        if expected >= ENOUGH / 3 and below[bins] < RESOLVED * expected:
+        if expected >= MIN_PAIRS / 3 and below[bins] < RESOLVED_SHARE * expected:
             return (bins + 1) * BIN_PX
-    return SPOT_PX if below[-1] < ENOUGH else BIN_PX
+    return BLEND_PX if below[-1] < MIN_PAIRS else BIN_PX
 
 
-def _ends_of(tracked: TrackedSpots) -> _SpotEnds:
+def _ends_of(tracked: TrackedDetections) -> _TrackletEnds:
     first, last = tracked.bounds[:-1], tracked.bounds[1:]
     t = tracked.time_s
     time = np.column_stack([t[first], t[last - 1]])
@@ -143,11 +145,13 @@ def _ends_of(tracked: TrackedSpots) -> _SpotEnds:
     reach = np.clip(time[:, 1] - time[:, 0], 1e-3, CARRIED_S / 2)
     variance = np.trace(fit.cov_noise, axis1=1, axis2=2).reshape(-1, 2) / 2
     flux = np.full(len(first), np.nan)
-    return _SpotEnds(time, fit.u.reshape(-1, 2, 3), fit.w.reshape(-1, 2, 3), variance, reach, flux)
+    return _TrackletEnds(
+        time, fit.u.reshape(-1, 2, 3), fit.w.reshape(-1, 2, 3), variance, reach, flux
+    )
 
 
-def _own_flux(tracked: TrackedSpots, blended: npt.NDArray[np.bool_]) -> Array:
-    """Return the median flux of each tracklet's detections that are no blends; NaN if none."""
+def _usual_flux(tracked: TrackedDetections, blended: npt.NDArray[np.bool_]) -> Array:
+    """Return the median flux of each tracklet's unblended detections; NaN if unknown."""
     out = np.full(len(tracked.bounds) - 1, np.nan)
     known = ~blended & np.isfinite(tracked.flux)
     for k, (first, last) in enumerate(pairwise(tracked.bounds)):
@@ -184,11 +188,11 @@ def _enter_blends(time, u, tracklet, by_frame, starts, bounds, frame_s, ends, sp
             while k < bounds[b + 1] and time[k] < frame_s[f]:
                 k += 1
             if k < bounds[b + 1] and time[k] == frame_s[f]:
-                continue  # a spot of its own
+                continue  # it is detected separately
             variance = _carry(time, u, bounds, ends, b, k, frame_s[f], p)
             if not variance < spot * spot:
                 continue  # it may be anywhere
-            # Its light is in the nearest spot, which may be a tracklet of its own that follows.
+            # Its light is in the nearest detection, which may be its next tracklet.
             nearest = np.inf
             for q in range(starts[f], starts[f + 1]):
                 nearest = min(nearest, _distance(u[by_frame[q]], p))
@@ -241,6 +245,6 @@ def _coexist(time, bounds, ends, a, b):
     for t in (a, b):
         lo = np.searchsorted(time[bounds[t] : bounds[t + 1]], begun)
         hi = np.searchsorted(time[bounds[t] : bounds[t + 1]], ended, side="right")
-        if hi - lo < BESIDE:
+        if hi - lo < MIN_COEXISTING:
             return False
     return True

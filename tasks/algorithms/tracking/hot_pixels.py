@@ -1,6 +1,6 @@
 """Hot pixels: detections that stay at one pixel position while the sky moves through the image.
 
-`fixed_places` finds the positions that half of the frames show, and the odds that each is a hot
+`fixed_positions` finds the positions that half of the frames show, and the odds that each is a hot
 pixel. It is one for certain if it stays through a repointing, or a fast turn, that no object can
 follow. Otherwise the centroids are the evidence (`log_ratio`), because a sensor that follows an
 object keeps its light at one position too:
@@ -25,33 +25,33 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-SCALES = np.geomspace(0.01, 3.0, 200)  # of a place's scatter, over what its sigmas say
-TOLD_WITHIN = np.log(1.5)  # 1-sigma of ln of that scale for light: sigmas are told so well
+SCALES = np.geomspace(0.01, 3.0, 200)  # of a position's scatter, over its stated sigmas
+STATED_WITHIN = np.log(1.5)  # 1-sigma of ln of that scale for light: accuracy of the stated sigmas
 STEADIEST, UNSTEADIEST = 0.01, 2.0  # the same scale of a hot pixel: any between, alike in ln
 OFF_MIDDLE = 0.1  # share of hot pixels that are not on a middle: two neighbours, for example
 MIDDLE_PX = 0.02  # 1-sigma of the others: neighbours are a little warm
-HELD_STILL = 0.5  # share of followed objects that do not drift
-HELD_ON_MIDDLE = 0.1  # share of followed objects that the sensor holds on the middle of a pixel
+FOLLOWED_STILL = 0.5  # share of followed objects that do not drift
+FOLLOWED_ON_MIDDLE = 0.1  # share of followed objects that the sensor keeps on the middle of a pixel
 AT_CENTRE = 0.5  # share of followed objects that are near the principal point
 CENTRE = 0.1  # 1-sigma of their distance from it, in widths of the field
-UNKNOWN = 0.5  # places of each kind that are added to those counted: Jeffreys' prior
-SHARE = 0.5  # least share of the frames, and of the pointings, that show a hot pixel
-FEWEST = 5  # frames
+JEFFREYS = 0.5  # positions of each kind that are added to those counted: Jeffreys' prior
+MIN_SHARE = 0.5  # minimum share of the frames, and of the pointings, that show a hot pixel
+MIN_FRAMES = 5  # minimum number of frames that show a hot pixel
 MIN_STILL = 10  # frames, where only its centroids are evidence
 NOWHERE = -1
 CERTAIN = np.log(1e4)  # from these odds on it is a hot pixel, whatever other sensors see
 LIKELY = np.log(10.0)  # from these odds on it is one, unless another sensor sees an object there
-REPOINTED_PX = 20.0  # least motion of the sky through the image at a repointing
-BOUND = 10.0  # times the bound on apparent motion: no object follows a repointing
+REPOINTED_PX = 20.0  # minimum motion of the sky through the image at a repointing
+MOTION_BOUND = 10.0  # times the bound on apparent motion: no object follows a repointing
 FAST_TURN_RAD_S = 3e-3  # three times a low orbit's: no object is seen to keep it up
 HALF_TURN_RAD = np.pi
 
 
-class FixedPlace(NamedTuple):
-    """Detections at one place of the image.
+class FixedDetections(NamedTuple):
+    """Detections at one position of the image.
 
     time_s, x_px, y_px, sigma_px : (n,) float
-    reach_px : detections farther than this from the middle of all belong to no place
+    reach_px : detections farther than this from the middle of all belong to no position
     """
 
     time_s: Array
@@ -62,9 +62,9 @@ class FixedPlace(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """A straight line through the centroids of a place, about the middle of a pixel.
+    """A straight line through the centroids of a position, about the middle of a pixel.
 
-    off, drift : (2,) float, mean place [px] and its rate [px/s], with variances for a scale of 1
+    off, drift : (2,) float, mean position [px] and its rate [px/s], with variances for a scale of 1
     misfit, freedom : chi-square and its degrees of freedom
     """
 
@@ -76,54 +76,54 @@ class _Line(NamedTuple):
     freedom: int
 
 
-def log_ratio(place: FixedPlace, camera: Camera, n_places: int) -> float:
+def log_ratio(position: FixedDetections, camera: Camera, n_positions: int) -> float:
     """Return ln of the likelihood of a hot pixel over that of light.
 
     Parameters
     ----------
-    place
-        Detections at one place, at least three.
-    n_places
+    position
+        Detections at one position, at least three.
+    n_positions
         Places of the sensor that may be light: it holds one of them on the middle of a pixel.
     """
-    line = _line(place)
+    line = _line(position)
     of_scatter = -line.freedom * np.log(SCALES) - 0.5 * line.misfit / SCALES**2
     off_2, drift_2 = float(line.off @ line.off), float(line.drift @ line.drift)
     on_middle = _normal(off_2, line.off_variance * SCALES**2 + MIDDLE_PX**2)
     still = _normal(drift_2, line.drift_variance * SCALES**2)
-    farthest = 2 * place.reach_px / max(float(np.ptp(place.time_s)), 1e-9)
+    farthest = 2 * position.reach_px / max(float(np.ptp(position.time_s)), 1e-9)
     drifting = _normal(drift_2, line.drift_variance * SCALES**2 + farthest**2)
     hot = np.logaddexp(np.log(OFF_MIDDLE), np.log(1 - OFF_MIDDLE) + on_middle) + still
-    held = HELD_ON_MIDDLE / n_places
-    light = np.logaddexp(np.log(1 - held), np.log(held) + on_middle)
-    light += np.logaddexp(np.log(HELD_STILL) + still, np.log(1 - HELD_STILL) + drifting)
+    followed = FOLLOWED_ON_MIDDLE / n_positions
+    light = np.logaddexp(np.log(1 - followed), np.log(followed) + on_middle)
+    light += np.logaddexp(np.log(FOLLOWED_STILL) + still, np.log(1 - FOLLOWED_STILL) + drifting)
     steady = (SCALES >= STEADIEST) & (SCALES <= UNSTEADIEST)
-    as_told = -0.5 * (np.log(SCALES) / TOLD_WITHIN) ** 2
+    as_stated = -0.5 * (np.log(SCALES) / STATED_WITHIN) ** 2
     hot = logsumexp((of_scatter + hot)[steady]) - np.log(np.sum(steady))
-    light = logsumexp(of_scatter + light + as_told) - logsumexp(as_told)
-    return float(hot - light - _nearness(place, camera))
+    light = logsumexp(of_scatter + light + as_stated) - logsumexp(as_stated)
+    return float(hot - light - _nearness(position, camera))
 
 
 def with_population(ratios: Array) -> Array:
-    """Return ln of the odds of places, from their log ratios and what the other places are.
+    """Return ln of the odds of positions, from their log ratios and what the other positions are.
 
-    The more of the other places are hot pixels, the likelier each is one.
+    The more of the other positions are hot pixels, the likelier each is one.
     """
     odds = np.zeros(len(ratios))
     for _ in range(100):
         hot = 1 / (1 + np.exp(-np.clip(ratios + odds, -50, 50)))
         others_hot, others_light = hot.sum() - hot, (1 - hot).sum() - (1 - hot)
-        odds = np.log((others_hot + UNKNOWN) / (others_light + UNKNOWN))
+        odds = np.log((others_hot + JEFFREYS) / (others_light + JEFFREYS))
     return np.asarray(ratios + odds)
 
 
-def _line(place: FixedPlace) -> _Line:
-    weight = place.sigma_px**-2.0
-    off = np.stack([place.x_px - np.round(place.x_px.mean()),
-                    place.y_px - np.round(place.y_px.mean())], axis=1)  # fmt: skip
+def _line(position: FixedDetections) -> _Line:
+    weight = position.sigma_px**-2.0
+    off = np.stack([position.x_px - np.round(position.x_px.mean()),
+                    position.y_px - np.round(position.y_px.mean())], axis=1)  # fmt: skip
     total = weight.sum()
     mean = weight @ off / total
-    lever = place.time_s - weight @ place.time_s / total
+    lever = position.time_s - weight @ position.time_s / total
     spread = max(float(weight @ lever**2), 1e-12)
     drift = (weight * lever) @ (off - mean) / spread
     left = off - mean - lever[:, None] * drift
@@ -136,10 +136,12 @@ def _normal(distance_2: float, variance: Array) -> Array:
     return np.asarray(-0.5 * distance_2 / variance - np.log(2 * np.pi * variance))
 
 
-def _nearness(place: FixedPlace, camera: Camera) -> float:
+def _nearness(position: FixedDetections, camera: Camera) -> float:
     """Return ln of how much likelier an object is followed here than anywhere in the field."""
     area, variance = camera.width * camera.height, (CENTRE * camera.width) ** 2
-    distance_2 = (place.x_px.mean() - camera.cx_px) ** 2 + (place.y_px.mean() - camera.cy_px) ** 2
+    distance_2 = (position.x_px.mean() - camera.cx_px) ** 2 + (
+        position.y_px.mean() - camera.cy_px
+    ) ** 2
     near = np.exp(-0.5 * distance_2 / variance) / (2 * np.pi * variance)
     return float(np.log(1 - AT_CENTRE + AT_CENTRE * area * near))
 
@@ -147,24 +149,24 @@ def _nearness(place: FixedPlace, camera: Camera) -> float:
 # Fixed positions
 
 
-class FixedPlaces(NamedTuple):
+class FixedPositions(NamedTuple):
     """Places of the image that half of the frames show.
 
-    place : (n,) int, of each detection the index of its place; NOWHERE where it has none
-    log_odds : (p,) float, of each place ln of the odds that it is a hot pixel, not light;
+    position : (n,) int, of each detection the index of its position; NOWHERE where it has none
+    log_odds : (p,) float, of each position ln of the odds that it is a hot pixel, not light;
         infinite where light cannot stay there, minus infinite where nothing speaks for it
     """
 
-    place: Indices
+    position: Indices
     log_odds: Array
 
-    def with_odds(self, least: float) -> Flags:
-        """Return which detections are at a place with at least these odds."""
+    def with_odds(self, min_odds: float) -> Flags:
+        """Return which detections are at a position with at least these log-odds."""
         odds = np.append(self.log_odds, -np.inf)  # NOWHERE takes the last one
-        return np.asarray(odds[self.place] >= least)
+        return np.asarray(odds[self.position] >= min_odds)
 
 
-def fixed_places(
+def fixed_positions(
     frame: Indices,
     x_px: Array,
     y_px: Array,
@@ -172,13 +174,13 @@ def fixed_places(
     time_s: Array,
     q_sensor_from_icrs: Array,
     camera: Camera,
-) -> FixedPlaces:
-    """Return the places that half of the frames show, and how likely each is a hot pixel.
+) -> FixedPositions:
+    """Return the positions that half of the frames show, and how likely each is a hot pixel.
 
     Parameters
     ----------
     frame, x_px, y_px, sigma_px : (n,)
-        Detections: their frame, place in the image and its 1-sigma error [px].
+        Detections: their frame, position in the image and its 1-sigma error [px].
     time_s, q_sensor_from_icrs : (f,), (f, 4) float
         Frames, in time order: time [s] and attitude.
     camera
@@ -186,45 +188,45 @@ def fixed_places(
 
     Notes
     -----
-    A sensor that follows an object keeps it in place as well, and a sensor with a fixed attitude
-    keeps the stars. A place is a hot pixel for certain where it stays through repointings that
+    A sensor that follows an object keeps it at one position as well, and one with a fixed attitude
+    keeps the stars. A position is a hot pixel for certain where it stays through repointings that
     no object follows, or through a fast turn of more than half a circle. Otherwise its centroids
     are evidence: see `hot_pixel_odds`.
     """
     n_frames = len(time_s)
-    place = np.full(len(frame), NOWHERE)
-    if n_frames < FEWEST or not len(frame):
-        return FixedPlaces(place, np.zeros(0))
+    position = np.full(len(frame), NOWHERE)
+    if n_frames < MIN_FRAMES or not len(frame):
+        return FixedPositions(position, np.zeros(0))
     reach = max(4 * float(np.median(sigma_px)), 0.25)
     R = matrix_from_quaternion(q_sensor_from_icrs)
     certain: list[bool] = []
-    evidence: list[FixedPlace] = []
-    for members in _fixed_places(x_px, y_px, reach, (camera.width, camera.height), n_frames):
+    evidence: list[FixedDetections] = []
+    for members in _find_positions(x_px, y_px, reach, (camera.width, camera.height), n_frames):
         shown = np.unique(frame[members])
-        if len(shown) < max(SHARE * n_frames, FEWEST):
+        if len(shown) < max(MIN_SHARE * n_frames, MIN_FRAMES):
             continue
-        place[members] = len(certain)
+        position[members] = len(certain)
         x, y = x_px[members], y_px[members]
         where = unproject(camera, x.mean(keepdims=True), y.mean(keepdims=True))
-        path = where[0] @ R  # the row form of R' u: where the place pointed, frame by frame
+        path = where[0] @ R  # the row form of R' u: where the position pointed, frame by frame
         certain.append(
             _stays_through_repointing(shown, _pointings(time_s, path, camera.pixel_rad))
             or _turns_fast(time_s, path)
         )
-        evidence.append(FixedPlace(time_s[frame[members]], x, y, sigma_px[members], reach))
-    return FixedPlaces(place, _log_odds(np.array(certain, bool), evidence, camera))
+        evidence.append(FixedDetections(time_s[frame[members]], x, y, sigma_px[members], reach))
+    return FixedPositions(position, _log_odds(np.array(certain, bool), evidence, camera))
 
 
-def _log_odds(certain: Flags, places: list[FixedPlace], camera: Camera) -> Array:
-    """Return ln of the odds of each place that it is a hot pixel."""
+def _log_odds(certain: Flags, positions: list[FixedDetections], camera: Camera) -> Array:
+    """Return ln of the odds of each position that it is a hot pixel."""
     odds = np.where(certain, np.inf, -np.inf)
-    asked = [k for k, place in enumerate(places) if len(place.x_px) >= MIN_STILL]
+    asked = [k for k, position in enumerate(positions) if len(position.x_px) >= MIN_STILL]
     asked = [k for k in asked if not certain[k]]
     for k in asked:
-        odds[k] = log_ratio(places[k], camera, 1)
+        odds[k] = log_ratio(positions[k], camera, 1)
     # Hot pixels that hardly scatter tell nothing about others that scatter as light does.
     open_ = [k for k in asked if odds[k] < CERTAIN]
-    ratios = np.array([log_ratio(places[k], camera, len(open_)) for k in open_])
+    ratios = np.array([log_ratio(positions[k], camera, len(open_)) for k in open_])
     odds[open_] = with_population(ratios)
     return odds
 
@@ -232,8 +234,8 @@ def _log_odds(certain: Flags, places: list[FixedPlace], camera: Camera) -> Array
 def _stays_through_repointing(shown: Indices, pointing: Indices) -> bool:
     """Return whether half of the frames show it in half of the pointings, at least in two."""
     frames_in = np.bincount(pointing)
-    shows = np.bincount(pointing[shown], minlength=len(frames_in)) >= SHARE * frames_in
-    return bool(shows.sum() > 1 and shows.mean() >= SHARE)
+    shows = np.bincount(pointing[shown], minlength=len(frames_in)) >= MIN_SHARE * frames_in
+    return bool(shows.sum() > 1 and shows.mean() >= MIN_SHARE)
 
 
 def _rates(time_s: Array, path: Array) -> tuple[Array, Array]:
@@ -252,7 +254,7 @@ def _pointings(time_s: Array, path: Array, pixel_rad: float) -> Indices:
     bound = np.array([acceleration(r) for r in np.linalg.norm(rate, axis=1)])
     # A repointing enters two rates. The smaller one is the rate an object may have had.
     bound[1:] = np.minimum(bound[1:], bound[:-1])
-    jumped = change * dt > REPOINTED_PX * pixel_rad + BOUND * bound * dt * dt
+    jumped = change * dt > REPOINTED_PX * pixel_rad + MOTION_BOUND * bound * dt * dt
     return np.concatenate([[0], np.cumsum(jumped)]).astype(np.int64)
 
 
@@ -261,18 +263,18 @@ def _turns_fast(time_s: Array, path: Array) -> bool:
     rate, dt = _rates(time_s, path)
     speed = np.linalg.norm(rate, axis=1)
     fast = speed > FAST_TURN_RAD_S
-    return bool(np.sum(speed[fast] * dt[fast]) > HALF_TURN_RAD and np.mean(fast) > SHARE)
+    return bool(np.sum(speed[fast] * dt[fast]) > HALF_TURN_RAD and np.mean(fast) > MIN_SHARE)
 
 
-def _fixed_places(
+def _find_positions(
     x_px: Array, y_px: Array, reach_px: float, size_px: tuple[int, int], n_frames: int
 ) -> list[Indices]:
-    """Return the detections at each place that has some in many frames; each place once."""
+    """Return the detections at each position that has some in many frames; each position once."""
     cell = max(2 * reach_px, 1.0)
     width, height = (int(s / cell) + 3 for s in size_px)
     out: list[Indices] = []
     taken = np.zeros(len(x_px), bool)
-    # Four grids half a cell apart: in one of them, a place is away from the edges of its cell.
+    # Four grids half a cell apart: in one of them, a position is away from the edges of its cell.
     for shift_x, shift_y in ((0.5, 0.5), (1.0, 0.5), (0.5, 1.0), (1.0, 1.0)):
         column = np.clip(x_px / cell + shift_x, 0, width - 1).astype(np.int64)
         row = np.clip(y_px / cell + shift_y, 0, height - 1).astype(np.int64)
@@ -280,13 +282,13 @@ def _fixed_places(
         order = np.argsort(index, kind="stable")
         ordered = index[order]
         cells, count = np.unique(index[~taken], return_counts=True)
-        for busy in cells[count >= max(SHARE * n_frames, FEWEST)].tolist():
+        for busy in cells[count >= max(MIN_SHARE * n_frames, MIN_FRAMES)].tolist():
             inside = _in_cells(order, ordered, busy, busy)
             inside = inside[~taken[inside]]
-            if not len(inside):  # they belong to a place in a neighbouring cell
+            if not len(inside):  # they belong to a position in a neighbouring cell
                 continue
             middle_x, middle_y = np.median(x_px[inside]), np.median(y_px[inside])
-            # A place is at most half a cell wide on each side of its middle.
+            # A position is at most half a cell wide on each side of its middle.
             around = [busy + step * width for step in (-1, 0, 1)]
             near = np.concatenate([_in_cells(order, ordered, c - 1, c + 1) for c in around])
             near = np.sort(near)

@@ -122,11 +122,11 @@ class _Evidence(NamedTuple):
 class _Chains(NamedTuple):
     """The strongest chain of each detection of the newest frame.
 
-    held, strength : (n,) int64 and float, number of detections (0: no chain) and log-evidence
+    length, strength : (n,) int64 and float, number of detections (0: no chain) and log-evidence
     members : (n, longest) int64, detections, newest first
     """
 
-    held: Indices
+    length: Indices
     strength: Array
     members: Indices
 
@@ -370,7 +370,7 @@ def _try_pair(pair, detections, recent, rule, evidence, chains, room):
         return
     n, gained = _chain_back(pair, detections, recent, rule, evidence.density, best, wanted, room)
     if n >= rule.need and gained > wanted:
-        chains.held[row], chains.strength[row] = n, gained - evidence.tries
+        chains.length[row], chains.strength[row] = n, gained - evidence.tries
         chains.members[row, :n] = room.members[:n]
 
 
@@ -462,18 +462,18 @@ def new_tracks(f, depth, n_tracks, detections, recent, rule):
     -------
     begun : (b,) int64
         Rows of frame f that begin a track, in the order of the track numbers.
-    held, members : (n,) int64, (n, longest) int64
+    length, members : (n,) int64, (n, longest) int64
         Chains of all rows, see `_Chains`.
     """
     track = detections.track
     chains = _strongest_chains(f, depth, detections, recent, rule)
-    begun = np.empty(len(chains.held), np.int64)
+    begun = np.empty(len(chains.length), np.int64)
     count = 0
     # A stable sort: the same order in every run.
     for row in np.argsort(-chains.strength, kind="mergesort"):
-        if chains.held[row] == 0:
+        if chains.length[row] == 0:
             break
-        members = chains.members[row, : chains.held[row]]
+        members = chains.members[row, : chains.length[row]]
         free = True
         for m in members:
             free = free and track[m] == NONE
@@ -482,4 +482,4 @@ def new_tracks(f, depth, n_tracks, detections, recent, rule):
                 track[m] = n_tracks + count
             begun[count] = row
             count += 1
-    return begun[:count], chains.held, chains.members
+    return begun[:count], chains.length, chains.members

@@ -42,7 +42,7 @@ class _MotionDetections(NamedTuple):
     bias_trace: Array
 
 
-class _MotionPlaces(NamedTuple):
+class _MotionFits(NamedTuple):
     """What `directions_at` returns."""
 
     u: Array
@@ -200,7 +200,7 @@ def _fit(detections, lo, hi, at, rate, half, unknown_rate):
 
 
 @kernel
-def _enter_errors(q, lo, value, unmodelled, detections, places):
+def _enter_errors(q, lo, value, unmodelled, detections, fits):
     """Write the propagated errors of query q, fitted to the detections from `lo` on."""
     noise, bias = detections.noise, detections.bias
     # One error, larger in some frames than in others (0 where stars gave the attitude): it
@@ -221,19 +221,19 @@ def _enter_errors(q, lo, value, unmodelled, detections, places):
                 for k in range(len(value)):
                     shared += abs(value[k]) * bias[lo + k, a, b]
             independent += max(unmodelled, 0.0) if a == b else 0.0
-            places.noise[q, a, b] = places.noise[q, b, a] = independent
-            places.bias[q, a, b] = places.bias[q, b, a] = share * shared
+            fits.noise[q, a, b] = fits.noise[q, b, a] = independent
+            fits.bias[q, a, b] = fits.bias[q, b, a] = share * shared
 
 
 @kernel
-def _evaluate(queries, detections, places):
+def _evaluate(queries, detections, fits):
     t, u = detections.t, detections.u
     for q in range(len(queries.at)):
         first, last, at = queries.first[q], queries.last[q], queries.at[q]
         nearest = _nearest(t, first, last, at)
         sigma = np.sqrt(detections.noise_trace[nearest] / 2)
         lo, hi, rate, half = _window(t, u, first, last, at, sigma, queries.widest)
-        places.fitted[q, 0], places.fitted[q, 1] = lo, hi
+        fits.fitted[q, 0], fits.fitted[q, 1] = lo, hi
         value, slope, unmodelled = _fit(detections, lo, hi, at, rate, half, queries.unknown_rate)
         for a in range(3):
             mean, moving = 0.0, 0.0
@@ -241,15 +241,15 @@ def _evaluate(queries, detections, places):
                 # Differences from the nearest detection keep the digits that matter.
                 mean += value[k] * (u[lo + k, a] - u[nearest, a])
                 moving += slope[k] * (u[lo + k, a] - u[nearest, a])
-            places.u[q, a] = u[nearest, a] + mean
-            places.w[q, a] = moving
+            fits.u[q, a] = u[nearest, a] + mean
+            fits.w[q, a] = moving
         for k in range(hi - lo):
             tau = t[lo + k] - at
-            places.moments[q, 0] += value[k] * tau
-            places.moments[q, 1] += value[k] * tau * tau
-            places.moments[q, 2] += value[k] * tau * tau * tau
-        places.unmodelled[q] = max(unmodelled, 0.0)
-        _enter_errors(q, lo, value, unmodelled, detections, places)
+            fits.moments[q, 0] += value[k] * tau
+            fits.moments[q, 1] += value[k] * tau * tau
+            fits.moments[q, 2] += value[k] * tau * tau * tau
+        fits.unmodelled[q] = max(unmodelled, 0.0)
+        _enter_errors(q, lo, value, unmodelled, detections, fits)
 
 
 def directions_at(
@@ -300,12 +300,10 @@ def directions_at(
         *(np.ascontiguousarray(a, float) for a in (time_s, u_icrs, cov_noise, cov_bias)),
         *(np.trace(cov, axis1=1, axis2=2) for cov in (cov_noise, cov_bias)),
     )
-    places = _MotionPlaces(
+    fits = _MotionFits(
         np.empty((q, 3)), np.empty((q, 3)), np.empty((q, 3, 3)), np.empty((q, 3, 3)),
         np.empty((q, 2), np.int64), np.zeros((q, 3)), np.empty(q),
     )  # fmt: skip
-    _evaluate(queries, detections, places)
-    u = places.u / np.linalg.norm(places.u, axis=1, keepdims=True)
-    return LocalMotion(
-        u, places.w, places.noise, places.bias, places.fitted, places.moments, places.unmodelled
-    )
+    _evaluate(queries, detections, fits)
+    u = fits.u / np.linalg.norm(fits.u, axis=1, keepdims=True)
+    return LocalMotion(u, fits.w, fits.noise, fits.bias, fits.fitted, fits.moments, fits.unmodelled)

@@ -6,7 +6,7 @@ each frame, `_follow` does these steps:
 1. The frame's detections are sorted into a grid (`_lay_frame`).
 2. Tracks with too many misses end.
 3. The others are predicted, and take the detections within their gates, the smallest chi-square
-   first (`_claim`).
+   first (`_assign`).
 4. Two tracks exchange detections where both together then fit better (`_exchange`).
 5. Detections that are still free may begin tracks (`initiation.new_tracks`).
 
@@ -42,15 +42,15 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
 
 Array = npt.NDArray[np.float64]
 
-SLACK = 4  # a track begins within so many frames more than the fewest detections
-# About how many pairs are tried in a sequence: of denser clutter, the fastest objects are not
-# searched for. At least so many are tried per frame.
+SLACK_FRAMES = 4  # a track begins within this many frames beyond the minimum of detections
+# Limit of pairs in a sequence, and its minimum per frame. In denser clutter, the fastest objects
+# are not searched for.
 PAIRS_OF_ALL, MIN_PAIRS = 20_000_000, 5_000
 # Accepted number of false tracks in a sequence. It counts every pair of detections as a test. Most
 # pairs are too fast to reach the evidence, so that 1 to 5 % of this number are measured.
 FALSE_ALARM_SEQUENCE = 1.0
-SHORT = 2  # a sequence is short up to so many times the frames in which a track begins
-DEEPEST = 9  # the same where false alarms are so dense that it takes more detections
+SHORT_SEQUENCE = 2  # a sequence is short up to twice the frames in which a track may begin
+EXTRA_DETECTIONS = 9  # maximum number of frames beyond the minimum of detections, in dense clutter
 
 
 class _Tracks(NamedTuple):
@@ -100,7 +100,7 @@ def follow_detections(
     max_missed
         Most misses in a row that a track survives.
     min_detections
-        Fewest detections that begin a track (at least 2), within `SLACK` frames more.
+        Fewest detections that begin a track (at least 2), within `SLACK_FRAMES` frames more.
     gate_sigma
         A detection continues a track within this many standard deviations.
     field_sr
@@ -110,7 +110,7 @@ def follow_detections(
         dense, or an object is fast, it takes more detections to begin a track.
     false_alarm_sequence
         Accepted number of such tracks in the whole sequence. Few frames cannot give the evidence
-        that many can. So in a short sequence, detections that no track has claimed are followed
+        that many can. So in a short sequence, detections without a track are followed
         again, with what this number allows per frame.
 
     Returns
@@ -133,7 +133,7 @@ def follow_detections(
     track = _followed(time_s, offsets, u_icrs, sigma_rad, rule)
     n_frames = int(np.count_nonzero(np.diff(offsets)))
     free = np.flatnonzero(track == NONE)
-    if n_frames > SHORT * (rule.need + DEEPEST) or not len(free):
+    if n_frames > SHORT_SEQUENCE * (rule.need + EXTRA_DETECTIONS) or not len(free):
         return track
     per_frame = max(false_alarm, false_alarm_sequence / n_frames)
     before = np.searchsorted(free, offsets)
@@ -183,7 +183,7 @@ def _follow(detections, most, rule):
     )
     live = np.empty(0, np.int64)
     # Not the literal 0: `new_tracks` would be compiled for that type as well.
-    n_tracks, n_slots = len(live), rule.need + DEEPEST + 1
+    n_tracks, n_slots = len(live), rule.need + EXTRA_DETECTIONS + 1
     recent = RecentFrames(make_grids(n_slots, most), np.full(n_slots, np.inf), np.zeros(n_slots))
     for f in range(len(times)):
         _lay_frame(f, detections, recent)
@@ -192,10 +192,12 @@ def _follow(detections, most, rule):
             (tracks.missed[live] <= rule.max_missed)
             & (times[f] - tracks.at[live] <= rule.max_coast)
         ]
-        _claim(f, live, tracks, detections, recent, rule.gate2)
-        begun, held, chains = new_tracks(f, rule.need + SLACK, n_tracks, detections, recent, rule)
+        _assign(f, live, tracks, detections, recent, rule.gate2)
+        begun, length, chains = new_tracks(
+            f, rule.need + SLACK_FRAMES, n_tracks, detections, recent, rule
+        )
         for row in begun:
-            members = chains[row, : held[row]]
+            members = chains[row, : length[row]]
             u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
             _state_of(members, detections, u[n_tracks], w[n_tracks], bend[n_tracks], P[n_tracks])
             tracks.at[n_tracks], tracks.missed[n_tracks] = times[f], 0
@@ -213,7 +215,7 @@ def _lay_frame(f, detections, recent):
 
 
 @kernel
-def _claim(f, live, tracks, detections, recent, gate2):
+def _assign(f, live, tracks, detections, recent, gate2):
     """Move the live tracks to frame f, give them its detections and correct them."""
     u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
     time, slot = detections.times[f], f % len(recent.largest)
@@ -225,15 +227,15 @@ def _claim(f, live, tracks, detections, recent, gate2):
         tracks.missed[m] += 1
     track, detection, chi2 = _candidates(live, tracks, detections, recent, slot, gate2)
     row = np.searchsorted(live, track)
-    claimed = np.full(len(live), NONE)
+    assigned = np.full(len(live), NONE)
     for p in np.argsort(chi2, kind="mergesort"):
         q, j = row[p], detection[p]
-        if claimed[q] == NONE and detections.track[j] == NONE:
-            claimed[q] = j
+        if assigned[q] == NONE and detections.track[j] == NONE:
+            assigned[q] = j
             detections.track[j] = track[p]
-    _exchange(live, tracks, detections, (row, detection, chi2), claimed, gate2)
+    _exchange(live, tracks, detections, (row, detection, chi2), assigned, gate2)
     for q in range(len(live)):
-        m, j = live[q], claimed[q]
+        m, j = live[q], assigned[q]
         if j == NONE:
             continue
         tracks.missed[m] = 0
@@ -271,23 +273,23 @@ def _candidates(live, tracks, detections, recent, slot, gate2):
 
 
 @kernel
-def _exchange(live, tracks, detections, candidates, claimed, gate2):
+def _exchange(live, tracks, detections, candidates, assigned, gate2):
     """Exchange the detections of two tracks where both together then fit better.
 
     Predictions of neighbours may all be off to one side. Then the nearest detection is often the
-    neighbour's. `candidates` are row in `live`, detection and chi-square; `claimed` (len(live),)
-    the detection of each live track. Changes `claimed` and `detections.track`.
+    neighbour's. `candidates` are row in `live`, detection and chi-square; `assigned` (len(live),)
+    the detection of each live track. Changes `assigned` and `detections.track`.
     """
     row, detection, chi2 = candidates
     for p in range(len(row)):
         q, k = row[p], detection[p]
-        j, other = claimed[q], detections.track[k]
+        j, other = assigned[q], detections.track[k]
         if j in (NONE, k) or other == NONE:
             continue
         now = _chi2(tracks, live[q], detections, j) + _chi2(tracks, other, detections, k)
         back = _chi2(tracks, other, detections, j)
         if back < gate2 and chi2[p] + back < now:
-            claimed[q], claimed[np.searchsorted(live, other)] = k, j
+            assigned[q], assigned[np.searchsorted(live, other)] = k, j
             detections.track[k], detections.track[j] = live[q], other
 
 

@@ -202,13 +202,13 @@ def begin(u_1, t_1, var_1, u_2, t_2, var_2, u, w, bend, P):
 # detections within a distance are in the cells that this distance touches. A grid is a tuple of
 # arrays, as compiled code takes them. Slot k of each belongs to the frames k, k + size, ...
 
-FINEST = 128  # most cells along a side
+MAX_CELLS_PER_SIDE = 128  # maximum number of cells along a side
 
 
 @kernel
 def make_grids(size, most):
     """Return arrays for `size` frames of at most `most` detections."""
-    side = max(min(int(np.sqrt(most)), FINEST), 1)
+    side = max(min(int(np.sqrt(most)), MAX_CELLS_PER_SIDE), 1)
     axes = np.zeros((size, 2, 3))
     shape = np.zeros((size, 4))  # lowest on both axes, cells per unit, cells along a side
     start = np.zeros((size, side * side + 1), np.int64)
@@ -257,17 +257,17 @@ def fill_grid(grids, slot, directions, lo, hi):
     if n == 0:
         return
     _lay_axes(directions, lo, hi, axes[slot])
-    place = np.empty((n, 2))
+    position = np.empty((n, 2))
     for k in range(n):
-        place[k, 0] = _along(directions[lo + k], axes[slot, 0])
-        place[k, 1] = _along(directions[lo + k], axes[slot, 1])
-    low_0, low_1 = place[:, 0].min(), place[:, 1].min()
-    extent = max(place[:, 0].max() - low_0, place[:, 1].max() - low_1, 1e-12)
+        position[k, 0] = _along(directions[lo + k], axes[slot, 0])
+        position[k, 1] = _along(directions[lo + k], axes[slot, 1])
+    low_0, low_1 = position[:, 0].min(), position[:, 1].min()
+    extent = max(position[:, 0].max() - low_0, position[:, 1].max() - low_1, 1e-12)
     shape[slot, 0], shape[slot, 1], shape[slot, 2] = low_0, low_1, side / extent
     cell = np.empty(n, np.int64)
     for k in range(n):
-        x = min(int((place[k, 0] - low_0) * shape[slot, 2]), side - 1)
-        y = min(int((place[k, 1] - low_1) * shape[slot, 2]), side - 1)
+        x = min(int((position[k, 0] - low_0) * shape[slot, 2]), side - 1)
+        y = min(int((position[k, 1] - low_1) * shape[slot, 2]), side - 1)
         cell[k] = y * side + x
         start[slot, cell[k] + 1] += 1
     for c in range(side * side):

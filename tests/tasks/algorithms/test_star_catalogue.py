@@ -11,7 +11,7 @@ from epipole.tasks.algorithms.constants import AU_KM
 from epipole.tasks.algorithms.star_catalogue import (
     limit_for_density,
     navigation_catalogue,
-    places_at,
+    star_directions,
 )
 
 ARCSEC = np.pi / 648000
@@ -30,7 +30,7 @@ def test_proper_motion_agrees_with_astropy():
         np.array([300.0, -798.0, 40.0]),
         np.array([-200.0, 10328.0, -90.0]),
     )
-    u = places_at(ra, dec, np.zeros(3), pm_ra, pm_dec, 28.0, np.zeros(3))
+    u = star_directions(ra, dec, np.zeros(3), pm_ra, pm_dec, 28.0, np.zeros(3))
     stars = SkyCoord(
         ra * units.rad,
         dec * units.rad,
@@ -46,7 +46,7 @@ def test_proper_motion_agrees_with_astropy():
 
 def test_parallax_moves_a_star_away_from_the_observer_by_its_size():
     # Star at the pole, observer 1 au along +x: the star is seen shifted to -x by its parallax.
-    u = places_at(
+    u = star_directions(
         np.zeros(1), np.full(1, np.pi / 2), np.array([742.0]), np.zeros(1), np.zeros(1), 0.0,
         np.array([AU_KM, 0.0, 0.0]),
     )  # fmt: skip
@@ -55,7 +55,7 @@ def test_parallax_moves_a_star_away_from_the_observer_by_its_size():
 
 def test_a_negative_parallax_moves_nothing():
     args = (np.zeros(1), np.zeros(1), np.array([-5.0]), np.zeros(1), np.zeros(1), 10.0)
-    np.testing.assert_array_equal(places_at(*args, np.full(3, AU_KM)), [[1.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(star_directions(*args, np.full(3, AU_KM)), [[1.0, 0.0, 0.0]])
 
 
 def test_a_close_double_becomes_one_star_with_the_light_of_both():

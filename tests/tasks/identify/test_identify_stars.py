@@ -13,7 +13,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import EXPOSURES, SENSOR_STATES_AT_FRAMES
 from epipole.tasks.algorithms.geometry.camera import inside, project
 from epipole.tasks.algorithms.geometry.directions import aberrate, canonical
-from epipole.tasks.algorithms.star_catalogue import navigation_catalogue, places_at
+from epipole.tasks.algorithms.star_catalogue import navigation_catalogue, star_directions
 from epipole.tasks.algorithms.times import earth_barycentric, julian_year
 from epipole.tasks.identify.identify_stars import identify_stars
 
@@ -37,7 +37,7 @@ def sky(catalogue):
     time = np.int64(T0_NS)
     years = float(julian_year(time)) - HIPPARCOS_EPOCH
     motions = [array(catalogue, n) for n in names]
-    u = places_at(*places, *motions, years, earth_barycentric(time)[0])
+    u = star_directions(*places, *motions, years, earth_barycentric(time)[0])
     nav = navigation_catalogue(
         array(catalogue, "star_id"), u, array(catalogue, "magnitude"), 2 * CAMERA.pixel_rad
     )

@@ -32,35 +32,35 @@ from epipole.tasks.algorithms.association.views import (
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel
 
 # Columns of `WorkSpace.predicted`: coordinates and covariance on the sensor's plane, depth [km],
-# stretch of the plane, the delay of `later_s` [s], and how far the sensor's own motion moves the
-# coordinates in that time.
-A0, A1, H00, H01, H11, DEPTH, STRETCH, LATER, OWN0, OWN1 = range(10)
+# stretch of the plane, the delay of `later_s` [s], and how far the motion of the
+# sensor itself moves the coordinates in that time.
+A0, A1, H00, H01, H11, DEPTH, STRETCH, LATER, MOTION0, MOTION1 = range(10)
 
 
 @inlined_kernel
-def best_of_sensor(space, work, s, own, least):
+def best_of_sensor(space, work, s, same_sensor, min_gain):
     """Return the free tracklet of sensor s that adds most to the log-odds.
 
-    Only grid cells within the gate are searched. A tracklet is weighed once, at the first
-    instant that it shares with the points.
+    Only grid cells within the gate are searched. A tracklet is weighed at the first instant that
+    it shares with the points, and at no other.
 
     Parameters
     ----------
-    own : (n,) int
-        Tracklets of the sensor that the hypothesis has already.
-    least : float
-        A tracklet that adds less is not chosen.
+    same_sensor : (n,) int
+        Members of the hypothesis that are of this sensor.
+    min_gain : float
+        Minimum log-odds that the tracklet must add.
 
     Returns
     -------
     int
-        The tracklet, -1 for none.
+        The tracklet; -1 if no tracklet adds enough.
     float, float
-        What it adds, and what the second best adds; `least` without one.
+        Log-odds that it adds, and that the second best adds; `min_gain` where there is none.
     """
     views, chance, taken, gate_sigma = space.views, space.chance, space.taken, space.gate_sigma
     predicted, seen_by = work.predicted, work.points.seen_by
-    best, best_gain, second = -1, least, least
+    best, best_gain, second = -1, min_gain, min_gain
     _predict(views, s, work.points, predicted)
     for m in range(len(views.time_s)):
         if seen_by[m] < 2 or views.grid[s, m, 1] == 0 or not predicted[m, DEPTH] > 0.0:
@@ -74,7 +74,7 @@ def best_of_sensor(space, work, s, own, least):
                 if taken[c] or _shared_before(views, c, m, seen_by):
                     continue
                 gain = _fit(views, chance, s, c, seen_by, predicted, gate_sigma)
-                if gain > second and not _clashes(views, c, own):
+                if gain > second and not _clashes(views, c, same_sensor):
                     if gain > best_gain:
                         best, best_gain, second = c, gain, best_gain
                     else:
@@ -84,7 +84,10 @@ def best_of_sensor(space, work, s, own, least):
 
 @borrowing_kernel
 def _predict(views, s, points, predicted):
-    """Write where sensor s should see the points, with covariance; DEPTH 0 or less: behind it."""
+    """Write to `predicted` (k, 10) where sensor s should see the points, with covariance.
+
+    Coordinates are on the sensor's plane. DEPTH is 0 or less for a point behind the sensor.
+    """
     x, _, P, seen_by = points
     cam = views.camera  # element by element, see `views.residual`
     for m in range(len(views.time_s)):
@@ -116,26 +119,26 @@ def _predict(views, s, points, predicted):
         later = later_s(d0, d1, d2, x[m])
         v0, v1, v2 = cam[s, m, V_KM_S], cam[s, m, V_KM_S + 1], cam[s, m, V_KM_S + 2]
         predicted[m, LATER] = later
-        predicted[m, OWN0] = later * (p0 * v0 + p1 * v1 + p2 * v2)
-        predicted[m, OWN1] = later * (q0 * v0 + q1 * v1 + q2 * v2)
+        predicted[m, MOTION0] = later * (p0 * v0 + p1 * v1 + p2 * v2)
+        predicted[m, MOTION1] = later * (q0 * v0 + q1 * v1 + q2 * v2)
 
 
 @borrowing_kernel
 def _gate(views, s, m, predicted, gate_sigma):
-    """Return how far a tracklet may be from the prediction, along both coordinates."""
+    """Return the maximum distance of a tracklet from the prediction, along both coordinates."""
     cam = views.camera
     gate = np.sqrt(quantile(2, gate_sigma))
-    place = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
-    errors = (cam[s, m, WIDEST] + place * place) * predicted[m, STRETCH]
+    position_error = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
+    errors = (cam[s, m, WIDEST] + position_error * position_error) * predicted[m, STRETCH]
     drift = abs(predicted[m, LATER]) * cam[s, m, FASTEST]
-    reach0 = gate * np.sqrt(predicted[m, H00] + errors) + abs(predicted[m, OWN0]) + drift
-    reach1 = gate * np.sqrt(predicted[m, H11] + errors) + abs(predicted[m, OWN1]) + drift
+    reach0 = gate * np.sqrt(predicted[m, H00] + errors) + abs(predicted[m, MOTION0]) + drift
+    reach1 = gate * np.sqrt(predicted[m, H11] + errors) + abs(predicted[m, MOTION1]) + drift
     return reach0, reach1
 
 
 @borrowing_kernel
 def _window(views, s, m, predicted, reach0, reach1):
-    """Return the grid cells within the gate: first and last row, first and last in each row."""
+    """Return the grid cells within the gate: first and last row, first and last column."""
     cam, side = views.camera, views.grid[s, m, 1]
     here = predicted[m, A0] - cam[s, m, CORNER]
     lo0 = max(int(np.floor((here - reach0) * cam[s, m, SCALE])), 0)
@@ -150,9 +153,9 @@ def _window(views, s, m, predicted, reach0, reach1):
 def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
     """Return what tracklet c adds to the log-odds; -inf where it does not fit the points.
 
-    The log-likelihood of its directions as views of the points, minus that as an unrelated
-    tracklet. After the first shared instant, an unrelated tracklet is uncertain only by how
-    differently the tracklets of the sensor move.
+    This is the log-likelihood of its directions as views of the points, minus the one as an
+    unrelated tracklet. At the first instant that they share, an unrelated tracklet may be anywhere
+    in the field. From there on, it is uncertain only by the spread of the sensor's rates.
     """
     gain, total, n, begun_at, see = 0.0, 0.0, 0, 0.0, views.sight
     largest = quantile(2 * len(views.time_s), gate_sigma)
@@ -164,8 +167,8 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
             return -np.inf
         x0, x1 = see[c, m, X], see[c, m, Y]
         later, moves = predicted[m, LATER], see[c, m, MOVES]
-        e0 = predicted[m, A0] - x0 - moves * predicted[m, OWN0] - later * see[c, m, DX]
-        e1 = predicted[m, A1] - x1 - moves * predicted[m, OWN1] - later * see[c, m, DY]
+        e0 = predicted[m, A0] - x0 - moves * predicted[m, MOTION0] - later * see[c, m, DX]
+        e1 = predicted[m, A1] - x1 - moves * predicted[m, MOTION1] - later * see[c, m, DY]
         extra = (see[c, m, SIGMA_KM] / depth) ** 2
         c00 = see[c, m, XX] + extra * (1.0 + x0 * x0) + predicted[m, H00]
         c01 = see[c, m, XY] + extra * x0 * x1 + predicted[m, H01]
@@ -197,9 +200,9 @@ def _shared_before(views, c, m, seen_by):
 
 
 @borrowing_kernel
-def _clashes(views, c, own):
-    """Return whether c is one of these tracklets of its sensor, or overlaps in time with one."""
-    for o in own:
+def _clashes(views, c, same_sensor):
+    """Return whether c overlaps in time with one of these tracklets of its sensor, or is one."""
+    for o in same_sensor:
         if o == c or (views.start_s[c] <= views.end_s[o] and views.start_s[o] <= views.end_s[c]):
             return True
     return False
@@ -207,7 +210,10 @@ def _clashes(views, c, own):
 
 @borrowing_kernel
 def fills(views, c, seen_by):
-    """Return whether c overlaps with any other tracklet of its sensor that the points may have."""
+    """Return whether c lasts from the first solved instant to the last.
+
+    Then no other tracklet of its sensor can be the same object at these instants.
+    """
     first, last = -1, -1
     for m in range(len(seen_by)):
         if seen_by[m] >= 2:
@@ -219,10 +225,10 @@ def fills(views, c, seen_by):
 
 
 @borrowing_kernel
-def claims_another(space, work, s, group, g):
-    """Return whether a tracklet of another group than g may be near the points in sensor s.
+def other_group_near(space, work, s, group, g):
+    """Return whether sensor s has a tracklet of another group than g within the gate.
 
-    A fast first test: not every tracklet within the gate fits.
+    A fast first test: a tracklet within the gate need not fit.
     """
     views, seen_by, predicted = space.views, work.points.seen_by, work.predicted
     _predict(views, s, work.points, predicted)
@@ -245,7 +251,7 @@ def claims_another(space, work, s, group, g):
 
 @borrowing_kernel
 def odds_of_view(space, work, s, c):
-    """Return what tracklet c of sensor s adds to the log-odds of these points; no gate."""
+    """Return what tracklet c of sensor s adds to the log-odds of the points, without a gate."""
     _predict(space.views, s, work.points, work.predicted)
     seen_by = work.points.seen_by
     return _fit(space.views, space.chance, s, c, seen_by, work.predicted, np.inf)

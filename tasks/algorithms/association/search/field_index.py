@@ -1,8 +1,13 @@
 """Field index: which sensors' fields share space, by the cells that the fields sweep.
 
 Space is divided into cells whose size grows with the distance from the Earth. Each field is a
-cone; it is entered in all cells that it touches at any instant. Two fields can share a place only
-where they share a cell, so the work goes with the sensors that share a cell, not with all pairs.
+cone; it is entered in all cells that it touches at any instant. Two fields can overlap only
+where they share a cell, so the cost grows with the sensors per cell, not with all pairs.
+
+1. `cones_of` gives the cone about each field.
+2. `field_index` enters the cones in cells, whose size it doubles until they fit.
+3. `near_points` looks up the sensors that may see the points of a hypothesis, `sensors_sharing`
+   those that share a cell with two sensors.
 """
 
 from typing import NamedTuple
@@ -19,12 +24,13 @@ from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-FEW_SENSORS = 32  # up to this many: one cell, all sensors share it
+FEW_SENSORS = 32  # up to this many sensors, a single cell holds all of them
 SMALLEST_CELL = 0.05  # at the Earth's surface, over the Earth's radius
-MAX_CELLS = 400  # per sensor, on average: with more, the cells are made twice as large
-SAMPLED = 16  # sensors that are entered first, to find a size of cells
-PIECE = 0.5  # length of a piece of a cone over the size of the cells there
-EDGE_RAD, WIDEST_RAD = 1e-3, 1.5  # added to the half-angle of a cone, and the largest one
+MAX_CELLS = 400  # mean number per sensor: beyond it, the size of the cells is doubled
+N_SAMPLED = 16  # sensors with which a first size of cells is found
+PIECE_CELLS = 0.5  # length of a step along a cone, in sizes of the cells there
+EDGE_RAD = 1e-3  # added to the half-angle of a cone [rad]
+WIDEST_RAD = 1.5  # maximum half-angle of a cone [rad]: its tangent must be finite
 AXIS, TANGENT = 3, 6  # columns of a cone
 OFFSET = 1 << 20  # makes the coordinates of cells positive
 
@@ -34,8 +40,9 @@ class FieldIndex(NamedTuple):
 
     first, sensor : (c + 1,), (v,) int
         Sensors of cell q are ``sensor[first[q]:first[q + 1]]``, in increasing order.
-    own_first, own_cell : (s + 1,), (v,) int
-        Cells of sensor s are ``own_cell[own_first[s]:own_first[s + 1]]``, in increasing order.
+    by_sensor_first, by_sensor_cell : (s + 1,), (v,) int
+        Cells of sensor s, in increasing order, are
+        ``by_sensor_cell[by_sensor_first[s]:by_sensor_first[s + 1]]``.
     size : float
         Size of the cells, see `SMALLEST_CELL`; 0 where there is only one.
     keys, slots : (h,) int
@@ -44,8 +51,8 @@ class FieldIndex(NamedTuple):
 
     first: Indices
     sensor: Indices
-    own_first: Indices
-    own_cell: Indices
+    by_sensor_first: Indices
+    by_sensor_cell: Indices
     size: float
     keys: Indices
     slots: Indices
@@ -60,17 +67,20 @@ def field_index(cones: Array, farthest_km: float) -> FieldIndex:
             np.zeros(1, np.int64), np.zeros(1, np.int64),
         )  # fmt: skip
     size = SMALLEST_CELL
-    for few in (cones[:: -(-n // SAMPLED)], cones):  # most sizes that are too small: by a few
+    # A few sensors show quickly which sizes are too small.
+    for few in (cones[:: -(-n // N_SAMPLED)], cones):
         while True:
             room = MAX_CELLS * len(few)
-            own_first, own_cell, n_cells, keys, slots = _enter(few, farthest_km, size, room)
+            by_sensor_first, by_sensor_cell, n_cells, keys, slots = _enter(
+                few, farthest_km, size, room
+            )
             if n_cells >= 0:
                 break
             size *= 2
-    sensor = np.repeat(np.arange(n), np.diff(own_first))
-    order = np.argsort(own_cell, kind="stable")
-    first = np.searchsorted(own_cell[order], np.arange(n_cells + 1))
-    return FieldIndex(first, sensor[order], own_first, own_cell, size, keys, slots)
+    sensor = np.repeat(np.arange(n), np.diff(by_sensor_first))
+    order = np.argsort(by_sensor_cell, kind="stable")
+    first = np.searchsorted(by_sensor_cell[order], np.arange(n_cells + 1))
+    return FieldIndex(first, sensor[order], by_sensor_first, by_sensor_cell, size, keys, slots)
 
 
 @borrowing_kernel
@@ -85,10 +95,11 @@ def _slot(keys, key):
 
 @borrowing_kernel
 def _cells_per_km(radius_km, size):
-    """Return how many cells there are in a kilometre at a distance from the Earth's centre.
+    """Return the number of cells per kilometre at a distance from the Earth's centre.
 
-    Among the cells the distance r, in Earth radii, becomes 1 + ln(r), and stays r inside the Earth.
-    This stretches by (1 + ln(r)) / r across and by less, 1 / r, along the radius.
+    In the grid of cells, the distance r, in Earth radii, becomes 1 + ln(r) outside the Earth and
+    stays r inside. Lengths across the radius scale by (1 + ln(r)) / r, along it by 1 / r, which is
+    less: the larger factor is returned.
     """
     r = radius_km / EARTH_RADIUS_KM
     return ((1.0 + np.log(r)) / r if r > 1.0 else 1.0) / (EARTH_RADIUS_KM * size)
@@ -100,16 +111,16 @@ def _key(i, j, k):
 
 
 class Entering(NamedTuple):
-    """Fields as they are entered in cells of a size; work arrays.
+    """Work arrays with which fields are entered in cells of one size.
 
     keys, slots : (h,) int
         As in `FieldIndex`.
     latest : (c,) int
-        The sensor that was last entered in each cell.
-    own_cell : (v,) int
+        The last sensor entered in each cell.
+    by_sensor_cell : (v,) int
         Cells of the sensors, one after the other.
     filled : (2,) int
-        How many entries and cells there are.
+        Numbers of entries and of cells.
     low, high : (3,) int
         Lowest and highest coordinates of the cells about a ball.
     """
@@ -118,19 +129,19 @@ class Entering(NamedTuple):
     keys: Indices
     slots: Indices
     latest: Indices
-    own_cell: Indices
+    by_sensor_cell: Indices
     filled: Indices
     low: Indices
     high: Indices
 
 
 @borrowing_kernel
-def ground_range(place, axis, half):
+def ground_range(position, axis, half):
     """Return the longest range [km] in a cone to the ground; inf if some of it passes the Earth."""
     radius2, down = 0.0, 0.0
     for a in range(3):
-        radius2 += place[a] * place[a]
-        down -= place[a] * axis[a]
+        radius2 += position[a] * position[a]
+        down -= position[a] * axis[a]
     radius = np.sqrt(radius2)
     if not radius > EARTH_RADIUS_KM:
         return np.inf
@@ -145,7 +156,7 @@ def ground_range(place, axis, half):
 def cones_of(views):
     """Return the cone about each field and its tracklets, (s, k, 7).
 
-    The sensor's place [km], the cone's axis, and the tangent of its half-angle: 0 without
+    The sensor's position [km], the cone's axis, and the tangent of its half-angle: 0 without
     tracklets. The axis is the boresight, or if it is unknown the normal of the sensor's plane.
     """
     n_sensors, n_instants, cam = views.camera.shape[0], len(views.time_s), views.camera
@@ -159,15 +170,15 @@ def cones_of(views):
             cones[s, m, TANGENT] = cam[s, m, REACH]
             if not np.isfinite(cam[s, m, TURN + 6]):
                 continue
-            least = 1.0 / np.sqrt(1.0 + cam[s, m, HALF] ** 2 + cam[s, m, HALF + 1] ** 2)
+            least_cosine = 1.0 / np.sqrt(1.0 + cam[s, m, HALF] ** 2 + cam[s, m, HALF + 1] ** 2)
             for i in range(views.first[s], views.first[s + 1]):
                 if views.seen[i, m]:
                     direction(views, i, m, u)
                     along = 0.0
                     for a in range(3):
                         along += u[a] * cam[s, m, TURN + 6 + a]
-                    least = min(least, along)
-            tangent = np.tan(min(np.arccos(max(least, -1.0)) + EDGE_RAD, WIDEST_RAD))
+                    least_cosine = min(least_cosine, along)
+            tangent = np.tan(min(np.arccos(max(least_cosine, -1.0)) + EDGE_RAD, WIDEST_RAD))
             if tangent < cam[s, m, REACH]:
                 cones[s, m, AXIS:TANGENT] = cam[s, m, TURN + 6 : HALF]
                 cones[s, m, TANGENT] = tangent
@@ -184,7 +195,7 @@ def _enter(cones, farthest_km, size, room):
     table = 1
     while table < 2 * room:
         table *= 2
-    own_first = np.zeros(n_sensors + 1, np.int64)
+    by_sensor_first = np.zeros(n_sensors + 1, np.int64)
     entering = Entering(
         size,
         np.zeros(table, np.int64),
@@ -195,7 +206,7 @@ def _enter(cones, farthest_km, size, room):
         np.empty(3, np.int64),
         np.empty(3, np.int64),
     )
-    own_cell, count = entering.own_cell, entering.filled
+    by_sensor_cell, count = entering.by_sensor_cell, entering.filled
     for s in range(n_sensors):
         m = 0
         while m < n_instants:
@@ -205,18 +216,25 @@ def _enter(cones, farthest_km, size, room):
             last, shift, turn, reach = _together(cones, s, m, size)
             sweep = (s, m, shift, turn, reach)
             if not _walk(cones, sweep, farthest_km, entering):
-                return own_first, own_cell[:0], -1, entering.keys, entering.slots
+                return by_sensor_first, by_sensor_cell[:0], -1, entering.keys, entering.slots
             m = last + 1
-        own_first[s + 1] = count[0]
-        own_cell[own_first[s] : count[0]].sort()
-    return own_first, own_cell[: count[0]].copy(), count[1], entering.keys, entering.slots
+        by_sensor_first[s + 1] = count[0]
+        by_sensor_cell[by_sensor_first[s] : count[0]].sort()
+    return (
+        by_sensor_first,
+        by_sensor_cell[: count[0]].copy(),
+        count[1],
+        entering.keys,
+        entering.slots,
+    )
 
 
 @borrowing_kernel
 def _together(cones, s, m, size):
-    """Return until which instant a field moves by less than a cell, and how far.
+    """Return the last instant until which a field moves by less than a cell, and its motion.
 
-    The shift of its place [km], the turn of its axis [rad], and its widest reach.
+    The motion is the maximum shift of the position [km] and turn of the axis [rad], and the
+    maximum tangent of the cone's half-angle.
     """
     last, shift, turn, reach = m, 0.0, 0.0, cones[s, m, TANGENT]
     for h in range(m + 1, cones.shape[1]):
@@ -235,9 +253,9 @@ def _together(cones, s, m, size):
 
 @borrowing_kernel
 def _walk(cones, sweep, farthest_km, entering):
-    """Enter one cone, piece after piece along its axis; return whether there was room.
+    """Enter one cone, step by step along its axis; return false if there is no room left.
 
-    A ball holds each piece. The walk ends beyond the farthest distance, or at the Earth.
+    A ball encloses each step. The walk ends beyond the farthest distance, or at the Earth.
     """
     s, m, shift, turn, reach = sweep
     half = np.arctan(reach) + turn
@@ -247,7 +265,7 @@ def _walk(cones, sweep, farthest_km, entering):
     while True:
         x0, x1, x2 = _along(cones, s, m, at)
         per_km = _cells_per_km(np.sqrt(x0 * x0 + x1 * x1 + x2 * x2), entering.size)
-        length = max(PIECE / per_km, PIECE * at * min(reach, 1.0))
+        length = max(PIECE_CELLS / per_km, PIECE_CELLS * at * min(reach, 1.0))
         middle = at + length / 2
         x0, x1, x2 = _along(cones, s, m, middle)
         ball = np.hypot((at + length) * reach, length / 2) + shift + middle * turn
@@ -272,7 +290,7 @@ def _along(cones, s, m, at):
 
 @borrowing_kernel
 def _enter_ball(cones, sweep, x, ball, entering):
-    """Enter a sensor in the cells that a ball and its cone touch; return whether there was room."""
+    """Enter a sensor in the cells that a ball and its cone touch; return false without room."""
     size, low, high, count = entering.size, entering.low, entering.high, entering.filled
     keys, slots, latest = entering.keys, entering.slots, entering.latest
     distance = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
@@ -304,17 +322,17 @@ def _enter_ball(cones, sweep, x, ball, entering):
                         return False
                     keys[at], slots[at] = key, count[1]
                     count[1] += 1
-                if count[0] >= len(entering.own_cell):
+                if count[0] >= len(entering.by_sensor_cell):
                     return False
                 latest[slots[at]] = sweep[0]
-                entering.own_cell[count[0]] = slots[at]
+                entering.by_sensor_cell[count[0]] = slots[at]
                 count[0] += 1
     return True
 
 
 @borrowing_kernel
 def _touches(cones, sweep, size, i, j, k):
-    """Return whether a cell touches a cone: its centre is within half its diagonal of the cone."""
+    """Return whether the centre of a cell is within half its diagonal of a cone."""
     s, m, shift, turn, reach = sweep
     y0, y1, y2 = (i + 0.5) * size, (j + 0.5) * size, (k + 0.5) * size
     f = max(np.sqrt(y0 * y0 + y1 * y1 + y2 * y2), 1e-9)
@@ -336,7 +354,7 @@ def _touches(cones, sweep, size, i, j, k):
 
 @borrowing_kernel
 def cell_at(index, x):
-    """Return the cell that holds the point x (3,), -1 where no field is."""
+    """Return the cell that holds the point x (3,) [km, GCRF]; -1 if no field touches that cell."""
     if index.size == 0.0:
         return np.int64(0)
     per_km = _cells_per_km(np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]), index.size)
@@ -362,10 +380,10 @@ def cells_across(index, x, radius_km):
 
 @borrowing_kernel
 def sensors_about(index, x, radius_km, stamp, mark, out, n):
-    """Add the sensors with a part of their field within a ball to `out`; return how many it has.
+    """Append to `out` the sensors whose fields may touch a ball; return the new length of `out`.
 
-    Sensors with ``stamp[s] == mark`` are in `out` already. The ball should not be much larger than
-    a cell.
+    `x` (3,) is the centre [km, GCRF]. Sensors with ``stamp[s] == mark`` are in `out` already. The
+    ball should not be much larger than a cell: all cells that it touches are visited.
     """
     if index.size == 0.0:
         return _add_cell(index, 0, stamp, mark, out, n)
@@ -395,9 +413,9 @@ def _add_cell(index, q, stamp, mark, out, n):
 @borrowing_kernel
 def sensors_sharing(index, a, b, stamp, mark, out):
     """Write the sensors that share a cell with both a and b; return how many there are."""
-    i, j, n = index.own_first[a], index.own_first[b], 0
-    while i < index.own_first[a + 1] and j < index.own_first[b + 1]:
-        p, q = index.own_cell[i], index.own_cell[j]
+    i, j, n = index.by_sensor_first[a], index.by_sensor_first[b], 0
+    while i < index.by_sensor_first[a + 1] and j < index.by_sensor_first[b + 1]:
+        p, q = index.by_sensor_cell[i], index.by_sensor_cell[j]
         if p == q:
             n = _add_cell(index, p, stamp, mark, out, n)
         i += p <= q
@@ -407,10 +425,10 @@ def sensors_sharing(index, a, b, stamp, mark, out):
 
 @borrowing_kernel
 def near_points(space, work, a, b):
-    """Write `work.near`: the sensors whose field may hold the points; return how many they are.
+    """Write to `work.near` the sensors whose field may hold the points; return their number.
 
-    They are looked for in the cells about the points, or where these are too uncertain, in the
-    cells that sensors a and b share.
+    Candidates come from the cells about the points. If the points are uncertain by more than a
+    cell, they come from the cells that sensors a and b share.
     """
     index, points, n = space.fields, work.points, np.int64(0)
     mark, known = next_mark(work.stamp), True

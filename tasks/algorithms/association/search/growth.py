@@ -34,15 +34,15 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-FEW = 3  # sensors that must have looked before a hypothesis is given up
-GIVEN_UP = -4.0  # log-odds of the sensors beside the seed's at which it is given up
-SPEAKS = 2.0  # log-odds at which a view of a well-known point is clearly of the object
-CONTESTED = 5.0  # log-odds by which the best view of a sensor must lead the next one
-ENOUGH = 4  # views that fix a point well enough to choose them all again
-WELL_KNOWN = 8  # views after which a sensor's choice needs no review
-COMPLETE = 0.85  # of the expected detections, those of a clear hypothesis
-REVIEWS = 2  # the first may still rest on a false member
-DROPPED_TOGETHER = 64  # 1 + n // 64 of n members are dropped per pass
+MIN_LOOKS = 3  # minimum number of other sensors with the points in their field to give up a seed
+GIVE_UP_LOG_ODDS = -4.0  # log-odds of the other sensors below which a seed is given up
+MIN_GAIN = 2.0  # minimum log-odds that a view adds to a well-known point to be one of it
+MIN_LEAD = 5.0  # minimum difference of the log-odds of a sensor's best view and the next one
+MIN_REVIEWED = 4  # minimum number of views of a hypothesis that is reviewed
+WELL_KNOWN = 8  # number of views from which points are well known: choices need no review
+MIN_COMPLETENESS = 0.85  # minimum share of the expected detections, of a clear hypothesis
+REVIEWS = 2  # after the first one, a false member may still distort the points
+DROPPED_TOGETHER = 64  # drop 1 + n // 64 of n members per pass
 
 
 class Grown(NamedTuple):
@@ -73,8 +73,8 @@ class Grown(NamedTuple):
 
 
 @kernel
-def grow_all(space, work, seeds, clear, least):
-    """Return what the seeds grow into, as `Grown`.
+def grow_all(space, work, seeds, clear, min_score):
+    """Return the hypotheses that the seeds grow into, as `Grown`.
 
     Parameters
     ----------
@@ -85,8 +85,8 @@ def grow_all(space, work, seeds, clear, least):
     clear : float
         Log-odds at which a hypothesis is taken at once, see `_clear_of_doubt`. Its tracklets are
         entered in `space.taken`.
-    least : float
-        Hypotheses of lower log-odds are left out.
+    min_score : float
+        Minimum log-odds of a hypothesis that is returned.
     """
     views, taken = space.views, space.taken
     members = work.members
@@ -108,7 +108,7 @@ def grow_all(space, work, seeds, clear, least):
         if n < 2 or not possible(space, members[:n], work.points):
             continue
         value, n_missed = score(space, work, members[:n], work.near[:n_near])
-        if not value > least:
+        if not value > min_score:
             continue
         if h == len(seed):
             seed, value_of, clears = _more(seed, h), _more(value_of, h), _more(clears, h)
@@ -138,9 +138,10 @@ def grow_all(space, work, seeds, clear, least):
 def _grow(space, work, members, nearby):
     """Grow the first two members; return the size and the number of sensors in `work.near`.
 
-    The size is 0 where the hypothesis fails. Sensor after sensor, the tracklet that adds most to
-    the odds joins. A miss counts against the hypothesis. It is given up as soon as the other
-    sensors speak clearly against it (Wald's sequential test).
+    Sensor after sensor, the tracklet that adds most to the odds joins, and a miss lowers them. The
+    hypothesis is given up, with size 0, as soon as the log-odds of the other sensors are below
+    `GIVE_UP_LOG_ODDS` (Wald's sequential test). `members` (t + 2,) is changed in place; `nearby`
+    (n,) are the sensors that share space with those of the seed, in order.
     """
     views, near = space.views, work.near
     n = np.int64(2)  # a plain 2 is a type of its own to numba: all would compile twice
@@ -154,7 +155,7 @@ def _grow(space, work, members, nearby):
     while begin < n_near and near[begin] < a:
         begin += 1
     for turn in range(n_near + 2):
-        # The seed's own sensors come last: they may hold another fragment of the object.
+        # The sensors of the seed come last: they may have another fragment of the object.
         if turn < n_near:
             s = near[(begin + turn) % n_near]
             if s in (a, b):
@@ -176,19 +177,19 @@ def _grow(space, work, members, nearby):
             looked += expected
             if expected and not detected:
                 evidence += np.log(1.0 - space.chance.detected[s])
-            if looked >= FEW and evidence < GIVEN_UP:
+            if looked >= MIN_LOOKS and evidence < GIVE_UP_LOG_ODDS:
                 return np.int64(0), np.int64(0)
     if n < 2 * WELL_KNOWN:
         n = _settle(space, work, members, n)
     for _ in range(REVIEWS if n < 2 * WELL_KNOWN else 1):
-        if n >= ENOUGH:
+        if n >= MIN_REVIEWED:
             n = _review(space, work, members, n, early)
     return n, n_near
 
 
 @borrowing_kernel
 def _begin(space, work, members, nearby):
-    """Solve the points of a seed; return how many sensors may see them, -1 if none can be there."""
+    """Solve the points of a seed; return the number of sensors near them, -1 if impossible."""
     points = work.points
     points.seen_by[:] = 0
     chi2, dof = solve(space.views, members, points, work.part)
@@ -203,27 +204,27 @@ def _begin(space, work, members, nearby):
 def _join_sensor(space, work, s, members, n, evidence):
     """Add the tracklets of sensor s that fit to the members.
 
-    Returns the new size (-1 where a point cannot be solved any more), the log-odds `evidence`
-    with what they add, and whether the sensor detects the object: it does also where two
-    tracklets are about equal and none joins.
+    Returns the new size (-1 if a point can no longer be solved), the log-odds `evidence` with what
+    the tracklets add, and whether the sensor detects the object. It does so too if two tracklets
+    fit about equally well, so that neither joins.
     """
-    views, detected, n_own = space.views, False, 0
+    views, detected, n_same = space.views, False, 0
     for i in members[:2]:
         if views.sensor[i] == s:
-            work.own[n_own] = i
-            n_own += 1
+            work.same_sensor[n_same] = i
+            n_same += 1
     while n < len(members):
         known = n >= WELL_KNOWN
-        least = SPEAKS if known else np.log(1.0 - space.chance.detected[s])
-        c, gain, second = best_of_sensor(space, work, s, work.own[:n_own], least)
-        if c < 0 or (known and second > SPEAKS and gain - second < CONTESTED):
+        min_score = MIN_GAIN if known else np.log(1.0 - space.chance.detected[s])
+        c, gain, second = best_of_sensor(space, work, s, work.same_sensor[:n_same], min_score)
+        if c < 0 or (known and second > MIN_GAIN and gain - second < MIN_LEAD):
             detected |= c >= 0
             break
         detected = True
         evidence += gain
-        members[n], work.own[n_own] = c, c
+        members[n], work.same_sensor[n_same] = c, c
         n += 1
-        n_own += 1
+        n_same += 1
         if not join(views, c, work.points, work.part):
             return np.int64(-1), evidence, detected
         # A sensor has one tracklet of an object at a time.
@@ -234,10 +235,10 @@ def _join_sensor(space, work, s, members, n, evidence):
 
 @borrowing_kernel
 def _settle(space, work, members, n):
-    """Solve, and drop the members that fit worst until all fit; return the size.
+    """Solve the points and drop the members that fit worst, until all fit; return the size.
 
-    The seed's tracklets may be dropped too. One is dropped at a time, of many a share: so the work
-    goes with their number. 0 where fewer than two are left.
+    The seed's tracklets may be dropped too. Large hypotheses drop several at a time, so the cost
+    grows with their size only. The size is 0 if fewer than two are left.
     """
     views, part = space.views, work.part
     X, _, _, seen_by = work.points
@@ -265,17 +266,17 @@ def _settle(space, work, members, n):
                 members[q], work.misfit[q] = members[q + 1], work.misfit[q + 1]
             n -= 1
         if np.isnan(chi2):
-            seen_by[:] = 0  # such points are no start
+            seen_by[:] = 0  # start afresh: these points are invalid
     return np.int64(0)
 
 
 @borrowing_kernel
 def _review(space, work, members, n, early):
-    """Choose the early members again, now that the points are well known; return the size.
+    """Choose the first `early` members again, now that the points are well known; return the size.
 
-    They were chosen by points from a few views only. A false member does more harm than a miss:
-    a tracklet joins only where it clearly speaks for the object, and a sensor with two such
-    tracklets that are about equal contributes none.
+    They were chosen by points from few views. A false member does more harm than a miss. So a
+    tracklet joins only if it adds at least `MIN_GAIN`, and leads the sensor's next best one by
+    `MIN_LEAD` if that one adds as much. All other members stay if they still fit.
     """
     views, stamp, early = space.views, work.stamp, min(early, n)
     mark = next_mark(stamp)
@@ -284,32 +285,32 @@ def _review(space, work, members, n, early):
         s = views.sensor[i]
         if stamp[s] != mark:
             stamp[s] = mark
-            place = n_again
-            while place > 0 and work.missed[place - 1] > s:
-                work.missed[place] = work.missed[place - 1]
-                place -= 1
-            work.missed[place] = s
+            slot = n_again
+            while slot > 0 and work.missed[slot - 1] > s:
+                work.missed[slot] = work.missed[slot - 1]
+                slot -= 1
+            work.missed[slot] = s
             n_again += 1
     before = work.before
     for q in range(n):
         before[q] = members[q]
     kept = np.int64(0)
     for i in before[:n]:
-        if stamp[views.sensor[i]] != mark and _speaks(space, work, i):
+        if stamp[views.sensor[i]] != mark and _still_fits(space, work, i):
             members[kept] = i
             kept += 1
     for s in work.missed[:n_again]:
-        n_own = 0
+        n_same = 0
         while kept < len(members):
-            c, gain, second = best_of_sensor(space, work, s, work.own[:n_own], SPEAKS)
-            if c < 0 or (second > SPEAKS and gain - second < CONTESTED):
+            c, gain, second = best_of_sensor(space, work, s, work.same_sensor[:n_same], MIN_GAIN)
+            if c < 0 or (second > MIN_GAIN and gain - second < MIN_LEAD):
                 break
-            members[kept], work.own[n_own] = c, c
+            members[kept], work.same_sensor[n_same] = c, c
             kept += 1
-            n_own += 1
+            n_same += 1
             if fills(views, c, work.points.seen_by):
                 break
-    if kept < ENOUGH - 1:
+    if kept < MIN_REVIEWED - 1:
         kept = n
         for q in range(n):
             members[q] = before[q]
@@ -317,8 +318,8 @@ def _review(space, work, members, n, early):
 
 
 @borrowing_kernel
-def _speaks(space, work, i):
-    """Return whether a member still speaks for the object, by the first instant they share."""
+def _still_fits(space, work, i):
+    """Return whether a member still adds `MIN_GAIN` log-odds, at the first shared instant."""
     views, chance, points, part = space.views, space.chance, work.points, work.part
     for m in range(len(views.time_s)):
         if points.seen_by[m] >= 2 and views.seen[i, m]:
@@ -326,7 +327,7 @@ def _speaks(space, work, i):
             if residual(views, i, m, points.x_km[m], part) == 0.0:
                 return False
             odds = np.log(chance.detected[s] / (chance.density[s] * spot))
-            return odds - 0.5 * misfit(part) >= SPEAKS
+            return odds - 0.5 * misfit(part) >= MIN_GAIN
     return True
 
 
@@ -334,8 +335,8 @@ def _speaks(space, work, i):
 def _clear_of_doubt(space, work, members, n_missed, value, clear):
     """Return whether a hypothesis may be taken at once.
 
-    It has many views, and of the sensors that have it in their field about as many detect it
-    as usual. A mixture of two objects' tracklets fits in some of the sensors only.
+    It needs many views, and must be detected by about as many of the sensors that have it in their
+    field as expected. A mixture of two objects' tracklets fits only some of these sensors.
     """
     if not (value > clear and len(members) >= WELL_KNOWN):
         return False
@@ -349,7 +350,7 @@ def _clear_of_doubt(space, work, members, n_missed, value, clear):
             usual += detected[s]
     for s in work.missed[:n_missed]:
         usual += detected[s]
-    return has >= COMPLETE * usual
+    return has >= MIN_COMPLETENESS * usual
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Unions: hypotheses that share a tracklet and follow each other in time may be one object.
+"""Merging: hypotheses that share a tracklet and follow each other in time may be one object.
 
 A hypothesis grows by tracklets that are seen at its solved instants. A sensor that sees the object
 only before or after these begins a second hypothesis, with a tracklet of the first. The two do not
@@ -38,13 +38,13 @@ def _weigh(space, work, members, x_km):
     return score(space, work, members, work.near[:n_near])
 
 
-def best_union(
+def best_merger(
     space: SearchSpace, work: WorkSpace, h: Hypothesis, others: Iterable[Hypothesis]
 ) -> Hypothesis | None:
-    """Return the likeliest union of a hypothesis with another one, if it is likelier than both.
+    """Return the likeliest merger of a hypothesis with another one, None if none beats both.
 
-    Only others whose own tracklets are not seen where `h` is solved are tried: those that are
-    seen there did not fit when it grew.
+    Another one is tried only if its other tracklets are not seen at the solved instants of `h`:
+    those that are seen there did not fit when `h` grew.
     """
     seen = space.views.seen
     solved = seen[list(h.members)].sum(axis=0) >= 2

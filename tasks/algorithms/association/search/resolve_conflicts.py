@@ -1,23 +1,25 @@
-"""Contests: tracklets that a second object explains as well as the object that has them.
+"""Conflicts: tracklets that a second object explains as well as the object that has them.
 
-Hypotheses that grew first took what fitted best, before the others were known. Once all are
-known, every tracklet is judged again: it goes to the object that clearly explains it best, and
-to no object where two explain it about equally well.
+Hypotheses that grew first took what fitted best, before the others were known. Once all groups are
+known, each tracklet is weighed again. It goes to the object that clearly explains it best. If two
+explain it about equally well, it goes to neither.
 """
 
 import numpy as np
 
 from epipole.tasks.algorithms.association.search.candidates import (
     best_of_sensor,
-    claims_another,
     odds_of_view,
+    other_group_near,
 )
 from epipole.tasks.algorithms.association.search.field_index import near_points
-from epipole.tasks.algorithms.association.search.growth import CONTESTED, SPEAKS
+from epipole.tasks.algorithms.association.search.growth import MIN_GAIN, MIN_LEAD
 from epipole.tasks.algorithms.association.search.instant_points import solve
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
-FEWEST = 3  # tracklets of an object that may gain or lose one
+MIN_TRACKLETS = (
+    3  # minimum number of tracklets of an object, before it gains and after it loses one
+)
 
 
 @kernel
@@ -37,7 +39,7 @@ def resolve_conflicts(space, work, group, x_km):
     n_near = 0
     for g in range(n_groups):
         of_group = members[first[g] : first[g + 1]]
-        if len(of_group) < FEWEST:
+        if len(of_group) < MIN_TRACKLETS:
             continue
         work.points.seen_by[:] = 0
         if k == 1:  # a good start
@@ -65,23 +67,23 @@ def resolve_conflicts(space, work, group, x_km):
         filled[s] += 1
     for s in range(n_sensors):  # one sensor's tracklets fit into a processor's cache
         for g in groups_near[first_near[s] : first_near[s + 1]]:
-            if size[g] < FEWEST:
+            if size[g] < MIN_TRACKLETS:
                 continue
             _enter_points(work.points, g, X, P, seen_by)
-            if not claims_another(space, work, s, group, g):
+            if not other_group_near(space, work, s, group, g):
                 continue
-            c, gain, _ = best_of_sensor(space, work, s, members[:0], SPEAKS)
+            c, gain, _ = best_of_sensor(space, work, s, members[:0], MIN_GAIN)
             if c < 0 or group[c] < 0 or group[c] == g:
                 continue
             o = group[c]
-            if size[o] <= FEWEST:
+            if size[o] <= MIN_TRACKLETS:
                 continue
             _enter_points(work.points, o, X, P, seen_by)
             theirs = odds_of_view(space, work, s, c)
-            if theirs - gain < CONTESTED:
+            if theirs - gain < MIN_LEAD:
                 size[o] -= 1
                 group[c] = -1
-                if gain - theirs >= CONTESTED and not _has(views, group, s, g):
+                if gain - theirs >= MIN_LEAD and not _has(views, group, s, g):
                     group[c] = g
                     size[g] += 1
 

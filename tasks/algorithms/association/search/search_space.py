@@ -63,7 +63,7 @@ class WorkSpace(NamedTuple):
         may hold the points, and of these the ones that miss the object. The first ones count.
     stamp : (s + 1,) int
         Which sensors are in a list, by the number of the list; the last one counts the lists.
-    own : (c,) int
+    same_sensor : (c,) int
         Tracklets of one sensor among the members, see `candidates.best_of_sensor`.
     members, before, misfit : (t + 2,) int, int, float
         Members, those before a review, and how badly they fit.
@@ -76,7 +76,7 @@ class WorkSpace(NamedTuple):
     near: Indices
     missed: Indices
     stamp: Indices
-    own: Indices
+    same_sensor: Indices
     members: Indices
     before: Indices
     misfit: Array
@@ -95,7 +95,7 @@ def work_space(views: Views) -> WorkSpace:
         near=np.empty(n_sensors, np.int64),
         missed=np.empty(n_sensors, np.int64),
         stamp=np.zeros(n_sensors + 1, np.int64),
-        own=np.empty(int(np.diff(views.first).max(initial=0)) + 1, np.int64),
+        same_sensor=np.empty(int(np.diff(views.first).max(initial=0)) + 1, np.int64),
         members=np.empty(n + 2, np.int64),
         before=np.empty(n + 2, np.int64),
         misfit=np.empty(n + 2),

@@ -2,7 +2,7 @@
 
 The baseline of two sensors and a direction span a plane. The angle of this plane about the
 baseline is one number for each direction, and equal for both sensors' views of one object. With
-the angles sorted, a binary search gives the partners of a view, and pairs that cannot meet
+the angles sorted, a binary search gives the views that it may meet, and pairs that cannot meet
 cost nothing.
 """
 
@@ -13,10 +13,10 @@ from epipole.tasks.algorithms.association.views import MOVES, PLANE, SIGMA_KM, X
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
-SHORTEST_BASELINE_KM = 1.0
-NEAREST_KM = 300.0  # range at which errors of the baseline turn the plane most
-FASTEST_KM_S = 11.0  # of an object near the Earth, which moves while light travels
-LARGEST_SIGMA = 3.0  # the most that it can move counts as an error of this many sigmas
+SHORTEST_BASELINE_KM = 1.0  # minimum baseline of a pair: below, ranges are undetermined
+NEAREST_KM = 300.0  # minimum range [km]: errors of the baseline turn the plane most there
+FASTEST_KM_S = 11.0  # maximum speed in orbit (escape speed): motion during the light time
+LARGEST_SIGMA = 3.0  # this maximum motion counts as an error of 3 sigma
 
 
 @kernel
@@ -124,12 +124,14 @@ def _write_axes(views, a, m, baseline, axes):
         axes[0, q] = views.camera[a, m, PLANE + 6 + q] - along / length2 * baseline[q]
         across2 += axes[0, q] ** 2
     if not across2 > 1e-18 * towards2:  # the field lies along the baseline: any axis will do
-        least = 0
+        smallest = 0
         for q in range(3):
-            least = q if abs(baseline[q]) < abs(baseline[least]) else least
+            smallest = q if abs(baseline[q]) < abs(baseline[smallest]) else smallest
         across2 = 0.0
         for q in range(3):
-            axes[0, q] = (1.0 if q == least else 0.0) - baseline[least] / length2 * baseline[q]
+            axes[0, q] = (1.0 if q == smallest else 0.0) - baseline[smallest] / length2 * baseline[
+                q
+            ]
             across2 += axes[0, q] ** 2
     for q in range(3):
         axes[0, q] /= np.sqrt(across2)

@@ -27,21 +27,21 @@ Flags = npt.NDArray[np.bool_]
 
 NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a field, to see whether it meets another one
 TESTED_INSTANTS = 3
-LEADERS = 8  # sensors of a crowded cell that all others are paired with
-MAX_PARTNERS = 64  # of a sensor; half of them are leaders of crowded cells
-MAX_TESTS = 512  # of whether two fields meet, for each sensor
+N_LEADERS = 8  # sensors of a crowded cell with which all others there are paired
+MAX_OVERLAPPING = 64  # maximum number of others that a sensor is paired with, half of them leaders
+MAX_TESTS = 512  # maximum number of tests per sensor of whether two fields overlap
 N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its plane
 # Share of a crowded field that counts as covered by a pair: its edges are not looked at.
-MIDDLE = 0.5
+MIDDLE_SHARE = 0.5
 
 
 def meeting_pairs(index: FieldIndex, cones: Array, farthest_km: float) -> tuple[Indices, Indices]:
     """Return pairs of sensors whose fields meet, each once; the first has the lower number.
 
-    Up to `FEW_SENSORS` sensors: all pairs. Else those that share a cell; each sensor looks for a
-    limited number of partners. First among the leaders of its most crowded cells, the same for all
-    sensors there, so that few pairs cover the place. Then in its cells from the emptiest on, where
-    it may be one of the few that see an object.
+    Up to `FEW_SENSORS` sensors, all pairs are tested. Beyond, each sensor is paired with at most
+    `MAX_OVERLAPPING` others that share a cell with it: first with the leaders of its most crowded
+    cells, which are the same for all sensors there, so that few pairs cover the space; then with
+    sensors in its emptiest cells, where it may be one of the few that see an object.
     """
     n = len(cones)
     if index.size == 0.0:
@@ -50,17 +50,17 @@ def meeting_pairs(index: FieldIndex, cones: Array, farthest_km: float) -> tuple[
         return a[meet], b[meet]
     # Leaders at random, so that they are all around: they have long baselines with some others.
     rank = np.random.default_rng(n).permutation(n)
-    pairs = _partners(index, rank, *_tested(cones, farthest_km))
+    pairs = _overlapping_pairs(index, rank, *_tested(cones, farthest_km))
     key = np.unique(pairs.min(axis=1) * n + pairs.max(axis=1))
     return key // n, key % n
 
 
 def fields_meet(cones: Array, a: Indices, b: Indices, farthest_km: float) -> npt.NDArray[np.bool_]:
-    """Return whether the fields of two sensors share any place, (n,).
+    """Return whether the fields of two sensors overlap anywhere, (n,) bool.
 
-    At some instants, the axis of sensor a's cone is stepped through. A ball about each step holds
-    the cone up to the next one. The test is whether the ball touches the cone of b. Cones end at
-    the ground. It may say yes too often, never no where the fields meet.
+    At some instants, the axis of sensor a's cone is followed in steps. A ball about each step
+    encloses the cone up to the next one, and is tested for contact with the cone of b. Cones end
+    at the ground. The result is never false if the fields overlap, but may be true if they do not.
 
     Parameters
     ----------
@@ -119,28 +119,28 @@ def _meet(cones, steps, a, b):
 
 
 @kernel
-def _partners(index, rank, cones, steps):
+def _overlapping_pairs(index, rank, cones, steps):
     """Return pairs of sensors, (n, 2); some of them twice."""
-    n_sensors, n_cells = len(index.own_first) - 1, len(index.first) - 1
+    n_sensors, n_cells = len(index.by_sensor_first) - 1, len(index.first) - 1
     leader, occupied = _leaders(index, rank), np.empty(n_cells, np.int64)
     for q in range(n_cells):
         occupied[q] = index.first[q + 1] - index.first[q]
-    out = np.empty((MAX_PARTNERS * n_sensors, 2), np.int64)
+    out = np.empty((MAX_OVERLAPPING * n_sensors, 2), np.int64)
     tested = np.full(n_sensors, -1)  # the sensor that was last tested with each one
     n = 0
     for s in range(n_sensors):
-        own = index.own_cell[index.own_first[s] : index.own_first[s + 1]]
-        order = np.argsort(occupied[own], kind="mergesort")
+        cells = index.by_sensor_cell[index.by_sensor_first[s] : index.by_sensor_first[s + 1]]
+        order = np.argsort(occupied[cells], kind="mergesort")
         tested[s], count, tests = s, 0, 0
-        for turn in range(2 * len(own)):
-            crowded = turn < len(own)
-            q = own[order[len(own) - 1 - turn]] if crowded else own[order[turn - len(own)]]
+        for turn in range(2 * len(cells)):
+            crowded = turn < len(cells)
+            q = cells[order[len(cells) - 1 - turn]] if crowded else cells[order[turn - len(cells)]]
             if crowded and occupied[q] <= FEW_SENSORS + 1:
                 continue
             some = leader[q] if crowded else index.sensor[index.first[q] : index.first[q + 1]]
-            most = MAX_PARTNERS // 2 if crowded else MAX_PARTNERS
+            most = MAX_OVERLAPPING // 2 if crowded else MAX_OVERLAPPING
             for k in range(len(some)):
-                o = some[(k + s) % len(some)]  # other sensors begin with other partners
+                o = some[(k + s) % len(some)]  # each sensor begins elsewhere
                 if count >= most or tests >= MAX_TESTS:
                     break
                 if tested[o] == s:
@@ -157,13 +157,13 @@ def _partners(index, rank, cones, steps):
 @kernel
 def _leaders(index, rank):
     """Return the sensors of the lowest rank in each crowded cell, (c, 8); -1 elsewhere."""
-    leader = np.full((len(index.first) - 1, LEADERS), -1)
+    leader = np.full((len(index.first) - 1, N_LEADERS), -1)
     for q in range(len(leader)):
         if index.first[q + 1] - index.first[q] <= FEW_SENSORS + 1:
             continue
         for s in index.sensor[index.first[q] : index.first[q + 1]]:
             moved = s
-            for k in range(LEADERS):
+            for k in range(N_LEADERS):
                 if leader[q, k] < 0:
                     leader[q, k] = moved
                     break
@@ -191,29 +191,29 @@ class SensorPairs:
     """Pairs of sensors that may see one object, in the order in which they should seed.
 
     Pairs with a longer baseline across the line of sight come first: they fix a point better and
-    have fewer chance partners. But every sensor takes part once before any takes part again.
-    Pairs whose fields do not meet are skipped. Where many sensors share a place, each of them is
-    paired with a few only, see `meeting_pairs`.
+    have fewer chance meetings. But every sensor takes part once before any takes part again.
+    Pairs whose fields do not overlap are skipped. In crowded space each sensor is paired with a few
+    only, see `meeting_pairs`.
     """
 
     def __init__(self, views: Views, farthest_km: float, index: FieldIndex, cones: Array) -> None:
-        look, place, half, edges = _middle(views, N_EDGES)
+        look, position, half, edges = _middle(views, N_EDGES)
         a, b = meeting_pairs(index, cones, farthest_km)
-        baseline = place[b] - place[a]
+        baseline = position[b] - position[a]
         known = np.linalg.norm(baseline, axis=1) > SHORTEST_BASELINE_KM  # false for NaN
         across = np.linalg.norm(np.cross(baseline, look[a] + look[b]), axis=1) / 2
         order = np.flatnonzero(known)[np.argsort(-across[known], kind="stable")]
         self._a, self._b = a[order], b[order]
-        n_partners = np.bincount(np.append(a, b), minlength=len(look))
-        middle, many = (look, place, half), n_partners > FEW_SENSORS
+        n_overlapping = np.bincount(np.append(a, b), minlength=len(look))
+        middle, many = (look, position, half), n_overlapping > FEW_SENSORS
         few = ~many[self._a] & ~many[self._b]
         self._points = np.full((len(order), 1 + N_EDGES, 3), np.nan)
         self._points[:, 0] = _middle_points(middle, many, self._a, self._b, farthest_km)
         self._points[few, 1:] = _shared_points(
             middle, edges, self._a[few], self._b[few], farthest_km
         )
-        self._share = np.where(few, 1.0, MIDDLE)
-        self._look, self._place, self._half = middle
+        self._share = np.where(few, 1.0, MIDDLE_SHARE)
+        self._look, self._position, self._half = middle
         self._waiting = np.ones(len(order), bool)
         self._busy = np.zeros(len(look), bool)
         # Earlier pairs that cover each point of a pair. A point that is not shared (NaN) counts as
@@ -230,7 +230,7 @@ class SensorPairs:
         """Return the next pair, None after the last.
 
         A pair is skipped where `enough` of the earlier pairs cover each point that it shares.
-        These are the middle of the field and, where not too many sensors share it, its edges.
+        These points are in the middle of the shared space and, if it is not crowded, at its edges.
         """
         state = (self._a, self._b, self._waiting, self._covered, self._busy)
         k = _next_pair(*state, float(enough), self._next)
@@ -245,7 +245,7 @@ class SensorPairs:
         self._busy[[a, b]] = True
         self._next = k + 1
         _cover(
-            self._index, a, b, (self._look, self._place, self._half), self._share, self._points,
+            self._index, a, b, (self._look, self._position, self._half), self._share, self._points,
             self._first, self._by_cell, self._covered,
         )  # fmt: skip
         return a, b
@@ -265,16 +265,16 @@ def _next_pair(a, b, waiting, covered, busy, enough, begin):
 @kernel
 def _cover(index, a, b, middle, share, points, first, by_cell, covered):
     """Count the pair of sensors a and b for all points that both have in their field."""
-    look, place, half = middle
-    i, j, n_points = index.own_first[a], index.own_first[b], points.shape[1]
-    while i < index.own_first[a + 1] and j < index.own_first[b + 1]:
-        p, q = index.own_cell[i], index.own_cell[j]
+    look, position, half = middle
+    i, j, n_points = index.by_sensor_first[a], index.by_sensor_first[b], points.shape[1]
+    while i < index.by_sensor_first[a + 1] and j < index.by_sensor_first[b + 1]:
+        p, q = index.by_sensor_cell[i], index.by_sensor_cell[j]
         if p == q:
             for k in by_cell[first[p] : first[p + 1]]:
                 pair, c = k // n_points, k % n_points
                 x, part = points[pair, c], share[pair]
-                if _in_cone(x, look[a], place[a], part * half[a]) and _in_cone(
-                    x, look[b], place[b], part * half[b]
+                if _in_cone(x, look[a], position[a], part * half[a]) and _in_cone(
+                    x, look[b], position[b], part * half[b]
                 ):
                     covered[pair, c] += 1
         i += p <= q
@@ -282,11 +282,11 @@ def _cover(index, a, b, middle, share, points, first, by_cell, covered):
 
 
 @borrowing_kernel
-def _in_cone(x, look, place, half):
+def _in_cone(x, look, position, half):
     """Return whether a point is within an angle of a sensor's axis."""
     along, length2 = 0.0, 0.0
     for q in range(3):
-        d = x[q] - place[q]
+        d = x[q] - position[q]
         along += d * look[q]
         length2 += d * d
     return along > np.cos(half) * np.sqrt(length2)
@@ -307,11 +307,12 @@ def _cells_of(index, points):
 def _middle(views, n_edges):
     """Return each sensor's mean direction, position [km], and radius of its tracklets [rad].
 
-    And the directions of its outermost tracklets on several ways, (s, n_edges, 3); at the instant
-    of most tracklets. NaN without tracklets.
+    All are (s, 3), (s, 3), (s,), at the instant with most tracklets; NaN without tracklets. The
+    fourth value are the directions of the outermost tracklets along `n_edges` axes of the plane,
+    (s, n_edges, 3).
     """
     n = views.camera.shape[0]
-    look, place, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
+    look, position, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
     edges, ways = np.full((n, n_edges, 3), np.nan), np.empty((n_edges, 2))
     for e in range(n_edges):
         ways[e] = np.cos(e * 2 * np.pi / n_edges), np.sin(e * 2 * np.pi / n_edges)
@@ -324,7 +325,7 @@ def _middle(views, n_edges):
                 m, most = h, count
         if most == 0:
             continue
-        look[s], place[s] = views.camera[s, m, PLANE + 6 : PLANE + 9], views.camera[s, m, :3]
+        look[s], position[s] = views.camera[s, m, PLANE + 6 : PLANE + 9], views.camera[s, m, :3]
         widest2, farthest = 0.0, np.full(n_edges, -np.inf)
         for i in range(views.first[s], views.first[s + 1]):
             if not views.seen[i, m]:
@@ -338,30 +339,30 @@ def _middle(views, n_edges):
         for e in range(n_edges):
             direction(views, outermost[e], m, edges[s, e])
         half[s] = np.arctan(np.sqrt(widest2)) + 1e-3
-    return look, place, half, edges
+    return look, position, half, edges
 
 
 def _middle_points(
     middle: tuple[Array, Array, Array], many: Flags, a: Indices, b: Indices, farthest_km: float
 ) -> Array:
-    """Return a place [km] in the middle of what each pair of sensors shares, (n, 3).
+    """Return a point [km] in the middle of the space that each pair of sensors shares, (n, 3).
 
-    The axes' closest approach. For nearly parallel axes this is at random. So if many sensors share
-    space with one of the pair, it is the closest approach of that one and its first partner, if
-    this is well in the field of the other. The pairs with the longest baselines come first.
+    It is the closest approach of the two axes. For nearly parallel axes that point is arbitrary.
+    So in crowded space, the closest approach of one sensor of the pair and the first sensor that
+    it is paired with (longest baseline) is taken instead, if it is well inside the other's field.
     """
-    look, place, half = middle
-    range_a, _, _ = _closest_approach(place[b] - place[a], look[a], look[b])
+    look, position, half = middle
+    range_a, _, _ = _closest_approach(position[b] - position[a], look[a], look[b])
     reach = np.where(range_a > 0, np.minimum(range_a, farthest_km), farthest_km)
-    out = place[a] + reach[:, None] * look[a]
+    out = position[a] + reach[:, None] * look[a]
     sensors, first = np.unique(np.column_stack([a, b]), return_index=True)
     best = np.full((len(look), 3), np.nan)
     best[sensors] = out[first // 2]
     best[~many] = np.nan
     for one, other in ((b, a), (a, b)):
-        toward = best[one] - place[other]
+        toward = best[one] - position[other]
         along = np.sum(toward * look[other], axis=1)
-        cosine = np.cos(MIDDLE * half[other])
+        cosine = np.cos(MIDDLE_SHARE * half[other])
         well_in = along > cosine * np.linalg.norm(toward, axis=1)  # false for NaN
         out[well_in] = best[one][well_in]
     return out
@@ -380,10 +381,10 @@ def _shared_points(
     the axis of sensor b, or to an outermost tracklet of it, whichever passes most closely. NaN
     where this is outside the field of b. `middle` and `edges` are those of `_middle`.
     """
-    look, place, half = middle
+    look, position, half = middle
     best = np.full((len(a), N_EDGES), np.inf)
     points = np.full((len(a), N_EDGES, 3), np.nan)
-    baseline = np.repeat(place[b] - place[a], N_EDGES, axis=0)
+    baseline = np.repeat(position[b] - position[a], N_EDGES, axis=0)
     u = edges[a].reshape(-1, 3)
     for towards in (*np.moveaxis(edges, 1, 0), look):
         u_b = np.repeat(towards[b], N_EDGES, axis=0)
@@ -394,9 +395,9 @@ def _shared_points(
         miss = miss.reshape(-1, N_EDGES)
         nearer = miss < best
         best[nearer] = miss[nearer]
-        at = place[a][:, None] + (reach[:, None] * u).reshape(-1, N_EDGES, 3)
+        at = position[a][:, None] + (reach[:, None] * u).reshape(-1, N_EDGES, 3)
         points[nearer] = at[nearer]
-    toward = points - place[b][:, None]
+    toward = points - position[b][:, None]
     along = np.einsum("npi,ni->np", toward, look[b])
     inside = along > np.cos(half[b])[:, None] * np.linalg.norm(toward, axis=2)
     return np.where(inside[..., None], points, np.nan)

@@ -92,8 +92,8 @@ def _speed(views, i, m, range_km, n0, n1, n2):
     a = cam[PLANE] * n0 + cam[PLANE + 1] * n1 + cam[PLANE + 2] * n2
     b = cam[PLANE + 3] * n0 + cam[PLANE + 4] * n1 + cam[PLANE + 5] * n2
     turning = (see[DX] * a + see[DY] * b) / np.sqrt(1.0 + see[X] ** 2 + see[Y] ** 2)
-    own = cam[V_KM_S] * n0 + cam[V_KM_S + 1] * n1 + cam[V_KM_S + 2] * n2
-    return own + range_km * turning
+    sensor_speed = cam[V_KM_S] * n0 + cam[V_KM_S + 1] * n1 + cam[V_KM_S + 2] * n2
+    return sensor_speed + range_km * turning
 
 
 @borrowing_kernel

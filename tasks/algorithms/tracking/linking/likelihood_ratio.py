@@ -1,8 +1,15 @@
-"""Links by the likelihood ratio of one motion against two: no window, nothing to tune.
+"""Links by the likelihood ratio of one motion against two, without a window to tune.
 
-The motion of a fragment is a cubic in time on the plane of the sky, with priors on acceleration
-and jerk that follow from the apparent rate. Each fragment is reduced once to sums over its
-detections. A pair then costs a few small matrices, however long its fragments are.
+A motion is a cubic in time on the tangent plane, with priors on acceleration and jerk that follow
+from the apparent rate. `link_by_likelihood` works in these steps:
+
+1. Each end of each fragment is reduced to sums over its detections (`_reduce`), so that a pair
+   costs a few small matrices, however long its fragments are.
+2. Pairs within the longest gap are searched by a quick test: do straight lines from both ends come
+   near each other in mid-gap (`_search`)?
+3. These pairs are compared: one cubic through both against one through each (`_compare`).
+4. The gain of a link also counts how many other fragments could have begun there (`_others`).
+5. The links that gain most together are chosen (`chains.choose_links`).
 """
 
 from typing import NamedTuple
@@ -30,17 +37,18 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-FARTHEST_RAD = 0.5  # longest arc between fragments: a plane stands for the sky
-SEARCH_SIGMA = 6.0  # of the quick test that most pairs fail
+FARTHEST_RAD = 0.5  # maximum arc between fragments, for which a plane approximates the sky
+SEARCH_SIGMA = 6.0  # gate of the quick test; most pairs fail it
 SLOWEST_JERK = LOW_ORBIT_S * FAR_RAD_S2  # [rad/s^3] `jerk` of an object that stands still
-MAX_PAIRS = 10_000_000  # compared: where more are possible, the longest gaps are not bridged
+MAX_PAIRS = 10_000_000  # limit of pairs compared: beyond it, the longest gaps are not bridged
 
 
 class _Ends(NamedTuple):
     """Sums over the detections near one end of each fragment, about a middle instant.
 
     S[:, k] = sum w t^k, B[:, k] = sum w t^k (u - u0), C = sum w (u - u0)(u - u0)', with
-    w = 1 / sigma^2 and t from the instant t0. At the end itself: time `at`, place `u` and rate `w`
+    w = 1 / sigma^2 [rad^-2] and t [s] from the instant t0. At the end itself: time `at` [s],
+    direction `u` (3,), rate `w` (3,) [rad/s]
     with their variances (infinite for the rate of a single detection), and `extra`, the square
     of the acceleration beyond noise and beyond the bound that the rate sets.
     """
@@ -80,7 +88,7 @@ class _Plane(NamedTuple):
 
 @kernel
 def _sums(fragments, lo, hi, ends, f):
-    """Fill the sums of fragment f over the detections lo:hi."""
+    """Add the detections lo:hi to the sums S (7,), B (4, 3), C (3, 3) of fragment f."""
     time_s, u, sigma = fragments.time_s, fragments.u_icrs, fragments.sigma_rad
     t0, u0, S, B, C = ends.t0[f], ends.u0[f], ends.S[f], ends.B[f], ends.C[f]
     for k in range(lo, hi):
@@ -101,7 +109,8 @@ def _sums(fragments, lo, hi, ends, f):
 def _unforeseen(S, B, half, bend):
     """Return the square [rad^2/s^4] of a fragment's acceleration beyond noise and bound.
 
-    A near object that approaches head-on is slow at first and soon fast: its rate sets no bound.
+    `half` [s] is half its length, `bend` [rad/s^2] the bound that its rate sets. The bound fails
+    for a near object that approaches head-on: it is slow at first and soon fast.
     """
     # Time in units of the half-length, and a parabola free of value and slope.
     s_0, s_1, s_2 = S[0], S[1] / half, S[2] / half**2
@@ -122,8 +131,10 @@ def _unforeseen(S, B, half, bend):
 
 @kernel
 def _part(fragments, f, last):
-    """Return the rows lo, hi of a fragment's last (or first) part that a cubic describes, and
-    the fragment's rate."""
+    """Return rows lo:hi of a fragment's last (or first) part, and the fragment's rate [rad/s].
+
+    The part is short enough for a cubic, and has at least three detections where there are three.
+    """
     time_s, u = fragments.time_s, fragments.u_icrs
     lo, hi = fragments.offsets[f], fragments.offsets[f + 1]
     length = time_s[hi - 1] - time_s[lo]
@@ -144,7 +155,7 @@ def _part(fragments, f, last):
 
 @kernel
 def _reduce(fragments, last, ends):
-    """Fill the sums of every fragment's last (or first) part."""
+    """Fill `ends` with sums over each fragment's last (or first) part, and its straight line."""
     time_s, u = fragments.time_s, fragments.u_icrs
     for f in range(len(fragments.offsets) - 1):
         lo, hi, rate = _part(fragments, f, last)
@@ -231,7 +242,11 @@ def _shift(ends, f, plane, out_A, out_b):
 
 @kernel
 def _misfit(A, b, prior_2, prior_3, factor):
-    """Return b' (A + L)^-1 b summed over both axes, and ln det(A + L), by Cholesky."""
+    """Return b' (A + L)^-1 b summed over both axes, and ln det(A + L), by Cholesky.
+
+    A (4, 4), b (4, 2); L is diagonal: prior_2 and prior_3 for acceleration and jerk, else 0.
+    Writes the factor of A + L to `factor` (4, 4).
+    """
     for i in range(4):
         for j in range(i + 1):
             value = A[i, j]
@@ -258,7 +273,7 @@ def _misfit(A, b, prior_2, prior_3, factor):
 
 @kernel
 def _free_parameters(factor, prior_2, prior_3):
-    """Return how many of the 4 parameters the data decide: 4 - tr((A + L)^-1 L).
+    """Return the effective number of parameters that the data determine: 4 - tr((A + L)^-1 L).
 
     Only the last two have a prior: of the inverse, the lower right corner is needed.
     """
@@ -332,7 +347,7 @@ def _compare(tail, head, i, j, first, last, room):
 
 @kernel
 def _near(tail, head, i, j):
-    """Return whether straight lines from both ends come near each other in mid-gap."""
+    """Return whether straight lines from both ends come within `SEARCH_SIGMA` in mid-gap."""
     gap = head.at[j] - tail.at[i]
     half, miss, arc, rate = 0.5 * gap, 0.0, 0.0, 0.0
     for a in range(3):
@@ -347,7 +362,7 @@ def _near(tail, head, i, j):
 
 @kernel
 def _search(tail, head, by_start, gap_s):
-    """Return the pairs (earlier, later) that pass the longest gap and the quick test."""
+    """Return the pairs (earlier, later), at most `gap_s` apart, that pass the quick test."""
     n, room, count = len(head.at), 1024, 0
     first, second = np.empty(room, np.int64), np.empty(room, np.int64)
     sorted_start = head.at[by_start]
@@ -386,11 +401,11 @@ def link_by_likelihood(fragments: Fragments, rule: LinkRule) -> Links:
     Notes
     -----
     D = J(i u j) - J(i) - J(j), J the misfit of a cubic with a prior on acceleration and jerk, is
-    chi-square with 4 degrees of freedom where the prior decides both, with 8 where the data do.
+    chi-square with 4 degrees of freedom if the prior determines both, with 8 if the data do.
     The gain of a link is the log of the ratio of two marginal likelihoods, one motion against
     two. It depends on D, and on how precisely the one motion predicts the other fragment compared
     with how many others could have begun there. So no gap is too long where the prediction is
-    good enough. Gaps are bridged as far as any motion can be foretold.
+    good enough. Gaps are bridged as far as any motion can be predicted.
     """
     head, tail = _ends(fragments, False), _ends(fragments, True)
     offsets, time_s = fragments.offsets, fragments.time_s
@@ -410,10 +425,10 @@ def link_by_likelihood(fragments: Fragments, rule: LinkRule) -> Links:
 
 
 def _longest_gap(starts: Array, ends: Array, rule: LinkRule) -> float:
-    """Return the longest gap [s] that is worth a comparison, or that the rule asks for.
+    """Return the longest gap [s] that is bridged: that of the rule, or else the longest useful one.
 
-    Over a longer one, the jerk that even the slowest object may have makes its place unsure by
-    the whole field. Shorter ones count where there are too many fragments to compare them all.
+    Over a longer one, the jerk that even the slowest object may have makes its position uncertain
+    by the whole field. The gap is shortened until at most `MAX_PAIRS` pairs are compared.
     """
     longest = float(np.cbrt(6 * np.sqrt(rule.field_sr) / SLOWEST_JERK))
     if np.isfinite(rule.gap_s):
@@ -431,10 +446,11 @@ def _begun(starts: Array, after: Array, until: Array) -> Indices:
 
 
 def _others(starts: Array, end: Array, start: Array, gap_s: float) -> Array:
-    """Return among how many fragments each continuation was found.
+    """Return the number of fragments among which each continuation was found, normalised.
 
-    All that begin up to then could have been it. Gaps of any length are as likely, in the log of
-    that number: the harmonic sum of all that begin within the longest gap makes it a prior.
+    All fragments that begin after the end and up to the start could have been the continuation.
+    The prior of a link is one over this number; the harmonic sum over all that begin within the
+    longest gap normalises it.
     """
     up_to, all_of = _begun(starts, end, start), _begun(starts, end, end + gap_s)
     return np.asarray(np.maximum(up_to, 1) * (np.log(np.maximum(all_of, 1)) + np.euler_gamma + 0.5))

@@ -6,8 +6,8 @@ from scenes.aged_elements import HIGH, LOW, aged
 from scenes.walker import NIGHT_NS, satellites
 
 from epipole.tasks.algorithms.known_objects.matching import (
-    FEWEST,
     MAX_ROWS,
+    MIN_MATCHES,
     KnownSatellites,
     Observed,
     candidates,
@@ -128,7 +128,7 @@ def test_errors_are_learnt_from_sure_matches():
     assert learnt.along_km_day == pytest.approx(LOW.drift_km_day * factor, rel=0.35)
     assert learnt.across_km == pytest.approx(LOW.across_km * factor, rel=0.35)
     assert learnt.radial_km == pytest.approx(LOW.radial_km * factor, rel=0.35)
-    assert learn_errors(best[: FEWEST - 1], made[: FEWEST - 1], start) == start
+    assert learn_errors(best[: MIN_MATCHES - 1], made[: MIN_MATCHES - 1], start) == start
 
 
 def test_both_kinds_of_orbits_are_in_the_scene(scene):

@@ -7,8 +7,8 @@ from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.covariances import centroid_covariance
 from epipole.tasks.algorithms.tracking.blends import (
     BIN_PX,
-    SPOT_PX,
-    TrackedSpots,
+    BLEND_PX,
+    TrackedDetections,
     blend_variance,
     of_neighbour,
     resolved_px,
@@ -49,7 +49,7 @@ def _tracked(rng, times, places, flux):
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     bounds = np.cumsum([0, *map(len, times)])
     noise = centroid_covariance(u, np.full(len(u), SIGMA))
-    return TrackedSpots(bounds, np.concatenate(times), u, noise, np.concatenate(flux))
+    return TrackedDetections(bounds, np.concatenate(times), u, noise, np.concatenate(flux))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -104,9 +104,9 @@ def test_the_data_tell_below_which_separation_spots_are_one(seed, apart):
     rng = np.random.default_rng(seed)
     separation = 5.0 * np.sqrt(rng.uniform(size=2000))
     resolved = separation[(separation > apart) | (rng.uniform(size=2000) < 0.02)]
-    pairs = np.histogram(resolved, np.arange(0, 2 * SPOT_PX + BIN_PX / 2, BIN_PX))[0]
+    pairs = np.histogram(resolved, np.arange(0, 2 * BLEND_PX + BIN_PX / 2, BIN_PX))[0]
     assert apart <= resolved_px(pairs) <= apart + 2 * BIN_PX
 
 
 def test_few_pairs_do_not_tell():
-    assert resolved_px(np.zeros(20, int)) == SPOT_PX
+    assert resolved_px(np.zeros(20, int)) == BLEND_PX

@@ -5,7 +5,7 @@ import pytest
 
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.directions import multiply, quaternion_from_rotation_vector
-from epipole.tasks.algorithms.tracking.hot_pixels import CERTAIN, LIKELY, fixed_places
+from epipole.tasks.algorithms.tracking.hot_pixels import CERTAIN, LIKELY, fixed_positions
 
 CAMERA = Camera(512, 512, 14667.0, 14667.0, 255.5, 255.5)
 SIGMA = 0.15
@@ -35,7 +35,7 @@ def image(seed, n_frames, fixed, n_false=5, noise=SIGMA):
 
 
 def find(frame, x, y, time_s, q, least=CERTAIN):
-    places = fixed_places(frame, x, y, np.full(len(x), SIGMA), time_s, q, CAMERA)
+    places = fixed_positions(frame, x, y, np.full(len(x), SIGMA), time_s, q, CAMERA)
     return places.with_odds(least)
 
 

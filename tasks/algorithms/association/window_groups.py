@@ -1,4 +1,4 @@
-"""Verdicts: the group of each tracklet, window by window, and how longer evidence changes it.
+"""Groups of windows: the group of each tracklet in each window, and how longer windows change it.
 
 Two lines of sight to different things may meet by chance for half a minute, but rarely for ten.
 So the groups of a window that are not sure are judged again over longer and longer windows, as
@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-LONGER = 2.0  # a tracklet is judged again once it is longer than before by this factor
+LONGER = 2.0  # a tracklet is judged again once it lasts twice as long as before
 
 
 class Items(NamedTuple):
@@ -38,7 +38,7 @@ class Items(NamedTuple):
     n_views: Indices
 
 
-class Verdicts:
+class WindowGroups:
     """The group of each item, numbered through the windows; FREE for no group."""
 
     def __init__(self, items: Items) -> None:

@@ -1,4 +1,4 @@
-"""Verdicts: what half a minute leaves open is judged over ten; sure groups are unchanged."""
+"""Groups of windows: what half a minute leaves open is judged over ten."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from scenes.associations import associated, wrong_views
 from scenes.tracklet_scenes import Scene
 
 from epipole.tasks.algorithms.association.samples import Groups
-from epipole.tasks.algorithms.association.verdicts import Items, Verdicts
+from epipole.tasks.algorithms.association.window_groups import Items, WindowGroups
 
 EVERY_S = 6.0
 
@@ -16,7 +16,7 @@ def ten_minutes(seed: int) -> Scene:
     return scene.objects(10).strays(30)
 
 
-def entered(score: float, tracklets=(0, 1)) -> Verdicts:
+def entered(score: float, tracklets=(0, 1)) -> WindowGroups:
     """Two tracklets of two sensors, five windows of 30 s: one group in the first window.
 
     Their views are 10 s apart.
@@ -24,7 +24,7 @@ def entered(score: float, tracklets=(0, 1)) -> Verdicts:
     window, tracklet = np.repeat(np.arange(5), 2), np.tile([0, 1], 5)
     first_ns = window * 30_000_000_000
     items = Items(window, tracklet, tracklet, first_ns, first_ns + 20_000_000_000, np.full(10, 3))
-    verdicts = Verdicts(items)
+    verdicts = WindowGroups(items)
     verdicts.enter(np.flatnonzero(items.window == 0), np.array(tracklets), group_of(2, score))
     return verdicts
 
