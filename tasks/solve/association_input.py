@@ -5,7 +5,7 @@ few instants at which tracklets are compared.
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +27,8 @@ from epipole.tasks.common.sightings import camera_of
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-MAX_SAMPLES = 12  # instants in a window
+MAX_SAMPLES = 12  # even instants in a window
+END_STEP_NS = 1_000_000_000  # between the instants at which tracklets enter or leave
 BLENDED = 4.0  # times the noise: what blends may add makes a view useless to tell objects apart
 
 
@@ -64,22 +65,29 @@ def even_instants(epochs: Indices, window_s: float) -> Indices:
     return np.unique(epochs[np.argmin(np.abs(epochs[:, None] - middle), axis=0)])
 
 
-def with_extra_instants(even: Indices, tracklets: Iterable[Indices]) -> Indices:
-    """Return the instants of a window, with one for each tracklet without a view at these.
+def with_ends(even: Indices, epochs: Indices, first: Indices, last: Indices) -> Indices:
+    """Return the instants of a window, with the ends of the tracklets that enter or leave it.
+
+    Two tracklets that share a few seconds only are compared where both have a view: between the
+    later first and the earlier last view. At two instants their motion is evidence as well.
 
     Parameters
     ----------
-    tracklets
-        For each tracklet without a clear view at the even instants, in order: the epochs of its
-        clear views. It gets the middle one, unless it has a view at the instant of another.
+    even
+        The even instants.
+    epochs
+        Epochs of the window, in order; the ends are put on the first epoch of each `END_STEP_NS`.
+    first, last : (n,) int
+        First and last clear view of each tracklet that lacks a view at one of the even instants.
     """
-    chosen = set(even.tolist())
-    for epochs in tracklets:
-        if len(chosen) >= MAX_SAMPLES:
-            break
-        if len(epochs) and not chosen.intersection(epochs.tolist()):
-            chosen.add(int(epochs[len(epochs) // 2]))
-    return np.array(sorted(chosen), np.int64)
+    _, begins = np.unique(epochs // END_STEP_NS, return_index=True)
+    coarse = epochs[begins]
+    after = np.searchsorted(coarse, first)
+    before = np.searchsorted(coarse, last, side="right") - 1
+    short = after > before
+    middle = epochs[np.searchsorted(epochs, (first[short] + last[short]) // 2)]
+    ends = np.concatenate([coarse[after[~short]], coarse[before[~short]], middle])
+    return np.union1d(even, ends)
 
 
 # -- Sensor poses: where the sensors are and where they look at a few instants.
@@ -163,7 +171,19 @@ def _near_frames(epochs: pa.Table) -> _Frames:
 SAMPLED = [
     name
     for name in VIEWS.names
-    if name in ("epoch", "ux", "uy", "uz", "x_km", "y_km", "z_km", "position_sigma_km")
+    if name
+    in (
+        "epoch",
+        "ux",
+        "uy",
+        "uz",
+        "x_km",
+        "y_km",
+        "z_km",
+        "position_sigma_km",
+        "first_fitted",
+        "last_fitted",
+    )
     or name.startswith(("w", "cov_"))
 ]
 
@@ -259,28 +279,35 @@ class BlockViews:
             even_instants(epochs[lo:hi], self.half_width_s)
             for lo, hi in itertools.pairwise(cuts.tolist())
         ]
-        lacking = self._lacking(np.concatenate([*even, np.zeros(0, np.int64)]))
+        ends = self._ends(even)
         self.instants = [
-            with_extra_instants(instants, (lacking[w][key] for key in sorted(lacking[w])))
-            for w, instants in enumerate(even)
+            with_ends(instants, epochs[lo:hi], *of_window)
+            for instants, (lo, hi), of_window in zip(
+                even, itertools.pairwise(cuts.tolist()), ends, strict=True
+            )
         ]
 
-    def _lacking(self, even: Indices) -> list[dict[int, Indices]]:
-        """Return, for each window, the epochs of the clear views of each tracklet that has none
-        at the even instants."""
-        lacking: list[dict[int, Indices]] = [{} for _ in self.window_number]
-        wanted = np.isin(self.epochs, even)
+    def _ends(self, even: Sequence[Indices]) -> list[tuple[Indices, Indices]]:
+        """Return, for each window, the first and last clear view of each tracklet that lacks a
+        clear view at one of the even instants."""
+        wanted = np.isin(self.epochs, np.concatenate([*even, np.zeros(0, np.int64)]))
+        n_even = np.array([len(instants) for instants in even], np.int64)
+        parts = []
         for epoch_ns, epoch, tracklet, clear in zip(
             self._epoch_ns, self._epoch, self._tracklet, self._clear, strict=True
         ):
+            epoch_ns, epoch, tracklet = epoch_ns[clear], epoch[clear], tracklet[clear]
             bounds = group_offsets(epoch_ns // self.window_ns, tracklet)
-            there = wanted[epoch] & clear
-            has = np.add.reduceat(there, bounds[:-1]) > 0 if len(there) else np.zeros(0, bool)
-            for k in np.flatnonzero(~has).tolist():
-                rows = slice(bounds[k], bounds[k + 1])
-                w = np.searchsorted(self.window_number, epoch_ns[bounds[k]] // self.window_ns)
-                lacking[w][int(tracklet[bounds[k]])] = epoch_ns[rows][clear[rows]]
-        return lacking
+            if len(bounds) == 1:
+                continue
+            has = np.add.reduceat(wanted[epoch].astype(np.int64), bounds[:-1])
+            first, last = epoch_ns[bounds[:-1]], epoch_ns[bounds[1:] - 1]
+            window = np.searchsorted(self.window_number, first // self.window_ns)
+            lacks = has < n_even[window]
+            parts.append(np.stack([window, first, last])[:, lacks])
+        window, first, last = np.concatenate([np.zeros((3, 0), np.int64), *parts], axis=1)
+        rows = [np.flatnonzero(window == w) for w in range(len(even))]
+        return [(first[of_window], last[of_window]) for of_window in rows]
 
     def views_at(self, instants: Indices, items: Indices | None = None) -> tuple[pa.Table, Indices]:
         """Return the clear views at some epochs, and the tracklet of each.
@@ -343,6 +370,7 @@ class SampledViews:
         self.noise = stack_covariance(views, "cov_noise_{}_rad2", TANGENT_AXES)
         self.bias = stack_covariance(views, "cov_bias_{}_rad2", TANGENT_AXES)
         self.sigma_km = array(views, "position_sigma_km")
+        self.width_s = (array(views, "last_fitted") - array(views, "first_fitted")) / 1e9
 
     def samples(self, instants: Indices, skipped: Indices) -> tuple[Samples, Indices]:
         """Return the samples of the tracklets at some epochs, and the tracklets' numbers.
@@ -363,7 +391,9 @@ class SampledViews:
         # The common error is one for all k samples. With k times its variance in each of them,
         # they count together as one.
         n_samples = seen.sum(axis=1)[item].astype(float)
-        repeated = _repeated(seen, instants / 1e9, self.block.half_width_s)[item, at]
+        width_s = np.zeros((t, k))
+        width_s[item, at] = self.width_s[rows]
+        repeated = _repeated(seen, (instants - instants[:1]) / 1e9, width_s)[item, at]
         cov[item, at] = (
             repeated[:, None, None] * self.noise[rows] + n_samples[:, None, None] * self.bias[rows]
         )
@@ -390,11 +420,11 @@ class SampledViews:
         ), tracklet
 
 
-def _repeated(seen: npt.NDArray[np.bool_], time_s: Array, window_s: float) -> Array:
+def _repeated(seen: npt.NDArray[np.bool_], time_s: Array, width_s: Array) -> Array:
     """Return how many samples of its tracklet each sample repeats, itself included, (t, k).
 
-    Samples nearer than twice the half-window share detections, and with them their errors. With
-    the noise so many times larger, they count together as what is independent.
+    Samples that rest on the same detections share their errors. With the noise so many times
+    larger, they count together as what is independent.
 
     Parameters
     ----------
@@ -402,8 +432,11 @@ def _repeated(seen: npt.NDArray[np.bool_], time_s: Array, window_s: float) -> Ar
         Whether tracklet t has a sample at instant k.
     time_s : (k,) float
         The instants [s].
+    width_s : (t, k) float
+        Time that the detections of each sample span.
     """
     apart = np.abs(time_s[:, None] - time_s[None, :])
-    shared = np.maximum(1 - apart / max(2 * window_s, 1e-9), 0.0)
-    np.fill_diagonal(shared, 1.0)
-    return seen.astype(float) @ shared
+    width = np.maximum((width_s[:, :, None] + width_s[:, None, :]) / 2, 1e-9)
+    shared = np.maximum(1 - apart / width, 0.0)
+    shared[:, np.arange(len(time_s)), np.arange(len(time_s))] = 1.0
+    return np.einsum("tij,tj->ti", shared, seen.astype(float))

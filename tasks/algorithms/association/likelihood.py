@@ -45,7 +45,11 @@ from epipole.tasks.algorithms.association.search.merge_hypotheses import best_me
 from epipole.tasks.algorithms.association.search.resolve_conflicts import resolve_conflicts
 from epipole.tasks.algorithms.association.search.search_space import SearchSpace, work_space
 from epipole.tasks.algorithms.association.search.seeds import seeds_between
-from epipole.tasks.algorithms.association.search.sensor_pairs import EveryPair, SensorPairs
+from epipole.tasks.algorithms.association.search.sensor_pairs import (
+    FEW_TRACKLETS,
+    EveryPair,
+    SensorPairs,
+)
 from epipole.tasks.algorithms.association.views import views_of
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 
@@ -147,6 +151,7 @@ class _Search:
         self.space, self.order, self.margin = space, order, float(margin)
         self.work = work_space(space.views)
         self.many = len(space.views.half_field) > FEW_SENSORS
+        self.sparse = np.diff(space.views.first) <= FEW_TRACKLETS
         self.group, self.ambiguous = np.full(len(order), FREE), np.zeros(len(order), np.bool_)
         self.groups: list[Hypothesis] = []
 
@@ -178,7 +183,9 @@ class _Search:
 
     def hypotheses(self, a: int, b: int) -> list[Hypothesis]:
         """Return what the seeds of two sensors grow into; clear groups are accepted at once."""
-        gate_sigma = min(self.space.gate_sigma, SEED_SIGMA) if self.many else self.space.gate_sigma
+        gate_sigma = self.space.gate_sigma
+        if self.many and not (self.sparse[a] and self.sparse[b]):
+            gate_sigma = min(gate_sigma, SEED_SIGMA)
         seeds = seeds_between(self.space, a, b, gate_sigma)
         grown, taken = self.grow(seeds, CLEAR_LOG_ODDS if self.many else np.inf)
         for h, clear in zip(grown, taken, strict=True):

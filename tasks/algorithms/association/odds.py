@@ -90,33 +90,36 @@ def looks_at(views, s, X, seen_by):
 
 
 @borrowing_kernel
-def should_detect(views, s, points, farthest_km2):
+def should_detect(views, s, points, nearest_km2):
     """Return whether a sensor without a tracklet of the object counts as a miss.
 
     It does where the points are in its field, and not much fainter than for the members' sensors:
-    `farthest_km2` is `farthest_range2` of these.
+    `nearest_km2` is `nearest_range2` of these.
     """
     if not looks_at(views, s, points.x_km, points.seen_by):
         return False
     for m in range(len(views.time_s)):
         if points.seen_by[m] >= 2:
-            return _range2(views.camera, s, m, points.x_km[m]) <= FAINTER * FAINTER * farthest_km2
+            return _range2(views.camera, s, m, points.x_km[m]) <= FAINTER * FAINTER * nearest_km2
     return True
 
 
 @borrowing_kernel
-def farthest_range2(views, members, points):
-    """Return the longest squared range [km^2] from which members see the first solved point."""
-    farthest2 = 0.0
+def nearest_range2(views, members, points):
+    """Return the shortest squared range [km^2] from which members see the first solved point.
+
+    How faint the others could detect it is not known: their cameras may be better.
+    """
+    nearest2 = np.inf
     for m in range(len(views.time_s)):
         if points.seen_by[m] < 2:
             continue
         for i in members:
             if views.seen[i, m]:
                 range2 = _range2(views.camera, views.sensor[i], m, points.x_km[m])
-                farthest2 = max(farthest2, range2)
+                nearest2 = min(nearest2, range2)
         break
-    return farthest2
+    return nearest2
 
 
 @borrowing_kernel
@@ -209,7 +212,7 @@ def _detections(space, work, members, near):
     """
     views, detected = space.views, space.chance.detected
     total, n_missed = 0.0, 0
-    farthest2 = farthest_range2(views, members, work.points)
+    nearest2 = nearest_range2(views, members, work.points)
     mark = next_mark(work.stamp)
     for i in members:
         s = views.sensor[i]
@@ -217,7 +220,7 @@ def _detections(space, work, members, near):
             work.stamp[s] = mark
             total += np.log(detected[s])
     for s in near:
-        if work.stamp[s] != mark and should_detect(views, s, work.points, farthest2):
+        if work.stamp[s] != mark and should_detect(views, s, work.points, nearest2):
             work.missed[n_missed] = s
             n_missed += 1
             total += np.log(1.0 - detected[s])

@@ -1,4 +1,4 @@
-"""Choose instants: a few epochs that share no detections, and one for each short tracklet."""
+"""Choose instants: a few epochs that share no detections, and the ends of short tracklets."""
 
 import numpy as np
 from scenes.associations import block_of, filled, tables
@@ -10,7 +10,7 @@ from epipole.tasks.solve.association_input import (
     MAX_SAMPLES,
     clear_views,
     even_instants,
-    with_extra_instants,
+    with_ends,
 )
 
 SECOND_NS = 1_000_000_000
@@ -34,9 +34,9 @@ def test_long_windows_have_no_more_than_the_most_instants():
     assert len(even_instants(np.arange(600) * SECOND_NS, 6.0)) == MAX_SAMPLES
 
 
-def test_a_tracklet_between_the_even_instants_adds_one_of_its_epochs():
+def test_a_tracklet_between_the_even_instants_adds_its_ends():
     scene = Scene(3, 2, times=TIMES).objects(2)
-    scene.seen[0] = (TIMES > 15) & (TIMES < 19)
+    scene.seen[0] = (TIMES > 15) & (TIMES < 21)
     of = tables(scene)
     settings = Settings(
         association=AssociationSettings(span_s=600.0), alignment=AlignmentSettings(window_s=30.0)
@@ -47,26 +47,42 @@ def test_a_tracklet_between_the_even_instants_adds_one_of_its_epochs():
     of_tracklet = of.views.filter(np.array(of.views["tracklet_id"]) == "t0000")
     of_tracklet = of_tracklet["epoch"].cast("int64").to_numpy()
     assert not np.isin(of_tracklet, even).any()
-    assert np.isin(of_tracklet, chosen).sum() == 1
-    assert set(even.tolist()) < set(chosen.tolist())
+    assert chosen.tolist() == sorted([*even, of_tracklet[0], of_tracklet[-1]])
 
 
-def test_two_tracklets_share_an_extra_instant():
-    even = np.array([10, 50])
-    chosen = with_extra_instants(even, [np.array([20, 21, 22]), np.array([21, 30, 31])])
-    assert chosen.tolist() == [10, 21, 50]
-    apart = with_extra_instants(even, [np.array([20, 21, 22]), np.array([30, 31])])
-    assert apart.tolist() == [10, 21, 31, 50]
+EPOCHS = np.arange(0, 30 * SECOND_NS, SECOND_NS // 2)
 
 
-def test_extra_instants_are_limited():
-    tracklets = [np.array([1000 + k]) for k in range(2 * MAX_SAMPLES)]
-    chosen = with_extra_instants(np.array([10, 50]), tracklets)
-    assert chosen.tolist() == [10, 50, *range(1000, 1000 + MAX_SAMPLES - 2)]
+def at(*seconds):
+    return np.array([round(s * SECOND_NS) for s in seconds])
 
 
-def test_a_tracklet_that_is_a_blend_throughout_adds_no_instant():
-    assert with_extra_instants(np.array([10]), [np.zeros(0, np.int64)]).tolist() == [10]
+def test_two_tracklets_are_compared_at_both_ends_of_the_time_they_share():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        first = rng.choice(EPOCHS[:40], 2)
+        last = first + rng.choice(EPOCHS[3:20], 2)
+        chosen = with_ends(at(7.5, 22.5), EPOCHS, first, last)
+        begin, end = first.max(), last.min()
+        if end - begin >= 2 * SECOND_NS:
+            shared = chosen[(chosen >= begin) & (chosen <= end)]
+            assert shared[0] - begin < SECOND_NS
+            assert end - shared[-1] < SECOND_NS
+
+
+def test_a_tracklet_shorter_than_the_step_has_one_instant():
+    assert with_ends(at(7.5), EPOCHS, at(10.5), at(10.5)).tolist() == at(7.5, 10.5).tolist()
+
+
+def test_ends_are_few_however_many_tracklets_there_are():
+    rng = np.random.default_rng(1)
+    first = rng.choice(EPOCHS[:40], 5000)
+    assert len(with_ends(at(7.5, 22.5), EPOCHS, first, first + 3 * SECOND_NS)) <= 32
+
+
+def test_without_tracklets_the_even_instants_stay():
+    none = np.zeros(0, np.int64)
+    assert with_ends(at(7.5, 22.5), EPOCHS, none, none).tolist() == at(7.5, 22.5).tolist()
 
 
 def test_views_are_clear_where_a_neighbour_adds_little_to_their_errors():

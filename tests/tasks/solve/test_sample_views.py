@@ -1,6 +1,7 @@
 """Samples of views: a few instants, their errors, and poses of the sensors at them."""
 
 import numpy as np
+import pyarrow as pa
 import pytest
 from scenes.associations import START_NS, SceneTables, block_of, tables
 from scenes.tracklet_scenes import Scene
@@ -32,7 +33,8 @@ def with_columns(of: SceneTables, **columns) -> SceneTables:
     rows = of.views
     for name, values in columns.items():
         k = rows.schema.get_field_index(name)
-        rows = rows.set_column(k, rows.schema.field(k), [values])
+        field = rows.schema.field(k)
+        rows = rows.set_column(k, field, pa.array(values).cast(field.type))
     return of._replace(views=rows)
 
 
@@ -78,6 +80,9 @@ def test_an_error_that_all_frames_share_counts_once_in_any_number_of_samples(sce
 def test_samples_that_share_detections_count_together_as_what_is_independent(scene):
     of = tables(scene)
     noise = of.views["cov_noise_11_rad2"][0].as_py()
+    epoch = of.views["epoch"].cast("int64").to_numpy()
+    half = 6_000_000_000
+    of = with_columns(of, first_fitted=epoch - half, last_fitted=epoch + half)
     apart, near = at(*(np.arange(6) * 12.0)), at(*(np.arange(6) * 2.0))  # less than one window
     weight = [
         np.sum(1 / samples_of(of, instants)[0].cov[:, :, 0, 0], axis=1)

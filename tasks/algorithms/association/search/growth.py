@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.association.odds import (
-    farthest_range2,
     near_fields,
+    nearest_range2,
     next_mark,
     score,
     should_detect,
@@ -150,7 +150,7 @@ def _grow(space, work, members, nearby):
         return np.int64(0), np.int64(0)
     a, b = views.sensor[members[0]], views.sensor[members[1]]
     evidence, looked, early = 0.0, 0, np.int64(0)
-    farthest2 = farthest_range2(views, members[:n], work.points)
+    nearest2 = nearest_range2(views, members[:n], work.points)
     begin = 0
     while begin < n_near and near[begin] < a:
         begin += 1
@@ -168,12 +168,12 @@ def _grow(space, work, members, nearby):
             return np.int64(0), np.int64(0)
         if n > before and before < WELL_KNOWN:
             early = min(n, np.int64(WELL_KNOWN))
-            farthest2 = farthest_range2(views, members[:n], work.points)
+            nearest2 = nearest_range2(views, members[:n], work.points)
         elif n > before:
-            more = farthest_range2(views, members[before:n], work.points)
-            farthest2 = max(farthest2, more)
+            more = nearest_range2(views, members[before:n], work.points)
+            nearest2 = min(nearest2, more)
         if turn < n_near:
-            expected = detected or should_detect(views, s, work.points, farthest2)
+            expected = detected or should_detect(views, s, work.points, nearest2)
             looked += expected
             if expected and not detected:
                 evidence += np.log(1.0 - space.chance.detected[s])

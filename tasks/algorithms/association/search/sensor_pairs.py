@@ -30,6 +30,7 @@ TESTED_INSTANTS = 3
 N_LEADERS = 8  # sensors of a crowded cell with which all others there are paired
 MAX_OVERLAPPING = 64  # maximum number of others that a sensor is paired with, half of them leaders
 MAX_TESTS = 512  # maximum number of tests per sensor of whether two fields overlap
+FEW_TRACKLETS = 8  # of a sensor in a window, with which seeding costs next to nothing
 N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its plane
 # Share of a crowded field that counts as covered by a pair: its edges are not looked at.
 MIDDLE_SHARE = 0.5
@@ -194,6 +195,9 @@ class SensorPairs:
     have fewer chance meetings. But every sensor takes part once before any takes part again.
     Pairs whose fields do not overlap are skipped. In crowded space each sensor is paired with a few
     only, see `meeting_pairs`.
+
+    Two sensors of few tracklets always seed: that costs little, and a passage of seconds may have
+    been seen by these two alone, whatever other fields swept the same space.
     """
 
     def __init__(self, views: Views, farthest_km: float, index: FieldIndex, cones: Array) -> None:
@@ -214,6 +218,8 @@ class SensorPairs:
         )
         self._share = np.where(few, 1.0, MIDDLE_SHARE)
         self._look, self._position, self._half = middle
+        sparse = np.diff(views.first) <= FEW_TRACKLETS
+        self._always = sparse[self._a] & sparse[self._b]
         self._waiting = np.ones(len(order), bool)
         self._busy = np.zeros(len(look), bool)
         # Earlier pairs that cover each point of a pair. A point that is not shared (NaN) counts as
@@ -232,7 +238,7 @@ class SensorPairs:
         A pair is skipped where `enough` of the earlier pairs cover each point that it shares.
         These points are in the middle of the shared space and, if it is not crowded, at its edges.
         """
-        state = (self._a, self._b, self._waiting, self._covered, self._busy)
+        state = (self._a, self._b, self._always, self._waiting, self._covered, self._busy)
         k = _next_pair(*state, float(enough), self._next)
         if k < 0:
             self._busy[:] = False
@@ -252,10 +258,12 @@ class SensorPairs:
 
 
 @borrowing_kernel
-def _next_pair(a, b, waiting, covered, busy, enough, begin):
+def _next_pair(a, b, always, waiting, covered, busy, enough, begin):
     """Return the first pair from `begin` on that should seed, its sensors not busy, or -1."""
     for k in range(begin, len(a)):
         if waiting[k] and not busy[a[k]] and not busy[b[k]]:
+            if always[k]:
+                return k
             for c in range(covered.shape[1]):
                 if covered[k, c] < enough:
                     return k

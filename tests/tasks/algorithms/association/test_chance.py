@@ -1,8 +1,12 @@
-"""Detection: the probability of detection is estimated from the groups themselves."""
+"""Chance: how unrelated tracklets behave is estimated from the data, and not from too few."""
 
 import numpy as np
 import pytest
+from scenes.passages import passages
 from scenes.tracklet_scenes import Scene, judge, solve
+
+from epipole.tasks.algorithms.association.chance import USUAL_SPREAD, chance_of
+from epipole.tasks.algorithms.constants import ARCSEC
 
 
 def partly_seen(seed, n_sensors, detected, n_objects=30):
@@ -56,3 +60,29 @@ def test_many_sensors_leave_few_strays_and_no_ghosts():
     assert len({int(np.bincount(members[members >= 0]).argmax()) for members in large}) == 40
     assert len(large) == 40
     assert sum((members != members[0]).any() for members in large) <= 2
+
+
+def test_a_single_tracklet_tells_nothing_of_the_usual_rates_of_its_sensor():
+    chance = chance_of(Scene(1, 3).objects(1).samples(), 1e5, 0.9)
+    np.testing.assert_allclose(chance.spread, USUAL_SPREAD)
+    np.testing.assert_allclose(chance.drift, 0.0)
+
+
+def test_many_tracklets_that_move_alike_have_a_narrow_spread():
+    chance = chance_of(Scene(1, 3).objects(20).samples(), 1e5, 0.9)
+    assert (chance.spread < 20 * ARCSEC).all()
+    of_objects = np.linalg.norm(chance.drift, axis=1)
+    assert (of_objects > 5 * ARCSEC).all()
+
+
+def test_a_passage_is_found_among_sensors_that_look_elsewhere():
+    """Not so for any number of them: what they do not see in common makes objects seem fewer."""
+
+    def found(n):
+        groups = [solve(passages(seed, n)).group for seed in range(10)]
+        return {k for k, group in enumerate(groups) if group[0] == group[1] >= 0}
+
+    alone = found(2)
+    assert len(alone) >= 8
+    assert alone <= found(8)
+    assert len(alone & found(32)) >= len(alone) - 1
