@@ -148,7 +148,7 @@ class TrackletSettings(Group):
         description="Largest distance of a detection from the prediction of its track.",
     )
     max_rate_deg_s: float = Field(
-        2.0, gt=0, le=180, description="Fastest apparent motion to search for."
+        12.0, gt=0, le=180, description="Fastest apparent motion to search for."
     )
     max_missed: int = Field(
         3,

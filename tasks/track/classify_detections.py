@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from epipole.schemas.bridge import array
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.algorithms.orbits.planets import planet_directions
 from epipole.tasks.algorithms.tracking.hot_pixels import FixedPositions, fixed_positions
@@ -63,19 +63,37 @@ def is_planet(frames: Frames, sightings: Sightings, camera: Camera) -> Flags:
 
 
 def at_star(sightings: Sightings, rows: npt.NDArray[np.int64], stars: Array) -> Flags:
-    """Return which of some sightings stand at a run that stood still, an unlisted star.
+    """Return which of some sightings stand at a star.
 
     Parameters
     ----------
     rows : (n,) int
         Indices of these sightings.
     stars : (s, 3) float
-        Unit vectors of the runs that stood still.
+        Directions of stars, unit vectors.
     """
     if not len(stars) or not len(rows):
         return np.zeros(len(rows), bool)
     off, _ = cKDTree(stars).query(sightings.u_icrs[rows])
     return np.asarray(off < GATE_SIGMA * sighting_sigma(sightings)[rows])
+
+
+def star_directions(frames: Frames, stars: pa.Table, camera: Camera) -> Array:
+    """Return where each star of STARS was measured, the mean over its frames: (s, 3) unit vectors,
+    ICRS, with the aberration of the sensor."""
+    by_number = np.argsort(frames.number, kind="stable")
+    number = array(stars, "frame_number")
+    if not len(number) or not len(by_number):
+        return np.zeros((0, 3))
+    at = np.minimum(np.searchsorted(frames.number[by_number], number), len(by_number) - 1)
+    frame = by_number[at]
+    known = frames.number[frame] == number
+    u = unproject(camera, array(stars, "x_px")[known], array(stars, "y_px")[known])
+    R = matrix_from_quaternion(frames.q_sensor_from_icrs)[frame[known]]
+    u = np.einsum("nij,ni->nj", R, u)
+    ids, star = np.unique(array(stars, "star_id")[known], return_inverse=True)
+    mean = np.column_stack([np.bincount(star, u[:, a], minlength=len(ids)) for a in range(3)])
+    return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True))
 
 
 def sighting_sigma(sightings: Sightings) -> Array:

@@ -25,7 +25,7 @@ from epipole.schemas.options import TRACK_LINKING, load_method
 from epipole.schemas.settings import Settings, TrackletSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
-from epipole.schemas.tables import DETECTIONS
+from epipole.schemas.tables import DETECTIONS, STARS
 from epipole.schemas.work_tables import HOT_SUSPECTS, SOLUTIONS, TRACKLET_RUNS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.camera import Camera
@@ -55,6 +55,7 @@ from epipole.tasks.track.classify_detections import (
     at_star,
     is_planet,
     sighting_sigma,
+    star_directions,
     static_positions,
 )
 
@@ -69,11 +70,19 @@ STAR_DRIFT = 0.05 * ARCSEC
 STAR_RATE_KNOWN = 1.0 * ARCSEC  # rad/s: with a larger sigma, a run is not taken for a star
 
 
+MOST_AT_STAR = 0.5  # share of a resting run's detections that must lie at one
+
+
 class TrackRun(NamedTuple):
-    """The sightings of one track, in order of time, and its motion."""
+    """The sightings of one track, in order of time, and its motion.
+
+    It `rests` where its rate agrees with that of a star, and `stands_still` where besides the rate
+    is known well enough to exclude an object in orbit.
+    """
 
     members: npt.NDArray[np.int64]
     rate_rad_s: float
+    rests: bool
     stands_still: bool
     residual_px: float
 
@@ -110,9 +119,10 @@ def measure_runs(
     for lo, hi in itertools.pairwise(bounds):
         members = order[lo:hi]
         rate, sigma = _mean_rate(t[lo:hi], u[lo:hi], variance[lo:hi])
-        still = rate < max(STAR_RATE_SIGMA * sigma, STAR_DRIFT) and sigma < STAR_RATE_KNOWN
+        rests = rate < max(STAR_RATE_SIGMA * sigma, STAR_DRIFT)
+        still = rests and sigma < STAR_RATE_KNOWN
         residual = float(np.sqrt(np.mean(miss[lo:hi] ** 2) / 2)) / camera.pixel_rad
-        runs.append(TrackRun(members, rate, still, residual))
+        runs.append(TrackRun(members, rate, rests, still, residual))
     return runs
 
 
@@ -140,9 +150,15 @@ class Tracked(NamedTuple):
 
 
 def build_tracklets(
-    solutions: pa.Table, detections: pa.Table, cameras: pa.Table, settings: Settings
+    solutions: pa.Table,
+    detections: pa.Table,
+    cameras: pa.Table,
+    settings: Settings,
+    stars: pa.Table | None = None,
 ) -> Tracked:
     """Return one sensor's detections with tracklet_id, track_id and kind, and its tracklets.
+
+    `stars` are the STARS of the sensor: what rests where one is identified in other frames is it.
 
     Frames with an attitude are tracked on the sky. Frames without are tracked apart from them, in
     the image. There stars move like objects and cannot be distinguished from them.
@@ -154,7 +170,7 @@ def build_tracklets(
         *(np.full(detections.num_rows, None, dtype=object) for _ in range(2)),
     )
     parts = [
-        _label(part, labels, detections, settings)
+        _label(part, labels, detections, settings, empty(STARS) if stars is None else stars)
         for part in _parts(solutions, detections, cameras)
     ]
     columns = {name: detections[name] for name in DETECTIONS.names} | labels._asdict()
@@ -225,7 +241,11 @@ def _follow(
 
 
 def _label(
-    part: _TrackedFrames, labels: _Labels, detections: pa.Table, settings: Settings
+    part: _TrackedFrames,
+    labels: _Labels,
+    detections: pa.Table,
+    settings: Settings,
+    identified: pa.Table,
 ) -> tuple[pa.Table, pa.Table]:
     """Label the detections of some frames; return their tracklets, and those that may be hot."""
     frames, sightings, camera = part.frames, part.sightings, part.camera
@@ -242,9 +262,11 @@ def _label(
     track = _follow(part, sightings, settings.tracklets)
     runs = measure_runs(frames, sightings, track, camera, settings.alignment.window_s)
     if part.on_sky:
-        stars = [run for run in runs if run.stands_still]
-        runs = [run for run in runs if not run.stands_still]
-        _label_stars(labels, sightings, stars, np.flatnonzero(track == NONE))
+        u_stars = star_directions(frames, identified, camera)
+        still = _unlisted_stars(sightings, runs, u_stars)
+        stars = [run for run, is_star in zip(runs, still, strict=True) if is_star]
+        runs = [run for run, is_star in zip(runs, still, strict=True) if not is_star]
+        _label_stars(labels, sightings, stars, u_stars, np.flatnonzero(track == NONE))
     # What no run holds, no other sensor can confirm.
     in_runs = _in_runs(fixed.position[kept], runs)
     labels.kind[sightings.row[suspected & ~in_runs]] = "hot_pixel"
@@ -283,13 +305,43 @@ def _label_objects(
 
 
 def _label_stars(
-    labels: _Labels, sightings: Sightings, stars: list[TrackRun], single: npt.NDArray[np.int64]
+    labels: _Labels,
+    sightings: Sightings,
+    stars: list[TrackRun],
+    u_stars: Array,
+    single: npt.NDArray[np.int64],
 ) -> None:
-    """Label runs that stand still, and single sightings at their positions, as unlisted stars."""
+    """Label the runs of unlisted stars, and single sightings at these or at identified stars."""
     for run in stars:
         labels.kind[sightings.row[run.members]] = "star_unlisted"
-    directions = np.array([sightings.u_icrs[run.members].mean(axis=0) for run in stars])
+    directions = np.concatenate([u_stars, _mean_directions(sightings, stars)])
     labels.kind[sightings.row[single[at_star(sightings, single, directions)]]] = "star_unlisted"
+
+
+def _unlisted_stars(sightings: Sightings, runs: list[TrackRun], u_stars: Array) -> list[bool]:
+    """Return which runs are stars: they stand still; or they rest, and a star is identified there
+    in other frames, or another run stands still there.
+
+    A star that lies far from its position in the catalogue, a double or one of large proper motion,
+    is identified in a part of its frames. In the others it makes runs too short to know their
+    rates.
+    """
+    still = [run.stands_still for run in runs]
+    resting = [k for k, run in enumerate(runs) if run.rests and not run.stands_still]
+    if not resting:
+        return still
+    others = [run for run in runs if run.stands_still]
+    directions = np.concatenate([u_stars, _mean_directions(sightings, others)])
+    for k in resting:
+        members = runs[k].members
+        still[k] = bool(at_star(sightings, members, directions).mean() > MOST_AT_STAR)
+    return still
+
+
+def _mean_directions(sightings: Sightings, runs: list[TrackRun]) -> Array:
+    """Return the mean direction of each run, (r, 3)."""
+    means = [sightings.u_icrs[run.members].mean(axis=0) for run in runs]
+    return np.array(means).reshape(-1, 3)
 
 
 def _name(
@@ -399,6 +451,7 @@ def track_span(
             identified.rows_within(wide, DETECTIONS, "detections"),
             cameras,
             settings,
+            identified.rows_within(wide, STARS, "stars"),
         )
         write_part(parts.of(span), TRACKED, tracked._asdict())
     return parts.read(span, "tracklets").num_rows

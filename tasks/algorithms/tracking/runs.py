@@ -22,6 +22,7 @@ from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.initiation import (
     MAX_PAIRS,
     NONE,
+    P_DETECTION,
     Detections,
     RecentFrames,
     TrackRule,
@@ -192,7 +193,7 @@ def _follow(detections, most, rule):
             (tracks.missed[live] <= rule.max_missed)
             & (times[f] - tracks.at[live] <= rule.max_coast)
         ]
-        _assign(f, live, tracks, detections, recent, rule.gate2)
+        _assign(f, live, tracks, detections, recent, rule)
         begun, length, chains = new_tracks(
             f, rule.need + SLACK_FRAMES, n_tracks, detections, recent, rule
         )
@@ -215,17 +216,17 @@ def _lay_frame(f, detections, recent):
 
 
 @kernel
-def _assign(f, live, tracks, detections, recent, gate2):
+def _assign(f, live, tracks, detections, recent, rule):
     """Move the live tracks to frame f, give them its detections and correct them."""
     u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
-    time, slot = detections.times[f], f % len(recent.largest)
+    time = detections.times[f]
     for m in live:
         dt = time - tracks.at[m]
         grow(P[m], rate_of(w[m]), rate_of(bend[m]), dt)
         advance(u[m], w[m], bend[m], dt)
         tracks.at[m] = time
         tracks.missed[m] += 1
-    track, detection, chi2 = _candidates(live, tracks, detections, recent, slot, gate2)
+    track, detection, chi2 = _candidates(f, live, tracks, detections, recent, rule)
     row = np.searchsorted(live, track)
     assigned = np.full(len(live), NONE)
     for p in np.argsort(chi2, kind="mergesort"):
@@ -233,7 +234,7 @@ def _assign(f, live, tracks, detections, recent, gate2):
         if assigned[q] == NONE and detections.track[j] == NONE:
             assigned[q] = j
             detections.track[j] = track[p]
-    _exchange(live, tracks, detections, (row, detection, chi2), assigned, gate2)
+    _exchange(live, tracks, detections, (row, detection, chi2), assigned, rule.gate2)
     for q in range(len(live)):
         m, j = live[q], assigned[q]
         if j == NONE:
@@ -243,8 +244,10 @@ def _assign(f, live, tracks, detections, recent, gate2):
 
 
 @kernel
-def _candidates(live, tracks, detections, recent, slot, gate2):
-    """Return all (track, detection, chi-square) within the gate."""
+def _candidates(f, live, tracks, detections, recent, rule):
+    """Return all (track, detection, chi-square) within the gates of the tracks in frame f."""
+    slot, n_in = f % len(recent.largest), detections.offsets[f + 1] - detections.offsets[f]
+    density = max(n_in, 1) / rule.field_sr
     start, items = recent.grids[2], recent.grids[3]
     directions, variances = detections.directions, detections.variances
     room, count = 4 * len(live) + 16, 0
@@ -252,6 +255,9 @@ def _candidates(live, tracks, detections, recent, slot, gate2):
     chi2 = np.empty(room)
     for m in live:
         variance = tracks.P[m, 0]
+        gate2 = _gate2(variance + recent.smallest[slot], density, rule)
+        if not gate2 > 0.0:
+            continue
         reach = np.sqrt(gate2 * (variance + recent.largest[slot]))
         x_from, x_to, y_from, y_to, side = window(recent.grids, slot, tracks.u[m], reach)
         if x_from > x_to:
@@ -270,6 +276,27 @@ def _candidates(live, tracks, detections, recent, slot, gate2):
                 track[count], detection[count], chi2[count] = m, j, miss
                 count += 1
     return track[:count], detection[:count], chi2[:count]
+
+
+@kernel
+def _gate2(variance, density, rule):
+    """Return the squared gate [sigma^2] of a track: within it a detection is more likely of the
+    object than a false alarm.
+
+    Parameters
+    ----------
+    variance : float
+        Of the distance between prediction and detection, per axis [rad^2].
+    density : float
+        Detections per steradian in the frame.
+
+    Notes
+    -----
+    ``P_D / (density * 2 pi variance) * exp(-chi2 / 2) > 1``, see Blackman, Multiple-Target Tracking
+    with Radar Applications (1986). Without this limit a track whose rate is lost would take
+    whatever the image holds.
+    """
+    return min(rule.gate2, 2.0 * np.log(P_DETECTION / (density * 2 * np.pi * variance)))
 
 
 @kernel

@@ -10,9 +10,10 @@ from epipole.flows.command_line.log_info import of_sensor
 from epipole.schemas.bridge import table
 from epipole.schemas.columns import TIME
 from epipole.schemas.settings import Settings, validate_settings
-from epipole.schemas.tables import DETECTIONS
+from epipole.schemas.tables import DETECTIONS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
-from epipole.tasks.algorithms.geometry.camera import Camera
+from epipole.tasks.algorithms.geometry.camera import Camera, unproject
+from epipole.tasks.algorithms.geometry.directions import radec_from_unit
 from epipole.tasks.track.track_span import build_tracklets
 
 SCENE = """
@@ -282,3 +283,53 @@ def kinds(rate_arcsec_s):
 )
 def test_a_slow_drift_is_a_stars_and_a_faster_one_an_objects(rate_arcsec_s, kind):
     assert kinds(rate_arcsec_s).count(kind) > 0.98 * N
+
+
+def resting(runs_at, identified_at, rate_arcsec_s=0.0):
+    """Return the kinds of the detections of a point that is detected in short runs, five frames
+    each, and was identified as a star in other frames."""
+    rng = np.random.default_rng(2)
+    key = {"sensor_id": ["a"] * N, "frame_number": np.arange(N), "time": TIME_NS}
+    solutions = filled(
+        SOLUTIONS, N, **key, attitude_source=["stars"] * N,
+        qx=np.zeros(N), qy=np.zeros(N), qz=np.zeros(N), qw=np.ones(N),
+        **{f"cov_att_{ab}_arcsec2": np.full(N, 1.0 if ab in ("xx", "yy", "zz") else 0.0)
+           for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
+    )  # fmt: skip
+    camera = Camera(**CAMERA)
+    x_px, y_px = 700.0, 300.0
+    frame = np.concatenate([np.arange(k, k + 5) for k in runs_at])
+    n = len(frame)
+    x = x_px + rate_arcsec_s * (frame - frame[0]) / 21.1 + rng.normal(0, 0.2, n)
+    y = y_px + rng.normal(0, 0.2, n)
+    u = unproject(camera, x, y)
+    ra, dec = radec_from_unit(u)
+    detections = filled(
+        DETECTIONS, n, sensor_id=["a"] * n, frame_number=frame, time=TIME_NS[frame],
+        ra_deg=np.degrees(ra), dec_deg=np.degrees(dec), sigma_arcsec=np.full(n, 4.2),
+        kind=["unknown"] * n, x_px=x, y_px=y,
+    )  # fmt: skip
+    at = np.array(identified_at, np.int64)
+    stars = filled(
+        STARS, len(at), sensor_id=["a"] * len(at), frame_number=at, time=TIME_NS[at],
+        star_id=np.full(len(at), 7), x_px=x_px + rng.normal(0, 0.2, len(at)),
+        y_px=y_px + rng.normal(0, 0.2, len(at)),
+    )  # fmt: skip
+    cameras = cameras_of({"a": camera})
+    return build_tracklets(solutions, detections, cameras, Settings(), stars)
+
+
+def test_what_rests_where_a_star_is_identified_in_other_frames_is_that_star():
+    built = resting(runs_at=[10, 40], identified_at=range(100, 140))
+    assert set(built.detections["kind"].to_pylist()) == {"star_unlisted"}
+    assert built.tracklets.num_rows == 0
+
+
+def test_what_rests_where_no_star_is_may_be_an_object():
+    built = resting(runs_at=[10], identified_at=[])
+    assert set(built.detections["kind"].to_pylist()) == {"object"}
+
+
+def test_what_moves_away_from_a_star_is_an_object():
+    built = resting(runs_at=[10], identified_at=range(100, 140), rate_arcsec_s=30.0)
+    assert set(built.detections["kind"].to_pylist()) == {"object"}

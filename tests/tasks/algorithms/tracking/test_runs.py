@@ -203,3 +203,15 @@ def test_more_frames_are_held_to_the_rate_per_frame():
     ]
     assert (tracks[0] == tracks[1]).all()
     assert tracks[0].max() == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_fast_track_that_loses_its_object_does_not_live_on_false_alarms(seed):
+    """Its rate is soon unknown: a gate as wide as the image would always hold something."""
+    times, offsets, u, who = scene(
+        seed, n_objects=3, n_false=20, n_frames=60, rate_arcsec_s=4000.0, missed=0.1
+    )
+    track = follow(times, offsets, u, max_rate_rad_s=np.radians(12.0))
+    for t in range(track.max(initial=-1) + 1):
+        last = np.flatnonzero((track == t) & (who >= 0)).max(initial=-1)
+        assert ((track == t) & (np.arange(len(track)) > last)).sum() <= 2
