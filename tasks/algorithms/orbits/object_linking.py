@@ -9,9 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.special import gammaincinv, gammaln
 
 from epipole.tasks.algorithms.constants import GM_KM3_S2
@@ -72,8 +69,8 @@ def link_by_motion(
     gap_s
         Longest time between the observations [s].
     log_odds
-        Each link must raise the log-odds of all links by this, against the best ones without
-        it. So an object is not linked where two could be its continuation.
+        Least log-odds of a link, also against any other of its two objects that contradicts it.
+        So an object is not linked where either of two others could be its continuation.
     allowed : (n, n) bool
         Whether the first may continue as the second; None: any.
 
@@ -82,7 +79,7 @@ def link_by_motion(
     before : (n,) int
         The object that each object continues, -1 for a new one. No two continue the same.
     odds : (n,) float
-        Log-odds of the link; NaN for a new object.
+        Log-odds of the link by which an object was recognised; NaN for a new object.
 
     Notes
     -----
@@ -93,15 +90,10 @@ def link_by_motion(
     n = len(motions.first_s)
     before, odds = np.full(n, NONE), np.full(n, np.nan)
     pairs = _pairs(motions, gap_s, allowed)
-    gain = _gains(motions, pairs)
-    likely = gain > 0.0
-    earlier, later, gain = pairs.earlier[likely], pairs.later[likely], gain[likely]
-    graph = coo_array((np.ones(len(gain)), (earlier, later)), shape=(n, n))
-    _, part = connected_components(graph, directed=False)
-    for label in np.unique(part[earlier]):
-        linked = np.flatnonzero(part[earlier] == label)
-        for k in linked[_sure(earlier[linked], later[linked], gain[linked], log_odds)]:
-            before[later[k]], odds[later[k]] = earlier[k], gain[k]
+    links = _Links(motions, gap_s, pairs, _gains(motions, pairs))
+    for members, joined in links.joined(log_odds):
+        for k in range(1, len(members)):
+            before[members[k]], odds[members[k]] = members[k - 1], joined[members[k]]
     return before, odds
 
 
@@ -263,27 +255,67 @@ def _log_density(apart: Array, S: Array) -> float:
     return float(max(-nearest, floor))
 
 
-def _sure(earlier: Indices, later: Indices, gain: Array, log_odds: float) -> list[int]:
-    """Return the pairs of the best assignment without which any other is clearly worse."""
-    rows, row = np.unique(earlier, return_inverse=True)
-    columns, column = np.unique(later, return_inverse=True)
-    benefit = np.zeros((len(rows), len(columns)))
-    benefit[row, column] = gain  # 0: both stay unlinked
-    best, total = _assigned(benefit)
-    out = []
-    for k in range(len(gain)):
-        if not best[row[k], column[k]]:
-            continue
-        without = benefit.copy()
-        without[row[k], column[k]] = 0.0
-        if total - _assigned(without)[1] >= log_odds:
-            out.append(k)
-    return out
+class _Links:
+    """Links between objects that may be one, and the objects that they join.
 
+    An object may be joined to several: what was seen at three times is three objects, and where
+    only one of them has a velocity, the other two are each compared with it.
+    """
 
-def _assigned(benefit: Array) -> tuple[npt.NDArray[np.bool_], float]:
-    """Return the one-to-one pairs with the largest sum of benefits, and the sum."""
-    row, column = linear_sum_assignment(benefit, maximize=True)
-    chosen = np.zeros(benefit.shape, bool)
-    chosen[row, column] = benefit[row, column] > 0.0
-    return chosen, float(benefit[chosen].sum())
+    def __init__(
+        self, motions: ObservedMotions, gap_s: float, pairs: _CandidatePairs, gain: Array
+    ) -> None:
+        self.motions, self.gap_s = motions, gap_s
+        self.moves = np.isfinite(motions.tail[:, 3]) | np.isfinite(motions.head[:, 3])
+        self.gain: dict[int, dict[int, float]] = {}
+        likely = gain > 0.0
+        rows = zip(pairs.earlier[likely], pairs.later[likely], gain[likely], strict=True)
+        for i, j, of_pair in rows:
+            self.gain.setdefault(int(i), {})[int(j)] = float(of_pair)
+            self.gain.setdefault(int(j), {})[int(i)] = float(of_pair)
+
+    def joined(self, log_odds: float) -> list[tuple[list[int], dict[int, float]]]:
+        """Return the members of each joined object in order of time, and the log-odds of the link
+        that brought each in: the surest links first."""
+        edges = [
+            (-gain, i, j)
+            for i, others in self.gain.items()
+            for j, gain in others.items()
+            if i < j and gain >= log_odds
+        ]
+        group: dict[int, list[int]] = {}
+        odds: dict[int, float] = {}
+        for negative, i, j in sorted(edges):
+            one, other = group.get(i, [i]), group.get(j, [j])
+            if one is other or not all(self._compatible(a, b) for a in one for b in other):
+                continue
+            if self._has_rival(i, other, -negative - log_odds) or self._has_rival(
+                j, one, -negative - log_odds
+            ):
+                continue
+            odds |= {k: -negative for k in (i, j) if k not in odds}
+            together = one + other
+            group |= dict.fromkeys(together, together)
+        groups = {id(members): members for members in group.values()}.values()
+        return [(sorted(g, key=lambda k: self.motions.first_s[k]), odds) for g in groups]
+
+    def _has_rival(self, i: int, others: list[int], least: float) -> bool:
+        """Return whether object i is linked better than `least` to what these cannot be."""
+        return any(
+            gain > least and not all(self._compatible(k, other) for other in others)
+            for k, gain in self.gain[i].items()
+            if k not in others
+        )
+
+    def _compatible(self, i: int, j: int) -> bool:
+        """Return whether nothing tells that two objects are different ones.
+
+        They are where they were seen at the same time, or where their motions were compared and do
+        not agree.
+        """
+        seen = self.motions
+        gap = max(seen.first_s[i] - seen.last_s[j], seen.first_s[j] - seen.last_s[i])
+        if not gap > 0.0:
+            return False
+        compared = gap <= self.gap_s and (self.moves[i] or self.moves[j])
+        return not compared or j in self.gain.get(i, {})

@@ -196,3 +196,22 @@ def test_the_order_of_the_objects_changes_nothing():
     mixed, _ = link_by_motion(ObservedMotions(*(values[order] for values in seen)), **RULE)
     expected = np.where(before[order] == NONE, NONE, place[before[order]])
     np.testing.assert_array_equal(mixed, expected)
+
+
+def test_passes_without_a_velocity_are_all_recognised_by_the_one_that_has_it():
+    """Two short passes of one object and a long one: each is compared with the long one."""
+    rng = np.random.default_rng(3)
+    seen = motions([(LOW, 0, 5), (LOW, 60, 65), (LOW, 120, 180)], rng)
+    head, tail = seen.head.copy(), seen.tail.copy()
+    head[:2, 3:], tail[:2, 3:] = np.nan, np.nan
+    short = seen._replace(head=head, tail=tail)
+    before, odds = link_by_motion(short, **RULE)
+    assert before.tolist() == [NONE, 0, 1]
+    assert (odds[1:] >= RULE["log_odds"]).all()
+
+
+def test_two_objects_seen_at_one_time_are_not_both_an_earlier_one():
+    rng = np.random.default_rng(4)
+    seen = motions([(LOW, 0, 60), (LOW, 120, 180), (LOW, 150, 200)], rng)
+    before, _ = link_by_motion(seen, **RULE)
+    assert before.tolist() == [NONE, NONE, NONE]
