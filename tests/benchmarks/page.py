@@ -103,11 +103,16 @@ PLAN = {
 
 
 def commit() -> str:
-    """Return the commit of the working tree, and whether its files differ from it."""
+    """Return the commit of the working tree, and whether its files differ from it.
+
+    A copy without a repository has none.
+    """
     git = ("git", "-C", str(ROOT))
     name = subprocess.run(
-        [*git, "rev-parse", "--short", "HEAD"], check=True, capture_output=True, text=True
+        [*git, "rev-parse", "--short", "HEAD"], check=False, capture_output=True, text=True
     )
+    if name.returncode:
+        return "no commit"
     changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", ".", ":!BENCHMARKS.md"])
     return name.stdout.strip() + (" with changes" if changed.returncode else "")
 
