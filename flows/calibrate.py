@@ -56,7 +56,7 @@ def calibrate(
     with temporary_folder("calibrate") as made:
         folder = ReadFolder(made)
         read = [read_log_into.fn(folder, k, path) for k, path in enumerate(paths)]
-        frames = order_logs(folder, read, settings)
+        frames = order_logs(folder, read, settings.sensors)
         numbers = [k for k, time_ns in enumerate(frames.time_ns) if len(time_ns)]
         if not numbers:
             raise LogError(f"{', '.join(paths)}: no frames in these logs; check the recording")

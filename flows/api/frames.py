@@ -156,7 +156,10 @@ def identify_frame(
     cameras = _one_row(CAMERAS, at_ns, **optics, **covariance)
     settings = settings or Settings()
     catalogue = read_star_catalogue(settings.identification.catalogue)
-    made = identify_stars(exposures, states, cameras, catalogue, settings)
+    made = identify_stars(
+        exposures, states, cameras, catalogue, settings.sensors, settings.identification,
+        settings.tracklets.most_detections,
+    )  # fmt: skip
     star_id = np.full(n, -1, np.int64)
     star_id[array(made.stars, "centroid")] = array(made.stars, "star_id")
     row = made.solutions

@@ -13,7 +13,7 @@ from epipole.io.logs.messages.batches import valid_sensor_id
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.bridge import rows_of, table, table_name, to_polars
 from epipole.schemas.log_messages import SENSOR_ID_RULE
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import SensorSettings
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, SENSOR_STATES
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.read.states_to_gcrf import states_to_gcrf
@@ -90,7 +90,7 @@ def read_log(path: str | os.PathLike[str]) -> LogTables:
     18.0
     """
     found = reader.read_log(path)
-    states = states_to_gcrf(found.states, Settings())
+    states = states_to_gcrf(found.states, SensorSettings().position_sigma_km)
     return LogTables(
         to_polars(found.exposures.select(_FRAMES.names)),
         to_polars(states.select(_STATES.names)),

@@ -52,7 +52,8 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     }
     futures = [
         find_sensor_camera.submit(
-            work.frames, sensor, work.identified[sensor], of_sensor, work.cameras, settings,
+            work.frames, sensor, work.identified[sensor], of_sensor, work.cameras, settings.sensors,
+            settings.identification,
         )
         for sensor, of_sensor in spans.items()
     ]  # fmt: skip

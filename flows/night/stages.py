@@ -63,7 +63,7 @@ def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> Ordered
     """Read the logs, a task per log, and order their frames and states."""
     futures = [read_log_into.submit(folder, k, log) for k, log in enumerate(logs)]
     logs = results(Stage.READ, futures)
-    frames = order_logs(folder, logs, settings)
+    frames = order_logs(folder, logs, settings.sensors)
     count = sum(len(time_ns) for time_ns in frames.time_ns)
     LOGGER.info("read %s of %s", many(count, "frame"), many(len(frames.sources), "log"))
     return frames
@@ -81,7 +81,8 @@ def identify_spans(stage: Stage, work: Work, settings: Settings) -> None:
     """Identify the frames of all spans of `work`; the parts go to `work.identified`."""
     futures = [
         identify_span.submit(
-            work.frames, sensor, span, work.cameras, settings, work.identified[sensor],
+            work.frames, sensor, span, work.cameras, settings.sensors, settings.identification,
+            settings.tracklets.most_detections, work.identified[sensor],
         )
         for sensor, span in work.by_span()
     ]  # fmt: skip
@@ -98,7 +99,8 @@ def track(work: Work, night: str, settings: Settings) -> None:
     parts = work.sensor_parts()
     futures = [
         track_span.submit(
-            sensor, parts[sensor].identified, span, work.cameras, settings, parts[sensor].tracked,
+            sensor, parts[sensor].identified, span, work.cameras, settings.tracklets,
+            settings.alignment.window_s, parts[sensor].tracked,
         )
         for sensor, span in work.by_span()
     ]  # fmt: skip
@@ -188,7 +190,8 @@ def _correct_clocks(work: Work, wrong: Sequence[SensorVerdict], settings: Settin
     pairs = [(sensor, span) for sensor, span in work.by_span() if sensor in where]
     futures = [
         correct_clock.submit(
-            work.frames, sensor, work.identified[sensor], span, clocks[sensor.sensor_id], settings,
+            work.frames, sensor, work.identified[sensor], span, clocks[sensor.sensor_id],
+            settings.sensors,
             where[sensor],
         )
         for sensor, span in pairs
@@ -233,7 +236,7 @@ def name(
             for piece in solved.read(span, table):
                 rows.append(renamed(outermost(piece), numbers[span.folder]))
     first: dict[str, str] = link_objects(
-        concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings
+        concat(POSITIONS, ends["positions"]), concat(STATES, ends["states"]), settings.states
     )
     linked = {
         folder: {old: first.get(number, number) for old, number in of_span.items()}
@@ -300,7 +303,7 @@ def choose_elements(
     if known.faults:
         LOGGER.warning("%s: %s skipped, the first is %s", known.file,
                        many(len(known.faults), "invalid record"), known.faults[0])  # fmt: skip
-    elements, rejects = elements_of_night(known, night, settings)
+    elements, rejects = elements_of_night(known, night, settings.known_objects.most_days)
     if not elements.sets:
         newest = np.datetime64(max(each.epoch_ns for each in known.sets), "ns")
         LOGGER.warning(
@@ -317,7 +320,9 @@ def name_known(
     settings: Settings,
 ) -> list[SensorResidual]:
     """Name the known objects of a night whose tables are written; see `name_known_objects`."""
-    future = name_known_objects.submit(folder, known, earlier, settings)
+    future = name_known_objects.submit(
+        folder, known, earlier, settings.known_objects, settings.states.link_log_odds
+    )
     (residuals,) = results(Stage.PUBLISH, [future])
     return residuals
 

@@ -81,7 +81,7 @@ def calibrate_unknown(
     """
     sensor_id = exposures["sensor_id"][0].as_py()
     nominal, reach = _start(exposures, cameras, field_deg)
-    frame_states = interpolate_sensor_states(exposures, states, settings)
+    frame_states = interpolate_sensor_states(exposures, states, settings.sensors)
     found = _search(exposures, frame_states, nominal, reach, settings)
     has_calibration = cameras.num_rows > 0 and field_deg is None
     nothing = CameraReport(
@@ -127,9 +127,9 @@ def _search(
     # Not those with most centroids: these may be mostly clutter.
     rows = rows[np.argsort(np.abs(counts[rows] - np.median(counts[rows])), kind="stable")]
     rows = np.sort(rows[:TRIED])
-    images = image_frames(exposures.take(rows), frame_states.take(rows), settings)
-    skies = skies_at(int(array(exposures, "time")[rows[0]]), settings)
-    found = find_agreed_camera(images, nominal, reach, skies, settings)
+    images = image_frames(exposures.take(rows), frame_states.take(rows), settings.sensors)
+    skies = skies_at(int(array(exposures, "time")[rows[0]]), settings.identification)
+    found = find_agreed_camera(images, nominal, reach, skies, settings.identification)
     return found and found.camera
 
 
@@ -158,7 +158,10 @@ def _fitted(
     assert report.camera is not None
     cameras, nominal = _as_table(report, report.camera), _as_table(report, _given(report))
     for _ in range(ROUNDS):
-        identified = identify_stars(exposures, frame_states, cameras, catalogue, settings)
+        identified = identify_stars(
+            exposures, frame_states, cameras, catalogue, settings.sensors,
+            settings.identification, settings.tracklets.most_detections,
+        )  # fmt: skip
         fit: Calibrated = calibrate_sensors(
             identified.stars, cameras, nominal, settings.sensors.principal_point_sigma_px
         )

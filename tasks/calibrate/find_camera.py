@@ -19,7 +19,7 @@ from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.io.work.parts import Parts
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array, concat, flatten
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import IdentificationSettings, SensorSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import STARS
@@ -181,7 +181,8 @@ def find_sensor_camera(
     identified: Parts,
     spans: Sequence[Span],
     cameras: pa.Table,
-    settings: Settings,
+    sensors: SensorSettings,
+    identification: IdentificationSettings,
 ) -> CameraFinding | None:
     """Return what can be found of the camera of a sensor whose frames contradict its calibration.
 
@@ -199,10 +200,10 @@ def find_sensor_camera(
     images = [
         image._replace(n_stars=n_stars)
         for t, n_stars in zip(array(tried, "time"), array(tried, "n_stars"), strict=True)
-        for image in image_frames(*_frame_with_state(frames, sensor, int(t), settings), settings)
+        for image in image_frames(*_frame_with_state(frames, sensor, int(t), sensors), sensors)
     ]
-    skies_of = skies_at(int(array(tried, "time")[0]), settings)
-    found = find_agreed_camera(images, camera, REACH, skies_of, settings)
+    skies_of = skies_at(int(array(tried, "time")[0]), identification)
+    found = find_agreed_camera(images, camera, REACH, skies_of, identification)
     if found is None and some:
         return None
     return CameraFinding(sensor.sensor_id, camera, found and found.camera)
@@ -227,11 +228,11 @@ def find_agreed_camera(
     nominal: Camera,
     reach: float,
     skies_of: Callable[[float], Skies],
-    settings: Settings,
+    identification: IdentificationSettings,
 ) -> FoundCamera | None:
     """Return the first frame's camera that another frame agrees with; the only frame needs no
     other."""
-    matching = match_settings(settings)
+    matching = match_settings(identification)
     for found in find_cameras(frames, nominal, reach, skies_of, matching):
         others = [frame for k, frame in enumerate(frames) if k != found.frame]
         if not others or any(
@@ -241,22 +242,21 @@ def find_agreed_camera(
     return None
 
 
-def skies_at(time_ns: int, settings: Settings) -> Callable[[float], Skies]:
+def skies_at(time_ns: int, rule: IdentificationSettings) -> Callable[[float], Skies]:
     """Return the skies of a day, by the angle of a pixel."""
-    rule = settings.identification
     catalogue = Catalogue(read_star_catalogue(rule.catalogue))
     return lambda pixel_rad: CachedSkies(catalogue, time_ns // DAY_NS, pixel_rad, rule.merge_px)
 
 
 def image_frames(
-    exposures: pa.Table, frame_states: pa.Table, settings: Settings
+    exposures: pa.Table, frame_states: pa.Table, sensors: SensorSettings
 ) -> list[ImageFrame]:
     """Return the centroids of each frame, brightest first.
 
     `frame_states` are SENSOR_STATES_AT_FRAMES of `exposures`.
     """
     x_px, first = flatten(exposures, "x_px")
-    c = flatten_centroids(exposures, CAMERAS.empty_table(), settings)
+    c = flatten_centroids(exposures, CAMERAS.empty_table(), sensors)
     at = brightest_first(first, c.flux)
     magnitude = -2.5 * np.log10(c.flux[at])
     beta = barycentric_velocity(array(exposures, "time"), frame_states) / SPEED_OF_LIGHT_KM_S
@@ -271,13 +271,13 @@ def image_frames(
 
 
 def _frame_with_state(
-    frames: ReadFolder, sensor: Sensor, time_ns: int, settings: Settings
+    frames: ReadFolder, sensor: Sensor, time_ns: int, sensors: SensorSettings
 ) -> tuple[pa.Table, pa.Table]:
     """Return EXPOSURES of one frame, and its SENSOR_STATES_AT_FRAMES."""
     instant = Span(time_ns, time_ns + 1)
     exposures = concat(EXPOSURES, [frames_between(frames, sensor.number, *instant)])
     return exposures, interpolate_sensor_states(
-        exposures, states_about(frames, sensor, instant, settings), settings
+        exposures, states_about(frames, sensor, instant, sensors.state_gap_s), sensors
     )
 
 

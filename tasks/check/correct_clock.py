@@ -6,7 +6,7 @@ import pyarrow as pa
 from epipole.io.work.parts import IDENTIFIED, Parts, write_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array, from_polars, to_polars
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import SensorSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import SOLUTIONS
@@ -29,7 +29,7 @@ def correct_clock(
     identified: Parts,
     span: Span,
     clock: SensorVerdict,
-    settings: Settings,
+    settings: SensorSettings,
     parts: Parts,
 ) -> None:
     """Set a part's frames to their true times, and their sensor to its positions then.
@@ -45,7 +45,7 @@ def correct_clock(
         return
     names = ("solutions", "stars", "detections")
     tables = {name: at_true_times(identified.read(span, name), clock) for name in names}
-    states = states_about(frames, sensor, span, settings)
+    states = states_about(frames, sensor, span, settings.state_gap_s)
     places = interpolate_sensor_states(tables["solutions"], states, settings)
     tables["solutions"] = at_places(tables["solutions"], places)
     tables["rejects"] = identified.read(span, "rejects")

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from epipole.schemas.bridge import array, flatten, nullable, stack, table, unstack
 from epipole.schemas.log_bounds import POSITION, SPEED
-from epipole.schemas.settings import SensorSettings, Settings
+from epipole.schemas.settings import SensorSettings
 from epipole.schemas.work_tables import SENSOR_STATES_AT_FRAMES
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, unproject
 from epipole.tasks.algorithms.orbits.state_interpolation import (
@@ -46,14 +46,16 @@ class FlatCentroids(NamedTuple):
     cameras: dict[int, Camera]
 
 
-def flatten_centroids(exposures: pa.Table, cameras: pa.Table, settings: Settings) -> FlatCentroids:
+def flatten_centroids(
+    exposures: pa.Table, cameras: pa.Table, settings: SensorSettings
+) -> FlatCentroids:
     """Return the centroids of one sensor's frames, with the valid cameras."""
     x_px, first = flatten(exposures, "x_px")
     y_px, _ = flatten(exposures, "y_px")
     frame = np.repeat(np.arange(exposures.num_rows), np.diff(first))
     sigma_px = _optional(exposures, "sigma_px", len(x_px))
-    if settings.sensors.centroid_sigma_px is not None:
-        sigma_px = np.where(np.isnan(sigma_px), settings.sensors.centroid_sigma_px, sigma_px)
+    if settings.centroid_sigma_px is not None:
+        sigma_px = np.where(np.isnan(sigma_px), settings.centroid_sigma_px, sigma_px)
     camera_of_frame, used = _cameras_of(exposures, cameras)
     u, pixel_rad = np.zeros((len(x_px), 3)), np.ones(len(x_px))
     in_image = np.zeros(len(x_px), np.bool_)
@@ -101,14 +103,14 @@ MAX_SPEED_KM_S, MAX_RADIUS_KM = 2 * SPEED.maximum, 2 * POSITION.maximum
 
 
 def interpolate_sensor_states(
-    exposures: pa.Table, states: pa.Table, settings: Settings
+    exposures: pa.Table, states: pa.Table, settings: SensorSettings
 ) -> pa.Table:
     """Return SENSOR_STATES_AT_FRAMES, one row per row of `exposures`; see `interpolate_states`.
 
     `states` are sorted by sensor and time, each time once, as `order_logs` returns them.
     """
     sensor, time_ns = array(exposures, "sensor_id"), array(exposures, "time")
-    state_sensor, all_states = array(states, "sensor_id"), _states(states, settings.sensors)
+    state_sensor, all_states = array(states, "sensor_id"), _states(states, settings)
     n = len(time_ns)
     at_frames = Places(*(np.full((n, *width), np.nan) for width in ((3,), (3,), (), (4,), ())))
     stated = np.zeros(n, bool)
@@ -120,7 +122,7 @@ def interpolate_sensor_states(
         found = interpolate_states(
             SensorStates(*columns),
             time_ns[frames],
-            settings.sensors.state_gap_s,
+            settings.state_gap_s,
         )
         for column, values in zip(at_frames, _possible(found), strict=True):
             column[frames] = values

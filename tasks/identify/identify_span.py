@@ -11,7 +11,7 @@ from epipole.io.work.parts import IDENTIFIED, Parts, write_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.rejects import Reason, reject_rows
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import IdentificationSettings, SensorSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
@@ -39,7 +39,9 @@ def identify_span(
     sensor: Sensor,
     span: Span,
     cameras: pa.Table,
-    settings: Settings,
+    sensors: SensorSettings,
+    identification: IdentificationSettings,
+    most_detections: int,
     parts: Parts,
 ) -> Counts:
     """Identify one sensor's frames of a span, unless the part exists.
@@ -53,10 +55,12 @@ def identify_span(
     """
     if not parts.holds(span):
         exposures = frames_between(frames, sensor.number, *span)
-        states = states_about(frames, sensor, span, settings)
-        frame_states = interpolate_sensor_states(exposures, states, settings)
-        catalogue = read_star_catalogue(settings.identification.catalogue)
-        identified = identify_stars(exposures, frame_states, cameras, catalogue, settings)
+        states = states_about(frames, sensor, span, sensors.state_gap_s)
+        frame_states = interpolate_sensor_states(exposures, states, sensors)
+        catalogue = read_star_catalogue(identification.catalogue)
+        identified = identify_stars(
+            exposures, frame_states, cameras, catalogue, sensors, identification, most_detections
+        )
         rejects = concat(REJECTS, [identified.rejects, _without_state(frame_states)])
         write_part(parts.of(span), IDENTIFIED, {**identified._asdict(), "rejects": rejects})
     return _counts(parts, span)
@@ -72,9 +76,9 @@ def _counts(parts: Parts, span: Span) -> Counts:
     )
 
 
-def states_about(frames: ReadFolder, sensor: Sensor, span: Span, settings: Settings) -> pa.Table:
+def states_about(frames: ReadFolder, sensor: Sensor, span: Span, state_gap_s: float) -> pa.Table:
     """Return the states of a sensor that are needed for its frames of a span."""
-    reach_ns = BRIDGED_NS + round(settings.sensors.state_gap_s * 1e9)
+    reach_ns = BRIDGED_NS + round(state_gap_s * 1e9)
     return states_between(frames, sensor.number, *span.widened(reach_ns))
 
 

@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from epipole.schemas.bridge import array, empty, stack
 from epipole.schemas.options import STAR_IDENTIFICATION, load_method
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import IdentificationSettings, SensorSettings
 from epipole.schemas.star_lists import with_catalogue
 from epipole.schemas.tables import DETECTIONS, REJECTS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
@@ -64,22 +64,24 @@ def identify_stars(
     frame_states: pa.Table,
     cameras: pa.Table,
     catalogue: pa.Table,
-    settings: Settings,
+    sensors: SensorSettings,
+    identification: IdentificationSettings,
+    most_detections: int,
 ) -> IdentifiedTables:
     """Return the stars, attitudes and other centroids of one sensor's frames, in any order."""
     if exposures.num_rows == 0:
         return IdentifiedTables(empty(SOLUTIONS), empty(STARS), empty(DETECTIONS), empty(REJECTS))
     order = np.argsort(array(exposures, "time"), kind="stable")
     exposures, frame_states = exposures.take(order), frame_states.take(order)
-    centroids = flatten_centroids(exposures, cameras, settings)
-    found, rows = _identify(exposures, frame_states, centroids, catalogue, settings)
-    attitudes = _attitudes(frame_states, found, settings)
+    centroids = flatten_centroids(exposures, cameras, sensors)
+    found, rows = _identify(exposures, frame_states, centroids, catalogue, sensors, identification)
+    attitudes = _attitudes(frame_states, found, sensors)
     matches = _matches(found, rows, centroids)
     attitudes = _with_optics(attitudes, centroids, matches, cameras)
     attitudes = _with_unknown_velocity(attitudes, frame_states)
     stars = stars_table(exposures, frame_states, centroids, attitudes, matches)
     stars = with_catalogue(stars, catalogue.schema)
-    most = settings.tracklets.most_detections
+    most = most_detections
     detections, left_out = detections_table(exposures, centroids, attitudes, matches, most)
     result = IdentifiedTables(
         solutions_table(exposures, frame_states, centroids, attitudes, matches, stars),
@@ -100,7 +102,8 @@ def _identify(
     frame_states: pa.Table,
     c: FlatCentroids,
     catalogue: pa.Table,
-    settings: Settings,
+    sensors: SensorSettings,
+    rule: IdentificationSettings,
 ) -> tuple[IdentifiedSensor | None, npt.NDArray[np.int64]]:
     """Return the identified stars, and the centroids that took part: brightest first in each
     frame."""
@@ -110,16 +113,15 @@ def _identify(
     time_ns = array(exposures, "time")
     day = int(time_ns[len(time_ns) // 2] // DAY_NS)
     pixel_rad = next(iter(c.cameras.values())).pixel_rad
-    rule = settings.identification
     skies = CachedSkies(Catalogue(catalogue), day, pixel_rad, rule.merge_px)
     identify = load_method(STAR_IDENTIFICATION, rule.method)
-    t_s, priors = (time_ns - time_ns[0]) / 1e9, _priors(frame_states, settings)
+    t_s, priors = (time_ns - time_ns[0]) / 1e9, _priors(frame_states, sensors)
     beta = barycentric_velocity(time_ns, frame_states) / SPEED_OF_LIGHT_KM_S
     best, taken = None, rows
     for kept in _selections(c):
         part = rows[kept[rows]]
         raw = _raw_centroids(c, part, kept, beta)
-        found = identify(t_s, raw, priors, skies, rule.magnitude_limit, match_settings(settings))
+        found = identify(t_s, raw, priors, skies, rule.magnitude_limit, match_settings(rule))
         if best is None or found.solutions.solved.sum() > best.solutions.solved.sum():
             best, taken = found, part
         if best.solutions.solved.mean() > IDENTIFIES:
@@ -127,9 +129,8 @@ def _identify(
     return best, taken
 
 
-def match_settings(settings: Settings) -> MatchSettings:
+def match_settings(rule: IdentificationSettings) -> MatchSettings:
     """Return how frames are judged, before anything is known of their sensor."""
-    rule = settings.identification
     return MatchSettings(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
 
 
@@ -162,22 +163,22 @@ def _raw_centroids(
     )
 
 
-def _priors(frame_states: pa.Table, settings: Settings) -> Priors:
-    q, sigma = stack(frame_states, "q{}", "xyzw"), _prior_sigma(frame_states, settings) * ARCSEC
+def _priors(frame_states: pa.Table, sensors: SensorSettings) -> Priors:
+    q, sigma = stack(frame_states, "q{}", "xyzw"), _prior_sigma(frame_states, sensors) * ARCSEC
     return Priors(matrix_from_quaternion(q), np.where(np.isfinite(q[:, 3]), sigma, np.nan))
 
 
-def _prior_sigma(frame_states: pa.Table, settings: Settings) -> Array:
+def _prior_sigma(frame_states: pa.Table, sensors: SensorSettings) -> Array:
     sigma = array(frame_states, "attitude_sigma_arcsec").astype(float)
-    return np.where(sigma > 0, sigma, settings.sensors.attitude_sigma_arcsec)
+    return np.where(sigma > 0, sigma, sensors.attitude_sigma_arcsec)
 
 
 def _attitudes(
-    frame_states: pa.Table, found: IdentifiedSensor | None, settings: Settings
+    frame_states: pa.Table, found: IdentifiedSensor | None, sensors: SensorSettings
 ) -> StarAttitudes:
     """Return the attitude from stars where there is one, else the prior, unchanged."""
     n = frame_states.num_rows
-    q, sigma = stack(frame_states, "q{}", "xyzw"), _prior_sigma(frame_states, settings)
+    q, sigma = stack(frame_states, "q{}", "xyzw"), _prior_sigma(frame_states, sensors)
     R = matrix_from_quaternion(q)
     cov = np.eye(3) * (sigma**2)[:, None, None]
     source = np.where(np.isfinite(q[:, 3]), "prior", "none").astype(object)

@@ -17,7 +17,7 @@ from epipole.io.datasets.night_tables import read_columns, take_rows, write_tabl
 from epipole.schemas.bridge import array, concat, stack, stack_covariance, table
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.rejects import Reason, reject_rows
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import KnownObjectSettings
 from epipole.schemas.spans import DAY_NS
 from epipole.schemas.stages import Stage
 from epipole.schemas.star_lists import ElementSet, nearest_sets
@@ -50,7 +50,7 @@ HOUR_S = 3600.0
 
 
 def recognise_objects(
-    folder: Path, objects: Sequence[str], earlier: pa.Table, settings: Settings
+    folder: Path, objects: Sequence[str], earlier: pa.Table, earlier_h: float, log_odds: float
 ) -> dict[str, str]:
     """Return the ids that objects of a night had in an earlier one, where their motion decides.
 
@@ -68,7 +68,7 @@ def recognise_objects(
     The last state of the earlier object is propagated to the first one of the night; see
     `link_by_motion` for forces, process noise and when a link is refused.
     """
-    gap_s = settings.known_objects.earlier_h * HOUR_S
+    gap_s = earlier_h * HOUR_S
     if not (len(objects) and earlier.num_rows and gap_s > 0.0):
         return {}
     before = pl.DataFrame(earlier)
@@ -86,7 +86,7 @@ def recognise_objects(
     links, _ = link_by_motion(
         _motions(both),
         gap_s=gap_s,
-        log_odds=settings.states.link_log_odds,
+        log_odds=log_odds,
         allowed=is_old[:, None] & ~is_old,
     )
     names = both["object_id"].to_list()
@@ -118,14 +118,14 @@ class ElementsOfNight(NamedTuple):
 
 
 def elements_of_night(
-    known: KnownObjects, night: str, settings: Settings
+    known: KnownObjects, night: str, most_days: float
 ) -> tuple[ElementsOfNight, pa.Table]:
     """Return the elements that are used in a night, and `rejects` of those that are not.
 
     Of each object it is the set whose epoch is nearest to the middle of the night.
     """
     middle_ns = int(np.datetime64(night, "ns").astype(np.int64)) + DAY_NS // 2
-    most_ns = settings.known_objects.most_days * DAY_NS
+    most_ns = most_days * DAY_NS
     nearest = nearest_sets(known.sets, middle_ns)
     recent = [each for each in nearest if abs(each.epoch_ns - middle_ns) <= most_ns]
     made = ElementsOfNight(known.sha256, recent)
@@ -154,7 +154,11 @@ COVARIANCE = ["cov_xx", "cov_xy", "cov_xz", "cov_yy", "cov_yz", "cov_zz"]
 
 @stage_task(Stage.NAME, "known objects")
 def name_known_objects(
-    folder: Path, known: ElementsOfNight | None, earlier: pa.Table, settings: Settings
+    folder: Path,
+    known: ElementsOfNight | None,
+    earlier: pa.Table,
+    settings: KnownObjectSettings,
+    link_log_odds: float,
 ) -> list[SensorResidual]:
     """Write the table `identifications` of a night whose other tables are written.
 
@@ -173,10 +177,10 @@ def name_known_objects(
         How far each sensor's detections of known objects are from their predictions.
     """
     observed, spans = observed_objects(folder)
-    verdicts = judge_objects(observed, known, settings) if known is not None else {}
+    verdicts = judge_objects(observed, known, settings.probability) if known is not None else {}
     verdicts = _without_rivals(verdicts, spans)
     unnamed = [name for name in observed if _status(verdicts, name) != "known"]
-    same_as = recognise_objects(folder, unnamed, earlier, settings)
+    same_as = recognise_objects(folder, unnamed, earlier, settings.earlier_h, link_log_odds)
     rows = _rows(list(observed), verdicts, known, same_as)
     write_table(folder, "identifications", [rows])
     if known is None:
@@ -212,7 +216,7 @@ def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, tuple
 
 
 def judge_objects(
-    observed: Mapping[str, Observed], known: ElementsOfNight, settings: Settings
+    observed: Mapping[str, Observed], known: ElementsOfNight, least: float
 ) -> dict[str, NameVerdict]:
     """Return what each object is, with the errors of elements learnt from the sure matches."""
     satellites = satellites_of(known.elements)
@@ -223,7 +227,6 @@ def judge_objects(
     judged = [judge(found, SURE) for found in first.values()]
     sure = [each.best for each in judged if each.status == "known" and each.best is not None]
     learnt = _learnt(catalogue, sure)
-    least = settings.known_objects.probability
     return {
         name: judge(candidates(of, learnt, screen) if first[name] else [], least)
         for name, of in observed.items()

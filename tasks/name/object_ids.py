@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from epipole.io.work.work_layout import SolvedParts
 from epipole.schemas.bridge import concat, stack_covariance, to_polars
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import StateSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import ASSOCIATIONS
@@ -27,7 +27,7 @@ COUNTS = ("n_epochs", "n_views", "dof", "chi2")  # of a state, not of its motion
 
 
 @stage_task(Stage.NAME, "objects")
-def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> dict[str, str]:
+def link_objects(positions: pa.Table, states: pa.Table, settings: StateSettings) -> dict[str, str]:
     """Return the new ids of objects that are the same as an earlier object: the earlier one's id.
 
     Only the first and last position of each object are used (see `outermost`), and its first and
@@ -45,9 +45,7 @@ def link_objects(positions: pa.Table, states: pa.Table, settings: Settings) -> d
         ),
         *(stack_covariance(ends, f"{side}_cov_{{}}", STATE_AXES) for side in ("head", "tail")),
     )
-    before, _ = link_by_motion(
-        seen, gap_s=settings.states.link_gap_s, log_odds=settings.states.link_log_odds
-    )
+    before, _ = link_by_motion(seen, gap_s=settings.link_gap_s, log_odds=settings.link_log_odds)
     names, head = ends["object_id"].to_list(), chains(before)
     return {names[k]: names[h] for k, h in enumerate(head.tolist()) if h != k}
 

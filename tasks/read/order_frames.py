@@ -20,7 +20,7 @@ from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array, concat, conform, table, unstack_covariance
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.rejects import Reason
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import SensorSettings
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX, LOG_STATES, LogSource
 from epipole.tasks.algorithms.times import (
@@ -56,7 +56,9 @@ class OrderedFrames(NamedTuple):
     rejects: pa.Table
 
 
-def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) -> OrderedFrames:
+def order_logs(
+    folder: ReadFolder, logs: Sequence[ReadLog], settings: SensorSettings
+) -> OrderedFrames:
     """Order the content of logs; the order of the logs does not matter.
 
     A frame that occurs twice counts once; `order_frames` says what a repeat is. Of two logs with
@@ -84,7 +86,7 @@ def order_logs(folder: ReadFolder, logs: Sequence[ReadLog], settings: Settings) 
         time_ns.append(array(index, "time"))
     cameras = with_uncertain_principal_points(
         _sorted_cameras(_piece_tables(pieces, "cameras", CAMERAS)),
-        settings.sensors.principal_point_sigma_px or 0.0,
+        settings.principal_point_sigma_px or 0.0,
     )
     left_out = concat(REJECTS, rejects)
     sources = _dated([log.source for log in logs], array(keys, "time"))
@@ -189,7 +191,7 @@ def _dated(sources: Sequence[LogSource], time_ns: Indices) -> list[LogSource]:
 
 
 def _sorted_states(
-    folder: ReadFolder, logs: Sequence[ReadLog], sensor_id: str, settings: Settings
+    folder: ReadFolder, logs: Sequence[ReadLog], sensor_id: str, settings: SensorSettings
 ) -> tuple[pa.Table, pa.Table]:
     """Return one sensor's states in GCRF, sorted, each time once; and the rejects of repeats."""
     states, names = [], []
@@ -202,7 +204,7 @@ def _sorted_states(
     order, repeats = order_states(np.zeros(rows.num_rows, np.int64), array(rows, "time"))
     named = rows.select(["sensor_id", "time"]).append_column("source", pa.array(names, pa.string()))
     rejects = frames_left_out(named.take(pa.array(order[repeats])), Reason.DUPLICATE_STATE)
-    return states_to_gcrf(rows.take(pa.array(order[~repeats])), settings), rejects
+    return states_to_gcrf(rows.take(pa.array(order[~repeats])), settings.position_sigma_km), rejects
 
 
 def _sorted_cameras(cameras: pa.Table) -> pa.Table:

@@ -8,14 +8,13 @@ import pyarrow as pa
 
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.schemas.bridge import array, nullable, stack, table, unstack
-from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import ITRF, SENSOR_STATES
 from epipole.tasks.algorithms.orbits.reference_frames import orientation_at, to_gcrf
 
 LOGGER = logging.getLogger(__name__)
 
 
-def states_to_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
+def states_to_gcrf(states: pa.Table, unknown_sigma_km: float) -> pa.Table:
     """Return SENSOR_STATES for the rows of LOG_STATES.
 
     For times outside the Earth-orientation table, sigmas of Earth-fixed positions are increased by
@@ -30,7 +29,7 @@ def states_to_gcrf(states: pa.Table, settings: Settings) -> pa.Table:
         r_km[i], v_km_s[i] = to_gcrf(name, time_ns[i], r_km[i], v_km_s[i], orientation)
         if name == ITRF and orientation.sigma_rad.any():
             turn_km = orientation.sigma_rad * np.linalg.norm(r_km[i], axis=1)
-            known_km = np.where(sigma_km[i] > 0, sigma_km[i], settings.sensors.position_sigma_km)
+            known_km = np.where(sigma_km[i] > 0, sigma_km[i], unknown_sigma_km)
             sigma_km[i] = np.where(turn_km > 0, np.hypot(known_km, turn_km), sigma_km[i])
             _warn_of_orientation(turn_km)
     values = {name: states[name] for name in SENSOR_STATES.names}

@@ -22,7 +22,7 @@ import pyarrow as pa
 from epipole.io.work.parts import TRACKED, Parts, write_part
 from epipole.schemas.bridge import array, concat, empty, nullable, table
 from epipole.schemas.options import TRACK_LINKING, load_method
-from epipole.schemas.settings import Settings, TrackletSettings
+from epipole.schemas.settings import TrackletSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import DETECTIONS, STARS
@@ -153,12 +153,14 @@ def build_tracklets(
     solutions: pa.Table,
     detections: pa.Table,
     cameras: pa.Table,
-    settings: Settings,
+    settings: TrackletSettings,
+    half_width_s: float,
     stars: pa.Table | None = None,
 ) -> Tracked:
     """Return one sensor's detections with tracklet_id, track_id and kind, and its tracklets.
 
     `stars` are the STARS of the sensor: what rests where one is identified in other frames is it.
+    `half_width_s` is the time on each side of a detection in which its motion is fitted.
 
     Frames with an attitude are tracked on the sky. Frames without are tracked apart from them, in
     the image. There stars move like objects and cannot be distinguished from them.
@@ -169,8 +171,9 @@ def build_tracklets(
         np.full(detections.num_rows, "unknown", dtype=object),
         *(np.full(detections.num_rows, None, dtype=object) for _ in range(2)),
     )
+    identified = empty(STARS) if stars is None else stars
     parts = [
-        _label(part, labels, detections, settings, empty(STARS) if stars is None else stars)
+        _label(part, labels, detections, settings, half_width_s, identified)
         for part in _parts(solutions, detections, cameras)
     ]
     columns = {name: detections[name] for name in DETECTIONS.names} | labels._asdict()
@@ -244,7 +247,8 @@ def _label(
     part: _TrackedFrames,
     labels: _Labels,
     detections: pa.Table,
-    settings: Settings,
+    settings: TrackletSettings,
+    half_width_s: float,
     identified: pa.Table,
 ) -> tuple[pa.Table, pa.Table]:
     """Label the detections of some frames; return their tracklets, and those that may be hot."""
@@ -259,8 +263,8 @@ def _label(
         labels.kind[sightings.row[planet]] = "planet"
     kept = ~hot & ~planet
     sightings, suspected = part_of(sightings, kept), fixed.with_odds(LIKELY)[kept]
-    track = _follow(part, sightings, settings.tracklets)
-    runs = measure_runs(frames, sightings, track, camera, settings.alignment.window_s)
+    track = _follow(part, sightings, settings)
+    runs = measure_runs(frames, sightings, track, camera, half_width_s)
     if part.on_sky:
         u_stars = star_directions(frames, identified, camera)
         still = _unlisted_stars(sightings, runs, u_stars)
@@ -286,7 +290,7 @@ def _label_objects(
     objects: list[TrackRun],
     labels: _Labels,
     detections: pa.Table,
-    settings: Settings,
+    settings: TrackletSettings,
     suspected: npt.NDArray[np.bool_],
 ) -> tuple[pa.Table, pa.Table]:
     """Label the sightings of objects; return their TRACKLET_RUNS and HOT_SUSPECTS."""
@@ -357,10 +361,10 @@ def _name(
 
 
 def _link(
-    part: _TrackedFrames, sightings: Sightings, runs: list[TrackRun], settings: Settings
+    part: _TrackedFrames, sightings: Sightings, runs: list[TrackRun], settings: TrackletSettings
 ) -> Links:
     """Return which run continues which, by the method of the settings."""
-    chosen, frames, camera = settings.tracklets, part.frames, part.camera
+    chosen, frames, camera = settings, part.frames, part.camera
     if not runs:
         return Links(np.full(0, NONE), np.full(0, np.nan))
     members = np.concatenate([run.members for run in runs])
@@ -416,9 +420,9 @@ MARGIN_S = 90.0
 LINK_MARGIN_S = 90.0
 
 
-def track_margin_ns(settings: Settings) -> int:
+def track_margin_ns(settings: TrackletSettings) -> int:
     """Return how far before and after a span its detections are followed."""
-    return round((MARGIN_S + (settings.tracklets.link_gap_s or LINK_MARGIN_S)) * 1e9)
+    return round((MARGIN_S + (settings.link_gap_s or LINK_MARGIN_S)) * 1e9)
 
 
 @stage_task(Stage.TRACK, "{sensor} {span}")
@@ -427,7 +431,8 @@ def track_span(
     identified: Parts,
     span: Span,
     cameras: pa.Table,
-    settings: Settings,
+    settings: TrackletSettings,
+    half_width_s: float,
     parts: Parts,
 ) -> int:
     """Follow one sensor's detections through a span and its margins, unless the part exists.
@@ -451,6 +456,7 @@ def track_span(
             identified.rows_within(wide, DETECTIONS, "detections"),
             cameras,
             settings,
+            half_width_s,
             identified.rows_within(wide, STARS, "stars"),
         )
         write_part(parts.of(span), TRACKED, tracked._asdict())

@@ -22,7 +22,7 @@ from scenes.aged_elements import aged
 from scenes.walker import DAY_NS, NIGHT_NS, satellites
 
 from epipole.io.catalogues.element_sets import parse_element_sets
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import KnownObjectSettings
 from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.known_objects.matching import Observed, spread_rows
 from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
@@ -99,7 +99,7 @@ def count_verdicts(scene: Scene) -> tuple[Counter[tuple[str, str]], list[str], f
     """Return the verdicts by kind of object, the wrong ones, and the CPU time [s]."""
     known = ElementsOfNight("", scene.catalogue)
     start = time.process_time()
-    verdicts = judge_objects(scene.observed, known, Settings())
+    verdicts = judge_objects(scene.observed, known, KnownObjectSettings().probability)
     cpu_s = time.process_time() - start
     counts: Counter[tuple[str, str]] = Counter()
     wrong = []

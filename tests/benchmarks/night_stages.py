@@ -22,7 +22,6 @@ from epipole.schemas.tables import DETECTIONS
 from epipole.schemas.work_tables import HOT_SUSPECTS, OBJECT_MEMBERS, SOLUTIONS, TRACKLET_RUNS
 from epipole.tasks.algorithms.simulation.paths import state_at
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
-from epipole.tasks.identify.identify_stars import identify_stars
 from epipole.tasks.solve.align_epochs import align_epochs
 from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.number_objects import number_objects
@@ -31,11 +30,12 @@ from epipole.tasks.solve.sightings import sight_objects, tabulate_sightings
 from epipole.tasks.solve.solve_piece import gather_views
 from epipole.tasks.solve.view_groups import ViewGroups, unpack_views
 from epipole.tasks.solve.views import sensor_epochs, view_objects, viewed_tracklets
-from epipole.tasks.track.track_span import Tracked, build_tracklets
+from epipole.tasks.track.track_span import Tracked
 
 Array = npt.NDArray[np.float64]
 sys.path.append(str(Path(__file__).parents[1]))  # helpers beside the tests
 
+from scenes.identified import identified, tracked  # noqa: E402
 from scenes.whole_logs import read_whole  # noqa: E402
 
 
@@ -50,10 +50,10 @@ class IdentifiedLog(NamedTuple):
 def see(log: Path, settings: Settings) -> IdentifiedLog:
     """Read a log and identify its stars."""
     read = read_whole([log], settings)
-    places = interpolate_sensor_states(read.exposures, read.states, settings)
+    places = interpolate_sensor_states(read.exposures, read.states, settings.sensors)
     catalogue = read_star_catalogue(settings.identification.catalogue)
     parts = [
-        identify_stars(
+        identified(
             of_sensor(read.exposures, name),
             of_sensor(places, name),
             read.cameras,
@@ -72,7 +72,7 @@ def see(log: Path, settings: Settings) -> IdentifiedLog:
 def track(seen: IdentifiedLog, settings: Settings) -> Tracked:
     """Build the tracklets of every sensor."""
     parts = [
-        build_tracklets(
+        tracked(
             of_sensor(seen.solutions, name),
             of_sensor(seen.detections, name),
             seen.cameras,

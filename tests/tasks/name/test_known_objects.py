@@ -86,7 +86,9 @@ def named(tmp_path):
             write_table(tmp_path, table, [rows])
         before = states(earlier) if earlier else STATES.empty_table()
         settings = settings or Settings()
-        residuals = name_known_objects.fn(tmp_path, known, before, settings)
+        residuals = name_known_objects.fn(
+            tmp_path, known, before, settings.known_objects, settings.states.link_log_odds
+        )
         return pl.read_parquet(tmp_path / "identifications" / PART), residuals
 
     return name

@@ -74,7 +74,7 @@ PASSES = [("1", GEO, 0, 60), ("2", OTHER, 0, 60), ("3", OTHER, 300, 360), ("4", 
 
 def test_ids_change_to_the_first_one_of_their_object():
     positions, states = positions_of(PASSES), states_of(PASSES)
-    new_id = link_objects.fn(positions, states, SETTINGS)
+    new_id = link_objects.fn(positions, states, SETTINGS.states)
     assert new_id == {"3": "2", "4": "1"}
     ids = set(renamed(positions, new_id)["object_id"].to_pylist())
     assert ids == {"1", "2"}
@@ -83,26 +83,28 @@ def test_ids_change_to_the_first_one_of_their_object():
 
 def test_an_object_without_a_state_is_recognised_by_its_position():
     states = states_of(PASSES[:2])
-    assert link_objects.fn(positions_of(PASSES), states, SETTINGS) == {"3": "2", "4": "1"}
-    assert link_objects.fn(positions_of(PASSES), states.slice(0, 0), SETTINGS) == {}
+    assert link_objects.fn(positions_of(PASSES), states, SETTINGS.states) == {"3": "2", "4": "1"}
+    assert link_objects.fn(positions_of(PASSES), states.slice(0, 0), SETTINGS.states) == {}
 
 
 def test_only_first_and_last_positions_are_needed():
     positions, states = positions_of(PASSES), states_of(PASSES)
     few = outermost(positions)
     assert few.num_rows == 2 * len(PASSES)
-    assert link_objects.fn(few, states, SETTINGS) == link_objects.fn(positions, states, SETTINGS)
+    assert link_objects.fn(few, states, SETTINGS.states) == link_objects.fn(
+        positions, states, SETTINGS.states
+    )
 
 
 def test_linking_can_be_switched_off():
     off = SETTINGS.model_copy(
         update={"states": SETTINGS.states.model_copy(update={"link_gap_s": 0.0})}
     )
-    assert link_objects.fn(positions_of(PASSES), states_of(PASSES), off) == {}
+    assert link_objects.fn(positions_of(PASSES), states_of(PASSES), off.states) == {}
 
 
 def test_no_positions_give_no_links():
-    assert link_objects.fn(empty(POSITIONS), empty(STATES), SETTINGS) == {}
+    assert link_objects.fn(empty(POSITIONS), empty(STATES), SETTINGS.states) == {}
     assert renamed(empty(ASSOCIATIONS), {"2": "1"}).num_rows == 0
 
 

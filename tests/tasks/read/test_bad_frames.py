@@ -3,14 +3,13 @@
 import numpy as np
 import pyarrow.compute as pc
 import pytest
+from scenes.identified import identified, tracked
 from scenes.whole_logs import read_whole
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
 from epipole.io.logs.writer import LogWriter
 from epipole.schemas.settings import Settings
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
-from epipole.tasks.identify.identify_stars import identify_stars
-from epipole.tasks.track.track_span import build_tracklets
 
 START_NS = 1_554_091_200_000_000_000
 OPTICS = {
@@ -49,9 +48,9 @@ def track(tmp_path, frames):
                 x_px=places[:, 0], y_px=places[:, 1], sigma_px=np.full(len(places), SIGMA),
             )  # fmt: skip
     read = read_whole([str(path)], SETTINGS)
-    places = interpolate_sensor_states(read.exposures, read.states, SETTINGS)
-    found = identify_stars(read.exposures, places, read.cameras, read_hipparcos(), SETTINGS)
-    return build_tracklets(found.solutions, found.detections, read.cameras, SETTINGS), read
+    places = interpolate_sensor_states(read.exposures, read.states, SETTINGS.sensors)
+    found = identified(read.exposures, places, read.cameras, read_hipparcos(), SETTINGS)
+    return tracked(found.solutions, found.detections, read.cameras, SETTINGS), read
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ import polars as pl
 import pyarrow as pa
 import pytest
 from scenes.cameras import cameras_of
+from scenes.identified import identified, tracked
 
 from epipole.flows.command_line.log_info import of_sensor
 from epipole.schemas.bridge import table
@@ -14,7 +15,6 @@ from epipole.schemas.tables import DETECTIONS, STARS
 from epipole.schemas.work_tables import SOLUTIONS
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit
-from epipole.tasks.track.track_span import build_tracklets
 
 SCENE = """
 name = "kinds"
@@ -45,15 +45,14 @@ def seen(tmp_path_factory):
     from epipole.flows.simulate import simulate
     from epipole.io.catalogues.hipparcos import read_hipparcos
     from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
-    from epipole.tasks.identify.identify_stars import identify_stars
 
     folder = tmp_path_factory.mktemp("kinds")
     (folder / "scene.toml").write_text(SCENE)
     simulate(str(folder / "scene.toml"), folder / "k.mcap")
     settings = validate_settings({}, "test")
     log = read_whole([str(folder / "k.mcap")], settings)
-    places = interpolate_sensor_states(log.exposures, log.states, settings)
-    found = identify_stars(log.exposures, places, log.cameras, read_hipparcos(), settings)
+    places = interpolate_sensor_states(log.exposures, log.states, settings.sensors)
+    found = identified(log.exposures, places, log.cameras, read_hipparcos(), settings)
     truth = pl.read_parquet(folder / "k.mcap.truth" / "points.parquet")
     return found._replace(detections=steadied(found.detections, truth)), log.cameras, truth
 
@@ -84,7 +83,7 @@ def build(seen, broken=False, suspects=False, **tracklets):
         first = frame.min()
         detections = detections.filter((frame < first + GAP[0]) | (frame >= first + GAP[1]))
     settings = validate_settings({"tracklets": tracklets}, "test")
-    built = build_tracklets(of_sensor(found.solutions, "a"), detections, cameras, settings)
+    built = tracked(of_sensor(found.solutions, "a"), detections, cameras, settings)
     key = ["sensor_id", "frame_number", "centroid"]
     cast = [pl.col("frame_number").cast(pl.Int64), pl.col("centroid").cast(pl.Int64)]
     known = pl.from_arrow(built.detections).rename({"kind": "taken_for"}).with_columns(cast)
@@ -194,7 +193,7 @@ def test_frames_without_attitude_are_tracked_in_the_image(seen):
     found, cameras, _ = seen
     settings = validate_settings({}, "test")
     solutions, detections = without_attitude(found, range(20, 32))
-    built = build_tracklets(solutions, detections, cameras, settings)
+    built = tracked(solutions, detections, cameras, settings)
     assert built.tracklets.num_rows == 15  # five before, five after, five in between
     assert len(set(built.tracklets["tracklet_id"].to_pylist())) == 15
     assert built.tracklets["link_chi2"].null_count == 10
@@ -205,14 +204,14 @@ def test_frames_without_attitude_are_tracked_in_the_image(seen):
 def test_frames_without_attitude_that_are_far_apart_give_no_track(seen):
     found, cameras, _ = seen
     solutions, detections = without_attitude(found, range(0, 60, 8))
-    built = build_tracklets(solutions, detections, cameras, validate_settings({}, "test"))
+    built = tracked(solutions, detections, cameras, validate_settings({}, "test"))
     assert built.tracklets.num_rows == 5
 
 
 def test_no_detections_give_no_tracklets(seen):
     found, cameras, _ = seen
     settings = validate_settings({}, "test")
-    built = build_tracklets(found.solutions, found.detections.slice(0, 0), cameras, settings)
+    built = tracked(found.solutions, found.detections.slice(0, 0), cameras, settings)
     assert built.tracklets.num_rows == 0
 
 
@@ -231,7 +230,7 @@ def test_a_frame_of_ten_thousand_strays_breaks_no_track(seen):
     at = many.schema.get_field_index("centroid")
     numbers = pa.array(np.arange(10_000, dtype=np.int32) + 1000)
     many = many.set_column(at, many.schema.field(at), numbers)
-    built = build_tracklets(
+    built = tracked(
         of_sensor(found.solutions, "a"), pa.concat_tables([detections, many]), cameras,
         validate_settings({}, "test"),
     )  # fmt: skip
@@ -274,7 +273,7 @@ def kinds(rate_arcsec_s):
         x_px=500 + off / 21.1, y_px=np.full(N, 300.3) + rng.normal(0, 0.14, N),
     )  # fmt: skip
     cameras = cameras_of({"a": Camera(**CAMERA)})
-    built = build_tracklets(solutions, detections, cameras, Settings())
+    built = tracked(solutions, detections, cameras, Settings())
     return built.detections["kind"].to_pylist()
 
 
@@ -316,7 +315,7 @@ def resting(runs_at, identified_at, rate_arcsec_s=0.0):
         y_px=y_px + rng.normal(0, 0.2, len(at)),
     )  # fmt: skip
     cameras = cameras_of({"a": camera})
-    return build_tracklets(solutions, detections, cameras, Settings(), stars)
+    return tracked(solutions, detections, cameras, Settings(), stars)
 
 
 def test_what_rests_where_a_star_is_identified_in_other_frames_is_that_star():
