@@ -50,7 +50,8 @@ class Orbits:
     """The satellites of some files, and where they are."""
 
     def __init__(self, files: Sequence[str]) -> None:
-        self.files = [str(Path(file).resolve()) for file in files]
+        # A name that is no file on the disk is that of a built-in one.
+        self.files = [str(p.resolve()) if (p := Path(file)).exists() else file for file in files]
         named = [(file, s) for file in self.files for s in read_element_sets(file)]
         self.file = [file for file, _ in named]
         self.sets = [element_set for _, element_set in named]
