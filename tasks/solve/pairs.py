@@ -71,7 +71,7 @@ def _seen_together(groups: ViewGroups) -> Array:
 def _position_error(groups: ViewGroups) -> Array:
     """Return the square of the error that each view alone leaves at the object [km^2]."""
     views = groups.views
-    across = np.trace(views.cov_noise + views.cov_bias, axis1=1, axis2=2) / 2
+    across = np.trace(views.cov, axis1=1, axis2=2) / 2
     away_km = np.linalg.norm(groups.x_km[groups.group] - views.r_km, axis=1)
     return across * away_km**2 + views.sigma_km**2
 
@@ -109,7 +109,7 @@ def _distances(groups: ViewGroups, first: Indices, second: Indices) -> tuple[Arr
     r, u = _seen_together(groups), views.u
     angle = np.abs(epipolar_angle(r[first], u[first], r[second], u[second]))
     basis = tangent_basis(u)
-    cov = np.swapaxes(basis, -1, -2) @ (views.cov_noise + views.cov_bias) @ basis
+    cov = np.swapaxes(basis, -1, -2) @ views.cov @ basis
     sigma_km = views.sigma_km
     sigma = epipolar_sigma(
         UncertainSight(r[first], u[first], cov[first], sigma_km[first]),

@@ -57,9 +57,8 @@ def _solve(views: ObjectViews, reject_sigma: float) -> ViewGroups:
     group = np.repeat(np.arange(len(start)), np.diff(offsets))
     velocity = np.zeros((len(start), 3))
     for last in (False, True):
-        cov = views.cov_noise + views.cov_bias
         x_km, cov_km2, chi2, used, mean_range = triangulate(
-            offsets, views.r_km, views.u, cov, views.sigma_km, velocity, reject_sigma
+            offsets, views.r_km, views.u, views.cov, views.sigma_km, velocity, reject_sigma
         )
         velocity, spread_s = _velocities(epoch_ns, number, x_km)
         if not last:

@@ -80,8 +80,12 @@ def _of_one_object(fitted: FittedOrbits, n_views: Indices) -> list[tuple[Indices
 
 
 class _NamedArcs(NamedTuple):
-    """Arcs, each with its object, middle epoch and number of epochs; and the sensors' ids."""
+    """Arcs, each with its object, middle epoch and number of epochs; and the sensors' ids.
 
+    `solved` are the groups that have a position, by object and epoch.
+    """
+
+    solved: Indices
     arcs: Arcs
     sensor_ids: npt.NDArray[np.str_]
     object_id: npt.NDArray[np.object_]
@@ -91,7 +95,8 @@ class _NamedArcs(NamedTuple):
 
 def _arcs_of(groups: ViewGroups, settings: StateSettings) -> _NamedArcs:
     """Return the arcs of all objects: the used views of independent positions."""
-    rows, arc = _rows_of_arcs(groups, settings)
+    solved = _by_object(groups)
+    rows, arc = _rows_of_arcs(groups, solved, settings)
     views, sensor_ids = groups.views.take(rows), groups.views.sensor_ids
     present, sensor = np.unique(views.sensor, return_inverse=True)
     offsets = group_offsets(arc) if len(arc) else np.zeros(1, np.int64)
@@ -109,12 +114,13 @@ def _arcs_of(groups: ViewGroups, settings: StateSettings) -> _NamedArcs:
         sigma_km=views.sigma_km,
     )
     object_id = groups.object_id[groups.group[rows[offsets[:-1]]]]
-    return _NamedArcs(arcs, sensor_ids[present], object_id, middle, n_epochs)
+    return _NamedArcs(solved, arcs, sensor_ids[present], object_id, middle, n_epochs)
 
 
-def _rows_of_arcs(groups: ViewGroups, settings: StateSettings) -> tuple[Indices, Indices]:
+def _rows_of_arcs(
+    groups: ViewGroups, solved: Indices, settings: StateSettings
+) -> tuple[Indices, Indices]:
     """Return the rows of the views to fit, by arc, epoch and sensor, and the arc of each."""
-    solved = _by_object(groups)
     name, kept = groups.object_id[solved], groups.independent[solved]
     arc = _arcs(name, groups.epoch_ns[solved], settings.arc_s)
     arc = np.where(kept & _long_enough(arc, kept, settings.min_epochs), arc, -1)
@@ -171,7 +177,7 @@ def _long_enough(arc: Indices, kept: npt.NDArray[np.bool_], least: int) -> npt.N
 
 def _starts(groups: ViewGroups, named: _NamedArcs) -> Array:
     """Return initial states: the position at each arc's middle, and the slope there."""
-    solved = _by_object(groups)
+    solved = named.solved
     name, epoch_ns = groups.object_id[solved], groups.epoch_ns[solved]
     x_km = groups.x_km[solved]
     v_km_s, _ = velocities(group_offsets(name), (epoch_ns - epoch_ns[0]) / 1e9, x_km, SLOPE_S)

@@ -66,6 +66,11 @@ class ObjectViews(NamedTuple):
     sigma_km: Array
     pixel_rad: Array
 
+    @property
+    def cov(self) -> Array:
+        """Covariances of the directions, independent and shared errors together [rad^2]."""
+        return self.cov_noise + self.cov_bias
+
     def take(self, rows: Indices) -> "ObjectViews":
         """Return these rows."""
         whole = self._asdict()

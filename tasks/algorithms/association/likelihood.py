@@ -46,9 +46,9 @@ from epipole.tasks.algorithms.association.search.resolve_conflicts import resolv
 from epipole.tasks.algorithms.association.search.search_space import SearchSpace, work_space
 from epipole.tasks.algorithms.association.search.seeds import seeds_between
 from epipole.tasks.algorithms.association.search.sensor_pairs import (
-    FEW_TRACKLETS,
     EveryPair,
     SensorPairs,
+    sparse_sensors,
 )
 from epipole.tasks.algorithms.association.views import views_of
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
@@ -94,7 +94,7 @@ def associate_tracklets(
     min_altitude_km, max_range_km
         Objects are sought between this altitude and this distance from the Earth's centre.
     min_log_odds
-        A group is reported if its log-odds (natural) against chance are at min_score this.
+        A group is reported if its log-odds (natural) against chance are at least this.
     ambiguity_log_odds
         Neither of two contradicting groups is reported if their log-odds differ by less.
     shells
@@ -151,7 +151,7 @@ class _Search:
         self.space, self.order, self.margin = space, order, float(margin)
         self.work = work_space(space.views)
         self.many = len(space.views.half_field) > FEW_SENSORS
-        self.sparse = np.diff(space.views.first) <= FEW_TRACKLETS
+        self.sparse = sparse_sensors(space.views)
         self.group, self.ambiguous = np.full(len(order), FREE), np.zeros(len(order), np.bool_)
         self.groups: list[Hypothesis] = []
 

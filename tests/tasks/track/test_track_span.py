@@ -256,24 +256,30 @@ def filled(schema, n, **given):
     return table(schema, given)
 
 
-def kinds(rate_arcsec_s):
-    """Return the kinds of the detections of a point that moves at this rate for ten minutes."""
-    rng = np.random.default_rng(1)
-    key = {"sensor_id": ["a"] * N, "frame_number": np.arange(N), "time": TIME_NS}
-    solutions = filled(
-        SOLUTIONS, N, **key, attitude_source=["stars"] * N,
+KEY = {"sensor_id": ["a"] * N, "frame_number": np.arange(N), "time": TIME_NS}
+
+
+def still_sensor():
+    """Return SOLUTIONS of a sensor whose attitude does not change, from stars, for ten minutes."""
+    return filled(
+        SOLUTIONS, N, **KEY, attitude_source=["stars"] * N,
         qx=np.zeros(N), qy=np.zeros(N), qz=np.zeros(N), qw=np.ones(N),
         **{f"cov_att_{ab}_arcsec2": np.full(N, 1.0 if ab in ("xx", "yy", "zz") else 0.0)
            for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
     )  # fmt: skip
+
+
+def kinds(rate_arcsec_s):
+    """Return the kinds of the detections of a point that moves at this rate for ten minutes."""
+    rng = np.random.default_rng(1)
     off = 600.0 + rate_arcsec_s * np.arange(N) + rng.normal(0, 3.0, N)
     detections = filled(
-        DETECTIONS, N, **key, ra_deg=30 + rng.normal(0, 3.0, N) / 600.0 * 57.3,
+        DETECTIONS, N, **KEY, ra_deg=30 + rng.normal(0, 3.0, N) / 600.0 * 57.3,
         dec_deg=90.0 - off / 3600, sigma_arcsec=np.full(N, 3.0), kind=["unknown"] * N,
         x_px=500 + off / 21.1, y_px=np.full(N, 300.3) + rng.normal(0, 0.14, N),
     )  # fmt: skip
     cameras = cameras_of({"a": Camera(**CAMERA)})
-    built = tracked(solutions, detections, cameras, Settings())
+    built = tracked(still_sensor(), detections, cameras, Settings())
     return built.detections["kind"].to_pylist()
 
 
@@ -288,13 +294,6 @@ def resting(runs_at, identified_at, rate_arcsec_s=0.0):
     """Return the kinds of the detections of a point that is detected in short runs, five frames
     each, and was identified as a star in other frames."""
     rng = np.random.default_rng(2)
-    key = {"sensor_id": ["a"] * N, "frame_number": np.arange(N), "time": TIME_NS}
-    solutions = filled(
-        SOLUTIONS, N, **key, attitude_source=["stars"] * N,
-        qx=np.zeros(N), qy=np.zeros(N), qz=np.zeros(N), qw=np.ones(N),
-        **{f"cov_att_{ab}_arcsec2": np.full(N, 1.0 if ab in ("xx", "yy", "zz") else 0.0)
-           for ab in ("xx", "xy", "xz", "yy", "yz", "zz")},
-    )  # fmt: skip
     camera = Camera(**CAMERA)
     x_px, y_px = 700.0, 300.0
     frame = np.concatenate([np.arange(k, k + 5) for k in runs_at])
@@ -315,7 +314,7 @@ def resting(runs_at, identified_at, rate_arcsec_s=0.0):
         y_px=y_px + rng.normal(0, 0.2, len(at)),
     )  # fmt: skip
     cameras = cameras_of({"a": camera})
-    return tracked(solutions, detections, cameras, Settings(), stars)
+    return tracked(still_sensor(), detections, cameras, Settings(), stars)
 
 
 def test_what_rests_where_a_star_is_identified_in_other_frames_is_that_star():

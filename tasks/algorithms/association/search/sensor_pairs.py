@@ -176,6 +176,11 @@ def _leaders(index, rank):
 # Order of the pairs
 
 
+def sparse_sensors(views: Views) -> Flags:
+    """Return which sensors have few tracklets, (s,)."""
+    return np.asarray(np.diff(views.first) <= FEW_TRACKLETS)
+
+
 class EveryPair:
     """All pairs of sensors whose fields meet: of few sensors, two may be all that see an object."""
 
@@ -218,7 +223,7 @@ class SensorPairs:
         )
         self._share = np.where(few, 1.0, MIDDLE_SHARE)
         self._look, self._position, self._half = middle
-        sparse = np.diff(views.first) <= FEW_TRACKLETS
+        sparse = sparse_sensors(views)
         self._always = sparse[self._a] & sparse[self._b]
         self._waiting = np.ones(len(order), bool)
         self._busy = np.zeros(len(look), bool)
