@@ -28,7 +28,8 @@ Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 MAX_SAMPLES = 12  # even instants in a window
-END_STEP_NS = 1_000_000_000  # between the instants at which tracklets enter or leave
+END_STEP_NS = 1_000_000_000  # least time between the instants at which tracklets enter or leave
+MAX_ENDS = 30  # of these in a window: in a longer one they are farther apart
 BLENDED = 4.0  # times the noise: what blends may add makes a view useless to tell objects apart
 
 
@@ -76,11 +77,13 @@ def with_ends(even: Indices, epochs: Indices, first: Indices, last: Indices) -> 
     even
         The even instants.
     epochs
-        Epochs of the window, in order; the ends are put on the first epoch of each `END_STEP_NS`.
+        Epochs of the window, in order. The ends are put on the first epoch of each second, or of
+        each thirtieth of a longer window.
     first, last : (n,) int
         First and last clear view of each tracklet that lacks a view at one of the even instants.
     """
-    _, begins = np.unique(epochs // END_STEP_NS, return_index=True)
+    step_ns = max(END_STEP_NS, int(np.ptp(epochs)) // MAX_ENDS) if len(epochs) else END_STEP_NS
+    _, begins = np.unique(epochs // step_ns, return_index=True)
     coarse = epochs[begins]
     after = np.searchsorted(coarse, first)
     before = np.searchsorted(coarse, last, side="right") - 1

@@ -7,6 +7,7 @@ from scenes.tracklet_scenes import Scene
 from epipole.schemas.settings import AlignmentSettings, AssociationSettings, Settings
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.solve.association_input import (
+    MAX_ENDS,
     MAX_SAMPLES,
     clear_views,
     even_instants,
@@ -78,6 +79,13 @@ def test_ends_are_few_however_many_tracklets_there_are():
     rng = np.random.default_rng(1)
     first = rng.choice(EPOCHS[:40], 5000)
     assert len(with_ends(at(7.5, 22.5), EPOCHS, first, first + 3 * SECOND_NS)) <= 32
+
+
+def test_a_long_window_has_no_more_ends_than_a_short_one():
+    epochs = np.arange(0, 600 * SECOND_NS, SECOND_NS)
+    first = np.random.default_rng(2).choice(epochs[:-60], 5000)
+    chosen = with_ends(even_instants(epochs, 6.0), epochs, first, first + 50 * SECOND_NS)
+    assert len(chosen) <= MAX_SAMPLES + MAX_ENDS + 1
 
 
 def test_without_tracklets_the_even_instants_stay():
