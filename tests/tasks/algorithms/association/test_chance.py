@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scenes.passages import passages
+from scenes.ten_tracklets import ten_tracklets
 from scenes.tracklet_scenes import Scene, judge, solve
 
 from epipole.tasks.algorithms.association.chance import USUAL_SPREAD, chance_of
@@ -86,3 +87,51 @@ def test_a_passage_is_found_among_sensors_that_look_elsewhere():
     assert len(alone) >= 8
     assert alone <= found(8)
     assert len(alone & found(32)) >= len(alone) - 1
+
+
+@pytest.mark.parametrize("times", [(0.0,), (0.0, 7.0, 30.0)])
+@pytest.mark.parametrize("seed", range(5))
+def test_densities_drifts_and_spreads_are_those_of_counting_tracklet_by_tracklet(seed, times):
+    scene = ten_tracklets(seed, n_strays=seed, n_objects=1, times=times, seen=0.6)
+    samples, n_sensors = scene.samples, 5  # the last one has no tracklet
+    field = np.vstack([samples.half_field, [0.02, 0.03]])
+    if seed == 4:  # instants without any tracklet do not count
+        samples = samples._replace(
+            time_s=np.append(samples.time_s, 50.0),
+            seen=np.column_stack([samples.seen, np.zeros(len(scene.who), bool)]),
+            u=np.concatenate([samples.u, samples.u[:, :1]], axis=1),
+        )
+    samples = samples._replace(half_field=field)
+    chance = chance_of(samples, 2e4, 0.8)
+    counts, solid = [], []
+    n_instants = sum(samples.seen[:, m].any() for m in range(samples.seen.shape[1]))
+    for s in range(n_sensors):
+        mine = [i for i in range(len(scene.who)) if samples.sensor[i] == s]
+        rates = []
+        for i in mine:
+            there = np.flatnonzero(samples.seen[i])
+            if len(there) > 1:
+                dt = samples.time_s[there[-1]] - samples.time_s[there[0]]
+                rates.append((samples.u[i, there[-1]] - samples.u[i, there[0]]) / dt)
+        solid.append(solid_angle(field[s]))
+        at_once = sum(samples.seen[i].sum() for i in mine) / n_instants
+        assert chance.density[s] == pytest.approx(max(at_once, 1.0) / solid[s], rel=1e-6)
+        n_others = max(len(rates) - 1, 0)
+        drift = np.median(rates, axis=0) * n_others / len(rates) if rates else np.zeros(3)
+        np.testing.assert_allclose(chance.drift[s], drift, rtol=1e-9, atol=1e-15)
+        squares = sum(np.sum((rate - drift) ** 2) / 2 for rate in rates)
+        spread = np.sqrt((squares + (10 * ARCSEC) ** 2) / (n_others + 2))
+        shrunk = (spread**n_others * USUAL_SPREAD) ** (1 / (n_others + 1))
+        assert chance.spread[s] == pytest.approx(shrunk)
+        counts.append(len(mine))
+    assert chance.objects_in_view == max(np.median(counts), 1.0)
+    volume = np.median(solid) * 2e4**3 / 3
+    assert chance.objects_km3 == pytest.approx(chance.objects_in_view / volume, rel=1e-6)
+    assert chance.detected.tolist() == [0.8] * n_sensors
+
+
+def solid_angle(half):
+    """Return the solid angle of a rectangular field, summed over small parts of it."""
+    x, y = (np.linspace(-h, h, 401)[:-1] + h / 400 for h in half)
+    parts = (1 + x[:, None] ** 2 + y**2) ** -1.5
+    return parts.sum() * (2 * half[0] / 400) * (2 * half[1] / 400)
