@@ -1,0 +1,216 @@
+"""Initiation: the tracks that begin are those of following every pair of detections back."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
+from epipole.tasks.algorithms.tracking.initiation import (
+    NONE,
+    Detections,
+    RecentFrames,
+    TrackRule,
+    new_tracks,
+)
+from epipole.tasks.algorithms.tracking.runs import EXTRA_DETECTIONS, SLACK_FRAMES, _lay_frame
+from epipole.tasks.algorithms.tracking.sky_filter import acceleration, jerk_of, make_grids
+
+FIELD_RAD = np.radians(4.0)
+P_DETECTION = 0.9
+TIMES = {
+    "even": [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+    "uneven": [0.0, 0.7, 2.0, 2.4, 4.1, 5.0, 6.3],
+    "twice": [0.0, 1.0, 2.0, 2.0, 3.0, 4.0, 5.0],
+}
+
+
+def rule(**changes):
+    options = {
+        "max_rate": np.radians(2.0),
+        "max_coast": 4.5,
+        "max_missed": 3,
+        "need": 3,
+        "gate2": 16.0,
+        "field_sr": FIELD_RAD**2,
+        "enough": -np.log(1e-2),
+        "most_pairs": 5000.0,
+    }
+    return TrackRule(**options | changes)
+
+
+def scene(seed, *, times, rate_arcsec_s, n_objects=2, n_strays=2, missed=0.1):
+    """Return detections of a few frames: objects on curved paths, strays, some that have a track.
+
+    Their errors differ by a factor of four.
+    """
+    rng = np.random.default_rng(seed)
+    centre = rng.normal(size=3)
+    centre /= np.linalg.norm(centre)
+    start = rng.uniform(-0.3, 0.3, (n_objects, 2)) * FIELD_RAD
+    heading = rng.uniform(0, 2 * np.pi, n_objects)
+    rate = rate_arcsec_s * ARCSEC * np.column_stack([np.cos(heading), np.sin(heading)])
+    bend = rng.uniform(-0.5, 0.5, (n_objects, 2)) * acceleration(rate_arcsec_s * ARCSEC)
+    offsets, u, sigma = [0], [], []
+    for t in times:
+        strays = rng.uniform(-0.5, 0.5, (rng.poisson(n_strays), 2)) * FIELD_RAD
+        at = np.vstack([start + rate * t + bend * t**2 / 2, strays])
+        at = rng.permutation(at[rng.random(len(at)) > missed])
+        sigma.append(rng.uniform(1.0, 4.0, len(at)) * ARCSEC)
+        at = at + rng.normal(size=at.shape) * sigma[-1][:, None]
+        u.append(centre + at @ tangent_basis(centre))
+        offsets.append(offsets[-1] + len(at))
+    u = np.concatenate(u)
+    track = np.where(rng.random(len(u)) < 0.05, 7, NONE)
+    return Detections(
+        times=np.array(times),
+        offsets=np.array(offsets),
+        frame_of=np.repeat(np.arange(len(times)), np.diff(offsets)),
+        directions=u / np.linalg.norm(u, axis=1, keepdims=True),
+        variances=np.concatenate(sigma) ** 2,
+        track=track,
+    )
+
+
+def begun_in_last_frame(detections, of):
+    """Return the members of the new tracks that end in the last frame, in order."""
+    n_slots = of.need + EXTRA_DETECTIONS + 1
+    recent = RecentFrames(
+        make_grids(n_slots, int(np.diff(detections.offsets).max())),
+        np.full(n_slots, np.inf),
+        np.zeros(n_slots),
+    )
+    f = len(detections.times) - 1
+    for k in range(f + 1):
+        _lay_frame(k, detections, recent)
+    depth, n_tracks = of.need + SLACK_FRAMES, 100
+    begun, length, members = new_tracks(f, depth, n_tracks, detections, recent, of)
+    tracks = [members[row, : length[row]].tolist() for row in begun]
+    for k, track in enumerate(tracks):
+        assert np.flatnonzero(detections.track == n_tracks + k).tolist() == sorted(track)
+    return tracks
+
+
+class State(NamedTuple):
+    """Direction, rate [1/s] and acceleration [1/s^2], (3,) each; covariance (3, 3) of one axis."""
+
+    u: np.ndarray
+    w: np.ndarray
+    bend: np.ndarray
+    P: np.ndarray
+
+
+def begin(u_1, t_1, var_1, u_2, t_2, var_2):
+    """Return the state at the second of two directions."""
+    dt, across = t_2 - t_1, u_2 * (u_1 @ u_2) - u_1
+    angle = np.arctan2(np.linalg.norm(across), u_1 @ u_2)
+    a = acceleration(abs(angle / dt))
+    # Errors of the state by those of both directions and by the unknown acceleration.
+    G = np.array([[0.0, 1.0, 0.0], [-1 / dt, 1 / dt, dt / 2], [0.0, 0.0, 1.0]])
+    w = across / np.linalg.norm(across) * angle / dt
+    return State(u_2, w, np.zeros(3), G @ np.diag([var_1, var_2, a**2]) @ G.T)
+
+
+def predict(state, dt):
+    u, w, bend, P = state
+    rate = np.linalg.norm(w)
+    F = np.array([[1.0, dt, dt**2 / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
+    noise = jerk_of(rate, np.linalg.norm(bend)) * np.array([dt**3 / 6, dt**2 / 2, dt])
+    angle, ahead = rate * dt, w / rate
+    moved = u * np.cos(angle) + ahead * np.sin(angle) + bend * dt**2 / 2
+    w = w * np.cos(angle) - u * rate * np.sin(angle) + bend * dt
+    return straight(moved, w, bend, F @ P @ F.T + np.outer(noise, noise))
+
+
+def correct(state, measured, variance):
+    u, w, bend, P = state
+    gain = P[0] / (P[0, 0] + variance)
+    off = measured - u
+    P = P - np.outer(gain, P[0])
+    return straight(u + gain[0] * off, w + gain[1] * off, bend + gain[2] * off, P)
+
+
+def straight(u, w, bend, P):
+    u = u / np.linalg.norm(u)
+    return State(u, w - w @ u * u, bend - bend @ u * u, P)
+
+
+def free_in(detections, f):
+    lo, hi = detections.offsets[f : f + 2]
+    return [j for j in range(lo, hi) if detections.track[j] == NONE]
+
+
+def follow_back(detections, of, f, j, g, i):
+    """Return the members and log-evidence of a pair that is followed to the first frame."""
+    times, u, var = detections.times, detections.directions, detections.variances
+    missed = np.log(1 - P_DETECTION)
+    state = begin(u[j], times[f], var[j], u[i], times[g], var[i])
+    members, evidence, waiting, at = [j, i], (f - g - 1) * missed, 0.0, times[g]
+    for h in range(g - 1, -1, -1):
+        if times[h] == at:
+            continue
+        state, at = predict(state, times[h] - at), times[h]
+        free, gain = free_in(detections, h), -np.inf
+        chi2 = [np.sum((u[m] - state.u) ** 2) / (state.P[0, 0] + var[m]) for m in free]
+        if free and min(chi2) < of.gate2:
+            m = free[int(np.argmin(chi2))]
+            spot = 2 * np.pi * (state.P[0, 0] + var[m])
+            gain = np.log(P_DETECTION / (len(free) / of.field_sr * spot)) - min(chi2) / 2 + waiting
+        if gain < 0.0:
+            waiting += missed
+            continue
+        evidence, waiting = evidence + gain, 0.0
+        state, members = correct(state, u[m], var[m]), [*members, m]
+    return members, evidence
+
+
+def by_trying_all(detections, of):
+    """Return the members of the new tracks: of every pair in the last frames, whatever its rate."""
+    times, u, f, best = detections.times, detections.directions, len(detections.times) - 1, {}
+    for g in (f - 1, f - 2):
+        dt = times[f] - times[g]
+        if not 0.0 < dt <= of.max_coast:
+            continue
+        ends, starts = free_in(detections, f), free_in(detections, g)
+        by_chance = np.log(max(len(ends), 1) * max(len(starts), 1))
+        for j in ends:
+            for i in starts:
+                if np.linalg.norm(u[i] - u[j]) > of.max_rate * dt:
+                    continue
+                members, evidence = follow_back(detections, of, f, j, g, i)
+                strength = evidence - by_chance
+                if len(members) >= of.need and strength > max(
+                    of.enough, best.get(j, (-np.inf,))[0]
+                ):
+                    best[j] = strength, members
+    tracks, used = [], set()
+    for _, members in sorted(best.values(), key=lambda chain: -chain[0]):
+        if used.isdisjoint(members):
+            tracks.append(members)
+            used.update(members)
+    return tracks
+
+
+@pytest.mark.parametrize("rate_arcsec_s", [0.0, 5.0, 60.0, 900.0, 3000.0])
+@pytest.mark.parametrize("times", TIMES)
+def test_no_track_is_lost_by_the_pairs_that_are_skipped(times, rate_arcsec_s):
+    n_begun = 0
+    for seed in range(12):
+        detections = scene(seed, times=TIMES[times], rate_arcsec_s=rate_arcsec_s)
+        of = rule(need=3 + seed % 2)  # all frames are then followed back
+        expected = by_trying_all(detections, of)
+        assert begun_in_last_frame(detections, of) == expected, seed
+        n_begun += len(expected)
+    assert n_begun > 5
+
+
+def test_strays_alone_begin_the_tracks_of_trying_all_pairs():
+    n_begun = 0
+    for seed in range(40):
+        detections = scene(seed, times=TIMES["even"], rate_arcsec_s=0.0, n_objects=0, n_strays=12)
+        of = rule(enough=np.log(0.3))  # a weak demand, so that chance begins tracks
+        expected = by_trying_all(detections, of)
+        assert begun_in_last_frame(detections, of) == expected, seed
+        n_begun += len(expected)
+    assert n_begun > 5
