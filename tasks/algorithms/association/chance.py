@@ -4,13 +4,13 @@ The odds of a hypothesis need three estimates, in the order in which a search ma
 
 1. `chance_of`, before anything is associated: density and motion of each sensor's tracklets.
 2. `estimated_detection`, from certain groups: each sensor's probability of detection.
-3. `revised_odds`, from all groups: the number of objects in each altitude shell, and with it the
-   groups' final log-odds.
+3. `revised_odds`, from all groups: the number of objects near each group, in each altitude shell,
+   and with it the groups' final log-odds.
 
 The third one is empirical Bayes. The search assumes that every tracklet may be an object, and the
-altitude prior as stated. The certain groups show how many objects the visible volume really holds
-and at which altitudes. The count of each shell is Poisson; its rate has a gamma prior about the
-rate common to all shells.
+altitude prior as stated. The certain groups show how many objects the volume really holds and at
+which altitudes. Counts are Poisson. The rate of all shells together has a gamma prior about the
+rate that the search assumed, and the rate of a shell one about the rate common to all shells.
 """
 
 from collections.abc import Sequence
@@ -35,10 +35,11 @@ CERTAIN_LOG_ODDS = 8.0  # log-odds from which a group is certain
 OTHERS, OTHERS_AT_ONCE = 3, 4
 PRIOR_LOOKS = 10.0  # weight of the prior, as a number of detections and misses
 MIN_DETECTION, MAX_DETECTION = 0.05, 0.99
-SIGHTS = 100  # lines of sight that sample all fields; beyond 100 sensors, one in each of 100 fields
+SIGHTS = 10  # lines of sight that sample a field, along each of its sides
 STEPS = 24  # along a line of sight, in addition to the shells' edges
+SAME_SENSORS = 0.8  # two sets of sensors count as one if they share this much of their union
 MAX_RATE_RATIO = 10.0  # maximum rate of a shell over the common rate
-PRIOR_OBJECTS = 1.0  # weight of the prior of a shell, as a number of objects
+PRIOR_OBJECTS = 1.0  # weight of a prior on the number of objects, as a number of objects
 ROUNDS = 100  # maximum number of iterations of `revised_odds`
 # 1-sigma per axis of the rates of unrelated objects, seen from a low orbit [rad/s]: 900 arcsec/s.
 # Counts as one tracklet. In two simulated constellations the medians were 1,600 and 2,900 arcsec/s.
@@ -182,69 +183,133 @@ def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float
 # Number of objects
 
 
-def visible_volume(views: Views, shells: Array, farthest_km: float) -> Array:
-    """Return the volume [km^3] that at least two sensors see in each shell, times its weight, (j,).
+def visible_volume(views: Views, sensors: Indices, shells: Array, farthest_km: float) -> Array:
+    """Return the volume [km^3] that just these sensors see in each shell, times its weight, (j,).
 
-    `shells` are rows of (lowest, highest radius [km], weight). The volume is integrated along
-    sample lines of sight, at the instant at which most sensors have a known attitude. Zero if
-    fewer than two sensors have one.
+    It is integrated along lines of sight of the sensor with the smallest field, at the instant at
+    which most sensors have a known attitude. Points that almost the same sensors see count, too,
+    see `SAME_SENSORS`. NaN if fewer than two of the sensors have a known attitude.
     """
     ready = np.isfinite(views.position_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
-    m = int(np.argmax(ready.sum(axis=0)))
-    known = np.flatnonzero(ready[:, m])
-    out = np.zeros(len(shells))
+    m = int(np.argmax(ready[sensors].sum(axis=0)))
+    of_set = ready[:, m] & np.isin(np.arange(len(ready)), sensors)
+    known = np.flatnonzero(of_set)
     if len(known) < 2:
-        return out
-    side = max(int(np.sqrt(SIGHTS / len(known))), 1)
-    camera = np.ascontiguousarray(views.camera[known, m])
-    of = max(len(known) / SIGHTS, 1.0)  # each sampled sensor stands for this many
-    known = known[(np.arange(int(len(known) / of)) * of).astype(int)]
-    middle = (np.arange(side) + 0.5) / side * 2 - 1
-    for s in known.tolist():
-        a, b = np.meshgrid(*(middle * half for half in views.half_field[s]), indexing="ij")
-        stretch = np.sqrt(1 + a * a + b * b).ravel()
-        toward = np.stack([a.ravel(), b.ravel(), np.ones(a.size)], axis=1) / stretch[:, None]
-        u = toward @ views.attitude[s, m]
-        cell_sr = np.prod(views.half_field[s]) * 4 / side**2 / stretch**3
-        rho, edges = _steps(views.position_km[s, m], u, shells, farthest_km)
-        x = views.position_km[s, m] + rho[..., None] * u[:, None]
-        count = _in_view_of(camera, x.reshape(-1, 3)).reshape(rho.shape)
-        volume = np.diff(edges**3, axis=1) / 3 * cell_sr[:, None]
-        volume = np.where(count >= 2, volume / np.maximum(count, 1), 0.0)
-        radius = np.linalg.norm(x, axis=2)
-        for j, (lowest, highest, weight) in enumerate(shells):
-            inside = (radius >= lowest) & (radius < highest)
-            out[j] += of * weight * volume[inside].sum()
-    return out
+        return np.full(len(shells), np.nan)
+    first = known[np.argmin(np.prod(views.half_field[known], axis=1))]
+    r_km, attitude = views.position_km[first, m], views.attitude[first, m]
+    u, cell_sr = _sights(views.half_field[first], attitude)
+    others = known[known != first]
+    rho, edges = _steps(r_km, u, shells, *_overlap(views, others, m, r_km, u, farthest_km))
+    x = r_km + rho[..., None] * u[:, None]
+    camera = np.ascontiguousarray(views.camera[ready[:, m], m])
+    shared = _shared(camera, of_set[ready[:, m]], x.reshape(-1, 3)).reshape(rho.shape)
+    volume = np.diff(edges**3, axis=1) / 3 * cell_sr[:, None] * (shared >= SAME_SENSORS)
+    radius = np.linalg.norm(x, axis=2)
+    inside = [(radius >= inner) & (radius < outer) for inner, outer in shells[:, :2]]
+    return np.array([w * volume[here].sum() for w, here in zip(shells[:, 2], inside, strict=True)])
+
+
+def _sights(half_field: Array, R_sensor_from_icrs: Array) -> tuple[Array, Array]:
+    """Return lines of sight that sample a field evenly, (n, 3), and their solid angles [sr]."""
+    middle = (np.arange(SIGHTS) + 0.5) / SIGHTS * 2 - 1
+    a, b = np.meshgrid(*(middle * half for half in half_field), indexing="ij")
+    stretch = np.sqrt(1 + a * a + b * b).ravel()
+    toward = np.stack([a.ravel(), b.ravel(), np.ones(a.size)], axis=1) / stretch[:, None]
+    return toward @ R_sensor_from_icrs, np.prod(half_field) * 4 / SIGHTS**2 / stretch**3
+
+
+def _overlap(
+    views: Views, sensors: Indices, m: int, r_km: Array, u: Array, farthest_km: float
+) -> tuple[Array, Array]:
+    """Return between which ranges [km] lines of sight from r_km lie in any field, (n,) each.
+
+    A field is where four planes and the plane of the sensor's camera have it on their right side,
+    so a line has one piece in it. Without such a piece both ranges are 0.
+    """
+    R, half = views.attitude[sensors, m], views.half_field[sensors, :, None]
+    sides = [half[:, k] * R[:, 2] + sign * R[:, k] for k in (0, 1) for sign in (-1, 1)]
+    normal = np.stack([R[:, 2], *sides], axis=1)
+    start = np.einsum("ski,si->sk", normal, r_km - views.position_km[sensors, m])
+    slope = np.einsum("ni,ski->nsk", u, normal)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = -start / slope
+    low = np.where(slope > 0, at, np.where((slope == 0) & (start < 0), np.inf, 0.0)).max(axis=2)
+    high = np.where(slope < 0, at, farthest_km).min(axis=2)
+    low, high = np.clip(low, 0, farthest_km), np.clip(high, 0, farthest_km)
+    crosses = low < high
+    lowest = np.where(crosses, low, farthest_km).min(axis=1)
+    highest = np.where(crosses, high, 0.0).max(axis=1)
+    return np.minimum(lowest, highest), highest
 
 
 @kernel
-def _in_view_of(camera, x):
-    """Return how many sensors, rows of `camera` (s, 33), see each point x (n, 3) [km], (n,)."""
-    count = np.zeros(len(x), np.int64)
+def _shared(camera, of_set, x):
+    """Return how nearly the sensors that see each point x (n, 3) [km] are those of a set, (n,).
+
+    Sensors are rows of `camera` (s, 33), those of the set are flagged in `of_set` (s,). The result
+    is the number of those of the set that see the point, over that of all that do or are of it.
+    """
+    shared = np.empty(len(x))
     for i in range(len(x)):
+        inside, either = 0, 0
         for s in range(len(camera)):
-            count[i] += in_view(camera[s], x[i])
-    return count
+            sees_it = in_view(camera[s], x[i])
+            inside += of_set[s] and sees_it
+            either += of_set[s] or sees_it
+        shared[i] = inside / either
+    return shared
 
 
-def _steps(r_km: Array, u: Array, shells: Array, farthest_km: float) -> tuple[Array, Array]:
+def _steps(
+    r_km: Array, u: Array, shells: Array, lowest_km: Array, highest_km: Array
+) -> tuple[Array, Array]:
     """Return middles and edges [km] of steps along lines of sight, split at the shells' edges."""
+    lowest, highest = lowest_km[:, None], highest_km[:, None]
     along, r2 = u @ r_km, r_km @ r_km
-    edges = [np.tile(np.linspace(0, farthest_km, STEPS), (len(u), 1))]
+    edges = [lowest + (highest - lowest) * np.linspace(0, 1, STEPS)]
     for radius in np.unique(shells[:, :2]):
         if 0 < radius < np.inf:
             square = along**2 - r2 + radius**2
             root = np.sqrt(np.maximum(square, 0))
-            edges += [np.maximum(-along - root, 0)[:, None], np.maximum(-along + root, 0)[:, None]]
-    edge = np.sort(np.clip(np.concatenate(edges, axis=1), 0, farthest_km), axis=1)
+            edges += [(-along - root)[:, None], (-along + root)[:, None]]
+    edge = np.sort(np.clip(np.concatenate(edges, axis=1), lowest, highest), axis=1)
     return (edge[:, 1:] + edge[:, :-1]) / 2, edge
 
 
+def sets_of_sensors(views: Views, groups: Sequence[Hypothesis]) -> tuple[list[Indices], Indices]:
+    """Return sets of sensors, and for each group the set that has it in the fields, (g,).
+
+    The commonest set is the first. One that shares most sensors with an earlier one is not made.
+    """
+    looks = looks_of(views, groups)
+    seen = np.zeros((len(groups), len(views.half_field)), np.bool_)
+    seen[looks.row, looks.sensor] = True
+    rows, of, count = np.unique(seen, axis=0, return_inverse=True, return_counts=True)
+    kept: list[int] = []
+    same_as = np.empty(len(rows), np.int64)
+    for k in np.argsort(-count, kind="stable").tolist():
+        shared = (rows[kept] & rows[k]).sum(axis=1) / (rows[kept] | rows[k]).sum(axis=1)
+        if len(kept) and shared.max() >= SAME_SENSORS:
+            same_as[k] = np.argmax(shared)
+        else:
+            same_as[k] = len(kept)
+            kept.append(k)
+    return [np.flatnonzero(row) for row in rows[kept]], same_as[of.ravel()]
+
+
 def revised_odds(
-    scores: Array, radius_km: Array, shells: Array, volume_km3: Array, chance: Chance
+    scores: Array,
+    radius_km: Array,
+    shells: Array,
+    set_of: Indices,
+    volume_km3: Array,
+    chance: Chance,
 ) -> Array:
-    """Return the groups' log-odds once the number of objects is known.
+    """Return the groups' log-odds once the number of objects near them is known.
+
+    What other sensors see elsewhere says nothing of the number of objects here. So it is estimated
+    for each set of sensors, from the groups that these have in their fields.
 
     Parameters
     ----------
@@ -252,8 +317,10 @@ def revised_odds(
         Log-odds of the search, and the groups' distances from the Earth's centre.
     shells : (j, 3) float
         Lowest, highest radius, weight.
-    volume_km3 : (j,) float
-        Volumes in view, see `visible_volume`.
+    set_of : (g,) int
+        The set of sensors of each group, see `sets_of_sensors`.
+    volume_km3 : (p, j) float
+        What each set of sensors sees, see `visible_volume`.
     chance
         With the object density that the search assumed.
 
@@ -264,13 +331,13 @@ def revised_odds(
     """
     inside = (radius_km[:, None] >= shells[:, 0]) & (radius_km[:, None] < shells[:, 1])
     believed = inside * shells[:, 2] + 1e-9
-    if not volume_km3.any():  # unknown: as if two sensors saw all of it
-        volume_km3 = np.full(len(shells), chance.objects_in_view / chance.objects_km3)
-    expected = chance.objects_km3 * volume_km3 + 1e-9
+    # Where the volume is unknown, as if two sensors saw all of it.
+    unknown = chance.objects_in_view / len(shells)
+    expected = np.where(np.isnan(volume_km3), unknown, chance.objects_km3 * volume_km3)
     sure = (scores > CERTAIN_LOG_ODDS).astype(float)
     revised = scores
     for _ in range(ROUNDS):
-        factor = _shell_rates(sure, believed, expected)
+        factor = _shell_rates(sure, believed, set_of, expected)
         revised = scores + np.log((believed * factor).sum(axis=1) / believed.sum(axis=1))
         last, sure = sure, 1 / (1 + np.exp(-np.clip(revised, -50, 50)))
         if np.abs(sure - last).max() < 1e-6:
@@ -278,13 +345,20 @@ def revised_odds(
     return revised
 
 
-def _shell_rates(sure: Array, believed: Array, expected: Array) -> Array:
-    """Return the rate of objects in each shell over the assumed rate."""
-    common = max(sure.sum(), 0.5) / expected.sum()
-    factor = np.full(len(expected), common)
+def _shell_rates(sure: Array, believed: Array, set_of: Indices, expected: Array) -> Array:
+    """Return the rate of objects over the assumed rate in each shell, near each group, (g, j).
+
+    A group does not count for itself.
+    """
+    others = np.bincount(set_of, sure)[set_of] - sure + PRIOR_OBJECTS
+    common = (others / (expected.sum(axis=1)[set_of] + PRIOR_OBJECTS))[:, None]
+    factor = np.repeat(common, expected.shape[1], axis=1)
     for _ in range(10):  # an object may belong to either of two shells that overlap
         belongs = believed * factor
-        count = (sure[:, None] * belongs / belongs.sum(axis=1, keepdims=True)).sum(axis=0)
-        ratio = (count + PRIOR_OBJECTS) / (common * expected + PRIOR_OBJECTS)
+        share = sure[:, None] * belongs / belongs.sum(axis=1, keepdims=True)
+        count = np.zeros_like(expected)
+        np.add.at(count, set_of, share)
+        others = count[set_of] - share + PRIOR_OBJECTS
+        ratio = others / (common * expected[set_of] + PRIOR_OBJECTS)
         factor = common * np.minimum(ratio, MAX_RATE_RATIO)
     return factor

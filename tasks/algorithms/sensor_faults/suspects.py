@@ -193,20 +193,23 @@ class Agreement(NamedTuple):
     joined : (s,) int
         Those of them that have a tracklet of the sensor.
     free : (s,) int
-        Tracklets of the sensor without an object.
+        Tracklets of the sensor without an object, or with one of doubted sensors alone: those may
+        agree with each other, and with no other sensor.
     """
 
     looked: Indices
     joined: Indices
     free: Indices
 
+    @property
+    def doubted(self) -> npt.NDArray[np.bool_]:
+        """Whether a sensor joins hardly any object of the others, (s,)."""
+        few = self.joined < MIN_JOINED_SHARE * self.looked
+        return np.asarray(few & (self.looked >= MIN_OBJECTS))
+
     def disagreeing(self) -> Indices:
         """Return the sensors that detect but disagree: they should be left out."""
-        return np.flatnonzero(
-            (self.looked >= MIN_OBJECTS)
-            & (self.joined < MIN_JOINED_SHARE * self.looked)
-            & (self.free >= MIN_STRAYS * self.looked)
-        )
+        return np.flatnonzero(self.doubted & (self.free >= MIN_STRAYS * self.looked))
 
 
 def agreement(samples: Samples, groups: Groups) -> Agreement:
@@ -228,8 +231,10 @@ def agreement(samples: Samples, groups: Groups) -> Agreement:
         others = has[g].sum() - has[g] >= 2
         looked += others & (in_field | (has[g] > 0))
         joined += others & (has[g] > 0)
-    free = np.bincount(samples.sensor[groups.group == FREE], minlength=n_sensors)
-    return Agreement(looked, joined, free)
+    found = Agreement(looked, joined, np.zeros(n_sensors, np.int64))
+    nowhere = np.append(~has.astype(bool)[:, ~found.doubted].any(axis=1), True)  # the last: FREE
+    free = np.bincount(samples.sensor[nowhere[groups.group]], minlength=n_sensors)
+    return found._replace(free=free)
 
 
 def _members_at_best(samples: Samples, groups: Groups) -> tuple[Indices, Indices, Indices]:

@@ -5,6 +5,7 @@ import pytest
 from scenes.many_sensors import POSITION_KM, lines_of_many
 from scenes.tracklet_scenes import GEO, Scene, solve
 
+from epipole.tasks.algorithms.association.samples import FREE, Groups
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     CLOCK,
     EPHEMERIS,
@@ -87,6 +88,24 @@ def test_a_sensor_whose_attitude_is_wrong_is_found(wrong):
     scene = turned(Scene(1, 4).objects(8, spread_km=100.0).strays(1), wrong, np.radians(0.1))
     samples = scene.samples()
     assert agreement(samples, solve(samples)).disagreeing().tolist() == [wrong]
+
+
+def test_two_sensors_that_agree_with_each_other_only_are_found():
+    """What both see is 60 km off for both, so that their lines of sight meet, at nothing."""
+    scene = Scene(1, 5).objects(8, spread_km=50.0)
+    for i, sensor in enumerate(scene.sensor):
+        if sensor in (2, 4):
+            range_km = np.linalg.norm(scene.r[sensor] - GEO, axis=1)[:, None]
+            u = scene.u[i] * range_km + np.array([40.0, 30.0, 35.0])
+            scene.u[i] = u / np.linalg.norm(u, axis=1, keepdims=True)
+    samples = scene.samples()
+    of_both = np.isin(samples.sensor, [2, 4])
+    group = np.array(scene.who) + 8 * of_both
+    nothing = np.full(len(group), False)
+    groups = Groups(group, np.full(16, 9.0), nothing, np.full(5, 0.9))
+    assert agreement(samples, groups).disagreeing().tolist() == [2, 4]
+    alone = groups._replace(group=np.where(of_both, FREE, group), score=groups.score[:8])
+    assert agreement(samples, alone).disagreeing().tolist() == [2, 4]
 
 
 def test_sound_sensors_are_left_alone():
