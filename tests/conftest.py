@@ -57,14 +57,31 @@ def night_log(tmp_path_factory) -> Path:
     return log
 
 
+@pytest.fixture
+def no_early_server(monkeypatch):
+    """Keep `epipole run` in this process from launching Prefect's server before it is needed.
+
+    Each start takes two seconds of CPU. These runs use the server of the session, or none.
+    """
+    from epipole.flows.command_line import run, run_nightly
+
+    for module in (run, run_nightly):
+        monkeypatch.setattr(module, "launch", lambda _: None)
+
+
 @pytest.fixture(scope="session")
-def night_dataset(prefect, night_log, tmp_path_factory) -> Path:
-    """Return the dataset of `night_log`."""
+def night_run(prefect, night_log, tmp_path_factory):
+    """Return the dataset of `night_log`, which tests only read, and the summary of its run."""
     from epipole.flows.nightly import nightly
 
     out = tmp_path_factory.mktemp("dataset") / "out"
-    nightly([str(night_log)], str(out))
-    return out
+    return out, nightly([str(night_log)], str(out))
+
+
+@pytest.fixture(scope="session")
+def night_dataset(night_run) -> Path:
+    """Return the dataset of `night_log`, which tests only read."""
+    return night_run[0]
 
 
 @pytest.fixture(scope="session")

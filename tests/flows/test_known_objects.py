@@ -90,7 +90,7 @@ def test_an_old_catalogue_is_told_in_one_line_and_names_nothing(log, tmp_path, c
                     "2025-05-30): no object is named")  # fmt: skip
 
 
-def test_a_catalogue_that_is_none_ends_a_run_before_it_begins(log, tmp_path):
+def test_a_catalogue_that_is_none_ends_a_run_before_it_begins(log, tmp_path, no_early_server):
     (tmp_path / "none.tle").write_text("")
     with pytest.raises(CatalogueError, match="has no element sets"):
         nightly(str(log), str(tmp_path / "out"), known=str(tmp_path / "none.tle"))

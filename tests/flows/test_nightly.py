@@ -188,9 +188,9 @@ def test_a_bad_frame_is_a_reject_and_the_others_are_used(tmp_path):
     assert rejects.select("sensor_id", "source", "count").rows() == [("a", "n.mcap", 1)]
 
 
-def test_what_was_left_out_is_counted_by_reason(night_dataset, night_log, tmp_path):
-    summary = nightly([str(night_log)], str(tmp_path / "out"))
-    rejects = scan(tmp_path / "out", "rejects")
+def test_what_was_left_out_is_counted_by_reason(night_run):
+    night_dataset, summary = night_run
+    rejects = scan(night_dataset, "rejects")
     assert sum(summary.rejects.values()) == rejects["count"].sum()
     assert summary.positions == len(scan(night_dataset, "positions"))
     assert summary.objects == 9

@@ -105,7 +105,7 @@ def test_a_run_of_a_url_with_secrets_keeps_none_of_them(prefect, server, tmp_pat
     assert files_with(f"http://{server}/night.mcap", os.environ["PREFECT_HOME"])  # it is searched
 
 
-def test_no_message_has_the_secrets_of_a_url(server):
+def test_no_message_has_the_secrets_of_a_url(server, no_early_server):
     at = f"http://me:{PASSWORD}@{server}"
     for url in (
         f"{at}/none.mcap?token={TOKEN}", f"{at}/night.mcap?token=wrong-{PASSWORD}",
@@ -139,7 +139,7 @@ def test_keys_of_a_store_may_stand_in_the_url(s3, night_log, tmp_path, monkeypat
         assert json.loads(printed[printed.index("[") :])[0]["log"] == "s3://logs/keys/night.mcap"
 
 
-def test_urls_that_differ_in_secrets_only_are_refused():
+def test_urls_that_differ_in_secrets_only_are_refused(no_early_server):
     code, printed = epipole("run", "http://a:b@h/x.mcap", "http://a:c@h/x.mcap", "--out", "out")
     assert code == 1
     assert "differ only in their passwords or queries" in printed

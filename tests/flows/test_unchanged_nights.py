@@ -1,6 +1,7 @@
 """Runs of a night that has not changed: it is not made again, unless that is asked for."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from epipole.flows.nightly import nightly
 
 NIGHT = "2019-04-01"
 
-pytestmark = pytest.mark.usefixtures("prefect")
+pytestmark = pytest.mark.usefixtures("prefect", "no_early_server")
 
 
 def state(folder: Path) -> dict[str, tuple[int, bytes]]:
@@ -20,9 +21,10 @@ def state(folder: Path) -> dict[str, tuple[int, bytes]]:
 
 
 @pytest.fixture(scope="module")
-def made(night_log, tmp_path_factory):
-    out = tmp_path_factory.mktemp("unchanged") / "out"
-    return out, nightly([str(night_log)], str(out))
+def made(night_run, tmp_path_factory):
+    """Return a copy of the session's dataset, and the summary of its run."""
+    dataset, summary = night_run
+    return shutil.copytree(dataset, tmp_path_factory.mktemp("unchanged") / "out"), summary
 
 
 def run(*arguments) -> tuple[int, str]:

@@ -24,7 +24,7 @@ EPIPOLE = [sys.executable, "-c", "from epipole.flows.command_line.main import ma
 
 
 @pytest.fixture
-def epipole(monkeypatch, capfd, tmp_path):
+def epipole(monkeypatch, capfd, tmp_path, no_early_server):
     """Return a function that runs a command line and gives (exit code, stdout, stderr)."""
     monkeypatch.chdir(tmp_path)
 

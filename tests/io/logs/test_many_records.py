@@ -9,6 +9,15 @@ from scenes import many_records
 
 KINDS = [*many_records.KINDS, "chunk indexes"]
 SLOW = {"chunks", "chunks with a wrong checksum", "messages and chunks in turn"}
+# Left out one by one, each counted in `rejects`.
+COUNTED = {
+    "foreign records",
+    "empty data ends",
+    "empty messages",
+    "messages without a channel",
+    "chunks with a wrong checksum",
+}
+QUICK = [*sorted(COUNTED), "messages and chunks in turn", "channels", "chunk indexes"]
 SLOWEST = "logs in sequence"
 MAX_RATIO = 8.0  # of the CPU time for four times as many; in proportion it is four
 NO_TIME_S = 0.2  # CPU times below it are noise
@@ -32,12 +41,12 @@ def check(kind, n, memory_mib):
     assert cpu_s < MAX_RATIO * max(few_s, NO_TIME_S)
     assert mib < memory_mib
     assert rows < 60_000
-    return cpu_s, mib, count
+    assert count == n or kind not in COUNTED
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", QUICK)
 def test_many_records_take_little_memory_and_time_in_proportion(kind):
-    n = 8_000 if kind == SLOWEST else 40_000 if kind in SLOW else 400_000
+    n = 16_000 if kind in SLOW else 400_000
     check(kind, n, ROWS_MIB + n * INDEX_BYTES / (1 << 20) * (kind == "chunk indexes"))
 
 
@@ -46,18 +55,3 @@ def test_many_records_take_little_memory_and_time_in_proportion(kind):
 def test_millions_of_records_stay_below_a_gibibyte(kind):
     n = 100_000 if kind == SLOWEST else 500_000 if kind in SLOW else 5_000_000
     check(kind, n, 700)
-
-
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "foreign records",
-        "empty data ends",
-        "empty messages",
-        "messages without a channel",
-        "chunks with a wrong checksum",
-    ],
-)
-def test_each_of_many_records_that_is_left_out_is_counted(kind):
-    *_, count = check(kind, 70_000, 100)
-    assert count == 70_000
