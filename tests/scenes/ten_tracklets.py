@@ -350,8 +350,7 @@ def score(scene, members):
         for i in members:
             if samples.seen[i, m]:
                 error, cov = residual(samples, i, m, x)
-                # Without the error of the sensor's position, as `odds.score` has it; see test_odds.
-                spot = 2 * np.pi * np.sqrt(np.linalg.det(samples.cov[i, m]))
+                spot = 2 * np.pi * np.sqrt(np.linalg.det(cov))
                 total -= np.log(space.chance.density[samples.sensor[i]] * spot)
                 total -= 0.5 * error @ np.linalg.solve(cov, error)
     else:

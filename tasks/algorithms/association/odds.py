@@ -13,10 +13,10 @@ from epipole.tasks.algorithms.association.views import (
     HALF,
     PLANE,
     REACH,
-    SPOT_SR,
     TURN,
     misfit,
     residual,
+    spot_sr,
 )
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
@@ -194,8 +194,8 @@ def score(space, work, members, near):
         total = 1.5 * LN_2PI + 0.5 * np.log(_det3(points.cov_km2[m]))
         for i in members:
             if views.seen[i, m]:
-                total -= np.log(chance.density[views.sensor[i]] * views.sight[i, m, SPOT_SR])
                 residual(views, i, m, points.x_km[m], work.part)
+                total -= np.log(chance.density[views.sensor[i]] * spot_sr(views, i, m, work.part))
                 total -= 0.5 * misfit(work.part)
     else:
         total = arc_odds(views, chance, members, points)

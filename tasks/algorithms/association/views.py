@@ -21,10 +21,10 @@ Flags = npt.NDArray[np.bool_]
 
 # Columns of `Views.sight` and `Views.camera`. For a tracklet or a sensor at an instant the search
 # reads a single row. Few arrays also compile fast.
-X, Y, XX, XY, YY, SIGMA_KM, SPOT_SR, DX, DY, MOVES = range(10)
+X, Y, XX, XY, YY, SIGMA_KM, DX, DY, MOVES = range(9)
 R_KM, PLANE, TURN, HALF, CORNER, SCALE, WIDEST, REACH = 0, 3, 12, 21, 23, 25, 27, 28
 V_KM_S, FASTEST = 29, 32
-N_SIGHT, N_CAMERA = 10, 33
+N_SIGHT, N_CAMERA = 9, 33
 
 
 class Views(NamedTuple):
@@ -34,11 +34,10 @@ class Views(NamedTuple):
         Tracklets of sensor s are ``first[s]:first[s + 1]``.
     sensor, start_s, end_s, seen, time_s
         As in `Samples`.
-    sight : (t, k, 10) float
+    sight : (t, k, 9) float
         Gnomonic coordinates in the sensor's plane (X, Y), their variances and covariance (XX, XY,
-        YY), the 1-sigma error of the sensor's position [km], 2 pi times the square root of the
-        determinant of the direction's covariance [sr], the rates of the coordinates [1/s] (DX,
-        DY), and 1 where these are known, else 0 (MOVES).
+        YY), the 1-sigma error of the sensor's position [km], the rates of the coordinates [1/s]
+        (DX, DY), and 1 where these are known, else 0 (MOVES).
     camera : (s, k, 33) float
         The sensor's position [km]; the plane's two axes and its normal; the sensor's axes (NaN
         where unknown); tangents of half its field; the grid's lowest coordinates and its cells
@@ -277,7 +276,6 @@ def _flatten(sensor, order, seen, u, cov, rate, camera, sight):
                     for c in range(3):
                         M[a, b] += (p[a, c] - here * p[2, c]) * t[b, c] / depth
             c00, c01, c11 = cov[i, m, 0, 0], cov[i, m, 0, 1], cov[i, m, 1, 1]
-            sight[n, m, SPOT_SR] = 2 * np.pi * np.sqrt(max(c00 * c11 - c01 * c01, 0.0))
             for k in range(3):
                 a, b = k // 2, (k + 1) // 2  # xx, xy, yy
                 along, across = c00 * M[b, 0] + c01 * M[b, 1], c01 * M[b, 0] + c11 * M[b, 1]
@@ -395,3 +393,14 @@ def misfit(part):
     """Return the chi-square of what `residual` wrote."""
     e0, e1 = part[0], part[1]
     return part[8] * e0 * e0 + 2 * part[9] * e0 * e1 + part[10] * e1 * e1
+
+
+@borrowing_kernel
+def spot_sr(views, i, m, part):
+    """Return the solid angle [sr] of the errors of what `residual` wrote.
+
+    It is 2 pi times the square root of the determinant of their covariance, that of the sensor's
+    position included.
+    """
+    flat = 1.0 + views.sight[i, m, X] ** 2 + views.sight[i, m, Y] ** 2
+    return 2 * np.pi / np.sqrt((part[8] * part[10] - part[9] ** 2) * flat**3)

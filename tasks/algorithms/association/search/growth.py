@@ -27,7 +27,7 @@ from epipole.tasks.algorithms.association.search.candidates import best_of_senso
 from epipole.tasks.algorithms.association.search.field_index import sensors_sharing
 from epipole.tasks.algorithms.association.search.instant_points import join, possible, solve
 from epipole.tasks.algorithms.association.search.sight_lines import quantile
-from epipole.tasks.algorithms.association.views import SPOT_SR, misfit, residual
+from epipole.tasks.algorithms.association.views import misfit, residual, spot_sr
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
 
 Array = npt.NDArray[np.float64]
@@ -323,10 +323,10 @@ def _still_fits(space, work, i):
     views, chance, points, part = space.views, space.chance, work.points, work.part
     for m in range(len(views.time_s)):
         if points.seen_by[m] >= 2 and views.seen[i, m]:
-            s, spot = views.sensor[i], views.sight[i, m, SPOT_SR]
+            s = views.sensor[i]
             if residual(views, i, m, points.x_km[m], part) == 0.0:
                 return False
-            odds = np.log(chance.detected[s] / (chance.density[s] * spot))
+            odds = np.log(chance.detected[s] / (chance.density[s] * spot_sr(views, i, m, part)))
             return odds - 0.5 * misfit(part) >= MIN_GAIN
     return True
 

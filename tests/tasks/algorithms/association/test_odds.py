@@ -212,11 +212,7 @@ def test_every_set_of_tracklets_that_may_be_one_object_has_the_odds_of_the_formu
 
 @pytest.mark.parametrize(
     ("seed", "sigma_km"),
-    [
-        (0, 0.0),
-        (1, 0.0),
-        pytest.param(0, 0.05, marks=pytest.mark.xfail(reason="SPOT_SR lacks the position's error")),
-    ],
+    [(0, 0.0), (1, 0.0), (0, 0.05)],
 )
 def test_the_score_at_one_instant_is_an_integral_over_space(seed, sigma_km):
     """ln of: density of objects, times likelihood over that of unrelated directions, integrated."""
