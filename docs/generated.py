@@ -34,6 +34,7 @@ from epipole.schemas.scene import (
     SceneDetection,
     SceneFaults,
     SceneSensor,
+    SceneShell,
     SceneStates,
     SceneTargets,
 )
@@ -57,8 +58,8 @@ MADE_BY = {
 TUTORIAL = "docs/first_night.md"
 
 SCENE_PARTS = (
-    "scene", "sensors", "targets", "orbit", "pointing", "camera", "camera.departure", "detection",
-    "states", "faults",
+    "scene", "sensors", "targets", "orbit", "orbit.shells", "pointing", "camera",
+    "camera.departure", "detection", "states", "faults",
 )  # fmt: skip
 
 
@@ -155,8 +156,8 @@ def settings() -> str:
 
 def scene() -> str:
     """Return a section for each part of a scene: names, defaults, meanings."""
-    parts = (Scene, SceneSensor, SceneTargets, Orbit, Pointing, SceneCamera, LensDeparture,
-             SceneDetection, SceneStates, SceneFaults)  # fmt: skip
+    parts = (Scene, SceneSensor, SceneTargets, Orbit, SceneShell, Pointing, SceneCamera,
+             LensDeparture, SceneDetection, SceneStates, SceneFaults)  # fmt: skip
     names = dict(zip(parts, SCENE_PARTS, strict=True))
     sections = []
     for group, heading in names.items():

@@ -1,12 +1,13 @@
 """Simulate a scene: write a log and its truth."""
 
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 import pyarrow as pa
@@ -30,6 +31,7 @@ from epipole.tasks.algorithms.simulation.sensor import (
 )
 from epipole.tasks.simulate.draw_sensors import sent_optics
 from epipole.tasks.simulate.simulate_scene import (
+    SceneSky,
     Simulation,
     expose_blocks,
     simulate_scene,
@@ -52,19 +54,37 @@ class Simulated:
     centroids: int
 
 
+class SceneOptions(TypedDict, total=False):
+    """Values used instead of a scene's; None leaves the scene's.
+
+    seed, hours, seconds, start : its seed, duration and start (an aware datetime)
+    sensors, objects : the number of them in the first group of sensors and of targets
+    satellites : the number of satellites of a constellation
+    near : whether those are near each other; False leaves what the scene says
+    elements : file of element sets, real satellites instead of the objects of the first group
+    rate_hz : frames per second of every sensor
+    """
+
+    seed: int | None
+    sensors: int | None
+    objects: int | None
+    satellites: int | None
+    near: bool
+    elements: str | os.PathLike[str] | None
+    hours: float | None
+    seconds: float | None
+    rate_hz: float | None
+    start: datetime | None
+
+
 def simulate(
     scene: str | os.PathLike[str] | Scene,
     out: str | os.PathLike[str],
     *,
-    seed: int | None = None,
-    sensors: int | None = None,
-    objects: int | None = None,
-    hours: float | None = None,
-    rate_hz: float | None = None,
-    start: datetime | None = None,
     logs: int = 1,
     encoding: str = "protobuf",
     compression: str = "zstd",
+    **options: Unpack[SceneOptions],
 ) -> Simulated:
     """Simulate a scene: write its log, and its truth to the folder ``<out>.truth``.
 
@@ -73,18 +93,15 @@ def simulate(
     scene
         The name of a built-in scene, a TOML file, or a scene.
     out
-        The log to write, an MCAP file.
-    seed, hours, start
-        Used instead of the scene's seed, duration and start (an aware datetime).
-    sensors, objects
-        The number of them in the scene's first group of sensors and of targets.
-    rate_hz
-        Frames per second of every sensor.
+        The log to write, an MCAP file. For a constellation (a scene with `shells`), a name
+        without ``.mcap`` is a folder, with one log for each satellite.
     logs
         The number of logs, one after the other in time. Several logs are called
         ``<stem>-1.mcap`` and so on. The truth is still ``<out>.truth``.
     encoding, compression
         See `LogWriter`.
+    options
+        See `SceneOptions`.
 
     Raises
     ------
@@ -92,31 +109,69 @@ def simulate(
         Where the scene or an option is invalid, or the log cannot be written.
     """
     settled = scene if isinstance(scene, Scene) else read_scene(scene)
-    settled = _with_options(settled, seed, sensors, objects, hours, rate_hz, start)
+    settled = _with_options(settled, options)
     if not 1 <= logs <= MAX_LOGS:
         raise SceneError(f"logs = {logs}: give 1 to {MAX_LOGS}")
     out = Path(out)
     if (fault := fault_of_name(out.name)) is not None:
         raise SceneError(f"log {out}: {fault}")
-    names = [out] if logs == 1 else [out.with_stem(f"{out.stem}-{k + 1}") for k in range(logs)]
-    truth = Path(str(out) + SUFFIX)
+    is_folder = out.suffix != ".mcap" and any(g.orbit.shells for g in settled.sensors)
+    if is_folder and logs > 1:
+        raise SceneError(f"logs = {logs}: a folder has one log for each satellite")
     simulation = simulate_scene(settled)
+    form: dict[str, Any] = {"encoding": encoding, "compression": compression}
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as stack:
-            writers = [
-                stack.enter_context(LogWriter(name, encoding=encoding, compression=compression))
-                for name in names
-            ]
-            true = stack.enter_context(TruthWriter(truth, scenario(simulation)))
-            if (orbits := true_orbits(simulation)) is not None:
-                true.write_orbits(orbits)
-            frames, centroids = _write(simulation, writers, true)
+        if is_folder:
+            return _write_folder(simulation, out, form)
+        names = [out] if logs == 1 else [out.with_stem(f"{out.stem}-{k + 1}") for k in range(logs)]
+        return _write_in_time(simulation, out, names, form)
     except OSError as error:
         raise SceneError(f"{out}: cannot be written: {error}") from error
-    return Simulated(
-        names, truth, len(simulation.sensors), len(simulation.objects), frames, centroids
-    )
+
+
+def _write_in_time(
+    simulation: Simulation, out: Path, names: list[Path], form: dict[str, Any]
+) -> Simulated:
+    """Write all sensors to the same logs, one log after the other in time."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    truth = Path(str(out) + SUFFIX)
+    with ExitStack() as stack:
+        writers = [stack.enter_context(LogWriter(name, **form)) for name in names]
+        true = stack.enter_context(TruthWriter(truth, scenario(simulation)))
+        _write_orbits(simulation, true)
+        members = range(len(simulation.sensors))
+        counts = _write(simulation, members, SceneSky(simulation), writers, true)
+    return _simulated(simulation, names, truth, counts)
+
+
+def _write_folder(simulation: Simulation, out: Path, form: dict[str, Any]) -> Simulated:
+    """Write one log for each satellite, one after the other: memory is that of one."""
+    sensors_of: dict[str, list[int]] = {}
+    for k, satellite in enumerate(simulation.satellites):
+        sensors_of.setdefault(satellite, []).append(k)
+    names = [out / f"{satellite}.mcap" for satellite in sensors_of]
+    out.mkdir(parents=True, exist_ok=True)
+    if others := sorted(set(out.iterdir()) - set(names)):
+        raise SceneError(f"{out}: has other files, such as {others[0].name}; give a new folder")
+    sky, truth, counts = SceneSky(simulation), Path(str(out) + SUFFIX), (0, 0)
+    with TruthWriter(truth, scenario(simulation)) as true:
+        _write_orbits(simulation, true)
+        for name, members in zip(names, sensors_of.values(), strict=True):
+            with LogWriter(name, **form) as writer:
+                n_frames, n_centroids = _write(simulation, members, sky, [writer], true)
+            counts = counts[0] + n_frames, counts[1] + n_centroids
+    return _simulated(simulation, names, truth, counts)
+
+
+def _write_orbits(simulation: Simulation, true: TruthWriter) -> None:
+    if (orbits := true_orbits(simulation)) is not None:
+        true.write_orbits(orbits)
+
+
+def _simulated(
+    simulation: Simulation, names: list[Path], truth: Path, counts: tuple[int, int]
+) -> Simulated:
+    return Simulated(names, truth, len(simulation.sensors), len(simulation.objects), *counts)
 
 
 def scenario(simulation: Simulation) -> dict[str, Any]:
@@ -135,6 +190,7 @@ def _describe_sensor(simulation: Simulation, k: int) -> dict[str, Any]:
     s, faults = simulation.sensors[k], simulation.groups[k].faults
     described = {
         "id": s.sensor_id,
+        "sat": simulation.satellites[k],
         **_describe_path(s.path, simulation.sensor_sets[k]),
         "rate_hz": s.rate_hz,
         "phase": s.phase,
@@ -142,6 +198,11 @@ def _describe_sensor(simulation: Simulation, k: int) -> dict[str, Any]:
         "sigma_px": s.sigma_px,
         "camera": dict(s.optics._asdict()),
     }
+    if s.mode == "body":
+        described |= {
+            "azimuth_deg": math.degrees(s.azimuth),
+            "elevation_deg": math.degrees(s.elevation),
+        }
     if simulation.groups[k].clock_offset_s:
         described["clock_s"] = simulation.groups[k].clock_offset_s
     if s.position_offset_km.any():
@@ -169,55 +230,83 @@ def _describe_path(path: Paths, element_set: ElementSet | None) -> dict[str, Any
     if element_set is None:
         return {"elements": path.elements[0].tolist()}
     epoch = np.datetime64(element_set.epoch_ns, "ns")
+    if not element_set.number:
+        return {"name": element_set.name}
     return {
         "name": element_set.name,
+        "norad": element_set.number,
         "norad_id": element_set.number,
         "element_epoch": f"{np.datetime_as_string(epoch, unit='ms')}Z",
     }
 
 
-def _with_options(
-    scene: Scene,
-    seed: int | None,
-    sensors: int | None,
-    objects: int | None,
-    hours: float | None,
-    rate_hz: float | None,
-    start: datetime | None,
-) -> Scene:
+def _with_options(scene: Scene, options: SceneOptions) -> Scene:
+    given: dict[str, Any] = {key: value for key, value in options.items() if value is not None}
     values = scene.model_dump(exclude_unset=True)
-    top = {
-        "seed": seed,
-        "start": start,
-        "duration_s": None if hours is None else hours * 3600.0,
-    }
-    values |= {key: value for key, value in top.items() if value is not None}
-    if sensors is not None:
-        values["sensors"][0]["count"] = sensors
-    if objects is not None:
+    _change_satellites(values, given, scene)
+    if "hours" in given and "seconds" in given:
+        raise SceneError("give hours or seconds, not both")
+    if "hours" in given:
+        given["seconds"] = given["hours"] * 3600.0
+    names = {"seed": "seed", "start": "start", "seconds": "duration_s"}
+    values |= {name: given[key] for key, name in names.items() if key in given}
+    if "sensors" in given:
+        values["sensors"][0]["count"] = given["sensors"]
+    if "objects" in given:
+        number = given["objects"]
         if not values.get("targets"):
-            raise SceneError(f"{scene.name}: has no targets, so their number cannot be {objects}")
-        values["targets"][0]["count"] = objects
-    if rate_hz is not None:
+            raise SceneError(f"{scene.name}: has no targets, so their number cannot be {number}")
+        values["targets"][0]["count"] = number
+    if "rate_hz" in given:
         for sensor in values["sensors"]:
-            sensor["rate_hz"] = rate_hz
+            sensor["rate_hz"] = given["rate_hz"]
     return validate_scene(values, scene.name)
 
 
-def _write(simulation: Simulation, writers: list[LogWriter], true: TruthWriter) -> tuple[int, int]:
-    """Write all messages in order of time, calibrations first. Return the counts."""
-    for sensor, group in zip(simulation.sensors, simulation.groups, strict=True):
+def _change_satellites(values: dict[str, Any], given: dict[str, Any], scene: Scene) -> None:
+    """Change the groups of a scene's values that are on satellites, as the options say."""
+    groups = [g for g in values["sensors"] + values.get("targets", []) if g["orbit"].get("shells")]
+    if not groups and ("satellites" in given or given.get("near")):
+        raise SceneError(
+            f"{scene.name}: is no constellation, so it takes neither satellites nor near"
+        )
+    for group in groups:
+        group["count"] = given.get("satellites", group.get("count"))
+        if given.get("near"):
+            group["orbit"]["near"] = True
+    if "elements" in given:
+        if not values.get("targets"):
+            raise SceneError(f"{scene.name}: has no targets that element sets could replace")
+        target = values["targets"][0]
+        target["orbit"] = {"elements": os.fspath(given["elements"]), "usable_only": True}
+        for name in ("count", "spread_km"):
+            target.pop(name, None)
+
+
+def _write(
+    simulation: Simulation,
+    members: Sequence[int],
+    sky: SceneSky,
+    writers: list[LogWriter],
+    true: TruthWriter,
+) -> tuple[int, int]:
+    """Write the messages of some sensors in order of time, calibrations first.
+
+    The counts of frames and centroids are returned.
+    """
+    for k in members:
         for writer in writers:
-            writer.camera(sensor.sensor_id, simulation.t0_ns, sent_optics(group.camera))
+            camera = sent_optics(simulation.groups[k].camera)
+            writer.camera(simulation.sensors[k].sensor_id, simulation.t0_ns, camera)
     bounds = _log_bounds(simulation, len(writers))
-    states = [_States(simulation, k) for k in range(len(simulation.sensors))]
+    states = [_States(simulation, k) for k in members]
     n_frames = n_centroids = 0
-    for block in expose_blocks(simulation):
-        _write_truth(simulation, block, true)
+    for block in expose_blocks(simulation, members, sky):
+        _write_truth(simulation, members, block, true)
         ends = [int(exposed.time_ns[-1]) for exposed in block if len(exposed.time_ns)]
         until = max(ends, default=0) + 1
         messages = [m for s in states for m in s.until(until)]
-        for k, exposed in enumerate(block):
+        for k, exposed in zip(members, block, strict=True):
             messages += _frames(simulation, k, exposed)
             n_frames += len(exposed.time_ns)
             n_centroids += int(exposed.offsets[-1])
@@ -226,10 +315,12 @@ def _write(simulation: Simulation, writers: list[LogWriter], true: TruthWriter) 
     return n_frames, n_centroids
 
 
-def _write_truth(simulation: Simulation, block: list[Exposures], true: TruthWriter) -> None:
+def _write_truth(
+    simulation: Simulation, members: Sequence[int], block: list[Exposures], true: TruthWriter
+) -> None:
     tables = [
-        true_tables(sensor.sensor_id, exposed)
-        for sensor, exposed in zip(simulation.sensors, block, strict=True)
+        true_tables(simulation.sensors[k].sensor_id, exposed)
+        for k, exposed in zip(members, block, strict=True)
     ]
     frames, points = zip(*tables, strict=True)
     true.write(pa.concat_tables(frames), pa.concat_tables(points))

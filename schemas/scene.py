@@ -18,11 +18,49 @@ from epipole.schemas.text import toml_values
 Vector = tuple[float, float, float]
 
 
+_WALKER = r"^\d{1,3}(\.\d+)?:\d{1,5}/\d{1,4}/\d{1,4}$"
+
+
+class SceneShell(Group):
+    """A shell of a constellation: a Walker pattern of circular orbits at one altitude."""
+
+    altitude_km: float = Field(gt=150, le=3000, description="Above the equatorial radius.")
+    walker: str = Field(
+        pattern=_WALKER,
+        description="`i:t/p/f`: inclination in degrees, satellites, planes, and phasing between "
+        'neighbouring planes in units of 360 / t degrees, such as "53:1584/72/39".',
+    )
+    arc_deg: float = Field(
+        360.0,
+        gt=0,
+        le=360,
+        description="Arc of the equator that the ascending nodes fill: 360 for a Walker delta "
+        "pattern, 180 for a star of polar planes.",
+    )
+
+    @property
+    def pattern(self) -> tuple[float, int, int, int]:
+        """Return inclination [deg], satellites, planes and phasing."""
+        inclination, rest = self.walker.split(":")
+        t, p, f = map(int, rest.split("/"))
+        return float(inclination), t, p, f
+
+    @model_validator(mode="after")
+    def _whole_planes(self) -> Self:
+        inclination, t, p, f = self.pattern
+        if inclination > 180 or not t or not p or t % p or f >= p:
+            raise ValueError(
+                f"walker {self.walker}: expected i <= 180, t a multiple of p, and f below p"
+            )
+        return self
+
+
 class Orbit(Group):
     """An orbit about the Earth.
 
-    By elements or by a position at the start of the scene, random, or of real satellites: by SGP4
-    from a file of published element sets.
+    By elements or by a position at the start of the scene, random, of a constellation, or of real
+    satellites: by SGP4 from a file of published element sets. Those of a constellation, and
+    random ones of the kind "low", move by SGP4 too.
     """
 
     a_km: float | None = Field(None, gt=6378.0, description="Semi-major axis.")
@@ -36,8 +74,10 @@ class Orbit(Group):
     velocity_km_s: Vector | None = Field(
         None, description="GCRF velocity there. Default: a circular orbit eastward."
     )
-    random: Literal["leo", "meo", "geo"] | None = Field(
-        None, description="A random orbit of this kind."
+    random: Literal["leo", "low", "meo", "geo"] | None = Field(
+        None,
+        description='A random orbit of this kind. "low": the shells and inclinations in which low '
+        "satellites are, for objects only.",
     )
 
     elements: str | None = Field(
@@ -49,17 +89,44 @@ class Orbit(Group):
     satellites: list[str | int] = Field(
         [], description="Names or catalogue numbers to take from the file. Default: all."
     )
+    usable_only: bool = Field(
+        False,
+        description="elements: leave out satellites whose elements are too old or that SGP4 "
+        "fails for, instead of refusing the scene.",
+    )
+
+    shells: list[SceneShell] = Field(
+        [],
+        description="A constellation. Groups with the same shells and count are on the same "
+        "satellites, called s001 and so on.",
+    )
+    scatter_km: float = Field(
+        0.0, ge=0, le=100, description="shells: 1-sigma per axis about the regular pattern."
+    )
+    near: bool = Field(
+        False,
+        description="shells: take the satellites nearest to a random one in the middle of the "
+        "scene. Default: some at random from all of the pattern.",
+    )
+
+    @property
+    def is_of_satellites(self) -> bool:
+        """Return whether the orbit is of several satellites: of a file, or a constellation."""
+        return self.elements is not None or bool(self.shells)
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
-        ways = (self.a_km, self.position_km, self.random, self.elements)
+        ways = (self.a_km, self.position_km, self.random, self.elements, self.shells or None)
         if sum(way is not None for way in ways) != 1:
-            raise ValueError("an orbit takes one of a_km, position_km, random and elements")
-        if self.satellites and self.elements is None:
-            raise ValueError("satellites goes with elements")
-        if self.elements is not None:
-            for name in sorted(self.model_fields_set - {"elements", "satellites"}):
-                raise ValueError(f"{name} does not go with elements")
+            raise ValueError("an orbit takes one of a_km, position_km, random, elements and shells")
+        goes = {"elements": {"satellites", "usable_only"}, "shells": {"scatter_km", "near"}}
+        for way, names in goes.items():
+            others = self.model_fields_set - names - {way}
+            if not getattr(self, way):
+                for name in sorted(self.model_fields_set & names):
+                    raise ValueError(f"{name} goes with {way}")
+            elif others:
+                raise ValueError(f"{min(others)} does not go with {way}")
         if self.mean_anomaly_deg is not None and self.true_anomaly_deg is not None:
             raise ValueError("an orbit takes mean_anomaly_deg or true_anomaly_deg, not both")
         if self.position_km is not None and not any(self.position_km[:2]):
@@ -141,6 +208,17 @@ class Pointing(Group):
     elevation_deg: float = Field(
         0.0, ge=-90, le=90, description="body: from the horizontal away from the Earth."
     )
+    azimuth_from: Literal["motion", "anti_sun"] = Field(
+        "motion",
+        description="body: what the azimuth is counted from: the motion, or the horizontal away "
+        "from the Sun at the start. It stays fixed to the body in either case.",
+    )
+    spread_deg: float = Field(
+        0.0,
+        ge=0,
+        le=90,
+        description="body: azimuth and elevation of each sensor differ by up to this, at random.",
+    )
     ra_deg: float | None = Field(None, description="fixed, spin: boresight at the start.")
     dec_deg: float | None = Field(None, ge=-90, le=90)
     axis: Vector = Field((0.0, 0.0, 1.0), description="spin: inertial axis of rotation.")
@@ -195,6 +273,20 @@ class SceneDetection(Group):
         description="1-sigma width of the magnitude limit of objects, drawn anew in each frame. "
         "Default: a sharp limit.",
     )
+    blend_px: float = Field(
+        0.0,
+        ge=0,
+        le=20,
+        description="Stars and objects nearer than this are one centroid at the middle of their "
+        "light, and what is too faint alone counts. Default: only stars do so, within 2 px.",
+    )
+    trail_error: float = Field(
+        0.0,
+        ge=0,
+        lt=1,
+        description="1-sigma along the motion of an object, relative to the length of its trail, "
+        "beside `sigma_px`. It is not sent.",
+    )
 
 
 class SceneStates(Group):
@@ -218,6 +310,9 @@ class SceneStates(Group):
     )
     prior_bias_arcsec: float = Field(
         0.0, ge=0, description="1-sigma per axis, constant for each sensor."
+    )
+    prior_share: float = Field(
+        1.0, ge=0, le=1, description="Share of the satellites whose logs have attitudes."
     )
 
 
@@ -250,8 +345,8 @@ class SceneSensor(Group):
         None,
         ge=1,
         le=10000,
-        description="Default: 1, or one for each satellite of `orbit.elements`. A smaller number "
-        "takes these satellites at random.",
+        description="Default: 1, or one for each satellite of `orbit.elements` or "
+        "`orbit.shells`. A smaller number takes some of these satellites at random.",
     )
     orbit: Orbit
     in_view: bool = Field(
@@ -298,8 +393,8 @@ class SceneTargets(Group):
         None,
         ge=0,
         le=1000000,
-        description="Default: 1, or one for each satellite of `orbit.elements`. A smaller number "
-        "takes these satellites at random.",
+        description="Default: 1, or one for each satellite of `orbit.elements` or "
+        "`orbit.shells`. A smaller number takes some of these satellites at random.",
     )
     orbit: Orbit
     spread_km: float = Field(
@@ -318,8 +413,8 @@ class SceneTargets(Group):
     def _one_magnitude(self) -> Self:
         if self.standard_magnitude is not None and "magnitude" in self.model_fields_set:
             raise ValueError("an object takes magnitude or standard_magnitude, not both")
-        if self.spread_km and self.orbit.elements is not None:
-            raise ValueError("spread_km does not go with an orbit of element sets")
+        if self.spread_km and (self.orbit.is_of_satellites or self.orbit.random == "low"):
+            raise ValueError("spread_km does not go with satellites that move by SGP4")
         return self
 
 
@@ -357,12 +452,18 @@ class Scene(Group):
     )
 
     @model_validator(mode="after")
+    def _no_low_sensors(self) -> Self:
+        if low := [s.id for s in self.sensors if s.orbit.random == "low"]:
+            raise ValueError(f'sensor {low[0]}: random = "low" is for objects')
+        return self
+
+    @model_validator(mode="after")
     def _distinct(self) -> Self:
         names = [s.id for s in self.sensors]
         if len(set(names)) < len(names):
             raise ValueError("two sensors have the same id")
         counts = [
-            1 if g.count is None and g.orbit.elements is None else g.count for g in self.targets
+            1 if g.count is None and not g.orbit.is_of_satellites else g.count for g in self.targets
         ]
         n = None if None in counts else sum(c for c in counts if c is not None)
         for sensor in self.sensors:

@@ -27,7 +27,12 @@ def simulate(
         str, typer.Argument(metavar="SCENE", help="Name of a built-in scene, or a TOML file.")
     ],
     out: Annotated[
-        Path, typer.Option(metavar="LOG", help="Log to write. Its truth goes to LOG.truth.")
+        Path,
+        typer.Option(
+            metavar="LOG",
+            help="Log to write. Its truth goes to LOG.truth. For a constellation, a name without "
+            ".mcap is a folder, with a log for each satellite.",
+        ),
     ],
     seed: Annotated[
         int | None,
@@ -41,8 +46,25 @@ def simulate(
     objects: Annotated[
         int | None, typer.Option(min=0, metavar="N", help="Number of objects in the first group.")
     ] = None,
+    satellites: Annotated[
+        int | None,
+        typer.Option(min=1, metavar="N", help="constellation: number of satellites with sensors."),
+    ] = None,
+    near: Annotated[
+        bool, typer.Option("--near", help="constellation: satellites that are near each other.")
+    ] = False,
+    elements: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Element sets (TLE or OMM): real objects instead of those of the first group.",
+        ),
+    ] = None,
     hours: Annotated[
         float | None, typer.Option(metavar="H", help="Duration in hours, instead of the scene's.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="Duration in seconds instead.")
     ] = None,
     rate_hz: Annotated[
         float | None,
@@ -78,6 +100,8 @@ def simulate(
 
     real_leo: real satellites, low ones in wide fields above the pole
 
+    constellation: satellites with two trackers each, fixed to the body, that see what passes
+
     A scene's orbits may come from files of element sets (two-line elements, or OMM in
     JSON, CSV or XML): docs/scenes.md.
     """
@@ -90,7 +114,11 @@ def simulate(
         seed=seed,
         sensors=sensors,
         objects=objects,
+        satellites=satellites,
+        near=near,
+        elements=elements,
         hours=hours,
+        seconds=seconds,
         rate_hz=rate_hz,
         start=_instant(start),
         logs=logs,
@@ -105,6 +133,8 @@ def simulate(
         f"{many(made.frames, 'frame')}, {many(made.centroids, 'centroid')}"
     )
     logs_made = ", ".join(str(log) for log in made.logs)
+    if len(made.logs) > 1 and out.is_dir():
+        logs_made = f"{out} ({many(len(made.logs), 'log')})"
     print_lines([f"log    {logs_made}", f"truth  {made.truth}", counts])
 
 

@@ -74,7 +74,7 @@ class TruthWriter:
 
 
 def read_truth(path: str | os.PathLike[str]) -> Truth:
-    """Return the truth in a folder. The log beside the folder may be named instead.
+    """Return the truth in a folder. The log, or folder of logs, beside it may be named instead.
 
     `orbits.parquet` is optional: objects that do not move by two-body orbits have it.
 
@@ -85,8 +85,9 @@ def read_truth(path: str | os.PathLike[str]) -> Truth:
         has no orbit.
     """
     folder = Path(path)
-    if not folder.is_dir() and Path(os.fspath(path) + SUFFIX).is_dir():
-        folder = Path(os.fspath(path) + SUFFIX)
+    beside = Path(str(folder) + SUFFIX)
+    if beside.is_dir() and not (folder / "scenario.json").is_file():
+        folder = beside
     if not folder.is_dir():
         raise DatasetError(f"{path}: no truth folder; `epipole simulate` writes it as LOG{SUFFIX}")
     needed = [*(f"{name}.parquet" for name in _FILES), "scenario.json"]

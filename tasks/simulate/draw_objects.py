@@ -12,7 +12,12 @@ from epipole.io.simulation.scenes import read_element_sets
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Orbit, Scene, SceneTargets
 from epipole.schemas.star_lists import ElementSet, nearest_sets
-from epipole.tasks.algorithms.simulation.constants import DAY_S, GM_KM3_S2, SECOND_NS
+from epipole.tasks.algorithms.simulation.constants import (
+    DAY_S,
+    EARTH_RADIUS_KM,
+    GM_KM3_S2,
+    SECOND_NS,
+)
 from epipole.tasks.algorithms.simulation.element_sets import propagate
 from epipole.tasks.algorithms.simulation.paths import (
     Paths,
@@ -26,11 +31,20 @@ from epipole.tasks.algorithms.simulation.paths import (
     two_body_paths,
 )
 from epipole.tasks.algorithms.simulation.sensor import random_stream
+from epipole.tasks.algorithms.simulation.shells import (
+    mean_elements,
+    nearest_of,
+    random_population,
+    scattered,
+    walker_elements,
+)
 from epipole.tasks.algorithms.simulation.sources import SimulatedObjects
 
 # Orbits: elements, positions, random ones, and objects near them.
 
 Array = npt.NDArray[np.float64]
+
+NO_SENSOR = 1_000_000  # first index of the random streams that belong to no sensor
 
 
 def draw_elements(orbit: Orbit, rng: np.random.Generator) -> Array:
@@ -102,19 +116,73 @@ def propagate_satellites(scene: Scene, orbit: Orbit, t0_ns: int) -> Satellites:
         raise SceneError(f"{scene.name}: an orbit without elements has no satellites")
     middle_ns = t0_ns + round(scene.duration_s / 2 * SECOND_NS)
     sets = nearest_sets(_chosen(read_element_sets(orbit.elements), orbit), middle_ns)
+    if orbit.usable_only:
+        sets = [each for each in sets if _days_from(each, middle_ns) <= scene.element_age_days]
+        if not sets:
+            raise SceneError(f"{orbit.elements}: no elements near the scene's {_text(t0_ns)}")
     for element_set in sets:
         _require_near(element_set, middle_ns, scene, orbit.elements)
+    return _propagated(scene, sets, t0_ns, orbit.elements, orbit.usable_only)
+
+
+def _propagated(
+    scene: Scene, sets: list[ElementSet], t0_ns: int, where: str, usable_only: bool = False
+) -> Satellites:
+    """Return the satellites of element sets with their paths; `where` names them in messages."""
     t_s = scene_nodes(scene)
     time_ns = t0_ns + np.rint(t_s * SECOND_NS).astype(np.int64)
-    elements = np.array([element_set.elements for element_set in sets])
+    elements = np.array([element_set.elements for element_set in sets]).reshape(len(sets), 10)
     r_km, failures = propagate(elements, time_ns)
+    if failures and usable_only:
+        failed = {failure.satellite for failure in failures}
+        kept = [k for k in range(len(sets)) if k not in failed]
+        return Satellites([sets[k] for k in kept], sampled_paths(t_s, r_km[kept]))
     if failures:
         first = failures[0]
         raise SceneError(
-            f"{orbit.elements}: {sets[first.satellite].label}: SGP4 fails at "
+            f"{where}: {sets[first.satellite].label}: SGP4 fails at "
             f"{_text(first.time_ns)}: {first.reason}; leave this satellite out"
         )
     return Satellites(sets, sampled_paths(t_s, r_km))
+
+
+def constellation(scene: Scene, orbit: Orbit, count: int | None, t0_ns: int) -> Satellites:
+    """Return the satellites of the shells of an orbit, or `count` of them.
+
+    They depend on the scene's seed, the shells and the count only: several groups of sensors and
+    of objects are on the same satellites.
+
+    Raises
+    ------
+    SceneError
+        Where the shells have fewer satellites.
+    """
+    rng = random_stream(scene.seed, NO_SENSOR, "constellation")
+    patterns = []
+    for shell in orbit.shells:
+        i_deg, t, p, f = shell.pattern
+        a_km, arc = EARTH_RADIUS_KM + shell.altitude_km, math.radians(shell.arc_deg)
+        patterns.append(walker_elements(a_km, math.radians(i_deg), (t, p, f), arc))
+    elements = scattered(np.concatenate(patterns), orbit.scatter_km, rng)
+    total, count = len(elements), len(elements) if count is None else count
+    if count > total:
+        raise SceneError(f"{scene.name}: {count} satellites are wanted of {total} in the shells")
+    mean = mean_elements(elements, t0_ns)
+    if orbit.near and count < total:
+        middle = np.array([t0_ns + round(scene.duration_s / 2 * SECOND_NS)])
+        centre = int(rng.integers(total))
+        chosen = nearest_of(propagate(mean, middle)[0][:, 0], centre, count)
+    else:
+        chosen = np.sort(rng.permutation(total)[:count])
+    digits = max(3, len(str(count)))
+    names = [f"s{k + 1:0{digits}d}" for k in range(count)]
+    return _propagated(scene, _made_sets(names, mean[chosen], t0_ns), t0_ns, scene.name)
+
+
+def _made_sets(names: list[str], mean: Array, t0_ns: int) -> list[ElementSet]:
+    """Return element sets of satellites that are in no catalogue: their number is 0."""
+    rows = zip(names, mean.tolist(), strict=True)
+    return [ElementSet(name, 0, t0_ns, tuple(row)) for name, row in rows]
 
 
 def draw_satellites(
@@ -157,7 +225,7 @@ def _chosen(sets: list[ElementSet], orbit: Orbit) -> list[ElementSet]:
 
 
 def _require_near(element_set: ElementSet, time_ns: int, scene: Scene, file: str) -> None:
-    days = abs(element_set.epoch_ns - time_ns) / SECOND_NS / DAY_S
+    days = _days_from(element_set, time_ns)
     if days > scene.element_age_days:
         raise SceneError(
             f"{file}: {element_set.label}: its elements are of {_text(element_set.epoch_ns)}, "
@@ -166,13 +234,15 @@ def _require_near(element_set: ElementSet, time_ns: int, scene: Scene, file: str
         )
 
 
+def _days_from(element_set: ElementSet, time_ns: int) -> float:
+    return abs(element_set.epoch_ns - time_ns) / SECOND_NS / DAY_S
+
+
 def _text(time_ns: int) -> str:
     return datetime.fromtimestamp(time_ns // SECOND_NS, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 # Objects.
-
-NO_SENSOR = 1_000_000  # first index of the random streams that belong to no sensor
 
 
 class DrawnObjects(NamedTuple):
@@ -220,6 +290,14 @@ def _drawn(
     if group.orbit.elements is not None:
         found = draw_satellites(propagate_satellites(scene, group.orbit, t0_ns), group.count, rng)
         return found.paths, list(found.sets)
+    if group.orbit.shells:
+        found = constellation(scene, group.orbit, group.count, t0_ns)
+        return found.paths, list(found.sets)
     count = 1 if group.count is None else group.count
+    if group.orbit.random == "low":
+        mean = mean_elements(random_population(count, rng), t0_ns)
+        names = [f"o{k + 1:05d}" for k in range(count)]
+        found = _propagated(scene, _made_sets(names, mean, t0_ns), t0_ns, scene.name)
+        return found.paths, list(found.sets)
     made = [draw_near(group.orbit, group.spread_km, rng) for _ in range(count)]
     return two_body_paths(np.array(made)), [None] * count

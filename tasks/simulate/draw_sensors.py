@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -12,12 +13,19 @@ from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import Scene, SceneCamera, SceneSensor
 from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.simulation.constants import ARCSEC
+from epipole.tasks.algorithms.simulation.element_sets import directions_to_sun
 from epipole.tasks.algorithms.simulation.optics import TrueOptics, hidden_by_earth
 from epipole.tasks.algorithms.simulation.paths import Paths, resting_path, two_body_paths
-from epipole.tasks.algorithms.simulation.sensor import SimulatedSensor, random_stream
+from epipole.tasks.algorithms.simulation.sensor import (
+    SimulatedSensor,
+    azimuth_away,
+    random_stream,
+)
 from epipole.tasks.simulate.draw_objects import (
+    NO_SENSOR,
     DrawnObjects,
     Satellites,
+    constellation,
     draw_elements,
     propagate_satellites,
 )
@@ -63,13 +71,16 @@ class DrawnSensor(NamedTuple):
     sensor: SimulatedSensor
     group: SceneSensor
     element_set: ElementSet | None
+    satellite: str  # its name, by which sensors on one satellite are known
 
 
 def draw_sensors(scene: Scene, t0_ns: int, objects: DrawnObjects) -> list[DrawnSensor]:
     """Return the sensors of all groups of a scene, in its order."""
     drawn: list[DrawnSensor] = []
     for group in scene.sensors:
-        if group.orbit.elements is None:
+        if group.orbit.shells:
+            drawn += _on_constellation(scene, group, t0_ns, objects, len(drawn))
+        elif group.orbit.elements is None:
             drawn += _near_orbits(scene, group, t0_ns, objects, len(drawn))
         else:
             drawn += _on_satellites(scene, group, t0_ns, objects, len(drawn))
@@ -88,7 +99,24 @@ def _near_orbits(
         followed = _followed(scene, group, t0_ns, objects, rng)
         path = _two_body_path(scene, group, followed, rng)
         made = _sensor(scene, group, name, first + k, t0_ns, phase, path, followed)
-        yield DrawnSensor(made, group, None)
+        yield DrawnSensor(made, group, None, name)
+
+
+def _on_constellation(
+    scene: Scene, group: SceneSensor, t0_ns: int, objects: DrawnObjects, first: int
+) -> Iterator[DrawnSensor]:
+    """Yield the sensors of a group, one on each satellite of a constellation."""
+    satellites = constellation(scene, group.orbit, group.count, t0_ns)
+    for k, element_set in enumerate(satellites.sets):
+        rng = random_stream(scene.seed, first + k, "sensor")
+        phase = _phase(group, rng)
+        followed = _followed(scene, group, t0_ns, objects, rng)
+        path = satellites.paths.of(k)
+        name = f"{element_set.name}{group.id}"
+        made = _sensor(scene, group, name, first + k, t0_ns, phase, path, followed)
+        if random_stream(scene.seed, NO_SENSOR + k, "priors").random() >= group.states.prior_share:
+            made = replace(made, prior_noise=None)
+        yield DrawnSensor(made, group, element_set, element_set.name)
 
 
 def _on_satellites(
@@ -110,7 +138,7 @@ def _on_satellites(
         taken += 1
         name = group.id if group.count == 1 or len(order) == 1 else f"{group.id}{taken}"
         made = _sensor(scene, group, name, first + taken - 1, t0_ns, phase, path, followed)
-        yield DrawnSensor(made, group, satellites.sets[row])
+        yield DrawnSensor(made, group, satellites.sets[row], name)
         if taken == group.count:
             return
     if not taken or group.count is not None:
@@ -198,6 +226,7 @@ def _sensor(
     streams = partial(random_stream, scene.seed, index)
     ra, dec = math.radians(pointing.ra_deg or 0.0), math.radians(pointing.dec_deg or 0.0)
     noise_arcsec = states.prior_noise_arcsec
+    azimuth, elevation = _mounting(group, path, t0_ns, streams("mounting"))
     return SimulatedSensor(
         sensor_id=name,
         index=index,
@@ -215,8 +244,8 @@ def _sensor(
         ),
         axis=np.array(pointing.axis),
         spin_rate=math.radians(pointing.rate_deg_s),
-        azimuth=math.radians(pointing.azimuth_deg),
-        elevation=math.radians(pointing.elevation_deg),
+        azimuth=azimuth,
+        elevation=elevation,
         hold_s=pointing.hold_s or 1 / group.rate_hz,
         clearance=_radians(pointing.clear_of_earth_deg),
         skip_hidden=pointing.skip_hidden,
@@ -237,6 +266,8 @@ def _sensor(
         hot_pixels=detection.hot_pixels,
         star_drop=detection.star_drop,
         target_drop=detection.target_drop,
+        blend_px=detection.blend_px,
+        trail_error=detection.trail_error,
         state_rate_hz=states.rate_hz,
         state_margin_s=states.margin_s,
         position_noise_km=states.position_noise_km,
@@ -248,6 +279,20 @@ def _sensor(
         prior_offset=_offset(faults.prior_offset_arcsec, streams, "attitude fault") * ARCSEC,
         prior_told=faults.prior_told,
     )
+
+
+def _mounting(
+    group: SceneSensor, path: Paths, t0_ns: int, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return azimuth and elevation of a boresight that is fixed to the body [rad]."""
+    pointing = group.pointing
+    turn = np.radians(pointing.spread_deg) * rng.uniform(-1.0, 1.0, 2)
+    azimuth = math.radians(pointing.azimuth_deg) + float(turn[0])
+    elevation = math.radians(pointing.elevation_deg) + float(turn[1])
+    if pointing.azimuth_from == "anti_sun":
+        r_km, v_km_s = path.at(np.zeros(1))
+        azimuth += azimuth_away(r_km[0], v_km_s[0], directions_to_sun(np.array([t0_ns]))[0])
+    return azimuth, elevation
 
 
 def _offset(

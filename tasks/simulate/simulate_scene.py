@@ -4,7 +4,7 @@ These are plain functions, not Prefect tasks, because a simulation is not schedu
 results.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +17,16 @@ from epipole.schemas.scene import Scene, SceneSensor
 from epipole.schemas.star_lists import ElementSet
 from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_ORBITS, TRUE_POINTS
 from epipole.tasks.algorithms.simulation.constants import SECOND_NS
-from epipole.tasks.algorithms.simulation.exposures import Exposing, Exposures
+from epipole.tasks.algorithms.simulation.exposures import BLEND_DEPTH, Exposing, Exposures
 from epipole.tasks.algorithms.simulation.optics import field_radius
 from epipole.tasks.algorithms.simulation.paths import END_NODES
 from epipole.tasks.algorithms.simulation.sensor import SimulatedSensor, frame_times
-from epipole.tasks.algorithms.simulation.sources import SimulatedObjects, StarField, star_field
+from epipole.tasks.algorithms.simulation.sources import (
+    SimulatedObjects,
+    StarField,
+    may_be_detected,
+    star_field,
+)
 from epipole.tasks.simulate.draw_objects import draw_objects, scene_nodes
 from epipole.tasks.simulate.draw_sensors import draw_sensors
 
@@ -37,6 +42,7 @@ class Simulation:
     sensors: list[SimulatedSensor]
     sensor_sets: list[ElementSet | None]  # what each sensor moves by, where it is an element set
     groups: list[SceneSensor]  # the group of the scene that each sensor belongs to
+    satellites: list[str]  # on which each sensor is
     objects: SimulatedObjects
     object_sets: list[ElementSet | None]
 
@@ -56,24 +62,53 @@ def simulate_scene(scene: Scene) -> Simulation:
         [s.sensor for s in sensors],
         [s.element_set for s in sensors],
         [s.group for s in sensors],
+        [s.satellite for s in sensors],
         drawn.objects,
         drawn.sets,
     )
 
 
-def expose_blocks(simulation: Simulation) -> Iterator[list[Exposures]]:
-    """Yield what each sensor sees, in blocks of time that limit the memory."""
-    faintest = max(s.magnitude_limit for s in simulation.sensors)
-    stars = read_stars(simulation.scene.catalogue, faintest)
-    fields: dict[tuple[float, float], StarField] = {}
+class SceneSky:
+    """The stars of a scene, prepared once for all sensors with the same optics and limit."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        faintest = max(_faintest(s) for s in simulation.sensors)
+        self._stars = read_stars(simulation.scene.catalogue, faintest)
+        self._fields: dict[tuple[float, ...], StarField] = {}
+
+    def field(self, sensor: SimulatedSensor) -> StarField:
+        """Return the stars that the sensor may detect."""
+        focal_px = min(sensor.optics.fx_px, sensor.optics.fy_px)
+        key = sensor.magnitude_limit, field_radius(sensor.optics), sensor.blend_px / focal_px
+        if key not in self._fields:
+            self._fields[key] = _field(self._stars, *key)
+        return self._fields[key]
+
+
+def _faintest(sensor: SimulatedSensor) -> float:
+    return sensor.magnitude_limit + (BLEND_DEPTH if sensor.blend_px else 0.0)
+
+
+def expose_blocks(
+    simulation: Simulation, members: Sequence[int] | None = None, sky: SceneSky | None = None
+) -> Iterator[list[Exposures]]:
+    """Yield what each sensor sees, in blocks of time that limit the memory.
+
+    Parameters
+    ----------
+    members : sequence of int
+        The sensors. Default: all. What one sees does not depend on the others.
+    sky : SceneSky
+        The stars of the simulation, to share them between calls.
+    """
+    chosen = range(len(simulation.sensors)) if members is None else members
+    sensors = [simulation.sensors[k] for k in chosen]
+    sky = SceneSky(simulation) if sky is None else sky
     work = []
-    for sensor in simulation.sensors:
-        key = (sensor.magnitude_limit, field_radius(sensor.optics))
-        if key not in fields:
-            fields[key] = _field(stars, *key)
-        exposing = Exposing(sensor, fields[key], simulation.objects)
+    for sensor in sensors:
+        exposing = Exposing(sensor, sky.field(sensor), simulation.objects)
         work.append((exposing, *frame_times(sensor)))
-    rate = sum(s.rate_hz for s in simulation.sensors)
+    rate = sum(s.rate_hz for s in sensors)
     step_ns = max(int(FRAMES_AT_ONCE / rate * SECOND_NS), 1)
     last_ns = max((int(t[-1]) for _, _, t in work if len(t)), default=simulation.t0_ns - 1)
     for low in range(simulation.t0_ns, last_ns + 1, step_ns):
@@ -110,7 +145,7 @@ def true_tables(sensor_id: str, exposed: Exposures) -> tuple[pa.Table, pa.Table]
             "kind": exposed.kind,
             "source": exposed.source,
             "magnitude": exposed.magnitude,
-            "also": pa.nulls(len(first), pa.int64()),  # no two sources share a centroid
+            "also": pa.array(exposed.also, pa.int64(), mask=exposed.also < 0),
         },
     )
     return frames, points
@@ -136,8 +171,21 @@ def true_orbits(simulation: Simulation) -> pa.Table | None:
     )
 
 
-def _field(stars: SkyStars, magnitude_limit: float, radius_rad: float) -> StarField:
+def _field(
+    stars: SkyStars, magnitude_limit: float, radius_rad: float, blend_rad: float
+) -> StarField:
     bright = stars.magnitude <= magnitude_limit
+    if blend_rad:
+        deep = stars.magnitude <= magnitude_limit + BLEND_DEPTH
+        cos_dec = np.cos(stars.dec)
+        u = [cos_dec * np.cos(stars.ra), cos_dec * np.sin(stars.ra), np.sin(stars.dec)]
+        # A lens stretches by a few per cent at most, proper motion by some arcseconds.
+        apart_rad = 1.2 * blend_rad + 3e-4
+        found = may_be_detected(
+            np.stack(u, axis=1)[deep], stars.magnitude[deep], magnitude_limit, apart_rad
+        )
+        bright = deep.copy()
+        bright[deep] = found
     return star_field(
         stars.star_id[bright],
         stars.ra[bright],

@@ -3,6 +3,7 @@
 import numpy as np
 import polars as pl
 import pytest
+from scenes.satellites import two_lines
 from scenes.simulated import scene_of
 from scipy.spatial.transform import Rotation
 
@@ -156,3 +157,45 @@ def test_several_logs_of_a_night_have_one_truth(tmp_path):
     made = simulate("four_sensor_geo", tmp_path / "n.mcap", logs=3)
     assert [p.name for p in made.logs] == ["n-1.mcap", "n-2.mcap", "n-3.mcap"]
     assert read_truth(tmp_path / "n.mcap").frames.num_rows == made.frames == 240
+
+
+def test_a_constellation_is_a_folder_with_a_log_for_each_satellite(tmp_path):
+    made = simulate("constellation", tmp_path / "logs", satellites=3, objects=300, seconds=5.0)
+    assert [log.name for log in made.logs] == ["s001.mcap", "s002.mcap", "s003.mcap"]
+    assert made.truth == tmp_path / "logs.truth"
+    assert (made.sensors, made.objects) == (6, 303)
+    truth = read_truth(tmp_path / "logs")
+    assert {s["sat"] for s in truth.scenario["sensors"]} == {"s001", "s002", "s003"}
+    # All in one log: the same exposures.
+    simulate("constellation", tmp_path / "n.mcap", satellites=3, objects=300, seconds=5.0)
+    one = to_polars(read_log(tmp_path / "n.mcap").exposures).drop("source", "offset")
+    parts = [to_polars(read_log(log).exposures).drop("source", "offset") for log in made.logs]
+    keys = ["sensor_id", "frame_number"]
+    assert pl.concat(parts).sort(keys).equals(one.sort(keys))
+    assert set(pl.concat(parts)["sensor_id"]) == {f"s00{k}{t}" for k in (1, 2, 3) for t in "ab"}
+    with pytest.raises(SceneError, match="logs: has other files, such as s003"):
+        simulate("constellation", tmp_path / "logs", satellites=2, seconds=1.0)
+    with pytest.raises(SceneError, match="a folder has one log for each satellite"):
+        simulate("constellation", tmp_path / "x", satellites=2, logs=2)
+
+
+def test_a_catalogue_takes_the_place_of_random_objects_without_what_cannot_be_used(tmp_path):
+    lines = [("NEW", two_lines("11", 15.0)), ("OLD", two_lines("12", 15.0, days=-40.0)),
+             ("FALLING", two_lines("13", 16.9, bstar=1.0, days=-1.0))]  # fmt: skip
+    file = tmp_path / "some.tle"
+    file.write_text("\n".join(f"{name}\n" + "\n".join(each) for name, each in lines))
+    made = simulate("constellation", tmp_path / "logs", satellites=2, elements=file, seconds=2.0)
+    targets = read_truth(made.truth).scenario["targets"]
+    assert [(t["name"], t.get("norad")) for t in targets] == [
+        ("NEW", 11), ("s001", None), ("s002", None)
+    ]  # fmt: skip
+
+
+def test_options_of_a_constellation_are_refused_elsewhere(tmp_path):
+    for options in ({"satellites": 3}, {"near": True}):
+        with pytest.raises(SceneError, match="night: is no constellation"):
+            simulate("night", tmp_path / "n.mcap", **options)
+    with pytest.raises(SceneError, match="hours or seconds, not both"):
+        simulate("night", tmp_path / "n.mcap", hours=1.0, seconds=1.0)
+    with pytest.raises(SceneError, match="has no targets that element sets could replace"):
+        simulate("lost_in_space", tmp_path / "n.mcap", elements="real_leo.tle")

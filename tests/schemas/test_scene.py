@@ -8,6 +8,9 @@ from scenes.simulated import scene_of
 from epipole.schemas.errors import SceneError
 from epipole.schemas.scene import parse_scene
 
+SHELL = {"altitude_km": 550.0, "walker": "53:1584/72/39"}
+SHELLS = [SHELL]
+
 BAD_SCENES = {
     "sensors.0.camera: a camera takes one of": {"camera": {"fov_deg": 2.0, "focal_px": 100.0}},
     "sensors.0.orbit: the orbit's perigee lies below": {"orbit": {"a_km": 7000.0, "e": 0.5}},
@@ -40,10 +43,19 @@ def test_a_bad_scene_is_one_line_that_names_the_field(says):
     [
         ("magnitude or standard_magnitude", {"magnitude": 8.0, "standard_magnitude": 3.0}),
         ("spread_km does not go", {"spread_km": 3.0, "orbit": {"elements": "a.tle"}}),
+        ("spread_km does not go", {"spread_km": 3.0, "orbit": {"random": "low"}}),
+        ("takes one of a_km", {"orbit": {"a_km": 7000.0, "shells": SHELLS}}),
+        ("e does not go with shells", {"orbit": {"e": 0.1, "shells": SHELLS}}),
+        ("near goes with shells", {"orbit": {"a_km": 7000.0, "near": True}}),
+        ("usable_only goes with elements", {"orbit": {"shells": SHELLS, "usable_only": True}}),
+        ("t a multiple of p", {"orbit": {"shells": [SHELL | {"walker": "53:10/3/1"}]}}),
+        ("f below p", {"orbit": {"shells": [SHELL | {"walker": "53:9/3/3"}]}}),
+        ("i <= 180", {"orbit": {"shells": [SHELL | {"walker": "181:9/3/1"}]}}),
+        ("walker = '53/9/3/1'", {"orbit": {"shells": [SHELL | {"walker": "53/9/3/1"}]}}),
     ],
 )
 def test_objects_that_contradict_themselves_are_refused(says, target):
-    with pytest.raises(SceneError, match=rf"^test: targets.0: .*{says}"):
+    with pytest.raises(SceneError, match=rf"^test: targets.0.*{re.escape(says)}"):
         scene_of(targets=[{"orbit": {"a_km": 7000.0}} | target])
 
 

@@ -1,6 +1,7 @@
 """Exposures: all centroids of a sensor in a block of frames, and the source of each."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
@@ -44,9 +45,12 @@ Indices = npt.NDArray[np.int64]
 STAR, TARGET, FALSE = 0, 1, 2
 MERGE_PX = 2.0  # stars closer than this are one spot
 FLUX_AT_ZERO = 1e6  # of magnitude 0, arbitrary units
+BLEND_DEPTH = 1.5  # [mag] fainter than the limit by more: does not count in a blend
 ABERRATION_ROOM = 1.5e-3  # [rad] aberration is 1.3e-4, proper motion in 30 years at most 1.5e-3
 SATELLITE_RADIUS_KM = 0.1  # nearer is the satellite that carries the sensor, or is docked to it
 TARGETS_AT_ONCE = 500_000  # pairs of a frame and a target, to bound the memory
+SEGMENT_S = 4.0  # frames for which candidates about the field are chosen at once
+MAX_SPEED_KM_S = 12.0  # of an object on a closed orbit: escape velocity at the ground is 11.2
 
 
 @dataclass
@@ -59,6 +63,20 @@ class TrueSpots:
     magnitude: Array
     kind: npt.NDArray[np.int8]
     source: Indices
+    also: Indices  # an object that is blended into the spot; -1 without one
+    trail_x_px: Array  # from the begin of the exposure to its end
+    trail_y_px: Array
+
+
+def true_spots(
+    frame: Indices, x_px: Array, y_px: Array, magnitude: Array, kind: int, source: Indices
+) -> TrueSpots:
+    """Return spots of one kind that are not blended and leave no trail."""
+    n = len(frame)
+    also, trail = np.full(n, -1), np.zeros(n)
+    return TrueSpots(
+        frame, x_px, y_px, magnitude, np.full(n, kind, np.int8), source, also, trail, trail
+    )
 
 
 @dataclass
@@ -81,6 +99,7 @@ class Exposures:
     kind: npt.NDArray[np.int8]
     source: Indices
     magnitude: Array  # without noise
+    also: Indices
 
 
 class Exposing:
@@ -94,11 +113,11 @@ class Exposing:
         self._radius = field_radius(sensor.optics)
         purposes = (
             "jitter", "star drop", "target drop", "target fade", "false count", "false place",
-            "false light", "centroid noise", "flux noise", "shuffle",
+            "false light", "centroid noise", "flux noise", "shuffle", "trail noise",
         )  # fmt: skip
         self._streams = {p: random_stream(sensor.seed, sensor.index, p) for p in purposes}
         self._hot = self._hot_pixels()
-        self._neighbours = self._close_stars()
+        self._neighbours = None if sensor.blend_px else self._close_stars()
 
     def expose(self, frame_number: Indices, time_ns: Indices) -> Exposures:
         """Return the exposures of these frames, without those that the sensor skips."""
@@ -115,17 +134,24 @@ class Exposing:
             return _nothing(frame_number, time_ns, r_km, v_km_s, attitude)
         R_sensor_from_icrs = attitude.as_matrix()
         earth_km, earth_km_s = earth_at(time_ns)
+        stars = self._star_spots(time_ns, r_km, earth_km, earth_km_s + v_km_s, R_sensor_from_icrs)
+        targets = self._target_spots(time_ns, r_km, v_km_s, earth_km_s, R_sensor_from_icrs)
+        if s.blend_px:
+            faintest = max(s.magnitude_limit, s.object_limit) + BLEND_DEPTH
+            lit = _selected(targets, np.flatnonzero(targets.magnitude <= faintest))
+            both = blended(_joined([stars, lit]), s.blend_px)
+            stars = _selected(both, np.flatnonzero(both.kind == STAR))
+            stars = _selected(stars, np.flatnonzero(stars.magnitude <= s.magnitude_limit))
+            targets = _selected(both, np.flatnonzero(both.kind == TARGET))
         spots = [
-            self._star_spots(time_ns, r_km, earth_km, earth_km_s + v_km_s, R_sensor_from_icrs),
-            self._target_spots(time_ns, r_km, v_km_s, earth_km_s, R_sensor_from_icrs),
-            self._false_spots(len(time_ns)),
-        ]
+            self._kept_stars(stars), self._detected(targets), self._false_spots(len(time_ns))
+        ]  # fmt: skip
         return self._measure(_joined(spots), frame_number, time_ns, r_km, v_km_s, attitude)
 
     def _star_spots(
         self, time_ns: Indices, r_km: Array, earth_km: Array, v_km_s: Array, R: Array
     ) -> TrueSpots:
-        s, field = self.sensor, self.stars
+        field = self.stars
         frame, star = stars_in_cones(field, R[:, 2], self._radius + ABERRATION_ROOM)
         years = julian_years_since(field.epoch, time_ns)
         u = star_directions(field, star, years[frame], (earth_km + r_km)[frame])
@@ -133,7 +159,13 @@ class Exposing:
         frame, star, u = frame[clear], star[clear], u[clear]
         x, y, ok = self._image(boost(u, v_km_s[frame]), R[frame])
         frame, star, x, y = frame[ok], star[ok], x[ok], y[ok]
-        spots = self._merged(frame, star, x, y)
+        if self._neighbours is not None:
+            return self._merged(frame, star, x, y, self._neighbours)
+        return true_spots(frame, x, y, field.magnitude[star], STAR, field.star_id[star])
+
+    def _kept_stars(self, spots: TrueSpots) -> TrueSpots:
+        """Return the spots of stars that are on the image and not missed."""
+        s = self.sensor
         inside = on_image(s.optics, spots.x_px, spots.y_px)
         kept = self._streams["star drop"].random(int(inside.sum())) >= s.star_drop
         return _selected(spots, np.flatnonzero(inside)[kept])
@@ -141,34 +173,98 @@ class Exposing:
     def _target_spots(
         self, time_ns: Indices, r_km: Array, v_km_s: Array, earth_km_s: Array, R: Array
     ) -> TrueSpots:
+        """Return the spots of all objects on the image, however faint."""
         s, objects = self.sensor, self.objects
         t_s = seconds_since(s.t0_ns, time_ns)
         u_to_sun = directions_to_sun(time_ns) if objects.need_sun else np.empty((len(t_s), 3))
-        parts = []
-        step = max(TARGETS_AT_ONCE // max(len(objects), 1), 1)
-        for low in range(0, len(time_ns) if len(objects) else 0, step):
-            frame, target = self._in_cone(t_s, r_km, R, low, min(low + step, len(t_s)))
+        after = self._later_pose(time_ns)
+        none = np.empty(0)
+        parts = [true_spots(np.empty(0, np.int64), none, none, none, TARGET, np.empty(0, np.int64))]
+        for frame, target in self._pairs_about_field(t_s, r_km, R):
             states_at = partial(objects.paths.at, body=target)
             d, r_sent = received_from(states_at, t_s[frame], r_km[frame], earth_km_s[frame])
             distance = np.linalg.norm(d, axis=1)
             u = d / distance[:, None]
             ok = ~hidden_by_earth(r_km[frame], u, distance)
-            x, y, inside = self._image(boost(u, (earth_km_s + v_km_s)[frame]), R[frame])
+            v_observer = earth_km_s + v_km_s
+            x, y, inside = self._image(boost(u, v_observer[frame]), R[frame])
             ok &= inside & on_image(s.optics, x, y)
             magnitude = objects.magnitudes(target, d, r_sent, u_to_sun[frame])
-            parts.append((frame[ok], target[ok], x[ok], y[ok], magnitude[ok]))
-        frame, target, x, y, magnitude = (
-            np.concatenate([np.empty(0, k), *[p[i] for p in parts]])
-            for i, k in enumerate((np.int64, np.int64, float, float, float))
-        )
-        kind = np.full(len(frame), TARGET, np.int8)
-        return self._detected(TrueSpots(frame, x, y, magnitude, kind, target))
+            frame, target, u, x, y = frame[ok], target[ok], u[ok], x[ok], y[ok]
+            spots = true_spots(frame, x, y, magnitude[ok], TARGET, target)
+            if after is not None:
+                later = self._later_direction(t_s, r_km, d[ok], frame, target, after)
+                later_x, later_y, _ = self._image(boost(later, v_observer[frame]), after[1][frame])
+                # NaN where the trail leaves the camera's cone.
+                spots.trail_x_px = np.nan_to_num(2 * (later_x - x))
+                spots.trail_y_px = np.nan_to_num(2 * (later_y - y))
+            parts.append(spots)
+        return _joined(parts)
+
+    def _later_pose(self, time_ns: Indices) -> tuple[Array, Array] | None:
+        """Return positions and rotations at the end of each exposure; None without trails."""
+        s = self.sensor
+        if not s.trail_error:
+            return None
+        later_ns = time_ns + round(s.exposure_s / 2 * 1e9)
+        r_km, v_km_s = s.path.at(seconds_since(s.t0_ns, later_ns))
+        return r_km, self.attitudes.at(later_ns, r_km, v_km_s).as_matrix()
+
+    def _later_direction(
+        self,
+        t_s: Array,
+        r_km: Array,
+        d_km: Array,
+        frame: Indices,
+        target: Indices,
+        after: tuple[Array, Array],
+    ) -> Array:
+        """Return unit vectors to objects at the end of the exposure, from those at its middle."""
+        half_s = self.sensor.exposure_s / 2
+        _, v_km_s = self.objects.paths.at(t_s[frame], target)
+        later = d_km + v_km_s * half_s - (after[0] - r_km)[frame]
+        return later / np.linalg.norm(later, axis=1, keepdims=True)
+
+    def _pairs_about_field(
+        self, t_s: Array, r_km: Array, R: Array
+    ) -> Iterator[tuple[Indices, Indices]]:
+        """Yield the pairs of a frame and an object about its field, in order, a part at a time."""
+        found: list[tuple[Indices, Indices]] = []
+        n, most = len(self.objects), max(TARGETS_AT_ONCE // max(len(self.objects), 1), 1)
+        low = 0
+        while n and low < len(t_s):
+            end = int(np.searchsorted(t_s, t_s[low] + SEGMENT_S, side="right"))
+            high = min(max(end, low + 1), low + most)
+            about = self._about_segment(t_s[low:high], r_km[low:high], R[low:high, 2])
+            found.append(self._in_cone(t_s, r_km, R, np.arange(low, high), about))
+            low = high
+            if low == len(t_s) or sum(len(frame) for frame, _ in found) >= TARGETS_AT_ONCE:
+                frames, targets = zip(*found, strict=True)
+                yield np.concatenate(frames), np.concatenate(targets)
+                found = []
+
+    def _about_segment(self, t_s: Array, r_km: Array, boresight: Array) -> Indices:
+        """Return the objects that may be in the field in one of a few neighbouring frames.
+
+        None is left out that is there: objects, sensor and boresight are taken as they are in the
+        middle, and the cone is wider by as much as they may move until the first and last frame.
+        """
+        middle = len(t_s) // 2
+        moved_km = MAX_SPEED_KM_S * float(np.abs(t_s - t_s[middle]).max())
+        moved_km += float(np.linalg.norm(r_km - r_km[middle], axis=1).max())
+        turned = float(np.arccos(np.clip(boresight @ boresight[middle], -1, 1)).max())
+        everything = np.arange(len(self.objects))
+        d = self.objects.paths.at(t_s[middle], everything)[0] - r_km[middle]
+        distance_km = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
+        room = np.arcsin(np.minimum(moved_km / distance_km, 1.0)) + turned + 1e-6
+        half_angle = np.minimum(self._radius + ABERRATION_ROOM + room, np.pi)
+        near = d @ boresight[middle] >= distance_km * np.cos(half_angle)
+        return np.flatnonzero(near | (distance_km <= moved_km))
 
     def _in_cone(
-        self, t_s: Array, r_km: Array, R: Array, low: int, high: int
+        self, t_s: Array, r_km: Array, R: Array, of_frame: Indices, of_target: Indices
     ) -> tuple[Indices, Indices]:
-        """Return the pairs of a frame (from low to high) and an object about its field."""
-        of_frame, of_target = np.arange(low, high), np.arange(len(self.objects))
+        """Return those pairs of a frame and an object in which the object is about the field."""
         frame, target = (v.ravel() for v in np.meshgrid(of_frame, of_target, indexing="ij"))
         d = self.objects.paths.at(t_s[frame], target)[0] - r_km[frame]
         along = np.einsum("ij,ij->i", d, R[frame, 2])
@@ -199,8 +295,8 @@ class Exposing:
         size = np.array([s.optics.width, s.optics.height])
         x_y = np.concatenate([x_y * size - 0.5, np.tile(hot, (n_frames, 1))])
         magnitude = np.concatenate([magnitude, np.tile(hot_magnitude, n_frames)])
-        kind = np.full(len(frame), FALSE, np.int8)
-        return TrueSpots(frame, x_y[:, 0], x_y[:, 1], magnitude, kind, np.full(len(frame), -1))
+        source = np.full(len(frame), -1)
+        return true_spots(frame, x_y[:, 0], x_y[:, 1], magnitude, FALSE, source)
 
     def _image(self, u: Array, R: Array) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
         """Return columns and rows [px], and which directions are within the camera's cone."""
@@ -219,13 +315,15 @@ class Exposing:
         pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
         return pairs[:, 0], pairs[:, 1]
 
-    def _merged(self, frame: Indices, star: Indices, x: Array, y: Array) -> TrueSpots:
+    def _merged(
+        self, frame: Indices, star: Indices, x: Array, y: Array, pairs: tuple[Indices, Indices]
+    ) -> TrueSpots:
         """Return star spots; stars within MERGE_PX are one, with the number of the brightest."""
         n_stars = len(self.stars.star_id)
         key = frame * n_stars + star
         order = np.argsort(key, kind="stable")
         frame, star, x, y, key = frame[order], star[order], x[order], y[order], key[order]
-        first, second = self._neighbours
+        first, second = pairs
         low, high = np.searchsorted(first, star), np.searchsorted(first, star, side="right")
         n = high - low
         a = np.repeat(np.arange(len(star)), n)
@@ -241,12 +339,12 @@ class Exposing:
         # The brightest of each spot comes first in this order.
         order = np.lexsort((-light, spot))
         brightest = order[np.searchsorted(spot[order], np.arange(n_spots))]
-        return TrueSpots(
+        return true_spots(
             frame[brightest],
             np.bincount(spot, light * x, n_spots) / total,
             np.bincount(spot, light * y, n_spots) / total,
             -2.5 * np.log10(total),
-            np.full(n_spots, STAR, np.int8),
+            STAR,
             self.stars.star_id[star[brightest]],
         )
 
@@ -277,6 +375,9 @@ class Exposing:
         shuffle = self._streams["shuffle"].random(len(order))
         x = spots.x_px[order] + noise[:, 0] * sigma[order]
         y = spots.y_px[order] + noise[:, 1] * sigma[order]
+        if s.trail_error:
+            along = s.trail_error * self._streams["trail noise"].standard_normal(len(order))
+            x, y = x + along * spots.trail_x_px[order], y + along * spots.trail_y_px[order]
         flux = FLUX_AT_ZERO * 10 ** (-0.4 * spots.magnitude[order])
         flux = flux * np.maximum(1 + s.flux_error * light, 0.01)
         # Noise may carry a spot over the edge: there is no pixel to see it.
@@ -297,6 +398,7 @@ class Exposing:
             spots.kind[order][mixed],
             spots.source[order][mixed],
             spots.magnitude[order][mixed],
+            spots.also[order][mixed],
         )
 
 
@@ -306,19 +408,44 @@ def _random_magnitudes(rng: np.random.Generator, n: int, limit: float) -> Array:
 
 
 def _selected(spots: TrueSpots, at: Indices) -> TrueSpots:
-    return TrueSpots(
-        spots.frame[at],
-        spots.x_px[at],
-        spots.y_px[at],
-        spots.magnitude[at],
-        spots.kind[at],
-        spots.source[at],
-    )
+    return TrueSpots(*[getattr(spots, field.name)[at] for field in fields(spots)])
 
 
 def _joined(parts: list[TrueSpots]) -> TrueSpots:
-    names = ("frame", "x_px", "y_px", "magnitude", "kind", "source")
+    names = [field.name for field in fields(TrueSpots)]
     return TrueSpots(*[np.concatenate([getattr(p, name) for p in parts]) for name in names])
+
+
+def blended(spots: TrueSpots, width_px: float) -> TrueSpots:
+    """Return the spots with those of a frame that are near each other as one.
+
+    One spot lies at the middle of its light, with the kind, source and trail of its brightest part;
+    `also` is the brightest other object in it. Spots in a chain of near ones are one.
+
+    Parameters
+    ----------
+    width_px : float
+        Spots of a frame that are nearer than this become one.
+    """
+    n = len(spots.frame)
+    apart = spots.frame * (10.0 * width_px)
+    tree = cKDTree(np.stack([spots.x_px, spots.y_px, apart], axis=1))
+    pairs = tree.query_pairs(width_px, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    n_spots, spot = connected_components(links, directed=False)
+    light = 10 ** (-0.4 * spots.magnitude)
+    # The brightest part of each spot comes first in this order, in which the spots are sorted.
+    order = np.lexsort((-light, spot))
+    of, first = spot[order], np.searchsorted(spot[order], np.arange(n_spots))
+    made = _selected(spots, order[first])
+    total = np.bincount(spot, light, n_spots)
+    made.x_px = np.bincount(spot, light * spots.x_px, n_spots) / total
+    made.y_px = np.bincount(spot, light * spots.y_px, n_spots) / total
+    made.magnitude = -2.5 * np.log10(total)
+    hidden = (spots.kind[order] == TARGET) & (np.arange(n) != first[of])
+    rows, at = np.unique(of[hidden], return_index=True)
+    made.also[rows] = spots.source[order][hidden][at]
+    return _selected(made, np.argsort(made.frame, kind="stable"))
 
 
 def _nothing(
@@ -327,5 +454,5 @@ def _nothing(
     none, whole = np.empty(0), np.empty(0, np.int64)
     return Exposures(
         frame_number, time_ns, r_km, v_km_s, attitude, np.zeros(1, np.int64),
-        none, none, none, none, np.empty(0, np.int8), whole, none,
+        none, none, none, none, np.empty(0, np.int8), whole, none, whole,
     )  # fmt: skip

@@ -54,6 +54,18 @@ def body_fixed(
     return look_along(z, up, roll_rad)
 
 
+def azimuth_away(r_km: Array, v_km_s: Array, u: Array) -> float:
+    """Return the azimuth [rad] of the horizontal away from a direction, see `body_fixed`.
+
+    All are (3,): position and velocity of the sensor, and a unit vector, GCRF.
+    """
+    across = np.cross(r_km, v_km_s)
+    along = np.cross(across, r_km)
+    return float(
+        np.arctan2(-u @ across / np.linalg.norm(across), -u @ along / np.linalg.norm(along))
+    )
+
+
 def spinning(start: Rotation, axis: Array, rate_rad_s: float, t_s: Array) -> Rotation:
     """Return attitudes, sensor from ICRS, of a constant rotation about an inertial axis."""
     turned = np.asarray(t_s)[:, None] * (rate_rad_s * axis / np.linalg.norm(axis))
@@ -128,6 +140,8 @@ class SimulatedSensor:
     hot_pixels: int
     star_drop: float
     target_drop: float
+    blend_px: float
+    trail_error: float
     # states
     state_rate_hz: float
     state_margin_s: float

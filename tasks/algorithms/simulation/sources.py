@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from epipole.tasks.algorithms.simulation.constants import (
@@ -132,6 +135,25 @@ def star_directions(
     u = u0 + field.motion[star] * (years + ahead_s / JULIAN_YEAR_S)[:, None]
     u -= (field.parallax[star] / AU_KM)[:, None] * r_barycentric_km
     return u / np.linalg.norm(u, axis=1, keepdims=True)
+
+
+def may_be_detected(
+    u: Array, magnitude: Array, limit: float, apart_rad: float
+) -> npt.NDArray[np.bool_]:
+    """Return which stars are bright enough, alone or together with others near them.
+
+    Parameters
+    ----------
+    u : (n, 3) float
+        Unit vectors.
+    apart_rad : float
+        Stars that are nearer to each other, or in a chain of such, may be one spot.
+    """
+    pairs = cKDTree(u).query_pairs(apart_rad, output_type="ndarray")
+    links = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(u),) * 2)
+    n, group = connected_components(links, directed=False)
+    light = np.bincount(group, 10 ** (-0.4 * magnitude), n)
+    return -2.5 * np.log10(light)[group] <= limit
 
 
 # Magnitudes of objects, and which of them a sensor detects.
