@@ -1,7 +1,6 @@
 """Runs of a night that has not changed: it is not made again, unless that is asked for."""
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -20,21 +19,14 @@ def state(folder: Path) -> dict[str, tuple[int, bytes]]:
     return {str(p.relative_to(folder)): (p.stat().st_ino, p.read_bytes()) for p in files}
 
 
-@pytest.fixture(scope="module")
-def made(night_run, tmp_path_factory):
-    """Return a copy of the session's dataset, and the summary of its run."""
-    dataset, summary = night_run
-    return shutil.copytree(dataset, tmp_path_factory.mktemp("unchanged") / "out"), summary
-
-
 def run(*arguments) -> tuple[int, str]:
     ended = CliRunner().invoke(app, ["run", *map(str, arguments)])
     return ended.exit_code, ended.stdout
 
 
 @pytest.mark.long
-def test_a_run_tells_what_an_unchanged_night_holds_and_writes_nothing(made, night_log):
-    out, first = made
+def test_a_run_tells_what_an_unchanged_night_holds_and_writes_nothing(night_run, night_log):
+    out, first = night_run
     before = state(out)
     second = nightly([str(night_log)], str(out))
     assert state(out) == before
@@ -43,8 +35,9 @@ def test_a_run_tells_what_an_unchanged_night_holds_and_writes_nothing(made, nigh
 
 
 @pytest.mark.long
-def test_a_run_that_is_asked_to_makes_the_same_night_again(made, night_log):
-    out, first = made
+def test_a_run_that_is_asked_to_makes_the_same_night_again(night_log, tmp_path):
+    out = tmp_path / "out"
+    first = nightly([str(night_log)], str(out))
     before = state(out)
     again = nightly([str(night_log)], str(out), again=True)
     after = state(out)
@@ -55,22 +48,22 @@ def test_a_run_that_is_asked_to_makes_the_same_night_again(made, night_log):
     assert all(after[name][0] != before[name][0] for name in after)
 
 
-def test_the_command_line_knows_it_before_prefect_is_there(made, night_log, monkeypatch):
+def test_the_command_line_knows_it_before_prefect_is_there(night_run, night_log, monkeypatch):
     import epipole.flows.command_line.run_nightly as started
 
     def fail(*_):
         raise AssertionError("Prefect was started")
 
     monkeypatch.setattr(started.Nights, "_start", fail)
-    code, text = run(night_log, "--out", made[0], "--quiet", "--json")
+    code, text = run(night_log, "--out", night_run[0], "--quiet", "--json")
     told = json.loads(text)
     assert code == 0
     assert told["unchanged"]
-    assert told["positions"] == made[1].positions
+    assert told["positions"] == night_run[1].positions
 
 
-def test_a_range_of_nights_tells_how_each_ended(made, night_log, monkeypatch):
-    arguments = (night_log, "--out", made[0], "--night", "2019-03-31", "--to", "2019-04-01")
+def test_a_range_of_nights_tells_how_each_ended(night_run, night_log, monkeypatch):
+    arguments = (night_log, "--out", night_run[0], "--night", "2019-03-31", "--to", "2019-04-01")
     code, text = run(*arguments)
     assert code == 0
     assert text.splitlines() == [
@@ -80,7 +73,7 @@ def test_a_range_of_nights_tells_how_each_ended(made, night_log, monkeypatch):
     assert [night["outcome"] for night in json.loads(text)] == ["without frames", "unchanged"]
 
 
-def test_a_night_that_fails_does_not_stop_the_next(made, night_log, monkeypatch):
+def test_a_night_that_fails_does_not_stop_the_next(night_run, night_log, monkeypatch):
     import epipole.flows.command_line.run_nightly as started
     from epipole.schemas.errors import DatasetError
 
@@ -92,7 +85,7 @@ def test_a_night_that_fails_does_not_stop_the_next(made, night_log, monkeypatch)
         return real(dataset, given, night, *rest)
 
     monkeypatch.setattr(started, "unchanged_nights", fail)
-    code, text = run(night_log, "--out", made[0], "--night", "2019-03-31", "--to", NIGHT)
+    code, text = run(night_log, "--out", night_run[0], "--night", "2019-03-31", "--to", NIGHT)
     assert code == 1
     assert text.splitlines() == [
         "2019-03-31  failed: the disk is full", "2019-04-01  unchanged", "1 failed, 1 unchanged",
@@ -113,6 +106,6 @@ def test_a_range_that_is_none_is_refused(night_log, tmp_path, options, says):
     assert says in ended.output
 
 
-def test_stale_nights_are_made_again_and_others_are_not(made, night_log):
-    code, text = run(night_log, "--out", made[0], "--stale")
+def test_stale_nights_are_made_again_and_others_are_not(night_run, night_log):
+    code, text = run(night_log, "--out", night_run[0], "--stale")
     assert (code, text.splitlines()) == (0, ["no night"])
