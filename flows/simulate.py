@@ -270,6 +270,8 @@ def _change_satellites(values: dict[str, Any], given: dict[str, Any], scene: Sce
         raise SceneError(
             f"{scene.name}: is no constellation, so it takes neither satellites nor near"
         )
+    if groups and "sensors" in given:
+        raise SceneError(f"{scene.name}: is a constellation: give satellites instead of sensors")
     for group in groups:
         group["count"] = given.get("satellites", group.get("count"))
         if given.get("near"):

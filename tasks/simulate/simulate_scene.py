@@ -28,7 +28,7 @@ from epipole.tasks.algorithms.simulation.sources import (
     star_field,
 )
 from epipole.tasks.simulate.draw_objects import draw_objects, scene_nodes
-from epipole.tasks.simulate.draw_sensors import draw_sensors
+from epipole.tasks.simulate.draw_sensors import DrawnSensor, draw_sensors
 
 FRAMES_AT_ONCE = 4096
 
@@ -56,6 +56,7 @@ def simulate_scene(scene: Scene) -> Simulation:
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise SceneError(f"{scene.name}: two sensors would be called {twice}")
+    _require_one_path(scene, sensors)
     return Simulation(
         scene,
         t0_ns,
@@ -66,6 +67,17 @@ def simulate_scene(scene: Scene) -> Simulation:
         drawn.objects,
         drawn.sets,
     )
+
+
+def _require_one_path(scene: Scene, sensors: list[DrawnSensor]) -> None:
+    """Raise where two satellites of constellations would have the same name."""
+    sets: dict[str, ElementSet | None] = {}
+    for drawn in sensors:
+        if sets.setdefault(drawn.satellite, drawn.element_set) != drawn.element_set:
+            raise SceneError(
+                f"{scene.name}: two satellites would be called {drawn.satellite}; give all sensors "
+                "with shells the same orbit and count"
+            )
 
 
 class SceneSky:

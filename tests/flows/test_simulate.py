@@ -195,6 +195,8 @@ def test_options_of_a_constellation_are_refused_elsewhere(tmp_path):
     for options in ({"satellites": 3}, {"near": True}):
         with pytest.raises(SceneError, match="night: is no constellation"):
             simulate("night", tmp_path / "n.mcap", **options)
+    with pytest.raises(SceneError, match="give satellites instead of sensors"):
+        simulate("constellation", tmp_path / "n.mcap", sensors=3)
     with pytest.raises(SceneError, match="hours or seconds, not both"):
         simulate("night", tmp_path / "n.mcap", hours=1.0, seconds=1.0)
     with pytest.raises(SceneError, match="has no targets that element sets could replace"):

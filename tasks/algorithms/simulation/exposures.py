@@ -64,7 +64,7 @@ class TrueSpots:
     kind: npt.NDArray[np.int8]
     source: Indices
     also: Indices  # an object that is blended into the spot; -1 without one
-    trail_x_px: Array  # from the begin of the exposure to its end
+    trail_x_px: Array  # from the start of the exposure to its end
     trail_y_px: Array
 
 
@@ -257,9 +257,9 @@ class Exposing:
         d = self.objects.paths.at(t_s[middle], everything)[0] - r_km[middle]
         distance_km = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
         room = np.arcsin(np.minimum(moved_km / distance_km, 1.0)) + turned + 1e-6
-        half_angle = np.minimum(self._radius + ABERRATION_ROOM + room, np.pi)
-        near = d @ boresight[middle] >= distance_km * np.cos(half_angle)
-        return np.flatnonzero(near | (distance_km <= moved_km))
+        half_angle = self._radius + ABERRATION_ROOM + room
+        near = d @ boresight[middle] >= distance_km * np.cos(np.minimum(half_angle, np.pi))
+        return np.flatnonzero(near | (distance_km <= moved_km) | (half_angle >= np.pi))
 
     def _in_cone(
         self, t_s: Array, r_km: Array, R: Array, of_frame: Indices, of_target: Indices

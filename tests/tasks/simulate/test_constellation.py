@@ -109,6 +109,13 @@ def test_trackers_are_fixed_to_the_body_away_from_the_earth_the_sun_and_each_oth
     assert np.ptp(apart) > 20.0  # no two satellites are alike
 
 
+def test_satellites_of_one_name_are_one():
+    values = scene_with().model_dump(exclude_unset=True)
+    values["sensors"][1]["count"] = 11
+    with pytest.raises(SceneError, match="two satellites would be called s0"):
+        stage.simulate_scene(validate_scene(values, "constellation"))
+
+
 def test_half_of_the_satellites_send_attitudes_from_both_trackers():
     simulation = stage.simulate_scene(scene_with(satellites=60))
     a, b = np.array([s.prior_noise is not None for s in simulation.sensors]).reshape(2, 60)

@@ -23,10 +23,17 @@ def exposures(scene):
     return next(stage.expose_blocks(stage.simulate_scene(scene)))
 
 
-def test_the_length_of_blocks_changes_nothing(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("scene", "options"),
+    [
+        ("night", {"sensors": 6, "hours": 0.01}),
+        ("constellation", {"satellites": 4, "near": True, "objects": 4000, "seconds": 20.0}),
+    ],
+)
+def test_the_length_of_blocks_changes_nothing(scene, options, tmp_path, monkeypatch):
     for name, frames in (("long", 4096), ("short", 11)):
         monkeypatch.setattr(stage, "FRAMES_AT_ONCE", frames)
-        simulate("night", tmp_path / name / "n.mcap", sensors=6, hours=0.01)
+        simulate(scene, tmp_path / name / "n.mcap", **options)
     truths = [read_truth(tmp_path / name / "n.mcap") for name in ("long", "short")]
     assert in_order(truths[0].points).equals(in_order(truths[1].points))
     assert in_order(truths[0].frames).equals(in_order(truths[1].frames))
