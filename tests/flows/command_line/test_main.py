@@ -201,6 +201,19 @@ def test_info_says_what_cannot_be_used(epipole, tmp_path):
     assert json.loads(as_json)[0]["sensors"][0]["frames"] == 1
 
 
+def test_simulate_writes_a_constellation_to_a_folder(epipole):
+    options = ("--satellites", "2", "--near", "--objects", "50", "--seconds", "2", "--seed", "3")
+    code, out, _ = epipole("simulate", "constellation", "--out", "logs", *options)
+    assert code == 0
+    assert re.search(r"log +logs \(2 logs\)\n", out)
+    assert "4 sensors, 52 objects" in out
+    assert sorted(p.name for p in Path("logs").iterdir()) == ["s001.mcap", "s002.mcap"]
+    again = ("--satellites", "2", "--hours", "1", "--seconds", "2")
+    code, _, err = epipole("simulate", "constellation", "--out", "other", *again)
+    assert code == 1
+    assert one_line(err) == "epipole: give hours or seconds, not both"
+
+
 def test_simulate_writes_the_log_and_says_so(epipole, tmp_path):
     code, out, _ = epipole("simulate", "four_sensor_geo", "--out", "a.mcap", "--seed", "5")
     assert code == 0
