@@ -222,7 +222,7 @@ def _describe_object(simulation: Simulation, k: int) -> dict[str, Any]:
     objects = simulation.objects
     key = "standard_mag" if objects.is_standard[k] else "mag"
     path = _describe_path(objects.paths.of(k), simulation.object_sets[k])
-    return path | {key: float(objects.magnitude[k])}
+    return {"object": k} | path | {key: float(objects.magnitude[k])}
 
 
 def _describe_path(path: Paths, element_set: ElementSet | None) -> dict[str, Any]:

@@ -186,8 +186,8 @@ def test_a_catalogue_takes_the_place_of_random_objects_without_what_cannot_be_us
     file.write_text("\n".join(f"{name}\n" + "\n".join(each) for name, each in lines))
     made = simulate("constellation", tmp_path / "logs", satellites=2, elements=file, seconds=2.0)
     targets = read_truth(made.truth).scenario["targets"]
-    assert [(t["name"], t.get("norad")) for t in targets] == [
-        ("NEW", 11), ("s001", None), ("s002", None)
+    assert [(t["object"], t["name"], t.get("norad")) for t in targets] == [
+        (0, "NEW", 11), (1, "s001", None), (2, "s002", None)
     ]  # fmt: skip
 
 
