@@ -9,6 +9,8 @@ from epipole.flows.command_line.main import app
 from epipole.io.catalogues.element_sets import parse_element_sets
 from epipole.schemas.errors import CatalogueError
 
+pytestmark = pytest.mark.usefixtures("no_early_server")
+
 
 def test_odd_command_lines_end_in_one_line(tmp_path):
     found = [(words, fault) for words, fault in faults(60, seed=11, folder=tmp_path) if fault]

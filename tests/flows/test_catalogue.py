@@ -15,7 +15,7 @@ from epipole.schemas.star_lists import label_of
 
 
 @pytest.fixture
-def epipole(monkeypatch, capfd, tmp_path):
+def epipole(monkeypatch, capfd, tmp_path, no_early_server):
     """Return a function that runs a command line and gives (exit code, stdout, stderr)."""
     monkeypatch.chdir(tmp_path)
 

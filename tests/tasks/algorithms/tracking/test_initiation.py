@@ -40,10 +40,10 @@ def rule(**changes):
     return TrackRule(**options | changes)
 
 
-def scene(seed, *, times, rate_arcsec_s, n_objects=2, n_strays=2, missed=0.1):
+def scene(seed, *, times, rate_arcsec_s, n_objects=2, n_strays=2, missed=0.1, errors=(1.0, 4.0)):
     """Return detections of a few frames: objects on curved paths, strays, some that have a track.
 
-    Their errors differ by a factor of four.
+    Their errors are between `errors` [arcsec].
     """
     rng = np.random.default_rng(seed)
     centre = rng.normal(size=3)
@@ -57,7 +57,7 @@ def scene(seed, *, times, rate_arcsec_s, n_objects=2, n_strays=2, missed=0.1):
         strays = rng.uniform(-0.5, 0.5, (rng.poisson(n_strays), 2)) * FIELD_RAD
         at = np.vstack([start + rate * t + bend * t**2 / 2, strays])
         at = rng.permutation(at[rng.random(len(at)) > missed])
-        sigma.append(rng.uniform(1.0, 4.0, len(at)) * ARCSEC)
+        sigma.append(rng.uniform(*errors, len(at)) * ARCSEC)
         at = at + rng.normal(size=at.shape) * sigma[-1][:, None]
         u.append(centre + at @ tangent_basis(centre))
         offsets.append(offsets[-1] + len(at))
@@ -198,18 +198,30 @@ def test_no_track_is_lost_by_the_pairs_that_are_skipped(times, rate_arcsec_s):
     n_begun = 0
     for seed in range(12):
         detections = scene(seed, times=TIMES[times], rate_arcsec_s=rate_arcsec_s)
-        of = rule(need=3 + seed % 2)  # all frames are then followed back
+        # All frames are followed back where at least 3 detections are needed. Where the demand is
+        # strong, a miss rules a pair out.
+        of = rule(need=3 + seed % 2, enough=5.0 + 8.0 * (seed % 6))
         expected = by_trying_all(detections, of)
         assert begun_in_last_frame(detections, of) == expected, seed
         n_begun += len(expected)
     assert n_begun > 5
 
 
-def test_strays_alone_begin_the_tracks_of_trying_all_pairs():
+@pytest.mark.parametrize("n_objects", [0, 4])
+def test_weak_chains_among_strays_are_those_of_trying_all_pairs(n_objects):
     n_begun = 0
-    for seed in range(40):
-        detections = scene(seed, times=TIMES["even"], rate_arcsec_s=0.0, n_objects=0, n_strays=12)
-        of = rule(enough=np.log(0.3))  # a weak demand, so that chance begins tracks
+    for seed in range(30):
+        # Large errors, many misses, a weak demand: chains are near the limit, chance begins some.
+        detections = scene(
+            seed,
+            times=TIMES["even"],
+            rate_arcsec_s=300.0 * (seed % 3),
+            n_objects=n_objects,
+            n_strays=12,
+            missed=0.3,
+            errors=(80.0, 81.0 + 80.0 * (seed % 2)),
+        )
+        of = rule(enough=np.log(0.3) + seed % 5 * (n_objects > 0))
         expected = by_trying_all(detections, of)
         assert begun_in_last_frame(detections, of) == expected, seed
         n_begun += len(expected)

@@ -8,6 +8,7 @@ from epipole.tasks.algorithms.association.odds import near_fields
 from epipole.tasks.algorithms.association.samples import Samples
 from epipole.tasks.algorithms.association.search.field_index import (
     FEW_SENSORS,
+    cells_across,
     near_points,
     sensors_sharing,
 )
@@ -62,14 +63,18 @@ def point_in_field(samples, s, m, rng):
     return x if in_field(samples, s, m, x) else None
 
 
-def enter_points(scene, s, rng, sigma_km):
-    """Enter points in the field of sensor s at some instants; return these, as {instant: x}."""
+def enter_points(scene, s, rng, error_cells):
+    """Enter points in the field of sensor s at some instants; return these, {instant: (x, km)}.
+
+    Their error of 6 sigma [km] is `error_cells` times the size of the cells there.
+    """
     points, at = scene.work.points, {}
     points.seen_by[:] = 0
-    points.cov_km2[:] = np.eye(3) * sigma_km**2
     for m in range(len(TIMES)):
         if rng.random() < 0.6 and (x := point_in_field(scene.samples, s, m, rng)) is not None:
-            points.x_km[m], points.seen_by[m], at[m] = x, 2, x
+            error_km = error_cells / (cells_across(scene.space.fields, x, 1.0) or 1 / 300.0)
+            points.x_km[m], points.seen_by[m], at[m] = x, 2, (x, error_km)
+            points.cov_km2[m] = np.eye(3) * (error_km / NEAR_SIGMA) ** 2 / 3
     return at
 
 
@@ -78,28 +83,29 @@ def with_tracklets(samples, s, m):
 
 
 @pytest.mark.parametrize("n_sensors", [FEW_SENSORS, FEW_SENSORS + 1, 80])
-@pytest.mark.parametrize("sigma_km", [0.5, 30.0, 3000.0])
-def test_every_sensor_whose_field_may_hold_a_point_is_near(n_sensors, sigma_km):
+@pytest.mark.parametrize("error_cells", [0.01, 0.9, 10.0])
+def test_every_sensor_whose_field_may_hold_a_point_is_near(n_sensors, error_cells):
     scene, rng = sensors_everywhere(n_sensors, n_sensors), np.random.default_rng(1)
     samples, work, n_found = scene.samples, scene.work, 0
     every, near = np.arange(n_sensors), np.empty(n_sensors, np.int64)
     for a in np.tile(every, 2):
-        at = enter_points(scene, a, rng, sigma_km)
+        at = enter_points(scene, a, rng, error_cells)
         n_near = near_fields(scene.space.views, work.points, every, near)
         allowed = set(near[:n_near].tolist())
-        # Points within 6 sigma stand for the whole ball; an uncertain one is looked up by the
-        # cells of the seed's sensors instead.
-        ball = NEAR_SIGMA * np.sqrt(3) * sigma_km * (sigma_km < 1000.0)
+        # Points at 6 sigma stand for the whole ball. One that is uncertain by more than a cell is
+        # looked up by the cells of the seed's sensors instead.
+        in_ball = around(rng) if error_cells < 1.0 else np.zeros((1, 3))
         expected = {
             s
-            for m, x in at.items()
+            for m, (x, error_km) in at.items()
             for s in range(n_sensors)
             if with_tracklets(samples, s, m)
-            and any(in_field(samples, s, m, x + ball * d) for d in around(rng))
+            and any(in_field(samples, s, m, x + error_km * d) for d in in_ball)
         }
         found = work.near[: near_points(scene.space, work, a, a)].tolist()
         assert len(set(found)) == len(found)
-        assert expected <= set(found) <= allowed
+        # `near_fields` tells what counts as near; a field at the edge of the ball may not.
+        assert expected & allowed <= set(found) <= allowed
         if n_sensors <= FEW_SENSORS:
             assert set(found) == allowed
         n_found += len(expected - {a})
@@ -107,9 +113,8 @@ def test_every_sensor_whose_field_may_hold_a_point_is_near(n_sensors, sigma_km):
 
 
 def around(rng):
-    """Yield the centre of a ball of radius 1, and points in it."""
-    yield np.zeros(3)
-    yield from unit(rng.normal(size=(4, 3))) * rng.random((4, 1))
+    """Return the centre of a ball of radius 1, and points at its edge."""
+    return np.vstack([np.zeros(3), 0.99 * unit(rng.normal(size=(6, 3)))])
 
 
 @pytest.mark.parametrize("seed", range(2))

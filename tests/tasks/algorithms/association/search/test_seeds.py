@@ -60,6 +60,27 @@ def test_seeds_are_all_pairs_whose_lines_meet(seed, options, gate_sigma):
     assert meeting > 3 or gate_sigma == 1.0
 
 
+PRECISE = {"n_objects": 10, "spread_km": 0.3, "sigma_km": 0.0005}  # positions of sensors
+
+
+@pytest.mark.parametrize(
+    "gate_sigma",
+    [
+        GATE_SIGMA,
+        pytest.param(
+            1.0, marks=pytest.mark.xfail(reason="angles are compared within less than the gate")
+        ),
+    ],
+)
+def test_angles_of_precise_sensors_leave_out_no_pair_whose_lines_meet(gate_sigma):
+    for seed in range(3):
+        scene = ten_tracklets(seed, n_sensors=3, **PRECISE)
+        for a, b in [(0, 1), (2, 0), (1, 2)]:
+            sure, _ = of_all_pairs(scene, a, b, gate_sigma)
+            seeds = seeds_between(scene.space, a, b, gate_sigma)
+            assert sure <= set(map(tuple, seeds.tolist()))
+
+
 def test_sensors_at_one_position_have_no_seeds():
     scene = ten_tracklets(3, n_sensors=2)
     assert len(seeds_between(scene.space, 0, 1, GATE_SIGMA)) >= 2
