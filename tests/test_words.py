@@ -27,7 +27,6 @@ WAITING = (
     "tasks/algorithms/known_objects",
     "tasks/algorithms/orbits",
     "tasks/algorithms/photometry.py",
-    "tasks/algorithms/sensor_faults",
     "tasks/algorithms/star_catalogue.py",
     "tasks/algorithms/tracking",
     "tasks/check",

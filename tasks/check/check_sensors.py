@@ -18,7 +18,7 @@ from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import CLOCK_LINES, OBJECT_VIEWS, VIEWS
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.sensor_faults.clock_search import Meetings, search_offset
+from epipole.tasks.algorithms.sensor_faults.clock_search import CandidatePairs, search_offset
 from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     ATTITUDE,
     CLOCK,
@@ -218,9 +218,9 @@ def _search(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:
     if not len(free):
         return None
     match = search_offset(
-        Meetings(
+        CandidatePairs(
             tracklet=free["tracklet_id"].rank("dense").to_numpy().astype(np.int64),
-            item=free["object_id"].rank("dense").to_numpy().astype(np.int64),
+            object=free["object_id"].rank("dense").to_numpy().astype(np.int64),
             u=stack(free, "u{}"),
             cov=_direction_cov(free, "noise") + _direction_cov(free, "bias"),
             r_km=stack(free, "sensor_{}_km"),

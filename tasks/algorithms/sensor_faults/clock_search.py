@@ -1,8 +1,8 @@
 """Clock search: the offset at which a sensor's lines of sight meet the objects of the others.
 
 A sensor whose clock is seconds off agrees with no other sensor, so its lines belong to no object.
-But each pair of a line and an object gives the offset at which the two would meet. The offsets of
-wrong pairs scatter, those of right pairs are equal.
+But each pair of a line and an object gives an offset at which the line passes the object. The
+offsets of false pairs scatter, those of true pairs are equal.
 """
 
 from typing import NamedTuple
@@ -16,32 +16,32 @@ from epipole.tasks.algorithms.geometry.directions import tangent_basis
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MAX_OFFSET_S = 5.0  # maximum clock offset that is searched for
-MEETS_SIGMA = 4.0  # largest miss of a line and its object at the best offset
+MAX_OFFSET_S = 5.0  # largest clock offset that is searched
+GATE_SIGMA = 4.0  # largest residual of a line and its object at the best offset
 QUARTER_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
-SAME_SIGMA = 3.0  # offsets that differ by less are the same
-FAR_SIGMA = 1e9  # [sigma] miss of an object behind the sensor
+SAME_SIGMA = 3.0  # offsets agree if they differ by less
+FAR_SIGMA = 1e9  # [sigma] residual of an object behind the sensor
 MIN_OBJECTS = 3  # minimum number of objects that agree on an offset
-FALSE_ALARM = 1e-4  # accepted probability that the offsets agree by chance
+MAX_FALSE_ALARM = 1e-4  # largest accepted false-alarm probability
 
 
-class Meetings(NamedTuple):
-    """Pairs of a line of sight of one sensor and an object of its epoch, all combinations.
+class CandidatePairs(NamedTuple):
+    """All pairs of a line of sight of one sensor and an object at the same epoch.
 
-    tracklet, item : (n,) int
-        Tracklet of the line, and the object; any numbers.
+    tracklet, object : (n,) int
+        Numbers of the tracklet and of the object; any.
     u, cov : (n, 3), (n, 2, 2) float
         Direction without aberration and its covariance on `tangent_basis(u)` [rad^2].
     r_km, v_sensor_km_s : (n, 3) float
-        The sensor, GCRF.
+        Position and velocity of the sensor, GCRF.
     sigma_km : (n,) float
         1-sigma error of its position, per axis.
     x_km, v_km_s, cov_km2 : (n, 3), (n, 3), (n, 3, 3) float
-        The object at the epoch, from the other sensors.
+        Position, velocity and covariance of the object at the epoch, GCRF, from the other sensors.
     """
 
     tracklet: Indices
-    item: Indices
+    object: Indices
     u: Array
     cov: Array
     r_km: Array
@@ -53,42 +53,42 @@ class Meetings(NamedTuple):
 
 
 class Match(NamedTuple):
-    """The offset [s], reported minus true time, and the rows whose line and object then meet."""
+    """The offset [s], reported minus true time, and the pairs that agree with it, as rows."""
 
     offset_s: float
     row: Indices
 
 
-def search_offset(meetings: Meetings) -> Match | None:
-    """Return the clock offset with which a sensor sees the objects, None if no offset is sure.
+def search_offset(candidates: CandidatePairs) -> Match | None:
+    """Return the clock offset of a sensor, None if the evidence for the best one is too weak.
 
     Notes
     -----
-    An offset is sure if more objects agree on it, each with a different tracklet, than chance
-    explains. The rate of chance meetings is counted at right angles to the direction in which
-    an offset moves the line: there all meetings are by chance.
+    The evidence is the number of objects that agree on an offset, each with a different tracklet.
+    It is compared with the expected number of false pairs. Their density is counted at right
+    angles to the direction in which an offset moves the line: there all pairs are false.
     """
     pairs, which = np.unique(
-        np.column_stack([meetings.tracklet, meetings.item]), axis=0, return_inverse=True
+        np.column_stack([candidates.tracklet, candidates.object]), axis=0, return_inverse=True
     )
     which = which.ravel()
-    miss, rate = _passes(meetings)
+    miss, rate = _misses_and_rates(candidates)
     along, sigma = _mean_offset(miss, rate, which, len(pairs))
     aside, sigma_aside = _mean_offset(miss, rate @ QUARTER_TURN, which, len(pairs))
-    meets = (np.abs(aside) < MEETS_SIGMA * sigma_aside) & (np.abs(along) < MAX_OFFSET_S)
-    wrong = (np.abs(along) < MEETS_SIGMA * sigma) & (np.abs(aside) < MAX_OFFSET_S) & ~meets
-    good = np.flatnonzero(meets)
-    best = _surest(pairs[good], along[good], sigma[good], int(wrong.sum()))
+    passes = (np.abs(aside) < GATE_SIGMA * sigma_aside) & (np.abs(along) < MAX_OFFSET_S)
+    false = (np.abs(along) < GATE_SIGMA * sigma) & (np.abs(aside) < MAX_OFFSET_S) & ~passes
+    good = np.flatnonzero(passes)
+    best = _best_supported(pairs[good], along[good], sigma[good], int(false.sum()))
     if best is None:
         return None
     chosen = good[_one_to_one(pairs[good], along[good], sigma[good], best)]
     return Match(best, np.flatnonzero(np.isin(which, chosen)))
 
 
-def _passes(m: Meetings) -> tuple[Array, Array]:
-    """Return the miss of each line and object (n, 2), and its rate with the offset (n, 2).
+def _misses_and_rates(m: CandidatePairs) -> tuple[Array, Array]:
+    """Return the residual of each pair, and its derivative by the offset, both (n, 2).
 
-    In units of the errors, and the same per second.
+    In standard deviations, and per second.
     """
     away = m.x_km - m.r_km
     reach = np.linalg.norm(away, axis=1)
@@ -104,19 +104,19 @@ def _passes(m: Meetings) -> tuple[Array, Array]:
 
 
 def _mean_offset(miss: Array, rate: Array, which: Indices, n: int) -> tuple[Array, Array]:
-    """Return the offset [s] at which each tracklet is nearest to its object, and its sigma.
+    """Return the offset [s] at which each tracklet passes its object, and its 1-sigma error [s].
 
-    The mean over the epochs of the pair; large where the object is behind the sensor.
+    The weighted mean over the epochs of the pair; large where the object is behind the sensor.
     """
     weight = np.bincount(which, np.sum(rate * rate, axis=1), n)
     weight = np.maximum(weight, 1e-300)
     return np.bincount(which, np.sum(rate * miss, axis=1), n) / weight, 1 / np.sqrt(weight)
 
 
-def _surest(pairs: Indices, offset: Array, sigma: Array, n_aside: int) -> float | None:
-    """Return the offset on which most objects agree, None where that may be chance.
+def _best_supported(pairs: Indices, offset: Array, sigma: Array, n_false: int) -> float | None:
+    """Return the offset with the most significant agreement, None if it may be a false alarm.
 
-    `n_aside` is the number of pairs that certainly met by chance.
+    `n_false` is the number of false pairs at right angles, within the same interval of offsets.
     """
     n = len(offset)
     best: tuple[float, float] | None = None
@@ -126,15 +126,14 @@ def _surest(pairs: Indices, offset: Array, sigma: Array, n_aside: int) -> float 
         agree = min(len(np.unique(pairs[near, 0])), len(np.unique(pairs[near, 1])))
         if agree < MIN_OBJECTS:
             continue
-        chance = (n_aside + 1) * min(float(np.mean(window)) / MAX_OFFSET_S, 1.0)
-        with np.errstate(divide="ignore"):  # log of 0: no chance at all
-            odds = float(
-                np.log(pdtrc(agree - 2, chance))
-            )  # the pair at the middle agrees by definition
+        expected = (n_false + 1) * min(float(np.mean(window)) / MAX_OFFSET_S, 1.0)
+        with np.errstate(divide="ignore"):
+            # One less: the pair in the middle agrees by definition.
+            odds = float(np.log(pdtrc(agree - 2, expected)))
         if best is None or odds < best[0]:
             weight = 1 / sigma[near] ** 2
             best = odds, float(np.sum(weight * offset[near]) / np.sum(weight))
-    if best is None or best[0] + np.log(n) > np.log(FALSE_ALARM):
+    if best is None or best[0] + np.log(n) > np.log(MAX_FALSE_ALARM):
         return None
     return best[1]
 

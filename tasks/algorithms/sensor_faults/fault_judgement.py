@@ -1,14 +1,15 @@
-"""Faults of sensors, constant over a night, from the residuals of positions.
+"""Faults of sensors, constant over a night, from the residuals of triangulated positions.
 
-A frame with a time stamp late by d shows the sky of d earlier: its lines of sight lag by d times
-their rate. A wrong ephemeris moves the lines by its error over the range, a wrong attitude turns
-them all alike. The objects' positions, and for each sensor a clock offset, a bias of its position
-and one of its attitude, are solved together.
+If a frame's time stamp is late by d, its lines of sight lag by d times their rate. A wrong
+ephemeris shifts the lines, a wrong attitude turns them all alike. The positions of the objects and,
+for each sensor, a clock offset, a bias of its position and a bias of its attitude are solved
+together.
 
-Most sensors are sound. Clock errors of sensors that look the same way cannot be separated, and a
-wrong ephemeris or attitude may look like a wrong clock. So all sensors are judged together: the
-fewest faults that explain the lines far better than sound sensors do, and better than other faults.
-Where the sensor is clear and its fault is not, it only disagrees.
+Clock errors of sensors that look the same way cannot be separated, and a wrong ephemeris or
+attitude may look like a wrong clock. So sets of faults of all sensors are compared by their
+evidence, with a penalty for each fault: most sensors are sound. A fault is declared if it is in all
+of the best sets. If these agree on the sensor but not on the kind of its fault, the sensor
+disagrees.
 """
 
 import itertools
@@ -26,16 +27,16 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-PRIOR_S = 10.0  # 1-sigma prior of the offset of a wrong clock
-SOUND_S = 1e-3  # 1-sigma of the offset of a right clock
-FAULT_KM = 10.0  # 1-sigma per axis of a wrong ephemeris
-FAULT_RAD = 600 * ARCSEC  # 1-sigma per axis of a wrong attitude
-MIN_LOG_ODDS = 12.5  # log-odds from which a fault is declared: five sigma
-CLOCK_PRIOR_LOG_ODDS = 5.0  # prior log-odds of a wrong clock against another fault
-DISTINCT_LOG_ODDS = 5.0  # log-odds from which it is this fault and not another one
-MAX_SETS = 1100  # sets of faults that are all judged; where there are more, from small to large
-OUTLIER_CHI2 = 20.0  # chi-square (2 degrees of freedom) of a line that is of another object
-ROUNDS = 4  # fits, each with better offsets and without outliers
+PRIOR_S = 10.0  # 1-sigma prior of a wrong clock's offset
+SOUND_S = 1e-3  # 1-sigma prior of a right clock's offset
+FAULT_KM = 10.0  # 1-sigma prior of a wrong ephemeris, per axis
+FAULT_RAD = 600 * ARCSEC  # 1-sigma prior of a wrong attitude, per axis
+MIN_LOG_ODDS = 12.5  # minimum log odds of a fault: five sigma
+CLOCK_PRIOR_LOG_ODDS = 5.0  # prior log odds of a wrong clock against another fault
+DISTINCT_LOG_ODDS = 5.0  # minimum log odds of a set of faults against another set
+MAX_SETS = 1100  # maximum number of sets that are all compared; with more, a stepwise search
+OUTLIER_CHI2 = 20.0  # largest chi-square (2 degrees of freedom) of a line of the object
+ITERATIONS = 4  # of the fit, each about the last offsets and without outliers
 PER_SENSOR = 7  # offset, bias of position (3), bias of attitude (3)
 SOUND, CLOCK, EPHEMERIS, ATTITUDE, DISAGREES = "", "clock", "ephemeris", "attitude", "disagrees"
 COLUMNS = {CLOCK: slice(0, 1), EPHEMERIS: slice(1, 4), ATTITUDE: slice(4, 7)}
@@ -49,16 +50,16 @@ class Lines(NamedTuple):
     group : (n,) int
         Position (object at an epoch) of the line, 0 .. g - 1.
     sensor : (n,) int
-        Sensor, 0 .. s - 1; -1 for a line of a sensor that is sound for sure, whose biases are a
+        Sensor, 0 .. s - 1; -1 for a line of a sensor that is assumed sound, whose biases are a
         part of `cov`.
     u : (n, 3) float
         Measured directions, aberration removed.
     cov : (n, 2, 2) float
         Covariance of their independent errors on `tangent_basis(u)` [rad^2].
     x_km, v_km_s : (n, 3) float
-        Solved position and velocity of the object, at the line's time.
+        Solved position and velocity of the object at the line's time, GCRF.
     r_km, v_sensor_km_s : (n, 3) float
-        Position and velocity of the sensor.
+        Position and velocity of the sensor, GCRF.
     """
 
     group: Indices
@@ -75,12 +76,12 @@ class JudgedSensors(NamedTuple):
     """Clock offsets of sensors (reported minus true time), and their faults.
 
     offset_s, sigma_s : (s,) float
-        Offset and its 1-sigma error; NaN for a sensor without lines. Clocks that are not wrong
-        are assumed right, or all unknown where the faults cannot be told. A sigma near `PRIOR_S`
-        means that the geometry does not determine the offset.
+        Offset and its 1-sigma error; NaN for a sensor without lines. The other clocks are assumed
+        right unless declared wrong. If the faults cannot be separated, all clocks are free. A sigma
+        near `PRIOR_S` means that the geometry does not determine the offset.
     cause : (s,) of str
-        The fault that is sure: `CLOCK`, `EPHEMERIS`, `ATTITUDE`; `DISAGREES` where a fault is
-        sure and its kind is not; `SOUND` for none.
+        The declared fault: `CLOCK`, `EPHEMERIS` or `ATTITUDE`; `DISAGREES` if its kind is unknown;
+        `SOUND` without a fault.
     size, size_sigma : (s,) float
         Size of a wrong ephemeris [km] or attitude [rad], and its 1-sigma error; else 0.
     """
@@ -93,7 +94,7 @@ class JudgedSensors(NamedTuple):
 
     @property
     def wrong(self) -> Flags:
-        """(s,) bool: the clock is surely wrong."""
+        """(s,) bool: the clock is declared wrong."""
         return np.array([cause == CLOCK for cause in self.cause], bool)
 
 
@@ -113,7 +114,7 @@ def judge_sensors(
         1-sigma per axis of the biases that a sensor keeps over the night: of its position
         [km], and of its attitude [rad] (0 for attitudes from stars, which are never at fault).
     guess_s : (s,) float
-        First offsets, needed where they are seconds. Default 0.
+        Initial clock offsets; needed if one is seconds. Default 0.
 
     Notes
     -----
@@ -124,26 +125,26 @@ def judge_sensors(
     n_sensors = len(position_sigma_km)
     guess = np.zeros(n_sensors) if guess_s is None else np.array(guess_s, float)
     has_lines = np.bincount(lines.sensor[lines.sensor >= 0], minlength=n_sensors) > 0
-    spread = spread_of(position_sigma_km, attitude_sigma_rad)
+    prior_sigma = prior_sigmas(position_sigma_km, attitude_sigma_rad)
     kept = np.ones(len(lines.sensor), bool)
-    for _ in range(ROUNDS):
-        about = shifted(lines, guess)
-        normal, right = _equations(about, kept, spread)
-        model = Model(normal, right, guess / PRIOR_S, spread)
+    for _ in range(ITERATIONS):
+        about = shift_lines(lines, guess)
+        normal, right = _equations(about, kept, prior_sigma)
+        model = Model(normal, right, guess / PRIOR_S, prior_sigma)
         explained = _explain(model, np.flatnonzero(has_lines), attitude_sigma_rad > 0)
         wrong = np.array([(s, CLOCK) in explained.faults for s in range(n_sensors)])
         unknowns = model.estimate(explained.faults)[0]
         step_s = unknowns[::PER_SENSOR][wrong] * PRIOR_S
-        good = _chi2(about, kept, spread, unknowns) < OUTLIER_CHI2
+        good = _chi2(about, kept, prior_sigma, unknowns) < OUTLIER_CHI2
         guess[wrong] += step_s
         if (good == kept).all() and (np.abs(step_s) < 1e-4).all():
             break
         kept = good
-    return _estimates(model, explained, has_lines)
+    return _judged(model, explained, has_lines)
 
 
-def spread_of(position_sigma_km: Array, attitude_sigma_rad: Array) -> Array:
-    """Return the prior 1-sigma of all unknowns, sensor by sensor."""
+def prior_sigmas(position_sigma_km: Array, attitude_sigma_rad: Array) -> Array:
+    """Return the prior 1-sigma of all unknowns [s, km, rad], sensor by sensor: (7 s,)."""
     return np.concatenate(
         [
             np.full((len(position_sigma_km), 1), PRIOR_S),
@@ -155,24 +156,28 @@ def spread_of(position_sigma_km: Array, attitude_sigma_rad: Array) -> Array:
 
 
 class Model:
-    """The normal equations of all sensors' unknowns, in units of their spread.
+    """The normal equations of all sensors' unknowns, in units of their prior sigma.
 
     The equations are linear about the offsets `guess`, the prior is about offset 0.
     """
 
-    def __init__(self, normal: Array, right: Array, guess: Array, spread: Array) -> None:
-        self.normal, self.right, self.spread = normal, right, spread.reshape(-1, PER_SENSOR)
-        self.guess = np.zeros_like(self.spread)
+    def __init__(self, normal: Array, right: Array, guess: Array, prior_sigma: Array) -> None:
+        self.normal, self.right, self.prior_sigma = (
+            normal,
+            right,
+            prior_sigma.reshape(-1, PER_SENSOR),
+        )
+        self.guess = np.zeros_like(self.prior_sigma)
         self.guess[:, 0] = guess
 
     def estimate(self, faults: Faults) -> tuple[Array, Array]:
-        """Return the unknowns beyond the guess and their covariance, if these faults may be."""
+        """Return the unknowns minus the guess, and their covariance, with these faults allowed."""
         A, b, _ = self._with_prior(faults)
         cov = np.linalg.inv(A)
         return np.asarray(cov @ b), np.asarray(cov)
 
     def evidence(self, faults: Faults) -> float:
-        """Return the log-probability of the lines, if these faults may be."""
+        """Return the log evidence of these faults: ln p(lines | faults) and a constant."""
         A, b, constant = self._with_prior(faults)
         return float(b @ np.linalg.solve(A, b) - np.linalg.slogdet(A)[1]) / 2 + constant
 
@@ -180,18 +185,18 @@ class Model:
         """Return the size of a wrong ephemeris [km] or attitude [rad], and its sigma."""
         x, cov = self.estimate(faults)
         columns = np.arange(PER_SENSOR)[COLUMNS[cause]] + PER_SENSOR * sensor
-        unit = self.spread.ravel()[columns]
+        unit = self.prior_sigma.ravel()[columns]
         off = x[columns] * unit
         length = float(np.linalg.norm(off))
         along = off / max(length, 1e-300) * unit
         return length, float(np.sqrt(along @ cov[np.ix_(columns, columns)] @ along))
 
     def _with_prior(self, faults: Faults) -> tuple[Array, Array, float]:
-        weight = np.ones_like(self.spread)
+        weight = np.ones_like(self.prior_sigma)
         weight[:, 0] = (PRIOR_S / SOUND_S) ** 2
         for s, cause in faults:
             usual = {CLOCK: PRIOR_S, EPHEMERIS: FAULT_KM, ATTITUDE: FAULT_RAD}[cause]
-            weight[s, COLUMNS[cause]] = (self.spread[s, COLUMNS[cause]] / usual) ** 2
+            weight[s, COLUMNS[cause]] = (self.prior_sigma[s, COLUMNS[cause]] / usual) ** 2
         pull = weight * self.guess
         constant = np.log(weight).sum() - np.sum(pull * self.guess)
         right = self.right - pull.ravel()
@@ -199,8 +204,10 @@ class Model:
 
 
 class _Explanation(NamedTuple):
-    """Faults that are sure, sensors with a fault of unknown kind, and whether no other
-    explanation is about as good."""
+    """Declared faults, sensors with a fault of unknown kind, and whether the best set is distinct.
+
+    It is distinct if no other set of faults has nearly the same score.
+    """
 
     faults: Faults
     disagreeing: list[int]
@@ -208,10 +215,10 @@ class _Explanation(NamedTuple):
 
 
 def _explain(model: Model, sensors: Indices, has_prior_attitude: Flags) -> _Explanation:
-    """Return the explanation of the lines by the fewest faults.
+    """Return the faults that are in the best set and in all sets of nearly the same score.
 
-    Sure are the faults that are in the best explanation and in all others that are about as
-    good. An attitude can be wrong only where `has_prior_attitude`.
+    The score is the log evidence minus a penalty for each fault. An attitude can be wrong only
+    where `has_prior_attitude`.
     """
     score: dict[Faults, float] = {}
     kinds = [
@@ -235,7 +242,7 @@ def _explain(model: Model, sensors: Indices, has_prior_attitude: Flags) -> _Expl
         best = max(score, key=judge)
     else:
         while True:
-            better = max([best, *_beside(best, kinds)], key=judge)
+            better = max([best, *_neighbouring_sets(best, kinds)], key=judge)
             if better == best:
                 break
             best = better
@@ -245,8 +252,8 @@ def _explain(model: Model, sensors: Indices, has_prior_attitude: Flags) -> _Expl
     return _Explanation(sure, sorted(at_fault - {s for s, _ in sure}), len(good) == 1)
 
 
-def _beside(faults: Faults, kinds: list[list[tuple[int, str]]]) -> list[Faults]:
-    """Return the sets with one fault added, removed, or exchanged; one fault per sensor."""
+def _neighbouring_sets(faults: Faults, kinds: list[list[tuple[int, str]]]) -> list[Faults]:
+    """Return the sets with one fault added, removed or exchanged; at most one fault per sensor."""
     sensors = {s for s, _ in faults}
     possible = [fault for of_sensor in kinds for fault in of_sensor]
     more = [faults | {fault} for fault in possible if fault[0] not in sensors]
@@ -260,8 +267,8 @@ def _beside(faults: Faults, kinds: list[list[tuple[int, str]]]) -> list[Faults]:
     return [*more, *less, *exchanged]
 
 
-def _estimates(model: Model, explained: _Explanation, has_lines: Flags) -> JudgedSensors:
-    """Return each sensor's offset, if it and what is at fault may be wrong; and the faults."""
+def _judged(model: Model, explained: _Explanation, has_lines: Flags) -> JudgedSensors:
+    """Return each sensor's offset, with its clock and the declared faults free, and its fault."""
     n = len(has_lines)
     faults = explained.faults
     offset, sigma = np.full(n, np.nan), np.full(n, np.nan)
@@ -283,51 +290,52 @@ def _estimates(model: Model, explained: _Explanation, has_lines: Flags) -> Judge
     return JudgedSensors(offset, sigma, cause, size, size_sigma)
 
 
-def shifted(lines: Lines, offset_s: Array) -> Lines:
+def shift_lines(lines: Lines, offset_s: Array) -> Lines:
     """Return the lines moved to the reported times, for clocks with these offsets.
 
-    A line shows the object and the sensor where they were `offset_s` earlier.
+    A line has the object and the sensor at their positions `offset_s` earlier.
     """
     d = np.append(offset_s, 0.0)[lines.sensor][:, None]
     moved = (lines.v_km_s - lines.v_sensor_km_s) * d
-    bent = (_gravity(lines.r_km) - _gravity(lines.x_km)) * d * d / 2
-    return lines._replace(r_km=lines.r_km + moved + bent)
+    fall = (_gravity(lines.r_km) - _gravity(lines.x_km)) * d * d / 2
+    return lines._replace(r_km=lines.r_km + moved + fall)
 
 
 def _gravity(r_km: Array) -> Array:
     return -GM_KM3_S2 * r_km / np.linalg.norm(r_km, axis=1, keepdims=True) ** 3
 
 
-def _equations(lines: Lines, kept: Flags, spread: Array) -> tuple[Array, Array]:
-    """Return the normal equations of the sensors' unknowns, in units of their spread."""
-    normal, right = np.zeros((len(spread), len(spread))), np.zeros(len(spread))
-    for _, columns, wide, e in _groups(lines, kept, spread):
+def _equations(lines: Lines, kept: Flags, prior_sigma: Array) -> tuple[Array, Array]:
+    """Return the normal equations of the sensors' unknowns, in units of their prior sigma."""
+    normal, right = np.zeros((len(prior_sigma), len(prior_sigma))), np.zeros(len(prior_sigma))
+    for _, columns, jacobian, e in _groups(lines, kept, prior_sigma):
         # A sensor has one line in a group, as a rule: its columns come once.
         if len(np.unique(columns)) == len(columns):
-            normal[np.ix_(columns, columns)] += wide.T @ wide
-            right[columns] += wide.T @ e
+            normal[np.ix_(columns, columns)] += jacobian.T @ jacobian
+            right[columns] += jacobian.T @ e
         else:
-            np.add.at(normal, np.ix_(columns, columns), wide.T @ wide)
-            np.add.at(right, columns, wide.T @ e)
+            np.add.at(normal, np.ix_(columns, columns), jacobian.T @ jacobian)
+            np.add.at(right, columns, jacobian.T @ e)
     return normal, right
 
 
-def _chi2(lines: Lines, kept: Flags, spread: Array, unknowns: Array) -> Array:
-    """Return the chi-square of each line for solved unknowns; inf for lines left out before."""
+def _chi2(lines: Lines, kept: Flags, prior_sigma: Array, unknowns: Array) -> Array:
+    """Return the chi-square of each line for solved unknowns; inf for rejected lines."""
     out = np.where(kept, 0.0, np.inf)
-    for rows, columns, wide, e in _groups(lines, kept, spread):
-        out[rows] = np.sum((e - wide @ unknowns[columns]).reshape(-1, 2) ** 2, axis=1)
+    for rows, columns, jacobian, e in _groups(lines, kept, prior_sigma):
+        out[rows] = np.sum((e - jacobian @ unknowns[columns]).reshape(-1, 2) ** 2, axis=1)
     return out
 
 
 def _groups(
-    lines: Lines, kept: Flags, spread: Array
+    lines: Lines, kept: Flags, prior_sigma: Array
 ) -> Iterator[tuple[Indices, Indices, Array, Array]]:
     """Yield each position's lines: rows, columns of unknowns, derivatives and residuals.
 
-    The part that the position can absorb is removed: it tells nothing about the sensors.
+    Derivatives by the position are projected out: what a shift of the position explains has no
+    information about the sensors.
     """
-    to_position, to_sensor, misses = whitened(lines, spread)
+    to_position, to_sensor, residuals = whitened(lines, prior_sigma)
     order = np.argsort(lines.group, kind="stable")
     order = order[kept[order]]
     bounds = np.flatnonzero(np.diff(lines.group[order], prepend=-1, append=-1))
@@ -338,19 +346,21 @@ def _groups(
         judged = np.flatnonzero(lines.sensor[rows] >= 0)
         if not len(judged):
             continue
-        H, A, e = to_position[rows].reshape(-1, 3), to_sensor[rows], misses[rows].ravel()
+        H, A, e = to_position[rows].reshape(-1, 3), to_sensor[rows], residuals[rows].ravel()
         free, _ = np.linalg.qr(H)
         sensor = lines.sensor[rows[judged]]
         columns = (PER_SENSOR * sensor[:, None] + np.arange(PER_SENSOR)).ravel()
-        wide = np.zeros((len(e), len(columns)))
+        jacobian = np.zeros((len(e), len(columns)))
         for k, row in enumerate(judged.tolist()):
-            wide[2 * row : 2 * row + 2, PER_SENSOR * k : PER_SENSOR * (k + 1)] = A[row]
-        yield rows, columns, wide - free @ (free.T @ wide), e - free @ (free.T @ e)
+            jacobian[2 * row : 2 * row + 2, PER_SENSOR * k : PER_SENSOR * (k + 1)] = A[row]
+        yield rows, columns, jacobian - free @ (free.T @ jacobian), e - free @ (free.T @ e)
 
 
-def whitened(lines: Lines, spread: Array) -> tuple[Array, Array, Array]:
-    """Return derivatives by position (n, 2, 3) and by the sensor's unknowns (n, 2, 7), and
-    residuals (n, 2), in units of the noise and of the unknowns' spread."""
+def whitened(lines: Lines, prior_sigma: Array) -> tuple[Array, Array, Array]:
+    """Return the derivatives of lines by position and by the sensor's unknowns, and residuals.
+
+    (n, 2, 3), (n, 2, 7) and (n, 2), in units of the noise and of the unknowns' prior sigma.
+    """
     basis = tangent_basis(lines.u)
     away = lines.x_km - lines.r_km
     reach = np.linalg.norm(away, axis=1)
@@ -360,6 +370,6 @@ def whitened(lines: Lines, spread: Array) -> tuple[Array, Array, Array]:
     rate = np.einsum("nij,nj->ni", by_position, lines.v_km_s - lines.v_sensor_km_s)
     by_turn = root @ basis @ -skew(lines.u)
     by_sensor = np.concatenate([-rate[:, :, None], by_position, by_turn], axis=2)
-    per_line = np.vstack([spread.reshape(-1, PER_SENSOR), np.ones(PER_SENSOR)])[lines.sensor]
-    misses = np.einsum("nij,nj->ni", root @ basis, lines.u - predicted)
-    return by_position, by_sensor * per_line[:, None, :], misses
+    per_line = np.vstack([prior_sigma.reshape(-1, PER_SENSOR), np.ones(PER_SENSOR)])[lines.sensor]
+    residuals = np.einsum("nij,nj->ni", root @ basis, lines.u - predicted)
+    return by_position, by_sensor * per_line[:, None, :], residuals

@@ -1,9 +1,8 @@
-"""Faults among many sensors: which are judged together, and which join no object at all.
+"""Faults among many sensors: which sensors are judged together, and which join no object.
 
 Judging all sensors together costs the cube of their number. But one wrong sensor hardly moves the
-positions that many others determine. So each sensor is first judged as if all others were sound,
-from sums over its lines of sight. Only the most suspicious are then judged together, with all
-their faults (`judge_many_sensors`).
+positions that many others determine. So each sensor is first judged alone, with all others assumed
+sound. Only the most suspicious sensors are then judged together (`judge_many_sensors`).
 
 A fault may be so large that none of a sensor's tracklets join an object, although objects of the
 other sensors are in its field. `agreement` finds these sensors.
@@ -28,19 +27,19 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     Lines,
     Model,
     judge_sensors,
-    shifted,
-    spread_of,
+    prior_sigmas,
+    shift_lines,
     whitened,
 )
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MAX_TOGETHER = 24  # sensors that are judged together
-MAX_ROUNDS = 4  # each judges the next suspects, without those found at fault
-MIN_OBJECTS = 3  # objects in its field from which a sensor is judged
+MAX_TOGETHER = 24  # maximum number of sensors that are judged together
+MAX_ROUNDS = 4  # each round judges the next suspects, without the sensors already at fault
+MIN_OBJECTS = 3  # minimum number of objects in the field of a sensor that is judged
 MIN_JOINED_SHARE = 0.3  # minimum share of them that a sound sensor joins
-MIN_STRAYS = 0.5  # minimum of tracklets without object per object in the field, if at fault
+MIN_UNASSIGNED = 0.5  # minimum of unassigned tracklets per object in the field, if at fault
 
 
 def judge_many_sensors(
@@ -53,30 +52,34 @@ def judge_many_sensors(
     n_sensors = len(position_sigma_km)
     if n_sensors <= MAX_TOGETHER:
         return judge_sensors(lines, position_sigma_km, attitude_sigma_rad, guess_s)
-    spread = spread_of(position_sigma_km, attitude_sigma_rad)
+    prior_sigma = prior_sigmas(position_sigma_km, attitude_sigma_rad)
     found = _nothing_known(n_sensors)
     faulty = np.zeros(n_sensors, bool)
     for _ in range(MAX_ROUNDS):
-        left = _without(lines, faulty)
-        sums = _sums_alone(_anonymous(left, spread), left.sensor, guess_s, spread)
+        left = _of_other_sensors(lines, faulty)
+        equations = _equations_alone(
+            _with_biases_as_noise(left, prior_sigma), left.sensor, guess_s, prior_sigma
+        )
         if not faulty.any():
-            _enter_alone(found, sums, guess_s, spread)
-        suspicion = np.where(faulty, -np.inf, _suspicion(sums, guess_s, spread, attitude_sigma_rad))
+            _store_offsets(found, equations, guess_s, prior_sigma)
+        suspicion = np.where(
+            faulty, -np.inf, _suspicion(equations, guess_s, prior_sigma, attitude_sigma_rad)
+        )
         together = np.sort(np.argsort(-suspicion, kind="stable")[:MAX_TOGETHER])
         judged = judge_sensors(
-            _about(left, together, spread),
+            _with_sound_others(left, together, prior_sigma),
             position_sigma_km[together],
             attitude_sigma_rad[together],
             guess_s[together],
         )
-        newly = _enter_judged(found, judged, together)
+        newly = _store_judged(found, judged, together)
         if not newly:
             break
         faulty[newly] = True
     return found
 
 
-class _Sums(NamedTuple):
+class _Equations(NamedTuple):
     """Normal equations (s, 7, 7) and right sides (s, 7) of each sensor alone."""
 
     normal: Array
@@ -89,89 +92,99 @@ def _nothing_known(n: int) -> JudgedSensors:
     )
 
 
-def _without(lines: Lines, faulty: npt.NDArray[np.bool_]) -> Lines:
+def _of_other_sensors(lines: Lines, faulty: npt.NDArray[np.bool_]) -> Lines:
     """Return the lines of the other sensors."""
     kept = ~faulty[lines.sensor]
     return lines._replace(**{name: getattr(lines, name)[kept] for name in Lines._fields})
 
 
-def _anonymous(lines: Lines, spread: Array) -> Lines:
+def _with_biases_as_noise(lines: Lines, prior_sigma: Array) -> Lines:
     """Return the lines with the biases of their sensors as a part of their errors."""
-    of_sensor = spread.reshape(-1, PER_SENSOR)[lines.sensor]
+    of_sensor = prior_sigma.reshape(-1, PER_SENSOR)[lines.sensor]
     reach = np.linalg.norm(lines.x_km - lines.r_km, axis=1)
     variance = (of_sensor[:, 1] / reach) ** 2 + of_sensor[:, 4] ** 2
     cov = lines.cov + variance[:, None, None] * np.eye(2)
     return lines._replace(cov=cov, sensor=np.full(len(lines.sensor), -1))
 
 
-def _about(lines: Lines, together: Indices, spread: Array) -> Lines:
-    """Return the lines; those of other sensors than these are of sound sensors for sure."""
+def _with_sound_others(lines: Lines, together: Indices, prior_sigma: Array) -> Lines:
+    """Return the lines, with all sensors but these assumed sound."""
     number = np.full(lines.sensor.max(initial=-1) + 1, -1)
     inside = together[together < len(number)]
     number[inside] = np.arange(len(together))[together < len(number)]
     sensor = number[lines.sensor]
-    cov = np.where((sensor >= 0)[:, None, None], lines.cov, _anonymous(lines, spread).cov)
+    cov = np.where(
+        (sensor >= 0)[:, None, None], lines.cov, _with_biases_as_noise(lines, prior_sigma).cov
+    )
     return lines._replace(sensor=sensor, cov=cov)
 
 
-def _sums_alone(anonymous: Lines, sensor: Indices, guess_s: Array, spread: Array) -> _Sums:
-    """Return the equations of each sensor, with all others sound.
+def _equations_alone(
+    noisy: Lines, sensor: Indices, guess_s: Array, prior_sigma: Array
+) -> _Equations:
+    """Return the normal equations of each sensor, with all others assumed sound.
 
-    The part that the position of the object can absorb is removed, from sums over its lines.
+    The position of each object is eliminated, by sums over its lines.
     """
-    lines = shifted(anonymous._replace(sensor=sensor), guess_s)
-    to_position, to_sensor, misses = whitened(lines, spread)
+    lines = shift_lines(noisy._replace(sensor=sensor), guess_s)
+    to_position, to_sensor, residuals = whitened(lines, prior_sigma)
     _, group = np.unique(lines.group, return_inverse=True)
     n_groups = group.max(initial=-1) + 1
     normal, pull = np.zeros((n_groups, 3, 3)), np.zeros((n_groups, 3))
     np.add.at(normal, group, np.einsum("nik,nil->nkl", to_position, to_position))
-    np.add.at(pull, group, np.einsum("nik,ni->nk", to_position, misses))
+    np.add.at(pull, group, np.einsum("nik,ni->nk", to_position, residuals))
     several = np.bincount(group, minlength=n_groups) > 1
     inverse = np.zeros_like(normal)
     inverse[several] = np.linalg.pinv(normal[several], hermitian=True)
     rows = several[group]
     by_position = np.einsum("nik,nkl->nil", to_position, inverse[group])
-    left = misses - np.einsum("nil,nl->ni", by_position, pull[group])
+    left = residuals - np.einsum("nil,nl->ni", by_position, pull[group])
     reduced = np.eye(2) - np.einsum("nil,njl->nij", by_position, to_position)
     n_sensors = len(guess_s)
-    out = _Sums(np.zeros((n_sensors, PER_SENSOR, PER_SENSOR)), np.zeros((n_sensors, PER_SENSOR)))
+    out = _Equations(
+        np.zeros((n_sensors, PER_SENSOR, PER_SENSOR)), np.zeros((n_sensors, PER_SENSOR))
+    )
     weighted = np.einsum("nij,njk->nik", reduced, to_sensor)
     np.add.at(out.normal, sensor[rows], np.einsum("nik,nil->nkl", to_sensor, weighted)[rows])
     np.add.at(out.right, sensor[rows], np.einsum("nik,ni->nk", to_sensor, left)[rows])
     return out
 
 
-def _models(sums: _Sums, guess_s: Array, spread: Array) -> list[Model]:
+def _models(equations: _Equations, guess_s: Array, prior_sigma: Array) -> list[Model]:
     """Return the model of each sensor alone."""
-    per_sensor = spread.reshape(-1, PER_SENSOR)
+    per_sensor = prior_sigma.reshape(-1, PER_SENSOR)
     return [
-        Model(sums.normal[s], sums.right[s], guess_s[s : s + 1] / PRIOR_S, per_sensor[s])
+        Model(equations.normal[s], equations.right[s], guess_s[s : s + 1] / PRIOR_S, per_sensor[s])
         for s in range(len(guess_s))
     ]
 
 
-def _suspicion(sums: _Sums, guess_s: Array, spread: Array, attitude_sigma_rad: Array) -> Array:
-    """Return the log-odds of each sensor's best fault against none."""
+def _suspicion(
+    equations: _Equations, guess_s: Array, prior_sigma: Array, attitude_sigma_rad: Array
+) -> Array:
+    """Return the log odds of each sensor's likeliest fault against a sound sensor."""
     out = np.full(len(guess_s), -np.inf)
-    for s, model in enumerate(_models(sums, guess_s, spread)):
+    for s, model in enumerate(_models(equations, guess_s, prior_sigma)):
         kinds = [kind for kind in COLUMNS if kind != ATTITUDE or attitude_sigma_rad[s] > 0]
         sound = model.evidence(frozenset())
         out[s] = max(model.evidence(frozenset({(0, kind)})) for kind in kinds) - sound
     return out
 
 
-def _enter_alone(found: JudgedSensors, sums: _Sums, guess_s: Array, spread: Array) -> None:
-    """Enter the clock offset of each sensor that has lines."""
+def _store_offsets(
+    found: JudgedSensors, equations: _Equations, guess_s: Array, prior_sigma: Array
+) -> None:
+    """Store the clock offset of each sensor that has lines."""
     clock = frozenset({(0, CLOCK)})
-    for s, model in enumerate(_models(sums, guess_s, spread)):
-        if sums.normal[s, 0, 0] > 0.0:
+    for s, model in enumerate(_models(equations, guess_s, prior_sigma)):
+        if equations.normal[s, 0, 0] > 0.0:
             step, cov = model.estimate(clock)
             found.offset_s[s] = guess_s[s] + step[0] * PRIOR_S
             found.sigma_s[s] = np.sqrt(cov[0, 0]) * PRIOR_S
 
 
-def _enter_judged(found: JudgedSensors, judged: JudgedSensors, together: Indices) -> list[int]:
-    """Enter what is known of sensors that were judged together; return those at fault."""
+def _store_judged(found: JudgedSensors, judged: JudgedSensors, together: Indices) -> list[int]:
+    """Store the results of sensors that were judged together; return those at fault."""
     for name in ("offset_s", "sigma_s", "size", "size_sigma"):
         getattr(found, name)[together] = getattr(judged, name)
     newly = []
@@ -188,38 +201,40 @@ def _enter_judged(found: JudgedSensors, judged: JudgedSensors, together: Indices
 class Agreement(NamedTuple):
     """How many objects were in each sensor's field, and how many it joined.
 
-    looked : (s,) int
+    n_in_field : (s,) int
         Objects of at least two other sensors that were in the sensor's field.
-    joined : (s,) int
-        Those of them that have a tracklet of the sensor.
-    free : (s,) int
-        Tracklets of the sensor without an object, or with one of doubted sensors alone: those may
-        agree with each other, and with no other sensor.
+    n_joined : (s,) int
+        Objects among these with a tracklet of the sensor.
+    n_unassigned : (s,) int
+        Tracklets of the sensor without an object, or with an object of doubted sensors only: their
+        tracklets may agree with each other, but with no other sensor's.
     """
 
-    looked: Indices
-    joined: Indices
-    free: Indices
+    n_in_field: Indices
+    n_joined: Indices
+    n_unassigned: Indices
 
     @property
     def doubted(self) -> npt.NDArray[np.bool_]:
-        """Whether a sensor joins hardly any object of the others, (s,)."""
-        few = self.joined < MIN_JOINED_SHARE * self.looked
-        return np.asarray(few & (self.looked >= MIN_OBJECTS))
+        """(s,) bool: the sensor joins too few objects of the others."""
+        few = self.n_joined < MIN_JOINED_SHARE * self.n_in_field
+        return np.asarray(few & (self.n_in_field >= MIN_OBJECTS))
 
     def disagreeing(self) -> Indices:
-        """Return the sensors that detect but disagree: they should be left out."""
-        return np.flatnonzero(self.doubted & (self.free >= MIN_STRAYS * self.looked))
+        """Return the sensors that have detections but disagree: they should be excluded."""
+        return np.flatnonzero(
+            self.doubted & (self.n_unassigned >= MIN_UNASSIGNED * self.n_in_field)
+        )
 
 
 def agreement(samples: Samples, groups: Groups) -> Agreement:
-    """Return how far each sensor agrees with the objects of the other sensors."""
+    """Return how many objects of the other sensors each sensor joins."""
     n_sensors, n_groups = len(samples.half_field), len(groups.score)
-    looked, joined = np.zeros(n_sensors, np.int64), np.zeros(n_sensors, np.int64)
+    n_in_field, n_joined = np.zeros(n_sensors, np.int64), np.zeros(n_sensors, np.int64)
     member, group, instant = _members_at_best(samples, groups)
-    has = np.zeros((n_groups, n_sensors), np.int64)
-    np.add.at(has, (group, samples.sensor[member]), 1)
-    points = _points(samples, member, group, instant, n_groups)
+    n_members = np.zeros((n_groups, n_sensors), np.int64)
+    np.add.at(n_members, (group, samples.sensor[member]), 1)
+    points = _triangulated(samples, member, group, instant, n_groups)
     half_field = np.array(samples.half_field, float)
     in_field = np.zeros(n_sensors, bool)
     for g in np.flatnonzero(np.isfinite(points[:, 0])).tolist():
@@ -228,13 +243,14 @@ def agreement(samples: Samples, groups: Groups) -> Agreement:
             for values in (samples.sensor_km, samples.R_sensor_from_icrs)
         )
         seeing(position, attitude, half_field, points[g], in_field)
-        others = has[g].sum() - has[g] >= 2
-        looked += others & (in_field | (has[g] > 0))
-        joined += others & (has[g] > 0)
-    found = Agreement(looked, joined, np.zeros(n_sensors, np.int64))
-    nowhere = np.append(~has.astype(bool)[:, ~found.doubted].any(axis=1), True)  # the last: FREE
-    free = np.bincount(samples.sensor[nowhere[groups.group]], minlength=n_sensors)
-    return found._replace(free=free)
+        others = n_members[g].sum() - n_members[g] >= 2
+        n_in_field += others & (in_field | (n_members[g] > 0))
+        n_joined += others & (n_members[g] > 0)
+    found = Agreement(n_in_field, n_joined, np.zeros(n_sensors, np.int64))
+    has_members = n_members.astype(bool)[:, ~found.doubted].any(axis=1)
+    unassigned = np.append(~has_members, True)  # the last one is FREE
+    n_unassigned = np.bincount(samples.sensor[unassigned[groups.group]], minlength=n_sensors)
+    return found._replace(n_unassigned=n_unassigned)
 
 
 def _members_at_best(samples: Samples, groups: Groups) -> tuple[Indices, Indices, Indices]:
@@ -252,10 +268,10 @@ def _members_at_best(samples: Samples, groups: Groups) -> tuple[Indices, Indices
     return member, groups.group[member], instant
 
 
-def _points(
+def _triangulated(
     samples: Samples, member: Indices, group: Indices, instant: Indices, n_groups: int
 ) -> Array:
-    """Return the points where the groups' lines of sight meet, (g, 3); NaN where they do not."""
+    """Return the triangulated points of groups [km], GCRF, (g, 3); NaN where that fails."""
     m = instant[group]
     x, *_ = triangulate(
         np.searchsorted(group, np.arange(n_groups + 1)),

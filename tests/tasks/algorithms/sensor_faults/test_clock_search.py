@@ -6,7 +6,7 @@ from scenes.late_sensors import SENSORS, orbit
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
-from epipole.tasks.algorithms.sensor_faults.clock_search import Meetings, search_offset
+from epipole.tasks.algorithms.sensor_faults.clock_search import CandidatePairs, search_offset
 from epipole.tasks.algorithms.simulation.paths import state_at
 
 SIGMA = 2.0 * ARCSEC
@@ -39,10 +39,10 @@ def meetings(seed, offset, *, n=9, strays=0, epochs=5, missing=()):
         for j, (x, v) in enumerate(objects):
             x = x + shared + rng.normal(size=(epochs, 3)) * POSITION_KM
             rows += [(k, j, u[i], r[i] + bias, v_sensor[i], x[i], v[i]) for i in range(epochs)]
-    tracklet, item, u, r, v_sensor, x, v = (np.array(c) for c in zip(*rows, strict=True))
+    tracklet, number, u, r, v_sensor, x, v = (np.array(c) for c in zip(*rows, strict=True))
     size = len(rows)
-    return Meetings(
-        tracklet, item, u, np.tile(np.eye(2) * SIGMA**2, (size, 1, 1)), r, v_sensor,
+    return CandidatePairs(
+        tracklet, number, u, np.tile(np.eye(2) * SIGMA**2, (size, 1, 1)), r, v_sensor,
         np.full(size, PLACE_KM), x, v, np.tile(np.eye(3) * POSITION_KM**2, (size, 1, 1)),
     )  # fmt: skip
 
@@ -53,7 +53,7 @@ def test_an_offset_of_seconds_is_found_and_each_line_meets_its_own_object(offset
         given = meetings(seed, offset)
         match = search_offset(given)
         assert abs(match.offset_s - offset) < 0.1  # 0.8 km: the error of the positions
-        assert (given.tracklet[match.row] == given.item[match.row]).all()
+        assert (given.tracklet[match.row] == given.object[match.row]).all()
         assert len(match.row) > 0.9 * 9 * 5
 
 
@@ -61,7 +61,7 @@ def test_strays_and_objects_that_were_missed_do_not_hide_it():
     given = meetings(1, -1.5, strays=20, missing=(2, 5))
     match = search_offset(given)
     assert abs(match.offset_s + 1.5) < 0.1
-    assert set(given.item[match.row]) == {0, 1, 3, 4, 6, 7, 8}
+    assert set(given.object[match.row]) == {0, 1, 3, 4, 6, 7, 8}
 
 
 def test_agreement_by_chance_is_no_offset():
@@ -78,4 +78,4 @@ def test_an_offset_beyond_the_search_is_not_found():
 
 
 def test_no_lines_give_none():
-    assert search_offset(Meetings(*(values[:0] for values in meetings(4, 0.0, n=1)))) is None
+    assert search_offset(CandidatePairs(*(values[:0] for values in meetings(4, 0.0, n=1)))) is None

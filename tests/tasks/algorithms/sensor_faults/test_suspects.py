@@ -112,15 +112,15 @@ def test_sound_sensors_are_left_alone():
     samples = Scene(2, 4).objects(8, spread_km=100.0).strays(10).samples()
     found = agreement(samples, solve(samples))
     assert found.disagreeing().tolist() == []
-    assert (found.joined >= 0.9 * found.looked).all()
+    assert (found.n_joined >= 0.9 * found.n_in_field).all()
 
 
 def test_a_sensor_without_detections_is_not_at_fault():
     scene = Scene(3, 4).objects(8, spread_km=100.0, seen_by=[0, 1, 2])
     samples = scene.samples()
     found = agreement(samples, solve(samples))
-    assert found.looked[3] >= 5
-    assert found.joined[3] == 0
+    assert found.n_in_field[3] >= 5
+    assert found.n_joined[3] == 0
     assert found.disagreeing().tolist() == []
 
 
