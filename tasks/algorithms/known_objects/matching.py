@@ -1,9 +1,9 @@
 """Matching: the probability that an object of the night is a given satellite of a catalogue.
 
-An object's positions are compared with a satellite's prediction at the same times. Their
-difference has the covariance of the positions, and that of the elements' errors, which all rows
-share. Each satellite is a hypothesis. So is an object that the catalogue does not have: an
-unrelated one, or a companion of a listed one. Companions matter: satellites that share a
+An object's positions are compared with a satellite's predicted positions at the same times. The
+covariance of the difference is that of the positions plus that of the elements' errors, which all
+rows share. Each satellite is a hypothesis. So is an object that is missing from the catalogue:
+an unrelated one, or a companion of a listed one. Companions matter: satellites that share a
 geostationary slot, and parts of one launch, are near each other.
 
 `learn_errors` estimates the size of the elements' errors from the certain matches of a night.
@@ -31,36 +31,36 @@ from epipole.tasks.algorithms.known_objects.prediction import (
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MAX_ROWS = 8  # positions of an object that are compared
-KEPT_SHARE = 0.9999  # share of true matches that pass the chi-square test
-REACH_SIGMA = 6.0
-# Companions that are not listed: the share of satellites that have one, and how far it is, as
-# errors of elements would put it there: in one slot, and in one plane.
+MAX_ROWS = 8  # maximum number of positions of an object that are compared
+GATE_SHARE = 0.9999  # share of true matches that pass the chi-square test
+REACH_SIGMA = 6.0  # gate of the search
+# Unlisted companions: the share of satellites with one, and the 1-sigma separation, in the order of
+# `ERROR_COMPONENTS`: in one geostationary slot, and in one orbit plane.
 COMPANIONS = ((0.05, (50.0, 25.0, 25.0, 50.0, 50.0, 5.0)), (0.05, (300.0, 5.0, 5.0, 5.0, 5.0, 5.0)))
-COMPANION_KM = 50.0
-# Density of other objects [1/km^3]: that of all tracked objects in low orbit.
-OTHERS_KM3 = 1e-8
-# Errors of element sets, in units of the usual ones, and the share of such sets.
+COMPANION_KM = 50.0  # separation of a companion that is still searched, per axis
+# Density of unrelated objects [1/km^3]: that of all tracked objects in low orbit.
+OTHERS_PER_KM3 = 1e-8
+# Errors of element sets, in units of `ElementErrors`, and the share of such sets.
 QUALITIES = ((1.0, 0.8), (2.0, 0.15), (4.0, 0.05))
 WORST = QUALITIES[-1][0]
-MIN_NAMED = 1e-3  # probability of a satellite that an ambiguous object may be
-DRAG_REACH_KM_DAY2 = 0.2  # unknown drag of a satellite that comes down soon
+MIN_LISTED = 1e-3  # minimum probability of a satellite that is listed for an object
+DRAG_REACH_KM_DAY2 = 0.2  # drag error of a satellite that decays soon
 DAY_NS = 86_400_000_000_000
-# What is known before: each error is right within a factor of three (1-sigma of its logarithm).
+# Prior of `learn_errors`: each error is known to a factor of three (1-sigma of its logarithm).
 PRIOR_SIGMA = float(np.log(3.0))
 SIMPLEX_STEP = 0.7  # first step of the search, in ln of a factor: a factor of two
 MIN_MATCHES = 5  # minimum number of matches to learn from
 
 
 class Observed(NamedTuple):
-    """Some positions of one object: at m times.
+    """Positions of one object at m times.
 
     time_ns : (m,) int
         UTC since 1970, in order.
     r_km : (m, 3) float
         GCRF.
     cov : (m, 3, 3) float
-        Their covariances [km^2]. Their errors may be common to all of them.
+        Their covariances [km^2]. The errors of different rows may be correlated, up to equal.
     """
 
     time_ns: npt.NDArray[np.int64]
@@ -69,19 +69,19 @@ class Observed(NamedTuple):
 
     @property
     def anchor(self) -> int:
-        """The row that is best known."""
+        """The row with the smallest covariance."""
         return int(np.argmin(np.trace(self.cov, axis1=1, axis2=2)))
 
 
 class KnownSatellites(NamedTuple):
-    """The satellites of a catalogue that are compared, and the errors of their elements.
+    """The satellites of a catalogue, and the errors of their elements.
 
     satellites
-        Of SGP4; n of them.
+        n satellites of SGP4.
     epoch_ns : (n,) int
         Epochs of the elements.
     low, high
-        Errors of the elements of low orbits and of those with periods above 225 minutes.
+        Errors of the elements: of low orbits, and of orbits with periods above 225 minutes.
     """
 
     satellites: Satellites
@@ -90,7 +90,7 @@ class KnownSatellites(NamedTuple):
     high: ElementErrors
 
     def sigmas(self, row: int, time_ns: int) -> Array:
-        """Return the errors of a satellite at a time; see `prediction.sigmas`."""
+        """Return the errors of a satellite's elements at a time; see `prediction.sigmas`."""
         satellite = self.satellites[row]
         errors = self.high if is_deep_space(satellite) else self.low
         return sigmas(satellite, (time_ns - int(self.epoch_ns[row])) / DAY_NS, errors)
@@ -99,15 +99,17 @@ class KnownSatellites(NamedTuple):
 class Candidate(NamedTuple):
     """A satellite that an object may be.
 
-    `apart_km` (3,) is the object minus the prediction at the anchor: along, up, across. In these
-    axes `cov` (3, 3) is the covariance of the object's position, `lever` (3, 6) the derivatives of
-    the prediction by the errors of the elements, and `sigma` (6,) these errors.
+    `apart_km` (3,) is the object's position minus the predicted one at the anchor: along, up,
+    across. In these axes `cov` (3, 3) is the covariance of the object's position, and `jacobian`
+    (3, 6) the derivatives of the predicted position by the errors of the elements. `sigma` (6,)
+    are the 1-sigma errors of the elements. The three `log_` are log densities of the positions: of
+    the satellite, of a companion, of an unrelated object.
     """
 
     row: int  # of the catalogue
     apart_km: Array
     cov: Array
-    lever: Array
+    jacobian: Array
     sigma: Array
     age_days: float
     log_match: float
@@ -117,18 +119,18 @@ class Candidate(NamedTuple):
 
     @property
     def distance_km(self) -> float:
-        """Distance of the object from the prediction."""
+        """Distance of the object from the predicted position [km]."""
         return float(np.linalg.norm(self.apart_km))
 
     @property
     def mahalanobis(self) -> float:
-        """The same in units of its standard deviation."""
-        S = self.cov + _spread(self.lever, self.sigma)
+        """Mahalanobis distance of the object from the predicted position."""
+        S = self.cov + _element_covariance(self.jacobian, self.sigma)
         return float(np.sqrt(self.apart_km @ np.linalg.solve(S, self.apart_km)))
 
 
 def candidates(observed: Observed, catalogue: KnownSatellites, screen: Screen) -> list[Candidate]:
-    """Return the satellites that an object may be, and others near it, in the catalogue's order."""
+    """Return the satellites near an object, in the catalogue's order."""
     k = observed.anchor
     time_ns, r_km = int(observed.time_ns[k]), observed.r_km[k]
     ages = np.abs(time_ns - catalogue.epoch_ns) / DAY_NS
@@ -145,7 +147,7 @@ def candidates(observed: Observed, catalogue: KnownSatellites, screen: Screen) -
 
 
 def _reach(catalogue: KnownSatellites, age_days: Array, cov: Array) -> Array:
-    """Return how far a prediction may be from the object, about: (n,) [km]."""
+    """Return the distances within which the satellites are searched, (n,) [km]."""
     widest = [
         max(getattr(catalogue.low, name), getattr(catalogue.high, name))
         for name in ("along_km", "along_km_day")
@@ -162,38 +164,47 @@ def _candidate(
     time_ns, state = int(observed.time_ns[k]), states[k]
     axes = along_up_across(state)
     apart = observed.r_km - states[:, :3]
-    here, P = axes @ apart[k], axes @ observed.cov[k] @ axes.T
+    at_anchor_km, P = axes @ apart[k], axes @ observed.cov[k] @ axes.T
     sigma = catalogue.sigmas(row, time_ns)
     reach = WORST * (sigma[[0, 1, 3]] + 2 * sigma[1]) + np.sqrt(np.diag(P))
-    if (np.abs(here) > REACH_SIGMA * reach + 2 * COMPANION_KM).any():
+    if (np.abs(at_anchor_km) > REACH_SIGMA * reach + 2 * COMPANION_KM).any():
         return None
     H = sensitivities(catalogue.satellites[row], observed.time_ns, k)
-    lever = axes @ H[k]
+    jacobian = axes @ H[k]
     H = H.reshape(-1, 6)
-    from_elements = _spread(H, sigma)
-    # Errors that all rows share count once: m rows tell as much as one, and the motion.
+    element_cov = _element_covariance(H, sigma)
+    # The rows may share their errors: their variances times m, so that m rows weigh as one.
     noise = _block_diagonal(observed.cov * len(observed.cov))
     z = apart.ravel()
-    match, fits = _log_mixture(z, noise, from_elements)
-    at_anchor, fits_there = _log_mixture(here, P, _spread(lever, sigma))
+    match, fits = _log_mixture(z, noise, element_cov)
+    at_anchor, fits_there = _log_mixture(at_anchor_km, P, _element_covariance(jacobian, sigma))
     companion = logsumexp(
         [
-            _log_normal(z, noise + from_elements + _spread(H, np.array(far)))[0]
+            _log_normal(z, noise + element_cov + _element_covariance(H, np.array(far)))[0]
             for _, far in COMPANIONS
         ],
         b=[share for share, _ in COMPANIONS],
     )
     age = (time_ns - int(catalogue.epoch_ns[row])) / DAY_NS
-    # Another object would be anywhere, and move as it may: at most as likely as this one's motion.
-    other = match - at_anchor + np.log(OTHERS_KM3)
+    # An unrelated object may be anywhere; its motion is at most as likely as the satellite's.
+    other = match - at_anchor + np.log(OTHERS_PER_KM3)
     return Candidate(
-        row, here, P, lever, sigma, age, match, float(companion), other, fits and fits_there
+        row,
+        at_anchor_km,
+        P,
+        jacobian,
+        sigma,
+        age,
+        match,
+        float(companion),
+        other,
+        fits and fits_there,
     )
 
 
-def _spread(lever: Array, sigma: Array) -> Array:
-    """Return the covariance of places by the errors of the elements."""
-    return np.asarray((lever * sigma**2) @ lever.T)
+def _element_covariance(jacobian: Array, sigma: Array) -> Array:
+    """Return the (k, k) covariance of positions due to the errors of elements, [km^2]."""
+    return np.asarray((jacobian * sigma**2) @ jacobian.T)
 
 
 def _block_diagonal(blocks: Array) -> Array:
@@ -203,18 +214,18 @@ def _block_diagonal(blocks: Array) -> Array:
     return out.reshape(3 * m, 3 * m)
 
 
-def _log_mixture(z: Array, noise: Array, from_elements: Array) -> tuple[float, bool]:
-    """Return the log-density of a difference, and whether it fits.
+def _log_mixture(z: Array, noise: Array, element_cov: Array) -> tuple[float, bool]:
+    """Return the log density of a difference, and whether it passes the chi-square test.
 
-    Catalogues are uneven: the errors of some element sets are several times the usual ones.
+    A mixture over `QUALITIES`: the errors of some element sets are several times the usual ones.
     """
-    terms = [_log_normal(z, noise + factor**2 * from_elements) for factor, _ in QUALITIES]
+    terms = [_log_normal(z, noise + factor**2 * element_cov) for factor, _ in QUALITIES]
     density = logsumexp([term for term, _ in terms], b=[share for _, share in QUALITIES])
     return float(density), min(d2 for _, d2 in terms) < _quantile(len(z))
 
 
 def _log_normal(z: Array, S: Array) -> tuple[float, float]:
-    """Return the logarithm of the normal density, and the squared Mahalanobis distance."""
+    """Return the log density of a normal distribution, and the squared Mahalanobis distance."""
     L = np.linalg.cholesky(S)
     d2 = float(np.sum(np.linalg.solve(L, z) ** 2))
     log_det = 2 * float(np.log(np.diag(L)).sum())
@@ -222,16 +233,16 @@ def _log_normal(z: Array, S: Array) -> tuple[float, float]:
 
 
 def _quantile(size: int) -> float:
-    return float(2 * gammaincinv(size / 2, KEPT_SHARE))  # chi-square
+    return float(2 * gammaincinv(size / 2, GATE_SHARE))  # chi-square
 
 
 class NameVerdict(NamedTuple):
-    """What an object is.
+    """Which satellite an object is.
 
-    `probability` is that of the status: of the satellite where it is known, of any of the
-    satellites that it may be where that is ambiguous, of none of them where it is unknown.
-    `best` is the likeliest satellite, or the nearest one that it is not; `rows` of the catalogue
-    are those that it may be, the likeliest first.
+    `status` is known, ambiguous or unknown. `probability` is that of the status: that the object is
+    the satellite, any of the satellites, or another object. `best` is the likeliest satellite; for
+    an unknown object the nearest one. `rows` are the catalogue's rows of the possible satellites,
+    the likeliest first.
     """
 
     status: str
@@ -241,9 +252,9 @@ class NameVerdict(NamedTuple):
 
 
 def judge(found: Sequence[Candidate], min_probability: float) -> NameVerdict:
-    """Return what an object is, by its candidates.
+    """Return which of its candidates an object is.
 
-    `min_probability` is the minimum probability of a name.
+    `min_probability` is the minimum probability of a known object.
     """
     if not found:
         return NameVerdict("unknown", 1.0, None)
@@ -254,7 +265,7 @@ def judge(found: Sequence[Candidate], min_probability: float) -> NameVerdict:
     share = np.exp(match - total)
     best = int(np.argmax(share))
     order = np.argsort(-share, kind="stable")
-    rows = tuple(found[k].row for k in order if share[k] >= MIN_NAMED)
+    rows = tuple(found[k].row for k in order if share[k] >= MIN_LISTED)
     if share[best] >= min_probability:
         return NameVerdict("known", float(share[best]), found[best], rows)
     if share.sum() >= 0.5:
@@ -264,9 +275,9 @@ def judge(found: Sequence[Candidate], min_probability: float) -> NameVerdict:
 
 
 def spread_rows(time_ns: npt.NDArray[np.int64], preferred: npt.NDArray[np.bool_]) -> Indices:
-    """Return at most `MAX_ROWS` rows that are spread over the time; preferred ones where any are.
+    """Return at most `MAX_ROWS` rows, evenly spread over the time and in its order.
 
-    The rows are in order of time.
+    Only preferred rows, if there are any.
     """
     rows = np.flatnonzero(preferred) if preferred.any() else np.arange(len(time_ns))
     if len(rows) <= MAX_ROWS:
@@ -281,36 +292,37 @@ def spread_rows(time_ns: npt.NDArray[np.int64], preferred: npt.NDArray[np.bool_]
 def learn_errors(
     matches: Sequence[Candidate], satellites: Sequence[object], start: ElementErrors
 ) -> ElementErrors:
-    """Return the errors of elements under which the differences of sure matches are likeliest.
+    """Return the most probable errors of elements, from the differences of certain matches.
 
     Parameters
     ----------
     matches
-        Sure matches.
+        Certain matches.
     satellites
-        Those of SGP4 that they are, in the same order.
+        Their satellites of SGP4, in the same order.
     start
-        What is known of the errors before.
+        The prior.
 
     Returns
     -------
     ElementErrors
-        The greatest posterior density, by the factors of: the error along at the epoch, its growth,
-        the radial and the across error. `start` where there are fewer than `MIN_MATCHES` matches.
+        The maximum of the posterior density over four factors: of the error along the track at the
+        epoch, of its growth, of the radial and of the across error. `start` with fewer than
+        `MIN_MATCHES` matches.
     """
     if len(matches) < MIN_MATCHES:
         return start
 
     apart_km = np.array([match.apart_km for match in matches])
     cov = np.array([match.cov for match in matches])
-    lever = np.array([match.lever for match in matches])
+    jacobian = np.array([match.jacobian for match in matches])
 
     def cost(log_factors: Array) -> float:
         errors = _scaled(start, np.exp(log_factors))
         sigma = np.array(
             [sigmas(s, m.age_days, errors) for s, m in zip(satellites, matches, strict=True)]
         )
-        S = cov + (lever * sigma[:, None, :] ** 2) @ np.swapaxes(lever, 1, 2)
+        S = cov + (jacobian * sigma[:, None, :] ** 2) @ np.swapaxes(jacobian, 1, 2)
         d2 = np.einsum("ni,ni->n", apart_km, np.linalg.solve(S, apart_km[:, :, None])[:, :, 0])
         log_det = np.linalg.slogdet(S)[1]
         return float((d2 + log_det).sum() + (log_factors**2).sum() / PRIOR_SIGMA**2)

@@ -8,7 +8,7 @@ Two-line element sets, practice and use, IAC-12-C1.6.12). `ElementErrors` starts
 
 `Screen` finds the satellites near a position without SGP4: it keeps states of the whole catalogue
 at every half hour and compares orbit planes, radii, and positions of two-body orbits. Those that
-pass are then predicted exactly.
+pass are then predicted by SGP4.
 """
 
 from collections.abc import Sequence
@@ -30,25 +30,26 @@ Indices = npt.NDArray[np.int64]
 DAY_S = 86400.0
 UNIX_EPOCH_JD = 2440587.5
 SGP4_EPOCH_JD = 2433281.5  # 1949 December 31, 0h
-MIN_TILT = 1e-4  # sine of an inclination: below it the node says nothing
-DRAG_UNKNOWN = 0.15  # share of the drag that is not known: density and area change from day to day
+MIN_TILT = 1e-4  # minimum sine of an inclination: below it the node is undefined
+DRAG_UNKNOWN = 0.15  # unknown share of the drag: density and area change from day to day
 # Mean motions [rad/s] below this are of periods above 225 minutes: SGP4's deep space.
 DEEP_SPACE_RAD_S = 2 * np.pi / (225 * 60)
-# What the errors of elements do: ahead along the track [km], the eccentricity as a vector, times
-# the semi-major axis [km], the pole of the orbit plane [km at the semi-major axis], and a drift
-# along the track [km/day].
-SENSITIVE_TO = ("along", "radial", "radial", "across", "across", "drift")
+# Components of the errors of elements: along the track [km], the two of the eccentricity vector
+# times the semi-major axis [km], the two of the pole of the orbit plane [km at the semi-major
+# axis], and a drift along the track [km/day].
+ERROR_COMPONENTS = ("along", "radial", "radial", "across", "across", "drift")
 NODE_NS = 1_800_000_000_000
-# What two bodies leave out in a quarter of an hour: 0.005 of the radius is twice what was found.
-ROOM = 0.005
+# Error of two-body motion over a quarter of an hour, as a share of the radius: twice the largest
+# error that was measured.
+NEGLECTED_SHARE = 0.005
 KEPLER_STEPS = 6
 
 
 class ElementErrors(NamedTuple):
     """1-sigma errors of element sets: along the track, radial, and across the orbit plane.
 
-    Each is the root of the squares of its error at the epoch [km], and of its growth [km/day]
-    times the age.
+    Each is the root of the sum of squares of the error at the epoch [km] and of the growth
+    [km/day] times the age.
     """
 
     along_km: float
@@ -64,7 +65,7 @@ HIGH_ORBIT = ElementErrors(2.0, 0.7, 1.0, 0.1, 1.0, 0.1)
 
 
 def satellites_of(elements: Array) -> list[Satrec]:
-    """Return SGP4's satellites of (n, 10) mean elements: the arguments of `sgp4init`, in order."""
+    """Return SGP4's satellites of (n, 10) mean elements: the arguments of `sgp4init` in order."""
     made = []
     for row in np.asarray(elements, float).tolist():
         satellite = Satrec()
@@ -86,7 +87,7 @@ def predict(satellites: Satellites, time_ns: Nanoseconds) -> Array:
     Returns
     -------
     (n, m, 6) float
-        Position [km] and velocity [km/s], GCRF; NaN where SGP4 fails, as for one that has decayed.
+        Position [km] and velocity [km/s], GCRF; NaN where SGP4 fails, as after a decay.
 
     References
     ----------
@@ -97,9 +98,9 @@ def predict(satellites: Satellites, time_ns: Nanoseconds) -> Array:
         return np.empty((*shape, 6))
     utc = utc_julian_date(time_ns)
     code, r_km, v_km_s = SatrecArray(list(satellites)).sgp4(*utc)
-    none = np.zeros(len(time_ns))
-    # The rotation from TEME hardly depends on UT1, for which UTC is taken.
-    orientation = Orientation(utc, none, none, none)
+    zeros = np.zeros(len(time_ns))
+    # The rotation from TEME hardly depends on UT1: UTC is used instead.
+    orientation = Orientation(utc, zeros, zeros, zeros)
     axes = [np.tile(axis, (len(time_ns), 1)) for axis in np.eye(3)]
     R = np.stack([gcrf_from_teme(time_ns, x, x, orientation)[0] for x in axes], axis=2)
     states = np.concatenate(
@@ -115,14 +116,14 @@ def is_deep_space(satellite: Any) -> bool:
 
 
 def sigmas(satellite: Any, age_days: float, errors: ElementErrors) -> Array:
-    """Return the 1-sigma errors of a satellite's elements, (6,), in the order of `SENSITIVE_TO`.
+    """Return the 1-sigma errors of a satellite's elements, (6,); see `ERROR_COMPONENTS`.
 
-    Unknown drag grows with the square of the age: it is a share of the change of the mean motion by
-    which SGP4 has brought a low satellite ahead.
+    The error due to drag grows with the square of the age. It is a share of the displacement along
+    the track by which drag moves a low satellite in SGP4.
     """
     a_km = semi_major_axis(satellite)
     minutes = abs(age_days) * DAY_S / 60.0
-    drag_km = DRAG_UNKNOWN * a_km * abs(_sped_up(satellite, minutes)) * minutes / 2
+    drag_km = DRAG_UNKNOWN * a_km * abs(_drag_change(satellite, minutes)) * minutes / 2
     along = np.hypot(np.hypot(errors.along_km, errors.along_km_day * age_days), drag_km)
     radial = np.hypot(errors.radial_km, errors.radial_km_day * age_days)
     across = np.hypot(errors.across_km, errors.across_km_day * age_days)
@@ -131,22 +132,22 @@ def sigmas(satellite: Any, age_days: float, errors: ElementErrors) -> Array:
 
 
 def sensitivities(satellite: Any, time_ns: Nanoseconds, anchor: int) -> Array:
-    """Return the derivatives of a satellite's places by the errors of its elements.
+    """Return the derivatives of a satellite's positions by the errors of its elements.
 
-    They are differences of SGP4's own places, so that they hold for days: two bodies alone would be
-    wrong by a tenth after one orbit.
+    They are differences of positions by SGP4, valid for days. Derivatives of two-body motion would
+    be wrong by a tenth after one orbit.
 
     Parameters
     ----------
     time_ns : (m,) int
         UTC since 1970.
     anchor
-        Row of the time about which the drift turns.
+        Row of the time at which the drift is zero.
 
     Returns
     -------
     (m, 3, 6) float
-        GCRF; km per unit of `SENSITIVE_TO`.
+        GCRF; km per unit of `ERROR_COMPONENTS`.
     """
     a_km = semi_major_axis(satellite)
     ex, ey = satellite.ecco * np.cos(satellite.argpo), satellite.ecco * np.sin(satellite.argpo)
@@ -155,9 +156,9 @@ def sensitivities(satellite: Any, time_ns: Nanoseconds, anchor: int) -> Array:
     epoch_ns = (satellite.jdsatepoch - UNIX_EPOCH_JD + satellite.jdsatepochF) * DAY_S * 1e9
     minutes = (float(time_ns[anchor]) - epoch_ns) / 60e9
     motion = 1.0 / a_km / (DAY_S / 60.0)
-    none = _changed(satellite, ex, ey)
+    nominal = _changed(satellite, ex, ey)
     changed = [
-        none,
+        nominal,
         _changed(satellite, ex, ey, longitude=1.0 / a_km),
         _changed(satellite, ex + 1.0 / a_km, ey),
         _changed(satellite, ex, ey + 1.0 / a_km),
@@ -165,8 +166,8 @@ def sensitivities(satellite: Any, time_ns: Nanoseconds, anchor: int) -> Array:
         _changed(satellite, ex, ey, node=node, longitude=-node * np.cos(satellite.inclo)),
         _changed(satellite, ex, ey, motion=motion, longitude=-motion * minutes),
     ]
-    places = predict(satellites_of(np.array(changed)), time_ns)[:, :, :3]
-    return np.asarray(np.moveaxis(places[1:] - places[0], 0, 2))
+    positions = predict(satellites_of(np.array(changed)), time_ns)[:, :, :3]
+    return np.asarray(np.moveaxis(positions[1:] - positions[0], 0, 2))
 
 
 def _changed(
@@ -197,8 +198,8 @@ def semi_major_axis(satellite: Any) -> float:
     return float(GM_KM3_S2 / (satellite.no_kozai / 60.0) ** 2) ** (1 / 3)
 
 
-def _sped_up(satellite: Any, minutes: float) -> float:
-    """Return the change of the mean motion by drag, as SGP4 has it [rad/min]."""
+def _drag_change(satellite: Any, minutes: float) -> float:
+    """Return the change of the mean motion by drag in SGP4 after some minutes [rad/min]."""
     if is_deep_space(satellite):
         return 0.0
     mean_motions = []
@@ -209,8 +210,10 @@ def _sped_up(satellite: Any, minutes: float) -> float:
 
 
 def along_up_across(state: Array) -> Array:
-    """Return the unit vectors along the velocity, at right angles to it in the orbit plane, and
-    across the plane, as rows; (3, 3)."""
+    """Return unit vectors as rows, (3, 3), of a (6,) state.
+
+    Along the velocity, at right angles to it in the orbit plane (up), and across the plane.
+    """
     ahead = state[3:] / np.linalg.norm(state[3:])
     side = np.cross(state[:3], state[3:])
     side /= np.linalg.norm(side)
@@ -223,7 +226,7 @@ def along_up_across(state: Array) -> Array:
 def track_residuals(
     directions: Array, sensor_km: Array, sensor_km_s: Array, states: Array
 ) -> Array:
-    """Return observed minus predicted places at the object's distance, along and across its track.
+    """Return observed minus predicted positions at the object's distance, along and across track.
 
     Parameters
     ----------
@@ -237,8 +240,7 @@ def track_residuals(
     Returns
     -------
     (n, 2) float
-        [km]: along the apparent motion, and to the left of it as the sensor sees it from inside
-        the sky.
+        [km]: along the apparent motion, and to the left of it as the sensor sees it.
     """
     apart = states[:, :3] - sensor_km
     delay_s = np.linalg.norm(apart, axis=1, keepdims=True) / SPEED_OF_LIGHT_KM_S
@@ -259,7 +261,7 @@ def track_residuals(
 
 
 class Screen:
-    """A catalogue whose satellites near a place and time can be asked for.
+    """A fast search for the satellites of a catalogue near a position at a time.
 
     Parameters
     ----------
@@ -272,19 +274,19 @@ class Screen:
         self._nodes: dict[int, Array] = {}
 
     def near(self, r_km: Array, time_ns: int, reach_km: Array) -> Indices:
-        """Return the satellites that may be within `reach_km` (n,) of a (3,) place, GCRF."""
+        """Return the satellites that may be within `reach_km` (n,) of a (3,) position, GCRF."""
         node = (time_ns + NODE_NS // 2) // NODE_NS
         if node not in self._nodes:
             self._nodes[node] = predict(self._satellites, np.array([node * NODE_NS]))[:, 0]
         states = self._nodes[node]
-        gate = reach_km + ROOM * np.linalg.norm(r_km)
+        gate = reach_km + NEGLECTED_SHARE * np.linalg.norm(r_km)
         found = _in_plane_and_shell(states, r_km, gate)
-        there = two_body(states[found], (time_ns - node * NODE_NS) / 1e9)
-        return found[np.linalg.norm(there - r_km, axis=1) < gate[found]]
+        propagated = two_body(states[found], (time_ns - node * NODE_NS) / 1e9)
+        return found[np.linalg.norm(propagated - r_km, axis=1) < gate[found]]
 
 
 def _in_plane_and_shell(states: Array, r_km: Array, gate: Array) -> Indices:
-    """Return the rows of states whose orbits pass the place within the gate."""
+    """Return the rows of (n, 6) states whose orbits pass a (3,) position within (n,) `gate` km."""
     r, v = states[:, :3], states[:, 3:]
     momentum = np.cross(r, v)
     off_plane = np.abs(momentum @ r_km) / np.linalg.norm(momentum, axis=1)
@@ -294,11 +296,11 @@ def _in_plane_and_shell(states: Array, r_km: Array, gate: Array) -> Indices:
     e = np.sqrt(np.maximum(e2, 0.0))
     at = np.linalg.norm(r_km)
     in_shell = (at > a * (1 - e) - gate) & (at < a * (1 + e) + gate)
-    return np.flatnonzero((off_plane < gate) & in_shell)  # NaN: neither
+    return np.flatnonzero((off_plane < gate) & in_shell)  # false for NaN
 
 
 def two_body(states: Array, dt_s: float) -> Array:
-    """Return (n, 3) places of (n, 6) elliptic states after a time, for two bodies."""
+    """Return (n, 3) positions [km] of (n, 6) elliptic states [km, km/s] after dt_s, two-body."""
     r, v = states[:, :3], states[:, 3:]
     distance = np.linalg.norm(r, axis=1)
     a = 1.0 / (2.0 / distance - np.sum(v * v, axis=1) / GM_KM3_S2)

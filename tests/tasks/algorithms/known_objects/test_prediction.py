@@ -6,9 +6,9 @@ from scenes.satellites import ISS
 from scenes.walker import NIGHT_NS, satellites
 
 from epipole.tasks.algorithms.known_objects.prediction import (
+    ERROR_COMPONENTS,
     HIGH_ORBIT,
     LOW_ORBIT,
-    SENSITIVE_TO,
     Screen,
     along_up_across,
     is_deep_space,
@@ -72,7 +72,7 @@ def test_errors_of_elements_move_a_satellite_as_their_names_say(elements):
         states = predict([satellite], times)[0]
         axes = np.array([along_up_across(state) for state in states])
         H = axes @ sensitivities(satellite, times, len(times) // 2)
-        sizes = {name: np.abs(H[:, :, k]).max(axis=0) for k, name in enumerate(SENSITIVE_TO)}
+        sizes = {name: np.abs(H[:, :, k]).max(axis=0) for k, name in enumerate(ERROR_COMPONENTS)}
         assert sizes["along"] == pytest.approx([1.0, 0.0, 0.0], abs=0.05)
         assert sizes["radial"] == pytest.approx([2.0, 1.0, 0.0], abs=0.1)
         assert sizes["across"][2] == pytest.approx(1.0, abs=0.05)
