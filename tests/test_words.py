@@ -28,7 +28,6 @@ WAITING = (
     "tasks/algorithms/photometry.py",
     "tasks/algorithms/star_catalogue.py",
     "tasks/algorithms/tracking",
-    "tasks/check",
     "tasks/solve",
 )
 # In text, with the uses that are allowed; in names, as words between underscores or capitals.

@@ -29,7 +29,7 @@ from epipole.schemas.tables import POSITIONS, REJECTS, STATES
 from epipole.tasks.check.check_sensors import (
     REASONS,
     SensorVerdict,
-    as_in_the_logs,
+    add_corrections,
     check_sensors,
 )
 from epipole.tasks.check.correct_clock import correct_clock
@@ -144,7 +144,7 @@ def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     log_verdicts(verdicts)
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
     late = [verdict for verdict in faulty if verdict.is_late]
-    work = work._replace(verdicts=tuple(as_in_the_logs(work.verdicts, verdicts)))
+    work = work._replace(verdicts=tuple(add_corrections(work.verdicts, verdicts)))
     correctable = settings.alignment.correct_clocks and work.round < MAX_CORRECTIONS
     if late and correctable:
         return Checked(_correct_clocks(work, late, settings), again=True, left_out={})

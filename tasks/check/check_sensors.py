@@ -33,11 +33,11 @@ from epipole.tasks.solve.sample_sight_lines import meetings
 
 Array = npt.NDArray[np.float64]
 
-MAX_EPOCHS = 300  # more do not help: the offset is one constant
-MAX_LINES = 30_000  # of sight to objects, of all sensors together
-MAX_PAIRS = 100_000  # of a view and an object, of one sensor
+MAX_EPOCHS = 300  # more do not help: the offset is constant
+MAX_LINES = 30_000  # lines of sight to objects, of all sensors together
+MAX_PAIRS = 100_000  # pairs of a view and an object, per sensor
 KEY = ["epoch", "object_id", "sensor_id"]
-KNOWN_S = 1.0  # with a larger sigma a clock counts as unknown
+MAX_KNOWN_SIGMA_S = 1.0  # a clock with a larger sigma is unknown
 
 
 # The reasons for which a sensor is left out, by its fault.
@@ -50,11 +50,11 @@ REASONS = {
 
 
 class SensorVerdict(NamedTuple):
-    """What the check says of a sensor.
+    """The clock offset of a sensor, and its fault.
 
-    `offset_s` is the clock offset, reported minus true time, with its 1-sigma error `sigma_s`.
-    `cause` is the fault that is sure, '' for a sound sensor; `size` and `size_sigma` are those of
-    a wrong ephemeris [km] or attitude [rad].
+    `offset_s` is the offset [s], reported minus true time, `sigma_s` its 1-sigma error. `cause` is
+    the declared fault, '' for a sound sensor. `size` and `size_sigma` are the size of a wrong
+    ephemeris [km] or attitude [rad] and its 1-sigma error.
     """
 
     sensor_id: str
@@ -66,12 +66,12 @@ class SensorVerdict(NamedTuple):
 
     @property
     def is_late(self) -> bool:
-        """Whether the clock is surely wrong, late or early."""
+        """Whether the clock is declared wrong, late or early."""
         return self.cause == CLOCK
 
     @property
     def is_faulty(self) -> bool:
-        """Whether any fault is sure."""
+        """Whether a fault is declared."""
         return self.cause != SOUND
 
     def __str__(self) -> str:
@@ -99,25 +99,29 @@ class SensorVerdict(NamedTuple):
 def check_sensors(
     solved: SolvedParts, viewed: ViewedParts, sensors: Sequence[Sensor], spans: Sequence[Span]
 ) -> list[SensorVerdict]:
-    """Return the verdicts on the sensors that the lines of sight of the night determine.
+    """Return the verdicts on those sensors that the night's lines of sight can judge.
 
     Parameters
     ----------
     solved
-        The parts of `solve` of these spans.
+        The parts of stage `solve`.
     viewed
-        The parts of the views of the sensors.
+        The parts with the views of each sensor.
     """
     epochs = _epochs(solved, spans)
     if not len(epochs):
         return []
-    lines, objects = (_of_objects(solved, spans, name, epochs) for name in ("lines", "objects"))
-    claims = _at(solved, spans, "object_views", epochs).partition_by("sensor_id", as_dict=True)
+    lines, objects = (
+        _with_ids_of_night(solved, spans, name, epochs) for name in ("lines", "objects")
+    )
+    views_of_objects = _rows_at(solved, spans, "object_views", epochs).partition_by(
+        "sensor_id", as_dict=True
+    )
     nothing = pl.DataFrame(OBJECT_VIEWS.empty_table())
     first_guess, of_objects = {}, [lines]
     for number, name in sensors:
-        own = claims.get((name,), nothing)
-        match = _search(_others(viewed[number], spans, own, objects))
+        assigned = views_of_objects.get((name,), nothing)
+        match = _search_clock(_candidate_pairs(viewed[number], spans, assigned, objects))
         if match is not None:
             first_guess[name], matched = match
             of_objects.append(matched.join(lines, on=KEY, how="anti"))
@@ -125,16 +129,18 @@ def check_sensors(
 
 
 def _epochs(solved: SolvedParts, spans: Sequence[Span]) -> pl.Series:
-    """Return some of the epochs with lines of sight, evenly spread."""
+    """Return evenly spread epochs with lines of sight, within `MAX_EPOCHS` and `MAX_LINES`."""
     columns = [CLOCK_LINES.empty_table().select(["epoch"])]
     columns += [rows for span in spans for rows in solved.read(span, "lines", ["epoch"])]
     per_epoch = to_polars(pa.concat_tables(columns)).group_by("epoch").len().sort("epoch")
-    fewer = max(len(per_epoch) / MAX_EPOCHS, per_epoch["len"].sum() / MAX_LINES)
-    return per_epoch["epoch"][:: max(math.ceil(fewer), 1)]
+    stride = max(len(per_epoch) / MAX_EPOCHS, per_epoch["len"].sum() / MAX_LINES)
+    return per_epoch["epoch"][:: max(math.ceil(stride), 1)]
 
 
-def _at(solved: SolvedParts, spans: Sequence[Span], name: str, epochs: pl.Series) -> pl.DataFrame:
-    """Return a table's rows at some epochs, with the span that each is of."""
+def _rows_at(
+    solved: SolvedParts, spans: Sequence[Span], name: str, epochs: pl.Series
+) -> pl.DataFrame:
+    """Return a table's rows at some epochs, with their span."""
     return pl.concat(
         to_polars(rows)
         .filter(pl.col("epoch").is_in(epochs.implode()))
@@ -144,56 +150,55 @@ def _at(solved: SolvedParts, spans: Sequence[Span], name: str, epochs: pl.Series
     )
 
 
-def _of_objects(
+def _with_ids_of_night(
     solved: SolvedParts, spans: Sequence[Span], name: str, epochs: pl.Series
 ) -> pl.DataFrame:
-    """Return a table's rows at some epochs; the ids of objects, which are those of the span, are
-    made ids of the night."""
-    rows = _at(solved, spans, name, epochs)
+    """Return a table's rows at some epochs; ids of objects in the span become ids in the night."""
+    rows = _rows_at(solved, spans, name, epochs)
     return rows.with_columns(object_id=pl.format("{}/{}", "span", "object_id")).drop("span")
 
 
-def _others(
-    viewed: Parts, spans: Sequence[Span], own: pl.DataFrame, objects: pl.DataFrame
+def _candidate_pairs(
+    viewed: Parts, spans: Sequence[Span], assigned: pl.DataFrame, objects: pl.DataFrame
 ) -> pl.DataFrame:
-    """Return the views of a sensor that are of no object, each with every object of its epoch.
+    """Return the pairs of an unassigned view of a sensor and an object of its epoch.
 
-    If a sensor's clock is seconds off, none of its views fits an object. A sensor with most of its
-    views on objects has none that are to be searched.
+    If a sensor's clock is seconds off, none of its views fits an object. A sensor with half of its
+    views on objects, or more, is not searched: there are no pairs.
 
     Parameters
     ----------
-    own
-        OBJECT_VIEWS of the sensor.
+    assigned
+        The sensor's views that are assigned to objects, OBJECT_VIEWS.
     """
     epochs = objects["epoch"].unique().sort()
     tables = [viewed.read(span, "views") for span in spans if viewed.holds(span)]
     wanted = epochs.cast(pl.Int64).to_numpy()
     at = [np.flatnonzero(np.isin(array(rows, "epoch"), wanted)) for rows in tables]
-    if 2 * len(own) >= sum(map(len, at)):
+    if 2 * len(assigned) >= sum(map(len, at)):
         return pl.DataFrame(CLOCK_LINES.empty_table())
     views = concat(VIEWS, [rows.take(k) for rows, k in zip(tables, at, strict=True)])
-    free = to_polars(views).join(own, on=["epoch", "tracklet_id"], how="anti")
+    free = to_polars(views).join(assigned, on=["epoch", "tracklet_id"], how="anti")
     n_objects = objects.group_by("epoch").agg(n=pl.len())
     pairs = free.select("epoch").join(n_objects, on="epoch")["n"].sum()
-    fewer = epochs[:: max(-(-pairs // MAX_PAIRS), 1)]
+    stride = epochs[:: max(-(-pairs // MAX_PAIRS), 1)]
     return to_polars(
-        meetings(free.filter(pl.col("epoch").is_in(fewer.implode())), objects, on=["epoch"])
+        meetings(free.filter(pl.col("epoch").is_in(stride.implode())), objects, on=["epoch"])
     )
 
 
 def verdicts_of(
     rows: pl.DataFrame, first_guess: Mapping[str, float] | None = None
 ) -> list[SensorVerdict]:
-    """Return the verdicts that CLOCK_LINES determine, by sensor.
+    """Return the verdicts on those sensors that CLOCK_LINES can judge, by sensor.
 
-    `first_guess` are clock offsets that were found, by sensor [s].
+    `first_guess` has initial clock offsets by sensor [s].
     """
     guess = first_guess or {}
     rows = rows.sort("epoch", "object_id", "sensor_id")
     if not len(rows):
         return []
-    # A few tracklets may be blends throughout: no error of the attitude.
+    # A quantile: blends in a few tracklets are not an error of the attitude.
     spread = (pl.col("cov_bias_11_rad2") + pl.col("cov_bias_22_rad2")) / 2
     bias = rows.group_by("sensor_id").agg(
         pl.col("position_sigma_km").max(), attitude_sigma_rad=spread.quantile(0.9).sqrt()
@@ -210,11 +215,11 @@ def verdicts_of(
             bias["sensor_id"], *judged, strict=True
         )
     ]
-    return [one for one in verdicts if one.sigma_s < KNOWN_S or one.is_faulty]
+    return [one for one in verdicts if one.sigma_s < MAX_KNOWN_SIGMA_S or one.is_faulty]
 
 
-def _search(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:
-    """Return the offset at which a sensor's views fit objects, and these views."""
+def _search_clock(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:
+    """Return the clock offset at which a sensor's views fit objects, and these views."""
     if not len(free):
         return None
     match = search_offset(
@@ -235,7 +240,7 @@ def _search(free: pl.DataFrame) -> tuple[float, pl.DataFrame] | None:
 
 
 def _lines(rows: pl.DataFrame, sensors: pl.Series) -> Lines:
-    """Return views of objects as lines of sight; sensors are numbered in the given order."""
+    """Return views of objects as `Lines`; sensors are numbered in the given order."""
     return Lines(
         group=rows.select(pl.struct("epoch", "object_id").rle_id()).to_series().to_numpy(),
         sensor=np.asarray(sensors.search_sorted(rows["sensor_id"]), np.int64),
@@ -252,10 +257,10 @@ def _direction_cov(rows: pl.DataFrame, which: str) -> Array:
     return stack_covariance(rows, f"cov_{which}_{{}}_rad2", TANGENT_AXES)
 
 
-def as_in_the_logs(
+def add_corrections(
     before: Sequence[SensorVerdict], now: Sequence[SensorVerdict]
 ) -> list[SensorVerdict]:
-    """Return the verdicts with the clock offsets of the logs: corrections so far and the rest."""
+    """Return the verdicts with clock offsets as in the logs: corrections so far plus the rest."""
     corrected = {verdict.sensor_id: verdict for verdict in before if verdict.is_late}
     total = [
         verdict._replace(

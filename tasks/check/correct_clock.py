@@ -15,7 +15,7 @@ from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_span import states_about
 
-PLACED = [
+STATE_COLUMNS = [
     *("x_km", "y_km", "z_km"),
     *("vx_km_s", "vy_km_s", "vz_km_s"),
     *("position_sigma_km", "used_position_sigma_km"),
@@ -32,12 +32,12 @@ def correct_clock(
     settings: SensorSettings,
     parts: Parts,
 ) -> None:
-    """Set a part's frames to their true times, and their sensor to its positions then.
+    """Set a part's frames to their true times, with the states of the sensor at these times.
 
     Parameters
     ----------
     identified
-        The sensor's parts, with the times of its clock.
+        The sensor's parts, with times by its clock.
     parts
         Where the corrected part goes: `IDENTIFIED`.
     """
@@ -46,24 +46,25 @@ def correct_clock(
     names = ("solutions", "stars", "detections")
     tables = {name: at_true_times(identified.read(span, name), clock) for name in names}
     states = states_about(frames, sensor, span, settings.state_gap_s)
-    places = interpolate_sensor_states(tables["solutions"], states, settings)
-    tables["solutions"] = at_places(tables["solutions"], places)
+    at_frames = interpolate_sensor_states(tables["solutions"], states, settings)
+    tables["solutions"] = with_sensor_states(tables["solutions"], at_frames)
     tables["rejects"] = identified.read(span, "rejects")
     write_part(parts.of(span), IDENTIFIED, tables)
 
 
 def at_true_times(rows: pa.Table, clock: SensorVerdict) -> pa.Table:
-    """Return the rows with true times instead of the clock's."""
+    """Return the rows with true times instead of times by the clock."""
     at = rows.schema.get_field_index("time")
     field = rows.schema.field(at)
     time_ns = array(rows, "time") - np.int64(round(clock.offset_s * 1e9))
     return rows.set_column(at, field, pa.array(time_ns).cast(field.type))
 
 
-def at_places(solutions: pa.Table, places: pa.Table) -> pa.Table:
-    """Return the solutions with the sensor positions and velocities of `places`, by frame."""
+def with_sensor_states(solutions: pa.Table, at_frames: pa.Table) -> pa.Table:
+    """Return the solutions with the sensor states `at_frames`, joined by frame."""
     key = ["sensor_id", "frame_number"]
-    moved = to_polars(solutions).drop(PLACED).join(
-        to_polars(places).select([*key, *PLACED]), on=key, how="left", maintain_order="left"
+    states = to_polars(at_frames).select([*key, *STATE_COLUMNS])
+    moved = to_polars(solutions).drop(STATE_COLUMNS).join(
+        states, on=key, how="left", maintain_order="left"
     )  # fmt: skip
     return from_polars(SOLUTIONS, moved)

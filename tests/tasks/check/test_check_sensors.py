@@ -10,7 +10,7 @@ from epipole.schemas.tables import POSITIONS
 from epipole.schemas.work_tables import CLOCK_LINES, VIEWS
 from epipole.tasks.check.check_sensors import (
     SensorVerdict,
-    as_in_the_logs,
+    add_corrections,
     check_sensors,
     verdicts_of,
 )
@@ -25,7 +25,7 @@ SOUND = SensorVerdict("c", 0.01, 0.01)
 
 def test_an_offset_is_the_correction_and_what_remains_of_it():
     remaining = [SensorVerdict("a", 0.001, 0.008), SOUND]
-    total = as_in_the_logs([LATE, EARLY], remaining)
+    total = add_corrections([LATE, EARLY], remaining)
     assert [clock.sensor_id for clock in total] == ["a", "b", "c"]
     assert total[0] == SensorVerdict("a", 0.251, 0.008, "clock")
     assert total[1:] == [EARLY, SOUND]

@@ -1,4 +1,4 @@
-"""Correct a clock: frames at their true times, their sensor where it was then."""
+"""Correct a clock: frames at their true times, with the states of their sensor then."""
 
 import numpy as np
 import pyarrow as pa
@@ -6,7 +6,7 @@ import pyarrow as pa
 from epipole.schemas.bridge import array, table
 from epipole.schemas.work_tables import SENSOR_STATES_AT_FRAMES, SOLUTIONS
 from epipole.tasks.check.check_sensors import SensorVerdict
-from epipole.tasks.check.correct_clock import at_places, at_true_times
+from epipole.tasks.check.correct_clock import at_true_times, with_sensor_states
 
 LATE, EARLY = SensorVerdict("a", 0.25, 0.01, "clock"), SensorVerdict("b", -0.5, 0.01, "clock")
 
@@ -34,11 +34,11 @@ def test_frames_of_wrong_clocks_are_put_at_their_true_times():
         assert moved.schema.equals(SENSOR_STATES_AT_FRAMES)
 
 
-def test_places_are_taken_by_frame_whatever_their_order():
-    places = frames(SENSOR_STATES_AT_FRAMES, **{f"{a}_km": np.arange(6.0) for a in "xyz"})
+def test_states_are_joined_by_frame_whatever_their_order():
+    at_frames = frames(SENSOR_STATES_AT_FRAMES, **{f"{a}_km": np.arange(6.0) for a in "xyz"})
     solutions = frames(SOLUTIONS, x_km=np.full(6, 7.0))
-    moved = at_places(solutions, places.take([5, 3, 1, 0, 2, 4]))
+    moved = with_sensor_states(solutions, at_frames.take([5, 3, 1, 0, 2, 4]))
     assert moved["x_km"].to_pylist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     assert moved["sensor_id"].equals(solutions["sensor_id"])
-    missing = at_places(solutions, places.slice(1))
+    missing = with_sensor_states(solutions, at_frames.slice(1))
     assert missing["x_km"].to_pylist() == [None, 1.0, 2.0, 3.0, 4.0, 5.0]
