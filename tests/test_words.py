@@ -24,7 +24,6 @@ WAITING = (
     "tasks/algorithms/evaluation.py",
     "tasks/algorithms/geometry",
     "tasks/algorithms/kernels.py",
-    "tasks/algorithms/orbits",
     "tasks/algorithms/photometry.py",
     "tasks/algorithms/star_catalogue.py",
     "tasks/algorithms/tracking",

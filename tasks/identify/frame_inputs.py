@@ -17,7 +17,7 @@ from epipole.schemas.settings import SensorSettings
 from epipole.schemas.work_tables import SENSOR_STATES_AT_FRAMES
 from epipole.tasks.algorithms.geometry.camera import Camera, inside, pixel_angle, unproject
 from epipole.tasks.algorithms.orbits.state_interpolation import (
-    Places,
+    InterpolatedStates,
     SensorStates,
     interpolate_states,
 )
@@ -112,7 +112,9 @@ def interpolate_sensor_states(
     sensor, time_ns = array(exposures, "sensor_id"), array(exposures, "time")
     state_sensor, all_states = array(states, "sensor_id"), _states(states, settings)
     n = len(time_ns)
-    at_frames = Places(*(np.full((n, *width), np.nan) for width in ((3,), (3,), (), (4,), ())))
+    at_frames = InterpolatedStates(
+        *(np.full((n, *width), np.nan) for width in ((3,), (3,), (), (4,), ()))
+    )
     stated = np.zeros(n, bool)
     for name in sorted(set(sensor)):
         frames = np.flatnonzero(sensor == name)
@@ -143,7 +145,7 @@ def interpolate_sensor_states(
     )
 
 
-def _possible(found: Places) -> Places:
+def _possible(found: InterpolatedStates) -> InterpolatedStates:
     """Return the states, without a position where the sensor would be too fast or too far away.
 
     A wrong clock or position shows only between two states: neither states a speed for which a log

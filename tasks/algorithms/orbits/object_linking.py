@@ -1,8 +1,8 @@
-"""Object linking: an object that was not seen for a while is recognised by its motion.
+"""Object linking: an object is recognised after a gap by its motion.
 
-The state of an earlier object is propagated to the instant of a later one. Whether the two are
-the same is a likelihood ratio: the difference of the states under both covariances, against a
-new object. New objects are taken to be as dense as the known ones nearby.
+The state of an earlier object is propagated to the instant of a later one. A likelihood ratio
+decides whether they are one object: the density of the difference of the states under both
+covariances, against the density of new objects. The latter is taken from the objects nearby.
 """
 
 from typing import NamedTuple
@@ -18,20 +18,20 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 NONE = -1
-FAR_SIGMA = 10.0  # pairs whose energies differ by more are skipped
-OBLATE = 2e-3  # share of an orbit's two-body energy that varies with the oblate Earth
-KEPT = 0.9999  # share of true links that pass the chi-square test
-# The least density of objects: that of all tracked objects in low orbit.
-MIN_KM3 = 1e-8
-VELOCITIES_KM3_S3 = 1.0  # volume of velocity space that they fill, about
-# Neglected accelerations: Sun and Moon at geostationary height, and as a share of gravity the
-# higher harmonics.
+MAX_ENERGY_SIGMA = 10.0  # gate of the difference of the energies
+OBLATENESS_SHARE = 2e-3  # share of the two-body energy that varies because of J2
+GATE_SHARE = 0.9999  # share of true links that pass the chi-square test
+# Minimum density of objects [1/km^3]: that of all tracked objects in low orbit.
+MIN_DENSITY_KM3 = 1e-8
+VELOCITIES_KM3_S3 = 1.0  # volume that their velocities fill, about
+# Neglected accelerations: of Sun and Moon at geostationary height; of the higher harmonics, as a
+# share of gravity.
 ACCELERATION_KM_S2 = 1e-8
 SHARE_OF_GRAVITY = 1e-5
 
 
 class ObservedMotions(NamedTuple):
-    """Objects with their motion at the beginning and at the end of their observation.
+    """Objects with their states at the beginning and at the end of their observation.
 
     first_s, last_s : (n,) float
         First and last instant of observation [s].
@@ -60,7 +60,7 @@ def link_by_motion(
     log_odds: float,
     allowed: npt.NDArray[np.bool_] | None = None,
 ) -> tuple[Indices, Array]:
-    """Return which object continues which.
+    """Return which earlier object each object continues.
 
     Parameters
     ----------
@@ -69,8 +69,8 @@ def link_by_motion(
     gap_s
         Longest time between the observations [s].
     log_odds
-        Least log-odds of a link, also against any other of its two objects that contradicts it.
-        So an object is not linked where either of two others could be its continuation.
+        Minimum log odds of a link, also against any contradicting link of its two objects. So an
+        object is not linked if two others could continue it equally well.
     allowed : (n, n) bool
         Whether the first may continue as the second; None: any.
 
@@ -79,18 +79,17 @@ def link_by_motion(
     before : (n,) int
         The object that each object continues, -1 for a new one. No two continue the same.
     odds : (n,) float
-        Log-odds of the link by which an object was recognised; NaN for a new object.
+        Log odds of the link by which an object was recognised; NaN for a new object.
 
     Notes
     -----
-    Errors that the sensors keep over the gap are in both states and count twice: the test is
-    conservative. Forces: two bodies and J2. A constant acceleration of unknown direction stands
-    for the neglected forces.
+    Errors that the sensors keep over the gap are counted in both states: the test is conservative.
+    Forces: two bodies and J2. Process noise stands for the neglected forces.
     """
     n = len(motions.first_s)
     before, odds = np.full(n, NONE), np.full(n, np.nan)
     pairs = _pairs(motions, gap_s, allowed)
-    links = _Links(motions, gap_s, pairs, _gains(motions, pairs))
+    links = _Links(motions, gap_s, pairs, _log_odds_of_pairs(motions, pairs))
     for members, joined in links.joined(log_odds):
         for k in range(1, len(members)):
             before[members[k]], odds[members[k]] = members[k - 1], joined[members[k]]
@@ -98,7 +97,7 @@ def link_by_motion(
 
 
 def chains(before: Indices) -> Indices:
-    """Return the first object of each object's chain, from `before` of `link_by_motion`."""
+    """Return the first object of each object's chain of links; `before` is of `link_by_motion`."""
     head = np.where(before == NONE, np.arange(len(before)), before)
     while (head[head] != head).any():
         head = head[head]
@@ -108,8 +107,8 @@ def chains(before: Indices) -> Indices:
 class _CandidatePairs(NamedTuple):
     """Pairs of an earlier and a later object, and the difference of their motions.
 
-    `apart` (p, 6) is the state of the later object minus the propagated one of the earlier; its
-    velocity is NaN where either is unknown. `cov` is its covariance.
+    `apart` (p, 6) is the state of the later object minus the propagated state of the earlier one;
+    its velocity is NaN where either is unknown. `cov` (p, 6, 6) is its covariance.
     """
 
     earlier: Indices
@@ -123,11 +122,11 @@ def _pairs(
 ) -> _CandidatePairs:
     """Return the pairs that may be one object, by time and energy, with their differences."""
     gap = motions.first_s - motions.last_s[:, None]
-    timely = (gap > 0.0) & (gap <= gap_s)
+    in_time = (gap > 0.0) & (gap <= gap_s)
     if allowed is not None:
-        timely &= allowed
+        in_time &= allowed
     moving, moves = np.isfinite(motions.tail[:, 3]), np.isfinite(motions.head[:, 3])
-    kept = timely & _alike(motions)
+    kept = in_time & _energies_agree(motions)
     parts = []
     for i in np.flatnonzero(moving):  # forward, from each earlier object
         later = np.flatnonzero(kept[i])
@@ -152,15 +151,17 @@ def _pairs(
     return _CandidatePairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
-def _alike(motions: ObservedMotions) -> npt.NDArray[np.bool_]:
+def _energies_agree(motions: ObservedMotions) -> npt.NDArray[np.bool_]:
     """Return which (earlier, later) pairs agree in energy; true where either is unknown.
 
-    A wide gate at no cost: two-body motion keeps the energy, and J2 changes it by a thousandth.
+    A fast, wide gate: two-body motion keeps the energy, and J2 changes it by a thousandth.
     """
     tail, tail_variance = _energy(motions.tail, motions.tail_cov)
     head, head_variance = _energy(motions.head, motions.head_cov)
-    room = FAR_SIGMA * np.sqrt(tail_variance[:, None] + head_variance) + OBLATE * np.abs(head)
-    return ~(np.abs(tail[:, None] - head) > room)
+    gate = MAX_ENERGY_SIGMA * np.sqrt(
+        tail_variance[:, None] + head_variance
+    ) + OBLATENESS_SHARE * np.abs(head)
+    return ~(np.abs(tail[:, None] - head) > gate)
 
 
 def _energy(state: Array, cov: Array) -> tuple[Array, Array]:
@@ -172,21 +173,21 @@ def _energy(state: Array, cov: Array) -> tuple[Array, Array]:
     return energy, np.einsum("ni,nij,nj->n", slope, cov, slope)
 
 
-def _gains(motions: ObservedMotions, pairs: _CandidatePairs) -> Array:
-    """Return the log-odds of each pair; -inf where the difference is too large."""
+def _log_odds_of_pairs(motions: ObservedMotions, pairs: _CandidatePairs) -> Array:
+    """Return the log odds of each pair; -inf where the difference is too large."""
     gain = np.full(len(pairs.later), -np.inf)
     order = np.argsort(pairs.later, kind="stable")
     cuts = np.flatnonzero(np.diff(pairs.later[order])) + 1
     for same_later in np.split(order, cuts) if len(order) else []:
-        present = _present(motions, int(pairs.later[same_later[0]]))
+        present = _differences_to_present(motions, int(pairs.later[same_later[0]]))
         past = pairs.earlier[same_later]
         for k in same_later:
             i, size = pairs.earlier[k], 6 if np.isfinite(pairs.apart[k]).all() else 3
             S, d = pairs.cov[k, :size, :size], pairs.apart[k, :size]
             d2 = float(d @ np.linalg.solve(S, d))
-            if not d2 < 2 * gammaincinv(size / 2, KEPT):  # chi-square
+            if not d2 < 2 * gammaincinv(size / 2, GATE_SHARE):  # chi-square
                 continue
-            # Two objects that were seen at the same time are different ones.
+            # Objects that were observed at the same time are different objects.
             distinct = (motions.first_s[past] <= motions.last_s[i]) & (
                 motions.last_s[past] >= motions.first_s[i]
             )
@@ -199,32 +200,35 @@ def _gains(motions: ObservedMotions, pairs: _CandidatePairs) -> Array:
 def _propagated(state: Array, cov: Array, dt_s: Array) -> tuple[Array, Array]:
     """Return a state propagated by several times, with covariances.
 
-    Half of the variance of the neglected forces is that of a constant acceleration, half that of
-    one that changes all the time: the pull of Sun and Moon turns within hours.
+    The variance of the neglected forces is half that of a constant acceleration and half that of
+    white noise: the accelerations of Sun and Moon turn within hours.
     """
-    there, transition = trajectory(state, dt_s)
+    propagated, transition = trajectory(state, dt_s)
     gravity = GM_KM3_S2 / float(state[:3] @ state[:3])
-    left_out = ACCELERATION_KM_S2 + SHARE_OF_GRAVITY * gravity
-    # Of position, of both, of velocity: the constant one, and white noise of the same position.
+    neglected = ACCELERATION_KM_S2 + SHARE_OF_GRAVITY * gravity
+    # Of position, of both, of velocity: constant acceleration, and white noise with the same
+    # variance of the position.
     shares = np.array([[1 / 4, 1 / 2, 1.0], [1 / 4, 3 / 8, 3 / 4]]).mean(axis=0)
-    of_place, of_both, of_velocity = (
-        left_out**2 * shares[:, None] * dt_s ** np.array([[4], [3], [2]])
+    of_position, of_both, of_velocity = (
+        neglected**2 * shares[:, None] * dt_s ** np.array([[4], [3], [2]])
     )
-    grown = np.zeros((len(dt_s), 6, 6))
+    noise = np.zeros((len(dt_s), 6, 6))
     axes = np.arange(3)
-    grown[:, axes, axes] = of_place[:, None]
-    grown[:, axes, axes + 3] = grown[:, axes + 3, axes] = of_both[:, None]
-    grown[:, axes + 3, axes + 3] = of_velocity[:, None]
-    return there, transition @ cov @ np.swapaxes(transition, -1, -2) + grown
+    noise[:, axes, axes] = of_position[:, None]
+    noise[:, axes, axes + 3] = noise[:, axes + 3, axes] = of_both[:, None]
+    noise[:, axes + 3, axes + 3] = of_velocity[:, None]
+    return propagated, transition @ cov @ np.swapaxes(transition, -1, -2) + noise
 
 
-def _present(motions: ObservedMotions, later: int) -> Array:
-    """Return the later object's state minus those of the objects that were seen with it."""
+def _differences_to_present(motions: ObservedMotions, later: int) -> Array:
+    """Return the later object's state minus the states of objects observed at the same time."""
     at = motions.head_s[later]
-    there = (motions.first_s <= motions.last_s[later]) & (motions.last_s >= motions.first_s[later])
-    there[later] = False
-    out = np.empty((int(there.sum()), 6))
-    for row, k in enumerate(np.flatnonzero(there)):
+    present = (motions.first_s <= motions.last_s[later]) & (
+        motions.last_s >= motions.first_s[later]
+    )
+    present[later] = False
+    out = np.empty((int(present.sum()), 6))
+    for row, k in enumerate(np.flatnonzero(present)):
         near_head = abs(motions.head_s[k] - at) < abs(motions.tail_s[k] - at)
         state, when = (
             (motions.head[k], motions.head_s[k])
@@ -238,14 +242,14 @@ def _present(motions: ObservedMotions, later: int) -> Array:
 
 
 def _log_density(apart: Array, S: Array) -> float:
-    """Return the log-density of objects about a state, by its nearest neighbour.
+    """Return the log density of objects about a state, from its nearest neighbour.
 
-    Per km^3, or per km^3 (km/s)^3 with velocities: one object in the ellipsoid of the shape of
-    S that reaches to the neighbour.
+    One object per volume of the ellipsoid with the shape of S that reaches to the neighbour, per
+    km^3, or per km^3 (km/s)^3 with velocities.
     """
     size = len(S)
     apart = apart[np.isfinite(apart).all(axis=1)]
-    floor = np.log(MIN_KM3) - (np.log(VELOCITIES_KM3_S3) if size == 6 else 0.0)
+    floor = np.log(MIN_DENSITY_KM3) - (np.log(VELOCITIES_KM3_S3) if size == 6 else 0.0)
     if not len(apart):
         return float(floor)
     d2 = np.einsum("ni,ni->n", apart, np.linalg.solve(S, apart.T).T).min()
@@ -256,10 +260,10 @@ def _log_density(apart: Array, S: Array) -> float:
 
 
 class _Links:
-    """Links between objects that may be one, and the objects that they join.
+    """Possible links between objects, and the groups that they join.
 
-    An object may be joined to several: what was seen at three times is three objects, and where
-    only one of them has a velocity, the other two are each compared with it.
+    An object may be linked to several others: if one object was observed at three times and only
+    one observation gives a velocity, each of the other two is compared with that one.
     """
 
     def __init__(
@@ -275,8 +279,10 @@ class _Links:
             self.gain.setdefault(int(j), {})[int(i)] = float(of_pair)
 
     def joined(self, log_odds: float) -> list[tuple[list[int], dict[int, float]]]:
-        """Return the members of each joined object in order of time, and the log-odds of the link
-        that brought each in: the surest links first."""
+        """Return the members of each group in order of time, and the log odds of their links.
+
+        The links with the largest log odds join first.
+        """
         edges = [
             (-gain, i, j)
             for i, others in self.gain.items()
@@ -299,19 +305,18 @@ class _Links:
         groups = {id(members): members for members in group.values()}.values()
         return [(sorted(g, key=lambda k: self.motions.first_s[k]), odds) for g in groups]
 
-    def _has_rival(self, i: int, others: list[int], least: float) -> bool:
-        """Return whether object i is linked better than `least` to what these cannot be."""
+    def _has_rival(self, i: int, others: list[int], minimum: float) -> bool:
+        """Return whether i has a link above `minimum` to an object that contradicts the others."""
         return any(
-            gain > least and not all(self._compatible(k, other) for other in others)
+            gain > minimum and not all(self._compatible(k, other) for other in others)
             for k, gain in self.gain[i].items()
             if k not in others
         )
 
     def _compatible(self, i: int, j: int) -> bool:
-        """Return whether nothing tells that two objects are different ones.
+        """Return whether two objects may be one.
 
-        They are where they were seen at the same time, or where their motions were compared and do
-        not agree.
+        Not if they were observed at the same time, or if their motions were compared and differ.
         """
         seen = self.motions
         gap = max(seen.first_s[i] - seen.last_s[j], seen.first_s[j] - seen.last_s[i])

@@ -1,8 +1,8 @@
 """Motion of objects from span to span: velocities, independent positions, and object numbers.
 
-- `velocities` and `neglected_motion`: velocities from positions, and the part of the motion that a
-  fit of directions neglects.
-- `keep_independent`: positions of an object that share no detection.
+- `velocities`: from positions.
+- `neglected_motion`: the error of fitted directions because the fit neglects motion.
+- `keep_independent`: selects positions of an object that share no detection.
 - `ObjectRegistry`: an object keeps its number from span to span while one of its tracklets lasts.
 """
 
@@ -37,16 +37,16 @@ def velocities(
     Returns
     -------
     v_km_s : (n, 3) float
-        Velocities [km/s]; 0 where the window holds a single position.
+        Velocities [km/s]; 0 where the window has a single position.
     spread_s : (n,) float
-        Rms distance of the window's times from their mean [s]: an error that the window's
-        positions share in part makes an error of the velocity of at most itself over this. 0
-        where the window holds a single position.
+        Rms distance of the window's times from their mean [s]; 0 where the window has a single
+        position. An error that the positions share in part changes the velocity by at most the
+        error over this.
 
     Notes
     -----
-    Gravity's part, taken at the window's mean position, is removed: it would turn the slope where
-    the window is longer on one side.
+    The effect of gravity, at the window's mean position, is removed: it would bias the slope of a
+    window that is longer on one side.
     """
     v_km_s, spread_s = np.zeros_like(r_km), np.zeros(len(r_km))
     for lo, hi in itertools.pairwise(offsets):
@@ -71,7 +71,7 @@ def velocities(
         fall = gravity(r_km[known[0]] + total(x) / n[:, None])
         with np.errstate(invalid="ignore", divide="ignore"):
             slope = (cross - bent[:, None] * fall) / spread[:, None]
-        # Below 1e-6 s^2 all positions are of one epoch, and the slope is rounding.
+        # Below 1e-6 s^2 all positions are of one epoch: the slope is only rounding.
         several = spread > 1e-6
         v_km_s[lo:hi] = np.where(several[:, None], slope, 0.0)
         spread_s[lo:hi] = np.where(several, np.sqrt(np.maximum(spread, 0.0) / n), 0.0)
@@ -79,12 +79,12 @@ def velocities(
 
 
 def neglected_motion(object_state: Array, sensor_state: Array, moments: Array) -> Array:
-    """Return how far fitted directions lie from the true ones, because motion was neglected.
+    """Return the error of fitted directions because the fit neglects a part of the motion.
 
     A direction fitted to detections around an instant is their weighted mean. It differs from
-    the direction at the instant by the moments of their times, times the derivatives of the
-    direction. For a low sensor, a geostationary object and 6 s on both sides these are 0.3 arcsec,
-    towards the same side in each fit: as if the sensor were 50 m nearer to the Earth.
+    the direction at the instant by the moments of the times, times the derivatives of the
+    direction. For a low sensor, a geostationary object and 6 s on both sides the error is 0.3
+    arcsec, with the same sign in each fit: as if the sensor were 50 m nearer to the Earth.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def neglected_motion(object_state: Array, sensor_state: Array, moments: Array) -
     def along(a: Array, b: Array) -> Array:
         return np.einsum("ij,ij->i", a, b)[:, None]
 
-    # Derivatives of u = d / rho, from those of d = rho u; all over rho.
+    # Derivatives of u = d / rho from those of d = rho u, all divided by rho.
     rate_rho = along(away, rate)
     u1 = rate - rate_rho * away
     bend_rho = along(away, bend) + along(u1, u1)
@@ -119,7 +119,7 @@ def neglected_motion(object_state: Array, sensor_state: Array, moments: Array) -
 
 
 def _derivatives(state: Array) -> tuple[Array, Array, Array, Array]:
-    """Return position, velocity, acceleration by gravity, and its rate."""
+    """Return position, velocity, acceleration by gravity and its derivative, each (n, 3)."""
     r, v = state[:, :3], state[:, 3:]
     return r, v, gravity(r), (gravity(r + v / 2) - gravity(r - v / 2))  # over one second
 
@@ -131,18 +131,18 @@ def keep_independent(offsets, used, track, first_ns, last_ns, until, apart):
     Parameters
     ----------
     offsets : (g + 1,) int
-        Group k, one object at one epoch, has the views ``offsets[k]:offsets[k + 1]``; in order of
-        time.
+        Group k, one object at one epoch, has the views ``offsets[k]:offsets[k + 1]``. The groups
+        are in order of time.
     used : (n,) bool
-        The view counts.
+        Whether the view is used.
     track : (n,) int
-        Its tracklet, from 0 on.
+        Tracklet of the view, from 0.
     first_ns, last_ns : (n,) int
-        The first and the last detection that its direction was fitted to.
-    until : (tracklets,) int, out
-        Starts below all times: then the last detection of each tracklet that a kept group uses.
+        Times of the first and last detection that the view's direction was fitted to.
+    until : (tracklets,) int, in and out
+        In: before all times. Out: the last detection of each tracklet in a kept group.
     apart : (g,) bool, in and out
-        The groups that may be kept; then those that are.
+        In: the groups that may be kept. Out: the groups that are kept.
     """
     for g in range(len(apart)):
         for v in range(offsets[g], offsets[g + 1]):
@@ -157,15 +157,15 @@ def keep_independent(offsets, used, track, first_ns, last_ns, until, apart):
 class ObjectRegistry:
     """Numbers for groups of tracklets, span after span.
 
-    A group gets the object that most of its tracklets belonged to last. Of two groups that
-    claim one object, the one with more of its tracklets gets it. Ties are decided by the lower
-    number, so the result depends on the order of the spans only.
+    A group gets the number that most of its tracklets had last. If two groups would get one number,
+    the group with more of its tracklets gets it. Ties go to the lower number, so the result depends
+    on the order of the spans only.
 
     Parameters
     ----------
     weight : (t,) float
-        What each tracklet counts, one if missing. A long tracklet is rarely of two objects, a
-        short one often.
+        Weight of each tracklet; 1 without. A long tracklet rarely mixes two objects, a short one
+        often.
     """
 
     def __init__(self, weight: npt.NDArray[np.float64] | None = None) -> None:
@@ -175,15 +175,15 @@ class ObjectRegistry:
 
     def name_groups(self, groups: Sequence[Indices]) -> list[int]:
         """Return the object number of each group of tracklets of one span."""
-        claims = []
+        votes = []
         for g, members in enumerate(groups):
-            held: dict[int, float] = defaultdict(float)
+            votes_of: dict[int, float] = defaultdict(float)
             for t in members.tolist():
                 if t in self._object_of:
-                    held[self._object_of[t]] += 1.0 if self._weight is None else self._weight[t]
-            claims += [(-weight, number, g) for number, weight in held.items()]
+                    votes_of[self._object_of[t]] += 1.0 if self._weight is None else self._weight[t]
+            votes += [(-weight, number, g) for number, weight in votes_of.items()]
         named: dict[int, int] = {}
-        for _, number, g in sorted(claims):
+        for _, number, g in sorted(votes):
             if g not in named and number not in named.values():
                 named[g] = number
         for g, members in enumerate(groups):

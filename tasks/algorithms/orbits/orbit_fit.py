@@ -1,8 +1,8 @@
 """Orbit fit: position and velocity of an object over an arc, from all its lines of sight.
 
 The unknowns are the state at one instant and, for each sensor, the errors that all its views
-share: one of its directions and one of its position, both with a prior covariance. So a shared
-error does not average out over the arc; only independent errors do.
+share: of the directions and of the position, both with a prior covariance. So a shared error does
+not average out over the arc; only independent errors do.
 """
 
 from typing import NamedTuple
@@ -19,11 +19,11 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 LIGHT = SPEED_OF_LIGHT_KM_S
-STEP_S = 10.0  # Runge-Kutta then errs by less than 1 m over 10 minutes of a low orbit
+STEP_S = 10.0  # error of Runge-Kutta: below 1 m over 10 minutes of a low orbit
 ITERATIONS = 20
-CONVERGED = 1e-6  # sigmas squared
-MIN_BIAS_RAD = 5e-9  # 1 mas: keeps the prior invertible where nothing is shared
-MIN_PLACE_KM = 1e-6
+CONVERGED = 1e-6  # decrease of chi-square
+MIN_BIAS_RAD = 5e-9  # 1 mas: keeps the prior invertible if nothing is shared
+MIN_POSITION_KM = 1e-6
 
 
 class Arcs(NamedTuple):
@@ -32,7 +32,7 @@ class Arcs(NamedTuple):
     time_s : (n,) float
         Time of the exposure since the instant of the arc's state [s], increasing.
     sensor : (n,) int
-        Sensor of the view; any numbers from 0.
+        Sensor of the view; any numbers, from 0.
     r_km, u : (n, 3) float
         Reported position of the sensor, GCRF [km]; direction to the object without aberration.
     cov_noise, cov_bias : (n, 2, 2) float
@@ -53,7 +53,7 @@ class Arcs(NamedTuple):
 
 
 class ArcViews(NamedTuple):
-    """Views of a single arc, for the compiled loops.
+    """Views of a single arc, for kernels.
 
     time_s, sensor, r_km, u
         As in `Arcs`, the sensors numbered from 0.
@@ -71,7 +71,10 @@ class ArcViews(NamedTuple):
 
 @kernel
 def _rates(y, out):
-    """Write the time derivatives of a state (6) and its transition matrix (36, row by row)."""
+    """Write the time derivatives of a state and its transition matrix to `out`.
+
+    `y` and `out` (42,) have the state (6) [km, km/s], GCRF, and the matrix (36), row by row.
+    """
     x, v, z = y[:3], y[3:6], y[2]
     r2 = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
     pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
@@ -92,7 +95,7 @@ def _rates(y, out):
 
 @kernel
 def _advance(y, dt_s):
-    """Propagate a state and its transition matrix by dt_s, in place (Runge-Kutta)."""
+    """Propagate a state and its transition matrix, `y` (42,), by dt_s in place (Runge-Kutta)."""
     n = int(np.ceil(abs(dt_s) / STEP_S))
     if n == 0:
         return
@@ -134,7 +137,7 @@ def trajectory(state: Array, dt_s: Array) -> tuple[Array, Array]:
     begin = np.concatenate([np.asarray(state, float), np.eye(6).ravel()])
     y, now = begin.copy(), 0.0
     for k, t in enumerate(np.asarray(dt_s, float).tolist()):
-        if (t - now) * t < 0.0 or now * t < 0.0:  # nearer than the last time, or on the other side
+        if (t - now) * t < 0.0 or now * t < 0.0:  # back towards the start, or across it
             y, now = begin.copy(), 0.0
         _advance(y, t - now)
         out[k], now = y, t
@@ -143,15 +146,16 @@ def trajectory(state: Array, dt_s: Array) -> tuple[Array, Array]:
 
 @kernel
 def _accumulate(y, view, shared, sums, s):
-    """Add one view of sensor s to the normal equations; return its chi-square, NaN behind it.
+    """Add one view of sensor s to the normal equations; return its chi-square.
 
-    `view` is (r, u, basis, weight). `shared` holds the sensor's errors of direction and position
-    so far.
+    `y` (42,) is the object's state with transition matrix, GCRF. `view` is (r, u, basis, weight) as
+    in `ArcViews`. `shared` (6,) are the sensor's errors of direction [rad] and position [km] at
+    present. `sums` is `ArcEquations`. NaN if the object is behind the sensor.
     """
     r, u, basis, W = view
     delay = 0.0
     d = np.empty(3)
-    for _ in range(2):  # light left earlier; two rounds are right to a millimetre
+    for _ in range(2):  # light time; two iterations are right to a millimetre
         rho2 = 0.0
         for a in range(3):
             r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
@@ -172,7 +176,7 @@ def _accumulate(y, view, shared, sums, s):
             for k in range(6):
                 moved = y[6 + 6 * a + k] - delay * y[6 + 6 * (3 + a) + k]
                 J[i, k] += basis[i, a] / rho * moved
-    state, coupling, own, of_state, of_sensors = sums
+    state, coupling, blocks, of_state, of_sensors = sums
     chi2 = 0.0
     for i in range(2):
         for j in range(2):
@@ -183,13 +187,17 @@ def _accumulate(y, view, shared, sums, s):
                 for m in range(6):
                     state[k, m] += J[i, k] * W[i, j] * J[j, m]
                     coupling[s, k, m] += J[i, 6 + k] * W[i, j] * J[j, m]
-                    own[s, k, m] += J[i, 6 + k] * W[i, j] * J[j, 6 + m]
+                    blocks[s, k, m] += J[i, 6 + k] * W[i, j] * J[j, 6 + m]
     return chi2
 
 
 @kernel
 def _add_views(state, errors, views, sums):
-    """Add all views to the normal equations at a state; return their chi-square."""
+    """Add all views to the normal equations; return their chi-square, NaN if one fails.
+
+    `state` (6,) [km, km/s], GCRF; `errors` (s, 6) shared errors of each sensor [rad, km]; `views`
+    is `ArcViews`, `sums` is `ArcEquations`.
+    """
     time_s, sensor, r, u, basis, weight = views
     chi2 = 0.0
     middle = np.searchsorted(time_s, 0.0)
@@ -209,11 +217,10 @@ def _add_views(state, errors, views, sums):
 
 
 def _fit(state: Array, prior: Array, views: ArcViews) -> tuple[Array, Array, float, ArcEquations]:
-    """Return state, covariance and chi-square of one arc, NaN where the fit fails; and its
-    equations, without the prior.
+    """Return state, covariance, chi-square and equations of one arc; NaN if the fit fails.
 
-    The errors of each sensor are eliminated before the state is solved: the cost grows with the
-    number of sensors, not with its cube.
+    The equations are without the prior. The errors of each sensor are eliminated before the state
+    is solved: the cost grows with the number of sensors, not with its cube.
     """
     errors = np.zeros((len(prior), 6))
     failed = np.full(6, np.nan), np.full((6, 6), np.nan), np.nan, no_equations(len(prior))
@@ -221,11 +228,11 @@ def _fit(state: Array, prior: Array, views: ArcViews) -> tuple[Array, Array, flo
         pull = (prior @ errors[:, :, None])[:, :, 0]
         sums = no_equations(len(prior))
         chi2 = float(np.sum(errors * pull)) + _add_views(state, errors, views, sums)
-        own = sums.own + prior
+        blocks = sums.blocks + prior
         if not (np.isfinite(chi2) and (np.diag(sums.state) > 0.0).all()):
             return failed
         try:
-            absorbed = _solve(own, np.concatenate(
+            absorbed = _solve(blocks, np.concatenate(
                 [sums.coupling, (sums.of_sensors - pull)[:, :, None]], axis=2))  # fmt: skip
             back = np.einsum("ski,skj->ij", sums.coupling, absorbed)
             cov = _inverse(sums.state - back[:, :6])
@@ -244,14 +251,14 @@ def _fit(state: Array, prior: Array, views: ArcViews) -> tuple[Array, Array, flo
 
 
 def _solve(matrices: Array, right: Array) -> Array:
-    """Solve (s, 6, 6) symmetric systems; km and radians are scaled to one size."""
+    """Solve (s, 6, 6) symmetric systems, scaled: the unknowns are km and radians."""
     scale = 1.0 / np.sqrt(np.diagonal(matrices, axis1=1, axis2=2))
     scaled = matrices * scale[:, :, None] * scale[:, None, :]
     return np.asarray(scale[:, :, None] * np.linalg.solve(scaled, scale[:, :, None] * right))
 
 
 def _inverse(matrix: Array) -> Array:
-    """Return the inverse of a (6, 6) matrix; km and km/s are scaled to one size."""
+    """Return the inverse of a (6, 6) matrix, scaled: the unknowns are km and km/s."""
     diagonal = np.diag(matrix)
     if not (diagonal > 0.0).all():
         raise np.linalg.LinAlgError
@@ -260,11 +267,13 @@ def _inverse(matrix: Array) -> Array:
 
 
 def _about_no_errors(sums: ArcEquations, prior: Array, errors: Array) -> ArcEquations:
-    """Return the equations at the best state and errors as if about no errors.
+    """Return the equations at the solution, with right sides for errors counted from zero.
 
-    At the best, the lines of sight pull as much as the prior.
+    At the solution the gradient of the lines of sight balances that of the prior.
     """
-    of_sensors = np.einsum("sij,sj->si", prior, errors) + np.einsum("sij,sj->si", sums.own, errors)
+    of_sensors = np.einsum("sij,sj->si", prior, errors) + np.einsum(
+        "sij,sj->si", sums.blocks, errors
+    )
     of_state = np.einsum("ski,sk->i", sums.coupling, errors)
     return sums._replace(of_state=of_state, of_sensors=of_sensors)
 
@@ -278,9 +287,9 @@ class FittedOrbits(NamedTuple):
     cov : (g, 6, 6) float
         Covariance.
     chi2 : (g,) float
-        Weighted sum of squares, with those of the shared errors; 2 n - 6 degrees of freedom.
+        Weighted sum of squares, with the shared errors'; 2 n - 6 degrees of freedom.
     equations : g of (array of sensors, ArcEquations)
-        What each arc tells of its sensors' errors, without their prior.
+        Equations of each arc's state and its sensors' errors, without the prior.
     """
 
     state: Array
@@ -290,14 +299,14 @@ class FittedOrbits(NamedTuple):
 
 
 def fit_orbits(arcs: Arcs, start: Array) -> FittedOrbits:
-    """Return the states that fit arcs best, with covariance.
+    """Return the least-squares states of arcs, with covariances.
 
     Parameters
     ----------
     arcs
         The views. No two of a sensor may share a detection: their noise must be independent.
     start : (g, 6) float
-        First states [km, km/s], with errors small against the distances to the sensors.
+        Initial states [km, km/s], GCRF; errors small against the distances to the sensors.
 
     Notes
     -----
@@ -331,9 +340,9 @@ def fit_orbits(arcs: Arcs, start: Array) -> FittedOrbits:
 
 
 def prior_of(arcs: Arcs, rows: slice, sensor: Indices, n_sensors: int) -> Array:
-    """Return (s, 6, 6) inverse covariances of each sensor's shared errors: direction, then place.
+    """Return (s, 6, 6) inverse covariances of each sensor's errors: direction, then position.
 
-    `sensor` has the sensor of each of the rows; a sensor without rows has zeros.
+    [rad^-2, km^-2]. `sensor` has the sensor of each of the rows; zeros for a sensor without rows.
     """
     out = np.zeros((n_sensors, 6, 6))
     basis = tangent_basis(arcs.u[rows])
@@ -345,6 +354,6 @@ def prior_of(arcs: Arcs, rows: slice, sensor: Indices, n_sensors: int) -> Array:
         of_sensor = sensor == s
         direction = full[of_sensor].mean(axis=0) + MIN_BIAS_RAD**2 * np.eye(3)
         out[s, :3, :3] = np.linalg.inv(direction)
-        place = max(float(arcs.sigma_km[rows][of_sensor].mean()), MIN_PLACE_KM)
-        out[s, 3:, 3:] = np.eye(3) / place**2
+        position_km = max(float(arcs.sigma_km[rows][of_sensor].mean()), MIN_POSITION_KM)
+        out[s, 3:, 3:] = np.eye(3) / position_km**2
     return out

@@ -17,7 +17,7 @@ Nanoseconds = npt.NDArray[np.int64]
 NUMBERS = (1, 2, 4, 5, 6, 7, 8)  # of plan94: Mercury, Venus, Mars ... Neptune
 
 # Largest heliocentric errors of plan94 from 1800 to 2050 (ERFA, plan94), longitude and latitude
-# together [arcsec]; radii of the discs [km], because the light of a crescent is off the centre.
+# together [arcsec]; radii of the discs [km]: the centroid of a crescent is off the centre.
 _ERROR_ARCSEC = np.array([4.1, 5.1, 17.0, 71.2, 82.0, 86.3, 11.2])
 _RADIUS_KM = np.array([2440.0, 6052.0, 3390.0, 69911.0, 58232.0, 25362.0, 24622.0])
 
@@ -65,9 +65,9 @@ def planet_directions(
 class _Paths(NamedTuple):
     """Splines over time [s].
 
-    seen : (7, 4), for each planet the vector from the Earth to where its light left that now is at
-        the Earth, and the bound of its error [km]. A sensor's own light time differs: 0.05 arcsec.
-    earth_km : (3,), barycentric
+    seen : (7, 4), vectors from the Earth to the planets, corrected for light time, and bounds of
+        their errors [km]. The light time to a sensor differs: 0.05 arcsec.
+    earth_km : (3,), barycentric position of the Earth
     """
 
     seen: CubicSpline
@@ -75,24 +75,26 @@ class _Paths(NamedTuple):
 
 
 def _paths(first_ns: int, last_ns: int) -> _Paths:
-    """Return the paths from first to last time."""
+    """Return the splines from first to last time, UTC since 1970 [ns]."""
     # Light from Neptune takes more than four hours.
     nodes = np.arange(first_ns - 33 * _NODE_NS, last_ns + 3 * _NODE_NS, _NODE_NS)
     at = (nodes - first_ns) / 1e9
     jd = tt_julian_date(nodes)
     from_sun, barycentric = erfa.epv00(*jd)
     earth_km = CubicSpline(at, barycentric["p"] * AU_KM)
-    here = from_sun["p"] * AU_KM
-    asked = at >= -3 * _NODE_NS / 1e9
-    seen = np.empty((np.count_nonzero(asked), len(NUMBERS), 4))
+    earth_from_sun_km = from_sun["p"] * AU_KM
+    needed = at >= -3 * _NODE_NS / 1e9
+    seen = np.empty((np.count_nonzero(needed), len(NUMBERS), 4))
     for k, number in enumerate(NUMBERS):
         planet = CubicSpline(at, erfa.plan94(*jd, number)["p"] * AU_KM)
         delay_s = np.zeros(len(seen))
         for _ in range(3):
             # The motion of the Sun is neglected: 0.01 arcsec in the hours of light from Neptune.
-            place = planet(at[asked] - delay_s)
-            line = place - here[asked]
+            from_sun_km = planet(at[needed] - delay_s)
+            line = from_sun_km - earth_from_sun_km[needed]
             delay_s = np.linalg.norm(line, axis=1) / SPEED_OF_LIGHT_KM_S
         seen[:, k, :3] = line
-        seen[:, k, 3] = _ERROR_ARCSEC[k] * ARCSEC * np.linalg.norm(place, axis=1) + _RADIUS_KM[k]
-    return _Paths(CubicSpline(at[asked], seen), earth_km)
+        seen[:, k, 3] = (
+            _ERROR_ARCSEC[k] * ARCSEC * np.linalg.norm(from_sun_km, axis=1) + _RADIUS_KM[k]
+        )
+    return _Paths(CubicSpline(at[needed], seen), earth_km)

@@ -1,9 +1,9 @@
 """Shared errors: are the errors that all views of a sensor share larger than stated?
 
-An ephemeris or a prior attitude is told with a standard deviation, and sometimes it is worse. What
-a single object shows of that is little, all objects of a sensor together show it well. The stated
-deviation is taken as the scale of a Student distribution: most errors are of this size, and some
-are much larger. Then the likeliest scale follows from the lines of sight.
+The error of an ephemeris or a prior attitude is sometimes larger than its stated standard
+deviation. A single object has little information on that, all objects of a sensor together have
+much. The stated deviation is taken as the scale of a Student distribution: most errors are of this
+size, some are much larger. The factor of each sensor's variance follows from its lines of sight.
 """
 
 from collections.abc import Sequence
@@ -19,34 +19,34 @@ FREEDOM = 4.0  # degrees of freedom of the Student distribution: 1 error in 90 b
 AXES = 3
 ITERATIONS = 200
 CONVERGED = 1e-3  # relative change of the factors
-MAX_TOGETHER = 32  # sensors that are scaled at a time
-SWEEPS = 2  # over all groups of sensors, the second with the factors of the first
+MAX_TOGETHER = 32  # maximum number of sensors that are scaled at a time
+SWEEPS = 2  # over all groups of sensors; the second has the factors of the first
 
 
 class ArcEquations(NamedTuple):
     """Normal equations of one arc: its object's state, and the shared errors of its s sensors.
 
-    Each sensor has six unknowns: an error of its directions [rad] and one of its place [km],
-    three axes each. Without a prior, about no errors.
+    Each sensor has six unknowns: the error of its directions [rad] and of its position [km], three
+    axes each. The equations are without the prior; the errors are counted from zero.
 
     state : (6, 6) float
     coupling : (s, 6, 6) float
         Rows are the unknowns of the sensor, columns those of the state.
-    own : (s, 6, 6) float
-        Two sensors are coupled by the state only.
+    blocks : (s, 6, 6) float
+        Diagonal blocks of the sensors: two sensors are coupled by the state only.
     of_state, of_sensors : (6,), (s, 6) float
         Right sides.
     """
 
     state: Array
     coupling: Array
-    own: Array
+    blocks: Array
     of_state: Array
     of_sensors: Array
 
 
 def no_equations(n_sensors: int) -> ArcEquations:
-    """Return the equations of no views."""
+    """Return the equations of an arc without views: zeros."""
     return ArcEquations(
         np.zeros((6, 6)),
         np.zeros((n_sensors, 6, 6)),
@@ -59,32 +59,32 @@ def no_equations(n_sensors: int) -> ArcEquations:
 def scale_shared_errors(
     arcs: Sequence[tuple[Indices, ArcEquations]], prior: Array, free: npt.NDArray[np.bool_]
 ) -> Array:
-    """Return by which factors the variances of sensors' shared errors are larger than stated.
+    """Return the factors of the stated variances of sensors' shared errors.
 
     Parameters
     ----------
     arcs
         The sensors of each arc of all objects, and its equations.
     prior : (s, 6, 6) float
-        Inverse of the stated covariance of each sensor's errors, direction and place not
+        Inverse of the stated covariance of each sensor's errors; direction and position not
         correlated.
     free : (s, 2) bool
-        Whether the direction and the place may have a larger error than stated.
+        Whether the variances of direction and position may be larger than stated.
 
     Returns
     -------
     (s, 2) float
-        Factors of the variances of direction and place, 1 or larger.
+        Factors of the variances of direction and position, 1 or larger.
 
     Notes
     -----
     An error e of k axes with covariance C, from a Student distribution with f degrees of freedom,
     has the variance factor (f + e' C^-1 e) / (f + k). If the stated covariance is right, its mean
-    is 1. Expectation maximisation: e' C^-1 e is the expected one, so a sensor whose errors do not
-    show keeps a factor of 1.
+    is 1. In expectation maximisation e' C^-1 e is its expected value. So a sensor whose errors are
+    not observable keeps the factor 1.
 
     At most `MAX_TOGETHER` sensors are scaled at a time. The errors of the others count as
-    independent from arc to arc: with so many sensors each has little weight.
+    independent from arc to arc: with that many sensors each has little weight.
 
     References
     ----------
@@ -104,16 +104,18 @@ def scale_shared_errors(
 def _absorbed(
     sensors: Indices, arc: ArcEquations, prior: Array, factor: Array
 ) -> tuple[Array, Array]:
-    """Return by how much each sensor's unknown errors lessen what is known of the state:
-    (s, 6, 6), and the right sides (s, 6)."""
+    """Return what eliminating each sensor's errors subtracts from the equations of the state.
+
+    (s, 6, 6), and right sides (s, 6).
+    """
     weight = 1.0 / np.repeat(np.sqrt(factor[sensors]), AXES, axis=1)
-    own = arc.own + prior[sensors] * weight[:, :, None] * weight[:, None, :]
-    unit = 1.0 / np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    blocks = arc.blocks + prior[sensors] * weight[:, :, None] * weight[:, None, :]
+    unit = 1.0 / np.sqrt(np.diagonal(blocks, axis1=1, axis2=2))
     both = np.concatenate([arc.coupling, arc.of_sensors[:, :, None]], axis=2)
-    scaled = own * unit[:, :, None] * unit[:, None, :]
+    scaled = blocks * unit[:, :, None] * unit[:, None, :]
     solved = unit[:, :, None] * np.linalg.solve(scaled, unit[:, :, None] * both)
-    lessened = np.swapaxes(arc.coupling, 1, 2) @ solved
-    return lessened[:, :, :6], lessened[:, :, 6]
+    absorbed = np.swapaxes(arc.coupling, 1, 2) @ solved
+    return absorbed[:, :, :6], absorbed[:, :, 6]
 
 
 def _of_group(
@@ -126,11 +128,11 @@ def _of_group(
 
     The states, and with them the errors of all other sensors, are eliminated.
     """
-    place = np.full(n_sensors, -1)
-    place[group] = np.arange(len(group))
+    index = np.full(n_sensors, -1)
+    index[group] = np.arange(len(group))
     normal, right = np.zeros((6 * len(group),) * 2), np.zeros(6 * len(group))
     for (sensors, arc), (less, less_right) in zip(arcs, absorbed, strict=True):
-        inside = place[sensors] >= 0
+        inside = index[sensors] >= 0
         if not inside.any():
             continue
         state = arc.state - less[~inside].sum(axis=0)
@@ -140,16 +142,16 @@ def _of_group(
         inverse *= scale[:, None] * scale
         to_state = arc.coupling[inside].reshape(-1, 6)
         reduced = -to_state @ inverse @ to_state.T
-        for k, own in enumerate(arc.own[inside]):
-            reduced[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += own
-        at = (6 * place[sensors[inside]][:, None] + np.arange(6)).ravel()
+        for k, block in enumerate(arc.blocks[inside]):
+            reduced[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += block
+        at = (6 * index[sensors[inside]][:, None] + np.arange(6)).ravel()
         normal[np.ix_(at, at)] += reduced
         right[at] += arc.of_sensors[inside].ravel() - to_state @ (inverse @ of_state)
     return normal, right
 
 
 def _scaled(normal: Array, right: Array, prior: Array, free: npt.NDArray[np.bool_]) -> Array:
-    """Return the factors of sensors whose equations are given."""
+    """Return the variance factors (s, 2) of sensors from the equations of their errors."""
     n_sensors = len(prior)
     factor = np.ones((n_sensors, 2))
     unit = _units(prior)
@@ -162,7 +164,7 @@ def _scaled(normal: Array, right: Array, prior: Array, free: npt.NDArray[np.bool
         stated[of_sensor, of_sensor] = prior[s] * unit[of_sensor, None] * unit[of_sensor]
     for _ in range(ITERATIONS):
         weight = 1.0 / factor.ravel()[block]
-        # Within a block the weight is one, and blocks are not correlated.
+        # All axes of a block have one weight, and blocks are not correlated.
         cov = np.linalg.inv(normal + stated * np.sqrt(weight[:, None] * weight))
         error = cov @ right
         square = np.sum(stated * (np.outer(error, error) + cov), axis=1)
@@ -177,5 +179,5 @@ def _scaled(normal: Array, right: Array, prior: Array, free: npt.NDArray[np.bool
 
 
 def _units(prior: Array) -> Array:
-    """Return the stated standard deviation of each unknown, to have all in one size."""
+    """Return the stated standard deviation of each unknown, (6 s,) [rad, km]."""
     return np.asarray(1.0 / np.sqrt(np.diagonal(prior, axis1=1, axis2=2)).ravel())

@@ -1,12 +1,12 @@
 """State interpolation: a sensor's states at the times of its frames.
 
 Between two states the position is the quintic polynomial with their positions, velocities and
-accelerations. An acceleration is gravity at the state's position, which an error of ten metres
+accelerations. The acceleration is gravity at the state's position, which an error of ten metres
 does not change. So the error of the path is centimetres over minutes. Independent errors of the
 states are averaged and never amplified, because nearby positions are not differenced. Missing
-velocities come from a fit to 20 s of positions, after gravity's part of the motion is removed.
+velocities come from a fit to 20 s of positions, after the effect of gravity is removed.
 
-Below 80 km altitude a vehicle is not on an orbit and its acceleration is taken as zero. With one
+Below 80 km altitude a vehicle is not in orbit, and its acceleration is taken as zero. With one
 state per second a point at rest on Earth is still right to a metre.
 """
 
@@ -24,15 +24,15 @@ Mask = npt.NDArray[np.bool_]
 
 LOWEST_ORBIT_KM = EARTH_RADIUS_KM + 80.0
 
-# Widest gap between two states that is interpolated. The quintic of a low orbit then errs by 5 cm
-# with reported velocities. Fitted velocities err by some m/s.
+# Largest gap between two states that is interpolated. With reported velocities the quintic of a low
+# orbit is then right to 5 cm. Fitted velocities have errors of some m/s.
 MAX_BRIDGE_S = 240.0
 MAX_BRIDGE_FITTED_S = 120.0
-# A missing velocity is fitted to the positions within this of the state, and at least to the
-# nearest one on each side. At most so many points are used: more do not help.
+# A missing velocity is fitted to the positions within this time of the state, and at least to the
+# nearest one on each side. `FIT_POINTS` is the maximum number of positions: more do not help.
 FIT_HALF_WIDTH_S = 10.0
 FIT_POINTS = 21
-# An extrapolation with a reported velocity doubles the variance after this time.
+# The variance of an extrapolation with a reported velocity has doubled after this time.
 VELOCITY_MEMORY_S = 30.0
 # Prior attitudes are interpolated between states that are at most this far apart.
 MAX_ATTITUDE_GAP_S = 10.0
@@ -49,8 +49,8 @@ class SensorStates(NamedTuple):
     attitude_sigma: Array  # (n,) 1-sigma per axis, any unit
 
 
-class Places(NamedTuple):
-    """Position, velocity and attitude of a sensor at m times; NaN where no state is near enough."""
+class InterpolatedStates(NamedTuple):
+    """Position, velocity and attitude of a sensor at m times; NaN far from all states."""
 
     r_gcrf_km: Array  # (m, 3)
     v_gcrf_km_s: Array  # (m, 3)
@@ -59,21 +59,23 @@ class Places(NamedTuple):
     attitude_sigma: Array  # (m,)
 
 
-def interpolate_states(states: SensorStates, at_ns: Nanoseconds, state_gap_s: float) -> Places:
+def interpolate_states(
+    states: SensorStates, at_ns: Nanoseconds, state_gap_s: float
+) -> InterpolatedStates:
     """Return position, velocity and attitude of a sensor at given times.
 
     Parameters
     ----------
     states
-        Any number, including none.
+        Any number, also 0.
     at_ns : (m,) int
         UTC since 1970, in any order.
     state_gap_s
-        Farther than this from every state, the result is NaN.
+        Largest time to the nearest state [s]; NaN beyond.
 
     Returns
     -------
-    Places
+    InterpolatedStates
         Beyond the first and last state, and in a gap that is too wide to interpolate, the
         nearest state is propagated under gravity and its sigma grows. Attitudes are never
         extrapolated: a sensor may turn at any time.
@@ -81,11 +83,11 @@ def interpolate_states(states: SensorStates, at_ns: Nanoseconds, state_gap_s: fl
     n, m = len(states.time_ns), len(at_ns)
     if n == 0 or m == 0:
         nan = np.full((m, 4), np.nan)
-        return Places(nan[:, :3], nan[:, :3], nan[:, 0], nan, nan[:, 0])
+        return InterpolatedStates(nan[:, :3], nan[:, :3], nan[:, 0], nan, nan[:, 0])
     v_km_s, growth = _with_velocities(states)
     right = np.clip(np.searchsorted(states.time_ns, at_ns), 1, max(n - 1, 1)) % n
     left = np.maximum(right - 1, 0)
-    # Integers first: float seconds since 1970 are right to a quarter microsecond only.
+    # Differences of integers: float seconds since 1970 have steps of a quarter microsecond.
     since_left_s = (at_ns - states.time_ns[left]) / SECOND_NS
     since_right_s = (at_ns - states.time_ns[right]) / SECOND_NS
     use_left = np.abs(since_left_s) <= np.abs(since_right_s)
@@ -96,7 +98,7 @@ def interpolate_states(states: SensorStates, at_ns: Nanoseconds, state_gap_s: fl
     between = (since_left_s >= 0) & (since_right_s <= 0) & (left != right)
     between &= since_left_s - since_right_s <= bridge_s
 
-    r, v = _carry_on(states.r_gcrf_km[nearest], v_km_s[nearest], np.where(between, 0.0, since_s))
+    r, v = _propagated(states.r_gcrf_km[nearest], v_km_s[nearest], np.where(between, 0.0, since_s))
     linear, square = growth[nearest].T
     variance = 1 + linear * since_s + square * since_s**2
     sigma = states.position_sigma_km[nearest] * np.sqrt(variance)
@@ -107,7 +109,7 @@ def interpolate_states(states: SensorStates, at_ns: Nanoseconds, state_gap_s: fl
     sigma[i] = (1 - share) * states.position_sigma_km[a] + share * states.position_sigma_km[b]
     far = np.abs(since_s) > state_gap_s
     r[far], v[far], sigma[far] = np.nan, np.nan, np.nan
-    return Places(r, v, sigma, *_attitudes(states, at_ns))
+    return InterpolatedStates(r, v, sigma, *_attitudes(states, at_ns))
 
 
 def gravity(r_km: Array) -> Array:
@@ -122,7 +124,7 @@ def gravity(r_km: Array) -> Array:
     radius2 = np.einsum("...i,...i->...", r_km, r_km)
     flattening = 1.5 * J2 * EARTH_RADIUS_KM**2 / radius2
     z2 = 5 * r_km[..., 2] ** 2 / radius2
-    # Products: a power that is no square takes ten times as long.
+    # Products: a power other than a square takes ten times as long.
     pull = np.where(radius2 > LOWEST_ORBIT_KM**2, -GM_KM3_S2 / (radius2 * np.sqrt(radius2)), 0.0)
     across = pull * (1 + flattening * (1 - z2))
     along = pull * (1 + flattening * (3 - z2))
@@ -151,7 +153,7 @@ def _bridge(
     return r, v
 
 
-def _carry_on(r_km: Array, v_km_s: Array, step_s: Array) -> tuple[Array, Array]:
+def _propagated(r_km: Array, v_km_s: Array, step_s: Array) -> tuple[Array, Array]:
     """Return states propagated under gravity by (n,) seconds, in four Runge-Kutta steps.
 
     The error is centimetres over minutes on a low orbit.
@@ -172,8 +174,8 @@ def _carry_on(r_km: Array, v_km_s: Array, step_s: Array) -> tuple[Array, Array]:
 def _with_velocities(states: SensorStates) -> tuple[Array, Array]:
     """Return all velocities, reported or fitted, and the growth (a, b) of their variance, (n, 2).
 
-    After t seconds the variance of the position is that of the state times 1 + a t + b t^2. A
-    single state without velocity has NaN in both.
+    After t seconds the variance of the position is that of the state times 1 + a t + b t^2. Both
+    are NaN for a single state without velocity.
     """
     v = states.v_gcrf_km_s.copy()
     growth = np.tile([0.0, VELOCITY_MEMORY_S**-2], (len(v), 1))
@@ -210,7 +212,7 @@ def _fit_points(time_ns: Nanoseconds, which: Nanoseconds) -> tuple[Nanoseconds, 
     last = np.searchsorted(time_ns, time_ns[which] + reach, side="right") - 1
     first = np.maximum(np.minimum(first, which - 1), 0)
     last = np.minimum(np.maximum(last, which + 1), n - 1)
-    # At either end there is no neighbour on one side: take a second one from the other side.
+    # At either end one side has no neighbour: take a second one from the other side.
     first = np.where(last == which, np.maximum(np.minimum(first, which - 2), 0), first)
     last = np.where(first == which, np.minimum(np.maximum(last, which + 2), n - 1), last)
     share = np.linspace(0.0, 1.0, FIT_POINTS)
