@@ -72,7 +72,7 @@ class _NightTables:
     def by_object(self, table: str, wanted: Sequence[str]) -> dict[str, pl.DataFrame]:
         """Return the rows of each object, of these or of all."""
         rows = self.read(table)
-        found = rows.partition_by("object_id", as_dict=True)
+        found = rows.drop_nulls("object_id").partition_by("object_id", as_dict=True)
         by_id = {str(key): of_object for (key,), of_object in sorted(found.items())}
         missing = [name for name in wanted if name not in by_id]
         if missing:

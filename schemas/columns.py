@@ -10,6 +10,7 @@ STATE_AXES = ("x", "y", "z", "vx", "vy", "vz")  # of a position and velocity
 POSITION = ["x_km", "y_km", "z_km"]  # of an object
 VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 OPTICS_AXES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # numbers of a camera
+ATTRIBUTABLE_AXES = ("ra", "dec", "vra", "vdec")  # of a direction (ra times cos dec) and its rate
 TANGENT_AXES = ("1", "2")  # of the plane at right angles to a direction
 
 
@@ -83,6 +84,11 @@ def covariance(
         column(pattern.format(a + b), pa.float64(), unit=unit, frame=frame, doc=doc, null=null)
         for a, b in upper_triangle(names)
     ]
+
+
+def rate_unit(quantity: str, a: str, b: str) -> str:
+    """Return the unit of a covariance of a quantity and its rates; axes of rates begin with v."""
+    return f"{quantity}^2" + ("", "/s", "/s^2")[a.startswith("v") + b.startswith("v")]
 
 
 def schema(name: str, doc: str, fields: Iterable[pa.Field], version: str = "1") -> pa.Schema:

@@ -205,7 +205,9 @@ class Report:
     )
 
     observations: int | None = _measure(
-        "observations", "of objects", definition="Rows of the table observations."
+        "observations",
+        "of objects",
+        definition="Rows of the table observations that have an object.",
     )
     observations_of_others: int | None = _measure(
         "observations",

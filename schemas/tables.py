@@ -6,11 +6,14 @@ travels in the Parquet files as field metadata.
 
 import pyarrow as pa
 
+from epipole.schemas.attributable import ATTRIBUTABLE_FIELDS
 from epipole.schemas.columns import (
+    STATE_AXES,
     axes,
     column,
     covariance,
     id_column,
+    rate_unit,
     schema,
     time_column,
     upper_triangle,
@@ -155,32 +158,47 @@ DETECTIONS = schema(
     ],
 )
 
+
+# What tracking knows of a tracklet.
+TRACKLET_FIELDS = [
+    id_column("tracklet_id", doc="Its id in the night."),
+    id_column(
+        "track_id", doc="Track that the tracklet belongs to; fragments of one object share it."
+    ),
+    SENSOR_ID,
+    time_column("start_time", doc="First detection, UTC."),
+    time_column("end_time", doc="Last detection, UTC."),
+    column("n_detections", I32, doc="Detections of the tracklet."),
+    column("rate_arcsec_s", F64, unit="arcsec/s", doc="Mean apparent rate on the sky."),
+    column(
+        "residual_px",
+        F64,
+        unit="px",
+        doc="Rms distance of the detections from the local motion.",
+    ),
+    column(
+        "link_chi2",
+        F64,
+        null=True,
+        doc="Chi-square of the link to the fragment before; null for the first fragment.",
+    ),
+]
+
 TRACKLETS = schema(
     "tracklets",
-    "One row per tracklet: an unbroken run of detections of one object by one sensor.",
+    "One row per tracklet: an unbroken run of detections of one object by one sensor. Its "
+    "direction, rates and their covariance (an attributable) are all that one sensor tells of an "
+    "orbit.",
     [
-        id_column("tracklet_id", doc="Its id in the night."),
-        id_column(
-            "track_id", doc="Track that the tracklet belongs to; fragments of one object share it."
-        ),
-        SENSOR_ID,
-        time_column("start_time", doc="First detection, UTC."),
-        time_column("end_time", doc="Last detection, UTC."),
-        column("n_detections", I32, doc="Detections of the tracklet."),
-        column("rate_arcsec_s", F64, unit="arcsec/s", doc="Mean apparent rate on the sky."),
+        *TRACKLET_FIELDS,
         column(
-            "residual_px",
-            F64,
-            unit="px",
-            doc="Rms distance of the detections from the local motion.",
-        ),
-        column(
-            "link_chi2",
-            F64,
+            "object_id",
+            pa.string(),
             null=True,
-            doc="Chi-square of the link to the fragment before; null for the first fragment.",
+            doc="The object that it shows; null: none found.",
         ),
         column("outcome", pa.string(), doc="What became of it: an `Outcome`."),
+        *ATTRIBUTABLE_FIELDS,
     ],
 )
 
@@ -259,10 +277,20 @@ POSITIONS = schema(
 
 OBSERVATIONS = schema(
     "observations",
-    "One row per detection of an object, with all that an orbit determination from angles needs.",
+    "One row per detection of a tracklet, whether or not another sensor saw its object, with all "
+    "that an orbit determination from angles needs.",
     [
         FRAME_TIME,
-        OBJECT_ID,
+        id_column(
+            "tracklet_id", null=True, doc="Null for a detection that belongs to no tracklet."
+        ),
+        column(
+            "object_id",
+            pa.string(),
+            null=True,
+            doc="The object that it shows; null where no object was found, or where the object's "
+            "position was solved without it.",
+        ),
         SENSOR_ID,
         FRAME_NUMBER,
         CENTROID,
@@ -326,13 +354,6 @@ OBSERVATIONS = schema(
     ],
 )
 
-_STATE = ("x", "y", "z", "vx", "vy", "vz")
-
-
-def _state_unit(a: str, b: str) -> str:
-    return ("km^2", "km^2/s", "km^2/s^2")[a.startswith("v") + b.startswith("v")]
-
-
 STATES = schema(
     "states",
     "One row per object and arc: position and velocity at the arc's middle epoch.",
@@ -343,9 +364,13 @@ STATES = schema(
         *axes("v{}_km_s", unit="km/s", frame="GCRF", doc="Object velocity"),
         *[
             column(
-                f"cov_{a}{b}", F64, unit=_state_unit(a, b), frame="GCRF", doc="State covariance."
+                f"cov_{a}{b}",
+                F64,
+                unit=rate_unit("km", a, b),
+                frame="GCRF",
+                doc="State covariance.",
             )
-            for a, b in upper_triangle(_STATE)
+            for a, b in upper_triangle(STATE_AXES)
         ],
         column("n_epochs", I32, doc="Epochs of the arc that share no detection."),
         column("n_views", I32, doc="Views that were fitted."),

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
+from epipole.schemas.attributable import ATTRIBUTABLE_FIELDS
 from epipole.schemas.columns import (
     OPTICS_AXES,
     TANGENT_AXES,
@@ -24,7 +25,7 @@ from epipole.schemas.tables import (
     OBJECT_ID,
     OBSERVATIONS,
     SENSOR_ID,
-    TRACKLETS,
+    TRACKLET_FIELDS,
 )
 
 # From stage to stage.
@@ -164,12 +165,9 @@ SOLUTIONS = schema(
 
 SIGHTINGS = schema(
     "sightings",
-    "One row per detection of a tracklet of one sensor: the columns of `observations`, the "
-    "tracklet instead of the object.",
-    [
-        *[field for field in OBSERVATIONS if field.name != "object_id"],
-        id_column("tracklet_id", doc="Its id in the night; see `lone_detections` for those alone."),
-    ],
+    "One row per detection of a tracklet of one sensor: `observations` without the object. A "
+    "detection that belongs to no tracklet has the mark of `lone_detections`.",
+    [field for field in OBSERVATIONS if field.name != "object_id"],
 )
 
 VIEWS = schema(
@@ -260,7 +258,7 @@ VIEWED_TRACKLETS = schema(
     "One row per tracklet of one sensor with views in a span: a row of `tracklet_runs`, and where "
     "its views are.",
     [
-        *[field for field in TRACKLETS if field.name != "outcome"],
+        *TRACKLET_FIELDS,
         column("first_view", I64, doc="Its first row in the sensor's views, sorted by tracklet."),
         column("n_views", I64, doc="Number of its views."),
     ],
@@ -351,8 +349,20 @@ TRACKLET_OUTCOMES = schema(
 
 TRACKLET_RUNS = schema(
     "tracklet_runs",
-    "A row of `tracklets` whose outcome is not known yet.",
-    [field for field in TRACKLETS if field.name != "outcome"],
+    "What tracking knows of a row of `tracklets`.",
+    TRACKLET_FIELDS,
+)
+
+JUDGED_TRACKLETS = schema(
+    "judged_tracklets",
+    "A row of `tracklets` whose outcome is known.",
+    [*TRACKLET_FIELDS, column("outcome", pa.string(), doc="What became of it: an `Outcome`.")],
+)
+
+ATTRIBUTABLES = schema(
+    "attributables",
+    "One row per tracklet of one sensor whose middle is in a span and that has a direction.",
+    [id_column("tracklet_id", doc="Its id in the night."), *ATTRIBUTABLE_FIELDS],
 )
 
 HOT_SUSPECTS = schema(

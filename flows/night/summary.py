@@ -10,7 +10,7 @@ import pyarrow.compute as pc
 
 from epipole.io.datasets.night_tables import Where, count_rows, read_columns
 from epipole.schemas.bridge import array
-from epipole.schemas.rejects import NameStatus, Reason
+from epipole.schemas.rejects import NameStatus, Outcome, Reason
 from epipole.tasks.report.night_facts import ReportExtract
 
 
@@ -62,6 +62,7 @@ class Summary:
     stars: int
     detections: int
     tracklets: int
+    outcomes: dict[str, int]
     epochs: int
     objects: int
     positions: int
@@ -89,6 +90,7 @@ class Summary:
             f"identified  {self.identified:,} by {self.stars:,} stars",
             f"objects     {self.objects:,} in {self.detections:,} detections, "
             f"{many(self.tracklets, 'tracklet')}",
+            *self._without_object(),
             f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
             *self._names(),
             *[f"fault       {fault}" for fault in self.faults],
@@ -110,6 +112,14 @@ class Summary:
         if self.rejects:
             parts.append(f"{sum(self.rejects.values()):,} left out")
         return ", ".join(parts)
+
+    def _without_object(self) -> list[str]:
+        """Return how many tracklets have no object, by outcome; nothing where none has not."""
+        alone = {name: n for name, n in self.outcomes.items() if name != Outcome.OBJECT}
+        if not alone:
+            return []
+        parts = ", ".join(f"{count:,} {name}" for name, count in alone.items())
+        return [f"  without   {many(sum(alone.values()), 'tracklet')}: {parts}"]
 
     def _names(self) -> list[str]:
         """Return what is known of the objects' names, and of the sensors by known objects."""
@@ -133,7 +143,7 @@ class Summary:
 # The columns that are counted: all columns of a whole night would not fit in memory.
 _COLUMNS = {
     "frames": ["sensor_id", "time", "attitude_source", "residual_px"],
-    "tracklets": ["sensor_id", "track_id"],
+    "tracklets": ["sensor_id", "track_id", "outcome"],
     "epochs": ["epoch"],
     "positions": ["object_id"],
     "sources": ["sha256"],
@@ -175,6 +185,7 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
         dataset=dataset,
         nights=list(nights),
         **counts,
+        outcomes=_outcomes(tables["tracklets"]),
         names=_names(tables["identifications"]),
         rejects=by_reason(tables["rejects"]),
         faults=_by_night({night: row["faults"] for night, row in rows.items()}),
@@ -200,6 +211,13 @@ def _names(identifications: pa.Table) -> dict[str, int]:
     statuses = identifications.filter(pc.is_valid(identifications["catalogue"]))["status"]
     counts = dict(zip(*(c.to_pylist() for c in pc.value_counts(statuses).flatten()), strict=True))
     return {status.value: counts[status] for status in NameStatus if status in counts}
+
+
+def _outcomes(tracklets: pa.Table) -> dict[str, int]:
+    """Return the number of tracklets by outcome, in the order of `Outcome`."""
+    counts = pc.value_counts(tracklets["outcome"].combine_chunks())
+    found = dict(zip(*(c.to_pylist() for c in counts.flatten()), strict=True))
+    return {outcome.value: found[outcome.value] for outcome in Outcome if outcome.value in found}
 
 
 def _by_night(sentences: Mapping[str, Sequence[str]]) -> list[str]:

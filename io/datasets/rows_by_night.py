@@ -10,8 +10,8 @@ from epipole.schemas.bridge import array
 from epipole.schemas.columns import TIME
 from epipole.schemas.spans import DAY_NS, day_of
 
-# The time column that decides to which night a row belongs, where it is not `time`. Calibrations
-# and sources belong to a whole night.
+# The time column that decides to which night a row belongs, where it is not its epoch or `time`.
+# Calibrations and sources belong to a whole night.
 _NIGHT_COLUMN = {"tracklets": "start_time"}
 _WHOLE_NIGHT = {"calibrations", "identifications", "nights", "sources"}
 
@@ -33,7 +33,8 @@ def rows_of_night(name: str, rows: pa.Table, night: str) -> pa.Table:
         return rows.filter(pa.array((first <= day) & (day <= last)))
     if name in _WHOLE_NIGHT:
         return rows
-    column = "epoch" if "epoch" in rows.column_names else _NIGHT_COLUMN.get(name, "time")
+    usual = "epoch" if "epoch" in rows.column_names else "time"
+    column = _NIGHT_COLUMN.get(name, usual)
     return rows.filter(pa.array(array(rows, column) // DAY_NS == day))
 
 

@@ -28,6 +28,7 @@ from epipole.schemas.tables import (
     STATES,
 )
 from epipole.schemas.work_tables import (
+    ATTRIBUTABLES,
     CAMERAS,
     CLOCK_LINES,
     EXPOSURES,
@@ -78,6 +79,7 @@ VIEWED: Final[PartTables] = {
     "epochs": SENSOR_EPOCHS,
     "views": VIEWS,
     "sightings": SIGHTINGS,
+    "attributables": ATTRIBUTABLES,
     "tracklets": VIEWED_TRACKLETS,
 }
 ASSOCIATED: Final[PartTables] = {

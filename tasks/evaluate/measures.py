@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from epipole.io.simulation.truth import Truth
 from epipole.schemas.bridge import array, stack, stack_covariance, to_polars
@@ -267,6 +268,7 @@ def measure_observations(
     blended
         Objects whose errors are not measured: `blended_objects`.
     """
+    observations = observations.filter(pc.is_valid(observations["object_id"]))
     rows = to_polars(observations.select(["object_id", *POINT]))
     shown = true_objects(with_truth(rows, points))
     number = rows["object_id"].rank("dense").to_numpy().astype(np.int64) - 1

@@ -12,8 +12,8 @@ import pyarrow.compute as pc
 from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import array, concat, conform, to_polars
 from epipole.schemas.rejects import Outcome, Reason, reject_rows
-from epipole.schemas.tables import DETECTIONS, REJECTS, TRACKLETS
-from epipole.schemas.work_tables import HOT_SUSPECTS, TRACKLET_RUNS
+from epipole.schemas.tables import DETECTIONS, REJECTS
+from epipole.schemas.work_tables import HOT_SUSPECTS, JUDGED_TRACKLETS, TRACKLET_RUNS
 from epipole.tasks.publish.night_parts import NightParts
 from epipole.tasks.solve.associate_block import best_outcomes
 
@@ -21,7 +21,7 @@ UNCONFIRMED = (Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)
 
 
 def tracklets_of_run(parts: NightParts) -> pa.Table:
-    """Return TRACKLETS of the run, each with its outcome over all spans."""
+    """Return JUDGED_TRACKLETS of the run: each has its outcome over all spans."""
     runs = [read_part(sensor.names.of_night(), "tracklets") for sensor in parts.sensors]
     tracklets = concat(TRACKLET_RUNS, runs)
     outcomes = best_outcomes(
@@ -33,19 +33,19 @@ def tracklets_of_run(parts: NightParts) -> pa.Table:
     )  # fmt: skip
     row = pc.index_in(tracklets["tracklet_id"], outcomes["tracklet_id"].combine_chunks())
     outcome = pc.coalesce(outcomes["outcome"].take(row), Outcome.NOT_COMPARED.value)
-    return conform(TRACKLETS, tracklets.append_column("outcome", outcome))
+    return conform(JUDGED_TRACKLETS, tracklets.append_column("outcome", outcome))
 
 
 def hot_tracklets(parts: NightParts) -> pa.Table:
-    """Return the rows of TRACKLETS of the run that are hot pixels."""
+    """Return the rows of JUDGED_TRACKLETS of the run that are hot pixels."""
     suspects = _suspects(parts)
     if not suspects.num_rows:
-        return TRACKLETS.empty_table()
+        return JUDGED_TRACKLETS.empty_table()
     return _hot(tracklets_of_run(parts), suspects)
 
 
 def confirmed_tracklets(parts: NightParts) -> pa.Table:
-    """Return TRACKLETS of the run without those that are hot pixels."""
+    """Return JUDGED_TRACKLETS of the run without those that are hot pixels."""
     tracklets = tracklets_of_run(parts)
     hot = _hot(tracklets, _suspects(parts))["tracklet_id"]
     return tracklets.filter(pc.invert(pc.is_in(tracklets["tracklet_id"], hot)))

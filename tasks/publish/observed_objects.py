@@ -1,8 +1,9 @@
-"""Observed objects: the sightings of tracklets, each as an observation of its object.
+"""Observations: the sightings of all tracklets, each with its object where there is one.
 
 A tracklet is an unbroken run of detections of one object. So its detections before and after the
 epochs at which other sensors saw the object are observations of it too. Near an epoch at which the
-position was solved without the tracklet, they are not.
+position was solved without the tracklet, they are not. A tracklet that no other sensor saw has
+observations without an object.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,6 +18,7 @@ from epipole.schemas.spans import Span
 from epipole.schemas.tables import ASSOCIATIONS, OBSERVATIONS
 from epipole.schemas.work_tables import SHARED_ERRORS, SIGHTINGS
 from epipole.tasks.common.sightings import MARK
+from epipole.tasks.publish.hot_tracklets import hot_tracklets
 from epipole.tasks.publish.night_parts import NightParts, in_slices
 
 _KEY = ["sensor_id", "frame_number", "centroid"]
@@ -25,12 +27,15 @@ _KEY = ["sensor_id", "frame_number", "centroid"]
 def observations(parts: NightParts) -> Iterator[pa.Table]:
     """Yield OBSERVATIONS, sorted by time, sensor and centroid, some time of a span each."""
     runs = object_runs(parts)
+    hot = pl.Series(hot_tracklets(parts)["tracklet_id"])
     for span in parts.spans:
         viewed_parts = [of.viewed for of in parts.sensors if of.viewed.holds(span)]
         tables = [partial(viewed.read, span, "sightings") for viewed in viewed_parts]
         errors = _shared_errors(parts, span)
         for rows in in_slices(tables, span, "time"):
-            seen = of_objects(to_polars(concat(SIGHTINGS, rows)), runs)
+            seen = with_objects(to_polars(concat(SIGHTINGS, rows)), runs)
+            seen = seen.filter(pl.col("tracklet_id").is_in(hot.implode()).not_())
+            seen = published(seen)
             yield from_polars(OBSERVATIONS, with_shared_errors(seen, errors))
 
 
@@ -81,19 +86,49 @@ def runs_of_views(views: pl.DataFrame) -> pl.DataFrame:
     )
 
 
-def of_objects(sightings: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
-    """Return the sightings whose tracklet shows an object at the nearest of its epochs."""
+def with_objects(sightings: pl.DataFrame, runs: pl.DataFrame) -> pl.DataFrame:
+    """Return the sightings with the object that their tracklet shows at the nearest epoch.
+
+    Null without one, and where the object's position was solved without the tracklet.
+    """
     rows = sightings.sort("time", maintain_order=True).with_row_index("row")
     before, after = _asof(rows, runs, "first", "backward"), _asof(rows, runs, "last", "forward")
     # Within a run both are the same run; between two runs the nearer one counts.
     to_last = (before["time"] - before["last"]).dt.total_nanoseconds()
     to_first = (after["first"] - after["time"]).dt.total_nanoseconds()
     is_before = to_first.is_null() | (to_last.is_not_null() & (to_last <= to_first))
-    added = [
-        before[name].zip_with(is_before.fill_null(True), after[name]).alias(name)
-        for name in ("object_id", "used")
-    ]
-    return rows.with_columns(added).filter(pl.col("used").fill_null(False)).sort("row")
+    name, used = (
+        before[column].zip_with(is_before.fill_null(True), after[column])
+        for column in ("object_id", "used")
+    )
+    shown = name.zip_with(used.fill_null(False), pl.Series([None], dtype=pl.String))
+    return rows.with_columns(object_id=shown).sort("row")
+
+
+def published(sightings: pl.DataFrame) -> pl.DataFrame:
+    """Return the sightings that `observations` has: a lone detection only if it shows an object."""
+    lone = pl.col("tracklet_id").str.starts_with(MARK)
+    kept = sightings.filter(lone.not_() | pl.col("object_id").is_not_null())
+    return kept.with_columns(tracklet_id=pl.when(lone.not_()).then("tracklet_id"))
+
+
+def longest_object(runs: pl.DataFrame) -> pl.DataFrame:
+    """Return the object of each tracklet that shows one: the one that it shows for longest.
+
+    Returns
+    -------
+    polars.DataFrame
+        tracklet_id, object_id.
+    """
+    lasted = (pl.col("last") - pl.col("first")).dt.total_nanoseconds()
+    return (
+        runs.filter("used")
+        .group_by("tracklet_id", "object_id", maintain_order=True)
+        .agg(lasted.sum())
+        .sort("last", descending=True, maintain_order=True)
+        .unique("tracklet_id", keep="first", maintain_order=True)
+        .select("tracklet_id", "object_id")
+    )
 
 
 def _asof(

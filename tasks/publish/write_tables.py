@@ -12,13 +12,13 @@ import pyarrow.compute as pc
 from epipole.io.datasets.night_tables import write_table
 from epipole.io.datasets.rows_by_night import in_order, rows_of_night
 from epipole.io.work.parts import read_part
-from epipole.schemas.bridge import array, concat, conform, table
+from epipole.schemas.bridge import array, concat, conform, from_polars, table, to_polars
 from epipole.schemas.rejects import Reason, Trait, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, Span, spans_between
 from epipole.schemas.stages import Stage
-from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES
-from epipole.schemas.work_tables import SOLUTIONS, LogSource
+from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES, TRACKLETS
+from epipole.schemas.work_tables import ATTRIBUTABLES, SOLUTIONS, LogSource
 from epipole.tasks.common.sightings import with_lone_objects, with_names
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.publish.hot_tracklets import (
@@ -28,7 +28,7 @@ from epipole.tasks.publish.hot_tracklets import (
     with_hot_pixels,
 )
 from epipole.tasks.publish.night_parts import NightParts, in_slices
-from epipole.tasks.publish.observed_objects import observations
+from epipole.tasks.publish.observed_objects import longest_object, object_runs, observations
 
 # These tables may not fit in memory as a whole: they are written in slices of time.
 BY_SENSOR = ("frames", "stars", "detections")
@@ -65,12 +65,26 @@ def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None
 
 def _of_night(name: str, parts: NightParts) -> pa.Table:
     if name == "tracklets":
-        rows = confirmed_tracklets(parts)
+        rows = _tracklets(parts)
     elif name == "rejects":
         rows = counted([parts.whole[name], *_rejects(parts), hot_pixel_rejects(parts)])
     else:
         rows = parts.whole[name]
     return in_order(rows_of_night(name, rows, parts.night))
+
+
+def _tracklets(parts: NightParts) -> pa.Table:
+    """Return TRACKLETS of the run: with their objects, and with their attributables."""
+    found = [
+        of.viewed.read(span, "attributables")
+        for of in parts.sensors
+        for span in parts.all_spans
+        if of.viewed.holds(span)
+    ]
+    rows = to_polars(confirmed_tracklets(parts))
+    for more in (longest_object(object_runs(parts)), to_polars(concat(ATTRIBUTABLES, found))):
+        rows = rows.join(more, on="tracklet_id", how="left", maintain_order="left")
+    return from_polars(TRACKLETS, rows)
 
 
 def _of_sensors(name: str, parts: NightParts) -> Iterator[pa.Table]:

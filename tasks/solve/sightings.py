@@ -10,10 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from epipole.schemas.bridge import array, empty, nullable, table, unstack
+from epipole.schemas.bridge import array, empty, nullable, table, unstack, unstack_covariance
+from epipole.schemas.columns import ATTRIBUTABLE_AXES
 from epipole.schemas.settings import TrackletSettings
-from epipole.schemas.work_tables import SIGHTINGS
-from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.schemas.spans import Span
+from epipole.schemas.work_tables import ATTRIBUTABLES, SIGHTINGS
+from epipole.tasks.algorithms.constants import ARCSEC, GM_KM3_S2
 from epipole.tasks.algorithms.geometry.camera import Camera
 from epipole.tasks.algorithms.geometry.covariances import (
     centroid_covariance,
@@ -27,6 +29,7 @@ from epipole.tasks.algorithms.geometry.directions import (
     radec_from_unit,
 )
 from epipole.tasks.algorithms.photometry import FluxScale
+from epipole.tasks.algorithms.tracking.attributables import attributables
 from epipole.tasks.algorithms.tracking.blends import TrackedDetections, blend_variance, of_neighbour
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.grouping import factorize, group_offsets
@@ -233,7 +236,8 @@ def _with_split_prior(
     return tracklets._replace(cov_noise=noise, cov_bias=bias)
 
 
-# -- Tabulate sightings: each detection of a tracklet as an observation, its object still unknown.
+# -- Tables: each detection of a tracklet as an observation, its object still unknown, and the
+# attributable of each tracklet.
 
 
 def tabulate_sightings(sighted: Sighted | None) -> pa.Table:
@@ -245,12 +249,7 @@ def tabulate_sightings(sighted: Sighted | None) -> pa.Table:
     v_km_s = frames.v_gcrf_km_s[frame]
     u = aberrate(tracklets.u_icrs, -np.nan_to_num(v_km_s))
     ra, dec = radec_from_unit(u)
-    cov_blend = centroid_covariance(u, np.sqrt(tracklets.blend_rad2))
-    noise = _on_sky(u, tracklets.cov_noise + cov_blend)
-    R = matrix_from_quaternion(frames.q_sensor_from_icrs[frame])
-    u_sensor = np.einsum("nij,nj->ni", R, tracklets.u_icrs)
-    by_optics = optics_covariance(sighted, R, u_sensor, frames.from_stars[frame])
-    shared = _on_sky(u, tracklets.cov_bias - cov_blend + by_optics)
+    noise = _on_sky(u, _noise(sighted, u))
     sigma = np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
     r_km = frames.r_gcrf_km[frame]
     magnitude, magnitude_sigma = _magnitudes(sighted)
@@ -264,8 +263,7 @@ def tabulate_sightings(sighted: Sighted | None) -> pa.Table:
         "sigma_ra_arcsec": sigma[:, 0] / ARCSEC,
         "sigma_dec_arcsec": sigma[:, 1] / ARCSEC,
         "correlation": noise[:, 0, 1] / (sigma[:, 0] * sigma[:, 1]),
-        "bias_sigma_arcsec": np.sqrt(np.maximum(np.trace(shared, axis1=1, axis2=2) / 2, 0.0))
-        / ARCSEC,
+        "bias_sigma_arcsec": _bias_sigma(sighted, np.arange(len(u))) / ARCSEC,
         **unstack("{}_km", r_km),
         "position_sigma_km": frames.position_sigma_km[frame],
         "tracklet_id": tracklets.name[tracklets.tracklet],
@@ -282,6 +280,124 @@ def tabulate_sightings(sighted: Sighted | None) -> pa.Table:
         {name: values[kept] for name, values in columns.items()}
         | {name: nullable(values[kept]) for name, values in maybe.items()},
     )
+
+
+def _noise(sighted: Sighted, u: Array) -> Array:
+    """Return the errors (n, 3, 3) of directions that are independent in each frame [rad^2]."""
+    blend = centroid_covariance(u, np.sqrt(sighted.tracklets.blend_rad2))
+    return sighted.tracklets.cov_noise + blend
+
+
+def _bias_sigma(sighted: Sighted, rows: Indices) -> Array:
+    """Return the 1-sigma error per axis [rad] that some sightings share with their sensor's."""
+    frames, tracklets = sighted.frames, sighted.tracklets
+    frame, u_icrs = tracklets.frame[rows], tracklets.u_icrs[rows]
+    R = matrix_from_quaternion(frames.q_sensor_from_icrs[frame])
+    u_sensor = np.einsum("nij,nj->ni", R, u_icrs)
+    shared = tracklets.cov_bias[rows] + optics_covariance(
+        sighted, R, u_sensor, frames.from_stars[frame]
+    )
+    trace = np.trace(shared, axis1=1, axis2=2) - 2 * tracklets.blend_rad2[rows]
+    return np.sqrt(np.maximum(trace / 2, 0.0))
+
+
+def tabulate_attributables(sighted: Sighted | None, tracklets: pa.Table, span: Span) -> pa.Table:
+    """Return ATTRIBUTABLES of one sensor's tracklets whose middle is in a span.
+
+    Parameters
+    ----------
+    tracklets
+        TRACKLET_RUNS of the sensor.
+    """
+    middle = (array(tracklets, "start_time") + array(tracklets, "end_time")) // 2
+    inside = (middle >= span.start_ns) & (middle < span.end_ns)
+    if sighted is None or not inside.any():
+        return empty(ATTRIBUTABLES)
+    frames, of = sighted.frames, sighted.tracklets
+    names, middle = array(tracklets, "tracklet_id")[inside], middle[inside]
+    by_name = {name: row for row, name in enumerate(of.name)}
+    number = np.array([by_name.get(name, -1) for name in names], np.int64)
+    names, middle, number = names[number >= 0], middle[number >= 0], number[number >= 0]
+    origin, time_ns = frames.time_ns[0], frames.time_ns[of.frame]
+    u = aberrate(of.u_icrs, -np.nan_to_num(frames.v_gcrf_km_s[of.frame]))
+    fit = attributables(
+        np.stack([of.bounds[number], of.bounds[number + 1]], axis=1),
+        (middle - origin) / 1e9,
+        (time_ns - origin) / 1e9,
+        u,
+        _noise(sighted, u),
+    )
+    nearest = _nearest(time_ns, of.bounds, number, middle)
+    ra, dec = radec_from_unit(fit.u)
+    east, north = np.moveaxis(east_north(fit.u), 1, 0)
+    dt_s = (time_ns[nearest] - middle) / 1e9
+    r_km, v_km_s = carried(frames, of.frame[nearest], dt_s)
+    columns = {
+        "ra_deg": np.degrees(ra),
+        "dec_deg": np.degrees(dec),
+        "ra_rate_arcsec_s": np.einsum("ni,ni->n", fit.w, east) / ARCSEC,
+        "dec_rate_arcsec_s": np.einsum("ni,ni->n", fit.w, north) / ARCSEC,
+        **unstack_covariance("cov_{}", fit.cov / ARCSEC**2, ATTRIBUTABLE_AXES),
+        "bias_sigma_arcsec": _bias_sigma(sighted, nearest) / ARCSEC,
+        **unstack("{}_km", r_km),
+        **unstack("v{}_km_s", v_km_s),
+        "position_sigma_km": frames.position_sigma_km[of.frame[nearest]],
+        **_mean_magnitudes(sighted, number),
+    }
+    return table(
+        ATTRIBUTABLES,
+        {"tracklet_id": names, "epoch": middle}
+        | {name: nullable(values) for name, values in columns.items()},
+    )
+
+
+def _nearest(time_ns: Indices, bounds: Indices, number: Indices, at_ns: Indices) -> Indices:
+    """Return the sighting of each tracklet that is nearest to an instant."""
+    rows = [
+        bounds[k] + np.argmin(np.abs(time_ns[bounds[k] : bounds[k + 1]] - at))
+        for k, at in zip(number.tolist(), at_ns.tolist(), strict=True)
+    ]
+    return np.array(rows, np.int64)
+
+
+def _mean_magnitudes(sighted: Sighted, number: Indices) -> dict[str, Array]:
+    """Return the mean magnitudes of tracklets, their errors and scatter; NaN where unknown."""
+    of = sighted.tracklets
+    magnitude, sigma = _magnitudes(sighted)
+    known, n = np.isfinite(magnitude) & (sigma > 0), len(of.name)
+    weight = np.where(known, 1 / np.where(known, sigma, 1.0) ** 2, 0.0)
+    value = np.where(known, magnitude, 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        total = np.bincount(of.tracklet, weight, n)
+        count = np.bincount(of.tracklet, known, n)
+        mean = np.bincount(of.tracklet, weight * value, n) / total
+        square = np.bincount(of.tracklet, known * (value - mean[of.tracklet]) ** 2, n)
+        scatter = np.sqrt(square / np.where(count > 1, count - 1, np.nan))
+        of_mean = np.fmax(np.sqrt(1 / total), scatter / np.sqrt(count))
+    columns = {
+        "magnitude": mean,
+        "magnitude_sigma": np.where(count > 0, of_mean, np.nan),
+        "magnitude_scatter": scatter,
+    }
+    return {name: values[number] for name, values in columns.items()}
+
+
+def carried(frames: Frames, served: Indices, dt_s: Array) -> tuple[Array, Array]:
+    """Return the sensor's positions and velocities at instants near frames, from those at these.
+
+    Gravity is included: in one second it bends an orbit by 4 m.
+
+    Parameters
+    ----------
+    served : (n,) int
+        The frame of each instant.
+    dt_s : (n,) float
+        Time of the frame minus the instant [s].
+    """
+    r, v = frames.r_gcrf_km[served], frames.v_gcrf_km_s[served]
+    back = -dt_s[:, None]
+    gravity = -GM_KM3_S2 * r / np.linalg.norm(r, axis=1, keepdims=True) ** 3
+    return r + np.nan_to_num(v) * back + gravity * back**2 / 2, v + gravity * back
 
 
 def _on_sky(u: Array, cov: Array) -> Array:

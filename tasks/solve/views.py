@@ -15,7 +15,6 @@ from epipole.schemas.settings import AlignmentSettings, TrackletSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import SENSOR_EPOCHS, SOLUTIONS, VIEWED_TRACKLETS, VIEWS
-from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.geometry.camera import project
 from epipole.tasks.algorithms.geometry.covariances import on_tangent_plane
 from epipole.tasks.algorithms.geometry.directions import (
@@ -23,6 +22,7 @@ from epipole.tasks.algorithms.geometry.directions import (
     interpolate_quaternions,
     matrix_from_quaternion,
 )
+from epipole.tasks.algorithms.tracking.attributables import MAX_HALF_S
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import (
@@ -36,8 +36,10 @@ from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
 from epipole.tasks.solve.sightings import (
     Sighted,
     TrackletSightings,
+    carried,
     optics_covariance,
     sight_objects,
+    tabulate_attributables,
     tabulate_sightings,
 )
 
@@ -130,7 +132,7 @@ def _view_table(
     R = matrix_from_quaternion(q)
     u_sensor = np.einsum("nij,nj->ni", R, aberrate(u, v[served]))
     x_px, y_px = project(camera, u_sensor)
-    r_km, v_km_s = _carried(frames, served, array(epochs, "dt_s")[row])
+    r_km, v_km_s = carried(frames, served, array(epochs, "dt_s")[row])
     cov_noise, cov_bias = (on_tangent_plane(u, cov) for cov in motion[2:4])
     cov_noise, cov_bias, blend_rad2 = _without_blends(tracklet, cov_noise, cov_bias)
     if sighted.cov_optics.any():
@@ -191,17 +193,6 @@ def _centroids(
     return tracklets.centroid[at], key[at] != wanted
 
 
-def _carried(frames: Frames, served: Indices, dt_s: Array) -> tuple[Array, Array]:
-    """Return the sensor's positions and velocities at the epochs, from those at their frames.
-
-    Gravity is included: in one second it bends an orbit by 4 m.
-    """
-    r, v = frames.r_gcrf_km[served], frames.v_gcrf_km_s[served]
-    back = -dt_s[:, None]  # dt is frame minus epoch
-    gravity = -GM_KM3_S2 * r / np.linalg.norm(r, axis=1, keepdims=True) ** 3
-    return r + np.nan_to_num(v) * back + gravity * back**2 / 2, v + gravity * back
-
-
 MIN_FRAMES = 6  # beyond the ends of a span: the motion at an epoch is fitted to these too
 
 
@@ -238,8 +229,8 @@ def _view(
     tracklets: TrackletSettings,
     alignment: AlignmentSettings,
 ) -> dict[str, pa.Table]:
-    margin_ns = round(2e9 * alignment.window_s) + MIN_FRAMES * grid.interval_ns
-    wide = span.widened(margin_ns)
+    margin_s = max(2 * alignment.window_s, MAX_HALF_S)
+    wide = span.widened(round(1e9 * margin_s) + MIN_FRAMES * grid.interval_ns)
     solutions = sensor.identified.rows_within(wide, SOLUTIONS, "solutions")
     epochs = span.of(align_epochs(solutions, alignment, grid), "epoch")
     half_width_s = alignment.window_s
@@ -251,6 +242,7 @@ def _view(
         "epochs": sensor_epochs(epochs, solutions),
         "views": views,
         "sightings": span.of(tabulate_sightings(sighted), "time"),
+        "attributables": tabulate_attributables(sighted, named, span),
         "tracklets": viewed_tracklets(named, views),
     }
 

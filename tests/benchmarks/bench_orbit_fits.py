@@ -41,7 +41,7 @@ def fits_of(log: Path, folder: Path, fit: Callable[..., Any]) -> pl.DataFrame:
     shown = true_objects(with_truth(observations, to_polars(truth.points)))
     found = []
     for row in states.iter_rows(named=True):
-        mine = (observations["object_id"] == row["object_id"]).to_numpy()
+        mine = observations["object_id"].eq_missing(row["object_id"]).to_numpy()
         own = observations.filter(pl.Series(mine))
         guess = np.array([row[name] for name in STATE])
         state, cov, chi2, freedom = fit(own, row["epoch"], guess)

@@ -14,7 +14,14 @@ from epipole.io.work.parts import VIEWED, Parts, write_part
 from epipole.schemas.bridge import array, empty
 from epipole.schemas.settings import AssociationSettings, Settings
 from epipole.schemas.spans import SPAN_NS, Span
-from epipole.schemas.work_tables import CAMERAS, SIGHTINGS, SOLUTIONS, TRACKLET_RUNS, VIEWS
+from epipole.schemas.work_tables import (
+    ATTRIBUTABLES,
+    CAMERAS,
+    SIGHTINGS,
+    SOLUTIONS,
+    TRACKLET_RUNS,
+    VIEWS,
+)
 from epipole.tasks.algorithms.geometry.directions import quaternion_from_matrix
 from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
 from epipole.tasks.solve.associate_block import blocks_of, object_members
@@ -152,7 +159,7 @@ def write_views(folder: Path, sensors: Sequence[SensorViews], span: Span) -> Map
     viewed = {of.number: Parts(folder / str(of.number)) for of in sensors}
     for of in sensors:
         tables = {"views": of.read_views(), "epochs": of.epochs, "tracklets": of.tracklets}
-        tables["sightings"] = empty(SIGHTINGS)
+        tables |= {"sightings": empty(SIGHTINGS), "attributables": empty(ATTRIBUTABLES)}
         write_part(viewed[of.number].of(span), VIEWED, tables)
     return viewed
 

@@ -78,6 +78,7 @@ def main(log: Path, dataset: Path, messages: Path, *medians: Path) -> None:
 def objects_shown(log: Path, dataset: Path) -> dict[str, int]:
     """Return which true object each object shows mostly."""
     observations = pl.read_parquet(f"{dataset}/night=*/observations/*.parquet")
+    observations = observations.drop_nulls("object_id")
     of = true_objects(with_truth(observations, to_polars(read_truth(log).points)))
     named = observations.select("object_id", shown=pl.Series(of)).filter(pl.col("shown") >= 0)
     return dict(named.group_by("object_id").agg(pl.col("shown").mode().first()).iter_rows())

@@ -9,6 +9,7 @@ drift), not one for each instant.
 import numpy as np
 
 from epipole.tasks.algorithms.association.views import PLANE, X, Y, direction, residual
+from epipole.tasks.algorithms.cholesky import factor
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
 from epipole.tasks.algorithms.kernels import kernel
 
@@ -19,31 +20,6 @@ CONVERGED = 1e-4  # sigmas squared
 RADIAL_SHARE = 0.6  # an orbiting object's 1-sigma radial velocity over that of a circular orbit
 LN_2PI = np.log(2 * np.pi)
 SLACK_SIGMA = 3.0
-
-
-@kernel
-def factor(N, b):
-    """Solve N x = b in place (Cholesky); return ln det N, NaN if N is not positive definite."""
-    n, log_det = len(b), 0.0
-    for k in range(n):
-        for j in range(k):
-            N[k, k] -= N[k, j] * N[k, j]
-        if not N[k, k] > 0.0:
-            return np.nan
-        N[k, k] = np.sqrt(N[k, k])
-        log_det += 2.0 * np.log(N[k, k])
-        for i in range(k + 1, n):
-            for j in range(k):
-                N[i, k] -= N[i, j] * N[k, j]
-            N[i, k] /= N[k, k]
-        for j in range(k):
-            b[k] -= N[k, j] * b[j]
-        b[k] /= N[k, k]
-    for k in range(n - 1, -1, -1):
-        for j in range(k + 1, n):
-            b[k] -= N[j, k] * b[j]
-        b[k] /= N[k, k]
-    return log_det
 
 
 @kernel

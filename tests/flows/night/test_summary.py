@@ -13,7 +13,8 @@ from epipole.schemas.tables import TABLES
 
 FOUND = Summary(
     dataset="/data/out", nights=["2019-04-01"], logs=1, sensors=2, frames=1234, identified=1200,
-    stars=9000, detections=8, tracklets=1, epochs=6, objects=5, positions=4, rejects={},
+    stars=9000, detections=8, tracklets=1, outcomes={"object": 1}, epochs=6, objects=5, positions=4,
+    rejects={},
     faults=[], by_sensor=[], names={}, residuals=[], unchanged=False, extracts=(),
 )  # fmt: skip
 
@@ -23,6 +24,14 @@ def test_a_night_with_nothing_left_out_says_nothing_of_it():
     assert lines[1] == "frames      1,234 of 2 sensors in 1 log"
     assert lines[3] == "objects     5 in 8 detections, 1 tracklet"
     assert not any("left out" in line or line.startswith("clock") for line in lines)
+
+
+def test_tracklets_without_object_are_counted_by_outcome():
+    from dataclasses import replace
+
+    lines = replace(FOUND, outcomes={"object": 5, "ambiguous": 1, "seen_by_one": 1200}).lines()
+    assert lines[4] == "  without   1,201 tracklets: 1 ambiguous, 1,200 seen_by_one"
+    assert not any("without" in line for line in FOUND.lines())
 
 
 def test_each_reason_is_shown_with_its_sentence():
@@ -55,7 +64,10 @@ def test_staged_nights_are_counted_together(tmp_path):
             "sensor_id": ["a", "a", "b"], "attitude_source": ["stars", "prior", "none"],
             "residual_px": pa.array([0.25, None, None]),
         },
-        tracklets={"sensor_id": ["a", "a", "b"], "track_id": ["t", "t", "u"]},
+        tracklets={
+            "sensor_id": ["a", "a", "b"], "track_id": ["t", "t", "u"],
+            "outcome": ["seen_by_one", "object", "seen_by_one"],
+        },
         epochs={"epoch": [1, 1, 2]},
         positions={"object_id": ["o", "p", "o"]},
         sources={"sha256": ["s"]},
@@ -77,6 +89,7 @@ def test_staged_nights_are_counted_together(tmp_path):
     summary = summarise("/data", {"2019-04-01": first, "2019-04-02": second})
     assert (summary.logs, summary.sensors, summary.frames) == (1, 2, 4)
     assert (summary.identified, summary.stars, summary.tracklets) == (2, 4, 3)
+    assert summary.outcomes == {"object": 1, "seen_by_one": 2}
     assert (summary.epochs, summary.objects, summary.positions) == (2, 2, 4)
     # The most frequent first, then by name.
     assert list(summary.rejects.items()) == [("no_state", 9), ("bad_sigma", 3), ("nan", 3)]

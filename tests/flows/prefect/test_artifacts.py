@@ -19,7 +19,8 @@ from epipole.tasks.report.night_facts import PagePicture, ReportExtract
 
 FOUND = {
     "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
-    "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "epochs": 6, "objects": 5,
+    "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "outcomes": {"object": 7},
+    "epochs": 6, "objects": 5,
     "positions": 4, "rejects": {"no_state": 34, "bad_sigma": 1}, "faults": [], "by_sensor": [],
     "names": {}, "residuals": [], "unchanged": False, "extracts": (),
 }  # fmt: skip

@@ -11,8 +11,13 @@ from epipole.io.work.work_layout import SensorParts, SolvedParts, WorkFolder
 from epipole.schemas.bridge import empty, table
 from epipole.schemas.rejects import Outcome
 from epipole.schemas.spans import BLOCK_NS, SPAN_NS, Sensor, Span
-from epipole.schemas.tables import DETECTIONS, TRACKLETS
-from epipole.schemas.work_tables import HOT_SUSPECTS, TRACKLET_OUTCOMES, TRACKLET_RUNS
+from epipole.schemas.tables import DETECTIONS
+from epipole.schemas.work_tables import (
+    HOT_SUSPECTS,
+    JUDGED_TRACKLETS,
+    TRACKLET_OUTCOMES,
+    TRACKLET_RUNS,
+)
 from epipole.tasks.publish.hot_tracklets import (
     confirmed_tracklets,
     hot_pixel_rejects,
@@ -86,7 +91,7 @@ def test_each_tracklet_has_its_first_outcome_of_all_spans(tmp_path):
     rows = tracklets_of_run(parts)
     assert rows["tracklet_id"].to_pylist() == ["a1", "a2", "a3", "b1"]
     assert rows["outcome"].to_pylist() == ["object", "ambiguous", "not_compared", "object"]
-    assert rows.schema.equals(TRACKLETS)
+    assert rows.schema.equals(JUDGED_TRACKLETS)
 
 
 def test_the_outcomes_of_all_blocks_and_pieces_count(tmp_path):

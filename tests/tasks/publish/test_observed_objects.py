@@ -1,4 +1,4 @@
-"""Observations of objects: each sighting is of the object at the nearest epoch of its tracklet."""
+"""Observations: each sighting is of the object at the nearest epoch of its tracklet, or of none."""
 
 import polars as pl
 import pytest
@@ -6,7 +6,13 @@ from scenes.associations import filled
 
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.work_tables import SIGHTINGS
-from epipole.tasks.publish.observed_objects import of_objects, runs_of_views, with_shared_errors
+from epipole.tasks.publish.observed_objects import (
+    longest_object,
+    published,
+    runs_of_views,
+    with_objects,
+    with_shared_errors,
+)
 
 SECOND = 1_000_000_000
 
@@ -35,7 +41,7 @@ def runs(*views: tuple[str | None, str, float, bool]) -> pl.DataFrame:
 
 
 def objects(seen: pl.DataFrame, of_runs: pl.DataFrame) -> dict[int, str]:
-    found = of_objects(seen, of_runs)
+    found = with_objects(seen, of_runs).drop_nulls("object_id")
     return dict(zip(found["centroid"].to_list(), found["object_id"].to_list(), strict=True))
 
 
@@ -45,7 +51,7 @@ def test_a_tracklet_shows_its_object_before_between_and_after_its_epochs():
     assert objects(seen, of_runs) == {0: "o", 1: "o", 2: "p", 3: "o"}
 
 
-def test_near_an_epoch_that_was_rejected_it_is_no_observation():
+def test_near_an_epoch_that_was_rejected_it_is_of_no_object():
     of_runs = runs(("t", "o", 10, True), ("t", "o", 11, False), ("t", "o", 12, True))
     seen = sightings(*[("t", s) for s in (10.4, 10.6, 11.0, 11.4, 11.6)])
     assert objects(seen, of_runs) == {0: "o", 4: "o"}
@@ -63,13 +69,31 @@ def test_a_lone_detection_has_the_object_that_used_it():
 
 
 @pytest.mark.parametrize("views", [[], [("t", "o", 10, False)]])
-def test_without_used_views_there_are_no_observations(views):
+def test_without_used_views_there_are_no_objects(views):
     assert objects(sightings(("t", 10)), runs(*views)) == {}
+
+
+def test_a_tracklet_without_object_is_published_and_a_lone_detection_is_not():
+    of_runs = runs(("t", "o", 10, True), (None, "p", 10, True))
+    seen = sightings(("t", 10), ("u", 10), ("lone:s-7-3", 10.2), ("lone:s-7-4", 10.2))
+    rows = published(with_objects(seen, of_runs))
+    assert rows["tracklet_id"].to_list() == ["t", "u", None]
+    assert rows["object_id"].to_list() == ["o", None, "p"]
+
+
+def test_a_tracklet_of_two_objects_has_the_one_that_it_shows_for_longest():
+    of_runs = runs(
+        ("t", "o", 10, True), ("t", "p", 20, True), ("t", "p", 21, True), ("u", "q", 5, True),
+        ("v", "o", 3, False),
+    )  # fmt: skip
+    found = longest_object(of_runs)
+    pairs = zip(found["tracklet_id"].to_list(), found["object_id"].to_list(), strict=True)
+    assert dict(pairs) == {"t": "p", "u": "q"}
 
 
 def test_rows_are_in_the_order_of_time_and_then_as_they_came():
     of_runs = runs(("t", "o", 10, True), ("u", "p", 10, True))
-    found = of_objects(sightings(("u", 11), ("t", 10), ("u", 10), ("t", 11)), of_runs)
+    found = with_objects(sightings(("u", 11), ("t", 10), ("u", 10), ("t", 11)), of_runs)
     assert found["centroid"].to_list() == [1, 2, 0, 3]
 
 

@@ -8,12 +8,17 @@ from scipy.spatial.transform import Rotation
 
 from epipole.schemas.bridge import array, unstack, unstack_covariance
 from epipole.schemas.settings import AlignmentSettings, TrackletSettings
+from epipole.schemas.spans import Span
 from epipole.schemas.tables import DETECTIONS
-from epipole.schemas.work_tables import SOLUTIONS
+from epipole.schemas.work_tables import SOLUTIONS, TRACKLET_RUNS
 from epipole.tasks.algorithms.constants import ARCSEC, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.camera import Camera, unproject
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit
-from epipole.tasks.solve.sightings import sight_objects, tabulate_sightings
+from epipole.tasks.solve.sightings import (
+    sight_objects,
+    tabulate_attributables,
+    tabulate_sightings,
+)
 
 T0 = 1_554_091_200_000_000_000
 N = 40
@@ -29,7 +34,11 @@ HALF_WIDTH_S = AlignmentSettings().window_s
 
 
 def sighted(source="stars", *, tracklet="t", flux=np.nan, cov_optics=None, **changed):
-    """Observations of an object that stands at one place of the image."""
+    """Observations of an object that stands at one pixel position."""
+    return tabulate_sightings(sighting(source, tracklet, flux, cov_optics, **changed))
+
+
+def sighting(source="stars", tracklet="t", flux=np.nan, cov_optics=None, **changed):
     u_sensor = unproject(CAMERA, *(np.full(N, p) for p in PLACE_PX))
     ra, dec = radec_from_unit(ATTITUDE.inv().apply(u_sensor))
     key = {
@@ -50,9 +59,7 @@ def sighted(source="stars", *, tracklet="t", flux=np.nan, cov_optics=None, **cha
         "tracklet_id": [tracklet] * N, "track_id": [tracklet] * N, "flux": np.full(N, flux),
     })  # fmt: skip
     cameras = cameras_of({"s": CAMERA}, cov_optics)
-    return tabulate_sightings(
-        sight_objects(solutions, detections, cameras, TrackletSettings(), HALF_WIDTH_S)
-    )
+    return sight_objects(solutions, detections, cameras, TrackletSettings(), HALF_WIDTH_S)
 
 
 def moved(seed, n=40_000):
@@ -128,3 +135,55 @@ def test_frames_without_a_position_have_no_rows_and_without_a_velocity_nulls():
 
 def test_without_tracklets_there_are_no_rows():
     assert sighted(tracklet=None).num_rows == 0
+
+
+HOUR = Span(T0, T0 + 3_600_000_000_000)
+
+
+def attributable(span=HOUR, **scene):
+    """The attributables in a span."""
+    ends = {"start_time": [T0], "end_time": [T0 + (N - 1) * 1_000_000_000]}
+    runs = filled(TRACKLET_RUNS, 1, {"tracklet_id": ["t"], "sensor_id": ["s"], **ends})
+    return tabulate_attributables(sighting(**scene), runs, span)
+
+
+def test_an_attributable_is_at_the_middle_and_has_the_observations_mean():
+    found, rows = attributable(), sighted()
+    assert array(found, "epoch").tolist() == [T0 + (N - 1) * 500_000_000]
+    middle = np.mean(array(rows, "ra_deg")[N // 2 - 1 : N // 2 + 1])
+    assert found["ra_deg"][0].as_py() == pytest.approx(middle, abs=1 / 3600)
+    noise = array(rows, "sigma_dec_arcsec")[0]
+    sigma = np.sqrt(found["cov_decdec"][0].as_py())
+    assert noise / np.sqrt(N) < sigma < 2 * noise / np.sqrt(N)
+    assert abs(found["ra_rate_arcsec_s"][0].as_py()) < 1.0
+    shared = [table["bias_sigma_arcsec"][0].as_py() for table in (found, rows)]
+    assert shared[0] == pytest.approx(shared[1])
+    # The sensor at the middle, from the frame half a second before: it falls 1 m meanwhile.
+    assert found["x_km"][0].as_py() == pytest.approx(7000.0 + 0.5 * V_KM_S[0], abs=2e-3)
+    assert found["vz_km_s"][0].as_py() == pytest.approx(V_KM_S[2], abs=1e-2)
+
+
+def test_an_attributable_belongs_to_the_span_of_its_middle():
+    before, after = Span(T0 - 10, T0 + 5), Span(T0 + 5, T0 + 3_600_000_000_000)
+    assert attributable(span=before).num_rows == 0
+    assert attributable(span=after).num_rows == 1
+
+
+def test_without_flux_or_position_these_are_null():
+    found = attributable(**unstack("{}_km", np.full((N, 3), np.nan)))
+    row = found.to_pylist()[0]
+    assert row["magnitude"] is row["magnitude_scatter"] is row["x_km"] is None
+    assert row["ra_deg"] is not None
+
+
+def test_the_mean_magnitude_has_the_scatter_of_the_detections():
+    rng = np.random.default_rng(4)
+    flux = 1000.0 * 10 ** (0.4 * 0.3 * rng.normal(size=N))
+    zero = {"zero_mag": np.full(N, 15.0), "zero_variance_mag2": np.full(N, 1e-4),
+            "flux_floor_mag2": np.full(N, 1e-4), "flux_photon_mag2": np.zeros(N)}  # fmt: skip
+    row = attributable(flux=flux, **zero).to_pylist()[0]
+    magnitude = 15.0 - 2.5 * np.log10(flux)
+    assert row["magnitude"] == pytest.approx(magnitude.mean(), abs=1e-6)
+    assert row["magnitude_scatter"] == pytest.approx(magnitude.std(ddof=1))
+    assert row["magnitude_sigma"] == pytest.approx(magnitude.std(ddof=1) / np.sqrt(N))
+    assert attributable().to_pylist()[0]["magnitude"] is None

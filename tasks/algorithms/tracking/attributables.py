@@ -1,0 +1,244 @@
+"""Attributables: the direction of a tracklet at its middle, its rate, and their covariance.
+
+An attributable is what seconds of one sensor tell of an orbit (Tommei, Milani and Rossi 2007,
+"Orbit determination of space debris: admissible regions", Celestial Mechanics 97, 289). The range
+and its rate are not seen.
+
+A polynomial of fifth order in time is fitted to the detections about the middle, along the motion
+and across it. Its second and higher derivatives have priors: zero, with a spread as orbits with
+this rate have. So the detections decide on the order of the fit: where they say nothing of a
+derivative, it adds what it may to the errors.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.cholesky import factor, solve_factored
+from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.tracking.sky_filter import (
+    FAR_RAD_S2,
+    LOW_ORBIT_S,
+    acceleration,
+    approach,
+    jerk,
+)
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+ORDER = 5  # of the polynomial
+N_ROWS = 2 * (ORDER + 1)
+MAX_HALF_S = 90.0  # detections farther from the middle are not fitted
+MAX_TURN = 0.5  # time from the middle over that in which the range may change by its own size
+MAX_ROUNDS = 8  # each doubles how fast the range may change
+MAX_SIGMA = 1.0  # of chi-square: what fits worse has changed its range faster than is usual
+NEAR = 1e-5  # rad
+BEND = 0.5  # 1-sigma derivatives as a share of the bounds that the rate allows
+
+
+class Attributables(NamedTuple):
+    """Directions and rates of t tracklets.
+
+    u : (t, 3) float
+        Directions, ICRS.
+    w : (t, 3) float
+        Their rates [rad/s], at right angles to them.
+    cov : (t, 4, 4) float
+        Covariance of (east, north, east rate, north rate) [rad, rad/s]; NaN without detections.
+    """
+
+    u: Array
+    w: Array
+    cov: Array
+
+
+def attributables(
+    rows: Indices, at_s: Array, time_s: Array, u_icrs: Array, cov_noise: Array
+) -> Attributables:
+    """Return the attributables of tracklets.
+
+    Parameters
+    ----------
+    rows : (t, 2) int
+        The detections of tracklet k are ``rows[k, 0]:rows[k, 1]``, in order of time.
+    at_s : (t,) float
+        The epochs of the attributables [s], usually the middles of the tracklets.
+    time_s, u_icrs : (n,), (n, 3) float
+        Detections: times [s] and unit vectors without aberration, ICRS.
+    cov_noise : (n, 3, 3) float
+        Their errors [rad^2], ICRS, independent from frame to frame.
+    """
+    n = len(at_s)
+    out = Attributables(np.zeros((n, 3)), np.zeros((n, 3)), np.full((n, 4, 4), np.nan))
+    _fit_all(
+        np.ascontiguousarray(rows, np.int64),
+        *(np.ascontiguousarray(a, float) for a in (at_s, time_s, u_icrs, cov_noise)),
+        out,
+    )
+    return out
+
+
+@kernel
+def _fit_all(rows, at_s, time_s, u, noise, out):
+    frame, derivatives = np.empty((3, 3)), np.empty((ORDER + 1, 2))
+    N, rhs = np.empty((N_ROWS, N_ROWS)), np.empty(N_ROWS)
+    for k in range(len(at_s)):
+        lo, hi = _about(time_s, rows[k, 0], rows[k, 1], at_s[k], MAX_HALF_S)
+        if lo == hi:
+            continue
+        scale, more = 1.0, 1.0
+        for _ in range(MAX_ROUNDS):
+            rate = _frame(time_s, u, lo, hi, at_s[k], frame)
+            faster = more * (rate + LOW_ORBIT_S + 2 * approach(rate))
+            lo, hi = _about(time_s, lo, hi, at_s[k], MAX_TURN / faster)
+            chi2 = 0.0
+            for _ in range(2):  # again about the direction that the first fit gives
+                scale, chi2 = _solve(time_s, u, noise, lo, hi, at_s[k], rate, more, frame, N, rhs)
+                for m in range(ORDER + 1):
+                    for a in range(2):
+                        derivatives[m, a] = rhs[2 * m + a] / scale**m
+                _turn(frame, derivatives[0])
+            dof = 2 * (hi - lo) - 4
+            if dof <= 0 or chi2 < dof + MAX_SIGMA * np.sqrt(2.0 * dof):
+                break
+            more *= 2.0
+        _write(frame, derivatives, N, scale, out, k)
+
+
+@kernel
+def _about(t, first, last, at, half):
+    """Return the detections within a half-width of an instant, at least three if there are any."""
+    lo = first + np.searchsorted(t[first:last], at - half)
+    hi = first + np.searchsorted(t[first:last], at + half, side="right")
+    while hi - lo < min(3, last - first):
+        if hi == last or (lo > first and at - t[lo - 1] <= t[hi] - at):
+            lo -= 1
+        else:
+            hi += 1
+    return lo, hi
+
+
+@kernel
+def _frame(t, u, lo, hi, at, frame):
+    """Write axes along the motion, across it, and towards the detection nearest to the instant.
+
+    Returns the rate [rad/s] from the first to the last detection, 0 with one.
+    """
+    nearest = lo
+    for k in range(lo, hi):
+        if abs(t[k] - at) < abs(t[nearest] - at):
+            nearest = k
+    frame[2] = u[nearest]
+    along = u[hi - 1] - u[lo]
+    chord = np.sqrt(np.sum(along**2))
+    if not chord > 0.0:
+        along[:] = 0.0
+        along[np.argmin(np.abs(frame[2]))] = 1.0
+    along = along - np.sum(along * frame[2]) * frame[2]
+    frame[0] = along / np.sqrt(np.sum(along**2))
+    frame[1] = np.cross(frame[2], frame[0])
+    return chord / (t[hi - 1] - t[lo]) if hi - lo > 1 else 0.0
+
+
+@kernel
+def _offset(u, frame, xy, J):
+    """Write the offset xy (2,) of a direction from the frame's: angle times direction.
+
+    A great circle through the middle is a straight line, and uniform motion on it is uniform.
+    J (2, 3) receives the derivatives of the offset by the direction.
+    """
+    a, b, c = np.sum(u * frame[0]), np.sum(u * frame[1]), np.sum(u * frame[2])
+    s2 = a * a + b * b
+    s = np.sqrt(s2)
+    near = s < NEAR  # the angle over its sine is 1 there
+    stretch = 1.0 if near else np.arctan2(s, c) / s
+    xy[0], xy[1] = stretch * a, stretch * b
+    for k in range(3):
+        inward = a * frame[0, k] + b * frame[1, k]
+        more = 0.0 if near else (c - stretch) * inward / s2 - frame[2, k]
+        J[0, k] = stretch * frame[0, k] + a * more
+        J[1, k] = stretch * frame[1, k] + b * more
+
+
+@kernel
+def _solve(t, u, noise, lo, hi, at, rate, more, frame, N, rhs):
+    """Solve for the scaled derivatives, along and across in turn; N becomes its factor.
+
+    Returns the time [s] by which the derivatives are scaled, and chi-square with the priors.
+    """
+    N[:], rhs[:] = 0.0, 0.0
+    scale, chi2 = 1e-3, 0.0
+    for k in range(lo, hi):
+        scale = max(scale, abs(t[k] - at))
+    xy, J, W, h = np.empty(2), np.empty((2, 3)), np.empty((2, 2)), np.empty(ORDER + 1)
+    for k in range(lo, hi):
+        _offset(u[k], frame, xy, J)
+        C = J @ noise[k] @ J.T
+        det = C[0, 0] * C[1, 1] - C[0, 1] * C[0, 1]
+        W[0, 0], W[1, 1], W[0, 1] = C[1, 1] / det, C[0, 0] / det, -C[0, 1] / det
+        W[1, 0] = W[0, 1]
+        x = (t[k] - at) / scale
+        h[0] = 1.0
+        for m in range(1, ORDER + 1):
+            h[m] = h[m - 1] * x / m
+        chi2 += W[0, 0] * xy[0] ** 2 + 2 * W[0, 1] * xy[0] * xy[1] + W[1, 1] * xy[1] ** 2
+        for m in range(ORDER + 1):
+            for a in range(2):
+                for b in range(2):
+                    rhs[2 * m + a] += h[m] * W[a, b] * xy[b]
+                    for j in range(m + 1):
+                        N[2 * m + a, 2 * j + b] += h[m] * h[j] * W[a, b]
+    _add_prior(rate, more, scale, N)
+    pull = rhs.copy()
+    factor(N, rhs)
+    return scale, chi2 - np.sum(pull * rhs)
+
+
+@kernel
+def _add_prior(rate, more, scale, N):
+    """Add the priors of the derivatives from the second one on, along and across the motion.
+
+    Without gravity a path is a great circle: nothing bends it across.
+    """
+    faster = more * (rate + LOW_ORBIT_S + 2 * approach(rate))
+    along, across = more * acceleration(rate), more * (LOW_ORBIT_S * rate + FAR_RAD_S2)
+    for m in range(2, ORDER + 1):
+        N[2 * m, 2 * m] += 1.0 / (BEND * along * scale**m) ** 2
+        N[2 * m + 1, 2 * m + 1] += 1.0 / (BEND * across * scale**m) ** 2
+        along = more**2 * jerk(rate) if m == 2 else along * m * faster
+        across *= m * faster
+
+
+@kernel
+def _turn(frame, offset):
+    """Turn the frame so that it looks along an offset (2,) of it [rad]."""
+    u = frame[2] + offset[0] * frame[0] + offset[1] * frame[1]
+    frame[2] = u / np.sqrt(np.sum(u**2))
+    along = frame[0] - np.sum(frame[0] * frame[2]) * frame[2]
+    frame[0] = along / np.sqrt(np.sum(along**2))
+    frame[1] = np.cross(frame[2], frame[0])
+
+
+@kernel
+def _write(frame, derivatives, L, scale, out, k):
+    """Write direction, rate and covariance, from the frame's axes to east and north."""
+    out.u[k] = frame[2]
+    out.w[k] = derivatives[1, 0] * frame[0] + derivatives[1, 1] * frame[1]
+    x, y = frame[2, 0], frame[2, 1]
+    level = max(np.sqrt(x * x + y * y), 1e-15)
+    east = np.array([-y / level, x / level, 0.0])
+    north = np.cross(frame[2], east)
+    turn = np.zeros((4, 4))
+    for a in range(2):
+        turn[0, a] = turn[2, 2 + a] = np.sum(east * frame[a])
+        turn[1, a] = turn[3, 2 + a] = np.sum(north * frame[a])
+    cov, column = np.empty((4, 4)), np.empty(N_ROWS)
+    for a in range(4):
+        column[:] = 0.0
+        column[a] = 1.0
+        solve_factored(L, column)
+        for b in range(4):
+            cov[a, b] = column[b] / scale ** (a // 2 + b // 2)
+    out.cov[k] = turn @ cov @ turn.T
