@@ -22,7 +22,6 @@ WAITING = (
     "tasks/algorithms/association",
     "tasks/algorithms/constants.py",
     "tasks/algorithms/evaluation.py",
-    "tasks/algorithms/geometry",
     "tasks/algorithms/kernels.py",
     "tasks/algorithms/photometry.py",
     "tasks/algorithms/star_catalogue.py",

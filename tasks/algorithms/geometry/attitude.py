@@ -26,7 +26,7 @@ def optimal_attitude(u_sensor: Array, u_icrs: Array, sigma_rad: Array) -> tuple[
     -------
     R_sensor_from_icrs : (3, 3) float
     cov_rad2 : (3, 3) float
-        Of the small rotation about the sensor axes; NaN where the directions do not fix it.
+        Of the small rotation about the sensor axes; NaN if the directions do not determine it.
 
     References
     ----------
@@ -56,7 +56,7 @@ def attitude_covariance(u_sensor: Array, sigma_rad: Array) -> Array:
     """Return (sum of (I - u u') / sigma^2)^-1 [rad^2] about the sensor axes; NaN if singular."""
     weight = 1.0 / np.square(sigma_rad)
     information = weight.sum() * np.eye(3) - np.einsum("n,ni,nj->ij", weight, u_sensor, u_sensor)
-    # Directions within a millionth of a radian do not fix the roll.
+    # Directions within a millionth of a radian do not determine the roll.
     if len(u_sensor) < 2 or np.linalg.cond(information) > 1e12:
         return np.full((3, 3), np.nan)
     return np.linalg.inv(information)
@@ -64,7 +64,10 @@ def attitude_covariance(u_sensor: Array, sigma_rad: Array) -> Array:
 
 @borrowing_kernel
 def attitude_information(u_sensor, sigma_rad, A):
-    """Write the sum of (I - u u') / sigma^2 [rad^-2] about the sensor axes (compiled)."""
+    """Write the sum of (I - u u') / sigma^2 [rad^-2] about the sensor axes to A (compiled).
+
+    u_sensor (n, 3) are unit vectors, sigma_rad (n,) their 1-sigma errors, A is (3, 3).
+    """
     A[:] = 0.0
     for k in range(len(u_sensor)):
         w = 1.0 / (sigma_rad[k] * sigma_rad[k])
@@ -78,7 +81,7 @@ def attitude_information(u_sensor, sigma_rad, A):
 def invert_symmetric(A, out):
     """Write the inverse of a symmetric 3x3 matrix (compiled).
 
-    Returns the determinant; 0, without an inverse, unless it is positive.
+    A and out are (3, 3). Returns the determinant; 0 if it is not positive, with out unchanged.
     """
     c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
     c01 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
@@ -97,7 +100,7 @@ def invert_symmetric(A, out):
 
 @borrowing_kernel
 def copy_matrix(source, target):
-    """Copy a 3x3 matrix (compiled); a slice assignment compiles to much more code."""
+    """Copy a (3, 3) matrix (compiled); a slice assignment compiles to much more code."""
     for i in range(3):
         for j in range(3):
             target[i, j] = source[i, j]
@@ -105,7 +108,10 @@ def copy_matrix(source, target):
 
 @borrowing_kernel
 def turn(R, x, y, z):
-    """Turn R by the rotation vector (x, y, z) about its sensor axes, in place (compiled)."""
+    """Turn R (3, 3), sensor from ICRS, in place by the rotation vector (x, y, z) (compiled).
+
+    [rad], about the sensor axes of R.
+    """
     angle = np.sqrt(x * x + y * y + z * z)
     if angle == 0.0:
         return
@@ -127,7 +133,7 @@ def turn(R, x, y, z):
 
 @borrowing_kernel
 def orthonormalise(R):
-    """Make the rows of R orthonormal, in place, and keep the boresight (compiled)."""
+    """Make the rows of R (3, 3) orthonormal in place; the boresight, row 2, is kept (compiled)."""
     n = np.sqrt(R[2, 0] ** 2 + R[2, 1] ** 2 + R[2, 2] ** 2)
     for j in range(3):
         R[2, j] /= n
@@ -153,20 +159,20 @@ def refine_attitude(R, u, sigma, a, star_of, P):
     R : (3, 3) float, sensor from ICRS, near the optimum (a few degrees)
     u, sigma : (n, 3), (n,) float, measured directions and their errors [rad]
     a : (m, 3) float, apparent directions of stars, ICRS axes
-    star_of : (n,) int, the star of each direction, -1 for none
+    star_of : (n,) int, the star of each direction; -1 without
     P : (3, 3) float, out: covariance about the sensor axes [rad^2]
 
     Returns
     -------
     bool
-        False where the matches do not fix the attitude; R and P are then invalid.
+        False if the matches do not determine the attitude; R and P are then invalid.
     """
     return refine_attitude_in(R, u, sigma, a, star_of, P, np.empty((3, 3)))
 
 
 @borrowing_kernel
 def refine_attitude_in(R, u, sigma, a, star_of, P, A):
-    """Do what `refine_attitude` does; A (3, 3) is work space (compiled)."""
+    """Do what `refine_attitude` does, with work space A (3, 3) (compiled)."""
     for _ in range(3):
         A[:] = 0.0
         b0, b1, b2, total = 0.0, 0.0, 0.0, 0.0

@@ -11,8 +11,8 @@ boresight d, so ``u . d = f / sqrt(f^2 + a^2)``: linear in d. Three stars give d
 
 References
 ----------
-Star identification in celestial navigation, 16th "Huawei Cup" graduate mathematical contest in
-modelling (2019): the equations of this module.
+Star identification in celestial navigation, 16th "Huawei Cup" competition in mathematical
+modelling for graduates (2019): the equations of this module.
 """
 
 from itertools import combinations
@@ -22,9 +22,9 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-MAX_STEPS = 50  # of Newton's or Gauss-Newton's method; convergence takes some five
+MAX_STEPS = 50  # of Newton's or Gauss-Newton's method; convergence takes about five
 CONVERGED = 1e-12  # relative change of the focal length
-MAX_CHOSEN_FROM = 60  # stars; all their triples are tried
+MAX_CHOSEN_FROM = 60  # maximum number of stars of which all triples are tried
 
 
 def boresight_of_three(u_icrs: Array, distance_px: Array, focal_px: float) -> Array:

@@ -15,12 +15,12 @@ from epipole.tasks.algorithms.geometry.directions import skew, tangent_basis
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MAX_LEVERAGE = 0.8  # a direction that decides its own fit has no residual
-OUTLIER = 20.0  # variances: a product of two residuals beyond is of another object
-MIN_RESIDUALS = 20  # their variance is then known to a third
+MAX_LEVERAGE = 0.8  # a direction with more determines the fit: no residual is left
+MAX_PRODUCT = 20.0  # [variances] a larger product of two residuals is of another object
+MIN_RESIDUALS = 20  # minimum number: their variance is then known to a third
 OPTICS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
-FRAMES_AT_ONCE = 500  # a row of the derivatives has 27 numbers
-GRID = 9  # places on each side of the image that stand for a frame's stars
+FRAMES_AT_ONCE = 500  # limits the memory: 27 derivatives per star
+GRID = 9  # grid positions on each side of the image, for a frame's stars
 
 
 def centroid_covariance(u_icrs: Array, sigma_rad: Array) -> Array:
@@ -64,47 +64,48 @@ def on_tangent_plane(u_icrs: Array, cov: Array) -> Array:
 def scatter_beyond(
     residual_rad: Array, sigma_rad: Array, leverage: Array, follows: npt.NDArray[np.bool_]
 ) -> float:
-    """Return the variance, per axis, by which directions scatter beyond their own errors [rad^2].
+    """Return the variance of directions, per axis, in excess of their stated one [rad^2].
 
-    So the error of a prior attitude is divided into one that changes from frame to frame and one
-    that stays: only the former scatters about a smooth motion.
+    It divides the error of a prior attitude into a part that changes from frame to frame and a
+    constant part: only the former scatters about a smooth motion.
 
     Parameters
     ----------
     residual_rad : (n, 3) float
-        Directions minus those of the smooth motion that was fitted to them.
+        Directions minus the smooth motion that was fitted to them.
     sigma_rad : (n,) float
         1-sigma errors of the directions, per axis.
     leverage : (n,) float
-        Weight of each direction in its own fitted one; it makes the residual smaller.
+        Weight of each direction in its fitted value; it makes the residual smaller.
     follows : (n,) bool
-        Whether a direction is the next one of the same object after the row before.
+        Whether a row is the next direction of the object of the row before.
 
     Returns
     -------
     float
-        0 where too few residuals can tell. Where neighbours correlate, because attitudes were
-        interpolated, it is the variance of independent errors with the same mean over many frames.
+        0 with too few residuals. If neighbours correlate, because attitudes were interpolated, it
+        is the variance of independent errors whose mean over many frames has the same variance.
 
     Notes
     -----
-    From the median, so that detections of another object do not count: half the square of a
-    Gaussian residual on two axes is exponentially distributed, and its median is ln 2 variances.
+    A robust estimate from the median, because some detections are of another object. Half the
+    square of a Gaussian residual on two axes is exponentially distributed; its median is ln 2
+    variances.
     """
-    telling = leverage < MAX_LEVERAGE
-    if np.count_nonzero(telling) < MIN_RESIDUALS:
+    has_residual = leverage < MAX_LEVERAGE
+    if np.count_nonzero(has_residual) < MIN_RESIDUALS:
         return 0.0
-    half_square = np.sum(residual_rad[telling] ** 2, axis=1) / 2
-    variance = np.median(half_square / (1.0 - leverage[telling])) / np.log(2.0)
-    beyond = variance - np.median(sigma_rad[telling] ** 2)
-    pairs = follows & telling
-    pairs[1:] &= telling[:-1]
+    half_square = np.sum(residual_rad[has_residual] ** 2, axis=1) / 2
+    variance = np.median(half_square / (1.0 - leverage[has_residual])) / np.log(2.0)
+    beyond = variance - np.median(sigma_rad[has_residual] ** 2)
+    pairs = follows & has_residual
+    pairs[1:] &= has_residual[:-1]
     if beyond > 0.0 and np.count_nonzero(pairs) >= MIN_RESIDUALS:
         later = np.flatnonzero(pairs)
         product = np.sum(residual_rad[later] * residual_rad[later - 1], axis=1) / 2
-        usual = np.abs(product) < OUTLIER * variance
-        # The fit alone makes neighbours correlate by minus the weight that one has in the other.
-        beyond += 2 * max(np.mean((product + leverage[later] * variance)[usual]), 0.0)
+        inlier = np.abs(product) < MAX_PRODUCT * variance
+        # The fit makes neighbours correlate: minus the weight of one in the fitted other.
+        beyond += 2 * max(np.mean((product + leverage[later] * variance)[inlier]), 0.0)
     return float(max(beyond, 0.0))
 
 
@@ -112,7 +113,7 @@ def scatter_beyond(
 
 
 def image_derivatives(camera: Camera, u: Array) -> tuple[Array, Array]:
-    """Return the derivatives of image places by the attitude and by the optics.
+    """Return the derivatives of pixel positions by the attitude and by the optics.
 
     Parameters
     ----------
@@ -130,7 +131,7 @@ def image_derivatives(camera: Camera, u: Array) -> tuple[Array, Array]:
     r2, xy2 = x * x + y * y, 2 * x * y
     across, mixed, down = slopes(camera, x, y)
     stretch = np.stack([across, mixed, mixed, down], axis=1).reshape(-1, 2, 2)
-    turned = np.empty((len(x), 2, 3))  # derivative of the undistorted place by the rotation vector
+    turned = np.empty((len(x), 2, 3))  # undistorted position by the rotation vector
     turned[:, 0] = np.stack([-x * y, 1 + x * x, -y], axis=1)
     turned[:, 1] = np.stack([-1 - y * y, x * y, x], axis=1)
     f = np.array([camera.fx_px, camera.fy_px])
@@ -162,7 +163,7 @@ def shared_attitude_covariance(
     sigma_rad : (n,) float
         Their 1-sigma errors, per axis.
     offsets : (f + 1,) int
-        Frame k has the stars ``offsets[k]:offsets[k + 1]``, at least two that are not at one place.
+        Frame k has the stars ``offsets[k]:offsets[k + 1]``, at least two with different directions.
     """
     cov = np.empty((len(offsets) - 1, 3, 3))
     for first in range(0, len(cov), FRAMES_AT_ONCE):
@@ -187,8 +188,8 @@ def shared_direction_covariance(
     u : (n, 3) float
         Measured directions, sensor frame.
     from_stars : (n,) bool
-        Whether stars gave the attitude, with the same optics. It then compensates a part of the
-        error: that of an attitude from stars all over the image.
+        Whether the attitude is from stars, with the same optics. The attitude then compensates a
+        part of the error, computed for stars all over the image.
     """
     side = np.linspace(0.0, camera.width - 1.0, GRID)
     down = np.linspace(0.0, camera.height - 1.0, GRID)
@@ -202,9 +203,9 @@ def shared_direction_covariance(
 
 
 def _apparent_turns(camera: Camera, u: Array) -> Array:
-    """Return (n, 3, 9): the rotation of each direction that moves its image as the optics do.
+    """Return (n, 3, 9): the rotation of each direction with the same effect as the optics.
 
-    The least rotation: at right angles to the direction.
+    The smallest such rotation; its axis is at right angles to the direction.
     """
     J_turn, J_optics = image_derivatives(camera, u)
     turned = np.swapaxes(J_turn, 1, 2)
@@ -212,12 +213,12 @@ def _apparent_turns(camera: Camera, u: Array) -> Array:
 
 
 def _levers(turns: Array, u: Array, sigma_rad: Array, starts: Indices) -> Array:
-    """Return (f, 3, 9): how far the optics turn the best attitude of each frame, but for the sign.
+    """Return (f, 3, 9): minus the derivatives of each frame's attitude by the optics.
 
-    The normal equations of `optimal_attitude`: the weighted mean of the stars' own rotations.
+    The weighted mean of the stars' rotations, by the normal equations of `optimal_attitude`.
     """
     weight = 1.0 / np.square(sigma_rad)
     across = np.eye(3) - u[:, :, None] * u[:, None, :]
     A = np.add.reduceat(weight[:, None, None] * across, starts)
-    A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # all at one place
+    A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)  # if all are equal
     return np.linalg.solve(A, np.add.reduceat(weight[:, None, None] * turns, starts))

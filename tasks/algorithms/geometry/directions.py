@@ -186,14 +186,14 @@ def boresight_angles(R_sensor_from_icrs: Array) -> tuple[Array, Array, Array]:
 
 
 def apparent_positions(x_km: Array, v_km_s: Array, light_s: Array, r_km: Array) -> Array:
-    """Return the places that sensors see at an epoch: where objects were when their light left.
+    """Return the positions of objects when the light left that reaches sensors at an epoch.
 
     Parameters
     ----------
     x_km, v_km_s : (n, 3) float
         Positions [km] and velocities [km/s] of the objects, GCRF.
     light_s : (n,) float
-        Time from the positions to the epoch [s].
+        Time from the given positions to the epoch [s].
     r_km : (n, 3) float
         Positions of the sensors at the epoch, GCRF [km].
 

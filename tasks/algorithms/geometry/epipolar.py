@@ -48,7 +48,7 @@ def epipolar_angle(r_1_km: Array, u_1: Array, r_2_km: Array, u_2: Array) -> Arra
     -------
     (...) float
         Signed angle; times the focal length in pixels it is the distance to the epipolar line.
-        0 where the first direction lies along the baseline: no plane is defined.
+        0 if the first direction lies along the baseline: the plane is undefined.
 
     References
     ----------
@@ -72,7 +72,7 @@ def epipolar_sigma(first: UncertainSight, second: UncertainSight, x_km: Array) -
     first, second
         The two lines of sight, in the same axes.
     x_km : (..., 3) float
-        The object's position [km]: an error of the first direction counts by the ratio of the
+        The object's position [km]. The error of the first direction is scaled by the ratio of the
         ranges.
     """
     normal = np.cross(first.u, second.u)
@@ -86,8 +86,11 @@ def epipolar_sigma(first: UncertainSight, second: UncertainSight, x_km: Array) -
 
 
 @kernel
-def _mean_squares(offsets, ranked, most, r, u, out):
-    """Write each view's mean square of the angles to the planes of the first ranked others."""
+def _mean_squares(offsets, ranked, max_others, r, u, out):
+    """Write the mean square of each view's angles to the epipolar planes of others to `out`.
+
+    Arguments as in `epipolar_rms`; `r` (n, 3) [km], `u` (n, 3), `out` (n,) [rad^2].
+    """
     for g in range(len(offsets) - 1):
         lo, hi = offsets[g], offsets[g + 1]
         for b in range(lo, hi):
@@ -96,7 +99,7 @@ def _mean_squares(offsets, ranked, most, r, u, out):
                 a = ranked[k]
                 if a == b:
                     continue
-                if count == most:
+                if count == max_others:
                     break
                 count += 1
                 x, y, z = r[b, 0] - r[a, 0], r[b, 1] - r[a, 1], r[b, 2] - r[a, 2]
@@ -110,7 +113,9 @@ def _mean_squares(offsets, ranked, most, r, u, out):
             out[b] = total / max(count, 1)
 
 
-def epipolar_rms(offsets: Indices, ranked: Indices, most: int, r_km: Array, u: Array) -> Array:
+def epipolar_rms(
+    offsets: Indices, ranked: Indices, max_others: int, r_km: Array, u: Array
+) -> Array:
     """Return each view's rms distance to the epipolar planes of others of its group [rad].
 
     Parameters
@@ -118,16 +123,16 @@ def epipolar_rms(offsets: Indices, ranked: Indices, most: int, r_km: Array, u: A
     offsets : (g + 1,) int
         Group k has the views ``offsets[k]:offsets[k + 1]``.
     ranked : (n,) int
-        The views of each group, the best first.
-    most
-        So many of the others count, the best ones: the cost does not grow with the square of the
-        sensors.
+        The views of each group, the best first, as rows of `u`.
+    max_others
+        Maximum number of others, the best ones: so the cost does not grow with the square of the
+        number of sensors.
     r_km, u : (n, 3) float
         Sensor positions [km] and directions; see `epipolar_angle`.
     """
     out = np.empty(len(u))
     _mean_squares(
-        np.array(offsets, np.int64), np.array(ranked, np.int64), int(most),
+        np.array(offsets, np.int64), np.array(ranked, np.int64), int(max_others),
         np.array(r_km, float, order="C"), np.array(u, float, order="C"), out,
     )  # fmt: skip
     return np.sqrt(out)

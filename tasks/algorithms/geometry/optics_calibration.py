@@ -1,10 +1,11 @@
 """Optics calibration: a sensor's focal lengths, principal point and distortion from its stars.
 
-All frames share the optics. Each frame has its own small rotation, which is eliminated frame by
-frame (Schur complement), so the cost grows linearly with the number of stars.
+All frames share the optics. Each frame has a small rotation, which is eliminated frame by frame
+(Schur complement): the cost grows linearly with the number of stars.
 
-Two fits: `calibrate_optics` with all numbers free tells whether the optics differ from the given
-ones. If they do, `calibrate_in_steps` moves only the numbers that the stars demand.
+There are two fits. `calibrate_optics`, with all parameters free, decides whether the optics differ
+from the given ones. If they do, `calibrate_in_steps` changes only those parameters that lower
+chi-square enough (Bayesian information criterion).
 """
 
 from collections.abc import Sequence
@@ -19,29 +20,29 @@ from epipole.tasks.algorithms.geometry.covariances import OPTICS, image_derivati
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-# 1-sigma prior about the given calibration. It only matters for what the stars do not determine:
-# in a narrow field a shift of the principal point equals a rotation of the sensor, and the
-# higher terms of the distortion are negligible.
+# 1-sigma prior about the given calibration. It matters only for what the stars do not determine: in
+# a narrow field a shift of the principal point equals a rotation of the sensor, and the higher
+# terms of the distortion are negligible.
 FOCAL_SHARE = 0.02  # of the focal length
-CORNER_PX = 20.0  # by which a term of the distortion moves the corners of the image
-# A detector of 6 mm that is set behind its lens with usual tolerances, about 30 micrometres.
+CORNER_PX = 20.0  # effect of a term of the distortion at the corners of the image
+# A detector of 6 mm, mounted with usual tolerances of about 30 micrometres.
 PRINCIPAL_POINT_SHARE = 0.005  # of the image's size
-MIN_PRINCIPAL_POINT_PX = 1e-3  # of a principal point that is stated as exact
+MIN_PRINCIPAL_POINT_PX = 1e-3  # if the principal point is stated as exact
 MAX_ITERATIONS = 15
 HUBER = 2.0  # [sigma] larger residuals have less weight
-MIN_FRAMES, MIN_STARS = 3, 60  # of a fit
-# The principal point moves only where its sigma, with all numbers free, is below this share of its
-# prior. Otherwise it stands for a rotation of the sensor.
+MIN_FRAMES, MIN_STARS = 3, 60  # minimum numbers for a fit
+# The principal point is free only if its sigma, with all parameters free, is below this share of
+# its prior. Otherwise it cannot be separated from a rotation of the sensor.
 MAX_SIGMA_SHARE = 0.5
 
 
 def _direction(**weights: float) -> Array:
-    """Return a direction in the space of `OPTICS`, of length 1, as a column."""
+    """Return a unit vector in the space of `OPTICS`, (9, 1)."""
     column = np.array([[weights.get(name, 0.0)] for name in OPTICS])
     return column / np.linalg.norm(column)
 
 
-# In the order in which lenses differ from their calibration, the largest effect first.
+# In the order of their usual effects, the largest first.
 STEPS = (
     _direction(fx_px=1.0, fy_px=1.0),
     _direction(k1=1.0),
@@ -49,7 +50,7 @@ STEPS = (
     _direction(k2=1.0),
     _direction(k3=1.0),
 )
-NOTHING = np.zeros((9, 0))
+FIXED = np.zeros((9, 0))
 TANGENTIAL = np.hstack([_direction(p1=1.0), _direction(p2=1.0)])
 PRINCIPAL_POINT = np.hstack([_direction(cx_px=1.0), _direction(cy_px=1.0)])
 
@@ -57,7 +58,8 @@ PRINCIPAL_POINT = np.hstack([_direction(cx_px=1.0), _direction(cy_px=1.0)])
 class NominalOptics(NamedTuple):
     """The calibration of a log: the prior of the fits.
 
-    principal_point_px : its 1-sigma error per axis; None: as of an assembled camera
+    principal_point_px : 1-sigma error of the principal point, per axis; None: that of an
+        assembled camera
     """
 
     camera: Camera
@@ -65,7 +67,7 @@ class NominalOptics(NamedTuple):
 
     @property
     def sigma(self) -> Array:
-        """1-sigma prior of each number of OPTICS."""
+        """1-sigma prior of each parameter of `OPTICS`, (9,)."""
         camera = self.camera
         f, r = np.sqrt(camera.fx_px * abs(camera.fy_px)), np.tan(camera.half_diagonal_rad)
         at_corner = CORNER_PX / f / np.array([r**3, r**5, r**2, r**2, r**7])
@@ -82,13 +84,13 @@ class StarImages(NamedTuple):
     x_px, y_px : (n,) float
         Measured pixel positions.
     u_sensor : (n, 3) float
-        Catalogue directions in the sensor frame. The attitudes may come from wrong optics: a
-        rotation of each frame is fitted too.
+        Catalogue directions in the sensor frame. The attitudes may be from wrong optics: a rotation
+        of each frame is fitted too.
     frame : (n,) int
         Number of the frame; the stars of a frame are consecutive.
     star : (n,) int
-        Number of the star. Errors of the catalogue, and of close pairs that are one image, are
-        the same in every frame. Covariances include them, however many frames there are.
+        Number of the star. Errors of the catalogue and of blended pairs are the same in every
+        frame. Covariances include them; they do not average out.
     """
 
     x_px: Array
@@ -103,8 +105,8 @@ class OpticsFit(NamedTuple):
 
     residual_px : robust rms of the image residuals, per axis
     gain : decrease of chi-square from the present optics, with free attitudes in both; at most
-        the squared distance of the optics in units of `cov`; about 9 by chance
-    n_independent : number of independent images that would determine the optics as well
+        the squared Mahalanobis distance of the optics by `cov`; expected from noise: about 9
+    n_independent : number of independent images that would determine the optics equally well
     """
 
     camera: Camera
@@ -116,7 +118,7 @@ class OpticsFit(NamedTuple):
 
 
 class _Images(NamedTuple):
-    """The images as the fits take them."""
+    """The images, grouped by frame and star."""
 
     xy: Array
     starts: Indices  # of each frame
@@ -127,7 +129,7 @@ class _Images(NamedTuple):
 class _Fit(NamedTuple):
     camera: Camera
     u: Array  # stars in the sensor frame, after the fitted rotations
-    moved: Array  # (k,) what is free, minus the given calibration, in units of the prior
+    moved: Array  # (k,) free parameters minus the given calibration, in units of the prior
     cov: Array  # (k, k) its covariance
     residual: Array
     sigma_px: float
@@ -135,7 +137,7 @@ class _Fit(NamedTuple):
 
 
 class _Choice(NamedTuple):
-    """What is free, and the fit with it."""
+    """A basis (9, k) of the free parameters, and its fit."""
 
     fit: _Fit
     basis: Array
@@ -144,7 +146,7 @@ class _Choice(NamedTuple):
 def calibrate_optics(
     given: NominalOptics, images: StarImages, present: Camera | None = None
 ) -> OpticsFit | None:
-    """Return the optics that fit identified stars best, None with too few stars.
+    """Return the optics that fit identified stars best, with all parameters free; None if too few.
 
     Parameters
     ----------
@@ -159,69 +161,69 @@ def calibrate_optics(
     complement); Huber's weights, scaled by the median absolute residual. Cameron and Miller
     (2015), A practitioner's guide to cluster-robust inference: errors shared by a star's images.
     """
-    taken = _taken(images)
-    if taken is None:
+    grouped = _grouped(images)
+    if grouped is None:
         return None
     present = present or given.camera
-    fixed = _fit(given, present, taken, images.u_sensor, NOTHING)
-    free = _fit(given, present, taken, fixed.u, np.eye(9))
-    shared, scale = _with_shared_errors(free, taken.of_star), given.sigma
+    fixed = _fit(given, present, grouped, images.u_sensor, FIXED)
+    free = _fit(given, present, grouped, fixed.u, np.eye(9))
+    shared, scale = _with_shared_errors(free, grouped.of_star), given.sigma
     cov = shared * np.outer(scale, scale)
     gain = _gain(fixed, free, cov, free.sigma_px)
     times = float(np.trace(np.linalg.solve(free.cov, shared))) / 9
-    n = len(taken.xy)
+    n = len(grouped.xy)
     return OpticsFit(free.camera, cov, n, free.sigma_px, gain, n / times)
 
 
 def calibrate_in_steps(
     given: NominalOptics, images: StarImages, free: OpticsFit, present: Camera | None = None
 ) -> OpticsFit:
-    """Return optics that differ from the given ones only in what the stars demand.
+    """Return optics that differ from the given ones only in parameters that the stars demand.
 
-    Where a number is free that the stars do not demand, it takes up errors of others: the
-    principal point those of the tangential terms, and the attitude moves with it.
+    A free parameter that the stars do not demand absorbs errors of others: the principal point
+    those of the tangential terms, and it biases the attitude.
 
     Parameters
     ----------
     given
-        The calibration of the log. If it is shown to be wrong, its principal point is as uncertain
-        as the prior says, unless the stars say more.
+        The calibration of the log. Its principal point is as uncertain as the prior unless the
+        stars determine it.
     free
-        The fit of all numbers to the same images, from `calibrate_optics`.
+        The fit of all parameters to the same images, from `calibrate_optics`.
     present
         The optics to begin with, which the gain is counted from; default: the given ones.
 
     Returns
     -------
     OpticsFit
-        `cov` is the mean square of the error: the covariance with all numbers free, and the square
-        of what they would move. So it includes the numbers that are not moved.
+        `cov` is the mean square of the error: the covariance with all parameters free, plus the
+        square of the difference to that fit. So it includes the parameters that are fixed.
 
     References
     ----------
-    Schwarz (1978), Estimating the dimension of a model: a number is demanded if it lowers
+    Schwarz (1978), Estimating the dimension of a model: a parameter is demanded if it lowers
     chi-square by more than the logarithm of the number of images. Kish (1965), Survey sampling,
     section 8.2: of images that share errors, fewer are independent.
     """
-    taken = _taken(images)
-    if taken is None:
+    grouped = _grouped(images)
+    if grouped is None:
         return free
-    sigma, price = free.residual_px, np.log(max(free.n_independent, 1.0))
-    fixed = start = _fit(given, present or given.camera, taken, images.u_sensor, NOTHING, sigma)
+    sigma, penalty = free.residual_px, np.log(max(free.n_independent, 1.0))
+    fixed = start = _fit(given, present or given.camera, grouped, images.u_sensor, FIXED, sigma)
     if present not in (None, given.camera):
-        start = _fit(given, given.camera, taken, fixed.u, NOTHING, sigma)
-    radial = _extended(given, taken, _Choice(start, NOTHING), STEPS, price)
-    best = _extended(given, taken, radial, [TANGENTIAL], price)
+        start = _fit(given, given.camera, grouped, fixed.u, FIXED, sigma)
+    radial = _with_steps(given, grouped, _Choice(start, FIXED), STEPS, penalty)
+    best = _with_steps(given, grouped, radial, [TANGENTIAL], penalty)
     if _determines_principal_point(free.cov, given.sigma):
-        # Tangential terms may only stand for the principal point, so it is also tried before them.
-        before = _extended(given, taken, radial, [PRINCIPAL_POINT, TANGENTIAL], price)
-        after = _extended(given, taken, best, [PRINCIPAL_POINT], price)
-        best = min(before, after, key=lambda choice: _criterion(given, choice, price))
+        # Tangential terms may only imitate the principal point: it is also tried before them.
+        before = _with_steps(given, grouped, radial, [PRINCIPAL_POINT, TANGENTIAL], penalty)
+        after = _with_steps(given, grouped, best, [PRINCIPAL_POINT], penalty)
+        best = min(before, after, key=lambda choice: _criterion(given, choice, penalty))
     rest = _values(free.camera) - _values(best.fit.camera)
     return free._replace(
         camera=best.fit.camera,
         cov=free.cov + np.outer(rest, rest),
-        residual_px=_robust_sigma(best.fit.residual, _degrees_of_freedom(taken, best.basis)),
+        residual_px=_robust_sigma(best.fit.residual, _degrees_of_freedom(grouped, best.basis)),
         gain=_gain(fixed, best.fit, free.cov, sigma),
     )
 
@@ -245,8 +247,8 @@ def fit_radial(camera: Camera, x_px: Array, y_px: Array, u_sensor: Array) -> Cam
     return _fit(NominalOptics(camera), camera, images, u_sensor, basis).camera
 
 
-def _taken(images: StarImages) -> _Images | None:
-    """Return the images as the fits take them, None if they are too few."""
+def _grouped(images: StarImages) -> _Images | None:
+    """Return the images grouped by frame and star, None if they are too few."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(images.frame)) + 1])
     n = len(images.frame)
     if n < MIN_STARS or len(starts) < MIN_FRAMES:
@@ -257,40 +259,40 @@ def _taken(images: StarImages) -> _Images | None:
 
 
 def _determines_principal_point(cov: Array, scale: Array) -> bool:
-    """Return whether the stars distinguish the principal point from a rotation of the sensor."""
-    place = [OPTICS.index("cx_px"), OPTICS.index("cy_px")]
-    worst = np.linalg.eigvalsh(cov[np.ix_(place, place)])[-1]
-    return bool(np.sqrt(worst) < MAX_SIGMA_SHARE * scale[place[0]])
+    """Return whether the stars separate the principal point from a rotation of the sensor."""
+    point = [OPTICS.index("cx_px"), OPTICS.index("cy_px")]
+    worst = np.linalg.eigvalsh(cov[np.ix_(point, point)])[-1]
+    return bool(np.sqrt(worst) < MAX_SIGMA_SHARE * scale[point[0]])
 
 
 def _gain(fixed: _Fit, fit: _Fit, cov: Array, sigma_px: float) -> float:
-    """Return the decrease of chi-square, at most the squared distance in units of `cov`."""
+    """Return the decrease of chi-square, at most the squared Mahalanobis distance by `cov`."""
     off = _values(fit.camera) - _values(fixed.camera)
     decrease = _huber_cost(fixed.residual / sigma_px) - _huber_cost(fit.residual / sigma_px)
     return min(decrease, float(off @ np.linalg.solve(cov, off)))
 
 
-def _extended(
-    given: NominalOptics, images: _Images, choice: _Choice, steps: Sequence[Array], price: float
+def _with_steps(
+    given: NominalOptics, images: _Images, choice: _Choice, steps: Sequence[Array], penalty: float
 ) -> _Choice:
-    """Return the choice with those of the steps that the stars demand, each after the other."""
+    """Return the choice with those of the steps that the stars demand, tested in order."""
     for step in steps:
         wider, n = np.hstack([choice.basis, step]), step.shape[1]
         fit = _fit(given, choice.fit.camera, images, choice.fit.u, wider, choice.fit.sigma_px)
         decrease = _cost(given, choice.fit) - _cost(given, fit)
-        # What all images of a star have in common may lower chi-square without any meaning.
+        # Errors that a star's images share may lower chi-square without significance.
         cov, moved = _with_shared_errors(fit, images.of_star)[-n:, -n:], fit.moved[-n:]
-        if min(decrease, float(moved @ np.linalg.solve(cov, moved))) > n * price:
+        if min(decrease, float(moved @ np.linalg.solve(cov, moved))) > n * penalty:
             choice = _Choice(fit, wider)
     return choice
 
 
-def _criterion(given: NominalOptics, choice: _Choice, price: float) -> float:
-    return _cost(given, choice.fit) + price * choice.basis.shape[1]
+def _criterion(given: NominalOptics, choice: _Choice, penalty: float) -> float:
+    return _cost(given, choice.fit) + penalty * choice.basis.shape[1]
 
 
 def _cost(given: NominalOptics, fit: _Fit) -> float:
-    """Return chi-square, with the prior's part."""
+    """Return chi-square, prior included."""
     prior = (_values(fit.camera) - _values(given.camera)) / given.sigma
     return _huber_cost(fit.residual / fit.sigma_px) + float(prior @ prior)
 
@@ -300,10 +302,10 @@ def _with_shared_errors(fit: _Fit, of_star: Indices) -> Array:
     n, k = of_star.max() + 1, len(fit.cov)
     pull = np.zeros((n, k))
     np.add.at(pull, of_star, fit.score)
-    # A star bends the fit towards its own error, which hides a part of it: as much as its share in
-    # the fit. Squared, so that few stars state rather too much (CV3 of Cameron and Miller).
-    few = (n / max(n - k, 1)) ** 2
-    shared = fit.cov @ (few * pull.T @ pull - fit.score.T @ fit.score) @ fit.cov
+    # The fit follows each star's error in part, by the star's leverage: the scores are too small.
+    # The correction is squared: conservative for few stars (CV3 of Cameron and Miller).
+    correction = (n / max(n - k, 1)) ** 2
+    shared = fit.cov @ (correction * pull.T @ pull - fit.score.T @ fit.score) @ fit.cov
     value, vector = np.linalg.eigh(shared)
     return fit.cov + (vector * np.maximum(value, 0.0)) @ vector.T
 
@@ -321,21 +323,20 @@ def _fit(
     Parameters
     ----------
     basis : (9, k) float
-        What is free, in units of the prior.
+        Free directions of the parameters, in units of the prior.
     sigma_px
-        Error of the images, per axis, if it is known; 0: that of the residuals.
+        1-sigma error of the images, per axis; 0: from the residuals.
     """
     scale, nominal, k = given.sigma, _values(given.camera), basis.shape[1]
     used = _degrees_of_freedom(images, basis)
     for _ in range(MAX_ITERATIONS):
         r, J_turn, J_optics = _linearise(camera, images.xy, u)
-        sigma = max(sigma_px, _robust_sigma(r, used))  # far from the stars all weigh alike
+        sigma = max(sigma_px, _robust_sigma(r, used))  # far from the optimum all weights are 1
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12)) / sigma**2
         J_optics = J_optics * scale @ basis
         A = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_turn), images.starts)
-        A += (
-            1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        )  # all stars at one place
+        # Also with all stars of a frame at one position.
+        A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
         b = np.add.reduceat(np.einsum("nai,na->ni", J_turn, weight * r), images.starts)
         turn = np.linalg.solve(A, b[..., None])[..., 0]
         B = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_optics), images.starts)

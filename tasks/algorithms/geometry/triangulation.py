@@ -1,6 +1,6 @@
-"""Triangulation: the point that explains all lines of sight, by weighted least squares.
+"""Triangulation: the point that fits all lines of sight best, by weighted least squares.
 
-A view is a sensor's place, a direction and the direction's covariance, all at one epoch. The
+A view is a sensor's position, a direction and the direction's covariance, all at one epoch. The
 residual is the angle between the direction and the point, on the direction's tangent plane.
 """
 
@@ -22,7 +22,7 @@ LIGHT = SPEED_OF_LIGHT_KM_S
 
 
 class LinesOfSight(NamedTuple):
-    """Views of all groups, one after the other, for the compiled loops.
+    """Views of all groups, one after the other, for kernels.
 
     r_km, u : (n, 3) float
         Sensor positions [km] and directions.
@@ -43,8 +43,8 @@ class Triangulated(NamedTuple):
     """Positions of g groups from n views.
 
     r_km : (g, 3) float
-        Positions [km] at the epoch minus the mean light time of the views used; NaN where the
-        lines are parallel or meet behind a sensor, or fewer than two views are left.
+        Positions [km] at the epoch minus the mean light time of the used views; NaN if the lines
+        are parallel or meet behind a sensor, or with fewer than two views.
     cov_km2 : (g, 3, 3) float
         Covariances of the positions.
     chi2 : (g,) float
@@ -52,7 +52,7 @@ class Triangulated(NamedTuple):
     used : (n,) bool
         False for rejected views.
     mean_range_km : (g,) float
-        Mean distance of the sensors used.
+        Mean distance to the sensors of the used views.
     """
 
     r_km: Array
@@ -64,7 +64,10 @@ class Triangulated(NamedTuple):
 
 @borrowing_kernel
 def invert3(M, out):
-    """Write the inverse of a symmetric 3x3 matrix; return its determinant, 0 where it fails."""
+    """Write the inverse of a symmetric matrix M (3, 3) to out (3, 3); return its determinant.
+
+    0, without an inverse, if it is not positive.
+    """
     a, b, c = M[0, 0], M[0, 1], M[0, 2]
     d, e, f = M[1, 1], M[1, 2], M[2, 2]
     m00, m01, m02 = d * f - e * e, c * e - b * f, b * e - c * d
@@ -80,9 +83,10 @@ def invert3(M, out):
 
 @kernel
 def start_point(use, r, u, x):
-    """Write the point nearest to the lines in use; return false where they are parallel.
+    """Write the point nearest to the lines in `use` to x (3,) [km]; return false if parallel.
 
-    The sum of squared distances [km^2] is minimal, without weights: a start for the iteration.
+    `use` has rows of r (n, 3), sensor positions [km], and u (n, 3), directions. The sum of the
+    squared distances is minimal, without weights: a start for the iteration.
     """
     N, inverse, rhs = np.zeros((3, 3)), np.empty((3, 3)), np.zeros(3)
     n = 0
@@ -104,7 +108,10 @@ def start_point(use, r, u, x):
 
 @kernel
 def _residual(r, u, basis, shift, x, out):
-    """Write a view's residual [rad] on its tangent plane; return the range [km]."""
+    """Write a view's residual on its tangent plane to out (2,) [rad]; return the range [km].
+
+    r (3,) is the sensor [km], basis (2, 3) the tangent plane; the object is at x + shift (3,) [km].
+    """
     d0, d1, d2 = x[0] + shift[0] - r[0], x[1] + shift[1] - r[1], x[2] + shift[2] - r[2]
     rho = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     for a in range(2):
@@ -114,7 +121,11 @@ def _residual(r, u, basis, shift, x, out):
 
 @kernel
 def weight_of(cov, sigma_km, rho, out):
-    """Write the inverse of a view's 2x2 covariance, with the error of the sensor's place."""
+    """Write the inverse covariance of a view to out (2, 2) [rad^-2].
+
+    The covariance is cov (2, 2) [rad^2] plus that of the sensor's position, sigma_km over the range
+    rho [km].
+    """
     extra = (sigma_km / rho) ** 2
     a, b, c = cov[0, 0] + extra, cov[0, 1], cov[1, 1] + extra
     det = a * c - b * b
@@ -124,11 +135,11 @@ def weight_of(cov, sigma_km, rho, out):
 
 @kernel
 def solve_point(use, lines, velocity, x, P):
-    """Solve one point over the views in `use`; return chi-square, NaN where it fails.
+    """Solve one point over the views in `use`, rows of `LinesOfSight`; return chi-square.
 
-    x holds the start and receives the point, P receives the covariance. Light that reaches a
-    more distant sensor left earlier: `velocity` [km/s] moves the object between the emissions,
-    and the point is its place at their mean. It fails where lines are parallel or the point is
+    x (3,) [km] has the start and then the point, P (3, 3) [km^2] its covariance. Light to a more
+    distant sensor left earlier: the object moves by `velocity` (3,) [km/s] between the emissions,
+    and the point is its position at their mean time. NaN if the lines are parallel or the point is
     behind a sensor.
     """
     r, u, basis, cov, sigma_km = lines
@@ -180,7 +191,7 @@ def solve_point(use, lines, velocity, x, P):
 
 @kernel
 def _worst(use, lines, velocity, x, P):
-    """Return the view with the largest normalised residual, and that residual squared.
+    """Return the view with the largest normalised residual, and its square; as `solve_point`.
 
     It is normalised by the covariance of the residual, C - J P J', which is smaller than C.
     """
@@ -205,8 +216,8 @@ def _worst(use, lines, velocity, x, P):
                 c00 -= basis[v, 0, i] * p * basis[v, 0, j]
                 c01 -= basis[v, 0, i] * p * basis[v, 1, j]
                 c11 -= basis[v, 1, i] * p * basis[v, 1, j]
-        # With few views the residual carries no information along one axis: its variance there
-        # is rounding. The axis of the larger eigenvalue can always be judged.
+        # With few views the residual has no information along one axis: its variance there is
+        # rounding. The axis of the larger eigenvalue can always be tested.
         half, diff = 0.5 * (c00 + c11), 0.5 * (c00 - c11)
         radius = np.sqrt(diff * diff + c01 * c01)
         big, small = half + radius, half - radius
@@ -224,7 +235,11 @@ def _worst(use, lines, velocity, x, P):
 
 @kernel
 def _solve_groups(offsets, lines, velocity, reject2, out):
-    """Triangulate each group; while its worst residual is too large, drop that view."""
+    """Triangulate each group; while the largest residual is above the limit, reject that view.
+
+    offsets (g + 1,), `lines` are `LinesOfSight`, velocity (g, 3) [km/s]; `reject2` is the square of
+    the limit [sigma^2]; `out` is `Triangulated`.
+    """
     r, u = lines.r_km, lines.u
     x, P, chi2, used, mean_range = out
     for g in range(len(offsets) - 1):
@@ -275,7 +290,8 @@ def triangulate(
     velocity_km_s : (g, 3) float
         Velocity of each object. It matters only over the differences of light time.
     reject_sigma
-        Of three or more views, those with a larger residual are rejected, the worst first.
+        Limit of the normalised residual: with three or more views, larger ones are rejected, the
+        largest first.
 
     References
     ----------
@@ -283,7 +299,7 @@ def triangulate(
     for minimising errors in the image instead of distances in space.
     """
     n, g = len(r_gcrf_km), len(offsets) - 1
-    # Copies: to numba a read-only array is another type, and all would compile twice.
+    # Copies: a read-only array is another type to numba, and all kernels would compile twice.
     lines = LinesOfSight(
         r_km=np.array(r_gcrf_km, float, order="C"),
         u=np.array(u_icrs, float, order="C"),
