@@ -17,7 +17,12 @@ from epipole.schemas.star_lists import (
     labelled,
 )
 from epipole.tasks.algorithms.geometry.directions import unit_from_radec
-from epipole.tasks.algorithms.star_catalogue import johnson_v_of_gaia, join, joined_magnitude, moved
+from epipole.tasks.algorithms.star_catalogue import (
+    johnson_v_of_gaia,
+    join,
+    joined_magnitude,
+    propagate_positions,
+)
 
 # The errors of Gaia DR3 are about 0.02 mas, and below this value for all but a few bright stars.
 GAIA_SIGMA_MAS = 1.0
@@ -79,7 +84,7 @@ def _at_gaia_epoch(hipparcos: pa.Table) -> pa.Table:
     """Return Hipparcos' stars at Gaia's epoch, with the errors of their positions there."""
     label = label_of(hipparcos.schema)
     years = GAIA_EPOCH - label.epoch
-    ra, dec, pm_ra, pm_dec = moved(
+    ra, dec, pm_ra, pm_dec = propagate_positions(
         np.radians(array(hipparcos, "ra_deg")),
         np.radians(array(hipparcos, "dec_deg")),
         array(hipparcos, "pm_ra_mas_yr"),

@@ -1,6 +1,6 @@
 """Physical constants and units, each with its source.
 
-The simulator has its own (`simulation/`): what is judged must not judge itself.
+The simulator has separate constants (`simulation/`): the code under test must not test itself.
 """
 
 import math
@@ -16,7 +16,7 @@ SPEED_OF_LIGHT_KM_S = 299_792.458
 AU_KM = 149_597_870.7
 
 # The Earth: GM with the atmosphere, IERS Conventions (2010), table 1.1; the equatorial radius,
-# WGS 84 (NGA.STND.0036); J2 of EGM96 (Lemoine et al. 1998, NASA/TP-1998-206861), whose own
+# WGS 84 (NGA.STND.0036); J2 of EGM96 (Lemoine et al. 1998, NASA/TP-1998-206861), whose
 # radius is 0.7 m smaller: 2e-7 of J2's effect.
 GM_KM3_S2 = 398_600.4418
 EARTH_RADIUS_KM = 6378.137

@@ -1,4 +1,4 @@
-"""How far results are from the truth: attitudes, positions, states, and identities."""
+"""Errors of results against the truth: attitudes, positions, states and identities."""
 
 import math
 from typing import NamedTuple
@@ -36,7 +36,7 @@ def attitude_errors(q_found: Array, q_true: Array) -> tuple[Array, Array]:
 def squared_normalised_errors(error: Array, covariance: Array) -> Array:
     """Return e' C^-1 e of errors, the normalised estimation error squared (NEES).
 
-    Its distribution is chi-square of k where the covariances agree with the errors.
+    If the covariances are right, it has a chi-square distribution with k degrees of freedom.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def squared_normalised_errors(error: Array, covariance: Array) -> Array:
 
 
 class Majority(NamedTuple):
-    """The most frequent value of each group (-1: no member is counted), and how often it occurs."""
+    """The most frequent value of each group (-1: none is counted), and how often it occurs."""
 
     value: Indices
     votes: Indices
@@ -80,8 +80,8 @@ def majority(group: Indices, value: Indices, n_groups: int) -> Majority:
     value : (n,) int
         Value of each member; negative ones are not counted.
     """
-    there = np.flatnonzero(value >= 0)
-    group, value = group[there], value[there]
+    counted = np.flatnonzero(value >= 0)
+    group, value = group[counted], value[counted]
     order = np.lexsort((np.arange(len(group)), value, group))
     group, value = group[order], value[order]
     new = np.ones(len(group), bool)
@@ -89,10 +89,10 @@ def majority(group: Indices, value: Indices, n_groups: int) -> Majority:
     start = np.flatnonzero(new)
     count = np.diff(np.append(start, len(group)))
     best = np.lexsort((order[start], -count, group[start]))
-    owner, first = np.unique(group[start][best], return_index=True)
+    groups, first = np.unique(group[start][best], return_index=True)
     out = Majority(np.full(n_groups, -1, np.int64), np.zeros(n_groups, np.int64))
-    out.value[owner] = value[start][best][first]
-    out.votes[owner] = count[best][first]
+    out.value[groups] = value[start][best][first]
+    out.votes[groups] = count[best][first]
     return out
 
 
@@ -128,7 +128,7 @@ def mean_of_group_means(group: Indices, value: Array) -> tuple[float, float]:
     """Return the mean of the means of groups, and its standard error from their scatter.
 
     Members of a group may share an error, so the groups, not the members, are independent. Both
-    are not finite where a value is infinite.
+    results are not finite if a value is infinite.
 
     Parameters
     ----------
@@ -161,12 +161,12 @@ def interpolate_orbits(orbits: SampledOrbits, objects: Indices, t_s: Array) -> t
     Parameters
     ----------
     orbits
-        Has rows of all `objects`.
+        Must have rows of all `objects`.
     objects : (n,) int
         An object per row.
     t_s : (n,) float
         A time per row [s], since the epoch of the orbits. Before the first and after the last
-        sample of an object its first and last cubic go on.
+        sample of an object its first and last cubic are extrapolated.
 
     Returns
     -------
@@ -177,7 +177,9 @@ def interpolate_orbits(orbits: SampledOrbits, objects: Indices, t_s: Array) -> t
     order = np.argsort(objects, kind="stable")
     numbers, start = np.unique(objects[order], return_index=True)
     for number, rows in zip(numbers, np.split(order, start[1:]), strict=False):
-        own = slice(*np.searchsorted(orbits.object, [number, number + 1]))
-        path = CubicHermiteSpline(orbits.t_s[own], orbits.r_km[own], orbits.v_km_s[own])
+        rows_of_object = slice(*np.searchsorted(orbits.object, [number, number + 1]))
+        path = CubicHermiteSpline(
+            orbits.t_s[rows_of_object], orbits.r_km[rows_of_object], orbits.v_km_s[rows_of_object]
+        )
         r_km[rows], v_km_s[rows] = path(t_s[rows]), path(t_s[rows], nu=1)
     return r_km, v_km_s

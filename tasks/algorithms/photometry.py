@@ -1,8 +1,8 @@
 """Magnitudes from fluxes: each frame's zero point from its stars, with honest errors.
 
-What a sensor measures is not V: a star's colour moves it by a tenth of a magnitude, in all frames
-alike. That is an error of the zero point. How well the sensor measures a flux shows where it
-measures one star twice.
+A sensor's passband is not V: a star's magnitude differs by about 0.1 with its colour, the same in
+all frames. That scatter is an error of the zero point. The error of a measured flux is estimated
+from stars that are measured repeatedly.
 """
 
 from typing import NamedTuple
@@ -17,14 +17,16 @@ Indices = npt.NDArray[np.int64]
 MIN_VALUES = 20  # minimum number of residuals for an estimate of the variance
 MIN_PER_BIN = 25  # minimum number of residuals per bin of flux
 MAX_BINS = 8
-UNKNOWN_STAR_MAG2 = 0.3**2  # variance of a star with too few residuals: colours, variable stars
+UNKNOWN_STAR_MAG2 = (
+    0.3**2
+)  # variance of one star if there are too few residuals: colours, variables
 MIN_MAG2 = 1e-8
-CLIP_SIGMA = 3.5  # sigmas: stars beyond are variable, blended or wrong in the catalogue
-REJECTED_WEIGHT = 1e-6  # share of their weight that stars beyond `CLIP_SIGMA` keep
-ITERATIONS = 3  # of zero points and the variance about them
-MAX_SHARE = 0.8  # of a star image in the means that are taken from it
-MAX_IMAGES = 5000  # of stars that are measured again and again: they tell the variance well
-SWEEPS = 10  # over frames and stars, each a mean of what is left
+CLIP_SIGMA = 3.5  # larger residuals: variable, blended or wrong in the catalogue
+REJECTED_WEIGHT = 1e-6  # factor of the weight beyond `CLIP_SIGMA`
+ITERATIONS = 3  # of zero points and their variance model
+MAX_LEVERAGE = 0.8  # largest weight of a star image in the means that are subtracted from it
+MAX_IMAGES = 5000  # maximum number of images of repeatedly measured stars: more do not help
+SWEEPS = 10  # alternating over frames and stars: each subtracts the mean residuals
 GAUSSIAN = 1.4826  # standard deviation over median absolute deviation
 
 
@@ -32,7 +34,7 @@ class FluxScale(NamedTuple):
     """How fluxes of one sensor become magnitudes, a row per frame or per flux.
 
     zero_mag : (n,) float
-        Magnitude of a flux of 1; NaN where no star has a flux.
+        Magnitude of a flux of 1; NaN for a frame without measured stars.
     zero_variance_mag2 : (n,) float
         Its variance.
     floor_mag2, photon_mag2 : (n,) float
@@ -47,7 +49,7 @@ class FluxScale(NamedTuple):
     def magnitudes(self, flux: Array) -> tuple[Array, Array]:
         """Return the magnitude of a flux in each row, and its 1-sigma error [mag].
 
-        NaN where there is no zero point, or no flux.
+        NaN without a zero point or a flux.
         """
         known = np.where((flux > 0) & np.isfinite(flux), flux, np.nan)
         variance = self.zero_variance_mag2 + self.floor_mag2 + self.photon_mag2 / known
@@ -71,14 +73,14 @@ def flux_scale(
     offset = magnitude + 2.5 * np.log10(flux[usable])
     count = np.bincount(frame, minlength=n_frames)
     zero = _medians(frame, offset, n_frames)
-    # The expected flux: a star that is too bright by far must not stand among the bright ones.
+    # The expected flux: a star with a wrong flux must not be among the bright ones.
     flux = 10 ** (-0.4 * (magnitude - zero[frame]))
     of_star = (UNKNOWN_STAR_MAG2, 0.0)
     for _ in range(ITERATIONS):
         residual = offset - zero[frame]
         of_star = _variance_by_flux(*_with_others(residual, flux, count[frame]))
         weight = 1.0 / _variance(of_star, flux)
-        # Not zero: a rejected star still counts in a frame that has no other.
+        # Not zero: a rejected star still counts in a frame without others.
         weight[np.abs(residual) > CLIP_SIGMA / np.sqrt(weight)] *= REJECTED_WEIGHT
         total = np.bincount(frame, weight, n_frames)
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -91,10 +93,10 @@ def flux_scale(
 def _repeat_variance(
     frame: Indices, star: Indices, offset: Array, flux: Array, n_frames: int
 ) -> tuple[float, float] | None:
-    """Return the variance of a measured flux, from stars that are measured again and again.
+    """Return (floor, photon) of a flux's variance, from stars that are measured repeatedly.
 
-    It is the scatter about an offset of each star and one of each frame. None if too few stars
-    are measured often.
+    It is the scatter about an offset of each star plus one of each frame. None if too few stars are
+    measured repeatedly.
     """
     some = frame <= np.sort(frame)[: MAX_IMAGES + 1].max(initial=-1)  # whole frames
     frame, offset, flux = frame[some], offset[some], flux[some]
@@ -113,14 +115,14 @@ def _repeat_variance(
                 mean = np.bincount(group, weight * residual) / of_group
                 residual = residual - mean[group]
         share = weight / total[0][frame] + weight / total[1][star]
-        free = share < MAX_SHARE
+        free = share < MAX_LEVERAGE
         residual = residual[free] / np.sqrt(1.0 - share[free])
         model = _variance_by_flux(residual, flux[free])
     return model
 
 
 def _with_others(residual: Array, flux: Array, count: Indices) -> tuple[Array, Array]:
-    """Return residuals from a mean of several stars, of which each is one, as from the truth."""
+    """Return the residuals, corrected for the star's share in its frame's mean, and the fluxes."""
     others = count > 1
     n = count[others]
     return residual[others] * np.sqrt(n / (n - 1)), flux[others]

@@ -1,8 +1,7 @@
 """Star catalogues: the stars at a date for a camera, and Gaia joined with Hipparcos.
 
-`navigation_catalogue` makes the list that stars are identified with. `join` and
-`johnson_v_of_gaia` prepare its source: Gaia with V magnitudes, and the bright stars of Hipparcos
-that Gaia lacks.
+`navigation_catalogue` makes the catalogue for star identification. `join` and `johnson_v_of_gaia`
+prepare its source: Gaia with V magnitudes, and the bright stars of Hipparcos that Gaia lacks.
 """
 
 from typing import NamedTuple
@@ -18,17 +17,18 @@ Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
 MAS = np.pi / 648_000_000.0  # rad
-# Stars within this are the same: 99.9 % of Hipparcos' places at 2016 are within 0.7" of Gaia's.
+# Largest separation of one star in both: 99.9 % of Hipparcos' positions at 2016 are within 0.7" of
+# Gaia's.
 SAME_ARCSEC = 1.0
-# A Hipparcos star is missing from Gaia if no Gaia star of similar brightness is this near (as
-# there is for a double that one of the catalogues resolves) and it is brighter than this.
+# A Hipparcos star is missing from Gaia if it is brighter than `SURELY_LISTED_MAG` and no Gaia star
+# of similar brightness is near. (Near: in a double that only one of the catalogues resolves.)
 NEAR_ARCSEC = 3.0
 LIKE_MAG = 1.5
 SURELY_LISTED_MAG = 9.0
-# Where Hipparcos is brighter by more, its magnitude is used: the relation below fails for the
-# reddest variables, and of some doubles Gaia lists the faint star only.
+# If Hipparcos is brighter by more, its magnitude is used: the relation below fails for the reddest
+# variables, and of some doubles Gaia lists only the faint star.
 MORE_LIGHT_MAG = 1.0
-COLOURS = (-0.5, 5.0)  # BP-RP to which the relation holds
+COLOURS = (-0.5, 5.0)  # range of BP-RP in which the relation holds
 
 
 class NavigationCatalogue(NamedTuple):
@@ -58,7 +58,7 @@ def star_directions(
     Parameters
     ----------
     ra, dec : (n,) float
-        Barycentric places at the epoch, ICRS [rad].
+        Barycentric positions at the epoch, ICRS [rad].
     parallax_mas, pm_ra_mas_yr, pm_dec_mas_yr : (n,) float
         Parallax (negative values count as 0); proper motions, in right ascension times cos(dec).
     years : float
@@ -69,7 +69,7 @@ def star_directions(
     References
     ----------
     ESA (1997), The Hipparcos Catalogue, vol. 1, section 1.2.8. Radial velocities are neglected:
-    they move no star by 0.2" in a century.
+    their effect is below 0.2" in a century for all stars.
     """
     cos_ra, sin_ra, cos_dec, sin_dec = np.cos(ra), np.sin(ra), np.cos(dec), np.sin(dec)
     u = np.stack([cos_dec * cos_ra, cos_dec * sin_ra, sin_dec], axis=-1)
@@ -78,12 +78,12 @@ def star_directions(
     motion = (pm_ra_mas_yr * MAS)[:, None] * east + (pm_dec_mas_yr * MAS)[:, None] * north
     parallax = np.maximum(parallax_mas, 0.0)[:, None] * MAS
     # In units of the star's distance.
-    place = u + motion * years - parallax * (np.asarray(r_observer_km) / AU_KM)
-    return place / np.linalg.norm(place, axis=1, keepdims=True)
+    position = u + motion * years - parallax * (np.asarray(r_observer_km) / AU_KM)
+    return position / np.linalg.norm(position, axis=1, keepdims=True)
 
 
 def star_sigmas(sigma_mas: Array, pm_sigma_mas_yr: Array, years: float) -> Array:
-    """Return 1-sigma errors, per axis [rad], of places `years` after the catalogue's epoch."""
+    """Return 1-sigma errors, per axis [rad], of positions `years` after the catalogue's epoch."""
     return np.hypot(sigma_mas, pm_sigma_mas_yr * years) * MAS
 
 
@@ -93,28 +93,29 @@ def navigation_catalogue(
     """Return the stars, brightest first, with those closer than `merge_rad` merged.
 
     A star merges with the brightest star within `merge_rad` that is not merged itself. The
-    result has the brightest star's id, the light-weighted place and the total light. Apply a
+    result has the brightest star's id, the light-weighted position and the total light. Apply a
     magnitude limit afterwards only: faint companions add light.
     """
     order = np.lexsort((star_id, magnitude))
     star_id, u_icrs, magnitude = star_id[order], u_icrs[order], magnitude[order]
-    owner = np.arange(len(star_id))
+    merged_into = np.arange(len(star_id))
     for brighter, fainter in _close_pairs(u_icrs, merge_rad):
-        if owner[brighter] == brighter and owner[fainter] == fainter:
-            owner[fainter] = brighter
+        if merged_into[brighter] == brighter and merged_into[fainter] == fainter:
+            merged_into[fainter] = brighter
     light = 10.0 ** (-0.4 * magnitude)
-    keep = owner == np.arange(len(owner))
-    together = np.bincount(owner, light, len(owner))[keep]
-    place = np.stack(
-        [np.bincount(owner, light * u_icrs[:, i], len(owner))[keep] for i in range(3)], axis=1
+    keep = merged_into == np.arange(len(merged_into))
+    together = np.bincount(merged_into, light, len(merged_into))[keep]
+    position = np.stack(
+        [np.bincount(merged_into, light * u_icrs[:, i], len(merged_into))[keep] for i in range(3)],
+        axis=1,
     )
-    merged = np.bincount(owner, minlength=len(owner))[keep] > 1
-    place = np.where(
-        merged[:, None], place / np.linalg.norm(place, axis=1, keepdims=True), u_icrs[keep]
+    merged = np.bincount(merged_into, minlength=len(merged_into))[keep] > 1
+    position = np.where(
+        merged[:, None], position / np.linalg.norm(position, axis=1, keepdims=True), u_icrs[keep]
     )
     total = np.where(merged, -2.5 * np.log10(together), magnitude[keep])
     again = np.lexsort((star_id[keep], total))
-    return NavigationCatalogue(star_id[keep][again], place[again], total[again])
+    return NavigationCatalogue(star_id[keep][again], position[again], total[again])
 
 
 def _close_pairs(u: Array, merge_rad: float) -> list[tuple[int, int]]:
@@ -137,7 +138,7 @@ def limit_for_density(magnitude: Array, stars_per_sr: float) -> float:
 class Joined(NamedTuple):
     """Gaia's stars matched with those of Hipparcos.
 
-    hipparcos_of : (n,) int, row of the Hipparcos star of each Gaia star, -1 for none
+    hipparcos_of : (n,) int, row of the Hipparcos star of each Gaia star; -1 without
     missing : (k,) int, rows of Hipparcos stars that Gaia lacks
     """
 
@@ -160,18 +161,18 @@ def johnson_v_of_gaia(g: Array, bp: Array, rp: Array) -> Array:
     return g - (-0.02704 + colour * (0.01424 + colour * (-0.2156 + colour * 0.01426)))
 
 
-def moved(
+def propagate_positions(
     ra: Array, dec: Array, pm_ra_mas_yr: Array, pm_dec_mas_yr: Array, years: float
 ) -> tuple[Array, Array, Array, Array]:
-    """Return places [rad] and motions [mas/yr] after some Julian years, for the barycentre.
+    """Return barycentric positions [rad] and proper motions [mas/yr] after some Julian years.
 
     Radial velocities are neglected.
     """
     u, east, north = unit_from_radec(ra, dec), *_axes(ra, dec)
     motion = pm_ra_mas_yr[:, None] * east + pm_dec_mas_yr[:, None] * north
-    place = u + motion * (MAS * years)
-    distance = np.linalg.norm(place, axis=1, keepdims=True)
-    u = place / distance
+    position = u + motion * (MAS * years)
+    distance = np.linalg.norm(position, axis=1, keepdims=True)
+    u = position / distance
     motion = (motion - np.sum(motion * u, axis=1, keepdims=True) * u) / distance
     ra, dec = radec_from_unit(u)
     east, north = _axes(ra, dec)
@@ -206,11 +207,11 @@ def join(u_gaia: Array, v_gaia: Array, u_hipparcos: Array, v_hipparcos: Array) -
     hipparcos_of[gaia[nearest_last]] = nearest_last
     candidates = every[~same & (v_hipparcos < SURELY_LISTED_MAG)]
     near = tree.query_ball_point(u_hipparcos[candidates], NEAR_ARCSEC * ARCSEC)
-    alone = [
+    missing = [
         not np.any(v_gaia[rows] < v_hipparcos[row] + LIKE_MAG)
         for row, rows in zip(candidates, near, strict=True)
     ]
-    return Joined(hipparcos_of, candidates[np.array(alone, bool)])
+    return Joined(hipparcos_of, candidates[np.array(missing, bool)])
 
 
 def joined_magnitude(v_gaia: Array, v_hipparcos: Array) -> Array:

@@ -8,7 +8,12 @@ from astropy.time import Time
 
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.directions import unit_from_radec
-from epipole.tasks.algorithms.star_catalogue import johnson_v_of_gaia, join, joined_magnitude, moved
+from epipole.tasks.algorithms.star_catalogue import (
+    johnson_v_of_gaia,
+    join,
+    joined_magnitude,
+    propagate_positions,
+)
 
 MAS = ARCSEC / 1000
 
@@ -25,7 +30,7 @@ def test_places_and_motions_move_as_astropy_moves_them():
         radial_velocity=np.zeros(4) * units.km / units.s,
         obstime=Time(1991.25, format="jyear"),
     ).apply_space_motion(new_obstime=Time(2016.0, format="jyear"))
-    new_ra, new_dec, new_pm_ra, new_pm_dec = moved(ra, dec, pm_ra, pm_dec, 24.75)
+    new_ra, new_dec, new_pm_ra, new_pm_dec = propagate_positions(ra, dec, pm_ra, pm_dec, 24.75)
     want = unit_from_radec(stars.ra.rad, stars.dec.rad)
     assert np.max(np.linalg.norm(unit_from_radec(new_ra, new_dec) - want, axis=1)) < MAS
     # The apparent transverse speed changes with perspective by parts in a million a century.
@@ -35,7 +40,9 @@ def test_places_and_motions_move_as_astropy_moves_them():
 
 def test_a_star_without_motion_stays():
     ra, dec, none = np.array([1.0]), np.array([-0.5]), np.zeros(1)
-    np.testing.assert_allclose(np.concatenate(moved(ra, dec, none, none, 30.0)), [1, -0.5, 0, 0])
+    np.testing.assert_allclose(
+        np.concatenate(propagate_positions(ra, dec, none, none, 30.0)), [1, -0.5, 0, 0]
+    )
 
 
 def test_v_follows_from_g_and_colour():

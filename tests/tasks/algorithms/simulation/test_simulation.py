@@ -41,7 +41,7 @@ from epipole.tasks.algorithms.simulation.optics import (
 )
 from epipole.tasks.algorithms.simulation.paths import elements_from_state, state_at
 from epipole.tasks.algorithms.simulation.sources import star_directions, star_field
-from epipole.tasks.algorithms.star_catalogue import moved
+from epipole.tasks.algorithms.star_catalogue import propagate_positions
 from epipole.tasks.simulate.simulate_scene import expose_blocks, simulate_scene
 
 MAS = np.pi / 648e6
@@ -169,7 +169,7 @@ def field_of(stars, **changes):
 def test_a_scene_with_a_catalogue_file_shows_its_stars(tmp_path):
     # Hipparcos' stars of the truth below at another epoch and under other numbers.
     hipparcos = read_stars("hipparcos", 6.5)
-    ra, dec, pm_ra, pm_dec = moved(
+    ra, dec, pm_ra, pm_dec = propagate_positions(
         hipparcos.ra, hipparcos.dec, hipparcos.pm_ra_mas_yr, hipparcos.pm_dec_mas_yr, 20.0
     )
     none = np.zeros(len(ra))
