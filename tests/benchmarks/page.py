@@ -99,6 +99,7 @@ PLAN = {
     "orekit_orbits": Benchmark("orekit_orbits"),
     "known_objects": Benchmark("known_objects", "--objects 300 --ages 3 10", 8),
     "real_orbits": Benchmark("real_orbits", "--scenes 4 --seed 71 --out {folder}", 12),
+    "passages": Benchmark("passages", "--seeds 1 2 3", 6),
 }
 
 
