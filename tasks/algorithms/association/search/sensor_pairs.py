@@ -26,7 +26,7 @@ Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a field, to see whether it meets another one
-TESTED_INSTANTS = 3
+TESTED_INSTANTS = 8  # at most, of those at which both sensors have tracklets
 N_LEADERS = 8  # sensors of a crowded cell with which all others there are paired
 MAX_OVERLAPPING = 64  # maximum number of others that a sensor is paired with, half of them leaders
 MAX_TESTS = 512  # maximum number of tests per sensor of whether two fields overlap
@@ -51,7 +51,7 @@ def meeting_pairs(index: FieldIndex, cones: Array, farthest_km: float) -> tuple[
         return a[meet], b[meet]
     # Leaders at random, so that they are all around: they have long baselines with some others.
     rank = np.random.default_rng(n).permutation(n)
-    pairs = _overlapping_pairs(index, rank, *_tested(cones, farthest_km))
+    pairs = _overlapping_pairs(index, rank, cones, _steps_along(farthest_km))
     key = np.unique(pairs.min(axis=1) * n + pairs.max(axis=1))
     return key // n, key % n
 
@@ -59,9 +59,10 @@ def meeting_pairs(index: FieldIndex, cones: Array, farthest_km: float) -> tuple[
 def fields_meet(cones: Array, a: Indices, b: Indices, farthest_km: float) -> npt.NDArray[np.bool_]:
     """Return whether the fields of two sensors overlap anywhere, (n,) bool.
 
-    At some instants, the axis of sensor a's cone is followed in steps. A ball about each step
-    encloses the cone up to the next one, and is tested for contact with the cone of b. Cones end
-    at the ground. The result is never false if the fields overlap, but may be true if they do not.
+    At some of the instants at which both have tracklets, the axis of sensor a's cone is followed in
+    steps. A ball about each step encloses the cone up to the next one, and is tested for contact
+    with the cone of b. Cones end at the ground. The result is never false if the fields overlap at
+    a tested instant, but may be true if they do not.
 
     Parameters
     ----------
@@ -70,15 +71,12 @@ def fields_meet(cones: Array, a: Indices, b: Indices, farthest_km: float) -> npt
     a, b : (n,) int
         Pairs of sensors.
     """
-    return np.asarray(_meet_all(*_tested(cones, farthest_km), a, b))
+    return np.asarray(_meet_all(cones, _steps_along(farthest_km), a, b))
 
 
-def _tested(cones: Array, farthest_km: float) -> tuple[Array, Array]:
-    """Return the cones at the tested instants, and the steps along them [km]."""
-    tested = np.unique(np.linspace(0, cones.shape[1] - 1, TESTED_INSTANTS).astype(int))
-    return np.ascontiguousarray(cones[:, tested]), np.geomspace(
-        NEAREST_STEP_KM, farthest_km, N_STEPS
-    )
+def _steps_along(farthest_km: float) -> Array:
+    """Return the steps along a cone [km]."""
+    return np.geomspace(NEAREST_STEP_KM, farthest_km, N_STEPS)
 
 
 @kernel
@@ -92,10 +90,18 @@ def _meet_all(cones, steps, a, b):
 @borrowing_kernel
 def _meet(cones, steps, a, b):
     """Return whether the fields of two sensors meet, see `fields_meet`."""
-    step = steps[1] / steps[0]
+    step, common = steps[1] / steps[0], 0
+    for m in range(cones.shape[1]):
+        common += cones[a, m, TANGENT] > 0.0 and cones[b, m, TANGENT] > 0.0
+    # Evenly among the common ones, first and last included: they may be two of the window's thirty.
+    passed, tested, n_tested = 0, 0, min(common, TESTED_INSTANTS)
     for m in range(cones.shape[1]):
         if not (cones[a, m, TANGENT] > 0.0 and cones[b, m, TANGENT] > 0.0):
             continue
+        passed += 1
+        if (passed - 1) * (n_tested - 1) < tested * (common - 1):
+            continue
+        tested += 1
         tangent, half_b = cones[a, m, TANGENT] + (step - 1) / 2, np.arctan(cones[b, m, TANGENT])
         ends_a = ground_range(cones[a, m, :AXIS], cones[a, m, AXIS:TANGENT],
                               np.arctan(cones[a, m, TANGENT]))  # fmt: skip

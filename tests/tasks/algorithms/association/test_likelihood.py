@@ -141,3 +141,11 @@ def test_sensors_at_very_different_ranges_agree_on_a_low_object():
     assert solve(light_time_samples()).group.tolist() == [0, 0, 0]
     without_rates = light_time_samples()._replace(rate=None)
     assert solve(without_rates).group.tolist() != [0, 0, 0]  # light time matters here
+
+
+def test_two_sensors_find_a_passage_of_a_few_seconds():
+    times = np.arange(0.0, 30.0)
+    scene = Scene(3, 2, times=times).objects(1)
+    for i in range(2):
+        scene.seen[i] = (times >= 4.0) & (times <= 7.0)
+    assert (solve(scene.samples()).group == 0).all()

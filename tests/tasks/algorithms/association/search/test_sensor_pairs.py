@@ -64,3 +64,30 @@ def test_fields_that_share_a_place_meet(seed):
     assert share.sum() > 20
     assert meet[share].all()
     assert meet.mean() < 0.5
+
+
+@pytest.mark.parametrize("common", [[4, 5], [7], [0, 1, 2, 25]])
+def test_fields_meet_where_both_sensors_have_tracklets(common):
+    """A passage lasts for few of a window's instants, and a field without tracklets is no cone."""
+    cones = np.zeros((3, 30, 7))
+    place, toward = np.array([7000.0, 0.0, 0.0]), np.array([7600.0, 0.0, 0.0])
+    for s, aside in enumerate((-100.0, 100.0)):
+        r = place + np.array([0.0, aside, 0.0])
+        look = (toward - r) / np.linalg.norm(toward - r)
+        cones[s, common] = [*r, *look, np.tan(np.radians(5.0))]
+    cones[0, 9:14], cones[1, 15:20] = cones[0, common[0]], cones[1, common[0]]  # one alone
+    cones[2] = [*place, 0.0, 0.0, 1.0, np.tan(np.radians(5.0))]
+    meet = fields_meet(cones, np.array([0, 0, 1]), np.array([1, 2, 2]), 1e5)
+    assert meet.tolist() == [True, False, False]
+
+
+def test_fields_that_meet_at_the_end_only_are_a_pair():
+    cones = np.zeros((2, 30, 7))
+    for m in range(30):
+        for s, side in enumerate((-1.0, 1.0)):
+            off = np.radians(90.0 - 3.0 * m) * side  # the fields turn towards each other
+            look = [np.cos(off), np.sin(off), 0.0]
+            cones[s, m] = [7000.0, 300.0 * side, 0.0, *look, np.tan(np.radians(5.0))]
+    pair = np.array([0]), np.array([1])
+    assert not fields_meet(cones[:, :20], *pair, 1e5)[0]
+    assert fields_meet(cones, *pair, 1e5)[0]
