@@ -151,15 +151,23 @@ def _grow(space, work, members, nearby):
     a, b = views.sensor[members[0]], views.sensor[members[1]]
     evidence, looked, early = 0.0, 0, np.int64(0)
     nearest2 = nearest_range2(views, members[:n], work.points)
-    begin = 0
-    while begin < n_near and near[begin] < a:
-        begin += 1
-    for turn in range(n_near + 2):
+    begin, mark = np.searchsorted(near[:n_near], a), next_mark(work.stamp)
+    work.stamp[a] = work.stamp[b] = mark
+    turn = -1
+    while turn < n_near + 1:
+        turn += 1
+        if turn == n_near and n > 2 and _outlast(views, members[:n], work.points.seen_by):
+            n = _settle(space, work, members, n)
+            if n < 2:
+                return np.int64(0), np.int64(0)
+            n_near, turn = np.int64(near_fields(views, work.points, nearby, near)), -1
+            continue
         # The sensors of the seed come last: they may have another fragment of the object.
         if turn < n_near:
             s = near[(begin + turn) % n_near]
-            if s in (a, b):
+            if work.stamp[s] == mark:
                 continue
+            work.stamp[s] = mark
         else:
             s = a if turn == n_near else b
         before = n
@@ -198,6 +206,21 @@ def _begin(space, work, members, nearby):
     if not possible(space, members, points):
         return np.int64(-1)
     return np.int64(near_fields(space.views, points, nearby, work.near))
+
+
+@borrowing_kernel
+def _outlast(views, members, seen_by):
+    """Return whether two members share an instant that is not solved.
+
+    Only those of the seed are, but other sensors may see the object at others.
+    """
+    for m in range(len(seen_by)):
+        count = 0
+        for i in members:
+            count += views.seen[i, m]
+        if count >= 2 and seen_by[m] < 2:
+            return True
+    return False
 
 
 @inlined_kernel

@@ -143,6 +143,21 @@ def test_sensors_at_very_different_ranges_agree_on_a_low_object():
     assert solve(without_rates).group.tolist() != [0, 0, 0]  # light time matters here
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_an_object_that_sensors_see_one_after_the_other_is_one_group(seed):
+    """What two sensors see for a moment grows by those that see it later."""
+    times = np.arange(0.0, 24.0, 2.0)
+    scene = Scene(seed, 15, times=times).objects(1)
+    early, late = times < 8.0, times >= 14.0
+    for i, s in enumerate(scene.sensor):
+        if s < 5:
+            scene.seen[i] = early
+        elif s >= 10:
+            scene.seen[i] = late
+    groups = solve(scene.samples())
+    assert (groups.group == 0).all()
+
+
 def test_two_sensors_find_a_passage_of_a_few_seconds():
     times = np.arange(0.0, 30.0)
     scene = Scene(3, 2, times=times).objects(1)
