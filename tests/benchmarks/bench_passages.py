@@ -34,11 +34,12 @@ RATIOS = {
 }
 
 
-def measure(satellites: int, seed: int, near: bool) -> Report:
+def measure(satellites: int, seed: int, near: bool, seconds: float | None) -> Report:
     """Return the report of a constellation."""
     with tempfile.TemporaryDirectory() as folder:
         logs, out = Path(folder) / "logs", Path(folder) / "out"
-        simulate("constellation", logs, satellites=satellites, seed=seed, near=near)
+        size = {"satellites": satellites, "near": near, "seconds": seconds}
+        simulate("constellation", logs, seed=seed, **size)  # type: ignore[arg-type]
         whole_run(logs, out, {}, lambda _: 0.0)
         return evaluate(out, Path(f"{logs}.truth"))
 
@@ -48,9 +49,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--satellites", type=int, default=16)
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--seconds", type=float, default=None)
     parser.add_argument("--apart", action="store_true")
     chosen = parser.parse_args()
-    reports = [measure(chosen.satellites, seed, not chosen.apart) for seed in chosen.seeds]
+    reports = [
+        measure(chosen.satellites, seed, not chosen.apart, chosen.seconds) for seed in chosen.seeds
+    ]
     print(f"| seed | {' | '.join(map(str, chosen.seeds))} |\n|---|{'---|' * len(reports)}")
     for label, names in MEASURES.items():
         cells = ["; ".join(figure(n, getattr(report, n)) for n in names) for report in reports]

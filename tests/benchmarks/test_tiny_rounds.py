@@ -37,6 +37,7 @@ TINY = {
     "night": "--shares 1 --hours 0.02",
     "orbit_fits": "--seeds 1",
     "page": "--rounds 1",
+    "passages": "--satellites 2 --seeds 1 --seconds 20",
     "photographs": "{folder}/list.csv --width 1024 --height 1024 --field 20 --year 2024 --reach 0",
     "positions": "--positions 20",
     "queries": "--nights 10 --rows 1000 --runs 1",
