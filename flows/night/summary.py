@@ -114,7 +114,7 @@ class Summary:
         return ", ".join(parts)
 
     def _without_object(self) -> list[str]:
-        """Return how many tracklets have no object, by outcome; nothing where none has not."""
+        """Return how many tracklets have no object, by outcome; nothing if all have one."""
         alone = {name: n for name, n in self.outcomes.items() if name != Outcome.OBJECT}
         if not alone:
             return []

@@ -26,10 +26,7 @@ def factor(N, b):
         for j in range(k):
             b[k] -= N[k, j] * b[j]
         b[k] /= N[k, k]
-    for k in range(n - 1, -1, -1):
-        for j in range(k + 1, n):
-            b[k] -= N[j, k] * b[j]
-        b[k] /= N[k, k]
+    _substitute_back(N, b)
     return log_det
 
 
@@ -41,6 +38,13 @@ def solve_factored(L, b):
         for j in range(k):
             b[k] -= L[k, j] * b[j]
         b[k] /= L[k, k]
+    _substitute_back(L, b)
+
+
+@kernel
+def _substitute_back(L, b):
+    """Solve L^T x = b in place; L (n, n) is a lower factor."""
+    n = len(b)
     for k in range(n - 1, -1, -1):
         for j in range(k + 1, n):
             b[k] -= L[j, k] * b[j]

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.cholesky import factor, solve_factored
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.tracking.local_motion import about
 from epipole.tasks.algorithms.tracking.sky_filter import (
     FAR_RAD_S2,
     LOW_ORBIT_S,
@@ -85,14 +86,14 @@ def _fit_all(rows, at_s, time_s, u, noise, out):
     frame, derivatives = np.empty((3, 3)), np.empty((ORDER + 1, 2))
     N, rhs = np.empty((N_ROWS, N_ROWS)), np.empty(N_ROWS)
     for k in range(len(at_s)):
-        lo, hi = _about(time_s, rows[k, 0], rows[k, 1], at_s[k], MAX_HALF_S)
+        lo, hi = about(time_s, rows[k, 0], rows[k, 1], at_s[k], MAX_HALF_S)
         if lo == hi:
             continue
         scale, more = 1.0, 1.0
         for _ in range(MAX_ROUNDS):
             rate = _frame(time_s, u, lo, hi, at_s[k], frame)
             faster = more * (rate + LOW_ORBIT_S + 2 * approach(rate))
-            lo, hi = _about(time_s, lo, hi, at_s[k], MAX_TURN / faster)
+            lo, hi = about(time_s, lo, hi, at_s[k], MAX_TURN / faster)
             chi2 = 0.0
             for _ in range(2):  # again about the direction that the first fit gives
                 scale, chi2 = _solve(time_s, u, noise, lo, hi, at_s[k], rate, more, frame, N, rhs)
@@ -105,19 +106,6 @@ def _fit_all(rows, at_s, time_s, u, noise, out):
                 break
             more *= 2.0
         _write(frame, derivatives, N, scale, out, k)
-
-
-@kernel
-def _about(t, first, last, at, half):
-    """Return the detections within a half-width of an instant, at least three if there are any."""
-    lo = first + np.searchsorted(t[first:last], at - half)
-    hi = first + np.searchsorted(t[first:last], at + half, side="right")
-    while hi - lo < min(3, last - first):
-        if hi == last or (lo > first and at - t[lo - 1] <= t[hi] - at):
-            lo -= 1
-        else:
-            hi += 1
-    return lo, hi
 
 
 @kernel

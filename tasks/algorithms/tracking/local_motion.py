@@ -131,7 +131,7 @@ def _coefficients(t, weight, scale, curvature_prior, value, slope):
 
 
 @kernel
-def _about(t, first, last, at, half):
+def about(t, first, last, at, half):
     """Return the detections within a half-width of an instant, at least three if there are any."""
     lo = first + np.searchsorted(t[first:last], at - half)
     hi = first + np.searchsorted(t[first:last], at + half, side="right")
@@ -150,7 +150,7 @@ def _window(t, u, first, last, at, sigma, widest):
     Three detections are kept, however slow the sensor or fast the object. The prior covers the
     curvature, and a window beyond the half-width adds to the error.
     """
-    lo, hi = _about(t, first, last, at, widest)
+    lo, hi = about(t, first, last, at, widest)
     rate = 0.0
     if hi - lo > 1:
         chord = 0.0
@@ -158,7 +158,7 @@ def _window(t, u, first, last, at, sigma, widest):
             chord += (u[hi - 1, a] - u[lo, a]) ** 2
         rate = np.sqrt(chord) / (t[hi - 1] - t[lo])
     half = _half_width(rate, sigma, widest)
-    lo, hi = _about(t, lo, hi, at, half)
+    lo, hi = about(t, lo, hi, at, half)
     return lo, hi, rate, half
 
 
