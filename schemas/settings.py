@@ -377,8 +377,8 @@ class WorkSettings(Group):
     )
 
     @property
-    def most_views(self) -> int:
-        """The views of objects that a task may hold at the same time."""
+    def max_views(self) -> int:
+        """The limit of the views that a task has in memory at the same time."""
         return self.memory_mib * 2**20 // BYTES_PER_VIEW
 
 

@@ -21,7 +21,6 @@ MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*
 WAITING = (
     "tasks/algorithms/association",
     "tasks/algorithms/tracking",
-    "tasks/solve",
 )
 # In text, with the uses that are allowed; in names, as words between underscores or capitals.
 TEXTS = {

@@ -19,7 +19,7 @@ from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span, spans_between
 from epipole.schemas.stages import Stage
-from epipole.tasks.solve.align_epochs import EpochGrid, frames_that_serve, grid_of
+from epipole.tasks.solve.align_epochs import EpochGrid, usable_frames, night_grid
 from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.number_objects import number_objects
 from epipole.tasks.solve.positions import VELOCITY_WINDOW_S
@@ -60,14 +60,14 @@ class _Night(NamedTuple):
     @property
     def epochs_apart(self) -> int:
         """Number of epochs after which no detection serves again."""
-        if self.grid.instants_ns is not None:
+        if self.grid.epochs_ns is not None:
             return 1
         return math.floor(2e9 * self.settings.alignment.window_s / self.grid.interval_ns) + 1
 
     @property
     def apart_ns(self) -> int:
         """Time between these epochs, which are multiples of it; 1 where all epochs are."""
-        return 1 if self.grid.instants_ns is not None else self.epochs_apart * self.grid.interval_ns
+        return 1 if self.grid.epochs_ns is not None else self.epochs_apart * self.grid.interval_ns
 
 
 def solve_objects(
@@ -96,15 +96,15 @@ def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
     times = []
     for sensor, spans in work.spans.items():
         rows = [work.identified[sensor].read(span, "solutions", columns) for span in spans]
-        serving = [array(frames_that_serve(part), "time") for part in rows]
+        serving = [array(usable_frames(part), "time") for part in rows]
         times.append(np.concatenate([np.zeros(0, np.int64), *serving]))
-    return grid_of(times, settings.alignment)
+    return night_grid(times, settings.alignment)
 
 
 def _view(night: _Night) -> dict[Span, int]:
     """View the tracklets of all sensors, some of them a task; return the views of each span."""
     work, settings = night.work, night.settings
-    sensors, limit = work.sensor_parts(), settings.work.most_views // VIEWS_AT_ONCE
+    sensors, limit = work.sensor_parts(), settings.work.max_views // VIEWS_AT_ONCE
     groups = [
         (span, group)
         for span in night.spans
@@ -148,13 +148,13 @@ def _associate(night: _Night, n_views: Mapping[Span, int], left_out: Mapping[str
     futures = []
     for span in night.spans:
         blocks = blocks_of(span, night.settings.association)
-        together = n_views[span] <= night.settings.work.most_views
+        together = n_views[span] <= night.settings.work.max_views
         for of_task in [blocks] if together else [[block] for block in blocks]:
             futures.append(
                 associate_blocks.submit(
                     night.sensors, night.viewed, of_task, night.work.cameras, left_out,
                     night.settings.association, night.settings.alignment.window_s,
-                    night.settings.work.most_views, night.solved.blocks,
+                    night.settings.work.max_views, night.solved.blocks,
                 )
             )  # fmt: skip
     results(Stage.SOLVE, futures, (1, STEPS))
@@ -164,7 +164,7 @@ def _solve(night: _Night, n_views: Mapping[Span, int]) -> int:
     """Solve the objects, a task per piece; return the number of positions."""
     spans, settings, solved = night.spans, night.settings, night.solved
     numbered = number_objects.submit(
-        spans, night.margin_ns, settings.association, settings.work.most_views, solved
+        spans, night.margin_ns, settings.association, settings.work.max_views, solved
     )
     (counts,) = results(Stage.SOLVE, [numbered], (2, STEPS))
     viewed, margin_ns = night.viewed, night.margin_ns

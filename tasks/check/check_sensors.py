@@ -29,7 +29,7 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
 )
 from epipole.tasks.algorithms.sensor_faults.suspects import judge_many_sensors
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.solve.sample_sight_lines import meetings
+from epipole.tasks.solve.sample_sight_lines import pair_with_objects
 
 Array = npt.NDArray[np.float64]
 
@@ -183,7 +183,9 @@ def _candidate_pairs(
     pairs = free.select("epoch").join(n_objects, on="epoch")["n"].sum()
     stride = epochs[:: max(-(-pairs // MAX_PAIRS), 1)]
     return to_polars(
-        meetings(free.filter(pl.col("epoch").is_in(stride.implode())), objects, on=["epoch"])
+        pair_with_objects(
+            free.filter(pl.col("epoch").is_in(stride.implode())), objects, on=["epoch"]
+        )
     )
 
 

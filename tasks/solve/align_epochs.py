@@ -1,4 +1,4 @@
-"""Align epochs: common instants of all sensors, and the frame that each sensor has for them."""
+"""Align epochs: common times of all sensors, and the nearest frame of each sensor."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -23,27 +23,27 @@ class EpochGrid(NamedTuple):
     """The epochs of a whole night, the same for each of its spans."""
 
     interval_ns: int
-    instants_ns: tuple[int, ...] | None  # the epochs, where no sensor has a frame interval
+    epochs_ns: tuple[int, ...] | None  # the epochs, if no sensor has a frame interval
 
 
-def grid_of(time_ns: Sequence[npt.NDArray[np.int64]], settings: AlignmentSettings) -> EpochGrid:
+def night_grid(time_ns: Sequence[npt.NDArray[np.int64]], settings: AlignmentSettings) -> EpochGrid:
     """Return a night's grid of epochs.
 
     Parameters
     ----------
     time_ns
-        For each sensor, the times of the frames that can be used; see `frames_that_serve`.
+        For each sensor, the times of its `usable_frames`.
     """
-    wanted_s = settings.interval_s
-    if wanted_s is not None:
-        return EpochGrid(max(round(wanted_s * 1e9), 1), None)
+    interval_s = settings.interval_s
+    if interval_s is not None:
+        return EpochGrid(max(round(interval_s * 1e9), 1), None)
     interval_ns = epoch_interval_ns(list(time_ns))
     if any(len(t) > 1 for t in time_ns) or not len(time_ns):
         return EpochGrid(interval_ns, None)
     return EpochGrid(interval_ns, tuple(instants_of(np.concatenate(time_ns), interval_ns).tolist()))
 
 
-def frames_that_serve(solutions: pa.Table) -> pa.Table:
+def usable_frames(solutions: pa.Table) -> pa.Table:
     """Return the frames that have an attitude and a position."""
     return solutions.filter(
         (pa.compute.field("attitude_source") != "none") & pa.compute.field("x_km").is_valid()
@@ -55,31 +55,31 @@ def align_epochs(
 ) -> pa.Table:
     """Return EPOCHS: for each epoch and sensor the nearest frame, and its distance in time.
 
-    An epoch is kept if any sensor has a frame for it. Without `grid`, these frames give it.
+    An epoch is kept if any sensor has a frame for it. Without `grid`, it is that of these frames.
     """
-    served = frames_that_serve(solutions).sort_by("time")
+    served = usable_frames(solutions).sort_by("time")
     sensors = sorted(set(served["sensor_id"].to_pylist()))
     parts = [served.filter(pa.compute.field("sensor_id") == s) for s in sensors]
     times = [array(part, "time") for part in parts]
     if not parts:
         return concat(EPOCHS, [])
-    interval_ns, instants_ns = grid or grid_of(times, settings)
-    if instants_ns is None:
+    interval_ns, epochs_ns = grid or night_grid(times, settings)
+    if epochs_ns is None:
         epochs = epoch_grid(
             min(int(t[0]) for t in times) - interval_ns // 2,
             max(int(t[-1]) for t in times) + interval_ns // 2,
             interval_ns,
         )
     else:
-        epochs = np.array(instants_ns, np.int64)
+        epochs = np.array(epochs_ns, np.int64)
     rows = [
-        _serving(epochs, sensor, array(part, "frame_number"), t, interval_ns, settings)
+        _nearest_frames(epochs, sensor, array(part, "frame_number"), t, interval_ns, settings)
         for sensor, part, t in zip(sensors, parts, times, strict=True)
     ]
     return concat(EPOCHS, rows).sort_by([("epoch", "ascending"), ("sensor_id", "ascending")])
 
 
-def _serving(
+def _nearest_frames(
     epochs: npt.NDArray[np.int64],
     sensor: str,
     frame_number: npt.NDArray[np.int64],

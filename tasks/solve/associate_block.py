@@ -33,10 +33,10 @@ from epipole.tasks.solve.association_input import BlockViews, SensorViews
 _RANK = {outcome.value: rank for rank, outcome in enumerate(Outcome)}
 
 
-def judge_views(associations: pa.Table) -> pa.Table:
+def view_outcomes(associations: pa.Table) -> pa.Table:
     """Return TRACKLET_OUTCOMES of the views of objects: used by a position, or rejected.
 
-    Lone detections, which are not published, have none.
+    Lone detections are left out: they are not published.
     """
     used, ids = associations["used"], associations["tracklet_id"]
     return best_outcomes(
@@ -63,7 +63,7 @@ def best_outcomes(tables: Iterable[pa.Table]) -> pa.Table:
 
 
 def outcomes(tracklet_id: pa.ChunkedArray, outcome: Outcome) -> pa.Table:
-    """Return TRACKLET_OUTCOMES: one outcome for all these tracklets, lone detections excepted."""
+    """Return TRACKLET_OUTCOMES: one outcome for all these tracklets, without lone detections."""
     ids = pc.unique(published_ids(tracklet_id)).drop_null()
     values = pa.array([outcome.value] * len(ids), pa.string())
     return table(TRACKLET_OUTCOMES, {"tracklet_id": ids, "outcome": values})
@@ -78,7 +78,7 @@ def associate_blocks(
     left_out: Mapping[str, Reason],
     settings: AssociationSettings,
     half_width_s: float,
-    most_views: int,
+    max_views: int,
     parts: Parts,
 ) -> None:
     """Find the objects of some blocks of one span, unless the parts exist.
@@ -93,31 +93,33 @@ def associate_blocks(
         Sensors at fault, each with its reason; their views are not used.
     half_width_s
         Time on each side of an epoch in which the direction of a view was fitted.
-    most_views
-        Views that one task may hold.
+    max_views
+        Limit of the views that a task has in memory at the same time.
     parts
         Where the parts go: `ASSOCIATED` of each block.
     """
     for block in blocks:
         if not parts.holds(block):
             views = [
-                sensor_views(of, viewed[of.number], block.span)
-                for of in sensors
-                if viewed[of.number].holds(block.span)
+                sensor_views(sensor, viewed[sensor.number], block.span)
+                for sensor in sensors
+                if viewed[sensor.number].holds(block.span)
             ]
             taking_part = [
-                of for of in views if of.sensor_id not in left_out and of.epochs.num_rows
+                sensor
+                for sensor in views
+                if sensor.sensor_id not in left_out and sensor.epochs.num_rows
             ]
-            of_block = None
-            if any(of.tracklets.num_rows for of in taking_part):
-                of_block = BlockViews(taking_part, cameras, block, settings.span_s, half_width_s)
-            tables = _associate(of_block, settings, most_views)
-            faulty = [of for of in views if of.sensor_id in left_out]
+            block_views = None
+            if any(sensor.tracklets.num_rows for sensor in taking_part):
+                block_views = BlockViews(taking_part, cameras, block, settings.span_s, half_width_s)
+            tables = _associate(block_views, settings, max_views)
+            faulty = [sensor for sensor in views if sensor.sensor_id in left_out]
             write_part(parts.of(block), ASSOCIATED, _with_faulty(tables, faulty, block, left_out))
 
 
 def blocks_of(span: Span, settings: AssociationSettings) -> list[Span]:
-    """Return the blocks of a span: as long as the longest evidence, or else the span."""
+    """Return the blocks of a span, or the span itself if windows are longer than a block."""
     return [span] if settings.span_s * 1e9 > BLOCK_NS else span.blocks
 
 
@@ -133,17 +135,17 @@ def sensor_views(sensor: Sensor, viewed: Parts, span: Span) -> SensorViews:
 
 
 def _associate(
-    block: BlockViews | None, settings: AssociationSettings, most_views: int
+    block: BlockViews | None, settings: AssociationSettings, max_views: int
 ) -> dict[str, pa.Table]:
-    """Return the tables of a block; None: there is nothing to associate."""
+    """Return the tables of a block; empty ones for a block without views."""
     if block is None:
         schemas = {"members": OBJECT_MEMBERS, "rejects": REJECTS, "outcomes": TRACKLET_OUTCOMES}
         return {name: empty(schema) for name, schema in schemas.items()}
-    associated = associate_objects(block, settings, most_views)
+    associated = associate_objects(block, settings, max_views)
     return {
         "members": object_members(block, associated),
         "rejects": associated.rejects,
-        "outcomes": best_outcomes(_of_items(block, associated)),
+        "outcomes": best_outcomes(_item_outcomes(block, associated)),
     }
 
 
@@ -153,17 +155,17 @@ def _with_faulty(
     block: Span,
     left_out: Mapping[str, Reason],
 ) -> dict[str, pa.Table]:
-    """Return the tables of a block with what is said of the sensors at fault."""
-    outcomes_of_faulty = _outcomes(faulty, Outcome.SENSOR_LEFT_OUT)
+    """Return the tables of a block with the rejects and outcomes of the sensors at fault."""
+    outcomes_of_faulty = _sensor_outcomes(faulty, Outcome.SENSOR_LEFT_OUT)
     return {
         "members": tables["members"],
-        "rejects": concat(REJECTS, [_left_out(faulty, block, left_out), tables["rejects"]]),
+        "rejects": concat(REJECTS, [_rejects(faulty, block, left_out), tables["rejects"]]),
         "outcomes": best_outcomes([outcomes_of_faulty, tables["outcomes"]]),
     }
 
 
 def object_members(block: BlockViews, associated: Associated) -> pa.Table:
-    """Return OBJECT_MEMBERS of a block: windows that follow one another are one row."""
+    """Return OBJECT_MEMBERS of a block: successive windows of one object and tracklet are a row."""
     items, number = block.items, associated.object_number
     order = np.lexsort((items.window, items.tracklet))
     tracklet, object_ = items.tracklet[order], number[order]
@@ -173,7 +175,7 @@ def object_members(block: BlockViews, associated: Associated) -> pa.Table:
     rows = np.flatnonzero(object_[first] >= 0)
     rows = rows[np.lexsort((tracklet[first[rows]], object_[first[rows]]))]
     first, last, n_views = first[rows], last[rows], n_views[rows]
-    numbers = np.array([of.number for of in block.sensors])
+    numbers = np.array([sensor.number for sensor in block.sensors])
     of_tracklet = block.tracklets.take(tracklet[first])
     return table(
         OBJECT_MEMBERS,
@@ -190,41 +192,41 @@ def object_members(block: BlockViews, associated: Associated) -> pa.Table:
     )
 
 
-def _of_items(block: BlockViews, associated: Associated) -> list[pa.Table]:
-    """Return the outcomes of the tracklets of a block, objects excepted."""
+def _item_outcomes(block: BlockViews, associated: Associated) -> list[pa.Table]:
+    """Return the outcomes of the tracklets of a block, except those of objects."""
     tracklet = block.items.tracklet
-    undecided = associated.ambiguous & associated.believed
+    undecided = associated.ambiguous & associated.agreeing
 
-    def of(rows: np.ndarray, outcome: Outcome) -> pa.Table:
+    def outcomes_of(rows: np.ndarray, outcome: Outcome) -> pa.Table:
         ids = block.tracklets["tracklet_id"].take(np.unique(tracklet[rows]))
         return outcomes(ids, outcome)
 
     return [
-        of(np.ones(len(tracklet), bool), Outcome.SEEN_BY_ONE),
-        of(undecided, Outcome.AMBIGUOUS),
-        of(~associated.believed, Outcome.SENSOR_LEFT_OUT),
+        outcomes_of(np.ones(len(tracklet), bool), Outcome.SEEN_BY_ONE),
+        outcomes_of(undecided, Outcome.AMBIGUOUS),
+        outcomes_of(~associated.agreeing, Outcome.SENSOR_LEFT_OUT),
     ]
 
 
-def _outcomes(sensors: Sequence[SensorViews], outcome: Outcome) -> pa.Table:
-    """Return one outcome for all tracklets of sensors."""
-    ids = [outcomes(of.tracklets["tracklet_id"], outcome) for of in sensors]
-    return concat(TRACKLET_OUTCOMES, ids)
+def _sensor_outcomes(sensors: Sequence[SensorViews], outcome: Outcome) -> pa.Table:
+    """Return TRACKLET_OUTCOMES: the same outcome for all tracklets of some sensors."""
+    tables = [outcomes(sensor.tracklets["tracklet_id"], outcome) for sensor in sensors]
+    return concat(TRACKLET_OUTCOMES, tables)
 
 
-def _left_out(
+def _rejects(
     sensors: Sequence[SensorViews], block: Span, left_out: Mapping[str, Reason]
 ) -> pa.Table:
-    """Return a row of `rejects` per sensor that is left out: its views in the block."""
+    """Return a row of `rejects` per sensor that is left out, with the number of its views."""
     tables = [empty(REJECTS)]
-    for of in sensors:
-        epoch_ns = array(of.read_views(), "epoch")
+    for sensor in sensors:
+        epoch_ns = array(sensor.read_views(), "epoch")
         epoch_ns = epoch_ns[block.holds(epoch_ns)]
         if len(epoch_ns):
             tables.append(
                 reject_rows(
-                    left_out[of.sensor_id],
-                    sensor_id=of.sensor_id,
+                    left_out[sensor.sensor_id],
+                    sensor_id=sensor.sensor_id,
                     time=[int(epoch_ns.min())],
                     count=[len(epoch_ns)],
                 )

@@ -1,4 +1,8 @@
-"""Associate objects: which tracklets of different sensors are one object, window by window."""
+"""Associate objects: which tracklets of different sensors are one object, window by window.
+
+`associate_objects` calls the method that the settings name. All methods take the same arguments,
+samples, focal lengths and settings, and return groups.
+"""
 
 import logging
 from collections.abc import Iterator
@@ -22,33 +26,31 @@ from epipole.tasks.algorithms.sensor_faults.suspects import agreement
 from epipole.tasks.common.sightings import only_id
 from epipole.tasks.solve.association_input import BlockViews, SampledViews, even_instants
 
-# -- Associate objects: which tracklets of different sensors are one object, window by window.
-
 LOGGER = logging.getLogger(__name__)
 
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-LONGER_S = (120.0, 600.0)  # each divides a span
+LONGER_WINDOWS_S = (120.0, 600.0)  # of windows for undecided tracklets; each divides a span
 
 
 class Associated(NamedTuple):
     """The object of each item of a block, -1 for none; and rows of `rejects`.
 
-    `ambiguous` and `believed` tell of each item whether its tracklet is ambiguous, and whether
-    its sensor agreed with the others at that time.
+    `ambiguous` are the items whose tracklet is ambiguous, `agreeing` those whose sensor agreed with
+    the others at that time.
     """
 
     object_number: Indices
     ambiguous: Flags
-    believed: Flags
+    agreeing: Flags
     rejects: pa.Table
 
 
 def associate_objects(
-    block: BlockViews, settings: AssociationSettings, most_views: int
+    block: BlockViews, settings: AssociationSettings, max_views: int
 ) -> Associated:
-    """Return which tracklets that two or more sensors detect are one object, in each window.
+    """Return the objects of each window: tracklets of two or more sensors that are one object.
 
     Object numbers count from 0 in the order of first appearance. An object keeps its number from
     window to window as long as one of its tracks continues. A sensor that disagrees with all
@@ -56,30 +58,30 @@ def associate_objects(
 
     Parameters
     ----------
-    most_views
-        Views that are sampled at the same time, a limit of memory.
+    max_views
+        Limit of the views that are sampled at the same time: they must fit in memory.
     """
     items = block.items
-    verdicts = WindowGroups(items)
-    believed = np.ones(len(items.window), bool)
+    window_groups = WindowGroups(items)
+    agreeing = np.ones(len(items.window), bool)
     windows = _windows(items.window)
     rejects = []
-    for sampled, window in _sampled_windows(block, most_views):
+    for sampled, window in _sampled_windows(block, max_views):
         rows = windows[window]
-        disagreeing = _judge(block, sampled, window, rows, verdicts, settings)
+        disagreeing = _associate_window(block, sampled, window, rows, window_groups, settings)
         if len(disagreeing):
             left_out = rows[np.isin(items.sensor[rows], disagreeing)]
-            believed[left_out] = False
+            agreeing[left_out] = False
             rejects.append(_reject_table(block, Reason.SENSOR_DISAGREES, left_out))
     if settings.method == "likelihood":
-        _judge_again(block, verdicts, believed, settings)
+        _associate_longer(block, window_groups, agreeing, settings)
     for rows in windows:
-        ambiguous = rows[verdicts.ambiguous[rows]]
+        ambiguous = rows[window_groups.ambiguous[rows]]
         if len(ambiguous):
             rejects.append(_reject_table(block, Reason.AMBIGUOUS, ambiguous))
-    _warn_of(block.sensor_id[np.unique(items.sensor[~believed])])
-    number = _numbered(block, verdicts.group, windows)
-    return Associated(number, verdicts.ambiguous, believed, concat(REJECTS, rejects))
+    _warn_about(block.sensor_id[np.unique(items.sensor[~agreeing])])
+    number = _number_objects(block, window_groups.group, windows)
+    return Associated(number, window_groups.ambiguous, agreeing, concat(REJECTS, rejects))
 
 
 def _windows(window: Indices) -> list[Indices]:
@@ -88,47 +90,47 @@ def _windows(window: Indices) -> list[Indices]:
     return np.split(np.arange(len(window)), cuts) if len(window) else []
 
 
-def _sampled_windows(block: BlockViews, most_views: int) -> Iterator[tuple[SampledViews, int]]:
-    """Yield each window, with the views of as many windows as may be held at the same time."""
+def _sampled_windows(block: BlockViews, max_views: int) -> Iterator[tuple[SampledViews, int]]:
+    """Yield each window, with the views of as many windows as fit in memory."""
     n_instants = np.array([len(instants) for instants in block.instants])
     n_items = np.bincount(block.items.window, minlength=len(n_instants))
     first, n_windows = 0, len(n_instants)
     while first < n_windows:
-        held = np.cumsum((n_instants * n_items)[first:])
-        last = first + max(int(np.searchsorted(held, most_views, side="right")), 1)
+        n_views = np.cumsum((n_instants * n_items)[first:])
+        last = first + max(int(np.searchsorted(n_views, max_views, side="right")), 1)
         sampled = SampledViews(block, np.concatenate(block.instants[first:last]))
         for window in range(first, min(last, n_windows)):
             yield sampled, window
         first = last
 
 
-def _judge(
+def _associate_window(
     block: BlockViews,
     sampled: SampledViews,
     window: int,
     rows: Indices,
-    verdicts: WindowGroups,
+    window_groups: WindowGroups,
     settings: AssociationSettings,
 ) -> Indices:
-    """Enter the verdict on a window's items; return the sensors that disagree with all others.
+    """Enter the groups of a window; return the sensors that disagree with all others.
 
-    If there are any, the other sensors are judged again without them.
+    If there are any, the other sensors are associated again without them.
     """
     instants = block.instants[window]
     samples, tracklet = sampled.samples(instants, np.zeros(0, np.int64))
-    groups = _solve(block, samples, settings)
+    groups = _find_groups(block, samples, settings)
     disagreeing = agreement(samples, groups).disagreeing()
     if len(disagreeing):
         rows = rows[~np.isin(block.items.sensor[rows], disagreeing)]
         if not len(rows):
             return disagreeing
         samples, tracklet = sampled.samples(instants, disagreeing)
-        groups = _solve(block, samples, settings)
-    verdicts.enter(rows, tracklet, groups)
+        groups = _find_groups(block, samples, settings)
+    window_groups.enter(rows, tracklet, groups)
     return disagreeing
 
 
-def _warn_of(sensors: npt.NDArray[np.str_]) -> None:
+def _warn_about(sensors: npt.NDArray[np.str_]) -> None:
     if len(sensors):
         LOGGER.warning(
             "%s: lines of sight agree with no other sensor's (wrong clock, position or "
@@ -136,23 +138,23 @@ def _warn_of(sensors: npt.NDArray[np.str_]) -> None:
         )  # fmt: skip
 
 
-def _judge_again(
-    block: BlockViews, verdicts: WindowGroups, believed: Flags, settings: AssociationSettings
+def _associate_longer(
+    block: BlockViews, window_groups: WindowGroups, agreeing: Flags, settings: AssociationSettings
 ) -> None:
-    """Judge undecided tracklets again, over longer windows."""
-    judged_s = settings.span_s
-    for window_s in LONGER_S:
-        if not judged_s < window_s <= settings.longest_span_s:
+    """Associate undecided tracklets again, over longer windows."""
+    window_before_s = settings.span_s
+    for window_s in LONGER_WINDOWS_S:
+        if not window_before_s < window_s <= settings.longest_span_s:
             continue
         longer = block.items.first_ns // round(window_s * 1e9)
-        for number in np.unique(longer[believed]).tolist():
-            rows = np.flatnonzero((longer == number) & believed)
-            open_items = verdicts.open_items(rows, judged_s)
+        for number in np.unique(longer[agreeing]).tolist():
+            rows = np.flatnonzero((longer == number) & agreeing)
+            open_items = window_groups.open_items(rows, window_before_s)
             if len(open_items):
                 samples, tracklet = _long_samples(block, rows, number, window_s)
-                groups = _solve(block, samples, settings)
-                verdicts.reconsider(rows, open_items, tracklet, groups)
-        judged_s = window_s
+                groups = _find_groups(block, samples, settings)
+                window_groups.reconsider(rows, open_items, tracklet, groups)
+        window_before_s = window_s
 
 
 def _long_samples(
@@ -165,11 +167,11 @@ def _long_samples(
     width_ns = round(window_s * 1e9)
     epochs = block.epochs[block.epochs // width_ns == number]
     instants = even_instants(epochs, block.half_width_s)
-    sampled = SampledViews(block, instants, believed_items=rows)
+    sampled = SampledViews(block, instants, agreeing_items=rows)
     return sampled.samples(instants, np.zeros(0, np.int64))
 
 
-def _numbered(block: BlockViews, group: Indices, windows: list[Indices]) -> Indices:
+def _number_objects(block: BlockViews, group: Indices, windows: list[Indices]) -> Indices:
     """Return each item's object number: groups that share a track are one object."""
     items, track = block.items, block.track
     registry = ObjectRegistry(np.bincount(track[items.tracklet], items.n_views).astype(float))
@@ -185,7 +187,7 @@ def _numbered(block: BlockViews, group: Indices, windows: list[Indices]) -> Indi
     return number
 
 
-def _solve(block: BlockViews, samples: Samples, settings: AssociationSettings) -> Groups:
+def _find_groups(block: BlockViews, samples: Samples, settings: AssociationSettings) -> Groups:
     associate = load_method(ASSOCIATION, settings.method)
     groups: Groups = associate(samples, block.poses.focal_px, settings)
     return groups
@@ -211,7 +213,7 @@ def _reject_table(block: BlockViews, reason: Reason, left_out: Indices) -> pa.Ta
     )
 
 
-# -- The methods of association, called alike: samples, focal lengths and settings in, groups out.
+# The methods of association.
 
 
 def associate_by_likelihood(

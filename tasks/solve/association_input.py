@@ -1,7 +1,11 @@
-"""Block views: the views of all sensors in a block of time, window by window.
+"""The input of association: the views of all sensors in a block, sampled at a few instants.
 
-Only what tells the windows and tracklets apart is held for all views. The rest is read for the
-few instants at which tracklets are compared.
+- `even_instants` and `with_ends` choose the instants of a window at which its tracklets are
+  compared.
+- `SensorPoses` has the attitudes and positions of the sensors.
+- `BlockViews` keeps the epoch and tracklet of all views. The other columns are read for the chosen
+  instants only.
+- `SampledViews` turns the views at these instants into the arrays of the methods.
 """
 
 import itertools
@@ -22,28 +26,27 @@ from epipole.tasks.algorithms.geometry.directions import matrix_from_quaternion
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import camera_of
 
-# -- Choose instants: the few epochs of a window at which its tracklets are compared.
-
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
+# Instants.
+
 MAX_SAMPLES = 12  # even instants in a window
-END_STEP_NS = 1_000_000_000  # least time between the instants at which tracklets enter or leave
-MAX_ENDS = 30  # of these in a window: in a longer one they are farther apart
-BLENDED = 4.0  # times the noise: what blends may add makes a view useless to tell objects apart
+END_STEP_NS = 1_000_000_000  # minimum time between instants at which tracklets enter or leave
+MAX_ENDS = 30  # limit of these in a window: in a long one they are farther apart
+MAX_BLEND = 4.0  # variance that blends may add to a clear view, over that of its noise or bias
 
 
 def clear_views(views: pa.Table) -> Flags:
-    """Return which VIEWS tell objects apart: blends add little to their variance.
+    """Return which VIEWS are clear: blends add little to their variance.
 
-    The direction of the others may be of one object or of its neighbour. A group that is found
-    without them has them as well. A tracklet that is a blend throughout is judged by its best
-    views.
+    The others may show the object or its neighbour. Groups are found without them; they belong to
+    the group of their tracklet. A tracklet that is blended throughout is judged by its best views.
     """
     blend = 2 * array(views, "blend_rad2")
     noise = array(views, "cov_noise_11_rad2") + array(views, "cov_noise_22_rad2") - blend
     shared = array(views, "cov_bias_11_rad2") + array(views, "cov_bias_22_rad2")
-    return np.asarray(blend <= BLENDED * np.maximum(noise, shared))
+    return np.asarray(blend <= MAX_BLEND * np.maximum(noise, shared))
 
 
 def even_instants(epochs: Indices, window_s: float) -> Indices:
@@ -54,8 +57,8 @@ def even_instants(epochs: Indices, window_s: float) -> Indices:
     epochs
         Distinct, in order [ns].
     window_s
-        A view rests on detections within this time of its epoch: two epochs within twice this
-        time share detections.
+        A view is fitted to detections within this time of its epoch: views at two epochs within
+        twice this time share detections.
     """
     if not len(epochs):
         return epochs
@@ -69,16 +72,16 @@ def even_instants(epochs: Indices, window_s: float) -> Indices:
 def with_ends(even: Indices, epochs: Indices, first: Indices, last: Indices) -> Indices:
     """Return the instants of a window, with the ends of the tracklets that enter or leave it.
 
-    Two tracklets that share a few seconds only are compared where both have a view: between the
-    later first and the earlier last view. At two instants their motion is evidence as well.
+    Two tracklets that overlap for a few seconds only are compared while both have views: from the
+    later first view to the earlier last view. With two instants their motions are compared too.
 
     Parameters
     ----------
     even
         The even instants.
     epochs
-        Epochs of the window, in order. The ends are put on the first epoch of each second, or of
-        each thirtieth of a longer window.
+        Epochs of the window, in order. The ends are moved to the first epoch of a second, or of a
+        thirtieth of a longer window.
     first, last : (n,) int
         First and last clear view of each tracklet that lacks a view at one of the even instants.
     """
@@ -93,7 +96,7 @@ def with_ends(even: Indices, epochs: Indices, first: Indices, last: Indices) -> 
     return np.union1d(even, ends)
 
 
-# -- Sensor poses: where the sensors are and where they look at a few instants.
+# Sensor poses.
 
 Array = npt.NDArray[np.float64]
 
@@ -133,7 +136,7 @@ class SensorPoses:
     def at(self, instants: Indices) -> Poses:
         """Return the poses at some epochs."""
         n, k = len(self._frames), len(instants)
-        q, place = np.full((n, k, 4), np.nan), np.full((n, k, 3), np.nan)
+        q, r_km = np.full((n, k, 4), np.nan), np.full((n, k, 3), np.nan)
         velocity = np.full((n, k, 3), np.nan)
         for s, frames in enumerate(self._frames):
             if not len(frames.epoch_ns):
@@ -141,9 +144,9 @@ class SensorPoses:
             at = np.searchsorted(frames.epoch_ns, instants)
             at = np.minimum(at, len(frames.epoch_ns) - 1)
             there = np.flatnonzero(frames.epoch_ns[at] == instants)
-            q[s, there], place[s, there] = frames.q[at[there]], frames.r_km[at[there]]
+            q[s, there], r_km[s, there] = frames.q[at[there]], frames.r_km[at[there]]
             velocity[s, there] = frames.v_km_s[at[there]]
-        return Poses(matrix_from_quaternion(q), place, velocity)
+        return Poses(matrix_from_quaternion(q), r_km, velocity)
 
 
 class _Frames(NamedTuple):
@@ -166,10 +169,7 @@ def _near_frames(epochs: pa.Table) -> _Frames:
     )
 
 
-# -- Block views: the views of all sensors in a block of time, window by window.
-#
-# Only what tells the windows and tracklets apart is held for all views. The rest is read for the
-# few instants at which tracklets are compared.
+# Views of a block.
 
 SAMPLED = [
     name
@@ -192,15 +192,15 @@ SAMPLED = [
 
 
 class SensorViews(NamedTuple):
-    """The views of one sensor in a span: VIEWS sorted by tracklet, and tables that go with them.
+    """The views of one sensor in a span: VIEWS sorted by tracklet, and the tables beside them.
 
-    `number` and `sensor_id` are the sensor's in the run, `epochs` are SENSOR_EPOCHS, `tracklets`
+    `number` and `sensor_id` name the sensor in the run, `epochs` are SENSOR_EPOCHS, `tracklets`
     are VIEWED_TRACKLETS.
     """
 
     number: int
     sensor_id: str
-    read_views: Callable[[], pa.Table]  # they stay in their file: all views are too many to hold
+    read_views: Callable[[], pa.Table]  # they stay in their file: all of them do not fit in memory
     epochs: pa.Table
     tracklets: pa.Table
 
@@ -215,7 +215,7 @@ class BlockViews:
     block
         Views at other epochs are left out.
     window_s, half_width_s
-        Length of a window, and half the time whose detections a view rests on [s].
+        Length of a window, and half the time of the detections that a view is fitted to [s].
     """
 
     def __init__(
@@ -227,14 +227,14 @@ class BlockViews:
         half_width_s: float,
     ) -> None:
         self.sensors, self.half_width_s = list(sensors), half_width_s
-        self.sensor_id = np.array([of.sensor_id for of in sensors], str)
-        self.tracklets = pa.concat_tables([of.tracklets for of in sensors]).combine_chunks()
+        self.sensor_id = np.array([one.sensor_id for one in sensors], str)
+        self.tracklets = pa.concat_tables([one.tracklets for one in sensors]).combine_chunks()
         ids = array(self.tracklets, "tracklet_id").astype(str)
         order = np.argsort(ids, kind="stable")
         self.tracklets = self.tracklets.take(order)
         self.tracklet_id = ids[order]
         self.sensor_of_tracklet = np.repeat(
-            np.arange(len(sensors)), [of.tracklets.num_rows for of in sensors]
+            np.arange(len(sensors)), [one.tracklets.num_rows for one in sensors]
         )[order]
         _, self.track = np.unique(
             array(self.tracklets, "track_id").astype(str), return_inverse=True
@@ -243,22 +243,22 @@ class BlockViews:
         self.end_ns = array(self.tracklets, "end_time")
         self.origin_ns = block.start_ns
         self.window_ns = max(round(window_s * 1e9), 1)
-        self.poses = SensorPoses([of.epochs for of in sensors], cameras)
-        self._place = np.argsort(order, kind="stable")  # of each tracklet, sensor by sensor
+        self.poses = SensorPoses([one.epochs for one in sensors], cameras)
+        self._tracklet_row = np.argsort(order, kind="stable")  # of tracklets, sensor by sensor
         self._read(block)
         self._choose_instants()
 
     def _read(self, block: Span) -> None:
-        """Read the epochs, tracklets and clearness of the views in the block."""
+        """Read the epochs and tracklets of the views in the block, and which views are clear."""
         self._rows, self._epoch_ns, self._tracklet, self._clear = [], [], [], []
         before, parts = 0, []
-        for s, of in enumerate(self.sensors):
-            views = of.read_views()
+        for s, sensor in enumerate(self.sensors):
+            views = sensor.read_views()
             epoch_ns = array(views, "epoch")
             rows = np.flatnonzero(block.holds(epoch_ns))
-            n = of.tracklets.num_rows
-            local = np.repeat(np.arange(n), array(of.tracklets, "n_views"))[rows]
-            tracklet = self._place[before : before + n][local]
+            n = sensor.tracklets.num_rows
+            local = np.repeat(np.arange(n), array(sensor.tracklets, "n_views"))[rows]
+            tracklet = self._tracklet_row[before : before + n][local]
             before += n
             self._rows.append(rows)
             self._epoch_ns.append(epoch_ns[rows])
@@ -320,11 +320,11 @@ class BlockViews:
         tables, tracklets = [VIEWS.empty_table().select(SAMPLED)], []
         wanted = np.isin(self.epochs, instants)
         key = self._item_key(items) if items is not None else None
-        for s, of in enumerate(self.sensors):
+        for s, sensor in enumerate(self.sensors):
             chosen = np.flatnonzero(wanted[self._epoch[s]] & self._clear[s])
             if key is not None:
                 chosen = chosen[np.isin(self._view_key(s, chosen), key)]
-            tables.append(of.read_views().select(SAMPLED).take(self._rows[s][chosen]))
+            tables.append(sensor.read_views().select(SAMPLED).take(self._rows[s][chosen]))
             tracklets.append(self._tracklet[s][chosen])
         return pa.concat_tables(tables), np.concatenate(tracklets)
 
@@ -339,7 +339,7 @@ class BlockViews:
 def _items(
     epoch_ns: Indices, tracklet: Indices, sensor: int, window_ns: int
 ) -> tuple[Indices, ...]:
-    """Return the columns of ITEMS of one sensor, whose views are sorted by tracklet and epoch."""
+    """Return the columns of `Items` of one sensor, whose views are sorted by tracklet and epoch."""
     window = epoch_ns // window_ns
     bounds = group_offsets(window, tracklet)
     first, last = bounds[:-1], bounds[1:] - 1
@@ -353,17 +353,17 @@ def _items(
     )
 
 
-# -- Sample views: the views of a block at a few instants, as arrays for the association.
+# Samples of views.
 
 
 class SampledViews:
     """Clear views of some windows at their instants, and samples of them for the association."""
 
     def __init__(
-        self, block: BlockViews, instants: Indices, believed_items: Indices | None = None
+        self, block: BlockViews, instants: Indices, agreeing_items: Indices | None = None
     ) -> None:
-        """Read the views of a block at some epochs: of all items, or of those believed."""
-        views, tracklet = block.views_at(instants, believed_items)
+        """Read the views of a block at some epochs: of all items, or of those given."""
+        views, tracklet = block.views_at(instants, agreeing_items)
         order = np.lexsort((tracklet, array(views, "epoch")))
         views, self.tracklet = views.take(order), tracklet[order]
         self.block = block
@@ -391,8 +391,8 @@ class SampledViews:
         rate = np.zeros((t, k, 3))
         seen[item, at] = True
         u[item, at], rate[item, at] = self.u[rows], self.w_rad_s[rows]
-        # The common error is one for all k samples. With k times its variance in each of them,
-        # they count together as one.
+        # All k samples share the common error. With k times its variance in each of them, it counts
+        # once.
         n_samples = seen.sum(axis=1)[item].astype(float)
         width_s = np.zeros((t, k))
         width_s[item, at] = self.width_s[rows]
@@ -426,8 +426,8 @@ class SampledViews:
 def _repeated(seen: npt.NDArray[np.bool_], time_s: Array, width_s: Array) -> Array:
     """Return how many samples of its tracklet each sample repeats, itself included, (t, k).
 
-    Samples that rest on the same detections share their errors. With the noise so many times
-    larger, they count together as what is independent.
+    Samples that are fitted to the same detections share their errors. With this factor on the noise
+    of each, the shared detections count once.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
 """Number objects: one number in the night for the objects of all blocks, and the pieces of spans.
 
-A piece is some of a span's objects, with as many views as a task may hold. Pieces depend on the
+A piece is a part of a span's objects, whose views fit in the memory of a task. Pieces depend on the
 data and the settings only, never on the workers.
 """
 
@@ -30,7 +30,7 @@ def number_objects(
     spans: Sequence[Span],
     margin_ns: int,
     settings: AssociationSettings,
-    most_views: int,
+    max_views: int,
     solved: SolvedParts,
 ) -> list[int]:
     """Number the objects of all blocks, unless the parts exist; return each span's pieces.
@@ -40,9 +40,9 @@ def number_objects(
     spans
         In order.
     margin_ns
-        The motion of an object at the ends of a span needs its views in this time beyond them.
-    most_views
-        Views that one task may hold.
+        Views within this time outside a span are needed for the motion of objects at its ends.
+    max_views
+        Limit of the views in the memory of a task.
     solved
         `blocks` is read, `objects` gets a part for each span.
 
@@ -55,12 +55,12 @@ def number_objects(
         for k, span in enumerate(spans):
             near = [numbered[j] for j in (k - 1, k, k + 1) if 0 <= j < len(spans)]
             rows = _within(pl.concat(near), span.widened(margin_ns))
-            members = from_polars(OBJECT_MEMBERS, _in_pieces(rows, span, most_views))
+            members = from_polars(OBJECT_MEMBERS, _in_pieces(rows, span, max_views))
             write_part(solved.objects.of(span), NUMBERED, {"members": members})
-    return [_pieces(solved.objects.read(span, "members", ["piece"])) for span in spans]
+    return [_count_pieces(solved.objects.read(span, "members", ["piece"])) for span in spans]
 
 
-def _pieces(members: pa.Table) -> int:
+def _count_pieces(members: pa.Table) -> int:
     return int(members["piece"].to_numpy().max(initial=-1)) + 1
 
 
@@ -86,7 +86,7 @@ def _number(
 
 
 def _tracks(members: pl.DataFrame, known: dict[str, int]) -> dict[int, Indices]:
-    """Return the numbers of each object's tracks; later tracks last."""
+    """Return the numbers of each object's tracks, in the order of their last epochs."""
     rows = (
         members.group_by("object", "track_id")
         .agg(pl.col("last_epoch").max())
@@ -99,21 +99,21 @@ def _tracks(members: pl.DataFrame, known: dict[str, int]) -> dict[int, Indices]:
 
 
 def _within(members: pl.DataFrame, time: Span) -> pl.DataFrame:
-    """Return the members with views in a time."""
+    """Return the members with views within a time."""
     first, last = (pl.col(name).cast(pl.Int64) for name in ("first_epoch", "last_epoch"))
     return members.filter((last >= time.start_ns) & (first < time.end_ns))
 
 
-def _in_pieces(members: pl.DataFrame, span: Span, most_views: int) -> pl.DataFrame:
+def _in_pieces(members: pl.DataFrame, span: Span, max_views: int) -> pl.DataFrame:
     """Return the members of the objects in a span, each object in a piece."""
     inside = _within(members, span)
     size = inside.group_by("object").agg(pl.col("n_views").sum()).sort("object")
-    piece, held = [], 0
+    piece, in_piece = [], 0
     number = 0
     for n_views in size["n_views"].to_list():
-        if held and held + n_views > most_views:
-            number, held = number + 1, 0
-        held += n_views
+        if in_piece and in_piece + n_views > max_views:
+            number, in_piece = number + 1, 0
+        in_piece += n_views
         piece.append(number)
     pieces = size.select("object", piece=pl.Series(piece, dtype=pl.Int64))
     return (

@@ -19,7 +19,7 @@ from epipole.tasks.solve.view_groups import ViewGroups
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MAX_OTHERS = 8  # views to which a view's epipolar distance is taken, those of the least error
+MAX_OTHERS = 8  # views from which a view's epipolar distance is taken: those of least error
 
 
 def association_table(groups: ViewGroups) -> pa.Table:
@@ -72,8 +72,8 @@ def _position_error(groups: ViewGroups) -> Array:
     """Return the square of the error that each view alone leaves at the object [km^2]."""
     views = groups.views
     across = np.trace(views.cov, axis1=1, axis2=2) / 2
-    away_km = np.linalg.norm(groups.x_km[groups.group] - views.r_km, axis=1)
-    return across * away_km**2 + views.sigma_km**2
+    range_km = np.linalg.norm(groups.x_km[groups.group] - views.r_km, axis=1)
+    return across * range_km**2 + views.sigma_km**2
 
 
 def _with_reference(
@@ -91,13 +91,13 @@ def _every_two(group: Indices, candidates: npt.NDArray[np.bool_]) -> tuple[Indic
     """Return every two candidates of a group; their number grows with the square of the views."""
     rows = np.flatnonzero(candidates)
     pairs = [np.zeros((0, 2), np.int64)]
-    apart = 1
-    while apart < len(rows):
-        same = np.flatnonzero(group[rows[apart:]] == group[rows[:-apart]])
+    step = 1
+    while step < len(rows):
+        same = np.flatnonzero(group[rows[step:]] == group[rows[:-step]])
         if not len(same):
             break
-        pairs.append(np.column_stack([rows[same], rows[same + apart]]))
-        apart += 1
+        pairs.append(np.column_stack([rows[same], rows[same + step]]))
+        step += 1
     first, second = np.concatenate(pairs).T
     order = np.lexsort((second, first))
     return first[order], second[order]

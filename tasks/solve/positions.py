@@ -30,9 +30,9 @@ def solve_positions(
 ) -> ViewGroups:
     """Return the positions, with covariances, of objects that two or more sensors detect.
 
-    They are solved twice. The first solution gives the velocities, which are needed because the
-    light time to near and far sensors differs, and for the motion that the fits of the directions
-    neglected.
+    They are solved twice. The first solution gives the velocities. The second one needs them
+    because the light times to the sensors differ, and because the fits of the directions neglected
+    a part of the motion.
 
     Parameters
     ----------
@@ -91,47 +91,53 @@ def with_neglected_motion(
     state : (n, 6) float
         Position and velocity of each view's object; NaN where unknown.
     sigma_km, spread_s : (n,) float
-        1-sigma error of the position, and the `spread_s` of the velocity.
+        1-sigma error of the position, and the time spread behind the velocity, see `velocities`.
 
     Notes
     -----
-    The error of the correction takes the place of the variance of the neglected motion. A view
-    for which it is not smaller stays as it is.
+    The variance of the correction replaces that of the neglected motion. A view for which it is not
+    smaller is not changed.
     """
     sensor = np.hstack([views.r_km, views.v_km_s])
     moments, neglected = views.moments, views.unmodelled
-    off = neglected_motion(state, sensor, moments)
-    reach = np.linalg.norm(state[:, :3] - sensor[:, :3], axis=1)
+    correction = neglected_motion(state, sensor, moments)
+    range_km = np.linalg.norm(state[:, :3] - sensor[:, :3], axis=1)
     speed = np.linalg.norm(state[:, 3:] - sensor[:, 3:], axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        error = sigma_km / (spread_s * reach) * (
-            np.abs(moments[:, 0]) + np.abs(moments[:, 1]) * speed / reach
+        error = sigma_km / (spread_s * range_km) * (
+            np.abs(moments[:, 0]) + np.abs(moments[:, 1]) * speed / range_km
         )  # fmt: skip
-        error = np.hypot(error, np.linalg.norm(off, axis=1) * sigma_km / reach)
+        error = np.hypot(error, np.linalg.norm(correction, axis=1) * sigma_km / range_km)
     known = error**2 < neglected
-    off[~known] = 0.0
-    u = views.u - off
+    correction[~known] = 0.0
+    u = views.u - correction
     u /= np.linalg.norm(u, axis=1, keepdims=True)
-    less = np.where(known, neglected - error**2, 0.0)
-    cov = views.cov_noise - less[:, None, None] * np.eye(2)
-    return views._replace(u=u, cov_noise=cov, unmodelled=neglected - less)
+    removed = np.where(known, neglected - error**2, 0.0)
+    cov = views.cov_noise - removed[:, None, None] * np.eye(2)
+    return views._replace(u=u, cov_noise=cov, unmodelled=neglected - removed)
 
 
 def _independent(groups: ViewGroups, span: Span | None) -> npt.NDArray[np.bool_]:
-    """Return the groups to use where no two may share a detection: in order of time, each that
-    shares none with those before.
+    """Return groups of which no two share a detection: in order of time, each group that shares no
+    detection with those chosen before.
 
-    Where a detection lies outside the span, the neighbouring span may use it: not such a group.
+    Groups with a detection outside the span are left out: the neighbouring span may use it.
     """
-    views, apart = groups.views, groups.solved
+    views, independent = groups.views, groups.solved
     if span is not None:
         outside = ~(span.holds(views.first_ns) & span.holds(views.last_ns))
-        apart[groups.group[outside & groups.used]] = False
+        independent[groups.group[outside & groups.used]] = False
     until = np.full(int(views.tracklet.max(initial=-1)) + 1, np.iinfo(np.int64).min)
     keep_independent(
-        groups.offsets, groups.used, views.tracklet, views.first_ns, views.last_ns, until, apart
+        groups.offsets,
+        groups.used,
+        views.tracklet,
+        views.first_ns,
+        views.last_ns,
+        until,
+        independent,
     )
-    return apart
+    return independent
 
 
 def object_names(epoch_ns: Indices, number: Indices) -> npt.NDArray[np.object_]:
@@ -184,8 +190,8 @@ def _residual_px(groups: ViewGroups) -> Array:
     """Return the rms image distance of each group's used views from its position."""
     sight = groups.apparent_km - groups.views.r_km
     sight /= np.linalg.norm(sight, axis=1, keepdims=True)
-    off = np.sum((sight - groups.views.u) ** 2, axis=1) / groups.views.pixel_rad**2
-    square = np.where(groups.used, off, 0.0)
+    distance2 = np.sum((sight - groups.views.u) ** 2, axis=1) / groups.views.pixel_rad**2
+    square = np.where(groups.used, distance2, 0.0)
     size = len(groups.epoch_ns)
     count = np.maximum(np.bincount(groups.group, groups.used, minlength=size), 1)
     return np.sqrt(np.bincount(groups.group, square, minlength=size) / count)

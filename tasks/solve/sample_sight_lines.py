@@ -1,4 +1,4 @@
-"""Keep lines: the lines of sight to objects, and the objects, that the check of sensors needs."""
+"""Sample sight lines: the lines of sight, and their objects, that the check of sensors needs."""
 
 import zlib
 from typing import Any, NamedTuple
@@ -31,8 +31,8 @@ Indices = npt.NDArray[np.int64]
 
 
 class LineSampling(NamedTuple):
-    """Which lines of sight are kept: at epochs that are multiples of a time since midnight, one in
-    so many of these."""
+    """Which lines of sight are kept: one in `one_in` of those at epochs that are multiples of
+    `every_ns` since midnight."""
 
     every_ns: int
     one_in: int = 1
@@ -60,23 +60,22 @@ def object_views(views: ObjectViews, objects: pa.Table) -> pa.Table:
     return conform(OBJECT_VIEWS, views.labels.take(_at_epochs(views, objects)))
 
 
-def sample_sight_lines(groups: ViewGroups, objects: pa.Table, kept: LineSampling) -> pa.Table:
+def sample_sight_lines(groups: ViewGroups, objects: pa.Table, sampling: LineSampling) -> pa.Table:
     """Return CLOCK_LINES: views of objects at the epochs of MOVING_OBJECTS.
 
-    Where only some are kept, each object loses other sensors at each epoch, and each sensor other
-    objects: a sensor is judged by many epochs, because all lines of a frame share the error of its
-    attitude.
+    If only some are kept, each epoch and object lose other sensors. So all sensors are judged by
+    many epochs, which matters because all lines of a frame share the error of its attitude.
     """
     rows = _at_epochs(groups.views, objects)
-    rows = rows[_turn(groups, rows, kept) == 0]
+    rows = rows[_phase(groups, rows, sampling) == 0]
     object_id = groups.object_id[groups.group[rows]].tolist()
-    seen = _packed(groups.views.take(rows)).with_columns(
+    seen = _view_columns(groups.views.take(rows)).with_columns(
         object_id=pl.Series(object_id, dtype=pl.String)
     )
-    return meetings(seen, to_polars(objects), on=["epoch", "object_id"])
+    return pair_with_objects(seen, to_polars(objects), on=["epoch", "object_id"])
 
 
-def _packed(views: ObjectViews) -> pl.DataFrame:
+def _view_columns(views: ObjectViews) -> pl.DataFrame:
     """Return views as the columns of VIEWS that CLOCK_LINES has."""
     columns: dict[str, Any] = {
         **unstack("u{}", views.u),
@@ -95,12 +94,12 @@ def _at_epochs(views: ObjectViews, objects: pa.Table) -> Indices:
     return np.flatnonzero(np.isin(views.epoch_ns, np.unique(array(objects, "epoch"))))
 
 
-def _turn(groups: ViewGroups, rows: Indices, kept: LineSampling) -> Indices:
-    """Return a number below `one_in` of each view, evenly spread over sensors and objects."""
+def _phase(groups: ViewGroups, rows: Indices, sampling: LineSampling) -> Indices:
+    """Return a number below `one_in` for each view, spread evenly over sensors and objects."""
     sensors = groups.views.sensor_ids[groups.views.sensor[rows]]
     numbers = [_checksums(sensors), _checksums(groups.object_id[groups.group[rows]])]
-    epoch = groups.views.epoch_ns[rows] // kept.every_ns
-    return np.asarray((numbers[0] + numbers[1] + epoch) % kept.one_in)
+    epoch = groups.views.epoch_ns[rows] // sampling.every_ns
+    return np.asarray((numbers[0] + numbers[1] + epoch) % sampling.one_in)
 
 
 def _checksums(texts: npt.NDArray[Any]) -> Indices:
@@ -109,10 +108,10 @@ def _checksums(texts: npt.NDArray[Any]) -> Indices:
     return np.array([zlib.crc32(text.encode()) for text in distinct.tolist()], np.int64)[which]
 
 
-def meetings(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Table:
+def pair_with_objects(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Table:
     """Return CLOCK_LINES: each view with the objects that are equal in the columns `on`.
 
-    Each object is put where its light left for the sensor of the row.
+    The position of an object is the one at which the light left that the sensor sees.
     """
     rows = (
         views.rename({name: f"sensor_{name}" for name in POSITION})

@@ -1,7 +1,7 @@
-"""Tracklet sightings: one sensor's detections by tracklet, with honest errors.
+"""Tracklet sightings: one sensor's detections by tracklet, with errors that the log does not state.
 
-Two errors are told by the detections together: which part of a prior attitude's error changes from
-frame to frame, and what the light of a neighbour may add to a centroid.
+The detections together show two errors: the part of a prior attitude's error that changes from
+frame to frame, and the shift of a centroid by the light of a neighbour.
 """
 
 from typing import NamedTuple
@@ -43,11 +43,6 @@ from epipole.tasks.common.sightings import (
     with_lone_detections,
 )
 
-# -- Tracklet sightings: one sensor's detections by tracklet, with honest errors.
-#
-# Two errors are told by the detections together: which part of a prior attitude's error changes
-# from frame to frame, and what the light of a neighbour may add to a centroid.
-
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
@@ -56,7 +51,7 @@ class TrackletSightings(NamedTuple):
     """Sightings sorted by tracklet, then frame.
 
     Tracklet k has the rows ``bounds[k]:bounds[k + 1]``, and the id ``name[k]``. `blend_rad2` is a
-    part of `cov_bias`: what the light of a neighbour may add, per axis.
+    part of `cov_bias`: the variance per axis that the light of a neighbour may add.
     """
 
     frame: Indices
@@ -75,7 +70,7 @@ class TrackletSightings(NamedTuple):
         return np.repeat(np.arange(len(self.name)), np.diff(self.bounds))
 
 
-class Sighted(NamedTuple):
+class SensorSightings(NamedTuple):
     """The sightings of one sensor, its frames and its optics."""
 
     frames: Frames
@@ -90,10 +85,10 @@ def sight_objects(
     cameras: pa.Table,
     settings: TrackletSettings,
     half_width_s: float,
-) -> Sighted | None:
+) -> SensorSightings | None:
     """Return the sightings of one sensor's detections that have a tracklet and a direction.
 
-    A detection in a lone frame is a tracklet of one detection. None where there are none.
+    A detection in a lone frame is a tracklet of one detection. None without such detections.
 
     Parameters
     ----------
@@ -103,19 +98,21 @@ def sight_objects(
     frames = solved_frames(solutions)
     detections = _with_lone(frames, detections, settings)
     # Detections without a direction were tracked in the image alone.
-    placed = pa.compute.field("tracklet_id").is_valid() & pa.compute.field("ra_deg").is_valid()
-    tracked = detections.filter(placed)
+    has_direction = (
+        pa.compute.field("tracklet_id").is_valid() & pa.compute.field("ra_deg").is_valid()
+    )
+    tracked = detections.filter(has_direction)
     if not tracked.num_rows:
         return None
     row = int(frames.camera[0])
     camera = camera_of(cameras, row)
     tracklets = _with_split_prior(_by_tracklet(frames, tracked), frames, half_width_s)
     tracklets = _with_blends(tracklets, frames, camera)
-    return Sighted(frames, tracklets, camera, optics_covariance_of(cameras, row))
+    return SensorSightings(frames, tracklets, camera, optics_covariance_of(cameras, row))
 
 
 def optics_covariance(
-    sighted: Sighted, R: Array, u_sensor: Array, from_stars: npt.NDArray[np.bool_]
+    sightings: SensorSightings, R: Array, u_sensor: Array, from_stars: npt.NDArray[np.bool_]
 ) -> Array:
     """Return (n, 3, 3) covariances of directions, ICRS, due to the error of fitted optics [rad^2].
 
@@ -130,14 +127,16 @@ def optics_covariance(
     from_stars : (n,) bool
         Whether stars gave the attitude.
     """
-    if not sighted.cov_optics.any():
+    if not sightings.cov_optics.any():
         return np.zeros_like(R)
-    shared = shared_direction_covariance(sighted.camera, sighted.cov_optics, u_sensor, from_stars)
+    shared = shared_direction_covariance(
+        sightings.camera, sightings.cov_optics, u_sensor, from_stars
+    )
     return np.asarray(np.swapaxes(R, 1, 2) @ shared @ R)
 
 
 def _with_lone(frames: Frames, detections: pa.Table, settings: TrackletSettings) -> pa.Table:
-    """Return the detections; unknown ones in lone frames get the id of a tracklet of their own."""
+    """Return the detections; each unknown one in a lone frame gets the id of a new tracklet."""
     lone_frames = frames.number[in_lone_frames(frames.time_ns, settings)]
     if not len(lone_frames):
         return detections
@@ -168,7 +167,7 @@ def _by_tracklet(frames: Frames, tracked: pa.Table) -> TrackletSightings:
 def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -> TrackletSightings:
     """Return the sightings with the errors that the light of neighbours may add.
 
-    Those of a neighbour alone are left out.
+    Sightings that show only a neighbour are left out.
     """
     time_s = (frames.time_ns - frames.time_ns[0]) / 1e9
     tracked = TrackedDetections(
@@ -180,16 +179,16 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
     )
     variance = blend_variance(tracked, time_s, camera.pixel_rad)
     cov_bias = tracklets.cov_bias + centroid_covariance(tracklets.u_icrs, np.sqrt(variance))
-    own = ~of_neighbour(tracked, variance)
-    left = np.concatenate([[0], np.cumsum(own)])
+    of_object = ~of_neighbour(tracked, variance)
+    left = np.concatenate([[0], np.cumsum(of_object)])
     return TrackletSightings(
-        tracklets.frame[own],
-        tracklets.centroid[own],
-        tracklets.u_icrs[own],
-        tracklets.cov_noise[own],
-        cov_bias[own],
-        variance[own],
-        tracklets.flux[own],
+        tracklets.frame[of_object],
+        tracklets.centroid[of_object],
+        tracklets.u_icrs[of_object],
+        tracklets.cov_noise[of_object],
+        cov_bias[of_object],
+        variance[of_object],
+        tracklets.flux[of_object],
         left[tracklets.bounds],
         tracklets.name,
     )
@@ -198,18 +197,18 @@ def _with_blends(tracklets: TrackletSightings, frames: Frames, camera: Camera) -
 def _with_split_prior(
     tracklets: TrackletSightings, frames: Frames, half_width_s: float
 ) -> TrackletSightings:
-    """Return the sightings with each prior attitude's error divided as the detections show it.
+    """Return the sightings with each prior attitude's error divided into noise and bias.
 
-    What changes from frame to frame scatters about the smooth motion of objects: it is noise. The
-    rest of the stated variance is the bias that all frames share. It is not less than the error of
-    the division.
+    Detections scatter about the smooth motion of objects by the part of the error that changes from
+    frame to frame: it is noise. The rest of the stated variance is the bias that all frames share.
+    It is not less than the error of the division.
     """
     prior = np.flatnonzero(~frames.from_stars[tracklets.frame])
     if not len(prior):
         return tracklets
     v = np.nan_to_num(frames.v_gcrf_km_s)
     u = aberrate(tracklets.u_icrs, -v[tracklets.frame])
-    own = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[prior] / 2
+    noise_rad2 = np.trace(tracklets.cov_noise, axis1=1, axis2=2)[prior] / 2
     tracklet = tracklets.tracklet[prior]
     time_s = (frames.time_ns[tracklets.frame] - frames.time_ns[0]) / 1e9
     fit = directions_at(
@@ -223,9 +222,9 @@ def _with_split_prior(
         tracklets.cov_bias,
         half_width_s,
     )
-    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / own
+    leverage = (np.trace(fit.cov_noise, axis1=1, axis2=2) / 2 - fit.unmodelled) / noise_rad2
     follows = np.append(False, (np.diff(tracklet) == 0) & (np.diff(prior) == 1))
-    scatter = scatter_beyond(u[prior] - fit.u, np.sqrt(own), leverage, follows)
+    scatter = scatter_beyond(u[prior] - fit.u, np.sqrt(noise_rad2), leverage, follows)
     stated = np.trace(tracklets.cov_bias, axis1=1, axis2=2)[prior] / 2
     share = scatter / np.maximum(stated, 1e-30)
     n_frames = len(np.unique(tracklets.frame[prior]))
@@ -236,23 +235,22 @@ def _with_split_prior(
     return tracklets._replace(cov_noise=noise, cov_bias=bias)
 
 
-# -- Tables: each detection of a tracklet as an observation, its object still unknown, and the
-# attributable of each tracklet.
+# Tables of observations and attributables.
 
 
-def tabulate_sightings(sighted: Sighted | None) -> pa.Table:
-    """Return SIGHTINGS of one sensor, sorted by time; of frames whose sensor has a position."""
-    if sighted is None:
+def tabulate_sightings(sightings: SensorSightings | None) -> pa.Table:
+    """Return SIGHTINGS of one sensor, sorted by time: those of frames with a known position."""
+    if sightings is None:
         return empty(SIGHTINGS)
-    frames, tracklets = sighted.frames, sighted.tracklets
+    frames, tracklets = sightings.frames, sightings.tracklets
     frame = tracklets.frame
     v_km_s = frames.v_gcrf_km_s[frame]
     u = aberrate(tracklets.u_icrs, -np.nan_to_num(v_km_s))
     ra, dec = radec_from_unit(u)
-    noise = _on_sky(u, _noise(sighted, u))
+    noise = _on_sky(u, _noise(sightings, u))
     sigma = np.sqrt(np.diagonal(noise, axis1=1, axis2=2))
     r_km = frames.r_gcrf_km[frame]
-    magnitude, magnitude_sigma = _magnitudes(sighted)
+    magnitude, magnitude_sigma = _magnitudes(sightings)
     columns = {
         "time": frames.time_ns[frame],
         "sensor_id": array(frames.table, "sensor_id")[frame],
@@ -263,7 +261,7 @@ def tabulate_sightings(sighted: Sighted | None) -> pa.Table:
         "sigma_ra_arcsec": sigma[:, 0] / ARCSEC,
         "sigma_dec_arcsec": sigma[:, 1] / ARCSEC,
         "correlation": noise[:, 0, 1] / (sigma[:, 0] * sigma[:, 1]),
-        "bias_sigma_arcsec": _bias_sigma(sighted, np.arange(len(u))) / ARCSEC,
+        "bias_sigma_arcsec": _bias_sigma(sightings, np.arange(len(u))) / ARCSEC,
         **unstack("{}_km", r_km),
         "position_sigma_km": frames.position_sigma_km[frame],
         "tracklet_id": tracklets.name[tracklets.tracklet],
@@ -282,26 +280,28 @@ def tabulate_sightings(sighted: Sighted | None) -> pa.Table:
     )
 
 
-def _noise(sighted: Sighted, u: Array) -> Array:
+def _noise(sightings: SensorSightings, u: Array) -> Array:
     """Return the errors (n, 3, 3) of directions that are independent in each frame [rad^2]."""
-    blend = centroid_covariance(u, np.sqrt(sighted.tracklets.blend_rad2))
-    return sighted.tracklets.cov_noise + blend
+    blend = centroid_covariance(u, np.sqrt(sightings.tracklets.blend_rad2))
+    return sightings.tracklets.cov_noise + blend
 
 
-def _bias_sigma(sighted: Sighted, rows: Indices) -> Array:
-    """Return the 1-sigma error per axis [rad] that some sightings share with their sensor's."""
-    frames, tracklets = sighted.frames, sighted.tracklets
+def _bias_sigma(sightings: SensorSightings, rows: Indices) -> Array:
+    """Return the 1-sigma error per axis [rad] that sightings share with others of the sensor."""
+    frames, tracklets = sightings.frames, sightings.tracklets
     frame, u_icrs = tracklets.frame[rows], tracklets.u_icrs[rows]
     R = matrix_from_quaternion(frames.q_sensor_from_icrs[frame])
     u_sensor = np.einsum("nij,nj->ni", R, u_icrs)
     shared = tracklets.cov_bias[rows] + optics_covariance(
-        sighted, R, u_sensor, frames.from_stars[frame]
+        sightings, R, u_sensor, frames.from_stars[frame]
     )
     trace = np.trace(shared, axis1=1, axis2=2) - 2 * tracklets.blend_rad2[rows]
     return np.sqrt(np.maximum(trace / 2, 0.0))
 
 
-def tabulate_attributables(sighted: Sighted | None, tracklets: pa.Table, span: Span) -> pa.Table:
+def tabulate_attributables(
+    sightings: SensorSightings | None, tracklets: pa.Table, span: Span
+) -> pa.Table:
     """Return ATTRIBUTABLES of one sensor's tracklets whose middle is in a span.
 
     Parameters
@@ -311,38 +311,38 @@ def tabulate_attributables(sighted: Sighted | None, tracklets: pa.Table, span: S
     """
     middle = (array(tracklets, "start_time") + array(tracklets, "end_time")) // 2
     inside = (middle >= span.start_ns) & (middle < span.end_ns)
-    if sighted is None or not inside.any():
+    if sightings is None or not inside.any():
         return empty(ATTRIBUTABLES)
-    frames, of = sighted.frames, sighted.tracklets
+    frames, grouped = sightings.frames, sightings.tracklets
     names, middle = array(tracklets, "tracklet_id")[inside], middle[inside]
-    by_name = {name: row for row, name in enumerate(of.name)}
+    by_name = {name: row for row, name in enumerate(grouped.name)}
     number = np.array([by_name.get(name, -1) for name in names], np.int64)
     names, middle, number = names[number >= 0], middle[number >= 0], number[number >= 0]
-    origin, time_ns = frames.time_ns[0], frames.time_ns[of.frame]
-    u = aberrate(of.u_icrs, -np.nan_to_num(frames.v_gcrf_km_s[of.frame]))
+    origin, time_ns = frames.time_ns[0], frames.time_ns[grouped.frame]
+    u = aberrate(grouped.u_icrs, -np.nan_to_num(frames.v_gcrf_km_s[grouped.frame]))
     fit = attributables(
-        np.stack([of.bounds[number], of.bounds[number + 1]], axis=1),
+        np.stack([grouped.bounds[number], grouped.bounds[number + 1]], axis=1),
         (middle - origin) / 1e9,
         (time_ns - origin) / 1e9,
         u,
-        _noise(sighted, u),
+        _noise(sightings, u),
     )
-    nearest = _nearest(time_ns, of.bounds, number, middle)
+    nearest = _nearest(time_ns, grouped.bounds, number, middle)
     ra, dec = radec_from_unit(fit.u)
     east, north = np.moveaxis(east_north(fit.u), 1, 0)
     dt_s = (time_ns[nearest] - middle) / 1e9
-    r_km, v_km_s = carried(frames, of.frame[nearest], dt_s)
+    r_km, v_km_s = states_near_frames(frames, grouped.frame[nearest], dt_s)
     columns = {
         "ra_deg": np.degrees(ra),
         "dec_deg": np.degrees(dec),
         "ra_rate_arcsec_s": np.einsum("ni,ni->n", fit.w, east) / ARCSEC,
         "dec_rate_arcsec_s": np.einsum("ni,ni->n", fit.w, north) / ARCSEC,
         **unstack_covariance("cov_{}", fit.cov / ARCSEC**2, ATTRIBUTABLE_AXES),
-        "bias_sigma_arcsec": _bias_sigma(sighted, nearest) / ARCSEC,
+        "bias_sigma_arcsec": _bias_sigma(sightings, nearest) / ARCSEC,
         **unstack("{}_km", r_km),
         **unstack("v{}_km_s", v_km_s),
-        "position_sigma_km": frames.position_sigma_km[of.frame[nearest]],
-        **_mean_magnitudes(sighted, number),
+        "position_sigma_km": frames.position_sigma_km[grouped.frame[nearest]],
+        **_mean_magnitudes(sightings, number),
     }
     return table(
         ATTRIBUTABLES,
@@ -352,7 +352,7 @@ def tabulate_attributables(sighted: Sighted | None, tracklets: pa.Table, span: S
 
 
 def _nearest(time_ns: Indices, bounds: Indices, number: Indices, at_ns: Indices) -> Indices:
-    """Return the sighting of each tracklet that is nearest to an instant."""
+    """Return the sighting of each tracklet that is nearest to a time."""
     rows = [
         bounds[k] + np.argmin(np.abs(time_ns[bounds[k] : bounds[k + 1]] - at))
         for k, at in zip(number.tolist(), at_ns.tolist(), strict=True)
@@ -360,18 +360,18 @@ def _nearest(time_ns: Indices, bounds: Indices, number: Indices, at_ns: Indices)
     return np.array(rows, np.int64)
 
 
-def _mean_magnitudes(sighted: Sighted, number: Indices) -> dict[str, Array]:
+def _mean_magnitudes(sightings: SensorSightings, number: Indices) -> dict[str, Array]:
     """Return the mean magnitudes of tracklets, their errors and scatter; NaN where unknown."""
-    of = sighted.tracklets
-    magnitude, sigma = _magnitudes(sighted)
-    known, n = np.isfinite(magnitude) & (sigma > 0), len(of.name)
+    tracklets = sightings.tracklets
+    magnitude, sigma = _magnitudes(sightings)
+    known, n = np.isfinite(magnitude) & (sigma > 0), len(tracklets.name)
     weight = np.where(known, 1 / np.where(known, sigma, 1.0) ** 2, 0.0)
     value = np.where(known, magnitude, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        total = np.bincount(of.tracklet, weight, n)
-        count = np.bincount(of.tracklet, known, n)
-        mean = np.bincount(of.tracklet, weight * value, n) / total
-        square = np.bincount(of.tracklet, known * (value - mean[of.tracklet]) ** 2, n)
+        total = np.bincount(tracklets.tracklet, weight, n)
+        count = np.bincount(tracklets.tracklet, known, n)
+        mean = np.bincount(tracklets.tracklet, weight * value, n) / total
+        square = np.bincount(tracklets.tracklet, known * (value - mean[tracklets.tracklet]) ** 2, n)
         scatter = np.sqrt(square / np.where(count > 1, count - 1, np.nan))
         of_mean = np.fmax(np.sqrt(1 / total), scatter / np.sqrt(count))
     columns = {
@@ -382,17 +382,17 @@ def _mean_magnitudes(sighted: Sighted, number: Indices) -> dict[str, Array]:
     return {name: values[number] for name, values in columns.items()}
 
 
-def carried(frames: Frames, served: Indices, dt_s: Array) -> tuple[Array, Array]:
-    """Return the sensor's positions and velocities at instants near frames, from those at these.
+def states_near_frames(frames: Frames, served: Indices, dt_s: Array) -> tuple[Array, Array]:
+    """Return the sensor's positions and velocities at times near frames, from those at the frames.
 
-    Gravity is included: in one second it bends an orbit by 4 m.
+    Gravity is included: in one second it moves a satellite by 4 m.
 
     Parameters
     ----------
     served : (n,) int
-        The frame of each instant.
+        The frame of each time.
     dt_s : (n,) float
-        Time of the frame minus the instant [s].
+        Time of the frame minus the time [s].
     """
     r, v = frames.r_gcrf_km[served], frames.v_gcrf_km_s[served]
     back = -dt_s[:, None]
@@ -406,8 +406,8 @@ def _on_sky(u: Array, cov: Array) -> Array:
     return basis @ cov @ np.swapaxes(basis, 1, 2)
 
 
-def _magnitudes(sighted: Sighted) -> tuple[Array, Array]:
-    frames, tracklets = sighted.frames, sighted.tracklets
+def _magnitudes(sightings: SensorSightings) -> tuple[Array, Array]:
+    frames, tracklets = sightings.frames, sightings.tracklets
     of_frames = (
         array(frames.table, name).astype(float)[tracklets.frame]
         for name in ("zero_mag", "zero_variance_mag2", "flux_floor_mag2", "flux_photon_mag2")

@@ -1,8 +1,7 @@
 """Solve a piece: the positions and states of some objects of a span, part to part.
 
-Margins before and after the span are solved too, so that the velocities at its first and last
-epochs rest on as much as all others. Rows of the margins are not kept: they belong to the
-neighbouring spans.
+Margins before and after the span are solved too: the velocities at its first and last epochs need
+positions on both sides. Rows of the margins are not kept: they belong to the neighbouring spans.
 """
 
 from collections.abc import Iterator
@@ -23,7 +22,7 @@ from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import VIEWS
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.solve.associate_block import judge_views
+from epipole.tasks.solve.associate_block import view_outcomes
 from epipole.tasks.solve.pairs import association_table, pair_table
 from epipole.tasks.solve.positions import position_table, reject_table, solve_positions
 from epipole.tasks.solve.sample_sight_lines import (
@@ -46,7 +45,7 @@ Indices = npt.NDArray[np.int64]
 def gather_views(
     viewed: ViewedParts, members: pa.Table, time: Span, every_ns: int = 1
 ) -> tuple[pa.Table, Indices]:
-    """Return the VIEWS of objects in a time, and the number of the object of each.
+    """Return the VIEWS of objects within a time, and the number of the object of each.
 
     Parameters
     ----------
@@ -59,18 +58,18 @@ def gather_views(
 
     Notes
     -----
-    Two fragments of a track in one sensor may both have a view of an object at an epoch. Only one
-    counts: the one with a centroid in the frame, or else the first. Views at epochs at which no
-    second sensor has one are left out.
+    Two tracklets of one sensor may both have a view of an object at an epoch. Only one counts: the
+    one with a centroid in the frame, or else the first. Views at epochs at which no other sensor
+    has a view of the object are left out.
     """
     tables, numbers, sensors = [], [], []
-    for sensor, own in to_polars(members).group_by("sensor", maintain_order=True):
+    for sensor, members_of_sensor in to_polars(members).group_by("sensor", maintain_order=True):
         for span in spans_between(*time):
             if not viewed[int(sensor[0])].holds(span):
                 continue
             parts = viewed[int(sensor[0])]
             views = parts.read(span, "views")
-            rows, number = _rows(views, parts.read(span, "tracklets"), own, time)
+            rows, number = _rows(views, parts.read(span, "tracklets"), members_of_sensor, time)
             kept = array(views, "epoch")[rows] % DAY_NS % every_ns == 0
             rows, number = rows[kept], number[kept]
             tables.append(views.take(rows))
@@ -87,14 +86,14 @@ def gather_views(
 def _rows(
     views: pa.Table, tracklets: pa.Table, members: pl.DataFrame, time: Span
 ) -> tuple[Indices, Indices]:
-    """Return the rows of one sensor's views that are of objects, and the objects."""
+    """Return the rows of one sensor's views that show objects, and the object of each."""
     epoch_ns = array(views, "epoch")
     first = dict(zip(tracklets["tracklet_id"].to_pylist(), array(tracklets, "first_view").tolist(),
                      strict=True))  # fmt: skip
     n_views = array(tracklets, "n_views")
     count = dict(zip(first, n_views.tolist(), strict=True))
     rows, numbers = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for name, number, start_ns, end_ns in _asked(members, time):
+    for name, number, start_ns, end_ns in _member_times(members, time):
         if name not in first:
             continue
         begin, end = first[name], first[name] + count[name]
@@ -105,7 +104,7 @@ def _rows(
     return np.concatenate(rows), np.concatenate(numbers)
 
 
-def _asked(members: pl.DataFrame, time: Span) -> Iterator[tuple[str, int, int, int]]:
+def _member_times(members: pl.DataFrame, time: Span) -> Iterator[tuple[str, int, int, int]]:
     """Yield tracklet, object, first and last epoch of each member within a time."""
     columns = members.select(
         "tracklet_id",
@@ -128,14 +127,14 @@ def _seen_by_two(views: pa.Table, number: Indices, sensor: Indices) -> Indices:
 
 
 class Piece(NamedTuple):
-    """Some objects of a span: the piece's number, and of how many."""
+    """Some objects of a span: the number of the piece, and how many pieces there are."""
 
     span: Span
     number: int
     of: int
 
     def __str__(self) -> str:
-        """Return the times of day, and which piece of how many."""
+        """Return the times of day, the number of the piece (from 1) and the number of pieces."""
         return f"{self.span}" + (f" {self.number + 1}/{self.of}" if self.of > 1 else "")
 
 
@@ -144,7 +143,7 @@ def solve_piece(
     viewed: ViewedParts,
     piece: Piece,
     margin_ns: int,
-    kept: LineSampling,
+    sampling: LineSampling,
     positions: PositionSettings,
     states: StateSettings,
     solved: SolvedParts,
@@ -155,7 +154,7 @@ def solve_piece(
     ----------
     viewed
         The parts of the views of the sensors.
-    kept
+    sampling
         Lines of sight that are kept for the check of the sensors.
     solved
         `objects` and `errors` are read; the part goes to `piece`.
@@ -174,22 +173,22 @@ def solve_piece(
         groups = solve_positions(
             with_larger_errors(views, errors), positions.reject_sigma, piece.span
         )
-        write_part(part, SOLVED, _tables(groups, errors, kept, positions.all_pairs, states))
+        write_part(part, SOLVED, _tables(groups, errors, sampling, positions.all_pairs, states))
     return read_part(part, "positions").num_rows
 
 
 def _tables(
     groups: ViewGroups,
     errors: pa.Table,
-    kept: LineSampling,
+    sampling: LineSampling,
     all_pairs: bool,
     states: StateSettings,
 ) -> dict[str, pa.Table]:
     """Return the tables of a solved piece."""
     positions, associations = position_table(groups), association_table(groups)
     fitting, misfits = refuse_misfits(fit_states(groups, states))
-    objects = moving_objects(positions, kept.every_ns)
-    # The check of the sensors holds the lines against the errors that the sensors state.
+    objects = moving_objects(positions, sampling.every_ns)
+    # The check of the sensors compares the lines with the errors that the sensors state.
     stated = groups._replace(views=with_stated_errors(groups.views, errors))
     return {
         "associations": associations,
@@ -197,14 +196,14 @@ def _tables(
         "pairs": pair_table(groups, all_pairs),
         "states": fitting,
         "rejects": concat(REJECTS, [reject_table(groups), misfits]),
-        "outcomes": judge_views(associations),
-        "lines": sample_sight_lines(stated, objects, kept),
+        "outcomes": view_outcomes(associations),
+        "lines": sample_sight_lines(stated, objects, sampling),
         "object_views": object_views(groups.views, objects),
         "objects": objects,
     }
 
 
-ENOUGH = 8  # objects that show the errors of a sensor
+MIN_OBJECTS = 8  # from which the errors of a sensor are estimated
 
 
 @stage_task(Stage.SOLVE, "errors {span}")
@@ -213,7 +212,7 @@ def judge_span(
     span: Span,
     margin_ns: int,
     every_ns: int,
-    most_views: int,
+    max_views: int,
     positions: PositionSettings,
     states: StateSettings,
     solved: SolvedParts,
@@ -224,30 +223,31 @@ def judge_span(
     ----------
     viewed
         The parts of the views of the sensors.
-    every_ns, most_views
-        Only epochs that are multiples of this time since midnight are solved, and objects with so
-        many views at most, all epochs counted.
+    every_ns, max_views
+        Only epochs that are multiples of `every_ns` since midnight are solved, and some objects
+        with at most `max_views` views together at all epochs.
     solved
         `objects` is read, `errors` gets the part.
     """
     if solved.errors.holds(span):
         return
-    members = telling_objects(solved.objects.read(span, "members"), most_views)
+    members = sample_objects(solved.objects.read(span, "members"), max_views)
     gathered = gather_views(viewed, members, span.widened(margin_ns), every_ns)
     views = unpack_views(*gathered)
     groups = solve_positions(views, positions.reject_sigma, span)
-    # Directions as they were fitted: what the fits neglect is part of the noise of each.
+    # Directions as fitted, not corrected: the motion that the fits neglect is in their noise.
     fitted = groups._replace(views=views.take(groups.row))
     write_part(solved.errors.of(span), JUDGED, {"errors": judge_errors(fitted, states)})
 
 
-def telling_objects(members: pa.Table, most_views: int) -> pa.Table:
-    """Return the OBJECT_MEMBERS of objects with so many views together, at most.
+def sample_objects(members: pa.Table, max_views: int) -> pa.Table:
+    """Return the OBJECT_MEMBERS of some objects, with at most `max_views` views together.
 
-    Where these are not all, each sensor gets some: those with few objects first, each its longest.
+    If these are not all objects, each sensor gets some. Sensors with few objects choose first, and
+    choose those of which they have the most views.
     """
     rows = to_polars(members)
-    if rows["n_views"].sum() <= most_views:
+    if rows["n_views"].sum() <= max_views:
         return members
     size = dict(rows.group_by("object").agg(pl.col("n_views").sum()).iter_rows())
     seen = (
@@ -261,13 +261,13 @@ def telling_objects(members: pa.Table, most_views: int) -> pa.Table:
         of_sensor.setdefault(sensor, []).append(object_)
     sees = {o: set(s) for o, s in seen.group_by("object").agg(pl.col("sensor")).iter_rows()}
     chosen: set[int] = set()
-    held = 0
+    n_views = 0
     for sensor, objects in of_sensor.items():
         for object_ in objects:
-            enough = sum(sensor in sees[one] for one in chosen) >= ENOUGH
-            if enough or (chosen and held + size[object_] > most_views):
+            enough = sum(sensor in sees[one] for one in chosen) >= MIN_OBJECTS
+            if enough or (chosen and n_views + size[object_] > max_views):
                 break
             if object_ not in chosen:
                 chosen.add(object_)
-                held += size[object_]
+                n_views += size[object_]
     return members.filter(pa.array(np.isin(rows["object"].to_numpy(), sorted(chosen))))

@@ -24,17 +24,17 @@ from epipole.tasks.solve.view_groups import ViewGroups
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-MIN_PROBABLE = 1e-6  # a chi-square less probable than this does not fit
-# Chi-square per degree of freedom, over that of most arcs, above which an arc mixes objects.
-MIXED = 3.0
+MIN_PROBABILITY = 1e-6  # of a chi-square: a state with a less probable one is rejected
+# Chi-square per degree of freedom over the median of all arcs: an arc above this mixes objects.
+MAX_CHI2_RATIO = 3.0
 SLOPE_S = 60.0  # positions within this time of an arc's middle give the initial velocity
 
 
 def fit_states(groups: ViewGroups, settings: StateSettings) -> pa.Table:
     """Return STATES: one for each object and arc, at the arc's middle epoch.
 
-    Only the views used for `independent` positions are fitted: these share no detection. Each
-    sensor's common error is estimated together with the state.
+    Only the views used for `independent` positions are fitted: no two of these share a detection.
+    Each sensor's common error is estimated together with the state.
     """
     named = _arcs_of(groups, settings)
     if not len(named.middle_ns):
@@ -47,8 +47,8 @@ def fit_states(groups: ViewGroups, settings: StateSettings) -> pa.Table:
 def judge_errors(groups: ViewGroups, settings: StateSettings) -> pa.Table:
     """Return SHARED_ERRORS: the sensors whose shared errors are larger than stated.
 
-    All objects together show whether the errors that a sensor's views share are of the stated
-    size; see `scale_shared_errors`.
+    The size of the errors that a sensor's views share is estimated from all objects together; see
+    `scale_shared_errors`.
     """
     named = _arcs_of(groups, settings)
     if not len(named.middle_ns):
@@ -58,8 +58,8 @@ def judge_errors(groups: ViewGroups, settings: StateSettings) -> pa.Table:
     prior = prior_of(arcs, slice(None), arcs.sensor, len(sensor_ids))
     has_bias = np.bincount(arcs.sensor, np.trace(arcs.cov_bias, axis1=1, axis2=2)) > 0.0
     free = np.column_stack([has_bias, np.ones(len(sensor_ids), bool)])
-    telling = _of_one_object(fitted, np.diff(arcs.offsets))
-    factor = scale_shared_errors(telling, prior, free)
+    equations = _unmixed_arcs(fitted, np.diff(arcs.offsets))
+    factor = scale_shared_errors(equations, prior, free)
     larger = np.flatnonzero((factor > 1.0).any(axis=1))
     return table(
         SHARED_ERRORS,
@@ -71,12 +71,12 @@ def judge_errors(groups: ViewGroups, settings: StateSettings) -> pa.Table:
     )
 
 
-def _of_one_object(fitted: FittedOrbits, n_views: Indices) -> list[tuple[Indices, ArcEquations]]:
+def _unmixed_arcs(fitted: FittedOrbits, n_views: Indices) -> list[tuple[Indices, ArcEquations]]:
     """Return the equations of the arcs that do not mix objects."""
     reduced = fitted.chi2 / np.maximum(2 * n_views - 6, 1)
-    # A sensor with a large error makes all arcs fit badly, a mixture one.
+    # A sensor with a large error makes all its arcs fit badly; mixed objects spoil one arc.
     usual = max(1.0, float(np.nanmedian(reduced))) if np.isfinite(reduced).any() else 1.0
-    return [fitted.equations[k] for k in np.flatnonzero(reduced < MIXED * usual)]
+    return [fitted.equations[k] for k in np.flatnonzero(reduced < MAX_CHI2_RATIO * usual)]
 
 
 class _NamedArcs(NamedTuple):
@@ -149,10 +149,10 @@ class FittingStates(NamedTuple):
 def refuse_misfits(states: pa.Table) -> FittingStates:
     """Return the states whose chi-square fits their degrees of freedom.
 
-    Any other state mixes two objects, or the errors of its views are larger than stated. Its
-    covariance is not valid.
+    Other states mix two objects, or the errors of their views are larger than stated. Their
+    covariances are not valid.
     """
-    fits = chdtrc(array(states, "dof"), array(states, "chi2")) > MIN_PROBABLE
+    fits = chdtrc(array(states, "dof"), array(states, "chi2")) > MIN_PROBABILITY
     misfits = states.filter(pa.array(~fits)).sort_by("epoch")
     count = np.ones(misfits.num_rows, np.int64)
     rejects = reject_rows(Reason.STATE_MISFIT, time=misfits["epoch"], count=count)
@@ -162,21 +162,21 @@ def refuse_misfits(states: pa.Table) -> FittingStates:
 def _arcs(name: npt.NDArray[np.object_], epoch_ns: Indices, arc_s: float) -> Indices:
     """Return the arc of each epoch of sorted objects."""
     arc = np.zeros(len(name), np.int64)
-    number, begun = -1, 0
+    number, start = -1, 0
     for k, t in enumerate(epoch_ns.tolist()):
-        if k == 0 or name[k] != name[k - 1] or t - begun > arc_s * 1e9:
-            number, begun = number + 1, t
+        if k == 0 or name[k] != name[k - 1] or t - start > arc_s * 1e9:
+            number, start = number + 1, t
         arc[k] = number
     return arc
 
 
-def _long_enough(arc: Indices, kept: npt.NDArray[np.bool_], least: int) -> npt.NDArray[np.bool_]:
+def _long_enough(arc: Indices, kept: npt.NDArray[np.bool_], minimum: int) -> npt.NDArray[np.bool_]:
     count = np.bincount(arc, kept, minlength=1)
-    return count[arc] >= least if len(arc) else np.zeros(0, bool)
+    return count[arc] >= minimum if len(arc) else np.zeros(0, bool)
 
 
 def _starts(groups: ViewGroups, named: _NamedArcs) -> Array:
-    """Return initial states: the position at each arc's middle, and the slope there."""
+    """Return initial states: the position at each arc's middle, and the slope of the positions."""
     solved = named.solved
     name, epoch_ns = groups.object_id[solved], groups.epoch_ns[solved]
     x_km = groups.x_km[solved]

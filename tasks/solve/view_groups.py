@@ -1,7 +1,7 @@
 """Views as arrays: the views of objects, and their groups by epoch and object.
 
-The table VIEWS is unpacked once, when the views of a piece have been gathered. Everything that
-solves a piece computes on these arrays; what it publishes is packed into tables once.
+The table VIEWS is unpacked once, when the views of a piece have been gathered. A piece is solved
+with these arrays; the results are packed into tables once.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,7 @@ LABELS = ("epoch", "sensor_id", "frame_number", "tracklet_id", "centroid", "x_px
 
 
 class ObjectViews(NamedTuple):
-    """Views of objects, row by row the same; see VIEWS for the frames.
+    """Views of objects, a row per view; see VIEWS for the reference frames.
 
     labels : table
         The columns `LABELS`.
@@ -45,7 +45,7 @@ class ObjectViews(NamedTuple):
     r_km, v_km_s, sigma_km : (n, 3), (n, 3), (n,) float
         Positions and velocities of the sensors, GCRF, and 1-sigma of a position per axis.
     pixel_rad : (n,) float
-        Angle a pixel spans.
+        Angle of a pixel [rad].
     """
 
     labels: pa.Table
@@ -119,13 +119,13 @@ def _scaled(views: ObjectViews, errors: pa.Table, power: float) -> ObjectViews:
     if not errors.num_rows:
         return views
     row = pc.index_in(pa.array(views.sensor_ids), errors["sensor_id"].combine_chunks())
-    direction, place = (
+    direction, position = (
         pc.fill_null(errors[name].take(row), 1.0).to_numpy()[views.sensor] ** power
         for name in ("direction", "position")
     )
     return views._replace(
         cov_bias=views.cov_bias * direction[:, None, None],
-        sigma_km=views.sigma_km * np.sqrt(place),
+        sigma_km=views.sigma_km * np.sqrt(position),
     )
 
 
@@ -176,7 +176,7 @@ class ViewGroups(NamedTuple):
 
     @property
     def apparent_km(self) -> Array:
-        """Where the sensor of each view sees the object: light from it left at another time."""
+        """Position at which the sensor of each view sees the object: where its light left."""
         group = self.group
         light_s = self.mean_range_km / SPEED_OF_LIGHT_KM_S
         return apparent_positions(

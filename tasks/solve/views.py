@@ -34,9 +34,9 @@ from epipole.tasks.common.sightings import (
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
 from epipole.tasks.solve.sightings import (
-    Sighted,
+    SensorSightings,
     TrackletSightings,
-    carried,
+    states_near_frames,
     optics_covariance,
     sight_objects,
     tabulate_attributables,
@@ -48,39 +48,39 @@ Indices = npt.NDArray[np.int64]
 
 
 def view_objects(
-    epochs: pa.Table, sighted: Sighted | None, max_rate_deg_s: float, half_width_s: float
+    epochs: pa.Table, sightings: SensorSightings | None, max_rate_deg_s: float, half_width_s: float
 ) -> pa.Table:
     """Return VIEWS of one sensor: each tracklet at each epoch that it covers, in this order.
 
     A detection in a lone frame is a tracklet of one detection, at an unknown rate.
 
-    A tracklet covers the epochs between its ends, and those beyond them that are no farther away
-    than an epoch may be from its frame. The aberration by the sensor's geocentric velocity is
-    removed from each detection before the motion is fitted.
+    A tracklet covers the epochs between its ends, and those as near to an end as an epoch may be to
+    its frame. The aberration by the sensor's geocentric velocity is removed from each detection
+    before the motion is fitted.
 
     Parameters
     ----------
     max_rate_deg_s
-        Fastest apparent motion, the prior of a rate that is unknown.
+        Maximum of the apparent motion: 3 sigma of the prior of an unknown rate.
     half_width_s
         Time on each side of an epoch in which the motion is fitted.
     """
-    if sighted is None or not epochs.num_rows:
+    if sightings is None or not epochs.num_rows:
         return empty(VIEWS)
-    query = _queries(sighted.tracklets, epochs, sighted.frames)
-    return _view_table(sighted, query, epochs, max_rate_deg_s, half_width_s)
+    query = _queries(sightings.tracklets, epochs, sightings.frames)
+    return _view_table(sightings, query, epochs, max_rate_deg_s, half_width_s)
 
 
 class _EpochQueries(NamedTuple):
-    """What is asked for: each tracklet at each epoch that it covers."""
+    """The views to compute: each tracklet at each epoch that it covers."""
 
     tracklet: Indices
     row: Indices  # of `epochs`
-    frame: Indices  # that serves the epoch
+    frame: Indices  # of the epoch
 
 
 def frames_of(epochs: pa.Table, frames: Frames) -> Indices:
-    """Return the row in `frames` of the frame that serves each epoch."""
+    """Return the row in `frames` of the frame of each epoch."""
     by_number = np.argsort(frames.number, kind="stable")
     return by_number[
         np.searchsorted(frames.number[by_number], array(epochs, "frame_number"))
@@ -102,14 +102,14 @@ def _queries(tracklets: TrackletSightings, epochs: pa.Table, frames: Frames) -> 
 
 
 def _view_table(
-    sighted: Sighted,
+    sightings: SensorSightings,
     query: _EpochQueries,
     epochs: pa.Table,
     max_rate_deg_s: float,
     half_width_s: float,
 ) -> pa.Table:
-    frames, tracklets, camera = sighted.frames, sighted.tracklets, sighted.camera
-    tracklet, row, served = query
+    frames, tracklets, camera = sightings.frames, sightings.tracklets, sightings.camera
+    tracklet, row, frame = query
     origin = frames.time_ns[0]
     bounds = tracklets.bounds
     v = np.nan_to_num(frames.v_gcrf_km_s)
@@ -119,7 +119,7 @@ def _view_table(
         bounds[tracklet],
         bounds[tracklet + 1],
         at_s,
-        np.radians(max_rate_deg_s) / 3,  # the fastest is a 3-sigma rate
+        np.radians(max_rate_deg_s) / 3,  # the maximum is a 3-sigma rate
         (frames.time_ns[tracklets.frame] - origin) / 1e9,
         u_still,
         tracklets.cov_noise,
@@ -130,19 +130,19 @@ def _view_table(
     q = interpolate_quaternions((frames.time_ns - origin) / 1e9, frames.q_sensor_from_icrs, at_s)
     u, fitted = motion.u, motion.fitted
     R = matrix_from_quaternion(q)
-    u_sensor = np.einsum("nij,nj->ni", R, aberrate(u, v[served]))
+    u_sensor = np.einsum("nij,nj->ni", R, aberrate(u, v[frame]))
     x_px, y_px = project(camera, u_sensor)
-    r_km, v_km_s = carried(frames, served, array(epochs, "dt_s")[row])
+    r_km, v_km_s = states_near_frames(frames, frame, array(epochs, "dt_s")[row])
     cov_noise, cov_bias = (on_tangent_plane(u, cov) for cov in motion[2:4])
     cov_noise, cov_bias, blend_rad2 = _without_blends(tracklet, cov_noise, cov_bias)
-    if sighted.cov_optics.any():
-        by_optics = optics_covariance(sighted, R, u_sensor, frames.from_stars[served])
+    if sightings.cov_optics.any():
+        by_optics = optics_covariance(sightings, R, u_sensor, frames.from_stars[frame])
         cov_bias = cov_bias + on_tangent_plane(u, by_optics)
     kept = np.isfinite(x_px) & np.isfinite(r_km[:, 0])
     columns = {
         "epoch": array(epochs, "epoch")[row],
         "sensor_id": array(epochs, "sensor_id")[row],
-        "frame_number": frames.number[served],
+        "frame_number": frames.number[frame],
         "tracklet_id": tracklets.name[tracklet],
         "x_px": x_px,
         "y_px": y_px,
@@ -156,7 +156,7 @@ def _view_table(
         **unstack("moment_{}", motion.moments, "123"),
         "unmodelled_rad2": motion.unmodelled,
         **unstack("{}_km", r_km),
-        "position_sigma_km": frames.position_sigma_km[served],
+        "position_sigma_km": frames.position_sigma_km[frame],
         "pixel_rad": np.full(len(row), camera.pixel_rad),
     }
     columns = {key: values[kept] for key, values in columns.items()}
@@ -169,15 +169,15 @@ def _view_table(
 def _without_blends(
     tracklet: Indices, cov_noise: Array, cov_bias: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the covariances of noise and bias, and what some views have more bias than others.
+    """Return the covariances of noise and bias, and the variance per axis that blends add.
 
-    What all views of a tracklet have is common to them. What blends add to some of them is not: it
-    becomes a part of their noise, with this variance per axis.
+    All views of a tracklet share the smallest bias among them. Blends add more to some of them:
+    this part is not shared, and so becomes noise.
     """
     shared = np.trace(cov_bias, axis1=1, axis2=2)
-    least = np.full(int(tracklet.max(initial=-1)) + 1, np.inf)
-    np.minimum.at(least, tracklet, shared)
-    stays = (least[tracklet] / np.where(shared > 0.0, shared, np.inf))[:, None, None]
+    minimum = np.full(int(tracklet.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(minimum, tracklet, shared)
+    stays = (minimum[tracklet] / np.where(shared > 0.0, shared, np.inf))[:, None, None]
     more = (1 - stays) * cov_bias
     return cov_noise + more, stays * cov_bias, np.trace(more, axis1=1, axis2=2) / 2
 
@@ -185,12 +185,12 @@ def _without_blends(
 def _centroids(
     tracklets: TrackletSightings, query: _EpochQueries
 ) -> tuple[Indices, npt.NDArray[np.bool_]]:
-    """Return each query's centroid in the frame that serves, and which queries have none."""
+    """Return each query's centroid in its frame, and for which queries it is missing."""
     n_frames = max(int(tracklets.frame.max()), int(query.frame.max(initial=0))) + 1
     key = tracklets.tracklet * n_frames + tracklets.frame  # increasing
-    wanted = query.tracklet * n_frames + query.frame
-    at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-    return tracklets.centroid[at], key[at] != wanted
+    queried = query.tracklet * n_frames + query.frame
+    at = np.minimum(np.searchsorted(key, queried), len(key) - 1)
+    return tracklets.centroid[at], key[at] != queried
 
 
 MIN_FRAMES = 6  # beyond the ends of a span: the motion at an epoch is fitted to these too
@@ -235,14 +235,14 @@ def _view(
     epochs = span.of(align_epochs(solutions, alignment, grid), "epoch")
     half_width_s = alignment.window_s
     detections = detections_within(sensor, wide)
-    sighted = sight_objects(solutions, detections, cameras, tracklets, half_width_s)
-    views = view_objects(epochs, sighted, tracklets.max_rate_deg_s, half_width_s)
+    sightings = sight_objects(solutions, detections, cameras, tracklets, half_width_s)
+    views = view_objects(epochs, sightings, tracklets.max_rate_deg_s, half_width_s)
     named = read_part(sensor.names.of_night(), "tracklets")
     return {
         "epochs": sensor_epochs(epochs, solutions),
         "views": views,
-        "sightings": span.of(tabulate_sightings(sighted), "time"),
-        "attributables": tabulate_attributables(sighted, named, span),
+        "sightings": span.of(tabulate_sightings(sightings), "time"),
+        "attributables": tabulate_attributables(sightings, named, span),
         "tracklets": viewed_tracklets(named, views),
     }
 

@@ -98,9 +98,9 @@ def solve(seen: IdentifiedLog, tracked: Tracked, settings: Settings) -> ViewGrou
             blocks = blocks_of(span, settings.association)
             associate_blocks.fn(
                 sensors, viewed, blocks, seen.cameras, {}, settings.association,
-                settings.alignment.window_s, settings.work.most_views, solved.blocks,
+                settings.alignment.window_s, settings.work.max_views, solved.blocks,
             )  # fmt: skip
-        number_objects.fn(spans, 0, settings.association, settings.work.most_views, solved)
+        number_objects.fn(spans, 0, settings.association, settings.work.max_views, solved)
         members = [solved.objects.read(span, "members") for span in spans]
         time = Span(spans[0].start_ns, spans[-1].end_ns)
         views = unpack_views(*gather_views(viewed, concat(OBJECT_MEMBERS, members), time))

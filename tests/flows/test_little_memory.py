@@ -115,7 +115,7 @@ def with_little(prefect, log, tmp_path_factory) -> Path:
 
 
 def test_little_memory_gives_the_same_objects(log, with_little, tmp_path):
-    assert len(rows(with_little, "associations")) > WorkSettings(memory_mib=LITTLE_MIB).most_views
+    assert len(rows(with_little, "associations")) > WorkSettings(memory_mib=LITTLE_MIB).max_views
     out = tmp_path / "out"
     assert run(log, out) == [1, 1, 1, 1, 1]
     assert rows(out, "states").height == 9
@@ -134,7 +134,7 @@ def test_an_object_a_task_over_the_border_of_two_spans_gives_the_same_objects(
     log = write_log(tmp_path / "night.mcap", "04:29:40", 40.0, 1.0)
     assert run(log, tmp_path / "out") == [2, 2, 1, 2, 2]
     monkeypatch.setattr("epipole.schemas.settings.BYTES_PER_VIEW", 6_000_000)
-    assert Settings().work.most_views < 100
+    assert Settings().work.max_views < 100
     # A task per sensor, block and object, in each of the two spans.
     assert run(log, tmp_path / "small") == [8, 6, 1, 2, 18]
     assert rows(tmp_path / "out", "positions")["object_id"].n_unique() == 9

@@ -168,7 +168,7 @@ def associated(scene: Scene, names=None, **changes) -> Found:
     """Return the objects of a scene, with the views that positions are solved from."""
     settings = Settings(association=AssociationSettings(**changes))
     block = block_of(tables(scene, names), settings)
-    found = associate_objects(block, settings.association, settings.work.most_views)
+    found = associate_objects(block, settings.association, settings.work.max_views)
     members = object_members(block, found)
     with tempfile.TemporaryDirectory() as folder:
         viewed = write_views(Path(folder), block.sensors, SPAN)

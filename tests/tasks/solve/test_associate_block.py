@@ -18,7 +18,7 @@ from epipole.tasks.solve.associate_block import (
     associate_blocks,
     best_outcomes,
     blocks_of,
-    judge_views,
+    view_outcomes,
     object_members,
     outcomes,
 )
@@ -38,7 +38,7 @@ def found_by(folder, of, left_out, settings=SETTINGS, blocks=None) -> Parts:
     blocks = blocks or blocks_of(SPAN, settings.association)
     associate_blocks.fn(
         named, viewed, blocks, of.cameras, left_out, settings.association,
-        settings.alignment.window_s, settings.work.most_views, parts,
+        settings.alignment.window_s, settings.work.max_views, parts,
     )  # fmt: skip
     return parts
 
@@ -131,7 +131,7 @@ def test_little_memory_gives_the_same_bits(tmp_path, monkeypatch):
     of = tables(scene)
     one = found_by(tmp_path / "one", of, {})
     monkeypatch.setattr("epipole.schemas.settings.BYTES_PER_VIEW", 1 << 40)
-    assert SETTINGS.work.most_views == 0
+    assert SETTINGS.work.max_views == 0
     other = found_by(tmp_path / "other", of, {})
     for name in ("members", "rejects", "outcomes"):
         assert one.read(BLOCKS[0], name).equals(other.read(BLOCKS[0], name))
@@ -151,7 +151,7 @@ def test_evidence_longer_than_a_block_is_summed_over_the_span(tmp_path):
 def test_members_are_the_tracklets_of_each_object_with_their_times():
     scene = Scene(11, 3, times=np.arange(0.0, 120.0, 6.0)).objects(2, spread_km=300.0).strays(2)
     block = block_of(tables(scene))
-    found = associate_objects(block, SETTINGS.association, SETTINGS.work.most_views)
+    found = associate_objects(block, SETTINGS.association, SETTINGS.work.max_views)
     members = to_polars(object_members(block, found))
     assert members.columns == OBJECT_MEMBERS.names
     of_objects = [k for k, who in enumerate(scene.who) if who >= 0]
@@ -176,7 +176,7 @@ def test_a_tracklet_that_is_of_no_object_for_a_while_has_two_members():
     """Seen by its own sensor only between two passes of another one, it is of no object there."""
     scene = Scene(11, 2, times=np.arange(0.0, 120.0, 6.0)).objects(1, spread_km=300.0)
     block = block_of(tables(scene))
-    found = associate_objects(block, SETTINGS.association, SETTINGS.work.most_views)
+    found = associate_objects(block, SETTINGS.association, SETTINGS.work.max_views)
     assert (found.object_number == 0).all()
     number = np.where(block.items.window == 1, -1, found.object_number)
     members = to_polars(object_members(block, found._replace(object_number=number)))
@@ -216,7 +216,7 @@ def test_each_tracklet_has_its_first_outcome():
             outcomes(ids("a", "b", "c", "d", "e", "a"), Outcome.SEEN_BY_ONE),
             outcomes(ids("f"), Outcome.SENSOR_LEFT_OUT),
             undecided(c="ambiguous", d="sensor_left_out", a="ambiguous"),
-            judge_views(associations(a=True, b=False)),
+            view_outcomes(associations(a=True, b=False)),
         ]
     )
     assert as_dict(judged) == {
@@ -236,12 +236,12 @@ def test_lone_detections_have_no_outcome():
 
 def test_views_without_a_published_tracklet_have_no_outcome():
     views = pa.table({"tracklet_id": pa.array([None, "a"]), "used": pa.array([True, True])})
-    assert as_dict(judge_views(views)) == {"a": Outcome.OBJECT}
+    assert as_dict(view_outcomes(views)) == {"a": Outcome.OBJECT}
 
 
 def test_a_tracklet_that_one_position_used_is_of_an_object():
     views = pa.table({"tracklet_id": ["a", "a", "b", "b"], "used": [False, True, False, False]})
-    assert as_dict(judge_views(views)) == {"a": Outcome.OBJECT, "b": Outcome.DISAGREES}
+    assert as_dict(view_outcomes(views)) == {"a": Outcome.OBJECT, "b": Outcome.DISAGREES}
 
 
 @pytest.mark.parametrize("later", ["ambiguous", "seen_by_one", "disagrees"])
@@ -253,7 +253,7 @@ def test_an_object_in_one_span_is_one_in_the_night(later):
 
 def test_no_tracklets_have_no_outcomes():
     assert outcomes(ids(), Outcome.SEEN_BY_ONE).num_rows == 0
-    assert judge_views(associations()).num_rows == 0
+    assert view_outcomes(associations()).num_rows == 0
     assert best_outcomes([]).num_rows == 0
 
 

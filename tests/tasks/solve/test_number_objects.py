@@ -35,7 +35,7 @@ def numbered(tmp_path, blocks, settings=None, spans=SPANS[:2]) -> tuple[SolvedPa
         tables["members"] = members(*blocks[k]) if k in blocks else empty(OBJECT_MEMBERS)
         write_part(solved.blocks.of(block), ASSOCIATED, tables)
     return solved, number_objects.fn(
-        spans, MARGIN_NS, settings.association, settings.work.most_views, solved
+        spans, MARGIN_NS, settings.association, settings.work.max_views, solved
     )
 
 
@@ -125,9 +125,9 @@ def test_pieces_hold_whole_objects_and_what_a_task_may_hold(tmp_path, memory_mib
     held = rows.group_by("piece").agg(pl.col("n_views").sum(), pl.col("object").n_unique())
     assert sorted(held["piece"].to_list()) == list(range(pieces[0]))
     for n_views, n_objects in held.select("n_views", "object").iter_rows():
-        assert n_views <= settings.work.most_views or n_objects == 1
+        assert n_views <= settings.work.max_views or n_objects == 1
     total = rows["n_views"].sum()
-    assert pieces[0] >= total / settings.work.most_views
+    assert pieces[0] >= total / settings.work.max_views
     assert pieces[1] == 0
 
 
@@ -160,7 +160,7 @@ def test_parts_that_exist_are_not_made_again(tmp_path):
     before = {p: p.stat().st_ino for p in tmp_path.glob("objects/*/*")}
     assert (
         number_objects.fn(
-            SPANS[:2], MARGIN_NS, AssociationSettings(), WorkSettings().most_views, solved
+            SPANS[:2], MARGIN_NS, AssociationSettings(), WorkSettings().max_views, solved
         )
         == pieces
     )

@@ -21,11 +21,11 @@ from epipole.tasks.solve.associate_block import object_members
 from epipole.tasks.solve.associate_objects import associate_objects
 from epipole.tasks.solve.sample_sight_lines import LineSampling
 from epipole.tasks.solve.solve_piece import (
-    ENOUGH,
+    MIN_OBJECTS,
     Piece,
     gather_views,
     solve_piece,
-    telling_objects,
+    sample_objects,
 )
 
 EVERY_NS = 10_000_000_000
@@ -47,7 +47,7 @@ def piece_of(folder, block, errors, piece=0, count=1):
     settings, solved = Settings(), SolvedParts(folder)
     viewed = write_views(folder / "views", block.sensors, SPAN)
     members = object_members(
-        block, associate_objects(block, settings.association, settings.work.most_views)
+        block, associate_objects(block, settings.association, settings.work.max_views)
     )
     numbers = members["object"] if count > 1 else pa.array(np.zeros(members.num_rows, np.int64))
     at = members.schema.get_field_index("piece")
@@ -272,7 +272,7 @@ def total(rows) -> int:
 
 def test_all_objects_tell_where_all_may_be_held():
     rows = random_members(1)
-    assert telling_objects(rows, total(rows)).equals(rows)
+    assert sample_objects(rows, total(rows)).equals(rows)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -280,7 +280,7 @@ def test_all_objects_tell_where_all_may_be_held():
 def test_some_objects_are_whole_and_no_more_than_may_be_held(seed, share):
     rows = random_members(seed)
     most = int(share * total(rows))
-    chosen = telling_objects(rows, most)
+    chosen = sample_objects(rows, most)
     assert 0 < total(chosen) <= most
     objects = set(chosen["object"].to_pylist())
     assert chosen.equals(rows.filter(np.isin(rows["object"].to_numpy(), list(objects))))
@@ -289,34 +289,34 @@ def test_some_objects_are_whole_and_no_more_than_may_be_held(seed, share):
 @pytest.mark.parametrize("seed", range(4))
 def test_each_sensor_gets_some_and_one_that_sees_few_gets_all_it_sees(seed):
     rows = random_members(seed)
-    chosen = to_polars(telling_objects(rows, total(rows) // 2))
+    chosen = to_polars(sample_objects(rows, total(rows) // 2))
     seen = collections.Counter(chosen.select("sensor", "object").unique()["sensor"].to_list())
     assert seen.keys() == set(range(7))
     assert seen[6] == 2
-    assert all(seen[sensor] >= ENOUGH for sensor in range(6))
+    assert all(seen[sensor] >= MIN_OBJECTS for sensor in range(6))
 
 
 def test_a_sensor_s_longest_objects_are_the_first():
     rows = members(*[
         (k, s, f"{s}-{k}", f"{s}-{k}", 0, 60, 100 + 10 * k) for k in range(20) for s in (0, 1)
     ])  # fmt: skip
-    chosen = telling_objects(rows, total(rows) - 1)
-    assert sorted(set(chosen["object"].to_pylist())) == list(range(20 - ENOUGH, 20))
+    chosen = sample_objects(rows, total(rows) - 1)
+    assert sorted(set(chosen["object"].to_pylist())) == list(range(20 - MIN_OBJECTS, 20))
 
 
 def test_one_object_is_judged_however_long_it_is():
     rows = members((0, 0, "a", "a", 0, 60, 500), (0, 1, "b", "b", 0, 60, 500))
-    assert telling_objects(rows, 10).equals(rows)
+    assert sample_objects(rows, 10).equals(rows)
 
 
 def test_the_order_of_the_rows_does_not_matter():
     rows = random_members(2)
     mixed = rows.take(np.random.default_rng(0).permutation(rows.num_rows))
-    one, other = (telling_objects(r, total(rows) // 4) for r in (rows, mixed))
+    one, other = (sample_objects(r, total(rows) // 4) for r in (rows, mixed))
     key = ["object", "sensor"]
     assert to_polars(one).sort(key).equals(to_polars(other).sort(key))
     assert pl.Series(one["object"].to_pylist()).n_unique() < 60
 
 
 def test_no_objects_stay_none():
-    assert telling_objects(empty(OBJECT_MEMBERS), 100).num_rows == 0
+    assert sample_objects(empty(OBJECT_MEMBERS), 100).num_rows == 0
