@@ -96,7 +96,7 @@ def _cameras_of(
     return holds, {int(r): Camera(**v) for r, v in zip(used, values, strict=True)}
 
 
-# -- States.
+# States.
 
 # Bounds in GCRF. Earth-fixed axes turn, so states of a log may be twice as fast there.
 MAX_SPEED_KM_S, MAX_RADIUS_KM = 2 * SPEED.maximum, 2 * POSITION.maximum

@@ -38,7 +38,7 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 
-# -- The limit of detections.
+# The limit of detections.
 
 
 def within_limit(frame: npt.NDArray[np.int64], flux: npt.NDArray[np.float64], most: int) -> Flags:
@@ -74,7 +74,7 @@ def _most_per_frame(counts: npt.NDArray[np.int64], most: int) -> int:
     return low
 
 
-# -- The tables.
+# The tables.
 
 
 class StarAttitudes(NamedTuple):

@@ -181,7 +181,7 @@ def brightest_first(first, flux):
     return row
 
 
-# -- Centroids that stay at one pixel: hot pixels, where the sky moves over the image.
+# Centroids that stay at one pixel: hot pixels, where the sky moves over the image.
 
 # Least number of frames, and least share of all frames, with a centroid at a pixel that is static.
 MIN_STATIC_FRAMES, MIN_STATIC_SHARE = 4, 0.3

@@ -356,7 +356,7 @@ def identify_lost(
     ), False
 
 
-# -- Clusters of false centroids: a reflection, a bright object's halo, a damaged part of the chip.
+# Clusters of false centroids: a reflection, a bright object's halo, a damaged part of the chip.
 
 CLUSTER_CELLS = 8  # along each side of the image
 # A cell keeps this number of centroids, or this many times the number in the median cell.
@@ -383,7 +383,7 @@ def without_clusters(u: npt.NDArray[np.float64], box: npt.NDArray[np.float64]) -
     return np.flatnonzero(rank < max(MIN_PER_CELL, TIMES_MEDIAN * np.median(count)))
 
 
-# -- The field of view of a camera.
+# The field of view of a camera.
 
 EDGE_POINTS = 9  # of each edge of the image, at which the distortion is taken
 

@@ -39,7 +39,7 @@ from epipole.tasks.algorithms.star_identification.star_grid import Sky
 
 Array = npt.NDArray[np.float64]
 
-# -- Another brightness of the same stars.
+# Another brightness of the same stars.
 
 # Frames that failed are tried in four further ways: with an unknown zero point, and with the three
 # errors of `by_quality`. Each is one more chance of a false alarm.
@@ -68,7 +68,7 @@ def of_other_brightness(
     return solutions
 
 
-# -- Poor frames.
+# Poor frames.
 
 # A frame is poor if its share of stars among its centroids is below this part of the typical one.
 # Measured (bench_unlike_frames): with 0.3, frames that shook keep the errors of the others; with
@@ -179,7 +179,7 @@ def _n_stars(solution: Solution) -> int:
     return int(np.count_nonzero(solution.star >= 0))
 
 
-# -- Other centroid errors.
+# Other centroid errors.
 
 # Rounds of learning each frame's error, and the change (ln) of all that ends them.
 QUALITY_ROUNDS, SETTLED = 6, 0.02

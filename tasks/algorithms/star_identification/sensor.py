@@ -169,7 +169,7 @@ def _open_status(status: Statuses, solutions: Solutions) -> Statuses:
     return [None if solved else s for s, solved in zip(status, solutions.solved, strict=True)]
 
 
-# -- Pass 1: the probe.
+# Pass 1: the probe.
 
 
 def _probe(
@@ -267,7 +267,7 @@ def _likeliest_scale(
     return best, chosen
 
 
-# -- Pass 2: the sample.
+# Pass 2: the sample.
 
 
 def _with_floor(
@@ -305,7 +305,7 @@ def _runs_around(n: int, rows: Rows) -> Rows:
     return np.unique(start[:, None] + np.arange(length))
 
 
-# -- Pass 4: all frames again.
+# Pass 4: all frames again.
 
 
 def _identify_again(
@@ -324,7 +324,7 @@ def evenly_spaced(n: int, wanted: int) -> Rows:
     return np.unique(np.linspace(0, max(n - 1, 0), wanted).astype(np.int64))[:n]
 
 
-# -- Pass 5: the true errors.
+# Pass 5: the true errors.
 
 
 def _with_true_scale(

@@ -76,7 +76,7 @@ class SensorModel(NamedTuple):
     adjusted: bool
 
 
-# -- Centroid error.
+# Centroid error.
 
 
 class Scale(NamedTuple):
@@ -109,7 +109,7 @@ def is_significant(residuals: Scale) -> bool:
     return abs(residuals.scale - 1) > max(0.05, 3 / np.sqrt(2 * max(residuals.dof, 1)))
 
 
-# -- Brightness.
+# Brightness.
 
 
 def zero_point(
@@ -131,7 +131,7 @@ def zero_point(
     return middle, 1.4826 * float(np.median(np.abs(known - middle)))
 
 
-# -- Errors beside the stated ones.
+# Errors beside the stated ones.
 
 
 def rematch(
@@ -190,7 +190,7 @@ def likeliest_floor(
     return float(floors_px[best]) if evidence[best] > evidence[0] + MIN_FLOOR_GAIN else 0.0
 
 
-# -- Faintest star.
+# Faintest star.
 
 
 def faintest_star(
@@ -242,7 +242,7 @@ def faintest_star(
     return float(edges[last + 1])
 
 
-# -- All of it.
+# The whole model.
 
 
 def learn(
@@ -288,7 +288,7 @@ def _learned_limit(
     return faintest_star(frames, deeper, deep, model.matching.gate_sigma, start)
 
 
-# -- Centroid error of each frame.
+# Centroid error of each frame.
 #
 # Frames of one sensor may differ: it turns faster, the image is blurred, exposures change. A
 # frame's residuals say so, but with few stars the estimate is noisy. So each frame's variance is

@@ -16,7 +16,7 @@ from epipole.tasks.algorithms.star_catalogue import NavigationCatalogue
 from epipole.tasks.algorithms.star_identification.evidence import log_magnitude_density
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable, build_pair_table
 
-# -- The star nearest to a direction.
+# The star nearest to a direction.
 
 
 class SkyGrid(NamedTuple):
@@ -103,7 +103,7 @@ def nearest_star(x, y, z, radius, u_icrs, first, star, n_face):
     return best, best_d2
 
 
-# -- All stars in a cone.
+# All stars in a cone.
 
 # Cells of z and of azimuth. With 2048 cells a field of 8 degrees reaches into some six.
 BANDS, SECTORS = 32, 64
@@ -189,7 +189,7 @@ def find_in_cone(stars, x, y, z, cosine, at):
     return n
 
 
-# -- The sky to a magnitude limit.
+# The sky to a magnitude limit.
 
 # Mean number of bright stars in a field whose pairs are tabled: enough that sparse fields have
 # several, and few enough that not many pairs share a separation.

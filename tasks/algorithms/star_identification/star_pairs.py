@@ -20,7 +20,7 @@ TURN = 1 << 16  # a full turn in units of a stored position angle: differences w
 NEAR_SHARE = 0.24
 
 
-# -- Ranges in a sorted vector.
+# Ranges in a sorted vector.
 
 
 class KVector(NamedTuple):
@@ -94,7 +94,7 @@ def range_of(index, low, high):
     return first, last
 
 
-# -- The pairs.
+# The pairs.
 
 
 class NearStars(NamedTuple):

@@ -107,7 +107,7 @@ def _same_hand(u: Array, s: Array) -> bool:
     return bool(np.linalg.det(u.T @ s) > 0.0)
 
 
-# -- A sensor's frames, each by itself.
+# A sensor's frames, each by itself.
 
 # Takes (n, 3) directions, brightest first, and (n,) sigmas [rad]; returns (n,) rows of the sky's
 # catalogue, -1 where a centroid is not identified.

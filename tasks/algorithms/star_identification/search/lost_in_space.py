@@ -56,7 +56,7 @@ from epipole.tasks.algorithms.star_identification.search.votes import (
 )
 from epipole.tasks.algorithms.star_identification.star_pairs import range_of
 
-# -- The brightest pairs.
+# The brightest pairs.
 
 # Number of brightest centroids that are paired, and of the brightest stars of an average field that
 # they may be.
@@ -125,7 +125,7 @@ def _try_centroids(problem, i, j, n_bright, scratch, best):
     return work
 
 
-# -- Pivots and votes.
+# Pivots and votes.
 
 SLACK = 2  # votes that a hypothesis may lack of the matches it needs
 # Rounds, each more thorough than the one before: number of pivots; minimum of companions of each;

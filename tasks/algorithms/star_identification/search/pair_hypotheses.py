@@ -333,7 +333,7 @@ def _judge(problem, beaten, R, P, row_of):
     return evidence + log_ways(n, matches, float(matches)) - log_ways(n, matches, in_view)
 
 
-# -- The best attitude of a search.
+# The best attitude of a search.
 
 # Attitudes closer than this are the same one [rad, about 0.3 degrees].
 SAME_ATTITUDE = 5e-3

@@ -185,7 +185,7 @@ def _cast(star, turn, wide, log2, votes):
             votes.reached[count] += 1
 
 
-# -- Refined votes.
+# Refined votes.
 
 MAX_REFINED = 1 << 13  # votes of a pivot that are counted again
 _BINS_LOG2 = 14  # a bin serves all stars and rolls with one hash: collisions only cost time
