@@ -143,7 +143,7 @@ def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
     verdicts: list[SensorVerdict] = check_sensors(solved, viewed, list(work.spans), spans)
     log_verdicts(verdicts)
     faulty = [verdict for verdict in verdicts if verdict.is_faulty]
-    late = [verdict for verdict in faulty if verdict.is_late]
+    late = [verdict for verdict in faulty if verdict.has_wrong_clock]
     work = work._replace(verdicts=tuple(add_corrections(work.verdicts, verdicts)))
     correctable = settings.alignment.correct_clocks and work.round < MAX_CORRECTIONS
     if late and correctable:

@@ -65,7 +65,7 @@ class SensorVerdict(NamedTuple):
     size_sigma: float = 0.0
 
     @property
-    def is_late(self) -> bool:
+    def has_wrong_clock(self) -> bool:
         """Whether the clock is declared wrong, late or early."""
         return self.cause == CLOCK
 
@@ -125,7 +125,7 @@ def check_sensors(
         if match is not None:
             first_guess[name], matched = match
             of_objects.append(matched.join(lines, on=KEY, how="anti"))
-    return verdicts_of(pl.concat(of_objects), first_guess)
+    return sensor_verdicts(pl.concat(of_objects), first_guess)
 
 
 def _epochs(solved: SolvedParts, spans: Sequence[Span]) -> pl.Series:
@@ -189,7 +189,7 @@ def _candidate_pairs(
     )
 
 
-def verdicts_of(
+def sensor_verdicts(
     rows: pl.DataFrame, first_guess: Mapping[str, float] | None = None
 ) -> list[SensorVerdict]:
     """Return the verdicts on those sensors that CLOCK_LINES can judge, by sensor.
@@ -263,7 +263,7 @@ def add_corrections(
     before: Sequence[SensorVerdict], now: Sequence[SensorVerdict]
 ) -> list[SensorVerdict]:
     """Return the verdicts with clock offsets as in the logs: corrections so far plus the rest."""
-    corrected = {verdict.sensor_id: verdict for verdict in before if verdict.is_late}
+    corrected = {verdict.sensor_id: verdict for verdict in before if verdict.has_wrong_clock}
     total = [
         verdict._replace(
             offset_s=verdict.offset_s + corrected[verdict.sensor_id].offset_s,

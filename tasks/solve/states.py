@@ -16,7 +16,12 @@ from epipole.schemas.settings import StateSettings
 from epipole.schemas.tables import STATES
 from epipole.schemas.work_tables import SHARED_ERRORS
 from epipole.tasks.algorithms.orbits.object_motion import velocities
-from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, FittedOrbits, fit_orbits, prior_of
+from epipole.tasks.algorithms.orbits.orbit_fit import (
+    Arcs,
+    FittedOrbits,
+    fit_orbits,
+    prior_information,
+)
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, scale_shared_errors
 from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.solve.view_groups import ViewGroups
@@ -55,7 +60,7 @@ def judge_errors(groups: ViewGroups, settings: StateSettings) -> pa.Table:
         return empty(SHARED_ERRORS)
     arcs, sensor_ids = named.arcs, named.sensor_ids
     fitted = fit_orbits(arcs, _starts(groups, named))
-    prior = prior_of(arcs, slice(None), arcs.sensor, len(sensor_ids))
+    prior = prior_information(arcs, slice(None), arcs.sensor, len(sensor_ids))
     has_bias = np.bincount(arcs.sensor, np.trace(arcs.cov_bias, axis1=1, axis2=2)) > 0.0
     free = np.column_stack([has_bias, np.ones(len(sensor_ids), bool)])
     equations = _unmixed_arcs(fitted, np.diff(arcs.offsets))

@@ -333,13 +333,13 @@ def fit_orbits(arcs: Arcs, start: Array) -> FittedOrbits:
             arcs.time_s[rows], sensor.astype(np.int64), arcs.r_km[rows], arcs.u[rows], basis[rows],
             weight[rows],
         )  # fmt: skip
-        prior = prior_of(arcs, rows, sensor, len(names))
+        prior = prior_information(arcs, rows, sensor, len(names))
         state[k], cov[k], chi2[k], of_arc = _fit(state[k], prior, views)
         equations.append((names, of_arc))
     return FittedOrbits(state, cov, chi2, equations)
 
 
-def prior_of(arcs: Arcs, rows: slice, sensor: Indices, n_sensors: int) -> Array:
+def prior_information(arcs: Arcs, rows: slice, sensor: Indices, n_sensors: int) -> Array:
     """Return (s, 6, 6) inverse covariances of each sensor's errors: direction, then position.
 
     [rad^-2, km^-2]. `sensor` has the sensor of each of the rows; zeros for a sensor without rows.

@@ -12,7 +12,7 @@ from epipole.tasks.check.check_sensors import (
     SensorVerdict,
     add_corrections,
     check_sensors,
-    verdicts_of,
+    sensor_verdicts,
 )
 from epipole.tasks.solve.positions import solve_positions
 from epipole.tasks.solve.sample_sight_lines import LineSampling, moving_objects, sample_sight_lines
@@ -37,8 +37,8 @@ def test_without_views_no_clock_is_known():
     groups = solve_positions(views, reject_sigma=5.0)
     lines = sample_sight_lines(groups, objects, LineSampling(1))
     assert lines.equals(empty(CLOCK_LINES))
-    assert verdicts_of(to_polars(lines)) == []
-    assert verdicts_of(to_polars(lines), {"a": 0.5}) == []
+    assert sensor_verdicts(to_polars(lines)) == []
+    assert sensor_verdicts(to_polars(lines), {"a": 0.5}) == []
 
 
 def test_without_objects_no_clock_is_known(tmp_path):

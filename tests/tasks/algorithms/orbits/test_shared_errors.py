@@ -4,7 +4,7 @@ import numpy as np
 from scenes.arcs import GEO, trial
 
 from epipole.tasks.algorithms.orbits import shared_errors
-from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, fit_orbits, prior_of
+from epipole.tasks.algorithms.orbits.orbit_fit import Arcs, fit_orbits, prior_information
 from epipole.tasks.algorithms.orbits.shared_errors import no_equations, scale_shared_errors
 
 PLACE_KM = 0.02
@@ -28,7 +28,7 @@ def objects(seed, worse=1.0):
 
 
 def factors(arcs, fitted):
-    prior = prior_of(arcs, slice(None), arcs.sensor, N_SENSORS)
+    prior = prior_information(arcs, slice(None), arcs.sensor, N_SENSORS)
     free = np.tile([False, True], (N_SENSORS, 1))
     return scale_shared_errors(fitted.equations, prior, free)
 
