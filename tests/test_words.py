@@ -18,10 +18,7 @@ ROOT = Path(__file__).parents[1]
 FOLDERS = ("schemas", "io", "tasks", "flows")
 MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 # Packages that still have some of the words. A package leaves the list when it is clean.
-WAITING = (
-    "tasks/algorithms/association",
-    "tasks/algorithms/tracking",
-)
+WAITING = ("tasks/algorithms/association",)
 # In text, with the uses that are allowed; in names, as words between underscores or capitals.
 TEXTS = {
     "place": r"(?<!in )(?<!into )\bplaces?\b",

@@ -377,7 +377,7 @@ def _link(
     )
     rule = LinkRule(
         gap_s=np.inf if chosen.link_gap_s is None else chosen.link_gap_s,
-        kept=chosen.link_kept,
+        confidence=chosen.link_kept,
         field_sr=camera.width * camera.height * camera.pixel_rad**2,
         interval_s=part.interval_s,
         noise_rad2_s3=chosen.link_noise_px * camera.pixel_rad**2,

@@ -46,7 +46,8 @@ def main() -> None:
                     late_clock = clock
                 else:
                     wrong += clock.is_faulty
-            estimate = f"{late_clock.offset_s:.3f} | {late_clock.sigma_s:.3f} | {late_clock.has_wrong_clock}"
+            found = late_clock.has_wrong_clock
+            estimate = f"{late_clock.offset_s:.3f} | {late_clock.sigma_s:.3f} | {found}"
             print(f"| {offset_s} | {estimate} | {wrong} | {summary.rejects} |", flush=True)
     print(f"rms over sigma {np.sqrt(np.mean(np.square(scores))):.2f} of {len(scores)}")
 

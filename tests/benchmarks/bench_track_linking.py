@@ -41,10 +41,10 @@ CASES = [
     (250, (60, 120), 480.0),
     (250, (120, 300), 900.0),
 ]
-LONGEST_S = 300.0  # told to the rivals: no gap of a case is longer by design
+MAX_GAP_S = 300.0  # told to the rivals: no gap of a case is longer by design
 RULE = LinkRule(
     gap_s=np.inf,
-    kept=0.9999,
+    confidence=0.9999,
     field_sr=FIELD_RAD**2,
     interval_s=1.0,
     noise_rad2_s3=1e-3 * PIXEL_RAD**2,
@@ -57,7 +57,7 @@ def likelihood_ratio(scene: BrokenTracks) -> Labels:
 
 
 def prediction(scene: BrokenTracks) -> Labels:
-    links = link_by_prediction(Fragments(*scene[:4]), RULE._replace(gap_s=LONGEST_S))
+    links = link_by_prediction(Fragments(*scene[:4]), RULE._replace(gap_s=MAX_GAP_S))
     return np.repeat(chain_heads(links.before), np.diff(scene.offsets))
 
 
@@ -89,7 +89,7 @@ def laptrack(scene: BrokenTracks) -> Labels:
         tracker = LapTrack(
             cutoff=10.0**2,
             gap_closing_cutoff=cutoff_px**2,
-            gap_closing_max_frame_count=int(LONGEST_S),
+            gap_closing_max_frame_count=int(MAX_GAP_S),
         )
         tracks, _, _ = tracker.predict_dataframe(
             table, ["x", "y"], frame_col="frame", only_coordinate_cols=False
@@ -142,7 +142,7 @@ def stone_soup(scene: BrokenTracks) -> Labels:
         forward_hypothesiser=DistanceHypothesiser(
             predictor, updater, Mahalanobis(), missed_distance=6.0
         ),
-        search_window=timedelta(seconds=LONGEST_S),
+        search_window=timedelta(seconds=MAX_GAP_S),
     )
     _, chains = stitcher.stitch(tracks, start)
     number = {track.id: k for k, track in enumerate(tracks)}

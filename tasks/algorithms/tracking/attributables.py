@@ -1,13 +1,13 @@
 """Attributables: the direction of a tracklet at its middle, its rate, and their covariance.
 
-An attributable is what seconds of one sensor tell of an orbit (Tommei, Milani and Rossi 2007,
-"Orbit determination of space debris: admissible regions", Celestial Mechanics 97, 289). The range
-and its rate are not seen.
+An attributable is the information on an orbit that one sensor gets within seconds (Tommei, Milani
+and Rossi 2007, "Orbit determination of space debris: admissible regions", Celestial Mechanics 97,
+289). The range and its rate remain unknown.
 
 A polynomial of fifth order in time is fitted to the detections about the middle, along the motion
-and across it. Its second and higher derivatives have priors: zero, with a spread as orbits with
-this rate have. So the detections decide on the order of the fit: where they say nothing of a
-derivative, it adds what it may to the errors.
+and across it. Its second and higher derivatives have priors: zero, with the scatter of orbits with
+this rate. So the detections decide the order of the fit: a derivative that they do not determine
+adds its scatter to the errors.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.cholesky import factor, solve_factored
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.local_motion import about
+from epipole.tasks.algorithms.tracking.local_motion import detections_about
 from epipole.tasks.algorithms.tracking.sky_filter import (
     FAR_RAD_S2,
     LOW_ORBIT_S,
@@ -32,10 +32,10 @@ Indices = npt.NDArray[np.int64]
 ORDER = 5  # of the polynomial
 N_ROWS = 2 * (ORDER + 1)
 MAX_HALF_S = 90.0  # detections farther from the middle are not fitted
-MAX_TURN = 0.5  # time from the middle over that in which the range may change by its own size
+MAX_TURN = 0.5  # maximum time from the middle times the relative range rate
 MAX_ROUNDS = 8  # each doubles how fast the range may change
-MAX_SIGMA = 1.0  # of chi-square: what fits worse has changed its range faster than is usual
-NEAR = 1e-5  # rad
+MAX_SIGMA = 1.0  # of chi-square: a worse fit means that the range changes faster than usual
+SMALL_RAD = 1e-5  # an angle below this equals its sine
 BEND = 0.5  # 1-sigma derivatives as a share of the bounds that the rate allows
 
 
@@ -86,17 +86,19 @@ def _fit_all(rows, at_s, time_s, u, noise, out):
     frame, derivatives = np.empty((3, 3)), np.empty((ORDER + 1, 2))
     N, rhs = np.empty((N_ROWS, N_ROWS)), np.empty(N_ROWS)
     for k in range(len(at_s)):
-        lo, hi = about(time_s, rows[k, 0], rows[k, 1], at_s[k], MAX_HALF_S)
+        lo, hi = detections_about(time_s, rows[k, 0], rows[k, 1], at_s[k], MAX_HALF_S)
         if lo == hi:
             continue
-        scale, more = 1.0, 1.0
+        scale, widening = 1.0, 1.0
         for _ in range(MAX_ROUNDS):
             rate = _frame(time_s, u, lo, hi, at_s[k], frame)
-            faster = more * (rate + LOW_ORBIT_S + 2 * approach(rate))
-            lo, hi = about(time_s, lo, hi, at_s[k], MAX_TURN / faster)
+            faster = widening * (rate + LOW_ORBIT_S + 2 * approach(rate))
+            lo, hi = detections_about(time_s, lo, hi, at_s[k], MAX_TURN / faster)
             chi2 = 0.0
-            for _ in range(2):  # again about the direction that the first fit gives
-                scale, chi2 = _solve(time_s, u, noise, lo, hi, at_s[k], rate, more, frame, N, rhs)
+            for _ in range(2):  # again about the direction of the first fit
+                scale, chi2 = _solve(
+                    time_s, u, noise, lo, hi, at_s[k], rate, widening, frame, N, rhs
+                )
                 for m in range(ORDER + 1):
                     for a in range(2):
                         derivatives[m, a] = rhs[2 * m + a] / scale**m
@@ -104,13 +106,13 @@ def _fit_all(rows, at_s, time_s, u, noise, out):
             dof = 2 * (hi - lo) - 4
             if dof <= 0 or chi2 < dof + MAX_SIGMA * np.sqrt(2.0 * dof):
                 break
-            more *= 2.0
+            widening *= 2.0
         _write(frame, derivatives, N, scale, out, k)
 
 
 @kernel
 def _frame(t, u, lo, hi, at, frame):
-    """Write axes along the motion, across it, and towards the detection nearest to the instant.
+    """Write axes along the motion, across it, and towards the detection nearest to `at`.
 
     Returns the rate [rad/s] from the first to the last detection, 0 with one.
     """
@@ -140,18 +142,18 @@ def _offset(u, frame, xy, J):
     a, b, c = np.sum(u * frame[0]), np.sum(u * frame[1]), np.sum(u * frame[2])
     s2 = a * a + b * b
     s = np.sqrt(s2)
-    near = s < NEAR  # the angle over its sine is 1 there
+    near = s < SMALL_RAD  # the angle over its sine is 1 there
     stretch = 1.0 if near else np.arctan2(s, c) / s
     xy[0], xy[1] = stretch * a, stretch * b
     for k in range(3):
         inward = a * frame[0, k] + b * frame[1, k]
-        more = 0.0 if near else (c - stretch) * inward / s2 - frame[2, k]
-        J[0, k] = stretch * frame[0, k] + a * more
-        J[1, k] = stretch * frame[1, k] + b * more
+        rest = 0.0 if near else (c - stretch) * inward / s2 - frame[2, k]
+        J[0, k] = stretch * frame[0, k] + a * rest
+        J[1, k] = stretch * frame[1, k] + b * rest
 
 
 @kernel
-def _solve(t, u, noise, lo, hi, at, rate, more, frame, N, rhs):
+def _solve(t, u, noise, lo, hi, at, rate, widening, frame, N, rhs):
     """Solve for the scaled derivatives, along and across in turn; N becomes its factor.
 
     Returns the time [s] by which the derivatives are scaled, and chi-square with the priors.
@@ -178,24 +180,24 @@ def _solve(t, u, noise, lo, hi, at, rate, more, frame, N, rhs):
                     rhs[2 * m + a] += h[m] * W[a, b] * xy[b]
                     for j in range(m + 1):
                         N[2 * m + a, 2 * j + b] += h[m] * h[j] * W[a, b]
-    _add_prior(rate, more, scale, N)
-    pull = rhs.copy()
+    _add_prior(rate, widening, scale, N)
+    rhs_before = rhs.copy()
     factor(N, rhs)
-    return scale, chi2 - np.sum(pull * rhs)
+    return scale, chi2 - np.sum(rhs_before * rhs)
 
 
 @kernel
-def _add_prior(rate, more, scale, N):
+def _add_prior(rate, widening, scale, N):
     """Add the priors of the derivatives from the second one on, along and across the motion.
 
     Without gravity a path is a great circle: nothing bends it across.
     """
-    faster = more * (rate + LOW_ORBIT_S + 2 * approach(rate))
-    along, across = more * acceleration(rate), more * (LOW_ORBIT_S * rate + FAR_RAD_S2)
+    faster = widening * (rate + LOW_ORBIT_S + 2 * approach(rate))
+    along, across = widening * acceleration(rate), widening * (LOW_ORBIT_S * rate + FAR_RAD_S2)
     for m in range(2, ORDER + 1):
         N[2 * m, 2 * m] += 1.0 / (BEND * along * scale**m) ** 2
         N[2 * m + 1, 2 * m + 1] += 1.0 / (BEND * across * scale**m) ** 2
-        along = more**2 * jerk(rate) if m == 2 else along * m * faster
+        along = widening**2 * jerk(rate) if m == 2 else along * m * faster
         across *= m * faster
 
 

@@ -3,8 +3,8 @@
 Two images closer than about their diameter give one centroid. It lies between the two, and it
 stays there while they pass: for a slow object up to half a minute. So the error is common to
 all these detections, and no average removes it. The other object's tracklet has a gap there, or
-it has ended or not yet begun. Carried over that time, it tells which detections are concerned, and
-how far off they may be.
+it has ended or not yet begun. Its predicted direction shows which detections may be blends, and how
+large their errors may be.
 """
 
 from itertools import pairwise
@@ -24,11 +24,9 @@ BLEND_PX = 2.5  # separation below which two images blend, if there are too few 
 BIN_PX = 0.25  # width of the bins of separation
 RESOLVED_SHARE = 0.25  # images blend where less than this share of the expected pairs is found
 MIN_PAIRS = 100  # minimum number of pairs of detections for that measurement
-CARRIED_S = 60.0  # longest time over which a tracklet is carried beyond its ends
+MAX_PREDICTED_S = 60.0  # longest time over which a tracklet is predicted beyond its ends
 MIN_FLUX_SHARE = 0.5  # share of the usual flux below which a blend is the neighbour alone
-MIN_COEXISTING = (
-    3  # minimum number of detections of either tracklet in the time of both: two objects
-)
+MIN_COEXISTING = 3  # minimum number of detections of each tracklet in the time of both
 
 
 class TrackedDetections(NamedTuple):
@@ -56,15 +54,15 @@ class TrackedDetections(NamedTuple):
 class _TrackletEnds(NamedTuple):
     """Each tracklet's first (0) and last (1) detection: time, direction, rate, variance.
 
-    The arrays are (t, 2), (t, 2, 3), (t, 2, 3), (t, 2); `reach` (t,) is how long [s] the
-    detections are that gave the rate, `flux` (t,) the median flux.
+    The arrays are (t, 2), (t, 2, 3), (t, 2, 3), (t, 2); `fitted_s` (t,) is the time
+    [s] of the detections that gave the rate, `flux` (t,) the median flux.
     """
 
     time: Array
     u: Array
     w: Array
     variance: Array
-    reach: Array
+    fitted_s: Array
     flux: Array
 
 
@@ -89,14 +87,23 @@ def blend_variance(tracked: TrackedDetections, frame_s: Array, pixel_rad: float)
     tracklet = np.repeat(np.arange(len(tracked.bounds) - 1), np.diff(tracked.bounds))
     n_bins = 2 * round(BLEND_PX / BIN_PX)
     pairs = _separations(u, by_frame, starts, BIN_PX * pixel_rad, n_bins)
-    spot, frame_s = resolved_px(pairs) * pixel_rad, np.ascontiguousarray(frame_s, float)
+    blend_rad, frame_s = resolved_px(pairs) * pixel_rad, np.ascontiguousarray(frame_s, float)
     ends, out = _ends_of(tracked), np.zeros(len(tracked.time_s))
     for _ in range(2):
         # Blends are brighter. Once they are known, so are the fluxes of the objects.
         ends = ends._replace(flux=_usual_flux(tracked, out > 0))
         out[:] = 0.0
         _enter_blends(
-            tracked.time_s, u, tracklet, by_frame, starts, tracked.bounds, frame_s, ends, spot, out
+            tracked.time_s,
+            u,
+            tracklet,
+            by_frame,
+            starts,
+            tracked.bounds,
+            frame_s,
+            ends,
+            blend_rad,
+            out,
         )
     return out
 
@@ -104,9 +111,8 @@ def blend_variance(tracked: TrackedDetections, frame_s: Array, pixel_rad: float)
 def of_neighbour(tracked: TrackedDetections, variance: Array) -> npt.NDArray[np.bool_]:
     """Return which detections are too faint to hold their tracklet's object, (n,).
 
-    A blend is brighter than either object. Where detections may be blends by their `variance`
-    (n,), but are much fainter than the others of their tracklet, the tracklet has gone over to the
-    neighbour.
+    A blend is brighter than either object. Detections that may be blends by their `variance` (n,),
+    but are much fainter than the others of their tracklet, show the neighbour alone.
     """
     blended = variance > 0
     usual = np.repeat(_usual_flux(tracked, blended), np.diff(tracked.bounds))
@@ -114,7 +120,7 @@ def of_neighbour(tracked: TrackedDetections, variance: Array) -> npt.NDArray[np.
 
 
 def resolved_px(pairs: Indices) -> float:
-    """Return the separation [px] below which spots may be one centroid.
+    """Return the separation [px] below which two images may be one centroid.
 
     Parameters
     ----------
@@ -123,8 +129,8 @@ def resolved_px(pairs: Indices) -> float:
 
     Notes
     -----
-    Without blends the pairs below a separation are a third as many as those between it and twice
-    as much: they lie anywhere.
+    Without blends, pairs are spread evenly: there are a third as many below a separation as between
+    it and twice the separation.
     """
     below = np.concatenate([[0], np.cumsum(pairs)])
     for bins in range(len(pairs) // 2, 0, -1):
@@ -140,13 +146,13 @@ def _ends_of(tracked: TrackedDetections) -> _TrackletEnds:
     time = np.column_stack([t[first], t[last - 1]])
     fit = directions_at(
         np.repeat(first, 2), np.repeat(last, 2), time.ravel(), 1.0,
-        t, tracked.u_icrs, tracked.cov_noise, np.zeros_like(tracked.cov_noise), CARRIED_S / 2,
+        t, tracked.u_icrs, tracked.cov_noise, np.zeros_like(tracked.cov_noise), MAX_PREDICTED_S / 2,
     )  # fmt: skip
-    reach = np.clip(time[:, 1] - time[:, 0], 1e-3, CARRIED_S / 2)
+    fitted_s = np.clip(time[:, 1] - time[:, 0], 1e-3, MAX_PREDICTED_S / 2)
     variance = np.trace(fit.cov_noise, axis1=1, axis2=2).reshape(-1, 2) / 2
     flux = np.full(len(first), np.nan)
     return _TrackletEnds(
-        time, fit.u.reshape(-1, 2, 3), fit.w.reshape(-1, 2, 3), variance, reach, flux
+        time, fit.u.reshape(-1, 2, 3), fit.w.reshape(-1, 2, 3), variance, fitted_s, flux
     )
 
 
@@ -168,45 +174,48 @@ def _separations(u, by_frame, starts, width, n_bins):
         for q in range(starts[f], starts[f + 1]):
             i = by_frame[q]
             for r in range(q + 1, starts[f + 1]):
-                j, away2 = by_frame[r], 0.0
+                j, chord2 = by_frame[r], 0.0
                 for c in range(3):
-                    away2 += (u[i, c] - u[j, c]) ** 2
-                if away2 < (n_bins * width) ** 2:
-                    out[int(np.sqrt(away2) / width)] += 1
+                    chord2 += (u[i, c] - u[j, c]) ** 2
+                if chord2 < (n_bins * width) ** 2:
+                    out[int(np.sqrt(chord2) / width)] += 1
     return out
 
 
 @kernel
-def _enter_blends(time, u, tracklet, by_frame, starts, bounds, frame_s, ends, spot, out):
+def _enter_blends(time, u, tracklet, by_frame, starts, bounds, frame_s, ends, blend_rad, out):
     """Write the variance of each detection's possible blends to `out` (n,)."""
     p = np.empty(3)
     for b in range(len(bounds) - 1):
         k = bounds[b]
-        lo = np.searchsorted(frame_s, ends.time[b, 0] - CARRIED_S)
-        hi = np.searchsorted(frame_s, ends.time[b, 1] + CARRIED_S, side="right")
+        lo = np.searchsorted(frame_s, ends.time[b, 0] - MAX_PREDICTED_S)
+        hi = np.searchsorted(frame_s, ends.time[b, 1] + MAX_PREDICTED_S, side="right")
         for f in range(lo, hi):
             while k < bounds[b + 1] and time[k] < frame_s[f]:
                 k += 1
             if k < bounds[b + 1] and time[k] == frame_s[f]:
                 continue  # it is detected separately
-            variance = _carry(time, u, bounds, ends, b, k, frame_s[f], p)
-            if not variance < spot * spot:
-                continue  # it may be anywhere
+            variance = _predict(time, u, bounds, ends, b, k, frame_s[f], p)
+            if not variance < blend_rad * blend_rad:
+                continue  # its direction is too uncertain
             # Its light is in the nearest detection, which may be its next tracklet.
             nearest = np.inf
             for q in range(starts[f], starts[f + 1]):
                 nearest = min(nearest, _distance(u[by_frame[q]], p))
-            farthest = min(spot + np.sqrt(variance), nearest + 2 * np.sqrt(variance))
+            farthest = min(blend_rad + np.sqrt(variance), nearest + 2 * np.sqrt(variance))
             for q in range(starts[f], starts[f + 1]):
                 i = by_frame[q]
-                away, a = _distance(u[i], p), tracklet[i]
-                if away > farthest or not _coexist(time, bounds, ends, a, b):
+                distance_rad, a = _distance(u[i], p), tracklet[i]
+                if distance_rad > farthest or not _coexist(time, bounds, ends, a, b):
                     continue
                 share = ends.flux[b] / (ends.flux[a] + ends.flux[b])
                 share = share if 0.0 <= share <= 1.0 else 0.5  # 0.5 for NaN
-                # The centroid lies nearer to the neighbour than the object by the share.
-                apart2 = min((away * away + variance) / max(1.0 - share, 1e-3) ** 2, spot * spot)
-                size = share * share * apart2
+                # The blend moves the centroid towards the neighbour by the share of the separation.
+                separation2 = min(
+                    (distance_rad * distance_rad + variance) / max(1.0 - share, 1e-3) ** 2,
+                    blend_rad * blend_rad,
+                )
+                size = share * share * separation2
                 out[i] = max(out[i], size)
 
 
@@ -217,10 +226,11 @@ def _distance(u, p):
 
 
 @kernel
-def _carry(time, u, bounds, ends, b, k, at, p):
-    """Write where tracklet b is at a time without a detection; return the variance per axis.
+def _predict(time, u, bounds, ends, b, k, at, p):
+    """Write the direction of tracklet b at a time without a detection; return its variance.
 
-    `k` is its next detection. Between two detections the direction is interpolated.
+    The variance is per axis; `k` is the next detection. Between two detections the direction is
+    interpolated.
     """
     if bounds[b] < k < bounds[b + 1]:
         x = (at - time[k - 1]) / (time[k] - time[k - 1])
@@ -233,7 +243,7 @@ def _carry(time, u, bounds, ends, b, k, at, p):
         p[c] = ends.u[b, e, c] + gap * ends.w[b, e, c]
         rate += ends.w[b, e, c] ** 2
     bent = BEND * acceleration(np.sqrt(rate)) * gap * gap / 2
-    return ends.variance[b, e] * (1 + 2 * abs(gap) / ends.reach[b]) ** 2 + bent * bent
+    return ends.variance[b, e] * (1 + 2 * abs(gap) / ends.fitted_s[b]) ** 2 + bent * bent
 
 
 @kernel
@@ -241,10 +251,10 @@ def _coexist(time, bounds, ends, a, b):
     """Return whether two tracklets are two objects: both have detections at the same times."""
     if a == b:
         return False
-    begun, ended = max(ends.time[a, 0], ends.time[b, 0]), min(ends.time[a, 1], ends.time[b, 1])
+    start, end = max(ends.time[a, 0], ends.time[b, 0]), min(ends.time[a, 1], ends.time[b, 1])
     for t in (a, b):
-        lo = np.searchsorted(time[bounds[t] : bounds[t + 1]], begun)
-        hi = np.searchsorted(time[bounds[t] : bounds[t + 1]], ended, side="right")
+        lo = np.searchsorted(time[bounds[t] : bounds[t + 1]], start)
+        hi = np.searchsorted(time[bounds[t] : bounds[t + 1]], end, side="right")
         if hi - lo < MIN_COEXISTING:
             return False
     return True

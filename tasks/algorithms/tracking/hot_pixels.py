@@ -1,7 +1,7 @@
 """Hot pixels: detections that stay at one pixel position while the sky moves through the image.
 
 `fixed_positions` finds the positions that half of the frames show, and the odds that each is a hot
-pixel. It is one for certain if it stays through a repointing, or a fast turn, that no object can
+pixel. It certainly is one if it stays through a repointing, or a fast turn, that no object can
 follow. Otherwise the centroids are the evidence (`log_ratio`), because a sensor that follows an
 object keeps its light at one position too:
 
@@ -27,9 +27,10 @@ Flags = npt.NDArray[np.bool_]
 
 SCALES = np.geomspace(0.01, 3.0, 200)  # of a position's scatter, over its stated sigmas
 STATED_WITHIN = np.log(1.5)  # 1-sigma of ln of that scale for light: accuracy of the stated sigmas
-STEADIEST, UNSTEADIEST = 0.01, 2.0  # the same scale of a hot pixel: any between, alike in ln
+# The same scale of a hot pixel: its ln is uniform between these.
+MIN_HOT_SCALE, MAX_HOT_SCALE = 0.01, 2.0
 OFF_MIDDLE = 0.1  # share of hot pixels that are not on a middle: two neighbours, for example
-MIDDLE_PX = 0.02  # 1-sigma of the others: neighbours are a little warm
+MIDDLE_PX = 0.02  # 1-sigma of the others: neighbouring pixels are slightly warm
 FOLLOWED_STILL = 0.5  # share of followed objects that do not drift
 FOLLOWED_ON_MIDDLE = 0.1  # share of followed objects that the sensor keeps on the middle of a pixel
 AT_CENTRE = 0.5  # share of followed objects that are near the principal point
@@ -37,13 +38,13 @@ CENTRE = 0.1  # 1-sigma of their distance from it, in widths of the field
 JEFFREYS = 0.5  # positions of each kind that are added to those counted: Jeffreys' prior
 MIN_SHARE = 0.5  # minimum share of the frames, and of the pointings, that show a hot pixel
 MIN_FRAMES = 5  # minimum number of frames that show a hot pixel
-MIN_STILL = 10  # frames, where only its centroids are evidence
+MIN_STILL = 10  # minimum number of detections if only the centroids are evidence
 NOWHERE = -1
-CERTAIN = np.log(1e4)  # from these odds on it is a hot pixel, whatever other sensors see
-LIKELY = np.log(10.0)  # from these odds on it is one, unless another sensor sees an object there
+CERTAIN = np.log(1e4)  # from these odds on a position is a hot pixel, whatever other sensors detect
+LIKELY = np.log(10.0)  # from these odds on it is one, unless another sensor detects an object there
 REPOINTED_PX = 20.0  # minimum motion of the sky through the image at a repointing
 MOTION_BOUND = 10.0  # times the bound on apparent motion: no object follows a repointing
-FAST_TURN_RAD_S = 3e-3  # three times a low orbit's: no object is seen to keep it up
+FAST_TURN_RAD_S = 3e-3  # three times that of a low orbit: no object keeps it for long
 HALF_TURN_RAD = np.pi
 
 
@@ -64,16 +65,16 @@ class FixedDetections(NamedTuple):
 class _Line(NamedTuple):
     """A straight line through the centroids of a position, about the middle of a pixel.
 
-    off, drift : (2,) float, mean position [px] and its rate [px/s], with variances for a scale of 1
-    misfit, freedom : chi-square and its degrees of freedom
+    offset, drift : (2,) float, mean position [px] and its rate [px/s]; variances for a scale of 1
+    chi2, dof : chi-square and its degrees of freedom
     """
 
-    off: Array
-    off_variance: float
+    offset: Array
+    offset_variance: float
     drift: Array
     drift_variance: float
-    misfit: float
-    freedom: int
+    chi2: float
+    dof: int
 
 
 def log_ratio(position: FixedDetections, camera: Camera, n_positions: int) -> float:
@@ -84,20 +85,21 @@ def log_ratio(position: FixedDetections, camera: Camera, n_positions: int) -> fl
     position
         Detections at one position, at least three.
     n_positions
-        Places of the sensor that may be light: it holds one of them on the middle of a pixel.
+        Number of the sensor's positions that may be light. The sensor keeps at most one of them on
+        the middle of a pixel.
     """
     line = _line(position)
-    of_scatter = -line.freedom * np.log(SCALES) - 0.5 * line.misfit / SCALES**2
-    off_2, drift_2 = float(line.off @ line.off), float(line.drift @ line.drift)
-    on_middle = _normal(off_2, line.off_variance * SCALES**2 + MIDDLE_PX**2)
-    still = _normal(drift_2, line.drift_variance * SCALES**2)
+    of_scatter = -line.dof * np.log(SCALES) - 0.5 * line.chi2 / SCALES**2
+    offset2, drift2 = float(line.offset @ line.offset), float(line.drift @ line.drift)
+    on_middle = _normal(offset2, line.offset_variance * SCALES**2 + MIDDLE_PX**2)
+    still = _normal(drift2, line.drift_variance * SCALES**2)
     farthest = 2 * position.reach_px / max(float(np.ptp(position.time_s)), 1e-9)
-    drifting = _normal(drift_2, line.drift_variance * SCALES**2 + farthest**2)
+    drifting = _normal(drift2, line.drift_variance * SCALES**2 + farthest**2)
     hot = np.logaddexp(np.log(OFF_MIDDLE), np.log(1 - OFF_MIDDLE) + on_middle) + still
     followed = FOLLOWED_ON_MIDDLE / n_positions
     light = np.logaddexp(np.log(1 - followed), np.log(followed) + on_middle)
     light += np.logaddexp(np.log(FOLLOWED_STILL) + still, np.log(1 - FOLLOWED_STILL) + drifting)
-    steady = (SCALES >= STEADIEST) & (SCALES <= UNSTEADIEST)
+    steady = (SCALES >= MIN_HOT_SCALE) & (SCALES <= MAX_HOT_SCALE)
     as_stated = -0.5 * (np.log(SCALES) / STATED_WITHIN) ** 2
     hot = logsumexp((of_scatter + hot)[steady]) - np.log(np.sum(steady))
     light = logsumexp(of_scatter + light + as_stated) - logsumexp(as_stated)
@@ -105,7 +107,7 @@ def log_ratio(position: FixedDetections, camera: Camera, n_positions: int) -> fl
 
 
 def with_population(ratios: Array) -> Array:
-    """Return ln of the odds of positions, from their log ratios and what the other positions are.
+    """Return ln of the odds of positions, from their log ratios and those of the other positions.
 
     The more of the other positions are hot pixels, the likelier each is one.
     """
@@ -119,30 +121,30 @@ def with_population(ratios: Array) -> Array:
 
 def _line(position: FixedDetections) -> _Line:
     weight = position.sigma_px**-2.0
-    off = np.stack([position.x_px - np.round(position.x_px.mean()),
+    offset = np.stack([position.x_px - np.round(position.x_px.mean()),
                     position.y_px - np.round(position.y_px.mean())], axis=1)  # fmt: skip
     total = weight.sum()
-    mean = weight @ off / total
+    mean = weight @ offset / total
     lever = position.time_s - weight @ position.time_s / total
     spread = max(float(weight @ lever**2), 1e-12)
-    drift = (weight * lever) @ (off - mean) / spread
-    left = off - mean - lever[:, None] * drift
-    misfit = float(weight @ np.sum(left**2, axis=1))
-    return _Line(mean, 1 / total, drift, 1 / spread, misfit, 2 * len(weight) - 4)
+    drift = (weight * lever) @ (offset - mean) / spread
+    residual = offset - mean - lever[:, None] * drift
+    chi2 = float(weight @ np.sum(residual**2, axis=1))
+    return _Line(mean, 1 / total, drift, 1 / spread, chi2, 2 * len(weight) - 4)
 
 
-def _normal(distance_2: float, variance: Array) -> Array:
+def _normal(distance2: float, variance: Array) -> Array:
     """Return ln of the density of a normal distribution on the plane."""
-    return np.asarray(-0.5 * distance_2 / variance - np.log(2 * np.pi * variance))
+    return np.asarray(-0.5 * distance2 / variance - np.log(2 * np.pi * variance))
 
 
 def _nearness(position: FixedDetections, camera: Camera) -> float:
-    """Return ln of how much likelier an object is followed here than anywhere in the field."""
+    """Return ln of the density of followed objects at a position over the mean of the field."""
     area, variance = camera.width * camera.height, (CENTRE * camera.width) ** 2
-    distance_2 = (position.x_px.mean() - camera.cx_px) ** 2 + (
+    distance2 = (position.x_px.mean() - camera.cx_px) ** 2 + (
         position.y_px.mean() - camera.cy_px
     ) ** 2
-    near = np.exp(-0.5 * distance_2 / variance) / (2 * np.pi * variance)
+    near = np.exp(-0.5 * distance2 / variance) / (2 * np.pi * variance)
     return float(np.log(1 - AT_CENTRE + AT_CENTRE * area * near))
 
 
@@ -150,11 +152,11 @@ def _nearness(position: FixedDetections, camera: Camera) -> float:
 
 
 class FixedPositions(NamedTuple):
-    """Places of the image that half of the frames show.
+    """Pixel positions at which half of the frames have a detection.
 
-    position : (n,) int, of each detection the index of its position; NOWHERE where it has none
+    position : (n,) int, of each detection the index of its position; NOWHERE if at none of these
     log_odds : (p,) float, of each position ln of the odds that it is a hot pixel, not light;
-        infinite where light cannot stay there, minus infinite where nothing speaks for it
+        infinite if light cannot stay there, minus infinite without evidence of a hot pixel
     """
 
     position: Indices
@@ -175,7 +177,7 @@ def fixed_positions(
     q_sensor_from_icrs: Array,
     camera: Camera,
 ) -> FixedPositions:
-    """Return the positions that half of the frames show, and how likely each is a hot pixel.
+    """Return the positions with detections in half of the frames, and the odds of a hot pixel.
 
     Parameters
     ----------
@@ -189,9 +191,9 @@ def fixed_positions(
     Notes
     -----
     A sensor that follows an object keeps it at one position as well, and one with a fixed attitude
-    keeps the stars. A position is a hot pixel for certain where it stays through repointings that
-    no object follows, or through a fast turn of more than half a circle. Otherwise its centroids
-    are evidence: see `hot_pixel_odds`.
+    keeps the stars. A position is certainly a hot pixel if it stays through repointings that no
+    object follows, or through a fast turn of more than half a circle. Otherwise its centroids are
+    the evidence: see `log_ratio`.
     """
     n_frames = len(time_s)
     position = np.full(len(frame), NOWHERE)
@@ -202,15 +204,15 @@ def fixed_positions(
     certain: list[bool] = []
     evidence: list[FixedDetections] = []
     for members in _find_positions(x_px, y_px, reach, (camera.width, camera.height), n_frames):
-        shown = np.unique(frame[members])
-        if len(shown) < max(MIN_SHARE * n_frames, MIN_FRAMES):
+        frames_with = np.unique(frame[members])
+        if len(frames_with) < max(MIN_SHARE * n_frames, MIN_FRAMES):
             continue
         position[members] = len(certain)
         x, y = x_px[members], y_px[members]
         where = unproject(camera, x.mean(keepdims=True), y.mean(keepdims=True))
-        path = where[0] @ R  # the row form of R' u: where the position pointed, frame by frame
+        path = where[0] @ R  # the row form of R' u: the direction of the position in each frame
         certain.append(
-            _stays_through_repointing(shown, _pointings(time_s, path, camera.pixel_rad))
+            _stays_through_repointing(frames_with, _pointings(time_s, path, camera.pixel_rad))
             or _turns_fast(time_s, path)
         )
         evidence.append(FixedDetections(time_s[frame[members]], x, y, sigma_px[members], reach))
@@ -220,22 +222,24 @@ def fixed_positions(
 def _log_odds(certain: Flags, positions: list[FixedDetections], camera: Camera) -> Array:
     """Return ln of the odds of each position that it is a hot pixel."""
     odds = np.where(certain, np.inf, -np.inf)
-    asked = [k for k, position in enumerate(positions) if len(position.x_px) >= MIN_STILL]
-    asked = [k for k in asked if not certain[k]]
-    for k in asked:
+    testable = [k for k, position in enumerate(positions) if len(position.x_px) >= MIN_STILL]
+    testable = [k for k in testable if not certain[k]]
+    for k in testable:
         odds[k] = log_ratio(positions[k], camera, 1)
-    # Hot pixels that hardly scatter tell nothing about others that scatter as light does.
-    open_ = [k for k in asked if odds[k] < CERTAIN]
-    ratios = np.array([log_ratio(positions[k], camera, len(open_)) for k in open_])
-    odds[open_] = with_population(ratios)
+    # Hot pixels that hardly scatter are no evidence on positions that scatter as light does.
+    uncertain = [k for k in testable if odds[k] < CERTAIN]
+    ratios = np.array([log_ratio(positions[k], camera, len(uncertain)) for k in uncertain])
+    odds[uncertain] = with_population(ratios)
     return odds
 
 
-def _stays_through_repointing(shown: Indices, pointing: Indices) -> bool:
-    """Return whether half of the frames show it in half of the pointings, at least in two."""
+def _stays_through_repointing(frames_with: Indices, pointing: Indices) -> bool:
+    """Return whether half of the frames have it in half of the pointings, and in two or more."""
     frames_in = np.bincount(pointing)
-    shows = np.bincount(pointing[shown], minlength=len(frames_in)) >= MIN_SHARE * frames_in
-    return bool(shows.sum() > 1 and shows.mean() >= MIN_SHARE)
+    in_pointing = (
+        np.bincount(pointing[frames_with], minlength=len(frames_in)) >= MIN_SHARE * frames_in
+    )
+    return bool(in_pointing.sum() > 1 and in_pointing.mean() >= MIN_SHARE)
 
 
 def _rates(time_s: Array, path: Array) -> tuple[Array, Array]:
@@ -245,14 +249,14 @@ def _rates(time_s: Array, path: Array) -> tuple[Array, Array]:
 
 
 def _pointings(time_s: Array, path: Array, pixel_rad: float) -> Indices:
-    """Return a number for each frame that rises wherever the sensor was repointed.
+    """Return the number of repointings before each frame.
 
-    Repointed: the rate changed by more than an object's apparent motion can.
+    At a repointing, the rate changes by more than the apparent motion of an object can.
     """
     rate, dt = _rates(time_s, path)
     change = np.linalg.norm(np.diff(rate, axis=0, prepend=rate[:1]), axis=1)
     bound = np.array([acceleration(r) for r in np.linalg.norm(rate, axis=1)])
-    # A repointing enters two rates. The smaller one is the rate an object may have had.
+    # A repointing affects two rates. The smaller one is the possible rate of an object.
     bound[1:] = np.minimum(bound[1:], bound[:-1])
     jumped = change * dt > REPOINTED_PX * pixel_rad + MOTION_BOUND * bound * dt * dt
     return np.concatenate([[0], np.cumsum(jumped)]).astype(np.int64)
@@ -269,7 +273,7 @@ def _turns_fast(time_s: Array, path: Array) -> bool:
 def _find_positions(
     x_px: Array, y_px: Array, reach_px: float, size_px: tuple[int, int], n_frames: int
 ) -> list[Indices]:
-    """Return the detections at each position that has some in many frames; each position once."""
+    """Return the detections of each position with detections in many frames."""
     cell = max(2 * reach_px, 1.0)
     width, height = (int(s / cell) + 3 for s in size_px)
     out: list[Indices] = []
@@ -282,18 +286,18 @@ def _find_positions(
         order = np.argsort(index, kind="stable")
         ordered = index[order]
         cells, count = np.unique(index[~taken], return_counts=True)
-        for busy in cells[count >= max(MIN_SHARE * n_frames, MIN_FRAMES)].tolist():
-            inside = _in_cells(order, ordered, busy, busy)
+        for full in cells[count >= max(MIN_SHARE * n_frames, MIN_FRAMES)].tolist():
+            inside = _in_cells(order, ordered, full, full)
             inside = inside[~taken[inside]]
             if not len(inside):  # they belong to a position in a neighbouring cell
                 continue
             middle_x, middle_y = np.median(x_px[inside]), np.median(y_px[inside])
             # A position is at most half a cell wide on each side of its middle.
-            around = [busy + step * width for step in (-1, 0, 1)]
+            around = [full + step * width for step in (-1, 0, 1)]
             near = np.concatenate([_in_cells(order, ordered, c - 1, c + 1) for c in around])
             near = np.sort(near)
-            off = np.hypot(x_px[near] - middle_x, y_px[near] - middle_y)
-            members = near[(off < reach_px) & ~taken[near]]
+            distance = np.hypot(x_px[near] - middle_x, y_px[near] - middle_y)
+            members = near[(distance < reach_px) & ~taken[near]]
             taken[members] = True
             out.append(members)
     return out

@@ -1,4 +1,4 @@
-"""Track initiation: detections without a track begin one where chance is ruled out.
+"""Track initiation: free detections begin a track if a false alarm is improbable enough.
 
 1. Pairs are formed of a free detection in the newest frame and one in either of the two frames
    before it (`_try_pairs`).
@@ -6,7 +6,7 @@
    the more precise the prediction and the lower the density of false alarms, the more it adds.
 3. The strongest chains become tracks (`new_tracks`).
 
-The rate of a pair limits the evidence that its chain can reach (`_best_evidence`). Pairs that
+The rate of a pair limits the evidence that its chain can reach (`_max_evidence`). Pairs that
 cannot reach enough are skipped. In dense frames these are most pairs; no track is lost.
 """
 
@@ -34,12 +34,14 @@ Indices = npt.NDArray[np.int64]
 
 NONE = -1
 P_DETECTION = 0.9  # probability that an object in the field is detected in a frame
-MISSED = np.log(1.0 - P_DETECTION)
+LOG_MISS = np.log(1.0 - P_DETECTION)
 N_RATES = 24  # classes of rate for which the maximum evidence is tabulated
 SLOWEST_RAD_S = 1e-6  # upper end of the slowest class of rate [rad/s]
 MAX_PAIRS = 500_000  # limit per frame, even in a short sequence
-FEW_TO_ASK = 1_000  # up to this many pairs, only the classes of rate that occur are tabulated
-FEW_PAIRS = 50_000  # up to this many, pairs that are two frames apart are tried as well
+FEW_TO_CLASSIFY = (
+    1_000  # up to this number of pairs, only the classes of rate that occur are tabulated
+)
+FEW_PAIRS = 50_000  # up to this number, pairs that are two frames apart are tried as well
 
 
 class Detections(NamedTuple):
@@ -75,21 +77,21 @@ class TrackRule(NamedTuple):
 
     max_rate : maximum rate [rad/s]
     max_coast, max_missed : maximum time [s] and number of successive frames without a detection
-    need : minimum number of detections of a new track
+    min_detections : minimum number of detections of a new track
     gate2 : maximum chi-square at which a detection continues a track
     field_sr : solid angle of the field [sr]
-    enough : log-evidence that a new track must have beyond the log of the number of pairs
-    most_pairs : maximum number of pairs per frame; beyond it, fast objects are not searched for
+    min_evidence : log-evidence that a new track must have beyond the log of the number of pairs
+    max_pairs : maximum number of pairs per frame; beyond it, fast objects are not searched for
     """
 
     max_rate: float
     max_coast: float
     max_missed: int
-    need: int
+    min_detections: int
     gate2: float
     field_sr: float
-    enough: float
-    most_pairs: float
+    min_evidence: float
+    max_pairs: float
 
 
 class _Pair(NamedTuple):
@@ -110,13 +112,13 @@ class _Evidence(NamedTuple):
     """How the pairs of two frames are judged.
 
     density : (depth,) float, free detections per steradian in the newest frame and those before
-    best : (N_RATES, k) float, the evidence that earlier frames can still add, see `_best_evidence`
-    tries : ln of the number of pairs, each of which may be one by chance
+    best : (N_RATES, k) float, the evidence that earlier frames can still add, see `_max_evidence`
+    log_pairs : ln of the number of pairs, each of which may be a false alarm
     """
 
     density: Array
     best: Array
-    tries: float
+    log_pairs: float
 
 
 class _Chains(NamedTuple):
@@ -151,7 +153,7 @@ class _ChainScratch(NamedTuple):
 def _free_density(f, depth, detections, field_sr):
     """Return free detections per steradian in frame f and up to depth - 1 frames before it.
 
-    Newest first. A frame without free detections counts as one with one.
+    Newest first. A frame without free detections counts as a frame with one.
     """
     offsets = detections.offsets
     out = np.empty(min(depth, f + 1))
@@ -174,18 +176,18 @@ def _class_rates(max_rate):
 
 
 @kernel
-def _best_evidence(f, g, times, density, variance, class_rates, asked):
+def _max_evidence(f, g, times, density, variance, class_rates, occurring):
     """Return the maximum log-evidence that frames before g can still add, (N_RATES, frames + 1).
 
     Row c is for a class of rate, column k for the frames g - 1 - k and earlier. It is an upper
     bound: it assumes a chain without a miss, and the lowest rate of the class, which is predicted
-    best. Rows of classes that are not `asked` (N_RATES,) for are zero.
+    best. Rows of classes that are not `occurring` (N_RATES,) are zero.
     """
     n_back = len(density) - (f - g) - 1
     out = np.zeros((N_RATES, n_back + 1))
     P = np.empty(SIZE)
     for c in range(N_RATES):
-        if not asked[c]:
+        if not occurring[c]:
             continue
         rate = class_rates[c]
         begin_covariance(rate, times[g] - times[f], variance, variance, P)
@@ -197,8 +199,8 @@ def _best_evidence(f, g, times, density, variance, class_rates, asked):
                 continue
             grow(P, rate, 0.0, dt)
             at = times[h]
-            spot = 2 * np.pi * (P[0] + variance)
-            out[c, k] = max(np.log(P_DETECTION / (density[f - h] * spot)), 0.0)
+            area = 2 * np.pi * (P[0] + variance)
+            out[c, k] = max(np.log(P_DETECTION / (density[f - h] * area)), 0.0)
             shrink(P, variance)
         for k in range(n_back - 1, -1, -1):
             out[c, k] += out[c, k + 1]
@@ -230,11 +232,11 @@ def _nearest_free(u, variance, detections, recent, slot, gate2):
 
 
 @kernel
-def _foretell(u_f, u_g, chord2, ratio, out):
+def _extrapolate(u_f, u_g, chord2, ratio, out):
     """Write to `out` (3,) the direction beyond u_g on the great circle from u_f through u_g.
 
-    It is `ratio` times as far from u_g as u_f is. Series stand for trigonometric functions: good
-    for some degrees, and only for a first test.
+    It is `ratio` times as far from u_g as u_f is. Series approximate the trigonometric functions:
+    they are good for some degrees, which is enough for a first test.
     """
     angle2 = chord2 * (1 + chord2 / 12)
     x2 = ratio * ratio * angle2
@@ -246,21 +248,21 @@ def _foretell(u_f, u_g, chord2, ratio, out):
 
 
 @kernel
-def _chain_back(pair, detections, recent, rule, density, best, wanted, room):
+def _chain_back(pair, detections, recent, rule, density, best, wanted, scratch):
     """Follow a pair back in time; return the number of detections and the log-evidence.
 
-    Writes the detections, newest first, to `room.members`. The evidence is the log-likelihood
+    Writes the detections, newest first, to `scratch.members`. The evidence is the log-likelihood
     ratio of one moving object against false alarms, over all detections but the first two. The
     number is 0 if the evidence can no longer reach `wanted`.
     """
     f, j, g, i = pair.f, pair.j, pair.g, pair.i
     times, directions, variances = detections.times, detections.directions, detections.variances
-    u, w, bend, P = room.u, room.w, room.bend, room.P
+    u, w, bend, P = scratch.u, scratch.w, scratch.bend, scratch.P
     begin(
         directions[j], times[f], variances[j], directions[i], times[g], variances[i], u, w, bend, P
     )
-    room.members[0], room.members[1] = j, i
-    n, evidence, at = 2, (f - g - 1) * MISSED, times[g]
+    scratch.members[0], scratch.members[1] = j, i
+    n, evidence, at = 2, (f - g - 1) * LOG_MISS, times[g]
     # Misses beyond the oldest detection count only if an older one follows: the object may have
     # entered the field there.
     waiting = 0.0
@@ -277,16 +279,16 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, room):
         slot = h % len(recent.largest)
         m, chi2 = _nearest_free(u, P[0], detections, recent, slot, rule.gate2)
         if m == NONE:
-            waiting += MISSED
+            waiting += LOG_MISS
             continue
-        spot = 2 * np.pi * (P[0] + variances[m])
-        gain = np.log(P_DETECTION / (density[f - h] * spot)) - 0.5 * chi2 + waiting
+        area = 2 * np.pi * (P[0] + variances[m])
+        gain = np.log(P_DETECTION / (density[f - h] * area)) - 0.5 * chi2 + waiting
         if gain < 0.0:
-            waiting += MISSED
+            waiting += LOG_MISS
             continue
         evidence, waiting = evidence + gain, 0.0
         correct(u, w, bend, P, directions[m], variances[m])
-        room.members[n] = m
+        scratch.members[n] = m
         n += 1
     return n, evidence
 
@@ -301,8 +303,8 @@ def _fastest(best, class_rates, wanted, dt, pairs_sr, rule):
     for c in range(N_RATES):
         if best[c, 0] >= wanted:
             top = class_rates[c + 1]
-    most = np.sqrt(rule.most_pairs / (np.pi * pairs_sr)) / abs(dt)
-    return min(top, most, rule.max_rate)
+    by_pairs = np.sqrt(rule.max_pairs / (np.pi * pairs_sr)) / abs(dt)
+    return min(top, by_pairs, rule.max_rate)
 
 
 @kernel
@@ -315,11 +317,11 @@ def _class_of(rate, max_rate):
 
 
 @kernel
-def _asked_rates(f, g, detections, density, rule):
+def _occurring_rates(f, g, detections, density, rule):
     """Return the classes of rate of the pairs of two frames, (N_RATES,) bool; all if many pairs."""
     offsets, track = detections.offsets, detections.track
     out = np.zeros(N_RATES, np.bool_)
-    if density[0] * density[f - g] * rule.field_sr**2 > FEW_TO_ASK:
+    if density[0] * density[f - g] * rule.field_sr**2 > FEW_TO_CLASSIFY:
         out[:] = True
         return out
     dt = detections.times[f] - detections.times[g]
@@ -336,49 +338,49 @@ def _asked_rates(f, g, detections, density, rule):
 
 
 @kernel
-def _may_chain(pair, detections, recent, rule, room):
+def _may_chain(pair, detections, recent, rule, scratch):
     """Return whether the frame before g has a free detection near the pair's prediction.
 
     A fast test that may pass too many pairs.
     """
     j, g, i, chord2, dt = pair.j, pair.g, pair.i, pair.chord2, pair.dt
-    directions, variances, P = detections.directions, detections.variances, room.P
+    directions, variances, P = detections.directions, detections.variances, scratch.P
     dt_back = detections.times[g] - detections.times[g - 1]
     begin_covariance(np.sqrt(chord2) / dt, -dt, variances[j], variances[i], P)
     grow(P, np.sqrt(chord2) / dt, 0.0, -dt_back)
-    _foretell(directions[j], directions[i], chord2, dt_back / dt, room.ahead)
+    _extrapolate(directions[j], directions[i], chord2, dt_back / dt, scratch.ahead)
     slot = (g - 1) % len(recent.largest)
-    m, _ = _nearest_free(room.ahead, P[0], detections, recent, slot, 1.02 * rule.gate2)
+    m, _ = _nearest_free(scratch.ahead, P[0], detections, recent, slot, 1.02 * rule.gate2)
     return m != NONE
 
 
 @kernel
-def _try_pair(pair, detections, recent, rule, evidence, chains, room):
+def _try_pair(pair, detections, recent, rule, evidence, chains, scratch):
     """Follow a pair back; keep its chain if it is the strongest of detection j."""
     f, g, times = pair.f, pair.g, detections.times
     row = pair.j - detections.offsets[f]
     best = evidence.best[_class_of(np.sqrt(pair.chord2) / pair.dt, rule.max_rate)]
-    wanted = evidence.tries + max(rule.enough, chains.strength[row])
-    if best[0] + (f - g - 1) * MISSED < wanted:
+    wanted = evidence.log_pairs + max(rule.min_evidence, chains.strength[row])
+    if best[0] + (f - g - 1) * LOG_MISS < wanted:
         return
-    # Most pairs are by chance. If a miss would rule a pair out, the next frame decides it quickly.
+    # Most pairs are false. If a miss would rule a pair out, the next frame decides it quickly.
     if (
-        (f - g) * MISSED + best[min(1, len(best) - 1)] < wanted
+        (f - g) * LOG_MISS + best[min(1, len(best) - 1)] < wanted
         and times[g] > times[g - 1]
-        and not _may_chain(pair, detections, recent, rule, room)
+        and not _may_chain(pair, detections, recent, rule, scratch)
     ):
         return
-    n, gained = _chain_back(pair, detections, recent, rule, evidence.density, best, wanted, room)
-    if n >= rule.need and gained > wanted:
-        chains.length[row], chains.strength[row] = n, gained - evidence.tries
-        chains.members[row, :n] = room.members[:n]
+    n, gained = _chain_back(pair, detections, recent, rule, evidence.density, best, wanted, scratch)
+    if n >= rule.min_detections and gained > wanted:
+        chains.length[row], chains.strength[row] = n, gained - evidence.log_pairs
+        chains.members[row, :n] = scratch.members[:n]
 
 
 @kernel
 def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
     """Follow all pairs within `reach` [rad]; keep the strongest chain of each detection of f."""
     directions, track = detections.directions, detections.track
-    room = _ChainScratch(
+    scratch = _ChainScratch(
         np.empty(3),
         np.empty(3),
         np.empty(3),
@@ -400,19 +402,19 @@ def _try_pairs(f, g, reach, detections, recent, rule, evidence, chains):
                 chord2 = distance2(directions[i], directions[j])
                 if track[i] == NONE and chord2 <= reach * reach:
                     pair = _Pair(f, j, g, i, chord2, dt)
-                    _try_pair(pair, detections, recent, rule, evidence, chains, room)
+                    _try_pair(pair, detections, recent, rule, evidence, chains, scratch)
 
 
 @kernel
 def _useful_depth(best, wanted):
-    """Return how many frames back a chain is followed.
+    """Return the number of frames back in which a chain is followed.
 
     In these, the slowest object reaches the evidence `wanted` even with one miss.
     """
     n_back = best.shape[1] - 1
     for k in range(1, n_back):
         last = best[0, k - 1] - best[0, k]
-        if best[0, 0] - best[0, k] > wanted + last - MISSED:
+        if best[0, 0] - best[0, k] > wanted + last - LOG_MISS:
             return k
     return n_back
 
@@ -431,12 +433,12 @@ def _strongest_chains(f, depth, detections, recent, rule):
         if dt <= 0.0 or dt > rule.max_coast or g == 0 or n == 0:
             continue
         pairs_sr = density[0] * density[f - g] * field_sr
-        wanted = np.log(pairs_sr * field_sr) + rule.enough
-        asked = _asked_rates(f, g, detections, density, rule)
-        if not asked.any():
+        wanted = np.log(pairs_sr * field_sr) + rule.min_evidence
+        occurring = _occurring_rates(f, g, detections, density, rule)
+        if not occurring.any():
             continue
-        asked[0] = True  # `_useful_depth` needs the slowest class
-        best = _best_evidence(f, g, times, density, variance, class_rates, asked)
+        occurring[0] = True  # `_useful_depth` needs the slowest class
+        best = _max_evidence(f, g, times, density, variance, class_rates, occurring)
         n_back = max(_useful_depth(best, wanted), min(depth - (f - g) - 1, best.shape[1] - 1))
         for c in range(N_RATES):
             best[c] -= best[c, n_back]
@@ -445,29 +447,30 @@ def _strongest_chains(f, depth, detections, recent, rule):
         if g < f - 1 and pairs_sr * np.pi * (rate * dt) ** 2 > FEW_PAIRS:
             continue
         # No chord is longer than its arc, so this reach holds everything up to that rate.
-        evidence = _Evidence(density, best, wanted - rule.enough)
+        evidence = _Evidence(density, best, wanted - rule.min_evidence)
         _try_pairs(f, g, rate * dt, detections, recent, rule, evidence, chains)
     return chains
 
 
 @kernel
 def new_tracks(f, depth, n_tracks, detections, recent, rule):
-    """Begin tracks from free detections, such that each ends in frame f.
+    """Begin tracks from free detections; each ends in frame f.
 
-    A chain becomes a track if it has at least `rule.need` detections and more evidence than
-    chance gives one of that many pairs. The strongest come first; each detection is used once.
+    A chain becomes a track if it has at least `rule.min_detections` detections, and more evidence
+    than false alarms in this number of pairs. The strongest come first. Each detection is used
+    once.
     Writes `detections.track`, numbered from `n_tracks`.
 
     Returns
     -------
-    begun : (b,) int64
+    began : (b,) int64
         Rows of frame f that begin a track, in the order of the track numbers.
     length, members : (n,) int64, (n, longest) int64
         Chains of all rows, see `_Chains`.
     """
     track = detections.track
     chains = _strongest_chains(f, depth, detections, recent, rule)
-    begun = np.empty(len(chains.length), np.int64)
+    began = np.empty(len(chains.length), np.int64)
     count = 0
     # A stable sort: the same order in every run.
     for row in np.argsort(-chains.strength, kind="mergesort"):
@@ -480,6 +483,6 @@ def new_tracks(f, depth, n_tracks, detections, recent, rule):
         if free:
             for m in members:
                 track[m] = n_tracks + count
-            begun[count] = row
+            began[count] = row
             count += 1
-    return begun[:count], chains.length, chains.members
+    return began[:count], chains.length, chains.members

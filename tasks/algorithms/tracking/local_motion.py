@@ -1,8 +1,8 @@
-"""Local motion: where an object stood at an instant, from its detections around it.
+"""Local motion: the direction of an object at a time, from its detections around that time.
 
-A polynomial in time is fitted to the directions in a window around the instant. Its value
-there is a weighted mean of the detections, ``sum c_k d_k`` with ``sum c_k = 1``. So covariances of
-the detections propagate exactly, both independent ones and one that all share.
+A polynomial is fitted to the directions in a window around the time. Its value there is a weighted
+of the detections, ``sum c_k d_k`` with ``sum c_k = 1``. So covariances of the detections propagate
+exactly, both independent ones and one that all share.
 """
 
 from typing import NamedTuple
@@ -15,20 +15,20 @@ from epipole.tasks.algorithms.tracking.sky_filter import acceleration, jerk
 
 Array = npt.NDArray[np.float64]
 
-BIAS_SHARE = 0.25  # most that the neglected third derivative may add, in sigmas of a detection
+BIAS_SHARE = 0.25  # maximum error by the neglected third derivative, in sigmas of a detection
 # 1-sigma acceleration per axis, as a share of the bound that the rate allows: real orbits have
 # 0.3 to 0.5.
 BEND = 0.5
 
 
 class _Queries(NamedTuple):
-    """Wanted instants, as `directions_at` takes them."""
+    """The arguments of `directions_at` that say which directions are computed."""
 
     first: npt.NDArray[np.int64]
     last: npt.NDArray[np.int64]
     at: Array
     unknown_rate: float
-    widest: float
+    max_half: float
 
 
 class _MotionDetections(NamedTuple):
@@ -55,7 +55,7 @@ class _MotionFits(NamedTuple):
 
 
 class LocalMotion(NamedTuple):
-    """Directions at wanted instants.
+    """Directions at the times of queries.
 
     u : (q, 3) float
         Unit vectors.
@@ -66,10 +66,10 @@ class LocalMotion(NamedTuple):
     fitted : (q, 2) int
         The detections that were fitted: ``fitted[k, 0]:fitted[k, 1]``.
     moments : (q, 3) float
-        Weighted means of (time minus instant)^1, ^2, ^3 [s, s^2, s^3] of the detections: u differs
-        from the true direction by these times its derivatives, over 1, 2 and 6.
+        Weighted means of (time minus that of the query)^1, ^2, ^3 [s, s^2, s^3] of the detections:
+        u differs from the true direction by these times its derivatives, over 1, 2 and 6.
     unmodelled : (q,) float
-        Variance per axis of what the fit neglects of these differences [rad^2].
+        Variance per axis of the part of these differences that the fit neglects [rad^2].
     """
 
     u: Array
@@ -82,9 +82,9 @@ class LocalMotion(NamedTuple):
 
 
 @kernel
-def _half_width(rate, sigma, widest):
+def _half_width(rate, sigma, max_half):
     """Return the window [s] in which the neglected cubic term stays below the noise."""
-    return min(widest, (6 * BIAS_SHARE * sigma / jerk(rate)) ** (1 / 3))
+    return min(max_half, (6 * BIAS_SHARE * sigma / jerk(rate)) ** (1 / 3))
 
 
 @kernel
@@ -131,8 +131,8 @@ def _coefficients(t, weight, scale, curvature_prior, value, slope):
 
 
 @kernel
-def about(t, first, last, at, half):
-    """Return the detections within a half-width of an instant, at least three if there are any."""
+def detections_about(t, first, last, at, half):
+    """Return the detections within a half-width of a time, or the three nearest if fewer."""
     lo = first + np.searchsorted(t[first:last], at - half)
     hi = first + np.searchsorted(t[first:last], at + half, side="right")
     while hi - lo < min(3, last - first):
@@ -144,27 +144,27 @@ def about(t, first, last, at, half):
 
 
 @kernel
-def _window(t, u, first, last, at, sigma, widest):
+def _window(t, u, first, last, at, sigma, max_half):
     """Return the part of first:last that is fitted, the rate [rad/s] and the half-width.
 
     Three detections are kept, however slow the sensor or fast the object. The prior covers the
     curvature, and a window beyond the half-width adds to the error.
     """
-    lo, hi = about(t, first, last, at, widest)
+    lo, hi = detections_about(t, first, last, at, max_half)
     rate = 0.0
     if hi - lo > 1:
         chord = 0.0
         for a in range(3):
             chord += (u[hi - 1, a] - u[lo, a]) ** 2
         rate = np.sqrt(chord) / (t[hi - 1] - t[lo])
-    half = _half_width(rate, sigma, widest)
-    lo, hi = about(t, lo, hi, at, half)
+    half = _half_width(rate, sigma, max_half)
+    lo, hi = detections_about(t, lo, hi, at, half)
     return lo, hi, rate, half
 
 
 @kernel
 def _nearest(t, first, last, at):
-    """Return the detection of first:last nearest in time to an instant."""
+    """Return the detection of first:last that is nearest to a time."""
     nearest = first + np.searchsorted(t[first:last], at)
     if nearest == last or (nearest > first and at - t[nearest - 1] <= t[nearest] - at):
         nearest -= 1
@@ -173,16 +173,16 @@ def _nearest(t, first, last, at):
 
 @kernel
 def _fit(detections, lo, hi, at, rate, half, unknown_rate):
-    """Return the coefficients of value and slope at an instant, and the variance that neither
-    noise nor bias explains."""
+    """Return the coefficients of value and slope at a time, and the variance that neither noise nor
+    bias explains."""
     n = hi - lo
     tau, weight = detections.t[lo:hi] - at, np.empty(n)
-    least = np.inf
+    smallest = np.inf
     for k in range(lo, hi):
-        least = min(least, detections.bias_trace[k])
+        smallest = min(smallest, detections.bias_trace[k])
     for k in range(n):
-        # What all share has no part in the weights; what some have more of has.
-        more = detections.bias_trace[lo + k] - least
+        # The bias that all share does not change the weights; what exceeds it does.
+        more = detections.bias_trace[lo + k] - smallest
         weight[k] = 2.0 / (detections.noise_trace[lo + k] + more)
     value, slope = np.empty(n), np.empty(n)
     if n == 1:
@@ -232,13 +232,13 @@ def _evaluate(queries, detections, fits):
         first, last, at = queries.first[q], queries.last[q], queries.at[q]
         nearest = _nearest(t, first, last, at)
         sigma = np.sqrt(detections.noise_trace[nearest] / 2)
-        lo, hi, rate, half = _window(t, u, first, last, at, sigma, queries.widest)
+        lo, hi, rate, half = _window(t, u, first, last, at, sigma, queries.max_half)
         fits.fitted[q, 0], fits.fitted[q, 1] = lo, hi
         value, slope, unmodelled = _fit(detections, lo, hi, at, rate, half, queries.unknown_rate)
         for a in range(3):
             mean, moving = 0.0, 0.0
             for k in range(hi - lo):
-                # Differences from the nearest detection keep the digits that matter.
+                # Differences from the nearest detection lose no digits.
                 mean += value[k] * (u[lo + k, a] - u[nearest, a])
                 moving += slope[k] * (u[lo + k, a] - u[nearest, a])
             fits.u[q, a] = u[nearest, a] + mean
@@ -261,25 +261,25 @@ def directions_at(
     u_icrs: Array,
     cov_noise: Array,
     cov_bias: Array,
-    widest_s: float,
+    max_half_s: float,
 ) -> LocalMotion:
-    """Return directions at wanted instants, their rates and covariances.
+    """Return directions at given times, their rates and covariances.
 
     Parameters
     ----------
     first, last : (q,) int
         Query q may use the detections ``first[q]:last[q]``, one tracklet's, in time order.
     at_s : (q,) float
-        Wanted instants [s].
+        Times of the queries [s].
     unknown_rate_rad_s
-        1-sigma rate an axis of an object that has a single detection [rad/s].
+        1-sigma rate per axis of an object with a single detection [rad/s].
     time_s, u_icrs : (n,), (n, 3) float
         Detections: times [s] and unit vectors.
     cov_noise, cov_bias : (n, 3, 3) float
         Their errors [rad^2], in ICRS components: independent from frame to frame, and shared
         by all frames.
-    widest_s
-        Half-width of the widest window.
+    max_half_s
+        Maximum half-width of a window [s].
 
     Notes
     -----
@@ -294,7 +294,7 @@ def directions_at(
         np.ascontiguousarray(last, np.int64),
         np.ascontiguousarray(at_s, float),
         float(unknown_rate_rad_s),
-        float(widest_s),
+        float(max_half_s),
     )
     detections = _MotionDetections(
         *(np.ascontiguousarray(a, float) for a in (time_s, u_icrs, cov_noise, cov_bias)),

@@ -1,16 +1,16 @@
 """Tracking of one sensor: detections, frame after frame, become runs of one object.
 
-Everything happens on the sky, with attitudes applied, so the sensor's own turning is removed. For
+Everything happens on the sky, with attitudes applied, so the rotation of the sensor is removed. For
 each frame, `_follow` does these steps:
 
-1. The frame's detections are sorted into a grid (`_lay_frame`).
+1. The frame's detections are sorted into a grid (`_fill_frame`).
 2. Tracks with too many misses end.
 3. The others are predicted, and take the detections within their gates, the smallest chi-square
    first (`_assign`).
 4. Two tracks exchange detections where both together then fit better (`_exchange`).
 5. Detections that are still free may begin tracks (`initiation.new_tracks`).
 
-A short sequence is then followed once more, with what is left and a weaker demand on evidence.
+The free detections of a short sequence are then followed once more, with a lower limit of evidence.
 """
 
 from typing import NamedTuple
@@ -44,9 +44,9 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
 Array = npt.NDArray[np.float64]
 
 SLACK_FRAMES = 4  # a track begins within this many frames beyond the minimum of detections
-# Limit of pairs in a sequence, and its minimum per frame. In denser clutter, the fastest objects
-# are not searched for.
-PAIRS_OF_ALL, MIN_PAIRS = 20_000_000, 5_000
+# Limit of pairs in a sequence, and the minimum of that limit per frame. In denser clutter, the
+# fastest objects are not searched for.
+MAX_PAIRS_OF_ALL, MIN_PAIRS = 20_000_000, 5_000
 # Accepted number of false tracks in a sequence. It counts every pair of detections as a test. Most
 # pairs are too fast to reach the evidence, so that 1 to 5 % of this number are measured.
 FALSE_ALARM_SEQUENCE = 1.0
@@ -84,7 +84,7 @@ def follow_detections(
     false_alarm: float,
     false_alarm_sequence: float = FALSE_ALARM_SEQUENCE,
 ) -> npt.NDArray[np.int64]:
-    """Return the track number of every detection, -1 where it belongs to none.
+    """Return the track number of every detection, -1 without a track.
 
     Parameters
     ----------
@@ -95,13 +95,14 @@ def follow_detections(
     u_icrs : (n, 3) float
         Directions, unit vectors.
     sigma_rad : (n,) float
-        1-sigma error an axis, of centroid and attitude together [rad].
+        1-sigma error per axis, of centroid and attitude together [rad].
     max_rate_rad_s, max_coast_s
-        Fastest motion searched for; longest time without a detection that a track survives.
+        Maximum rate of an object, and maximum time without a detection within a track.
     max_missed
-        Most misses in a row that a track survives.
+        Maximum number of successive misses within a track.
     min_detections
-        Fewest detections that begin a track (at least 2), within `SLACK_FRAMES` frames more.
+        Minimum number of detections that begin a track, 2 or more. They lie within `SLACK_FRAMES`
+        more frames than that.
     gate_sigma
         A detection continues a track within this many standard deviations.
     field_sr
@@ -110,9 +111,9 @@ def follow_detections(
         Accepted number of tracks per frame that consist of false alarms. Where false alarms are
         dense, or an object is fast, it takes more detections to begin a track.
     false_alarm_sequence
-        Accepted number of such tracks in the whole sequence. Few frames cannot give the evidence
-        that many can. So in a short sequence, detections without a track are followed
-        again, with what this number allows per frame.
+        Accepted number of such tracks in the whole sequence. Few frames give less evidence than
+        many. So in a short sequence, detections without a track are followed again, with this
+        number divided by the number of frames.
 
     Returns
     -------
@@ -120,7 +121,7 @@ def follow_detections(
         Tracks count from 0 by the frame in which they were confirmed; those of the second time
         come last.
     """
-    most_per_frame = max(PAIRS_OF_ALL / max(len(time_s), 1), MIN_PAIRS)
+    max_per_frame = max(MAX_PAIRS_OF_ALL / max(len(time_s), 1), MIN_PAIRS)
     rule = TrackRule(
         float(max_rate_rad_s),
         float(max_coast_s),
@@ -129,27 +130,27 @@ def follow_detections(
         float(gate_sigma) ** 2,
         float(field_sr),
         -float(np.log(false_alarm)),
-        float(min(most_per_frame, MAX_PAIRS)),
+        float(min(max_per_frame, MAX_PAIRS)),
     )
-    track = _followed(time_s, offsets, u_icrs, sigma_rad, rule)
+    track = _follow_by_rule(time_s, offsets, u_icrs, sigma_rad, rule)
     n_frames = int(np.count_nonzero(np.diff(offsets)))
     free = np.flatnonzero(track == NONE)
-    if n_frames > SHORT_SEQUENCE * (rule.need + EXTRA_DETECTIONS) or not len(free):
+    if n_frames > SHORT_SEQUENCE * (rule.min_detections + EXTRA_DETECTIONS) or not len(free):
         return track
     per_frame = max(false_alarm, false_alarm_sequence / n_frames)
     before = np.searchsorted(free, offsets)
-    again = _followed(
+    again = _follow_by_rule(
         time_s,
         before,
         u_icrs[free],
         sigma_rad[free],
-        rule._replace(enough=-float(np.log(per_frame))),
+        rule._replace(min_evidence=-float(np.log(per_frame))),
     )
     track[free] = np.where(again == NONE, NONE, again + track.max() + 1)
     return track
 
 
-def _followed(
+def _follow_by_rule(
     time_s: Array,
     offsets: npt.NDArray[np.int64],
     u_icrs: Array,
@@ -171,44 +172,46 @@ def _followed(
 
 
 @kernel
-def _follow(detections, most, rule):
-    """Fill in the tracks of all detections, of which there are at most `most` in a frame."""
-    times, room = detections.times, len(detections.track) // max(rule.need, 1) + 1
+def _follow(detections, max_in_frame, rule):
+    """Fill in the tracks of all detections; a frame has at most `max_in_frame`."""
+    times, capacity = detections.times, len(detections.track) // max(rule.min_detections, 1) + 1
     tracks = _Tracks(
-        np.empty((room, 3)),
-        np.empty((room, 3)),
-        np.empty((room, 3)),
-        np.empty((room, SIZE)),
-        np.empty(room),
-        np.zeros(room, np.int64),
+        np.empty((capacity, 3)),
+        np.empty((capacity, 3)),
+        np.empty((capacity, 3)),
+        np.empty((capacity, SIZE)),
+        np.empty(capacity),
+        np.zeros(capacity, np.int64),
     )
     live = np.empty(0, np.int64)
     # Not the literal 0: `new_tracks` would be compiled for that type as well.
-    n_tracks, n_slots = len(live), rule.need + EXTRA_DETECTIONS + 1
-    recent = RecentFrames(make_grids(n_slots, most), np.full(n_slots, np.inf), np.zeros(n_slots))
+    n_tracks, n_slots = len(live), rule.min_detections + EXTRA_DETECTIONS + 1
+    recent = RecentFrames(
+        make_grids(n_slots, max_in_frame), np.full(n_slots, np.inf), np.zeros(n_slots)
+    )
     for f in range(len(times)):
-        _lay_frame(f, detections, recent)
+        _fill_frame(f, detections, recent)
         # A track with too many misses has ended.
         live = live[
             (tracks.missed[live] <= rule.max_missed)
             & (times[f] - tracks.at[live] <= rule.max_coast)
         ]
         _assign(f, live, tracks, detections, recent, rule)
-        begun, length, chains = new_tracks(
-            f, rule.need + SLACK_FRAMES, n_tracks, detections, recent, rule
+        began, length, chains = new_tracks(
+            f, rule.min_detections + SLACK_FRAMES, n_tracks, detections, recent, rule
         )
-        for row in begun:
+        for row in began:
             members = chains[row, : length[row]]
             u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
             _state_of(members, detections, u[n_tracks], w[n_tracks], bend[n_tracks], P[n_tracks])
             tracks.at[n_tracks], tracks.missed[n_tracks] = times[f], 0
             n_tracks += 1
-        live = np.concatenate((live, np.arange(n_tracks - len(begun), n_tracks)))
+        live = np.concatenate((live, np.arange(n_tracks - len(began), n_tracks)))
 
 
 @kernel
-def _lay_frame(f, detections, recent):
-    """Lay the detections of frame f into its slot."""
+def _fill_frame(f, detections, recent):
+    """Enter the detections of frame f into its slot."""
     lo, hi, slot = detections.offsets[f], detections.offsets[f + 1], f % len(recent.largest)
     fill_grid(recent.grids, slot, detections.directions, lo, hi)
     recent.smallest[slot] = detections.variances[lo:hi].min() if hi > lo else np.inf
@@ -250,9 +253,9 @@ def _candidates(f, live, tracks, detections, recent, rule):
     density = max(n_in, 1) / rule.field_sr
     start, items = recent.grids[2], recent.grids[3]
     directions, variances = detections.directions, detections.variances
-    room, count = 4 * len(live) + 16, 0
-    track, detection = np.empty(room, np.int64), np.empty(room, np.int64)
-    chi2 = np.empty(room)
+    capacity, count = 4 * len(live) + 16, 0
+    track, detection = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    chi2 = np.empty(capacity)
     for m in live:
         variance = tracks.P[m, 0]
         gate2 = _gate2(variance + recent.smallest[slot], density, rule)
@@ -265,22 +268,22 @@ def _candidates(f, live, tracks, detections, recent, rule):
         for y in range(y_from, y_to + 1):
             for k in range(start[slot, y * side + x_from], start[slot, y * side + x_to + 1]):
                 j = items[slot, k]
-                miss = distance2(directions[j], tracks.u[m]) / (variance + variances[j])
-                if miss >= gate2:
+                distance = distance2(directions[j], tracks.u[m]) / (variance + variances[j])
+                if distance >= gate2:
                     continue
-                if count == room:
-                    track = np.concatenate((track, np.empty(room, np.int64)))
-                    detection = np.concatenate((detection, np.empty(room, np.int64)))
-                    chi2 = np.concatenate((chi2, np.empty(room)))
-                    room *= 2
-                track[count], detection[count], chi2[count] = m, j, miss
+                if count == capacity:
+                    track = np.concatenate((track, np.empty(capacity, np.int64)))
+                    detection = np.concatenate((detection, np.empty(capacity, np.int64)))
+                    chi2 = np.concatenate((chi2, np.empty(capacity)))
+                    capacity *= 2
+                track[count], detection[count], chi2[count] = m, j, distance
                 count += 1
     return track[:count], detection[:count], chi2[:count]
 
 
 @kernel
 def _gate2(variance, density, rule):
-    """Return the squared gate [sigma^2] of a track: within it a detection is more likely of the
+    """Return the squared gate [sigma^2] of a track: within it a detection is more probably the
     object than a false alarm.
 
     Parameters
@@ -293,8 +296,8 @@ def _gate2(variance, density, rule):
     Notes
     -----
     ``P_D / (density * 2 pi variance) * exp(-chi2 / 2) > 1``, see Blackman, Multiple-Target Tracking
-    with Radar Applications (1986). Without this limit a track whose rate is lost would take
-    whatever the image holds.
+    with Radar Applications (1986). Without this limit a track with an unknown rate would take
+    any detection.
     """
     return min(rule.gate2, 2.0 * np.log(P_DETECTION / (density * 2 * np.pi * variance)))
 

@@ -5,7 +5,7 @@ the direction share one covariance P of six elements: direction, direction-rate,
 direction-acceleration, rate-acceleration, acceleration. The acceleration of a new track is
 uncertain by what its rate allows. Between frames the covariance grows by the jerk that rate and
 acceleration allow. After a few frames, predictions over half a minute are good as well. No
-coordinates are used, so all directions are treated alike.
+spherical coordinates are used, so there are no poles.
 """
 
 import numpy as np
@@ -23,7 +23,7 @@ from epipole.tasks.algorithms.kernels import kernel
 #
 # The relative range rate is the rate times the cotangent of the angle between the line of sight
 # and the relative velocity. So it is bounded by the rate as well: an object that is known to be
-# slow cannot bend like one nearby.
+# slow cannot accelerate like a near one.
 
 LOW_ORBIT_S = 1e-3  # [1/s] angular rate of a low orbit; also g / v there
 APPROACH = 2.0  # relative range rate over apparent rate: real low orbits rarely exceed it
@@ -62,7 +62,7 @@ def jerk_of(rate: float, bend: float) -> float:
 
 @kernel
 def cubic_span(rate: float, sigma: float) -> float:
-    """Return over how long [s] a cubic describes the motion to a standard deviation [rad].
+    """Return the time [s] over which a cubic describes the motion to a standard deviation [rad].
 
     The best cubic misses a quartic s t^4 / 24 by an eighth of its value at the ends.
     """
@@ -206,18 +206,18 @@ MAX_CELLS_PER_SIDE = 128  # maximum number of cells along a side
 
 
 @kernel
-def make_grids(size, most):
-    """Return arrays for `size` frames of at most `most` detections."""
-    side = max(min(int(np.sqrt(most)), MAX_CELLS_PER_SIDE), 1)
+def make_grids(size, max_detections):
+    """Return arrays for `size` frames with at most `max_detections` detections each."""
+    side = max(min(int(np.sqrt(max_detections)), MAX_CELLS_PER_SIDE), 1)
     axes = np.zeros((size, 2, 3))
     shape = np.zeros((size, 4))  # lowest on both axes, cells per unit, cells along a side
     start = np.zeros((size, side * side + 1), np.int64)
-    items = np.zeros((size, max(most, 1)), np.int64)
+    items = np.zeros((size, max(max_detections, 1)), np.int64)
     return axes, shape, start, items
 
 
 @kernel
-def _lay_axes(directions, lo, hi, axes):
+def _set_axes(directions, lo, hi, axes):
     """Set two axes across the mean direction of a frame."""
     mean = np.zeros(3)
     for j in range(lo, hi):
@@ -248,7 +248,7 @@ def _along(u, axis):
 
 @kernel
 def fill_grid(grids, slot, directions, lo, hi):
-    """Lay the detections lo:hi of a frame into a slot."""
+    """Enter the detections lo:hi of a frame into a slot."""
     axes, shape, start, items = grids
     n = hi - lo
     side = max(min(int(np.sqrt(n)), int(np.sqrt(start.shape[1] - 1))), 1)
@@ -256,7 +256,7 @@ def fill_grid(grids, slot, directions, lo, hi):
     shape[slot, 3] = side
     if n == 0:
         return
-    _lay_axes(directions, lo, hi, axes[slot])
+    _set_axes(directions, lo, hi, axes[slot])
     position = np.empty((n, 2))
     for k in range(n):
         position[k, 0] = _along(directions[lo + k], axes[slot, 0])
@@ -280,10 +280,10 @@ def fill_grid(grids, slot, directions, lo, hi):
 
 @kernel
 def window(grids, slot, u, reach):
-    """Return the cells that a reach about a direction touches: x from, to, y from, to, side.
+    """Return the cells within `reach` of a direction: x from, to, y from, to, side.
 
     The cells x from .. to of a row y hold the items start[y * side + x from] to
-    start[y * side + x to + 1]. Empty (x from above x to) where nothing is near.
+    start[y * side + x to + 1]. Empty (x from above x to) outside the grid.
     """
     axes, shape = grids[0], grids[1]
     side = int(shape[slot, 3])

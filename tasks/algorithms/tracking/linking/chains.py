@@ -1,4 +1,4 @@
-"""Chains of fragments: which continues which, each at most one, best as a whole."""
+"""Chains of fragments: which continues which, with the maximum total gain."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ class Fragments(NamedTuple):
     offsets : (g + 1,) int64; fragment k has the detections offsets[k]:offsets[k + 1], in time
         order, at least one
     time_s, u_icrs, sigma_rad : (n,), (n, 3), (n,) float, times [s], unit vectors, and their
-        1-sigma errors an axis [rad]
+        1-sigma errors per axis [rad]
     """
 
     offsets: Indices
@@ -30,17 +30,17 @@ class Fragments(NamedTuple):
 
 
 class LinkRule(NamedTuple):
-    """What the methods of linking are told; each takes what it needs.
+    """Parameters of the linking methods; each method uses some of them.
 
-    gap_s : longest gap that is bridged; infinite: as far as the method itself goes
-    kept : share of true links that the chi-square test lets pass
+    gap_s : longest gap that is bridged; infinite: the limit of the method
+    confidence : of the chi-square test: share of true links that pass it
     field_sr : solid angle in which fragments begin, for their density
     interval_s : the sensor's frame interval
-    noise_rad2_s3 : process noise of a method that has one [rad^2/s^3]
+    noise_rad2_s3 : process noise, for methods with one [rad^2/s^3]
     """
 
     gap_s: float
-    kept: float
+    confidence: float
     field_sr: float
     interval_s: float
     noise_rad2_s3: float
@@ -54,30 +54,30 @@ class Links(NamedTuple):
 
 
 def choose_links(earlier: Indices, later: Indices, gain: Array, chi2: Array, n: int) -> Links:
-    """Return the links that gain most in sum; a fragment may stay alone.
+    """Return the links with the maximum total gain; a fragment may stay alone.
 
     Parameters
     ----------
     earlier, later : (p,) int
-        Fragments of each possible link, a pair at most once.
+        Fragments of each possible link; pairs are distinct.
     gain, chi2 : (p,) float
-        What the link is worth compared with leaving both ends open: links without gain are not
-        made. And its test quantity, which is passed on.
+        Gain of each link over leaving both ends open (links without gain are not made), and its
+        chi-square, which is passed on.
     n
         Number of fragments.
 
     Notes
     -----
-    An assignment on the matrix of gains, in which impossible links gain nothing. It has the same
+    This is an assignment on the matrix of gains, with zeros for impossible links. It has the same
     optimum as [[D, diag(c / 2)], [diag(c / 2), 0]] with gain = c - D, at a quarter of the size.
     Links that share no fragment, directly or through others, are assigned separately.
     """
-    before, kept = np.full(n, NONE), np.full(n, np.nan)
+    before, link_chi2 = np.full(n, NONE), np.full(n, np.nan)
     good = np.flatnonzero(gain > 0)
     if not len(good):
-        return Links(before, kept)
+        return Links(before, link_chi2)
     i, j = earlier[good], later[good]
-    # An end and a start of one fragment are two things: columns come after the rows.
+    # The end and the start of a fragment are two nodes: columns come after the rows.
     graph = coo_array((np.ones(len(good)), (i, n + j)), shape=(2 * n, 2 * n))
     _, label = connected_components(graph, directed=False)
     group = label[i]
@@ -89,8 +89,8 @@ def choose_links(earlier: Indices, later: Indices, gain: Array, chi2: Array, n: 
         chosen.append(_assign(order[lo : lo + k], i, j, gain[good]))
     picked = good[np.concatenate(chosen)]
     before[later[picked]] = earlier[picked]
-    kept[later[picked]] = chi2[picked]
-    return Links(before, kept)
+    link_chi2[later[picked]] = chi2[picked]
+    return Links(before, link_chi2)
 
 
 def leave_unlinked(fragments: Fragments, rule: LinkRule) -> Links:
@@ -100,7 +100,7 @@ def leave_unlinked(fragments: Fragments, rule: LinkRule) -> Links:
 
 
 def _assign(members: Indices, i: Indices, j: Indices, gain: Array) -> Indices:
-    """Return the links of one group that gain most together."""
+    """Return the links of one group with the maximum total gain."""
     rows, row = np.unique(i[members], return_inverse=True)
     columns, column = np.unique(j[members], return_inverse=True)
     matrix = np.zeros((len(rows), len(columns)))
@@ -119,7 +119,7 @@ def fill_in(links: Links, earlier: Indices, later: Indices, gain: Array, chi2: A
     contradicts neither. Parameters as in `choose_links`.
     """
     n = len(links.before)
-    before, kept = links.before.copy(), links.chi2.copy()
+    before, link_chi2 = links.before.copy(), links.chi2.copy()
     good = np.flatnonzero(gain > 0)
     pair = {(int(earlier[p]), int(later[p])): p for p in good}
     while True:
@@ -133,14 +133,14 @@ def fill_in(links: Links, earlier: Indices, later: Indices, gain: Array, chi2: A
             if (m, k) in pair
         ]
         if not inner:
-            return Links(before, kept)
+            return Links(before, link_chi2)
         _, p, q = max(inner)
         for link in (p, q):
-            before[later[link]], kept[later[link]] = earlier[link], chi2[link]
+            before[later[link]], link_chi2[later[link]] = earlier[link], chi2[link]
 
 
 def chain_heads(before: Indices) -> Indices:
-    """Return the first fragment of each fragment's chain; its own number where it is alone."""
+    """Return the first fragment of each fragment's chain; a lone fragment is a chain."""
     head = np.arange(len(before))
     linked = before != NONE
     head[linked] = before[linked]

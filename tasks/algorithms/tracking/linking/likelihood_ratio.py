@@ -5,11 +5,12 @@ from the apparent rate. `link_by_likelihood` works in these steps:
 
 1. Each end of each fragment is reduced to sums over its detections (`_reduce`), so that a pair
    costs a few small matrices, however long its fragments are.
-2. Pairs within the longest gap are searched by a quick test: do straight lines from both ends come
-   near each other in mid-gap (`_search`)?
+2. Pairs within the longest gap pass a quick test if straight lines from both ends come near each
+   other in mid-gap (`_search`).
 3. These pairs are compared: one cubic through both against one through each (`_compare`).
-4. The gain of a link also counts how many other fragments could have begun there (`_others`).
-5. The links that gain most together are chosen (`chains.choose_links`).
+4. The gain of a link depends on the number of fragments that could have begun there
+   (`_alternatives`).
+5. The links with the maximum total gain are chosen (`chains.choose_links`).
 """
 
 from typing import NamedTuple
@@ -37,17 +38,17 @@ from epipole.tasks.algorithms.tracking.sky_filter import (
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-FARTHEST_RAD = 0.5  # maximum arc between fragments, for which a plane approximates the sky
+MAX_ARC_RAD = 0.5  # maximum arc between fragments, for which a plane approximates the sky
 SEARCH_SIGMA = 6.0  # gate of the quick test; most pairs fail it
-SLOWEST_JERK = LOW_ORBIT_S * FAR_RAD_S2  # [rad/s^3] `jerk` of an object that stands still
+MIN_JERK = LOW_ORBIT_S * FAR_RAD_S2  # [rad/s^3] `jerk` of an object that stands still
 MAX_PAIRS = 10_000_000  # limit of pairs compared: beyond it, the longest gaps are not bridged
 
 
 class _Ends(NamedTuple):
-    """Sums over the detections near one end of each fragment, about a middle instant.
+    """Sums over the detections near one end of each fragment, about a middle time.
 
     S[:, k] = sum w t^k, B[:, k] = sum w t^k (u - u0), C = sum w (u - u0)(u - u0)', with
-    w = 1 / sigma^2 [rad^-2] and t [s] from the instant t0. At the end itself: time `at` [s],
+    w = 1 / sigma^2 [rad^-2] and t [s] from the time t0. At the end itself: time `at` [s],
     direction `u` (3,), rate `w` (3,) [rad/s]
     with their variances (infinite for the rate of a single detection), and `extra`, the square
     of the acceleration beyond noise and beyond the bound that the rate sets.
@@ -77,7 +78,7 @@ class _FitScratch(NamedTuple):
 
 
 class _Plane(NamedTuple):
-    """A tangent plane and a common instant: axes, a straight drift, instant, unit of time [s]."""
+    """A tangent plane and a common time: axes, a straight drift, that time, unit of time [s]."""
 
     e_1: Array
     e_2: Array
@@ -106,8 +107,8 @@ def _sums(fragments, lo, hi, ends, f):
 
 
 @kernel
-def _unforeseen(S, B, half, bend):
-    """Return the square [rad^2/s^4] of a fragment's acceleration beyond noise and bound.
+def _excess_acceleration2(S, B, half, bend):
+    """Return the square [rad^2/s^4] of a fragment's acceleration beyond its noise and bound.
 
     `half` [s] is half its length, `bend` [rad/s^2] the bound that its rate sets. The bound fails
     for a near object that approaches head-on: it is slow at first and soon fast.
@@ -130,10 +131,10 @@ def _unforeseen(S, B, half, bend):
 
 
 @kernel
-def _part(fragments, f, last):
+def _end_rows(fragments, f, last):
     """Return rows lo:hi of a fragment's last (or first) part, and the fragment's rate [rad/s].
 
-    The part is short enough for a cubic, and has at least three detections where there are three.
+    The part is short enough for a cubic, and has a minimum of three detections if there are three.
     """
     time_s, u = fragments.time_s, fragments.u_icrs
     lo, hi = fragments.offsets[f], fragments.offsets[f + 1]
@@ -158,7 +159,7 @@ def _reduce(fragments, last, ends):
     """Fill `ends` with sums over each fragment's last (or first) part, and its straight line."""
     time_s, u = fragments.time_s, fragments.u_icrs
     for f in range(len(fragments.offsets) - 1):
-        lo, hi, rate = _part(fragments, f, last)
+        lo, hi, rate = _end_rows(fragments, f, last)
         middle = (lo + hi) // 2
         ends.t0[f], ends.at[f] = time_s[middle], time_s[hi - 1] if last else time_s[lo]
         ends.u0[f] = u[middle]
@@ -178,7 +179,7 @@ def _reduce(fragments, last, ends):
             ends.var_u[f] = (S[2] - 2 * S[1] * dt + S[0] * dt * dt) / det
             ends.var_u[f] += (bend * half * half) ** 2
             ends.var_w[f] = S[0] / det + (bend * half) ** 2
-            ends.extra[f] = _unforeseen(S, B, half, bend)
+            ends.extra[f] = _excess_acceleration2(S, B, half, bend)
         else:
             ends.u[f] = ends.u0[f]
             ends.var_u[f], ends.var_w[f] = 1.0 / S[0], np.inf
@@ -196,21 +197,21 @@ def _ends(fragments: Fragments, last: bool) -> _Ends:
 
 @kernel
 def _shift(ends, f, plane, out_A, out_b):
-    """Fill A (4, 4) and b (4, 2) of one fragment about a common instant, in a tangent plane.
+    """Fill A (4, 4) and b (4, 2) of one fragment about a common time, in a tangent plane.
 
     A straight drift is subtracted first. It has no prior, and the remainder is small, so that
     no digits are lost. Returns c = sum w |d|^2.
     """
     S, B, C = ends.S[f], ends.B[f], ends.C[f]
     e_1, e_2, drift, scale = plane.e_1, plane.e_2, plane.drift, plane.scale
-    moved = np.empty((4, 2))
+    drifted = np.empty((4, 2))
     for k in range(4):
         x, y = 0.0, 0.0
         for a in range(3):
             value = B[k, a] - drift[a] * S[k + 1]
             x += value * e_1[a]
             y += value * e_2[a]
-        moved[k, 0], moved[k, 1] = x, y
+        drifted[k, 0], drifted[k, 1] = x, y
     c = 0.0
     for a in range(3):
         for b in range(3):
@@ -226,8 +227,8 @@ def _shift(ends, f, plane, out_A, out_b):
         for m in range(k, -1, -1):
             value += factor * shift * S[m]
             if k < 4:
-                x += factor * shift * moved[m, 0]
-                y += factor * shift * moved[m, 1]
+                x += factor * shift * drifted[m, 0]
+                y += factor * shift * drifted[m, 1]
             factor *= m / (k - m + 1.0)
             shift *= delta
         total[k] = value * power
@@ -241,7 +242,7 @@ def _shift(ends, f, plane, out_A, out_b):
 
 
 @kernel
-def _misfit(A, b, prior_2, prior_3, factor):
+def _explained(A, b, prior_2, prior_3, factor):
     """Return b' (A + L)^-1 b summed over both axes, and ln det(A + L), by Cholesky.
 
     A (4, 4), b (4, 2); L is diagonal: prior_2 and prior_3 for acceleration and jerk, else 0.
@@ -315,9 +316,9 @@ def _plane_between(tail, head, i, j, first, last):
 
 
 @kernel
-def _compare(tail, head, i, j, first, last, room):
+def _compare(tail, head, i, j, first, last, scratch):
     """Return (D, degrees of freedom, ln likelihood ratio without the prior volume)."""
-    A_1, b_1, A_2, b_2, factor = room.A_1, room.b_1, room.A_2, room.b_2, room.factor
+    A_1, b_1, A_2, b_2, factor = scratch.A_1, scratch.b_1, scratch.A_2, scratch.b_2, scratch.factor
     plane, rate = _plane_between(tail, head, i, j, first, last)
     scale, extra_2 = plane.scale, max(tail.extra[i], head.extra[j])
     c_1 = _shift(tail, i, plane, A_1, b_1)
@@ -325,46 +326,46 @@ def _compare(tail, head, i, j, first, last, room):
     bend2 = acceleration(rate) ** 2 + extra_2
     # An object that approaches at r' / r has the acceleration a = 2 r' / r times its rate, and
     # the jerk 1.5 a^2 over its rate.
-    twist = jerk(rate) + 1.5 * extra_2 / max(rate, 1e-9)
+    jerk_bound = jerk(rate) + 1.5 * extra_2 / max(rate, 1e-9)
     prior_2 = 4.0 / (bend2 * scale**4)
-    prior_3 = 36.0 / (twist * scale**3) ** 2
-    got_1, log_1 = _misfit(A_1, b_1, prior_2, prior_3, factor)
-    free = _free_parameters(factor, prior_2, prior_3)
-    got_2, log_2 = _misfit(A_2, b_2, prior_2, prior_3, factor)
-    free += _free_parameters(factor, prior_2, prior_3)
+    prior_3 = 36.0 / (jerk_bound * scale**3) ** 2
+    explained_1, log_1 = _explained(A_1, b_1, prior_2, prior_3, factor)
+    n_free = _free_parameters(factor, prior_2, prior_3)
+    explained_2, log_2 = _explained(A_2, b_2, prior_2, prior_3, factor)
+    n_free += _free_parameters(factor, prior_2, prior_3)
     for a in range(4):
         for b in range(4):
             A_1[a, b] += A_2[a, b]
         for axis in range(2):
             b_1[a, axis] += b_2[a, axis]
-    got, log_both = _misfit(A_1, b_1, prior_2, prior_3, factor)
-    free -= _free_parameters(factor, prior_2, prior_3)
-    D = (c_1 + c_2 - got) - (c_1 - got_1) - (c_2 - got_2)
+    explained, log_both = _explained(A_1, b_1, prior_2, prior_3, factor)
+    n_free -= _free_parameters(factor, prior_2, prior_3)
+    D = (c_1 + c_2 - explained) - (c_1 - explained_1) - (c_2 - explained_2)
     log_ratio = log_1 + log_2 - log_both - np.log(prior_2 * prior_3) - 2 * np.log(2 * np.pi)
     # A rate in units of the scale: its share of the prior volume is rad^2, not rad^2 / s^2.
-    return D, 2 * max(free, 2.0), log_ratio + 2 * np.log(scale) - 0.5 * D
+    return D, 2 * max(n_free, 2.0), log_ratio + 2 * np.log(scale) - 0.5 * D
 
 
 @kernel
 def _near(tail, head, i, j):
     """Return whether straight lines from both ends come within `SEARCH_SIGMA` in mid-gap."""
     gap = head.at[j] - tail.at[i]
-    half, miss, arc, rate = 0.5 * gap, 0.0, 0.0, 0.0
+    half, distance2, arc, rate = 0.5 * gap, 0.0, 0.0, 0.0
     for a in range(3):
-        miss += (tail.u[i, a] + half * tail.w[i, a] - head.u[j, a] + half * head.w[j, a]) ** 2
+        distance2 += (tail.u[i, a] + half * tail.w[i, a] - head.u[j, a] + half * head.w[j, a]) ** 2
         arc += (head.u[j, a] - tail.u[i, a]) ** 2
     rate = np.sqrt(arc) / gap
     bend2 = 0.25 * (acceleration(rate) ** 2 + max(tail.extra[i], head.extra[j])) * half**4
     allowed = tail.var_u[i] + head.var_u[j] + half * half * (tail.var_w[i] + head.var_w[j])
     allowed += 2 * bend2
-    return arc < FARTHEST_RAD**2 and miss < 2 * SEARCH_SIGMA**2 * allowed
+    return arc < MAX_ARC_RAD**2 and distance2 < 2 * SEARCH_SIGMA**2 * allowed
 
 
 @kernel
 def _search(tail, head, by_start, gap_s):
     """Return the pairs (earlier, later), at most `gap_s` apart, that pass the quick test."""
-    n, room, count = len(head.at), 1024, 0
-    first, second = np.empty(room, np.int64), np.empty(room, np.int64)
+    n, capacity, count = len(head.at), 1024, 0
+    first, second = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     sorted_start = head.at[by_start]
     for i in range(n):
         for k in range(np.searchsorted(sorted_start, tail.at[i], side="right"), n):
@@ -373,8 +374,8 @@ def _search(tail, head, by_start, gap_s):
                 break
             if not _near(tail, head, i, j):
                 continue
-            if count == room:
-                room *= 2
+            if count == capacity:
+                capacity *= 2
                 first = np.concatenate((first, np.empty(count, np.int64)))
                 second = np.concatenate((second, np.empty(count, np.int64)))
             first[count], second[count] = i, j
@@ -384,14 +385,16 @@ def _search(tail, head, by_start, gap_s):
 
 @kernel
 def _compare_all(tail, head, earlier, later, first, last):
-    """Return what `_compare` does for each pair."""
+    """Return the results of `_compare` for each pair."""
     n = len(earlier)
     D, free, log_ratio = np.empty(n), np.empty(n), np.empty(n)
-    room = _FitScratch(
+    scratch = _FitScratch(
         np.empty((4, 4)), np.empty((4, 2)), np.empty((4, 4)), np.empty((4, 2)), np.zeros((4, 4))
     )
     for p in range(n):
-        D[p], free[p], log_ratio[p] = _compare(tail, head, earlier[p], later[p], first, last, room)
+        D[p], free[p], log_ratio[p] = _compare(
+            tail, head, earlier[p], later[p], first, last, scratch
+        )
     return D, free, log_ratio
 
 
@@ -404,8 +407,8 @@ def link_by_likelihood(fragments: Fragments, rule: LinkRule) -> Links:
     chi-square with 4 degrees of freedom if the prior determines both, with 8 if the data do.
     The gain of a link is the log of the ratio of two marginal likelihoods, one motion against
     two. It depends on D, and on how precisely the one motion predicts the other fragment compared
-    with how many others could have begun there. So no gap is too long where the prediction is
-    good enough. Gaps are bridged as far as any motion can be predicted.
+    with the number of others that could have begun there. So no gap is too long if the prediction
+    is good enough. Gaps are bridged as far as any motion can be predicted.
     """
     head, tail = _ends(fragments, False), _ends(fragments, True)
     offsets, time_s = fragments.offsets, fragments.time_s
@@ -416,9 +419,9 @@ def link_by_likelihood(fragments: Fragments, rule: LinkRule) -> Links:
     D, free, log_ratio = _compare_all(
         tail, head, earlier, later, time_s[offsets[:-1]], time_s[offsets[1:] - 1]
     )
-    gain = log_ratio - np.log(_others(starts, tail.at[earlier], head.at[later], gap_s))
+    gain = log_ratio - np.log(_alternatives(starts, tail.at[earlier], head.at[later], gap_s))
     gain += np.log(rule.field_sr * _rate_area(head))
-    gain[chdtri(free, 1.0 - rule.kept) < D] = 0.0
+    gain[chdtri(free, 1.0 - rule.confidence) < D] = 0.0
     D = np.maximum(D, 0.0)
     links = choose_links(earlier, later, gain, D, len(offsets) - 1)
     return fill_in(links, earlier, later, gain, D)
@@ -427,32 +430,32 @@ def link_by_likelihood(fragments: Fragments, rule: LinkRule) -> Links:
 def _longest_gap(starts: Array, ends: Array, rule: LinkRule) -> float:
     """Return the longest gap [s] that is bridged: that of the rule, or else the longest useful one.
 
-    Over a longer one, the jerk that even the slowest object may have makes its position uncertain
-    by the whole field. The gap is shortened until at most `MAX_PAIRS` pairs are compared.
+    Over a longer one, even the jerk of the slowest object makes its direction uncertain by the
+    whole field. The gap is shortened until at most `MAX_PAIRS` pairs are compared.
     """
-    longest = float(np.cbrt(6 * np.sqrt(rule.field_sr) / SLOWEST_JERK))
+    longest = float(np.cbrt(6 * np.sqrt(rule.field_sr) / MIN_JERK))
     if np.isfinite(rule.gap_s):
         longest = float(rule.gap_s)
-    while _begun(starts, ends, ends + longest).sum() > MAX_PAIRS:
+    while _count_starts(starts, ends, ends + longest).sum() > MAX_PAIRS:
         longest *= 0.8
     return longest
 
 
-def _begun(starts: Array, after: Array, until: Array) -> Indices:
-    """Return how many of the sorted starts are after one time and up to another."""
+def _count_starts(starts: Array, after: Array, until: Array) -> Indices:
+    """Return the number of sorted starts after one time and up to another."""
     return np.searchsorted(starts, until, side="right") - np.searchsorted(
         starts, after, side="right"
     )
 
 
-def _others(starts: Array, end: Array, start: Array, gap_s: float) -> Array:
+def _alternatives(starts: Array, end: Array, start: Array, gap_s: float) -> Array:
     """Return the number of fragments among which each continuation was found, normalised.
 
     All fragments that begin after the end and up to the start could have been the continuation.
     The prior of a link is one over this number; the harmonic sum over all that begin within the
     longest gap normalises it.
     """
-    up_to, all_of = _begun(starts, end, start), _begun(starts, end, end + gap_s)
+    up_to, all_of = _count_starts(starts, end, start), _count_starts(starts, end, end + gap_s)
     return np.asarray(np.maximum(up_to, 1) * (np.log(np.maximum(all_of, 1)) + np.euler_gamma + 0.5))
 
 

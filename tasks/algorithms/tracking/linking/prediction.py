@@ -3,7 +3,7 @@
 Cheng, Wang, Li et al. (2021), patent: image-plane track fragment association by forward and
 backward prediction with velocity weighting. The old fragment is filtered forward, the new one
 backward, both with constant acceleration. Across the gap both are predicted with constant
-velocity, and they must agree about an instant that their speeds choose. The printed source lacks
+velocity, and they must agree about a time that follows from their speeds. The printed source lacks
 its formulas: process noise, window and test quantity are reconstructed.
 
 Directions stand in for the image plane: the filters run on the three components of the unit
@@ -27,11 +27,11 @@ from epipole.tasks.algorithms.tracking.linking.chains import (
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-LONGEST_S = 90.0  # gap that is bridged, where none is given: its process noise suits no longer one
-DEGREES_OF_FREEDOM = 4  # of one instant: those of the window are almost fully correlated
-HALF_WINDOW = 5  # instants on each side of the middle one
-FASTEST_RAD_S = 0.1  # 1-sigma of a rate not yet measured
-HARDEST_RAD_S2 = 1e-3  # 1-sigma of an acceleration not yet measured
+MAX_GAP_S = 90.0  # maximum gap unless one is given: the process noise does not suit longer ones
+DEGREES_OF_FREEDOM = 4  # of one time: those of the window are almost fully correlated
+HALF_WINDOW = 5  # times on each side of the middle one
+RATE_SIGMA_RAD_S = 0.1  # 1-sigma of a rate not yet measured
+ACCELERATION_SIGMA_RAD_S2 = 1e-3  # 1-sigma of an acceleration not yet measured
 
 
 class _EndStates(NamedTuple):
@@ -50,7 +50,7 @@ class _EndStates(NamedTuple):
 def _filter(fragments, first, last, step, q, x, P):
     """Run the constant-acceleration filter over the detections first, first + step .. last.
 
-    x (3, 3) receives place, rate and acceleration of the three components at the last one,
+    x (3, 3) receives value, rate and acceleration of the three components at the last one,
     P (3, 3) the covariance that the components share. Backward, time steps are negative and
     the process noise is -Q(T), which turns the sign of its odd terms only.
     """
@@ -58,7 +58,7 @@ def _filter(fragments, first, last, step, q, x, P):
     x[:] = 0.0
     x[0] = u[first]
     P[:] = 0.0
-    P[0, 0], P[1, 1], P[2, 2] = sigma[first] ** 2, FASTEST_RAD_S**2, HARDEST_RAD_S2**2
+    P[0, 0], P[1, 1], P[2, 2] = sigma[first] ** 2, RATE_SIGMA_RAD_S**2, ACCELERATION_SIGMA_RAD_S2**2
     phi, Q, gain = np.eye(3), np.empty((3, 3)), np.empty(3)
     k = first
     while k != last:
@@ -76,9 +76,9 @@ def _filter(fragments, first, last, step, q, x, P):
         for a in range(3):
             gain[a] = P[a, 0] / s
         for a in range(3):
-            miss = u[k, a] - x[0, a]
+            innovation = u[k, a] - x[0, a]
             for m in range(3):
-                x[m, a] += gain[m] * miss
+                x[m, a] += gain[m] * innovation
         row = P[0].copy()
         for m in range(3):
             for j in range(3):
@@ -133,7 +133,7 @@ def _distance(x_1, P_1, t_1, x_2, P_2, t_2, interval_s, q):
         a00, a01, a11 = _covariance_at(P_1, T_1, q)
         b00, b01, b11 = _covariance_at(P_2, T_2, q)
         c00, c01, c11 = a00 + b00, a01 + b01, a11 + b11
-        # What lies along the line of sight is no displacement on the sky.
+        # Only the displacement across the line of sight counts.
         pp, pv, vv, p_along, v_along = 0.0, 0.0, 0.0, 0.0, 0.0
         for a in range(3):
             p = x_1[0, a] + T_1 * x_1[1, a] - x_2[0, a] - T_2 * x_2[1, a]
@@ -154,9 +154,9 @@ def _distance(x_1, P_1, t_1, x_2, P_2, t_2, interval_s, q):
 @kernel
 def _compare_all(tail, head, by_start, rule, limit):
     """Return the pairs (earlier, later) within the limit and their test quantity."""
-    room, count, q = 1024, 0, rule.noise_rad2_s3
-    first, second = np.empty(room, np.int64), np.empty(room, np.int64)
-    distance = np.empty(room)
+    capacity, count, q = 1024, 0, rule.noise_rad2_s3
+    first, second = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+    distance = np.empty(capacity)
     start, end = head.at, tail.at
     sorted_start = start[by_start]
     for i in range(len(start)):
@@ -169,8 +169,8 @@ def _compare_all(tail, head, by_start, rule, limit):
             )
             if not limit > D:
                 continue
-            if count == room:
-                room *= 2
+            if count == capacity:
+                capacity *= 2
                 first = np.concatenate((first, np.empty(count, np.int64)))
                 second = np.concatenate((second, np.empty(count, np.int64)))
                 distance = np.concatenate((distance, np.empty(count)))
@@ -187,16 +187,16 @@ def link_by_prediction(fragments: Fragments, rule: LinkRule) -> Links:
     rule
         ``noise_rad2_s3`` is the process noise of both models: white acceleration [rad^2/s^3]
         across the gap, and the same number of white jerk [rad^2/s^5] in the fragments. It
-        decides what is linked. The instants compared are ``interval_s`` apart.
+        decides what is linked. The times compared are ``interval_s`` apart.
 
     References
     ----------
     Cheng, Wang, Li et al. (2021); see the module.
     """
-    rule = rule._replace(gap_s=rule.gap_s if np.isfinite(rule.gap_s) else LONGEST_S)
+    rule = rule._replace(gap_s=rule.gap_s if np.isfinite(rule.gap_s) else MAX_GAP_S)
     tail = _filter_all(fragments, False, rule.noise_rad2_s3)
     head = _filter_all(fragments, True, rule.noise_rad2_s3)
-    limit = float(chdtri(DEGREES_OF_FREEDOM, 1.0 - rule.kept))
+    limit = float(chdtri(DEGREES_OF_FREEDOM, 1.0 - rule.confidence))
     by_start = np.argsort(head.at, kind="stable")
     earlier, later, D = _compare_all(tail, head, by_start, rule, limit)
     return choose_links(earlier, later, limit - D, D, len(head.at))

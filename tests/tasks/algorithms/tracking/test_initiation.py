@@ -14,7 +14,7 @@ from epipole.tasks.algorithms.tracking.initiation import (
     TrackRule,
     new_tracks,
 )
-from epipole.tasks.algorithms.tracking.runs import EXTRA_DETECTIONS, SLACK_FRAMES, _lay_frame
+from epipole.tasks.algorithms.tracking.runs import EXTRA_DETECTIONS, SLACK_FRAMES, _fill_frame
 from epipole.tasks.algorithms.tracking.sky_filter import acceleration, jerk_of, make_grids
 
 FIELD_RAD = np.radians(4.0)
@@ -31,11 +31,11 @@ def rule(**changes):
         "max_rate": np.radians(2.0),
         "max_coast": 4.5,
         "max_missed": 3,
-        "need": 3,
+        "min_detections": 3,
         "gate2": 16.0,
         "field_sr": FIELD_RAD**2,
-        "enough": -np.log(1e-2),
-        "most_pairs": 5000.0,
+        "min_evidence": -np.log(1e-2),
+        "max_pairs": 5000.0,
     }
     return TrackRule(**options | changes)
 
@@ -75,7 +75,7 @@ def scene(seed, *, times, rate_arcsec_s, n_objects=2, n_strays=2, missed=0.1, er
 
 def begun_in_last_frame(detections, of):
     """Return the members of the new tracks that end in the last frame, in order."""
-    n_slots = of.need + EXTRA_DETECTIONS + 1
+    n_slots = of.min_detections + EXTRA_DETECTIONS + 1
     recent = RecentFrames(
         make_grids(n_slots, int(np.diff(detections.offsets).max())),
         np.full(n_slots, np.inf),
@@ -83,8 +83,8 @@ def begun_in_last_frame(detections, of):
     )
     f = len(detections.times) - 1
     for k in range(f + 1):
-        _lay_frame(k, detections, recent)
-    depth, n_tracks = of.need + SLACK_FRAMES, 100
+        _fill_frame(k, detections, recent)
+    depth, n_tracks = of.min_detections + SLACK_FRAMES, 100
     begun, length, members = new_tracks(f, depth, n_tracks, detections, recent, of)
     tracks = [members[row, : length[row]].tolist() for row in begun]
     for k, track in enumerate(tracks):
@@ -180,8 +180,8 @@ def by_trying_all(detections, of):
                     continue
                 members, evidence = follow_back(detections, of, f, j, g, i)
                 strength = evidence - by_chance
-                if len(members) >= of.need and strength > max(
-                    of.enough, best.get(j, (-np.inf,))[0]
+                if len(members) >= of.min_detections and strength > max(
+                    of.min_evidence, best.get(j, (-np.inf,))[0]
                 ):
                     best[j] = strength, members
     tracks, used = [], set()
@@ -200,7 +200,7 @@ def test_no_track_is_lost_by_the_pairs_that_are_skipped(times, rate_arcsec_s):
         detections = scene(seed, times=TIMES[times], rate_arcsec_s=rate_arcsec_s)
         # All frames are followed back where at least 3 detections are needed. Where the demand is
         # strong, a miss rules a pair out.
-        of = rule(need=3 + seed % 2, enough=5.0 + 8.0 * (seed % 6))
+        of = rule(min_detections=3 + seed % 2, min_evidence=5.0 + 8.0 * (seed % 6))
         expected = by_trying_all(detections, of)
         assert begun_in_last_frame(detections, of) == expected, seed
         n_begun += len(expected)
@@ -221,7 +221,7 @@ def test_weak_chains_among_strays_are_those_of_trying_all_pairs(n_objects):
             missed=0.3,
             errors=(80.0, 81.0 + 80.0 * (seed % 2)),
         )
-        of = rule(enough=np.log(0.3) + seed % 5 * (n_objects > 0))
+        of = rule(min_evidence=np.log(0.3) + seed % 5 * (n_objects > 0))
         expected = by_trying_all(detections, of)
         assert begun_in_last_frame(detections, of) == expected, seed
         n_begun += len(expected)

@@ -26,7 +26,7 @@ SIGMA = 4 * ARCSEC
 def rule(gap_s):
     return LinkRule(
         gap_s=gap_s,
-        kept=0.9999,
+        confidence=0.9999,
         field_sr=np.radians(8.0) ** 2,
         interval_s=1.0,
         noise_rad2_s3=1e-3 * (28 * ARCSEC) ** 2,
@@ -170,7 +170,7 @@ def test_the_likelihood_statistic_has_its_degrees_of_freedom_where_two_are_one_o
         parts = [((0, 0), (40, 0), t[:10]), ((0, 0), (40, 0), t[10:])]
         found.append(by_likelihood(*fragments(parts, seed=seed, bend=a)).chi2[1])
     found = np.array(found)
-    assert np.isfinite(found).mean() > 0.997  # `kept` is 0.9999
+    assert np.isfinite(found).mean() > 0.997  # `confidence` is 0.9999
     assert abs(np.nanmean(found) - 4.0) < 0.4  # 4 sigma of the mean is 0.36
     assert np.nanquantile(found, 0.99) < chi_square.ppf(0.99, 8)
 

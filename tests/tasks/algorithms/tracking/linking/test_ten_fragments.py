@@ -24,7 +24,7 @@ from epipole.tasks.algorithms.tracking.sky_filter import acceleration, cubic_spa
 
 SIGMA = 4 * ARCSEC
 KEPT, GAP_S, FIELD_SR = 0.9999, 60.0, np.radians(8.0) ** 2
-RULE = LinkRule(gap_s=GAP_S, kept=KEPT, field_sr=FIELD_SR, interval_s=1.0, noise_rad2_s3=0.0)
+RULE = LinkRule(gap_s=GAP_S, confidence=KEPT, field_sr=FIELD_SR, interval_s=1.0, noise_rad2_s3=0.0)
 WIDE_RAD, WIDE_RAD_S = 0.05, 0.005  # priors that stand for "anywhere" and "at any rate"
 
 
