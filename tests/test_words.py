@@ -17,8 +17,6 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("schemas", "io", "tasks", "flows")
 MODULES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
-# Packages that still have some of the words. A package leaves the list when it is clean.
-WAITING = ("tasks/algorithms/association",)
 # In text, with the uses that are allowed; in names, as words between underscores or capitals.
 TEXTS = {
     "place": r"(?<!in )(?<!into )\bplaces?\b",
@@ -109,8 +107,7 @@ def found(word: str, path: Path) -> list[str]:
 def test_a_word_that_has_a_better_one_does_not_return(word):
     """See docs/glossary.md for the word to use."""
     modules = {path: path.relative_to(ROOT).as_posix() for path in MODULES}
-    checked = [path for path, name in modules.items() if not name.startswith(WAITING)]
-    assert {modules[path]: where for path in checked if (where := found(word, path))} == {}
+    assert {name: where for path, name in modules.items() if (where := found(word, path))} == {}
 
 
 @pytest.mark.parametrize("word", TEXTS)

@@ -19,7 +19,7 @@ from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import Sensor, Span, spans_between
 from epipole.schemas.stages import Stage
-from epipole.tasks.solve.align_epochs import EpochGrid, usable_frames, night_grid
+from epipole.tasks.solve.align_epochs import EpochGrid, night_grid, usable_frames
 from epipole.tasks.solve.associate_block import associate_blocks, blocks_of
 from epipole.tasks.solve.number_objects import number_objects
 from epipole.tasks.solve.positions import VELOCITY_WINDOW_S

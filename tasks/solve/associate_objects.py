@@ -149,11 +149,11 @@ def _associate_longer(
         longer = block.items.first_ns // round(window_s * 1e9)
         for number in np.unique(longer[agreeing]).tolist():
             rows = np.flatnonzero((longer == number) & agreeing)
-            open_items = window_groups.open_items(rows, window_before_s)
-            if len(open_items):
+            undecided = window_groups.undecided(rows, window_before_s)
+            if len(undecided):
                 samples, tracklet = _long_samples(block, rows, number, window_s)
                 groups = _find_groups(block, samples, settings)
-                window_groups.reconsider(rows, open_items, tracklet, groups)
+                window_groups.reconsider(rows, undecided, tracklet, groups)
         window_before_s = window_s
 
 

@@ -36,9 +36,9 @@ from epipole.tasks.solve.align_epochs import EpochGrid, align_epochs
 from epipole.tasks.solve.sightings import (
     SensorSightings,
     TrackletSightings,
-    states_near_frames,
     optics_covariance,
     sight_objects,
+    states_near_frames,
     tabulate_attributables,
     tabulate_sightings,
 )

@@ -1,9 +1,9 @@
 """Arcs: the odds of a hypothesis from several instants, tied together by one orbit.
 
-An orbit has six parameters, however many instants there are. An unrelated tracklet has four of
-its own, a position and a drift relative to the orbit; its other directions follow from these and
-are no evidence. So a chance meeting of two tracklets takes two coincidences (the miss and its
-drift), not one for each instant.
+An orbit has six parameters, whatever the number of instants. An unrelated tracklet has four more,
+a position and a drift relative to the orbit; its other directions follow from these and are no
+evidence. So two unrelated tracklets match by two coincidences (position and drift), not by one for
+each instant.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from epipole.tasks.algorithms.cholesky import factor
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
 from epipole.tasks.algorithms.kernels import kernel
 
-J2_RE2_KM2 = J2 * EARTH_RADIUS_KM**2  # about GCRF's pole: near enough
+J2_RE2_KM2 = J2 * EARTH_RADIUS_KM**2  # about the pole of GCRF: accurate enough
 STEP_S = 60.0  # one Runge-Kutta step of a low orbit errs by 0.1 m
 ITERATIONS = 6
 CONVERGED = 1e-4  # sigmas squared
@@ -26,12 +26,12 @@ SLACK_SIGMA = 3.0
 def _derivative(y, dy):
     """Write the time derivative of a state (6) about an oblate Earth."""
     r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
-    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
+    gravity = GM_KM3_S2 / (r2 * np.sqrt(r2))
     flat = 1.5 * J2_RE2_KM2 / r2
     for a in range(3):
         dy[a] = y[3 + a]
-        dy[3 + a] = pull * y[a] * (flat * (5.0 * y[2] * y[2] / r2 - 1.0) - 1.0)
-    dy[5] -= 2.0 * pull * flat * y[2]
+        dy[3 + a] = gravity * y[a] * (flat * (5.0 * y[2] * y[2] / r2 - 1.0) - 1.0)
+    dy[5] -= 2.0 * gravity * flat * y[2]
 
 
 @kernel
@@ -66,7 +66,7 @@ def _begin(views, x, seen_by, state):
     mean_t /= n
     state[:] = 0.0
     r2 = x[first, 0] ** 2 + x[first, 1] ** 2 + x[first, 2] ** 2
-    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
+    gravity = GM_KM3_S2 / (r2 * np.sqrt(r2))
     square = 0.0
     for m in range(first, len(views.time_s)):
         if seen_by[m] < 2:
@@ -74,7 +74,7 @@ def _begin(views, x, seen_by, state):
         t = views.time_s[m] - views.time_s[first]
         square += (t - mean_t) ** 2
         for a in range(3):
-            straight = x[m, a] + 0.5 * pull * x[first, a] * t * t
+            straight = x[m, a] + 0.5 * gravity * x[first, a] * t * t
             state[a] += straight / n
             state[3 + a] += straight * (t - mean_t)
     for a in range(3):
@@ -97,7 +97,7 @@ def _normal_equations(views, members, first, state, at, k, N, rhs):
     G, H = np.empty((2, 6)), np.empty((2, 6))
     chi2 = 0.0
     r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
-    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
+    gravity = GM_KM3_S2 / (r2 * np.sqrt(r2))
     for m in range(first, len(views.time_s)):
         if m > first:
             _propagate(y, views.time_s[m] - views.time_s[m - 1], k)
@@ -112,7 +112,7 @@ def _normal_equations(views, members, first, state, at, k, N, rhs):
                 g = 2 + 3 * c
                 tide = part[g] * state[0] + part[g + 1] * state[1] + part[g + 2] * state[2]
                 for a in range(3):
-                    bend = pull * (3.0 * tide * state[a] / r2 - part[g + a])
+                    bend = gravity * (3.0 * tide * state[a] / r2 - part[g + a])
                     G[c, a] = part[g + a] + bend * t * t / 2.0
                     G[c, 3 + a] = (part[g + a] + bend * t * t / 6.0) * t
             g0 = part[8] * part[0] + part[9] * part[1]
@@ -131,25 +131,25 @@ def _normal_equations(views, members, first, state, at, k, N, rhs):
 @kernel
 def _ends(views, i, first):
     """Return the first and last instant, from `first` on, at which a tracklet is seen."""
-    begun, ended = -1, -1
+    first_seen, last_seen = -1, -1
     for m in range(first, len(views.time_s)):
         if views.seen[i, m]:
-            begun = m if begun < 0 else begun
-            ended = m
-    return begun, ended
+            first_seen = m if first_seen < 0 else first_seen
+            last_seen = m
+    return first_seen, last_seen
 
 
 @kernel
-def _scatter(views, chance, i, begun, ended, b):
+def _scatter(views, chance, i, first_seen, last_seen, b):
     """Write the drift of tracklet i relative to its sensor's others; return its variance.
 
     The variance is at least half the square of the drift: a far outlier is rare by a power law,
     not by a Gaussian's tail.
     """
-    s, dt = views.sensor[i], views.time_s[ended] - views.time_s[begun]
+    s, dt = views.sensor[i], views.time_s[last_seen] - views.time_s[first_seen]
     square, u = 0.0, np.empty(3)
-    direction(views, i, begun, u)
-    direction(views, i, ended, b)
+    direction(views, i, first_seen, u)
+    direction(views, i, last_seen, b)
     for a in range(3):
         b[a] = (b[a] - u[a]) / dt - chance.drift[s, a]
         square += b[a] * b[a]
@@ -157,22 +157,22 @@ def _scatter(views, chance, i, begun, ended, b):
 
 
 @kernel
-def _usual_velocity(views, chance, members, first, state, prior, usual):
+def _velocity_prior(views, chance, members, first, state, prior, prior_mean):
     """Write mean and inverse covariance of the velocity's prior; return its log norm.
 
     Across the line of sight objects move like the tracklets of the sensor whose tracklets
-    differ most; the norm includes how usual the first state is among these. Along the line of
+    differ most; the norm includes the density of the first state among these. Along the line of
     sight they move as orbits allow.
     """
     radius = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     along = RADIAL_SHARE * np.sqrt(GM_KM3_S2 / radius)
     across, chosen, cost, b = 0.0, members[0], 0.0, np.empty(3)
     for i in members:
-        begun, ended = _ends(views, i, first)
-        if begun == ended:
+        first_seen, last_seen = _ends(views, i, first)
+        if first_seen == last_seen:
             continue
-        variance = _scatter(views, chance, i, begun, ended, b)
-        scatter = _range(views, i, begun, state) * np.sqrt(variance)
+        variance = _scatter(views, chance, i, first_seen, last_seen, b)
+        scatter = _range(views, i, first_seen, state) * np.sqrt(variance)
         if scatter > across:
             across, chosen = scatter, i
             cost = 0.5 * (b[0] * b[0] + b[1] * b[1] + b[2] * b[2]) / variance
@@ -183,7 +183,7 @@ def _usual_velocity(views, chance, members, first, state, prior, usual):
     for a in range(3):
         radial += state[3 + a] * u[a]
     for a in range(3):
-        usual[a] = state[3 + a] - radial * u[a]
+        prior_mean[a] = state[3 + a] - radial * u[a]
         for c in range(3):
             prior[a, c] = u[a] * u[c] * (1.0 / along**2 - 1.0 / across**2)
         prior[a, a] += 1.0 / across**2
@@ -209,23 +209,23 @@ def _unrelated_odds(views, chance, i, first, at):
     """
     s = views.sensor[i]
     J, h, part = np.zeros((4, 4)), np.zeros(4), np.empty(11)
-    begun, ended = _ends(views, i, first)
+    first_seen, last_seen = _ends(views, i, first)
     variance, chi2, b = 1.0, 0.0, np.zeros(3)
-    if begun < ended:
-        variance = _scatter(views, chance, i, begun, ended, b)
+    if first_seen < last_seen:
+        variance = _scatter(views, chance, i, first_seen, last_seen, b)
     for c in range(2):
         # The residual drifts like the tracklet relative to the usual drift.
         mean = 0.0
         for a in range(3):
-            mean += views.camera[s, begun, PLANE + 3 * c + a] * b[a]
+            mean += views.camera[s, first_seen, PLANE + 3 * c + a] * b[a]
         J[2 + c, 2 + c] = 1.0 / variance
         h[2 + c] = mean / variance
         chi2 += mean * mean / variance
-    for m in range(begun, ended + 1):
+    for m in range(first_seen, last_seen + 1):
         if not views.seen[i, m]:
             continue
         residual(views, i, m, at[m], part)
-        t = views.time_s[m] - views.time_s[begun]
+        t = views.time_s[m] - views.time_s[first_seen]
         g0 = part[8] * part[0] + part[9] * part[1]
         g1 = part[9] * part[0] + part[10] * part[1]
         chi2 += part[0] * g0 + part[1] * g1
@@ -242,13 +242,13 @@ def _unrelated_odds(views, chance, i, first, at):
     for p in range(4):
         chi2 -= solved[p] * h[p]
     # The density is per area of the sky, the position one on the plane.
-    flat = 1.0 + views.sight[i, begun, X] ** 2 + views.sight[i, begun, Y] ** 2
+    flat = 1.0 + views.sight[i, first_seen, X] ** 2 + views.sight[i, first_seen, Y] ** 2
     prior = np.log(chance.density[s] / variance) - 1.5 * np.log(flat)
     return prior + LN_2PI - 0.5 * log_det - 0.5 * chi2
 
 
 @kernel
-def _leaves(state, L):
+def _is_hyperbolic(state, L):
     """Return whether the orbit is hyperbolic by 3 sigma; L is the factored information."""
     r = np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
     v2 = state[3] ** 2 + state[4] ** 2 + state[5] ** 2
@@ -273,17 +273,19 @@ def arc_odds(views, chance, members, points):
     """
     state, k = np.empty(6), np.empty((5, 6))
     at = np.empty((len(views.time_s), 6))
-    N, rhs, prior, usual = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty(3)
+    N, rhs, prior, prior_mean = np.empty((6, 6)), np.empty(6), np.empty((3, 3)), np.empty(3)
     first = _begin(views, points.x_km, points.seen_by, state)
-    log_prior = _usual_velocity(views, chance, members, first, state, prior, usual)
+    log_prior = _velocity_prior(views, chance, members, first, state, prior, prior_mean)
     chi2 = log_det = gain = np.inf
     for _ in range(ITERATIONS):
         chi2 = _normal_equations(views, members, first, state, at, k, N, rhs)
         for a in range(3):
             for b in range(3):
                 N[3 + a, 3 + b] += prior[a, b]
-                rhs[3 + a] -= prior[a, b] * (state[3 + b] - usual[b])
-                chi2 += prior[a, b] * (state[3 + a] - usual[a]) * (state[3 + b] - usual[b])
+                rhs[3 + a] -= prior[a, b] * (state[3 + b] - prior_mean[b])
+                chi2 += (
+                    prior[a, b] * (state[3 + a] - prior_mean[a]) * (state[3 + b] - prior_mean[b])
+                )
         if np.isnan(chi2):
             return -np.inf
         gain = 0.0
@@ -296,7 +298,7 @@ def arc_odds(views, chance, members, points):
             return -np.inf
         if gain < CONVERGED:
             break
-    if _leaves(state, N):
+    if _is_hyperbolic(state, N):
         return -np.inf
     total = log_prior + 3.0 * LN_2PI - 0.5 * log_det - 0.5 * (chi2 - gain)
     for i in members:

@@ -32,17 +32,19 @@ Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 CERTAIN_LOG_ODDS = 8.0  # log-odds from which a group is certain
 # Minimum number of other sensors that detect an object: with several instants, with a single one.
-OTHERS, OTHERS_AT_ONCE = 3, 4
+MIN_OTHERS, MIN_OTHERS_AT_ONCE = 3, 4
 PRIOR_LOOKS = 10.0  # weight of the prior, as a number of detections and misses
 MIN_DETECTION, MAX_DETECTION = 0.05, 0.99
 SIGHTS = 10  # lines of sight that sample a field, along each of its sides
 STEPS = 24  # along a line of sight, in addition to the shells' edges
-SAME_SENSORS = 0.8  # two sets of sensors count as one if they share this much of their union
+# Two sets of sensors count as one if both have this share of the sensors in either.
+SAME_SENSORS = 0.8
 MAX_RATE_RATIO = 10.0  # maximum rate of a shell over the common rate
 PRIOR_OBJECTS = 1.0  # weight of a prior on the number of objects, as a number of objects
 ROUNDS = 100  # maximum number of iterations of `revised_odds`
 # 1-sigma per axis of the rates of unrelated objects, seen from a low orbit [rad/s]: 900 arcsec/s.
-# Counts as one tracklet. In two simulated constellations the medians were 1,600 and 2,900 arcsec/s.
+# It counts as one tracklet. The medians of two simulated constellations were 1,600 and 2,900
+# arcsec/s.
 USUAL_SPREAD = 900 * ARCSEC
 MIN_SPREAD = 10 * ARCSEC  # rad/s; a prior for sensors whose tracklets move alike
 
@@ -86,7 +88,7 @@ def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
     for s in range(n_sensors):
         rates = rate[moving[first[s] : first[s + 1]]]
         if len(rates):
-            # The rate of a single tracklet tells nothing of what is usual: it is its own.
+            # The median of a single rate is that rate, not the usual one.
             drift[s] = np.median(rates, axis=0) * (1 - 1 / len(rates))
         spread[s] = _spread(rates - drift[s])
     volume = float(np.median(samples.field_sr)) * farthest_km**3 / 3
@@ -97,8 +99,8 @@ def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
 def _spread(deviation: Array) -> float:
     """Return the spread of a sensor's rates [rad/s, 1-sigma per axis], from their deviations.
 
-    The median takes one rate away: a sensor with one tracklet says nothing of its spread. The
-    logarithm is the mean of the sensor's and `USUAL_SPREAD`'s, which counts as one tracklet.
+    The median uses up one rate: one tracklet gives no spread. The logarithm is the mean of that of
+    the sensor's tracklets and that of `USUAL_SPREAD`, which counts as one tracklet.
     """
     others = max(len(deviation) - 1, 0)
     square = (np.sum(deviation**2) / 2 + MIN_SPREAD**2) / (others + 2)
@@ -163,17 +165,17 @@ def detection_odds(looks: Looks, n: int, detected: Array) -> Array:
 def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float) -> Array:
     """Return each sensor's probability of detection, (s,).
 
-    A sensor is judged by those groups that enough other sensors detect. They are found whether
-    this sensor detects them or not, so objects too faint to be found do not bias the estimate.
+    A sensor is judged by those groups that enough other sensors detect. These groups are found
+    even if this sensor misses them. So objects too faint to be found do not bias the estimate.
     The share of detections is shrunk towards the mean of all sensors, which itself is shrunk
     towards `prior`.
     """
     n_sensors = len(views.half_field)
     row, sensor, hit = looks_of(views, groups)
     others = np.bincount(row[hit], minlength=len(groups))[row] - hit
-    asked = others >= (OTHERS if len(views.time_s) > 1 else OTHERS_AT_ONCE)
-    looked = np.bincount(sensor[asked], minlength=n_sensors)
-    hits = np.bincount(sensor[asked & hit], minlength=n_sensors)
+    judging = others >= (MIN_OTHERS if len(views.time_s) > 1 else MIN_OTHERS_AT_ONCE)
+    looked = np.bincount(sensor[judging], minlength=n_sensors)
+    hits = np.bincount(sensor[judging & hit], minlength=n_sensors)
     common = (hits.sum() + PRIOR_LOOKS * prior) / (looked.sum() + PRIOR_LOOKS)
     return np.clip(
         (hits + PRIOR_LOOKS * common) / (looked + PRIOR_LOOKS), MIN_DETECTION, MAX_DETECTION
@@ -184,10 +186,10 @@ def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float
 
 
 def visible_volume(views: Views, sensors: Indices, shells: Array, farthest_km: float) -> Array:
-    """Return the volume [km^3] that just these sensors see in each shell, times its weight, (j,).
+    """Return the volume [km^3] that exactly these sensors see in each shell, weighted, (j,).
 
     It is integrated along lines of sight of the sensor with the smallest field, at the instant at
-    which most sensors have a known attitude. Points that almost the same sensors see count, too,
+    which most sensors have a known attitude. Points that almost the same sensors see count too,
     see `SAME_SENSORS`. NaN if fewer than two of the sensors have a known attitude.
     """
     ready = np.isfinite(views.position_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
@@ -222,10 +224,10 @@ def _sights(half_field: Array, R_sensor_from_icrs: Array) -> tuple[Array, Array]
 def _overlap(
     views: Views, sensors: Indices, m: int, r_km: Array, u: Array, farthest_km: float
 ) -> tuple[Array, Array]:
-    """Return between which ranges [km] lines of sight from r_km lie in any field, (n,) each.
+    """Return the ranges [km] between which lines of sight from r_km lie in any field, (n,) each.
 
-    A field is where four planes and the plane of the sensor's camera have it on their right side,
-    so a line has one piece in it. Without such a piece both ranges are 0.
+    A field is convex: it is bounded by four planes and that of the sensor. So a line has one piece
+    in it. Without such a piece both ranges are 0.
     """
     R, half = views.attitude[sensors, m], views.half_field[sensors, :, None]
     sides = [half[:, k] * R[:, 2] + sign * R[:, k] for k in (0, 1) for sign in (-1, 1)]
@@ -245,10 +247,11 @@ def _overlap(
 
 @kernel
 def _shared(camera, of_set, x):
-    """Return how nearly the sensors that see each point x (n, 3) [km] are those of a set, (n,).
+    """Return how similar the sensors that see each point x (n, 3) [km] are to those of a set, (n,).
 
     Sensors are rows of `camera` (s, 33), those of the set are flagged in `of_set` (s,). The result
-    is the number of those of the set that see the point, over that of all that do or are of it.
+    is the number of sensors that are in the set and see the point, over that of all that are in the
+    set or see it.
     """
     shared = np.empty(len(x))
     for i in range(len(x)):
@@ -280,7 +283,7 @@ def _steps(
 def sets_of_sensors(views: Views, groups: Sequence[Hypothesis]) -> tuple[list[Indices], Indices]:
     """Return sets of sensors, and for each group the set that has it in the fields, (g,).
 
-    The commonest set is the first. One that shares most sensors with an earlier one is not made.
+    The most common set is the first. Sets that are similar to an earlier one are merged into it.
     """
     looks = looks_of(views, groups)
     seen = np.zeros((len(groups), len(views.half_field)), np.bool_)
@@ -308,8 +311,8 @@ def revised_odds(
 ) -> Array:
     """Return the groups' log-odds once the number of objects near them is known.
 
-    What other sensors see elsewhere says nothing of the number of objects here. So it is estimated
-    for each set of sensors, from the groups that these have in their fields.
+    Objects that other sensors see elsewhere are no evidence on the number of objects here. So it is
+    estimated for each set of sensors, from the groups that these have in their fields.
 
     Parameters
     ----------
@@ -320,7 +323,7 @@ def revised_odds(
     set_of : (g,) int
         The set of sensors of each group, see `sets_of_sensors`.
     volume_km3 : (p, j) float
-        What each set of sensors sees, see `visible_volume`.
+        Volume that each set of sensors sees, see `visible_volume`.
     chance
         With the object density that the search assumed.
 
@@ -330,32 +333,32 @@ def revised_odds(
     numbers of objects that are consistent.
     """
     inside = (radius_km[:, None] >= shells[:, 0]) & (radius_km[:, None] < shells[:, 1])
-    believed = inside * shells[:, 2] + 1e-9
-    # Where the volume is unknown, as if two sensors saw all of it.
+    prior_weight = inside * shells[:, 2] + 1e-9
+    # An unknown volume counts as one that two sensors see in full.
     unknown = chance.objects_in_view / len(shells)
     expected = np.where(np.isnan(volume_km3), unknown, chance.objects_km3 * volume_km3)
-    sure = (scores > CERTAIN_LOG_ODDS).astype(float)
+    certainty = (scores > CERTAIN_LOG_ODDS).astype(float)
     revised = scores
     for _ in range(ROUNDS):
-        factor = _shell_rates(sure, believed, set_of, expected)
-        revised = scores + np.log((believed * factor).sum(axis=1) / believed.sum(axis=1))
-        last, sure = sure, 1 / (1 + np.exp(-np.clip(revised, -50, 50)))
-        if np.abs(sure - last).max() < 1e-6:
+        factor = _shell_rates(certainty, prior_weight, set_of, expected)
+        revised = scores + np.log((prior_weight * factor).sum(axis=1) / prior_weight.sum(axis=1))
+        last, certainty = certainty, 1 / (1 + np.exp(-np.clip(revised, -50, 50)))
+        if np.abs(certainty - last).max() < 1e-6:
             break
     return revised
 
 
-def _shell_rates(sure: Array, believed: Array, set_of: Indices, expected: Array) -> Array:
+def _shell_rates(certainty: Array, prior_weight: Array, set_of: Indices, expected: Array) -> Array:
     """Return the rate of objects over the assumed rate in each shell, near each group, (g, j).
 
     A group does not count for itself.
     """
-    others = np.bincount(set_of, sure)[set_of] - sure + PRIOR_OBJECTS
+    others = np.bincount(set_of, certainty)[set_of] - certainty + PRIOR_OBJECTS
     common = (others / (expected.sum(axis=1)[set_of] + PRIOR_OBJECTS))[:, None]
     factor = np.repeat(common, expected.shape[1], axis=1)
     for _ in range(10):  # an object may belong to either of two shells that overlap
-        belongs = believed * factor
-        share = sure[:, None] * belongs / belongs.sum(axis=1, keepdims=True)
+        belongs = prior_weight * factor
+        share = certainty[:, None] * belongs / belongs.sum(axis=1, keepdims=True)
         count = np.zeros_like(expected)
         np.add.at(count, set_of, share)
         others = count[set_of] - share + PRIOR_OBJECTS

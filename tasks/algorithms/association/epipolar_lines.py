@@ -3,7 +3,7 @@
 Huang, Zhang, Feng: Space target synchronization association method under distributed star
 sensor, doi 10.19650/j.cnki.cjsi.J1905157. Points of two images are a pair if one lies within a
 fixed distance of the other's epipolar line. All pairs of images are compared, and a table with a
-column for each image collects the objects on which all pairs agree. Errors are not weighed.
+column for each image collects the objects on which all pairs agree. Errors are not used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -160,11 +160,11 @@ def view_table(n_points: Sequence[int], pairs: Pairs) -> Indices:
 
 
 def intersect_sights(r_km: Array, u: Array) -> tuple[Array, int]:
-    """Return the mean of the points where two lines of sight meet, and how many were used.
+    """Return the mean of the points where two lines of sight meet, and the number of points.
 
     Two lines meet at the middle of their common perpendicular; parallel lines are skipped. A
     point more than 3 standard deviations from the mean in any coordinate is dropped. With fewer
-    than 11 points this cannot happen: of m values none is further off than (m - 1) / sqrt(m).
+    than 11 points this cannot happen: of m values, the maximum deviation is (m - 1) / sqrt(m).
 
     Parameters
     ----------
@@ -206,7 +206,7 @@ def associate_by_lines(samples: Samples, focal_px: Array, threshold_px: float) -
     Returns
     -------
     Groups
-        Scores are NaN and no tracklet is ambiguous: the method does not weigh errors. Two
+        Scores are NaN and no tracklet is ambiguous: the method uses no errors. Two
         tracklets are a pair if they are one at more than half of the instants that show both.
     """
     n_sensors = len(focal_px)
@@ -234,7 +234,7 @@ def _vote(
     made: dict[tuple[int, int], Array],
     both: dict[tuple[int, int], Array],
 ) -> None:
-    """Count in `made` the pairs of one instant, and in `both` the tracklets that it shows."""
+    """Count in `made` the pairs of one instant, and in `both` all pairs of its tracklets."""
     R, r = samples.R_sensor_from_icrs[:, m], samples.sensor_km[:, m]
     known = np.flatnonzero(np.isfinite(R).all(axis=(1, 2)) & np.isfinite(r).all(axis=1))
     shown, images = [], []

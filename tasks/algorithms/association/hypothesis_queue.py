@@ -29,7 +29,7 @@ class HypothesisQueue:
 
     def __init__(self, hypotheses: Iterable[Hypothesis]) -> None:
         self._heap: list[tuple[float, tuple[int, ...], int, Hypothesis]] = []
-        self._holding: dict[int, list[Hypothesis]] = defaultdict(list)
+        self._by_tracklet: dict[int, list[Hypothesis]] = defaultdict(list)
         self._pushed = 0
         for h in distinct(hypotheses):
             self.push(h)
@@ -39,7 +39,7 @@ class HypothesisQueue:
         heapq.heappush(self._heap, (-h.score, h.members, self._pushed, h))
         self._pushed += 1
         for i in h.members:
-            self._holding[i].append(h)
+            self._by_tracklet[i].append(h)
 
     def pop(self) -> Hypothesis | None:
         """Remove the likeliest hypothesis, None if empty. It stays a rival of the others."""
@@ -47,7 +47,7 @@ class HypothesisQueue:
 
     def sharing(self, h: Hypothesis) -> list[Hypothesis]:
         """Return the other hypotheses that share a tracklet with h, also those popped before."""
-        found = dict.fromkeys(other for i in h.members for other in self._holding[i])
+        found = dict.fromkeys(other for i in h.members for other in self._by_tracklet[i])
         return [other for other in found if other is not h]
 
     def rivals(

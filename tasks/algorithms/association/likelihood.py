@@ -13,7 +13,7 @@
 5. After the pairs, the probabilities of detection are estimated. If these are lower than assumed,
    more pairs are needed: back to 2.
 6. The remaining hypotheses become groups, the likeliest first (`_Search.take`). Two that follow
-   each other in time may be merged. What two explain about equally well is ambiguous.
+   each other in time may be merged. Tracklets that two explain about equally well are ambiguous.
 7. A tracklet goes to the group that clearly explains it best (`search.resolve_conflicts`).
 8. Groups that are doubtful, now that the number of objects is known, are withdrawn.
 """
@@ -58,10 +58,10 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 PRIOR_DETECTION = 0.9  # probability of detection before the data are known
-FEW_SENSORS = 6  # up to this many, every pair of sensors provides seeds
-SEED_SIGMA = 2.5  # with more sensors: the gate of seeds; another pair seeds what it rejects
-UNSEEDED = 0.01  # with more sensors: expected number of objects without a seed
-CLEAR_LOG_ODDS = 15.0  # with more sensors: such a group is taken before the next pair seeds
+FEW_SENSORS = 6  # up to this number, every pair of sensors provides seeds
+SEED_SIGMA = 2.5  # with more sensors: gate of seeds; other pairs seed objects that it rejects
+MAX_UNSEEDED = 0.01  # with more sensors: maximum expected number of objects without a seed
+CLEAR_LOG_ODDS = 15.0  # with more sensors: such a group is accepted before the next pair seeds
 MIN_KEPT_LOG_ODDS = -3.0  # minimum log-odds of a hypothesis before the number of objects is known
 DOUBTLESS_LOG_ODDS = 20.0  # log-odds above which the number of objects cannot make a group doubtful
 
@@ -95,9 +95,9 @@ def associate_tracklets(
     min_altitude_km, max_range_km
         Objects are sought between this altitude and this distance from the Earth's centre.
     min_log_odds
-        A group is reported if its log-odds (natural) against chance are at least this.
+        Minimum log-odds (natural) of a group, against unrelated tracklets.
     ambiguity_log_odds
-        Neither of two contradicting groups is reported if their log-odds differ by less.
+        If the log-odds of two contradicting groups differ by less, neither is reported.
     shells
         A weak prior on altitude. The share that the shells leave is spread evenly. Without
         shells the prior is uniform.
@@ -163,7 +163,7 @@ class _Search:
             while pair is not None:
                 waiting += self.hypotheses(*pair)
                 pair = pairs.next(self._enough_pairs())
-            # Where sensors miss more than was assumed, more pairs are needed.
+            # If sensors miss more than was assumed, more pairs are needed.
             waiting = self._learn_detection(waiting)
         self.take(waiting, MIN_KEPT_LOG_ODDS)
         nothing_taken = self.space._replace(taken=np.zeros_like(self.space.taken))
@@ -175,15 +175,15 @@ class _Search:
         return Groups(group, scores, ambiguous & (group == FREE), self.space.chance.detected)
 
     def _enough_pairs(self) -> float:
-        """Return how many pairs must cover a point, so that few objects there lack a seed.
+        """Return the number of pairs that must cover a point, so that few objects lack a seed.
 
-        A pair misses an object where either sensor does.
+        A pair misses an object if either sensor does.
         """
         missed = 1 - float(np.mean(self.space.chance.detected)) ** 2
-        return float(np.ceil(np.log(UNSEEDED / max(len(self.groups), 1)) / np.log(missed)))
+        return float(np.ceil(np.log(MAX_UNSEEDED / max(len(self.groups), 1)) / np.log(missed)))
 
     def hypotheses(self, a: int, b: int) -> list[Hypothesis]:
-        """Return what the seeds of two sensors grow into; clear groups are accepted at once."""
+        """Return the hypotheses of two sensors' seeds; clear ones become groups at once."""
         gate_sigma = self.space.gate_sigma
         if self.many and not (self.sparse[a] and self.sparse[b]):
             gate_sigma = min(gate_sigma, SEED_SIGMA)
@@ -195,7 +195,7 @@ class _Search:
         return distinct(h for h, clear in zip(grown, taken, strict=True) if not clear)
 
     def grow(self, seeds: Indices, clear: float = np.inf) -> tuple[list[Hypothesis], list[bool]]:
-        """Return what (n, 2) seeds grow into among the free tracklets, and which are clear.
+        """Return the hypotheses of (n, 2) seeds among the free tracklets, and which are clear.
 
         The tracklets of clear hypotheses are entered in `space.taken`.
         """
@@ -223,7 +223,7 @@ class _Search:
     def _learn_detection(self, waiting: list[Hypothesis]) -> list[Hypothesis]:
         """Estimate the probabilities of detection; return the hypotheses with their new odds.
 
-        The estimate is from the groups and the surest hypotheses.
+        The estimate is from the groups and the certain hypotheses.
         """
         used: set[int] = set()
         sure = []
@@ -231,18 +231,18 @@ class _Search:
             if h.score > CERTAIN_LOG_ODDS and used.isdisjoint(h.members):
                 used.update(h.members)
                 sure.append(h)
-        believed = self.space.chance.detected
+        assumed = self.space.chance.detected
         detected = estimated_detection(self.space.views, [*self.groups, *sure], PRIOR_DETECTION)
         self.space = self.space._replace(chance=self.space.chance._replace(detected=detected))
-        self.groups = self._with_detection(self.groups, believed, detected)
-        return self._with_detection(waiting, believed, detected)
+        self.groups = self._with_detection(self.groups, assumed, detected)
+        return self._with_detection(waiting, assumed, detected)
 
     def _with_detection(
-        self, hypotheses: list[Hypothesis], believed: Array, detected: Array
+        self, hypotheses: list[Hypothesis], assumed: Array, detected: Array
     ) -> list[Hypothesis]:
         """Return the hypotheses with their odds for other probabilities of detection."""
         looks, n = looks_of(self.space.views, hypotheses), len(hypotheses)
-        change = detection_odds(looks, n, detected) - detection_odds(looks, n, believed)
+        change = detection_odds(looks, n, detected) - detection_odds(looks, n, assumed)
         return [
             Hypothesis(h.score + more, h.seed, h.members, h.x_km, h.missed)
             for h, more in zip(hypotheses, change.tolist(), strict=True)
@@ -255,11 +255,11 @@ class _Search:
     def take(self, hypotheses: list[Hypothesis], min_log_odds: float) -> None:
         """Accept hypotheses, the likeliest first; members that a rival also has are ambiguous."""
         taken = self.space.taken
-        # What a clear group took tracklets from is usually nothing without them: grow it again.
+        # Hypotheses that lost tracklets to a clear group are grown again from their seeds.
         stale = [h for h in hypotheses if taken[list(h.members)].any()]
-        afresh, _ = self.grow(np.array([h.seed for h in stale], np.int64).reshape(-1, 2))
-        gone = set(map(id, stale))
-        queue = HypothesisQueue([h for h in hypotheses if id(h) not in gone] + afresh)
+        regrown, _ = self.grow(np.array([h.seed for h in stale], np.int64).reshape(-1, 2))
+        regrown_ids = set(map(id, stale))
+        queue = HypothesisQueue([h for h in hypotheses if id(h) not in regrown_ids] + regrown)
         while (best := queue.pop()) is not None and best.score >= min_log_odds:
             if taken[list(best.members)].any():
                 if not taken[list(best.seed)].any():
@@ -275,7 +275,7 @@ class _Search:
             rivals = queue.rivals(best, self.margin, self.group != FREE)
             kept = set(best.members).intersection(*(h.members for h in rivals))
             sensors = {int(self.space.views.sensor[i]) for i in kept}
-            # The rest of a group that lost most of its views is no object by itself.
+            # If a hypothesis loses most of its tracklets, the rest is not accepted.
             if len(sensors) >= 2 and 2 * len(kept) >= len(best.members):
                 self._accept(best, kept)
             else:
@@ -288,7 +288,7 @@ class _Search:
 
         Returns the log-odds of the groups that are left.
         """
-        scores = self._revised()
+        scores = self._revise_odds()
         kept = scores >= min_log_odds
         new = np.where(kept, np.cumsum(kept) - 1, FREE)
         member = self.group != FREE
@@ -297,8 +297,8 @@ class _Search:
         self.group[member] = new[self.group[member]]
         return np.asarray(scores[kept])
 
-    def _revised(self) -> Array:
-        """Return the groups' log-odds with the number of objects that they tell of."""
+    def _revise_odds(self) -> Array:
+        """Return the groups' log-odds with the number of objects estimated from them."""
         space, scores = self.space, np.array([h.score for h in self.groups])
         if not len(scores) or scores.min() > DOUBTLESS_LOG_ODDS:
             return scores

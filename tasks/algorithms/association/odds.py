@@ -1,4 +1,4 @@
-"""Odds of a hypothesis: how much likelier one object is than unrelated tracklets.
+"""Odds of a hypothesis: one object against unrelated tracklets.
 
 `score` adds three terms: the directions, which fit one point at a single instant or one orbit
 through several (`arcs`); the prior density of objects at that altitude; and which sensors detect
@@ -14,15 +14,15 @@ from epipole.tasks.algorithms.association.views import (
     PLANE,
     REACH,
     TURN,
-    misfit,
+    error_sr,
     residual,
-    spot_sr,
+    residual_chi2,
 )
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
-FAINTER = 1.5  # times the range: the object is 0.9 mag fainter and may not be detected
-INSIDE = 0.98  # of half the field: nearer to its edge misses are frequent
+MAX_RANGE_RATIO = 1.5  # of ranges: beyond it the object is 0.9 mag fainter and may not be detected
+FIELD_SHARE = 0.98  # of half the field: misses are frequent nearer to its edge
 NEAR_SIGMA = 6.0  # a point may lie this far outside a field and still have tracklets there
 
 
@@ -50,7 +50,7 @@ def sees(r, R, half_field, x):
         return False
     for a in range(2):
         side = (R[a, 0] * d0 + R[a, 1] * d1 + R[a, 2] * d2) / depth
-        if abs(side) > INSIDE * half_field[a]:
+        if abs(side) > FIELD_SHARE * half_field[a]:
             return False
     return not blocked(r, x, EARTH_RADIUS_KM)
 
@@ -71,7 +71,10 @@ def in_view(cam, x):
         return False
     for a in range(2):
         t = TURN + 3 * a
-        if abs(cam[t] * d0 + cam[t + 1] * d1 + cam[t + 2] * d2) > INSIDE * cam[HALF + a] * depth:
+        if (
+            abs(cam[t] * d0 + cam[t + 1] * d1 + cam[t + 2] * d2)
+            > FIELD_SHARE * cam[HALF + a] * depth
+        ):
             return False
     return not blocked(cam, x, EARTH_RADIUS_KM)
 
@@ -93,14 +96,17 @@ def looks_at(views, s, X, seen_by):
 def should_detect(views, s, points, nearest_km2):
     """Return whether a sensor without a tracklet of the object counts as a miss.
 
-    It does where the points are in its field, and not much fainter than for the members' sensors:
+    It does if the points are in its field, and not much fainter than for the members' sensors:
     `nearest_km2` is `nearest_range2` of these.
     """
     if not looks_at(views, s, points.x_km, points.seen_by):
         return False
     for m in range(len(views.time_s)):
         if points.seen_by[m] >= 2:
-            return _range2(views.camera, s, m, points.x_km[m]) <= FAINTER * FAINTER * nearest_km2
+            return (
+                _range2(views.camera, s, m, points.x_km[m])
+                <= MAX_RANGE_RATIO * MAX_RANGE_RATIO * nearest_km2
+            )
     return True
 
 
@@ -108,7 +114,7 @@ def should_detect(views, s, points, nearest_km2):
 def nearest_range2(views, members, points):
     """Return the shortest squared range [km^2] from which members see the first solved point.
 
-    How faint the others could detect it is not known: their cameras may be better.
+    The limits of other sensors are not used: their cameras may be better.
     """
     nearest2 = np.inf
     for m in range(len(views.time_s)):
@@ -133,7 +139,7 @@ def _range2(cam, s, m, x):
 def near_fields(views, points, sensors, near):
     """Write which of the sensors may have a point in their field at any solved instant.
 
-    `near` is the list of these; returns how many they are. A fast first test: within 6 sigma of the
+    `near` is the list of these; returns their number. A fast first test: within 6 sigma of the
     cone that holds the sensor's tracklets and field.
     """
     n, cam = 0, views.camera
@@ -174,8 +180,8 @@ def score(space, work, members, near):
 
     An unrelated tracklet may lie anywhere in its field (`chance.density`), an object anywhere in
     view (`chance.objects_km3`, weighted by altitude with `shells`). Several instants are tied
-    together by one orbit, see `arcs`. A sensor that has the point in its field but no tracklet
-    of it counts against the object: `work.missed` lists those.
+    together by one orbit, see `arcs`. A sensor with the point in its field but without a tracklet
+    of it is a miss, which lowers the odds: `work.missed` lists those.
 
     Parameters
     ----------
@@ -195,8 +201,8 @@ def score(space, work, members, near):
         for i in members:
             if views.seen[i, m]:
                 residual(views, i, m, points.x_km[m], work.part)
-                total -= np.log(chance.density[views.sensor[i]] * spot_sr(views, i, m, work.part))
-                total -= 0.5 * misfit(work.part)
+                total -= np.log(chance.density[views.sensor[i]] * error_sr(views, i, m, work.part))
+                total -= 0.5 * residual_chi2(work.part)
     else:
         total = arc_odds(views, chance, members, points)
     total += np.log(chance.objects_km3) + _altitude_weight(points.x_km[m], space.shells)
@@ -208,7 +214,7 @@ def score(space, work, members, near):
 def _detections(space, work, members, near):
     """Return the log-probability of which sensors detect the object and which miss it.
 
-    Writes the list of those that miss it; also returns how many they are.
+    Writes the list of those that miss it; also returns their number.
     """
     views, detected = space.views, space.chance.detected
     total, n_missed = 0.0, 0

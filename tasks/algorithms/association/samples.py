@@ -33,8 +33,8 @@ class Samples(NamedTuple):
     time_s : (k,) float
         The instants [s].
     sensor_km : (s, k, 3) float
-        Positions of the sensors, GCRF; NaN where unknown. A sensor must have one where a
-        tracklet of it is seen.
+        Positions of the sensors, GCRF; NaN where unknown. They must be known
+        at the instants at which a tracklet of the sensor is seen.
     R_sensor_from_icrs : (s, k, 3, 3) float
         Attitudes of the sensors; NaN where unknown.
     half_field : (s, 2) float
@@ -71,12 +71,12 @@ class Groups(NamedTuple):
     """Which tracklets are one object.
 
     group : (t,) int
-        Group of each tracklet; -1 where it belongs to none.
+        Group of each tracklet; -1 for no group.
     score : (g,) float
         Log-odds of each group against its members being unrelated.
     ambiguous : (t,) bool
         Tracklets in no group because two groups explain them about equally well, or because
-        the group that explains them is not sure enough.
+        the group that explains them is not certain enough.
     detected : (s,) float
         Estimated probability that a sensor detects an object in its field; NaN if not
         estimated.

@@ -21,9 +21,9 @@ Flags = npt.NDArray[np.bool_]
 
 # Columns of `Views.sight` and `Views.camera`. For a tracklet or a sensor at an instant the search
 # reads a single row. Few arrays also compile fast.
-X, Y, XX, XY, YY, SIGMA_KM, DX, DY, MOVES = range(9)
-R_KM, PLANE, TURN, HALF, CORNER, SCALE, WIDEST, REACH = 0, 3, 12, 21, 23, 25, 27, 28
-V_KM_S, FASTEST = 29, 32
+X, Y, XX, XY, YY, SIGMA_KM, DX, DY, HAS_RATE = range(9)
+R_KM, PLANE, TURN, HALF, CORNER, SCALE, MAX_VARIANCE, REACH = 0, 3, 12, 21, 23, 25, 27, 28
+V_KM_S, MAX_RATE = 29, 32
 N_SIGHT, N_CAMERA = 9, 33
 
 
@@ -37,7 +37,7 @@ class Views(NamedTuple):
     sight : (t, k, 9) float
         Gnomonic coordinates in the sensor's plane (X, Y), their variances and covariance (XX, XY,
         YY), the 1-sigma error of the sensor's position [km], the rates of the coordinates [1/s]
-        (DX, DY), and 1 where these are known, else 0 (MOVES).
+        (DX, DY), and 1 where these are known, else 0 (HAS_RATE).
     camera : (s, k, 33) float
         The sensor's position [km]; the plane's two axes and its normal; the sensor's axes (NaN
         where unknown); tangents of half its field; the grid's lowest coordinates and its cells
@@ -103,7 +103,7 @@ def views_of(samples: Samples) -> tuple[Views, Indices]:
     rate = np.zeros((0, n_instants, 3))
     if samples.rate is not None and samples.sensor_km_s is not None:
         rate = np.ascontiguousarray(samples.rate, float)
-        camera[..., V_KM_S:FASTEST] = np.nan_to_num(samples.sensor_km_s)
+        camera[..., V_KM_S:MAX_RATE] = np.nan_to_num(samples.sensor_km_s)
     sight = np.empty((len(order), n_instants, N_SIGHT))
     sight[..., SIGMA_KM] = samples.sigma_km[order]
     cov = np.ascontiguousarray(samples.cov, float)
@@ -151,7 +151,7 @@ def _planes(first, order, seen, u):
     plane = np.zeros((len(first) - 1, seen.shape[1], 3, 3))
     axis, across = np.zeros(3), np.zeros(3)
     for s in range(len(plane)):
-        begun = False
+        has_axis = False
         for m in range(seen.shape[1]):
             normal = plane[s, m, 2]
             for i in order[first[s] : first[s + 1]]:
@@ -161,13 +161,13 @@ def _planes(first, order, seen, u):
             if not length > 0.0:
                 continue
             normal /= length
-            if not begun:  # as in `sky.tangent_basis`
+            if not has_axis:  # as in `sky.tangent_basis`
                 axis[:] = 0.0
                 axis[2 if abs(normal[2]) < 0.9 else 0] = 1.0
                 for a in range(3):
                     b, c = (a + 1) % 3, (a + 2) % 3
                     across[a] = axis[b] * normal[c] - axis[c] * normal[b]
-                begun = True
+                has_axis = True
             else:
                 across[:] = axis - np.sum(axis * normal) * normal
             axis[:] = across / np.sqrt(np.sum(across * across))
@@ -182,7 +182,7 @@ def _planes(first, order, seen, u):
 def _sort_by_position(first, order, seen, u, plane):
     """Sort the tracklets of each sensor by cells of its plane at the first instant they are seen.
 
-    A hypothesis looks at the few tracklets near its points: these lie side by side in memory.
+    A hypothesis reads the few tracklets near its points: these become neighbours in memory.
     """
     n_instants = seen.shape[1]
     cell, position, sorted_ = (
@@ -224,7 +224,7 @@ def _reach(camera: Array, grid: Indices) -> Array:
     """Return tangents of the cones about the planes' normals that hold field and tracklets."""
     side = grid[..., 1:]
     low = camera[..., CORNER:SCALE]
-    high = low + side / np.maximum(camera[..., SCALE:WIDEST], 1e-300)
+    high = low + side / np.maximum(camera[..., SCALE:MAX_VARIANCE], 1e-300)
     tracklets = np.hypot(*np.moveaxis(np.maximum(np.abs(low), np.abs(high)), -1, 0))
     turned = np.sum(camera[..., PLANE + 6 : TURN] * camera[..., TURN + 6 : HALF], axis=-1)
     field = np.arccos(np.clip(turned, -1, 1)) + np.arctan(np.hypot(*camera[..., HALF:CORNER].T).T)
@@ -268,9 +268,9 @@ def _flatten(sensor, order, seen, u, cov, rate, camera, sight):
                     for b in range(3):
                         moved += (p[a, b] - here * p[2, b]) * rate[i, m, b] / depth
                         if rate[i, m, b] != 0.0:
-                            sight[n, m, MOVES] = 1.0
+                            sight[n, m, HAS_RATE] = 1.0
                     sight[n, m, DX + a] = moved
-                    camera[s, m, FASTEST] = max(camera[s, m, FASTEST], abs(moved))
+                    camera[s, m, MAX_RATE] = max(camera[s, m, MAX_RATE], abs(moved))
                 for b in range(2):
                     M[a, b] = 0.0
                     for c in range(3):
@@ -316,7 +316,7 @@ def _fill_grids(first, seen, sight, camera, grid, cell_start, cell_item):
                 cell_start[begin + q + 1] += 1
                 half = (sight[i, m, XX] + sight[i, m, YY]) / 2
                 apart = np.hypot((sight[i, m, XX] - sight[i, m, YY]) / 2, sight[i, m, XY])
-                camera[s, m, WIDEST] = max(camera[s, m, WIDEST], half + apart)
+                camera[s, m, MAX_VARIANCE] = max(camera[s, m, MAX_VARIANCE], half + apart)
             cell_start[begin] = filled
             for q in range(side * side):
                 cell_start[begin + q + 1] += cell_start[begin + q]
@@ -342,8 +342,8 @@ def direction(views, i, m, u):
 
 
 @borrowing_kernel
-def later_s(d0, d1, d2, x):
-    """Return by how much the sensor's light time is longer than the geocentric one of x [s].
+def extra_light_s(d0, d1, d2, x):
+    """Return the light time from x to the sensor minus that to the Earth's centre [s].
 
     `d0`, `d1`, `d2` is the vector from the sensor to the point x [km].
     """
@@ -356,7 +356,7 @@ def residual(views, i, m, x, part):
     """Write a view's residual, predicted minus measured, with partials and weight.
 
     The object is at x one geocentric light time before the instant. A sensor at another range
-    sees it there `later_s` after the instant. Sensor and direction are carried to that time.
+    sees it there `extra_light_s` after the instant. Sensor and direction are moved to that time.
 
     `part` (11,), on the sensor's plane: the residual (2), its partials (2 by 3) [1/km], and the
     inverse covariance (xx, xy, yy). Returns the depth of the point [km], 0 behind the sensor.
@@ -368,7 +368,7 @@ def residual(views, i, m, x, part):
     depth = n0 * d0 + n1 * d1 + n2 * d2
     if not depth > 0.0:
         return 0.0
-    later, moves = later_s(d0, d1, d2, x), see[i, m, MOVES]
+    later, moves = extra_light_s(d0, d1, d2, x), see[i, m, HAS_RATE]
     v0, v1, v2 = cam[s, m, V_KM_S], cam[s, m, V_KM_S + 1], cam[s, m, V_KM_S + 2]
     for a in range(2):
         q = PLANE + 3 * a
@@ -389,15 +389,15 @@ def residual(views, i, m, x, part):
 
 
 @borrowing_kernel
-def misfit(part):
-    """Return the chi-square of what `residual` wrote."""
+def residual_chi2(part):
+    """Return the chi-square of a residual that `residual` wrote."""
     e0, e1 = part[0], part[1]
     return part[8] * e0 * e0 + 2 * part[9] * e0 * e1 + part[10] * e1 * e1
 
 
 @borrowing_kernel
-def spot_sr(views, i, m, part):
-    """Return the solid angle [sr] of the errors of what `residual` wrote.
+def error_sr(views, i, m, part):
+    """Return the solid angle [sr] of the errors of a residual that `residual` wrote.
 
     It is 2 pi times the square root of the determinant of their covariance, that of the sensor's
     position included.

@@ -1,9 +1,8 @@
 """Groups of windows: the group of each tracklet in each window, and how longer windows change it.
 
-Two lines of sight to different things may meet by chance for half a minute, but rarely for ten.
-So the groups of a window that are not sure are judged again over longer and longer windows, as
-long as their tracklets continue. Sure groups keep their short windows, because tracklets come and
-go.
+Lines of sight to different objects may meet for half a minute, but rarely for ten minutes. So
+uncertain groups are decided again over longer windows, as long as their tracklets continue. Certain
+groups keep their short windows, because tracklets come and go.
 """
 
 from typing import NamedTuple
@@ -18,7 +17,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-LONGER = 2.0  # a tracklet is judged again once it lasts twice as long as before
+MIN_LENGTH_RATIO = 2.0  # minimum duration of a tracklet that is decided again, over the last window
 
 
 class Items(NamedTuple):
@@ -49,7 +48,7 @@ class WindowGroups:
         self._score = np.zeros(0)
 
     def enter(self, rows: Indices, tracklet: Indices, groups: Groups) -> None:
-        """Enter the groups of some tracklets for those of the items that are theirs."""
+        """Enter the groups of some tracklets for their items."""
         if not len(tracklet):
             return
         at = np.searchsorted(tracklet, self.items.tracklet[rows])
@@ -60,12 +59,11 @@ class WindowGroups:
         self.group[rows], self.ambiguous[rows] = new[at], groups.ambiguous[at]
         self._score = np.concatenate([self._score, groups.score])
 
-    def open_items(self, rows: Indices, judged_s: float) -> Indices:
-        """Return the items of a longer window that are to be judged again; empty where that is
-        useless.
+    def undecided(self, rows: Indices, window_s: float) -> Indices:
+        """Return the items of a longer window to decide again; empty if that is useless.
 
-        They belong to no sure group, and their tracklets last at least twice the time
-        `judged_s` [s] over which they were judged. So do all tracklets of their group.
+        They belong to no certain group. Their tracklets, and all others of their group, last at
+        least twice the last window, `window_s` [s].
         """
         items = self.items
         _, which = np.unique(items.tracklet[rows], return_inverse=True)
@@ -73,7 +71,7 @@ class WindowGroups:
         last = np.zeros_like(first)
         np.minimum.at(first, which, items.first_ns[rows])
         np.maximum.at(last, which, items.last_ns[rows])
-        continues = (last - first >= LONGER * judged_s * 1e9)[which]
+        continues = (last - first >= MIN_LENGTH_RATIO * window_s * 1e9)[which]
         group = self.group[rows]
         unfit = np.zeros(len(self._score) + 1, bool)
         unfit[:-1] = self._score >= CERTAIN_LOG_ODDS
@@ -83,34 +81,34 @@ class WindowGroups:
         return chosen[:0] if alone else chosen
 
     def reconsider(
-        self, rows: Indices, open_items: Indices, tracklet: Indices, groups: Groups
+        self, rows: Indices, undecided: Indices, tracklet: Indices, groups: Groups
     ) -> None:
-        """Enter the groups that longer evidence gives for the open items of a longer window.
+        """Enter the groups of a longer window for its undecided items.
 
-        Where a new group shares a tracklet with a sure group of a window, its other tracklets join
-        the sure group in that window. One whose sensor has a tracklet there already is free.
+        If a new group shares a tracklet with a certain group of a window, its other tracklets join
+        that group in this window, unless their sensor has a tracklet in it already.
         """
         items = self.items
-        sure = np.setdiff1d(rows, open_items)
-        sure = sure[self.group[sure] != FREE]
-        self.enter(open_items, tracklet, groups)
-        theirs = dict(zip(tracklet.tolist(), groups.group.tolist(), strict=True))
+        certain = np.setdiff1d(rows, undecided)
+        certain = certain[self.group[certain] != FREE]
+        self.enter(undecided, tracklet, groups)
+        group_of = dict(zip(tracklet.tolist(), groups.group.tolist(), strict=True))
         base = len(self._score) - len(groups.score)
         joined: dict[tuple[int, int], int] = {}
         taken: set[tuple[int, int, int]] = set()
-        for row in sure.tolist():
+        for row in certain.tolist():
             window, group = int(items.window[row]), int(self.group[row])
             taken.add((window, group, int(items.sensor[row])))
-            longer = theirs.get(int(items.tracklet[row]), FREE)
-            if longer != FREE:
-                joined.setdefault((window, base + longer), group)
+            new_group = group_of.get(int(items.tracklet[row]), FREE)
+            if new_group != FREE:
+                joined.setdefault((window, base + new_group), group)
         if not joined:
             return
-        now = self.group[open_items].copy()
-        for k, row in enumerate(open_items.tolist()):
+        now = self.group[undecided].copy()
+        for k, row in enumerate(undecided.tolist()):
             window = int(items.window[row])
             group = joined.get((window, int(now[k])), FREE)
             if group != FREE:
-                clash = (window, group, int(items.sensor[row])) in taken
-                now[k] = FREE if clash else group
-        self.group[open_items] = now
+                occupied = (window, group, int(items.sensor[row])) in taken
+                now[k] = FREE if occupied else group
+        self.group[undecided] = now

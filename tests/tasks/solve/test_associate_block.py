@@ -18,9 +18,9 @@ from epipole.tasks.solve.associate_block import (
     associate_blocks,
     best_outcomes,
     blocks_of,
-    view_outcomes,
     object_members,
     outcomes,
+    view_outcomes,
 )
 from epipole.tasks.solve.associate_objects import associate_objects
 

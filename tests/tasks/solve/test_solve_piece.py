@@ -24,8 +24,8 @@ from epipole.tasks.solve.solve_piece import (
     MIN_OBJECTS,
     Piece,
     gather_views,
-    solve_piece,
     sample_objects,
+    solve_piece,
 )
 
 EVERY_NS = 10_000_000_000

@@ -5,7 +5,7 @@
 1. The points are projected onto the sensor's plane, with their covariance (`_predict`).
 2. Only grid cells within the gate are searched (`_gate`, `_window`).
 3. Each free tracklet there is weighed: what it adds to the log-odds (`_fit`).
-4. One that overlaps in time with a tracklet that the hypothesis has already is skipped.
+4. Tracklets that overlap in time with a member of the same sensor are skipped.
 """
 
 import numpy as np
@@ -15,34 +15,34 @@ from epipole.tasks.algorithms.association.views import (
     CORNER,
     DX,
     DY,
-    FASTEST,
-    MOVES,
+    HAS_RATE,
+    MAX_RATE,
+    MAX_VARIANCE,
     PLANE,
     SCALE,
     SIGMA_KM,
     V_KM_S,
-    WIDEST,
     XX,
     XY,
     YY,
     X,
     Y,
-    later_s,
+    extra_light_s,
 )
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel
 
 # Columns of `WorkSpace.predicted`: coordinates and covariance on the sensor's plane, depth [km],
-# stretch of the plane, the delay of `later_s` [s], and how far the motion of the
-# sensor itself moves the coordinates in that time.
-A0, A1, H00, H01, H11, DEPTH, STRETCH, LATER, MOTION0, MOTION1 = range(10)
+# stretch of the plane, the delay of `extra_light_s` [s], and the shift of the coordinates by the
+# motion of the sensor in that time.
+A0, A1, H00, H01, H11, DEPTH, STRETCH, EXTRA_LIGHT, MOTION0, MOTION1 = range(10)
 
 
 @inlined_kernel
 def best_of_sensor(space, work, s, same_sensor, min_gain):
     """Return the free tracklet of sensor s that adds most to the log-odds.
 
-    Only grid cells within the gate are searched. A tracklet is weighed at the first instant that
-    it shares with the points, and at no other.
+    Only grid cells within the gate are searched. A tracklet is weighed once, at the first instant
+    that it shares with the points.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def best_of_sensor(space, work, s, same_sensor, min_gain):
     int
         The tracklet; -1 if no tracklet adds enough.
     float, float
-        Log-odds that it adds, and that the second best adds; `min_gain` where there is none.
+        Log-odds that it adds, and that the second best adds; `min_gain` if missing.
     """
     views, chance, taken, gate_sigma = space.views, space.chance, space.taken, space.gate_sigma
     predicted, seen_by = work.predicted, work.points.seen_by
@@ -74,7 +74,7 @@ def best_of_sensor(space, work, s, same_sensor, min_gain):
                 if taken[c] or _shared_before(views, c, m, seen_by):
                     continue
                 gain = _fit(views, chance, s, c, seen_by, predicted, gate_sigma)
-                if gain > second and not _clashes(views, c, same_sensor):
+                if gain > second and not _overlaps(views, c, same_sensor):
                     if gain > best_gain:
                         best, best_gain, second = c, gain, best_gain
                     else:
@@ -84,7 +84,7 @@ def best_of_sensor(space, work, s, same_sensor, min_gain):
 
 @borrowing_kernel
 def _predict(views, s, points, predicted):
-    """Write to `predicted` (k, 10) where sensor s should see the points, with covariance.
+    """Write to `predicted` (k, 10) the coordinates of the points for sensor s, with covariance.
 
     Coordinates are on the sensor's plane. DEPTH is 0 or less for a point behind the sensor.
     """
@@ -116,9 +116,9 @@ def _predict(views, s, points, predicted):
         t2 = P[m, 2, 0] * q0 + P[m, 2, 1] * q1 + P[m, 2, 2] * q2
         predicted[m, H11] = q0 * t0 + q1 * t1 + q2 * t2
         predicted[m, STRETCH] = 1.0 + a0 * a0 + a1 * a1
-        later = later_s(d0, d1, d2, x[m])
+        later = extra_light_s(d0, d1, d2, x[m])
         v0, v1, v2 = cam[s, m, V_KM_S], cam[s, m, V_KM_S + 1], cam[s, m, V_KM_S + 2]
-        predicted[m, LATER] = later
+        predicted[m, EXTRA_LIGHT] = later
         predicted[m, MOTION0] = later * (p0 * v0 + p1 * v1 + p2 * v2)
         predicted[m, MOTION1] = later * (q0 * v0 + q1 * v1 + q2 * v2)
 
@@ -129,8 +129,8 @@ def _gate(views, s, m, predicted, gate_sigma):
     cam = views.camera
     gate = np.sqrt(quantile(2, gate_sigma))
     position_error = views.sight[views.first[s], m, SIGMA_KM] / predicted[m, DEPTH]
-    errors = (cam[s, m, WIDEST] + position_error * position_error) * predicted[m, STRETCH]
-    drift = abs(predicted[m, LATER]) * cam[s, m, FASTEST]
+    errors = (cam[s, m, MAX_VARIANCE] + position_error * position_error) * predicted[m, STRETCH]
+    drift = abs(predicted[m, EXTRA_LIGHT]) * cam[s, m, MAX_RATE]
     reach0 = gate * np.sqrt(predicted[m, H00] + errors) + abs(predicted[m, MOTION0]) + drift
     reach1 = gate * np.sqrt(predicted[m, H11] + errors) + abs(predicted[m, MOTION1]) + drift
     return reach0, reach1
@@ -151,13 +151,13 @@ def _window(views, s, m, predicted, reach0, reach1):
 
 @borrowing_kernel
 def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
-    """Return what tracklet c adds to the log-odds; -inf where it does not fit the points.
+    """Return the log-odds that tracklet c adds; -inf if it does not fit the points.
 
     This is the log-likelihood of its directions as views of the points, minus the one as an
     unrelated tracklet. At the first instant that they share, an unrelated tracklet may be anywhere
     in the field. From there on, it is uncertain only by the spread of the sensor's rates.
     """
-    gain, total, n, begun_at, see = 0.0, 0.0, 0, 0.0, views.sight
+    gain, total, n, first_s, see = 0.0, 0.0, 0, 0.0, views.sight
     largest = quantile(2 * len(views.time_s), gate_sigma)
     for m in range(len(views.time_s)):
         if seen_by[m] < 2 or not views.seen[c, m]:
@@ -166,7 +166,7 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
         if not depth > 0.0:
             return -np.inf
         x0, x1 = see[c, m, X], see[c, m, Y]
-        later, moves = predicted[m, LATER], see[c, m, MOVES]
+        later, moves = predicted[m, EXTRA_LIGHT], see[c, m, HAS_RATE]
         e0 = predicted[m, A0] - x0 - moves * predicted[m, MOTION0] - later * see[c, m, DX]
         e1 = predicted[m, A1] - x1 - moves * predicted[m, MOTION1] - later * see[c, m, DY]
         extra = (see[c, m, SIGMA_KM] / depth) ** 2
@@ -179,13 +179,13 @@ def _fit(views, chance, s, c, seen_by, predicted, gate_sigma):
         if total > largest:  # most candidates end here, before any logarithm
             return -np.inf
         stretch = predicted[m, STRETCH]
-        spot = 2 * np.pi * np.sqrt(det / (stretch * stretch * stretch))
+        area_sr = 2 * np.pi * np.sqrt(det / (stretch * stretch * stretch))
         if n == 0:
-            gain += np.log(chance.detected[s] / (chance.density[s] * spot)) - 0.5 * chi2
-            begun_at = views.time_s[m]
+            gain += np.log(chance.detected[s] / (chance.density[s] * area_sr)) - 0.5 * chi2
+            first_s = views.time_s[m]
         else:
-            room = np.pi * (chance.spread[s] * (views.time_s[m] - begun_at)) ** 2
-            gain += np.log1p(room / spot) - 0.5 * chi2
+            spread_sr = np.pi * (chance.spread[s] * (views.time_s[m] - first_s)) ** 2
+            gain += np.log1p(spread_sr / area_sr) - 0.5 * chi2
         n += 1
     return gain if n > 0 and total <= quantile(2 * n, gate_sigma) else -np.inf
 
@@ -200,7 +200,7 @@ def _shared_before(views, c, m, seen_by):
 
 
 @borrowing_kernel
-def _clashes(views, c, same_sensor):
+def _overlaps(views, c, same_sensor):
     """Return whether c overlaps in time with one of these tracklets of its sensor, or is one."""
     for o in same_sensor:
         if o == c or (views.start_s[c] <= views.end_s[o] and views.start_s[o] <= views.end_s[c]):
@@ -209,7 +209,7 @@ def _clashes(views, c, same_sensor):
 
 
 @borrowing_kernel
-def fills(views, c, seen_by):
+def lasts_throughout(views, c, seen_by):
     """Return whether c lasts from the first solved instant to the last.
 
     Then no other tracklet of its sensor can be the same object at these instants.
@@ -228,7 +228,7 @@ def fills(views, c, seen_by):
 def other_group_near(space, work, s, group, g):
     """Return whether sensor s has a tracklet of another group than g within the gate.
 
-    A fast first test: a tracklet within the gate need not fit.
+    A fast first test: a tracklet within the gate may still not fit.
     """
     views, seen_by, predicted = space.views, work.points.seen_by, work.predicted
     _predict(views, s, work.points, predicted)
@@ -251,7 +251,7 @@ def other_group_near(space, work, s, group, g):
 
 @borrowing_kernel
 def odds_of_view(space, work, s, c):
-    """Return what tracklet c of sensor s adds to the log-odds of the points, without a gate."""
+    """Return the log-odds that tracklet c of sensor s adds to the points, without a gate."""
     _predict(space.views, s, work.points, work.predicted)
     seen_by = work.points.seen_by
     return _fit(space.views, space.chance, s, c, seen_by, work.predicted, np.inf)

@@ -1,4 +1,4 @@
-"""Field index: which sensors' fields share space, by the cells that the fields sweep.
+"""Field index: the sensors whose fields share space, by the cells that the fields sweep.
 
 Space is divided into cells whose size grows with the distance from the Earth. Each field is a
 cone; it is entered in all cells that it touches at any instant. Two fields can overlap only
@@ -24,19 +24,19 @@ from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-FEW_SENSORS = 32  # up to this many sensors, a single cell holds all of them
-SMALLEST_CELL = 0.05  # at the Earth's surface, over the Earth's radius
+FEW_SENSORS = 32  # up to this number of sensors, a single cell holds all of them
+MIN_CELL = 0.05  # size of a cell at the Earth's surface, over the Earth's radius
 MAX_CELLS = 400  # mean number per sensor: beyond it, the size of the cells is doubled
 N_SAMPLED = 16  # sensors with which a first size of cells is found
 PIECE_CELLS = 0.5  # length of a step along a cone, in sizes of the cells there
 EDGE_RAD = 1e-3  # added to the half-angle of a cone [rad]
-WIDEST_RAD = 1.5  # maximum half-angle of a cone [rad]: its tangent must be finite
+MAX_HALF_RAD = 1.5  # maximum half-angle of a cone [rad]: its tangent must be finite
 AXIS, TANGENT = 3, 6  # columns of a cone
 OFFSET = 1 << 20  # makes the coordinates of cells positive
 
 
 class FieldIndex(NamedTuple):
-    """Which of s sensors have a part of their field in which of c cells.
+    """The sensors, of s, whose field touches each of c cells.
 
     first, sensor : (c + 1,), (v,) int
         Sensors of cell q are ``sensor[first[q]:first[q + 1]]``, in increasing order.
@@ -44,7 +44,7 @@ class FieldIndex(NamedTuple):
         Cells of sensor s, in increasing order, are
         ``by_sensor_cell[by_sensor_first[s]:by_sensor_first[s + 1]]``.
     size : float
-        Size of the cells, see `SMALLEST_CELL`; 0 where there is only one.
+        Size of the cells, see `MIN_CELL`; 0 for a single cell.
     keys, slots : (h,) int
         Hash table: the cell of a key, see `_slot`.
     """
@@ -66,13 +66,13 @@ def field_index(cones: Array, farthest_km: float) -> FieldIndex:
             np.array([0, n]), np.arange(n), np.arange(n + 1), np.zeros(n, np.int64), 0.0,
             np.zeros(1, np.int64), np.zeros(1, np.int64),
         )  # fmt: skip
-    size = SMALLEST_CELL
+    size = MIN_CELL
     # A few sensors show quickly which sizes are too small.
-    for few in (cones[:: -(-n // N_SAMPLED)], cones):
+    for some in (cones[:: -(-n // N_SAMPLED)], cones):
         while True:
-            room = MAX_CELLS * len(few)
+            capacity = MAX_CELLS * len(some)
             by_sensor_first, by_sensor_cell, n_cells, keys, slots = _enter(
-                few, farthest_km, size, room
+                some, farthest_km, size, capacity
             )
             if n_cells >= 0:
                 break
@@ -85,7 +85,7 @@ def field_index(cones: Array, farthest_km: float) -> FieldIndex:
 
 @borrowing_kernel
 def _slot(keys, key):
-    """Return where a key is in the hash table, or where it belongs (keys are positive)."""
+    """Return the slot of a key in the hash table, or the free one for it (keys are positive)."""
     mask = len(keys) - 1
     at = (key * 0x9E3779B97F4A7C1 >> 20) & mask
     while keys[at] != 0 and keys[at] != key:
@@ -170,15 +170,15 @@ def cones_of(views):
             cones[s, m, TANGENT] = cam[s, m, REACH]
             if not np.isfinite(cam[s, m, TURN + 6]):
                 continue
-            least_cosine = 1.0 / np.sqrt(1.0 + cam[s, m, HALF] ** 2 + cam[s, m, HALF + 1] ** 2)
+            min_cosine = 1.0 / np.sqrt(1.0 + cam[s, m, HALF] ** 2 + cam[s, m, HALF + 1] ** 2)
             for i in range(views.first[s], views.first[s + 1]):
                 if views.seen[i, m]:
                     direction(views, i, m, u)
                     along = 0.0
                     for a in range(3):
                         along += u[a] * cam[s, m, TURN + 6 + a]
-                    least_cosine = min(least_cosine, along)
-            tangent = np.tan(min(np.arccos(max(least_cosine, -1.0)) + EDGE_RAD, WIDEST_RAD))
+                    min_cosine = min(min_cosine, along)
+            tangent = np.tan(min(np.arccos(max(min_cosine, -1.0)) + EDGE_RAD, MAX_HALF_RAD))
             if tangent < cam[s, m, REACH]:
                 cones[s, m, AXIS:TANGENT] = cam[s, m, TURN + 6 : HALF]
                 cones[s, m, TANGENT] = tangent
@@ -186,22 +186,22 @@ def cones_of(views):
 
 
 @kernel
-def _enter(cones, farthest_km, size, room):
+def _enter(cones, farthest_km, size, capacity):
     """Enter all fields in cells of a size; return the cells of the sensors and the hash table.
 
-    The number of cells is -1 if there are more than `room` entries.
+    The number of cells is -1 if there are more than `capacity` entries.
     """
     n_sensors, n_instants = cones.shape[0], cones.shape[1]
     table = 1
-    while table < 2 * room:
+    while table < 2 * capacity:
         table *= 2
     by_sensor_first = np.zeros(n_sensors + 1, np.int64)
     entering = Entering(
         size,
         np.zeros(table, np.int64),
         np.zeros(table, np.int64),
-        np.full(room, -1),
-        np.empty(room, np.int64),
+        np.full(capacity, -1),
+        np.empty(capacity, np.int64),
         np.zeros(2, np.int64),
         np.empty(3, np.int64),
         np.empty(3, np.int64),
@@ -253,7 +253,7 @@ def _together(cones, s, m, size):
 
 @borrowing_kernel
 def _walk(cones, sweep, farthest_km, entering):
-    """Enter one cone, step by step along its axis; return false if there is no room left.
+    """Enter one cone, step by step along its axis; return false if the arrays are full.
 
     A ball encloses each step. The walk ends beyond the farthest distance, or at the Earth.
     """
@@ -290,7 +290,7 @@ def _along(cones, s, m, at):
 
 @borrowing_kernel
 def _enter_ball(cones, sweep, x, ball, entering):
-    """Enter a sensor in the cells that a ball and its cone touch; return false without room."""
+    """Enter a sensor in the cells that a ball and its cone touch; false if the arrays are full."""
     size, low, high, count = entering.size, entering.low, entering.high, entering.filled
     keys, slots, latest = entering.keys, entering.slots, entering.latest
     distance = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
@@ -412,7 +412,7 @@ def _add_cell(index, q, stamp, mark, out, n):
 
 @borrowing_kernel
 def sensors_sharing(index, a, b, stamp, mark, out):
-    """Write the sensors that share a cell with both a and b; return how many there are."""
+    """Write the sensors that share a cell with both a and b; return their number."""
     i, j, n = index.by_sensor_first[a], index.by_sensor_first[b], 0
     while i < index.by_sensor_first[a + 1] and j < index.by_sensor_first[b + 1]:
         p, q = index.by_sensor_cell[i], index.by_sensor_cell[j]

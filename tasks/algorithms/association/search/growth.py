@@ -5,10 +5,10 @@ For each seed, `grow_all` goes through these steps (2 to 5 are `_grow`):
 1. The sensors that share space with both sensors of the seed are looked up.
 2. The seed's points are solved, and the sensors that may see them are listed (`_begin`).
 3. Sensor after sensor, the tracklet that adds most to the odds joins (`_join_sensor`). The seed is
-   given up as soon as the other sensors are clearly against it.
+   given up as soon as the other sensors make it improbable.
 4. Members that do not fit are dropped, the worst first (`_settle`).
-5. The first members were chosen by inaccurate points: they are chosen again (`_review`).
-6. The hypothesis is scored, and taken at once if it is clear (`_clear_of_doubt`).
+5. The first members were chosen with inaccurate points: they are chosen again (`_review`).
+6. The hypothesis is scored, and taken at once if it is clear (`_is_clear`).
 """
 
 from typing import NamedTuple
@@ -23,25 +23,25 @@ from epipole.tasks.algorithms.association.odds import (
     score,
     should_detect,
 )
-from epipole.tasks.algorithms.association.search.candidates import best_of_sensor, fills
+from epipole.tasks.algorithms.association.search.candidates import best_of_sensor, lasts_throughout
 from epipole.tasks.algorithms.association.search.field_index import sensors_sharing
 from epipole.tasks.algorithms.association.search.instant_points import join, possible, solve
 from epipole.tasks.algorithms.association.search.sight_lines import quantile
-from epipole.tasks.algorithms.association.views import misfit, residual, spot_sr
+from epipole.tasks.algorithms.association.views import error_sr, residual, residual_chi2
 from epipole.tasks.algorithms.kernels import borrowing_kernel, inlined_kernel, kernel
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-MIN_LOOKS = 3  # minimum number of other sensors with the points in their field to give up a seed
+MIN_LOOKS = 3  # minimum number of other sensors with the points in their field, to give up a seed
 GIVE_UP_LOG_ODDS = -4.0  # log-odds of the other sensors below which a seed is given up
-MIN_GAIN = 2.0  # minimum log-odds that a view adds to a well-known point to be one of it
+MIN_GAIN = 2.0  # minimum log-odds that a view adds to a well-known point, to join it
 MIN_LEAD = 5.0  # minimum difference of the log-odds of a sensor's best view and the next one
 MIN_REVIEWED = 4  # minimum number of views of a hypothesis that is reviewed
 WELL_KNOWN = 8  # number of views from which points are well known: choices need no review
 MIN_COMPLETENESS = 0.85  # minimum share of the expected detections, of a clear hypothesis
-REVIEWS = 2  # after the first one, a false member may still distort the points
+REVIEWS = 2  # with a single one, a false member may still distort the points
 DROPPED_TOGETHER = 64  # drop 1 + n // 64 of n members per pass
 
 
@@ -83,7 +83,7 @@ def grow_all(space, work, seeds, clear, min_score):
     seeds : (n, 2) int
         Pairs of tracklets. A pair of which one was taken since is skipped.
     clear : float
-        Log-odds at which a hypothesis is taken at once, see `_clear_of_doubt`. Its tracklets are
+        Log-odds at which a hypothesis is taken at once, see `_is_clear`. Its tracklets are
         entered in `space.taken`.
     min_score : float
         Minimum log-odds of a hypothesis that is returned.
@@ -111,16 +111,19 @@ def grow_all(space, work, seeds, clear, min_score):
         if not value > min_score:
             continue
         if h == len(seed):
-            seed, value_of, clears = _more(seed, h), _more(value_of, h), _more(clears, h)
-            x_km = _more(x_km, h)
-            first_member, first_missed = _more(first_member, h + 1), _more(first_missed, h + 1)
+            seed, value_of, clears = _doubled(seed, h), _doubled(value_of, h), _doubled(clears, h)
+            x_km = _doubled(x_km, h)
+            first_member, first_missed = (
+                _doubled(first_member, h + 1),
+                _doubled(first_missed, h + 1),
+            )
         begin, skip = first_member[h], first_missed[h]
-        member, missed = _room(member, begin, n), _room(missed, skip, n_missed)
+        member, missed = _with_capacity(member, begin, n), _with_capacity(missed, skip, n_missed)
         member[begin : begin + n] = members[:n]
         missed[skip : skip + n_missed] = work.missed[:n_missed]
         x_km[h] = work.points.x_km[np.argmax(work.points.seen_by >= 2)]
         member[begin : begin + n].sort()
-        is_clear = _clear_of_doubt(space, work, members[:n], n_missed, value, clear)
+        is_clear = _is_clear(space, work, members[:n], n_missed, value, clear)
         seed[h], value_of[h], clears[h] = q, value, is_clear
         h += 1
         first_member[h], first_missed[h] = begin + n, skip + n_missed
@@ -144,7 +147,7 @@ def _grow(space, work, members, nearby):
     (n,) are the sensors that share space with those of the seed, in order.
     """
     views, near = space.views, work.near
-    n = np.int64(2)  # a plain 2 is a type of its own to numba: all would compile twice
+    n = np.int64(2)  # for numba a literal 2 has another type: all would be compiled twice
     n_near = _begin(space, work, members[:n], nearby)
     if n_near < 0:
         return np.int64(0), np.int64(0)
@@ -156,7 +159,11 @@ def _grow(space, work, members, nearby):
     turn = -1
     while turn < n_near + 1:
         turn += 1
-        if turn == n_near and n > 2 and _outlast(views, members[:n], work.points.seen_by):
+        if (
+            turn == n_near
+            and n > 2
+            and _has_unsolved_instant(views, members[:n], work.points.seen_by)
+        ):
             n = _settle(space, work, members, n)
             if n < 2:
                 return np.int64(0), np.int64(0)
@@ -209,10 +216,10 @@ def _begin(space, work, members, nearby):
 
 
 @borrowing_kernel
-def _outlast(views, members, seen_by):
+def _has_unsolved_instant(views, members, seen_by):
     """Return whether two members share an instant that is not solved.
 
-    Only those of the seed are, but other sensors may see the object at others.
+    At first only those of the seed are solved. Other sensors may see the object at others.
     """
     for m in range(len(seen_by)):
         count = 0
@@ -228,8 +235,8 @@ def _join_sensor(space, work, s, members, n, evidence):
     """Add the tracklets of sensor s that fit to the members.
 
     Returns the new size (-1 if a point can no longer be solved), the log-odds `evidence` with what
-    the tracklets add, and whether the sensor detects the object. It does so too if two tracklets
-    fit about equally well, so that neither joins.
+    the tracklets add, and whether the sensor detects the object. It also does if two tracklets fit
+    about equally well, so that neither joins.
     """
     views, detected, n_same = space.views, False, 0
     for i in members[:2]:
@@ -250,8 +257,8 @@ def _join_sensor(space, work, s, members, n, evidence):
         n_same += 1
         if not join(views, c, work.points, work.part):
             return np.int64(-1), evidence, detected
-        # A sensor has one tracklet of an object at a time.
-        if fills(views, c, work.points.seen_by):
+        # A sensor has only one tracklet of an object at a time.
+        if lasts_throughout(views, c, work.points.seen_by):
             break
     return n, evidence, detected
 
@@ -278,18 +285,18 @@ def _settle(space, work, members, n):
                     continue
                 if residual(views, members[q], m, X[m], part) == 0.0:
                     total = np.inf
-                total += misfit(part)
+                total += residual_chi2(part)
                 shared += 1
-            work.misfit[q] = total / shared
+            work.member_chi2[q] = total / shared
         for _ in range(1 + n // DROPPED_TOGETHER):
             worst = 0
             for q in range(n):
-                worst = q if work.misfit[q] > work.misfit[worst] else worst
+                worst = q if work.member_chi2[q] > work.member_chi2[worst] else worst
             for q in range(worst, n - 1):
-                members[q], work.misfit[q] = members[q + 1], work.misfit[q + 1]
+                members[q], work.member_chi2[q] = members[q + 1], work.member_chi2[q + 1]
             n -= 1
         if np.isnan(chi2):
-            seen_by[:] = 0  # start afresh: these points are invalid
+            seen_by[:] = 0  # start again: these points are invalid
     return np.int64(0)
 
 
@@ -297,7 +304,7 @@ def _settle(space, work, members, n):
 def _review(space, work, members, n, early):
     """Choose the first `early` members again, now that the points are well known; return the size.
 
-    They were chosen by points from few views. A false member does more harm than a miss. So a
+    They were chosen with points from few views. A false member does more harm than a miss. So a
     tracklet joins only if it adds at least `MIN_GAIN`, and leads the sensor's next best one by
     `MIN_LEAD` if that one adds as much. All other members stay if they still fit.
     """
@@ -331,7 +338,7 @@ def _review(space, work, members, n, early):
             members[kept], work.same_sensor[n_same] = c, c
             kept += 1
             n_same += 1
-            if fills(views, c, work.points.seen_by):
+            if lasts_throughout(views, c, work.points.seen_by):
                 break
     if kept < MIN_REVIEWED - 1:
         kept = n
@@ -349,35 +356,35 @@ def _still_fits(space, work, i):
             s = views.sensor[i]
             if residual(views, i, m, points.x_km[m], part) == 0.0:
                 return False
-            odds = np.log(chance.detected[s] / (chance.density[s] * spot_sr(views, i, m, part)))
-            return odds - 0.5 * misfit(part) >= MIN_GAIN
+            odds = np.log(chance.detected[s] / (chance.density[s] * error_sr(views, i, m, part)))
+            return odds - 0.5 * residual_chi2(part) >= MIN_GAIN
     return True
 
 
 @borrowing_kernel
-def _clear_of_doubt(space, work, members, n_missed, value, clear):
+def _is_clear(space, work, members, n_missed, value, clear):
     """Return whether a hypothesis may be taken at once.
 
-    It needs many views, and must be detected by about as many of the sensors that have it in their
-    field as expected. A mixture of two objects' tracklets fits only some of these sensors.
+    It needs many views, and about the expected number of detections by the sensors that have it in
+    their field. A mixture of two objects' tracklets fits only some of these sensors.
     """
     if not (value > clear and len(members) >= WELL_KNOWN):
         return False
     views, detected = space.views, space.chance.detected
-    has, usual, mark = 0, 0.0, next_mark(work.stamp)
+    n_detecting, expected, mark = 0, 0.0, next_mark(work.stamp)
     for i in members:
         s = views.sensor[i]
         if work.stamp[s] != mark:
             work.stamp[s] = mark
-            has += 1
-            usual += detected[s]
+            n_detecting += 1
+            expected += detected[s]
     for s in work.missed[:n_missed]:
-        usual += detected[s]
-    return has >= MIN_COMPLETENESS * usual
+        expected += detected[s]
+    return n_detecting >= MIN_COMPLETENESS * expected
 
 
 @kernel
-def _more(values, n):
+def _doubled(values, n):
     """Return an array twice as long with the same first n rows."""
     out = np.empty((2 * len(values), *values.shape[1:]), values.dtype)
     out[:n] = values[:n]
@@ -385,8 +392,8 @@ def _more(values, n):
 
 
 @kernel
-def _room(values, n, more):
-    """Return the array, or a longer one with the same first n values and room for more."""
+def _with_capacity(values, n, more):
+    """Return the array, or a longer one with the same first n values, for `more` values."""
     while n + more > len(values):
-        values = _more(values, n)
+        values = _doubled(values, n)
     return values

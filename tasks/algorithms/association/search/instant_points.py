@@ -11,7 +11,7 @@ from epipole.tasks.algorithms.kernels import borrowing_kernel
 
 ITERATIONS = 6
 CONVERGED = 1e-4  # sigmas squared
-RHS = 11  # where the right-hand side of the normal equations begins, after the residual
+RHS = 11  # offset of the right-hand side of the normal equations, after the residual
 
 
 @borrowing_kernel
@@ -136,7 +136,7 @@ def possible(space, members, points):
             continue
         radius = np.sqrt(X[m, 0] ** 2 + X[m, 1] ** 2 + X[m, 2] ** 2)
         slack = SLACK_SIGMA * np.sqrt(P[m, 0, 0] + P[m, 1, 1] + P[m, 2, 2])
-        # An uncertain range is no excuse for a point far beyond the limit.
+        # A point far beyond the limit is impossible, even if its range is uncertain.
         if radius + slack < lowest or radius - min(slack, BEYOND * farthest) > farthest:
             return False
         for i in members:

@@ -2,7 +2,7 @@
 
 A hypothesis grows by tracklets that are seen at its solved instants. A sensor that sees the object
 only before or after these begins a second hypothesis, with a tracklet of the first. The two do not
-contradict each other. Whether they are one object is a matter of one orbit through both.
+contradict each other. They are one object if one orbit fits both.
 """
 
 from collections.abc import Iterable
@@ -20,9 +20,9 @@ from epipole.tasks.algorithms.kernels import kernel
 
 @kernel
 def _weigh(space, work, members, x_km):
-    """Return the log-odds of a set of tracklets as one object, and how many sensors miss it.
+    """Return the log-odds of a set of tracklets as one object, and the number of misses.
 
-    -inf where they do not fit. Writes `work.missed`, and the point `x_km` (3,) at the first solved
+    -inf if they do not fit. Writes `work.missed`, and the point `x_km` (3,) at the first solved
     instant.
     """
     views, points = space.views, work.points
@@ -41,10 +41,10 @@ def _weigh(space, work, members, x_km):
 def best_merger(
     space: SearchSpace, work: WorkSpace, h: Hypothesis, others: Iterable[Hypothesis]
 ) -> Hypothesis | None:
-    """Return the likeliest merger of a hypothesis with another one, None if none beats both.
+    """Return the likeliest merger of a hypothesis with another; None unless it beats both.
 
-    Another one is tried only if its other tracklets are not seen at the solved instants of `h`:
-    those that are seen there did not fit when `h` grew.
+    Another hypothesis is tried only if its other tracklets are not seen at the solved instants of
+    `h`: those that are seen there did not fit when `h` grew.
     """
     seen = space.views.seen
     solved = seen[list(h.members)].sum(axis=0) >= 2

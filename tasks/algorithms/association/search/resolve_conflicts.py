@@ -1,8 +1,8 @@
-"""Conflicts: tracklets that a second object explains as well as the object that has them.
+"""Conflicts: tracklets that another object explains as well as the one that they belong to.
 
-Hypotheses that grew first took what fitted best, before the others were known. Once all groups are
-known, each tracklet is weighed again. It goes to the object that clearly explains it best. If two
-explain it about equally well, it goes to neither.
+Hypotheses that grew first took the tracklets that fitted best, before the others were known. Once
+all groups are known, each tracklet is weighed again. It goes to the object that clearly explains it
+best. If two explain it about equally well, it goes to neither.
 """
 
 import numpy as np
@@ -17,9 +17,7 @@ from epipole.tasks.algorithms.association.search.growth import MIN_GAIN, MIN_LEA
 from epipole.tasks.algorithms.association.search.instant_points import solve
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
-MIN_TRACKLETS = (
-    3  # minimum number of tracklets of an object, before it gains and after it loses one
-)
+MIN_TRACKLETS = 3  # of an object, before it gains one and after it loses one
 
 
 @kernel
@@ -42,7 +40,7 @@ def resolve_conflicts(space, work, group, x_km):
         if len(of_group) < MIN_TRACKLETS:
             continue
         work.points.seen_by[:] = 0
-        if k == 1:  # a good start
+        if k == 1:  # a good initial point
             work.points.x_km[0], work.points.seen_by[0] = x_km[g], 2
         chi2, _ = solve(views, of_group, work.points, work.part)
         if np.isnan(chi2):
@@ -79,11 +77,11 @@ def resolve_conflicts(space, work, group, x_km):
             if size[o] <= MIN_TRACKLETS:
                 continue
             _enter_points(work.points, o, X, P, seen_by)
-            theirs = odds_of_view(space, work, s, c)
-            if theirs - gain < MIN_LEAD:
+            present_gain = odds_of_view(space, work, s, c)
+            if present_gain - gain < MIN_LEAD:
                 size[o] -= 1
                 group[c] = -1
-                if gain - theirs >= MIN_LEAD and not _has(views, group, s, g):
+                if gain - present_gain >= MIN_LEAD and not _has(views, group, s, g):
                     group[c] = g
                     size[g] += 1
 

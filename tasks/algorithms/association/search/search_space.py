@@ -26,7 +26,7 @@ class SearchSpace(NamedTuple):
     """The tracklets that are searched, and the limits of the search.
 
     views, chance
-        The tracklets, and how unrelated ones behave.
+        The tracklets, and the behaviour of unrelated ones.
     taken : (t,) bool
         Tracklets of known objects: no new hypothesis may use them.
     shells : (j, 3) float
@@ -36,7 +36,7 @@ class SearchSpace(NamedTuple):
     gate_sigma : float
         Views of one object agree within this (as a chi-square of the same probability).
     fields
-        Which sensors' fields share space.
+        The sensors whose fields share space.
     """
 
     views: Views
@@ -65,8 +65,8 @@ class WorkSpace(NamedTuple):
         Which sensors are in a list, by the number of the list; the last one counts the lists.
     same_sensor : (c,) int
         Tracklets of one sensor among the members, see `candidates.best_of_sensor`.
-    members, before, misfit : (t + 2,) int, int, float
-        Members, those before a review, and how badly they fit.
+    members, before, member_chi2 : (t + 2,) int, int, float
+        Members, those before a review, and the mean chi-square of their residuals.
     """
 
     points: InstantPoints
@@ -79,7 +79,7 @@ class WorkSpace(NamedTuple):
     same_sensor: Indices
     members: Indices
     before: Indices
-    misfit: Array
+    member_chi2: Array
 
 
 def work_space(views: Views) -> WorkSpace:
@@ -98,5 +98,5 @@ def work_space(views: Views) -> WorkSpace:
         same_sensor=np.empty(int(np.diff(views.first).max(initial=0)) + 1, np.int64),
         members=np.empty(n + 2, np.int64),
         before=np.empty(n + 2, np.int64),
-        misfit=np.empty(n + 2),
+        member_chi2=np.empty(n + 2),
     )

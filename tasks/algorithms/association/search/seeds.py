@@ -1,29 +1,29 @@
-"""Seeds: pairs of tracklets whose lines of sight meet, found by sorting one angle.
+"""Seeds: pairs of tracklets whose lines of sight meet. They are found by sorting one angle.
 
 The baseline of two sensors and a direction span a plane. The angle of this plane about the
 baseline is one number for each direction, and equal for both sensors' views of one object. With
-the angles sorted, a binary search gives the views that it may meet, and pairs that cannot meet
+the angles sorted, a binary search gives the views that a view may meet. Pairs that cannot meet
 cost nothing.
 """
 
 import numpy as np
 
 from epipole.tasks.algorithms.association.search.sight_lines import pair_miss, quantile
-from epipole.tasks.algorithms.association.views import MOVES, PLANE, SIGMA_KM, XX, YY, direction
+from epipole.tasks.algorithms.association.views import HAS_RATE, PLANE, SIGMA_KM, XX, YY, direction
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 SHORTEST_BASELINE_KM = 1.0  # minimum baseline of a pair: below, ranges are undetermined
 NEAREST_KM = 300.0  # minimum range [km]: errors of the baseline turn the plane most there
 FASTEST_KM_S = 11.0  # maximum speed in orbit (escape speed): motion during the light time
-LARGEST_SIGMA = 3.0  # this maximum motion counts as an error of 3 sigma
+MOTION_SIGMA = 3.0  # the maximum motion counts as an error of 3 sigma
 
 
 @kernel
 def seeds_between(space, a, b, gate_sigma):
     """Return (n, 2): free tracklets of sensors a and b whose lines of sight meet.
 
-    `gate_sigma` is the largest gap of the lines, as a chi-square of the same probability.
+    `gate_sigma` is the maximum gap of the lines, as a chi-square of the same probability.
     """
     views, n = space.views, 0
     out = np.empty((4 * (_size(views, a) + _size(views, b)), 2), np.int64)
@@ -41,9 +41,9 @@ def seeds_between(space, a, b, gate_sigma):
             continue
         order = np.argsort(angle_b, kind="mergesort")
         items_b, angle_b, sigma_b = items_b[order], angle_b[order], sigma_b[order]
-        widest = sigma_b.max()
+        max_sigma = sigma_b.max()
         for q in range(len(items_a)):
-            reach = gate_sigma * np.sqrt(sigma_a[q] ** 2 + widest**2)
+            reach = gate_sigma * np.sqrt(sigma_a[q] ** 2 + max_sigma**2)
             k = np.searchsorted(angle_b, angle_a[q] - reach)
             while k < len(items_b) and angle_b[k] <= angle_a[q] + reach:
                 if _meet(space, items_a[q], items_b[k], m, gate_sigma, axes):
@@ -66,13 +66,13 @@ def _size(views, s):
 def _meet(space, i, j, m, gate_sigma, work):
     """Return whether two tracklets meet at all instants they share, of which m is the first.
 
-    `work` (2, 3) is work space: the axes are made again for each instant.
+    `work` (2, 3) is work space: `axes` is written again for each instant.
     """
     views, total, shared = space.views, 0.0, 0
     for h in range(len(views.time_s)):
         if views.seen[i, h] and views.seen[j, h]:
             if h < m:
-                return False  # was weighed at the first instant they share
+                return False  # they were compared at the first instant that they share
             total += pair_miss(views, i, j, h, space.lowest_km, space.farthest_km, work[0], work[1])
             shared += 1
     return total <= quantile(shared, gate_sigma)  # false for NaN
@@ -90,7 +90,7 @@ def _plane_angles(space, s, m, baseline, axes):
     angle, sigma = np.empty(len(items)), np.empty(len(items))
     length = np.sqrt(np.sum(baseline * baseline))
     # Light time: the ranges of two sensors differ by at most the baseline.
-    moved_km = FASTEST_KM_S * length / SPEED_OF_LIGHT_KM_S / LARGEST_SIGMA
+    moved_km = FASTEST_KM_S * length / SPEED_OF_LIGHT_KM_S / MOTION_SIGMA
     for i in range(views.first[s], views.first[s + 1]):
         if space.taken[i] or not views.seen[i, m]:
             continue
@@ -104,7 +104,7 @@ def _plane_angles(space, s, m, baseline, axes):
         # The trace is at least the variance along any axis.
         variance = views.sight[i, m, XX] + views.sight[i, m, YY]
         variance += 2 * (views.sight[i, m, SIGMA_KM] / NEAREST_KM) ** 2
-        variance += views.sight[i, m, MOVES] * (moved_km / NEAREST_KM) ** 2
+        variance += views.sight[i, m, HAS_RATE] * (moved_km / NEAREST_KM) ** 2
         items[n], angle[n] = i, np.arctan2(second, first)
         sigma[n] = np.sqrt(variance) / across
         n += 1

@@ -25,14 +25,14 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a field, to see whether it meets another one
-TESTED_INSTANTS = 8  # at most, of those at which both sensors have tracklets
+NEAREST_STEP_KM, N_STEPS = 20.0, 64  # along a field, to test whether it meets another one
+MAX_TESTED_INSTANTS = 8  # of the instants at which both sensors have tracklets
 N_LEADERS = 8  # sensors of a crowded cell with which all others there are paired
 MAX_OVERLAPPING = 64  # maximum number of others that a sensor is paired with, half of them leaders
 MAX_TESTS = 512  # maximum number of tests per sensor of whether two fields overlap
-FEW_TRACKLETS = 8  # of a sensor in a window, with which seeding costs next to nothing
-N_EDGES = 8  # outermost tracklets of a sensor, one for each of the ways on its plane
-# Share of a crowded field that counts as covered by a pair: its edges are not looked at.
+FEW_TRACKLETS = 8  # of a sensor in a window: seeding with fewer costs next to nothing
+N_EDGES = 8  # outermost tracklets of a sensor, one for each of the axes on its plane
+# Share of a crowded field that counts as covered by a pair: its edges are left out.
 MIDDLE_SHARE = 0.5
 
 
@@ -93,8 +93,8 @@ def _meet(cones, steps, a, b):
     step, common = steps[1] / steps[0], 0
     for m in range(cones.shape[1]):
         common += cones[a, m, TANGENT] > 0.0 and cones[b, m, TANGENT] > 0.0
-    # Evenly among the common ones, first and last included: they may be two of the window's thirty.
-    passed, tested, n_tested = 0, 0, min(common, TESTED_INSTANTS)
+    # Evenly spread over the common instants, first and last included.
+    passed, tested, n_tested = 0, 0, min(common, MAX_TESTED_INSTANTS)
     for m in range(cones.shape[1]):
         if not (cones[a, m, TANGENT] > 0.0 and cones[b, m, TANGENT] > 0.0):
             continue
@@ -145,10 +145,10 @@ def _overlapping_pairs(index, rank, cones, steps):
             if crowded and occupied[q] <= FEW_SENSORS + 1:
                 continue
             some = leader[q] if crowded else index.sensor[index.first[q] : index.first[q + 1]]
-            most = MAX_OVERLAPPING // 2 if crowded else MAX_OVERLAPPING
+            max_count = MAX_OVERLAPPING // 2 if crowded else MAX_OVERLAPPING
             for k in range(len(some)):
                 o = some[(k + s) % len(some)]  # each sensor begins elsewhere
-                if count >= most or tests >= MAX_TESTS:
+                if count >= max_count or tests >= MAX_TESTS:
                     break
                 if tested[o] == s:
                     continue
@@ -163,7 +163,7 @@ def _overlapping_pairs(index, rank, cones, steps):
 
 @kernel
 def _leaders(index, rank):
-    """Return the sensors of the lowest rank in each crowded cell, (c, 8); -1 elsewhere."""
+    """Return the sensors with the lowest ranks in each crowded cell, (c, 8); -1 elsewhere."""
     leader = np.full((len(index.first) - 1, N_LEADERS), -1)
     for q in range(len(leader)):
         if index.first[q + 1] - index.first[q] <= FEW_SENSORS + 1:
@@ -188,14 +188,14 @@ def sparse_sensors(views: Views) -> Flags:
 
 
 class EveryPair:
-    """All pairs of sensors whose fields meet: of few sensors, two may be all that see an object."""
+    """All pairs of sensors whose fields meet: among few sensors, only two may see an object."""
 
     def __init__(self, index: FieldIndex, cones: Array, farthest_km: float) -> None:
         a, b = meeting_pairs(index, cones, farthest_km)
         self._pairs = zip(a.tolist(), b.tolist(), strict=True)
 
     def next(self, enough: float = np.inf) -> tuple[int, int] | None:
-        """Return the next pair, None after the last; a pair is never covered enough."""
+        """Return the next pair, None after the last; no pair is skipped, whatever `enough` is."""
         return next(self._pairs, None)
 
 
@@ -203,12 +203,12 @@ class SensorPairs:
     """Pairs of sensors that may see one object, in the order in which they should seed.
 
     Pairs with a longer baseline across the line of sight come first: they fix a point better and
-    have fewer chance meetings. But every sensor takes part once before any takes part again.
+    give fewer false seeds. But every sensor takes part once before any takes part again.
     Pairs whose fields do not overlap are skipped. In crowded space each sensor is paired with a few
     only, see `meeting_pairs`.
 
-    Two sensors of few tracklets always seed: that costs little, and a passage of seconds may have
-    been seen by these two alone, whatever other fields swept the same space.
+    Two sensors with few tracklets always seed: that costs little, and only these two may have seen
+    a passage of seconds.
     """
 
     def __init__(self, views: Views, farthest_km: float, index: FieldIndex, cones: Array) -> None:
@@ -326,23 +326,23 @@ def _cells_of(index, points):
 def _middle(views, n_edges):
     """Return each sensor's mean direction, position [km], and radius of its tracklets [rad].
 
-    All are (s, 3), (s, 3), (s,), at the instant with most tracklets; NaN without tracklets. The
+    All are (s, 3), (s, 3), (s,), at the instant with the most tracklets; NaN without tracklets. The
     fourth value are the directions of the outermost tracklets along `n_edges` axes of the plane,
     (s, n_edges, 3).
     """
     n = views.camera.shape[0]
     look, position, half = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.zeros(n)
-    edges, ways = np.full((n, n_edges, 3), np.nan), np.empty((n_edges, 2))
+    edges, axes = np.full((n, n_edges, 3), np.nan), np.empty((n_edges, 2))
     for e in range(n_edges):
-        ways[e] = np.cos(e * 2 * np.pi / n_edges), np.sin(e * 2 * np.pi / n_edges)
+        axes[e] = np.cos(e * 2 * np.pi / n_edges), np.sin(e * 2 * np.pi / n_edges)
     outermost = np.empty(n_edges, np.int64)
     for s in range(n):
-        m, most = 0, 0
+        m, max_count = 0, 0
         for h in range(len(views.time_s)):
             count = views.seen[views.first[s] : views.first[s + 1], h].sum()
-            if count > most:
-                m, most = h, count
-        if most == 0:
+            if count > max_count:
+                m, max_count = h, count
+        if max_count == 0:
             continue
         look[s], position[s] = views.camera[s, m, PLANE + 6 : PLANE + 9], views.camera[s, m, :3]
         widest2, farthest = 0.0, np.full(n_edges, -np.inf)
@@ -352,7 +352,7 @@ def _middle(views, n_edges):
             x, y = views.sight[i, m, X], views.sight[i, m, Y]
             widest2 = max(widest2, x * x + y * y)
             for e in range(n_edges):
-                out = x * ways[e, 0] + y * ways[e, 1]
+                out = x * axes[e, 0] + y * axes[e, 1]
                 if out > farthest[e]:
                     farthest[e], outermost[e] = out, i
         for e in range(n_edges):

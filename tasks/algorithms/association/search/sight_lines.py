@@ -5,7 +5,7 @@ import numpy as np
 from epipole.tasks.algorithms.association.views import (
     DX,
     DY,
-    MOVES,
+    HAS_RATE,
     PLANE,
     SIGMA_KM,
     V_KM_S,
@@ -35,10 +35,10 @@ def quantile(dof, sigma):
 
 @borrowing_kernel
 def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
-    """Return the squared gap of two lines of sight over its variance; NaN where impossible.
+    """Return the squared gap of two lines of sight over its variance; NaN if they cannot meet.
 
-    Impossible are parallel lines, and a meeting point behind a sensor or, by 3 sigma, outside
-    the limits [km from the Earth's centre]. `ui`, `uj` (3,) are work space.
+    They cannot if they are parallel, or meet behind a sensor or, by 3 sigma, outside the limits
+    [km from the Earth's centre]. `ui`, `uj` (3,) are work space.
     """
     direction(views, i, m, ui)
     direction(views, j, m, uj)
@@ -71,8 +71,8 @@ def pair_miss(views, i, j, m, lowest, farthest, ui, uj):
     variance += range_i**2 * _across(views, i, m, n0 / sine, n1 / sine, n2 / sine)
     variance += range_j**2 * _across(views, j, m, n0 / sine, n1 / sine, n2 / sine)
     miss = (b0 * n0 + b1 * n1 + b2 * n2) / sine
-    # Light takes longer to the farther sensor, which sees the object where it was earlier.
-    if views.sight[j, m, MOVES] > 0.0:
+    # Light takes longer to the farther sensor, which sees the object at an earlier position.
+    if views.sight[j, m, HAS_RATE] > 0.0:
         speed = _speed(views, j, m, range_j, n0 / sine, n1 / sine, n2 / sine)
     else:
         speed = _speed(views, i, m, range_i, n0 / sine, n1 / sine, n2 / sine)
@@ -87,7 +87,7 @@ def _speed(views, i, m, range_km, n0, n1, n2):
     The vector is perpendicular to the line of sight. 0 where the rate is unknown.
     """
     cam, see = views.camera[views.sensor[i], m], views.sight[i, m]
-    if see[MOVES] == 0.0:
+    if see[HAS_RATE] == 0.0:
         return 0.0
     a = cam[PLANE] * n0 + cam[PLANE + 1] * n1 + cam[PLANE + 2] * n2
     b = cam[PLANE + 3] * n0 + cam[PLANE + 4] * n1 + cam[PLANE + 5] * n2

@@ -17,7 +17,7 @@ from scenes.ten_tracklets import (
 
 from epipole.tasks.algorithms.association.search.candidates import (
     best_of_sensor,
-    fills,
+    lasts_throughout,
     odds_of_view,
     other_group_near,
 )
@@ -131,13 +131,13 @@ def test_a_tracklet_fills_where_no_other_one_could_be_another_fragment(seed):
             # Another fragment would have to be seen at one of these instants, before or after c.
             room = any(t < samples.start_s[c] or t > samples.end_s[c] for t in times)
             if not len(instants):
-                assert not fills(views, c, seen_by)
-            elif fills(views, c, seen_by):
+                assert not lasts_throughout(views, c, seen_by)
+            elif lasts_throughout(views, c, seen_by):
                 assert not room
             elif samples.seen[c, instants[[0, -1]]].all():
                 raise AssertionError("it is seen from the first instant to the last")
             views.bounded[:] = False
-            assert not fills(views, c, seen_by)
+            assert not lasts_throughout(views, c, seen_by)
             views.bounded[:] = True
 
 
