@@ -390,9 +390,9 @@ def states_near_frames(frames: Frames, served: Indices, dt_s: Array) -> tuple[Ar
     Parameters
     ----------
     served : (n,) int
-        The frame of each time.
+        The frame of each of the times.
     dt_s : (n,) float
-        Time of the frame minus the time [s].
+        Time of the frame minus the given time [s].
     """
     r, v = frames.r_gcrf_km[served], frames.v_gcrf_km_s[served]
     back = -dt_s[:, None]
