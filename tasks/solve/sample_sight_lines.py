@@ -63,8 +63,8 @@ def object_views(views: ObjectViews, objects: pa.Table) -> pa.Table:
 def sample_sight_lines(groups: ViewGroups, objects: pa.Table, sampling: LineSampling) -> pa.Table:
     """Return CLOCK_LINES: views of objects at the epochs of MOVING_OBJECTS.
 
-    If only some are kept, each epoch and object lose other sensors. So all sensors are judged by
-    many epochs, which matters because all lines of a frame share the error of its attitude.
+    If only some are kept, the choice changes from epoch to epoch and from object to object. So each
+    sensor keeps lines at many epochs: all lines of a frame share the error of its attitude.
     """
     rows = _at_epochs(groups.views, objects)
     rows = rows[_phase(groups, rows, sampling) == 0]
@@ -111,7 +111,7 @@ def _checksums(texts: npt.NDArray[Any]) -> Indices:
 def pair_with_objects(views: pl.DataFrame, objects: pl.DataFrame, on: list[str]) -> pa.Table:
     """Return CLOCK_LINES: each view with the objects that are equal in the columns `on`.
 
-    The position of an object is the one at which the light left that the sensor sees.
+    The position of the object is the apparent one for the sensor of the row: where its light left.
     """
     rows = (
         views.rename({name: f"sensor_{name}" for name in POSITION})

@@ -287,7 +287,7 @@ def _noise(sightings: SensorSightings, u: Array) -> Array:
 
 
 def _bias_sigma(sightings: SensorSightings, rows: Indices) -> Array:
-    """Return the 1-sigma error per axis [rad] that sightings share with others of the sensor."""
+    """Return the 1-sigma error per axis [rad] that sightings of a sensor share."""
     frames, tracklets = sightings.frames, sightings.tracklets
     frame, u_icrs = tracklets.frame[rows], tracklets.u_icrs[rows]
     R = matrix_from_quaternion(frames.q_sensor_from_icrs[frame])
