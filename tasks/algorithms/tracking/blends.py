@@ -94,17 +94,9 @@ def blend_variance(tracked: TrackedDetections, frame_s: Array, pixel_rad: float)
         ends = ends._replace(flux=_usual_flux(tracked, out > 0))
         out[:] = 0.0
         _enter_blends(
-            tracked.time_s,
-            u,
-            tracklet,
-            by_frame,
-            starts,
-            tracked.bounds,
-            frame_s,
-            ends,
-            blend_rad,
+            tracked.time_s, u, tracklet, by_frame, starts, tracked.bounds, frame_s, ends, blend_rad,
             out,
-        )
+        )  # fmt: skip
     return out
 
 

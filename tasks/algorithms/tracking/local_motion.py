@@ -1,8 +1,8 @@
 """Local motion: the direction of an object at a time, from its detections around that time.
 
 A polynomial is fitted to the directions in a window around the time. Its value there is a weighted
-of the detections, ``sum c_k d_k`` with ``sum c_k = 1``. So covariances of the detections propagate
-exactly, both independent ones and one that all share.
+mean of the detections, ``sum c_k d_k`` with ``sum c_k = 1``. So covariances of the detections
+propagate exactly, both independent ones and one that all share.
 """
 
 from typing import NamedTuple
