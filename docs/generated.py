@@ -50,7 +50,7 @@ MADE_BY = {
     Stage.IDENTIFY: ("frames", "stars", "detections"),
     Stage.CALIBRATE: ("calibrations",),
     Stage.TRACK: ("tracklets",),
-    Stage.SOLVE: ("epochs", "associations", "pairs", "positions", "states"),
+    Stage.SOLVE: ("epochs", "associations", "pairs", "positions", "states", "orbits"),
     Stage.NAME: ("identifications",),
     Stage.PUBLISH: ("observations", "sources", "nights", "rejects"),
 }

@@ -16,7 +16,7 @@ from epipole.tasks.evaluate.evaluate_dataset import evaluate_dataset
 
 TABLES = (
     *("frames", "stars", "tracklets", "detections", "epochs", "associations"),
-    *("positions", "observations", "states", "identifications"),
+    *("positions", "observations", "states", "orbits", "identifications"),
 )
 
 

@@ -18,6 +18,7 @@ from epipole.flows.night.stages import (
     Destination,
     check,
     choose_elements,
+    determine_orbits,
     identify,
     name,
     name_known,
@@ -136,6 +137,7 @@ def nightly(
                          "rejects": concat(REJECTS, [rejects, made.rejects, unused])}  # fmt: skip
                 staged[date] = staging / f"night={date}"
                 write_night(made.work, made.solved, date, names, whole, staged[date])
+                determine_orbits(staged[date], date)
                 states = earlier.last_states(date, settings)
                 residuals = name_known(staged[date], elements, states, settings)
                 faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]

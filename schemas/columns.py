@@ -9,6 +9,7 @@ TIME = pa.timestamp("ns", tz="UTC")
 STATE_AXES = ("x", "y", "z", "vx", "vy", "vz")  # of a position and velocity
 POSITION = ["x_km", "y_km", "z_km"]  # of an object
 VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
+ELEMENTS = ("a_km", "e", "i_deg", "raan_deg", "argp_deg", "mean_anomaly_deg")  # osculating
 OPTICS_AXES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # numbers of a camera
 ATTRIBUTABLE_AXES = ("ra", "dec", "vra", "vdec")  # of a direction (ra times cos dec) and its rate
 TANGENT_AXES = ("1", "2")  # of the plane at right angles to a direction

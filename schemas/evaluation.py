@@ -292,6 +292,43 @@ class Report:
         definition="States with a NEES below 16.81; 99 % where the covariances are right.",
     )
 
+    orbits: int | None = _measure(
+        "orbits",
+        "of true objects",
+        definition="Orbits of ids whose observations show a true object; the orbit is compared "
+        "with the true object that most of these show.",
+    )
+    orbits_of_nothing: int | None = _measure(
+        "orbits", "of ghosts", definition="Orbits of ids whose observations show no true object."
+    )
+    orbits_err_km_median: float | None = _measure(
+        "orbits",
+        "error, median",
+        "km",
+        definition="Median distance of the orbits, at their epochs, to the true positions.",
+    )
+    orbits_nees_mean: float | None = _measure(
+        "orbits",
+        "NEES / 6, mean (expected: 1)",
+        "number",
+        definition="Mean NEES / 6 of the orbits' states; 1 where the covariances are right.",
+    )
+    orbits_nees_median: float | None = _measure(
+        "orbits",
+        "NEES, median (expected: 5.35)",
+        "number",
+        definition="Median NEES of the orbits' states; 5.35 where the covariances are right.",
+    )
+    orbits_nees_max: float | None = _measure(
+        "orbits", "NEES, largest", "number", definition="Largest NEES of an orbit's state."
+    )
+    orbits_in_99: float | None = _measure(
+        "orbits",
+        "in the 99 % ellipsoid",
+        "share",
+        definition="Orbits with a NEES below 16.81; 99 % where the covariances are right.",
+    )
+
     tracks: int | None = _measure(
         "tracks", "tracks", definition="Different tracks of detections that are called objects."
     )

@@ -297,6 +297,18 @@ class Reason(StrEnum):
         Stage.SOLVE,
         "The chi-square of an object's state does not fit its degrees of freedom.",
     )
+    ORBIT_MISFIT = (
+        "orbit_misfit",
+        Stage.SOLVE,
+        "The chi-square of an object's orbit does not fit its degrees of freedom: it changed its "
+        "orbit, or its observations are of more than one object.",
+    )
+    NO_ORBIT = (
+        "no_orbit",
+        Stage.SOLVE,
+        "No orbit is found for an object: it has too few observations, or the fit does not "
+        "converge.",
+    )
     CLOCK_OFF = (
         "clock_off",
         Stage.CHECK,

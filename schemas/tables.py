@@ -18,6 +18,7 @@ from epipole.schemas.columns import (
     time_column,
     upper_triangle,
 )
+from epipole.schemas.orbit import ORBIT_FIELDS
 
 F64 = pa.float64()
 I32 = pa.int32()
@@ -379,6 +380,13 @@ STATES = schema(
     ],
 )
 
+ORBITS = schema(
+    "orbits",
+    "One row per object whose observations of the night fit one orbit: position and velocity at "
+    "the middle of the arc, fitted to all its rows of `observations`.",
+    [time_column("epoch", doc="Middle of the arc, UTC."), OBJECT_ID, *ORBIT_FIELDS],
+)
+
 IDENTIFICATIONS = schema(
     "identifications",
     "One row per object of the night, held against a catalogue of known ones.",
@@ -570,6 +578,7 @@ TABLES: dict[str, pa.Schema] = {
     "positions": POSITIONS,
     "observations": OBSERVATIONS,
     "states": STATES,
+    "orbits": ORBITS,
     "identifications": IDENTIFICATIONS,
     "calibrations": CALIBRATIONS,
     "pairs": PAIRS,

@@ -47,6 +47,7 @@ from epipole.tasks.name.object_ids import (
 )
 from epipole.tasks.name.sensor_residuals import SensorResidual
 from epipole.tasks.publish.night_parts import NightParts, publish_nights
+from epipole.tasks.publish.orbits import fit_orbits, orbit_shares, write_orbits
 from epipole.tasks.publish.write_tables import SHARES, write_tables
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs
 from epipole.tasks.read.read_logs import read_log_into
@@ -292,6 +293,15 @@ def write_night(
     parts = NightParts(night, of_night, spans, sensors, solved, names, whole)
     futures = [write_tables.submit(tables, folder, parts) for tables in SHARES]
     results(Stage.PUBLISH, futures)
+
+
+def determine_orbits(folder: Path, night: str) -> None:
+    """Fit the orbits of a night whose tables are written, and write them; see `fit_orbits`."""
+    shares = orbit_shares(folder, night)
+    futures = [fit_orbits.submit(folder, night, share, shares) for share in range(shares)]
+    fitted = results(Stage.PUBLISH, futures)
+    (count,) = results(Stage.PUBLISH, [write_orbits.submit(folder, night, fitted)])
+    LOGGER.info("fitted %s", many(count, "orbit"))
 
 
 def choose_elements(

@@ -24,3 +24,17 @@ J2 = 1.08262668e-3
 
 # IERS Conventions (2010), equation 5.15: the rate of the Earth rotation angle [rad/s of UT1].
 EARTH_RATE_RAD_S = 7.292115146706979e-5
+
+# EGM96, not normalised: zonal J3, J4, and the ellipticity of the equator.
+J3 = -2.53265649e-6
+J4 = -1.61962159e-6
+C22 = 1.57446037e-6
+S22 = -9.03803807e-7
+
+# JPL DE440 (Park et al. 2021, AJ 161:105): GM of the Sun and of the Moon [km^3/s^2].
+GM_SUN_KM3_S2 = 1.32712440041279e11
+GM_MOON_KM3_S2 = 4902.800118
+
+# Pressure of sunlight on a surface that absorbs it, at 1 AU [N/m^2]: the total solar irradiance,
+# 1361 W/m^2 (IAU 2015 Resolution B3), over the speed of light.
+SUNLIGHT_PRESSURE_N_M2 = 1361.0 / 299_792_458.0

@@ -30,6 +30,7 @@ from epipole.tasks.evaluate.measures import (
     measure_ids,
     measure_lost_objects,
     measure_observations,
+    measure_orbits,
     measure_positions,
     measure_stars,
     measure_states,
@@ -45,7 +46,7 @@ def evaluate_dataset(tables: Mapping[str, pa.Table], truth: Truth) -> Report:
     ----------
     tables
         `frames`, `stars`, `tracklets`, `detections`, `epochs`, `associations`, `positions`,
-        `observations`, `states` and `identifications` of the nights of the truth.
+        `observations`, `states`, `orbits` and `identifications` of the nights of the truth.
     truth
         The truth of all logs of these nights.
 
@@ -79,6 +80,7 @@ def _measure_objects(
     measures |= measure_ids(matched)
     measures |= measure_observations(tables["observations"], points, matched, truth, blended)
     measures |= measure_states(tables["states"], matched, truth, blended)
+    measures |= measure_orbits(tables["orbits"], tables["observations"], points, truth, blended)
     measures |= measure_passages(tables, points, truth)
     return measures | measure_tracks(detections, points)
 

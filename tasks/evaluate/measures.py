@@ -352,21 +352,55 @@ def measure_states(
         Objects whose errors are not measured: `blended_objects`.
     """
     of_state = _objects_of_ids(to_polars(states.select(["object_id"])), matched)
+    return _measure_motions("states", states, of_state, truth, blended)
+
+
+def measure_orbits(
+    orbits: pa.Table,
+    observations: pa.Table,
+    points: pl.DataFrame,
+    truth: Truth,
+    blended: Sequence[int] = (),
+) -> Measures:
+    """Return the number and the errors of orbits of true objects.
+
+    The true object of an orbit is the one that most observations of its id show.
+
+    Parameters
+    ----------
+    orbits, observations
+        ORBITS and OBSERVATIONS.
+    points
+        The centroids of the truth.
+    blended
+        Objects whose errors are not measured: `blended_objects`.
+    """
+    seen = to_polars(observations.select(["object_id", *POINT])).drop_nulls("object_id")
+    shown = with_truth(seen, points)
+    shown = shown.with_columns(true_object=pl.Series(true_objects(shown), dtype=pl.Int64))
+    of_orbit = _objects_of_ids(to_polars(orbits.select(["object_id"])), shown)
+    return _measure_motions("orbits", orbits, of_orbit, truth, blended)
+
+
+def _measure_motions(
+    name: str, states: pa.Table, of_state: Indices, truth: Truth, blended: Sequence[int]
+) -> Measures:
+    """Return the measures of STATES or ORBITS, each with its true object or -1."""
     n_of_nothing = int((of_state < 0).sum())
     real = (of_state >= 0) & ~np.isin(of_state, blended)
     if not real.any():
-        return {"states": 0}
+        return {name: 0}
     states, of_state = states.filter(pa.array(real)), of_state[real]
     error = _state_errors(states, of_state, truth)
     nees = squared_normalised_errors(error, stack_covariance(states, "cov_{}", STATE_AXES))
     return {
-        "states": len(nees),
-        "states_of_nothing": n_of_nothing,
-        "states_nees_mean": float(np.mean(nees)) / STATE_COMPONENTS,
-        "states_nees_median": float(np.median(nees)),
-        "states_nees_max": float(nees.max()),
-        "states_in_99": float(np.mean(nees < STATE_CHI2_99)),
-        "states_err_km_median": float(np.median(np.linalg.norm(error[:, :3], axis=1))),
+        name: len(nees),
+        f"{name}_of_nothing": n_of_nothing,
+        f"{name}_nees_mean": float(np.mean(nees)) / STATE_COMPONENTS,
+        f"{name}_nees_median": float(np.median(nees)),
+        f"{name}_nees_max": float(nees.max()),
+        f"{name}_in_99": float(np.mean(nees < STATE_CHI2_99)),
+        f"{name}_err_km_median": float(np.median(np.linalg.norm(error[:, :3], axis=1))),
     }
 
 

@@ -11,6 +11,7 @@ from epipole.schemas.tables import (
     FRAMES,
     IDENTIFICATIONS,
     OBSERVATIONS,
+    ORBITS,
     POSITIONS,
     STARS,
     STATES,
@@ -97,6 +98,7 @@ def little_dataset():
         "positions": rows(POSITIONS, *positions),
         "observations": rows(OBSERVATIONS, *observations),
         "states": rows(STATES, little_state("o1", x_km=1.0), little_state("o2")),
+        "orbits": rows(ORBITS, little_state("o1", x_km=0.5, forces="GM"), little_state("o3")),
         "identifications": rows(IDENTIFICATIONS),
     }
 

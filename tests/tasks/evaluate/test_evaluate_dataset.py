@@ -45,6 +45,9 @@ def test_every_measure_of_a_little_night_is_what_it_is_by_hand():
         "states": 1, "states_of_nothing": 1, "states_err_km_median": pytest.approx(1.0),
         "states_nees_mean": pytest.approx(4 / 6), "states_nees_median": pytest.approx(4.0),
         "states_nees_max": pytest.approx(4.0), "states_in_99": 1.0,
+        "orbits": 1, "orbits_of_nothing": 1, "orbits_err_km_median": pytest.approx(0.5),
+        "orbits_nees_mean": pytest.approx(1 / 6), "orbits_nees_median": pytest.approx(1.0),
+        "orbits_nees_max": pytest.approx(1.0), "orbits_in_99": 1.0,
         "tracks": 1, "track_purity": pytest.approx(1 / 3), "track_completeness": 0.25,
         "tracks_per_target": 1.0,
         **dict.fromkeys(OF_PASSAGES),  # none has five frames
@@ -55,7 +58,7 @@ def test_an_empty_dataset_has_found_nothing():
     tables = {name: empty(t.schema) for name, t in little_dataset().items()}
     found = evaluate_dataset(tables, little_truth())
     assert (found.frames, found.frames_solved, found.star_recall) == (0, 0.0, 0.0)
-    assert (found.object_recall, found.positions, found.states) == (0.0, 0, 0)
+    assert (found.object_recall, found.positions, found.states, found.orbits) == (0.0, 0, 0, 0)
     assert (found.att_wrong, found.tracks, found.nees_mean, found.states_in_99) == (None,) * 4
     assert found.id_swaps == 0
     json.dumps(found.as_dict(), allow_nan=False)

@@ -1,0 +1,154 @@
+"""Orbital elements of states, with their errors; and longitude and drift of geostationary ones."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.constants import (
+    EARTH_RATE_RAD_S,
+    GM_KM3_S2,
+)
+from epipole.tasks.algorithms.orbits.forces import Surroundings
+from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
+
+Array = npt.NDArray[np.float64]
+
+# Steps of the numerical derivatives: a share of the position and of the velocity, at which
+# rounding and curvature are both below 1e-6 of the derivative.
+DERIVATIVE_STEP = 1e-6
+TURN = 2 * np.pi
+GEOSTATIONARY_KM = (GM_KM3_S2 / EARTH_RATE_RAD_S**2) ** (1 / 3)
+# IADC Space Debris Mitigation Guidelines (2007), section 3.3.2: the geosynchronous region.
+REGION_KM = 200.0
+REGION_RAD = np.radians(15.0)
+SIGMAS = 3.0  # by which a semi-major axis may be off
+SIDEREAL_DAY_S = TURN / EARTH_RATE_RAD_S
+
+
+def elements_of(state: Array) -> Array:
+    """Return the osculating elements of states.
+
+    Parameters
+    ----------
+    state : (..., 6) float
+        Position [km] and velocity [km/s]; the elements are of the same axes.
+
+    Returns
+    -------
+    (..., 6) float
+        Semi-major axis [km], negative for a hyperbola; eccentricity; inclination, right ascension
+        of the node, argument of perigee and mean anomaly [rad], the last three in [0, 2 pi).
+
+    References
+    ----------
+    Vallado (2013), Fundamentals of Astrodynamics and Applications, algorithm 9 (RV2COE).
+    """
+    r, v = state[..., :3], state[..., 3:]
+    distance = np.linalg.norm(r, axis=-1)
+    momentum = np.cross(r, v)
+    to_perigee = np.cross(v, momentum) / GM_KM3_S2 - r / distance[..., None]
+    e = np.linalg.norm(to_perigee, axis=-1)
+    a = 1.0 / (2.0 / distance - np.sum(v * v, axis=-1) / GM_KM3_S2)
+    across = np.hypot(momentum[..., 0], momentum[..., 1])
+    i = np.arctan2(across, momentum[..., 2])
+    raan = np.arctan2(momentum[..., 0], -momentum[..., 1])
+    zero = np.zeros_like(raan)
+    node = np.stack([np.cos(raan), np.sin(raan), zero], axis=-1)
+    beyond = np.cross(momentum, node) / np.linalg.norm(momentum, axis=-1)[..., None]
+    argp = np.arctan2(np.sum(to_perigee * beyond, axis=-1), np.sum(to_perigee * node, axis=-1))
+    latitude = np.arctan2(np.sum(r * beyond, axis=-1), np.sum(r * node, axis=-1))
+    return np.stack(
+        [a, e, i, raan % TURN, argp % TURN, _mean_anomaly(latitude - argp, e) % TURN], axis=-1
+    )
+
+
+def _mean_anomaly(true: Array, e: Array) -> Array:
+    """Return mean anomalies [rad]; of a hyperbola by Kepler's equation of hyperbolas."""
+    with np.errstate(invalid="ignore"):
+        E = 2 * np.arctan(np.sqrt((1 - e) / (1 + e)) * np.tan(true / 2))
+        F = 2 * np.arctanh(np.sqrt((e - 1) / (e + 1)) * np.tan(true / 2))
+        return np.where(e < 1, E - e * np.sin(E), e * np.sinh(F) - F)
+
+
+def element_errors(state: Array, cov: Array) -> Array:
+    """Return the standard deviations of the elements of states, (n, 6), units as `elements_of`.
+
+    Parameters
+    ----------
+    state, cov : (n, 6), (n, 6, 6) float
+        States with their covariances.
+
+    Notes
+    -----
+    They are of the linear model. The perigee of a nearly circular orbit, and the node of one that
+    is nearly in the equator, have sigmas that are as large as the circle or larger.
+    """
+    lengths = [np.linalg.norm(part, axis=1) for part in (state[:, :3], state[:, 3:])]
+    step = DERIVATIVE_STEP * np.repeat(np.stack(lengths, axis=1), 3, axis=1)
+    moves = step[:, :, None] * np.eye(6)
+    change = elements_of(state[:, None] + moves) - elements_of(state[:, None] - moves)
+    change[..., 3:] = (change[..., 3:] + np.pi) % TURN - np.pi
+    jacobian = change / (2 * step[:, :, None])
+    return np.asarray(np.sqrt(np.einsum("nki,nkl,nli->ni", jacobian, cov, jacobian)))
+
+
+class Geostationary(NamedTuple):
+    """Longitude of a geostationary object at the epoch [rad], and its drift [rad/s], both east;
+    with their standard deviations."""
+
+    longitude_rad: float
+    sigma_longitude_rad: float
+    drift_rad_s: float
+    sigma_drift_rad_s: float
+
+
+def geostationary(
+    unknowns: Array, cov: Array, epoch_s: float, around: Surroundings
+) -> Geostationary | None:
+    """Return longitude and drift of an orbit in the geosynchronous region; None outside it.
+
+    Parameters
+    ----------
+    unknowns, cov : (8,), (8, 8) float
+        An orbit at the epoch, as in `DeterminedOrbit`.
+
+    Notes
+    -----
+    The drift is the change of longitude over a sidereal day around the epoch, in which the daily
+    motion of an eccentric or inclined orbit cancels.
+    """
+    state = unknowns[:6]
+    a_km, sigma_km = elements_of(state)[0], element_errors(state[None], cov[None, :6, :6])[0, 0]
+    distance = np.linalg.norm(state[:3])
+    if (
+        abs(distance - GEOSTATIONARY_KM) > REGION_KM
+        or abs(np.arcsin(state[2] / distance)) > REGION_RAD
+        or abs(a_km - GEOSTATIONARY_KM) > max(REGION_KM, SIGMAS * sigma_km)
+    ):
+        return None
+    longitude, slope = _longitude(unknowns, epoch_s, around)
+    ends, slopes = [], []
+    for half in (-0.5, 0.5):
+        to_s = epoch_s + half * SIDEREAL_DAY_S
+        there, transition = propagate_unknowns(unknowns, epoch_s, to_s, around)
+        end, of_end = _longitude(there, to_s, around)
+        ends.append(end)
+        slopes.append(of_end @ transition)
+    drift = ((ends[1] - ends[0] + np.pi) % TURN - np.pi) / SIDEREAL_DAY_S
+    of_drift = (slopes[1] - slopes[0]) / SIDEREAL_DAY_S
+    return Geostationary(
+        longitude,
+        float(np.sqrt(slope @ cov @ slope)),
+        float(drift),
+        float(np.sqrt(of_drift @ cov @ of_drift)),
+    )
+
+
+def _longitude(unknowns: Array, time_s: float, around: Surroundings) -> tuple[float, Array]:
+    """Return the longitude of an orbit [rad], in (-pi, pi], and its derivatives."""
+    x, y = unknowns[:2]
+    angle = np.arctan2(y, x) - around.era_rad - EARTH_RATE_RAD_S * time_s
+    slope = np.zeros_like(unknowns)
+    slope[:2] = np.array([-y, x]) / (x * x + y * y)
+    return float((angle + np.pi) % TURN - np.pi), slope

@@ -1,0 +1,130 @@
+"""Orbit determination: exact without errors, honest with them, and what an arc does not fit."""
+
+import numpy as np
+import pytest
+from scenes.night_orbits import AROUND, GEO, LOW, trial
+from scipy.special import chdtrc
+
+from epipole.tasks.algorithms.geometry.directions import tangent_basis
+from epipole.tasks.algorithms.orbits.orbit_determination import (
+    AreaPrior,
+    determine_orbit,
+    log_evidence,
+)
+from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
+
+METRE, MM_S = 1e-3, 1e-6
+FIXED = AreaPrior(np.zeros(2), np.zeros(2))
+SUNLIT = AreaPrior(np.array([0.03, 0.0]), np.array([0.02, 0.0]))
+AIR = AreaPrior(np.array([0.0, 0.03]), np.array([0.0, 0.06]))
+REVOLUTIONS = np.concatenate([c + np.linspace(-60, 60, 7) for c in (-21_000, -9_000, 200, 16_000)])
+
+
+def seeing(directions, u):
+    """Return the directions with other unit vectors."""
+    u = u / np.linalg.norm(u, axis=1, keepdims=True)
+    return directions._replace(u=u, basis=tangent_basis(u))
+
+
+def fit(directions, truth, areas, seed=0, km=3.0):
+    off = np.random.default_rng(seed).normal(size=6) * km * np.repeat([1.0, 1e-2], 3)
+    return determine_orbit(directions, truth[:6] + off, 0.0, 0.0, areas, AROUND)
+
+
+@pytest.mark.parametrize(("truth", "areas"), [(GEO, SUNLIT), (LOW, FIXED)])
+def test_without_errors_the_orbit_is_the_truth(truth, areas):
+    orbit = fit(trial(1, truth, noise=1e-3, bias=0.0, place_km=0.0), truth, areas)
+    assert np.linalg.norm(orbit.unknowns[:3] - truth[:3]) < 10 * METRE
+    assert np.linalg.norm(orbit.unknowns[3:6] - truth[3:6]) < 100 * MM_S
+    assert orbit.used.all()
+
+
+@pytest.mark.parametrize(
+    ("truth", "areas", "times_s", "n"),
+    [
+        (LOW, FIXED, np.linspace(-60.0, 60.0, 25), 150),
+        (GEO, SUNLIT, np.linspace(-2700.0, 2700.0, 19), 150),
+        (LOW + 0.02 * np.eye(8)[7], AIR, REVOLUTIONS, 60),
+    ],
+    ids=["two minutes of a low orbit", "90 minutes of a geostationary one", "revolutions in air"],
+)
+@pytest.mark.long
+def test_errors_over_many_trials_are_as_stated(truth, areas, times_s, n):
+    square, chi2, dof, improbable = [], 0.0, 0, 0
+    for seed in range(n):
+        directions = trial(seed, truth, times_s=times_s)
+        orbit = fit(directions, truth, areas, seed)
+        off = orbit.unknowns - truth
+        square.append(off[:6] @ np.linalg.solve(orbit.cov[:6, :6], off[:6]))
+        chi2, dof = chi2 + orbit.chi2, dof + 2 * int(orbit.used.sum()) - 6
+        improbable += chdtrc(2 * len(directions.time_s) - 6, orbit.chi2) < 1e-3
+    # The mean of n chi-squares of 6 degrees over 6 has a sigma of sqrt(1 / 3 n): 0.05 of 150.
+    assert abs(np.mean(square) / 6 - 1) < 3.5 * np.sqrt(1 / (3 * n))
+    assert abs(chi2 / dof - 1) < 0.03
+    assert improbable <= 2
+
+
+def test_a_night_of_few_passages_converges_from_a_state_of_minutes():
+    directions = trial(5, LOW, times_s=REVOLUTIONS)
+    near = trial(5, LOW, times_s=REVOLUTIONS[14:21])
+    orbit = determine_orbit(near, LOW[:6], 0.0, 0.0, FIXED, AROUND)
+    whole = determine_orbit(directions, orbit.unknowns[:6], 0.0, 0.0, FIXED, AROUND)
+    assert np.isfinite(whole.chi2)
+    # Hours of arc instead of minutes: what is predicted for six hours later is far better known.
+    sigma_km = []
+    for each in (orbit, whole):
+        _, transition = propagate_unknowns(each.unknowns, 0.0, 21_600.0, AROUND)
+        cov = transition @ each.cov @ transition.T
+        sigma_km.append(np.sqrt(np.trace(cov[:3, :3])))
+    assert sigma_km[1] < sigma_km[0] / 20
+
+
+def test_directions_of_something_else_are_left_out():
+    directions = trial(7, GEO)
+    u = directions.u.copy()
+    u[[4, 40]] += 1e-3 * directions.basis[[4, 40], 0]
+    orbit = fit(seeing(directions, u), GEO, SUNLIT)
+    assert np.flatnonzero(~orbit.used).tolist() == [4, 40]
+    off = orbit.unknowns[:6] - GEO[:6]
+    assert off @ np.linalg.solve(orbit.cov[:6, :6], off) < 22.5  # 1 in 1,000 is above
+
+
+def test_directions_of_two_objects_do_not_fit_one_orbit():
+    directions = trial(8, GEO)
+    other = GEO + 40.0 * np.eye(8)[2]
+    u = np.where((directions.sensor == 0)[:, None], trial(8, other, toward=GEO).u, directions.u)
+    orbit = fit(seeing(directions, u), GEO, SUNLIT)
+    assert orbit.used.all()
+    assert chdtrc(2 * len(u) - 6, orbit.chi2) < 1e-6
+
+
+def test_drag_is_fitted_where_the_arc_shows_it():
+    for area, shown in ((0.0, False), (0.05, True)):
+        truth = LOW + area * np.eye(8)[7]
+        directions = trial(9, truth, times_s=REVOLUTIONS)
+        still, slowed = (fit(directions, truth, areas) for areas in (FIXED, AIR))
+        gain = log_evidence(slowed, AIR) - log_evidence(still, FIXED)
+        assert (gain > 0) == shown
+    assert abs(slowed.unknowns[7] - 0.05) < 3 * np.sqrt(slowed.cov[7, 7])
+    assert np.sqrt(slowed.cov[7, 7]) < 0.01
+
+
+def test_a_fit_that_fails_is_nan():
+    directions = trial(10, GEO)
+    few = type(directions)(*(a[:3] for a in directions[:-1]), directions.prior)
+    for orbit in (
+        determine_orbit(few, GEO[:6], 0.0, 0.0, SUNLIT, AROUND),
+        determine_orbit(directions, -GEO[:6], 0.0, 0.0, SUNLIT, AROUND),
+    ):
+        assert np.isnan(orbit.unknowns).all()
+        assert np.isnan(orbit.chi2)
+        assert not orbit.used.any()
+
+
+def test_the_order_of_sensors_changes_nothing():
+    directions = trial(11, GEO)
+    turned = directions._replace(
+        sensor=2 - directions.sensor, prior=np.ascontiguousarray(directions.prior[::-1])
+    )
+    one, other = (fit(each, GEO, SUNLIT) for each in (directions, turned))
+    np.testing.assert_allclose(one.unknowns, other.unknowns, rtol=1e-9)
