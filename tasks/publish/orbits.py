@@ -30,6 +30,7 @@ from epipole.tasks.algorithms.constants import (
 )
 from epipole.tasks.algorithms.geometry.directions import east_north, unit_from_radec
 from epipole.tasks.algorithms.orbits.forces import Surroundings, surroundings
+from epipole.tasks.algorithms.orbits.initial_orbit import initial_orbit
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.algorithms.orbits.orbit_determination import (
     AreaPrior,
@@ -269,8 +270,19 @@ def observed_objects(rows: pl.DataFrame, origin_ns: int, around: Surroundings) -
 
 
 def _turned(rotation: Array, vectors: Array) -> Array:
-    """Return rotated vectors (..., k). By sums that do not depend on the rows beside a row."""
-    return np.ascontiguousarray(np.einsum("ij,...j->...i", rotation, vectors))
+    """Return rotated vectors (..., k), each the same whatever rows are beside it.
+
+    Products of matrices and `einsum` add in an order that depends on the number of rows.
+    """
+    out = np.zeros_like(vectors, order="C")
+    for i, j in np.ndindex(rotation.shape):
+        out[..., i] += rotation[i, j] * vectors[..., j]
+    return out
+
+
+def _both(rotation: Array) -> Array:
+    """Return the (6, 6) rotation of positions and velocities."""
+    return np.asarray(np.kron(np.eye(2), rotation), float)
 
 
 class FittedOrbit(NamedTuple):
@@ -289,12 +301,23 @@ class FittedOrbit(NamedTuple):
 def best_orbit(
     directions: ObjectDirections, start: Start | None, origin_ns: int, around: Surroundings
 ) -> FittedOrbit | None:
-    """Return an object's orbit; None without an initial state, and where no fit converges."""
-    if start is None:
-        return None
-    R = around.R_night_from_gcrf
-    state = np.concatenate([R @ start.state[:3], R @ start.state[3:]])
-    start_s = (start.time_ns - origin_ns) / SECOND_NS
+    """Return an object's orbit; None where no fit converges.
+
+    Without an initial state, or where no fit from it converges, it comes from the directions.
+    """
+    found = None
+    if start is not None:
+        state = _turned(_both(around.R_night_from_gcrf), start.state)
+        found = _from_state(directions, state, (start.time_ns - origin_ns) / SECOND_NS, around)
+    if found is None and (initial := initial_orbit(directions, around)) is not None:
+        found = _from_state(directions, *initial, around)
+    return found
+
+
+def _from_state(
+    directions: ObjectDirections, state: Array, start_s: float, around: Surroundings
+) -> FittedOrbit | None:
+    """Return the orbit, from an initial state, whose forces explain the directions best."""
     first_s, last_s = float(directions.time_s[0]), float(directions.time_s[-1])
     epoch_s = (first_s + last_s) / 2
     found: list[tuple[float, FittedOrbit]] = []
@@ -340,9 +363,9 @@ def orbit_table(
 ) -> pa.Table:
     """Return ORBITS of objects, given by their numbers."""
     rows, fitted, n = list(orbits), list(orbits.values()), len(orbits)
-    turn = np.asarray(np.kron(np.eye(2), around.R_night_from_gcrf.T), float)
+    turn = _both(around.R_night_from_gcrf.T)
     state = _turned(turn, np.array([each.orbit.unknowns[:6] for each in fitted]).reshape(n, 6))
-    cov = turn @ np.array([each.orbit.cov[:6, :6] for each in fitted]).reshape(n, 6, 6) @ turn.T
+    cov = np.array([turn @ each.orbit.cov[:6, :6] @ turn.T for each in fitted]).reshape(n, 6, 6)
     used = [np.flatnonzero(each.orbit.used) for each in fitted]
     at = [objects.rows(k).start + of_one for k, of_one in zip(rows, used, strict=True)]
     counted = {

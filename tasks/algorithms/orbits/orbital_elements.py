@@ -90,7 +90,8 @@ def element_errors(state: Array, cov: Array) -> Array:
     change = elements_of(state[:, None] + moves) - elements_of(state[:, None] - moves)
     change[..., 3:] = (change[..., 3:] + np.pi) % TURN - np.pi
     jacobian = change / (2 * step[:, :, None])
-    return np.asarray(np.sqrt(np.einsum("nki,nkl,nli->ni", jacobian, cov, jacobian)))
+    # Products matrix by matrix: a row does not depend on those beside it.
+    return np.asarray(np.sqrt(np.sum(jacobian * np.matmul(cov, jacobian), axis=1)))
 
 
 class Geostationary(NamedTuple):

@@ -61,4 +61,4 @@ def test_what_is_no_dataset_is_named(tmp_path):
 
 def test_an_unknown_table_is_named(night_dataset):
     with pytest.raises(KeyError, match="there is no such table; the tables are frames, stars"):
-        api.open_dataset(night_dataset)["orbits"]
+        api.open_dataset(night_dataset)["clouds"]

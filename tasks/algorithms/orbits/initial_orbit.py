@@ -1,0 +1,165 @@
+"""Initial orbit: a state from directions alone, without anything known of the distances.
+
+Over some minutes the path is nearly a parabola, and then the directions of several satellites are
+linear equations of its position and velocity. Where these do not decide, as with one satellite:
+two directions leave two unknowns, the distance and how fast it changes. All pairs of these are
+tried; each gives an orbit, which is compared with the directions between.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.constants import GM_KM3_S2
+from epipole.tasks.algorithms.orbits.forces import Surroundings
+from epipole.tasks.algorithms.orbits.orbit_determination import (
+    AreaPrior,
+    ObjectDirections,
+    determine_orbit,
+)
+from epipole.tasks.algorithms.orbits.state_interpolation import LOWEST_ORBIT_KM, gravity
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+LONGEST_S = 600.0  # between the two directions: beyond it one pair of distances has many orbits
+DISTANCES_KM = np.geomspace(50.0, 60_000.0, 48)  # 16 % apart, which the fit converges from
+RATES_KM_S = np.linspace(-15.0, 15.0, 41)  # of the distance: two low satellites that meet
+COMPARED, FITTED = 16, 100  # directions of these minutes, at most
+REFINED = 6  # of the best orbits, which are fitted
+STEP_S = 60.0  # of Runge-Kutta, about: right to some metres in ten minutes
+FITS = 1.5  # chi-square over its degrees of freedom: no other orbit is tried
+ROUNDS = 6  # of the linear equations, each with the gravity of the path before
+SHOTS = 3  # of the velocity; each leaves a hundredth of the miss
+GRAVITY_ALONE = AreaPrior(np.zeros(2), np.zeros(2))
+
+
+def initial_orbit(directions: ObjectDirections, around: Surroundings) -> tuple[Array, float] | None:
+    """Return a state (6,) [km, km/s] and its time [s] by some minutes of the directions.
+
+    None if no bound orbit fits. Axes and times are those of the directions.
+
+    References
+    ----------
+    Gooding (1997), A new procedure for the solution of the classical problem of minimal orbit
+    determination from three lines of sight, CMDA 66:387, improves two distances from a guess. Here
+    they are searched over a grid, so that no orbit is missed.
+    """
+    first, last = _widest_pair(directions)
+    if first == last:
+        return None
+    chosen = np.unique(np.linspace(first, last, COMPARED).round().astype(np.int64))
+    time_s, _, r_km, u, *_ = directions
+    span_s = float(time_s[last] - time_s[first])
+    rho, rate = (a.ravel()[:, None] for a in np.meshgrid(DISTANCES_KM, RATES_KM_S, indexing="ij"))
+    near = r_km[first] + rho * u[first]
+    far = r_km[last] + np.maximum(rho + rate * span_s, DISTANCES_KM[0]) * u[last]
+    states = _orbits_through(near, far, span_s)
+    misfit = _misfit(states, directions, chosen)
+    part = _rows(directions, np.unique(np.linspace(first, last, FITTED).round().astype(np.int64)))
+    order = np.argsort(misfit, kind="stable")[:REFINED]
+    tried = [_along_parabola(part), *states[order[np.isfinite(misfit[order])]]]
+    at_s, dof = float(time_s[first]), 2 * len(part.time_s) - 6
+    best: tuple[float, Array] | None = None
+    for state in tried:
+        orbit = determine_orbit(part, state, at_s, at_s, GRAVITY_ALONE, around)
+        above = float(np.linalg.norm(orbit.unknowns[:3])) > LOWEST_ORBIT_KM  # false of NaN
+        if above and (best is None or orbit.chi2 < best[0]):
+            best = orbit.chi2, orbit.unknowns[:6]
+        if best is not None and best[0] < FITS * dof:
+            break
+    return None if best is None else (best[1], at_s)
+
+
+def _along_parabola(part: ObjectDirections) -> Array:
+    """Return the state (6,) at the first direction whose path misses the lines of sight least.
+
+    The misses are weighed by the distances of the round before.
+    """
+    tau = part.time_s - part.time_s[0]
+    fall, weight = np.zeros((len(tau), 3)), np.ones(len(tau))
+    state = np.zeros(6)
+    for _ in range(ROUNDS):
+        rows = np.concatenate([part.basis, part.basis * tau[:, None, None]], axis=2)
+        right = np.einsum("npa,na->np", part.basis, part.r_km - fall)
+        scale = np.array([1.0, 1.0, 1.0, *(1.0 / max(tau[-1], 1.0) * np.ones(3))])
+        equations = (rows * weight[:, None, None] * scale).reshape(-1, 6)
+        state = scale * np.linalg.lstsq(equations, (right * weight[:, None]).ravel())[0]
+        path = state[:3] + tau[:, None] * state[3:] + fall
+        weight = 1.0 / np.maximum(np.linalg.norm(path - part.r_km, axis=1), 1.0)
+        pull = gravity(path)
+        # Twice the integral of the pull, as if it changed evenly from the first instant on.
+        fall = tau[:, None] ** 2 * (2.0 * pull[:1] + pull) / 6.0
+    return state
+
+
+def _widest_pair(directions: ObjectDirections) -> tuple[int, int]:
+    """Return the first and last direction of the stretch, at most `LONGEST_S`, that most sensors
+    saw, and of these the longest."""
+    time_s, sensor = directions.time_s, directions.sensor
+    ends = np.searchsorted(time_s, time_s + LONGEST_S, side="right") - 1
+    begins = np.flatnonzero(np.diff(ends, prepend=-1) > 0)
+    best = max(
+        begins.tolist(),
+        key=lambda k: (len(np.unique(sensor[k : ends[k] + 1])), time_s[ends[k]] - time_s[k]),
+    )
+    return best, int(ends[best])
+
+
+def _rows(directions: ObjectDirections, rows: Indices) -> ObjectDirections:
+    time_s, sensor, r_km, u, basis, weight, prior = directions
+    present, sensor = np.unique(sensor[rows], return_inverse=True)
+    return ObjectDirections(
+        time_s[rows], sensor.astype(np.int64), r_km[rows], u[rows], basis[rows], weight[rows],
+        prior[present],
+    )  # fmt: skip
+
+
+def _orbits_through(near: Array, far: Array, span_s: float) -> Array:
+    """Return states (n, 6) at the first of two positions; NaN where the orbit is not bound."""
+    with np.errstate(all="ignore"):
+        v = (far - near) / span_s - gravity((near + far) / 2) * span_s / 2
+        speed = np.linalg.norm((far - near) / span_s, axis=1)
+        radius = [np.linalg.norm(r, axis=1) for r in (near, far)]
+        possible = (np.minimum(*radius) > LOWEST_ORBIT_KM) & (
+            speed < np.sqrt(2 * GM_KM3_S2 / np.minimum(*radius))
+        )
+        states = np.full((len(near), 6), np.nan)
+        rows = np.flatnonzero(possible)
+        near, far, v = near[rows], far[rows], v[rows]
+        for _ in range(SHOTS):
+            v = v - (_moved(np.hstack([near, v]), span_s)[:, :3] - far) / span_s
+        bound = np.sum(v * v, axis=1) < 2 * GM_KM3_S2 / np.linalg.norm(near, axis=1)
+        states[rows] = np.where(bound[:, None], np.hstack([near, v]), np.nan)
+    return states
+
+
+def _moved(states: Array, dt_s: float) -> Array:
+    """Return states (n, 6) after a time: mass and flattening of the Earth (Runge-Kutta)."""
+    steps = max(int(np.ceil(abs(dt_s) / STEP_S)), 1)
+    h, y = dt_s / steps, states
+    for _ in range(steps):
+        k1 = _rates(y)
+        k2 = _rates(y + h / 2 * k1)
+        k3 = _rates(y + h / 2 * k2)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + _rates(y + h * k3))
+    return y
+
+
+def _rates(y: Array) -> Array:
+    return np.concatenate([y[:, 3:], gravity(y[:, :3])], axis=1)
+
+
+def _misfit(states: Array, directions: ObjectDirections, chosen: Indices) -> Array:
+    """Return the sum of squared angles [rad^2] between states and directions; infinite if NaN."""
+    total = np.full(len(states), np.inf)
+    rows = np.flatnonzero(np.isfinite(states[:, 0]))
+    y, now = states[rows], directions.time_s[chosen[0]]
+    squares = np.zeros(len(rows))
+    with np.errstate(all="ignore"):
+        for k in chosen:
+            y, now = _moved(y, float(directions.time_s[k] - now)), directions.time_s[k]
+            line = y[:, :3] - directions.r_km[k]
+            line /= np.linalg.norm(line, axis=1, keepdims=True)
+            squares += np.sum((line - directions.u[k]) ** 2, axis=1)
+    total[rows] = np.where(np.isfinite(squares), squares, np.inf)
+    return total
