@@ -389,9 +389,11 @@ ORBITS = schema(
 
 IDENTIFICATIONS = schema(
     "identifications",
-    "One row per object of the night, held against a catalogue of known ones.",
+    "One row per object of the night, and with a catalogue one per tracklet that belongs to none, "
+    "held against a catalogue of known objects.",
     [
-        OBJECT_ID,
+        id_column("object_id", null=True, doc="Null in the row of a tracklet."),
+        id_column("tracklet_id", null=True, doc="Null in the row of an object."),
         column("status", pa.string(), doc="A `NameStatus`: known, ambiguous or unknown."),
         id_column(
             "same_as",
@@ -419,14 +421,18 @@ IDENTIFICATIONS = schema(
             "nearest one that it is not.",
         ),
         column(
-            "distance_km", F64, unit="km", null=True, doc="Distance of the object from its place."
+            "distance_km",
+            F64,
+            unit="km",
+            null=True,
+            doc="Distance from its place; of a tracklet, that of the place from the line of sight.",
         ),
         column(
             "mahalanobis",
             F64,
             null=True,
             doc="The same in units of its standard deviation: of the elements, by their age, and "
-            "of the position.",
+            "of the position; of a tracklet with its rates.",
         ),
         column("probability", F64, null=True, doc="Of the status; null without a catalogue."),
         column(

@@ -34,7 +34,8 @@ from epipole.tasks.check.check_sensors import (
 )
 from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.identify.identify_span import Counts, identify_span
-from epipole.tasks.name.known_objects import ElementsOfNight, elements_of_night, name_known_objects
+from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
+from epipole.tasks.name.known_objects import name_known_objects
 from epipole.tasks.name.object_ids import (
     VIEWS,
     Names,

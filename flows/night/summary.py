@@ -1,6 +1,6 @@
 """The summary of a run: counts of what it found, and of what it left out by reason."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -48,7 +48,8 @@ class SensorSummary:
 class Summary:
     """Counts of what was published.
 
-    `names` are the objects by what is known of their names; empty without a catalogue. `faults` of
+    `names` are the objects by what is known of their names, `tracklet_names` the tracklets that
+    belong to none; both are empty without a catalogue. `faults` of
     sensors and `residuals` of their known objects are a sentence each. `unchanged` nights were not
     made again.
     """
@@ -67,6 +68,7 @@ class Summary:
     objects: int
     positions: int
     names: dict[str, int]
+    tracklet_names: dict[str, int]
     rejects: dict[str, int]
     faults: list[str]
     residuals: list[str]
@@ -122,11 +124,14 @@ class Summary:
         return [f"  without   {many(sum(alone.values()), 'tracklet')}: {parts}"]
 
     def _names(self) -> list[str]:
-        """Return what is known of the objects' names, and of the sensors by known objects."""
-        if not self.names:
-            return []
-        counts = ", ".join(f"{count:,} {status}" for status, count in self.names.items())
-        return [f"names       {counts}", *[f"  {residual}" for residual in self.residuals]]
+        """Return what is known of names, and of the sensors by known objects."""
+        lines = []
+        for counts, of in ((self.names, "object"), (self.tracklet_names, "tracklet")):
+            if counts:
+                parts = ", ".join(f"{count:,} {status}" for status, count in counts.items())
+                heading = "names" if not lines else ""
+                lines.append(f"{heading:<12}{many(sum(counts.values()), of)}: {parts}")
+        return lines + [f"  {residual}" for residual in self.residuals]
 
     def _left_out(self) -> list[str]:
         """Return what was left out, by reason; nothing where nothing was."""
@@ -147,7 +152,7 @@ _COLUMNS = {
     "epochs": ["epoch"],
     "positions": ["object_id"],
     "sources": ["sha256"],
-    "identifications": ["status", "catalogue"],
+    "identifications": ["object_id", "status", "catalogue"],
     "rejects": ["reason", "count"],
 }
 
@@ -186,7 +191,8 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
         nights=list(nights),
         **counts,
         outcomes=_outcomes(tables["tracklets"]),
-        names=_names(tables["identifications"]),
+        names=_names(tables["identifications"], pc.is_valid),
+        tracklet_names=_names(tables["identifications"], pc.is_null),
         rejects=by_reason(tables["rejects"]),
         faults=_by_night({night: row["faults"] for night, row in rows.items()}),
         residuals=_by_night({night: row["residuals"] for night, row in rows.items()}),
@@ -206,9 +212,10 @@ def _tables(folders: Sequence[Where]) -> dict[str, pa.Table]:
     }
 
 
-def _names(identifications: pa.Table) -> dict[str, int]:
-    """Return the objects by status; empty without a catalogue."""
-    statuses = identifications.filter(pc.is_valid(identifications["catalogue"]))["status"]
+def _names(identifications: pa.Table, has_object: Callable[..., Any]) -> dict[str, int]:
+    """Return the objects, or the tracklets, by status; empty without a catalogue."""
+    rows = identifications.filter(has_object(identifications["object_id"]))
+    statuses = rows.filter(pc.is_valid(rows["catalogue"]))["status"].combine_chunks()
     counts = dict(zip(*(c.to_pylist() for c in pc.value_counts(statuses).flatten()), strict=True))
     return {status.value: counts[status] for status in NameStatus if status in counts}
 

@@ -110,7 +110,11 @@ def as_markdown(summary: Summary) -> str:
         "objects": summary.objects,
         "epochs": summary.epochs,
         "positions": summary.positions,
-    } | {f"objects {status}": count for status, count in summary.names.items()}
+    } | {
+        f"{of} {status}": count
+        for of, counts in (("objects", summary.names), ("tracklets", summary.tracklet_names))
+        for status, count in counts.items()
+    }
     lines = [f"# Night {', '.join(summary.nights)}", "", *_table("what", counts), ""]
     if summary.unchanged:
         lines += ["Nothing has changed since it was made, so it was not made again.", ""]

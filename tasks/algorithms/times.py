@@ -81,6 +81,18 @@ def earth_velocity(time_ns: Nanoseconds) -> Array:
     return (1.0 - share) * before[at] + share * after[at]
 
 
+def direction_to_sun(time_ns: Nanoseconds) -> Array:
+    """Return unit vectors from the Earth to the Sun, (n, 3), ICRS axes, at any number of times.
+
+    Those of the nearest ten minutes: within 0.004 degrees.
+    """
+    node = (np.asarray(time_ns, np.int64) + NODE_NS // 2) // NODE_NS
+    nodes, at = np.unique(node, return_inverse=True)
+    from_sun, _ = erfa.epv00(*tt_julian_date(nodes * NODE_NS))
+    to_sun = -from_sun["p"]
+    return np.asarray(to_sun / np.linalg.norm(to_sun, axis=1, keepdims=True))[at]
+
+
 # Epochs
 
 

@@ -171,10 +171,16 @@ def _named(
     if not numbers:
         return {}
     known = identifications.filter(pl.col("status") == "known")
-    named = tracklets.join(ids, on="tracklet_id").join(
-        known.select("object_id", "norad_id").unique("object_id", keep="last"), on="object_id"
+    of_objects = known.drop_nulls("object_id").unique("object_id", keep="last")
+    of_tracklets = known.drop_nulls("tracklet_id").select("tracklet_id", of_it="norad_id")
+    named = (
+        tracklets.join(ids, on="tracklet_id", how="left")
+        .join(of_objects.select("object_id", "norad_id"), on="object_id", how="left")
+        .join(of_tracklets, on="tracklet_id", how="left")
+        .select("true_object", norad_id=pl.coalesce("of_it", "norad_id"))
+        .drop_nulls("norad_id")
     )
-    right = sum(numbers.get(k) == n for k, n in named.select("true_object", "norad_id").rows())
+    right = sum(numbers.get(k) == n for k, n in named.iter_rows())
     n_real = tracklets.filter(pl.col("true_object") >= 0).height
     return {"named_right": share(right, n_real), "named_wrong": named.height - right}
 

@@ -1,27 +1,22 @@
 """Name known objects: compare each object of a night with a catalogue and with earlier nights.
 
 The errors of the elements are learnt from the certain matches of the night. Then all objects are
-judged with them.
+judged with them, and after them the tracklets that belong to none.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from epipole.io.catalogues.element_sets import KnownObjects
 from epipole.io.datasets.night_tables import read_columns, take_rows, write_table
-from epipole.schemas.bridge import array, concat, stack, stack_covariance, table
+from epipole.schemas.bridge import array, stack, stack_covariance, table
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
-from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import KnownObjectSettings
-from epipole.schemas.spans import DAY_NS
 from epipole.schemas.stages import Stage
-from epipole.schemas.star_lists import ElementSet, nearest_sets
-from epipole.schemas.tables import IDENTIFICATIONS, REJECTS, STATES
+from epipole.schemas.tables import IDENTIFICATIONS, STATES
 from epipole.tasks.algorithms.known_objects.matching import (
     Candidate,
     KnownSatellites,
@@ -37,11 +32,12 @@ from epipole.tasks.algorithms.known_objects.prediction import (
     LOW_ORBIT,
     Screen,
     is_deep_space,
-    predict,
     satellites_of,
 )
 from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, link_by_motion
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.name.elements_of_night import ElementsOfNight, Names, names_of
+from epipole.tasks.name.known_tracklets import name_tracklets, tracklet_rows
 from epipole.tasks.name.sensor_residuals import SensorResidual, sensor_residuals
 
 # Objects of earlier nights, recognised by their motion.
@@ -102,50 +98,6 @@ def _motions(states: pl.DataFrame) -> ObservedMotions:
     return ObservedMotions(at_s, at_s, at_s, at_s, motion, motion, cov, cov)
 
 
-# Elements: one usable set for each object of a catalogue.
-
-
-class ElementsOfNight(NamedTuple):
-    """The element sets of a catalogue that are used in a night, each of another object."""
-
-    sha256: str
-    sets: list[ElementSet]
-
-    @property
-    def elements(self) -> np.ndarray:
-        """Mean elements, (n, 10); see `ElementSet`."""
-        return np.array([each.elements for each in self.sets]).reshape(-1, 10)
-
-
-def elements_of_night(
-    known: KnownObjects, night: str, most_days: float
-) -> tuple[ElementsOfNight, pa.Table]:
-    """Return the elements that are used in a night, and `rejects` of those that are not.
-
-    Of each object it is the set whose epoch is nearest to the middle of the night.
-    """
-    middle_ns = int(np.datetime64(night, "ns").astype(np.int64)) + DAY_NS // 2
-    most_ns = most_days * DAY_NS
-    nearest = nearest_sets(known.sets, middle_ns)
-    recent = [each for each in nearest if abs(each.epoch_ns - middle_ns) <= most_ns]
-    made = ElementsOfNight(known.sha256, recent)
-    states = predict(satellites_of(made.elements), np.array([middle_ns]))
-    sound = np.atleast_1d(np.isfinite(states[:, 0]).all(axis=1))
-    used = [each for each, is_sound in zip(recent, sound, strict=True) if is_sound]
-    counts = {
-        Reason.BAD_ELEMENTS: len(known.faults),
-        Reason.OTHER_ELEMENTS: len(known.sets) - len(nearest),
-        Reason.OLD_ELEMENTS: len(nearest) - len(recent),
-        Reason.FAILED_ELEMENTS: len(recent) - len(used),
-    }
-    rejects = [
-        reject_rows(reason, source=known.file, time=[middle_ns - DAY_NS // 2], count=[count])
-        for reason, count in counts.items()
-        if count
-    ]
-    return made._replace(sets=used), concat(REJECTS, rejects)
-
-
 # The judgement of all objects.
 
 SURE = 0.999  # probability of a match from which errors are learnt
@@ -167,7 +119,7 @@ def name_known_objects(
     folder
         The night's folder.
     known
-        None: without a catalogue; all objects are unknown.
+        None: without a catalogue; all objects are unknown, and tracklets have no rows.
     earlier
         STATES of earlier nights.
 
@@ -177,12 +129,16 @@ def name_known_objects(
         How far each sensor's detections of known objects are from their predictions.
     """
     observed, spans = observed_objects(folder)
-    verdicts = judge_objects(observed, known, settings.probability) if known is not None else {}
+    verdicts: dict[str, NameVerdict] = {}
+    of_tracklets = []
+    if known is not None:
+        verdicts, learnt = judge_objects(observed, known, settings.probability)
+        of_tracklets = [tracklet_rows(name_tracklets(folder, learnt, settings.probability), known)]
     verdicts = _without_rivals(verdicts, spans)
     unnamed = [name for name in observed if _status(verdicts, name) != "known"]
     same_as = recognise_objects(folder, unnamed, earlier, settings.earlier_h, link_log_odds)
     rows = _rows(list(observed), verdicts, known, same_as)
-    write_table(folder, "identifications", [rows])
+    write_table(folder, "identifications", [rows, *of_tracklets])
     if known is None:
         return []
     return sensor_residuals(
@@ -217,8 +173,8 @@ def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, tuple
 
 def judge_objects(
     observed: Mapping[str, Observed], known: ElementsOfNight, least: float
-) -> dict[str, NameVerdict]:
-    """Return what each object is, with the errors of elements learnt from the sure matches."""
+) -> tuple[dict[str, NameVerdict], KnownSatellites]:
+    """Return what each object is, and the catalogue with the errors that the sure matches show."""
     satellites = satellites_of(known.elements)
     epoch_ns = np.array([each.epoch_ns for each in known.sets], np.int64)
     catalogue = KnownSatellites(satellites, epoch_ns, LOW_ORBIT, HIGH_ORBIT)
@@ -227,10 +183,11 @@ def judge_objects(
     judged = [judge(found, SURE) for found in first.values()]
     sure = [each.best for each in judged if each.status == "known" and each.best is not None]
     learnt = _learnt(catalogue, sure)
-    return {
+    verdicts = {
         name: judge(candidates(of, learnt, screen) if first[name] else [], least)
         for name, of in observed.items()
     }
+    return verdicts, learnt
 
 
 def _learnt(catalogue: KnownSatellites, sure: Sequence[Candidate]) -> KnownSatellites:
@@ -276,27 +233,6 @@ def _status(verdicts: Mapping[str, NameVerdict], name: str) -> str:
     return verdicts[name].status if name in verdicts else "unknown"
 
 
-class _Names(NamedTuple):
-    """What the catalogue says of an object."""
-
-    norad_id: int | None = None
-    cospar_id: str | None = None
-    name: str | None = None
-    element_epoch: int | None = None
-
-
-def _names(verdict: NameVerdict | None, sets: Sequence[ElementSet]) -> _Names:
-    if verdict is None or verdict.best is None:
-        return _Names()
-    best = sets[verdict.best.row]
-    if verdict.status == "known":
-        return _Names(best.number, best.cospar_id or None, best.name or None, best.epoch_ns)
-    if verdict.status == "ambiguous":
-        names = " / ".join(sets[row].name or str(sets[row].number) for row in verdict.rows)
-        return _Names(name=names, element_epoch=best.epoch_ns)
-    return _Names(element_epoch=best.epoch_ns)
-
-
 def _rows(
     objects: Sequence[str],
     verdicts: Mapping[str, NameVerdict],
@@ -306,16 +242,15 @@ def _rows(
     """Return IDENTIFICATIONS: a row per object, in order of their ids."""
     sets = known.sets if known is not None else []
     of = [verdicts.get(name) for name in objects]
-    names = [_names(verdict, sets) for verdict in of]
+    names = [names_of(v.status, sets, v.best.row, v.rows) if v and v.best else Names() for v in of]
     best = [verdict.best if verdict is not None else None for verdict in of]
-    columns = {field: [getattr(each, field) for each in names] for field in _Names._fields}
-    time = IDENTIFICATIONS.field("element_epoch").type
-    columns["element_epoch"] = pa.array(columns["element_epoch"], pa.int64()).cast(time)
+    columns = {field: [getattr(each, field) for each in names] for field in Names._fields}
     return table(
         IDENTIFICATIONS,
         columns
         | {
             "object_id": list(objects),
+            "tracklet_id": [None] * len(objects),
             "status": [_status(verdicts, name) for name in objects],
             "same_as": [same_as.get(name) for name in objects],
             "distance_km": [each.distance_km if each else None for each in best],

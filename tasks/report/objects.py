@@ -92,7 +92,7 @@ def read_objects(night: NightReader) -> list[NightObject]:
 
 def _names(night: NightReader) -> dict[str, tuple[str, str]]:
     """Return the status and the name of each object."""
-    rows = night.read("identifications", ["object_id", "status", "name"])
+    rows = night.read("identifications", ["object_id", "status", "name"]).drop_nulls("object_id")
     return {
         name: (status, known if known is not None and status == NameStatus.KNOWN else "")
         for name, status, known in rows.iter_rows()

@@ -26,7 +26,8 @@ from epipole.schemas.settings import KnownObjectSettings
 from epipole.schemas.star_lists import ElementSet
 from epipole.tasks.algorithms.known_objects.matching import Observed, spread_rows
 from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
-from epipole.tasks.name.known_objects import ElementsOfNight, judge_objects
+from epipole.tasks.name.elements_of_night import ElementsOfNight
+from epipole.tasks.name.known_objects import judge_objects
 
 TOGETHER_KM = 20.0
 LISTED = 2 / 3
@@ -99,7 +100,7 @@ def count_verdicts(scene: Scene) -> tuple[Counter[tuple[str, str]], list[str], f
     """Return the verdicts by kind of object, the wrong ones, and the CPU time [s]."""
     known = ElementsOfNight("", scene.catalogue)
     start = time.process_time()
-    verdicts = judge_objects(scene.observed, known, KnownObjectSettings().probability)
+    verdicts, _ = judge_objects(scene.observed, known, KnownObjectSettings().probability)
     cpu_s = time.process_time() - start
     counts: Counter[tuple[str, str]] = Counter()
     wrong = []

@@ -10,7 +10,7 @@ geostationary slot, and parts of one launch, are near each other.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -99,7 +99,7 @@ class KnownSatellites(NamedTuple):
 class Candidate(NamedTuple):
     """A satellite that an object may be.
 
-    `apart_km` (3,) is the object's position minus the predicted one at the anchor: along, up,
+    `offset` (3,) [km] is the object's position minus the predicted one at the anchor: along, up,
     across. In these axes `cov` (3, 3) is the covariance of the object's position, and `jacobian`
     (3, 6) the derivatives of the predicted position by the errors of the elements. `sigma` (6,)
     are the 1-sigma errors of the elements. The three `log_` are log densities of the positions: of
@@ -107,7 +107,7 @@ class Candidate(NamedTuple):
     """
 
     row: int  # of the catalogue
-    apart_km: Array
+    offset: Array
     cov: Array
     jacobian: Array
     sigma: Array
@@ -120,13 +120,13 @@ class Candidate(NamedTuple):
     @property
     def distance_km(self) -> float:
         """Distance of the object from the predicted position [km]."""
-        return float(np.linalg.norm(self.apart_km))
+        return float(np.linalg.norm(self.offset))
 
     @property
     def mahalanobis(self) -> float:
         """Mahalanobis distance of the object from the predicted position."""
         S = self.cov + _element_covariance(self.jacobian, self.sigma)
-        return float(np.sqrt(self.apart_km @ np.linalg.solve(S, self.apart_km)))
+        return float(np.sqrt(self.offset @ np.linalg.solve(S, self.offset)))
 
 
 def candidates(observed: Observed, catalogue: KnownSatellites, screen: Screen) -> list[Candidate]:
@@ -221,7 +221,7 @@ def _log_mixture(z: Array, noise: Array, element_cov: Array) -> tuple[float, boo
     """
     terms = [_log_normal(z, noise + factor**2 * element_cov) for factor, _ in QUALITIES]
     density = logsumexp([term for term, _ in terms], b=[share for _, share in QUALITIES])
-    return float(density), min(d2 for _, d2 in terms) < _quantile(len(z))
+    return float(density), min(d2 for _, d2 in terms) < chi2_quantile(len(z))
 
 
 def _log_normal(z: Array, S: Array) -> tuple[float, float]:
@@ -232,8 +232,9 @@ def _log_normal(z: Array, S: Array) -> tuple[float, float]:
     return -(d2 + log_det + len(z) * np.log(2 * np.pi)) / 2, d2
 
 
-def _quantile(size: int) -> float:
-    return float(2 * gammaincinv(size / 2, GATE_SHARE))  # chi-square
+def chi2_quantile(size: int) -> float:
+    """Return the chi-square that a share `GATE_SHARE` of true matches of this size is below."""
+    return float(2 * gammaincinv(size / 2, GATE_SHARE))
 
 
 class NameVerdict(NamedTuple):
@@ -289,8 +290,25 @@ def spread_rows(time_ns: npt.NDArray[np.int64], preferred: npt.NDArray[np.bool_]
 # Errors of elements, learnt from matches
 
 
+class Residual(Protocol):
+    """An observed minus a predicted value, and where its error is from.
+
+    `offset` (k,), its covariance `cov` (k, k) without the errors of the elements, and its
+    derivatives `jacobian` (k, 6) by these errors, in any one set of units.
+    """
+
+    @property
+    def offset(self) -> Array: ...
+    @property
+    def cov(self) -> Array: ...
+    @property
+    def jacobian(self) -> Array: ...
+    @property
+    def age_days(self) -> float: ...
+
+
 def learn_errors(
-    matches: Sequence[Candidate], satellites: Sequence[object], start: ElementErrors
+    matches: Sequence[Residual], satellites: Sequence[object], start: ElementErrors
 ) -> ElementErrors:
     """Return the most probable errors of elements, from the differences of certain matches.
 
@@ -313,7 +331,7 @@ def learn_errors(
     if len(matches) < MIN_MATCHES:
         return start
 
-    apart_km = np.array([match.apart_km for match in matches])
+    offset = np.array([match.offset for match in matches])
     cov = np.array([match.cov for match in matches])
     jacobian = np.array([match.jacobian for match in matches])
 
@@ -323,7 +341,7 @@ def learn_errors(
             [sigmas(s, m.age_days, errors) for s, m in zip(satellites, matches, strict=True)]
         )
         S = cov + (jacobian * sigma[:, None, :] ** 2) @ np.swapaxes(jacobian, 1, 2)
-        d2 = np.einsum("ni,ni->n", apart_km, np.linalg.solve(S, apart_km[:, :, None])[:, :, 0])
+        d2 = np.einsum("ni,ni->n", offset, np.linalg.solve(S, offset[:, :, None])[:, :, 0])
         log_det = np.linalg.slogdet(S)[1]
         return float((d2 + log_det).sum() + (log_factors**2).sum() / PRIOR_SIGMA**2)
 

@@ -39,6 +39,7 @@ DEEP_SPACE_RAD_S = 2 * np.pi / (225 * 60)
 # axis], and a drift along the track [km/day].
 ERROR_COMPONENTS = ("along", "radial", "radial", "across", "across", "drift")
 NODE_NS = 1_800_000_000_000
+AXES_NS = 300_000_000_000
 # Error of two-body motion over a quarter of an hour, as a share of the radius: twice the largest
 # error that was measured.
 NEGLECTED_SHARE = 0.005
@@ -96,18 +97,47 @@ def predict(satellites: Satellites, time_ns: Nanoseconds) -> Array:
     shape = len(satellites), len(time_ns)
     if not all(shape):
         return np.empty((*shape, 6))
-    utc = utc_julian_date(time_ns)
-    code, r_km, v_km_s = SatrecArray(list(satellites)).sgp4(*utc)
-    zeros = np.zeros(len(time_ns))
-    # The rotation from TEME hardly depends on UT1: UTC is used instead.
-    orientation = Orientation(utc, zeros, zeros, zeros)
-    axes = [np.tile(axis, (len(time_ns), 1)) for axis in np.eye(3)]
-    R = np.stack([gcrf_from_teme(time_ns, x, x, orientation)[0] for x in axes], axis=2)
-    states = np.concatenate(
-        [np.einsum("mij,nmj->nmi", R, x) for x in (r_km, v_km_s)], axis=2, dtype=float
+    return predict_all(SatrecArray(list(satellites)), time_ns)
+
+
+def predict_all(satellites: SatrecArray, time_ns: Nanoseconds) -> Array:
+    """Return the same of an array of satellites, which takes a time to make for many."""
+    code, r_km, v_km_s = satellites.sgp4(*utc_julian_date(time_ns))
+    R = _gcrf_axes(time_ns)
+    turned = (
+        np.stack([x[:, k] @ axes.T for k, axes in enumerate(R)], axis=1) for x in (r_km, v_km_s)
     )
+    states = np.concatenate(list(turned), axis=2, dtype=float)
     bad = (np.asarray(code) != 0) | ~np.isfinite(states).all(axis=2)
     return np.where(bad[:, :, None], np.nan, states)
+
+
+def predict_each(satellites: Satellites, row: Indices, time_ns: Nanoseconds) -> Array:
+    """Return the states of satellites `row` (n,), each at a time of its own, (n, 6).
+
+    As `predict`. The axes of TEME are those of the nearest five minutes: they turn by less than
+    1e-9 rad in this time.
+    """
+    states = np.full((len(row), 6), np.nan)
+    utc = zip(*(part.tolist() for part in utc_julian_date(time_ns)), strict=True)
+    for k, (satellite, jd) in enumerate(zip(row.tolist(), utc, strict=True)):
+        code, r_km, v_km_s = satellites[satellite].sgp4(*jd)
+        if code == 0:
+            states[k] = *r_km, *v_km_s
+    nodes, at = np.unique((time_ns + AXES_NS // 2) // AXES_NS, return_inverse=True)
+    R = _gcrf_axes(nodes * AXES_NS)[at]
+    return np.asarray(np.einsum("nij,nkj->nki", R, states.reshape(-1, 2, 3)).reshape(-1, 6))
+
+
+def _gcrf_axes(time_ns: Nanoseconds) -> Array:
+    """Return (m, 3, 3) rotations from TEME, the axes of SGP4, to GCRF.
+
+    They hardly depend on UT1: UTC is used instead.
+    """
+    zeros = np.zeros(len(time_ns))
+    orientation = Orientation(utc_julian_date(time_ns), zeros, zeros, zeros)
+    axes = [np.tile(axis, (len(time_ns), 1)) for axis in np.eye(3)]
+    return np.stack([gcrf_from_teme(time_ns, x, x, orientation)[0] for x in axes], axis=2)
 
 
 def is_deep_space(satellite: Any) -> bool:
@@ -116,19 +146,31 @@ def is_deep_space(satellite: Any) -> bool:
 
 
 def sigmas(satellite: Any, age_days: float, errors: ElementErrors) -> Array:
-    """Return the 1-sigma errors of a satellite's elements, (6,); see `ERROR_COMPONENTS`.
+    """Return the 1-sigma errors of a satellite's elements, (6,); see `ERROR_COMPONENTS`."""
+    return sigmas_of(errors, age_days, drag_error_km(satellite, age_days))
 
-    The error due to drag grows with the square of the age. It is a share of the displacement along
-    the track by which drag moves a low satellite in SGP4.
+
+def sigmas_of(errors: ElementErrors, age_days: float | Array, drag_km: float | Array) -> Array:
+    """Return the 1-sigma errors of elements of some ages, (..., 6); see `ERROR_COMPONENTS`.
+
+    `drag_km` is the error along the track that is due to drag (see `drag_error_km`).
     """
-    a_km = semi_major_axis(satellite)
-    minutes = abs(age_days) * DAY_S / 60.0
-    drag_km = DRAG_UNKNOWN * a_km * abs(_drag_change(satellite, minutes)) * minutes / 2
     along = np.hypot(np.hypot(errors.along_km, errors.along_km_day * age_days), drag_km)
     radial = np.hypot(errors.radial_km, errors.radial_km_day * age_days)
     across = np.hypot(errors.across_km, errors.across_km_day * age_days)
-    drift = np.hypot(errors.along_km_day, 2 * drag_km / max(abs(age_days), 1.0))
-    return np.array([along, radial, radial, across, across, drift])
+    drift = np.hypot(errors.along_km_day, 2 * drag_km / np.maximum(np.abs(age_days), 1.0))
+    return np.stack([along, radial, radial, across, across, drift], axis=-1)
+
+
+def drag_error_km(satellite: Any, age_days: float) -> float:
+    """Return the 1-sigma error along the track due to drag [km].
+
+    It grows with the square of the age: a share of the displacement along the track by which drag
+    moves a low satellite in SGP4.
+    """
+    minutes = abs(age_days) * DAY_S / 60.0
+    change = abs(_drag_change(satellite, minutes))
+    return DRAG_UNKNOWN * semi_major_axis(satellite) * change * minutes / 2
 
 
 def sensitivities(satellite: Any, time_ns: Nanoseconds, anchor: int) -> Array:
@@ -199,14 +241,18 @@ def semi_major_axis(satellite: Any) -> float:
 
 
 def _drag_change(satellite: Any, minutes: float) -> float:
-    """Return the change of the mean motion by drag in SGP4 after some minutes [rad/min]."""
+    """Return the change of the mean motion by drag in SGP4 after some minutes [rad/min].
+
+    Zero of a satellite that has come down by then.
+    """
     if is_deep_space(satellite):
         return 0.0
     mean_motions = []
     for t in (0.0, minutes):
         satellite.sgp4_tsince(t)
         mean_motions.append(float(satellite.nm))
-    return mean_motions[1] - mean_motions[0]
+    change = mean_motions[1] - mean_motions[0]
+    return change if np.isfinite(change) else 0.0
 
 
 def along_up_across(state: Array) -> Array:

@@ -22,7 +22,7 @@ FOUND = {
     "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "outcomes": {"object": 7},
     "epochs": 6, "objects": 5,
     "positions": 4, "rejects": {"no_state": 34, "bad_sigma": 1}, "faults": [], "by_sensor": [],
-    "names": {}, "residuals": [], "unchanged": False, "extracts": (),
+    "names": {}, "tracklet_names": {}, "residuals": [], "unchanged": False, "extracts": (),
 }  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from scenes.walker import DAY_NS, NIGHT_NS, satellites
 
 from epipole.io.catalogues.element_sets import Fault, KnownObjects
 from epipole.schemas.settings import KnownObjectSettings, Settings
-from epipole.tasks.name.known_objects import elements_of_night
+from epipole.tasks.name.elements_of_night import elements_of_night
 
 NIGHT = "2026-05-30"
 

@@ -4,14 +4,16 @@ import numpy as np
 import polars as pl
 import pytest
 from scenes.associations import filled
+from scenes.seen_tracklets import as_table, seen_from_near
 from scenes.walker import NIGHT_NS, satellites
 
 from epipole.io.datasets.night_tables import PART, write_table
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY, upper_triangle
 from epipole.schemas.settings import KnownObjectSettings, Settings
-from epipole.schemas.tables import OBSERVATIONS, POSITIONS, STATES
+from epipole.schemas.tables import OBSERVATIONS, POSITIONS, STATES, TRACKLETS
 from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
-from epipole.tasks.name.known_objects import ElementsOfNight, name_known_objects
+from epipole.tasks.name.elements_of_night import ElementsOfNight
+from epipole.tasks.name.known_objects import name_known_objects
 
 SIGMA_KM = 0.1
 DAY_NS = 86_400_000_000_000
@@ -79,9 +81,10 @@ def states(seen, sigma_km=0.05, sigma_km_s=1e-5):
 def named(tmp_path):
     """Return a function that names the objects of a night, and returns the table's rows."""
 
-    def name(seen, known, *, earlier=None, sensors=(), settings=None):
+    def name(seen, known, *, earlier=None, sensors=(), settings=None, tracklets=None):
         tables = {"positions": positions(np.random.default_rng(1), seen), "states": states(seen),
-                  "observations": observations(seen, sensors)}  # fmt: skip
+                  "observations": observations(seen, sensors),
+                  "tracklets": tracklets or TRACKLETS.empty_table()}  # fmt: skip
         for table, rows in tables.items():
             write_table(tmp_path, table, [rows])
         before = states(earlier) if earlier else STATES.empty_table()
@@ -172,3 +175,44 @@ def test_a_late_clock_shows_in_the_residuals_of_its_sensor(named, fleet):
     assert late.along_km == pytest.approx(-3.7, abs=0.2)  # half a second of 7.4 km/s
     assert abs(late.across_km) < 0.05
     assert "b: along -3." in str(late)
+
+
+def test_tracklets_without_object_have_rows_of_their_own(named, fleet):
+    rng = np.random.default_rng(4)
+    seen, rows = seen_from_near(fleet, 40, rng)
+    ids = [f"t{k:02d}" for k in range(40)]
+    made = as_table(seen, ids, object_id=[*["o"] * 3, *[None] * 37])
+    found, _ = named({"o": (fleet[0], seconds(10))}, ElementsOfNight("digest", fleet[:20]),
+                     tracklets=made)  # fmt: skip
+    assert found["object_id"].to_list() == ["o", *[None] * 37]
+    assert found["tracklet_id"].to_list() == [None, *ids[3:]]
+    of = found.filter(pl.col("tracklet_id").is_not_null())
+    expected = [100_000 + k if k < 20 else None for k in rows[3:].tolist()]
+    assert of["norad_id"].to_list() == expected
+    assert of["status"].to_list() == ["unknown" if n is None else "known" for n in expected]
+    assert (of["catalogue"] == "digest").all()
+    assert of.filter(status="known")["distance_km"].max() < 1.0
+
+
+def test_two_tracks_of_one_sensor_at_one_time_are_not_one_satellite(named, fleet):
+    seen, _ = seen_from_near(fleet[:1], 1, np.random.default_rng(5))
+    twice = type(seen)(*(np.concatenate([column, column]) for column in seen))
+    for tracks, status in ((["a", "b"], "ambiguous"), (["a", "a"], "known")):
+        made = as_table(twice, ["t1", "t2"], track_id=tracks)
+        found, _ = named({}, ElementsOfNight("digest", fleet), tracklets=made)
+        assert found["status"].to_list() == [status] * 2
+    assert found["name"].to_list() == ["SAT 0"] * 2
+
+
+def test_without_a_catalogue_tracklets_have_no_rows(named, fleet):
+    seen, _ = seen_from_near(fleet, 3, np.random.default_rng(6))
+    rows, _ = named({}, None, tracklets=as_table(seen, ["t1", "t2", "t3"]))
+    assert not len(rows)
+
+
+def test_a_tracklet_without_direction_is_unknown(named, fleet):
+    seen, _ = seen_from_near(fleet, 2, np.random.default_rng(7))
+    made = as_table(seen, ["t1", "t2"], ra_deg=[None, 1.0], epoch=[None, NIGHT_NS])
+    rows, _ = named({}, ElementsOfNight("digest", fleet), tracklets=made)
+    assert rows["status"].to_list() == ["unknown"] * 2
+    assert rows["distance_km"].null_count() == 2

@@ -1,0 +1,163 @@
+"""Name tracklets: compare those that belong to no object with a catalogue.
+
+The errors of the elements are learnt once more, from the sure matches of the night's tracklets.
+Then all tracklets are judged with them.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+
+from epipole.io.datasets.night_tables import read_columns
+from epipole.schemas.bridge import nullable, stack_covariance, table
+from epipole.schemas.columns import ATTRIBUTABLE_AXES, POSITION, VELOCITY, upper_triangle
+from epipole.schemas.tables import IDENTIFICATIONS
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.known_objects.matching import KnownSatellites, learn_errors
+from epipole.tasks.algorithms.known_objects.prediction import is_deep_space
+from epipole.tasks.algorithms.known_objects.tracklet_matching import (
+    PairWeights,
+    TrackletNames,
+    judge_tracklets,
+    match_tracklets,
+    residuals_of,
+    weigh_pairs,
+)
+from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, Tracklets
+from epipole.tasks.name.elements_of_night import ElementsOfNight, Names, names_of
+
+SURE = 0.999  # probability of a match from which errors are learnt
+MAX_LEARNT = 300  # tracklets, evenly chosen: they tell the errors to a tenth
+_COVARIANCE = [f"cov_{a}{b}" for a, b in upper_triangle(ATTRIBUTABLE_AXES)]
+_COLUMNS = [
+    "tracklet_id", "track_id", "object_id", "sensor_id", "start_time", "end_time", "epoch",
+    "ra_deg", "dec_deg", "ra_rate_arcsec_s", "dec_rate_arcsec_s", *_COVARIANCE,
+    "bias_sigma_arcsec", *POSITION, *VELOCITY, "position_sigma_km", "magnitude",
+]  # fmt: skip
+
+
+class NamedTracklets(NamedTuple):
+    """The tracklets of a night that belong to no object, in order of their ids, and their names.
+
+    `names` has rows as `ids` has; `pairs` and `weights` are what it points to.
+    """
+
+    ids: list[str]
+    names: TrackletNames
+    pairs: Pairs
+    weights: PairWeights
+
+
+def name_tracklets(
+    folder: Path, catalogue: KnownSatellites, min_probability: float
+) -> NamedTracklets:
+    """Return what a catalogue says of the tracklets of a night that belong to no object.
+
+    Parameters
+    ----------
+    folder
+        The night's folder; its `tracklets` are written.
+    catalogue
+        Its errors of elements are those that the night's objects show.
+    min_probability
+        Minimum probability of a name that is given.
+    """
+    rows = pl.DataFrame(read_columns(folder, "tracklets", _COLUMNS))
+    rows = rows.filter(pl.col("object_id").is_null()).sort("tracklet_id")
+    has_orbit = rows.select(
+        pl.all_horizontal(pl.col("epoch", "cov_rara", *POSITION, *VELOCITY).is_not_null())
+    ).to_series()
+    compared = np.flatnonzero(has_orbit.to_numpy())
+    tracklets = _tracklets(rows[compared])
+    pairs = match_tracklets(tracklets, catalogue)
+    catalogue = _learnt(tracklets, pairs, catalogue)
+    weights = weigh_pairs(tracklets, pairs, catalogue)
+    pairs = pairs._replace(tracklet=compared[pairs.tracklet])
+    names = judge_tracklets(len(rows), pairs, weights, min_probability)
+    names = _without_rivals(names, pairs, rows)
+    return NamedTracklets(rows["tracklet_id"].to_list(), names, pairs, weights)
+
+
+def _tracklets(rows: pl.DataFrame) -> Tracklets:
+    cov = stack_covariance(rows, "cov_{}", ATTRIBUTABLE_AXES) * ARCSEC**2
+    bias = rows["bias_sigma_arcsec"].fill_null(0.0).to_numpy() * ARCSEC
+    cov[:, [0, 1], [0, 1]] += bias[:, None] ** 2
+    return Tracklets(
+        time_ns=rows["epoch"].cast(pl.Int64).to_numpy(),
+        ra_dec=np.radians(rows.select("ra_deg", "dec_deg").to_numpy()),
+        rates=rows.select("ra_rate_arcsec_s", "dec_rate_arcsec_s").to_numpy() * ARCSEC,
+        cov=cov,
+        r_km=rows.select(POSITION).to_numpy(),
+        v_km_s=rows.select(VELOCITY).to_numpy(),
+        position_sigma_km=rows["position_sigma_km"].fill_null(0.0).to_numpy(),
+        magnitude=rows["magnitude"].cast(pl.Float64).fill_null(np.nan).to_numpy(),
+    )
+
+
+def _learnt(tracklets: Tracklets, pairs: Pairs, catalogue: KnownSatellites) -> KnownSatellites:
+    """Return the catalogue with the errors of its elements as some sure matches show them."""
+    which = pairs.tracklet % (len(tracklets.time_ns) // MAX_LEARNT + 1) == 0
+    pairs = pairs.take(which)
+    weights = weigh_pairs(tracklets, pairs, catalogue)
+    first = judge_tracklets(len(tracklets.time_ns), pairs, weights, SURE)
+    sure = pairs.take(first.pair[first.status == "known"])
+    is_deep = np.array([is_deep_space(catalogue.satellites[k]) for k in sure.satellite], bool)
+    errors = []
+    for of_kind, start in ((~is_deep, catalogue.low), (is_deep, catalogue.high)):
+        chosen = sure.take(of_kind)
+        satellites = [catalogue.satellites[k] for k in chosen.satellite.tolist()]
+        residuals = residuals_of(tracklets, chosen, catalogue)
+        errors.append(learn_errors(residuals, satellites, start))
+    return catalogue._replace(low=errors[0], high=errors[1])
+
+
+def _without_rivals(names: TrackletNames, pairs: Pairs, rows: pl.DataFrame) -> TrackletNames:
+    """Return the names; two tracks of one sensor at one time are not one satellite."""
+    known = np.flatnonzero(names.status == "known")
+    of = (
+        rows[known]
+        .select("track_id", "sensor_id", "start_time", "end_time")
+        .with_columns(row=known, satellite=pairs.satellite[names.pair[known]])
+    )
+    both = of.join(of, on=["sensor_id", "satellite"], suffix="_other").filter(
+        pl.col("track_id") != pl.col("track_id_other"),
+        pl.col("start_time") <= pl.col("end_time_other"),
+        pl.col("start_time_other") <= pl.col("end_time"),
+    )
+    rivals = both["row"].unique().to_numpy()
+    status = names.status.copy()
+    status[rivals] = "ambiguous"
+    listed = {int(k): (int(pairs.satellite[names.pair[k]]),) for k in rivals}
+    return names._replace(status=status, listed=names.listed | listed)
+
+
+def tracklet_rows(named: NamedTracklets, known: ElementsOfNight) -> pa.Table:
+    """Return the rows of IDENTIFICATIONS of tracklets, in order of their ids."""
+    pair, status = named.names.pair, named.names.status.tolist()
+    row = np.full(len(pair), -1)
+    row[pair >= 0] = named.pairs.satellite[pair[pair >= 0]]
+    names = [
+        names_of(of, known.sets, best, named.names.listed.get(k, ())) if best >= 0 else Names()
+        for k, (of, best) in enumerate(zip(status, row.tolist(), strict=True))
+    ]
+    count = len(names)
+    fitted = {
+        name: np.append(getattr(named.weights, name), np.nan)[pair]
+        for name in ("distance_km", "mahalanobis")
+    }
+    return table(
+        IDENTIFICATIONS,
+        {field: [getattr(each, field) for each in names] for field in Names._fields}
+        | {name: nullable(values) for name, values in fitted.items()}
+        | {
+            "object_id": [None] * count,
+            "tracklet_id": named.ids,
+            "status": status,
+            "same_as": [None] * count,
+            "probability": named.names.probability,
+            "catalogue": [known.sha256] * count,
+        },
+    )
