@@ -125,7 +125,7 @@ class Summary:
 
     def _names(self) -> list[str]:
         """Return what is known of names, and of the sensors by known objects."""
-        lines = []
+        lines: list[str] = []
         for counts, of in ((self.names, "object"), (self.tracklet_names, "tracklet")):
             if counts:
                 parts = ", ".join(f"{count:,} {status}" for status, count in counts.items())

@@ -82,7 +82,7 @@ class Tracklets(NamedTuple):
 
     def take(self, rows: Indices) -> "Tracklets":
         """Return some of the tracklets."""
-        return Tracklets(*(column[rows] for column in self))
+        return Tracklets._make(column[rows] for column in self)
 
     def axes(self) -> Array:
         """Return the line of sight and the directions of growing ra and dec as rows, (m, 3, 3)."""
@@ -105,7 +105,7 @@ class Pairs(NamedTuple):
 
     def take(self, which: npt.NDArray[np.bool_] | Indices | slice) -> "Pairs":
         """Return some of the pairs."""
-        return Pairs(*(column[which] for column in self))
+        return Pairs._make(column[which] for column in self)
 
 
 def find_pairs(
