@@ -113,7 +113,7 @@ def predict_all(satellites: SatrecArray, time_ns: Nanoseconds) -> Array:
 
 
 def predict_each(satellites: Satellites, row: Indices, time_ns: Nanoseconds) -> Array:
-    """Return the states of satellites `row` (n,), each at a time of its own, (n, 6).
+    """Return the states of satellites `row` (n,), one time for each, (n, 6).
 
     As `predict`. The axes of TEME are those of the nearest five minutes: they turn by less than
     1e-9 rad in this time.

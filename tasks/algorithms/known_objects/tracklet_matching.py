@@ -60,7 +60,7 @@ CHUNK = 20_000  # pairs that are weighed at once
 class PairWeights(NamedTuple):
     """How well each of k pairs fits.
 
-    `distance_km` and `mahalanobis` are of the predicted place from the observed direction, as in
+    `distance_km` and `mahalanobis` are of the prediction from the observed direction, as in
     `matching.Candidate`, and so are the log densities; `fits` is false where no usual error
     explains the difference.
     """
@@ -125,7 +125,7 @@ def weigh_pairs(tracklets: Tracklets, pairs: Pairs, catalogue: KnownSatellites) 
 def residuals_of(
     tracklets: Tracklets, pairs: Pairs, catalogue: KnownSatellites
 ) -> list[TrackletResidual]:
-    """Return the differences of tracklets from their satellites, in units of their own."""
+    """Return the differences of tracklets from their satellites, in units of their errors."""
     errors = ErrorsOfPairs(catalogue, pairs.satellite, _middle_ns(tracklets))
     ages = _ages(tracklets, pairs, catalogue)
     linear = _linearised(tracklets, pairs, errors.sigmas(pairs.satellite, ages), ages)
@@ -210,7 +210,7 @@ class _Linear(NamedTuple):
     `offset` (k, 4): direction and rates, observed minus predicted, each in units of `unit` (k, 4)
     [rad, rad/s], its 1-sigma error; `cov` (k, 4, 4) and `jacobian` (k, 4, 6) as in
     `matching.Residual`. `distance_km` is that from the sensor,
-    `apart_km` that of the predicted place from the line of sight.
+    `apart_km` that of the prediction from the line of sight.
     """
 
     offset: Array
@@ -283,15 +283,15 @@ def _predicted(of: Tracklets, axes: Array, states: Array) -> tuple[Array, Array,
     w = w - receding / SPEED_OF_LIGHT_KM_S * v - delay_s * pull
     ahead, ahead_rate = (np.einsum("kj,kj->k", axes[:, 0], x)[:, None] for x in (line, w))
     ahead = np.maximum(ahead, MIN_AHEAD_SHARE * distance)
-    place = np.einsum("kij,kj->ki", axes[:, 1:], line) / ahead
-    towards = axes[:, 1:] - place[:, :, None] * axes[:, :1]
+    offset = np.einsum("kij,kj->ki", axes[:, 1:], line) / ahead
+    towards = axes[:, 1:] - offset[:, :, None] * axes[:, :1]
     rate = np.einsum("kij,kj->ki", towards, w) / ahead
     jacobian = np.zeros((len(states), 4, 6))
     jacobian[:, :2, :3] = jacobian[:, 2:, 3:] = towards / ahead[:, :, None]
     jacobian[:, 2:, :3] = -(
         towards * (ahead_rate / ahead**2)[:, :, None] + (rate / ahead)[:, :, None] * axes[:, :1]
     )
-    return np.concatenate([place, rate], axis=1), jacobian, distance[:, 0]
+    return np.concatenate([offset, rate], axis=1), jacobian, distance[:, 0]
 
 
 def _changes(states: Array) -> Array:

@@ -2,10 +2,10 @@
 
 1. All satellites are predicted at nodes of ten minutes, with cubics between them, and sorted into
    cubes of space anew for each half minute.
-2. A tracklet is a line of sight from its sensor. The satellites in the cubes along it are held
-   against it, and all that are farther from the Earth than the cubes reach.
-3. One that would be seen so if it were ahead of its place, or behind, and that would then move
-   nearly so, is predicted by SGP4 at the tracklet's own epoch.
+2. A tracklet is a line of sight from its sensor. The satellites in the cubes along it are
+   compared with it, and all that are farther from the Earth than the cubes reach.
+3. One that would be seen so if it were ahead of its prediction, or behind, and that would then move
+   nearly so, is predicted by SGP4 at the tracklet's epoch.
 """
 
 from typing import NamedTuple
@@ -39,13 +39,13 @@ N_CUBES = 30  # per axis: they reach to 9,000 km
 OVER, UP = (-1, -1, -1, 0, 0, 0, 1, 1, 1), (-1, 0, 1, -1, 0, 1, -1, 0, 1)  # columns of cubes
 LOWEST_KM = 6000.0  # a line of sight ends inside the Earth
 # The motion that is allowed to differ: a share of it, shares for each share of the distance that
-# the place may be off across the track, and errors of both.
+# the position may be off across the track, and errors of both.
 RATE_SHARE = 0.03
 RATE_SHARES = 3.0
 RATE_SIGMAS = 6.0
 RATE_KM_S = 0.03  # of the elements, beside what moves with the sensor
 # The Sun's radius over its distance: the Earth's shadow narrows by this. Within the margin of its
-# edge a satellite may be lit: its place is not known better, and air bends light.
+# edge a satellite may be lit: its position is not known better, and air bends light.
 SUN_RADIUS_RAD = 0.00465
 SHADOW_MARGIN_KM = 100.0
 MIN_DISTANCE_KM = 20.0  # nearer is the satellite that carries the sensor
@@ -118,7 +118,7 @@ def find_pairs(
     satellites
         n of them.
     along_km, aside_km : (n,) float
-        How far each satellite may be from its predicted place along its track, at most
+        How far each satellite may be from its prediction along its track, at most
         `MAX_REACH_KM`, and at right angles to it.
     """
     order = np.argsort(tracklets.time_ns, kind="stable")
@@ -140,7 +140,7 @@ def find_pairs(
 
 
 def _states(tracklets: Tracklets, satellites: Satellites, both: Indices) -> Array:
-    """Return the states of pairs. Velocities are derivatives: SGP4's own lack small terms."""
+    """Return the states of pairs. Velocities are derivatives: those of SGP4 lack small terms."""
     time_ns = tracklets.time_ns[both[:, 0]]
     before, at, after = (
         predict_each(satellites, both[:, 1], time_ns + dt_ns)[:, :3]
@@ -195,7 +195,7 @@ def _between(before, after, share):
 
 @inlined_kernel
 def _cube(x, y, z):
-    """Return the number of the cube of a place; `N_CUBES` ** 3 outside of all."""
+    """Return the number of the cube of a point; `N_CUBES` ** 3 outside of all."""
     half = N_CUBES // 2
     i, j = int(np.floor(x / CUBE_KM)) + half, int(np.floor(y / CUBE_KM)) + half
     k = int(np.floor(z / CUBE_KM)) + half
@@ -270,7 +270,7 @@ def _near(lines, dt_s, states, order, first, reach_km):
 
 @borrowing_kernel
 def _row(first, x, y, z):
-    """Return the first and last satellite in the cube of a place and the two beside it in z."""
+    """Return the first and last satellite in the cube of a point and the two beside it in z."""
     half = N_CUBES // 2
     i, j = int(np.floor(x / CUBE_KM)) + half, int(np.floor(y / CUBE_KM)) + half
     k = int(np.floor(z / CUBE_KM)) + half
@@ -320,7 +320,7 @@ def _is_beside(lines, i, dt, states, k, n):
 def _fits(lines, i, dt, states, k, reach_km, satellite):
     """Return whether a satellite may be on a line of sight, and move as the tracklet does.
 
-    It may be ahead of its place or behind.
+    It may be ahead of its prediction or behind.
     """
     along_km, aside_km = reach_km[satellite, 0], reach_km[satellite, 1]
     ux, uy, uz = lines[i, 0], lines[i, 1], lines[i, 2]
@@ -333,7 +333,7 @@ def _fits(lines, i, dt, states, k, reach_km, satellite):
     dv = dx * vx + dy * vy + dz * vz
     if d2 - ahead * ahead > (along_km + aside_km) ** 2:
         return False
-    # How far ahead of its place [s] it would be nearest to the line.
+    # How far ahead of its prediction [s] it would be nearest to the line.
     v2_aside = max(v2 - vu * vu, np.float32(1e-6) * v2)
     limit = along_km / np.sqrt(v2)
     s = min(max((ahead * vu - dv) / v2_aside, -limit), limit)
