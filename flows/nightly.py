@@ -136,8 +136,10 @@ def nightly(
                 whole = {"sources": sources, "calibrations": made.calibrations,
                          "rejects": concat(REJECTS, [rejects, made.rejects, unused])}  # fmt: skip
                 staged[date] = staging / f"night={date}"
-                write_night(made.work, made.solved, date, names, whole, staged[date])
-                determine_orbits(staged[date], date)
+                linked = write_night(
+                    made.work, made.solved, date, names, whole, staged[date], settings
+                )
+                determine_orbits(staged[date], date, linked)
                 states = earlier.last_states(date, settings)
                 residuals = name_known(staged[date], elements, states, settings)
                 faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]

@@ -362,6 +362,11 @@ class Outcome(Declared):
     """What became of a tracklet. If several are true at different times, the first one counts."""
 
     OBJECT = "object", "It belongs to an object, and a position of the object was solved with it."
+    LINKED = (
+        "linked",
+        "It belongs to an object by an orbit that also explains tracklets of other times or "
+        "sensors; no position was solved with it.",
+    )
     DISAGREES = (
         "disagrees",
         "It was associated with an object, but each position was solved without it (the reason "

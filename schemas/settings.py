@@ -344,6 +344,26 @@ class StateSettings(Group):
     )
 
 
+class LinkingSettings(Group):
+    """Tracklets of different times that are joined by one orbit."""
+
+    enabled: bool = Field(True, description="Whether tracklets are joined by orbits.")
+    max_gap_s: float = Field(
+        900.0,
+        gt=0,
+        le=2400,
+        description="Longest time between two tracklets that are compared. Less than half a low "
+        "orbit: beyond it, an object may have passed once more.",
+    )
+    log_odds: float = Field(
+        7.0,
+        gt=0,
+        le=MAX_LOG_ODDS,
+        description="Least log-odds (ln) that tracklets are one object. At the default, 1 in 1,000 "
+        "links is wrong.",
+    )
+
+
 class KnownObjectSettings(Group):
     """Objects compared with a catalogue of known ones, and with earlier nights."""
 
@@ -402,6 +422,7 @@ class Settings(Group):
     association: AssociationSettings = AssociationSettings()
     positions: PositionSettings = PositionSettings()
     states: StateSettings = StateSettings()
+    linking: LinkingSettings = LinkingSettings()
     known_objects: KnownObjectSettings = KnownObjectSettings()
     work: WorkSettings = WorkSettings()
     report: ReportSettings = ReportSettings()

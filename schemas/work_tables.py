@@ -365,6 +365,26 @@ ATTRIBUTABLES = schema(
     [id_column("tracklet_id", doc="Its id in the night."), *ATTRIBUTABLE_FIELDS],
 )
 
+LINKED_TRACKLETS = schema(
+    "linked_tracklets",
+    "One row per tracklet that an orbit joins to an object.",
+    [
+        id_column("tracklet_id", doc="Its id in the night."),
+        id_column("object_id", doc="The object."),
+    ],
+)
+
+LINKED_ORBITS = schema(
+    "linked_orbits",
+    "One row per object that has no position: the orbit that joins its tracklets.",
+    [
+        id_column("object_id", doc="The object."),
+        time_column("epoch", doc="Of the state, UTC."),
+        *axes("{}_km", unit="km", frame="GCRF", doc="Position"),
+        *axes("v{}_km_s", unit="km/s", frame="GCRF", doc="Velocity"),
+    ],
+)
+
 HOT_SUSPECTS = schema(
     "hot_suspects",
     "One row per tracklet of one sensor that is a hot pixel, unless another sensor sees an object "

@@ -36,6 +36,7 @@ from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.identify.identify_span import Counts, identify_span
 from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
 from epipole.tasks.name.known_objects import name_known_objects
+from epipole.tasks.name.link_tracklets import Links, link_tracklets
 from epipole.tasks.name.object_ids import (
     VIEWS,
     Names,
@@ -49,7 +50,7 @@ from epipole.tasks.name.object_ids import (
 from epipole.tasks.name.sensor_residuals import SensorResidual
 from epipole.tasks.publish.night_parts import NightParts, publish_nights
 from epipole.tasks.publish.orbits import fit_orbits, orbit_shares, write_orbits
-from epipole.tasks.publish.write_tables import SHARES, write_tables
+from epipole.tasks.publish.write_tables import SHARES, tracklets_of_night, write_tables
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs
 from epipole.tasks.read.read_logs import read_log_into
 from epipole.tasks.track.join_tracklets import join_tracklets
@@ -280,8 +281,11 @@ def write_night(
     names: Names,
     whole: Mapping[str, pa.Table],
     folder: Path,
-) -> None:
-    """Write the tables of a night to its folder.
+    settings: Settings,
+) -> pa.Table:
+    """Join tracklets by orbits, and write the tables of a night to its folder.
+
+    Returns LINKED_ORBITS.
 
     Parameters
     ----------
@@ -292,17 +296,36 @@ def write_night(
     sensors = list(work.sensor_parts().values())
     of_night = spans_of_night(spans, night)
     parts = NightParts(night, of_night, spans, sensors, solved, names, whole)
+    parts, orbits = _link(parts, settings)
     futures = [write_tables.submit(tables, folder, parts) for tables in SHARES]
     results(Stage.PUBLISH, futures)
+    return orbits
 
 
-def determine_orbits(folder: Path, night: str) -> None:
+def determine_orbits(folder: Path, night: str, linked: pa.Table) -> None:
     """Fit the orbits of a night whose tables are written, and write them; see `fit_orbits`."""
     shares = orbit_shares(folder, night)
-    futures = [fit_orbits.submit(folder, night, share, shares) for share in range(shares)]
+    futures = [fit_orbits.submit(folder, night, share, shares, linked) for share in range(shares)]
     fitted = results(Stage.PUBLISH, futures)
     (count,) = results(Stage.PUBLISH, [write_orbits.submit(folder, night, fitted)])
     LOGGER.info("fitted %s", many(count, "orbit"))
+
+
+def _link(parts: NightParts, settings: Settings) -> tuple[NightParts, pa.Table]:
+    """Return the parts with the tracklets that an orbit joins, and LINKED_ORBITS.
+
+    See `link_tracklets`.
+    """
+    future = link_tracklets.submit(tracklets_of_night(parts), parts.night, settings.linking)
+    links: Links
+    (links,) = results(Stage.NAME, [future])
+    if links.tracklets.num_rows:
+        LOGGER.info("linked %s by orbits", many(links.tracklets.num_rows, "tracklet"))
+    names = {
+        folder: {old: links.renamed.get(new, new) for old, new in of_span.items()}
+        for folder, of_span in parts.names.items()
+    }
+    return parts._replace(names=names, linked=links.tracklets), links.orbits
 
 
 def choose_elements(

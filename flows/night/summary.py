@@ -116,12 +116,15 @@ class Summary:
         return ", ".join(parts)
 
     def _without_object(self) -> list[str]:
-        """Return how many tracklets have no object, by outcome; nothing if all have one."""
-        alone = {name: n for name, n in self.outcomes.items() if name != Outcome.OBJECT}
+        """Return how many tracklets orbits joined, and how many have no object, by outcome."""
+        joined = {Outcome.OBJECT, Outcome.LINKED}
+        alone = {name: n for name, n in self.outcomes.items() if name not in joined}
+        linked = self.outcomes.get(Outcome.LINKED, 0)
+        lines = [f"  linked    {many(linked, 'tracklet')} by orbits"] if linked else []
         if not alone:
-            return []
+            return lines
         parts = ", ".join(f"{count:,} {name}" for name, count in alone.items())
-        return [f"  without   {many(sum(alone.values()), 'tracklet')}: {parts}"]
+        return [*lines, f"  without   {many(sum(alone.values()), 'tracklet')}: {parts}"]
 
     def _names(self) -> list[str]:
         """Return what is known of names, and of the sensors by known objects."""

@@ -13,6 +13,7 @@ from epipole.io.work.work_layout import SensorParts, SolvedParts
 from epipole.schemas.bridge import array
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
+from epipole.schemas.work_tables import LINKED_TRACKLETS
 from epipole.tasks.common.stage_tasks import stage_task
 
 # Parts.
@@ -23,7 +24,8 @@ class NightParts(NamedTuple):
 
     `spans` are the night's, in order; `all_spans` also has one before and after it. `names` has,
     for the folder of each span, the names in the night of its objects. `whole` has tables that
-    belong to no span: `calibrations`, `sources`, and some of the `rejects`.
+    belong to no span: `calibrations`, `sources`, and some of the `rejects`. `linked` are
+    LINKED_TRACKLETS.
     """
 
     night: str
@@ -33,6 +35,7 @@ class NightParts(NamedTuple):
     solved: SolvedParts
     names: Mapping[str, Mapping[str, str]]
     whole: Mapping[str, pa.Table]
+    linked: pa.Table = LINKED_TRACKLETS.empty_table()
 
 
 # Publication: the staged tables become the dataset's, all at once.

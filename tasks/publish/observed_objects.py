@@ -3,7 +3,7 @@
 A tracklet is an unbroken run of detections of one object. So its detections before and after the
 epochs at which other sensors saw the object are observations of it too. Near an epoch at which the
 position was solved without the tracklet, they are not. A tracklet that no other sensor saw has
-observations without an object.
+observations without an object, unless an orbit joins it to one.
 """
 
 from collections.abc import Iterator, Mapping
@@ -35,7 +35,7 @@ def observations(parts: NightParts) -> Iterator[pa.Table]:
         for rows in in_slices(tables, span, "time"):
             seen = with_objects(to_polars(concat(SIGHTINGS, rows)), runs)
             seen = seen.filter(pl.col("tracklet_id").is_in(hot.implode()).not_())
-            seen = published(seen)
+            seen = with_links(published(seen), parts)
             yield from_polars(OBSERVATIONS, with_shared_errors(seen, errors))
 
 
@@ -110,6 +110,15 @@ def published(sightings: pl.DataFrame) -> pl.DataFrame:
     lone = pl.col("tracklet_id").str.starts_with(MARK)
     kept = sightings.filter(lone.not_() | pl.col("object_id").is_not_null())
     return kept.with_columns(tracklet_id=pl.when(lone.not_()).then("tracklet_id"))
+
+
+def with_links(rows: pl.DataFrame, parts: NightParts) -> pl.DataFrame:
+    """Return rows of tracklets; those that an orbit joins to an object have its id."""
+    linked = to_polars(parts.linked).rename({"object_id": "linked_id"})
+    found = rows.select("tracklet_id").join(
+        linked, on="tracklet_id", how="left", maintain_order="left"
+    )
+    return rows.with_columns(object_id=pl.coalesce("object_id", found["linked_id"]))
 
 
 def longest_object(runs: pl.DataFrame) -> pl.DataFrame:

@@ -15,7 +15,14 @@ from scipy.special import chdtrc
 from epipole.io.catalogues.earth_orientation import read_earth_orientation
 from epipole.io.datasets.night_tables import NightReader, read_columns, write_table
 from epipole.io.datasets.rows_by_night import in_order
-from epipole.schemas.bridge import concat, nullable, table, unstack, unstack_covariance
+from epipole.schemas.bridge import (
+    concat,
+    nullable,
+    table,
+    to_polars,
+    unstack,
+    unstack_covariance,
+)
 from epipole.schemas.columns import ELEMENTS, POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS
@@ -89,10 +96,13 @@ def orbit_shares(folder: Path, night: str) -> int:
 
 
 @stage_task(Stage.PUBLISH, "orbits {share} of {shares} of {night}")
-def fit_orbits(folder: Path, night: str, share: int, shares: int) -> OrbitRows:
+def fit_orbits(
+    folder: Path, night: str, share: int, shares: int, linked: pa.Table | None = None
+) -> OrbitRows:
     """Fit the orbits of a share of the objects of a night whose other tables are written.
 
-    The orbit of an object depends on the rows of this object only.
+    The orbit of an object depends on the rows of this object only. `linked` are LINKED_ORBITS:
+    the initial states of objects without positions.
     """
     reader = NightReader.of_folder(folder, night)
     observed = _of_share(reader, "observations", _OBSERVED, share, shares)
@@ -100,6 +110,9 @@ def fit_orbits(folder: Path, night: str, share: int, shares: int) -> OrbitRows:
     around, origin_ns = surroundings_of(night), _noon_ns(night)
     objects = observed_objects(observed, origin_ns, around)
     starts = initial_states(reader, objects.names)
+    if linked is not None:
+        rows = to_polars(linked)
+        starts = _starts(rows, rows.select(*POSITION, *VELOCITY).to_numpy()) | starts
     fitted = [
         best_orbit(objects.directions(k), starts.get(name), origin_ns, around)
         for k, name in enumerate(objects.names)

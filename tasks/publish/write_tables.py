@@ -6,6 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -13,7 +14,7 @@ from epipole.io.datasets.night_tables import write_table
 from epipole.io.datasets.rows_by_night import in_order, rows_of_night
 from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import array, concat, conform, from_polars, table, to_polars
-from epipole.schemas.rejects import Reason, Trait, reject_rows
+from epipole.schemas.rejects import Outcome, Reason, Trait, reject_rows
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, Span, spans_between
 from epipole.schemas.stages import Stage
@@ -28,7 +29,12 @@ from epipole.tasks.publish.hot_tracklets import (
     with_hot_pixels,
 )
 from epipole.tasks.publish.night_parts import NightParts, in_slices
-from epipole.tasks.publish.observed_objects import longest_object, object_runs, observations
+from epipole.tasks.publish.observed_objects import (
+    longest_object,
+    object_runs,
+    observations,
+    with_links,
+)
 
 # These tables may not fit in memory as a whole: they are written in slices of time.
 BY_SENSOR = ("frames", "stars", "detections")
@@ -65,7 +71,7 @@ def write_tables(tables: Sequence[str], folder: Path, parts: NightParts) -> None
 
 def _of_night(name: str, parts: NightParts) -> pa.Table:
     if name == "tracklets":
-        rows = _tracklets(parts)
+        rows = tracklets_of_night(parts)
     elif name == "rejects":
         rows = counted([parts.whole[name], *_rejects(parts), hot_pixel_rejects(parts)])
     else:
@@ -73,7 +79,7 @@ def _of_night(name: str, parts: NightParts) -> pa.Table:
     return in_order(rows_of_night(name, rows, parts.night))
 
 
-def _tracklets(parts: NightParts) -> pa.Table:
+def tracklets_of_night(parts: NightParts) -> pa.Table:
     """Return TRACKLETS of the run: with their objects, and with their attributables."""
     found = [
         of.viewed.read(span, "attributables")
@@ -84,7 +90,10 @@ def _tracklets(parts: NightParts) -> pa.Table:
     rows = to_polars(confirmed_tracklets(parts))
     for more in (longest_object(object_runs(parts)), to_polars(concat(ATTRIBUTABLES, found))):
         rows = rows.join(more, on="tracklet_id", how="left", maintain_order="left")
-    return from_polars(TRACKLETS, rows)
+    linked = with_links(rows, parts)
+    joined = rows["object_id"].is_null() & linked["object_id"].is_not_null()
+    outcome = pl.when(joined).then(pl.lit(Outcome.LINKED.value)).otherwise("outcome")
+    return from_polars(TRACKLETS, linked.with_columns(outcome=outcome))
 
 
 def _of_sensors(name: str, parts: NightParts) -> Iterator[pa.Table]:

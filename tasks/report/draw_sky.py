@@ -34,6 +34,7 @@ Array = npt.NDArray[Any]
 
 _OUTCOMES = {
     Outcome.OBJECT: (BLUE, "-", "o"),
+    Outcome.LINKED: (SKY, "-", "P"),
     Outcome.SEEN_BY_ONE: (ORANGE, "--", "s"),
     Outcome.AMBIGUOUS: (PURPLE, "-.", "D"),
     Outcome.DISAGREES: (VERMILLION, ":", "v"),

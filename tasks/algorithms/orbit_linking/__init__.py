@@ -1,0 +1,1 @@
+"""Orbit linking: tracklets of different times and sensors that one orbit explains."""

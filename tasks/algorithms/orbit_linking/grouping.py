@@ -1,0 +1,368 @@
+"""Grouping: tracklets that are one object, by the evidence of the orbit through all of them.
+
+The evidence of a set of tracklets is the density of their attributables if they are one object of
+the population, times the number of objects. So the log odds that two sets are one object, and not
+two, are the difference of the log evidences. The pair with the largest odds is joined first.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.orbit_linking.arc_fit import (
+    Tracklets,
+    advance,
+    fit_arc,
+    fit_work,
+)
+from epipole.tasks.algorithms.orbit_linking.pair_search import (
+    may_be_one,
+    packed_tracklets,
+    search,
+)
+from epipole.tasks.algorithms.orbit_linking.population import log_attributable_density
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+NONE = -1
+# Members of each set that the joint orbit is fitted to, those nearest in time to the other set:
+# more of them do not change the answer, and an orbit over hours needs more forces.
+MAX_MEMBERS = 8
+MAX_ARC_S = 1800.0
+# Chi-square by which the joint fit may be worse than both alone: quantile 1 - 1e-5 for 2, 4 and 6
+# degrees of freedom (tracklet and tracklet, set and tracklet, set and set).
+GATES = (23.03, 28.47, 33.38)
+SET_SIGMA = 5.0  # of chi-square: a set that fits its own orbit worse is no single object
+KEPT_LOG_ODDS = -8.0  # of a pair: a third tracklet may yet show that it is one object
+PASSES = 3
+MIN_PAIRS = 4096
+
+
+class Edges(NamedTuple):
+    """Pairs of tracklets that may be one object, best first.
+
+    pair : (e, 2) int
+    odds : (e,) float
+        Log odds that they are one object.
+    epoch_s, state : (e,), (e, 6) float
+        Their orbit [km, km/s], GCRF.
+    offsets, row : (n + 1,), (2 e,) int
+        The edges of tracklet k are ``row[offsets[k]:offsets[k + 1]]``, best first.
+    """
+
+    pair: Indices
+    odds: Array
+    epoch_s: Array
+    state: Array
+    offsets: Indices
+    row: Indices
+
+
+class LinkedTracklets(NamedTuple):
+    """Which tracklets are one object.
+
+    label : (n,) int
+        Number of the object: the first row of its tracklets.
+    epoch_s, state : (n,), (n, 6) float
+        For the first row of an object that was joined: the orbit [km, km/s] of its last join, GCRF,
+        and its epoch. NaN for other rows.
+    """
+
+    label: Indices
+    epoch_s: Array
+    state: Array
+
+
+class Sets(NamedTuple):
+    """Sets of tracklets: `root` (n,) of each; the members of a set as a chain from its root."""
+
+    root: Indices
+    next: Indices
+    last: Indices
+    size: Indices
+
+
+def link_tracklets(
+    tracklets: Tracklets, known: Indices, *, max_gap_s: float, log_odds: float
+) -> LinkedTracklets:
+    """Return which tracklets are one object.
+
+    Parameters
+    ----------
+    tracklets
+        Sorted by time.
+    known : (n,) int
+        Objects that are known already, from 0; -1 for tracklets of none.
+    max_gap_s
+        Longest time between two tracklets that are compared [s].
+    log_odds
+        Minimum log odds of a join, also against any that contradicts it.
+
+    Notes
+    -----
+    Forces: two bodies and J2, over at most `MAX_ARC_S`.
+    """
+    n = len(known)
+    alone = log_attributable_density(tracklets.r_km, tracklets.v_km_s, tracklets.u, tracklets.w)
+    edges = _edges(tracklets, known, alone, max_gap_s)
+    sets = Sets(np.arange(n), np.full(n, NONE), np.arange(n), np.ones(n, np.int64))
+    epoch_s, state = np.full(n, np.nan), np.full((n, 6), np.nan)
+    _join_known(np.ascontiguousarray(known, np.int64), np.full(n, NONE), sets)
+    _join_all(tracklets, alone, edges, log_odds, sets, epoch_s, state)
+    return LinkedTracklets(sets.root, epoch_s, state)
+
+
+def _edges(tracklets: Tracklets, known: Indices, alone: Array, max_gap_s: float) -> Edges:
+    n = len(known)
+    room, packed = MIN_PAIRS + 8 * n, packed_tracklets(tracklets)
+    state, work = np.empty(6), np.empty((8, 3))
+    while True:
+        pairs, states = np.empty((room, 2), np.int64), np.empty((room, 6))
+        count = search(tracklets, packed, known, max_gap_s, 0, n, pairs, states, state, work)
+        if count <= room:
+            break
+        room = count
+    pairs, states = pairs[:count], states[:count]
+    odds, epoch_s = np.empty(count), np.empty(count)
+    _score(tracklets, alone, pairs, odds, epoch_s, states)
+    kept = np.flatnonzero(odds > KEPT_LOG_ODDS)
+    # Best first; ties by time. A pair that was found with several orbits keeps the best.
+    order = kept[np.lexsort((pairs[kept, 1], pairs[kept, 0], -odds[kept]))]
+    _, once = np.unique(pairs[order] @ np.array([n, 1]), return_index=True)
+    order = order[np.sort(once)]
+    pairs = pairs[order]
+    ends, row = pairs.T.ravel(), np.tile(np.arange(len(order)), 2)
+    by_end = np.lexsort((row, ends))
+    offsets = np.searchsorted(ends[by_end], np.arange(n + 1))
+    return Edges(pairs, odds[order], epoch_s[order], states[order], offsets, row[by_end])
+
+
+@kernel
+def _score(tracklets, alone, pairs, odds, epoch_s, states):
+    """Write the log odds of pairs, and move their orbits to the middle; NaN becomes -inf."""
+    work, y = fit_work(), np.empty(42)
+    for p in range(len(pairs)):
+        i, j = pairs[p, 0], pairs[p, 1]
+        epoch_s[p] = 0.5 * (tracklets.time_s[i] + tracklets.time_s[j])
+        _moved(states[p], epoch_s[p] - tracklets.time_s[i], y, work)
+        for m in range(6):
+            states[p, m] = y[m]
+        evidence, _ = fit_arc(tracklets, pairs[p], epoch_s[p], states[p], work)
+        odds[p] = evidence - alone[i] - alone[j]
+        if np.isnan(odds[p]):
+            odds[p] = -np.inf
+
+
+@kernel
+def _moved(state, dt_s, y, work):
+    """Write a state (6,) propagated by dt_s to the first of y (42,)."""
+    for m in range(42):
+        y[m] = state[m] if m < 6 else 0.0
+    advance(y, dt_s, work.steps)
+
+
+@kernel
+def _unite(sets, a, b):
+    """Append set b to set a, which are roots; the set's root is the smaller one."""
+    if b < a:
+        a, b = b, a
+    sets.next[sets.last[a]] = b
+    sets.last[a] = sets.last[b]
+    sets.size[a] += sets.size[b]
+    k = b
+    while k != NONE:
+        sets.root[k] = a
+        k = sets.next[k]
+
+
+@kernel
+def _join_known(known, first, sets):
+    """Unite the tracklets of each known object; `first` (n,) is scratch, of `NONE`."""
+    for k in range(len(known)):
+        if known[k] >= 0:
+            if first[known[k]] == NONE:
+                first[known[k]] = k
+            else:
+                _unite(sets, sets.root[first[known[k]]], k)
+
+
+@kernel
+def _nearest(tracklets, sets, root, at_s, out):
+    """Write at most MAX_MEMBERS members of a set that are nearest in time; return their number.
+
+    They are within MAX_ARC_S / 2; in order of distance in time.
+    """
+    count = 0
+    k = root
+    while k != NONE:
+        gap = abs(tracklets.time_s[k] - at_s)
+        if gap <= 0.5 * MAX_ARC_S:
+            at = count
+            if count == MAX_MEMBERS:
+                at = count - 1
+                if gap >= abs(tracklets.time_s[out[at]] - at_s):
+                    k = sets.next[k]
+                    continue
+            else:
+                count += 1
+            while at > 0 and gap < abs(tracklets.time_s[out[at - 1]] - at_s):
+                out[at] = out[at - 1]
+                at -= 1
+            out[at] = k
+        k = sets.next[k]
+    return count
+
+
+@kernel
+def _compatible(tracklets, sets, a, b):
+    """Return whether no sensor saw a member of each at one time."""
+    i = a
+    while i != NONE:
+        j = b
+        while j != NONE:
+            if not may_be_one(tracklets, i, j):
+                return False
+            j = sets.next[j]
+        i = sets.next[i]
+    return True
+
+
+@kernel
+def _sum(tracklets, alone, members, start_s, start, work):
+    """Return log evidence, chi-square and degrees of freedom of a set, and its epoch and orbit.
+
+    NaN if the orbit cannot be fitted, or does not fit.
+    """
+    state = start.copy()
+    if len(members) == 1:
+        return alone[members[0]], 0.0, 0, start_s, state
+    _sort(members)
+    epoch = 0.0
+    for k in members:
+        epoch += tracklets.time_s[k] / len(members)
+    y = np.empty(42)
+    _moved(start, epoch - start_s, y, work)
+    for m in range(6):
+        state[m] = y[m]
+    evidence, chi2 = fit_arc(tracklets, members, epoch, state, work)
+    return evidence, chi2, 4 * len(members) - 6, epoch, state
+
+
+@kernel
+def _sort(values):
+    """Sort a few integers in place."""
+    for k in range(1, len(values)):
+        value, at = values[k], k
+        while at > 0 and values[at - 1] > value:
+            values[at] = values[at - 1]
+            at -= 1
+        values[at] = value
+
+
+@kernel
+def _gain(tracklets, alone, a, b, start_s, start, work):
+    """Return the log odds that the members a and b are one object, with their epoch and orbit.
+
+    -inf where one orbit does not fit both, NaN where a or b alone is no single object.
+    """
+    both = np.empty(len(a) + len(b), np.int64)
+    for m in range(len(both)):
+        both[m] = a[m] if m < len(a) else b[m - len(a)]
+    joint, chi2, dof, epoch, state = _sum(tracklets, alone, both, start_s, start, work)
+    if not np.isfinite(joint):
+        return -np.inf, epoch, state
+    gain, freedom = joint, dof
+    for side in range(2):
+        part = a if side == 0 else b
+        evidence, of_part, dof_part, _, _ = _sum(tracklets, alone, part, epoch, state, work)
+        if not np.isfinite(evidence):
+            return np.nan, epoch, state
+        if of_part > dof_part + SET_SIGMA * np.sqrt(2.0 * dof_part):
+            return np.nan, epoch, state
+        gain -= evidence
+        chi2 -= of_part
+        freedom -= dof_part
+    if chi2 > GATES[min(max(freedom // 2 - 1, 0), 2)]:
+        return -np.inf, epoch, state
+    return gain, epoch, state
+
+
+@kernel
+def _odds(tracklets, alone, sets, a, b, at_s, start_s, start, work):
+    """Return the log odds that two sets are one object, by their members near a time."""
+    rows_a, rows_b = np.empty(MAX_MEMBERS, np.int64), np.empty(MAX_MEMBERS, np.int64)
+    n_a = _nearest(tracklets, sets, a, at_s, rows_a)
+    n_b = _nearest(tracklets, sets, b, at_s, rows_b)
+    if n_a == 0 or n_b == 0:
+        return -np.inf, start_s, start.copy()
+    return _gain(tracklets, alone, rows_a[:n_a], rows_b[:n_b], start_s, start, work)
+
+
+@kernel
+def _has_rival(tracklets, alone, edges, sets, edge, end, minimum, orbit_s, orbit, work):
+    """Return whether one end of an edge fits a third tracklet that contradicts the other end."""
+    i, j = edges.pair[edge, end], edges.pair[edge, 1 - end]
+    a, b = sets.root[i], sets.root[j]
+    for m in range(edges.offsets[i], edges.offsets[i + 1]):
+        other = edges.row[m]
+        if edges.odds[other] < minimum:
+            break
+        k = edges.pair[other, 0] + edges.pair[other, 1] - i
+        c = sets.root[k]
+        if c in (a, b):
+            continue
+        linked = False
+        for q in range(edges.offsets[k], edges.offsets[k + 1]):
+            third = edges.row[q]
+            if edges.pair[third, 0] + edges.pair[third, 1] - k == j:
+                linked = True
+                break
+        if linked:
+            continue
+        if not _compatible(tracklets, sets, b, c):
+            return True
+        at_s = tracklets.time_s[k]
+        odds, _, _ = _odds(tracklets, alone, sets, b, c, at_s, orbit_s, orbit, work)
+        if not odds > KEPT_LOG_ODDS:
+            return True
+    return False
+
+
+@kernel
+def _join_all(tracklets, alone, edges, log_odds, sets, epoch_s, states):
+    """Join sets, best pairs first, until nothing changes; write the orbit of each join."""
+    work = fit_work()
+    tried = np.full(len(edges.odds), NONE)  # size of both sets at the last attempt
+    for _ in range(PASSES):
+        joined = False
+        for edge in range(len(edges.odds)):
+            i, j = edges.pair[edge, 0], edges.pair[edge, 1]
+            a, b = sets.root[i], sets.root[j]
+            size = sets.size[a] + sets.size[b]
+            if a == b or tried[edge] == size:
+                continue
+            tried[edge] = size
+            if not _compatible(tracklets, sets, a, b):
+                continue
+            at_s, state = edges.epoch_s[edge], edges.state[edge]
+            gain, orbit_s, orbit = _odds(tracklets, alone, sets, a, b, at_s, at_s, state, work)
+            if not gain >= log_odds:
+                continue
+            minimum = edges.odds[edge] - log_odds
+            rival = False
+            for end in range(2):
+                rival = rival or _has_rival(
+                    tracklets, alone, edges, sets, edge, end, minimum, orbit_s, orbit, work
+                )
+            if rival:
+                continue
+            epoch_s[min(a, b)] = orbit_s
+            for m in range(6):
+                states[min(a, b), m] = orbit[m]
+            _unite(sets, a, b)
+            joined = True
+        if not joined:
+            break

@@ -1,0 +1,186 @@
+"""Link tracklets: objects that no two sensors saw at the same time, joined by one orbit.
+
+Most passages of a constellation are seen by one sensor at a time. Tracklets of different times are
+one object if one orbit explains their attributables, and chance does not. They join an object that
+has positions, or become an object without.
+"""
+
+import logging
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+import pyarrow as pa
+
+from epipole.schemas.bridge import from_polars, stack_covariance, table, to_polars, unstack
+from epipole.schemas.columns import ATTRIBUTABLE_AXES, POSITION, VELOCITY
+from epipole.schemas.rejects import Outcome
+from epipole.schemas.settings import LinkingSettings
+from epipole.schemas.stages import Stage
+from epipole.schemas.work_tables import LINKED_ORBITS, LINKED_TRACKLETS
+from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
+from epipole.tasks.algorithms.geometry.directions import east_north, unit_from_radec
+from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
+from epipole.tasks.algorithms.orbit_linking.grouping import LinkedTracklets
+from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets as link_by_orbit
+from epipole.tasks.common.stage_tasks import stage_task
+
+LOGGER = logging.getLogger(__name__)
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+FREE = (Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)  # tracklets that may join an object
+
+
+class Links(NamedTuple):
+    """Tracklets that were joined, and objects that are one.
+
+    `tracklets` is LINKED_TRACKLETS, `orbits` LINKED_ORBITS; `renamed` has the new id of each object
+    that is the same as an earlier one.
+    """
+
+    tracklets: pa.Table
+    orbits: pa.Table
+    renamed: dict[str, str]
+
+
+NO_LINKS = Links(LINKED_TRACKLETS.empty_table(), LINKED_ORBITS.empty_table(), {})
+
+
+@stage_task(Stage.NAME, "linked tracklets")
+def link_tracklets(tracklets: pa.Table, night: str, settings: LinkingSettings) -> Links:
+    """Return the objects of tracklets that are joined by an orbit.
+
+    Parameters
+    ----------
+    tracklets
+        TRACKLETS of the run, with the ids of the night's objects.
+    night
+        UTC date. New objects get its date and the numbers after those of the others, in order of
+        first appearance.
+    """
+    if not settings.enabled:
+        return NO_LINKS
+    rows = _candidates(to_polars(tracklets))
+    if rows["known"].n_unique() < 2:
+        return NO_LINKS
+    found = link_by_orbit(
+        attributables_of(rows), rows["known"].to_numpy(), max_gap_s=settings.max_gap_s,
+        log_odds=settings.log_odds,
+    )  # fmt: skip
+    links = _name(rows.with_columns(label=pl.Series(found.label)), night)
+    return links._replace(orbits=_orbits(rows, found, links.tracklets))
+
+
+def _candidates(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return the tracklets that take part, in order of time, with a number `known`.
+
+    Tracklets of one object, or of one track, have one number.
+    """
+    free = pl.col("outcome").is_in([outcome.value for outcome in FREE])
+    seen = pl.col("epoch").is_not_null() & pl.col("x_km").is_not_null()
+    rows = rows.filter(seen & pl.col("cov_rara").is_finite() & pl.col("vx_km_s").is_not_null())
+    rows = rows.filter(pl.col("object_id").is_not_null() | free).sort("epoch", "tracklet_id")
+    # An object's id has no slash.
+    name = pl.coalesce("object_id", pl.format("{}/{}", "sensor_id", "track_id"))
+    return rows.with_columns(known=name.rank("dense").cast(pl.Int64) - 1)
+
+
+def attributables_of(rows: pl.DataFrame) -> Tracklets:
+    """Return the attributables of rows of TRACKLETS, which are in order of time."""
+    ra_rate, dec_rate = (
+        rows[name].to_numpy() * ARCSEC for name in ("ra_rate_arcsec_s", "dec_rate_arcsec_s")
+    )
+    u = unit_from_radec(
+        np.radians(rows["ra_deg"].to_numpy()), np.radians(rows["dec_deg"].to_numpy())
+    )
+    east, north = (np.ascontiguousarray(axis) for axis in np.moveaxis(east_north(u), 1, 0))
+    cov = stack_covariance(rows, "cov_{}", ATTRIBUTABLE_AXES) * ARCSEC**2
+    shared = (rows["bias_sigma_arcsec"].fill_null(0.0).to_numpy() * ARCSEC) ** 2
+    cov[:, [0, 1], [0, 1]] += shared[:, None]
+    origin = rows["epoch"].min()
+    time_s, first_s, last_s = (
+        (rows[name] - origin).dt.total_nanoseconds().to_numpy() / 1e9
+        for name in ("epoch", "start_time", "end_time")
+    )
+    return Tracklets(
+        time_s,
+        first_s,
+        last_s,
+        rows["sensor_id"].rank("dense").cast(pl.Int64).to_numpy() - 1,
+        np.ascontiguousarray(rows.select(POSITION).to_numpy()),
+        np.ascontiguousarray(rows.select(VELOCITY).to_numpy()),
+        u,
+        east,
+        north,
+        ra_rate[:, None] * east + dec_rate[:, None] * north,
+        cov,
+        rows["position_sigma_km"].to_numpy().copy(),
+    )
+
+
+def _name(rows: pl.DataFrame, night: str) -> Links:
+    """Return the links of labelled tracklets: the earliest object of a label gives its id."""
+    joined = rows.filter(pl.col("known").n_unique().over("label") > 1)
+    renamed = _one_object(joined)
+    names = joined.with_columns(pl.col("object_id").replace(renamed).alias("id"))
+    names = names.with_columns(pl.col("id").drop_nulls().first().over("label"))
+    in_night = (pl.col("epoch").dt.date().cast(pl.String) == night).any().over("label")
+    unnamed = names.filter(pl.col("id").is_null() & in_night)
+    date = night.replace("-", "")
+    taken = rows["object_id"].drop_nulls().str.extract(f"^{date}-(\\d+)$").drop_nulls()
+    next_number = max((int(number) for number in taken.unique()), default=0) + 1
+    new = {
+        label: f"{date}-{next_number + k:05d}"
+        for k, label in enumerate(unnamed["label"].unique(maintain_order=True).to_list())
+    }
+    by_label = pl.col("label").replace_strict(new, default=None, return_dtype=pl.String)
+    linked = names.filter(pl.col("object_id").is_null())
+    linked = linked.select("tracklet_id", pl.coalesce("id", by_label).alias("object_id"))
+    return NO_LINKS._replace(
+        tracklets=from_polars(LINKED_TRACKLETS, linked.drop_nulls()), renamed=renamed
+    )
+
+
+def _orbits(rows: pl.DataFrame, found: LinkedTracklets, linked: pa.Table) -> pa.Table:
+    """Return LINKED_ORBITS of the objects that have no other tracklets than `linked`."""
+    first = found.label == np.arange(len(rows))
+    joined = np.flatnonzero(first & np.isfinite(found.epoch_s))
+    names = rows.select("tracklet_id").join(
+        to_polars(linked), on="tracklet_id", how="left", maintain_order="left"
+    )
+    names = names.with_columns(known=rows["object_id"], label=pl.Series(found.label))
+    ids = names.select(pl.when(pl.col("known").is_null().all().over("label")).then("object_id"))[
+        "object_id"
+    ].to_numpy()[joined]
+    kept = np.array([name is not None for name in ids], bool)
+    origin = rows["epoch"].cast(pl.Int64).min()
+    columns = {
+        "object_id": ids[kept].tolist(),
+        "epoch": origin + np.rint(found.epoch_s[joined][kept] * SECOND_NS).astype(np.int64),
+        **unstack("{}_km", found.state[joined][kept, :3]),
+        **unstack("v{}_km_s", found.state[joined][kept, 3:]),
+    }
+    return table(LINKED_ORBITS, columns)
+
+
+def _one_object(joined: pl.DataFrame) -> dict[str, str]:
+    """Return the new ids of objects that are the same as an earlier one.
+
+    Objects that were seen at the same time keep their ids: an object has one position per epoch.
+    """
+    objects = (
+        joined.drop_nulls("object_id")
+        .group_by("label", "object_id")
+        .agg(first=pl.col("start_time").min(), last=pl.col("end_time").max())
+        .sort("label", "first", "object_id")
+    )
+    renamed: dict[str, str] = {}
+    for _, of_label in objects.group_by("label", maintain_order=True):
+        name, until = of_label["object_id"][0], of_label["last"][0]
+        for object_id, first, last in of_label.select("object_id", "first", "last").rows()[1:]:
+            if first > until:
+                renamed[object_id], until = name, last
+    return renamed

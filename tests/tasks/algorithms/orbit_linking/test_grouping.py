@@ -1,0 +1,95 @@
+"""Grouping: the tracklets of an object become one, and those of others do not join it."""
+
+import numpy as np
+from scenes.orbit_tracklets import orbit_tracklets
+
+from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
+from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets
+from epipole.tasks.algorithms.orbits.orbit_fit import propagate
+
+NONE = -1
+
+
+def linked(scene, known=None, log_odds=7.0):
+    known = np.full(len(scene.object), NONE) if known is None else known
+    return link_tracklets(scene.tracklets, known, max_gap_s=900.0, log_odds=log_odds).label
+
+
+def wrong(label, number):
+    """Return how many tracklets are in a group that mostly belongs to another object."""
+    return sum(
+        (number[label == each] != np.bincount(number[label == each]).argmax()).sum()
+        for each in np.unique(label)
+    )
+
+
+def test_objects_of_three_tracklets_are_joined_and_none_is_wrong():
+    scene = orbit_tracklets(1, 200, 3, 100.0)
+    label = linked(scene)
+    assert wrong(label, scene.object) == 0
+    whole = [len(np.unique(label[scene.object == k])) == 1 for k in range(200)]
+    assert np.mean(whole) > 0.95
+
+
+def test_rough_tracklets_stay_alone_rather_than_join_others():
+    scene = orbit_tracklets(2, 200, 2, 100.0, direction_arcsec=20.0, rate_arcsec_s=100.0)
+    label = linked(scene)
+    assert wrong(label, scene.object) == 0
+    assert len(np.unique(label)) > 250
+
+
+def test_a_known_object_takes_its_tracklets():
+    scene = orbit_tracklets(3, 30, 4, 60.0)
+    first = np.unique(scene.object, return_index=True)[1]
+    second = [np.flatnonzero(scene.object == k)[1] for k in range(30)]
+    known = np.full(len(scene.object), NONE)
+    known[first] = known[second] = np.arange(30)
+    label = linked(scene, known)
+    assert wrong(label, scene.object) == 0
+    assert all(label[a] == label[b] for a, b in zip(first, second, strict=True))
+    assert len(np.unique(label)) <= 32
+
+
+def test_known_objects_that_are_two_take_no_tracklets():
+    scene = orbit_tracklets(4, 2, 4, 60.0)
+    known = np.where(np.arange(8) < 4, 0, NONE)  # of both
+    assert len(np.unique(scene.object[:4])) == 2
+    label = linked(scene, known)
+    assert (label[:4] == 0).all()
+    assert (label[4:] != 0).all()
+
+
+def test_no_object_has_two_tracklets_of_one_sensor_at_a_time():
+    scene = orbit_tracklets(5, 40, 3, 60.0)
+    seen = scene.tracklets
+    one = seen._replace(sensor=np.zeros_like(seen.sensor), last_s=seen.last_s + 1e3)
+    assert len(np.unique(linked(scene._replace(tracklets=one)))) == len(scene.object)
+
+
+def test_groups_do_not_depend_on_tracklets_elsewhere():
+    scene = orbit_tracklets(6, 60, 3, 60.0)
+    label = linked(scene)
+    kept = np.flatnonzero(scene.object < 30)
+    part = scene._replace(
+        tracklets=Tracklets(*(column[kept] for column in scene.tracklets)),
+        object=scene.object[kept],
+    )
+    np.testing.assert_array_equal(kept[linked(part)], label[kept])
+
+
+def test_no_tracklets_no_groups():
+    scene = orbit_tracklets(7, 1, 1, 1.0)
+    empty = Tracklets(*(column[:0] for column in scene.tracklets))
+    found = link_tracklets(empty, np.zeros(0, np.int64), max_gap_s=10.0, log_odds=5.0)
+    assert len(found.label) == len(found.epoch_s) == 0
+
+
+def test_the_orbit_of_an_object_is_near_the_true_one():
+    scene = orbit_tracklets(8, 20, 4, 60.0)
+    found = link_tracklets(scene.tracklets, np.full(80, NONE), max_gap_s=900.0, log_odds=7.0)
+    for number in range(20):
+        rows = np.flatnonzero(scene.object == number)
+        root = found.label[rows[0]]
+        dt_s = scene.tracklets.time_s[rows[0]] - found.epoch_s[root]
+        state = propagate(found.state[root], dt_s)
+        assert np.linalg.norm(state[:3] - scene.state[rows[0], :3]) < 5.0
