@@ -289,8 +289,8 @@ OBSERVATIONS = schema(
             "object_id",
             pa.string(),
             null=True,
-            doc="The object that it shows; null where no object was found, or where the object's "
-            "position was solved without it.",
+            doc="The object that it shows, also if only an orbit joins its tracklet to it; null "
+            "where no object was found, or where the object's position was solved without it.",
         ),
         SENSOR_ID,
         FRAME_NUMBER,

@@ -1,0 +1,131 @@
+"""Link tracklets: the task gives ids to what the orbits join, and merges objects only in turn."""
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+import pytest
+from scenes.associations import filled
+from scenes.orbit_tracklets import orbit_tracklets
+
+from epipole.schemas.bridge import array, unstack, unstack_covariance
+from epipole.schemas.columns import ATTRIBUTABLE_AXES
+from epipole.schemas.rejects import Outcome
+from epipole.schemas.settings import LinkingSettings
+from epipole.schemas.tables import TRACKLETS
+from epipole.tasks.algorithms.geometry.directions import radec_from_unit
+from epipole.tasks.name.link_tracklets import Links, link_tracklets
+
+NIGHT, START_NS = "2026-05-30", 1_780_099_200_000_000_000
+ARCSEC = np.pi / 648000
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return orbit_tracklets(11, 6, 4, 60.0)
+
+
+def rows_of(scene, **columns) -> pa.Table:
+    """Return TRACKLETS of a scene, each seen by one sensor alone unless `columns` differ."""
+    seen, n = scene.tracklets, len(scene.object)
+    ra, dec = radec_from_unit(seen.u)
+    times = {
+        name: START_NS + np.rint(values * 1e9).astype(np.int64)
+        for name, values in (("epoch", seen.time_s), ("start_time", seen.first_s),
+                             ("end_time", seen.last_s))
+    }  # fmt: skip
+    numbers = {
+        "ra_deg": np.degrees(ra), "dec_deg": np.degrees(dec),
+        "ra_rate_arcsec_s": np.einsum("ni,ni->n", seen.w, seen.east) / ARCSEC,
+        "dec_rate_arcsec_s": np.einsum("ni,ni->n", seen.w, seen.north) / ARCSEC,
+        "bias_sigma_arcsec": np.zeros(n), "position_sigma_km": seen.position_km,
+        **unstack_covariance("cov_{}", seen.cov / ARCSEC**2, ATTRIBUTABLE_AXES),
+        **unstack("{}_km", seen.r_km), **unstack("v{}_km_s", seen.v_km_s),
+    }  # fmt: skip
+    names = {
+        "tracklet_id": [f"t{k:02d}" for k in range(n)], "track_id": [f"t{k:02d}" for k in range(n)],
+        "sensor_id": [f"s{k:02d}" for k in range(n)], "object_id": [None] * n,
+        "outcome": [Outcome.SEEN_BY_ONE.value] * n,
+    }  # fmt: skip
+    return filled(TRACKLETS, n, {**times, **numbers, **names, **columns})
+
+
+def linked(rows: pa.Table, settings: LinkingSettings = LinkingSettings()) -> Links:  # noqa: B008
+    return link_tracklets.fn(rows, NIGHT, settings)
+
+
+def ids(links: Links) -> dict[str, str]:
+    return dict(zip(*(links.tracklets[name].to_pylist() for name in ("tracklet_id", "object_id")),
+                    strict=True))  # fmt: skip
+
+
+def test_objects_get_numbers_in_order_of_first_appearance(scene):
+    links = linked(rows_of(scene))
+    found = ids(links)
+    assert len(found) == 24
+    first = list(dict.fromkeys(found[f"t{k:02d}"] for k in range(24)))
+    assert first == [f"20260530-{k:05d}" for k in range(1, 7)]
+    for number in range(6):
+        assert len({found[f"t{k:02d}"] for k in np.flatnonzero(scene.object == number)}) == 1
+    assert sorted(links.orbits["object_id"].to_pylist()) == first
+    assert np.isfinite(array(links.orbits, "x_km")).all()
+
+
+def test_the_order_of_the_rows_does_not_matter(scene):
+    rows = rows_of(scene)
+    turned = rows.take(np.arange(24)[::-1])
+    assert ids(linked(rows)) == ids(linked(turned))
+
+
+def test_tracklets_join_the_object_that_is_there(scene):
+    of_two = np.flatnonzero(scene.object == 2)
+    named = [None] * 24
+    named[of_two[0]] = named[of_two[1]] = "20260530-00007"
+    outcome = ["object" if name else "seen_by_one" for name in named]
+    links = linked(rows_of(scene, object_id=named, outcome=outcome))
+    found = ids(links)
+    assert {found[f"t{k:02d}"] for k in of_two[2:]} == {"20260530-00007"}
+    assert min(set(found.values()) - {"20260530-00007"}) == "20260530-00008"
+    assert "20260530-00007" not in links.orbits["object_id"].to_pylist()  # it has positions
+    assert not links.renamed
+
+
+def test_an_object_that_is_seen_again_has_its_earlier_id(scene):
+    a, b, c, d = np.flatnonzero(scene.object == 4)
+    named = [None] * 24
+    named[a] = named[b] = "20260530-00001"
+    named[c] = named[d] = "20260530-00002"
+    outcome = ["object" if name else "seen_by_one" for name in named]
+    links = linked(rows_of(scene, object_id=named, outcome=outcome))
+    assert links.renamed == {"20260530-00002": "20260530-00001"}
+    # At the same time they stay two: an object has one position per epoch.
+    named[b], named[c] = named[c], named[b]
+    links = linked(rows_of(scene, object_id=named, outcome=outcome))
+    assert not links.renamed
+
+
+@pytest.mark.parametrize("outcome", ["ambiguous", "disagrees", "sensor_left_out"])
+def test_tracklets_of_other_outcomes_stay_as_they_are(scene, outcome):
+    links = linked(rows_of(scene, outcome=[outcome] * 24))
+    assert links.tracklets.num_rows == 0
+
+
+def test_tracklets_without_an_attributable_stay_as_they_are(scene):
+    rows = pl.DataFrame(rows_of(scene)).with_columns(
+        ra_deg=pl.when(pl.col("tracklet_id") != "t00").then("ra_deg"),
+        epoch=pl.when(pl.col("tracklet_id") != "t00").then("epoch"),
+    )
+    found = ids(linked(rows.to_arrow().cast(TRACKLETS)))
+    assert "t00" not in found
+    assert len(found) == 23
+
+
+def test_an_object_outside_the_night_gets_no_id(scene):
+    day = 86_400_000_000_000
+    later = scene.tracklets.time_s * 1e9 + START_NS + day
+    rows = rows_of(scene, epoch=later.astype(np.int64))
+    assert linked(rows).tracklets.num_rows == 0
+
+
+def test_linking_can_be_switched_off_and_needs_tracklets(scene):
+    assert linked(rows_of(scene), LinkingSettings(enabled=False)).tracklets.num_rows == 0
+    assert linked(TRACKLETS.empty_table()).tracklets.num_rows == 0
