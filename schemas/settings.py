@@ -356,11 +356,11 @@ class LinkingSettings(Group):
         "orbit: beyond it, an object may have passed once more.",
     )
     log_odds: float = Field(
-        7.0,
+        9.0,
         gt=0,
         le=MAX_LOG_ODDS,
-        description="Least log-odds (ln) that tracklets are one object. At the default, 1 in 1,000 "
-        "links is wrong.",
+        description="Least log-odds (ln) that tracklets are one object. At the default, 1 in "
+        "10,000 links is wrong.",
     )
 
 

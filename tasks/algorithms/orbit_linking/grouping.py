@@ -105,12 +105,12 @@ def link_tracklets(
     -----
     Forces: two bodies and J2, over at most `MAX_ARC_S`.
     """
-    n = len(known)
+    n, known = len(known), np.array(known, np.int64)
     alone = log_attributable_density(tracklets.r_km, tracklets.v_km_s, tracklets.u, tracklets.w)
     edges = _edges(tracklets, known, alone, max_gap_s)
     sets = Sets(np.arange(n), np.full(n, NONE), np.arange(n), np.ones(n, np.int64))
     epoch_s, state = np.full(n, np.nan), np.full((n, 6), np.nan)
-    _join_known(np.ascontiguousarray(known, np.int64), np.full(n, NONE), sets)
+    _join_known(known, np.full(n, NONE), sets)
     _join_all(tracklets, alone, edges, log_odds, sets, epoch_s, state)
     return LinkedTracklets(sets.root, epoch_s, state)
 
