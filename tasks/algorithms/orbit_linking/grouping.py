@@ -35,7 +35,7 @@ MAX_ARC_S = 1800.0
 # Chi-square by which the joint fit may be worse than both alone: quantile 1 - 1e-5 for 2, 4 and 6
 # degrees of freedom (tracklet and tracklet, set and tracklet, set and set).
 GATES = (23.03, 28.47, 33.38)
-SET_SIGMA = 5.0  # of chi-square: a set that fits its own orbit worse is no single object
+SET_SIGMA = 5.0  # of chi-square: a set whose orbit fits worse is not one object
 KEPT_LOG_ODDS = -8.0  # of a pair: a third tracklet may yet show that it is one object
 PASSES = 3
 MIN_PAIRS = 4096

@@ -112,8 +112,8 @@ def _ranges(tracklets, i, j, arc, a, b, model_km, oblate):
             else:
                 pa, pb = -of_other, of_rate
                 right -= gdot * _dot(axis, sj) - _dot(axis, si) - half
-            own, others = tracklets.cov[k], tracklets.cov[other]
-            variance = near * near * (g * g * own[2 + c, 2 + c] + own[c, c])
+            of_k, others = tracklets.cov[k], tracklets.cov[other]
+            variance = near * near * (g * g * of_k[2 + c, 2 + c] + of_k[c, c])
             weight = 1.0 / (variance + far * far * others[c, c] + common)
             n11 += weight * pa * pa
             n12 += weight * pa * pb
