@@ -266,7 +266,7 @@ def _sort(values):
 def _gain(tracklets, alone, a, b, start_s, start, work):
     """Return the log odds that the members a and b are one object, with their epoch and orbit.
 
-    -inf where one orbit does not fit both, NaN where a or b alone is no single object.
+    -inf where one orbit does not fit both, NaN where a or b alone is not one object.
     """
     both = np.empty(len(a) + len(b), np.int64)
     for m in range(len(both)):
