@@ -389,8 +389,8 @@ ORBITS = schema(
 
 IDENTIFICATIONS = schema(
     "identifications",
-    "One row per object of the night, and with a catalogue one per tracklet that belongs to none, "
-    "held against a catalogue of known objects.",
+    "One row per object with positions, and with a catalogue one per tracklet that belongs to none "
+    "of these, held against a catalogue of known objects.",
     [
         id_column("object_id", null=True, doc="Null in the row of a tracklet."),
         id_column("tracklet_id", null=True, doc="Null in the row of an object."),

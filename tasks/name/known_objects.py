@@ -1,7 +1,7 @@
 """Name known objects: compare each object of a night with a catalogue and with earlier nights.
 
 The errors of the elements are learnt from the certain matches of the night. Then all objects are
-judged with them, and after them the tracklets that belong to none.
+judged with them, and after them the tracklets that belong to none of them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -133,7 +133,11 @@ def name_known_objects(
     of_tracklets = []
     if known is not None:
         verdicts, learnt = judge_objects(observed, known, settings.probability)
-        of_tracklets = [tracklet_rows(name_tracklets(folder, learnt, settings.probability), known)]
+        of_tracklets = [
+            tracklet_rows(
+                name_tracklets(folder, list(observed), learnt, settings.probability), known
+            )
+        ]
     verdicts = _without_rivals(verdicts, spans)
     unnamed = [name for name in observed if _status(verdicts, name) != "known"]
     same_as = recognise_objects(folder, unnamed, earlier, settings.earlier_h, link_log_odds)

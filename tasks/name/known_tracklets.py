@@ -1,9 +1,10 @@
-"""Name tracklets: compare those that belong to no object with a catalogue.
+"""Name tracklets: compare those that belong to no object with positions with a catalogue.
 
 The errors of the elements are learnt once more, from the sure matches of the night's tracklets.
 Then all tracklets are judged with them.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,7 +41,7 @@ _COLUMNS = [
 
 
 class NamedTracklets(NamedTuple):
-    """The tracklets of a night that belong to no object, in order of their ids, and their names.
+    """Some tracklets of a night, in order of their ids, and their names.
 
     `names` has rows as `ids` has; `pairs` and `weights` are what it points to.
     """
@@ -52,21 +53,24 @@ class NamedTracklets(NamedTuple):
 
 
 def name_tracklets(
-    folder: Path, catalogue: KnownSatellites, min_probability: float
+    folder: Path, objects: Sequence[str], catalogue: KnownSatellites, min_probability: float
 ) -> NamedTracklets:
-    """Return what a catalogue says of the tracklets of a night that belong to no object.
+    """Return what a catalogue says of the tracklets of a night that belong to none of its objects.
 
     Parameters
     ----------
     folder
         The night's folder; its `tracklets` are written.
+    objects
+        Ids of the objects that have positions, which are named by these.
     catalogue
         Its errors of elements are those that the night's objects show.
     min_probability
         Minimum probability of a name that is given.
     """
     rows = pl.DataFrame(read_columns(folder, "tracklets", _COLUMNS))
-    rows = rows.filter(pl.col("object_id").is_null()).sort("tracklet_id")
+    is_named = pl.col("object_id").is_in(list(objects)).fill_null(False)
+    rows = rows.filter(~is_named).sort("tracklet_id")
     has_orbit = rows.select(
         pl.all_horizontal(pl.col("epoch", "cov_rara", *POSITION, *VELOCITY).is_not_null())
     ).to_series()
