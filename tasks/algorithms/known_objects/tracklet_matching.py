@@ -23,10 +23,12 @@ from epipole.tasks.algorithms.constants import DAY_NS, DAY_S, GM_KM3_S2, SPEED_O
 from epipole.tasks.algorithms.known_objects.matching import (
     COMPANIONS,
     MIN_LISTED,
-    QUALITIES,
+    THRUSTING,
     WORST,
     KnownSatellites,
     chi2_quantile,
+    error_sizes,
+    thrust_errors,
 )
 from epipole.tasks.algorithms.known_objects.prediction import (
     ElementErrors,
@@ -39,13 +41,6 @@ from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, Trackl
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-# Satellites that thrust: their share, and the 1-sigma growth of the error along the track [km/day],
-# which is their drift too, and the other errors beyond the usual, in the order of
-# `ERROR_COMPONENTS`. Measured on 132 low satellites, most of them with electric propulsion, by
-# elements 1.6 days old: one in ten is more than 15 km off, one in thirty more than 50 km, and nine
-# in ten of all are less than 0.8 km off in height and across.
-THRUSTING = ((0.10, 12.0), (0.03, 40.0))
-THRUSTING_KM = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.0])
 REACH_SIGMAS = 4.0
 # Unrelated objects: their density on the sky, all tracked ones in low orbit as seen from there; and
 # the spread of their velocities across the line of sight, per axis.
@@ -164,16 +159,9 @@ def _ages(tracklets: Tracklets, pairs: Pairs, catalogue: KnownSatellites) -> Arr
     return np.asarray(time_ns / DAY_NS)
 
 
-def _thrusting(ages: Array, km_day: float) -> Array:
-    """Return the 1-sigma errors of satellites that thrust, beyond the usual ones, (k, 6)."""
-    growth = np.zeros((len(ages), 6))
-    growth[:, 0], growth[:, 5] = km_day * ages, km_day
-    return np.hypot(THRUSTING_KM, growth)
-
-
 def _widest(sigma: Array, ages: Array) -> Array:
     """Return the largest errors that are considered, (k, 6)."""
-    return np.hypot(WORST * sigma, _thrusting(ages, THRUSTING[-1][1]))
+    return np.hypot(WORST * sigma, thrust_errors(ages, THRUSTING[-1][1]))
 
 
 def _weigh(
@@ -182,9 +170,7 @@ def _weigh(
     ages = _ages(tracklets, pairs, catalogue)
     sigma = errors.sigmas(pairs.satellite, ages)
     linear = _linearised(tracklets, pairs, sigma, ages)
-    usual = 1.0 - sum(share for share, _ in THRUSTING)
-    terms = [(factor * sigma, share * usual) for factor, share in QUALITIES]
-    terms += [(np.hypot(sigma, _thrusting(ages, km)), share) for share, km in THRUSTING]
+    terms = error_sizes(sigma, ages)
     far = [(np.hypot(sigma, size), share) for share, size in COMPANIONS]
     densities, chi2 = zip(*(linear.log_density(of) for of, _ in terms), strict=True)
     companions = [linear.log_density(of)[0] for of, _ in far]

@@ -14,7 +14,7 @@ from epipole.schemas.tables import TABLES
 FOUND = Summary(
     dataset="/data/out", nights=["2019-04-01"], logs=1, sensors=2, frames=1234, identified=1200,
     stars=9000, detections=8, tracklets=1, outcomes={"object": 1}, epochs=6, objects=5, positions=4,
-    rejects={},
+    rejects={}, tracklet_names={},
     faults=[], by_sensor=[], names={}, residuals=[], unchanged=False, extracts=(),
 )  # fmt: skip
 
