@@ -36,7 +36,7 @@ from epipole.tasks.check.correct_clock import correct_clock
 from epipole.tasks.identify.identify_span import Counts, identify_span
 from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
 from epipole.tasks.name.known_objects import name_known_objects
-from epipole.tasks.name.link_tracklets import Links, link_tracklets
+from epipole.tasks.name.link_tracklets import OrbitLinks, link_tracklets
 from epipole.tasks.name.object_ids import (
     VIEWS,
     Names,
@@ -317,7 +317,7 @@ def _link(parts: NightParts, settings: Settings) -> tuple[NightParts, pa.Table]:
     See `link_tracklets`.
     """
     future = link_tracklets.submit(tracklets_of_night(parts), parts.night, settings.linking)
-    links: Links
+    links: OrbitLinks
     (links,) = results(Stage.NAME, [future])
     if links.tracklets.num_rows:
         LOGGER.info("linked %s by orbits", many(links.tracklets.num_rows, "tracklet"))

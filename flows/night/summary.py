@@ -49,9 +49,8 @@ class Summary:
     """Counts of what was published.
 
     `names` are the objects by what is known of their names, `tracklet_names` the tracklets that
-    belong to none; both are empty without a catalogue. `faults` of
-    sensors and `residuals` of their known objects are a sentence each. `unchanged` nights were not
-    made again.
+    belong to none with positions; both are empty without a catalogue. `faults` of sensors and
+    `residuals` of their known objects are a sentence each. `unchanged` nights were not made again.
     """
 
     dataset: str

@@ -56,7 +56,7 @@ def elements_of_night(
     return made._replace(sets=used), concat(REJECTS, rejects)
 
 
-class Names(NamedTuple):
+class CatalogueNames(NamedTuple):
     """The columns of `identifications` that are what the catalogue says."""
 
     norad_id: int | None = None
@@ -65,7 +65,9 @@ class Names(NamedTuple):
     element_epoch: int | None = None
 
 
-def names_of(status: str, sets: Sequence[ElementSet], best: int, rows: Sequence[int]) -> Names:
+def names_of(
+    status: str, sets: Sequence[ElementSet], best: int, rows: Sequence[int]
+) -> CatalogueNames:
     """Return what the catalogue says of something that may be some of its objects.
 
     Parameters
@@ -79,8 +81,8 @@ def names_of(status: str, sets: Sequence[ElementSet], best: int, rows: Sequence[
     """
     of = sets[best]
     if status == "known":
-        return Names(of.number, of.cospar_id or None, of.name or None, of.epoch_ns)
+        return CatalogueNames(of.number, of.cospar_id or None, of.name or None, of.epoch_ns)
     if status == "ambiguous":
         names = " / ".join(sets[row].name or str(sets[row].number) for row in rows)
-        return Names(name=names, element_epoch=of.epoch_ns)
-    return Names(element_epoch=of.epoch_ns)
+        return CatalogueNames(name=names, element_epoch=of.epoch_ns)
+    return CatalogueNames(element_epoch=of.epoch_ns)

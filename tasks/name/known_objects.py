@@ -36,7 +36,7 @@ from epipole.tasks.algorithms.known_objects.prediction import (
 )
 from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, link_by_motion
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.name.elements_of_night import ElementsOfNight, Names, names_of
+from epipole.tasks.name.elements_of_night import CatalogueNames, ElementsOfNight, names_of
 from epipole.tasks.name.known_tracklets import name_tracklets, tracklet_rows
 from epipole.tasks.name.sensor_residuals import SensorResidual, sensor_residuals
 
@@ -246,9 +246,12 @@ def _rows(
     """Return IDENTIFICATIONS: a row per object, in order of their ids."""
     sets = known.sets if known is not None else []
     of = [verdicts.get(name) for name in objects]
-    names = [names_of(v.status, sets, v.best.row, v.rows) if v and v.best else Names() for v in of]
+    names = [
+        names_of(v.status, sets, v.best.row, v.rows) if v and v.best else CatalogueNames()
+        for v in of
+    ]
     best = [verdict.best if verdict is not None else None for verdict in of]
-    columns = {field: [getattr(each, field) for each in names] for field in Names._fields}
+    columns = {field: [getattr(each, field) for each in names] for field in CatalogueNames._fields}
     return table(
         IDENTIFICATIONS,
         columns

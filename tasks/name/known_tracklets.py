@@ -27,8 +27,8 @@ from epipole.tasks.algorithms.known_objects.tracklet_matching import (
     residuals_of,
     weigh_pairs,
 )
-from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, Tracklets
-from epipole.tasks.name.elements_of_night import ElementsOfNight, Names, names_of
+from epipole.tasks.algorithms.known_objects.tracklet_search import Attributables, Pairs
+from epipole.tasks.name.elements_of_night import CatalogueNames, ElementsOfNight, names_of
 
 SURE = 0.999  # probability of a match from which errors are learnt
 MAX_LEARNT = 300  # tracklets, evenly chosen: they tell the errors to a tenth
@@ -85,11 +85,11 @@ def name_tracklets(
     return NamedTracklets(rows["tracklet_id"].to_list(), names, pairs, weights)
 
 
-def _tracklets(rows: pl.DataFrame) -> Tracklets:
+def _tracklets(rows: pl.DataFrame) -> Attributables:
     cov = stack_covariance(rows, "cov_{}", ATTRIBUTABLE_AXES) * ARCSEC**2
     bias = rows["bias_sigma_arcsec"].fill_null(0.0).to_numpy() * ARCSEC
     cov[:, [0, 1], [0, 1]] += bias[:, None] ** 2
-    return Tracklets(
+    return Attributables(
         time_ns=rows["epoch"].cast(pl.Int64).to_numpy(),
         ra_dec=np.radians(rows.select("ra_deg", "dec_deg").to_numpy()),
         rates=rows.select("ra_rate_arcsec_s", "dec_rate_arcsec_s").to_numpy() * ARCSEC,
@@ -101,7 +101,7 @@ def _tracklets(rows: pl.DataFrame) -> Tracklets:
     )
 
 
-def _learnt(tracklets: Tracklets, pairs: Pairs, catalogue: KnownSatellites) -> KnownSatellites:
+def _learnt(tracklets: Attributables, pairs: Pairs, catalogue: KnownSatellites) -> KnownSatellites:
     """Return the catalogue with the errors of its elements as some sure matches show them."""
     which = pairs.tracklet % (len(tracklets.time_ns) // MAX_LEARNT + 1) == 0
     pairs = pairs.take(which)
@@ -144,7 +144,9 @@ def tracklet_rows(named: NamedTracklets, known: ElementsOfNight) -> pa.Table:
     row = np.full(len(pair), -1)
     row[pair >= 0] = named.pairs.satellite[pair[pair >= 0]]
     names = [
-        names_of(of, known.sets, best, named.names.listed.get(k, ())) if best >= 0 else Names()
+        names_of(of, known.sets, best, named.names.listed.get(k, ()))
+        if best >= 0
+        else CatalogueNames()
         for k, (of, best) in enumerate(zip(status, row.tolist(), strict=True))
     ]
     count = len(names)
@@ -154,7 +156,7 @@ def tracklet_rows(named: NamedTracklets, known: ElementsOfNight) -> pa.Table:
     }
     return table(
         IDENTIFICATIONS,
-        {field: [getattr(each, field) for each in names] for field in Names._fields}
+        {field: [getattr(each, field) for each in names] for field in CatalogueNames._fields}
         | {name: nullable(values) for name, values in fitted.items()}
         | {
             "object_id": [None] * count,

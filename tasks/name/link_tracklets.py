@@ -34,7 +34,7 @@ Indices = npt.NDArray[np.int64]
 FREE = (Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)  # tracklets that may join an object
 
 
-class Links(NamedTuple):
+class OrbitLinks(NamedTuple):
     """Tracklets that were joined, and objects that are one.
 
     `tracklets` is LINKED_TRACKLETS, `orbits` LINKED_ORBITS; `renamed` has the new id of each object
@@ -46,11 +46,11 @@ class Links(NamedTuple):
     renamed: dict[str, str]
 
 
-NO_LINKS = Links(LINKED_TRACKLETS.empty_table(), LINKED_ORBITS.empty_table(), {})
+NO_LINKS = OrbitLinks(LINKED_TRACKLETS.empty_table(), LINKED_ORBITS.empty_table(), {})
 
 
 @stage_task(Stage.NAME, "linked tracklets")
-def link_tracklets(tracklets: pa.Table, night: str, settings: LinkingSettings) -> Links:
+def link_tracklets(tracklets: pa.Table, night: str, settings: LinkingSettings) -> OrbitLinks:
     """Return the objects of tracklets that are joined by an orbit.
 
     Parameters
@@ -121,7 +121,7 @@ def attributables_of(rows: pl.DataFrame) -> Tracklets:
     )
 
 
-def _name(rows: pl.DataFrame, night: str) -> Links:
+def _name(rows: pl.DataFrame, night: str) -> OrbitLinks:
     """Return the links of labelled tracklets: the earliest object of a label gives its id."""
     joined = rows.filter(pl.col("known").n_unique().over("label") > 1)
     renamed = _one_object(joined)
