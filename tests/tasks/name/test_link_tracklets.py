@@ -13,7 +13,7 @@ from epipole.schemas.rejects import Outcome
 from epipole.schemas.settings import LinkingSettings
 from epipole.schemas.tables import TRACKLETS
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit
-from epipole.tasks.name.link_tracklets import Links, link_tracklets
+from epipole.tasks.name.link_tracklets import OrbitLinks, link_tracklets
 
 NIGHT, START_NS = "2026-05-30", 1_780_099_200_000_000_000
 ARCSEC = np.pi / 648000
@@ -49,11 +49,11 @@ def rows_of(scene, **columns) -> pa.Table:
     return filled(TRACKLETS, n, {**times, **numbers, **names, **columns})
 
 
-def linked(rows: pa.Table, settings: LinkingSettings = LinkingSettings()) -> Links:  # noqa: B008
+def linked(rows: pa.Table, settings: LinkingSettings = LinkingSettings()) -> OrbitLinks:  # noqa: B008
     return link_tracklets.fn(rows, NIGHT, settings)
 
 
-def ids(links: Links) -> dict[str, str]:
+def ids(links: OrbitLinks) -> dict[str, str]:
     return dict(zip(*(links.tracklets[name].to_pylist() for name in ("tracklet_id", "object_id")),
                     strict=True))  # fmt: skip
 
