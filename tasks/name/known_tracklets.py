@@ -27,7 +27,7 @@ from epipole.tasks.algorithms.known_objects.tracklet_matching import (
     residuals_of,
     weigh_pairs,
 )
-from epipole.tasks.algorithms.known_objects.tracklet_search import Attributables, Pairs
+from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, SeenTracklets
 from epipole.tasks.name.elements_of_night import CatalogueNames, ElementsOfNight, names_of
 
 SURE = 0.999  # probability of a match from which errors are learnt
@@ -85,11 +85,11 @@ def name_tracklets(
     return NamedTracklets(rows["tracklet_id"].to_list(), names, pairs, weights)
 
 
-def _tracklets(rows: pl.DataFrame) -> Attributables:
+def _tracklets(rows: pl.DataFrame) -> SeenTracklets:
     cov = stack_covariance(rows, "cov_{}", ATTRIBUTABLE_AXES) * ARCSEC**2
     bias = rows["bias_sigma_arcsec"].fill_null(0.0).to_numpy() * ARCSEC
     cov[:, [0, 1], [0, 1]] += bias[:, None] ** 2
-    return Attributables(
+    return SeenTracklets(
         time_ns=rows["epoch"].cast(pl.Int64).to_numpy(),
         ra_dec=np.radians(rows.select("ra_deg", "dec_deg").to_numpy()),
         rates=rows.select("ra_rate_arcsec_s", "dec_rate_arcsec_s").to_numpy() * ARCSEC,
@@ -101,7 +101,7 @@ def _tracklets(rows: pl.DataFrame) -> Attributables:
     )
 
 
-def _learnt(tracklets: Attributables, pairs: Pairs, catalogue: KnownSatellites) -> KnownSatellites:
+def _learnt(tracklets: SeenTracklets, pairs: Pairs, catalogue: KnownSatellites) -> KnownSatellites:
     """Return the catalogue with the errors of its elements as some sure matches show them."""
     which = pairs.tracklet % (len(tracklets.time_ns) // MAX_LEARNT + 1) == 0
     pairs = pairs.take(which)

@@ -9,7 +9,7 @@ from epipole.schemas.columns import ATTRIBUTABLE_AXES, POSITION, VELOCITY, upper
 from epipole.schemas.star_lists import ElementSet
 from epipole.schemas.tables import TRACKLETS
 from epipole.tasks.algorithms.known_objects.prediction import predict, satellites_of
-from epipole.tasks.algorithms.known_objects.tracklet_search import Attributables
+from epipole.tasks.algorithms.known_objects.tracklet_search import SeenTracklets
 from scenes.associations import filled
 from scenes.walker import NIGHT_NS
 
@@ -22,7 +22,7 @@ TO_SUN = np.array([0.365, 0.854, 0.371])  # on 30 May 2026, within a degree
 
 def seen_from_near(
     sets: Sequence[ElementSet], count: int, rng: np.random.Generator, hours: float = 24.0
-) -> tuple[Attributables, np.ndarray]:
+) -> tuple[SeenTracklets, np.ndarray]:
     """Return tracklets of satellites on the sunny side, and which satellite each shows."""
     satellites = satellites_of(np.array([each.elements for each in sets]))
     rows, times, sensors = [], [], []
@@ -41,7 +41,7 @@ def seen_from_near(
     values = np.array(made) + rng.normal(size=(count, 4)) * SIGMAS
     values[:, 0] += (1 / np.cos(values[:, 1]) - 1) * (values[:, 0] - np.array(made)[:, 0])
     states = np.array(sensors)
-    return Attributables(
+    return SeenTracklets(
         np.array(times), values[:, :2], values[:, 2:], np.tile(np.diag(SIGMAS**2), (count, 1, 1)),
         states[:, :3], states[:, 3:], np.zeros(count), np.full(count, 6.0),
     ), np.array(rows)  # fmt: skip
@@ -80,7 +80,7 @@ def _attributable(satellite, time_ns: int, sensor: np.ndarray) -> list[float]:
     return [ra, dec, moves @ east, moves @ np.cross(places[1], east)]
 
 
-def as_table(seen: Attributables, ids: Sequence[str], **columns: list) -> pa.Table:
+def as_table(seen: SeenTracklets, ids: Sequence[str], **columns: list) -> pa.Table:
     """Return TRACKLETS of one sensor each; `columns` replace those that are made."""
     count = len(ids)
     cov = seen.cov / ARCSEC**2

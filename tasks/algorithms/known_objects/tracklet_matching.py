@@ -36,7 +36,7 @@ from epipole.tasks.algorithms.known_objects.prediction import (
     is_deep_space,
     sigmas_of,
 )
-from epipole.tasks.algorithms.known_objects.tracklet_search import Attributables, Pairs, find_pairs
+from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, SeenTracklets, find_pairs
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -96,7 +96,7 @@ class TrackletNames(NamedTuple):
     listed: dict[int, tuple[int, ...]]
 
 
-def match_tracklets(tracklets: Attributables, catalogue: KnownSatellites) -> Pairs:
+def match_tracklets(tracklets: SeenTracklets, catalogue: KnownSatellites) -> Pairs:
     """Return the pairs of tracklets and satellites that may be one; see `find_pairs`."""
     middle_ns = _middle_ns(tracklets)
     rows = np.arange(len(catalogue.satellites))
@@ -107,7 +107,7 @@ def match_tracklets(tracklets: Attributables, catalogue: KnownSatellites) -> Pai
     return find_pairs(tracklets, catalogue.satellites, widest[:, 0], aside_km)
 
 
-def weigh_pairs(tracklets: Attributables, pairs: Pairs, catalogue: KnownSatellites) -> PairWeights:
+def weigh_pairs(tracklets: SeenTracklets, pairs: Pairs, catalogue: KnownSatellites) -> PairWeights:
     """Return how well each pair fits, by the catalogue's errors of elements."""
     errors = ErrorsOfPairs(catalogue, pairs.satellite, _middle_ns(tracklets))
     parts = [
@@ -118,7 +118,7 @@ def weigh_pairs(tracklets: Attributables, pairs: Pairs, catalogue: KnownSatellit
 
 
 def residuals_of(
-    tracklets: Attributables, pairs: Pairs, catalogue: KnownSatellites
+    tracklets: SeenTracklets, pairs: Pairs, catalogue: KnownSatellites
 ) -> list[TrackletResidual]:
     """Return the differences of tracklets from their satellites, in units of their errors."""
     errors = ErrorsOfPairs(catalogue, pairs.satellite, _middle_ns(tracklets))
@@ -150,11 +150,11 @@ class ErrorsOfPairs:
         return sigmas_of(errors, ages, self._drag_km_day2[rows] * ages**2)
 
 
-def _middle_ns(tracklets: Attributables) -> int:
+def _middle_ns(tracklets: SeenTracklets) -> int:
     return int(np.median(tracklets.time_ns)) if len(tracklets.time_ns) else 0
 
 
-def _ages(tracklets: Attributables, pairs: Pairs, catalogue: KnownSatellites) -> Array:
+def _ages(tracklets: SeenTracklets, pairs: Pairs, catalogue: KnownSatellites) -> Array:
     time_ns = tracklets.time_ns[pairs.tracklet] - catalogue.epoch_ns[pairs.satellite]
     return np.asarray(time_ns / DAY_NS)
 
@@ -165,7 +165,7 @@ def _widest(sigma: Array, ages: Array) -> Array:
 
 
 def _weigh(
-    tracklets: Attributables, pairs: Pairs, catalogue: KnownSatellites, errors: ErrorsOfPairs
+    tracklets: SeenTracklets, pairs: Pairs, catalogue: KnownSatellites, errors: ErrorsOfPairs
 ) -> PairWeights:
     ages = _ages(tracklets, pairs, catalogue)
     sigma = errors.sigmas(pairs.satellite, ages)
@@ -221,7 +221,7 @@ def _spread(jacobian: Array, sigma: Array) -> Array:
     return (jacobian * sigma[:, None] ** 2) @ np.swapaxes(jacobian, 1, 2)
 
 
-def _linearised(tracklets: Attributables, pairs: Pairs, sigma: Array, ages: Array) -> _Linear:
+def _linearised(tracklets: SeenTracklets, pairs: Pairs, sigma: Array, ages: Array) -> _Linear:
     """Return the differences, linearised at the errors that explain them best (Gauss-Newton)."""
     of = tracklets.take(pairs.tracklet)
     widest = _widest(sigma, ages)
@@ -246,7 +246,7 @@ def _linearised(tracklets: Attributables, pairs: Pairs, sigma: Array, ages: Arra
     return _Linear(offset, cov, H, unit, distance_km, apart_km)
 
 
-def _predicted(of: Attributables, axes: Array, states: Array) -> tuple[Array, Array, Array]:
+def _predicted(of: SeenTracklets, axes: Array, states: Array) -> tuple[Array, Array, Array]:
     """Return what sensors see of (k, 6) states: direction and rates on the plane of the sky.
 
     Returns

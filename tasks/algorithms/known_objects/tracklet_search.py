@@ -53,7 +53,7 @@ MIN_DISTANCE_KM = 20.0  # nearer is the satellite that carries the sensor
 BRIGHTEST_AT_1000_KM = -4.0
 
 
-class Attributables(NamedTuple):
+class SeenTracklets(NamedTuple):
     """What m tracklets tell, each of one sensor at its epoch.
 
     time_ns : (m,) int
@@ -80,9 +80,9 @@ class Attributables(NamedTuple):
     position_sigma_km: Array
     magnitude: Array
 
-    def take(self, rows: Indices) -> "Attributables":
+    def take(self, rows: Indices) -> "SeenTracklets":
         """Return some of the tracklets."""
-        return Attributables._make(column[rows] for column in self)
+        return SeenTracklets._make(column[rows] for column in self)
 
     def axes(self) -> Array:
         """Return the line of sight and the directions of growing ra and dec as rows, (m, 3, 3)."""
@@ -109,7 +109,7 @@ class Pairs(NamedTuple):
 
 
 def find_pairs(
-    tracklets: Attributables, satellites: Satellites, along_km: Array, aside_km: Array
+    tracklets: SeenTracklets, satellites: Satellites, along_km: Array, aside_km: Array
 ) -> Pairs:
     """Return the pairs of tracklets and satellites that are near each other and move alike.
 
@@ -139,7 +139,7 @@ def find_pairs(
     return pairs.take(_may_be_seen(tracklets, pairs))
 
 
-def _states(tracklets: Attributables, satellites: Satellites, both: Indices) -> Array:
+def _states(tracklets: SeenTracklets, satellites: Satellites, both: Indices) -> Array:
     """Return the states of pairs. Velocities are derivatives: those of SGP4 lack small terms."""
     time_ns = tracklets.time_ns[both[:, 0]]
     before, at, after = (
@@ -149,7 +149,7 @@ def _states(tracklets: Attributables, satellites: Satellites, both: Indices) -> 
     return np.concatenate([at, after - before], axis=1)
 
 
-def _lines(tracklets: Attributables) -> npt.NDArray[np.float32]:
+def _lines(tracklets: SeenTracklets) -> npt.NDArray[np.float32]:
     """Return direction, its rate, sensor position and velocity, and the rate's error, (m, 13)."""
     axes = tracklets.axes()
     rates = np.einsum("mi,mij->mj", tracklets.rates, axes[:, 1:])
@@ -359,7 +359,7 @@ def _fits(lines, i, dt, states, k, reach_km, satellite):
     return ex * ex + ey * ey + ez * ez < allowed * allowed
 
 
-def _may_be_seen(tracklets: Attributables, pairs: Pairs) -> npt.NDArray[np.bool_]:
+def _may_be_seen(tracklets: SeenTracklets, pairs: Pairs) -> npt.NDArray[np.bool_]:
     """Return whether each satellite is in sunlight, before the Earth, and not too bright."""
     r_km, from_km = pairs.states[:, :3], tracklets.r_km[pairs.tracklet]
     to_sun = direction_to_sun(tracklets.time_ns)[pairs.tracklet]
