@@ -18,20 +18,18 @@ from epipole.schemas.settings import KnownObjectSettings
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import IDENTIFICATIONS, STATES
 from epipole.tasks.algorithms.known_objects.matching import (
-    Candidate,
     KnownSatellites,
     NameVerdict,
     Observed,
     candidates,
     judge,
-    learn_errors,
     spread_rows,
+    with_learnt_errors,
 )
 from epipole.tasks.algorithms.known_objects.prediction import (
     HIGH_ORBIT,
     LOW_ORBIT,
     Screen,
-    is_deep_space,
     satellites_of,
 )
 from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, link_by_motion
@@ -186,22 +184,12 @@ def judge_objects(
     first = {name: candidates(of, catalogue, screen) for name, of in observed.items()}
     judged = [judge(found, SURE) for found in first.values()]
     sure = [each.best for each in judged if each.status == "known" and each.best is not None]
-    learnt = _learnt(catalogue, sure)
+    learnt = with_learnt_errors(catalogue, [each.row for each in sure], sure)
     verdicts = {
         name: judge(candidates(of, learnt, screen) if first[name] else [], least)
         for name, of in observed.items()
     }
     return verdicts, learnt
-
-
-def _learnt(catalogue: KnownSatellites, sure: Sequence[Candidate]) -> KnownSatellites:
-    """Return the catalogue with the errors of its elements as the sure matches show them."""
-    errors = []
-    for is_deep, start in ((False, catalogue.low), (True, catalogue.high)):
-        of_kind = [c for c in sure if is_deep_space(catalogue.satellites[c.row]) == is_deep]
-        errors.append(learn_errors(of_kind, [catalogue.satellites[c.row] for c in of_kind], start))
-    low, high = errors
-    return catalogue._replace(low=low, high=high)
 
 
 def _without_rivals(

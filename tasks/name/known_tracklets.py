@@ -13,12 +13,11 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.io.datasets.night_tables import read_columns
-from epipole.schemas.bridge import nullable, stack_covariance, table
+from epipole.schemas.bridge import nullable, table
 from epipole.schemas.columns import ATTRIBUTABLE_AXES, POSITION, VELOCITY, upper_triangle
 from epipole.schemas.tables import IDENTIFICATIONS
 from epipole.tasks.algorithms.constants import ARCSEC
-from epipole.tasks.algorithms.known_objects.matching import KnownSatellites, learn_errors
-from epipole.tasks.algorithms.known_objects.prediction import is_deep_space
+from epipole.tasks.algorithms.known_objects.matching import KnownSatellites, with_learnt_errors
 from epipole.tasks.algorithms.known_objects.tracklet_matching import (
     PairWeights,
     TrackletNames,
@@ -29,6 +28,7 @@ from epipole.tasks.algorithms.known_objects.tracklet_matching import (
 )
 from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, SeenTracklets
 from epipole.tasks.name.elements_of_night import CatalogueNames, ElementsOfNight, names_of
+from epipole.tasks.name.link_tracklets import covariance_of
 
 SURE = 0.999  # probability of a match from which errors are learnt
 MAX_LEARNT = 300  # tracklets, evenly chosen: they tell the errors to a tenth
@@ -86,14 +86,11 @@ def name_tracklets(
 
 
 def _tracklets(rows: pl.DataFrame) -> SeenTracklets:
-    cov = stack_covariance(rows, "cov_{}", ATTRIBUTABLE_AXES) * ARCSEC**2
-    bias = rows["bias_sigma_arcsec"].fill_null(0.0).to_numpy() * ARCSEC
-    cov[:, [0, 1], [0, 1]] += bias[:, None] ** 2
     return SeenTracklets(
         time_ns=rows["epoch"].cast(pl.Int64).to_numpy(),
         ra_dec=np.radians(rows.select("ra_deg", "dec_deg").to_numpy()),
         rates=rows.select("ra_rate_arcsec_s", "dec_rate_arcsec_s").to_numpy() * ARCSEC,
-        cov=cov,
+        cov=covariance_of(rows),
         r_km=rows.select(POSITION).to_numpy(),
         v_km_s=rows.select(VELOCITY).to_numpy(),
         position_sigma_km=rows["position_sigma_km"].fill_null(0.0).to_numpy(),
@@ -108,14 +105,9 @@ def _learnt(tracklets: SeenTracklets, pairs: Pairs, catalogue: KnownSatellites) 
     weights = weigh_pairs(tracklets, pairs, catalogue)
     first = judge_tracklets(len(tracklets.time_ns), pairs, weights, SURE)
     sure = pairs.take(first.pair[first.status == "known"])
-    is_deep = np.array([is_deep_space(catalogue.satellites[k]) for k in sure.satellite], bool)
-    errors = []
-    for of_kind, start in ((~is_deep, catalogue.low), (is_deep, catalogue.high)):
-        chosen = sure.take(of_kind)
-        satellites = [catalogue.satellites[k] for k in chosen.satellite.tolist()]
-        residuals = residuals_of(tracklets, chosen, catalogue)
-        errors.append(learn_errors(residuals, satellites, start))
-    return catalogue._replace(low=errors[0], high=errors[1])
+    return with_learnt_errors(
+        catalogue, sure.satellite.tolist(), residuals_of(tracklets, sure, catalogue)
+    )
 
 
 def _without_rivals(names: TrackletNames, pairs: Pairs, rows: pl.DataFrame) -> TrackletNames:

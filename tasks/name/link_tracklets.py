@@ -5,7 +5,6 @@ one object if one orbit explains their attributables, and chance does not. They 
 has positions, or become an object without.
 """
 
-import logging
 from typing import NamedTuple
 
 import numpy as np
@@ -25,8 +24,6 @@ from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
 from epipole.tasks.algorithms.orbit_linking.grouping import LinkedTracklets
 from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets as link_by_orbit
 from epipole.tasks.common.stage_tasks import stage_task
-
-LOGGER = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -97,9 +94,6 @@ def attributables_of(rows: pl.DataFrame) -> Tracklets:
         np.radians(rows["ra_deg"].to_numpy()), np.radians(rows["dec_deg"].to_numpy())
     )
     east, north = (np.ascontiguousarray(axis) for axis in np.moveaxis(east_north(u), 1, 0))
-    cov = stack_covariance(rows, "cov_{}", ATTRIBUTABLE_AXES) * ARCSEC**2
-    shared = (rows["bias_sigma_arcsec"].fill_null(0.0).to_numpy() * ARCSEC) ** 2
-    cov[:, [0, 1], [0, 1]] += shared[:, None]
     origin = rows["epoch"].min()
     time_s, first_s, last_s = (
         (rows[name] - origin).dt.total_nanoseconds().to_numpy() / 1e9
@@ -116,9 +110,20 @@ def attributables_of(rows: pl.DataFrame) -> Tracklets:
         east,
         north,
         ra_rate[:, None] * east + dec_rate[:, None] * north,
-        cov,
+        covariance_of(rows),
         rows["position_sigma_km"].to_numpy().copy(),
     )
+
+
+def covariance_of(rows: pl.DataFrame) -> Array:
+    """Return the covariances of attributables, with what the sensor's tracklets share, (n, 4, 4).
+
+    Of right ascension (times cos dec), declination [rad] and their rates [rad/s].
+    """
+    cov = stack_covariance(rows, "cov_{}", ATTRIBUTABLE_AXES) * ARCSEC**2
+    shared = (rows["bias_sigma_arcsec"].fill_null(0.0).to_numpy() * ARCSEC) ** 2
+    cov[:, [0, 1], [0, 1]] += shared[:, None]
+    return cov
 
 
 def _name(rows: pl.DataFrame, night: str) -> OrbitLinks:

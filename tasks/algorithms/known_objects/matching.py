@@ -387,6 +387,25 @@ def learn_errors(
     return _scaled(start, np.exp(found.x))
 
 
+def with_learnt_errors(
+    catalogue: KnownSatellites, rows: Sequence[int], matches: Sequence[Residual]
+) -> KnownSatellites:
+    """Return the catalogue with the errors of its elements as certain matches show them.
+
+    `rows` are the matches' satellites in the catalogue.
+    """
+    errors = []
+    for is_deep, start in ((False, catalogue.low), (True, catalogue.high)):
+        of_kind = [
+            (match, catalogue.satellites[row])
+            for row, match in zip(rows, matches, strict=True)
+            if is_deep_space(catalogue.satellites[row]) == is_deep
+        ]
+        errors.append(learn_errors([m for m, _ in of_kind], [s for _, s in of_kind], start))
+    low, high = errors
+    return catalogue._replace(low=low, high=high)
+
+
 def _scaled(errors: ElementErrors, factors: Array) -> ElementErrors:
     at_epoch, growth, radial, across = factors.tolist()
     return ElementErrors(
