@@ -24,7 +24,14 @@ from pydantic.fields import FieldInfo
 
 from epipole.flows import api
 from epipole.schemas.log_bounds import BOUNDS, TIME
-from epipole.schemas.rejects import FrameStatus, NameStatus, Outcome, Reason
+from epipole.schemas.rejects import (
+    Found,
+    FrameStatus,
+    NameStatus,
+    ObjectVerdict,
+    Outcome,
+    Reason,
+)
 from epipole.schemas.scene import (
     LensDeparture,
     Orbit,
@@ -52,7 +59,7 @@ MADE_BY = {
     Stage.TRACK: ("tracklets",),
     Stage.SOLVE: ("epochs", "associations", "pairs", "positions", "states", "orbits"),
     Stage.NAME: ("identifications",),
-    Stage.PUBLISH: ("observations", "sources", "nights", "rejects"),
+    Stage.PUBLISH: ("observations", "objects", "sources", "nights", "rejects"),
 }
 
 TUTORIAL = "docs/first_night.md"
@@ -133,6 +140,16 @@ def statuses() -> str:
 def object_names() -> str:
     """Return what may be known of an object's name."""
     return _words("status", NameStatus)
+
+
+def found() -> str:
+    """Return how objects are found."""
+    return _words("found", Found)
+
+
+def verdicts() -> str:
+    """Return the verdicts of objects."""
+    return _words("verdict", ObjectVerdict)
 
 
 def _words(heading: str, words: Iterable[StrEnum]) -> str:
@@ -270,6 +287,8 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "outcomes": outcomes,
         "statuses": statuses,
         "names": object_names,
+        "found": found,
+        "verdicts": verdicts,
     },
     "docs/input.md": {"bounds": bounds},
     "docs/settings.md": {"settings": settings},

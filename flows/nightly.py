@@ -20,6 +20,7 @@ from epipole.flows.night.stages import (
     choose_elements,
     determine_orbits,
     identify,
+    list_objects,
     name,
     name_known,
     publish,
@@ -139,9 +140,10 @@ def nightly(
                 linked = write_night(
                     made.work, made.solved, date, names, whole, staged[date], settings
                 )
-                determine_orbits(staged[date], date, linked)
+                misfits = determine_orbits(staged[date], date, linked)
                 states = earlier.last_states(date, settings)
                 residuals = name_known(staged[date], elements, states, settings)
+                list_objects(staged[date], date, misfits)
                 faults = [verdict for verdict in made.work.verdicts if verdict.is_faulty]
                 write_night_row(staged[date], recipe, earlier_key, faults, residuals)
             summary = publish(Destination(out, staged, replace), sources)

@@ -388,6 +388,43 @@ class Outcome(Declared):
     )
 
 
+class Found(Declared):
+    """How an object was found."""
+
+    TOGETHER = "together", "Two sensors or more saw it at one time: it has positions."
+    LINKED = "linked", "One orbit explains its tracklets, which are of different times."
+
+
+class ObjectVerdict(Declared):
+    """What is to be thought of an object. If several are true, the first one counts."""
+
+    BLENDED = (
+        "blended",
+        "More than half of its observations may hold the light of a second object.",
+    )
+    TWO_SENSORS_DISAGREE = (
+        "two_sensors_disagree",
+        "Only two sensors have views of it, and these miss each other by more than their errors "
+        "explain: it may be two objects.",
+    )
+    SENSORS_DISAGREE = (
+        "sensors_disagree",
+        "More than two sensors have views of it, which miss each other by more than their errors "
+        "explain; or most of its positions were solved without one of the views.",
+    )
+    ORBIT_MISFIT = (
+        "orbit_misfit",
+        "No single orbit fits its observations: it changed its orbit, or they are of more than "
+        "one object.",
+    )
+    NO_ORBIT = (
+        "no_orbit",
+        "Nothing is known against it, but no orbit is found: it has too few observations, or the "
+        "fit does not converge.",
+    )
+    SOUND = "sound", "One orbit fits all observations of it."
+
+
 class NameStatus(Declared):
     """What is known of an object's name."""
 

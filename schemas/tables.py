@@ -18,6 +18,8 @@ from epipole.schemas.columns import (
     time_column,
     upper_triangle,
 )
+from epipole.schemas.object_summary import OBJECT_FIELDS
+from epipole.schemas.observation import SIGHTED_FIELDS
 from epipole.schemas.orbit import ORBIT_FIELDS
 
 F64 = pa.float64()
@@ -295,63 +297,7 @@ OBSERVATIONS = schema(
         SENSOR_ID,
         FRAME_NUMBER,
         CENTROID,
-        column(
-            "ra_deg",
-            F64,
-            unit="deg",
-            frame="GCRF",
-            doc="Astrometric direction from the sensor: the aberration by the sensor's geocentric "
-            "velocity is removed (where that is known), the light time is not. It points to where "
-            "the object was when its light left.",
-        ),
-        column("dec_deg", F64, unit="deg", frame="GCRF", doc="The same."),
-        column(
-            "sigma_ra_arcsec",
-            F64,
-            unit="arcsec",
-            doc="1-sigma of ra times cos dec: of the centroid and of the frame's attitude. It is "
-            "independent in each frame.",
-        ),
-        column("sigma_dec_arcsec", F64, unit="arcsec", doc="1-sigma of dec, of the same."),
-        column("correlation", F64, doc="Of both."),
-        column(
-            "bias_sigma_arcsec",
-            F64,
-            unit="arcsec",
-            doc="1-sigma per axis of what all frames of the sensor have in common: fitted optics, "
-            "a prior attitude. 0 where nothing is known to be common.",
-        ),
-        *axes("{}_km", unit="km", frame="GCRF", doc="Sensor position at that time"),
-        *axes(
-            "v{}_km_s",
-            unit="km/s",
-            frame="GCRF",
-            null=True,
-            doc="Sensor velocity; null where unknown",
-        ),
-        column(
-            "position_sigma_km",
-            F64,
-            unit="km",
-            doc="1-sigma of the sensor position, per axis: of the log, or of the settings where "
-            "it tells none; larger where the objects show so. Mostly common to all frames of the "
-            "sensor.",
-        ),
-        column(
-            "magnitude",
-            F64,
-            unit="mag",
-            null=True,
-            doc="V by the frame's identified stars; null without flux, or without such stars.",
-        ),
-        column(
-            "magnitude_sigma",
-            F64,
-            unit="mag",
-            null=True,
-            doc="1-sigma: of the flux and of the frame's zero point. An object's colour may differ "
-            "from the stars'.",
-        ),
+        *SIGHTED_FIELDS,
     ],
 )
 
@@ -387,10 +333,17 @@ ORBITS = schema(
     [time_column("epoch", doc="Middle of the arc, UTC."), OBJECT_ID, *ORBIT_FIELDS],
 )
 
+OBJECTS = schema(
+    "objects",
+    "One row per object of the night, at a glance: when it was seen, how it was found, whether it "
+    "is sound, how bright it is and its name.",
+    [OBJECT_ID, *OBJECT_FIELDS],
+)
+
 IDENTIFICATIONS = schema(
     "identifications",
-    "One row per object with positions, and with a catalogue one per tracklet that belongs to none "
-    "of these, held against a catalogue of known objects.",
+    "One row per object, and with a catalogue one per tracklet that belongs to none, held against "
+    "a catalogue of known objects.",
     [
         id_column("object_id", null=True, doc="Null in the row of a tracklet."),
         id_column("tracklet_id", null=True, doc="Null in the row of an object."),
@@ -425,7 +378,8 @@ IDENTIFICATIONS = schema(
             F64,
             unit="km",
             null=True,
-            doc="Distance from its place; of a tracklet, that of the place from the line of sight.",
+            doc="Distance from its place; of a tracklet, and of an object without positions, that "
+            "of the place from a line of sight.",
         ),
         column(
             "mahalanobis",
@@ -520,7 +474,7 @@ _COUNTS = [
     ("detections", "Rows of `detections`."),
     ("tracklets", "Rows of `tracklets`."),
     ("epochs", "Different epochs in `epochs`."),
-    ("objects", "Different objects in `positions`."),
+    ("objects", "Rows of `objects`."),
     ("positions", "Rows of `positions`."),
     ("left_out", "Sum of the counts in `rejects`."),
 ]
@@ -585,6 +539,7 @@ TABLES: dict[str, pa.Schema] = {
     "observations": OBSERVATIONS,
     "states": STATES,
     "orbits": ORBITS,
+    "objects": OBJECTS,
     "identifications": IDENTIFICATIONS,
     "calibrations": CALIBRATIONS,
     "pairs": PAIRS,

@@ -48,8 +48,9 @@ from epipole.tasks.name.object_ids import (
     renamed,
 )
 from epipole.tasks.name.sensor_residuals import SensorResidual
+from epipole.tasks.publish.night_objects import write_objects
 from epipole.tasks.publish.night_parts import NightParts, publish_nights
-from epipole.tasks.publish.orbits import fit_orbits, orbit_shares, write_orbits
+from epipole.tasks.publish.orbits import OrbitRows, fit_orbits, orbit_shares, write_orbits
 from epipole.tasks.publish.write_tables import SHARES, tracklets_of_night, write_tables
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs
 from epipole.tasks.read.read_logs import read_log_into
@@ -302,13 +303,22 @@ def write_night(
     return orbits
 
 
-def determine_orbits(folder: Path, night: str, linked: pa.Table) -> None:
-    """Fit the orbits of a night whose tables are written, and write them; see `fit_orbits`."""
+def determine_orbits(folder: Path, night: str, linked: pa.Table) -> list[str]:
+    """Fit the orbits of a night whose tables are written, and write them; see `fit_orbits`.
+
+    Returns the objects whose observations fit no orbit.
+    """
     shares = orbit_shares(folder, night)
     futures = [fit_orbits.submit(folder, night, share, shares, linked) for share in range(shares)]
-    fitted = results(Stage.PUBLISH, futures)
+    fitted: list[OrbitRows] = results(Stage.PUBLISH, futures)
     (count,) = results(Stage.PUBLISH, [write_orbits.submit(folder, night, fitted)])
     LOGGER.info("fitted %s", many(count, "orbit"))
+    return [name for each in fitted for name in each.misfits]
+
+
+def list_objects(folder: Path, night: str, misfits: Sequence[str]) -> None:
+    """Write the objects of a night whose other tables are written; see `write_objects`."""
+    results(Stage.PUBLISH, [write_objects.submit(folder, night, misfits)])
 
 
 def _link(parts: NightParts, settings: Settings) -> tuple[NightParts, pa.Table]:

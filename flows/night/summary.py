@@ -10,7 +10,8 @@ import pyarrow.compute as pc
 
 from epipole.io.datasets.night_tables import Where, count_rows, read_columns
 from epipole.schemas.bridge import array
-from epipole.schemas.rejects import NameStatus, Outcome, Reason
+from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome, Reason
+from epipole.schemas.stages import Declared
 from epipole.tasks.report.night_facts import ReportExtract
 
 
@@ -48,8 +49,9 @@ class SensorSummary:
 class Summary:
     """Counts of what was published.
 
-    `names` are the objects by what is known of their names, `tracklet_names` the tracklets that
-    belong to none with positions; both are empty without a catalogue. `faults` of sensors and
+    `outcomes` are the tracklets by what became of them, `verdicts` the objects. `names` are the
+    objects by what is known of their names, `tracklet_names` the tracklets that belong to none;
+    both are empty without a catalogue. `faults` of sensors and
     `residuals` of their known objects are a sentence each. `unchanged` nights were not made again.
     """
 
@@ -65,6 +67,7 @@ class Summary:
     outcomes: dict[str, int]
     epochs: int
     objects: int
+    verdicts: dict[str, int]
     positions: int
     names: dict[str, int]
     tracklet_names: dict[str, int]
@@ -91,6 +94,7 @@ class Summary:
             f"identified  {self.identified:,} by {self.stars:,} stars",
             f"objects     {self.objects:,} in {self.detections:,} detections, "
             f"{many(self.tracklets, 'tracklet')}",
+            *self._doubtful(),
             *self._without_object(),
             f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
             *self._names(),
@@ -114,6 +118,13 @@ class Summary:
             parts.append(f"{sum(self.rejects.values()):,} left out")
         return ", ".join(parts)
 
+    def _doubtful(self) -> list[str]:
+        """Return how many objects are not sound, by verdict."""
+        doubtful = {name: n for name, n in self.verdicts.items() if name != ObjectVerdict.SOUND}
+        if not doubtful:
+            return []
+        return [f"  not sound {_listed(doubtful)}"]
+
     def _without_object(self) -> list[str]:
         """Return how many tracklets orbits joined, and how many have no object, by outcome."""
         joined = {Outcome.OBJECT, Outcome.LINKED}
@@ -122,17 +133,15 @@ class Summary:
         lines = [f"  linked    {many(linked, 'tracklet')} by orbits"] if linked else []
         if not alone:
             return lines
-        parts = ", ".join(f"{count:,} {name}" for name, count in alone.items())
-        return [*lines, f"  without   {many(sum(alone.values()), 'tracklet')}: {parts}"]
+        return [*lines, f"  without   {many(sum(alone.values()), 'tracklet')}: {_listed(alone)}"]
 
     def _names(self) -> list[str]:
         """Return what is known of names, and of the sensors by known objects."""
         lines: list[str] = []
         for counts, of in ((self.names, "object"), (self.tracklet_names, "tracklet")):
             if counts:
-                parts = ", ".join(f"{count:,} {status}" for status, count in counts.items())
                 heading = "names" if not lines else ""
-                lines.append(f"{heading:<12}{many(sum(counts.values()), of)}: {parts}")
+                lines.append(f"{heading:<12}{many(sum(counts.values()), of)}: {_listed(counts)}")
         return lines + [f"  {residual}" for residual in self.residuals]
 
     def _left_out(self) -> list[str]:
@@ -147,12 +156,16 @@ class Summary:
         return [f"left out    {sum(self.rejects.values()):,}:", *lines]
 
 
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count:,} {name}" for name, count in counts.items())
+
+
 # The columns that are counted: all columns of a whole night would not fit in memory.
 _COLUMNS = {
     "frames": ["sensor_id", "time", "attitude_source", "residual_px"],
     "tracklets": ["sensor_id", "track_id", "outcome"],
     "epochs": ["epoch"],
-    "positions": ["object_id"],
+    "objects": ["object_id", "verdict"],
     "sources": ["sha256"],
     "identifications": ["object_id", "status", "catalogue"],
     "rejects": ["reason", "count"],
@@ -172,8 +185,8 @@ def count(folders: Sequence[Where]) -> dict[str, int]:
         "detections": sum(count_rows(folder, "detections") for folder in folders),
         "tracklets": tables["tracklets"].num_rows,
         "epochs": pc.count_distinct(tables["epochs"]["epoch"]).as_py(),
-        "objects": pc.count_distinct(tables["positions"]["object_id"]).as_py(),
-        "positions": tables["positions"].num_rows,
+        "objects": pc.count_distinct(tables["objects"]["object_id"]).as_py(),
+        "positions": sum(count_rows(folder, "positions") for folder in folders),
         "left_out": pc.sum(tables["rejects"]["count"]).as_py() or 0,
     }
 
@@ -192,7 +205,8 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
         dataset=dataset,
         nights=list(nights),
         **counts,
-        outcomes=_outcomes(tables["tracklets"]),
+        outcomes=_counted(tables["tracklets"]["outcome"], Outcome),
+        verdicts=_counted(tables["objects"]["verdict"], ObjectVerdict),
         names=_names(tables["identifications"], pc.is_valid),
         tracklet_names=_names(tables["identifications"], pc.is_null),
         rejects=by_reason(tables["rejects"]),
@@ -217,16 +231,14 @@ def _tables(folders: Sequence[Where]) -> dict[str, pa.Table]:
 def _names(identifications: pa.Table, has_object: Callable[..., Any]) -> dict[str, int]:
     """Return the objects, or the tracklets, by status; empty without a catalogue."""
     rows = identifications.filter(has_object(identifications["object_id"]))
-    statuses = rows.filter(pc.is_valid(rows["catalogue"]))["status"].combine_chunks()
-    counts = dict(zip(*(c.to_pylist() for c in pc.value_counts(statuses).flatten()), strict=True))
-    return {status.value: counts[status] for status in NameStatus if status in counts}
+    return _counted(rows.filter(pc.is_valid(rows["catalogue"]))["status"], NameStatus)
 
 
-def _outcomes(tracklets: pa.Table) -> dict[str, int]:
-    """Return the number of tracklets by outcome, in the order of `Outcome`."""
-    counts = pc.value_counts(tracklets["outcome"].combine_chunks())
+def _counted(values: pa.ChunkedArray, declared: type[Declared]) -> dict[str, int]:
+    """Return how often each word of a column occurs, in the order in which they are declared."""
+    counts = pc.value_counts(values.combine_chunks())
     found = dict(zip(*(c.to_pylist() for c in counts.flatten()), strict=True))
-    return {outcome.value: found[outcome.value] for outcome in Outcome if outcome.value in found}
+    return {word.value: found[word.value] for word in declared if word.value in found}
 
 
 def _by_night(sentences: Mapping[str, Sequence[str]]) -> list[str]:

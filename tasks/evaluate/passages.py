@@ -41,7 +41,7 @@ def measure_passages(
     Parameters
     ----------
     tables
-        `detections`, `observations`, `associations` and `identifications`.
+        `detections`, `tracklets`, `observations` and `identifications`.
     points
         The centroids of the truth.
     """
@@ -51,7 +51,7 @@ def measure_passages(
     detections = to_polars(tables["detections"]).drop_nulls("tracklet_id")
     passages = _passages(shown, detections, to_polars(tables["observations"]), truth)
     tracklets = _objects_of_tracklets(detections, points)
-    ids = _ids_of_tracklets(to_polars(tables["associations"]))
+    ids = to_polars(tables["tracklets"]).select("tracklet_id", "object_id").drop_nulls()
     fast = passages.filter(pl.col("rate_deg_s") > FAST_DEG_S)
     return {
         "passages": passages.height,
@@ -134,13 +134,6 @@ def _objects_of_tracklets(detections: pl.DataFrame, points: pl.DataFrame) -> pl.
         "tracklet_id",
         true_object=pl.when(is_main).then("true_object").otherwise(-1).fill_null(-1),
     )
-
-
-def _ids_of_tracklets(associations: pl.DataFrame) -> pl.DataFrame:
-    """Return each associated `tracklet_id` with the `object_id` that it has most often."""
-    counts = associations.drop_nulls("tracklet_id").group_by("tracklet_id", "object_id").len()
-    ordered = counts.sort("len", "object_id", descending=[True, False])
-    return ordered.unique("tracklet_id", keep="first").select("tracklet_id", "object_id")
 
 
 def _joined_wrong(tracklets: pl.DataFrame, ids: pl.DataFrame) -> int:

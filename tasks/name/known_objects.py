@@ -1,7 +1,7 @@
 """Name known objects: compare each object of a night with a catalogue and with earlier nights.
 
-The errors of the elements are learnt from the certain matches of the night. Then all objects are
-judged with them, and after them the tracklets that belong to none of them.
+The errors of the elements are learnt from the certain matches of the night. Then all objects that
+have positions are judged with them, and after them the tracklets of others and of none.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from epipole.io.datasets.night_tables import read_columns, take_rows, write_table
-from epipole.schemas.bridge import array, stack, stack_covariance, table
+from epipole.schemas.bridge import array, concat, stack, stack_covariance, table
 from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.settings import KnownObjectSettings
 from epipole.schemas.stages import Stage
@@ -117,7 +118,7 @@ def name_known_objects(
     folder
         The night's folder.
     known
-        None: without a catalogue; all objects are unknown, and tracklets have no rows.
+        None: without a catalogue; all objects are unknown, and other tracklets have no rows.
     earlier
         STATES of earlier nights.
 
@@ -128,25 +129,29 @@ def name_known_objects(
     """
     observed, spans = observed_objects(folder)
     verdicts: dict[str, NameVerdict] = {}
-    of_tracklets = []
+    others = IDENTIFICATIONS.empty_table()
     if known is not None:
         verdicts, learnt = judge_objects(observed, known, settings.probability)
-        of_tracklets = [
-            tracklet_rows(
-                name_tracklets(folder, list(observed), learnt, settings.probability), known
-            )
-        ]
+        named = name_tracklets(folder, list(observed), learnt, settings.probability)
+        others = tracklet_rows(named, known)
     verdicts = _without_rivals(verdicts, spans)
     unnamed = [name for name in observed if _status(verdicts, name) != "known"]
     same_as = recognise_objects(folder, unnamed, earlier, settings.earlier_h, link_log_odds)
-    rows = _rows(list(observed), verdicts, known, same_as)
-    write_table(folder, "identifications", [rows, *of_tracklets])
+    objects = sorted(observed.keys() | _seen_objects(folder) - set(others["object_id"].to_pylist()))
+    rows = concat(IDENTIFICATIONS, [_rows(objects, verdicts, known, same_as), others])
+    write_table(folder, "identifications", [rows.sort_by([("object_id", "ascending")])])
     if known is None:
         return []
     return sensor_residuals(
         folder,
         {n: known.sets[v.best.row] for n, v in verdicts.items() if v.status == "known" and v.best},
     )
+
+
+def _seen_objects(folder: Path) -> set[str]:
+    """Return the objects that have observations; those without positions are among them."""
+    rows = read_columns(folder, "observations", ["object_id"])
+    return set(pc.unique(rows["object_id"]).drop_null().to_pylist())
 
 
 def observed_objects(folder: Path) -> tuple[dict[str, Observed], dict[str, tuple[int, int]]]:

@@ -1,7 +1,7 @@
 """Name tracklets: compare those that belong to no object with positions with a catalogue.
 
-The errors of the elements are learnt once more, from the sure matches of the night's tracklets.
-Then all tracklets are judged with them.
+Objects that have no positions are named by their tracklets. The errors of the elements are learnt
+once more, from the sure matches of the night's tracklets. Then all are judged with them.
 """
 
 from collections.abc import Sequence
@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
 from epipole.io.datasets.night_tables import read_columns
 from epipole.schemas.bridge import nullable, table
 from epipole.schemas.columns import ATTRIBUTABLE_AXES, POSITION, VELOCITY, upper_triangle
+from epipole.schemas.rejects import NameStatus
 from epipole.schemas.tables import IDENTIFICATIONS
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.known_objects.matching import KnownSatellites, with_learnt_errors
@@ -30,6 +32,8 @@ from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, SeenTr
 from epipole.tasks.name.elements_of_night import CatalogueNames, ElementsOfNight, names_of
 from epipole.tasks.name.link_tracklets import covariance_of
 
+Indices = npt.NDArray[np.int64]
+
 SURE = 0.999  # probability of a match from which errors are learnt
 MAX_LEARNT = 300  # tracklets, evenly chosen: they tell the errors to a tenth
 _COVARIANCE = [f"cov_{a}{b}" for a, b in upper_triangle(ATTRIBUTABLE_AXES)]
@@ -41,12 +45,15 @@ _COLUMNS = [
 
 
 class NamedTracklets(NamedTuple):
-    """Some tracklets of a night, in order of their ids, and their names.
+    """Objects and tracklets of a night, and their names.
 
-    `names` has rows as `ids` has; `pairs` and `weights` are what it points to.
+    Each has an `object_id` or a `tracklet_id`. `row` is its row in `names`, which are of tracklets;
+    `pairs` and `weights` are what these point to.
     """
 
-    ids: list[str]
+    object_id: list[str | None]
+    tracklet_id: list[str | None]
+    row: Indices
     names: TrackletNames
     pairs: Pairs
     weights: PairWeights
@@ -56,6 +63,10 @@ def name_tracklets(
     folder: Path, objects: Sequence[str], catalogue: KnownSatellites, min_probability: float
 ) -> NamedTracklets:
     """Return what a catalogue says of the tracklets of a night that belong to none of its objects.
+
+    Those that an orbit joins to an object give this object a name: of the satellites that fit all
+    of them, that of the tracklet that decides most clearly. The errors of the elements are the
+    same in all of them, so their evidence is not added.
 
     Parameters
     ----------
@@ -80,9 +91,42 @@ def name_tracklets(
     catalogue = _learnt(tracklets, pairs, catalogue)
     weights = weigh_pairs(tracklets, pairs, catalogue)
     pairs = pairs._replace(tracklet=compared[pairs.tracklet])
+    weights = weights._replace(fits=_fits_all(weights.fits, pairs, rows, compared))
     names = judge_tracklets(len(rows), pairs, weights, min_probability)
-    names = _without_rivals(names, pairs, rows)
-    return NamedTracklets(rows["tracklet_id"].to_list(), names, pairs, weights)
+    row = _deciding(names, rows)
+    names = _without_rivals(names, pairs, rows, row)
+    kept = np.unique(row)
+    object_id = rows["object_id"].gather(kept)
+    tracklet_id = rows["tracklet_id"].gather(kept).set(object_id.is_not_null(), None)
+    return NamedTracklets(object_id.to_list(), tracklet_id.to_list(), kept, names, pairs, weights)
+
+
+def _fits_all(
+    fits: npt.NDArray[np.bool_], pairs: Pairs, rows: pl.DataFrame, compared: Indices
+) -> npt.NDArray[np.bool_]:
+    """Return which pairs fit; those of an object, whether all its tracklets fit the satellite."""
+    members = rows[compared].group_by("object_id").agg(members=pl.len())
+    of = rows.select("object_id")[pairs.tracklet].with_columns(satellite=pairs.satellite, fits=fits)
+    of = of.join(members, on="object_id", how="left", maintain_order="left")
+    all_fit = pl.col("fits").sum().over("object_id", "satellite") == pl.col("members")
+    return np.asarray(
+        of.select(pl.when(pl.col("object_id").is_null()).then("fits").otherwise(all_fit))
+        .to_series()
+        .to_numpy(),
+        bool,
+    )
+
+
+def _deciding(names: TrackletNames, rows: pl.DataFrame) -> Indices:
+    """Return, for each tracklet, that one of its object whose name is the clearest; else itself."""
+    rank = pl.Series(names.status).replace_strict(
+        [status.value for status in NameStatus], range(len(NameStatus)), return_dtype=pl.Int64
+    )
+    of = rows.select("object_id").with_row_index("row")
+    of = of.with_columns(rank=rank, doubt=pl.Series(-names.probability))
+    clearest = pl.col("row").sort_by("rank", "doubt", "row").first().over("object_id")
+    row = pl.when(pl.col("object_id").is_null()).then("row").otherwise(clearest)
+    return of.select(row.cast(pl.Int64).alias("row")).to_series().to_numpy()
 
 
 def _tracklets(rows: pl.DataFrame) -> SeenTracklets:
@@ -110,16 +154,21 @@ def _learnt(tracklets: SeenTracklets, pairs: Pairs, catalogue: KnownSatellites) 
     )
 
 
-def _without_rivals(names: TrackletNames, pairs: Pairs, rows: pl.DataFrame) -> TrackletNames:
-    """Return the names; two tracks of one sensor at one time are not one satellite."""
-    known = np.flatnonzero(names.status == "known")
+def _without_rivals(
+    names: TrackletNames, pairs: Pairs, rows: pl.DataFrame, row: Indices
+) -> TrackletNames:
+    """Return the names; two tracks of one sensor at one time are not one satellite.
+
+    `row` is that of each tracklet's name. Tracklets of one object have one name.
+    """
+    known = np.flatnonzero(names.status[row] == "known")
     of = (
         rows[known]
-        .select("track_id", "sensor_id", "start_time", "end_time")
-        .with_columns(row=known, satellite=pairs.satellite[names.pair[known]])
+        .select("sensor_id", "start_time", "end_time", owner=pl.coalesce("object_id", "track_id"))
+        .with_columns(row=row[known], satellite=pairs.satellite[names.pair[row[known]]])
     )
     both = of.join(of, on=["sensor_id", "satellite"], suffix="_other").filter(
-        pl.col("track_id") != pl.col("track_id_other"),
+        pl.col("owner") != pl.col("owner_other"),
         pl.col("start_time") <= pl.col("end_time_other"),
         pl.col("start_time_other") <= pl.col("end_time"),
     )
@@ -131,15 +180,15 @@ def _without_rivals(names: TrackletNames, pairs: Pairs, rows: pl.DataFrame) -> T
 
 
 def tracklet_rows(named: NamedTracklets, known: ElementsOfNight) -> pa.Table:
-    """Return the rows of IDENTIFICATIONS of tracklets, in order of their ids."""
-    pair, status = named.names.pair, named.names.status.tolist()
-    row = np.full(len(pair), -1)
-    row[pair >= 0] = named.pairs.satellite[pair[pair >= 0]]
+    """Return their rows of IDENTIFICATIONS."""
+    pair, status = named.names.pair[named.row], named.names.status[named.row].tolist()
+    satellite = np.full(len(pair), -1)
+    satellite[pair >= 0] = named.pairs.satellite[pair[pair >= 0]]
     names = [
         names_of(of, known.sets, best, named.names.listed.get(k, ()))
         if best >= 0
         else CatalogueNames()
-        for k, (of, best) in enumerate(zip(status, row.tolist(), strict=True))
+        for k, of, best in zip(named.row.tolist(), status, satellite.tolist(), strict=True)
     ]
     count = len(names)
     fitted = {
@@ -151,11 +200,11 @@ def tracklet_rows(named: NamedTracklets, known: ElementsOfNight) -> pa.Table:
         {field: [getattr(each, field) for each in names] for field in CatalogueNames._fields}
         | {name: nullable(values) for name, values in fitted.items()}
         | {
-            "object_id": [None] * count,
-            "tracklet_id": named.ids,
+            "object_id": named.object_id,
+            "tracklet_id": named.tracklet_id,
             "status": status,
             "same_as": [None] * count,
-            "probability": named.names.probability,
+            "probability": named.names.probability[named.row],
             "catalogue": [known.sha256] * count,
         },
     )

@@ -84,10 +84,14 @@ class Start(NamedTuple):
 
 
 class OrbitRows(NamedTuple):
-    """ORBITS of some objects, and rows of `rejects` for the others."""
+    """ORBITS of some objects, and rows of `rejects` for the others.
+
+    `misfits` are those of the others whose observations fit no orbit.
+    """
 
     orbits: pa.Table
     rejects: pa.Table
+    misfits: list[str]
 
 
 def orbit_shares(folder: Path, night: str) -> int:
@@ -127,6 +131,7 @@ def fit_orbits(
             time=[objects.middle_ns(k) for k in failed],
             count=[1] * len(failed),
         ),
+        [objects.names[k] for k in failed if reasons[k] == Reason.ORBIT_MISFIT],
     )
 
 

@@ -90,11 +90,10 @@ def draw_ring(figure: Figure, objects: Sequence[NightObject]) -> None:
     """Draw objects near the geostationary ring: longitude and latitude, first to last position."""
     axes = axes_of(figure, "longitude [deg east]", "latitude [deg]")
     for status, (colour, marker) in _STATUSES.items():
-        of_status = [each for each in objects if each.status == status]
+        of_status = [o.ends for o in objects if o.status == status and o.ends is not None]
         if not of_status:
             continue
-        first, last = (np.array([side[:2] for side in ends]) for ends in
-                       ([o.first for o in of_status], [o.last for o in of_status]))  # fmt: skip
+        first, last = np.array(of_status)[:, :, :2].swapaxes(0, 1)
         jump = np.abs(first[:, 0] - last[:, 0]) > 180
         first[jump] = last[jump]
         axes.plot(*np.stack([first, last]).transpose(2, 0, 1), color=colour, linewidth=0.9)

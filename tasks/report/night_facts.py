@@ -173,8 +173,8 @@ def _nothing_found(facts: NightFacts) -> Iterator[str]:
         yield "The night has no frames."
     elif not facts.counts["stars"]:
         yield "No star is identified in the whole night."
-    elif not facts.counts["positions"]:
-        yield "No object has a position."
+    elif not facts.objects:
+        yield "No object is found."
 
 
 def _sensors(facts: NightFacts) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 
-from epipole.schemas.rejects import NameStatus, Outcome
+from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome
 from epipole.tasks.report.canvas import as_svg
 from epipole.tasks.report.draw_sensors import IMAGE_IN, draw_epipolar
 from epipole.tasks.report.draw_sky import draw_elements, draw_ring, draw_sky, draw_trend
@@ -58,7 +58,7 @@ def objects(facts: NightFacts) -> Section:
     """Return the section about the objects."""
     title, found = "Objects", facts.objects
     if not found:
-        return Section("objects", title, nothing("No object has a position."))
+        return Section("objects", title, nothing("No object is found."))
     ring = [each for each in found if each.near_geostationary]
     others = [each for each in found if each.has_orbit and not each.near_geostationary]
     pictures = []
@@ -73,38 +73,56 @@ def objects(facts: NightFacts) -> Section:
         pictures.append(figure(
             as_svg(partial(draw_elements, objects=others), 3.6),
             f"Semi-major axis, eccentricity and inclination of {len(others)} objects.",
-            "The other objects, by the best state of each. From a short arc, axis and eccentricity "
-            "are uncertain: their scatter is not that of orbits.",
+            "The other objects, by their orbits. From a short arc, axis and eccentricity are "
+            "uncertain: their scatter is not that of orbits.",
         ))  # fmt: skip
-    return Section("objects", title, paragraph(_names(found)) + figures(pictures) + _table(found))
+    body = paragraph(_names(found)) + _verdicts(found) + figures(pictures) + _table(found)
+    return Section("objects", title, body)
 
 
 def _names(found: Sequence[NightObject]) -> str:
     counts = {status: sum(each.status == status for each in found) for status in NameStatus}
     listed = ", ".join(f"{count:,} {status}" for status, count in counts.items() if count)
-    bare = sum(each.elements is None for each in found)
-    short = f" {bare:,} have no state: their arcs are too short." if bare else ""
-    return f"{len(found):,} objects have positions: {listed}.{short}"
+    linked = sum(not each.positions for each in found)
+    alone = f" {linked:,} have no positions: orbits join their tracklets." if linked else ""
+    return f"{len(found):,} objects: {listed}.{alone}"
+
+
+def _verdicts(found: Sequence[NightObject]) -> str:
+    """Return how many objects are sound, and how many are not and why."""
+    rows = [
+        (verdict.value, f"{count:,}", verdict.sentence)
+        for verdict in reversed(ObjectVerdict)
+        if (count := sum(each.verdict == verdict for each in found))
+    ]
+    return table("What is to be thought of them", ("verdict", "objects", "meaning"), rows)
 
 
 def _table(found: Sequence[NightObject]) -> str:
     order = sorted(found, key=lambda each: (each.status == NameStatus.KNOWN, -each.positions))
     shown = order[:MAX_OBJECTS]
     rows = [
-        (each.object_id, each.status, each.name, f"{each.positions:,}", clock(each.first_ns),
-         clock(each.last_ns), str(each.sensors), f"{each.sigma_km:.3g}", *_geography(each))
+        (each.object_id, each.status, each.name, each.verdict, f"{each.positions:,}",
+         clock(each.first_ns),
+         clock(each.last_ns), str(each.sensors), _number(each.sigma_km), *_geography(each))
         for each in shown
     ]  # fmt: skip
     caption = "Objects; unknown ones first"
     if len(found) > len(shown):
         caption += f", {len(shown)} of {len(found):,}"
-    heading = ("object", "status", "name", "positions", "from", "to", "sensors", "sigma km",
-               "radius km", "longitude", "latitude", "a km", "e", "i deg")  # fmt: skip
+    heading = ("object", "status", "name", "verdict", "positions", "from", "to", "sensors",
+               "sigma km", "radius km", "longitude", "latitude", "a km", "e", "i deg")  # fmt: skip
     return table(caption, heading, rows)
 
 
+def _number(value: float) -> str:
+    return f"{value:.3g}" if value == value else ""
+
+
 def _geography(each: NightObject) -> tuple[str, ...]:
-    longitude, latitude, radius = each.last
+    if each.ends is None:
+        return ("",) * 6
+    longitude, latitude, radius = each.ends[1]
     geography = f"{radius:,.0f}", f"{longitude:.2f}", f"{latitude:.2f}"
     if each.elements is None:
         return (*geography, "", "", "")

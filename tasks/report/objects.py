@@ -10,15 +10,15 @@ import numpy.typing as npt
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
-from epipole.schemas.columns import POSITION, VELOCITY
+from epipole.schemas.columns import POSITION
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.rejects import NameStatus, Outcome
-from epipole.tasks.algorithms.constants import GM_KM3_S2
 from epipole.tasks.algorithms.times import utc_julian_date
 
 # Objects: where they are, how they move, and what is known of their names.
 
 Array = npt.NDArray[np.float64]
+Geography = tuple[float, float, float]
 
 GEOSTATIONARY_KM = 42_164.0
 NEAR_KM = 1_500.0
@@ -28,79 +28,106 @@ LARGEST_LATITUDE_DEG = 20.0
 class NightObject(NamedTuple):
     """An object.
 
-    first, last : (longitude, latitude [deg], radius [km]) at its first and last position
-    elements : semi-major axis [km], eccentricity, inclination [deg] of its best state; None: no
-        state
+    ends : (longitude, latitude [deg], radius [km]) at its first and at its last position; of an
+        object without positions twice that at the epoch of its orbit. None: not known.
+    sigma_km : of its positions, or of its orbit; NaN where neither is known
+    elements : semi-major axis [km], eccentricity, inclination [deg] of its orbit; None: no orbit
     """
 
     object_id: str
     status: str
     name: str
+    verdict: str
     positions: int
     first_ns: int
     last_ns: int
     sensors: int
     sigma_km: float
-    first: tuple[float, float, float]
-    last: tuple[float, float, float]
+    ends: tuple[Geography, Geography] | None
     elements: tuple[float, float, float] | None
 
     @property
     def near_geostationary(self) -> bool:
         """Whether it is near the geostationary ring, by its position."""
-        _, latitude, radius = self.last
+        if self.ends is None:
+            return False
+        _, latitude, radius = self.ends[1]
         return abs(radius - GEOSTATIONARY_KM) < NEAR_KM and abs(latitude) < LARGEST_LATITUDE_DEG
 
     @property
     def has_orbit(self) -> bool:
-        """Whether it has a state, of an ellipse around the Earth."""
+        """Whether it has an orbit, an ellipse around the Earth."""
         return self.elements is not None and 0 < self.elements[0] < 1e6 and self.elements[1] < 1
+
+
+_OBJECTS = ["object_id", "verdict", "n_positions", "first_time", "last_time", "n_sensors", "name"]
 
 
 def read_objects(night: NightReader) -> list[NightObject]:
     """Return the objects of a night, in the order of their ids."""
-    columns = ["object_id", "time", *POSITION, "cov_xx", "cov_yy", "cov_zz", "n_sensors"]
-    variance = (pl.col("cov_xx") + pl.col("cov_yy") + pl.col("cov_zz")) / 3
-    sums = [
-        rows.group_by("object_id", maintain_order=True).agg(
-            positions=pl.len(), sensors=pl.col("n_sensors").max(), variance=variance.sum(),
-            first=pl.struct("time", *POSITION).first(), last=pl.struct("time", *POSITION).last(),
-        )
-        for rows in night.pieces("positions", columns)
-    ]  # fmt: skip
-    if not sums:
-        return []
-    rows = pl.concat(sums).group_by("object_id", maintain_order=True).agg(
-        pl.col("positions", "variance").sum(), pl.col("sensors").max(),
-        pl.col("first").first(), pl.col("last").last(),
-    ).sort("object_id")  # fmt: skip
-    names = _names(night)
-    elements = _elements(night)
-    ends = [_ends(rows[side].struct.unnest()) for side in ("first", "last")]
-    nothing = (NameStatus.UNKNOWN.value, "")
+    found = night.read("objects", _OBJECTS).sort("object_id")
+    statuses = night.read("identifications", ["object_id", "status"]).drop_nulls("object_id")
+    status = dict(statuses.iter_rows())
+    located = {**_of_orbits(night), **_of_positions(night)}
+    elements = night.read("orbits", ["object_id", "a_km", "e", "i_deg"]).rows_by_key(
+        "object_id", unique=True
+    )
     return [
         NightObject(
-            name, *names.get(name, nothing), row["positions"],
-            ends[0][1][k], ends[1][1][k], row["sensors"],
-            float(np.sqrt(row["variance"] / row["positions"])),
-            ends[0][0][k], ends[1][0][k], elements.get(name),
+            row["object_id"],
+            status.get(row["object_id"], NameStatus.UNKNOWN.value),
+            row["name"] or "",
+            row["verdict"],
+            row["n_positions"],
+            row["first_ns"],
+            row["last_ns"],
+            row["n_sensors"],
+            sigma_km,
+            ends,
+            elements.get(row["object_id"]),
         )
-        for k, row in enumerate(rows.select("positions", "variance", "sensors").to_dicts())
-        for name in (rows["object_id"][k],)
+        for row in found.with_columns(
+            first_ns=pl.col("first_time").dt.epoch("ns"), last_ns=pl.col("last_time").dt.epoch("ns")
+        ).to_dicts()
+        for ends, sigma_km in (located.get(row["object_id"], (None, float("nan"))),)
+    ]
+
+
+Located = dict[str, tuple[tuple[Geography, Geography], float]]  # ends, sigma [km]
+_VARIANCE = ["cov_xx", "cov_yy", "cov_zz"]
+
+
+def _of_positions(night: NightReader) -> Located:
+    """Return where each object is at its first and its last position."""
+    variance = pl.mean_horizontal(*_VARIANCE)
+    sums = [
+        rows.group_by("object_id", maintain_order=True).agg(
+            count=pl.len(), variance=variance.sum(),
+            first=pl.struct("time", *POSITION).first(), last=pl.struct("time", *POSITION).last(),
+        )
+        for columns in (["object_id", "time", *POSITION, *_VARIANCE],)
+        for rows in (night.empty("positions", columns), *night.pieces("positions", columns))
     ]  # fmt: skip
+    rows = pl.concat(sums).group_by("object_id", maintain_order=True).agg(
+        pl.col("count", "variance").sum(), pl.col("first").first(), pl.col("last").last()
+    )  # fmt: skip
+    first, last = (_geography(rows[side].struct.unnest()) for side in ("first", "last"))
+    sigma_km = (rows["variance"] / rows["count"]).sqrt().to_list()
+    ends = zip(first, last, strict=True)
+    return dict(zip(rows["object_id"].to_list(), zip(ends, sigma_km, strict=True), strict=True))
 
 
-def _names(night: NightReader) -> dict[str, tuple[str, str]]:
-    """Return the status and the name of each object."""
-    rows = night.read("identifications", ["object_id", "status", "name"]).drop_nulls("object_id")
-    return {
-        name: (status, known if known is not None and status == NameStatus.KNOWN else "")
-        for name, status, known in rows.iter_rows()
-    }
+def _of_orbits(night: NightReader) -> Located:
+    """Return where each object is at the epoch of its orbit."""
+    rows = night.read("orbits", ["object_id", "epoch", *POSITION, *_VARIANCE])
+    at = _geography(rows.rename({"epoch": "time"}))
+    sigma_km = rows.select(pl.mean_horizontal(*_VARIANCE).sqrt()).to_series().to_list()
+    ends = zip(at, at, strict=True)
+    return dict(zip(rows["object_id"].to_list(), zip(ends, sigma_km, strict=True), strict=True))
 
 
-def _ends(rows: pl.DataFrame) -> tuple[list[tuple[float, float, float]], list[int]]:
-    """Return longitudes, latitudes and radii of positions, and their times.
+def _geography(rows: pl.DataFrame) -> list[Geography]:
+    """Return longitudes, latitudes and radii of positions.
 
     UT1 is taken to be UTC: less than 0.004 degrees.
     """
@@ -111,30 +138,7 @@ def _ends(rows: pl.DataFrame) -> tuple[list[tuple[float, float, float]], list[in
     ra = np.arctan2(r[:, 1], r[:, 0])
     longitude = np.degrees(ra - erfa.era00(*utc_julian_date(time_ns)))
     longitude = (longitude + 180.0) % 360.0 - 180.0
-    geodetic = zip(longitude.tolist(), latitude.tolist(), radius.tolist(), strict=True)
-    return list(geodetic), time_ns.tolist()
-
-
-def _elements(night: NightReader) -> dict[str, tuple[float, float, float]]:
-    """Return a, e, i of the state of each object that has the most views."""
-    rows = night.read("states", ["object_id", "n_views", *POSITION, *VELOCITY])
-    rows = rows.sort("n_views", descending=True, maintain_order=True)
-    rows = rows.unique("object_id", keep="first", maintain_order=True)
-    shape = elements_of(rows.select(POSITION).to_numpy(), rows.select(VELOCITY).to_numpy())
-    return dict(zip(rows["object_id"].to_list(), map(tuple, shape.tolist()), strict=True))
-
-
-def elements_of(r_km: Array, v_km_s: Array) -> Array:
-    """Return (n, 3) semi-major axes [km], eccentricities and inclinations [deg] of states.
-
-    A state that is not bound has a negative semi-major axis.
-    """
-    r = np.linalg.norm(r_km, axis=-1)
-    a = 1.0 / (2.0 / r - np.sum(v_km_s**2, axis=-1) / GM_KM3_S2)
-    h = np.cross(r_km, v_km_s)
-    e = np.cross(v_km_s, h) / GM_KM3_S2 - r_km / r[..., None]
-    i = np.degrees(np.arctan2(np.hypot(h[..., 0], h[..., 1]), h[..., 2]))
-    return np.stack([a, np.linalg.norm(e, axis=-1), i], axis=-1)
+    return list(zip(longitude.tolist(), latitude.tolist(), radius.tolist(), strict=True))
 
 
 # Tracklets on the sky: some of each outcome, as lines.
@@ -235,16 +239,13 @@ def read_trend(nights: Iterable[NightReader]) -> list[NightNumbers]:
 
 
 def _numbers(night: NightReader) -> NightNumbers:
-    frames = identified = positions = 0
+    frames = identified = 0
     for rows in night.pieces("frames", ["attitude_source"]):
         frames += len(rows)
         identified += int((rows["attitude_source"] == "stars").sum())
-    objects: set[str] = set()
-    for rows in night.pieces("positions", ["object_id"]):
-        positions += len(rows)
-        objects.update(rows["object_id"].unique())
     rejects = sum(int(rows["count"].sum()) for rows in night.pieces("rejects", ["count"]))
     optics = night.read("calibrations", ["sensor_id", "fx_px", "fy_px"])
     mean = (pl.col("fx_px") * pl.col("fy_px")).abs().sqrt()
     focal_px = dict(optics.select("sensor_id", mean).iter_rows())
-    return NightNumbers(night.night, frames, identified, len(objects), positions, rejects, focal_px)
+    objects, positions = night.count("objects"), night.count("positions")
+    return NightNumbers(night.night, frames, identified, objects, positions, rejects, focal_px)

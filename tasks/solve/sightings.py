@@ -262,6 +262,7 @@ def tabulate_sightings(sightings: SensorSightings | None) -> pa.Table:
         "sigma_dec_arcsec": sigma[:, 1] / ARCSEC,
         "correlation": noise[:, 0, 1] / (sigma[:, 0] * sigma[:, 1]),
         "bias_sigma_arcsec": _bias_sigma(sightings, np.arange(len(u))) / ARCSEC,
+        "blended": tracklets.blend_rad2 > 0.0,
         **unstack("{}_km", r_km),
         "position_sigma_km": frames.position_sigma_km[frame],
         "tracklet_id": tracklets.name[tracklets.tracklet],

@@ -25,7 +25,6 @@ LOGS = [
     "logs_real_orbits/geo_cluster_every_30s.mcap",  # sampled orbits, and the next one
     "logs_real_orbits/low_8deg_5hz.mcap",
 ]
-AMBIGUOUS = ("joined_wrong", "passages_joined")
 
 
 def reference():
@@ -41,7 +40,6 @@ def reference():
 
 def compare(expected, found):
     """Require the same measures, number for number. A measure that is not there is null."""
-    expected = {name: value for name, value in expected.items() if name not in AMBIGUOUS}
     assert set(expected) <= set(found)
     for name, value in found.items():
         other = expected.get(name)
@@ -96,12 +94,9 @@ def spoil(dataset: Path, share: float) -> None:
 
 
 def shared_measures(dataset, log):
-    """The measures that the other tool has too: none of `observations`, nor of magnitudes.
-
-    Two of passages are not compared: where a tracklet has several ids, the other tool takes any.
-    """
+    """The measures that the other tool has too: none of `observations`, nor of magnitudes."""
     found = evaluate(dataset, log).as_dict()
-    left_out = ("observation", "magnitude", *AMBIGUOUS)
+    left_out = ("observation", "magnitude")
     return {name: value for name, value in found.items() if not name.startswith(left_out)}
 
 

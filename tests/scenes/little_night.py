@@ -15,6 +15,7 @@ from epipole.schemas.tables import (
     POSITIONS,
     STARS,
     STATES,
+    TRACKLETS,
 )
 from epipole.schemas.work_tables import TRUE_FRAMES, TRUE_POINTS
 
@@ -93,6 +94,7 @@ def little_dataset():
         "frames": rows(FRAMES, *frames),
         "stars": rows(STARS, *stars),
         "detections": rows(DETECTIONS, *detections),
+        "tracklets": rows(TRACKLETS),
         "epochs": rows(EPOCHS, {"sensor_id": "a"}, {"sensor_id": "b"}),
         "associations": rows(ASSOCIATIONS, *associations),
         "positions": rows(POSITIONS, *positions),

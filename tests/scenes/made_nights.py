@@ -68,6 +68,8 @@ def hostile_night(name: str) -> NightReader:
                             n_sensors=[2] * 3, chi2=[1.0] * 3, cov_xx=[1.0] * 3),
         "identifications": filled("identifications", object_id=[name], status=["known"],
                                   name=[name]),
+        "objects": filled("objects", object_id=[name], n_positions=[3], verdict=[name],
+                          name=[name]),
         "calibrations": filled("calibrations", sensor_id=[name], fx_px=[900.0], fy_px=[900.0]),
         "sources": filled("sources", name=[name], code_version=[name], settings_key=[name]),
         "rejects": filled("rejects", sensor_id=[name], source=[name], stage=["check"],

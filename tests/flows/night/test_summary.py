@@ -14,7 +14,7 @@ from epipole.schemas.tables import TABLES
 FOUND = Summary(
     dataset="/data/out", nights=["2019-04-01"], logs=1, sensors=2, frames=1234, identified=1200,
     stars=9000, detections=8, tracklets=1, outcomes={"object": 1}, epochs=6, objects=5, positions=4,
-    rejects={}, tracklet_names={},
+    verdicts={"sound": 5}, rejects={}, tracklet_names={},
     faults=[], by_sensor=[], names={}, residuals=[], unchanged=False, extracts=(),
 )  # fmt: skip
 
@@ -32,6 +32,14 @@ def test_tracklets_without_object_are_counted_by_outcome():
     lines = replace(FOUND, outcomes={"object": 5, "ambiguous": 1, "seen_by_one": 1200}).lines()
     assert lines[4] == "  without   1,201 tracklets: 1 ambiguous, 1,200 seen_by_one"
     assert not any("without" in line for line in FOUND.lines())
+
+
+def test_objects_that_are_not_sound_are_counted_by_verdict():
+    from dataclasses import replace
+
+    lines = replace(FOUND, verdicts={"blended": 1, "no_orbit": 1200, "sound": 3}).lines()
+    assert lines[4] == "  not sound 1 blended, 1,200 no_orbit"
+    assert not any("not sound" in line for line in FOUND.lines())
 
 
 def test_each_reason_is_shown_with_its_sentence():
@@ -70,6 +78,7 @@ def test_staged_nights_are_counted_together(tmp_path):
         },
         epochs={"epoch": [1, 1, 2]},
         positions={"object_id": ["o", "p", "o"]},
+        objects={"object_id": ["o", "p"], "verdict": ["sound", "blended"]},
         sources={"sha256": ["s"]},
         stars={"centroid": np.arange(4)},
         nights={"faults": [["the clock of a is late"]]},
@@ -83,6 +92,7 @@ def test_staged_nights_are_counted_together(tmp_path):
             "time": [7_000_000_000],
         },
         positions={"object_id": ["o"]},
+        objects={"object_id": ["o"], "verdict": ["sound"]},
         sources={"sha256": ["s"]},
         nights={"faults": [[]]},
     )  # fmt: skip
@@ -91,6 +101,7 @@ def test_staged_nights_are_counted_together(tmp_path):
     assert (summary.identified, summary.stars, summary.tracklets) == (2, 4, 3)
     assert summary.outcomes == {"object": 1, "seen_by_one": 2}
     assert (summary.epochs, summary.objects, summary.positions) == (2, 2, 4)
+    assert summary.verdicts == {"blended": 1, "sound": 2}
     # The most frequent first, then by name.
     assert list(summary.rejects.items()) == [("no_state", 9), ("bad_sigma", 3), ("nan", 3)]
     assert summary.faults == ["2019-04-01: the clock of a is late"]

@@ -27,6 +27,8 @@ from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
+WHOLE_NIGHT = {"sources", "nights", "calibrations", "identifications", "objects"}
+
 
 def test_every_table_has_a_file_each_night_with_its_units(tmp_path):
     publish(tmp_path / "out", {"sources": night_tables(TIMES)["sources"]}, [NIGHT])
@@ -53,7 +55,7 @@ def test_rows_go_to_the_night_of_their_time_in_order_of_time(tmp_path):
     shuffled = np.random.default_rng(3).permutation(OVER_MIDNIGHT)
     publish(tmp_path, night_tables(shuffled), [NIGHT, NEXT_NIGHT])
     found = []
-    for name in set(TABLES) - {"sources", "nights", "calibrations", "identifications"}:
+    for name in set(TABLES) - WHOLE_NIGHT:
         nights = [read_table(tmp_path, name, night) for night in (NIGHT, NEXT_NIGHT)]
         assert [t.num_rows for t in nights] == [10, 10], name
         column = next(f.name for f in nights[0].schema if f.type == TIME)

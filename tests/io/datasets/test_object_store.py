@@ -32,6 +32,7 @@ WHOLE_NIGHT = (
     "nights",
     "calibrations",
     "identifications",
+    "objects",
 )  # tables that are not of an instant
 pytestmark = pytest.mark.long
 

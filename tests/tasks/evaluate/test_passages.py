@@ -7,7 +7,7 @@ import pytest
 from scenes.little_night import little_dataset, little_truth, rows
 
 from epipole.schemas.bridge import empty, to_polars
-from epipole.schemas.tables import ASSOCIATIONS, DETECTIONS, IDENTIFICATIONS, OBSERVATIONS
+from epipole.schemas.tables import DETECTIONS, IDENTIFICATIONS, OBSERVATIONS, TRACKLETS
 from epipole.tasks.evaluate.evaluate_dataset import evaluate_dataset
 from epipole.tasks.evaluate.passages import measure_passages
 
@@ -27,18 +27,18 @@ def detections(sensor_id, centroid, tracklet_id, frames=range(N)):
     ]
 
 
-def view(tracklet_id, object_id):
-    return {"tracklet_id": tracklet_id, "object_id": object_id, "used": True}
+def tracklet(tracklet_id, object_id):
+    return {"tracklet_id": tracklet_id, "object_id": object_id}
 
 
-def measured(seen, views=(), observed=(), named=(), **scenario):
+def measured(seen, tracklets=(), observed=(), named=(), **scenario):
     truth = little_truth(N)
     sensors = [{"id": s, "sat": s, "rate_hz": 1.0} for s in "ab"]
     truth.scenario.update({"sensors": sensors} | scenario)
     tables = {
         "detections": rows(DETECTIONS, *seen),
         "observations": rows(OBSERVATIONS, *observed),
-        "associations": rows(ASSOCIATIONS, *views),
+        "tracklets": rows(TRACKLETS, *tracklets),
         "identifications": rows(IDENTIFICATIONS, *named),
     }
     return measure_passages(tables, to_polars(truth.points), truth)
@@ -71,22 +71,23 @@ def test_passages_are_observed_by_half_of_their_detections():
 
 def test_passages_through_two_satellites_are_joined_by_one_id():
     seen = [row for s in "ab" for k in (1, 2) for row in detections(s, k, f"{s}{k}")]
-    views = [view("a1", "o1"), view("b1", "o1"), view("a2", "o2"), view("b2", "o3")]
-    found = measured(seen, views)
+    ids = {"a1": "o1", "b1": "o1", "a2": "o2", "b2": "o3"}
+    joined = [tracklet(*pair) for pair in ids.items()]
+    found = measured(seen, joined)
     assert (found["passage_pairs"], found["passages_joined"]) == (2, 0.5)
     assert found["joined_wrong"] == 0
     one_satellite = [{"id": s, "sat": "x", "rate_hz": 1.0} for s in "ab"]
-    assert measured(seen, views, sensors=one_satellite)["passage_pairs"] == 0
-    mixed = [*views[:2], view("b2", "o1")]
+    assert measured(seen, joined, sensors=one_satellite)["passage_pairs"] == 0
+    mixed = [*joined[:2], tracklet("b2", "o1")]
     assert measured(seen, mixed)["joined_wrong"] == 1
 
 
 def test_tracklets_are_named_by_the_identification_of_their_object():
     seen = detections("a", 1, "a1") + detections("a", 2, "a2")
-    views = [view("a1", "o1"), view("a2", "o2")]
+    joined = [tracklet("a1", "o1"), tracklet("a2", "o2")]
     named = [{"object_id": o, "status": "known", "norad_id": 7} for o in ("o1", "o2")]
     targets = [{"norad": 7}, {"norad": 8}]
-    found = measured(seen, views, named=named, targets=targets)
+    found = measured(seen, joined, named=named, targets=targets)
     assert (found["named_right"], found["named_wrong"]) == (0.5, 1)
 
 

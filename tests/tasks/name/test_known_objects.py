@@ -81,8 +81,10 @@ def states(seen, sigma_km=0.05, sigma_km_s=1e-5):
 def named(tmp_path):
     """Return a function that names the objects of a night, and returns the table's rows."""
 
-    def name(seen, known, *, earlier=None, sensors=(), settings=None, tracklets=None):
-        tables = {"positions": positions(np.random.default_rng(1), seen), "states": states(seen),
+    def name(seen, known, *, earlier=None, sensors=(), settings=None, tracklets=None, unsolved=()):
+        solved = {name: of for name, of in seen.items() if name not in unsolved}
+        tables = {"positions": positions(np.random.default_rng(1), solved),
+                  "states": states(solved),
                   "observations": observations(seen, sensors),
                   "tracklets": tracklets or TRACKLETS.empty_table()}  # fmt: skip
         for table, rows in tables.items():
@@ -192,6 +194,36 @@ def test_tracklets_without_object_have_rows_of_their_own(named, fleet):
     assert of["status"].to_list() == ["unknown" if n is None else "known" for n in expected]
     assert (of["catalogue"] == "digest").all()
     assert of.filter(status="known")["distance_km"].max() < 1.0
+
+
+def test_objects_without_positions_are_named_by_their_tracklets(named, fleet):
+    seen, rows = seen_from_near(fleet, 40, np.random.default_rng(4))
+    ids, of = [f"t{k:02d}" for k in range(40)], [f"x{k:02d}" for k in rows.tolist()]
+    made = as_table(seen, ids, object_id=of)
+    found, _ = named({}, ElementsOfNight("digest", fleet[:20]), tracklets=made)
+    assert found["object_id"].to_list() == sorted(set(of))
+    assert found["tracklet_id"].null_count() == len(found)
+    for name, status, number in found.select("object_id", "status", "norad_id").iter_rows():
+        row = int(name[1:])
+        assert (status, number) == (("known", 100_000 + row) if row < 20 else ("unknown", None))
+
+
+def test_a_satellite_that_does_not_fit_all_tracklets_of_an_object_is_not_it(named, fleet):
+    seen, rows = seen_from_near(fleet, 40, np.random.default_rng(4))
+    (one,), other = np.flatnonzero(rows == rows[0])[:1], np.flatnonzero(rows != rows[0])[0]
+    mixed = type(seen)(*(column[[one, other]] for column in seen))
+    found, _ = named({}, ElementsOfNight("digest", fleet),
+                     tracklets=as_table(mixed, ["t0", "t1"], object_id=["x", "x"]))  # fmt: skip
+    assert found["status"].to_list() == ["unknown"]
+    assert found["norad_id"].to_list() == [None]
+
+
+def test_an_object_that_has_only_observations_has_a_row(named, fleet):
+    seen = {"o": (fleet[0], seconds(10)), "p": (fleet[1], seconds(10))}
+    for known, status in ((None, "unknown"), (ElementsOfNight("digest", fleet), "known")):
+        rows, _ = named(seen, known, sensors=[("a", np.zeros(3), 0.0)], unsolved=["p"])
+        assert rows["object_id"].to_list() == ["o", "p"]
+        assert rows["status"].to_list() == [status, "unknown"]
 
 
 def test_two_tracks_of_one_sensor_at_one_time_are_not_one_satellite(named, fleet):

@@ -115,7 +115,7 @@ def nights():
 def test_sections_without_data_say_so(night):
     page = page_of(night)
     list(drawings(page))
-    assert "No object has a position." in page
+    assert "No object is found." in page
     assert "The dataset has no earlier night." in page
     assert page.count('class="nothing"') >= 4
 

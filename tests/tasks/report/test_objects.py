@@ -1,31 +1,40 @@
-"""Objects: their elements against formulas, longitudes against a textbook's sidereal time."""
+"""Objects: longitudes against a textbook's sidereal time; what an object without positions has."""
 
 import numpy as np
-from scenes.made_nights import filled, reader_of
+from scenes.made_nights import START_NS, filled, reader_of
 
-from epipole.tasks.report.objects import elements_of, read_objects
-
-GM = 398600.4418
-
-
-def test_elements_of_a_circle_and_of_an_ellipse():
-    r = np.array([[42164.0, 0, 0], [7000.0, 0, 0]])
-    speed = np.array([np.sqrt(GM / 42164.0), np.sqrt(GM * (2 / 7000.0 - 1 / 10_000.0))])
-    v = np.stack([0 * speed, speed * np.cos(0.5), speed * np.sin(0.5)], axis=1)
-    a, e, i = elements_of(r, v).T
-    np.testing.assert_allclose(a, [42164.0, 10_000.0], rtol=1e-12)
-    np.testing.assert_allclose(e, [0.0, 0.3], atol=1e-12)
-    np.testing.assert_allclose(np.radians(i), [0.5, 0.5], atol=1e-12)
+from epipole.tasks.report.objects import read_objects
 
 
 def test_longitude_is_right_ascension_less_sidereal_time():
     # Greenwich mean sidereal time on 2019-04-01, 0 h UT: 12 h 36 m 16.7 s (Meeus, 12.4), from an
     # equinox that precession has moved by 0.2459 degrees since 2000: that is in this number too.
     made = reader_of({
-        "positions": filled("positions", object_id=["o"], x_km=[42164.0], n_sensors=[2],
+        "objects": filled("objects", object_id=["o"], n_positions=[1], verdict=["no_orbit"]),
+        "positions": filled("positions", object_id=["o"], x_km=[42164.0], cov_xx=[12.0],
                             time=[1_554_076_800_000_000_000])})  # fmt: skip
     (found,) = read_objects(made)
     expected = -(12 + 36 / 60 + 16.7 / 3600) * 15 + 0.2459
-    assert abs((found.last[0] - expected + 180) % 360 - 180) < 0.01
+    assert abs((found.ends[1][0] - expected + 180) % 360 - 180) < 0.01
     assert found.near_geostationary
+    assert found.sigma_km == 2.0
     assert found.elements is None
+    assert (found.status, found.name, found.verdict) == ("unknown", "", "no_orbit")
+
+
+def test_an_object_without_positions_is_where_its_orbit_is():
+    made = reader_of({
+        "objects": filled("objects", object_id=["o", "p"], n_sensors=[2, 1], name=["SAT 7", None]),
+        "identifications": filled("identifications", object_id=["o", None], status=["known"] * 2),
+        "orbits": filled("orbits", object_id=["o"], z_km=[7000.0], cov_xx=[3.0], a_km=[7000.0],
+                         e=[0.1], i_deg=[90.0])})  # fmt: skip
+    found, bare = read_objects(made)
+    assert found.ends[0][1:] == found.ends[1][1:] == (90.0, 7000.0)
+    assert (found.status, found.name, found.positions) == ("known", "SAT 7", 0)
+    assert (found.sigma_km, found.elements) == (1.0, (7000.0, 0.1, 90.0))
+    assert (found.sensors, found.first_ns) == (2, START_NS)
+    assert found.has_orbit
+    assert bare.ends is None
+    assert np.isnan(bare.sigma_km)
+    assert not bare.has_orbit
+    assert not bare.near_geostationary
