@@ -35,7 +35,8 @@ CERTAIN_LOG_ODDS = 8.0  # log-odds from which a group is certain
 MIN_OTHERS, MIN_OTHERS_AT_ONCE = 3, 4
 PRIOR_LOOKS = 10.0  # weight of the prior, as a number of detections and misses
 MIN_DETECTION, MAX_DETECTION = 0.05, 0.99
-SIGHTS = 10  # lines of sight that sample a field, along each of its sides
+SIGHTS = 200  # lines of sight that sample the fields of a set of sensors
+SAMPLED = 12  # sensors of a set whose fields are sampled
 STEPS = 24  # along a line of sight, in addition to the shells' edges
 # Two sets of sensors count as one if both have this share of the sensors in either.
 SAME_SENSORS = 0.8
@@ -185,40 +186,71 @@ def estimated_detection(views: Views, groups: Sequence[Hypothesis], prior: float
 # Number of objects
 
 
-def visible_volume(views: Views, sensors: Indices, shells: Array, farthest_km: float) -> Array:
-    """Return the volume [km^3] that exactly these sensors see in each shell, weighted, (j,).
+class VisibleVolumes(NamedTuple):
+    """Volumes [km^3] that sets of sensors see in each shell, times its weight, (p, j) each.
 
-    It is integrated along lines of sight of the sensor with the smallest field, at the instant at
-    which most sensors have a known attitude. Points that almost the same sensors see count too,
-    see `SAME_SENSORS`. NaN if fewer than two of the sensors have a known attitude.
+    NaN if fewer than two of a set's sensors have a known attitude.
+
+    shared
+        What two or more of the sensors see.
+    exclusive
+        The part of it that exactly these sensors see, or almost, see `SAME_SENSORS`.
+    """
+
+    shared: Array
+    exclusive: Array
+
+
+def visible_volumes(
+    views: Views, sets: Sequence[Indices], shells: Array, farthest_km: float
+) -> VisibleVolumes:
+    """Return the volumes that sets of sensors see."""
+    volume = [_visible_volume(views, sensors, shells, farthest_km) for sensors in sets]
+    shared, exclusive = np.reshape(volume, (-1, 2, len(shells))).swapaxes(0, 1)
+    return VisibleVolumes(shared, exclusive)
+
+
+def _visible_volume(views: Views, sensors: Indices, shells: Array, farthest_km: float) -> Array:
+    """Return the two volumes of one set, (2, j).
+
+    They are integrated along lines of sight of up to `SAMPLED` of the sensors, at the instant at
+    which most sensors have a known attitude.
     """
     ready = np.isfinite(views.position_km[..., 0]) & np.isfinite(views.attitude[..., 0, 0])
     m = int(np.argmax(ready[sensors].sum(axis=0)))
-    of_set = ready[:, m] & np.isin(np.arange(len(ready)), sensors)
-    known = np.flatnonzero(of_set)
+    known = sensors[ready[sensors, m]]
     if len(known) < 2:
-        return np.full(len(shells), np.nan)
-    first = known[np.argmin(np.prod(views.half_field[known], axis=1))]
-    r_km, attitude = views.position_km[first, m], views.attitude[first, m]
-    u, cell_sr = _sights(views.half_field[first], attitude)
-    others = known[known != first]
-    rho, edges = _steps(r_km, u, shells, *_overlap(views, others, m, r_km, u, farthest_km))
-    x = r_km + rho[..., None] * u[:, None]
-    camera = np.ascontiguousarray(views.camera[ready[:, m], m])
-    shared = _shared(camera, of_set[ready[:, m]], x.reshape(-1, 3)).reshape(rho.shape)
-    volume = np.diff(edges**3, axis=1) / 3 * cell_sr[:, None] * (shared >= SAME_SENSORS)
-    radius = np.linalg.norm(x, axis=2)
-    inside = [(radius >= inner) & (radius < outer) for inner, outer in shells[:, :2]]
-    return np.array([w * volume[here].sum() for w, here in zip(shells[:, 2], inside, strict=True)])
+        return np.full((2, len(shells)), np.nan)
+    others = np.setdiff1d(np.flatnonzero(ready[:, m]), known)
+    cameras = [np.ascontiguousarray(views.camera[part, m]) for part in (known, others)]
+    sampled = known[np.arange(min(len(known), SAMPLED)) * len(known) // min(len(known), SAMPLED)]
+    side = int(np.sqrt(SIGHTS / len(sampled)))
+    volume = np.zeros((2, len(shells)))
+    for s in sampled.tolist():
+        r_km, R = views.position_km[s, m], views.attitude[s, m]
+        u, cell_sr = _sights(views.half_field[s], R, side)
+        overlap = _overlap(views, known[known != s], m, r_km, u, farthest_km)
+        rho, edges = _steps(r_km, u, shells, *overlap)
+        x = r_km + rho[..., None] * u[:, None]
+        count, theirs = _seen_by(*cameras, x.reshape(-1, 3)).T.reshape(2, *rho.shape)
+        # A point is met from each sensor that sees it.
+        part = (
+            np.diff(edges**3, axis=1) / 3 * cell_sr[:, None] / np.maximum(count, 1) * (count >= 2)
+        )
+        parts = np.stack([part, part * theirs])
+        radius = np.linalg.norm(x, axis=2)
+        for j, (inner, outer) in enumerate(shells[:, :2]):
+            volume[:, j] += parts[:, (radius >= inner) & (radius < outer)].sum(axis=1)
+    return len(known) / len(sampled) * shells[:, 2] * volume
 
 
-def _sights(half_field: Array, R_sensor_from_icrs: Array) -> tuple[Array, Array]:
+def _sights(half_field: Array, R_sensor_from_icrs: Array, side: int) -> tuple[Array, Array]:
     """Return lines of sight that sample a field evenly, (n, 3), and their solid angles [sr]."""
-    middle = (np.arange(SIGHTS) + 0.5) / SIGHTS * 2 - 1
+    middle = (np.arange(side) + 0.5) / side * 2 - 1
     a, b = np.meshgrid(*(middle * half for half in half_field), indexing="ij")
     stretch = np.sqrt(1 + a * a + b * b).ravel()
     toward = np.stack([a.ravel(), b.ravel(), np.ones(a.size)], axis=1) / stretch[:, None]
-    return toward @ R_sensor_from_icrs, np.prod(half_field) * 4 / SIGHTS**2 / stretch**3
+    return toward @ R_sensor_from_icrs, np.prod(half_field) * 4 / side**2 / stretch**3
 
 
 def _overlap(
@@ -246,22 +278,28 @@ def _overlap(
 
 
 @kernel
-def _shared(camera, of_set, x):
-    """Return how similar the sensors that see each point x (n, 3) [km] are to those of a set, (n,).
+def _seen_by(camera, others, x):
+    """Return how many sensors of a set see each point x (n, 3) [km], and whether it is theirs.
 
-    Sensors are rows of `camera` (s, 33), those of the set are flagged in `of_set` (s,). The result
-    is the number of sensors that are in the set and see the point, over that of all that are in the
-    set or see it.
+    Sensors are rows of `camera` (s, 33), and of `others` those that are not of the set. A point is
+    theirs (1, else 0) if the set and all sensors that see it are similar, see `SAME_SENSORS`.
+    Result: (n, 2).
     """
-    shared = np.empty(len(x))
+    seen_by = np.zeros((len(x), 2))
     for i in range(len(x)):
-        inside, either = 0, 0
+        inside = 0
         for s in range(len(camera)):
-            sees_it = in_view(camera[s], x[i])
-            inside += of_set[s] and sees_it
-            either += of_set[s] or sees_it
-        shared[i] = inside / either
-    return shared
+            inside += in_view(camera[s], x[i])
+        seen_by[i, 0] = inside
+        if inside < 2:
+            continue
+        limit, either = inside / SAME_SENSORS, len(camera)
+        for s in range(len(others)):
+            if either > limit:
+                break
+            either += in_view(others[s], x[i])
+        seen_by[i, 1] = either <= limit
+    return seen_by
 
 
 def _steps(
@@ -280,10 +318,27 @@ def _steps(
     return (edge[:, 1:] + edge[:, :-1]) / 2, edge
 
 
-def sets_of_sensors(views: Views, groups: Sequence[Hypothesis]) -> tuple[list[Indices], Indices]:
-    """Return sets of sensors, and for each group the set that has it in the fields, (g,).
+class SensorSets(NamedTuple):
+    """Sets of sensors that have groups in their fields.
 
-    The most common set is the first. Sets that are similar to an earlier one are merged into it.
+    sensors : list of (n,) int
+        The sensors of each set.
+    set_of : (g,) int
+        The set that has each group in its fields.
+    row, group : (n,) int
+        The groups that at least two sensors of a set (`row`) have in their fields.
+    """
+
+    sensors: list[Indices]
+    set_of: Indices
+    row: Indices
+    group: Indices
+
+
+def sets_of_sensors(views: Views, groups: Sequence[Hypothesis]) -> SensorSets:
+    """Return the sets of sensors that have the groups in their fields, the most common one first.
+
+    Sets that are similar to an earlier one are merged into it.
     """
     looks = looks_of(views, groups)
     seen = np.zeros((len(groups), len(views.half_field)), np.bool_)
@@ -298,21 +353,24 @@ def sets_of_sensors(views: Views, groups: Sequence[Hypothesis]) -> tuple[list[In
         else:
             same_as[k] = len(kept)
             kept.append(k)
-    return [np.flatnonzero(row) for row in rows[kept]], same_as[of.ravel()]
+    common = rows[kept].astype(np.float32) @ seen.T.astype(np.float32)
+    row, group = np.nonzero(common > 1.5)  # these are whole numbers
+    return SensorSets([np.flatnonzero(r) for r in rows[kept]], same_as[of.ravel()], row, group)
 
 
 def revised_odds(
     scores: Array,
     radius_km: Array,
     shells: Array,
-    set_of: Indices,
-    volume_km3: Array,
+    sets: SensorSets,
+    volumes: VisibleVolumes,
     chance: Chance,
 ) -> Array:
     """Return the groups' log-odds once the number of objects near them is known.
 
     Objects that other sensors see elsewhere are no evidence on the number of objects here. So it is
-    estimated for each set of sensors, from the groups that these have in their fields.
+    estimated for each set of sensors: first from all groups that at least two of these have in
+    their fields, then from those of exactly this set. Most chance groups are alone in their set.
 
     Parameters
     ----------
@@ -320,10 +378,10 @@ def revised_odds(
         Log-odds of the search, and the groups' distances from the Earth's centre.
     shells : (j, 3) float
         Lowest, highest radius, weight.
-    set_of : (g,) int
-        The set of sensors of each group, see `sets_of_sensors`.
-    volume_km3 : (p, j) float
-        Volume that each set of sensors sees, see `visible_volume`.
+    sets
+        Of the groups, see `sets_of_sensors`.
+    volumes
+        Volumes that the sets see.
     chance
         With the object density that the search assumed.
 
@@ -336,11 +394,13 @@ def revised_odds(
     prior_weight = inside * shells[:, 2] + 1e-9
     # An unknown volume counts as one that two sensors see in full.
     unknown = chance.objects_in_view / len(shells)
-    expected = np.where(np.isnan(volume_km3), unknown, chance.objects_km3 * volume_km3)
+    expected = VisibleVolumes(
+        *(np.where(np.isnan(v), unknown, chance.objects_km3 * v)[sets.set_of] for v in volumes)
+    )
     certainty = (scores > CERTAIN_LOG_ODDS).astype(float)
     revised = scores
     for _ in range(ROUNDS):
-        factor = _shell_rates(certainty, prior_weight, set_of, expected)
+        factor = _shell_rates(certainty, prior_weight, sets, expected)
         revised = scores + np.log((prior_weight * factor).sum(axis=1) / prior_weight.sum(axis=1))
         last, certainty = certainty, 1 / (1 + np.exp(-np.clip(revised, -50, 50)))
         if np.abs(certainty - last).max() < 1e-6:
@@ -348,20 +408,26 @@ def revised_odds(
     return revised
 
 
-def _shell_rates(certainty: Array, prior_weight: Array, set_of: Indices, expected: Array) -> Array:
+def _shell_rates(
+    certainty: Array, prior_weight: Array, sets: SensorSets, expected: VisibleVolumes
+) -> Array:
     """Return the rate of objects over the assumed rate in each shell, near each group, (g, j).
 
-    A group does not count for itself.
+    `expected` are numbers of objects at the assumed rate. A group does not count for itself.
     """
+    n_sets, set_of, here = len(sets.sensors), sets.set_of, expected.exclusive
+    near = np.bincount(sets.row, certainty[sets.group], minlength=n_sets)[set_of]
+    others = near - certainty + PRIOR_OBJECTS
+    common = others / (expected.shared.sum(axis=1) + PRIOR_OBJECTS)
     others = np.bincount(set_of, certainty)[set_of] - certainty + PRIOR_OBJECTS
-    common = (others / (expected.sum(axis=1)[set_of] + PRIOR_OBJECTS))[:, None]
-    factor = np.repeat(common, expected.shape[1], axis=1)
+    common = (common * others / (common * here.sum(axis=1) + PRIOR_OBJECTS))[:, None]
+    factor = np.repeat(common, here.shape[1], axis=1)
     for _ in range(10):  # an object may belong to either of two shells that overlap
         belongs = prior_weight * factor
         share = certainty[:, None] * belongs / belongs.sum(axis=1, keepdims=True)
-        count = np.zeros_like(expected)
+        count = np.zeros((n_sets, here.shape[1]))
         np.add.at(count, set_of, share)
         others = count[set_of] - share + PRIOR_OBJECTS
-        ratio = others / (common * expected[set_of] + PRIOR_OBJECTS)
+        ratio = others / (common * here + PRIOR_OBJECTS)
         factor = common * np.minimum(ratio, MAX_RATE_RATIO)
     return factor

@@ -32,7 +32,7 @@ from epipole.tasks.algorithms.association.chance import (
     looks_of,
     revised_odds,
     sets_of_sensors,
-    visible_volume,
+    visible_volumes,
 )
 from epipole.tasks.algorithms.association.hypothesis_queue import (
     Hypothesis,
@@ -304,7 +304,7 @@ class _Search:
             return scores
         anywhere = np.array([[0.0, np.inf, 1.0]])
         shells = space.shells if len(space.shells) else anywhere
-        sets, set_of = sets_of_sensors(space.views, self.groups)
-        volume = np.array([visible_volume(space.views, s, shells, space.farthest_km) for s in sets])
+        sets = sets_of_sensors(space.views, self.groups)
+        volumes = visible_volumes(space.views, sets.sensors, shells, space.farthest_km)
         radius_km = np.linalg.norm([h.x_km for h in self.groups], axis=1)
-        return revised_odds(scores, radius_km, shells, set_of, volume, space.chance)
+        return revised_odds(scores, radius_km, shells, sets, volumes, space.chance)
