@@ -57,7 +57,15 @@ MADE_BY = {
     Stage.IDENTIFY: ("frames", "stars", "detections"),
     Stage.CALIBRATE: ("calibrations",),
     Stage.TRACK: ("tracklets",),
-    Stage.SOLVE: ("epochs", "associations", "pairs", "positions", "states", "orbits"),
+    Stage.SOLVE: (
+        "epochs",
+        "associations",
+        "pairs",
+        "positions",
+        "states",
+        "orbits",
+        "sensor_errors",
+    ),
     Stage.NAME: ("identifications",),
     Stage.PUBLISH: ("observations", "objects", "sources", "nights", "rejects"),
 }

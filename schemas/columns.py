@@ -12,6 +12,7 @@ VELOCITY = ["vx_km_s", "vy_km_s", "vz_km_s"]
 ELEMENTS = ("a_km", "e", "i_deg", "raan_deg", "argp_deg", "mean_anomaly_deg")  # osculating
 OPTICS_AXES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # numbers of a camera
 ATTRIBUTABLE_AXES = ("ra", "dec", "vra", "vdec")  # of a direction (ra times cos dec) and its rate
+SHARED_AXES = ("dx", "dy", "dz", "x", "y", "z")  # of a sensor's direction and position error
 TANGENT_AXES = ("1", "2")  # of the plane at right angles to a direction
 
 

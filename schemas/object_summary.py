@@ -25,8 +25,8 @@ OBJECT_FIELDS = [
         pa.float64(),
         unit="mag",
         null=True,
-        doc="From minimum to maximum of the sine with the scatter that the magnitudes have beyond "
-        "their sigmas; 0 where these explain it. Null with fewer than two magnitudes.",
+        doc="From minimum to maximum of the sine with the scatter that `magnitude_1000_km` has "
+        "beyond its sigmas; 0 where these explain it. Null with fewer than two of them.",
     ),
     column("norad_id", pa.int64(), null=True, doc="As in `identifications`; null: it has no name."),
     id_column("cospar_id", null=True, doc="The same."),

@@ -1,4 +1,4 @@
-"""Columns of an observation: what its sensor measured."""
+"""Columns of an observation: what its sensor measured, and what its object's orbit adds."""
 
 import pyarrow as pa
 
@@ -67,5 +67,48 @@ SIGHTED_FIELDS = [
         null=True,
         doc="1-sigma: of the flux and of the frame's zero point. An object's colour may differ "
         "from the stars'.",
+    ),
+]
+
+FITTED_FIELDS = [
+    column(
+        "residual_sigma",
+        pa.float64(),
+        null=True,
+        doc="Distance from the direction that its object's orbit predicts, in sigmas of its "
+        "independent error: the root of a chi-square of two degrees of freedom, so its mean square "
+        "is 2. The errors that the sensor shares are removed as this orbit shows them. Rows above "
+        "5.25 were left out of the orbit where they are few. Null where the object has no orbit.",
+    ),
+    column(
+        "range_km",
+        pa.float64(),
+        unit="km",
+        null=True,
+        doc="Distance of the object from the sensor, when its light left: by its orbit; without "
+        "one between its positions, where these are at most 30 s apart. Null where neither is "
+        "known; so are the three columns that follow.",
+    ),
+    column(
+        "phase_deg",
+        pa.float64(),
+        unit="deg",
+        null=True,
+        doc="Angle at the object between the Sun and the sensor; 0: fully lit.",
+    ),
+    column(
+        "sunlit",
+        pa.bool_(),
+        null=True,
+        doc="Whether the middle of the Sun is seen from the object, past the Earth (a sphere "
+        "without air).",
+    ),
+    column(
+        "magnitude_1000_km",
+        pa.float64(),
+        unit="mag",
+        null=True,
+        doc="The magnitude as it would be from a distance of 1,000 km. Null without a magnitude, "
+        "too.",
     ),
 ]

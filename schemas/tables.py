@@ -19,8 +19,9 @@ from epipole.schemas.columns import (
     upper_triangle,
 )
 from epipole.schemas.object_summary import OBJECT_FIELDS
-from epipole.schemas.observation import SIGHTED_FIELDS
+from epipole.schemas.observation import FITTED_FIELDS, SIGHTED_FIELDS
 from epipole.schemas.orbit import ORBIT_FIELDS
+from epipole.schemas.sensor_error import SENSOR_ERROR_FIELDS
 
 F64 = pa.float64()
 I32 = pa.int32()
@@ -298,6 +299,7 @@ OBSERVATIONS = schema(
         FRAME_NUMBER,
         CENTROID,
         *SIGHTED_FIELDS,
+        *FITTED_FIELDS,
     ],
 )
 
@@ -422,6 +424,14 @@ CALIBRATIONS = schema(
     ],
 )
 
+SENSOR_ERRORS = schema(
+    "sensor_errors",
+    "One row per sensor whose observations are in orbits: the errors that all its directions "
+    "share, as all orbits of the night together show them. None where common objects connect more "
+    "than 1,000 sensors.",
+    [SENSOR_ID, *SENSOR_ERROR_FIELDS],
+)
+
 PAIRS = schema(
     "pairs",
     "One row per pair of detections of one object by two sensors: each with the reference, which "
@@ -542,6 +552,7 @@ TABLES: dict[str, pa.Schema] = {
     "objects": OBJECTS,
     "identifications": IDENTIFICATIONS,
     "calibrations": CALIBRATIONS,
+    "sensor_errors": SENSOR_ERRORS,
     "pairs": PAIRS,
     "sources": SOURCES,
     "nights": NIGHTS,

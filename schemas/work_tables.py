@@ -15,6 +15,7 @@ from epipole.schemas.columns import (
     schema,
     time_column,
 )
+from epipole.schemas.observation import FITTED_FIELDS
 from epipole.schemas.tables import (
     EPOCH,
     EPOCHS,
@@ -165,9 +166,22 @@ SOLUTIONS = schema(
 
 SIGHTINGS = schema(
     "sightings",
-    "One row per detection of a tracklet of one sensor: `observations` without the object. A "
-    "detection that belongs to no tracklet has the mark of `lone_detections`.",
-    [field for field in OBSERVATIONS if field.name != "object_id"],
+    "One row per detection of a tracklet of one sensor: `observations` without what its object "
+    "tells. A detection that belongs to no tracklet has the mark of `lone_detections`.",
+    [
+        field
+        for field in OBSERVATIONS
+        if field.name not in {"object_id", *(field.name for field in FITTED_FIELDS)}
+    ],
+)
+
+FITTED_OBSERVATIONS = schema(
+    "fitted_observations",
+    "One row per row of `observations` that has an object: what its orbit, or its positions, tell.",
+    [
+        column("row", I64, doc="Row of the night's `observations`; they are in order."),
+        *[field for field in FITTED_FIELDS if field.name != "magnitude_1000_km"],
+    ],
 )
 
 VIEWS = schema(

@@ -48,6 +48,7 @@ from epipole.tasks.name.object_ids import (
     renamed,
 )
 from epipole.tasks.name.sensor_residuals import SensorResidual
+from epipole.tasks.publish.fitted_observations import complete_observations
 from epipole.tasks.publish.night_objects import write_objects
 from epipole.tasks.publish.night_parts import NightParts, publish_nights
 from epipole.tasks.publish.orbits import OrbitRows, fit_orbits, orbit_shares, write_orbits
@@ -312,6 +313,7 @@ def determine_orbits(folder: Path, night: str, linked: pa.Table) -> list[str]:
     futures = [fit_orbits.submit(folder, night, share, shares, linked) for share in range(shares)]
     fitted: list[OrbitRows] = results(Stage.PUBLISH, futures)
     (count,) = results(Stage.PUBLISH, [write_orbits.submit(folder, night, fitted)])
+    results(Stage.PUBLISH, [complete_observations.submit(folder, night, shares)])
     LOGGER.info("fitted %s", many(count, "orbit"))
     return [name for each in fitted for name in each.misfits]
 

@@ -170,6 +170,20 @@ def write_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
         ) from error
 
 
+def rewrite_table(night: Path, name: str, pieces: Iterable[pa.Table]) -> int:
+    """Write a table of a night again; the pieces may be made from its rows as they are.
+
+    The rest is as of `write_table`. The file is replaced when the new one is complete.
+    """
+    beside = night.with_name(f"{night.name}-again")
+    count = write_table(beside, name, pieces)
+    try:
+        (beside / name / PART).replace(night / name / PART)
+    except OSError as error:
+        raise DatasetError(f"{night / name}: cannot be written ({error.strerror})") from error
+    return count
+
+
 def _write(folder: Path, name: str, pieces: Iterable[pa.Table]) -> int:
     # It exists where a worker was killed as it wrote: the task starts again, the file anew.
     folder.mkdir(parents=True, exist_ok=True)

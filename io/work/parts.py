@@ -32,6 +32,7 @@ from epipole.schemas.work_tables import (
     CAMERAS,
     CLOCK_LINES,
     EXPOSURES,
+    FITTED_OBSERVATIONS,
     FRAME_INDEX,
     HOT_SUSPECTS,
     LOG_STATES,
@@ -100,6 +101,7 @@ SOLVED: Final[PartTables] = {
     "object_views": OBJECT_VIEWS,
     "objects": MOVING_OBJECTS,
 }
+FITTED: Final[PartTables] = {"observations": FITTED_OBSERVATIONS}
 
 
 def check_tables(part: str, declared: PartTables, tables: Mapping[str, pa.Table]) -> None:

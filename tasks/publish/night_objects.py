@@ -22,6 +22,7 @@ SINE = 2 * np.sqrt(2)  # a sine from its minimum to its maximum, over its standa
 
 _OBSERVED = [
     "time", "object_id", "tracklet_id", "sensor_id", "blended", "magnitude", "magnitude_sigma",
+    "magnitude_1000_km",
 ]  # fmt: skip
 _POSITIONS = ["time", "object_id", "n_sensors", "n_rejected", "chi2", "independent"]
 _NAMES = ["norad_id", "cospar_id", "name"]
@@ -34,12 +35,11 @@ def write_objects(folder: Path, night: str, misfits: Collection[str]) -> int:
     `misfits` are the objects whose observations fit no orbit.
     """
     reader = NightReader.of_folder(folder, night)
-    rows = objects_of(reader, misfits)
-    return write_table(folder, "objects", [in_order(rows)])
+    return write_table(folder, "objects", [objects_of(reader, misfits)])
 
 
 def objects_of(reader: NightReader, misfits: Collection[str]) -> pa.Table:
-    """Return OBJECTS of a night: all that have a position or an observation in it."""
+    """Return OBJECTS of a night: all that have a position or an observation in it, in order."""
     seen, solved = _observed(reader), _solved(reader)
     rows = seen.join(solved, on="object_id", how="full", coalesce=True, suffix="_solved")
     rows = rows.with_columns(pl.col(r"^n_.*$").fill_null(0))
@@ -54,53 +54,56 @@ def objects_of(reader: NightReader, misfits: Collection[str]) -> pa.Table:
     )
     names = reader.read("identifications", ["object_id", "status", *_NAMES])
     known = names.filter(pl.col("status") == NameStatus.KNOWN.value).drop_nulls("object_id")
-    return from_polars(OBJECTS, rows.join(known, on="object_id", how="left"))
+    return in_order(from_polars(OBJECTS, rows.join(known, on="object_id", how="left")))
 
 
 def _observed(reader: NightReader) -> pl.DataFrame:
     """Return what the observations tell of each object: times, counts, magnitudes."""
-    usable = pl.col("magnitude").is_not_null() & pl.col("blended").not_()
-    magnitude, variance = (
-        pl.when(usable).then(values).otherwise(0.0)
-        for values in ("magnitude", pl.col("magnitude_sigma") ** 2)
+    magnitude, reduced, variance = (
+        pl.when(pl.col("blended").not_()).then(values)
+        for values in ("magnitude", "magnitude_1000_km", pl.col("magnitude_sigma") ** 2)
     )
     sums, members = [], []
     empty = reader.empty("observations", _OBSERVED)
     for piece in (empty, *reader.pieces("observations", _OBSERVED)):
         rows = piece.drop_nulls("object_id")
         sums.append(
-            rows.group_by("object_id").agg(
+            rows.group_by("object_id", maintain_order=True).agg(
                 first_time=pl.col("time").min(), last_time=pl.col("time").max(),
                 n_observations=pl.len(), n_blended=pl.col("blended").sum(),
-                n_bright=usable.sum(), total=magnitude.sum(), square=(magnitude**2).sum(),
-                noise=variance.sum(),
+                n_bright=magnitude.count(), total=magnitude.sum(),
+                n_reduced=reduced.count(), reduced=reduced.sum(), square=(reduced**2).sum(),
+                noise=variance.filter(reduced.is_not_null()).sum(),
             )
         )  # fmt: skip
         members.append(rows.select("object_id", "sensor_id", "tracklet_id").unique())
-    total = pl.col("total", "square", "noise", r"^n_.*$").sum()
-    counts = pl.concat(members).unique().group_by("object_id").agg(
+    total = pl.col("total", "reduced", "square", "noise", r"^n_.*$").sum()
+    counts = pl.concat(members).unique().group_by("object_id", maintain_order=True).agg(
         n_sensors=pl.col("sensor_id").n_unique(),
         n_tracklets=pl.col("tracklet_id").drop_nulls().n_unique(),
     )  # fmt: skip
     ends = pl.col("first_time").min(), pl.col("last_time").max()
-    rows = pl.concat(sums).group_by("object_id").agg(*ends, total)
+    rows = pl.concat(sums).group_by("object_id", maintain_order=True).agg(*ends, total)
     return rows.join(counts, on="object_id").with_columns(**_brightness())
 
 
 def _brightness() -> dict[str, pl.Expr]:
     """Return mean and amplitude of the magnitudes, from their sums."""
-    n = pl.col("n_bright")
-    mean = pl.when(n > 0).then(pl.col("total") / n)
-    scatter = (pl.col("square") - n * mean**2) / (n - 1) - pl.col("noise") / n
+    n = pl.col("n_reduced")
+    scatter = (pl.col("square") - pl.col("reduced") ** 2 / n) / (n - 1) - pl.col("noise") / n
     amplitude = SINE * pl.max_horizontal(scatter, 0.0).sqrt()
-    return {"magnitude": mean, "magnitude_amplitude": pl.when(n > 1).then(amplitude)}
+    bright = pl.col("n_bright")
+    return {
+        "magnitude": pl.when(bright > 0).then(pl.col("total") / bright),
+        "magnitude_amplitude": pl.when(n > 1).then(amplitude),
+    }
 
 
 def _solved(reader: NightReader) -> pl.DataFrame:
     """Return what the positions tell of each object: times, counts, chi-squares."""
     alone = pl.col("independent")
     pieces = [
-        rows.group_by("object_id").agg(
+        rows.group_by("object_id", maintain_order=True).agg(
             first_time=pl.col("time").min(), last_time=pl.col("time").max(),
             n_positions=pl.len(), n_rejected=(pl.col("n_rejected") > 0).sum(),
             n_views=pl.col("n_sensors").max(), n_alone=alone.sum(),
@@ -109,7 +112,7 @@ def _solved(reader: NightReader) -> pl.DataFrame:
         )
         for rows in (reader.empty("positions", _POSITIONS), *reader.pieces("positions", _POSITIONS))
     ]  # fmt: skip
-    return pl.concat(pieces).group_by("object_id").agg(
+    return pl.concat(pieces).group_by("object_id", maintain_order=True).agg(
         pl.col("first_time").min(), pl.col("last_time").max(), pl.col("n_views").max(),
         pl.col("n_positions", "n_rejected", "n_alone", "chi2", "dof").sum(),
     )  # fmt: skip

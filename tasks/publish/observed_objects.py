@@ -14,6 +14,7 @@ import polars as pl
 import pyarrow as pa
 
 from epipole.schemas.bridge import concat, from_polars, to_polars
+from epipole.schemas.observation import FITTED_FIELDS
 from epipole.schemas.spans import Span
 from epipole.schemas.tables import ASSOCIATIONS, OBSERVATIONS
 from epipole.schemas.work_tables import SHARED_ERRORS, SIGHTINGS
@@ -22,6 +23,10 @@ from epipole.tasks.publish.hot_tracklets import hot_tracklets
 from epipole.tasks.publish.night_parts import NightParts, in_slices
 
 _KEY = ["sensor_id", "frame_number", "centroid"]
+_NOT_FITTED = {
+    field.name: pl.lit(None, pl.Boolean if field.type == pa.bool_() else pl.Float64)
+    for field in FITTED_FIELDS
+}
 
 
 def observations(parts: NightParts) -> Iterator[pa.Table]:
@@ -36,7 +41,8 @@ def observations(parts: NightParts) -> Iterator[pa.Table]:
             seen = with_objects(to_polars(concat(SIGHTINGS, rows)), runs)
             seen = seen.filter(pl.col("tracklet_id").is_in(hot.implode()).not_())
             seen = with_links(published(seen), parts)
-            yield from_polars(OBSERVATIONS, with_shared_errors(seen, errors))
+            seen = with_shared_errors(seen, errors).with_columns(**_NOT_FITTED)
+            yield from_polars(OBSERVATIONS, seen)
 
 
 def object_runs(parts: NightParts) -> pl.DataFrame:

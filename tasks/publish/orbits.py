@@ -41,7 +41,6 @@ from epipole.tasks.algorithms.orbits.initial_orbit import initial_orbit
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.algorithms.orbits.orbit_determination import (
     AreaPrior,
-    DeterminedOrbit,
     ObjectDirections,
     determine_orbit,
     log_evidence,
@@ -53,6 +52,13 @@ from epipole.tasks.algorithms.orbits.orbital_elements import (
 )
 from epipole.tasks.common.grouping import factorize, group_offsets
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.publish.fitted_observations import (
+    FittedOrbit,
+    fitted_part,
+    turned,
+    write_fitted,
+)
+from epipole.tasks.publish.sensor_errors import SensorSums, sensor_errors, summed_equations
 
 Array = npt.NDArray[np.float64]
 
@@ -86,12 +92,14 @@ class Start(NamedTuple):
 class OrbitRows(NamedTuple):
     """ORBITS of some objects, and rows of `rejects` for the others.
 
-    `misfits` are those of the others whose observations fit no orbit.
+    `misfits` are those of the others whose observations fit no orbit. `sensors` is what the orbits
+    tell of the sensors' errors.
     """
 
     orbits: pa.Table
     rejects: pa.Table
     misfits: list[str]
+    sensors: SensorSums
 
 
 def orbit_shares(folder: Path, night: str) -> int:
@@ -106,10 +114,11 @@ def fit_orbits(
     """Fit the orbits of a share of the objects of a night whose other tables are written.
 
     The orbit of an object depends on the rows of this object only. `linked` are LINKED_ORBITS:
-    the initial states of objects without positions.
+    the initial states of objects without positions. What an orbit adds to its observations goes to
+    a part; see `write_fitted`.
     """
     reader = NightReader.of_folder(folder, night)
-    observed = _of_share(reader, "observations", _OBSERVED, share, shares)
+    observed = of_share(reader, "observations", _OBSERVED, share, shares)
     observed = observed.sort("object_id", "time", "sensor_id", "tracklet_id")
     around, origin_ns = surroundings_of(night), _noon_ns(night)
     objects = observed_objects(observed, origin_ns, around)
@@ -124,6 +133,14 @@ def fit_orbits(
     reasons = [judge(each) for each in fitted]
     sound = {k: each for k, each in enumerate(fitted) if each is not None and reasons[k] is None}
     failed = [k for k in range(len(fitted)) if k not in sound]
+    without = {objects.names[k] for k in failed}
+    columns = ["time", "object_id", *POSITION]
+    positions = of_share(reader, "positions", columns, share, shares)
+    positions = positions.filter(pl.col("object_id").is_in(without))
+    write_fitted(
+        fitted_part(folder, share, shares), observed, objects.slices(), sound, positions, origin_ns,
+        around,
+    )  # fmt: skip
     return OrbitRows(
         orbit_table(objects, sound, origin_ns, around),
         reject_rows(
@@ -132,12 +149,19 @@ def fit_orbits(
             count=[1] * len(failed),
         ),
         [objects.names[k] for k in failed if reasons[k] == Reason.ORBIT_MISFIT],
+        objects.sensor_sums(sound),
     )
 
 
 @stage_task(Stage.PUBLISH, "orbits of {night}")
 def write_orbits(folder: Path, night: str, fitted: Sequence[OrbitRows]) -> int:
-    """Write the table `orbits` of a night, add its rejects, and return the number of orbits."""
+    """Write the tables `orbits` and `sensor_errors` of a night, and add its rejects.
+
+    Returns the number of orbits.
+    """
+    sums = [each.sensors for each in fitted]
+    errors = sensor_errors(sums, surroundings_of(night).R_night_from_gcrf)
+    write_table(folder, "sensor_errors", [errors])
     orbits = in_order(concat(ORBITS, [each.orbits for each in fitted]))
     earlier = read_columns(folder, "rejects", REJECTS.names)
     reasons = pa.array([reason.value for reason in (Reason.ORBIT_MISFIT, Reason.NO_ORBIT)])
@@ -148,18 +172,24 @@ def write_orbits(folder: Path, night: str, fitted: Sequence[OrbitRows]) -> int:
     return write_table(folder, "orbits", [orbits])
 
 
-def _of_share(
+def of_share(
     reader: NightReader, name: str, columns: Sequence[str], share: int, shares: int
 ) -> pl.DataFrame:
-    """Return the rows of a share of the objects; the share follows from the id alone."""
-    return pl.concat([reader.empty(name, columns), *_pieces(reader, name, columns, share, shares)])
+    """Return the rows of a share of the objects; the share follows from the id alone.
+
+    `row` is each one's row in the night's table.
+    """
+    pieces = _pieces(reader, name, columns, share, shares)
+    return pl.concat([reader.empty(name, columns).with_row_index("row"), *pieces])
 
 
 def _pieces(
     reader: NightReader, name: str, columns: Sequence[str], share: int, shares: int
 ) -> Iterator[pl.DataFrame]:
+    first = 0
     for piece in reader.pieces(name, columns):
-        rows = piece.filter(pl.col("object_id").is_not_null())
+        rows = piece.with_row_index("row", first).filter(pl.col("object_id").is_not_null())
+        first += len(piece)
         ids = rows["object_id"].unique()
         mine = [name for name in ids if zlib.crc32(name.encode()) % shares == share]
         yield rows.filter(pl.col("object_id").is_in(mine))
@@ -224,6 +254,7 @@ class ObservedObjects(NamedTuple):
     """
 
     names: list[str]
+    sensors: list[str]
     offsets: npt.NDArray[np.int64]
     time_ns: npt.NDArray[np.int64]
     tracklet: npt.NDArray[np.int64]
@@ -233,6 +264,21 @@ class ObservedObjects(NamedTuple):
     def rows(self, k: int) -> slice:
         """Return the rows of object k."""
         return slice(int(self.offsets[k]), int(self.offsets[k + 1]))
+
+    def slices(self) -> list[slice]:
+        """Return the rows of each object."""
+        return [self.rows(k) for k in range(len(self.names))]
+
+    def sensor_sums(self, orbits: Mapping[int, FittedOrbit]) -> SensorSums:
+        """Return what orbits of some objects, given by their numbers, tell of the sensors."""
+        used = [self.rows(k).start + np.flatnonzero(f.orbit.used) for k, f in orbits.items()]
+        rows = np.concatenate([np.zeros(0, np.int64), *used])
+        of_objects = [np.unique(self.views.sensor[self.rows(k)]) for k in orbits]
+        equations = [fitted.orbit.equations for fitted in orbits.values()]
+        return summed_equations(
+            self.sensors, list(zip(of_objects, equations, strict=True)),
+            self.views.sensor[rows], self.cov_shared[rows],
+        )  # fmt: skip
 
     def middle_ns(self, k: int) -> int:
         """Return the middle of an object's arc."""
@@ -274,12 +320,13 @@ def observed_objects(rows: pl.DataFrame, origin_ns: int, around: Surroundings) -
     shared = rows.select("bias_sigma_arcsec", "position_sigma_km").to_numpy() * [ARCSEC, 1.0]
     return ObservedObjects(
         names=names.texts.tolist(),
+        sensors=sensors.texts.tolist(),
         offsets=group_offsets(names.rank),
         time_ns=time_ns,
         tracklet=tracklets.rank,
         views=ObjectDirections(
             (time_ns - origin_ns) / SECOND_NS, sensors.rank,
-            _turned(R, rows.select(POSITION).to_numpy()), _turned(R, u), _turned(R, east_north(u)),
+            turned(R, rows.select(POSITION).to_numpy()), turned(R, u), turned(R, east_north(u)),
             np.asarray(np.linalg.inv(cov), float),
             np.zeros((0, 6, 6)),
         ),
@@ -287,33 +334,9 @@ def observed_objects(rows: pl.DataFrame, origin_ns: int, around: Surroundings) -
     )  # fmt: skip
 
 
-def _turned(rotation: Array, vectors: Array) -> Array:
-    """Return rotated vectors (..., k), each the same whatever rows are beside it.
-
-    Products of matrices and `einsum` add in an order that depends on the number of rows.
-    """
-    out = np.zeros_like(vectors, order="C")
-    for i, j in np.ndindex(rotation.shape):
-        out[..., i] += rotation[i, j] * vectors[..., j]
-    return out
-
-
 def _both(rotation: Array) -> Array:
     """Return the (6, 6) rotation of positions and velocities."""
     return np.asarray(np.kron(np.eye(2), rotation), float)
-
-
-class FittedOrbit(NamedTuple):
-    """An orbit at its epoch [s], with the names of its forces."""
-
-    orbit: DeterminedOrbit
-    epoch_s: float
-    forces: str
-
-    @property
-    def dof(self) -> int:
-        """Degrees of freedom of chi-square."""
-        return 2 * int(self.orbit.used.sum()) - 6
 
 
 def best_orbit(
@@ -325,7 +348,7 @@ def best_orbit(
     """
     found = None
     if start is not None:
-        state = _turned(_both(around.R_night_from_gcrf), start.state)
+        state = turned(_both(around.R_night_from_gcrf), start.state)
         found = _from_state(directions, state, (start.time_ns - origin_ns) / SECOND_NS, around)
     if found is None and (initial := initial_orbit(directions, around)) is not None:
         found = _from_state(directions, *initial, around)
@@ -382,7 +405,7 @@ def orbit_table(
     """Return ORBITS of objects, given by their numbers."""
     rows, fitted, n = list(orbits), list(orbits.values()), len(orbits)
     turn = _both(around.R_night_from_gcrf.T)
-    state = _turned(turn, np.array([each.orbit.unknowns[:6] for each in fitted]).reshape(n, 6))
+    state = turned(turn, np.array([each.orbit.unknowns[:6] for each in fitted]).reshape(n, 6))
     cov = np.array([turn @ each.orbit.cov[:6, :6] @ turn.T for each in fitted]).reshape(n, 6, 6)
     used = [np.flatnonzero(each.orbit.used) for each in fitted]
     at = [objects.rows(k).start + of_one for k, of_one in zip(rows, used, strict=True)]

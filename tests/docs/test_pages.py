@@ -73,6 +73,18 @@ def test_the_arcs_of_the_page_about_orbits_are_found(example):
     assert arcs["magnitude"].is_between(5, 12).all()
 
 
+def test_the_light_curve_of_the_page_about_orbits_is_of_one_geostationary_object(example):
+    names: dict = {}
+    exec(code("docs/orbits.md", "light", f"{example}/out/"), names)
+    curve = names["light_curve"]
+    assert len(curve) > 100
+    assert curve["range_km"].is_between(35_000, 49_000).all()
+    assert curve["phase_deg"].is_between(0, 180).all()
+    assert curve["sunlit"].n_unique() == 1
+    dimmer = curve["magnitude_1000_km"] + 5 * (curve["range_km"] / 1000).log(10)
+    assert dimmer.is_between(5, 12).all()
+
+
 def test_sql_finds_the_same_arcs_and_keeps_nanoseconds(example):
     pytest.importorskip("duckdb", minversion="2.0", reason="duckdb keeps nanoseconds from 2.0 on")
     by_polars, by_sql = {}, {}

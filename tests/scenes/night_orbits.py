@@ -27,12 +27,13 @@ def positions(unknowns, times_s):
 
 def trial(
     seed, truth=GEO, *, times_s=None, n_sensors=3, sensor_km=7000.0, noise=2.0, bias=3.0,
-    place_km=0.02, toward=None,
+    place_km=0.02, toward=None, shared=None,
 ):  # fmt: skip
     """Return directions from circular sensors, all at the same times.
 
     `noise` of each direction and `bias` of each sensor [arcsec], `place_km` of its position. The
-    sensors are near the line to `toward`, or to the object.
+    sensors are near the line to `toward`, or to the object. `shared` are the errors themselves:
+    directions [rad] and positions [km], each (n_sensors, 3).
     """
     rng = np.random.default_rng(seed)
     times_s = np.linspace(-300.0, 300.0, 21) if times_s is None else times_s
@@ -45,6 +46,7 @@ def trial(
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     shift = rng.normal(size=(n_sensors, 3)) * bias * ARCSEC
     place = rng.normal(size=(n_sensors, 3)) * place_km
+    shift, place = shared or (shift, place)
     time_s, sensor = np.repeat(times_s, n_sensors), np.tile(np.arange(n_sensors), len(times_s))
     angle = (time_s * np.sqrt(398600.0 / sensor_km**3))[:, None]
     r = sensor_km * (np.cos(angle) * out[sensor] + np.sin(angle) * along[sensor])

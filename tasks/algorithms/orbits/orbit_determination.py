@@ -14,6 +14,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbits.forces import N_UNKNOWNS, Surroundings
+from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, no_equations
 from epipole.tasks.algorithms.orbits.trajectories import (
     integrate,
     interpolate,
@@ -87,6 +88,11 @@ class DeterminedOrbit(NamedTuple):
         Directions that are fitted; false: those of something else.
     shared : (s, 6) float
         Errors of the sensors: direction [rad], position [km].
+    of_directions : (n,) float
+        Squared residual of each direction over its independent errors, two degrees of freedom; NaN
+        where the object is behind the sensor.
+    equations
+        Of the fit, without the priors of the sensors' errors.
     """
 
     unknowns: Array
@@ -94,6 +100,8 @@ class DeterminedOrbit(NamedTuple):
     chi2: float
     used: Mask
     shared: Array
+    of_directions: Array
+    equations: ArcEquations
 
 
 class Normal(NamedTuple):
@@ -218,10 +226,7 @@ def _step(
     """Return the steps of the unknowns and of the shared errors, the covariance, and the decrease
     of chi-square that they promise."""
     sums, free = point.sums, np.concatenate([np.ones(6, bool), areas.sigma > 0.0])
-    information = np.zeros(N_UNKNOWNS)
-    information[6:] = 1.0 / np.where(areas.sigma > 0.0, areas.sigma, 1.0) ** 2
-    right = sums.of_orbit.copy()
-    right[6:] -= information[6:] * (point.unknowns[6:] - areas.mean)
+    information, right = _with_areas(point, areas)
     pulled = sums.of_sensors - np.einsum("sij,sj->si", directions.prior, point.shared)
     blocks = sums.blocks + directions.prior
     unit = 1.0 / np.sqrt(np.diagonal(blocks, axis1=1, axis2=2))
@@ -239,6 +244,15 @@ def _step(
     step = cov @ (right - back[:, N_UNKNOWNS])
     turned = absorbed[:, :, N_UNKNOWNS] - absorbed[:, :, :N_UNKNOWNS] @ step
     return step, turned, cov, float(step @ right + np.sum(turned * pulled))
+
+
+def _with_areas(point: _Point, areas: AreaPrior) -> tuple[Array, Array]:
+    """Return the information of the areas' priors, (8,), and the right side with them."""
+    information = np.zeros(N_UNKNOWNS)
+    information[6:] = 1.0 / np.where(areas.sigma > 0.0, areas.sigma, 1.0) ** 2
+    right = point.sums.of_orbit.copy()
+    right[6:] -= information[6:] * (point.unknowns[6:] - areas.mean)
+    return information, right
 
 
 def _converge(
@@ -301,7 +315,8 @@ def determine_orbit(
     n = len(directions.time_s)
     failed = DeterminedOrbit(
         np.full(N_UNKNOWNS, np.nan), np.full((N_UNKNOWNS, N_UNKNOWNS), np.nan), np.nan,
-        np.zeros(n, bool), np.zeros((len(directions.prior), N_SHARED)),
+        np.zeros(n, bool), np.zeros((len(directions.prior), N_SHARED)), np.full(n, np.nan),
+        no_equations(len(directions.prior)),
     )  # fmt: skip
     if n < MIN_DIRECTIONS:
         return failed
@@ -357,7 +372,10 @@ def _without_outliers(
         if found is None:
             break
         point, cov = found
-        orbit = DeterminedOrbit(point.unknowns, cov, point.chi2, used, point.shared)
+        orbit = DeterminedOrbit(
+            point.unknowns, cov, point.chi2, used, point.shared, point.of_directions,
+            _equations(point, areas),
+        )  # fmt: skip
         whole = orbit if whole is None else whole
         # Far outliers draw the fit away from the others, so the worst come first.
         far = np.flatnonzero(~(point.of_directions < OUTLIER_CHI2))
@@ -370,6 +388,18 @@ def _without_outliers(
             break
         unknowns, shared, used = point.unknowns, point.shared, fits
     return whole
+
+
+def _equations(point: _Point, areas: AreaPrior) -> ArcEquations:
+    """Return the equations at a point, with the priors of the areas; errors count from zero."""
+    sums, free = point.sums, np.flatnonzero(np.append(np.ones(6), areas.sigma) > 0.0)
+    information, right = _with_areas(point, areas)
+    orbit = sums.orbit + np.diag(information)
+    right = right + np.einsum("ski,sk->i", sums.coupling, point.shared)
+    of_sensors = sums.of_sensors + np.einsum("sij,sj->si", sums.blocks, point.shared)
+    return ArcEquations(
+        orbit[np.ix_(free, free)], sums.coupling[:, :, free], sums.blocks, right[free], of_sensors
+    )
 
 
 def log_evidence(orbit: DeterminedOrbit, areas: AreaPrior) -> float:

@@ -27,14 +27,15 @@ class ArcEquations(NamedTuple):
     """Normal equations of one arc: its object's state, and the shared errors of its s sensors.
 
     Each sensor has six unknowns: the error of its directions [rad] and of its position [km], three
-    axes each. The equations are without the prior; the errors are counted from zero.
+    axes each. The equations are without the prior; the errors are counted from zero. The state has
+    m unknowns, six or more.
 
-    state : (6, 6) float
-    coupling : (s, 6, 6) float
+    state : (m, m) float
+    coupling : (s, 6, m) float
         Rows are the unknowns of the sensor, columns those of the state.
     blocks : (s, 6, 6) float
         Diagonal blocks of the sensors: two sensors are coupled by the state only.
-    of_state, of_sensors : (6,), (s, 6) float
+    of_state, of_sensors : (m,), (s, 6) float
         Right sides.
     """
 
@@ -135,19 +136,34 @@ def _of_group(
         inside = index[sensors] >= 0
         if not inside.any():
             continue
-        state = arc.state - less[~inside].sum(axis=0)
-        of_state = arc.of_state - less_right[~inside].sum(axis=0)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(state), 1e-300))
-        inverse = np.linalg.pinv(state * scale[:, None] * scale, hermitian=True)
-        inverse *= scale[:, None] * scale
-        to_state = arc.coupling[inside].reshape(-1, 6)
-        reduced = -to_state @ inverse @ to_state.T
-        for k, block in enumerate(arc.blocks[inside]):
-            reduced[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += block
+        reduced, of_sensors = without_state(
+            ArcEquations(
+                arc.state - less[~inside].sum(axis=0),
+                arc.coupling[inside],
+                arc.blocks[inside],
+                arc.of_state - less_right[~inside].sum(axis=0),
+                arc.of_sensors[inside],
+            )
+        )
         at = (6 * index[sensors[inside]][:, None] + np.arange(6)).ravel()
         normal[np.ix_(at, at)] += reduced
-        right[at] += arc.of_sensors[inside].ravel() - to_state @ (inverse @ of_state)
+        right[at] += of_sensors
     return normal, right
+
+
+def without_state(arc: ArcEquations) -> tuple[Array, Array]:
+    """Return the equations of the errors of an arc's s sensors, (6 s, 6 s) and (6 s,).
+
+    The state is eliminated.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(arc.state), 1e-300))
+    inverse = np.linalg.pinv(arc.state * scale[:, None] * scale, hermitian=True)
+    inverse *= scale[:, None] * scale
+    to_state = arc.coupling.reshape(-1, len(arc.state))
+    reduced = -to_state @ inverse @ to_state.T
+    for k, block in enumerate(arc.blocks):
+        reduced[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += block
+    return reduced, arc.of_sensors.ravel() - to_state @ (inverse @ arc.of_state)
 
 
 def _scaled(normal: Array, right: Array, prior: Array, free: npt.NDArray[np.bool_]) -> Array:

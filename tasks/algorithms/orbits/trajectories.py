@@ -194,6 +194,24 @@ def interpolate(t_s, path, x, jacobian):
             )
 
 
+def positions_at(path: Trajectory, time_s: Array) -> Array:
+    """Return an orbit's positions (n, 3) [km] at times (n,) [s], as `interpolate` does."""
+    h, last = path.step_s, len(path.values) - 2
+    k = np.clip(np.floor((time_s - path.start_s) / h).astype(np.int64), 0, last)
+    u = ((time_s - path.start_s) / h - k)[:, None]
+    rise = u**3 * (10 - 15 * u + 6 * u**2)
+    p, q = path.values[k], path.values[k + 1]
+    pull, next_pull = path.rates[k, 3:6], path.rates[k + 1, 3:6]
+    return np.asarray(
+        p[:, :3]
+        + (q[:, :3] - p[:, :3]) * rise
+        + h * u * (1 - 6 * u**2 + 8 * u**3 - 3 * u**4) * p[:, 3:6]
+        + h * u**3 * (-4 + 7 * u - 3 * u**2) * q[:, 3:6]
+        + 0.5 * h * h * u**2 * (1 - 3 * u + 3 * u**2 - u**3) * pull
+        + 0.5 * h * h * u**3 * (1 - 2 * u + u**2) * next_pull
+    )
+
+
 def propagate_unknowns(
     unknowns: Array, epoch_s: float, to_s: float, around: Surroundings
 ) -> tuple[Array, Array]:

@@ -27,7 +27,7 @@ from epipole.schemas.columns import TIME
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.tables import TABLES
 
-WHOLE_NIGHT = {"sources", "nights", "calibrations", "identifications", "objects"}
+WHOLE_NIGHT = {"sources", "nights", "calibrations", "identifications", "objects", "sensor_errors"}
 
 
 def test_every_table_has_a_file_each_night_with_its_units(tmp_path):

@@ -33,6 +33,7 @@ WHOLE_NIGHT = (
     "calibrations",
     "identifications",
     "objects",
+    "sensor_errors",
 )  # tables that are not of an instant
 pytestmark = pytest.mark.long
 

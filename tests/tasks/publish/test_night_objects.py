@@ -14,7 +14,8 @@ def observed(name, n=4, **columns):
     """Observations of an object, one a second, by turns of two sensors."""
     given = {"time": seconds(n), "sensor_id": (["a", "b"] * n)[:n], "tracklet_id": ["t"] * n,
              "blended": [False] * n}  # fmt: skip
-    return {"object_id": [name] * n, **given, **columns}
+    reduced = {"magnitude_1000_km": columns["magnitude"]} if "magnitude" in columns else {}
+    return {"object_id": [name] * n, **given, **columns, **reduced}
 
 
 def solved(name, n=4, n_sensors=2, **columns):
@@ -25,7 +26,7 @@ def solved(name, n=4, n_sensors=2, **columns):
 def rows(table, each):
     """Return all these rows; missing columns are those of `filled`."""
     names = {name for columns in each for name in columns}
-    blank = {"magnitude": None, "magnitude_sigma": None, "chi2": 0.0, "n_rejected": 0}
+    blank = {"chi2": 0.0, "n_rejected": 0}
     return filled(table, **{
         name: [v for of in each for v in of.get(name, [blank.get(name)] * len(of["time"]))]
         for name in names
@@ -108,6 +109,12 @@ def test_magnitudes_of_blended_detections_do_not_count():
     each = found(seen)
     of = {name: (row["magnitude"], row["magnitude_amplitude"]) for name, row in each.items()}
     assert of == {"o": (9.0, 0.0), "dark": (None, None), "once": (7.0, None)}
+
+
+def test_without_a_range_the_amplitude_is_not_known():
+    bright = {"magnitude": [8.0, 9.0], "magnitude_sigma": [0.1, 0.1]}
+    (each,) = found([observed("o", 2, **bright) | {"magnitude_1000_km": [None, 9.0]}]).values()
+    assert (each["magnitude"], each["magnitude_amplitude"]) == (8.5, None)
 
 
 def test_only_known_objects_have_a_name():

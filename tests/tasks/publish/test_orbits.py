@@ -5,14 +5,19 @@ import polars as pl
 import pytest
 from scenes.associations import filled
 from scenes.night_orbits import GEO, LOW, NOON_NS, trial
+from scenes.night_orbits import positions as where
 
 from epipole.io.datasets.night_tables import read_columns, write_table
-from epipole.schemas.bridge import stack_covariance, to_polars
-from epipole.schemas.columns import ELEMENTS, POSITION, STATE_AXES, VELOCITY
+from epipole.schemas.bridge import stack, stack_covariance, to_polars
+from epipole.schemas.columns import ELEMENTS, POSITION, SHARED_AXES, STATE_AXES, VELOCITY
+from epipole.schemas.observation import FITTED_FIELDS
 from epipole.schemas.rejects import Reason, reject_rows
-from epipole.schemas.tables import OBSERVATIONS, ORBITS, POSITIONS, REJECTS, STATES
+from epipole.schemas.tables import OBSERVATIONS, ORBITS, POSITIONS, REJECTS, SENSOR_ERRORS, STATES
+from epipole.tasks.algorithms.constants import ARCSEC
+from epipole.tasks.algorithms.orbits.illumination import illumination
 from epipole.tasks.algorithms.orbits.orbital_elements import elements_of
 from epipole.tasks.publish import orbits
+from epipole.tasks.publish.fitted_observations import complete_observations
 from epipole.tasks.publish.orbits import fit_orbits, surroundings_of, write_orbits
 
 NIGHT = "2026-05-30"
@@ -50,7 +55,8 @@ def state(name, truth, time_ns=NOON_NS):
 def positions(name, truth):
     at = np.array([-2.0, 0.0, 2.0])
     r_km = gcrf(truth)[:3] + at[:, None] * gcrf(truth)[3:]
-    rows = {"epoch": NOON_NS + (at * 1e9).astype(np.int64), "object_id": [name] * 3}
+    time_ns = NOON_NS + (at * 1e9).astype(np.int64)
+    rows = {"epoch": time_ns, "time": time_ns, "object_id": [name] * 3}
     rows |= dict(zip(POSITION, r_km.T, strict=True))
     return to_polars(filled(POSITIONS, 3, rows))
 
@@ -124,6 +130,83 @@ def test_an_object_without_state_or_position_has_an_orbit_by_its_observations(tm
         assert alone[name] == pytest.approx(started[name], rel=1e-3)
 
 
+def completed(folder, shares=1):
+    """Return the observations of a night with what its orbits add."""
+    made(folder, shares)
+    complete_observations.fn(folder, NIGHT, shares)
+    return to_polars(read_columns(folder, "observations", OBSERVATIONS.names))
+
+
+def test_observations_have_their_residuals_and_how_their_object_is_lit(tmp_path):
+    low = np.linspace(-60.0, 60.0, 25)
+    bright = observed("low", LOW, times_s=low).with_columns(magnitude=pl.lit(6.0))
+    seen = [observed("high", GEO), bright, bright.head(2).with_columns(object_id=None)]
+    written(tmp_path, seen, [state("high", GEO)], [positions("low", LOW)])
+    before = to_polars(read_columns(tmp_path, "observations", OBSERVATIONS.names))
+    rows = completed(tmp_path)
+    names = [field.name for field in FITTED_FIELDS]
+    assert rows.drop(names).equals(before.drop(names))
+    assert rows.filter(pl.col("object_id").is_null()).select(names).null_count().row(0) == (2,) * 5
+    fitted = rows.drop_nulls("object_id")
+    # 138 chi-squares of two degrees of freedom, less what is fitted.
+    assert (fitted["residual_sigma"] ** 2).mean() == pytest.approx(2.0, abs=5 * 2 / np.sqrt(138))
+    for name, truth in (("high", GEO), ("low", LOW)):
+        of = fitted.filter(object_id=name)
+        time_ns = of["time"].dt.epoch("ns").to_numpy()
+        sensor_km = of.select(POSITION).to_numpy()
+        true_km = where(truth, (time_ns - NOON_NS) / 1e9) @ R
+        lit = illumination(time_ns, true_km, sensor_km)
+        assert of["sunlit"].to_list() == lit.sunlit.tolist()
+        # Light time, at most 0.15 s of 7 km/s, and the errors of the orbit.
+        np.testing.assert_allclose(of["range_km"], lit.range_km, atol=3.0)
+        np.testing.assert_allclose(of["phase_deg"], np.degrees(lit.phase_rad), atol=0.2)
+        reduced = of["magnitude"] - 5 * (of["range_km"] / 1000).log(10)
+        assert reduced.null_count() == (len(of) if name == "high" else 0)
+        np.testing.assert_allclose(of["magnitude_1000_km"].to_numpy(), reduced.to_numpy())
+    assert completed(tmp_path, shares=3).equals(rows)
+
+
+def test_an_object_without_an_orbit_is_located_between_its_positions(tmp_path):
+    low = np.array([-40.0, -1.0, 0.5, 1.9, 3.0])
+    seen = observed("low", LOW, times_s=low, n_sensors=1)
+    mixed = seen.with_columns(dec_deg=pl.col("dec_deg") + pl.Series([0.0, 5.0, -5.0, 5.0, 0.0]))
+    written(tmp_path, [mixed], [], [positions("low", LOW)])
+    rows = completed(tmp_path)
+    assert rows["residual_sigma"].null_count() == 5
+    assert rows["range_km"].is_null().to_list() == [True, False, False, False, True]
+    assert rows["sunlit"].is_null().to_list() == [True, False, False, False, True]
+    true_km = where(LOW, low[1:4]) @ R
+    off = np.linalg.norm(true_km - rows.select(POSITION).to_numpy()[1:4], axis=1)
+    np.testing.assert_allclose(rows["range_km"][1:4], off, atol=0.3)
+
+
+def test_sensors_have_their_errors_as_all_orbits_show_them(tmp_path):
+    names = [f"o{k}" for k in range(4)]
+    rng = np.random.default_rng(3)
+    shared = rng.normal(size=(3, 3)) * 100 * ARCSEC, np.zeros((3, 3))
+    seen = [
+        observed(name, (GEO, LOW)[k % 2], seed=k, shared=shared,
+                 times_s=np.linspace(-60.0, 60.0, 15)).with_columns(bias_sigma_arcsec=100.0)
+        for k, name in enumerate(names)
+    ]  # fmt: skip
+    written(tmp_path, seen, [state(name, (GEO, LOW)[k % 2]) for k, name in enumerate(names)])
+    made(tmp_path)
+    rows = read_columns(tmp_path, "sensor_errors", SENSOR_ERRORS.names)
+    assert rows["sensor_id"].to_pylist() == ["s0", "s1", "s2"]
+    assert rows["n_objects"].to_pylist() == [4] * 3
+    assert rows["n_observations"].to_pylist() == [60] * 3
+    np.testing.assert_allclose(rows["bias_sigma_arcsec"], 100.0)
+    cov = stack_covariance(rows, "cov_{}", SHARED_AXES)
+    bias = stack(rows, "direction_error_{}_arcsec")
+    off = bias - shared[0] / ARCSEC @ R
+    square = np.einsum("si,sij,sj->s", off, np.linalg.inv(cov[:, :3, :3]), off)
+    assert square.max() < 16.3  # 1 in 1,000 of three degrees of freedom is above
+    assert np.trace(cov[:, :3, :3], axis1=1, axis2=2).max() < 3 * 100.0**2
+    made(tmp_path, shares=3)
+    other = read_columns(tmp_path, "sensor_errors", SENSOR_ERRORS.names)
+    np.testing.assert_allclose(stack(other, "direction_error_{}_arcsec"), bias, rtol=1e-6)
+
+
 def test_too_few_observations_are_a_reject(tmp_path):
     written(tmp_path, [observed("a", GEO).head(3)], [state("a", GEO)])
     rows, rejects = made(tmp_path)
@@ -144,6 +227,8 @@ def test_a_row_does_not_depend_on_the_objects_or_tasks_beside_it(tmp_path):
 
 def test_a_night_without_objects_has_no_orbits(tmp_path):
     written(tmp_path, [])
+    assert not len(completed(tmp_path))
+    assert not read_columns(tmp_path, "sensor_errors", SENSOR_ERRORS.names).num_rows
     rows, rejects = made(tmp_path)
     assert rows.num_rows == 0
     assert rejects.num_rows == 1

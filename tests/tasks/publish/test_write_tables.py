@@ -32,7 +32,13 @@ def view_rejected(time_ns: int, count: int, sensor_id="a", tracklet_id=None) -> 
 
 
 def test_every_table_of_a_dataset_is_written_by_one_task():
-    later = ("identifications", "nights", "objects", "orbits")  # made from the other tables
+    later = (
+        "identifications",
+        "nights",
+        "objects",
+        "orbits",
+        "sensor_errors",
+    )  # made from the other tables
     names = [*later, *(name for share in SHARES for name in share)]
     assert sorted(names) == sorted(TABLES)
     assert sorted((*later, *BY_SENSOR, *BY_SPAN, *WHOLE, "observations")) == sorted(TABLES)
