@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -20,38 +19,15 @@ from epipole.schemas.work_tables import FITTED_OBSERVATIONS
 from epipole.tasks.algorithms.constants import SECOND_NS, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.illumination import illumination, reduced_magnitude
-from epipole.tasks.algorithms.orbits.orbit_determination import BACK_S, DeterminedOrbit
+from epipole.tasks.algorithms.orbits.orbit_determination import BACK_S
 from epipole.tasks.algorithms.orbits.trajectories import integrate, positions_at
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.publish.object_orbits import FittedOrbit, turned
 
 Array = npt.NDArray[np.float64]
 
 MAX_APART_S = 30.0  # positions between which a straight line is right: within 1 km in low orbit
 LIGHT_ITERATIONS = 3  # right to 1e-12 of the distance
-
-
-class FittedOrbit(NamedTuple):
-    """An orbit at its epoch [s], with the names of its forces."""
-
-    orbit: DeterminedOrbit
-    epoch_s: float
-    forces: str
-
-    @property
-    def dof(self) -> int:
-        """Degrees of freedom of chi-square."""
-        return 2 * int(self.orbit.used.sum()) - 6
-
-
-def turned(rotation: Array, vectors: Array) -> Array:
-    """Return rotated vectors (..., k), each the same whatever rows are beside it.
-
-    Products of matrices and `einsum` add in an order that depends on the number of rows.
-    """
-    out = np.zeros_like(vectors, order="C")
-    for i, j in np.ndindex(rotation.shape):
-        out[..., i] += rotation[i, j] * vectors[..., j]
-    return out
 
 
 def fitted_part(folder: Path, share: int, shares: int) -> Path:

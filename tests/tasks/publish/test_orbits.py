@@ -18,7 +18,8 @@ from epipole.tasks.algorithms.orbits.illumination import illumination
 from epipole.tasks.algorithms.orbits.orbital_elements import elements_of
 from epipole.tasks.publish import orbits
 from epipole.tasks.publish.fitted_observations import complete_observations
-from epipole.tasks.publish.orbits import fit_orbits, surroundings_of, write_orbits
+from epipole.tasks.publish.object_orbits import surroundings_of
+from epipole.tasks.publish.orbits import fit_orbits, write_orbits
 
 NIGHT = "2026-05-30"
 R = surroundings_of(NIGHT).R_night_from_gcrf
