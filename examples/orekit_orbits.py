@@ -255,6 +255,8 @@ def main(folder, dataset=None):
     """Print the orbit of each object."""
     give_data()
     for path in sorted(Path(folder).glob("*.tdm")):
+        if path.with_suffix(".oem").exists():
+            continue  # of a sensor: its tracklets that belong to no object
         rows = read(path)
         if dataset:
             rows = with_own_sigmas(rows, path.stem, dataset)

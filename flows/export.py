@@ -2,12 +2,14 @@
 
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import polars as pl
 
 from epipole.io.ccsds import (
+    Directions,
+    Subject,
     ephemeris_message,
     safe_name,
     state_message,
@@ -19,10 +21,21 @@ from epipole.io.paths import fault_of_name
 from epipole.schemas.bridge import to_polars
 from epipole.schemas.errors import DatasetError
 from epipole.schemas.options import Message
-from epipole.tasks.export import arcs, directions, sensor_ephemeris, single_states
+from epipole.tasks.export import (
+    arcs,
+    directions,
+    orbit_arc,
+    sensor_ephemeris,
+    single_orbit,
+    single_states,
+    subjects,
+)
+from epipole.tasks.publish.object_orbits import noon_ns, surroundings_of
 
 OF_STATE = "State of an object, fitted to its lines of sight; covariance in the same frame."
 OF_ARC = "A fitted state, moved through its arc: point mass and J2; not to be extrapolated."
+OF_ORBIT = "Orbit fitted to all observations of the night; covariance in the same frame."
+OF_FORCES = "Forces of the fit, by which it is moved:"
 OF_SENSOR = "The sensor's positions and velocities at its frames, from its log."
 
 
@@ -34,8 +47,9 @@ def export(
     Returns
     -------
     list of str
-        The names of the files: of TDMs one per object and an ephemeris per sensor, of OEMs one
-        per object, of OPMs one per state.
+        The names of the files: of TDMs one per object, one per sensor with its tracklets that
+        belong to none, and an ephemeris per sensor; of OEMs one per object; of OPMs one per
+        orbit, or per state of an object without orbit.
 
     Raises
     ------
@@ -65,47 +79,81 @@ class _NightTables:
 
     def __init__(self, dataset: str, night: str) -> None:
         self.dataset, self.night = dataset, night
+        self._subjects = subjects(self.read("identifications"))
 
     def read(self, table: str) -> pl.DataFrame:
         return to_polars(read_table(self.dataset, table, self.night))
 
-    def by_object(self, table: str, wanted: Sequence[str]) -> dict[str, pl.DataFrame]:
-        """Return the rows of each object, of these or of all."""
-        rows = self.read(table)
-        found = rows.drop_nulls("object_id").partition_by("object_id", as_dict=True)
-        by_id = {str(key): of_object for (key,), of_object in sorted(found.items())}
-        missing = [name for name in wanted if name not in by_id]
-        if missing:
+    def subject(self, name: str) -> Subject:
+        """Return an object or a tracklet with what is known of it."""
+        return self._subjects.get(name, Subject(name))
+
+    def by_id(self, rows: pl.DataFrame, key: str) -> dict[str, pl.DataFrame]:
+        """Return the rows of each object or tracklet, in the order of the ids."""
+        found = rows.drop_nulls(key).partition_by(key, as_dict=True)
+        return {str(name): of_one for (name,), of_one in sorted(found.items())}
+
+    def check(self, what: str, wanted: Sequence[str], found: Collection[str]) -> None:
+        """Raise where an id that is asked for is missing."""
+        if missing := [name for name in wanted if name not in found]:
             raise DatasetError(
-                f"{self.dataset}: the night {self.night} has no {table} of {', '.join(missing)}"
+                f"{self.dataset}: the night {self.night} has no {what} of {', '.join(missing)}"
             )
-        return {name: by_id[name] for name in wanted or by_id}
 
 
 def _write_tracking_data(night: _NightTables, wanted: Sequence[str], folder: Path) -> None:
-    objects = night.by_object("observations", wanted)
-    sensors = {name for rows in objects.values() for name in rows["sensor_id"].unique()}
+    rows = night.read("observations")
+    objects = night.by_id(rows, "object_id")
+    tracklets = night.by_id(rows.filter(pl.col("object_id").is_null()), "tracklet_id")
+    night.check(Message.tdm.table, wanted, {*objects, *tracklets})
+    if wanted:
+        objects, tracklets = (
+            {name: of[name] for name in wanted if name in of} for of in (objects, tracklets)
+        )
+    sensors = {name for of in (*objects.values(), *tracklets.values()) for name in of["sensor_id"]}
     ephemerides = _file_names(sorted(sensors), "oem")
     frames = night.read("frames")
     for sensor, file in ephemerides.items():
         of_sensor = sensor_ephemeris(frames.filter(pl.col("sensor_id") == sensor))
-        write_message(folder / file, ephemeris_message(sensor, [of_sensor], [OF_SENSOR]))
-    for name, file in _file_names(list(objects), "tdm").items():
-        write_message(folder / file, tracking_data(name, directions(objects[name], ephemerides)))
+        write_message(folder / file, ephemeris_message(Subject(sensor), [of_sensor], [OF_SENSOR]))
+    segments: dict[str, list[tuple[Subject, str, Directions]]] = {}
+    for name, of in (*objects.items(), *tracklets.items()):
+        for sensor, seen in directions(of, ephemerides).items():
+            group = name if name in objects else sensor  # a sensor's tracklets are one message
+            segments.setdefault(group, []).append((night.subject(name), sensor, seen))
+    for name, file in _file_names(list(segments), "tdm").items():
+        write_message(folder / file, tracking_data(segments[name]))
 
 
 def _write_states(kind: Message, night: _NightTables, wanted: Sequence[str], folder: Path) -> None:
-    objects = night.by_object("states", wanted)
-    positions = night.read("positions") if kind == Message.oem else None
-    for name, file in _file_names(list(objects), kind.value).items():
-        states, path = objects[name], folder / file
-        if positions is not None:
-            of_object = positions.filter(pl.col("object_id") == name)
-            write_message(path, ephemeris_message(name, arcs(states, of_object), [OF_ARC]))
+    """Write the orbit of each object; without one, its states."""
+    rows = night.read("orbits").with_columns(epoch_ns=pl.col("epoch").dt.epoch("ns"))
+    orbits = {row["object_id"]: row for row in rows.drop("epoch").iter_rows(named=True)}
+    states = night.by_id(night.read("states"), "object_id")
+    night.check(kind.table, wanted, {*orbits, *states})
+    names = wanted or sorted({*orbits, *states})
+    around, origin_ns = surroundings_of(night.night), noon_ns(night.night)
+    positions = night.read("positions") if kind == Message.oem else pl.DataFrame()
+    for name, file in _file_names(names, kind.value).items():
+        path, of = folder / file, night.subject(name)
+        orbit = orbits.get(name)
+        if kind == Message.oem:
+            if orbit is not None:
+                comments = [OF_ORBIT, OF_FORCES, orbit["forces"]]
+                parts = [orbit_arc(orbit, around, origin_ns)]
+            else:
+                comments = [OF_ARC]
+                parts = arcs(states[name], positions.filter(pl.col("object_id") == name))
+            write_message(path, ephemeris_message(of, parts, comments))
             continue
-        for number, state in enumerate(single_states(states.sort("epoch")), 1):
+        if orbit is not None:
+            comments = [OF_ORBIT, OF_FORCES, orbit["forces"]]
+            parts = [single_orbit(orbit)]
+        else:
+            comments, parts = [OF_STATE], single_states(states[name].sort("epoch"))
+        for number, part in enumerate(parts, 1):
             numbered = path.with_name(f"{path.stem}-{number}{path.suffix}")
-            write_message(numbered, state_message(name, state, [OF_STATE]))
+            write_message(numbered, state_message(of, part, comments))
 
 
 def _file_names(names: Sequence[str], ending: str) -> Mapping[str, str]:

@@ -2,7 +2,7 @@
 
 import datetime
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.schemas.errors import DatasetError
+from epipole.schemas.text import as_line
 
 # Times, names and headers of all messages.
 
@@ -32,6 +33,11 @@ def now() -> str:
 def safe_name(text: str) -> str:
     """Return a name for a message or a file: letters, digits and ``._+-``, the rest as ``_``."""
     return _UNSAFE.sub("_", text) or "_"
+
+
+def as_ascii(text: str) -> str:
+    """Return a text as one line of ASCII."""
+    return as_line(text).encode("ascii", "replace").decode()
 
 
 def write_message(path: Path, text: str) -> None:
@@ -56,6 +62,31 @@ _AXES = ("x", "y", "z", "x_dot", "y_dot", "z_dot")
 DEGREE = 7  # of the Hermite interpolation, if there are enough states
 
 
+class Subject(NamedTuple):
+    """What a message is of: an object, a tracklet or a sensor, with its name in a catalogue."""
+
+    subject_id: str
+    norad_id: int | None = None
+    cospar_id: str | None = None
+    name: str | None = None
+
+    @property
+    def message_name(self) -> str:
+        """The name in a catalogue, else the id."""
+        return safe_name(self.name or self.subject_id)
+
+    @property
+    def message_id(self) -> str:
+        """The international designator, else the id."""
+        return safe_name(self.cospar_id or self.subject_id)
+
+    def comments(self) -> list[str]:
+        """Return a comment with the id and the numbers in a catalogue; none without these."""
+        numbers = {"NORAD": self.norad_id, "COSPAR": self.cospar_id, "NAME": self.name}
+        known = [f"{what} {value}" for what, value in numbers.items() if value is not None]
+        return [as_ascii(f"ID {self.subject_id}, {', '.join(known)}")] if known else []
+
+
 class Ephemeris(NamedTuple):
     """States of one object or sensor, sorted by time.
 
@@ -73,18 +104,17 @@ class Ephemeris(NamedTuple):
     covariance: Array
 
 
-def ephemeris_message(name: str, parts: Sequence[Ephemeris], comments: Sequence[str]) -> str:
-    """Return the OEM of one object, with a segment per part."""
-    segments = [_ephemeris_segment(name, part, comments) for part in parts]
+def ephemeris_message(of: Subject, parts: Sequence[Ephemeris], comments: Sequence[str]) -> str:
+    """Return the OEM of one object or sensor, with a segment per part."""
+    segments = [_ephemeris_segment(of, part, comments) for part in parts]
     return str(ccsds.Oem(_header(), segments).to_str("kvn"))
 
 
-def _ephemeris_segment(name: str, part: Ephemeris, comments: Sequence[str]) -> ccsds.OemSegment:
+def _ephemeris_segment(of: Subject, part: Ephemeris, comments: Sequence[str]) -> ccsds.OemSegment:
     at = times(part.time_ns)
-    known = safe_name(name)
     metadata = ccsds.OemMetadata(
-        known,
-        known,
+        of.message_name,
+        of.message_id,
         at[0],
         at[-1],
         center_name="EARTH",
@@ -92,7 +122,7 @@ def _ephemeris_segment(name: str, part: Ephemeris, comments: Sequence[str]) -> c
         time_system="UTC",
         interpolation="HERMITE",
         interpolation_degree=int(min(DEGREE, max(len(at) - 1, 1))),
-        comment=list(comments),
+        comment=[*of.comments(), *comments],
     )
     states = [
         ccsds.StateVectorAcc(epoch, *values)
@@ -106,12 +136,11 @@ def _ephemeris_segment(name: str, part: Ephemeris, comments: Sequence[str]) -> c
     return ccsds.OemSegment(metadata, ccsds.OemData(states, covariances))
 
 
-def state_message(name: str, part: Ephemeris, comments: Sequence[str]) -> str:
+def state_message(of: Subject, part: Ephemeris, comments: Sequence[str]) -> str:
     """Return the OPM of one state, with its covariance."""
-    known = safe_name(name)
     metadata = ccsds.OpmMetadata(
-        known, known, center_name="EARTH", ref_frame="GCRF", time_system="UTC",
-        comment=list(comments),
+        of.message_name, of.message_id, center_name="EARTH", ref_frame="GCRF", time_system="UTC",
+        comment=[*of.comments(), *comments],
     )  # fmt: skip
     (epoch,) = times(part.time_ns)
     data = ccsds.OpmData(ccsds.StateVector(epoch, *np.round(part.state[0], 9).tolist()))
@@ -128,7 +157,7 @@ def _header() -> ccsds.OdmHeader:
     return ccsds.OdmHeader(now(), ORIGINATOR)
 
 
-# Tracking data (TDM): the directions of one object, a segment per sensor.
+# Tracking data (TDM): directions, a segment per sensor and object or tracklet.
 
 
 class Directions(NamedTuple):
@@ -154,22 +183,22 @@ class Directions(NamedTuple):
     comments: Sequence[str]
 
 
-def tracking_data(object_id: str, of_sensors: Mapping[str, Directions]) -> str:
-    """Return the message of one object, with a segment per sensor."""
-    segments = [_tracking_segment(object_id, sensor, seen) for sensor, seen in of_sensors.items()]
+def tracking_data(seen: Iterable[tuple[Subject, str, Directions]]) -> str:
+    """Return a message with a segment for each object or tracklet and its sensor."""
+    segments = [_tracking_segment(*of) for of in seen]
     header = ccsds.TdmHeader(originator=ORIGINATOR, creation_date=now())
     message = ccsds.Tdm(header=header, body=ccsds.TdmBody(segments=segments))
     return str(message.to_str("kvn"))
 
 
-def _tracking_segment(object_id: str, sensor: str, seen: Directions) -> ccsds.TdmSegment:
+def _tracking_segment(of: Subject, sensor: str, seen: Directions) -> ccsds.TdmSegment:
     at = times(seen.time_ns)
     metadata = ccsds.TdmMetadata(
         time_system="UTC",
         start_time=at[0],
         stop_time=at[-1],
         participant_1=safe_name(sensor),
-        participant_2=safe_name(object_id),
+        participant_2=safe_name(of.subject_id),
         mode="SEQUENTIAL",
         path="2,1",
         ephemeris_name_1=seen.ephemeris,
@@ -179,7 +208,7 @@ def _tracking_segment(object_id: str, sensor: str, seen: Directions) -> ccsds.Td
         correction_aberration_yearly=0.0,
         correction_aberration_diurnal=seen.aberration_deg,
         corrections_applied="YES",
-        comment=list(seen.comments),
+        comment=[*of.comments(), *seen.comments],
     )
     rows = []
     columns = (at, seen.ra_deg.tolist(), seen.dec_deg.tolist(), seen.magnitude.tolist())

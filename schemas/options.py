@@ -116,5 +116,5 @@ class Message(StrEnum):
 
     @property
     def table(self) -> str:
-        """The table that it is made from."""
-        return "observations" if self is Message.tdm else "states"
+        """The tables that it is made from."""
+        return "observations" if self is Message.tdm else "orbits or states"

@@ -1,28 +1,44 @@
-"""Tables of a night for CCSDS messages: directions of an object by sensor, and ephemerides."""
+"""Tables of a night for CCSDS messages: directions by sensor, states and ephemerides."""
 
+import re
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import polars as pl
 
-from epipole.io.ccsds import Directions, Ephemeris
+from epipole.io.ccsds import Directions, Ephemeris, Subject
 from epipole.schemas.bridge import stack_covariance
-from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
-from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY, upper_triangle
+from epipole.schemas.rejects import NameStatus
+from epipole.tasks.algorithms.constants import SECOND_NS, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit, unit_from_radec
+from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.orbit_fit import trajectory
 from epipole.tasks.algorithms.orbits.reference_frames import EME2000_FROM_GCRF
+from epipole.tasks.algorithms.orbits.trajectories import propagate_unknowns
+from epipole.tasks.publish.object_orbits import DRAG, RADIATION
 
-# Directions of one object, and the ephemerides of the sensors.
+# What is known of names.
+
+
+def subjects(identifications: pl.DataFrame) -> dict[str, Subject]:
+    """Return the objects and tracklets that have a name in a catalogue, by their ids."""
+    known = identifications.filter(pl.col("status") == NameStatus.KNOWN.value)
+    columns = [pl.coalesce("object_id", "tracklet_id"), "norad_id", "cospar_id", "name"]
+    return {row[0]: Subject(*row) for row in known.select(columns).iter_rows()}
+
+
+# Directions of one object or tracklet, and the ephemerides of the sensors.
 
 
 def directions(observations: pl.DataFrame, ephemerides: Mapping[str, str]) -> dict[str, Directions]:
-    """Return the directions of one object by sensor, in the order of the names.
+    """Return the directions of one object or tracklet by sensor, in the order of the names.
 
     Parameters
     ----------
     observations
-        OBSERVATIONS of the object, sorted by time.
+        OBSERVATIONS of it, sorted by time.
     ephemerides
         The file of each sensor's ephemeris.
     """
@@ -74,11 +90,66 @@ def sensor_ephemeris(frames: pl.DataFrame) -> Ephemeris:
     )
 
 
-# Ephemerides of one object: each state, moved through the arc that it was fitted to.
+# The orbit of an object, moved through its arc under the forces that it was fitted with.
+
+STEPS = 60  # of an arc, at least
+MAX_STEP_S = 120.0  # between the states of an ephemeris: an interpolation is right to a millimetre
+_AREA = re.compile(r"(radiation|drag) (\S+) m2/kg")
+
+
+def areas_in(forces: str) -> list[float]:
+    """Return the areas over mass in sunlight and in the air that `orbits.forces` names [m^2/kg]."""
+    named = dict(_AREA.findall(forces))
+    return [float(named.get(force, 0.0)) for force in (RADIATION, DRAG)]
+
+
+def single_orbit(orbit: Mapping[str, Any]) -> Ephemeris:
+    """Return a row of ORBITS by itself, at its epoch."""
+    time_ns = np.array([orbit["epoch_ns"]])
+    state = np.array([[orbit[name] for name in (*POSITION, *VELOCITY)]])
+    return Ephemeris(time_ns, state, time_ns, _covariance(orbit)[None])
+
+
+def _covariance(row: Mapping[str, Any]) -> np.ndarray:
+    cov = np.zeros((6, 6))
+    for (a, b), (i, j) in zip(
+        upper_triangle(STATE_AXES), zip(*np.triu_indices(6), strict=True), strict=True
+    ):
+        cov[i, j] = cov[j, i] = row[f"cov_{a}{b}"]
+    return cov
+
+
+def orbit_arc(orbit: Mapping[str, Any], around: Surroundings, origin_ns: int) -> Ephemeris:
+    """Return the ephemeris of a row of ORBITS over its arc, with the covariance of each state.
+
+    `around` counts from `origin_ns`.
+    """
+    half_s = max(orbit["arc_s"] / 2, 1.0)
+    steps = max(STEPS // 2, int(np.ceil(half_s / MAX_STEP_S)))
+    epoch_s = (orbit["epoch_ns"] - origin_ns) / SECOND_NS
+    R = np.kron(np.eye(2), around.R_night_from_gcrf)
+    of = single_orbit(orbit)
+    start = np.concatenate([R @ of.state[0], areas_in(orbit["forces"])])
+    found: list[tuple[float, np.ndarray, np.ndarray]] = []
+    for direction in (-1, 1):
+        unknowns, transition = start, np.eye(len(start))
+        for k in range(1, steps + 1):
+            before, at = (direction * half_s * step / steps for step in (k - 1, k))
+            unknowns, moved = propagate_unknowns(unknowns, epoch_s + before, epoch_s + at, around)
+            transition = moved @ transition
+            turned = R.T @ transition[:6, :6] @ R
+            found.append((at, R.T @ unknowns[:6], turned @ of.covariance[0] @ turned.T))
+    found.append((0.0, of.state[0], of.covariance[0]))
+    found.sort(key=lambda each: each[0])
+    at_s, states, covariances = zip(*found, strict=True)
+    time_ns = orbit["epoch_ns"] + np.rint(np.array(at_s) * SECOND_NS).astype(np.int64)
+    chosen = [0, steps, 2 * steps]
+    return Ephemeris(time_ns, np.array(states), time_ns[chosen], np.array(covariances)[chosen])
+
+
+# Objects without an orbit: each state, moved through the arc that it was fitted to.
 
 HALF_ARC_S = 300.0  # a state is of an arc of ten minutes at most
-STEPS = 60  # of an arc, at least
-SECOND_NS = 1_000_000_000
 
 
 def single_states(states: pl.DataFrame) -> list[Ephemeris]:

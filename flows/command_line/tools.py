@@ -219,17 +219,22 @@ def export(
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder to write to, new or empty.")],
     object_ids: Annotated[
         list[str] | None,
-        typer.Option("--object", metavar="ID", help="Only this object; may be given again."),
+        typer.Option(
+            "--object",
+            metavar="ID",
+            help="Only this object, or tracklet of a tdm; may be given again.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a night's objects as CCSDS messages for orbit determination (KVN).
 
-    tdm: the directions of each object (TDM 2.0), with an ephemeris of each sensor
+    tdm: the directions of each object, and of tracklets without (TDM 2.0), with an ephemeris of
+    each sensor
 
-    oem: each object's states, moved through their arcs (OEM 3.0)
+    oem: each object's orbit, or its states, moved through its arc (OEM 3.0)
 
-    opm: each state with its covariance (OPM 3.0)
+    opm: each orbit, or state, with its covariance (OPM 3.0)
     """
     from epipole.flows.export import export
 

@@ -1,8 +1,11 @@
 """Export: what a night's tables say, as messages; all files or none, errors for people."""
 
+import shutil
+
 import ccsds_ndm as ccsds
 import numpy as np
 import polars as pl
+import pyarrow.parquet as pq
 import pytest
 
 from epipole.flows.export import export
@@ -43,15 +46,76 @@ def test_tracking_data_are_the_observations_and_their_sensors_places(night_datas
     assert np.isclose(near, first["x_km"], rtol=0, atol=1e-6).any()
 
 
-def test_states_are_messages_of_their_own_and_ephemerides_of_their_arcs(night_dataset, tmp_path):
-    states = observed(night_dataset, "states")
+def changed(dataset, folder, **tables):
+    """A copy of the dataset in which some tables are what their functions return of them."""
+    shutil.copytree(dataset, folder)
+    for name, change in tables.items():
+        (file,) = (folder / f"night={NIGHT}/{name}").iterdir()
+        schema = pq.read_schema(file)
+        rows = pl.DataFrame(pq.read_table(file, partitioning=None))
+        pq.write_table(change(rows).to_arrow().cast(schema), file)
+    return str(folder)
+
+
+def test_orbits_are_messages_of_their_own_and_ephemerides_of_their_arcs(night_dataset, tmp_path):
+    orbits = observed(night_dataset, "orbits").sort("object_id")
     opm = export(Message.opm, str(night_dataset), NIGHT, tmp_path / "opm")
     oem = export(Message.oem, str(night_dataset), NIGHT, tmp_path / "oem")
-    assert len(opm) == len(states)
-    assert len(oem) == states["object_id"].n_unique()
-    state = ccsds.Opm.from_file(str(tmp_path / "opm" / opm[0])).segment.data.state_vector
-    row = states.sort("object_id", "epoch").row(0, named=True)
+    assert len(opm) == len(oem) == len(orbits)
+    row = orbits.row(0, named=True)
+    data = ccsds.Opm.from_file(str(tmp_path / "opm" / opm[0])).segment.data
+    state, covariance = data.state_vector, data.covariance_matrix
     assert [state.x, state.z_dot] == pytest.approx([row["x_km"], row["vz_km_s"]], abs=1e-9)
+    assert covariance.cz_dot_x == pytest.approx(row["cov_xvz"], rel=1e-9)
+    (segment,) = ccsds.Oem.from_file(str(tmp_path / "oem" / oem[0])).segments
+    assert row["forces"] in list(segment.metadata.comment)
+    assert len(segment.data.covariance_matrix) == 3
+
+
+def test_an_object_without_an_orbit_is_exported_by_its_states(night_dataset, tmp_path):
+    name = observed(night_dataset, "states")["object_id"].sort()[0]
+    out = changed(
+        night_dataset, tmp_path / "ds", orbits=lambda rows: rows.filter(pl.col("object_id") != name)
+    )
+    states = observed(night_dataset, "states").filter(object_id=name).sort("epoch")
+    opm = export(Message.opm, out, NIGHT, tmp_path / "opm", [name])
+    oem = export(Message.oem, out, NIGHT, tmp_path / "oem", [name])
+    assert (len(opm), len(oem)) == (len(states), 1)
+    state = ccsds.Opm.from_file(str(tmp_path / "opm" / opm[0])).segment.data.state_vector
+    assert state.x == pytest.approx(states["x_km"][0], abs=1e-9)
+    assert len(ccsds.Oem.from_file(str(tmp_path / "oem" / oem[0])).segments) == len(states)
+
+
+def test_tracklets_without_object_are_in_the_message_of_their_sensor(night_dataset, tmp_path):
+    rows = observed(night_dataset)
+    lone = rows.drop_nulls("object_id")["tracklet_id"].drop_nulls().unique().sort()[:2].to_list()
+    alone = pl.col("tracklet_id").is_in(lone)
+
+    def without(rows):
+        return rows.with_columns(object_id=pl.when(alone.not_()).then("object_id"))
+
+    def named(rows):
+        known = rows.head(1).with_columns(
+            object_id=pl.lit(None, pl.String), tracklet_id=pl.lit(lone[0]), status=pl.lit("known"),
+            norad_id=pl.lit(7, pl.Int64), name=pl.lit("SAT 7"),
+        )  # fmt: skip
+        return pl.concat([rows, known])
+
+    out = changed(night_dataset, tmp_path / "ds", observations=without, identifications=named)
+    sensors = set(rows.filter(alone)["sensor_id"])
+    files = export(Message.tdm, out, NIGHT, tmp_path / "tdm")
+    assert {f"{sensor}.tdm" for sensor in sensors} <= set(files)
+    segments = [
+        segment
+        for sensor in sensors
+        for segment in ccsds.Tdm.from_file(str(tmp_path / "tdm" / f"{sensor}.tdm")).segments
+    ]
+    assert sorted(s.metadata.participant_2 for s in segments) == lone
+    comments = {s.metadata.participant_2: next(iter(s.metadata.comment)) for s in segments}
+    assert comments[lone[0]] == f"ID {lone[0]}, NORAD 7, NAME SAT 7"
+    assert comments[lone[1]].startswith("Astrometric directions")
+    one = export(Message.tdm, out, NIGHT, tmp_path / "one", [lone[0]])
+    assert len([f for f in one if f.endswith(".tdm")]) == 1
 
 
 def test_one_object_can_be_asked_for(night_dataset, tmp_path):

@@ -7,6 +7,7 @@ import pytest
 from epipole.io.ccsds import (
     Directions,
     Ephemeris,
+    Subject,
     ephemeris_message,
     safe_name,
     state_message,
@@ -40,7 +41,7 @@ def test_names_have_nothing_that_a_reader_or_a_folder_could_take_for_more(text, 
 
 
 def test_an_ephemeris_has_its_states_and_covariances():
-    read = ccsds.Oem.from_str(ephemeris_message("sat 1", [ephemeris()], ["from its log"]))
+    read = ccsds.Oem.from_str(ephemeris_message(Subject("sat 1"), [ephemeris()], ["from its log"]))
     (segment,) = read.segments
     meta = segment.metadata
     assert (meta.object_name, meta.center_name, meta.ref_frame) == ("sat_1", "EARTH", "GCRF")
@@ -55,7 +56,7 @@ def test_an_ephemeris_has_its_states_and_covariances():
 
 
 def test_a_state_has_its_covariance_by_name():
-    text = state_message("20190401-00001", ephemeris(1), ["fitted"])
+    text = state_message(Subject("20190401-00001"), ephemeris(1), ["fitted"])
     values = dict(line.split("=") for line in text.splitlines() if "=" in line)
     values = {key.strip(): value.strip() for key, value in values.items()}
     axes = ["X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT"]
@@ -67,13 +68,38 @@ def test_a_state_has_its_covariance_by_name():
     assert "MESSAGE_ID" not in values
 
 
+NAMED = Subject("20190401-00001", 25544, "1998-067A", "ISS (ZARYA)")
+
+
+def test_an_object_with_a_name_has_it_and_its_numbers():
+    oem = ccsds.Oem.from_str(ephemeris_message(NAMED, [ephemeris()], ["fitted"])).segments[0]
+    opm = ccsds.Opm.from_str(state_message(NAMED, ephemeris(1), ["fitted"])).segment
+    for meta in (oem.metadata, opm.metadata):
+        assert (meta.object_name, meta.object_id) == ("ISS__ZARYA_", "1998-067A")
+        says = "ID 20190401-00001, NORAD 25544, COSPAR 1998-067A, NAME ISS (ZARYA)"
+        assert list(meta.comment) == [says, "fitted"]
+    time_ns = T0 + np.arange(1)
+    seen = Directions(time_ns, np.zeros(1), np.zeros(1), np.zeros(1), 0.0, "s.oem", ["seen"])
+    (segment,) = ccsds.Tdm.from_str(tracking_data([(NAMED, "s", seen)])).segments
+    assert segment.metadata.participant_2 == "20190401-00001"
+    assert list(segment.metadata.comment) == [says, "seen"]
+
+
+def test_a_name_stays_one_line_of_ascii():
+    odd = Subject("o", name="é\nX = 1")
+    assert odd.comments() == ["ID o, NAME ?\\nX = 1"] or odd.comments() == ["ID o, NAME ? X = 1"]
+    assert Subject("o", cospar_id="2020-001A").comments() == ["ID o, COSPAR 2020-001A"]
+    assert Subject("o").comments() == []
+
+
 def test_tracking_data_have_a_segment_per_sensor():
     time_ns = T0 + np.arange(2) * 1_000_000_000
     seen = Directions(
         time_ns, np.array([0.1234567891, 359.9]), np.array([-5.0, 1.6e-9]),
         np.array([8.25, np.nan]), 0.0007, "sat1.oem", ["as told"],
     )  # fmt: skip
-    text = tracking_data("20190401-00001", {"sat1": seen, "sat2": seen})
+    of = Subject("20190401-00001")
+    text = tracking_data([(of, "sat1", seen), (of, "sat2", seen)])
     read = ccsds.Tdm.from_str(text)
     assert [s.metadata.participant_1 for s in read.segments] == ["sat1", "sat2"]
     meta = read.segments[0].metadata

@@ -64,6 +64,8 @@ def main(log: Path, dataset: Path, messages: Path, *medians: Path) -> None:
     truth, shown = read_truth(log), objects_shown(log, dataset)
     rows = []
     for path in sorted(messages.glob("*.tdm")):
+        if path.with_suffix(".oem").exists():
+            continue  # of a sensor: its tracklets that belong to no object
         seen = example.read(path)
         if not medians:
             seen = example.with_own_sigmas(seen, path.stem, dataset)

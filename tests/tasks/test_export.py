@@ -4,10 +4,20 @@ import numpy as np
 import polars as pl
 import pytest
 from scenes.little_night import little_state, rows
+from scenes.night_orbits import AROUND, GEO, LOW, NOON_NS, positions
 
+from epipole.io.ccsds import Subject
 from epipole.schemas.bridge import to_polars
-from epipole.schemas.tables import POSITIONS, STATES
-from epipole.tasks.export import HALF_ARC_S, arcs, single_states
+from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
+from epipole.schemas.tables import IDENTIFICATIONS, ORBITS, POSITIONS, STATES
+from epipole.tasks.export import (
+    HALF_ARC_S,
+    arcs,
+    areas_in,
+    orbit_arc,
+    single_states,
+    subjects,
+)
 
 
 def tables(*since_s: float) -> tuple[pl.DataFrame, pl.DataFrame]:
@@ -22,8 +32,8 @@ def tables(*since_s: float) -> tuple[pl.DataFrame, pl.DataFrame]:
 
 
 def test_an_arc_covers_the_positions_about_its_epoch():
-    states, positions = tables(-100.0, -3.0, 0.0, 250.0, 290.0, HALF_ARC_S + 5)
-    (arc,) = arcs(states, positions)
+    states, places = tables(-100.0, -3.0, 0.0, 250.0, 290.0, HALF_ARC_S + 5)
+    (arc,) = arcs(states, places)
     epoch_ns = states["epoch"].dt.epoch("ns")[0]
     assert np.all(np.diff(arc.time_ns) > 0)
     assert [(t - epoch_ns) / 1e9 for t in arc.time_ns[[0, -1]]] == [-100.0, 290.0]
@@ -31,8 +41,8 @@ def test_an_arc_covers_the_positions_about_its_epoch():
 
 
 def test_the_state_itself_is_in_it_and_its_covariance():
-    states, positions = tables(-100.0, 100.0)
-    (arc,), (alone,) = arcs(states, positions), single_states(states)
+    states, places = tables(-100.0, 100.0)
+    (arc,), (alone,) = arcs(states, places), single_states(states)
     at = int(np.flatnonzero(arc.time_ns == alone.time_ns[0])[0])
     assert np.array_equal(arc.state[at], alone.state[0])
     assert arc.covariance_ns.tolist() == [arc.time_ns[0], alone.time_ns[0], arc.time_ns[-1]]
@@ -41,8 +51,8 @@ def test_the_state_itself_is_in_it_and_its_covariance():
 
 
 def test_positions_move_by_the_velocity_and_their_covariance_by_its_error():
-    states, positions = tables(-200.0, 200.0)
-    (arc,) = arcs(states, positions)
+    states, places = tables(-200.0, 200.0)
+    (arc,) = arcs(states, places)
     dt = (arc.time_ns[-1] - arc.covariance_ns[1]) / 1e9
     middle = arc.state[arc.time_ns == arc.covariance_ns[1]][0]
     straight = middle[:3] + middle[3:] * dt
@@ -55,3 +65,50 @@ def test_positions_move_by_the_velocity_and_their_covariance_by_its_error():
 def test_a_state_without_positions_is_two_seconds_long():
     (arc,) = arcs(*tables())
     assert arc.time_ns[-1] - arc.time_ns[0] == 2e9
+
+
+def orbit(truth, arc_s, **other):
+    """A row of ORBITS at noon of a true orbit of `night_orbits`, with a diagonal covariance."""
+    R = AROUND.R_night_from_gcrf
+    state = np.concatenate([R.T @ truth[:3], R.T @ truth[3:6]])
+    cov = {f"cov_{a}{a}": v for a, v in zip(STATE_AXES, [0.04] * 3 + [1e-8] * 3, strict=True)}
+    names = dict(zip([*POSITION, *VELOCITY], state, strict=True))
+    (row,) = rows(ORBITS, {**names, **cov, "arc_s": arc_s, "forces": "GM"} | other).to_pylist()
+    return row | {"epoch_ns": NOON_NS}
+
+
+@pytest.mark.parametrize(("truth", "arc_s"), [(LOW, 7000.0), (GEO, 40_000.0), (LOW, 30.0)])
+def test_an_orbit_is_moved_through_its_arc_by_its_forces(truth, arc_s):
+    radiation = "GM J2-J4 C22 Sun Moon radiation 0.0300 m2/kg"
+    row = orbit(truth, arc_s, forces=radiation if truth is GEO else "GM J2-J4 C22 Sun Moon")
+    arc = orbit_arc(row, AROUND, NOON_NS)
+    since_s = (arc.time_ns - NOON_NS) / 1e9
+    assert (since_s[0], since_s[-1]) == (-arc_s / 2, arc_s / 2)
+    assert np.diff(since_s).max() <= 120.0
+    true_km = positions(truth, since_s) @ AROUND.R_night_from_gcrf
+    assert np.abs(arc.state[:, :3] - true_km).max() < 1e-3
+    start, epoch, end = arc.covariance_ns
+    assert (start, epoch, end) == (arc.time_ns[0], NOON_NS, arc.time_ns[-1])
+    np.testing.assert_allclose(arc.covariance[1], np.diag([0.04] * 3 + [1e-8] * 3))
+    if arc_s < 100:  # free of forces: position and velocity
+        grown = 0.04 + 1e-8 * (arc_s / 2) ** 2
+        np.testing.assert_allclose(np.diag(arc.covariance[2])[:3], grown, rtol=0.01)
+    else:
+        assert np.trace(arc.covariance[2][:3, :3]) > 0.13
+
+
+def test_areas_are_read_from_the_forces():
+    assert areas_in("GM J2-J4 C22 Sun Moon") == [0.0, 0.0]
+    assert areas_in("GM J2-J4 C22 Sun Moon radiation 0.0213 m2/kg") == [0.0213, 0.0]
+    assert areas_in("GM J2-J4 C22 Sun Moon drag -0.0100 m2/kg") == [0.0, -0.01]
+
+
+def test_only_known_names_are_given():
+    named = rows(
+        IDENTIFICATIONS,
+        {"object_id": "o", "status": "known", "norad_id": 7, "name": "SAT"},
+        {"tracklet_id": "t", "status": "known", "norad_id": 8, "cospar_id": "2020-001A"},
+        {"object_id": "p", "status": "ambiguous", "name": "A / B"},
+    )
+    expected = {"o": Subject("o", 7, None, "SAT"), "t": Subject("t", 8, "2020-001A")}
+    assert subjects(to_polars(named)) == expected
