@@ -1,4 +1,4 @@
-"""The public names for notebooks and scripts: logs, frames, objects, datasets.
+"""The public names for notebooks and scripts: logs, frames, objects, orbits, datasets.
 
     from epipole.flows import api
 
@@ -12,21 +12,27 @@ from epipole.flows.api.datasets import Dataset, open_dataset
 from epipole.flows.api.frames import IdentifiedFrame, identify_frame, view_frame
 from epipole.flows.api.logs import LogTables, read_log, write_log
 from epipole.flows.api.objects import FoundObjects, Positions, View, associate, triangulate
+from epipole.flows.api.orbits import Attributable, Orbit, attributable, fit_orbit, link
 from epipole.tasks.algorithms.geometry.camera import Camera
 
 __version__ = version("epipole")
 
 __all__ = [
+    "Attributable",
     "Camera",
     "Dataset",
     "FoundObjects",
     "IdentifiedFrame",
     "LogTables",
+    "Orbit",
     "Positions",
     "View",
     "__version__",
     "associate",
+    "attributable",
+    "fit_orbit",
     "identify_frame",
+    "link",
     "open_dataset",
     "read_log",
     "triangulate",

@@ -29,8 +29,8 @@ from epipole.tasks.algorithms.known_objects.tracklet_matching import (
     weigh_pairs,
 )
 from epipole.tasks.algorithms.known_objects.tracklet_search import Pairs, SeenTracklets
+from epipole.tasks.common.tracklet_arrays import covariance_of
 from epipole.tasks.name.elements_of_night import CatalogueNames, ElementsOfNight, names_of
-from epipole.tasks.name.link_tracklets import covariance_of
 
 Indices = npt.NDArray[np.int64]
 

@@ -12,18 +12,16 @@ import numpy.typing as npt
 import polars as pl
 import pyarrow as pa
 
-from epipole.schemas.bridge import from_polars, stack_covariance, table, to_polars, unstack
-from epipole.schemas.columns import ATTRIBUTABLE_AXES, POSITION, VELOCITY
+from epipole.schemas.bridge import from_polars, table, to_polars, unstack
 from epipole.schemas.rejects import Outcome
 from epipole.schemas.settings import LinkingSettings
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import LINKED_ORBITS, LINKED_TRACKLETS
-from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
-from epipole.tasks.algorithms.geometry.directions import east_north, unit_from_radec
-from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
+from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.orbit_linking.grouping import LinkedTracklets
 from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets as link_by_orbit
 from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.common.tracklet_arrays import attributables_of
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -83,47 +81,6 @@ def _candidates(rows: pl.DataFrame) -> pl.DataFrame:
     # An object's id has no slash.
     name = pl.coalesce("object_id", pl.format("{}/{}", "sensor_id", "track_id"))
     return rows.with_columns(known=name.rank("dense").cast(pl.Int64) - 1)
-
-
-def attributables_of(rows: pl.DataFrame) -> Tracklets:
-    """Return the attributables of rows of TRACKLETS, which are in order of time."""
-    ra_rate, dec_rate = (
-        rows[name].to_numpy() * ARCSEC for name in ("ra_rate_arcsec_s", "dec_rate_arcsec_s")
-    )
-    u = unit_from_radec(
-        np.radians(rows["ra_deg"].to_numpy()), np.radians(rows["dec_deg"].to_numpy())
-    )
-    east, north = (np.ascontiguousarray(axis) for axis in np.moveaxis(east_north(u), 1, 0))
-    origin = rows["epoch"].min()
-    time_s, first_s, last_s = (
-        (rows[name] - origin).dt.total_nanoseconds().to_numpy() / 1e9
-        for name in ("epoch", "start_time", "end_time")
-    )
-    return Tracklets(
-        time_s,
-        first_s,
-        last_s,
-        rows["sensor_id"].rank("dense").cast(pl.Int64).to_numpy() - 1,
-        np.ascontiguousarray(rows.select(POSITION).to_numpy()),
-        np.ascontiguousarray(rows.select(VELOCITY).to_numpy()),
-        u,
-        east,
-        north,
-        ra_rate[:, None] * east + dec_rate[:, None] * north,
-        covariance_of(rows),
-        rows["position_sigma_km"].to_numpy().copy(),
-    )
-
-
-def covariance_of(rows: pl.DataFrame) -> Array:
-    """Return the covariances of attributables, with what the sensor's tracklets share, (n, 4, 4).
-
-    Of right ascension (times cos dec), declination [rad] and their rates [rad/s].
-    """
-    cov = stack_covariance(rows, "cov_{}", ATTRIBUTABLE_AXES) * ARCSEC**2
-    shared = (rows["bias_sigma_arcsec"].fill_null(0.0).to_numpy() * ARCSEC) ** 2
-    cov[:, [0, 1], [0, 1]] += shared[:, None]
-    return cov
 
 
 def _name(rows: pl.DataFrame, night: str) -> OrbitLinks:

@@ -3,12 +3,20 @@
 from typing import NamedTuple
 
 import numpy as np
+import pyarrow as pa
 from scipy.integrate import solve_ivp
 
+from epipole.schemas.bridge import unstack, unstack_covariance
+from epipole.schemas.columns import ATTRIBUTABLE_AXES
+from epipole.schemas.rejects import Outcome
+from epipole.schemas.tables import TRACKLETS
+from epipole.tasks.algorithms.geometry.directions import radec_from_unit
 from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
+from scenes.associations import filled
 
 GM, RADIUS, OBLATE, LIGHT = 398600.4418, 6378.137, 1.08262668e-3, 299792.458
 ARCSEC = np.pi / 648000
+NIGHT, START_NS = "2026-05-30", 1_780_099_200_000_000_000  # of their rows
 
 
 def gravity(r):
@@ -108,3 +116,28 @@ def _seen(state, sensor):
             delay = np.linalg.norm(d, axis=1) / LIGHT
         sides.append(d / np.linalg.norm(d, axis=1, keepdims=True))
     return sides[1], (sides[2] - sides[0]) / 2e-3
+
+
+def rows_of(scene, **columns) -> pa.Table:
+    """Return TRACKLETS of a scene, each seen by one sensor alone unless `columns` differ."""
+    seen, n = scene.tracklets, len(scene.object)
+    ra, dec = radec_from_unit(seen.u)
+    times = {
+        name: START_NS + np.rint(values * 1e9).astype(np.int64)
+        for name, values in (("epoch", seen.time_s), ("start_time", seen.first_s),
+                             ("end_time", seen.last_s))
+    }  # fmt: skip
+    numbers = {
+        "ra_deg": np.degrees(ra), "dec_deg": np.degrees(dec),
+        "ra_rate_arcsec_s": np.einsum("ni,ni->n", seen.w, seen.east) / ARCSEC,
+        "dec_rate_arcsec_s": np.einsum("ni,ni->n", seen.w, seen.north) / ARCSEC,
+        "bias_sigma_arcsec": np.zeros(n), "position_sigma_km": seen.position_km,
+        **unstack_covariance("cov_{}", seen.cov / ARCSEC**2, ATTRIBUTABLE_AXES),
+        **unstack("{}_km", seen.r_km), **unstack("v{}_km_s", seen.v_km_s),
+    }  # fmt: skip
+    names = {
+        "tracklet_id": [f"t{k:02d}" for k in range(n)], "track_id": [f"t{k:02d}" for k in range(n)],
+        "sensor_id": [f"s{k:02d}" for k in range(n)], "object_id": [None] * n,
+        "outcome": [Outcome.SEEN_BY_ONE.value] * n,
+    }  # fmt: skip
+    return filled(TRACKLETS, n, {**times, **numbers, **names, **columns})

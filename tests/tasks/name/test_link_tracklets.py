@@ -4,49 +4,17 @@ import numpy as np
 import polars as pl
 import pyarrow as pa
 import pytest
-from scenes.associations import filled
-from scenes.orbit_tracklets import orbit_tracklets
+from scenes.orbit_tracklets import NIGHT, START_NS, orbit_tracklets, rows_of
 
-from epipole.schemas.bridge import array, unstack, unstack_covariance
-from epipole.schemas.columns import ATTRIBUTABLE_AXES
-from epipole.schemas.rejects import Outcome
+from epipole.schemas.bridge import array
 from epipole.schemas.settings import LinkingSettings
 from epipole.schemas.tables import TRACKLETS
-from epipole.tasks.algorithms.geometry.directions import radec_from_unit
 from epipole.tasks.name.link_tracklets import OrbitLinks, link_tracklets
-
-NIGHT, START_NS = "2026-05-30", 1_780_099_200_000_000_000
-ARCSEC = np.pi / 648000
 
 
 @pytest.fixture(scope="module")
 def scene():
     return orbit_tracklets(11, 6, 4, 60.0)
-
-
-def rows_of(scene, **columns) -> pa.Table:
-    """Return TRACKLETS of a scene, each seen by one sensor alone unless `columns` differ."""
-    seen, n = scene.tracklets, len(scene.object)
-    ra, dec = radec_from_unit(seen.u)
-    times = {
-        name: START_NS + np.rint(values * 1e9).astype(np.int64)
-        for name, values in (("epoch", seen.time_s), ("start_time", seen.first_s),
-                             ("end_time", seen.last_s))
-    }  # fmt: skip
-    numbers = {
-        "ra_deg": np.degrees(ra), "dec_deg": np.degrees(dec),
-        "ra_rate_arcsec_s": np.einsum("ni,ni->n", seen.w, seen.east) / ARCSEC,
-        "dec_rate_arcsec_s": np.einsum("ni,ni->n", seen.w, seen.north) / ARCSEC,
-        "bias_sigma_arcsec": np.zeros(n), "position_sigma_km": seen.position_km,
-        **unstack_covariance("cov_{}", seen.cov / ARCSEC**2, ATTRIBUTABLE_AXES),
-        **unstack("{}_km", seen.r_km), **unstack("v{}_km_s", seen.v_km_s),
-    }  # fmt: skip
-    names = {
-        "tracklet_id": [f"t{k:02d}" for k in range(n)], "track_id": [f"t{k:02d}" for k in range(n)],
-        "sensor_id": [f"s{k:02d}" for k in range(n)], "object_id": [None] * n,
-        "outcome": [Outcome.SEEN_BY_ONE.value] * n,
-    }  # fmt: skip
-    return filled(TRACKLETS, n, {**times, **numbers, **names, **columns})
 
 
 def linked(rows: pa.Table, settings: LinkingSettings = LinkingSettings()) -> OrbitLinks:  # noqa: B008

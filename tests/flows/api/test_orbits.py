@@ -1,0 +1,138 @@
+"""Orbits from passages: attributables, links and fits, as a notebook asks for them."""
+
+import numpy as np
+import polars as pl
+import pytest
+from scenes.night_orbits import AROUND, GEO, LOW, NOON_NS, trial
+from scenes.orbit_tracklets import orbit_tracklets, rows_of
+
+from epipole.flows import api
+from epipole.schemas.settings import LinkingSettings
+
+TIME = np.datetime64("2026-05-30T12:00", "ns") + np.arange(20) * np.timedelta64(500, "ms")
+R = AROUND.R_night_from_gcrf
+
+
+def passage(**other):
+    t_s = np.arange(20) * 0.5
+    given = {"time": TIME, "ra_deg": 40.0 + 0.1 * t_s, "dec_deg": 60.0 - 0.05 * t_s,
+             "sigma_arcsec": 3.0}  # fmt: skip
+    return api.attributable(**given | other)
+
+
+def test_direction_and_rates_are_of_the_middle():
+    found = passage()
+    assert found.epoch == np.datetime64("2026-05-30T12:00:04.75", "ns")
+    assert found.dec_deg == pytest.approx(60.0 - 0.05 * 4.75, abs=1e-3)
+    assert found.dec_rate_arcsec_s == pytest.approx(-180.0, abs=1.0)
+    cosine = np.cos(np.radians(found.dec_deg))
+    assert found.ra_rate_arcsec_s == pytest.approx(360.0 * cosine, abs=1.0)
+    # The mean of 20 detections, and their slope.
+    sigma = np.sqrt(np.diag(found.cov_arcsec2))
+    assert sigma[0] > 3.0 / np.sqrt(20)
+    assert sigma[2] > 3.0 / (0.5 * np.sqrt(20 * (20**2 - 1) / 12))
+
+
+def test_the_epoch_can_be_chosen_and_errors_given_one_by_one():
+    found = passage(at=TIME[3], sigma_arcsec=np.full(20, 3.0))
+    assert found.epoch == TIME[3]
+    assert found.dec_deg == pytest.approx(60.0 - 0.05 * 1.5, abs=1e-3)
+    late = passage(at=TIME[0] + np.timedelta64(1, "m"))
+    assert late.cov_arcsec2[0, 0] > 1e4 * found.cov_arcsec2[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        ({"time": TIME[::-1]}, "not in order"),
+        ({"time": TIME[:0]}, "no times"),
+        ({"ra_deg": [1.0]}, r"ra_deg: has shape \(1,\), expected \(20,\)"),
+    ],
+)
+def test_a_passage_that_cannot_be_used_is_an_error(other, says):
+    with pytest.raises(ValueError, match=says):
+        passage(**other)
+
+
+def observations(truth, **other):
+    """Observations of an object around noon, by three sensors, in no order."""
+    seen = trial(1, truth, noise=2.0, bias=3.0, **other)
+    u, n = seen.u @ R, len(seen.u)
+    rows = pl.DataFrame({
+        "time": NOON_NS + np.round(seen.time_s * 1e9).astype(np.int64),
+        "sensor_id": [f"s{k}" for k in seen.sensor],
+        "ra_deg": np.degrees(np.arctan2(u[:, 1], u[:, 0])),
+        "dec_deg": np.degrees(np.arcsin(u[:, 2])),
+        "sigma_ra_arcsec": [2.0] * n, "sigma_dec_arcsec": [2.0] * n, "correlation": [0.0] * n,
+        "bias_sigma_arcsec": [3.0] * n, "position_sigma_km": [0.02] * n,
+        **dict(zip(("x_km", "y_km", "z_km"), (seen.r_km @ R).T, strict=True)),
+    })  # fmt: skip
+    return rows.with_columns(pl.col("time").cast(pl.Datetime("ns", "UTC"))).reverse()
+
+
+@pytest.mark.parametrize(("truth", "times_s"), [(GEO, None), (LOW, np.linspace(-60, 60, 21))])
+def test_an_orbit_is_fitted_with_and_without_an_initial_state(truth, times_s):
+    rows = observations(truth, times_s=times_s)
+    true = np.concatenate([R.T @ truth[:3], R.T @ truth[3:6]])
+    for start in (None, true + 0.01):
+        orbit = api.fit_orbit(rows, start)
+        off = orbit.state - true
+        assert off @ np.linalg.solve(orbit.cov, off) < 22.5  # 1 in 1,000 is above
+        assert orbit.verdict is None
+        assert orbit.used.all()
+        assert orbit.epoch == np.datetime64(NOON_NS, "ns")
+        radius = np.linalg.norm(true[:3])
+        speed2 = true[3:] @ true[3:]
+        a_km = 1 / (2 / radius - speed2 / 398600.4418)
+        assert orbit.elements["a_km"] == pytest.approx(a_km, rel=0.05)
+
+
+def test_what_is_not_fitted_is_said_row_by_row():
+    rows = observations(GEO).with_row_index("n")
+    off = rows.with_columns(dec_deg=pl.col("dec_deg") + 0.5 * (pl.col("n") == 5))
+    assert np.flatnonzero(~api.fit_orbit(off).used).tolist() == [5]
+
+
+def test_too_few_rows_give_no_orbit():
+    orbit = api.fit_orbit(observations(GEO).head(3))
+    assert orbit.verdict == "no_orbit"
+    assert np.isnan(orbit.state).all()
+    assert not orbit.used.any()
+
+
+def test_missing_columns_and_rows_are_named():
+    rows = observations(GEO)
+    with pytest.raises(ValueError, match="has no column correlation, x_km"):
+        api.fit_orbit(rows.drop("correlation", "x_km"))
+    with pytest.raises(ValueError, match="has no rows"):
+        api.fit_orbit(rows.clear())
+
+
+def test_links_are_numbered_in_the_order_of_their_first_rows():
+    scene = orbit_tracklets(11, 6, 4, 60.0)
+    rows = pl.DataFrame(rows_of(scene))
+    first = list(dict.fromkeys(scene.object.tolist()))
+    expected = [first.index(k) for k in scene.object.tolist()]
+    assert api.link(rows).to_list() == expected
+    assert api.link(rows.drop("object_id")).to_list() == expected
+    # A row without an attributable has no object, and the others stay as they are.
+    bare = rows.with_columns(cov_rara=pl.when(pl.int_range(24) != 23).then("cov_rara"))
+    assert api.link(bare).to_list() == [*expected[:23], None]
+
+
+def test_known_objects_are_kept_and_links_can_be_refused():
+    scene = orbit_tracklets(11, 6, 4, 60.0)
+    rows = pl.DataFrame(rows_of(scene))
+    alone = api.link(rows, LinkingSettings(log_odds=1e9))
+    assert alone.to_list() == list(range(24))
+    known = rows.with_columns(object_id=pl.Series([f"o{k}" for k in scene.object]))
+    assert api.link(known, LinkingSettings(log_odds=1e9)).equals(api.link(known))
+
+
+def test_a_table_that_is_not_of_tracklets_is_an_error():
+    with pytest.raises(ValueError, match="tracklets: has no column"):
+        api.link(pl.DataFrame({"tracklet_id": ["t"]}))
+
+
+def test_no_tracklets_have_no_objects():
+    assert api.link(pl.DataFrame(rows_of(orbit_tracklets(11, 6, 4, 60.0))).clear()).to_list() == []
