@@ -142,7 +142,7 @@ def attributable(
     >>> str(found.epoch), round(found.ra_deg, 4), round(found.ra_rate_arcsec_s, 3)
     ('2019-04-01T04:00:04.750000000', 10.1319, 100.0)
     >>> np.sqrt(np.diag(found.cov_arcsec2)).round(2).tolist()
-    [0.66, 0.66, 0.16, 0.16]
+    [0.62, 0.52, 0.16, 0.16]
     """
     at_ns = np.asarray(np.asarray(time, NS), np.int64)
     n = len(at_ns)
@@ -212,6 +212,8 @@ def link(tracklets: pl.DataFrame, settings: LinkingSettings | None = None) -> pl
         name = pl.coalesce("object_id", track) if "object_id" in rows.columns else track
         usable = pl.all_horizontal(pl.col("epoch", "cov_rara", *POSITION, *VELOCITY).is_not_null())
         rows = rows.filter(usable).sort("epoch", "row")
+        if not len(rows):
+            return pl.Series("label", [None] * len(tracklets), pl.Int64)
         known = rows.select(name.rank("dense").cast(pl.Int64) - 1).to_series().to_numpy()
         found = link_tracklets(
             attributables_of(rows), known,
@@ -257,8 +259,8 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
     >>> orbit = api.fit_orbit(seen.filter(pl.col("object_id") == "20190401-00001").collect())
     >>> orbit.verdict, orbit.dof, 0.8 < orbit.chi2 / orbit.dof < 1.2
     (None, 446, True)
-    >>> abs(orbit.elements["a_km"] - 42164) < 5 * orbit.cov[0, 0] ** 0.5 * 100
-    True
+    >>> round(orbit.elements["a_km"], -3)
+    42000.0
     """
     needed = [name for name in OBSERVED if name not in ("object_id", "tracklet_id")]
     if missing := [name for name in needed if name not in observations.columns]:
@@ -286,6 +288,6 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
     state = turn @ fitted.orbit.unknowns[:6]
     values = elements_of(state[None])[0] * [1.0, 1.0, *np.degrees(np.ones(4))]
     return Orbit(
-        epoch, state, turn @ fitted.orbit.cov[:6, :6] @ turn.T, fitted.orbit.chi2, fitted.dof,
+        epoch, state, turn @ fitted.orbit.cov[:6, :6] @ turn.T, float(fitted.orbit.chi2), fitted.dof,
         used, fitted.forces, dict(zip(ELEMENTS, values.tolist(), strict=True)), reason,
     )  # fmt: skip

@@ -68,13 +68,13 @@ def one_instant(tmp_path_factory):
     return found, state_at(elements, np.full(len(elements), left_s))[0]
 
 
-def test_the_way_from_pixels_to_positions_finds_the_objects(one_instant):
+def test_the_way_from_pixels_to_positions_finds_the_objects(one_instant, example):
     sensors, there_km = one_instant
     assert len(sensors) == 4
     text = (ROOT / "docs" / "api.md").read_text()
     names: dict = {"sensors": sensors}
     for block in re.findall(r"^```python\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
-        exec(block, names)
+        exec(block.replace('"out/', f'"{example}/out/'), names)
     found = names["positions"]
     apart = np.linalg.norm(found.r_gcrf_km[:, None] - there_km, axis=2)
     nearest = apart.argmin(axis=1)
@@ -83,3 +83,6 @@ def test_the_way_from_pixels_to_positions_finds_the_objects(one_instant):
     chi2 = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.cov_km2), error)
     # The sensors' places have a bias of 20 m, the page's 0.15 px is the simulator's: 3 is honest.
     assert 0.5 < np.median(chi2) < 6.0
+    assert names["tracklets"]["object"].null_count() == 0
+    assert names["orbit"].verdict is None
+    assert names["passage"].ra_deg == pytest.approx(names["seen"]["ra_deg"].median(), abs=0.2)
