@@ -104,7 +104,9 @@ class _NightTables:
 def _write_tracking_data(night: _NightTables, wanted: Sequence[str], folder: Path) -> None:
     rows = night.read("observations")
     objects = night.by_id(rows, "object_id")
-    tracklets = night.by_id(rows.filter(pl.col("object_id").is_null()), "tracklet_id")
+    # Rows of an object's tracklet that do not show it are left out.
+    of_none = pl.col("object_id").is_null().all().over("tracklet_id")
+    tracklets = night.by_id(rows.filter(of_none), "tracklet_id")
     night.check(Message.tdm.table, wanted, {*objects, *tracklets})
     if wanted:
         objects, tracklets = (

@@ -24,7 +24,6 @@ SMALL = {
     "tasks/track": "a stage",
     "tasks/overlay": "a flow's tasks",
     "tasks/simulate": "a flow's tasks: the pipeline may not read it",
-    "tasks/common": "what several stages share",
 }
 MAX_MODULE_LINES = 600
 LONGEST_LINES = 60  # of a function's body, below its signature and docstring

@@ -12,7 +12,7 @@ from epipole.flows.api.datasets import Dataset, open_dataset
 from epipole.flows.api.frames import IdentifiedFrame, identify_frame, view_frame
 from epipole.flows.api.logs import LogTables, read_log, write_log
 from epipole.flows.api.objects import FoundObjects, Positions, View, associate, triangulate
-from epipole.flows.api.orbits import Attributable, Orbit, attributable, fit_orbit, link
+from epipole.flows.api.orbits import Attributable, ObjectOrbit, attributable, fit_orbit, link
 from epipole.tasks.algorithms.geometry.camera import Camera
 
 __version__ = version("epipole")
@@ -24,7 +24,7 @@ __all__ = [
     "FoundObjects",
     "IdentifiedFrame",
     "LogTables",
-    "Orbit",
+    "ObjectOrbit",
     "Positions",
     "View",
     "__version__",

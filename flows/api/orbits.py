@@ -58,7 +58,7 @@ class Attributable(NamedTuple):
     cov_arcsec2: Array
 
 
-class Orbit(NamedTuple):
+class ObjectOrbit(NamedTuple):
     """An orbit at the middle of its arc, GCRF.
 
     Attributes
@@ -227,7 +227,7 @@ def link(tracklets: pl.DataFrame, settings: LinkingSettings | None = None) -> pl
     return of_rows.join(label, on="row", how="left", maintain_order="left")["label"]
 
 
-def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) -> Orbit:
+def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) -> ObjectOrbit:
     """Return the orbit of an object, fitted to observations of it.
 
     Parameters
@@ -241,7 +241,7 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
 
     Returns
     -------
-    Orbit
+    ObjectOrbit
         NaN where none is found; `verdict` says why.
 
     Raises
@@ -281,13 +281,13 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
     if fitted is None:
         nothing, unused = np.full((7, 6), np.nan), np.zeros(len(rows), bool)
         none = dict.fromkeys(ELEMENTS, np.nan)
-        return Orbit(epoch, nothing[0], nothing[1:], np.nan, 0, unused, "", none, reason)
+        return ObjectOrbit(epoch, nothing[0], nothing[1:], np.nan, 0, unused, "", none, reason)
     used = np.zeros(len(rows), bool)
     used[rows["row"].to_numpy()] = fitted.orbit.used
     turn = both(around.R_night_from_gcrf.T)
     state = turn @ fitted.orbit.unknowns[:6]
     values = elements_of(state[None])[0] * [1.0, 1.0, *np.degrees(np.ones(4))]
-    return Orbit(
-        epoch, state, turn @ fitted.orbit.cov[:6, :6] @ turn.T, float(fitted.orbit.chi2), fitted.dof,
-        used, fitted.forces, dict(zip(ELEMENTS, values.tolist(), strict=True)), reason,
+    return ObjectOrbit(
+        epoch, state, turn @ fitted.orbit.cov[:6, :6] @ turn.T, float(fitted.orbit.chi2),
+        fitted.dof, used, fitted.forces, dict(zip(ELEMENTS, values.tolist(), strict=True)), reason,
     )  # fmt: skip
