@@ -8,7 +8,7 @@ import polars as pl
 
 from epipole.flows.api.arguments import Array, Time, floats, time_ns
 from epipole.schemas.columns import ELEMENTS, POSITION, VELOCITY
-from epipole.schemas.settings import LinkingSettings
+from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.geometry.covariances import centroid_covariance
 from epipole.tasks.algorithms.geometry.directions import (
@@ -167,7 +167,7 @@ def attributable(
     )  # fmt: skip
 
 
-def link(tracklets: pl.DataFrame, settings: LinkingSettings | None = None) -> pl.Series:
+def link(tracklets: pl.DataFrame, settings: Settings | None = None) -> pl.Series:
     """Return which tracklets are one object by the orbit through them.
 
     Parameters
@@ -176,8 +176,8 @@ def link(tracklets: pl.DataFrame, settings: LinkingSettings | None = None) -> pl
         Rows like those of the table `tracklets`: attributables, with `start_time`, `end_time`,
         `sensor_id` and `track_id`. Rows with the same `object_id` (if there is such a column), and
         with the same track of a sensor, are one object before.
-    settings : epipole.schemas.settings.LinkingSettings, optional
-        Those of a run: the group `linking`.
+    settings : epipole.schemas.settings.Settings, optional
+        Those of a run; its group `linking` counts.
 
     Returns
     -------
@@ -205,7 +205,7 @@ def link(tracklets: pl.DataFrame, settings: LinkingSettings | None = None) -> pl
     >>> len(found), found.null_count()
     (36, 0)
     """
-    settings = settings or LinkingSettings()
+    linking = (settings or Settings()).linking
     rows = tracklets.with_row_index("row")
     try:
         track = pl.format("{}/{}", "sensor_id", "track_id")
@@ -217,7 +217,7 @@ def link(tracklets: pl.DataFrame, settings: LinkingSettings | None = None) -> pl
         known = rows.select(name.rank("dense").cast(pl.Int64) - 1).to_series().to_numpy()
         found = link_tracklets(
             attributables_of(rows), known,
-            max_gap_s=settings.max_gap_s, log_odds=settings.log_odds,
+            max_gap_s=linking.max_gap_s, log_odds=linking.log_odds,
         )  # fmt: skip
     except pl.exceptions.ColumnNotFoundError as error:
         raise ValueError(f"tracklets: has no column {error}") from error

@@ -7,10 +7,11 @@ from scenes.night_orbits import AROUND, GEO, LOW, NOON_NS, trial
 from scenes.orbit_tracklets import orbit_tracklets, rows_of
 
 from epipole.flows import api
-from epipole.schemas.settings import LinkingSettings
+from epipole.schemas.settings import LinkingSettings, Settings
 
 TIME = np.datetime64("2026-05-30T12:00", "ns") + np.arange(20) * np.timedelta64(500, "ms")
 R = AROUND.R_night_from_gcrf
+NEVER = Settings(linking=LinkingSettings(log_odds=1000.0))
 
 
 def passage(**other):
@@ -123,10 +124,10 @@ def test_links_are_numbered_in_the_order_of_their_first_rows():
 def test_known_objects_are_kept_and_links_can_be_refused():
     scene = orbit_tracklets(11, 6, 4, 60.0)
     rows = pl.DataFrame(rows_of(scene))
-    alone = api.link(rows, LinkingSettings(log_odds=1000.0))
+    alone = api.link(rows, NEVER)
     assert alone.to_list() == list(range(24))
     known = rows.with_columns(object_id=pl.Series([f"o{k}" for k in scene.object]))
-    assert api.link(known, LinkingSettings(log_odds=1000.0)).equals(api.link(known))
+    assert api.link(known, NEVER).equals(api.link(known))
 
 
 def test_a_table_that_is_not_of_tracklets_is_an_error():
