@@ -280,6 +280,12 @@ class Reason(StrEnum):
         Stage.SOLVE,
         "The tracklet could belong to more than one object, and the evidence does not decide.",
     )
+    UNDECIDED = (
+        "undecided",
+        Stage.SOLVE,
+        "Another sensor has a tracklet that may be of the same object, but the evidence is not "
+        "enough.",
+    )
     VIEW_REJECTED = (
         "view_rejected",
         Stage.SOLVE,
@@ -381,7 +387,15 @@ class Outcome(Declared):
         "Its sensor was left out: its clock, ephemeris or attitude is wrong, or its lines of sight "
         "agree with no other's.",
     )
-    SEEN_BY_ONE = "seen_by_one", "No other sensor has a tracklet of the same object."
+    UNDECIDED = (
+        "undecided",
+        "Another sensor has a tracklet that may be of the same object, but the evidence is not "
+        "enough.",
+    )
+    SEEN_BY_ONE = (
+        "seen_by_one",
+        "No other sensor has a tracklet that fits one object with it.",
+    )
     NOT_COMPARED = (
         "not_compared",
         "It was not compared with other sensors: it has no attitude, sensor position or epoch.",

@@ -26,7 +26,8 @@ from epipole.tasks.common.tracklet_arrays import attributables_of
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-FREE = (Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)  # tracklets that may join an object
+# Tracklets that may join an object.
+FREE = (Outcome.UNDECIDED, Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)
 
 
 class OrbitLinks(NamedTuple):

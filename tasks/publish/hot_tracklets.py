@@ -17,7 +17,7 @@ from epipole.schemas.work_tables import HOT_SUSPECTS, JUDGED_TRACKLETS, TRACKLET
 from epipole.tasks.publish.night_parts import NightParts
 from epipole.tasks.solve.associate_block import best_outcomes
 
-UNCONFIRMED = (Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)
+UNCONFIRMED = (Outcome.UNDECIDED, Outcome.SEEN_BY_ONE, Outcome.NOT_COMPARED)
 
 
 def tracklets_of_run(parts: NightParts) -> pa.Table:

@@ -13,6 +13,7 @@ from epipole.schemas.rejects import NameStatus, Outcome
 from epipole.tasks.report.canvas import (
     BLACK,
     BLUE,
+    GREEN,
     GREY,
     INK,
     LINES,
@@ -37,6 +38,7 @@ _OUTCOMES = {
     Outcome.LINKED: (SKY, "-", "P"),
     Outcome.SEEN_BY_ONE: (ORANGE, "--", "s"),
     Outcome.AMBIGUOUS: (PURPLE, "-.", "D"),
+    Outcome.UNDECIDED: (GREEN, "-.", "p"),
     Outcome.DISAGREES: (VERMILLION, ":", "v"),
     Outcome.SENSOR_LEFT_OUT: (BLACK, ":", "X"),
     Outcome.NOT_COMPARED: (GREY, "--", "^"),

@@ -2,8 +2,8 @@
 
 1. The views of all sensors in a block are read.
 2. Views of each window of time are associated (`associate_objects`).
-3. Each tracklet without an object gets an outcome: ambiguous, seen by one sensor, or of a sensor
-   that is left out.
+3. Each tracklet without an object gets an outcome: ambiguous, undecided, seen by one sensor, or
+   of a sensor that is left out.
 4. Members of objects, outcomes and rejects are written as parts.
 """
 
@@ -195,7 +195,7 @@ def object_members(block: BlockViews, associated: Associated) -> pa.Table:
 def _item_outcomes(block: BlockViews, associated: Associated) -> list[pa.Table]:
     """Return the outcomes of the tracklets of a block, except those of objects."""
     tracklet = block.items.tracklet
-    undecided = associated.ambiguous & associated.agreeing
+    agreeing = associated.agreeing
 
     def outcomes_of(rows: np.ndarray, outcome: Outcome) -> pa.Table:
         ids = block.tracklets["tracklet_id"].take(np.unique(tracklet[rows]))
@@ -203,8 +203,9 @@ def _item_outcomes(block: BlockViews, associated: Associated) -> list[pa.Table]:
 
     return [
         outcomes_of(np.ones(len(tracklet), bool), Outcome.SEEN_BY_ONE),
-        outcomes_of(undecided, Outcome.AMBIGUOUS),
-        outcomes_of(~associated.agreeing, Outcome.SENSOR_LEFT_OUT),
+        outcomes_of(associated.undecided & agreeing, Outcome.UNDECIDED),
+        outcomes_of(associated.ambiguous & agreeing, Outcome.AMBIGUOUS),
+        outcomes_of(~agreeing, Outcome.SENSOR_LEFT_OUT),
     ]
 
 

@@ -19,10 +19,11 @@ from epipole.schemas.settings import AssociationSettings
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.algorithms.association.epipolar_lines import associate_by_lines
 from epipole.tasks.algorithms.association.likelihood import Shell, associate_tracklets
-from epipole.tasks.algorithms.association.samples import Groups, Samples
+from epipole.tasks.algorithms.association.samples import FREE, Groups, Samples
 from epipole.tasks.algorithms.association.window_groups import WindowGroups
 from epipole.tasks.algorithms.orbits.object_motion import ObjectRegistry
 from epipole.tasks.algorithms.sensor_faults.suspects import agreement
+from epipole.tasks.common.grouping import group_offsets
 from epipole.tasks.common.sightings import only_id
 from epipole.tasks.solve.association_input import BlockViews, SampledViews, even_instants
 
@@ -37,12 +38,13 @@ LONGER_WINDOWS_S = (120.0, 600.0)  # of windows for undecided tracklets; each di
 class Associated(NamedTuple):
     """The object of each item of a block, -1 for none; and rows of `rejects`.
 
-    `ambiguous` are the items whose tracklet is ambiguous, `agreeing` those whose sensor agreed with
-    the others at that time.
+    `ambiguous` and `undecided` are the items whose tracklet is so, see `Groups`; `agreeing` those
+    whose sensor agreed with the others at that time.
     """
 
     object_number: Indices
     ambiguous: Flags
+    undecided: Flags
     agreeing: Flags
     rejects: pa.Table
 
@@ -75,13 +77,20 @@ def associate_objects(
             rejects.append(_reject_table(block, Reason.SENSOR_DISAGREES, left_out))
     if settings.method == "likelihood":
         _associate_longer(block, window_groups, agreeing, settings)
-    for rows in windows:
-        ambiguous = rows[window_groups.ambiguous[rows]]
-        if len(ambiguous):
-            rejects.append(_reject_table(block, Reason.AMBIGUOUS, ambiguous))
+    undecided = window_groups.undecided & ~_have_a_group(items.tracklet, window_groups.group)
+    rejects += [
+        _reject_tracklets(block, Reason.AMBIGUOUS, np.flatnonzero(window_groups.ambiguous)),
+        _reject_tracklets(block, Reason.UNDECIDED, np.flatnonzero(undecided)),
+    ]
     _warn_about(block.sensor_id[np.unique(items.sensor[~agreeing])])
     number = _number_objects(block, window_groups.group, windows)
-    return Associated(number, window_groups.ambiguous, agreeing, concat(REJECTS, rejects))
+    ambiguous = window_groups.ambiguous
+    return Associated(number, ambiguous, undecided, agreeing, concat(REJECTS, rejects))
+
+
+def _have_a_group(tracklet: Indices, group: Indices) -> Flags:
+    """Return whether the tracklet of each item is in a group at any time."""
+    return np.asarray(np.bincount(tracklet, group != FREE)[tracklet] > 0)
 
 
 def _windows(window: Indices) -> list[Indices]:
@@ -149,11 +158,11 @@ def _associate_longer(
         longer = block.items.first_ns // round(window_s * 1e9)
         for number in np.unique(longer[agreeing]).tolist():
             rows = np.flatnonzero((longer == number) & agreeing)
-            undecided = window_groups.undecided(rows, window_before_s)
-            if len(undecided):
+            again = window_groups.to_decide_again(rows, window_before_s)
+            if len(again):
                 samples, tracklet = _long_samples(block, rows, number, window_s)
                 groups = _find_groups(block, samples, settings)
-                window_groups.reconsider(rows, undecided, tracklet, groups)
+                window_groups.reconsider(rows, again, tracklet, groups)
         window_before_s = window_s
 
 
@@ -191,6 +200,29 @@ def _find_groups(block: BlockViews, samples: Samples, settings: AssociationSetti
     associate = load_method(ASSOCIATION, settings.method)
     groups: Groups = associate(samples, block.poses.focal_px, settings)
     return groups
+
+
+def _reject_tracklets(block: BlockViews, reason: Reason, left_out: Indices) -> pa.Table:
+    """Return a row of `rejects` per tracklet of some items, at its first one.
+
+    Lone detections have no ids: they are counted sensor by sensor.
+    """
+    items = block.items
+    left_out = left_out[np.lexsort((items.first_ns[left_out], items.tracklet[left_out]))]
+    tracklet, first = np.unique(items.tracklet[left_out], return_index=True)
+    left_out = left_out[first]
+    ids = np.array([only_id(block.tracklet_id[[t]]) or "" for t in tracklet.tolist()], object)
+    sensor, time = items.sensor[left_out], items.first_ns[left_out]
+    order = np.lexsort((time, ids, sensor))
+    bounds = group_offsets(sensor[order], ids[order])
+    rows = order[bounds[:-1]]
+    return reject_rows(
+        reason,
+        sensor_id=block.sensor_id[sensor[rows]],
+        tracklet_id=[name or None for name in ids[rows].tolist()],
+        time=time[rows],
+        count=np.diff(bounds),
+    )
 
 
 def _reject_table(block: BlockViews, reason: Reason, left_out: Indices) -> pa.Table:

@@ -94,7 +94,8 @@ def openptv_table(seeds: int, false: list[int]) -> None:
             def method(samples: Samples, eps_px: float = eps_px) -> Groups:
                 group = associate_by_openptv(samples, eps_px)
                 nothing = np.zeros(len(group), bool)
-                return Groups(group, np.zeros(group.max(initial=-1) + 1), nothing, np.zeros(4))
+                scores = np.zeros(group.max(initial=-1) + 1)
+                return Groups(group, scores, nothing, nothing, np.zeros(4))
 
             f1, _, ms = cell(method, 4, 20, n_false, seeds)
             best.append(f"{eps_px}: {f1:.2f} ({ms:.1f})")

@@ -222,7 +222,8 @@ def associate_by_lines(samples: Samples, focal_px: Array, threshold_px: float) -
         shown = table[:, s] != FREE
         group[tracklets[table[shown, s]]] = np.flatnonzero(shown)
     nan = np.full(len(samples.half_field), np.nan)
-    return Groups(group, np.full(len(table), np.nan), np.zeros(len(group), bool), nan)
+    none = np.zeros(len(group), bool)
+    return Groups(group, np.full(len(table), np.nan), none, none, nan)
 
 
 def _vote(

@@ -109,7 +109,8 @@ def associate_tracklets(
     """
     if len(samples.sensor) == 0:
         nothing = np.full(len(samples.half_field), np.nan)
-        return Groups(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, bool), nothing)
+        none = np.zeros(0, bool)
+        return Groups(np.zeros(0, np.int64), np.zeros(0), none, none, nothing)
     views, order = views_of(samples)
     cones = cones_of(views)
     space = SearchSpace(
@@ -154,6 +155,7 @@ class _Search:
         self.many = len(space.views.half_field) > FEW_SENSORS
         self.sparse = sparse_sensors(space.views)
         self.group, self.ambiguous = np.full(len(order), FREE), np.zeros(len(order), np.bool_)
+        self.fits_another = np.zeros(len(order), np.bool_)  # a hypothesis has the tracklet
         self.groups: list[Hypothesis] = []
 
     def run(self, pairs: EveryPair | SensorPairs, min_log_odds: float) -> Groups:
@@ -171,8 +173,10 @@ class _Search:
         resolve_conflicts(nothing_taken, self.work, self.group, x_km)
         scores = self._withdraw_doubtful(min_log_odds)
         group, ambiguous = np.empty_like(self.group), np.empty_like(self.ambiguous)
-        group[self.order], ambiguous[self.order] = self.group, self.ambiguous
-        return Groups(group, scores, ambiguous & (group == FREE), self.space.chance.detected)
+        free, undecided = self.group == FREE, np.empty_like(self.ambiguous)
+        group[self.order], ambiguous[self.order] = self.group, self.ambiguous & free
+        undecided[self.order] = self.fits_another & free & ~self.ambiguous
+        return Groups(group, scores, ambiguous, undecided, self.space.chance.detected)
 
     def _enough_pairs(self) -> float:
         """Return the number of pairs that must cover a point, so that few objects lack a seed.
@@ -203,6 +207,7 @@ class _Search:
             return [], []
         min_score = MIN_KEPT_LOG_ODDS - self.margin
         grown = grow_all(self.space, self.work, seeds, float(clear), min_score)
+        self.fits_another[grown.member] = True
         member, first, skip = (
             values.tolist() for values in (grown.member, grown.first_member, grown.first_missed)
         )

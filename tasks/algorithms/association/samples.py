@@ -77,6 +77,9 @@ class Groups(NamedTuple):
     ambiguous : (t,) bool
         Tracklets in no group because two groups explain them about equally well, or because
         the group that explains them is not certain enough.
+    undecided : (t,) bool
+        Other tracklets in no group that fit one object with a tracklet of another sensor, but with
+        too little evidence.
     detected : (s,) float
         Estimated probability that a sensor detects an object in its field; NaN if not
         estimated.
@@ -85,6 +88,7 @@ class Groups(NamedTuple):
     group: Indices
     score: Array
     ambiguous: Flags
+    undecided: Flags
     detected: Array
 
 

@@ -38,13 +38,17 @@ class Items(NamedTuple):
 
 
 class WindowGroups:
-    """The group of each item, numbered through the windows; FREE for no group."""
+    """The group of each item, numbered through the windows; FREE for no group.
+
+    Items without a group may be ambiguous or undecided, see `Groups`.
+    """
 
     def __init__(self, items: Items) -> None:
         n = len(items.window)
         self.items = items
         self.group = np.full(n, FREE)
         self.ambiguous = np.zeros(n, bool)
+        self.undecided = np.zeros(n, bool)
         self._score = np.zeros(0)
 
     def enter(self, rows: Indices, tracklet: Indices, groups: Groups) -> None:
@@ -57,9 +61,10 @@ class WindowGroups:
         rows, at = rows[known], at[known]
         new = np.where(groups.group == FREE, FREE, groups.group + len(self._score))
         self.group[rows], self.ambiguous[rows] = new[at], groups.ambiguous[at]
+        self.undecided[rows] = groups.undecided[at]
         self._score = np.concatenate([self._score, groups.score])
 
-    def undecided(self, rows: Indices, window_s: float) -> Indices:
+    def to_decide_again(self, rows: Indices, window_s: float) -> Indices:
         """Return the items of a longer window to decide again; empty if that is useless.
 
         They belong to no certain group. Their tracklets, and all others of their group, last at
@@ -80,18 +85,16 @@ class WindowGroups:
         alone = len(np.unique(items.sensor[chosen])) < 2
         return chosen[:0] if alone else chosen
 
-    def reconsider(
-        self, rows: Indices, undecided: Indices, tracklet: Indices, groups: Groups
-    ) -> None:
-        """Enter the groups of a longer window for its undecided items.
+    def reconsider(self, rows: Indices, again: Indices, tracklet: Indices, groups: Groups) -> None:
+        """Enter the groups of a longer window for its items `again`.
 
         If a new group shares a tracklet with a certain group of a window, its other tracklets join
         that group in this window, unless their sensor has a tracklet in it already.
         """
         items = self.items
-        certain = np.setdiff1d(rows, undecided)
+        certain = np.setdiff1d(rows, again)
         certain = certain[self.group[certain] != FREE]
-        self.enter(undecided, tracklet, groups)
+        self.enter(again, tracklet, groups)
         group_of = dict(zip(tracklet.tolist(), groups.group.tolist(), strict=True))
         base = len(self._score) - len(groups.score)
         joined: dict[tuple[int, int], int] = {}
@@ -104,11 +107,11 @@ class WindowGroups:
                 joined.setdefault((window, base + new_group), group)
         if not joined:
             return
-        now = self.group[undecided].copy()
-        for k, row in enumerate(undecided.tolist()):
+        now = self.group[again].copy()
+        for k, row in enumerate(again.tolist()):
             window = int(items.window[row])
             group = joined.get((window, int(now[k])), FREE)
             if group != FREE:
                 occupied = (window, group, int(items.sensor[row])) in taken
                 now[k] = FREE if occupied else group
-        self.group[undecided] = now
+        self.group[again] = now

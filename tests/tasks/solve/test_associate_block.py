@@ -215,7 +215,8 @@ def test_each_tracklet_has_its_first_outcome():
         [
             outcomes(ids("a", "b", "c", "d", "e", "a"), Outcome.SEEN_BY_ONE),
             outcomes(ids("f"), Outcome.SENSOR_LEFT_OUT),
-            undecided(c="ambiguous", d="sensor_left_out", a="ambiguous"),
+            undecided(c="ambiguous", d="sensor_left_out", a="ambiguous", g="undecided"),
+            outcomes(ids("g", "c"), Outcome.SEEN_BY_ONE),
             view_outcomes(associations(a=True, b=False)),
         ]
     )
@@ -226,6 +227,7 @@ def test_each_tracklet_has_its_first_outcome():
         "d": Outcome.SENSOR_LEFT_OUT,
         "e": Outcome.SEEN_BY_ONE,
         "f": Outcome.SENSOR_LEFT_OUT,
+        "g": Outcome.UNDECIDED,
     }
 
 

@@ -83,7 +83,19 @@ def test_two_sensors_with_one_id_give_no_wrong_object():
     assert wrong_views(scene, found) == 0
 
 
-def test_undecided_tracklets_are_ambiguous():
+def test_each_undecided_tracklet_has_a_row_with_its_id():
+    scene = Scene(2, 2, times=np.array([0.0])).objects(5).strays(200)
+    found = associated(scene)
+    rows = [r for r in found.rejects.to_pylist() if r["reason"] == "undecided"]
+    assert len(rows) > 4
+    left_out = {r["tracklet_id"] for r in rows}
+    assert len(left_out) == len(rows) == sum(r["count"] for r in rows)
+    assert left_out.isdisjoint(found.views["tracklet_id"].to_pylist())
+    sensor = {f"t{i:04d}": f"sat{s}" for i, s in enumerate(scene.samples().sensor)}
+    assert all(sensor[r["tracklet_id"]] == r["sensor_id"] for r in rows)
+
+
+def test_tracklets_that_two_objects_explain_are_ambiguous():
     scene = Scene(3, 2, times=np.array([0.0]))
     baseline = scene.r[1, 0] - scene.r[0, 0]
     towards = np.array([-39359.89, 15125.76, 64.30]) - scene.r[0, 0]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scenes.light_time import light_time_samples
+from scenes.passages import passages
 from scenes.tracklet_scenes import GEO, V_GEO, Scene, judge, pairs, solve
 
 from epipole.tasks.algorithms.association.samples import Samples
@@ -44,6 +45,22 @@ def test_two_objects_that_two_sensors_cannot_tell_apart_are_ambiguous():
     groups = solve(scene.samples())
     assert groups.ambiguous.all()
     assert (groups.group == -1).all()
+
+
+def test_tracklets_that_fit_one_object_with_too_little_evidence_are_undecided():
+    scene = Scene(2, 2, times=np.array([0.0])).objects(5).strays(200)
+    groups, who = solve(scene.samples()), np.array(scene.who)
+    assert not (groups.undecided & (groups.ambiguous | (groups.group >= 0))).any()
+    true = np.flatnonzero(who >= 0)
+    apart = true[(groups.group[true] == -1) & ~groups.ambiguous[true]]
+    assert len(apart)
+    assert groups.undecided[apart].all()
+
+
+def test_tracklets_of_sensors_that_look_elsewhere_are_not_undecided():
+    groups = solve(passages(0, 8))
+    assert groups.group.tolist() == [0, 0, -1, -1, -1, -1, -1, -1]
+    assert not groups.undecided.any()
 
 
 def test_unrelated_tracklets_make_no_object():

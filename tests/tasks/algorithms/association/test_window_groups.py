@@ -31,7 +31,8 @@ def entered(score: float, tracklets=(0, 1)) -> WindowGroups:
 
 def group_of(n: int, *score: float) -> Groups:
     member = np.zeros(n, np.int64) if score else np.full(n, -1)
-    return Groups(member, np.array(score), np.zeros(n, bool), np.full(2, np.nan))
+    none = np.zeros(n, bool)
+    return Groups(member, np.array(score), none, none, np.full(2, np.nan))
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -53,21 +54,21 @@ def test_a_span_of_ten_minutes_by_settings_is_judged_once():
 
 def test_a_sure_group_is_not_judged_again_where_it_is_sure():
     verdicts = entered(score=9.0)
-    rows = verdicts.undecided(np.arange(10), 30.0)
+    rows = verdicts.to_decide_again(np.arange(10), 30.0)
     assert verdicts.items.window[rows].tolist() == [1, 1, 2, 2, 3, 3, 4, 4]
-    unsure = entered(score=3.0).undecided(np.arange(10), 30.0)
+    unsure = entered(score=3.0).to_decide_again(np.arange(10), 30.0)
     assert len(unsure) == 10
 
 
 def test_tracklets_that_do_not_continue_keep_their_verdict():
-    assert not len(entered(score=3.0).undecided(np.arange(4), 30.0))  # 50 s < 2 x 30 s
+    assert not len(entered(score=3.0).to_decide_again(np.arange(4), 30.0))  # 50 s < 2 x 30 s
 
 
 def test_longer_evidence_against_a_group_dissolves_it():
     verdicts = entered(score=3.0)
     rows = np.arange(10)
     assert (verdicts.group[:2] == 0).all()
-    verdicts.reconsider(rows, verdicts.undecided(rows, 30.0), np.array([0, 1]), group_of(2))
+    verdicts.reconsider(rows, verdicts.to_decide_again(rows, 30.0), np.array([0, 1]), group_of(2))
     assert (verdicts.group == -1).all()
 
 
@@ -75,10 +76,10 @@ def test_what_longer_evidence_adds_to_a_sure_group_joins_it():
     verdicts = entered(score=9.0, tracklets=(0, 2))
     # In the first window tracklet 0 is in a sure group and 1 in none; over 150 s they are one.
     rows = np.arange(10)
-    undecided = verdicts.undecided(rows, 30.0)
-    first = undecided[verdicts.items.window[undecided] == 0]
+    again = verdicts.to_decide_again(rows, 30.0)
+    first = again[verdicts.items.window[again] == 0]
     assert verdicts.items.tracklet[first].tolist() == [1]
-    verdicts.reconsider(rows, undecided, np.array([0, 1]), group_of(2, 12.0))
+    verdicts.reconsider(rows, again, np.array([0, 1]), group_of(2, 12.0))
     assert (verdicts.group[verdicts.items.window == 0] == verdicts.group[0]).all()
     assert len(np.unique(verdicts.group[verdicts.items.window > 0])) == 1
 

@@ -102,7 +102,7 @@ def test_two_sensors_that_agree_with_each_other_only_are_found():
     of_both = np.isin(samples.sensor, [2, 4])
     group = np.array(scene.who) + 8 * of_both
     nothing = np.full(len(group), False)
-    groups = Groups(group, np.full(16, 9.0), nothing, np.full(5, 0.9))
+    groups = Groups(group, np.full(16, 9.0), nothing, nothing, np.full(5, 0.9))
     assert agreement(samples, groups).disagreeing().tolist() == [2, 4]
     alone = groups._replace(group=np.where(of_both, FREE, group), score=groups.score[:8])
     assert agreement(samples, alone).disagreeing().tolist() == [2, 4]
