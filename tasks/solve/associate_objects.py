@@ -77,14 +77,15 @@ def associate_objects(
             rejects.append(_reject_table(block, Reason.SENSOR_DISAGREES, left_out))
     if settings.method == "likelihood":
         _associate_longer(block, window_groups, agreeing, settings)
+    numbered = _number_objects(block, window_groups.group, windows)
+    number = main_objects(block.track[items.tracklet], numbered, items.n_views)
+    ambiguous = window_groups.ambiguous | (number != numbered)
     undecided = window_groups.undecided & ~_have_a_group(items.tracklet, window_groups.group)
     rejects += [
-        _reject_tracklets(block, Reason.AMBIGUOUS, np.flatnonzero(window_groups.ambiguous)),
+        _reject_tracklets(block, Reason.AMBIGUOUS, np.flatnonzero(ambiguous)),
         _reject_tracklets(block, Reason.UNDECIDED, np.flatnonzero(undecided)),
     ]
     _warn_about(block.sensor_id[np.unique(items.sensor[~agreeing])])
-    number = _number_objects(block, window_groups.group, windows)
-    ambiguous = window_groups.ambiguous
     return Associated(number, ambiguous, undecided, agreeing, concat(REJECTS, rejects))
 
 
@@ -194,6 +195,23 @@ def _number_objects(block: BlockViews, group: Indices, windows: list[Indices]) -
         for of_group, object_ in zip(members, registry.name_groups(tracks), strict=True):
             number[of_group] = object_
     return number
+
+
+def main_objects(track: Indices, number: Indices, n_views: Indices) -> Indices:
+    """Return the items' object numbers; -1 for an object that is no track's main one.
+
+    The main object of a track has the most of its views. Other objects of it are pieces of that
+    one, or mix tracks of several objects for a moment.
+    """
+    inside = np.flatnonzero(number >= 0)
+    pairs, pair = np.unique(
+        np.column_stack([track[inside], number[inside]]), axis=0, return_inverse=True
+    )
+    count = np.bincount(pair.ravel(), n_views[inside], minlength=len(pairs))
+    most = np.zeros(track.max(initial=-1) + 1)
+    np.maximum.at(most, pairs[:, 0], count)
+    main = pairs[count >= most[pairs[:, 0]], 1]
+    return np.where(np.isin(number, main), number, -1)
 
 
 def _find_groups(block: BlockViews, samples: Samples, settings: AssociationSettings) -> Groups:

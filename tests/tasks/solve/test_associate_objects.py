@@ -5,6 +5,8 @@ import pytest
 from scenes.associations import associated, reasons, wrong_views
 from scenes.tracklet_scenes import Scene
 
+from epipole.tasks.solve.associate_objects import main_objects
+
 
 @pytest.mark.parametrize("method", ["likelihood", "epipolar"])
 def test_objects_come_out_with_all_their_views(method):
@@ -110,3 +112,19 @@ def test_tracklets_that_two_objects_explain_are_ambiguous():
     found = associated(scene)
     assert found.views.num_rows == 0
     assert reasons(found) == {"ambiguous": 4}
+
+
+def test_an_object_that_is_the_main_one_of_no_track_is_none():
+    track = np.array([0, 1, 0, 1, 2, 3, 0, 2, 4, 5])
+    number = np.array([0, 0, 0, 0, 1, 1, 2, 2, 2, -1])
+    n_views = np.array([5, 5, 5, 5, 9, 9, 3, 3, 3, 3])
+    # Track 4 has no views in another object: object 2 stays.
+    assert main_objects(track, number, n_views).tolist() == number.tolist()
+    found = main_objects(track[:8], number[:8], n_views[:8])
+    assert found.tolist() == [0, 0, 0, 0, 1, 1, -1, -1]
+    assert not len(main_objects(track[:0], number[:0], n_views[:0]))
+
+
+def test_a_track_that_changes_its_object_takes_none_away():
+    track, number = np.array([0, 1, 0, 2]), np.array([0, 0, 1, 1])
+    assert main_objects(track, number, np.array([9, 9, 2, 2])).tolist() == [0, 0, 1, 1]
