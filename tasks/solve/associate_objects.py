@@ -198,7 +198,7 @@ def _number_objects(block: BlockViews, group: Indices, windows: list[Indices]) -
 
 
 def main_objects(track: Indices, number: Indices, n_views: Indices) -> Indices:
-    """Return the items' object numbers; -1 for an object that is no track's main one.
+    """Return the items' object numbers; an object that no track has as its main one gives -1.
 
     The main object of a track has the most of its views. Other objects of it are pieces of that
     one, or mix tracks of several objects for a moment.
