@@ -94,7 +94,7 @@ class Summary:
             f"identified  {self.identified:,} by {self.stars:,} stars",
             f"objects     {self.objects:,} in {self.detections:,} detections, "
             f"{many(self.tracklets, 'tracklet')}",
-            *self._doubtful(),
+            *([f"  not sound {_listed(doubtful)}"] if (doubtful := self.doubtful()) else []),
             *self._without_object(),
             f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
             *self._names(),
@@ -118,12 +118,9 @@ class Summary:
             parts.append(f"{sum(self.rejects.values()):,} left out")
         return ", ".join(parts)
 
-    def _doubtful(self) -> list[str]:
+    def doubtful(self) -> dict[str, int]:
         """Return how many objects are not sound, by verdict."""
-        doubtful = {name: n for name, n in self.verdicts.items() if name != ObjectVerdict.SOUND}
-        if not doubtful:
-            return []
-        return [f"  not sound {_listed(doubtful)}"]
+        return {name: n for name, n in self.verdicts.items() if name != ObjectVerdict.SOUND}
 
     def _without_object(self) -> list[str]:
         """Return how many tracklets orbits joined, and how many have no object, by outcome."""

@@ -112,7 +112,11 @@ def as_markdown(summary: Summary) -> str:
         "positions": summary.positions,
     } | {
         f"{of} {status}": count
-        for of, counts in (("objects", summary.names), ("tracklets", summary.tracklet_names))
+        for of, counts in (
+            ("objects", summary.doubtful()),
+            ("objects", summary.names),
+            ("tracklets", summary.tracklet_names),
+        )
         for status, count in counts.items()
     }
     lines = [f"# Night {', '.join(summary.nights)}", "", *_table("what", counts), ""]

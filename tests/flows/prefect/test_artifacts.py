@@ -20,7 +20,7 @@ from epipole.tasks.report.night_facts import PagePicture, ReportExtract
 FOUND = {
     "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
     "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "outcomes": {"object": 7},
-    "epochs": 6, "objects": 5, "verdicts": {"sound": 5},
+    "epochs": 6, "objects": 5, "verdicts": {"blended": 2, "sound": 3},
     "positions": 4, "rejects": {"no_state": 34, "bad_sigma": 1}, "faults": [], "by_sensor": [],
     "names": {}, "tracklet_names": {}, "residuals": [], "unchanged": False, "extracts": (),
 }  # fmt: skip
@@ -30,6 +30,8 @@ def test_the_page_of_a_night_has_its_counts_and_what_was_left_out_by_reason():
     page = as_markdown(Summary(**FOUND))
     assert "# Night 2019-04-01" in page
     assert "| frames | 1,234 |" in page
+    assert "| objects blended | 2 |" in page
+    assert "sound" not in page
     assert "Left out: 35 things" in page
     no_state, bad_sigma = Reason.NO_STATE, Reason.BAD_SIGMA
     rows = f"| no_state | 34 | {no_state.sentence} |\n| bad_sigma | 1 | {bad_sigma.sentence} |"
