@@ -118,30 +118,44 @@ class Normal(NamedTuple):
 def _residual(direction, path, shared, work, e, J):
     """Write a direction's residual [rad] to `e` (2,) and its derivatives to `J` (2, 14).
 
-    `direction` is (time, r, u, basis); `shared` (6,) its sensor's errors at present; `work` (3, 9)
-    is space to work. Returns whether the object is before the sensor.
+    `direction` is (time, r, u, basis); `shared` (6,) its sensor's errors at present; `work`
+    (3, 10) is space to work. Returns whether the object is before the sensor.
     """
     time_s, r, u, basis = direction
-    jacobian, d = work[:, :N_UNKNOWNS], work[:, N_UNKNOWNS]
-    delay, rho = 0.0, 0.0
+    jacobian, d, v = work[:, :N_UNKNOWNS], work[:, N_UNKNOWNS], work[:, N_UNKNOWNS + 1]
+    delay, rho, used = 0.0, 0.0, 0.0
     for _ in range(3):  # light time; right to 1e-12 of the distance
+        used = delay
         interpolate(time_s - delay, path, d, jacobian)
         rho = 0.0
         for a in range(3):
             d[a] += shared[3 + a] - r[a]
+            if delay == 0.0:
+                v[a] = d[a]
             rho += d[a] * d[a]
         rho = np.sqrt(rho)
         delay = rho / SPEED_OF_LIGHT_KM_S
+    receding = 0.0
+    for a in range(3):
+        v[a] = (v[a] - d[a]) / used  # the mean velocity during the light time
+        receding += v[a] * d[a] / rho
     for p in range(2):
         e[p] = 0.0
         J[p, :N_UNKNOWNS] = 0.0
+        ahead, aside = 0.0, 0.0
         for a in range(3):
-            b = basis[p, a]
-            e[p] += b * (d[a] / rho + shared[a])
-            J[p, N_UNKNOWNS + a] = b
-            J[p, N_UNKNOWNS + 3 + a] = b / rho
+            e[p] += basis[p, a] * (d[a] / rho + shared[a])
+            ahead += basis[p, a] * d[a] / rho
+            aside += basis[p, a] * v[a]
+        # A step along the line of sight changes neither the direction nor, but for the light time,
+        # the residual: without these terms it would seem to make all residuals smaller.
+        aside = (aside - ahead * receding) / (SPEED_OF_LIGHT_KM_S + receding)
+        for a in range(3):
+            towards = (basis[p, a] - (ahead + aside) * d[a] / rho) / rho
+            J[p, N_UNKNOWNS + a] = basis[p, a]
+            J[p, N_UNKNOWNS + 3 + a] = towards
             for k in range(N_UNKNOWNS):
-                J[p, k] += b / rho * jacobian[a, k]
+                J[p, k] += towards * jacobian[a, k]
     return d[0] * u[0] + d[1] * u[1] + d[2] * u[2] > 0.0
 
 
@@ -170,7 +184,7 @@ def _sum_up(path, directions, used, shared, sums, chi2):
     behind the sensor chi-square is NaN.
     """
     time_s, sensor, r, u, basis, weight, _ = directions
-    work, e = np.empty((3, N_UNKNOWNS + 1)), np.empty(2)
+    work, e = np.empty((3, N_UNKNOWNS + 2)), np.empty(2)
     J = np.zeros((2, N_UNKNOWNS + N_SHARED))
     WJ = np.empty((2, N_UNKNOWNS + N_SHARED))
     for i in range(len(time_s)):

@@ -6,6 +6,7 @@ from scenes.night_orbits import AROUND, GEO, LOW, trial
 from scipy.special import chdtrc
 
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
+from epipole.tasks.algorithms.orbits import orbit_determination as determination
 from epipole.tasks.algorithms.orbits.orbit_determination import (
     AreaPrior,
     determine_orbit,
@@ -77,6 +78,35 @@ def test_a_night_of_few_passages_converges_from_a_state_of_minutes():
         cov = transition @ each.cov @ transition.T
         sigma_km.append(np.sqrt(np.trace(cov[:3, :3])))
     assert sigma_km[1] < sigma_km[0] / 20
+
+
+PASSAGES = np.concatenate([c + np.linspace(-15.0, 15.0, 40) for c in (-75.0, 75.0)])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_two_passages_before_one_sensor_converge_though_their_distance_is_hardly_seen(seed):
+    directions = trial(seed, LOW, n_sensors=1, times_s=PASSAGES, noise=10.0, bias=0.0)
+    orbit = fit(directions, LOW, FIXED, seed)
+    off = orbit.unknowns[:6] - LOW[:6]
+    assert off @ np.linalg.solve(orbit.cov[:6, :6], off) < 22.5  # 1 in 1,000 is above
+
+
+def test_the_derivatives_are_those_of_the_residuals():
+    directions, epoch_s = trial(3, LOW, times_s=np.linspace(-90.0, 90.0, 5), noise=600.0), 0.0
+    shared, areas = np.zeros((3, 6)), AIR
+    used = np.ones(len(directions.u), bool)
+
+    def at(step):
+        unknowns = LOW + step
+        given = epoch_s, directions, used, areas, AROUND
+        return determination._at(unknowns, shared, *given)
+
+    middle = at(np.zeros(8))
+    size = np.array([0.1] * 3 + [1e-4] * 3)
+    for k, h in enumerate(np.diag(np.append(size, [0.0, 0.0]))[:6]):
+        # Half of the slope of chi-square is the right side of the equations, with the other sign.
+        slope = (at(h).of_directions.sum() - at(-h).of_directions.sum()) / (2 * size[k])
+        assert -2 * middle.sums.of_orbit[k] == pytest.approx(slope, rel=1e-4, abs=1e-6 / size[k])
 
 
 def test_directions_of_something_else_are_left_out():
