@@ -120,7 +120,7 @@ class IdentificationSettings(Group):
         1e-5,
         gt=0,
         lt=1,
-        description="Accepted share of a sensor's frames that get an attitude by chance; of those "
+        description="Accepted share of a sensor's frames that get a false attitude; of those "
         "without stars, where these are half or more.",
     )
     time_limit_s: float = Field(
@@ -185,7 +185,7 @@ class TrackletSettings(Group):
         gt=0,
         le=DAY_S,
         description="Longest gap across which tracklets are joined. Default: as far as their "
-        "motion can be foretold; three minutes where the gap lies over the end of a span.",
+        "motion can be predicted; three minutes where the gap lies over the end of a span.",
     )
     link_kept: float = Field(
         0.9999, gt=0, lt=1, description="Share of true links that the chi-square test accepts."

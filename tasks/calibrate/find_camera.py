@@ -92,7 +92,7 @@ class CameraFinding(NamedTuple):
         if camera is None:
             return (
                 f"{name}: its frames show no stars, with focal lengths 10 % shorter to 11 % longer "
-                "than told, with distortion and with rows counted upward either"
+                "than logged, with distortion and with rows counted upward either"
             )
         parts = []
         if (camera.fy_px < 0) != (self.logged.fy_px < 0):
@@ -102,14 +102,14 @@ class CameraFinding(NamedTuple):
         )
         if abs(moved_px) >= 1.0:
             parts.append(
-                f"distortion moves its corners by some {abs(moved_px):.0f} px more than told "
+                f"distortion moves its corners by some {abs(moved_px):.0f} px more than logged "
                 f"(k1 about {camera.k1:.2g}, not {self.logged.k1:.2g})"
             )
         percent = 100 * (camera.fx_px / self.logged.fx_px - 1)
         if abs(percent) >= 0.1:
             size = "longer" if percent > 0 else "shorter"
             parts.append(
-                f"the focal length is {abs(percent):.1f} % {size} than told "
+                f"the focal length is {abs(percent):.1f} % {size} than logged "
                 f"({camera.fx_px:.1f} px, not {self.logged.fx_px:.1f})"
             )
         return f"{name}: {' and '.join(parts) or 'its stars were found in a second search'}"

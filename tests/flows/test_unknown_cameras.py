@@ -20,7 +20,7 @@ from epipole.tasks.calibrate import calibrate_sensors
 
 pytestmark = pytest.mark.long
 
-FOCAL = 0.05  # by which the true focal length is longer than told
+FOCAL = 0.05  # by which the true focal length is longer than logged
 
 
 def simulated(folder, **departure):
@@ -62,7 +62,7 @@ def test_a_run_finds_a_focal_length_and_says_so(log, told_px, tmp_path, caplog):
         made = run(log, tmp_path / "out")
     assert (made["frames"]["attitude_source"] == "stars").mean() > 0.9
     assert made["calibrations"]["fx_px"][0] == pytest.approx(told_px * (1 + FOCAL), rel=2e-3)
-    assert any("a: the focal length is 5.0 % longer than told" in r.message for r in caplog.records)
+    assert any("a: the focal length is 5.0 % longer than logged" in r.message for r in caplog.records)
     assert any(r.message.endswith("; used") for r in caplog.records)
 
 
@@ -72,7 +72,7 @@ def test_a_camera_is_not_used_where_the_settings_say_so(log, tmp_path, caplog, m
     with caplog.at_level(logging.WARNING):
         made = run(log, tmp_path / "out", calibrate=mode)
     assert (made["frames"]["attitude_source"] == "stars").sum() == 0
-    assert any("longer than told" in r.message for r in caplog.records) == said
+    assert any("longer than logged" in r.message for r in caplog.records) == said
 
 
 @pytest.mark.usefixtures("prefect")

@@ -22,7 +22,7 @@ TIME = 1_554_091_200_630_490_482  # not a whole number of microseconds
 def test_a_finding_says_what_is_different():
     longer = TOLD._replace(fx_px=3813.7, fy_px=3813.7)
     said = str(CameraFinding("a", TOLD, longer))
-    assert said == ("a: the focal length is 4.2 % longer than told (3813.7 px, not 3660.0)")
+    assert said == ("a: the focal length is 4.2 % longer than logged (3813.7 px, not 3660.0)")
     said = str(CameraFinding("a", TOLD, mirrored(TOLD)))
     assert said == "a: the image is mirrored (y up?)"
     assert "show no stars" in str(CameraFinding("a", TOLD, None))
@@ -33,7 +33,7 @@ def test_a_finding_says_how_far_distortion_moves_the_corners():
     said = str(CameraFinding("a", TOLD, found))
     moved = 3660 * (np.hypot(512, 512) / 3660) ** 3
     assert said == (
-        f"a: distortion moves its corners by some {moved:.0f} px more than told "
+        f"a: distortion moves its corners by some {moved:.0f} px more than logged "
         "(k1 about -1, not 0)"
     )
 

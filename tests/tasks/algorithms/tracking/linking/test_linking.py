@@ -153,7 +153,7 @@ def test_without_a_longest_gap_the_method_of_prediction_keeps_its_own():
 
 
 def test_a_fragment_that_could_be_anywhere_is_not_joined():
-    # Single detections, ten minutes apart: no motion is known, nothing is foretold.
+    # Single detections, ten minutes apart: no motion is known, nothing is predicted.
     parts = [((100 * k, 0), (0, 0), np.arange(600 * k, 600 * k + 1)) for k in range(4)]
     assert (by_likelihood(*fragments(parts), gap_s=np.inf).before == NONE).all()
 
