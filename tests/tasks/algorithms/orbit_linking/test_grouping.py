@@ -3,6 +3,7 @@
 import numpy as np
 from scenes.orbit_tracklets import orbit_tracklets
 
+from epipole.tasks.algorithms.orbit_linking import grouping
 from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
 from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
@@ -36,6 +37,23 @@ def test_rough_tracklets_stay_alone_rather_than_join_others():
     label = linked(scene)
     assert wrong(label, scene.object) == 0
     assert len(np.unique(label)) > 250
+
+
+def test_tracklets_that_say_little_in_pairs_are_joined_by_four(monkeypatch):
+    scene = orbit_tracklets(9, 60, 4, 60.0, rate_arcsec_s=12.0)
+    label = linked(scene, log_odds=9.0)
+    assert wrong(label, scene.object) == 0
+    assert len(np.unique(label)) == 60
+    monkeypatch.setattr(grouping, "LOOSE_LOG_ODDS", 99.0)
+    assert len(np.unique(linked(scene, log_odds=9.0))) >= 65
+
+
+def test_loosely_joined_pairs_are_released():
+    scene = orbit_tracklets(2, 60, 2, 100.0, direction_arcsec=20.0, rate_arcsec_s=100.0)
+    label = linked(scene, log_odds=9.0)
+    assert wrong(label, scene.object) == 0
+    sizes = np.bincount(label)
+    assert (sizes > 2).sum() == 0
 
 
 def test_a_known_object_takes_its_tracklets():
