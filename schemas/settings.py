@@ -154,7 +154,8 @@ class TrackletSettings(Group):
         3,
         ge=0,
         le=1000,
-        description="Most frames in a row in which a tracklet may have no detection.",
+        description="Most frames in a row in which a tracklet may have no detection; up to 24 if "
+        "it moves so evenly that a false detection in its gate is improbable.",
     )
     min_detections: int = Field(
         3, ge=2, le=1000, description="Minimum number of detections of a tracklet."

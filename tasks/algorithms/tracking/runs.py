@@ -20,6 +20,8 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.initiation import (
+    EXTRA_DETECTIONS,
+    FAINT_FRAMES,
     MAX_PAIRS,
     NONE,
     P_DETECTION,
@@ -51,7 +53,9 @@ MAX_PAIRS_OF_ALL, MIN_PAIRS = 20_000_000, 5_000
 # pairs are too fast to reach the evidence, so that 1 to 5 % of this number are measured.
 FALSE_ALARM_SEQUENCE = 1.0
 SHORT_SEQUENCE = 2  # a sequence is short up to twice the frames in which a track may begin
-EXTRA_DETECTIONS = 9  # maximum number of frames beyond the minimum of detections, in dense clutter
+# A track whose motion is known precisely goes on through more misses than `max_missed`: up to this
+# many frames, and while fewer false detections than this are expected in its gates.
+MAX_MISSED_FRAMES, MAX_STRAYS = 24, 3e-3
 
 
 class _Tracks(NamedTuple):
@@ -59,6 +63,7 @@ class _Tracks(NamedTuple):
 
     u, w, bend, P : (t, 3), (t, 3), (t, 3), (t, SIZE) float, see `sky_filter`
     at, missed : (t,) float and int64, time of the state, and misses in a row
+    strays : (t,) float, false detections expected in the gates since the last detection
     """
 
     u: Array
@@ -67,6 +72,7 @@ class _Tracks(NamedTuple):
     P: Array
     at: Array
     missed: npt.NDArray[np.int64]
+    strays: Array
 
 
 def follow_detections(
@@ -99,7 +105,8 @@ def follow_detections(
     max_rate_rad_s, max_coast_s
         Maximum rate of an object, and maximum time without a detection within a track.
     max_missed
-        Maximum number of successive misses within a track.
+        Number of successive misses after which a track ends, unless its motion is known so well
+        that a false detection in its gate is improbable (`MAX_STRAYS`).
     min_detections
         Minimum number of detections that begin a track, 2 or more. They lie within `SLACK_FRAMES`
         more frames than that.
@@ -182,19 +189,22 @@ def _follow(detections, max_in_frame, rule):
         np.empty((capacity, SIZE)),
         np.empty(capacity),
         np.zeros(capacity, np.int64),
+        np.zeros(capacity),
     )
     live = np.empty(0, np.int64)
     # Not the literal 0: `new_tracks` would be compiled for that type as well.
-    n_tracks, n_slots = len(live), rule.min_detections + EXTRA_DETECTIONS + 1
+    n_tracks = len(live)
+    n_slots = max(rule.min_detections + EXTRA_DETECTIONS, FAINT_FRAMES) + 1
     recent = RecentFrames(
         make_grids(n_slots, max_in_frame), np.full(n_slots, np.inf), np.zeros(n_slots)
     )
     for f in range(len(times)):
         _fill_frame(f, detections, recent)
         # A track with too many misses has ended.
+        missed = tracks.missed[live]
+        is_sure = (missed <= MAX_MISSED_FRAMES) & (tracks.strays[live] <= MAX_STRAYS)
         live = live[
-            (tracks.missed[live] <= rule.max_missed)
-            & (times[f] - tracks.at[live] <= rule.max_coast)
+            ((missed <= rule.max_missed) | is_sure) & (times[f] - tracks.at[live] <= rule.max_coast)
         ]
         _assign(f, live, tracks, detections, recent, rule)
         began, length, chains = new_tracks(
@@ -205,6 +215,7 @@ def _follow(detections, max_in_frame, rule):
             u, w, bend, P = tracks.u, tracks.w, tracks.bend, tracks.P
             _state_of(members, detections, u[n_tracks], w[n_tracks], bend[n_tracks], P[n_tracks])
             tracks.at[n_tracks], tracks.missed[n_tracks] = times[f], 0
+            tracks.strays[n_tracks] = 0.0
             n_tracks += 1
         live = np.concatenate((live, np.arange(n_tracks - len(began), n_tracks)))
 
@@ -242,7 +253,7 @@ def _assign(f, live, tracks, detections, recent, rule):
         m, j = live[q], assigned[q]
         if j == NONE:
             continue
-        tracks.missed[m] = 0
+        tracks.missed[m], tracks.strays[m] = 0, 0.0
         correct(u[m], w[m], bend[m], P[m], detections.directions[j], detections.variances[j])
 
 
@@ -250,18 +261,20 @@ def _assign(f, live, tracks, detections, recent, rule):
 def _candidates(f, live, tracks, detections, recent, rule):
     """Return all (track, detection, chi-square) within the gates of the tracks in frame f."""
     slot, n_in = f % len(recent.largest), detections.offsets[f + 1] - detections.offsets[f]
-    density = max(n_in, 1) / rule.field_sr
+    density = n_in / rule.field_sr
     start, items = recent.grids[2], recent.grids[3]
     directions, variances = detections.directions, detections.variances
     capacity, count = 4 * len(live) + 16, 0
     track, detection = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
     chi2 = np.empty(capacity)
-    for m in live:
+    for m in live if n_in else live[:0]:
         variance = tracks.P[m, 0]
         gate2 = _gate2(variance + recent.smallest[slot], density, rule)
         if not gate2 > 0.0:
+            tracks.strays[m] = np.inf
             continue
         reach = np.sqrt(gate2 * (variance + recent.largest[slot]))
+        tracks.strays[m] += density * np.pi * reach * reach
         x_from, x_to, y_from, y_to, side = window(recent.grids, slot, tracks.u[m], reach)
         if x_from > x_to:
             continue

@@ -27,7 +27,7 @@ from epipole.tasks.algorithms.kernels import kernel
 
 LOW_ORBIT_S = 1e-3  # [1/s] angular rate of a low orbit; also g / v there
 APPROACH = 2.0  # relative range rate over apparent rate: real low orbits rarely exceed it
-APPROACH_S = 7e-3  # [1/s] largest relative range rate: 14 km/s at 2,000 km
+APPROACH_S = 0.1  # [1/s] largest relative range rate: 14 km/s at 140 km
 FAR_RAD_S2 = 2.5e-7  # [rad/s^2] a low sensor's acceleration over the range of a far object
 
 

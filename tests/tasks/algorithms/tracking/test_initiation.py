@@ -8,13 +8,20 @@ import pytest
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.tracking.initiation import (
+    APART,
+    EXTRA_DETECTIONS,
+    FAINT_APART,
+    FAINT_FRAMES,
+    MAX_FAINT_MISSES,
+    MAX_FREE,
     NONE,
+    P_FAINT,
     Detections,
     RecentFrames,
     TrackRule,
     new_tracks,
 )
-from epipole.tasks.algorithms.tracking.runs import EXTRA_DETECTIONS, SLACK_FRAMES, _fill_frame
+from epipole.tasks.algorithms.tracking.runs import SLACK_FRAMES, _fill_frame
 from epipole.tasks.algorithms.tracking.sky_filter import acceleration, jerk_of, make_grids
 
 FIELD_RAD = np.radians(4.0)
@@ -75,7 +82,7 @@ def scene(seed, *, times, rate_arcsec_s, n_objects=2, n_strays=2, missed=0.1, er
 
 def begun_in_last_frame(detections, of):
     """Return the members of the new tracks that end in the last frame, in order."""
-    n_slots = of.min_detections + EXTRA_DETECTIONS + 1
+    n_slots = max(of.min_detections + EXTRA_DETECTIONS, FAINT_FRAMES) + 1
     recent = RecentFrames(
         make_grids(n_slots, int(np.diff(detections.offsets).max())),
         np.full(n_slots, np.inf),
@@ -141,34 +148,46 @@ def free_in(detections, f):
     return [j for j in range(lo, hi) if detections.track[j] == NONE]
 
 
+def is_sparse(detections, f):
+    return len(free_in(detections, f)) <= MAX_FREE
+
+
 def follow_back(detections, of, f, j, g, i):
-    """Return the members and log-evidence of a pair that is followed to the first frame."""
+    """Return the members and log-evidence of a pair that is followed to the first frame.
+
+    The evidence is that of the better of two probabilities of detection.
+    """
     times, u, var = detections.times, detections.directions, detections.variances
-    missed = np.log(1 - P_DETECTION)
+    detected = np.array([P_DETECTION, P_FAINT])
+    evidence = np.array([0.0, np.log(0.5) if is_sparse(detections, f) else -np.inf])
+    evidence += (f - g - 1) * np.log(1 - detected)
     state = begin(u[j], times[f], var[j], u[i], times[g], var[i])
-    members, evidence, waiting, at = [j, i], (f - g - 1) * missed, 0.0, times[g]
+    members, misses, at = [j, i], 0, times[g]
     for h in range(g - 1, -1, -1):
         if times[h] == at:
             continue
+        if is_sparse(detections, f) and misses == MAX_FAINT_MISSES:
+            break
         state, at = predict(state, times[h] - at), times[h]
-        free, gain = free_in(detections, h), -np.inf
+        free, after = free_in(detections, h), np.full(2, -np.inf)
         chi2 = [np.sum((u[m] - state.u) ** 2) / (state.P[0, 0] + var[m]) for m in free]
         if free and min(chi2) < of.gate2:
             m = free[int(np.argmin(chi2))]
             spot = 2 * np.pi * (state.P[0, 0] + var[m])
-            gain = np.log(P_DETECTION / (len(free) / of.field_sr * spot)) - min(chi2) / 2 + waiting
-        if gain < 0.0:
-            waiting += missed
+            odds = detected / (len(free) / of.field_sr * spot)
+            after = evidence + misses * np.log(1 - detected) + np.log(odds) - min(chi2) / 2
+        if max(after) < max(evidence):
+            misses += 1
             continue
-        evidence, waiting = evidence + gain, 0.0
+        evidence, misses = after, 0
         state, members = correct(state, u[m], var[m]), [*members, m]
-    return members, evidence
+    return members, max(evidence)
 
 
 def by_trying_all(detections, of):
     """Return the members of the new tracks: of every pair in the last frames, whatever its rate."""
     times, u, f, best = detections.times, detections.directions, len(detections.times) - 1, {}
-    for g in (f - 1, f - 2):
+    for g in range(f - 1, f - 1 - (FAINT_APART if is_sparse(detections, f) else APART), -1):
         dt = times[f] - times[g]
         if not 0.0 < dt <= of.max_coast:
             continue

@@ -12,13 +12,16 @@ FIELD = np.radians(4.0)
 SIGMA = 2 * ARCSEC
 
 
-def scene(seed, *, n_objects, n_false, n_frames, rate_arcsec_s, missed=0.05, axis=(0.3, 0.5, 0.8)):
+def scene(
+    seed, *, n_objects, n_false, n_frames, rate_arcsec_s, missed=0.05, axis=(0.3, 0.5, 0.8),
+    interval_s=1.0,
+):  # fmt: skip
     """Return detections of objects on great circles among false alarms: frame times and offsets,
     directions, and the object of each."""
     rng = np.random.default_rng(seed)
     centre = np.array(axis) / np.linalg.norm(axis)
     basis = tangent_basis(centre)
-    times = np.arange(n_frames) * 1.0
+    times = np.arange(n_frames) * interval_s
     start = rng.uniform(-FIELD / 2, FIELD / 2, (n_objects, 2))
     heading = rng.uniform(0, 2 * np.pi, n_objects)
     rate = rate_arcsec_s * ARCSEC * np.column_stack([np.cos(heading), np.sin(heading)])
@@ -84,10 +87,10 @@ def test_strays_alone_make_next_to_no_tracks():
 
 def test_an_object_missed_too_long_begins_a_new_track():
     times, offsets, u, _ = scene(
-        3, n_objects=1, n_false=0, n_frames=40, rate_arcsec_s=40.0, missed=0.0
+        3, n_objects=1, n_false=0, n_frames=60, rate_arcsec_s=40.0, missed=0.0
     )
     gone = np.zeros(len(u), bool)
-    gone[15:25] = True
+    gone[15:45] = True
     offsets = np.concatenate([[0], np.cumsum(np.diff(offsets) * ~gone)])
     track = follow(times, offsets, u[~gone])
     assert track[:15].tolist() == [0] * 15
@@ -215,3 +218,49 @@ def test_a_fast_track_that_loses_its_object_does_not_live_on_false_alarms(seed):
     for t in range(track.max(initial=-1) + 1):
         last = np.flatnonzero((track == t) & (who >= 0)).max(initial=-1)
         assert ((track == t) & (np.arange(len(track)) > last)).sum() <= 2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_faint_objects_that_are_seen_now_and_then_are_followed(seed):
+    times, offsets, u, who = scene(
+        seed,
+        n_objects=3,
+        n_false=2,
+        n_frames=100,
+        rate_arcsec_s=300.0,
+        missed=0.65,
+        interval_s=0.25,
+    )
+    true = [np.flatnonzero(who == k) for k in range(3)]
+    track = follow(times, offsets, u)
+    for rows in true:
+        if len(rows) >= 6:
+            assert (np.bincount(track[rows] + 1)[1:].max()) > 0.5 * len(rows)
+    assert score(track, who)[0] > 0.97
+
+
+def test_a_precise_track_goes_on_through_misses_where_false_detections_are_few():
+    times, offsets, u, who = scene(
+        7, n_objects=1, n_false=2, n_frames=60, rate_arcsec_s=100.0, missed=0.0, interval_s=0.25
+    )
+    frame = np.repeat(np.arange(60), np.diff(offsets))
+    gone = (who == 0) & (frame >= 30) & (frame < 37)
+    offsets = np.searchsorted(frame[~gone], np.arange(61))
+    track = follow(times, offsets, u[~gone])
+    seen = track[who[~gone] == 0]
+    assert (seen == seen[0]).all()
+    assert seen[0] >= 0
+
+
+def test_an_object_that_comes_straight_at_the_sensor_is_one_track():
+    # It passes at 60 km with 10 km/s: its rate grows twentyfold within half a minute.
+    times = np.arange(0.0, 29.0, 0.25)
+    there = np.column_stack([300.0 - 10.0 * times, np.full(len(times), 60.0), 0.0 * times])
+    u = there / np.linalg.norm(there, axis=1, keepdims=True)
+    u += np.random.default_rng(8).normal(size=u.shape) * SIGMA * 5
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    track = follow(
+        times, np.arange(len(times) + 1), u, sigma=5 * SIGMA, max_rate_rad_s=np.radians(12.0),
+        max_coast_s=1.2,
+    )  # fmt: skip
+    assert np.bincount(track + 1)[1:].max() >= 0.9 * len(times)
