@@ -62,7 +62,9 @@ def test_a_run_finds_a_focal_length_and_says_so(log, told_px, tmp_path, caplog):
         made = run(log, tmp_path / "out")
     assert (made["frames"]["attitude_source"] == "stars").mean() > 0.9
     assert made["calibrations"]["fx_px"][0] == pytest.approx(told_px * (1 + FOCAL), rel=2e-3)
-    assert any("a: the focal length is 5.0 % longer than logged" in r.message for r in caplog.records)
+    assert any(
+        "a: the focal length is 5.0 % longer than logged" in r.message for r in caplog.records
+    )
     assert any(r.message.endswith("; used") for r in caplog.records)
 
 
