@@ -96,6 +96,7 @@ PLAN = {
     "identity": Benchmark("identity", "--gaps 120 900 1800 --seeds 1 2", 6),
     "epipolar": Benchmark("epipolar", "--scenes 100", 8),
     "orbit_fits": Benchmark("orbit_fits", "--seeds 4", 8),
+    "orbit_linking": Benchmark("orbit_linking", "--satellites 60 240 420 --hours 1", 5),
     "orekit_orbits": Benchmark("orekit_orbits"),
     "known_objects": Benchmark("known_objects", "--objects 300 --ages 3 10", 8),
     "real_orbits": Benchmark("real_orbits", "--scenes 4 --seed 71 --out {folder}", 12),
