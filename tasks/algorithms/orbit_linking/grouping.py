@@ -122,9 +122,15 @@ def link_tracklets(
     is_loose = np.zeros(n, bool)
     _join_all(tracklets, alone, edges, log_odds, False, sets, is_loose, epoch_s, state)
     _join_all(tracklets, alone, edges, LOOSE_LOG_ODDS, True, sets, is_loose, epoch_s, state)
-    _confirm(tracklets, alone, known, log_odds, sets, is_loose, epoch_s, state)
+    _confirm(tracklets, alone, _stays(known), log_odds, sets, is_loose, epoch_s, state)
     _join_all(tracklets, alone, edges, log_odds, False, sets, is_loose, epoch_s, state)
     return LinkedTracklets(sets.root, epoch_s, state)
+
+
+def _stays(known: Indices) -> npt.NDArray[np.bool_]:
+    """Return which tracklets belong to a known object of several: no join releases them."""
+    count = np.bincount(np.maximum(known, 0), known >= 0)
+    return np.asarray((known >= 0) & (count[np.maximum(known, 0)] > 1))
 
 
 def _edges(tracklets: Tracklets, known: Indices, alone: Array, max_gap_s: float) -> Edges:
@@ -354,15 +360,15 @@ def _support(tracklets, alone, sets, root, k, start_s, start, work):
 
 
 @kernel
-def _weakest(tracklets, alone, known, sets, root, log_odds, epoch_s, states, work):
+def _weakest(tracklets, alone, stays, sets, root, log_odds, epoch_s, states, work):
     """Return the member of a set that the others support least, NONE if each has the log odds.
 
-    Members of known objects stay.
+    Members that are flagged in `stays` are not asked.
     """
     weakest, lowest = NONE, log_odds
     k = root
     while k != NONE:
-        if known[k] < 0:
+        if not stays[k]:
             gain = _support(tracklets, alone, sets, root, k, epoch_s[root], states[root], work)
             if not gain >= lowest:
                 weakest, lowest = k, gain if np.isfinite(gain) else -np.inf
@@ -391,22 +397,22 @@ def _release(sets, root, k):
 
 
 @kernel
-def _confirm(tracklets, alone, known, log_odds, sets, is_loose, epoch_s, states):
+def _confirm(tracklets, alone, stays, log_odds, sets, is_loose, epoch_s, states):
     """Release the tracklets of loosely joined sets that the others of the set do not support.
 
     Two tracklets alone do not stay: what they lack for a join is a rival less.
     """
     work = fit_work()
-    for label in range(len(known)):
+    for label in range(len(stays)):
         root = label
         if not is_loose[root] or sets.root[root] != root:
             continue
         while sets.size[root] > 1:
-            k = _weakest(tracklets, alone, known, sets, root, log_odds, epoch_s, states, work)
+            k = _weakest(tracklets, alone, stays, sets, root, log_odds, epoch_s, states, work)
             if k == NONE:
                 if sets.size[root] > 2:
                     break
-                k = root if known[root] < 0 else sets.next[root]
+                k = root if not stays[root] else sets.next[root]
             first = _release(sets, root, k)
             if first != root:
                 epoch_s[first] = epoch_s[root]

@@ -35,7 +35,7 @@ orbit = { position_km = [-39359.89, 15125.76, 64.30] }
 spread_km = 400.0
 magnitude = 7.0
 """
-GAP = (25, 37)  # frames from and to that show no object
+GAP = (18, 44)  # frames from and to that show no object
 
 
 @pytest.fixture(scope="module")
