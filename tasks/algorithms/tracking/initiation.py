@@ -262,12 +262,13 @@ def _extrapolate(u_f, u_g, chord2, ratio, out):
 
 
 @kernel
-def _chain_back(pair, detections, recent, rule, density, best, wanted, faint, scratch):
+def _chain_back(pair, detections, recent, rule, frames, best, wanted, scratch):
     """Follow a pair back in time; return the number of detections and the log-evidence.
 
     Writes the detections, newest first, to `scratch.members`. The evidence is the log-likelihood
     ratio of one moving object against false alarms, over all detections but the first two; with
-    `faint`, of an object that is detected in most frames or in few, whichever is likelier. The
+    `frames.faint`, of an object that is detected in most frames or in few, whichever is likelier.
+    `frames` is the `_Evidence` of the pairs of both frames, `best` its row for the pair's rate. The
     number is 0 if the evidence can no longer reach `wanted`.
     """
     f, j, g, i = pair.f, pair.j, pair.g, pair.i
@@ -279,7 +280,7 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, faint, sc
     scratch.members[0], scratch.members[1] = j, i
     n, at = 2, times[g]
     bright, dim = (f - g - 1) * LOG_MISS, -np.inf
-    if faint:
+    if frames.faint:
         dim = LOG_FAINT + (f - g - 1) * LOG_FAINT_MISS
     # Misses beyond the oldest detection count only if an older one follows: the object may have
     # entered the field there.
@@ -289,7 +290,7 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, faint, sc
         bright_after, dim_after = bright + misses * LOG_MISS, dim + misses * LOG_FAINT_MISS
         if max(evidence, max(bright_after, dim_after) + best[k]) < wanted:
             return 0, evidence
-        if faint and misses == MAX_FAINT_MISSES:
+        if frames.faint and misses == MAX_FAINT_MISSES:
             break
         h = g - 1 - k
         dt = times[h] - at
@@ -304,7 +305,7 @@ def _chain_back(pair, detections, recent, rule, density, best, wanted, faint, sc
             misses += 1
             continue
         area = 2 * np.pi * (P[0] + variances[m])
-        gain = np.log(P_DETECTION / (density[f - h] * area)) - 0.5 * chi2
+        gain = np.log(P_DETECTION / (frames.density[f - h] * area)) - 0.5 * chi2
         if max(bright_after, dim_after + LOG_FAINT_HIT) + gain < evidence:
             misses += 1
             continue
@@ -383,8 +384,7 @@ def _try_pair(pair, detections, recent, rule, evidence, chains, scratch):
     row = pair.j - detections.offsets[f]
     best = evidence.best[_class_of(np.sqrt(pair.chord2) / pair.dt, rule.max_rate)]
     wanted = evidence.log_pairs + max(rule.min_evidence, chains.strength[row])
-    faint = evidence.faint
-    log_miss = LOG_FAINT_MISS if faint else LOG_MISS
+    log_miss = LOG_FAINT_MISS if evidence.faint else LOG_MISS
     if best[0] + (f - g - 1) * log_miss < wanted:
         return
     # Most pairs are false. If a miss would rule a pair out, the next frame decides it quickly.
@@ -394,9 +394,7 @@ def _try_pair(pair, detections, recent, rule, evidence, chains, scratch):
         and not _may_chain(pair, detections, recent, rule, scratch)
     ):
         return
-    n, gained = _chain_back(
-        pair, detections, recent, rule, evidence.density, best, wanted, faint, scratch
-    )
+    n, gained = _chain_back(pair, detections, recent, rule, evidence, best, wanted, scratch)
     if n >= rule.min_detections and gained > wanted:
         chains.length[row], chains.strength[row] = n, gained - evidence.log_pairs
         chains.members[row, :n] = scratch.members[:n]
