@@ -154,6 +154,20 @@ def _step(state: Array) -> float:
 
 
 @kernel
+def _quintic(u, h):
+    """Return the weights of a quintic between two nodes: of the step, velocities, accelerations.
+
+    u is the share of the step h [s] that has passed. NumPy's arrays do as well, without compiling.
+    """
+    u2, u3 = u * u, u * u * u
+    u4, u5 = u3 * u, u3 * u2
+    rise = 10 * u3 - 15 * u4 + 6 * u5
+    v0, v1 = h * (u - 6 * u3 + 8 * u4 - 3 * u5), h * (-4 * u3 + 7 * u4 - 3 * u5)
+    a0 = 0.5 * h * h * (u2 - 3 * u3 + 3 * u4 - u5)
+    return rise, v0, v1, a0, 0.5 * h * h * (u3 - 2 * u4 + u5)
+
+
+@kernel
 def interpolate(t_s, path, x, jacobian):
     """Write an orbit's position at a time, and its derivatives by the unknowns.
 
@@ -172,12 +186,7 @@ def interpolate(t_s, path, x, jacobian):
     start_s, h, values, rates = path
     k = min(max(int(np.floor((t_s - start_s) / h)), 0), len(values) - 2)
     u = (t_s - start_s) / h - k
-    u2, u3 = u * u, u * u * u
-    u4, u5 = u3 * u, u3 * u2
-    rise = 10 * u3 - 15 * u4 + 6 * u5
-    v0, v1 = h * (u - 6 * u3 + 8 * u4 - 3 * u5), h * (-4 * u3 + 7 * u4 - 3 * u5)
-    a0 = 0.5 * h * h * (u2 - 3 * u3 + 3 * u4 - u5)
-    a1 = 0.5 * h * h * (u3 - 2 * u4 + u5)
+    rise, v0, v1, a0, a1 = _quintic(u, h)
     p, q, dp, dq = values[k], values[k + 1], rates[k], rates[k + 1]
     for a in range(3):
         b = 3 + a  # the velocity; its rate is the acceleration
@@ -194,17 +203,10 @@ def positions_at(path: Trajectory, time_s: Array) -> Array:
     h, last = path.step_s, len(path.values) - 2
     k = np.clip(np.floor((time_s - path.start_s) / h).astype(np.int64), 0, last)
     u = ((time_s - path.start_s) / h - k)[:, None]
-    rise = u**3 * (10 - 15 * u + 6 * u**2)
-    p, q = path.values[k], path.values[k + 1]
-    pull, next_pull = path.rates[k, 3:6], path.rates[k + 1, 3:6]
-    return np.asarray(
-        p[:, :3]
-        + (q[:, :3] - p[:, :3]) * rise
-        + h * u * (1 - 6 * u**2 + 8 * u**3 - 3 * u**4) * p[:, 3:6]
-        + h * u**3 * (-4 + 7 * u - 3 * u**2) * q[:, 3:6]
-        + 0.5 * h * h * u**2 * (1 - 3 * u + 3 * u**2 - u**3) * pull
-        + 0.5 * h * h * u**3 * (1 - 2 * u + u**2) * next_pull
-    )
+    rise, v0, v1, a0, a1 = _quintic.py_func(u, h)
+    p, q, dp, dq = path.values[k], path.values[k + 1], path.rates[k], path.rates[k + 1]
+    moved = (q[:, :3] - p[:, :3]) * rise + v0 * p[:, 3:6] + v1 * q[:, 3:6]
+    return np.asarray(p[:, :3] + moved + a0 * dp[:, 3:6] + a1 * dq[:, 3:6])
 
 
 def propagate_unknowns(
