@@ -9,7 +9,7 @@ import polars as pl
 
 from epipole.io.ccsds import Directions, Ephemeris, Subject
 from epipole.schemas.bridge import stack_covariance
-from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY, upper_triangle
+from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.rejects import NameStatus
 from epipole.tasks.algorithms.constants import SECOND_NS, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import radec_from_unit, unit_from_radec
@@ -107,16 +107,8 @@ def single_orbit(orbit: Mapping[str, Any]) -> Ephemeris:
     """Return a row of ORBITS by itself, at its epoch."""
     time_ns = np.array([orbit["epoch_ns"]])
     state = np.array([[orbit[name] for name in (*POSITION, *VELOCITY)]])
-    return Ephemeris(time_ns, state, time_ns, _covariance(orbit)[None])
-
-
-def _covariance(row: Mapping[str, Any]) -> np.ndarray:
-    cov = np.zeros((6, 6))
-    for (a, b), (i, j) in zip(
-        upper_triangle(STATE_AXES), zip(*np.triu_indices(6), strict=True), strict=True
-    ):
-        cov[i, j] = cov[j, i] = row[f"cov_{a}{b}"]
-    return cov
+    covariance = stack_covariance(pl.DataFrame([orbit]), "cov_{}", STATE_AXES)
+    return Ephemeris(time_ns, state, time_ns, covariance)
 
 
 def orbit_arc(orbit: Mapping[str, Any], around: Surroundings, origin_ns: int) -> Ephemeris:

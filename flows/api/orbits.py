@@ -7,7 +7,7 @@ import numpy.typing as npt
 import polars as pl
 
 from epipole.flows.api.arguments import Array, Time, floats, time_ns
-from epipole.schemas.columns import ELEMENTS, POSITION, VELOCITY
+from epipole.schemas.columns import ELEMENTS
 from epipole.schemas.settings import Settings
 from epipole.tasks.algorithms.constants import ARCSEC, SECOND_NS
 from epipole.tasks.algorithms.geometry.covariances import centroid_covariance
@@ -17,9 +17,13 @@ from epipole.tasks.algorithms.geometry.directions import (
     unit_from_radec,
 )
 from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets
-from epipole.tasks.algorithms.orbits.orbital_elements import elements_of
+from epipole.tasks.algorithms.orbits.orbital_elements import IN_DEGREES, elements_of
 from epipole.tasks.algorithms.tracking.attributables import attributables
-from epipole.tasks.common.tracklet_arrays import attributables_of
+from epipole.tasks.common.tracklet_arrays import (
+    HAS_ATTRIBUTABLE,
+    attributables_of,
+    known_numbers,
+)
 from epipole.tasks.publish.object_orbits import (
     OBSERVED,
     Start,
@@ -208,15 +212,13 @@ def link(tracklets: pl.DataFrame, settings: Settings | None = None) -> pl.Series
     linking = (settings or Settings()).linking
     rows = tracklets.with_row_index("row")
     try:
-        track = pl.format("{}/{}", "sensor_id", "track_id")
-        name = pl.coalesce("object_id", track) if "object_id" in rows.columns else track
-        usable = pl.all_horizontal(pl.col("epoch", "cov_rara", *POSITION, *VELOCITY).is_not_null())
-        rows = rows.filter(usable).sort("epoch", "row")
+        if "object_id" not in rows.columns:
+            rows = rows.with_columns(object_id=pl.lit(None, pl.String))
+        rows = rows.filter(HAS_ATTRIBUTABLE).sort("epoch", "row")
         if not len(rows):
             return pl.Series("label", [None] * len(tracklets), pl.Int64)
-        known = rows.select(name.rank("dense").cast(pl.Int64) - 1).to_series().to_numpy()
         found = link_tracklets(
-            attributables_of(rows), known,
+            attributables_of(rows), known_numbers(rows).to_numpy(),
             max_gap_s=linking.max_gap_s, log_odds=linking.log_odds,
         )  # fmt: skip
     except pl.exceptions.ColumnNotFoundError as error:
@@ -286,7 +288,7 @@ def fit_orbit(observations: pl.DataFrame, start: npt.ArrayLike | None = None) ->
     used[rows["row"].to_numpy()] = fitted.orbit.used
     turn = both(around.R_night_from_gcrf.T)
     state = turn @ fitted.orbit.unknowns[:6]
-    values = elements_of(state[None])[0] * [1.0, 1.0, *np.degrees(np.ones(4))]
+    values = elements_of(state) * IN_DEGREES
     return ObjectOrbit(
         epoch, state, turn @ fitted.orbit.cov[:6, :6] @ turn.T, float(fitted.orbit.chi2),
         fitted.dof, used, fitted.forces, dict(zip(ELEMENTS, values.tolist(), strict=True)), reason,

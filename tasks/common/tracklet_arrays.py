@@ -13,6 +13,19 @@ from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
 Array = npt.NDArray[np.float64]
 
 
+# Tracklets with an attributable, and a sensor whose position and velocity are known.
+HAS_ATTRIBUTABLE = pl.all_horizontal(
+    pl.col("epoch", *POSITION, *VELOCITY).is_not_null(), pl.col("cov_rara").is_finite()
+)
+
+
+def known_numbers(rows: pl.DataFrame) -> pl.Series:
+    """Return a number for each tracklet, from 0: one for those of an object, or of a track."""
+    # An object's id has no slash.
+    name = pl.coalesce("object_id", pl.format("{}/{}", "sensor_id", "track_id"))
+    return rows.select(known=name.rank("dense").cast(pl.Int64) - 1).to_series()
+
+
 def attributables_of(rows: pl.DataFrame) -> Tracklets:
     """Return the attributables of rows of TRACKLETS, which are in order of time."""
     ra_rate, dec_rate = (

@@ -21,7 +21,11 @@ from epipole.tasks.algorithms.constants import SECOND_NS
 from epipole.tasks.algorithms.orbit_linking.grouping import LinkedTracklets
 from epipole.tasks.algorithms.orbit_linking.grouping import link_tracklets as link_by_orbit
 from epipole.tasks.common.stage_tasks import stage_task
-from epipole.tasks.common.tracklet_arrays import attributables_of
+from epipole.tasks.common.tracklet_arrays import (
+    HAS_ATTRIBUTABLE,
+    attributables_of,
+    known_numbers,
+)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -71,17 +75,11 @@ def link_tracklets(tracklets: pa.Table, night: str, settings: LinkingSettings) -
 
 
 def _candidates(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return the tracklets that take part, in order of time, with a number `known`.
-
-    Tracklets of one object, or of one track, have one number.
-    """
+    """Return the tracklets that take part, in order of time, with their `known_numbers`."""
     free = pl.col("outcome").is_in([outcome.value for outcome in FREE])
-    seen = pl.col("epoch").is_not_null() & pl.col("x_km").is_not_null()
-    rows = rows.filter(seen & pl.col("cov_rara").is_finite() & pl.col("vx_km_s").is_not_null())
-    rows = rows.filter(pl.col("object_id").is_not_null() | free).sort("epoch", "tracklet_id")
-    # An object's id has no slash.
-    name = pl.coalesce("object_id", pl.format("{}/{}", "sensor_id", "track_id"))
-    return rows.with_columns(known=name.rank("dense").cast(pl.Int64) - 1)
+    rows = rows.filter(HAS_ATTRIBUTABLE, pl.col("object_id").is_not_null() | free)
+    rows = rows.sort("epoch", "tracklet_id")
+    return rows.with_columns(known=known_numbers(rows))
 
 
 def _name(rows: pl.DataFrame, night: str) -> OrbitLinks:

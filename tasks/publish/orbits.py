@@ -25,13 +25,11 @@ from epipole.schemas.columns import ELEMENTS, POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import ORBITS, REJECTS
-from epipole.tasks.algorithms.constants import (
-    DAY_S,
-    SECOND_NS,
-)
+from epipole.tasks.algorithms.constants import DAY_S, SECOND_NS
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.object_motion import velocities
 from epipole.tasks.algorithms.orbits.orbital_elements import (
+    IN_DEGREES,
     element_errors,
     elements_of,
     geostationary,
@@ -226,7 +224,6 @@ def orbit_table(
         "dof": [each.dof for each in fitted],
         "forces": [each.forces for each in fitted],
     }
-    degrees = np.array([1.0, 1.0, *np.degrees(np.ones(4))])
     return table(
         ORBITS,
         {
@@ -234,8 +231,8 @@ def orbit_table(
             **unstack("{}_km", state[:, :3]),
             **unstack("v{}_km_s", state[:, 3:]),
             **unstack_covariance("cov_{}", cov, STATE_AXES),
-            **unstack("{}", elements_of(state) * degrees, ELEMENTS),
-            **unstack("sigma_{}", element_errors(state, cov) * degrees, ELEMENTS),
+            **unstack("{}", elements_of(state) * IN_DEGREES, ELEMENTS),
+            **unstack("sigma_{}", element_errors(state, cov) * IN_DEGREES, ELEMENTS),
             **_longitudes(fitted, around),
         },
     )

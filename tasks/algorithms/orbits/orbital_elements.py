@@ -26,6 +26,9 @@ SIGMAS = 3.0  # by which a semi-major axis may be off
 SIDEREAL_DAY_S = TURN / EARTH_RATE_RAD_S
 
 
+IN_DEGREES = np.array([1.0, 1.0, *np.degrees(np.ones(4))])  # turns the angles of elements
+
+
 def elements_of(state: Array) -> Array:
     """Return the osculating elements of states.
 
