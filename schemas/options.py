@@ -64,7 +64,8 @@ _STARS = "epipole.tasks.algorithms.star_identification"
 _LINKING = "epipole.tasks.algorithms.tracking.linking"
 _ASSOCIATION = "epipole.tasks.solve.associate_objects"
 
-# (t_s, frames, priors, skies, magnitude_limit, how) -> IdentifiedSensor, as `identify_sensor`.
+# (t_s, centroids, priors, skies, magnitude_limit, matching) -> IdentifiedSensor:
+# see `identify_sensor`.
 STAR_IDENTIFICATION = {
     "likelihood": f"{_STARS}.sensor:identify_sensor",
     "four_base_stars": f"{_STARS}.published.four_base_stars:identify_by_four_base_stars",

@@ -171,12 +171,13 @@ class TrackletSettings(Group):
         "the default `min_detections`): detections that are in no tracklet are followed again with "
         "it. Every pair of detections counts as a test; 1 to 5 % of it are measured.",
     )
-    most_detections: int = Field(
+    max_detections: int = Field(
         500_000,
         ge=1_000,
         le=1_000_000_000,
-        description="Most detections of a sensor in half an hour that are followed; of more, the "
-        "fullest frames keep the brightest. It bounds the memory of a task: about 1 kB each.",
+        description="Maximum number of detections of a sensor in half an hour that are followed; "
+        "of more, the fullest frames keep the brightest. It bounds the memory of a task: about "
+        "1 kB each.",
     )
     link_method: LinkMethod = Field(
         "likelihood_ratio", description="How tracklets of one object are joined after a gap."
@@ -267,17 +268,17 @@ class AssociationSettings(Group):
     max_range_km: float = Field(
         1.0e5, gt=0, le=FARTHEST_KM, description="Range of the farthest object to search for."
     )
-    span_s: float = Field(
+    window_s: float = Field(
         30.0,
         ge=1,
         le=3600,
-        description="Length of the time spans over which evidence is first summed.",
+        description="Length of the windows of time over which evidence is first summed.",
     )
-    longest_span_s: float = Field(
+    max_window_s: float = Field(
         600.0,
         ge=0,
         le=DAY_S,
-        description="Undecided tracklets are judged again over spans of 2 and then 10 minutes, "
+        description="Undecided tracklets are judged again over windows of 2 and then 10 minutes, "
         "up to this length. 0: never.",
     )
     shells: tuple[AltitudeShell, ...] = Field(
@@ -289,13 +290,13 @@ class AssociationSettings(Group):
         0.5,
         ge=-MAX_LOG_ODDS,
         le=MAX_LOG_ODDS,
-        description="Least log-odds (ln) of a reported object against chance.",
+        description="Minimum log-odds (ln) of a reported object against chance.",
     )
     ambiguity_log_odds: float = Field(
         2.0,
         ge=0,
         le=MAX_LOG_ODDS,
-        description="Least difference in log-odds (ln) between two rival hypotheses. Below it, "
+        description="Minimum difference in log-odds (ln) between two rival hypotheses. Below it, "
         "neither is reported.",
     )
 
@@ -369,9 +370,9 @@ class KnownObjectSettings(Group):
     """Objects compared with a catalogue of known ones, and with earlier nights."""
 
     probability: float = Field(
-        0.99, gt=0.5, lt=1, description="Least probability of a name that is given to an object."
+        0.99, gt=0.5, lt=1, description="Minimum probability of a name that is given to an object."
     )
-    most_days: float = Field(
+    max_days: float = Field(
         30.0,
         gt=0,
         le=3660,

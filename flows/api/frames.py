@@ -158,7 +158,7 @@ def identify_frame(
     catalogue = read_star_catalogue(settings.identification.catalogue)
     made = identify_stars(
         exposures, states, cameras, catalogue, settings.sensors, settings.identification,
-        settings.tracklets.most_detections,
+        settings.tracklets.max_detections,
     )  # fmt: skip
     star_id = np.full(n, -1, np.int64)
     star_id[array(made.stars, "centroid")] = array(made.stars, "star_id")

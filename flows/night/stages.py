@@ -87,7 +87,7 @@ def identify_spans(stage: Stage, work: Work, settings: Settings) -> None:
     futures = [
         identify_span.submit(
             work.frames, sensor, span, work.cameras, settings.sensors, settings.identification,
-            settings.tracklets.most_detections, work.identified[sensor],
+            settings.tracklets.max_detections, work.identified[sensor],
         )
         for sensor, span in work.by_span()
     ]  # fmt: skip
@@ -349,12 +349,12 @@ def choose_elements(
     if known.faults:
         LOGGER.warning("%s: %s skipped, the first is %s", known.file,
                        many(len(known.faults), "invalid record"), known.faults[0])  # fmt: skip
-    elements, rejects = elements_of_night(known, night, settings.known_objects.most_days)
+    elements, rejects = elements_of_night(known, night, settings.known_objects.max_days)
     if not elements.sets:
         newest = np.datetime64(max(each.epoch_ns for each in known.sets), "ns")
         LOGGER.warning(
             "%s: no element set is within %g days of %s (the newest is of %s): no object is named",
-            known.file, settings.known_objects.most_days, night, newest.astype("datetime64[D]"),
+            known.file, settings.known_objects.max_days, night, newest.astype("datetime64[D]"),
         )  # fmt: skip
     return elements, rejects
 

@@ -160,7 +160,7 @@ def _fitted(
     for _ in range(ROUNDS):
         identified = identify_stars(
             exposures, frame_states, cameras, catalogue, settings.sensors,
-            settings.identification, settings.tracklets.most_detections,
+            settings.identification, settings.tracklets.max_detections,
         )  # fmt: skip
         fit: Calibrated = calibrate_sensors(
             identified.stars, cameras, nominal, settings.sensors.principal_point_sigma_px

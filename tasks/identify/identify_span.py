@@ -41,7 +41,7 @@ def identify_span(
     cameras: pa.Table,
     sensors: SensorSettings,
     identification: IdentificationSettings,
-    most_detections: int,
+    max_detections: int,
     parts: Parts,
 ) -> Counts:
     """Identify one sensor's frames of a span, unless the part exists.
@@ -59,7 +59,7 @@ def identify_span(
         frame_states = interpolate_sensor_states(exposures, states, sensors)
         catalogue = read_star_catalogue(identification.catalogue)
         identified = identify_stars(
-            exposures, frame_states, cameras, catalogue, sensors, identification, most_detections
+            exposures, frame_states, cameras, catalogue, sensors, identification, max_detections
         )
         rejects = concat(REJECTS, [identified.rejects, _without_state(frame_states)])
         write_part(parts.of(span), IDENTIFIED, {**identified._asdict(), "rejects": rejects})

@@ -66,7 +66,7 @@ def identify_stars(
     catalogue: pa.Table,
     sensors: SensorSettings,
     identification: IdentificationSettings,
-    most_detections: int,
+    max_detections: int,
 ) -> IdentifiedTables:
     """Return the stars, attitudes and other centroids of one sensor's frames, in any order."""
     if exposures.num_rows == 0:
@@ -81,8 +81,9 @@ def identify_stars(
     attitudes = _with_unknown_velocity(attitudes, frame_states)
     stars = stars_table(exposures, frame_states, centroids, attitudes, matches)
     stars = with_catalogue(stars, catalogue.schema)
-    most = most_detections
-    detections, left_out = detections_table(exposures, centroids, attitudes, matches, most)
+    detections, left_out = detections_table(
+        exposures, centroids, attitudes, matches, max_detections
+    )
     result = IdentifiedTables(
         solutions_table(exposures, frame_states, centroids, attitudes, matches, stars),
         stars,

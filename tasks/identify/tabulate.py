@@ -41,8 +41,10 @@ Flags = npt.NDArray[np.bool_]
 # The limit of detections.
 
 
-def within_limit(frame: npt.NDArray[np.int64], flux: npt.NDArray[np.float64], most: int) -> Flags:
-    """Return which detections are kept, so that there are at most `most`.
+def within_limit(
+    frame: npt.NDArray[np.int64], flux: npt.NDArray[np.float64], max_detections: int
+) -> Flags:
+    """Return which detections are kept, so that there are at most `max_detections`.
 
     The fullest frames are cut to one number, and keep their brightest. Frames with fewer keep all.
 
@@ -54,20 +56,20 @@ def within_limit(frame: npt.NDArray[np.int64], flux: npt.NDArray[np.float64], mo
         NaN where unknown: these are cut first, the later ones of a frame before the earlier.
     """
     counts = np.bincount(frame)
-    if len(frame) <= most:
+    if len(frame) <= max_detections:
         return np.ones(len(frame), bool)
     order = np.lexsort((-np.nan_to_num(flux, nan=-np.inf), frame))
     rank = np.empty(len(frame), np.int64)
     rank[order] = np.arange(len(frame)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return np.asarray(rank < _most_per_frame(counts, most))
+    return np.asarray(rank < _max_per_frame(counts, max_detections))
 
 
-def _most_per_frame(counts: npt.NDArray[np.int64], most: int) -> int:
-    """Return the largest number per frame with which all frames together have at most `most`."""
+def _max_per_frame(counts: npt.NDArray[np.int64], max_detections: int) -> int:
+    """Return the largest number per frame that keeps all frames together within the limit."""
     low, high = 0, int(counts.max())
     while low < high:
         middle = (low + high + 1) // 2
-        if np.minimum(counts, middle).sum() <= most:
+        if np.minimum(counts, middle).sum() <= max_detections:
             low = middle
         else:
             high = middle - 1
@@ -202,17 +204,17 @@ def solutions_table(
 
 
 def detections_table(
-    exposures: pa.Table, c: FlatCentroids, a: StarAttitudes, m: MatchedStars, most: int
+    exposures: pa.Table, c: FlatCentroids, a: StarAttitudes, m: MatchedStars, max_detections: int
 ) -> tuple[pa.Table, npt.NDArray[np.int64]]:
     """Return DETECTIONS, a row per centroid in the image that is not a star, and the number
-    of detections left out of each frame, (F,). There are at most `most` rows.
+    of detections left out of each frame, (F,). There are at most `max_detections` rows.
 
     A detection's direction is missing where the frame's attitude is unknown.
     """
     left = c.in_image.copy()
     left[m.at] = False
     at = np.flatnonzero(left)
-    kept = within_limit(c.frame[at], c.flux[at], most)
+    kept = within_limit(c.frame[at], c.flux[at], max_detections)
     left_out = np.bincount(c.frame[at[~kept]], minlength=exposures.num_rows)
     at = at[kept]
     frame = c.frame[at]

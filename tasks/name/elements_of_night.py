@@ -28,16 +28,16 @@ class ElementsOfNight(NamedTuple):
 
 
 def elements_of_night(
-    known: KnownObjects, night: str, most_days: float
+    known: KnownObjects, night: str, max_days: float
 ) -> tuple[ElementsOfNight, pa.Table]:
     """Return the elements that are used in a night, and `rejects` of those that are not.
 
     Of each object it is the set whose epoch is nearest to the middle of the night.
     """
     middle_ns = int(np.datetime64(night, "ns").astype(np.int64)) + DAY_NS // 2
-    most_ns = most_days * DAY_NS
+    max_ns = max_days * DAY_NS
     nearest = nearest_sets(known.sets, middle_ns)
-    recent = [each for each in nearest if abs(each.epoch_ns - middle_ns) <= most_ns]
+    recent = [each for each in nearest if abs(each.epoch_ns - middle_ns) <= max_ns]
     made = ElementsOfNight(known.sha256, recent)
     states = predict(satellites_of(made.elements), np.array([middle_ns]))
     sound = np.atleast_1d(np.isfinite(states[:, 0]).all(axis=1))

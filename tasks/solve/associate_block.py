@@ -112,7 +112,9 @@ def associate_blocks(
             ]
             block_views = None
             if any(sensor.tracklets.num_rows for sensor in taking_part):
-                block_views = BlockViews(taking_part, cameras, block, settings.span_s, half_width_s)
+                block_views = BlockViews(
+                    taking_part, cameras, block, settings.window_s, half_width_s
+                )
             tables = _associate(block_views, settings, max_views)
             faulty = [sensor for sensor in views if sensor.sensor_id in left_out]
             write_part(parts.of(block), ASSOCIATED, _with_faulty(tables, faulty, block, left_out))
@@ -120,7 +122,7 @@ def associate_blocks(
 
 def blocks_of(span: Span, settings: AssociationSettings) -> list[Span]:
     """Return the blocks of a span, or the span itself if windows are longer than a block."""
-    return [span] if settings.span_s * 1e9 > BLOCK_NS else span.blocks
+    return [span] if settings.window_s * 1e9 > BLOCK_NS else span.blocks
 
 
 def sensor_views(sensor: Sensor, viewed: Parts, span: Span) -> SensorViews:

@@ -152,9 +152,9 @@ def _associate_longer(
     block: BlockViews, window_groups: WindowGroups, agreeing: Flags, settings: AssociationSettings
 ) -> None:
     """Associate undecided tracklets again, over longer windows."""
-    window_before_s = settings.span_s
+    window_before_s = settings.window_s
     for window_s in LONGER_WINDOWS_S:
-        if not window_before_s < window_s <= settings.longest_span_s:
+        if not window_before_s < window_s <= settings.max_window_s:
             continue
         longer = block.items.first_ns // round(window_s * 1e9)
         for number in np.unique(longer[agreeing]).tolist():

@@ -150,7 +150,7 @@ def block_of(of: SceneTables, settings: Settings | None = None) -> BlockViews:
     settings = settings or Settings()
     block = blocks_of(SPAN, settings.association)[0]
     assert block.holds(array(of.views, "epoch")).all()
-    window_s, half_width_s = settings.association.span_s, settings.alignment.window_s
+    window_s, half_width_s = settings.association.window_s, settings.alignment.window_s
     return BlockViews(sensor_views(of, settings), of.cameras, block, window_s, half_width_s)
 
 

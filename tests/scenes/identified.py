@@ -17,7 +17,7 @@ def identified(
     """Return the stars of one sensor's frames."""
     return identify_stars(
         exposures, frame_states, cameras, catalogue, settings.sensors, settings.identification,
-        settings.tracklets.most_detections,
+        settings.tracklets.max_detections,
     )  # fmt: skip
 
 

@@ -307,7 +307,7 @@ def test_of_too_many_detections_some_are_left_out_and_counted(log, catalogue):
     rng = np.random.default_rng(4)
     x = [rng.uniform(0, 1023, 60) for _ in range(40)]
     exposures = log.make_exposures(x, x[::-1])
-    settings = Settings(tracklets={"most_detections": 1_000})
+    settings = Settings(tracklets={"max_detections": 1_000})
     found = identified(exposures, log.places, log.cameras, catalogue, settings)
     assert found.detections.num_rows == 1_000
     assert found.rejects["reason"].to_pylist() == ["too_many_detections"]

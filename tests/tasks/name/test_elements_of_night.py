@@ -13,8 +13,8 @@ NIGHT = "2026-05-30"
 
 def used(sets, faults=(), days=30.0):
     known = KnownObjects("a.tle", "digest", list(sets), list(faults))
-    settings = Settings(known_objects=KnownObjectSettings(most_days=days))
-    made, rejects = elements_of_night(known, NIGHT, settings.known_objects.most_days)
+    settings = Settings(known_objects=KnownObjectSettings(max_days=days))
+    made, rejects = elements_of_night(known, NIGHT, settings.known_objects.max_days)
     counts = dict(zip(rejects["reason"].to_pylist(), rejects["count"].to_pylist(), strict=True))
     assert set(rejects["source"].to_pylist()) <= {"a.tle"}
     return made, counts

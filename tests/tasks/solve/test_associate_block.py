@@ -140,7 +140,7 @@ def test_little_memory_gives_the_same_bits(tmp_path, monkeypatch):
 
 def test_evidence_longer_than_a_block_is_summed_over_the_span(tmp_path):
     scene = Scene(11, 4, times=np.array([5.0, 400.0, 1000.0, 1500.0])).objects(3, spread_km=300.0)
-    settings = Settings(association=AssociationSettings(span_s=1800.0))
+    settings = Settings(association=AssociationSettings(window_s=1800.0))
     parts = found_by(tmp_path, tables(scene), {}, settings)
     assert parts.holds(SPAN)
     members = to_polars(parts.read(SPAN, "members"))

@@ -40,7 +40,7 @@ def test_a_tracklet_between_the_even_instants_adds_its_ends():
     scene.seen[0] = (TIMES > 15) & (TIMES < 21)
     of = tables(scene)
     settings = Settings(
-        association=AssociationSettings(span_s=600.0), alignment=AlignmentSettings(window_s=30.0)
+        association=AssociationSettings(window_s=600.0), alignment=AlignmentSettings(window_s=30.0)
     )
     block = block_of(of, settings)
     (chosen,) = block.instants

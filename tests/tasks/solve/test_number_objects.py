@@ -71,7 +71,7 @@ def test_objects_without_a_common_track_are_two(tmp_path):
 
 
 def test_longer_evidence_than_a_block_makes_a_span_one_block(tmp_path):
-    settings = Settings(association=AssociationSettings(span_s=900.0))
+    settings = Settings(association=AssociationSettings(window_s=900.0))
     assert blocks_of(SPANS[0], settings.association) == [SPANS[0]]
     solved, pieces = numbered(
         tmp_path, {1: [member(0, "a", 1800, 3000), member(0, "b", 1800, 3000)]}, settings

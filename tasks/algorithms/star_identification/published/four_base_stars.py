@@ -65,7 +65,7 @@ def match_four_base_stars(
 
 def identify_by_four_base_stars(
     t_s: Array,
-    frames: RawCentroids,
+    centroids: RawCentroids,
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,
@@ -75,7 +75,7 @@ def identify_by_four_base_stars(
 
     Parameters and result as `sensor.identify_sensor`; times and priors are not used.
     """
-    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, matching)
+    return identify_each_frame(make_matcher, centroids, skies, magnitude_limit, matching)
 
 
 def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:

@@ -60,7 +60,7 @@ def states(u: Array, sigma_rad: Array, star_u: Array, pairs: PairTable) -> npt.N
 
 def identify_by_match_group(
     t_s: Array,
-    frames: RawCentroids,
+    centroids: RawCentroids,
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,
@@ -70,7 +70,7 @@ def identify_by_match_group(
 
     Parameters and result as `sensor.identify_sensor`; times and priors are not used.
     """
-    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, matching)
+    return identify_each_frame(make_matcher, centroids, skies, magnitude_limit, matching)
 
 
 def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:

@@ -80,7 +80,7 @@ def match_radial_cyclic(
 
 def identify_by_radial_cyclic(
     t_s: Array,
-    frames: RawCentroids,
+    centroids: RawCentroids,
     priors: Priors,
     skies: Skies,
     magnitude_limit: float | None,
@@ -90,7 +90,7 @@ def identify_by_radial_cyclic(
 
     Parameters and result as `sensor.identify_sensor`; times and priors are not used.
     """
-    return identify_each_frame(make_matcher, frames, skies, magnitude_limit, matching)
+    return identify_each_frame(make_matcher, centroids, skies, magnitude_limit, matching)
 
 
 def make_matcher(sky: Sky, optics: FieldOfView) -> Matcher:

@@ -38,7 +38,7 @@ def group_of(n: int, *score: float) -> Groups:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_two_sensors_find_over_ten_minutes_what_they_cannot_in_half_a_minute(seed):
     scene = ten_minutes(seed)
-    short, long = associated(scene, longest_span_s=0.0), associated(scene)
+    short, long = associated(scene, max_window_s=0.0), associated(scene)
     assert wrong_views(scene, long) == 0
     everything = 10 * 2 * len(scene.times)
     assert long.views.num_rows > short.views.num_rows
@@ -47,8 +47,8 @@ def test_two_sensors_find_over_ten_minutes_what_they_cannot_in_half_a_minute(see
 
 def test_a_span_of_ten_minutes_by_settings_is_judged_once():
     scene = ten_minutes(3)
-    once = associated(scene, span_s=600.0)
-    again = associated(scene, span_s=600.0, longest_span_s=0.0)
+    once = associated(scene, window_s=600.0)
+    again = associated(scene, window_s=600.0, max_window_s=0.0)
     assert once.views.equals(again.views)
 
 
