@@ -359,7 +359,7 @@ def score(scene, members):
             np.zeros((k, 3)), np.zeros((k, 3, 3)), np.zeros((k, 3, 3)), np.zeros(k, np.int64)
         )
         enter(scene.work._replace(points=arrays), samples, members, points)
-        total = arc_odds(space.views, space.chance, np.array(members), arrays)
+        total = arc_odds(space.views, space.chance, np.array(members), arrays)[0]
     total += np.log(space.chance.objects_km3) + altitude_weight(space.shells, x)
     has = {int(samples.sensor[i]) for i in members}
     missed = [s for s in expected_sensors(samples, members, points) if s not in has]

@@ -140,8 +140,10 @@ def _ends(views, i, first):
 
 
 @kernel
-def _scatter(views, chance, i, first_seen, last_seen, b):
-    """Write the drift of tracklet i relative to its sensor's others; return its variance.
+def _scatter(views, chance, i, last, first_seen, last_seen, b):
+    """Write the drift from tracklet i to `last`, relative to their sensor's others.
+
+    Both are the same tracklet, or fragments of one track. The variance is returned.
 
     The variance is at least half the square of the drift: a far outlier is rare by a power law,
     not by a Gaussian's tail.
@@ -149,7 +151,7 @@ def _scatter(views, chance, i, first_seen, last_seen, b):
     s, dt = views.sensor[i], views.time_s[last_seen] - views.time_s[first_seen]
     square, u = 0.0, np.empty(3)
     direction(views, i, first_seen, u)
-    direction(views, i, last_seen, b)
+    direction(views, last, last_seen, b)
     for a in range(3):
         b[a] = (b[a] - u[a]) / dt - chance.drift[s, a]
         square += b[a] * b[a]
@@ -171,7 +173,7 @@ def _velocity_prior(views, chance, members, first, state, prior, prior_mean):
         first_seen, last_seen = _ends(views, i, first)
         if first_seen == last_seen:
             continue
-        variance = _scatter(views, chance, i, first_seen, last_seen, b)
+        variance = _scatter(views, chance, i, i, first_seen, last_seen, b)
         scatter = _range(views, i, first_seen, state) * np.sqrt(variance)
         if scatter > across:
             across, chosen = scatter, i
@@ -200,19 +202,54 @@ def _range(views, i, m, x):
 
 
 @kernel
-def _unrelated_odds(views, chance, i, first, at):
-    """Return the log-likelihood of a tracklet's directions as those of an unrelated object.
+def _unrelated_odds_of_sensor(views, chance, members, q, first, at):
+    """Return the log-likelihood of a sensor's tracklets without the orbit: see `_unrelated_odds`.
+
+    All of one sensor count with its first member, q; others give 0. They may be fragments of one
+    unrelated object, or objects by themselves: the likelier of the two counts. Otherwise a track
+    that breaks would be evidence again and again. Also returns by how much it is likelier than
+    objects by themselves.
+    """
+    s, n = views.sensor[members[q]], 0
+    for k in range(len(members)):
+        if views.sensor[members[k]] == s:
+            if k < q:
+                return 0.0, 0.0
+            n += 1
+    if n == 1:
+        return _unrelated_odds(views, chance, members[q : q + 1], first, at), 0.0
+    fragments, n = np.empty(n, np.int64), 0
+    for i in members:
+        if views.sensor[i] == s:
+            fragments[n] = i
+            n += 1
+    together = _unrelated_odds(views, chance, fragments, first, at)
+    apart = 0.0
+    for k in range(n):
+        apart += _unrelated_odds(views, chance, fragments[k : k + 1], first, at)
+    return max(together, apart), max(together - apart, 0.0)
+
+
+@kernel
+def _unrelated_odds(views, chance, fragments, first, at):
+    """Return the log-likelihood of a sensor's tracklets as those of one unrelated object.
 
     It lies anywhere in the field and drifts like the sensor's other tracklets. Its position and
     drift are relative to the orbit with the states `at`, so the curvature of the path is common
     to both hypotheses.
     """
-    s = views.sensor[i]
+    s, i, last = views.sensor[fragments[0]], fragments[0], fragments[0]
     J, h, part = np.zeros((4, 4)), np.zeros(4), np.empty(11)
     first_seen, last_seen = _ends(views, i, first)
+    for k in fragments:
+        begin, end = _ends(views, k, first)
+        if begin < first_seen:
+            first_seen, i = begin, k
+        if end > last_seen:
+            last_seen, last = end, k
     variance, chi2, b = 1.0, 0.0, np.zeros(3)
     if first_seen < last_seen:
-        variance = _scatter(views, chance, i, first_seen, last_seen, b)
+        variance = _scatter(views, chance, i, last, first_seen, last_seen, b)
     for c in range(2):
         # The residual drifts like the tracklet relative to the usual drift.
         mean = 0.0
@@ -221,22 +258,23 @@ def _unrelated_odds(views, chance, i, first, at):
         J[2 + c, 2 + c] = 1.0 / variance
         h[2 + c] = mean / variance
         chi2 += mean * mean / variance
-    for m in range(first_seen, last_seen + 1):
-        if not views.seen[i, m]:
-            continue
-        residual(views, i, m, at[m], part)
-        t = views.time_s[m] - views.time_s[first_seen]
-        g0 = part[8] * part[0] + part[9] * part[1]
-        g1 = part[9] * part[0] + part[10] * part[1]
-        chi2 += part[0] * g0 + part[1] * g1
-        for p, tp in ((0, 1.0), (2, t)):
-            h[p] += tp * g0
-            h[p + 1] += tp * g1
-            for o, to in ((0, 1.0), (2, t)):
-                J[p, o] += tp * to * part[8]
-                J[p, o + 1] += tp * to * part[9]
-                J[p + 1, o] += tp * to * part[9]
-                J[p + 1, o + 1] += tp * to * part[10]
+    for k in fragments:
+        for m in range(first_seen, last_seen + 1):
+            if not views.seen[k, m]:
+                continue
+            residual(views, k, m, at[m], part)
+            t = views.time_s[m] - views.time_s[first_seen]
+            g0 = part[8] * part[0] + part[9] * part[1]
+            g1 = part[9] * part[0] + part[10] * part[1]
+            chi2 += part[0] * g0 + part[1] * g1
+            for p, tp in ((0, 1.0), (2, t)):
+                h[p] += tp * g0
+                h[p + 1] += tp * g1
+                for o, to in ((0, 1.0), (2, t)):
+                    J[p, o] += tp * to * part[8]
+                    J[p, o + 1] += tp * to * part[9]
+                    J[p + 1, o] += tp * to * part[9]
+                    J[p + 1, o + 1] += tp * to * part[10]
     solved = h.copy()
     log_det = factor(J, solved)
     for p in range(4):
@@ -269,7 +307,8 @@ def arc_odds(views, chance, members, points):
     """Return the log-odds of one orbit against unrelated tracklets, by the directions alone.
 
     Without the prior of the position and without misses (see `odds.score`). -inf where no orbit
-    fits, or only a hyperbolic one.
+    fits, or only a hyperbolic one. Also returns the log-odds that tracklets of one sensor are
+    fragments of one object, which do not count for the orbit.
     """
     state, k = np.empty(6), np.empty((5, 6))
     at = np.empty((len(views.time_s), 6))
@@ -287,7 +326,7 @@ def arc_odds(views, chance, members, points):
                     prior[a, b] * (state[3 + a] - prior_mean[a]) * (state[3 + b] - prior_mean[b])
                 )
         if np.isnan(chi2):
-            return -np.inf
+            return -np.inf, 0.0
         gain = 0.0
         step = rhs.copy()
         log_det = factor(N, step)
@@ -295,12 +334,15 @@ def arc_odds(views, chance, members, points):
             gain += step[a] * rhs[a]
             state[a] += step[a]
         if not gain < 1e12:
-            return -np.inf
+            return -np.inf, 0.0
         if gain < CONVERGED:
             break
     if _is_hyperbolic(state, N):
-        return -np.inf
+        return -np.inf, 0.0
     total = log_prior + 3.0 * LN_2PI - 0.5 * log_det - 0.5 * (chi2 - gain)
-    for i in members:
-        total -= _unrelated_odds(views, chance, i, first, at)
-    return total
+    fragments = 0.0
+    for q in range(len(members)):
+        unrelated, together = _unrelated_odds_of_sensor(views, chance, members, q, first, at)
+        total -= unrelated
+        fragments += together
+    return total, fragments

@@ -79,7 +79,8 @@ def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
     count = np.bincount(samples.sensor, minlength=n_sensors).astype(float)
     instants = np.maximum(samples.seen.any(axis=0).sum(), 1)
     # A tracklet counts by its share of the instants: it is in the field at these only.
-    share = np.bincount(samples.sensor, samples.seen.sum(axis=1), minlength=n_sensors) / instants
+    shown = samples.seen.sum(axis=1) / instants
+    share = np.bincount(samples.sensor, shown, minlength=n_sensors)
     density = np.maximum(share, 1.0) / samples.field_sr
     rate = _rates(samples)
     drift, spread = np.zeros((n_sensors, 3)), np.empty(n_sensors)
@@ -87,24 +88,26 @@ def chance_of(samples: Samples, farthest_km: float, detected: float) -> Chance:
     moving = moving[np.argsort(samples.sensor[moving], kind="stable")]
     first = np.searchsorted(samples.sensor[moving], np.arange(n_sensors + 1))
     for s in range(n_sensors):
-        rates = rate[moving[first[s] : first[s + 1]]]
+        mine = moving[first[s] : first[s + 1]]
+        rates, weight = rate[mine], shown[mine]
         if len(rates):
             # The median of a single rate is that rate, not the usual one.
-            drift[s] = np.median(rates, axis=0) * (1 - 1 / len(rates))
-        spread[s] = _spread(rates - drift[s])
+            drift[s] = np.median(rates, axis=0) * (1 - 1 / max(weight.sum(), 1.0))
+        spread[s] = _spread(rates - drift[s], weight)
     volume = float(np.median(samples.field_sr)) * farthest_km**3 / 3
     objects = max(float(np.median(count)), 1.0)
     return Chance(density, drift, spread, objects, objects / volume, np.full(n_sensors, detected))
 
 
-def _spread(deviation: Array) -> float:
+def _spread(deviation: Array, weight: Array) -> float:
     """Return the spread of a sensor's rates [rad/s, 1-sigma per axis], from their deviations.
 
+    Each counts by its share of the instants: the fragments of a track are one tracklet together.
     The median uses up one rate: one tracklet gives no spread. The logarithm is the mean of that of
     the sensor's tracklets and that of `USUAL_SPREAD`, which counts as one tracklet.
     """
-    others = max(len(deviation) - 1, 0)
-    square = (np.sum(deviation**2) / 2 + MIN_SPREAD**2) / (others + 2)
+    others = max(float(weight.sum()) - 1, 0.0)
+    square = (np.sum(weight[:, None] * deviation**2) / 2 + MIN_SPREAD**2) / (others + 2)
     log_spread = (others * np.log(square) / 2 + np.log(USUAL_SPREAD)) / (others + 1)
     return float(np.exp(log_spread))
 

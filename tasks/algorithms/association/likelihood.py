@@ -274,7 +274,6 @@ class _Search:
             if (
                 merged := best_merger(self.space, self.work, best, queue.sharing(best))
             ) is not None:
-                queue.push(best)
                 queue.push(merged)
                 continue
             rivals = queue.rivals(best, self.margin, self.group != FREE)

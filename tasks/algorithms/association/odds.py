@@ -176,7 +176,7 @@ def _det3(M):
 
 @borrowing_kernel
 def score(space, work, members, near):
-    """Return the log-odds of "one object" against "unrelated tracklets", and the number of misses.
+    """Return the log-odds of "one object" against "unrelated tracklets".
 
     An unrelated tracklet may lie anywhere in its field (`chance.density`), an object anywhere in
     view (`chance.objects_km3`, weighted by altitude with `shells`). Several instants are tied
@@ -189,9 +189,17 @@ def score(space, work, members, near):
         `SearchSpace`, and the `WorkSpace` with the solved points.
     near : (n,) int
         Sensors whose field may hold the points, see `near_fields`.
+
+    Returns
+    -------
+    float, float
+        The log-odds, and those that tracklets of one sensor are fragments of one object, whichever
+        it is, see `arcs`.
+    int
+        The number of misses.
     """
     views, chance, points = space.views, space.chance, work.points
-    m, instants = -1, 0
+    m, instants, fragments = -1, 0, 0.0
     for k in range(len(views.time_s)):
         if points.seen_by[k] >= 2:
             m = k if m < 0 else m
@@ -204,10 +212,10 @@ def score(space, work, members, near):
                 total -= np.log(chance.density[views.sensor[i]] * error_sr(views, i, m, work.part))
                 total -= 0.5 * residual_chi2(work.part)
     else:
-        total = arc_odds(views, chance, members, points)
+        total, fragments = arc_odds(views, chance, members, points)
     total += np.log(chance.objects_km3) + _altitude_weight(points.x_km[m], space.shells)
     detections, n_missed = _detections(space, work, members, near)
-    return total + detections, n_missed
+    return total + detections, fragments, n_missed
 
 
 @borrowing_kernel

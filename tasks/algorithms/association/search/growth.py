@@ -107,7 +107,7 @@ def grow_all(space, work, seeds, clear, min_score):
         n, n_near = _grow(space, work, members, work.nearby[:n_nearby])
         if n < 2 or not possible(space, members[:n], work.points):
             continue
-        value, n_missed = score(space, work, members[:n], work.near[:n_near])
+        value, _, n_missed = score(space, work, members[:n], work.near[:n_near])
         if not value > min_score:
             continue
         if h == len(seed):

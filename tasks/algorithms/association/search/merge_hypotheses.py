@@ -20,7 +20,7 @@ from epipole.tasks.algorithms.kernels import kernel
 
 @kernel
 def _weigh(space, work, members, x_km):
-    """Return the log-odds of a set of tracklets as one object, and the number of misses.
+    """Return the log-odds of a set of tracklets as one object, as `odds.score`.
 
     -inf if they do not fit. Writes `work.missed`, and the point `x_km` (3,) at the first solved
     instant.
@@ -29,7 +29,7 @@ def _weigh(space, work, members, x_km):
     points.seen_by[:] = 0
     chi2, dof = solve(views, members, points, work.part)
     if not chi2 <= quantile(max(dof, 1), space.gate_sigma) or not possible(space, members, points):
-        return -np.inf, 0
+        return -np.inf, 0.0, 0
     a = b = views.sensor[members[0]]
     for i in members:
         b = views.sensor[i] if views.sensor[i] != a else b
@@ -45,12 +45,16 @@ def best_merger(
 
     Another hypothesis is tried only if its other tracklets are not seen at the solved instants of
     `h`: those that are seen there did not fit when `h` grew.
+
+    A fragment of a track adds little to the odds of an object that has the rest of the track. So
+    that they are of one track counts here. The merger's score may be below that of `h`.
     """
     seen = space.views.seen
     solved = seen[list(h.members)].sum(axis=0) >= 2
     if solved.all():
         return None
-    best = None
+    best, likeliest, x_km = None, -np.inf, np.empty(3)
+    of_h: float | None = None
     tried = {h.members}
     for other in others:
         more = [i for i in other.members if i not in h.members]
@@ -58,8 +62,19 @@ def best_merger(
         if not more or members in tried or space.taken[more].any() or seen[more][:, solved].any():
             continue
         tried.add(members)
-        x_km = np.empty(3)
-        value, n_missed = _weigh(space, work, np.array(members, np.int64), x_km)
-        if value > max(h.score, other.score, best.score if best else -np.inf):
-            best = Hypothesis(value, h.seed, members, x_km, work.missed[:n_missed].copy())
+        value, fragments, n_missed = _weigh(space, work, np.array(members, np.int64), x_km)
+        if not value + fragments > likeliest:
+            continue
+        merger = Hypothesis(value, h.seed, members, x_km.copy(), work.missed[:n_missed].copy())
+        of_h = _with_fragments(space, work, h) if of_h is None else of_h
+        if value + fragments > max(of_h, _with_fragments(space, work, other)):
+            best, likeliest = merger, value + fragments
     return best
+
+
+def _with_fragments(space: SearchSpace, work: WorkSpace, h: Hypothesis) -> float:
+    """Return the log-odds of a hypothesis and of its fragments as one track."""
+    sensors = set(space.views.sensor[list(h.members)].tolist())
+    if len(sensors) == len(h.members):
+        return h.score
+    return h.score + float(_weigh(space, work, np.array(h.members, np.int64), np.empty(3))[1])

@@ -72,3 +72,22 @@ def test_a_low_orbit_is_found_over_its_curve():
     turned = np.stack([np.roll(look, 1, axis=2), np.roll(look, 2, axis=2), look], axis=2)
     groups = solve(samples._replace(R_sensor_from_icrs=turned))
     assert (groups.group == 0).all()
+
+
+@pytest.mark.parametrize("pieces", [2, 3])
+def test_a_broken_track_is_no_more_evidence_than_a_whole_one(pieces):
+    times = np.linspace(0.0, 25.0, 6)
+    scene = falling(Scene(70, 2, times=times), 0, GEO, V_GEO)
+    whole = solve(scene.samples(), min_log_odds=-3.0)
+    piece = np.arange(6) * pieces // 6
+    u = scene.u.pop()
+    scene.sensor.pop(), scene.who.pop(), scene.seen.pop()
+    for k in range(pieces):
+        scene.u.append(u)
+        scene.sensor.append(1)
+        scene.who.append(0)
+        scene.seen.append(piece == k)
+    broken = solve(scene.samples(), min_log_odds=-3.0)
+    assert (whole.group == 0).all()
+    assert (broken.group == 0).all()
+    assert broken.score[0] == pytest.approx(whole.score[0], abs=1.0)

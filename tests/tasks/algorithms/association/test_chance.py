@@ -104,19 +104,22 @@ def test_densities_drifts_and_spreads_are_those_of_counting_tracklet_by_tracklet
     n_instants = sum(samples.seen[:, m].any() for m in range(samples.seen.shape[1]))
     for s in range(n_sensors):
         mine = [i for i in range(len(scene.who)) if samples.sensor[i] == s]
-        rates = []
+        rates, shown = [], []
         for i in mine:
             there = np.flatnonzero(samples.seen[i])
             if len(there) > 1:
                 dt = samples.time_s[there[-1]] - samples.time_s[there[0]]
                 rates.append((samples.u[i, there[-1]] - samples.u[i, there[0]]) / dt)
+                shown.append(len(there) / n_instants)
         solid.append(solid_angle(field[s]))
         at_once = sum(samples.seen[i].sum() for i in mine) / n_instants
         assert chance.density[s] == pytest.approx(max(at_once, 1.0) / solid[s], rel=1e-6)
-        n_others = max(len(rates) - 1, 0)
-        drift = np.median(rates, axis=0) * n_others / len(rates) if rates else np.zeros(3)
+        n_others = max(sum(shown) - 1, 0)
+        drift = np.median(rates, axis=0) * n_others / sum(shown) if n_others else np.zeros(3)
         np.testing.assert_allclose(chance.drift[s], drift, rtol=1e-9, atol=1e-15)
-        squares = sum(np.sum((rate - drift) ** 2) / 2 for rate in rates)
+        squares = sum(
+            n * np.sum((rate - drift) ** 2) / 2 for n, rate in zip(shown, rates, strict=True)
+        )
         spread = np.sqrt((squares + (10 * ARCSEC) ** 2) / (n_others + 2))
         shrunk = (spread**n_others * USUAL_SPREAD) ** (1 / (n_others + 1))
         assert chance.spread[s] == pytest.approx(shrunk)

@@ -190,7 +190,7 @@ def score_of(scene, members):
     """Return what the kernel says of members whose points are known, and the sensors missed."""
     enter(scene.work, scene.samples, members, points_of(scene.samples, members)[0])
     near = np.arange(len(scene.samples.half_field))
-    total, n_missed = odds.score(scene.space, scene.work, np.array(members), near)
+    total, _, n_missed = odds.score(scene.space, scene.work, np.array(members), near)
     return total, scene.work.missed[:n_missed].tolist()
 
 
