@@ -70,7 +70,7 @@ def make_scene(number: int, low: Orbits, geo: Orbits, options: argparse.Namespac
     for _ in range(ATTEMPTS):
         kind = options.kind or ("geo" if rng.random() < 0.5 else "low")
         try:
-            values = _geo_scene(rng, low, geo) if kind == "geo" else _low_scene(rng, low, geo)
+            values = geo_scene(rng, low, geo) if kind == "geo" else low_scene(rng, low, geo)
             values |= {
                 "name": f"{kind}{number}",
                 "seed": int(rng.integers(1 << 31)),
@@ -120,7 +120,7 @@ def _start(rng: Rng, orbits: Orbits) -> datetime:
     return middle + timedelta(seconds=int(rng.integers(-43200, 43200)))
 
 
-def _geo_scene(rng: Rng, low: Orbits, geo: Orbits) -> dict[str, Any]:
+def geo_scene(rng: Rng, low: Orbits, geo: Orbits) -> dict[str, Any]:
     """Return low sensors that follow a geostationary object."""
     scene, sensor = _common(rng, "geo")
     start = _start(rng, geo)
@@ -139,7 +139,7 @@ def _geo_scene(rng: Rng, low: Orbits, geo: Orbits) -> dict[str, Any]:
     }
 
 
-def _low_scene(rng: Rng, low: Orbits, geo: Orbits) -> dict[str, Any]:
+def low_scene(rng: Rng, low: Orbits, geo: Orbits) -> dict[str, Any]:
     """Return low sensors, and at times a geostationary one, that follow a place among low ones."""
     scene, sensor = _common(rng, "low")
     start = _start(rng, low)
