@@ -5,7 +5,7 @@ samples, focal lengths and settings, and return groups.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -56,7 +56,7 @@ def associate_objects(
 
     Object numbers count from 0 in the order of first appearance. An object keeps its number from
     window to window as long as one of its tracks continues. A sensor that disagrees with all
-    others is left out.
+    others is left out of a window; if it disagrees in most windows, of the whole block.
 
     Parameters
     ----------
@@ -65,18 +65,14 @@ def associate_objects(
     """
     items = block.items
     window_groups = WindowGroups(items)
-    agreeing = np.ones(len(items.window), bool)
     windows = _windows(items.window)
-    rejects = []
-    for sampled, window in _sampled_windows(block, max_views):
-        rows = windows[window]
-        disagreeing = _associate_window(block, sampled, window, rows, window_groups, settings)
-        if len(disagreeing):
-            left_out = rows[np.isin(items.sensor[rows], disagreeing)]
-            agreeing[left_out] = False
-            rejects.append(_reject_table(block, Reason.SENSOR_DISAGREES, left_out))
+    left_out = _associate_windows(block, windows, window_groups, settings, max_views)
+    agreeing = np.ones(len(items.window), bool)
+    agreeing[np.concatenate([np.zeros(0, np.int64), *left_out])] = False
+    rejects = [_reject_table(block, Reason.SENSOR_DISAGREES, rows) for rows in left_out]
     if settings.method == "likelihood":
         _associate_longer(block, window_groups, agreeing, settings)
+        window_groups.continue_groups(agreeing)
     numbered = _number_objects(block, window_groups.group, windows)
     number = main_objects(block.track[items.tracklet], numbered, items.n_views)
     ambiguous = window_groups.ambiguous | (number != numbered)
@@ -100,44 +96,59 @@ def _windows(window: Indices) -> list[Indices]:
     return np.split(np.arange(len(window)), cuts) if len(window) else []
 
 
-def _sampled_windows(block: BlockViews, max_views: int) -> Iterator[tuple[SampledViews, int]]:
-    """Yield each window, with the views of as many windows as fit in memory."""
+def _sampled_windows(
+    block: BlockViews, wanted: Sequence[int], max_views: int
+) -> Iterator[tuple[SampledViews, int]]:
+    """Yield each wanted window, with the views of as many windows as fit in memory."""
     n_instants = np.array([len(instants) for instants in block.instants])
     n_items = np.bincount(block.items.window, minlength=len(n_instants))
-    first, n_windows = 0, len(n_instants)
-    while first < n_windows:
-        n_views = np.cumsum((n_instants * n_items)[first:])
-        last = first + max(int(np.searchsorted(n_views, max_views, side="right")), 1)
-        sampled = SampledViews(block, np.concatenate(block.instants[first:last]))
-        for window in range(first, min(last, n_windows)):
-            yield sampled, window
+    n_views = (n_instants * n_items)[list(wanted)]
+    first = 0
+    while first < len(wanted):
+        together = np.cumsum(n_views[first:])
+        last = first + max(int(np.searchsorted(together, max_views, side="right")), 1)
+        chosen = wanted[first:last]
+        sampled = SampledViews(block, np.concatenate([block.instants[w] for w in chosen]))
+        yield from ((sampled, window) for window in chosen)
         first = last
 
 
-def _associate_window(
+def _associate_windows(
     block: BlockViews,
-    sampled: SampledViews,
-    window: int,
-    rows: Indices,
+    windows: list[Indices],
     window_groups: WindowGroups,
     settings: AssociationSettings,
-) -> Indices:
-    """Enter the groups of a window; return the sensors that disagree with all others.
+    max_views: int,
+) -> list[Indices]:
+    """Enter the groups of all windows; return the items of each window that are left out.
 
-    If there are any, the other sensors are associated again without them.
+    In a short window, wide errors may hide that a sensor disagrees. So a sensor that disagrees in
+    most of the windows in which it is judged is left out of the others too.
     """
-    instants = block.instants[window]
-    samples, tracklet = sampled.samples(instants, np.zeros(0, np.int64))
-    groups = _find_groups(block, samples, settings)
-    disagreeing = agreement(samples, groups).disagreeing()
-    if len(disagreeing):
-        rows = rows[~np.isin(block.items.sensor[rows], disagreeing)]
-        if not len(rows):
-            return disagreeing
-        samples, tracklet = sampled.samples(instants, disagreeing)
+    sensor, n_sensors = block.items.sensor, len(block.sensor_id)
+    disagrees = np.zeros((len(windows), n_sensors), bool)
+    judged = np.zeros_like(disagrees)
+    for sampled, window in _sampled_windows(block, range(len(windows)), max_views):
+        instants, rows = block.instants[window], windows[window]
+        samples, tracklet = sampled.samples(instants, np.zeros(0, np.int64))
         groups = _find_groups(block, samples, settings)
-    window_groups.enter(rows, tracklet, groups)
-    return disagreeing
+        agreed = agreement(samples, groups)
+        judged[window] = agreed.judged
+        disagrees[window, agreed.disagreeing()] = True
+        if not disagrees[window].any():
+            window_groups.enter(rows, tracklet, groups)
+    mostly = 2 * disagrees.sum(axis=0) > judged.sum(axis=0)
+    left_out = [rows[(disagrees[w] | mostly)[sensor[rows]]] for w, rows in enumerate(windows)]
+    again = [w for w, rows in enumerate(left_out) if len(rows)]
+    for sampled, window in _sampled_windows(block, again, max_views):
+        rows = windows[window]
+        window_groups.clear(rows)
+        rows = np.setdiff1d(rows, left_out[window])
+        if len(rows):
+            without = np.flatnonzero(disagrees[window] | mostly)
+            samples, tracklet = sampled.samples(block.instants[window], without)
+            window_groups.enter(rows, tracklet, _find_groups(block, samples, settings))
+    return [rows for rows in left_out if len(rows)]
 
 
 def _warn_about(sensors: npt.NDArray[np.str_]) -> None:

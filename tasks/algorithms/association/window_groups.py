@@ -64,6 +64,37 @@ class WindowGroups:
         self.undecided[rows] = groups.undecided[at]
         self._score = np.concatenate([self._score, groups.score])
 
+    def clear(self, rows: Indices) -> None:
+        """Forget the groups of some items."""
+        self.group[rows] = FREE
+        self.ambiguous[rows] = self.undecided[rows] = False
+
+    def continue_groups(self, allowed: Flags) -> None:
+        """Let tracklets stay together for the rest of their time.
+
+        Tracklets of a certain group may go on into a neighbouring window for a few seconds only, in
+        which they are undecided: too short a time to show again what is known already. A group in
+        that window of any of its tracklets is not changed. Only the `allowed` items, (n,) bool.
+        """
+        items = self.items
+        step = items.tracklet.max(initial=0) + 1
+        key = items.window * step + items.tracklet
+        surely = np.append(self._score >= CERTAIN_LOG_ODDS, False)
+        sources = np.flatnonzero(surely[self.group])
+        for to_next in (step, -step):
+            row = np.minimum(np.searchsorted(key, key[sources] + to_next), len(key) - 1)
+            there = key[row] == key[sources] + to_next
+            source, row = self.group[sources[there]], row[there]
+            free = self.undecided[row] & (self.group[row] == FREE) & allowed[row]
+            others, count = np.unique(source, return_counts=True)
+            n_free = np.bincount(source[free], minlength=others.max(initial=-1) + 1)[others]
+            for g in others[(n_free == count) & (count > 1)].tolist():
+                members = row[source == g]
+                if len(np.unique(items.sensor[members])) == len(members):
+                    self.group[members] = len(self._score)
+                    self.undecided[members] = False
+                    self._score = np.append(self._score, self._score[g])
+
     def to_decide_again(self, rows: Indices, window_s: float) -> Indices:
         """Return the items of a longer window to decide again; empty if that is useless.
 

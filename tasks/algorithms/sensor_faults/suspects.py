@@ -215,10 +215,15 @@ class Agreement(NamedTuple):
     n_unassigned: Indices
 
     @property
+    def judged(self) -> npt.NDArray[np.bool_]:
+        """(s,) bool: enough objects of the others were in the sensor's field."""
+        return np.asarray(self.n_in_field >= MIN_OBJECTS)
+
+    @property
     def doubted(self) -> npt.NDArray[np.bool_]:
         """(s,) bool: the sensor joins too few objects of the others."""
         few = self.n_joined < MIN_JOINED_SHARE * self.n_in_field
-        return np.asarray(few & (self.n_in_field >= MIN_OBJECTS))
+        return np.asarray(few & self.judged)
 
     def disagreeing(self) -> Indices:
         """Return the sensors that have detections but disagree: they should be excluded."""

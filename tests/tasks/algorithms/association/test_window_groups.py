@@ -89,3 +89,30 @@ def test_groups_of_no_tracklets_change_nothing():
     before = verdicts.group.copy()
     verdicts.enter(np.arange(10), np.zeros(0, np.int64), group_of(0))
     assert (verdicts.group == before).all()
+
+
+@pytest.mark.parametrize(
+    ("score", "undecided", "allowed", "continues"),
+    [
+        (9.0, [0, 1], [0, 1], True),
+        (3.0, [0, 1], [0, 1], False),  # the group was not certain
+        (9.0, [0], [0, 1], False),  # tracklet 1 is decided: it belongs to no object there
+        (9.0, [0, 1], [0], False),
+    ],
+)
+def test_a_sure_group_goes_on_where_its_tracklets_end(score, undecided, allowed, continues):
+    verdicts = entered(score)
+    verdicts.undecided[2:] = np.isin(verdicts.items.tracklet[2:], undecided)
+    verdicts.continue_groups(np.isin(verdicts.items.tracklet, allowed))
+    assert (verdicts.group[2] == verdicts.group[3] != -1) == continues
+    assert (verdicts.group[4:] == -1).all()
+    assert verdicts.undecided[2:4].any() != continues or not undecided
+
+
+def test_a_sure_group_does_not_change_another_one_in_the_next_window():
+    verdicts = entered(score=9.0)
+    verdicts.enter(np.array([3]), np.array([1]), group_of(1, 5.0))
+    verdicts.undecided[2] = True
+    before = verdicts.group.copy()
+    verdicts.continue_groups(np.ones(10, bool))
+    assert (verdicts.group == before).all()
