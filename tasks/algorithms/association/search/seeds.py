@@ -26,6 +26,7 @@ def seeds_between(space, a, b, gate_sigma):
     `gate_sigma` is the maximum gap of the lines, as a chi-square of the same probability.
     """
     views, n = space.views, 0
+    gate = np.sqrt(quantile(1, gate_sigma))  # of the instant that a pair is first compared at
     out = np.empty((4 * (_size(views, a) + _size(views, b)), 2), np.int64)
     baseline, axes = np.empty(3), np.empty((2, 3))
     for m in range(len(views.time_s)):
@@ -43,7 +44,7 @@ def seeds_between(space, a, b, gate_sigma):
         items_b, angle_b, sigma_b = items_b[order], angle_b[order], sigma_b[order]
         max_sigma = sigma_b.max()
         for q in range(len(items_a)):
-            reach = gate_sigma * np.sqrt(sigma_a[q] ** 2 + max_sigma**2)
+            reach = gate * np.sqrt(sigma_a[q] ** 2 + max_sigma**2)
             k = np.searchsorted(angle_b, angle_a[q] - reach)
             while k < len(items_b) and angle_b[k] <= angle_a[q] + reach:
                 if _meet(space, items_a[q], items_b[k], m, gate_sigma, axes):

@@ -63,15 +63,7 @@ def test_seeds_are_all_pairs_whose_lines_meet(seed, options, gate_sigma):
 PRECISE = {"n_objects": 10, "spread_km": 0.3, "sigma_km": 0.0005}  # positions of sensors
 
 
-@pytest.mark.parametrize(
-    "gate_sigma",
-    [
-        GATE_SIGMA,
-        pytest.param(
-            1.0, marks=pytest.mark.xfail(reason="angles are compared within less than the gate")
-        ),
-    ],
-)
+@pytest.mark.parametrize("gate_sigma", [1.0, GATE_SIGMA])
 def test_angles_of_precise_sensors_leave_out_no_pair_whose_lines_meet(gate_sigma):
     for seed in range(3):
         scene = ten_tracklets(seed, n_sensors=3, **PRECISE)
