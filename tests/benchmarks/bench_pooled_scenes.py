@@ -46,6 +46,7 @@ LIMITS_S = (40.0, 240.0)
 CHI2_999 = 16.266  # of three degrees of freedom
 WRONG_STATE = 60.0  # squared error over covariance that no right state has
 MANY_SENSORS = 5  # of these two may be at fault
+NEAR_SATELLITES, SATELLITES = (8, 25), (30, 49)  # of a constellation; the last is not drawn
 BLEND_PX = 2.0  # satellites that are nearer to each other are one spot
 ATTEMPTS = 200
 AXES = ("x", "y", "z", "vx", "vy", "vz")
@@ -58,15 +59,16 @@ def make_log(number: int, low: Orbits, geo: Orbits, seed: int, out: Path) -> tup
     """Simulate the scene of this number; return what it is, and its log."""
     rng = np.random.default_rng([seed, number])
     if number % 3 == 0:
+        near = bool(rng.random() < 0.8)
         size = {
-            "satellites": int(rng.integers(6, 25)),
-            "near": bool(rng.random() < 0.8),
+            "satellites": int(rng.integers(*(NEAR_SATELLITES if near else SATELLITES))),
+            "near": near,
             "seconds": float(rng.uniform(40.0, 90.0)),
             "start": MIDDLE + timedelta(seconds=int(rng.integers(-43200, 43200))),
         }
         log = out / f"{number:04d}"
         simulate("constellation", log, seed=int(rng.integers(1 << 31)), **size)  # type: ignore[arg-type]
-        kind = "near" if size["near"] else "apart"
+        kind = "near" if near else "apart"
         return f"{kind}{size['satellites']}", log
     log = out / f"{number:04d}.mcap"
     for _ in range(ATTEMPTS):
