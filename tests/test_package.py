@@ -1,6 +1,7 @@
 """The package: what is in the source distribution and the wheel, and what an index shows."""
 
 import importlib.metadata
+import os
 import re
 import shutil
 import subprocess
@@ -13,10 +14,15 @@ from pathlib import Path
 
 import pytest
 
+from epipole.io.caches.kernel_list import read_kernels
+from epipole.io.caches.kernel_target import common_target
+from epipole.io.caches.kernels import HANDED_ON
+
 pytest.importorskip("build", reason="build is of the group dev")
 pytest.importorskip("setuptools_scm", reason="setuptools-scm is of the group dev")
 
 ROOT = Path(__file__).parents[1]
+KERNELS = "epipole/io/caches/compiled/"
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT = PYPROJECT["project"]
 LEFT_OUT = shutil.ignore_patterns(
@@ -60,11 +66,33 @@ def test_the_source_distribution_has_the_whole_repository(tree, dist):
 
 def test_the_wheel_has_all_modules_and_their_data_and_nothing_else(dist):
     with zipfile.ZipFile(next(dist.glob("*.whl"))) as wheel:
-        names = {n for n in wheel.namelist() if ".dist-info/" not in n}
+        names = {n for n in wheel.namelist() if ".dist-info/" not in n and KERNELS not in n}
     homes = ("schemas", "io", "tasks", "flows")
     files = (p for home in homes for p in (ROOT / home).rglob("*") if p.is_file())
     wanted = {f"epipole/{p.relative_to(ROOT).as_posix()}" for p in files if p.suffix != ".pyc"}
     assert names == wanted
+
+
+def test_the_wheel_has_kernels_that_serve_elsewhere(dist, tmp_path):
+    if common_target() is None:
+        pytest.skip("wheels have kernels for x86-64 processors of level 3 only")
+    (wheel,) = dist.glob("*-cp3*-linux_x86_64.whl")
+    with zipfile.ZipFile(wheel) as packed:
+        packed.extractall(tmp_path / "other")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "other"), HANDED_ON: ""}
+    environment |= {"EPIPOLE_CACHE": str(tmp_path / "cache"), "NUMBA_CACHE_DIR": ""}
+    code = "from epipole.flows.command_line.main import main; main()"
+    log = ROOT / "examples" / "four_sensor_geo.mcap"
+    said = subprocess.run(
+        [sys.executable, "-c", code, "info", log], env=environment, cwd=tmp_path, check=True,
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert said.stderr == ""  # else: compiling
+    (kept,) = (tmp_path / "cache" / "kernels").iterdir()
+    files = {p.relative_to(kept) for p in kept.rglob("*") if p.is_file()}
+    shipped = tmp_path / "other" / KERNELS
+    assert files == {p.relative_to(shipped) for p in shipped.rglob("*") if p.is_file()}
+    assert len(files) > 2 * len(read_kernels())  # an index and the code of each
 
 
 def metadata(dist: Path):

@@ -97,7 +97,7 @@ def tells_compiling(command: Callable[P, None]) -> Callable[P, None]:
 
     @wraps(command)
     def called(*args: P.args, **kwargs: P.kwargs) -> None:
-        from epipole.io.caches.kernel_warm_up import report_compiling
+        from epipole.io.caches.kernel_compiler import report_compiling
 
         said: list[int] = []
 

@@ -14,7 +14,13 @@ from epipole.flows.night.progress import compile_step, prepare
 from epipole.flows.night.recorded_nights import published_nights, unchanged_nights
 from epipole.flows.night.summary import Summary, summarise
 from epipole.flows.prefect.server_process import Launched, launch
-from epipole.io.caches.kernel_warm_up import compile_beside, compile_kernels, report_compiling
+from epipole.io.caches.kernel_compiler import (
+    compile_kernels,
+    nothing_compiled,
+    report_compiling,
+    second_process,
+)
+from epipole.io.caches.kernels import kernel_folder
 from epipole.io.catalogues.element_sets import read_known_objects
 from epipole.io.catalogues.star_catalogue import check_star_catalogue
 from epipole.io.datasets.dataset import check_folder, night_location
@@ -138,8 +144,7 @@ class Nights:
     def _start(self, started: contextlib.ExitStack) -> Callable[[str | None], Summary]:
         """Start Prefect, and return what makes a night."""
         options = self._options
-        is_first = started.enter_context(compile_beside())
-        started.enter_context(report_compiling(compile_step, is_first))
+        started.enter_context(report_compiling(compile_step))
         prepare("start Prefect")
         early = self._early or launch({})  # it imports Prefect while this process does
         self._early = None
@@ -152,8 +157,6 @@ class Nights:
 
         if not options.verbose:
             quiet_console()
-        if is_first:
-            LOGGER.info("first run of this version: compiling takes about a minute")
         runner = task_runner(options.runner, options.workers, options.scheduler)
         if options.scheduler is not None:
             check_scheduler(options.scheduler)
@@ -164,8 +167,7 @@ class Nights:
         # Done now, and not when they are needed: the server still starts.
         if self._settings.report.write:
             load_drawing()
-        if not is_first:
-            compile_kernels()  # which loads them
+        _load_kernels()
         started.enter_context(embedded_prefect(early))
         flow = nightly.with_options(task_runner=runner)
 
@@ -177,3 +179,20 @@ class Nights:
                 )  # fmt: skip
 
         return make
+
+
+def _load_kernels() -> None:
+    """Load the compiled kernels; compile them where this package came without.
+
+    Where the user has named a folder for numba, each is loaded or compiled as it is needed.
+    """
+    if kernel_folder() is None:
+        return
+    if not nothing_compiled():
+        compile_kernels()
+        return
+    LOGGER.info(
+        "this installation has no compiled kernels: compiling takes one to two minutes, once"
+    )
+    with second_process():
+        compile_kernels()

@@ -41,7 +41,7 @@ def cache_folder() -> Path | None:
         return folder
     private = private_folder("cache")
     log.warning(
-        "%s: no cache here (%s): this run compiles for a minute and keeps nothing; "
+        "%s: no cache here (%s): this run keeps nothing for later ones; "
         "set EPIPOLE_CACHE to a folder that only you can write to",
         folder or "~/.cache/epipole",
         fault,

@@ -1,55 +1,84 @@
-"""The folder of compiled kernels: its name contains a digest of the code and of where it lies.
+"""The folder of compiled kernels: where numba finds them, and keeps those that it compiles.
 
-By default numba keeps a kernel beside its source file and checks only that file. It does not notice
-a change in a function of another file that the kernel calls. After an upgrade it may also find
-signatures with classes that no longer exist. With a digest of all code in the folder's name,
-neither can happen. numba also identifies kernels by the path of their source file: two environments
-with the same code each compile their kernels, so each has its folder.
+By default numba keeps a kernel beside its source file, checks only that file, and compiles for the
+processor at hand. So it does not notice a change in a function of another file that the kernel
+calls, and no kernel serves another environment or machine. Here one folder holds the kernels of one
+version of the code: a digest of all code is in its name, and kernels are found by module. They are
+made for any x86-64 processor of level 3 (AVX2, since 2013), where this one is. A wheel carries such
+a folder, `compiled`; it is copied into the user's cache at the first use.
 """
 
 import contextlib
-import fcntl
+import functools
 import hashlib
+import importlib.metadata
 import logging
 import os
 import shutil
-import sys
-from collections.abc import Iterable, Iterator, Sequence
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from epipole.io.caches.arrays import cache_folder
+from epipole.io.caches.kernel_target import common_target
 from epipole.io.caches.private_folders import fault_of, is_ours, private_folder
 
 LOGGER = logging.getLogger(__name__)
 
 _ROOT = Path(__file__).parents[2]
 CODE = (_ROOT / "tasks" / "algorithms", _ROOT / "io")  # all kernels, and what they call
-KEPT = 8  # folders: several versions and environments of one user
-_USED = "used"  # this file exists after a run has succeeded
+COMPILED = Path(__file__).parent / "compiled"  # of a wheel; a checkout lacks it
+DIGEST = "digest"  # the file in it with the digest of the code it was made from
+# The folder of a process, for those that it starts: a temporary one is shared with them.
+HANDED_ON = "EPIPOLE_KERNELS"
+KEPT = 8  # folders: several versions of one user
+
+_folder: Path | None = None
 
 
 def use_kernel_cache(code: Sequence[Path] = CODE) -> None:
-    """Let numba keep kernels in the user's cache folder, under a digest of the code.
+    """Let numba find and keep kernels in the user's cache folder, under a digest of the code.
 
-    A user's NUMBA_CACHE_DIR takes precedence, if it can be written. With EPIPOLE_CACHE=off they
-    are kept beside the code if it can be written, else for this process only.
+    A user's NUMBA_CACHE_DIR takes precedence, if it can be written: numba then works as always.
+    With EPIPOLE_CACHE=off the wheel's kernels are used where they lie; without them each process
+    compiles.
 
     Called before any kernel is declared: numba then decides where it is kept.
     """
+    digest = digest_of(tuple(code))
+    given = Path(os.environ.get(HANDED_ON, ""))
+    is_given = given.name == digest and given.is_dir()
     named = os.environ.get("NUMBA_CACHE_DIR")
-    if named and _is_writable(Path(named)):
+    if not is_given and named and _is_writable(Path(named)):
         return
+    # Imports numba: as late as possible.
+    from epipole.io.caches.kernel_locator import locate_kernels, use_target
+
+    target = common_target()
+    if target is not None:
+        use_target(target)
+    global _folder
+    _folder = given if is_given else _folder_of(digest)
+    os.environ[HANDED_ON] = str(_folder)
+    locate_kernels()
+
+
+def kernel_folder() -> Path | None:
+    """Return the folder of all kernels. None: not yet known, or numba chooses."""
+    return _folder
+
+
+def _folder_of(digest: str) -> Path:
     root = cache_folder()
     if root is not None:
-        folder = _trusted(root / "kernels", _digest(code))
-    elif all(os.access(part, os.W_OK) for part in code):
-        return
-    else:
-        folder = private_folder("kernels")
-    os.environ["NUMBA_CACHE_DIR"] = str(folder)
-    numba = sys.modules.get("numba")
-    if numba is not None:
-        numba.config.CACHE_DIR = str(folder)
+        return _trusted(root / "kernels", digest)
+    return COMPILED if _fits(digest) else _private(digest)
+
+
+def _private(digest: str) -> Path:
+    folder = private_folder("kernels") / digest
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 def _is_writable(named: Path) -> bool:
@@ -70,53 +99,47 @@ def _trusted(kernels: Path, name: str) -> Path:
     A kernel is code: numba runs what it finds.
     """
     folder = kernels / name
-    fault = fault_of(kernels) or fault_of(folder)
+    fault = fault_of(kernels)
+    if fault is None and not folder.exists() and _fits(name):
+        _copy(COMPILED, folder)
+    fault = fault or fault_of(folder)
     if fault is None and not all(is_ours(path.lstat()) for path in folder.rglob("*")):
         fault = "has files of another user"
     if fault is not None:
-        LOGGER.warning(
-            "%s: kernels are not kept here (%s), this run compiles for a minute; remove the folder",
-            folder,
-            fault,
-        )
-        return private_folder("kernels")
+        cure = "remove the folder" if _fits(name) else "this run compiles; remove the folder"
+        LOGGER.warning("%s: kernels are not kept here (%s); %s", folder, fault, cure)
+        return COMPILED if _fits(name) else _private(name)
     with contextlib.suppress(OSError):  # another run may remove the same old folders
         os.utime(folder)
         _prune(kernels)
     return folder
 
 
-def new_kernel_folder() -> Path | None:
-    """Return the kernel folder of this code, as long as no run of this code has succeeded."""
-    root, path = cache_folder(), os.environ.get("NUMBA_CACHE_DIR")
-    if root is None or not path or Path(path).parent != root / "kernels":
-        return None
-    folder = Path(path)
-    return folder if folder.is_dir() and not (folder / _USED).exists() else None
+@functools.cache
+def _fits(digest: str) -> bool:
+    """Return whether this package came with kernels of this code, compiled by this numba."""
+    try:
+        return (COMPILED / DIGEST).read_text(encoding="ascii") == digest
+    except (OSError, ValueError):
+        return False
 
 
-def mark_used(folder: Path) -> None:
-    """Record that a run has succeeded: all kernels that it needs are compiled."""
-    with contextlib.suppress(OSError):
-        (folder / _USED).touch()
+def _copy(compiled: Path, folder: Path) -> None:
+    """Copy a folder of kernels as a whole: another run never sees half of them."""
+    with (
+        contextlib.suppress(OSError),  # another run was first, or the disk is full: it compiles
+        tempfile.TemporaryDirectory(dir=folder.parent, prefix=".copy-") as new,
+    ):
+        made = Path(shutil.copytree(compiled, Path(new) / "kernels"))
+        made.chmod(0o700)
+        made.rename(folder)
 
 
-@contextlib.contextmanager
-def only_one(folder: Path) -> Iterator[bool]:
-    """Yield whether no other process has called this for the same folder, and keep others out."""
-    with (folder / "lock").open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            yield False
-        else:
-            yield True
-
-
-def _digest(folders: Iterable[Path]) -> str:
-    digest = hashlib.sha256()
+@functools.cache
+def digest_of(folders: tuple[Path, ...]) -> str:
+    """Return the digest of all code in the folders, and of the version of numba."""
+    digest = hashlib.sha256(importlib.metadata.version("numba").encode())
     for folder in folders:
-        digest.update(str(folder.resolve()).encode())
         for file in sorted(folder.rglob("*.py")):
             name = file.relative_to(folder).as_posix()
             digest.update(name.encode() + b"\0" + file.read_bytes())

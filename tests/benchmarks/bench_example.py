@@ -2,8 +2,8 @@
 
     python tests/benchmarks/bench_example.py [--rounds 3] [--cached]
 
-Each is a process of its own. The first run has an empty cache, so it compiles the kernels; with
---cached it is left out. CPU is that of the process and of all it starts.
+Each is a process of its own. The first run has an empty cache: it copies the kernels of a wheel,
+else it compiles. With --cached it is left out. CPU is that of the process and all that it starts.
 """
 
 import argparse
@@ -48,7 +48,7 @@ def main() -> None:
         plain.write_text("report.write = false\n")
         if not chosen.cached:
             os.environ["EPIPOLE_CACHE"] = str(work / "cache")
-            row("first run: kernels are compiled", [measure("run", EXAMPLE, "--out", out)])
+            row("first run, with an empty cache", [measure("run", EXAMPLE, "--out", out)])
         else:
             measure("run", EXAMPLE, "--out", out)
         again = ("run", EXAMPLE, "--again", "--out", out)

@@ -1,4 +1,4 @@
-"""The list of kernels is that of a run; `.ci/generate` writes it again."""
+"""The list of kernels is that of a few runs; `.ci/generate` writes it again."""
 
 import os
 import pickle
@@ -16,11 +16,18 @@ from epipole.io.caches.kernel_list import KERNELS, Signature, kernel, read_kerne
 
 pytestmark = pytest.mark.long
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "four_sensor_geo.mcap"
+ROOT = Path(__file__).parents[3]
+EXAMPLE = ROOT / "examples" / "four_sensor_geo.mcap"
+ELEMENTS = ROOT / "io" / "simulation" / "built_in" / "real_leo.tle"
+# Scenes that use what the example does not: attitudes from scratch; many sensors, known objects.
+SCENES = {
+    "wide": ("six_sensor_wide", "--seconds", "2"),
+    "passing": ("constellation", "--satellites", "10", "--near", "--seconds", "40"),
+}
 
 _HEAD = """\
-# The kernels that a run of the example calls from Python, in the order of their first call,
-# with the types of their arguments. Written by `python tests/io/caches/test_kernel_list.py`.
+# The kernels that some short runs call from Python, in the order of their first call, with the
+# types of their arguments. Written by `python tests/io/caches/test_kernel_list.py`.
 """
 
 
@@ -56,6 +63,7 @@ def _quoted(text: str) -> str:
 # What numba is asked for: by Python, or by another kernel that it compiles.
 RUN = """
 import pickle, sys, threading
+import epipole.tasks
 from numba.core.dispatcher import Dispatcher
 
 asked, missed, within, compile = {}, set(), threading.local(), Dispatcher.compile
@@ -75,32 +83,43 @@ def recorded(self, types):
 
 Dispatcher.compile = recorded
 from epipole.flows.command_line.main import main
-log, out = sys.argv[1:]
-sys.argv = ["epipole", "run", log, "--out", out, "--quiet", "--again"]
+example, wide, passing, elements, called = sys.argv[1:]
 try:
-    main()
+    for k, arguments in enumerate(([example], [wide], [passing, "--known", elements])):
+        sys.argv = ["epipole", "run", *arguments, "--out", f"{called}.{k}", "--quiet"]
+        try:
+            main()
+        except SystemExit as ended:
+            if ended.code:
+                raise
 finally:
-    with open(out + ".kernels", "wb") as file:
+    with open(called, "wb") as file:
         pickle.dump((asked, missed), file)
 """
+SIMULATE = "from epipole.flows.command_line.main import main; main()"
 
 
-def kernels_of_a_run(folder):
-    """Return what a run of the example asks numba for, and what it then had to compile.
+def kernels_of_runs(folder):
+    """Return what runs of the example and the scenes ask numba for, and what it had to compile.
 
     The first is {(name, types): whether Python calls it}. A kernel that was compiled for another
     one is not asked for again.
     """
-    out = Path(folder) / "out"
-    subprocess.run([sys.executable, "-c", RUN, EXAMPLE, out], check=True, cwd=folder)
-    return pickle.loads(out.with_suffix(".kernels").read_bytes())
+    logs = {name: Path(folder) / name for name in SCENES}
+    for name, scene in SCENES.items():
+        command = [sys.executable, "-c", SIMULATE, "simulate", *scene, "--out", logs[name]]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    called = Path(folder) / "called"
+    command = [sys.executable, "-c", RUN, EXAMPLE, logs["wide"], logs["passing"], ELEMENTS, called]
+    subprocess.run(command, check=True, cwd=folder)
+    return pickle.loads(called.read_bytes())
 
 
 @pytest.fixture(scope="module")
 def after_compiling(tmp_path_factory):
-    compile_all = "from epipole.io.caches.kernel_warm_up import compile_kernels; compile_kernels()"
+    compile_all = "from epipole.io.caches.kernel_compiler import compile_kernels; compile_kernels()"
     subprocess.run([sys.executable, "-c", compile_all], check=True)
-    return kernels_of_a_run(tmp_path_factory.mktemp("run"))
+    return kernels_of_runs(tmp_path_factory.mktemp("run"))
 
 
 @pytest.fixture
@@ -108,11 +127,11 @@ def asked(after_compiling):
     return after_compiling[0]
 
 
-def test_a_run_of_the_example_has_nothing_to_compile_once_the_list_is_compiled(after_compiling):
+def test_a_run_has_nothing_to_compile_once_the_list_is_compiled(after_compiling):
     assert not after_compiling[1]
 
 
-def test_a_run_of_the_example_calls_what_the_list_says_and_nothing_else(asked):
+def test_the_runs_call_what_the_list_says_and_nothing_else(asked):
     listed = {(name, signature(arguments)) for name, arguments in read_kernels()}
     hint = "`.ci/generate` writes the list again"
     assert not {key for key, from_python in asked.items() if from_python} - listed, hint
@@ -135,6 +154,7 @@ if __name__ == "__main__":
     os.environ.setdefault("PREFECT_HOME", tempfile.mkdtemp())
     KERNELS.write_text(_HEAD)  # a run asks for all that is listed, also for what no longer exists
     with tempfile.TemporaryDirectory() as folder:
-        kernels_of_a_run(folder)  # compiles: what is loaded below is asked for one by one
-        asked, _ = kernels_of_a_run(folder)
+        kernels_of_runs(folder)  # compiles: what is loaded below is asked for one by one
+    with tempfile.TemporaryDirectory() as folder:
+        asked, _ = kernels_of_runs(folder)
     KERNELS.write_text(kernels_text(key for key, from_python in asked.items() if from_python))

@@ -1,0 +1,147 @@
+"""The kernels of the list are compiled by two processes, and put where a wheel can carry them."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from epipole.io.caches import kernel_compiler, kernel_list, kernels
+from epipole.io.caches.kernel_compiler import (
+    compile_into,
+    compile_kernels,
+    nothing_compiled,
+    report_compiling,
+    second_process,
+)
+from epipole.io.caches.kernels import CODE, DIGEST, digest_of
+
+MODULE = "epipole.io.caches.kernel_compiler"
+
+
+class Helper:
+    """A process that works until it is stopped."""
+
+    def __init__(self, command, **pipes):
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE
+        )
+        self.kill, self.communicate = self.process.kill, self.process.communicate
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Return a kernel folder without kernels."""
+    monkeypatch.setattr(kernels, "_folder", tmp_path / "kernels")
+    (tmp_path / "kernels" / "epipole.tasks").mkdir(parents=True)
+    return tmp_path / "kernels"
+
+
+def keep(folder):
+    kept = folder / "epipole.tasks"
+    (kept / f"{len(list(kept.iterdir()))}.nbi").touch()
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """Return the list of processes that were started."""
+    started = []
+
+    def start(*arguments, **options):
+        started.append(Helper(*arguments, **options))
+        return started[-1]
+
+    monkeypatch.setattr(kernel_compiler.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(kernel_compiler, "Popen", start)
+    return started
+
+
+def test_the_second_process_ends_with_the_first_also_where_that_fails(started):
+    def work():
+        with second_process():
+            assert started[0].process.poll() is None
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        work()
+    assert started[0].process.poll() is not None
+
+
+def test_the_second_process_ends_when_the_one_that_started_it_is_gone():
+    code = f"from {MODULE} import _end_with_parent; _end_with_parent(); exit(9)"
+    helper = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
+    helper.communicate(timeout=60)
+    assert helper.returncode == 0
+
+
+def test_with_one_processor_there_is_no_second_process(started, monkeypatch):
+    monkeypatch.setattr(kernel_compiler.os, "cpu_count", lambda: 1)
+    with second_process():
+        pass
+    assert not started
+
+
+def test_a_process_that_cannot_be_started_does_not_stop_the_first(monkeypatch):
+    def refuse(*arguments, **options):
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(kernel_compiler.os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(kernel_compiler, "Popen", refuse)
+    with second_process():
+        pass
+
+
+class Kernel:
+    """What the list calls a kernel."""
+
+    def __init__(self, compiled):
+        self.compile = compiled.append
+
+
+@pytest.fixture
+def compiled(monkeypatch):
+    """Have three kernels in the list, one of them unknown; return the types that were compiled."""
+    listed = [("good:one", ["int64"]), ("no.such:kernel", ["int64"]), ("good:two", ["float64"])]
+    compiled = []
+    there = {"good:one": Kernel(compiled), "good:two": Kernel(compiled)}
+    monkeypatch.setattr(kernel_list, "read_kernels", lambda: listed)
+    monkeypatch.setattr(kernel_list, "kernel", lambda name: there[name])
+    return compiled
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_a_kernel_that_cannot_be_compiled_is_left_to_the_run(backwards, compiled):
+    compile_kernels(backwards)
+    order = ["int64", "float64"]
+    assert [str(*types) for types in compiled] == (order[::-1] if backwards else order)
+
+
+def test_a_wheel_gets_all_kernels_and_the_digest_of_their_code(compiled, started, folder, tmp_path):
+    keep(folder)
+    compile_into(tmp_path / "wheel")
+    assert len(compiled) == 2
+    assert (tmp_path / "wheel" / "epipole.tasks" / "0.nbi").exists()
+    assert (tmp_path / "wheel" / DIGEST).read_text() == digest_of(CODE)
+
+
+def test_what_is_compiled_is_counted_from_the_files_that_appear(folder, monkeypatch):
+    monkeypatch.setattr(kernel_compiler, "LOOKED_EVERY_S", 0.01)
+
+    def counted() -> tuple[int, int]:
+        counts = []
+        with report_compiling(lambda *count: counts.append(count)):
+            keep(folder)
+            while not counts:
+                time.sleep(0.01)
+        return counts[-1]
+
+    assert nothing_compiled()
+    assert counted() == (1, kernel_compiler.FILES_OF_THE_LIST)
+    assert not nothing_compiled()
+    assert counted() == (1, 0)  # one more: nobody knows how many are needed
+
+
+def test_nothing_is_reported_where_nothing_is_compiled(folder, monkeypatch):
+    monkeypatch.setattr(kernel_compiler, "LOOKED_EVERY_S", 0.01)
+    with report_compiling(lambda *_: pytest.fail("nothing was compiled")):
+        time.sleep(0.05)
