@@ -7,9 +7,9 @@ from typing import Any
 import numba
 from numba.core.caching import CacheImpl, _CacheLocator
 
-from epipole.io.caches.kernels import kernel_folder
-
 _PACKAGE = "epipole."
+_Folder = Callable[[], Path | None]
+_kernel_folder: _Folder = lambda: None  # noqa: E731  set by `locate_kernels`
 
 
 class KernelLocator(_CacheLocator):
@@ -23,7 +23,7 @@ class KernelLocator(_CacheLocator):
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "KernelLocator | None":
         """Return the locator of a kernel of this package; None: numba goes on to its others."""
-        folder = kernel_folder()
+        folder = _kernel_folder()
         if folder is None or not py_func.__module__.startswith(_PACKAGE):
             return None
         return cls(py_func, folder)
@@ -41,8 +41,10 @@ class KernelLocator(_CacheLocator):
         return str(self._line)
 
 
-def locate_kernels() -> None:
-    """Have numba look for the kernels of this package in `kernel_folder`, from now on."""
+def locate_kernels(folder: _Folder) -> None:
+    """Have numba look for the kernels of this package in a folder, from now on."""
+    global _kernel_folder
+    _kernel_folder = folder
     if KernelLocator not in CacheImpl._locator_classes:
         CacheImpl._locator_classes.insert(0, KernelLocator)
 
@@ -52,4 +54,5 @@ def use_target(name: str) -> None:
 
     For all functions that numba compiles in this process from now on: it has one target.
     """
-    numba.config.CPU_NAME, numba.config.CPU_FEATURES = name, ""
+    numba.config.CPU_NAME = name  # type: ignore[attr-defined]
+    numba.config.CPU_FEATURES = ""  # type: ignore[attr-defined]

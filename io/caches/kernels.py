@@ -60,7 +60,7 @@ def use_kernel_cache(code: Sequence[Path] = CODE) -> None:
     global _folder
     _folder = given if is_given else _folder_of(digest)
     os.environ[HANDED_ON] = str(_folder)
-    locate_kernels()
+    locate_kernels(kernel_folder)
 
 
 def kernel_folder() -> Path | None:
