@@ -11,6 +11,8 @@ SECOND_NS = 1_000_000_000
 DAY_S = 86_400.0
 DAY_NS = 86_400 * SECOND_NS
 
+LN_2PI = math.log(2.0 * math.pi)  # of the norm of a normal distribution
+
 # IAU resolutions: SI brochure (exact), and IAU 2012 Resolution B2 (exact).
 SPEED_OF_LIGHT_KM_S = 299_792.458
 AU_KM = 149_597_870.7
@@ -21,6 +23,7 @@ AU_KM = 149_597_870.7
 GM_KM3_S2 = 398_600.4418
 EARTH_RADIUS_KM = 6378.137
 J2 = 1.08262668e-3
+ESCAPE_SPEED_KM_S = math.sqrt(2.0 * GM_KM3_S2 / EARTH_RADIUS_KM)  # 11.18: no bound object is faster
 
 # IERS Conventions (2010), equation 5.15: the rate of the Earth rotation angle [rad/s of UT1].
 EARTH_RATE_RAD_S = 7.292115146706979e-5

@@ -9,9 +9,9 @@ each instant.
 import numpy as np
 
 from epipole.tasks.algorithms.association.views import PLANE, X, Y, direction, residual
-from epipole.tasks.algorithms.cholesky import factor
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.symmetric_matrices import factor
 
 J2_RE2_KM2 = J2 * EARTH_RADIUS_KM**2  # about the pole of GCRF: accurate enough
 STEP_S = 60.0  # one Runge-Kutta step of a low orbit errs by 0.1 m

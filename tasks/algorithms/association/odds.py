@@ -20,6 +20,7 @@ from epipole.tasks.algorithms.association.views import (
 )
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+from epipole.tasks.algorithms.symmetric_matrices import determinant3
 
 MAX_RANGE_RATIO = 1.5  # of ranges: beyond it the object is 0.9 mag fainter and may not be detected
 FIELD_SHARE = 0.98  # of half the field: misses are frequent nearer to its edge
@@ -166,15 +167,6 @@ def near_fields(views, points, sensors, near):
 
 
 @borrowing_kernel
-def _det3(M):
-    return (
-        M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
-        - M[0, 1] * (M[1, 0] * M[2, 2] - M[1, 2] * M[2, 0])
-        + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])
-    )
-
-
-@borrowing_kernel
 def score(space, work, members, near):
     """Return the log-odds of "one object" against "unrelated tracklets".
 
@@ -205,7 +197,7 @@ def score(space, work, members, near):
             m = k if m < 0 else m
             instants += 1
     if instants == 1:
-        total = 1.5 * LN_2PI + 0.5 * np.log(_det3(points.cov_km2[m]))
+        total = 1.5 * LN_2PI + 0.5 * np.log(determinant3(points.cov_km2[m]))
         for i in members:
             if views.seen[i, m]:
                 residual(views, i, m, points.x_km[m], work.part)

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 
 Array = npt.NDArray[np.float64]
 
@@ -75,27 +76,6 @@ def attitude_information(u_sensor, sigma_rad, A):
             A[i, i] += w
             for j in range(3):
                 A[i, j] -= w * u_sensor[k, i] * u_sensor[k, j]
-
-
-@borrowing_kernel
-def invert_symmetric(A, out):
-    """Write the inverse of a symmetric 3x3 matrix (compiled).
-
-    A and out are (3, 3). Returns the determinant; 0 if it is not positive, with out unchanged.
-    """
-    c00 = A[1, 1] * A[2, 2] - A[1, 2] * A[1, 2]
-    c01 = A[0, 2] * A[1, 2] - A[0, 1] * A[2, 2]
-    c02 = A[0, 1] * A[1, 2] - A[0, 2] * A[1, 1]
-    determinant = A[0, 0] * c00 + A[0, 1] * c01 + A[0, 2] * c02
-    if determinant <= 0.0:
-        return 0.0
-    out[0, 0] = c00 / determinant
-    out[0, 1] = out[1, 0] = c01 / determinant
-    out[0, 2] = out[2, 0] = c02 / determinant
-    out[1, 1] = (A[0, 0] * A[2, 2] - A[0, 2] * A[0, 2]) / determinant
-    out[1, 2] = out[2, 1] = (A[0, 2] * A[0, 1] - A[0, 0] * A[1, 2]) / determinant
-    out[2, 2] = (A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]) / determinant
-    return determinant
 
 
 @borrowing_kernel

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
-from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -62,25 +63,6 @@ class Triangulated(NamedTuple):
     mean_range_km: Array
 
 
-@borrowing_kernel
-def invert3(M, out):
-    """Write the inverse of a symmetric matrix M (3, 3) to out (3, 3); return its determinant.
-
-    0, without an inverse, if it is not positive.
-    """
-    a, b, c = M[0, 0], M[0, 1], M[0, 2]
-    d, e, f = M[1, 1], M[1, 2], M[2, 2]
-    m00, m01, m02 = d * f - e * e, c * e - b * f, b * e - c * d
-    det = a * m00 + b * m01 + c * m02
-    if not det > 0.0:
-        return 0.0
-    out[0, 0], out[0, 1], out[0, 2] = m00 / det, m01 / det, m02 / det
-    out[1, 1], out[1, 2] = (a * f - c * c) / det, (b * c - a * e) / det
-    out[2, 2] = (a * d - b * b) / det
-    out[1, 0], out[2, 0], out[2, 1] = out[0, 1], out[0, 2], out[1, 2]
-    return det
-
-
 @kernel
 def start_point(use, r, u, x):
     """Write the point nearest to the lines in `use` to x (3,) [km]; return false if parallel.
@@ -97,7 +79,7 @@ def start_point(use, r, u, x):
                 p = (1.0 if i == j else 0.0) - u[v, i] * u[v, j]
                 N[i, j] += p
                 rhs[i] += p * r[v, j]
-    det = invert3(N, inverse)
+    det = invert_symmetric(N, inverse)
     # Two lines at angle t give det = n (n/2) ... sin^2 t; below 1e-6 rad it is rounding.
     if det < 1e-12 * n**3:
         return False
@@ -168,7 +150,7 @@ def solve_point(use, lines, velocity, x, P):
                         rhs[i] -= basis[v, a, i] / rho * W[a, b] * e[b]
                         for j in range(3):
                             N[i, j] += basis[v, a, i] * W[a, b] * basis[v, b, j] / (rho * rho)
-        if invert3(N, P) == 0.0:
+        if invert_symmetric(N, P) == 0.0:
             return np.nan
         step2, size2 = 0.0, 0.0
         for i in range(3):

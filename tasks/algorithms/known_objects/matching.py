@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 from scipy.special import gammaincinv, logsumexp
 
+from epipole.tasks.algorithms.constants import LN_2PI
 from epipole.tasks.algorithms.known_objects.prediction import (
     ElementErrors,
     Satellites,
@@ -265,7 +266,7 @@ def _log_normal(z: Array, S: Array) -> tuple[float, float]:
     L = np.linalg.cholesky(S)
     d2 = float(np.sum(np.linalg.solve(L, z) ** 2))
     log_det = 2 * float(np.log(np.diag(L)).sum())
-    return -(d2 + log_det + len(z) * np.log(2 * np.pi)) / 2, d2
+    return -(d2 + log_det + len(z) * LN_2PI) / 2, d2
 
 
 def chi2_quantile(size: int) -> float:

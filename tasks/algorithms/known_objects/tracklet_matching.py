@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import logsumexp
 
-from epipole.tasks.algorithms.constants import DAY_NS, DAY_S, GM_KM3_S2, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.constants import DAY_NS, DAY_S, GM_KM3_S2, LN_2PI, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.known_objects.matching import (
     COMPANIONS,
     MIN_LISTED,
@@ -214,7 +214,7 @@ class _Linear(NamedTuple):
         L = np.linalg.cholesky(S)
         chi2 = np.sum(np.linalg.solve(L, self.offset[:, :, None])[:, :, 0] ** 2, axis=1)
         log_det = 2 * np.log(np.einsum("kii->ki", L) * self.unit).sum(axis=1)
-        return -(chi2 + log_det + 4 * np.log(2 * np.pi)) / 2, chi2
+        return -(chi2 + log_det + 4 * LN_2PI) / 2, chi2
 
 
 def _spread(jacobian: Array, sigma: Array) -> Array:

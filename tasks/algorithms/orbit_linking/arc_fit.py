@@ -5,27 +5,22 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.cholesky import factor, solve_factored
-from epipole.tasks.algorithms.constants import (
-    EARTH_RADIUS_KM,
-    GM_KM3_S2,
-    J2,
-    SPEED_OF_LIGHT_KM_S,
-)
+from epipole.tasks.algorithms.constants import GM_KM3_S2, LN_2PI, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbit_linking.population import COMPONENTS, prior_of
+from epipole.tasks.algorithms.symmetric_matrices import factor, solve_factored
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-STEP_S = 60.0  # Runge-Kutta: error below 5 m in half an hour of a low orbit
+STEP_S = 60.0  # longest step of the propagation: right to 5 m in half an hour of a low orbit
 ITERATIONS = 12
 CONVERGED = 1e-3  # decrease of chi-square
 MAX_STEP_SHARE = 0.3  # of the distance to the geocentre: larger steps are shortened
 # Neglected accelerations, as a share of gravity: higher harmonics of the Earth.
 SHARE_OF_GRAVITY = 1e-5
 MIN_COSINE = 0.5  # of the angle between the measured and the computed direction
-LOG_2PI = np.log(2.0 * np.pi)
 
 
 class Tracklets(NamedTuple):
@@ -57,55 +52,6 @@ class Tracklets(NamedTuple):
     w: Array
     cov: Array
     position_km: Array
-
-
-@kernel
-def _rates(y, out):
-    """Write the time derivatives of a state and its transition matrix, both (42,), to `out`."""
-    x0, x1, x2 = y[0], y[1], y[2]
-    r2 = x0 * x0 + x1 * x1 + x2 * x2
-    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
-    oblate = 1.5 * J2 * EARTH_RADIUS_KM**2 / r2
-    tilt = 5.0 * x2 * x2 / r2
-    level = -pull * (1.0 + oblate * (1.0 - tilt))
-    out[0], out[1], out[2] = y[3], y[4], y[5]
-    out[3], out[4] = x0 * level, x1 * level
-    out[5] = -pull * x2 * (1.0 + oblate * (3.0 - tilt))
-    # The matrix neglects the oblateness: a thousandth of its elements.
-    three = 3.0 * pull / r2
-    for k in range(6):
-        c0, c1, c2 = y[6 + k], y[12 + k], y[18 + k]
-        out[6 + k], out[12 + k], out[18 + k] = y[24 + k], y[30 + k], y[36 + k]
-        along = three * (x0 * c0 + x1 * c1 + x2 * c2)
-        out[24 + k] = along * x0 - pull * c0
-        out[30 + k] = along * x1 - pull * c1
-        out[36 + k] = along * x2 - pull * c2
-
-
-@kernel
-def advance(y, dt_s, work):
-    """Propagate a state with its transition matrix, y (42,), by dt_s in place: two bodies and J2.
-
-    `work` (5, 42) is scratch.
-    """
-    n = int(np.ceil(abs(dt_s) / STEP_S))
-    if n == 0:
-        return
-    h = dt_s / n
-    k1, k2, k3, k4, at = work[0], work[1], work[2], work[3], work[4]
-    for _ in range(n):
-        _rates(y, k1)
-        for m in range(42):
-            at[m] = y[m] + 0.5 * h * k1[m]
-        _rates(at, k2)
-        for m in range(42):
-            at[m] = y[m] + 0.5 * h * k2[m]
-        _rates(at, k3)
-        for m in range(42):
-            at[m] = y[m] + h * k3[m]
-        _rates(at, k4)
-        for m in range(42):
-            y[m] += h / 6.0 * (k1[m] + 2.0 * k2[m] + 2.0 * k3[m] + k4[m])
 
 
 @kernel
@@ -257,7 +203,7 @@ def _add_tracklets(tracklets, members, epoch_s, state, work):
         now = epoch_s
         for n in range(len(members) - middle if side else middle):
             k = members[middle + n] if side else members[middle - 1 - n]
-            advance(y, tracklets.time_s[k] - now, work.steps)
+            advance(y, tracklets.time_s[k] - now, STEP_S, work.steps)
             now = tracklets.time_s[k]
             log_det = _compare(y, tracklets, k, now - epoch_s, work)
             if not np.isfinite(log_det):
@@ -334,8 +280,8 @@ def fit_component(tracklets, members, epoch_s, component, state, work):
         for m in range(6):
             gain += rhs[m] * work.gradient[m]
         if gain < CONVERGED or (iteration > 2 and abs(before - total) < CONVERGED):
-            evidence = log - 0.5 * (total - gain) + 3.0 * LOG_2PI - 0.5 * log_det
-            return evidence - len(members) * 2.0 * LOG_2PI - 0.5 * log_dets, chi2
+            evidence = log - 0.5 * (total - gain) + 3.0 * LN_2PI - 0.5 * log_det
+            return evidence - len(members) * 2.0 * LN_2PI - 0.5 * log_dets, chi2
         before = total
         size = np.sqrt(rhs[0] ** 2 + rhs[1] ** 2 + rhs[2] ** 2)
         limit = MAX_STEP_SHARE * np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)

@@ -15,13 +15,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.orbit_linking.arc_fit import (
-    Tracklets,
-    advance,
-    fit_arc,
-    fit_work,
-)
+from epipole.tasks.algorithms.orbit_linking.arc_fit import STEP_S, Tracklets, fit_arc, fit_work
 from epipole.tasks.algorithms.orbit_linking.pair_search import (
     may_be_one,
     packed_tracklets,
@@ -161,25 +157,15 @@ def _edges(tracklets: Tracklets, known: Indices, alone: Array, max_gap_s: float)
 @kernel
 def _score(tracklets, alone, pairs, odds, epoch_s, states):
     """Write the log odds of pairs, and move their orbits to the middle; NaN becomes -inf."""
-    work, y = fit_work(), np.empty(42)
+    work = fit_work()
     for p in range(len(pairs)):
         i, j = pairs[p, 0], pairs[p, 1]
         epoch_s[p] = 0.5 * (tracklets.time_s[i] + tracklets.time_s[j])
-        _moved(states[p], epoch_s[p] - tracklets.time_s[i], y, work)
-        for m in range(6):
-            states[p, m] = y[m]
+        advance(states[p], epoch_s[p] - tracklets.time_s[i], STEP_S, work.steps)
         evidence, _ = fit_arc(tracklets, pairs[p], epoch_s[p], states[p], work)
         odds[p] = evidence - alone[i] - alone[j]
         if np.isnan(odds[p]):
             odds[p] = -np.inf
-
-
-@kernel
-def _moved(state, dt_s, y, work):
-    """Write a state (6,) propagated by dt_s to the first of y (42,)."""
-    for m in range(42):
-        y[m] = state[m] if m < 6 else 0.0
-    advance(y, dt_s, work.steps)
 
 
 @kernel
@@ -261,10 +247,7 @@ def _sum(tracklets, alone, members, start_s, start, work):
     epoch = 0.0
     for k in members:
         epoch += tracklets.time_s[k] / len(members)
-    y = np.empty(42)
-    _moved(start, epoch - start_s, y, work)
-    for m in range(6):
-        state[m] = y[m]
+    advance(state, epoch - start_s, STEP_S, work.steps)
     evidence, chi2 = fit_arc(tracklets, members, epoch, state, work)
     return evidence, chi2, 4 * len(members) - 6, epoch, state
 

@@ -11,10 +11,11 @@ the coefficients of a circular orbit at the sensor's height.
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, ESCAPE_SPEED_KM_S, GM_KM3_S2, J2
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 from epipole.tasks.algorithms.orbit_linking.arc_fit import Tracklets
 from epipole.tasks.algorithms.orbit_linking.population import MIN_HEIGHT_KM
+from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -80,6 +81,37 @@ def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+# The normal equations of both ranges a and b [km]: the weighted sums of squares and products
+# (aa, ab, bb, a right, b right, right^2).
+NO_EQUATIONS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+SINGULAR = 1e-12  # least determinant over the product of the diagonal: beyond it is rounding
+
+
+@borrowing_kernel
+def _with_equation(sums, weight, of_a, of_b, right):
+    """Return the sums with the equation ``of_a * a + of_b * b = right`` of this weight."""
+    aa, ab, bb, a_right, b_right, square = sums
+    return (
+        aa + weight * of_a * of_a,
+        ab + weight * of_a * of_b,
+        bb + weight * of_b * of_b,
+        a_right + weight * of_a * right,
+        b_right + weight * of_b * right,
+        square + weight * right * right,
+    )
+
+
+@borrowing_kernel
+def _solved_ranges(sums):
+    """Return the ranges [km] that fit best, and chi-square; inf where the sums are singular."""
+    aa, ab, bb, a_right, b_right, square = sums
+    det = aa * bb - ab * ab
+    if not det > SINGULAR * aa * bb:
+        return 0.0, 0.0, np.inf
+    a, b = (bb * a_right - ab * b_right) / det, (aa * b_right - ab * a_right) / det
+    return a, b, square - a * a_right - b * b_right
+
+
 @borrowing_kernel
 def _ranges(tracklets, i, j, arc, a, b, model_km, oblate):
     """Return the ranges for which the rates of both directions fit best, and their chi-square.
@@ -96,8 +128,7 @@ def _ranges(tracklets, i, j, arc, a, b, model_km, oblate):
         Mean acceleration by the oblateness [km/s^2].
     """
     dt, f, g, gdot = arc
-    si, sj = tracklets.r_km[i], tracklets.r_km[j]
-    n11 = n12 = n22 = b1 = b2 = cc = 0.0
+    si, sj, sums = tracklets.r_km[i], tracklets.r_km[j], NO_EQUATIONS
     common = tracklets.position_km[i] ** 2 + tracklets.position_km[j] ** 2 + model_km * model_km
     for side in range(2):
         k, other, near, far = (i, j, a, b) if side == 0 else (j, i, b, a)
@@ -115,17 +146,8 @@ def _ranges(tracklets, i, j, arc, a, b, model_km, oblate):
             of_k, others = tracklets.cov[k], tracklets.cov[other]
             variance = near * near * (g * g * of_k[2 + c, 2 + c] + of_k[c, c])
             weight = 1.0 / (variance + far * far * others[c, c] + common)
-            n11 += weight * pa * pa
-            n12 += weight * pa * pb
-            n22 += weight * pb * pb
-            b1 += weight * pa * right
-            b2 += weight * pb * right
-            cc += weight * right * right
-    det = n11 * n22 - n12 * n12
-    if not det > 1e-12 * n11 * n22:
-        return 0.0, 0.0, np.inf
-    a, b = (n22 * b1 - n12 * b2) / det, (n11 * b2 - n12 * b1) / det
-    return a, b, cc - a * b1 - b * b2
+            sums = _with_equation(sums, weight, pa, pb, right)
+    return _solved_ranges(sums)
 
 
 @borrowing_kernel
@@ -210,17 +232,10 @@ def _velocity(tracklets, i, j, a, b, v, N, right):
     trace = N[0, 0] + N[1, 1] + N[2, 2]
     for m in range(3):
         N[m, m] += 1e-9 * trace
-    det = (
-        N[0, 0] * (N[1, 1] * N[2, 2] - N[1, 2] * N[2, 1])
-        - N[0, 1] * (N[1, 0] * N[2, 2] - N[1, 2] * N[2, 0])
-        + N[0, 2] * (N[1, 0] * N[2, 1] - N[1, 1] * N[2, 0])
-    )
+    if invert_symmetric(N, N) == 0.0:
+        N[0, 0] = N[1, 1] = N[2, 2] = np.nan
     for m in range(3):
-        p, q = (m + 1) % 3, (m + 2) % 3
-        v[m] = 0.0
-        for n in range(3):
-            s, t = (n + 1) % 3, (n + 2) % 3
-            v[m] += (N[p, s] * N[q, t] - N[p, t] * N[q, s]) / det * right[n]
+        v[m] = N[m, 0] * right[0] + N[m, 1] * right[1] + N[m, 2] * right[2]
 
 
 @borrowing_kernel
@@ -236,7 +251,6 @@ _R, _V, _U, _EAST, _NORTH = 0, 3, 6, 9, 12
 _OF_V, _OF_W, _OF_R = 15, 17, 19  # components east and north of v, w and r
 _RATE_VAR, _VAR, _POSITION_VAR, _REACH, _TIME = 21, 22, 23, 24, 25
 _COLUMNS = 26
-ESCAPE_KM_S = 11.2  # no bound object is faster, above the ground
 
 
 def packed_tracklets(tracklets: Tracklets) -> Array:
@@ -245,7 +259,7 @@ def packed_tracklets(tracklets: Tracklets) -> Array:
     across = tracklets.v_km_s - _along(tracklets.v_km_s, tracklets.u)[:, None] * tracklets.u
     rate = np.linalg.norm(tracklets.w, axis=1)
     with np.errstate(divide="ignore"):
-        reach = (ESCAPE_KM_S + np.linalg.norm(across, axis=1)) / rate
+        reach = (ESCAPE_SPEED_KM_S + np.linalg.norm(across, axis=1)) / rate
     columns = [
         tracklets.r_km, tracklets.v_km_s, tracklets.u, east, north,
         *(
@@ -272,37 +286,23 @@ def _dot_at(a, m, b, n):
 def _first_chi2(p, q, dt, f, g):
     """Return chi-square of the first solution of `join_pair`, of two rows of `packed_tracklets`.
 
-    inf where a range is negative.
+    The equations are those of `_ranges`, without oblateness. All pairs are tested, so both axes
+    share one weight: that of their mean variance. inf where a range is not positive.
     """
     fall = GRAVITY_SHARE * 0.5 * GM_KM3_S2 / _dot_at(p, _R, p, _R) * dt * dt
     square = FIRST_RANGE_KM * FIRST_RANGE_KM
     common = p[_POSITION_VAR] + q[_POSITION_VAR] + fall * fall + square * (p[_VAR] + q[_VAR])
     of_p = 1.0 / (common + g * g * square * p[_RATE_VAR])
     of_q = 1.0 / (common + g * g * square * q[_RATE_VAR])
-    n11 = n12 = n22 = b1 = b2 = cc = 0.0
+    sums = NO_EQUATIONS
     for c in range(2):
         axis = _EAST + 3 * c
-        pa, pb = -g * p[_OF_W + c], _dot_at(p, axis, q, _U)
         right = g * p[_OF_V + c] - _dot_at(p, axis, q, _R) + f * p[_OF_R + c]
-        n11 += of_p * pa * pa
-        n12 += of_p * pa * pb
-        n22 += of_p * pb * pb
-        b1 += of_p * pa * right
-        b2 += of_p * pb * right
-        cc += of_p * right * right
-        pa, pb = -_dot_at(q, axis, p, _U), -g * q[_OF_W + c]
+        sums = _with_equation(sums, of_p, -g * p[_OF_W + c], _dot_at(p, axis, q, _U), right)
         right = g * q[_OF_V + c] - f * q[_OF_R + c] + _dot_at(q, axis, p, _R)
-        n11 += of_q * pa * pa
-        n12 += of_q * pa * pb
-        n22 += of_q * pb * pb
-        b1 += of_q * pa * right
-        b2 += of_q * pb * right
-        cc += of_q * right * right
-    det = n11 * n22 - n12 * n12
-    a, b = n22 * b1 - n12 * b2, n11 * b2 - n12 * b1
-    if not (det > 1e-12 * n11 * n22 and a > 0.0 and b > 0.0):
-        return np.inf
-    return cc - (a * b1 + b * b2) / det
+        sums = _with_equation(sums, of_q, -_dot_at(q, axis, p, _U), -g * q[_OF_W + c], right)
+    a, b, chi2 = _solved_ranges(sums)
+    return chi2 if a > 0.0 and b > 0.0 else np.inf
 
 
 @borrowing_kernel
@@ -372,7 +372,7 @@ def _too_far(p, q, dt):
     apart2 = 0.0
     for m in range(3):
         apart2 += (q[_R + m] - p[_R + m]) ** 2
-    reach = p[_REACH] + q[_REACH] + ESCAPE_KM_S * dt
+    reach = p[_REACH] + q[_REACH] + ESCAPE_SPEED_KM_S * dt
     return apart2 > reach * reach
 
 

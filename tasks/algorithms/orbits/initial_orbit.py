@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.constants import GM_KM3_S2
+from epipole.tasks.algorithms.earth_gravity import LOWEST_ORBIT_KM, gravity, propagate_states
 from epipole.tasks.algorithms.orbits.forces import Surroundings
 from epipole.tasks.algorithms.orbits.orbit_determination import (
     AreaPrior,
     ObjectDirections,
     determine_orbit,
 )
-from epipole.tasks.algorithms.orbits.state_interpolation import LOWEST_ORBIT_KM, gravity
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -26,7 +26,7 @@ DISTANCES_KM = np.geomspace(50.0, 60_000.0, 48)  # 16 % apart, which the fit con
 RATES_KM_S = np.linspace(-15.0, 15.0, 41)  # of the distance: two low satellites that meet
 COMPARED, FITTED = 16, 100  # directions of these minutes, at most
 REFINED = 6  # of the best orbits, which are fitted
-STEP_S = 60.0  # of Runge-Kutta, about: right to some metres in ten minutes
+STEP_S = 60.0  # longest step of the propagation: right to some metres in ten minutes
 FITS = 1.5  # chi-square over its degrees of freedom: no other orbit is tried
 ROUNDS = 6  # of the linear equations, each with the gravity of the path before
 SHOTS = 3  # of the velocity; each leaves a hundredth of the miss
@@ -134,19 +134,9 @@ def _orbits_through(near: Array, far: Array, span_s: float) -> Array:
 
 
 def _moved(states: Array, dt_s: float) -> Array:
-    """Return states (n, 6) after a time: mass and flattening of the Earth (Runge-Kutta)."""
+    """Return states (n, 6) after a time, under the Earth's gravity."""
     steps = max(int(np.ceil(abs(dt_s) / STEP_S)), 1)
-    h, y = dt_s / steps, states
-    for _ in range(steps):
-        k1 = _rates(y)
-        k2 = _rates(y + h / 2 * k1)
-        k3 = _rates(y + h / 2 * k2)
-        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + _rates(y + h * k3))
-    return y
-
-
-def _rates(y: Array) -> Array:
-    return np.concatenate([y[:, 3:], gravity(y[:, :3])], axis=1)
+    return np.hstack(propagate_states(states[:, :3], states[:, 3:], np.array([dt_s]), steps))
 
 
 def _misfit(states: Array, directions: ObjectDirections, chosen: Indices) -> Array:

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from epipole.tasks.algorithms.earth_gravity import gravity
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.orbits.state_interpolation import gravity
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

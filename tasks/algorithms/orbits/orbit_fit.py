@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.constants import GM_KM3_S2, SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbits.shared_errors import ArcEquations, no_equations
@@ -19,7 +20,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 LIGHT = SPEED_OF_LIGHT_KM_S
-STEP_S = 10.0  # error of Runge-Kutta: below 1 m over 10 minutes of a low orbit
+STEP_S = 10.0  # longest step of the propagation: right to 1 m over 10 minutes of a low orbit
 ITERATIONS = 20
 CONVERGED = 1e-6  # decrease of chi-square
 MIN_BIAS_RAD = 5e-9  # 1 mas: keeps the prior invertible if nothing is shared
@@ -69,46 +70,6 @@ class ArcViews(NamedTuple):
     weight: Array
 
 
-@kernel
-def _rates(y, out):
-    """Write the time derivatives of a state and its transition matrix to `out`.
-
-    `y` and `out` (42,) have the state (6) [km, km/s], GCRF, and the matrix (36), row by row.
-    """
-    x, v, z = y[:3], y[3:6], y[2]
-    r2 = x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
-    pull = GM_KM3_S2 / (r2 * np.sqrt(r2))
-    oblate = 1.5 * J2 * EARTH_RADIUS_KM**2 / r2
-    tilt = 5.0 * z * z / r2
-    for a in range(3):
-        out[a] = v[a]
-        out[3 + a] = -pull * x[a] * (1.0 + oblate * ((3.0 if a == 2 else 1.0) - tilt))
-    # The matrix neglects the oblateness: a thousandth of its elements.
-    for a in range(3):
-        for k in range(6):
-            out[6 + 6 * a + k] = y[6 + 6 * (3 + a) + k]
-            total = 0.0
-            for b in range(3):
-                total += 3.0 * x[a] * x[b] / r2 * y[6 + 6 * b + k]
-            out[6 + 6 * (3 + a) + k] = pull * (total - y[6 + 6 * a + k])
-
-
-@kernel
-def _advance(y, dt_s):
-    """Propagate a state and its transition matrix, `y` (42,), by dt_s in place (Runge-Kutta)."""
-    n = int(np.ceil(abs(dt_s) / STEP_S))
-    if n == 0:
-        return
-    h = dt_s / n
-    k1, k2, k3, k4 = np.empty(42), np.empty(42), np.empty(42), np.empty(42)
-    for _ in range(n):
-        _rates(y, k1)
-        _rates(y + h / 2 * k1, k2)
-        _rates(y + h / 2 * k2, k3)
-        _rates(y + h * k3, k4)
-        y += h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-
 def propagate(state: Array, dt_s: float) -> Array:
     """Return a (6,) state [km, km/s], GCRF, propagated by dt_s: point mass and J2.
 
@@ -133,13 +94,13 @@ def trajectory(state: Array, dt_s: Array) -> tuple[Array, Array]:
     transition : (n, 6, 6) float
         Derivatives of these states by the given one, for two bodies.
     """
-    out = np.empty((len(dt_s), 42))
+    out, work = np.empty((len(dt_s), 42)), np.empty((5, 42))
     begin = np.concatenate([np.asarray(state, float), np.eye(6).ravel()])
     y, now = begin.copy(), 0.0
     for k, t in enumerate(np.asarray(dt_s, float).tolist()):
         if (t - now) * t < 0.0 or now * t < 0.0:  # back towards the start, or across it
             y, now = begin.copy(), 0.0
-        _advance(y, t - now)
+        advance(y, t - now, STEP_S, work)
         out[k], now = y, t
     return out[:, :6], out[:, 6:].reshape(-1, 6, 6)
 
@@ -199,7 +160,7 @@ def _add_views(state, errors, views, sums):
     is `ArcViews`, `sums` is `ArcEquations`.
     """
     time_s, sensor, r, u, basis, weight = views
-    chi2 = 0.0
+    work, chi2 = np.empty((5, 42)), 0.0
     middle = np.searchsorted(time_s, 0.0)
     for later in range(2):
         y = np.zeros(42)
@@ -209,7 +170,7 @@ def _add_views(state, errors, views, sums):
         now = 0.0
         for q in range(len(time_s) - middle if later else middle):
             i = middle + q if later else middle - 1 - q
-            _advance(y, time_s[i] - now)
+            advance(y, time_s[i] - now, STEP_S, work)
             now = time_s[i]
             view = (r[i], u[i], basis[i], weight[i])
             chi2 += _accumulate(y, view, errors[sensor[i]], sums, sensor[i])

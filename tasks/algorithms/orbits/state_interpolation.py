@@ -15,19 +15,19 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2, SECOND_NS
+from epipole.tasks.algorithms.constants import SECOND_NS
+from epipole.tasks.algorithms.earth_gravity import gravity, propagate_states
 from epipole.tasks.algorithms.geometry.directions import interpolate_quaternions
 
 Array = npt.NDArray[np.float64]
 Nanoseconds = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
-LOWEST_ORBIT_KM = EARTH_RADIUS_KM + 80.0
-
 # Largest gap between two states that is interpolated. With reported velocities the quintic of a low
 # orbit is then right to 5 cm. Fitted velocities have errors of some m/s.
 MAX_BRIDGE_S = 240.0
 MAX_BRIDGE_FITTED_S = 120.0
+STEPS = 4  # beyond the last state: the error is centimetres over minutes on a low orbit
 # A missing velocity is fitted to the positions within this time of the state, and at least to the
 # nearest one on each side. `FIT_POINTS` is the maximum number of positions: more do not help.
 FIT_HALF_WIDTH_S = 10.0
@@ -98,7 +98,8 @@ def interpolate_states(
     between = (since_left_s >= 0) & (since_right_s <= 0) & (left != right)
     between &= since_left_s - since_right_s <= bridge_s
 
-    r, v = _propagated(states.r_gcrf_km[nearest], v_km_s[nearest], np.where(between, 0.0, since_s))
+    extrapolated_s = np.where(between, 0.0, since_s)
+    r, v = propagate_states(states.r_gcrf_km[nearest], v_km_s[nearest], extrapolated_s, STEPS)
     linear, square = growth[nearest].T
     variance = 1 + linear * since_s + square * since_s**2
     sigma = states.position_sigma_km[nearest] * np.sqrt(variance)
@@ -110,25 +111,6 @@ def interpolate_states(
     far = np.abs(since_s) > state_gap_s
     r[far], v[far], sigma[far] = np.nan, np.nan, np.nan
     return InterpolatedStates(r, v, sigma, *_attitudes(states, at_ns))
-
-
-def gravity(r_km: Array) -> Array:
-    """Return the acceleration [km/s^2] of (..., 3) positions: Earth as a point, and J2.
-
-    J2 is about the z axis of the GCRF, which is within 0.2 degrees of the pole in this century.
-
-    References
-    ----------
-    Vallado (2013), Fundamentals of Astrodynamics and Applications, eq. 8-30.
-    """
-    radius2 = np.einsum("...i,...i->...", r_km, r_km)
-    flattening = 1.5 * J2 * EARTH_RADIUS_KM**2 / radius2
-    z2 = 5 * r_km[..., 2] ** 2 / radius2
-    # Products: a power other than a square takes ten times as long.
-    pull = np.where(radius2 > LOWEST_ORBIT_KM**2, -GM_KM3_S2 / (radius2 * np.sqrt(radius2)), 0.0)
-    across = pull * (1 + flattening * (1 - z2))
-    along = pull * (1 + flattening * (3 - z2))
-    return np.stack([across, across, along], axis=-1) * r_km
 
 
 def _bridge(
@@ -150,24 +132,6 @@ def _bridge(
     r += 0.5 * h**2 * ((s**2 - 3 * s3 + 3 * s4 - s5) * ga + (s3 - 2 * s4 + s5) * gb)
     rise = 3 * s**2 - 2 * s3
     v = va + (vb - va) * rise + h * ((s - 2 * s**2 + s3) * ga + (s3 - s**2) * gb)
-    return r, v
-
-
-def _propagated(r_km: Array, v_km_s: Array, step_s: Array) -> tuple[Array, Array]:
-    """Return states propagated under gravity by (n,) seconds, in four Runge-Kutta steps.
-
-    The error is centimetres over minutes on a low orbit.
-    """
-    steps = 4
-    h = (step_s / steps)[:, None]
-    r, v = r_km.copy(), v_km_s.copy()
-    for _ in range(steps):
-        v1, g1 = v, gravity(r)
-        v2, g2 = v + h / 2 * g1, gravity(r + h / 2 * v1)
-        v3, g3 = v + h / 2 * g2, gravity(r + h / 2 * v2)
-        v4, g4 = v + h * g3, gravity(r + h * v3)
-        r = r + h / 6 * (v1 + 2 * v2 + 2 * v3 + v4)
-        v = v + h / 6 * (g1 + 2 * g2 + 2 * g3 + g4)
     return r, v
 
 

@@ -21,8 +21,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.geometry.attitude import invert_symmetric
+from epipole.tasks.algorithms.constants import LN_2PI
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
+from epipole.tasks.algorithms.symmetric_matrices import determinant3, invert_symmetric
 
 Array = npt.NDArray[np.float64]
 
@@ -202,20 +203,13 @@ def _brightness(star_of, instrumental, magnitude, log_density, zero, scatter):
 
 @borrowing_kernel
 def _log_determinant(P):
-    return math.log(
-        max(
-            P[0, 0] * (P[1, 1] * P[2, 2] - P[1, 2] * P[2, 1])
-            - P[0, 1] * (P[1, 0] * P[2, 2] - P[1, 2] * P[2, 0])
-            + P[0, 2] * (P[1, 0] * P[2, 1] - P[1, 1] * P[2, 0]),
-            1e-300,
-        )
-    )
+    return math.log(max(determinant3(P), 1e-300))
 
 
 @borrowing_kernel
 def choice_lost(P):
     """Return the attitude's part of the log evidence, all attitudes equally likely (compiled)."""
-    return 0.5 * _log_determinant(P) + 1.5 * math.log(2.0 * math.pi) - math.log(8.0 * math.pi**2)
+    return 0.5 * _log_determinant(P) + 1.5 * LN_2PI - math.log(8.0 * math.pi**2)
 
 
 @kernel

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from epipole.tasks.algorithms.cholesky import factor, solve_factored
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.symmetric_matrices import factor, solve_factored
 from epipole.tasks.algorithms.tracking.local_motion import detections_about
 from epipole.tasks.algorithms.tracking.sky_filter import (
     FAR_RAD_S2,

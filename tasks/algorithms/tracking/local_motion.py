@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 from epipole.tasks.algorithms.tracking.sky_filter import acceleration, jerk
 
 Array = npt.NDArray[np.float64]
@@ -88,21 +89,6 @@ def _half_width(rate, sigma, max_half):
 
 
 @kernel
-def _solve3(S, rhs):
-    """Solve the symmetric 3x3 system S c = rhs by Cramer's rule."""
-    a, b, c = S[0, 0], S[0, 1], S[0, 2]
-    d, e, f = S[1, 1], S[1, 2], S[2, 2]
-    m00, m01, m02 = d * f - e * e, c * e - b * f, b * e - c * d
-    m11, m12, m22 = a * f - c * c, b * c - a * e, a * d - b * b
-    det = a * m00 + b * m01 + c * m02
-    return (
-        (m00 * rhs[0] + m01 * rhs[1] + m02 * rhs[2]) / det,
-        (m01 * rhs[0] + m11 * rhs[1] + m12 * rhs[2]) / det,
-        (m02 * rhs[0] + m12 * rhs[1] + m22 * rhs[2]) / det,
-    )
-
-
-@kernel
 def _coefficients(t, weight, scale, curvature_prior, value, slope):
     """Fill the coefficients of the polynomial's value and slope at t = 0; return the value's
     variance for detections of variance 1 / weight, with the prior's part.
@@ -121,8 +107,10 @@ def _coefficients(t, weight, scale, curvature_prior, value, slope):
         S[1, 2] += weight[k] * h1 * h2
         S[2, 2] += weight[k] * h2 * h2
     S[2, 2] += curvature_prior
-    v0, v1, v2 = _solve3(S, (1.0, 0.0, 0.0))
-    s0, s1, s2 = _solve3(S, (0.0, 1.0, 0.0))
+    inverse = np.full((3, 3), np.nan)
+    invert_symmetric(S, inverse)
+    v0, v1, v2 = inverse[0]
+    s0, s1, s2 = inverse[1]
     for k in range(len(t)):
         x = t[k] / scale
         value[k] = weight[k] * (v0 + v1 * x + 0.5 * v2 * x * x)

@@ -6,8 +6,8 @@ from epipole.tasks.algorithms.association.odds import blocked
 from epipole.tasks.algorithms.association.search.sight_lines import BEYOND, SLACK_SIGMA
 from epipole.tasks.algorithms.association.views import direction, residual
 from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
-from epipole.tasks.algorithms.geometry.triangulation import invert3
 from epipole.tasks.algorithms.kernels import borrowing_kernel
+from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 
 ITERATIONS = 6
 CONVERGED = 1e-4  # sigmas squared
@@ -31,7 +31,7 @@ def _start(views, members, m, points, part):
                 p = (1.0 if a == b else 0.0) - part[a] * part[b]
                 N[a, b] += p
                 part[RHS + a] += p * views.camera[views.sensor[i], m, b]
-    if invert3(N, inverse) < 1e-12 * count**3:
+    if invert_symmetric(N, inverse) < 1e-12 * count**3:
         return False
     for a in range(3):
         x[a] = inverse[a, 0] * part[RHS]
@@ -62,7 +62,7 @@ def _add_view(views, i, m, x, N, part):
 @borrowing_kernel
 def _step(x, N, part, P):
     """Invert N into P and move x; return the decrease of chi-square, NaN where it diverges."""
-    if invert3(N, P) == 0.0:
+    if invert_symmetric(N, P) == 0.0:
         return np.nan
     gain = 0.0
     for a in range(3):

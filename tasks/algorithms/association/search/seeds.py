@@ -10,13 +10,12 @@ import numpy as np
 
 from epipole.tasks.algorithms.association.search.sight_lines import pair_miss, quantile
 from epipole.tasks.algorithms.association.views import HAS_RATE, PLANE, SIGMA_KM, XX, YY, direction
-from epipole.tasks.algorithms.constants import SPEED_OF_LIGHT_KM_S
+from epipole.tasks.algorithms.constants import ESCAPE_SPEED_KM_S, SPEED_OF_LIGHT_KM_S
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 
 SHORTEST_BASELINE_KM = 1.0  # minimum baseline of a pair: below, ranges are undetermined
 NEAREST_KM = 300.0  # minimum range [km]: errors of the baseline turn the plane most there
-FASTEST_KM_S = 11.0  # maximum speed in orbit (escape speed): motion during the light time
-MOTION_SIGMA = 3.0  # the maximum motion counts as an error of 3 sigma
+MOTION_SIGMA = 3.0  # motion during the light time, at escape speed, counts as an error of 3 sigma
 
 
 @kernel
@@ -91,7 +90,7 @@ def _plane_angles(space, s, m, baseline, axes):
     angle, sigma = np.empty(len(items)), np.empty(len(items))
     length = np.sqrt(np.sum(baseline * baseline))
     # Light time: the ranges of two sensors differ by at most the baseline.
-    moved_km = FASTEST_KM_S * length / SPEED_OF_LIGHT_KM_S / MOTION_SIGMA
+    moved_km = ESCAPE_SPEED_KM_S * length / SPEED_OF_LIGHT_KM_S / MOTION_SIGMA
     for i in range(views.first[s], views.first[s + 1]):
         if space.taken[i] or not views.seen[i, m]:
             continue

@@ -20,7 +20,6 @@ import numpy as np
 
 from epipole.tasks.algorithms.geometry.attitude import (
     attitude_information,
-    invert_symmetric,
 )
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.star_identification.evidence import (
@@ -55,6 +54,7 @@ from epipole.tasks.algorithms.star_identification.search.votes import (
     make_votes,
 )
 from epipole.tasks.algorithms.star_identification.star_pairs import range_of
+from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 
 # The brightest pairs.
 

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtri
 
+from epipole.tasks.algorithms.constants import LN_2PI
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.tracking.linking.chains import (
     Fragments,
@@ -341,7 +342,7 @@ def _compare(tail, head, i, j, first, last, scratch):
     explained, log_both = _explained(A_1, b_1, prior_2, prior_3, factor)
     n_free -= _free_parameters(factor, prior_2, prior_3)
     D = (c_1 + c_2 - explained) - (c_1 - explained_1) - (c_2 - explained_2)
-    log_ratio = log_1 + log_2 - log_both - np.log(prior_2 * prior_3) - 2 * np.log(2 * np.pi)
+    log_ratio = log_1 + log_2 - log_both - np.log(prior_2 * prior_3) - 2 * LN_2PI
     # A rate in units of the scale: its share of the prior volume is rad^2, not rad^2 / s^2.
     return D, 2 * max(n_free, 2.0), log_ratio + 2 * np.log(scale) - 0.5 * D
 

@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from epipole.tasks.algorithms.geometry.attitude import (
     attitude_covariance,
-    invert_symmetric,
     optimal_attitude,
     orthonormalise,
     refine_attitude,
@@ -108,14 +107,3 @@ def test_turn_is_the_exponential_map(seed):
     orthonormalise(R)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-15)
     np.testing.assert_allclose(R, want, atol=1e-8)
-
-
-@settings(deadline=None)  # the first call compiles
-@given(seeds)
-def test_a_symmetric_matrix_is_inverted(seed):
-    A = np.random.default_rng(seed).normal(size=(3, 3))
-    A = A @ A.T + np.eye(3)
-    out = np.empty((3, 3))
-    assert abs(invert_symmetric(A, out) / np.linalg.det(A) - 1) < 1e-9
-    np.testing.assert_allclose(out @ A, np.eye(3), atol=1e-9)
-    assert invert_symmetric(np.zeros((3, 3)), out) == 0.0

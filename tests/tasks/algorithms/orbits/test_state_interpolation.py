@@ -7,7 +7,6 @@ from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry import directions as rotations
 from epipole.tasks.algorithms.orbits.state_interpolation import (
     SensorStates,
-    gravity,
     interpolate_states,
 )
 
@@ -181,18 +180,6 @@ def test_inputs_are_unchanged():
     interpolate_states(states, nanoseconds(np.array([0.5, 7.0])), GAP_S)
     for column, old in zip(states, before, strict=True):
         np.testing.assert_array_equal(column, old)
-
-
-def test_gravity_is_the_gradient_of_the_potential():
-    def potential(r):
-        radius = np.linalg.norm(r)
-        legendre = (3 * (r[2] / radius) ** 2 - 1) / 2
-        return 398600.4418 / radius * (1 - 1.08262668e-3 * (6378.137 / radius) ** 2 * legendre)
-
-    r, h = np.array([4000.0, -3000.0, 5000.0]), 0.1
-    steps = h * np.eye(3)
-    gradient = [(potential(r + d) - potential(r - d)) / (2 * h) for d in steps]
-    np.testing.assert_allclose(gravity(r), gradient, rtol=1e-7)
 
 
 # Prior attitudes
