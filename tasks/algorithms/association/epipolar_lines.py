@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Pairs = Mapping[tuple[int, int], Indices]
 
-OUTLIER_SIGMA = 3.0
+OUTLIER_SIGMA = 3.0  # farthest point from the mean, per axis, in standard deviations
 PARALLEL = 1e-14  # squared sine: 0.02 arcsec
 
 

@@ -19,6 +19,7 @@ from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.symmetric_matrices import factor, solve_factored
 from epipole.tasks.algorithms.tracking.local_motion import detections_about
 from epipole.tasks.algorithms.tracking.sky_filter import (
+    BEND_SHARE,
     FAR_RAD_S2,
     LOW_ORBIT_S,
     acceleration,
@@ -36,7 +37,6 @@ MAX_TURN = 0.5  # maximum time from the middle times the relative range rate
 MAX_ROUNDS = 8  # each doubles how fast the range may change
 MAX_SIGMA = 1.0  # of chi-square: a worse fit means that the range changes faster than usual
 SMALL_RAD = 1e-5  # an angle below this equals its sine
-BEND = 0.5  # 1-sigma derivatives as a share of the bounds that the rate allows
 
 
 class Attributables(NamedTuple):
@@ -83,6 +83,7 @@ def attributables(
 
 @kernel
 def _fit_all(rows, at_s, time_s, u, noise, out):
+    """Write the attributables of all tracklets to `out`; arguments as in `attributables`."""
     frame, derivatives = np.empty((3, 3)), np.empty((ORDER + 1, 2))
     N, rhs = np.empty((N_ROWS, N_ROWS)), np.empty(N_ROWS)
     for k in range(len(at_s)):
@@ -195,15 +196,15 @@ def _add_prior(rate, widening, scale, N):
     faster = widening * (rate + LOW_ORBIT_S + 2 * approach(rate))
     along, across = widening * acceleration(rate), widening * (LOW_ORBIT_S * rate + FAR_RAD_S2)
     for m in range(2, ORDER + 1):
-        N[2 * m, 2 * m] += 1.0 / (BEND * along * scale**m) ** 2
-        N[2 * m + 1, 2 * m + 1] += 1.0 / (BEND * across * scale**m) ** 2
+        N[2 * m, 2 * m] += 1.0 / (BEND_SHARE * along * scale**m) ** 2
+        N[2 * m + 1, 2 * m + 1] += 1.0 / (BEND_SHARE * across * scale**m) ** 2
         along = widening**2 * jerk(rate) if m == 2 else along * m * faster
         across *= m * faster
 
 
 @kernel
 def _turn(frame, offset):
-    """Turn the frame so that it looks along an offset (2,) of it [rad]."""
+    """Turn the frame (3, 3) in place so that it looks along an offset (2,) of it [rad]."""
     u = frame[2] + offset[0] * frame[0] + offset[1] * frame[1]
     frame[2] = u / np.sqrt(np.sum(u**2))
     along = frame[0] - np.sum(frame[0] * frame[2]) * frame[2]

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
-from epipole.tasks.algorithms.tracking.local_motion import BEND, directions_at
-from epipole.tasks.algorithms.tracking.sky_filter import acceleration
+from epipole.tasks.algorithms.tracking.local_motion import directions_at
+from epipole.tasks.algorithms.tracking.sky_filter import BEND_SHARE, acceleration
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -213,7 +213,7 @@ def _enter_blends(time, u, tracklet, by_frame, starts, bounds, frame_s, ends, bl
 
 @kernel
 def _distance(u, p):
-    """Return the chord between two directions."""
+    """Return the chord between two directions (3,): for small angles the angle [rad]."""
     return np.sqrt((u[0] - p[0]) ** 2 + (u[1] - p[1]) ** 2 + (u[2] - p[2]) ** 2)
 
 
@@ -234,7 +234,7 @@ def _predict(time, u, bounds, ends, b, k, at, p):
     for c in range(3):
         p[c] = ends.u[b, e, c] + gap * ends.w[b, e, c]
         rate += ends.w[b, e, c] ** 2
-    bent = BEND * acceleration(np.sqrt(rate)) * gap * gap / 2
+    bent = BEND_SHARE * acceleration(np.sqrt(rate)) * gap * gap / 2
     return ends.variance[b, e] * (1 + 2 * abs(gap) / ends.fitted_s[b]) ** 2 + bent * bent
 
 

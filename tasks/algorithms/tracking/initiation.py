@@ -50,10 +50,11 @@ MAX_FREE = 8.0  # free detections in a frame; with 10, this search would take 10
 N_RATES = 24  # classes of rate for which the maximum evidence is tabulated
 SLOWEST_RAD_S = 1e-6  # upper end of the slowest class of rate [rad/s]
 MAX_PAIRS = 500_000  # limit per frame, even in a short sequence
-FEW_TO_CLASSIFY = (
-    1_000  # up to this number of pairs, only the classes of rate that occur are tabulated
-)
-FEW_PAIRS = 50_000  # up to this number, pairs that are two frames apart are tried as well
+# Up to this number of pairs, only the classes of rate that occur are tabulated: sparse frames are
+# then faster.
+FEW_TO_CLASSIFY = 1_000
+# Up to this number, pairs that are two frames apart are tried as well: it bounds the time.
+FEW_PAIRS = 50_000
 
 
 class Detections(NamedTuple):
@@ -332,6 +333,7 @@ def _fastest(best, class_rates, wanted, dt, pairs_sr, rule):
 
 @kernel
 def _class_of(rate, max_rate):
+    """Return the class of a rate [rad/s], 0 to N_RATES - 1, see `_class_rates`."""
     if rate < SLOWEST_RAD_S:
         return 0
     top = max(max_rate, 2 * SLOWEST_RAD_S)

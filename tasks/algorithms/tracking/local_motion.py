@@ -12,14 +12,11 @@ import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
-from epipole.tasks.algorithms.tracking.sky_filter import acceleration, jerk
+from epipole.tasks.algorithms.tracking.sky_filter import BEND_SHARE, acceleration, jerk
 
 Array = npt.NDArray[np.float64]
 
 BIAS_SHARE = 0.25  # maximum error by the neglected third derivative, in sigmas of a detection
-# 1-sigma acceleration per axis, as a share of the bound that the rate allows: real orbits have
-# 0.3 to 0.5.
-BEND = 0.5
 
 
 class _Queries(NamedTuple):
@@ -84,7 +81,10 @@ class LocalMotion(NamedTuple):
 
 @kernel
 def _half_width(rate, sigma, max_half):
-    """Return the window [s] in which the neglected cubic term stays below the noise."""
+    """Return half the window [s] in which the neglected cubic term stays below the noise.
+
+    `rate` [rad/s], `sigma` [rad] of a detection, `max_half` [s] the largest half-width.
+    """
     return min(max_half, (6 * BIAS_SHARE * sigma / jerk(rate)) ** (1 / 3))
 
 
@@ -120,7 +120,10 @@ def _coefficients(t, weight, scale, curvature_prior, value, slope):
 
 @kernel
 def detections_about(t, first, last, at, half):
-    """Return the detections within a half-width of a time, or the three nearest if fewer."""
+    """Return the range of rows within `half` [s] of the time `at`, or the three nearest if fewer.
+
+    t (n,) are times [s] in order; only rows first:last count.
+    """
     lo = first + np.searchsorted(t[first:last], at - half)
     hi = first + np.searchsorted(t[first:last], at + half, side="right")
     while hi - lo < min(3, last - first):
@@ -152,7 +155,7 @@ def _window(t, u, first, last, at, sigma, max_half):
 
 @kernel
 def _nearest(t, first, last, at):
-    """Return the detection of first:last that is nearest to a time."""
+    """Return the row of first:last whose time t (n,) [s] is nearest to `at`."""
     nearest = first + np.searchsorted(t[first:last], at)
     if nearest == last or (nearest > first and at - t[nearest - 1] <= t[nearest] - at):
         nearest -= 1
@@ -178,7 +181,7 @@ def _fit(detections, lo, hi, at, rate, half, unknown_rate):
         unmodelled = (unknown_rate * tau[0]) ** 2
     else:
         scale = max(np.max(np.abs(tau)), 1e-9)
-        prior = 1.0 / (BEND * acceleration(rate) * scale * scale) ** 2
+        prior = 1.0 / (BEND_SHARE * acceleration(rate) * scale * scale) ** 2
         unmodelled = _coefficients(tau, weight, scale, prior, value, slope)
         if scale > half:
             unmodelled += (jerk(rate) * scale**3 / 6) ** 2

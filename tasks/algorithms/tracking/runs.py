@@ -180,7 +180,7 @@ def _follow_by_rule(
 
 @kernel
 def _follow(detections, max_in_frame, rule):
-    """Fill in the tracks of all detections; a frame has at most `max_in_frame`."""
+    """Write each detection's track to `detections.track`; a frame has at most `max_in_frame`."""
     times, capacity = detections.times, len(detections.track) // max(rule.min_detections, 1) + 1
     tracks = _Tracks(
         np.empty((capacity, 3)),
@@ -338,7 +338,7 @@ def _exchange(live, tracks, detections, candidates, assigned, gate2):
 
 @kernel
 def _chi2(tracks, m, detections, j):
-    """Return the squared distance, in sigmas, of detection j from the prediction of track m."""
+    """Return chi-square of detection j, 2 degrees of freedom, as one of track m."""
     variance = tracks.P[m, 0] + detections.variances[j]
     return distance2(detections.directions[j], tracks.u[m]) / variance
 

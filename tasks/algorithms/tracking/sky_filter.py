@@ -29,6 +29,9 @@ LOW_ORBIT_S = 1e-3  # [1/s] angular rate of a low orbit; also g / v there
 APPROACH = 2.0  # relative range rate over apparent rate: real low orbits rarely exceed it
 APPROACH_S = 0.1  # [1/s] largest relative range rate: 14 km/s at 140 km
 FAR_RAD_S2 = 2.5e-7  # [rad/s^2] a low sensor's acceleration over the range of a far object
+# 1-sigma acceleration, and each further derivative, per axis as a share of its bound: real orbits
+# have 0.3 to 0.5.
+BEND_SHARE = 0.5
 
 
 @kernel
@@ -74,16 +77,19 @@ def cubic_span(rate: float, sigma: float) -> float:
 
 SIZE = 6  # elements of a covariance
 
+# u (3,) is a direction, w (3,) its rate [rad/s], `bend` (3,) its acceleration [rad/s^2], and P (6,)
+# their covariance per axis [rad^2, rad^2/s ...]. Times dt and t are in seconds.
+
 
 @kernel
 def rate_of(w):
-    """Return the length of a rate vector."""
+    """Return the length [rad/s] of a rate w (3,)."""
     return np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
 
 
 @kernel
 def distance2(a, b):
-    """Return the squared chord between two directions."""
+    """Return the squared chord between two directions (3,): the squared angle, if small."""
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
@@ -144,7 +150,10 @@ def grow(P, rate, bend, dt):
 
 @kernel
 def shrink(P, variance):
-    """Update the covariance by a measured direction; return the gains of direction, rate, bend."""
+    """Update P by a measured direction of this variance [rad^2].
+
+    Returns the gains of direction, rate [1/s] and acceleration [1/s^2] (Kalman).
+    """
     s = P[0] + variance
     gain_u, gain_w, gain_bend = P[0] / s, P[1] / s, P[3] / s
     P[5] -= gain_bend * P[3]
@@ -158,7 +167,7 @@ def shrink(P, variance):
 
 @kernel
 def correct(u, w, bend, P, measured, variance):
-    """Update u, w, bend and P in place by a measured direction."""
+    """Update u, w, bend and P in place by a direction `measured` (3,) of a variance [rad^2]."""
     gain_u, gain_w, gain_bend = shrink(P, variance)
     for a in range(3):
         difference = measured[a] - u[a]
@@ -170,7 +179,10 @@ def correct(u, w, bend, P, measured, variance):
 
 @kernel
 def begin_covariance(rate, dt, var_1, var_2, P):
-    """Set P to the covariance at the second of two detections dt apart."""
+    """Set P to the covariance at the second of two detections, dt [s] apart.
+
+    `rate` [rad/s] bounds the acceleration; var_1 and var_2 [rad^2] are the detections' variances.
+    """
     a = acceleration(rate)
     P[0] = var_2
     P[1] = var_2 / dt
@@ -180,7 +192,10 @@ def begin_covariance(rate, dt, var_1, var_2, P):
 
 @kernel
 def begin(u_1, t_1, var_1, u_2, t_2, var_2, u, w, bend, P):
-    """Set u, w, bend, P to the state at the second of two detections."""
+    """Set u, w, bend, P to the state at the second of two detections.
+
+    u_1, u_2 (3,) are the directions, t_1, t_2 their times, var_1, var_2 [rad^2] their variances.
+    """
     dt = t_2 - t_1
     cosine = u_1[0] * u_2[0] + u_1[1] * u_2[1] + u_1[2] * u_2[2]
     chord = 0.0
@@ -202,12 +217,16 @@ def begin(u_1, t_1, var_1, u_2, t_2, var_2, u, w, bend, P):
 # detections within a distance are in the cells that this distance touches. A grid is a tuple of
 # arrays, as compiled code takes them. Slot k of each belongs to the frames k, k + size, ...
 
-MAX_CELLS_PER_SIDE = 128  # maximum number of cells along a side
+MAX_CELLS_PER_SIDE = 128  # 16,384 cells, about one detection each: bounds the memory of a grid
 
 
 @kernel
 def make_grids(size, max_detections):
-    """Return arrays for `size` frames with at most `max_detections` detections each."""
+    """Return arrays for `size` frames with at most `max_detections` detections each.
+
+    The plane's axes (size, 2, 3); its bounds and scale (size, 4); the first item of each cell
+    (size, side^2 + 1); the items, rows of the detections (size, max_detections).
+    """
     side = max(min(int(np.sqrt(max_detections)), MAX_CELLS_PER_SIDE), 1)
     axes = np.zeros((size, 2, 3))
     shape = np.zeros((size, 4))  # lowest on both axes, cells per unit, cells along a side
@@ -218,7 +237,7 @@ def make_grids(size, max_detections):
 
 @kernel
 def _set_axes(directions, lo, hi, axes):
-    """Set two axes across the mean direction of a frame."""
+    """Write two unit vectors across the mean of directions[lo:hi] to `axes` (2, 3)."""
     mean = np.zeros(3)
     for j in range(lo, hi):
         for a in range(3):
@@ -248,7 +267,7 @@ def _along(u, axis):
 
 @kernel
 def fill_grid(grids, slot, directions, lo, hi):
-    """Enter the detections lo:hi of a frame into a slot."""
+    """Enter the detections lo:hi of a frame, rows of `directions` (n, 3), into a slot."""
     axes, shape, start, items = grids
     n = hi - lo
     side = max(min(int(np.sqrt(n)), int(np.sqrt(start.shape[1] - 1))), 1)

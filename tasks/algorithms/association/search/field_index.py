@@ -107,6 +107,7 @@ def _cells_per_km(radius_km, size):
 
 @borrowing_kernel
 def _key(i, j, k):
+    """Return the key of the cell (i, j, k), positive; see `OFFSET`."""
     return ((i + OFFSET) << 42) | ((j + OFFSET) << 21) | (k + OFFSET)
 
 
@@ -281,6 +282,7 @@ def _walk(cones, sweep, farthest_km, entering):
 
 @borrowing_kernel
 def _along(cones, s, m, at):
+    """Return the point [km, GCRF] of a cone's axis that is `at` [km] from its sensor."""
     return (
         cones[s, m, 0] + at * cones[s, m, AXIS],
         cones[s, m, 1] + at * cones[s, m, AXIS + 1],
@@ -364,6 +366,7 @@ def cell_at(index, x):
 
 @borrowing_kernel
 def _cell(index, i, j, k):
+    """Return the row of the cell (i, j, k), -1 if no field touches it."""
     key = _key(i, j, k)
     at = _slot(index.keys, key)
     return index.slots[at] if index.keys[at] == key else np.int64(-1)
@@ -371,7 +374,7 @@ def _cell(index, i, j, k):
 
 @borrowing_kernel
 def cells_across(index, x, radius_km):
-    """Return the radius of a ball about x (3,) in sizes of cells."""
+    """Return the radius of a ball about x (3,) [km, GCRF] over the size of the cells there."""
     if index.size == 0.0:
         return 0.0
     distance = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])
@@ -401,6 +404,7 @@ def sensors_about(index, x, radius_km, stamp, mark, out, n):
 
 @borrowing_kernel
 def _add_cell(index, q, stamp, mark, out, n):
+    """Append the sensors of cell q to `out`, as in `sensors_about`; return the new length."""
     for k in range(index.first[q], index.first[q + 1]):
         s = index.sensor[k]
         if stamp[s] != mark:

@@ -9,8 +9,8 @@ from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 
-ITERATIONS = 6
-CONVERGED = 1e-4  # sigmas squared
+ITERATIONS = 6  # of Gauss and Newton, at most
+CONVERGED = 1e-4  # decrease of chi-square below which a point is solved: a hundredth of a sigma
 RHS = 11  # offset of the right-hand side of the normal equations, after the residual
 
 

@@ -59,6 +59,7 @@ def seeds_between(space, a, b, gate_sigma):
 
 @borrowing_kernel
 def _size(views, s):
+    """Return the number of tracklets of sensor s."""
     return views.first[s + 1] - views.first[s]
 
 

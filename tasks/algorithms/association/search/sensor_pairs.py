@@ -81,6 +81,7 @@ def _steps_along(farthest_km: float) -> Array:
 
 @kernel
 def _meet_all(cones, steps, a, b):
+    """Return `_meet` of each pair of sensors a (n,) and b (n,), (n,) bool."""
     meet = np.zeros(len(a), np.bool_)
     for k in range(len(a)):
         meet[k] = _meet(cones, steps, a[k], b[k])
@@ -302,7 +303,7 @@ def _cover(index, a, b, middle, share, points, first, by_cell, covered):
 
 @borrowing_kernel
 def _in_cone(x, look, position, half):
-    """Return whether a point is within an angle of a sensor's axis."""
+    """Return whether x (3,) [km] is within `half` [rad] of the axis `look` from `position`."""
     along, length2 = 0.0, 0.0
     for q in range(3):
         d = x[q] - position[q]
@@ -313,7 +314,7 @@ def _in_cone(x, look, position, half):
 
 @kernel
 def _cells_of(index, points):
-    """Return the cell of each point, -1 for NaN."""
+    """Return the cell of each point (n, p, 3) [km], (n, p); -1 for NaN."""
     out = np.full(points.shape[:2], -1)
     for k in range(out.shape[0]):
         for c in range(out.shape[1]):

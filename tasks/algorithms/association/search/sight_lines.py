@@ -98,7 +98,7 @@ def _speed(views, i, m, range_km, n0, n1, n2):
 
 @borrowing_kernel
 def _spread(views, i, m):
-    """Return the trace of a direction's covariance on its plane."""
+    """Return the trace of the covariance of tracklet i on its sensor's plane [rad^2]."""
     return views.sight[i, m, XX] + views.sight[i, m, YY]
 
 

@@ -6,8 +6,8 @@ import pytest
 from epipole.tasks.algorithms.constants import ARCSEC
 from epipole.tasks.algorithms.geometry.covariances import centroid_covariance
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
-from epipole.tasks.algorithms.tracking.local_motion import BEND, directions_at
-from epipole.tasks.algorithms.tracking.sky_filter import acceleration
+from epipole.tasks.algorithms.tracking.local_motion import directions_at
+from epipole.tasks.algorithms.tracking.sky_filter import BEND_SHARE, acceleration
 
 
 def passing(t, speed_km_s, range_km):
@@ -56,7 +56,7 @@ def test_the_covariance_is_honest_over_many_trials(n):
     squares = []
     for _ in range(3000):
         # The acceleration is one that the rate allows; the fit does not know which.
-        bend = rng.normal(size=2) * BEND * acceleration(rate)
+        bend = rng.normal(size=2) * BEND_SHARE * acceleration(rate)
         path = t[:, None] * [rate, 0.0] + 0.5 * t[:, None] ** 2 * bend
         seen = goal + (path + rng.normal(size=(n, 2)) * sigma) @ basis
         seen /= np.linalg.norm(seen, axis=1, keepdims=True)
