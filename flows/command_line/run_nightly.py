@@ -16,7 +16,7 @@ from epipole.flows.night.summary import Summary, summarise
 from epipole.flows.prefect.server_process import Launched, launch
 from epipole.io.caches.kernel_compiler import (
     compile_kernels,
-    nothing_compiled,
+    compiled_share,
     report_compiling,
     second_process,
 )
@@ -31,6 +31,8 @@ from epipole.schemas.options import Runner
 from epipole.schemas.settings import Settings
 
 LOGGER = logging.getLogger(__name__)
+
+WARM_SHARE = 0.5  # of the kernels: with more, one process compiles the others soon
 
 
 @dataclass(frozen=True)
@@ -188,7 +190,7 @@ def _load_kernels() -> None:
     """
     if kernel_folder() is None:
         return
-    if not nothing_compiled():
+    if compiled_share() > WARM_SHARE:
         compile_kernels()
         return
     LOGGER.info(

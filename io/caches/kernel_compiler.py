@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, Popen
 
-from epipole.io.caches.kernels import CODE, DIGEST, digest_of, kernel_folder
+from epipole.io.caches.kernels import folder_of, imported_by, kernel_folder
 
 LOGGER = logging.getLogger(__name__)
 
@@ -40,9 +40,19 @@ def compile_kernels(backwards: bool = False) -> None:
             LOGGER.info("%s could not be compiled beforehand: %r", name, error)
 
 
-def nothing_compiled() -> bool:
-    """Return whether the folder of all kernels is empty."""
-    return _count() == 0
+def compiled_share() -> float:
+    """Return the share of the list's kernels that are in the folder."""
+    from epipole.io.caches.kernel_list import read_kernels
+
+    names = [name.partition(":") for name, _ in read_kernels()]
+    kept = sum(_is_kept(module, function) for module, _, function in names)
+    return kept / len(names)
+
+
+def _is_kept(module: str, function: str) -> bool:
+    folder = folder_of(module)
+    name = f"{module.rpartition('.')[2]}.{function}-*.nbi"
+    return folder is not None and any(folder.glob(name))
 
 
 @contextlib.contextmanager
@@ -67,14 +77,15 @@ def _start() -> Popen[bytes] | None:
 
 
 @contextlib.contextmanager
-def report_compiling(report: Callable[[int, int], None]) -> Iterator[None]:
+def report_compiling(report: Callable[[int, int], None], total: int = 0) -> Iterator[None]:
     """Report how many functions are compiled, as long as this lasts.
 
     Parameters
     ----------
     report
-        Called with the number of new files in the kernel folder, and with how many there will be.
-        This is 0 where some are there already: nobody knows how many more are needed.
+        Called with the number of new files in the kernel folder, and with `total`.
+    total
+        How many there will be, about. 0: nobody knows.
     """
     ended = threading.Event()
     before = _count()
@@ -85,7 +96,7 @@ def report_compiling(report: Callable[[int, int], None]) -> Iterator[None]:
             # The folder is known as soon as the first module with kernels is imported.
             before = _count() if before is None else before
             if new := (_count() or 0) - (before or 0):
-                report(new, max(FILES_OF_THE_LIST, new) if before == 0 else 0)
+                report(new, total and max(total, new))
 
     watcher = threading.Thread(target=watch, daemon=True)
     watcher.start()
@@ -104,12 +115,15 @@ def _count() -> int | None:
 
 def compile_into(folder: Path) -> None:
     """Compile all kernels of the list, and put them into a folder that a wheel can carry."""
-    with report_compiling(_printer()), second_process():
+    from epipole.io.caches.kernel_list import read_kernels
+
+    with report_compiling(_printer(), FILES_OF_THE_LIST), second_process():
         compile_kernels()
-    made = kernel_folder()
-    assert made is not None
-    shutil.copytree(made, folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("*.tmp.*"))
-    (folder / DIGEST).write_text(digest_of(CODE), encoding="ascii")
+    modules = set().union(*(imported_by(name.partition(":")[0]) for name, _ in read_kernels()))
+    made = [kept for module in modules if (kept := folder_of(module)) is not None and kept.is_dir()]
+    ignored = shutil.ignore_patterns("*.tmp.*")
+    for kept in made:
+        shutil.copytree(kept, folder / kept.name, dirs_exist_ok=True, ignore=ignored)
 
 
 def _printer() -> Callable[[int, int], None]:

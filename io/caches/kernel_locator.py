@@ -1,5 +1,7 @@
-"""Where numba looks for a kernel of this package: by its module, in one folder for all."""
+"""Where numba looks for a kernel of this package: in the folder of its module."""
 
+import contextlib
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,44 +9,42 @@ from typing import Any
 import numba
 from numba.core.caching import CacheImpl, _CacheLocator
 
-_PACKAGE = "epipole."
-_Folder = Callable[[], Path | None]
-_kernel_folder: _Folder = lambda: None  # noqa: E731  set by `locate_kernels`
+_FolderOf = Callable[[str], Path | None]
+_folder_of: _FolderOf = lambda _: None  # noqa: E731  set by `locate_kernels`
 
 
 class KernelLocator(_CacheLocator):
     """The folder of one kernel. numba asks for it when the kernel is declared."""
 
     def __init__(self, function: Callable[..., Any], folder: Path) -> None:
-        """Take the folder of all kernels."""
-        self._path = folder / function.__module__.rpartition(".")[0]
-        self._line = function.__code__.co_firstlineno
+        """Take the folder of the kernel's module."""
+        self._path, self._line = folder, function.__code__.co_firstlineno
+        with contextlib.suppress(OSError):  # it is not there yet
+            os.utime(folder)  # it is in use
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "KernelLocator | None":
         """Return the locator of a kernel of this package; None: numba goes on to its others."""
-        folder = _kernel_folder()
-        if folder is None or not py_func.__module__.startswith(_PACKAGE):
-            return None
-        return cls(py_func, folder)
+        folder = _folder_of(py_func.__module__)
+        return None if folder is None else cls(py_func, folder)
 
     def get_cache_path(self) -> str:
-        """Return the folder of the kernel's package."""
+        """Return the folder of the kernel's module."""
         return str(self._path)
 
     def get_source_stamp(self) -> str:
-        """Return the same for all: the name of the whole folder changes with the code."""
-        return _PACKAGE
+        """Return the same for all: the name of the folder changes with the code."""
+        return self._path.name
 
     def get_disambiguator(self) -> str:
         """Return what tells functions of one name in a module apart."""
         return str(self._line)
 
 
-def locate_kernels(folder: _Folder) -> None:
-    """Have numba look for the kernels of this package in a folder, from now on."""
-    global _kernel_folder
-    _kernel_folder = folder
+def locate_kernels(folder_of: _FolderOf) -> None:
+    """Have numba look for kernels in the folder that this returns for their module, from now on."""
+    global _folder_of
+    _folder_of = folder_of
     if KernelLocator not in CacheImpl._locator_classes:
         CacheImpl._locator_classes.insert(0, KernelLocator)
 

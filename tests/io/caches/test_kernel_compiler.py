@@ -10,11 +10,11 @@ from epipole.io.caches import kernel_compiler, kernel_list, kernels
 from epipole.io.caches.kernel_compiler import (
     compile_into,
     compile_kernels,
-    nothing_compiled,
+    compiled_share,
     report_compiling,
     second_process,
 )
-from epipole.io.caches.kernels import CODE, DIGEST, digest_of
+from epipole.io.caches.kernels import folder_of
 
 MODULE = "epipole.io.caches.kernel_compiler"
 
@@ -33,13 +33,17 @@ class Helper:
 def folder(tmp_path, monkeypatch):
     """Return a kernel folder without kernels."""
     monkeypatch.setattr(kernels, "_folder", tmp_path / "kernels")
-    (tmp_path / "kernels" / "epipole.tasks").mkdir(parents=True)
+    (tmp_path / "kernels").mkdir()
     return tmp_path / "kernels"
 
 
-def keep(folder):
-    kept = folder / "epipole.tasks"
-    (kept / f"{len(list(kept.iterdir()))}.nbi").touch()
+MODULE_OF_ONE = "epipole.tasks.algorithms.geometry.attitude"
+
+
+def keep(function="one"):
+    folder = folder_of(MODULE_OF_ONE)
+    folder.mkdir(exist_ok=True)
+    (folder / f"attitude.{function}-{len(list(folder.iterdir()))}.py311.nbi").touch()
 
 
 @pytest.fixture
@@ -101,9 +105,10 @@ class Kernel:
 @pytest.fixture
 def compiled(monkeypatch):
     """Have three kernels in the list, one of them unknown; return the types that were compiled."""
-    listed = [("good:one", ["int64"]), ("no.such:kernel", ["int64"]), ("good:two", ["float64"])]
+    one, two = f"{MODULE_OF_ONE}:one", f"{MODULE_OF_ONE}:two"
+    listed = [(one, ["int64"]), ("no.such:kernel", ["int64"]), (two, ["float64"])]
     compiled = []
-    there = {"good:one": Kernel(compiled), "good:two": Kernel(compiled)}
+    there = {one: Kernel(compiled), two: Kernel(compiled)}
     monkeypatch.setattr(kernel_list, "read_kernels", lambda: listed)
     monkeypatch.setattr(kernel_list, "kernel", lambda name: there[name])
     return compiled
@@ -116,29 +121,38 @@ def test_a_kernel_that_cannot_be_compiled_is_left_to_the_run(backwards, compiled
     assert [str(*types) for types in compiled] == (order[::-1] if backwards else order)
 
 
-def test_a_wheel_gets_all_kernels_and_the_digest_of_their_code(compiled, started, folder, tmp_path):
-    keep(folder)
+def test_a_wheel_gets_the_kernels_of_this_code(compiled, started, folder, tmp_path):
+    keep()
+    (folder / "tasks.a-0123").mkdir()  # of another version
     compile_into(tmp_path / "wheel")
     assert len(compiled) == 2
-    assert (tmp_path / "wheel" / "epipole.tasks" / "0.nbi").exists()
-    assert (tmp_path / "wheel" / DIGEST).read_text() == digest_of(CODE)
+    (only,) = (tmp_path / "wheel").iterdir()
+    assert (only / "attitude.one-0.py311.nbi").exists()
+    assert only.name == folder_of(MODULE_OF_ONE).name
+
+
+def test_the_share_that_is_compiled_counts_functions(compiled, folder):
+    assert compiled_share() == 0.0
+    keep("one")
+    keep("one")
+    assert compiled_share() == 1 / 3
+    keep("two")
+    assert compiled_share() == 2 / 3
 
 
 def test_what_is_compiled_is_counted_from_the_files_that_appear(folder, monkeypatch):
     monkeypatch.setattr(kernel_compiler, "LOOKED_EVERY_S", 0.01)
 
-    def counted() -> tuple[int, int]:
+    def counted(total: int) -> tuple[int, int]:
         counts = []
-        with report_compiling(lambda *count: counts.append(count)):
-            keep(folder)
+        with report_compiling(lambda *count: counts.append(count), total):
+            keep()
             while not counts:
                 time.sleep(0.01)
         return counts[-1]
 
-    assert nothing_compiled()
-    assert counted() == (1, kernel_compiler.FILES_OF_THE_LIST)
-    assert not nothing_compiled()
-    assert counted() == (1, 0)  # one more: nobody knows how many are needed
+    assert counted(300) == (1, 300)
+    assert counted(0) == (1, 0)  # nobody knows how many there will be
 
 
 def test_nothing_is_reported_where_nothing_is_compiled(folder, monkeypatch):

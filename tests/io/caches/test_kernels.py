@@ -1,22 +1,25 @@
 """Compiled kernels are kept apart for other code, and those of a wheel are used."""
 
 import os
-import shutil
 import time
 
 import pytest
 
-from epipole.io.caches import kernel_target, kernels
+from epipole.io.caches import kernel_locator, kernel_target, kernels
+from epipole.io.caches.kernel_list import read_kernels
 from epipole.io.caches.kernel_locator import KernelLocator
 from epipole.io.caches.kernel_target import LEVEL_3, common_target
 from epipole.io.caches.kernels import (
-    DIGEST,
     HANDED_ON,
     KEPT,
     digest_of,
+    folder_of,
+    imported_by,
     kernel_folder,
     use_kernel_cache,
 )
+
+MODULE = "epipole.tasks.algorithms.geometry.attitude"
 
 
 @pytest.fixture(autouse=True)
@@ -26,106 +29,121 @@ def nothing_handed_on(tmp_path, monkeypatch):
     monkeypatch.setenv(HANDED_ON, "")
     monkeypatch.setattr(kernels, "_folder", None)
     monkeypatch.setattr(kernels, "COMPILED", tmp_path / "no_wheel")
-    kernels._fits.cache_clear()
-    yield
-    kernels._fits.cache_clear()
 
 
 @pytest.fixture
 def code(tmp_path):
-    folder = tmp_path / "code" / "inner"
-    folder.mkdir(parents=True)
-    (folder / "kernel.py").write_text("a = 1\n")
-    return tmp_path / "code"
+    """Return a package of three modules: one imports another, in two lines, the third none."""
+    root = tmp_path / "epipole"
+    (root / "tasks").mkdir(parents=True)
+    (root / "tasks" / "a.py").write_text("from epipole.tasks.b import (\n    one,\n    two,\n)\n")
+    (root / "tasks" / "b.py").write_text("def f():\n    from epipole.tasks import d\n")
+    (root / "tasks" / "c.py").write_text("import numpy\n")
+    (root / "tasks" / "d.py").write_text("x = 1\n")
+    return root
 
 
-def used(code):
-    digest_of.cache_clear()
-    os.environ[HANDED_ON] = ""
-    use_kernel_cache([code])
-    return kernel_folder()
+def test_a_module_depends_on_what_it_imports_directly_or_not(code):
+    names = {f"epipole.tasks.{name}" for name in "abd"}
+    assert imported_by("epipole.tasks.a", code) == names
+    assert imported_by("epipole.tasks.c", code) == {"epipole.tasks.c"}
 
 
-def test_the_same_code_has_the_same_folder_wherever_it_lies_and_other_code_another(code, tmp_path):
-    first = used(code)
-    assert first.parent == tmp_path / "cache" / "kernels"
-    assert used(code) == first
-    assert used(shutil.copytree(code, tmp_path / "other_environment")) == first
-    (code / "inner" / "kernel.py").write_text("a = 2\n")
-    assert used(code) != first
+def test_a_change_changes_the_digests_of_what_imports_the_module(code):
+    def digests():
+        kernels._source.cache_clear()
+        kernels._imports.cache_clear()
+        return [digest_of(f"epipole.tasks.{name}", code) for name in "abcd"]
+
+    before = digests()
+    (code / "tasks" / "d.py").write_text("x = 2\n")
+    after = digests()
+    assert [a == b for a, b in zip(before, after, strict=True)] == [False, False, True, False]
 
 
-def test_a_started_process_uses_the_folder_of_the_one_that_started_it(code, tmp_path, monkeypatch):
-    folder = used(code)
+def test_no_import_of_a_kernels_module_is_overlooked():
+    grimp = pytest.importorskip("grimp", reason="grimp comes with import-linter, of the group dev")
+    roots = [f"epipole.{folder}" for folder in ("schemas", "io", "tasks")]
+    graph = grimp.build_graph(*roots, cache_dir=None)
+    for module in {name.partition(":")[0] for name, _ in read_kernels()}:
+        missing = graph.find_upstream_modules(module) - imported_by(module)
+        assert {name for name in missing if not graph.find_children(name)} == set(), module
+
+
+def test_the_folder_of_a_module_is_in_the_users_cache(tmp_path):
+    use_kernel_cache()
+    assert kernel_folder() == tmp_path / "cache" / "kernels"
+    name = f"{MODULE.removeprefix('epipole.')}-{digest_of(MODULE)}"
+    assert folder_of(MODULE) == kernel_folder() / name
+    assert folder_of("scipy.special") is None
+
+
+def test_a_started_process_uses_the_folder_of_the_one_that_started_it(tmp_path, monkeypatch):
+    use_kernel_cache()
+    folder = kernel_folder()
     monkeypatch.setenv("EPIPOLE_CACHE", str(tmp_path / "other"))
-    use_kernel_cache([code])
+    use_kernel_cache()
     assert kernel_folder() == folder
-    (code / "inner" / "kernel.py").write_text("a = 2\n")  # another version of the code
-    digest_of.cache_clear()
-    use_kernel_cache([code])
-    assert kernel_folder().parent == tmp_path / "other" / "kernels"
+    folder.rmdir()  # the one that started it is gone, and with it a temporary folder
+    use_kernel_cache()
+    assert kernel_folder() == tmp_path / "other" / "kernels"
 
 
-def test_a_users_own_folder_wins(code, monkeypatch, tmp_path):
+def test_a_users_own_folder_wins(monkeypatch, tmp_path):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "mine"))
-    assert used(code) is None
+    use_kernel_cache()
+    assert kernel_folder() is None
+    assert folder_of(MODULE) is None
 
 
 @pytest.fixture
-def wheel(code, tmp_path, monkeypatch):
-    """Return the kernels that the package came with: of this code, by their digest."""
+def wheel(tmp_path, monkeypatch):
+    """Return the kernels that the package came with."""
     compiled = tmp_path / "compiled"
-    (compiled / "epipole.tasks").mkdir(parents=True)
-    (compiled / "epipole.tasks" / "a.nbi").write_text("index")
-    digest_of.cache_clear()
-    (compiled / DIGEST).write_text(digest_of((code,)))
+    (compiled / "tasks.a-0123").mkdir(parents=True)
+    (compiled / "tasks.a-0123" / "a.nbi").write_text("index")
     monkeypatch.setattr(kernels, "COMPILED", compiled)
     return compiled
 
 
-def test_the_kernels_of_a_wheel_are_copied_into_the_cache_once(code, wheel):
-    kept = used(code) / "epipole.tasks" / "a.nbi"
+@pytest.mark.parametrize("cache", ["on", "off"])
+def test_the_kernels_of_a_wheel_are_copied_into_the_cache_once(cache, wheel, monkeypatch):
+    if cache == "off":
+        monkeypatch.setenv("EPIPOLE_CACHE", "off")
+    use_kernel_cache()
+    kept = kernel_folder() / "tasks.a-0123" / "a.nbi"
     assert kept.read_text() == "index"
-    assert kept.parents[1].stat().st_mode & 0o777 == 0o700
+    assert kept.parent.stat().st_mode & 0o777 == 0o700
     kept.write_text("more")
-    used(code)
+    os.environ[HANDED_ON] = ""
+    use_kernel_cache()
     assert kept.read_text() == "more"
-    assert [p.name for p in kept.parents[2].iterdir()] == [kept.parents[1].name]  # no copy is left
+    assert "tasks.a-0123" in {path.name for path in kept.parents[1].iterdir()}
+    assert not list(kept.parents[1].glob(".copy-*"))
 
 
-def test_without_a_cache_the_kernels_of_a_wheel_are_used_where_they_lie(code, wheel, monkeypatch):
-    monkeypatch.setenv("EPIPOLE_CACHE", "off")
-    assert used(code) == wheel
-
-
-def test_the_kernels_of_other_code_are_not_used(code, wheel):
-    (code / "inner" / "kernel.py").write_text("a = 2\n")
-    assert list(used(code).iterdir()) == []
-
-
-def test_folders_of_code_that_is_long_gone_are_removed(code, tmp_path):
+def test_the_folders_that_were_not_used_for_longest_are_removed(tmp_path):
     old = time.time() - 86400
     for k in range(KEPT + 3):
         folder = tmp_path / "cache" / "kernels" / f"old{k}"
         folder.mkdir(parents=True)
         os.utime(folder, (old + k, old + k))
-    kept = used(code)
-    left = {p.name for p in (tmp_path / "cache" / "kernels").iterdir()}
+    (tmp_path / "cache").chmod(0o700)
+    (tmp_path / "cache" / "kernels").chmod(0o700)
+    use_kernel_cache()
+    left = {p.name for p in kernel_folder().iterdir()}
     assert len(left) == KEPT
-    assert kept.name in left
-    assert "old0" not in left
+    assert not left & {"old0", "old1", "old2"}
 
 
-def test_only_kernels_of_this_package_are_located(tmp_path, monkeypatch):
-    def of_another():
-        pass
-
-    of_another.__module__ = "scipy.special"
-    assert KernelLocator.from_function(digest_of.__wrapped__, __file__) is None  # no folder yet
-    monkeypatch.setattr(kernels, "_folder", tmp_path)
-    assert KernelLocator.from_function(of_another, __file__) is None
-    located = KernelLocator.from_function(digest_of.__wrapped__, __file__)
-    assert located.get_cache_path() == str(tmp_path / "epipole.io.caches")
+def test_a_folder_that_is_used_is_not_old(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_locator, "_folder_of", lambda _: tmp_path)
+    os.utime(tmp_path, (0, 0))
+    located = KernelLocator.from_function(digest_of, __file__)
+    assert located.get_cache_path() == str(tmp_path)
+    assert tmp_path.stat().st_mtime > time.time() - 3600
+    monkeypatch.setattr(kernel_locator, "_folder_of", lambda _: None)
+    assert KernelLocator.from_function(digest_of, __file__) is None
 
 
 FLAGS = "flags\t\t: fpu abm avx avx2 bmi1 bmi2 f16c fma movbe\n"
