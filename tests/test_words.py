@@ -120,3 +120,37 @@ def test_names_are_read_word_by_word():
     assert words("OF_PLACES") == {"of", "places"}
     assert words("LogPlaces_own2") == {"log", "places", "own"}
     assert words("replaced") == {"replaced"}
+
+
+# Names in backticks: what they name must exist.
+
+REFERENCE = re.compile(r"(?<!`)`([A-Za-z_]\w*(?:\.\w+)*)`(?!`)")
+# Names of other packages and formats.
+NOT_OURS = {
+    "log_time", "publish_time", "savefig", "erfa", "foxglove", "epipole", "log_", "ros2msg", "setup",
+}  # fmt: skip
+
+
+@functools.cache
+def known_names() -> set[str]:
+    """Return all names in the code of the program, of its modules and in its short strings."""
+    known = {part for path in MODULES for part in (path.stem, *path.relative_to(ROOT).parts[:-1])}
+    for path in MODULES:
+        for token in tokenize.generate_tokens(io.StringIO(path.read_text()).readline):
+            if token.type == tokenize.NAME:
+                known.add(token.string)
+            elif token.type == tokenize.STRING and re.fullmatch(r"[a-z]*\W\w+\W", token.string):
+                known.add(token.string.strip("rbf\"'"))
+    return known
+
+
+def test_names_in_backticks_exist():
+    missing = {
+        f"{path.relative_to(ROOT)}: {reference}"
+        for path in MODULES
+        for text in texts(path)
+        for reference in REFERENCE.findall(text)
+        if reference.split(".")[0] not in NOT_OURS
+        and not set(reference.split(".")) <= known_names()
+    }
+    assert missing == set()

@@ -27,8 +27,8 @@ from epipole.tasks.calibrate.find_camera import (
 
 LOGGER = logging.getLogger(__name__)
 
-# With better optics more stars take part, and they fit better still. Two are enough but for a
-# sensor that was hardly identified before.
+# Maximum number of rounds. Better optics identify more stars, and these improve the optics. Two
+# rounds are enough, except for a sensor that was hardly identified before.
 MAX_CALIBRATIONS = 4
 
 
@@ -40,7 +40,7 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     work
         With the cameras that were found.
     stated
-        CAMERAS as the log states them, but mirrored where the images are.
+        CAMERAS as the log states them, but mirrored where the images are mirrored.
     """
     mode = settings.identification.calibrate
     if mode == "off":
@@ -75,8 +75,8 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
 def calibrate(work: Work, stated: pa.Table, settings: Settings) -> tuple[Work, pa.Table]:
     """Fit each sensor's optics to its stars; identify again the sensors whose optics differ.
 
-    `stated` are the cameras of `find_cameras`. Optics with which a sensor identifies half of its
-    frames or fewer were fitted to wrong stars: they are not used, and are no calibration.
+    `stated` are the cameras of `find_cameras`. Optics with which a sensor has at most half as many
+    identified frames as before were fitted to wrong stars: they are neither used nor reported.
     """
     mode = settings.identification.calibrate
     calibrations, misled = CALIBRATIONS.empty_table(), set[str]()
@@ -99,10 +99,12 @@ def calibrate(work: Work, stated: pa.Table, settings: Settings) -> tuple[Work, p
 
 
 def _fit_sensors(
-    work: Work, stated: pa.Table, but: set[str], settings: Settings
+    work: Work, stated: pa.Table, excluded: set[str], settings: Settings
 ) -> list[Calibrated]:
-    """Fit the optics of each sensor but these to its stars."""
-    spans = {sensor: spans for sensor, spans in work.spans.items() if sensor.sensor_id not in but}
+    """Fit the optics of each sensor to its stars, except those excluded."""
+    spans = {
+        sensor: spans for sensor, spans in work.spans.items() if sensor.sensor_id not in excluded
+    }
     futures = [
         calibrate_sensor.submit(
             sensor, work.identified[sensor], of_sensor, work.cameras, stated,
@@ -149,7 +151,7 @@ def _identify_again(
     number: int,
     settings: Settings,
 ) -> Work:
-    """Identify the sensors whose optics differ again, with the fitted optics."""
+    """Identify again, with the fitted optics, the sensors whose optics differ."""
     cameras = _with_cameras(work.cameras, fitted, departed)
     spans = {sensor: of_sensor for sensor, of_sensor in work.spans.items()
              if sensor.sensor_id in departed}  # fmt: skip

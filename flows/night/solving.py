@@ -27,14 +27,14 @@ from epipole.tasks.solve.sample_sight_lines import LineSampling
 from epipole.tasks.solve.solve_piece import Piece, judge_span, solve_piece
 from epipole.tasks.solve.views import view_sensors
 
-STEPS = 5  # of the progress
+STEPS = 5  # of the stage, for the progress line
 MARGIN_NS = round(VELOCITY_WINDOW_S * 1e9)  # beyond a span: its positions show an object's motion
-MIN_EPOCHS = 6  # of a margin
-VIEWS_AT_ONCE = 4  # tasks that share what one task may hold: small tasks are spread evenly
-# Views that show the errors of the sensors of a span. Not a setting: positions do not depend on the
-# memory of a task.
+MIN_EPOCHS = 6  # minimum number in a margin, where epochs are far apart
+VIEWS_AT_ONCE = 4  # tasks of views are smaller than a task may be by this: they spread evenly
+# Maximum number of views of a span from which the errors of its sensors are estimated. Not a
+# setting: positions do not depend on the memory of a task.
 MAX_JUDGED = 100_000
-MAX_LINES = 30_000  # of sight, of a span, that are kept for the check of the sensors
+MAX_LINES = 30_000  # lines of sight of a span that are kept for the check of the sensors, about
 
 
 class _Night(NamedTuple):
@@ -59,14 +59,14 @@ class _Night(NamedTuple):
 
     @property
     def epochs_apart(self) -> int:
-        """Number of epochs after which no detection serves again."""
+        """Number of epochs after which no detection is used again."""
         if self.grid.epochs_ns is not None:
             return 1
         return math.floor(2e9 * self.settings.alignment.window_s / self.grid.interval_ns) + 1
 
     @property
     def apart_ns(self) -> int:
-        """Time between these epochs, which are multiples of it; 1 where all epochs are."""
+        """Interval of epochs that share no detection: multiples of it. 1: all epochs [ns]."""
         return 1 if self.grid.epochs_ns is not None else self.epochs_apart * self.grid.interval_ns
 
 
@@ -102,7 +102,7 @@ def epoch_grid(work: Work, settings: Settings) -> EpochGrid:
 
 
 def _view(night: _Night) -> dict[Span, int]:
-    """View the tracklets of all sensors, some of them a task; return the views of each span."""
+    """View the tracklets of all sensors, a few sensors per task; return the views of each span."""
     work, settings = night.work, night.settings
     sensors, limit = work.sensor_parts(), settings.work.max_views // VIEWS_AT_ONCE
     groups = [

@@ -14,9 +14,9 @@ from epipole.schemas.spans import DAY_NS
 
 # Rows of `rejects`, collected.
 
-ROWS_ALIKE = 100  # a log of which everything is damaged does not need a row per message
-# Of one log, so that it cannot fill the memory: a row takes about half a kilobyte until it is
-# written. Behind them each reason has one more row, which counts the rest.
+ROWS_ALIKE = 100  # a log that is damaged throughout does not need a row per message
+# Maximum number of rows of one log. It bounds the memory: a row takes about half a kilobyte until
+# it is written. Each reason then has one more row, which counts the rest.
 MAX_ROWS = 50_000
 
 _Key = tuple[int | None, str | None, Reason]
@@ -42,7 +42,7 @@ class RejectList:
         """Add a row; a time of 0 is unknown.
 
         Rows with the same chunk, sensor and reason are alike. Only `ROWS_ALIKE` of them are kept;
-        the last of these counts the others too. Behind `MAX_ROWS` rows all with one reason are
+        the last of these counts the others too. After `MAX_ROWS` rows, all with one reason are
         alike.
         """
         key: _Key = (offset, sensor_id, reason)
@@ -60,8 +60,9 @@ class RejectList:
         """Return the rows of `rejects`; `range_ns`: the log's time range.
 
         A row gets the time of the first frame if its time is unknown, or a day or more outside
-        the log, which only damage can explain. Else no night that is made would have the row.
-        Of a log without any valid time, the night is chosen when those of the run are known.
+        the log, which only damage can explain. With such a time it would be in no night that is
+        made. In a log without any valid time, rows get their night when those of the run are
+        known.
         """
         first_ns, last_ns = range_ns or (0, 0)
         near_ns = range(first_ns - DAY_NS + 1, last_ns + DAY_NS)
@@ -76,13 +77,13 @@ class RejectList:
         )
 
 
-# Strays: one frame with a wrong clock would make a night of its inside.
+# Strays: a frame with a wrong clock would otherwise make a night that has only this frame.
 
 Nanoseconds = npt.NDArray[np.int64]
 
 
 def log_time_range(times: Sequence[Nanoseconds]) -> tuple[int, int] | None:
-    """Return the first and last of the times near their median; None where there are none.
+    """Return the first and last of the times near their median; None without times.
 
     Unset clocks read early, so take the upper median.
     """

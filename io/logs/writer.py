@@ -61,9 +61,7 @@ class McapFile:
         if compression not in COMPRESSIONS:
             raise ValueError(f"compression {compression!r}: not one of {', '.join(COMPRESSIONS)}")
         self._path = Path(path)
-        if (
-            self._path.is_dir()
-        ):  # refused before all is written; an empty name is the current folder
+        if self._path.is_dir():  # refused before all is written; "" is the current folder
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
         self._partial = self._path.with_name(self._path.name + ".partial")
         self._file = self._partial.open("wb")
@@ -134,7 +132,7 @@ class LogWriter:
     path
         The file to write.
     encoding
-        A name in `messages.encodings.registry`: protobuf, json or ros2.
+        A name in `messages.registry.ENCODINGS`, such as protobuf.
     compression
         Of chunks: zstd, lz4 or none.
     chunk_size

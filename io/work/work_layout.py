@@ -1,4 +1,4 @@
-"""The layout of the work folder: where each part lies; `part_tables` has what it holds.
+"""The layout of the work folder: where each part lies; `parts` declares its tables.
 
 Parts of reading belong to a run; all others to the nights and a key (see `folder`):
 

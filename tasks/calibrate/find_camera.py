@@ -1,7 +1,7 @@
 """Find the camera of a sensor whose calibration does not fit its stars.
 
-`contradicts_camera` says for which sensors that is so: few frames are identified, or stars lie far
-from their predicted positions, or all in one part of the image. `find_sensor_camera` then searches
+`contradicts_camera` finds these sensors: few frames are identified, or stars lie far from their
+predicted positions, or all stars are in one part of the image. `find_sensor_camera` then searches
 three frames for focal length, direction of the rows and distortion (`camera_search`); another frame
 has to agree. A `CameraFinding` says what differs from the log's calibration.
 """
@@ -49,8 +49,8 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 LOGGER = logging.getLogger(__name__)
 
-# The camera is searched for if at most this share of the frames was identified. That none was found
-# is a warning only if at most the second share was.
+# The camera is searched for if at most the first share of the frames was identified. If no camera
+# is found, a warning says so only if at most the second share was.
 MAX_IDENTIFIED, MAX_IDENTIFIED_TO_WARN = 0.5, 0.05
 # With right optics, a frame's stars are all over the image: their variance is that of an even
 # distribution, 1/12 per axis in units of the image's sides. With strong distortion, dense clusters
@@ -60,7 +60,7 @@ CLUSTERED_VARIANCE = 0.1
 # [px], and more than this share of the centroids is unmatched.
 LARGE_RESIDUAL_PX, MANY_UNMATCHED = 1.0, 0.2
 REACH = 1.11  # focal lengths from 10 % shorter to 11 % longer than the nominal one are tried
-TRIED = 3  # frames
+TRIED = 3  # frames in which a camera is searched for
 RICH = 0.75  # quantile of the number of centroids, of the frames that are tried
 
 
@@ -137,9 +137,9 @@ def residuals_are_large(solved: pa.Table) -> bool:
     centroids are unmatched."""
     if not solved.num_rows:
         return False
-    shown = array(solved, "n_stars") / array(solved, "n_centroids")
+    star_share = array(solved, "n_stars") / array(solved, "n_centroids")
     return bool(np.median(array(solved, "residual_px")) > LARGE_RESIDUAL_PX) and bool(
-        np.median(shown) < 1 - MANY_UNMATCHED
+        np.median(star_share) < 1 - MANY_UNMATCHED
     )
 
 
@@ -230,8 +230,8 @@ def find_agreed_camera(
     skies_of: Callable[[float], Skies],
     identification: IdentificationSettings,
 ) -> FoundCamera | None:
-    """Return the first frame's camera that another frame agrees with; the only frame needs no
-    other."""
+    """Return the first camera of a frame that another frame agrees with; or that of the only
+    frame."""
     matching = match_settings(identification)
     for found in find_cameras(frames, nominal, reach, skies_of, matching):
         others = [frame for k, frame in enumerate(frames) if k != found.frame]

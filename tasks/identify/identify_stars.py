@@ -42,11 +42,11 @@ Array = npt.NDArray[np.float64]
 LOGGER = logging.getLogger(__name__)
 
 
-# Centroids of a frame that stay at one pixel: of more, stars are first searched without them; all
-# take part where so few frames are then identified.
-MANY_STAY, IDENTIFIES = 40, 0.5
-# Of a circular orbit 500 km high [km/s], sqrt(GM / r): few sensors move faster. One whose velocity
-# is unknown may move so, in any direction.
+# With more static centroids per frame than this, stars are first searched without them. If at most
+# this share of the frames is then identified, all centroids take part.
+MANY_STATIC, MIN_IDENTIFIED = 40, 0.5
+# Speed of a circular orbit 500 km high [km/s], sqrt(GM / r): few sensors move faster. A sensor of
+# unknown velocity may have this speed, in any direction.
 LOW_ORBIT_KM_S = 7.6
 
 
@@ -125,7 +125,7 @@ def _identify(
         found = identify(t_s, raw, priors, skies, rule.magnitude_limit, match_settings(rule))
         if best is None or found.solutions.solved.sum() > best.solutions.solved.sum():
             best, taken = found, part
-        if best.solutions.solved.mean() > IDENTIFIES:
+        if best.solutions.solved.mean() > MIN_IDENTIFIED:
             break
     return best, taken
 
@@ -136,14 +136,14 @@ def match_settings(rule: IdentificationSettings) -> MatchSettings:
 
 
 def _selections(c: FlatCentroids) -> Iterator[npt.NDArray[np.bool_]]:
-    """Yield which centroids may be stars: without those that stay, if there are many; then all.
+    """Yield which centroids may be stars: without the static ones, if there are many; then all.
 
-    A centroid outside the image is never one.
+    A centroid outside the image is never a star.
     """
-    if np.median(np.diff(c.first)) > MANY_STAY:
-        stays = c.in_image & static_centroids(c.first, c.x_px, c.y_px)
-        if np.median(np.bincount(c.frame[stays], minlength=len(c.first) - 1)) > MANY_STAY:
-            yield c.in_image & ~stays
+    if np.median(np.diff(c.first)) > MANY_STATIC:
+        static = c.in_image & static_centroids(c.first, c.x_px, c.y_px)
+        if np.median(np.bincount(c.frame[static], minlength=len(c.first) - 1)) > MANY_STATIC:
+            yield c.in_image & ~static
     yield c.in_image
 
 
@@ -196,7 +196,7 @@ def _attitudes(
 def _with_optics(
     a: StarAttitudes, c: FlatCentroids, m: MatchedStars, cameras: pa.Table
 ) -> StarAttitudes:
-    """Return the attitudes with the errors that those from stars have from errors of the optics."""
+    """Return the attitudes; those from stars get the error that wrong optics cause."""
     shared, of = a.shared_arcsec2.copy(), c.frame[m.at]
     for row, camera in c.cameras.items():
         cov_optics = optics_covariance_of(cameras, row)
@@ -213,8 +213,7 @@ def _with_optics(
 
 
 def _with_unknown_velocity(a: StarAttitudes, frame_states: pa.Table) -> StarAttitudes:
-    """Return the attitudes with the errors that those from stars have where the sensor's velocity
-    is unknown.
+    """Return the attitudes; those from stars get the error of an unknown velocity of the sensor.
 
     Its aberration moves all stars of a small field alike: a turn across the boresight. About the
     boresight the field does not turn.
@@ -228,7 +227,7 @@ def _with_unknown_velocity(a: StarAttitudes, frame_states: pa.Table) -> StarAtti
 def _matches(
     found: IdentifiedSensor | None, rows: npt.NDArray[np.int64], c: FlatCentroids
 ) -> MatchedStars:
-    """Return the stars of the centroids, of which these rows took part, in this order."""
+    """Return the stars of the centroids; `rows` took part, in this order."""
     if found is None:
         none, frames = np.empty(0, np.int64), len(c.first) - 1
         return MatchedStars(none, none, np.empty(0), np.empty((0, 3)), np.ones(frames))

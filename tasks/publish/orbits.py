@@ -60,8 +60,8 @@ SLOPE_S = 60.0  # positions within this time of the middle one give the initial 
 class OrbitRows(NamedTuple):
     """ORBITS of some objects, and rows of `rejects` for the others.
 
-    `misfits` are those of the others whose observations fit no orbit. `sensors` is what the orbits
-    tell of the sensors' errors.
+    `misfits` are the objects whose observations fit no orbit. `sensors` are the sums from which the
+    sensors' errors are estimated.
     """
 
     orbits: pa.Table
@@ -71,7 +71,7 @@ class OrbitRows(NamedTuple):
 
 
 def orbit_shares(folder: Path, night: str) -> int:
-    """Return into how many tasks the objects of a night are shared out."""
+    """Return the number of tasks among which the objects of a night are shared."""
     return max(-(-NightReader.of_folder(folder, night).count("observations") // ROWS_OF_TASK), 1)
 
 

@@ -104,8 +104,8 @@ class MessageEncoding:
     schema: Callable[[str], bytes]  # the content of the MCAP schema of a kind
     encode: Callable[[str, Values], bytes]  # a message of a kind; `timestamp` is in ns
     decode: Callable[[str, bytes], DecodedMessage]  # the same back; raises one of `_INVALID`
-    # A compiled loop (data, start, end, mine, types, fields) that fills `fields` (see
-    # `messages.fields`) for the messages that are `mine`. Without one, messages are decoded
+    # A compiled loop (data, start, end, mine, types, fields) that fills `fields` (see "Located
+    # fields" below) for the messages that are `mine`. Without one, messages are decoded
     # one at a time, which is slower and gives the same rows.
     locate: Callable[..., None] | None = None
     profile: str = ""  # the MCAP profile of a log that is written

@@ -363,7 +363,7 @@ def _locate_fields(data, at, end, types, fields, i):
 
 @kernel
 def locate(data, start, end, mine, types, fields):
-    """Fill in the rows of `fields` of the messages that are `mine`; see `messages.fields`."""
+    """Fill in the rows of `fields` of the messages that are `mine`; see `messages.encoding`."""
     for i in range(len(start)):
         if mine[i]:
             good = _locate_fields(data, start[i], end[i], types, fields, i)

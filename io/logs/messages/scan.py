@@ -1,6 +1,6 @@
 """The compiled loops that take most messages straight into columns.
 
-An encoding has located the fields of each message (see `messages.fields`). A scan takes the
+An encoding has located the fields of each message (see `messages.encoding`). A scan takes the
 messages one after the other as long as they are good: well formed, with every value usable. It
 stops at the first other one. That one is decoded and judged in Python, which knows all forms
 that are allowed (arrays in pieces, numbers one by one, big-endian CDR, JSON) and the reason for
@@ -57,7 +57,7 @@ class Messages(NamedTuple):
 
     data: Bytes
     channel: npt.NDArray[np.uint16]
-    fields: npt.NDArray[np.int64]  # as in `messages.fields`
+    fields: npt.NDArray[np.int64]  # as in `messages.encoding`
 
 
 class Names(NamedTuple):

@@ -161,7 +161,7 @@ def _planes(first, order, seen, u):
             if not length > 0.0:
                 continue
             normal /= length
-            if not has_axis:  # as in `sky.tangent_basis`
+            if not has_axis:  # as in `directions.tangent_basis`
                 axis[:] = 0.0
                 axis[2 if abs(normal[2]) < 0.9 else 0] = 1.0
                 for a in range(3):
@@ -234,7 +234,7 @@ def _reach(camera: Array, grid: Indices) -> Array:
 
 @kernel
 def _flatten(sensor, order, seen, u, cov, rate, camera, sight):
-    """Project directions, rates, and covariances on `sky.tangent_basis` onto the planes.
+    """Project directions, rates, and covariances on `directions.tangent_basis` onto the planes.
 
     `sensor` and `sight` are in the order of the search, the samples are not.
     """

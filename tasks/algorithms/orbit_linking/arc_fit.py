@@ -15,12 +15,16 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 STEP_S = 60.0  # longest step of the propagation: right to 5 m in half an hour of a low orbit
-ITERATIONS = 12
-CONVERGED = 1e-3  # decrease of chi-square
-MAX_STEP_SHARE = 0.3  # of the distance to the geocentre: larger steps are shortened
-# Neglected accelerations, as a share of gravity: higher harmonics of the Earth.
+ITERATIONS = 12  # of Gauss and Newton; a fit that needs more fails
+CONVERGED = 1e-3  # decrease of chi-square: the log evidence is then right to half of it
+# Longer steps, over the distance to the geocentre, are shortened: the equations are linear nearby.
+# With half or twice of it bench_orbit_linking finds the same objects.
+MAX_STEP_SHARE = 0.3
+# Neglected accelerations, as a share of gravity: harmonics of the Earth beyond J2 are 1e-6 to 1e-5.
 SHARE_OF_GRAVITY = 1e-5
-MIN_COSINE = 0.5  # of the angle between the measured and the computed direction
+MIN_COSINE = (
+    0.5  # of the angle between measured and computed direction: beyond 60 degrees a fit fails
+)
 
 
 class Tracklets(NamedTuple):

@@ -28,21 +28,21 @@ from epipole.tasks.algorithms.orbit_linking.population import log_attributable_d
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-NONE = -1
+NONE = -1  # no tracklet
 # Members of each set that the joint orbit is fitted to, those nearest in time to the other set:
 # more of them do not change the answer, and an orbit over hours needs more forces.
 MAX_MEMBERS = 8
-MAX_ARC_S = 1800.0
+MAX_ARC_S = 1800.0  # the propagation is right to 5 m in this time, see `arc_fit.STEP_S`
 # Chi-square by which the joint fit may be worse than both alone: quantile 1 - 1e-5 for 2, 4 and 6
 # degrees of freedom (tracklet and tracklet, set and tracklet, set and set).
 GATES = (23.03, 28.47, 33.38)
-SET_SIGMA = 5.0  # of chi-square: a set whose orbit fits worse is not one object
+SET_SIGMA = 5.0  # of chi-square about its mean: a set whose orbit fits worse is not one object
 KEPT_LOG_ODDS = -8.0  # of a pair: a third tracklet may yet show that it is one object
-PASSES = 3
+PASSES = 3  # through all pairs, at most: a join makes others possible
 # Of a join that further tracklets have to confirm. In a shell of 1,584 objects with 3 tracklets a
 # second it raises the objects found from 57 to 81 of 100; with 2.0 to 78; none of them wrongly.
 LOOSE_LOG_ODDS = 0.0
-MIN_PAIRS = 4096
+MIN_PAIRS = 4096  # room for pairs at first; if there are more, the search is repeated with more
 
 
 class Edges(NamedTuple):

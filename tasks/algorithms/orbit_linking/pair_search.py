@@ -4,7 +4,7 @@ Two ranges and the time between give an orbit (Lambert's problem). The rates of 
 then four numbers for two unknowns. With Lagrange's coefficients f and g of the orbit between both
 positions, the rates are linear in the two ranges (after Siminski et al. 2014, "Short-arc tracklet
 association for geostationary objects", Adv. Space Res. 53, 1184, whose boundary value problem
-searches the ranges). So three small least-squares solutions replace the search: the first with
+searches the ranges). So four small least-squares solutions replace the search: the first with
 the coefficients of a circular orbit at the sensor's height.
 """
 
@@ -20,19 +20,22 @@ from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-ROUNDS = 4
-FIRST_RANGE_KM = 1000.0  # sigmas of the first solution are those at this range
+ROUNDS = 4  # solutions, each with the coefficients of the orbit of the one before
+FIRST_RANGE_KM = (
+    1000.0  # ranges are unknown at first: the first solution has the sigmas at this one
+)
 # The path of a satellite is an orbit at range 0 from itself: it fits any two of its tracklets. So
 # other solutions are searched for from circular orbits at these ranges.
 OTHER_RANGES_KM = (150.0, 500.0, 1000.0, 1700.0, 2700.0)
+# Two sensors are on one satellite if its orbit leads from one to the other within this distance.
 SAME_SATELLITE_KM = 20.0
 # Error of the first solution, as a share of the effect of gravity: the object's height is unknown.
 GRAVITY_SHARE = 0.4
-FASTER = 0.1  # share of it that is left after each further solution
+FASTER = 0.1  # share of that error that is left after each further solution
 J2_SHARE = 0.1  # part of the effect of the oblateness that its mean value lacks
 FIRST_GATE = 40.0  # chi-square of 2 degrees of freedom, of the first solution
 GATE = 30.0  # and of the last: 3e-7 of true pairs are beyond it
-MAX_RANGE_KM = 100_000.0
+MAX_RANGE_KM = 100_000.0  # as `association.max_range_km`
 MAX_LATER = 3000  # tracklets that each is compared with: bounds the time of a dense night
 
 

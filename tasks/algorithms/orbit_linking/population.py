@@ -17,7 +17,8 @@ Array = npt.NDArray[np.float64]
 # and 54,000 by model. More objects mean more chance meetings: this is the careful end.
 N_OBJECTS = 50_000.0
 MIN_HEIGHT_KM = 100.0  # lower, an object does not stay in orbit
-# Heights: most objects within a band, the rest with an exponential distribution above it.
+# Heights: most objects are within a band above `MIN_HEIGHT_KM` [km]; the others have an exponential
+# distribution with this scale [km].
 BAND_KM = 1500.0
 BAND_SHARE = 0.85
 SCALE_KM = 8000.0
@@ -27,10 +28,10 @@ SIGMA = (0.02, 0.3)
 SHARE = (0.85, 0.15)
 COMPONENTS = 2
 
-# Integration over range and range rate.
+# Integration over range, evenly in its logarithm, and over the range rates that are bound.
 MIN_RANGE_KM = 10.0
 MAX_RANGE_KM = 60_000.0
-N_RANGES = 72
+N_RANGES = 72  # steps of 13 %
 N_RATES = 96
 NEGLIGIBLE = 40.0  # chi-square beyond which the density is zero
 

@@ -12,16 +12,18 @@ import numpy.typing as npt
 from scipy.special import pdtrc
 
 from epipole.tasks.algorithms.geometry.directions import tangent_basis
+from epipole.tasks.algorithms.sensor_faults.fault_judgement import MIN_OBJECTS
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MAX_OFFSET_S = 5.0  # largest clock offset that is searched
-GATE_SIGMA = 4.0  # largest residual of a line and its object at the best offset
+GATE_SIGMA = (
+    4.0  # largest residual of a line and its object at the best offset; 1 in 3,000 is beyond
+)
 QUARTER_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
-SAME_SIGMA = 3.0  # offsets agree if they differ by less
-FAR_SIGMA = 1e9  # [sigma] residual of an object behind the sensor
-MIN_OBJECTS = 3  # minimum number of objects that agree on an offset
+SAME_SIGMA = 3.0  # offsets agree if they differ by less; with half of it true ones are lost
+FAR_SIGMA = 1e9  # [sigma] stands for the residual of an object behind the sensor: beyond any gate
 MAX_FALSE_ALARM = 1e-4  # largest accepted false-alarm probability
 
 

@@ -37,6 +37,10 @@ DISTINCT_LOG_ODDS = 5.0  # minimum log odds of a set of faults against another s
 MAX_SETS = 1100  # maximum number of sets that are all compared; with more, a stepwise search
 OUTLIER_CHI2 = 20.0  # largest chi-square (2 degrees of freedom) of a line of the object
 ITERATIONS = 4  # of the fit, each about the last offsets and without outliers
+# Minimum number of objects from which anything is concluded about a sensor: of those that agree on
+# an offset of its clock, and of those in its field. With 1 or 6 the same offsets are found in the
+# tests: there the false-alarm probability decides.
+MIN_OBJECTS = 3
 PER_SENSOR = 7  # offset, bias of position (3), bias of attitude (3)
 SOUND, CLOCK, EPHEMERIS, ATTITUDE, DISAGREES = "", "clock", "ephemeris", "attitude", "disagrees"
 COLUMNS = {CLOCK: slice(0, 1), EPHEMERIS: slice(1, 4), ATTITUDE: slice(4, 7)}

@@ -20,6 +20,7 @@ from epipole.tasks.algorithms.sensor_faults.fault_judgement import (
     ATTITUDE,
     CLOCK,
     COLUMNS,
+    MIN_OBJECTS,
     PER_SENSOR,
     PRIOR_S,
     SOUND,
@@ -37,7 +38,6 @@ Indices = npt.NDArray[np.int64]
 
 MAX_TOGETHER = 24  # maximum number of sensors that are judged together
 MAX_ROUNDS = 4  # each round judges the next suspects, without the sensors already at fault
-MIN_OBJECTS = 3  # minimum number of objects in the field of a sensor that is judged
 MIN_JOINED_SHARE = 0.3  # minimum share of them that a sound sensor joins
 MIN_UNASSIGNED = 0.5  # minimum of unassigned tracklets per object in the field, if at fault
 

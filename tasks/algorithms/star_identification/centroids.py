@@ -82,7 +82,7 @@ class RawCentroids(NamedTuple):
         )  # fmt: skip
 
     def with_floor(self, floor_px: float) -> "RawCentroids":
-        """Return the centroids with an error that all have beside the stated ones."""
+        """Return the centroids with an error added in quadrature to the stated ones."""
         return self._replace(sigma_px=np.hypot(self.sigma_px, floor_px))
 
     def frames(self, scale: float, use_flux: bool = True) -> SensorCentroids:
@@ -137,7 +137,7 @@ class Solutions(NamedTuple):
         self.evidence[k] = solution.evidence
 
     def enter_all(self, rows: Rows, other: "Solutions", of: Rows) -> None:
-        """Write other solutions' frames `of`, which are solved, as the frames `rows`."""
+        """Write the frames `of` of other solutions, all of them solved, to the frames `rows`."""
         for row, k in zip(rows.tolist(), of.tolist(), strict=True):
             solution = other.frame(k)
             if solution is not None:
@@ -190,9 +190,9 @@ MIN_STATIC_FRAMES, MIN_STATIC_SHARE = 4, 0.3
 def static_centroids(
     first: npt.NDArray[np.int64], x_px: Array, y_px: Array
 ) -> npt.NDArray[np.bool_]:
-    """Return which centroids of a sensor's frames lie where many of its frames have one.
+    """Return which centroids of a sensor's frames are at a pixel where many frames have one.
 
-    Stars do so too where the sensor stares at one direction: the caller decides.
+    So are stars if the sensor keeps its direction: the caller decides.
 
     Parameters
     ----------
@@ -206,10 +206,8 @@ def static_centroids(
     frame = np.repeat(np.arange(n_frames), np.diff(first))
     stays = np.zeros(len(x_px), np.bool_)
     at = np.flatnonzero(np.isfinite(x_px) & np.isfinite(y_px))
-    for shift in (
-        0.0,
-        0.5,
-    ):  # a position at the border of two pixels is in the middle of a shifted one
+    # A position at the border of two pixels is in the middle of a shifted one.
+    for shift in (0.0, 0.5):
         cell = _cells(x_px[at] + shift, y_px[at] + shift)
         once = np.unique(cell * n_frames + frame[at]) // n_frames
         cells, frames = np.unique(once, return_counts=True)

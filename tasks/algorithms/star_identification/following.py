@@ -258,11 +258,11 @@ def _clear(k, first, solutions):
 @kernel
 def follow(frame_range, frames, priors, stars, rule, memory, solutions, status):
     """Identify frames from the attitudes before them; return the first frame whose sky has to
-    be searched, or `walk.stop` (compiled).
+    be searched, or `frame_range.stop` (compiled).
 
     Parameters
     ----------
-    walk, frames : FrameRange, FrameArrays
+    frame_range, frames : FrameRange, FrameArrays
         Which frames, in which order; and the frames.
     priors : Priors
         Attitudes that came with the log.

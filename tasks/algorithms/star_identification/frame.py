@@ -75,7 +75,7 @@ class FrameCentroids(NamedTuple):
     """Centroids of one frame, brightest first.
 
     u : (n, 3) float, directions, sensor frame
-    sigma_rad : (n,) float, error an axis
+    sigma_rad : (n,) float, error per axis
     instrumental_mag : (n,) float, -2.5 log10 flux; NaN where unknown
     beta : (3,) float, the sensor's barycentric velocity over that of light, ICRS axes
     optics : of the camera
@@ -207,7 +207,7 @@ def _least_of_lost(
 
 
 def aberrate_all(u_icrs: Array, beta: Array) -> Array:
-    """Return the directions an observer at beta (v / c) sees: `sky.aberrate` for one velocity."""
+    """Return the directions that an observer at beta (v / c) sees; see `directions.aberrate`."""
     out = np.empty_like(u_icrs)
     p = u_icrs @ beta
     g = np.sqrt(1.0 - beta @ beta)

@@ -74,13 +74,13 @@ def of_other_brightness(
 # Measured (bench_unlike_frames): with 0.3, frames that shook keep the errors of the others; with
 # 1.2, more than half of the frames are poor, and one in sixty is identified wrong.
 POOR = 0.6
-MIN_FRAMES = 5  # from which the typical share is known
-MORE_STARS = 1.5  # times as many stars are matched with larger errors, if these are true
-MIN_GAIN = 3.0  # log evidence that another attitude gains at least
+MIN_FRAMES = 5  # minimum number of identified frames, for a typical share
+MORE_STARS = 1.5  # larger errors are true if they match this many times the stars
+MIN_GAIN = 3.0  # minimum gain in log evidence of another attitude
 LARGER_ERRORS = (2.0, 4.0, 8.0, 16.0)  # factors on the errors that are tried
 # Rescalings of a frame's errors by its residuals, and the degrees of freedom that these need.
 RESCALINGS, MIN_DOF = 3, 5
-# Searches in a row that gain nothing, from which poor frames are skipped: 1, 3, 7 .. frames.
+# After this many searches in a row that gain nothing, poor frames are skipped: 1, 3, 7 ... of them.
 PATIENCE, MAX_BACKOFF_LOG2 = 4, 10
 
 
@@ -181,7 +181,8 @@ def _n_stars(solution: Solution) -> int:
 
 # Other centroid errors.
 
-# Rounds of learning each frame's error, and the change (ln) of all that ends them.
+# Maximum number of rounds in which the errors of the frames are learned, and the largest change
+# (ln) of an error at which they end.
 QUALITY_ROUNDS, SETTLED = 6, 0.02
 # Frames that failed are tried with the errors of the sensor's worst and best tenth, unless these
 # are within a factor of `MIN_OTHER_ERROR` of the sensor's, and with errors larger by `MUCH_WORSE`.

@@ -60,13 +60,12 @@ PROBED, PROBED_CROWDED, CROWDED = 5, 8, 100
 # The number of stars in a crowded field is unknown: the first number is assumed, then a sky that is
 # deeper by the second.
 STARS_IN_CROWD, DEEPER_IN_CROWD_MAG = 25.0, 1.5
-SAMPLED = (
-    24  # frames from which the model is learned; 12 and 48 do as well (docs/methods/passes.md)
-)
-# First guess of the stars in a field, per centroid: the sensor misses some. And without any frame.
+# Frames from which the model is learned; 12 and 48 do as well (docs/methods/passes.md).
+SAMPLED = 24
+# First guess of the stars in a field: per centroid, as the sensor misses some; and without a frame.
 STARS_PER_CENTROID, ASSUMED_IN_VIEW = 1.2, 10.0
-# Centroids may be mostly objects or clutter: skies that end earlier by this are tried as well, if
-# they still have `MIN_IN_VIEW` stars per field on average.
+# Centroids may be mostly objects or clutter. So skies with a faintest star that is brighter by this
+# are tried as well, if they still have `MIN_IN_VIEW` stars per field on average.
 BRIGHTER_MAG, MIN_IN_VIEW = (1.0, 2.0), 5.0
 # Centroid errors that are tried: factors on stated ones, or pixels where none are stated.
 KNOWN_SCALES, UNKNOWN_SCALES_PX = (1.0, 3.0, 0.4), (0.5, 1.5, 0.15)
@@ -196,7 +195,7 @@ def _probe(
 
 
 def aperiodic_rows(n: int, wanted: int) -> Rows:
-    """Return `wanted` of n rows, all over but in no period: every third frame may show the Earth.
+    """Return `wanted` of n rows, spread without a period: every third frame may show the Earth.
 
     They are multiples of the golden ratio, modulo 1.
     """

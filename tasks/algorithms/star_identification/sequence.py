@@ -2,7 +2,7 @@
 
 `identify_sample` identifies some or all frames with a sensor's model. It prepares the sky and calls
 `identify_sequence`, which goes forward in time, then backward for the frames that failed.
-`identify_again` matches frames near solutions they have, as with other errors.
+`identify_again` matches frames near the solutions that they have, for example with other errors.
 """
 
 from collections.abc import Callable
@@ -45,12 +45,12 @@ Array = npt.NDArray[np.float64]
 
 # Where searches keep failing: after PATIENCE of them, back off exponentially to at most
 # max(MAX_SKIPPED, n SKIPPED_SHARE) skipped frames of the n since the last success. The backward
-# pass retries them. With a hopeless sensor, the first failure counts as PATIENCE + 2 of them.
+# pass retries them. With a hopeless sensor, the first failure counts as PATIENCE + 2 failures.
 PATIENCE, MAX_SKIPPED, SKIPPED_SHARE = 6, 32, 1 / 32
 MAX_BACKOFF_LOG2 = 20  # keeps the power of two an integer of usual size
-PRIOR_SIGMAS = (
-    3.0  # an earlier solution had other errors, another sky: it is a prior this much wider
-)
+# Factor on the error of an earlier solution that serves as a prior: it had other errors or another
+# sky.
+PRIOR_SIGMAS = 3.0
 NO_CENTROIDS = 5
 STATUS = {
     TOO_FEW: "too_few_stars",
@@ -64,7 +64,7 @@ STATUS = {
 class Priors(NamedTuple):
     """Attitudes that came with the log.
 
-    R_sensor_from_icrs, sigma_rad : (F, 3, 3), (F,) float, attitude and its error an axis; NaN
+    R_sensor_from_icrs, sigma_rad : (F, 3, 3), (F,) float, attitude and its error per axis; NaN
         where missing
     """
 
@@ -194,7 +194,8 @@ def identify_sequence(
     forth, back, none = FrameRange(0, n, 1, False), FrameRange(n - 1, -1, -1, False), no_priors(n)
 
     def search(k: int, failures: int, step: int) -> tuple[Solution | None, bool]:
-        # Crowded frames take long: where the stars' brightness is unknown, ever fewer are tried.
+        # Crowded frames take long. Where the stars' brightness is unknown, they are tried after 0,
+        # 1, 2, 4, 8 ... failures only.
         often = not np.isnan(matching.zero_point_mag)
         tried = matching._replace(
             crowded=matching.crowded and (often or failures.bit_count() <= 1),
@@ -222,9 +223,9 @@ def identify_sequence(
 def identify_again(
     t_s: Array, frames: SensorCentroids, solutions: Solutions, sky: Sky, matching: MatchSettings
 ) -> Solutions:
-    """Return the frames identified again near their solutions, as with other errors.
+    """Return the frames identified again near their solutions, for example with other errors.
 
-    No sky is searched. Frames that are not solved are tried from the others.
+    The sky is not searched. Unsolved frames are followed from solved ones.
     """
     n = len(frames.beta)
     again, status = unsolved(frames.first), np.zeros(n, np.int8)
@@ -300,10 +301,10 @@ class _Sequence(NamedTuple):
 
 
 def _skipped(failures: int, frames: int) -> int:
-    """Return how many frames are skipped after this many failed searches over this many frames.
+    """Return the number of frames to skip after this many failed searches over this many frames.
 
-    So a sensor without stars takes bounded time, and one that shows stars again is found again,
-    however long it did not. The number varies, because stars may return periodically.
+    A sensor without stars then takes a bounded time, and stars that return are found, however long
+    they were missing. The number varies, because stars may return periodically.
     """
     if failures <= PATIENCE:
         return 0

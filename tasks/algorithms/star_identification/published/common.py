@@ -47,7 +47,7 @@ def agreeing_candidates(
     Parameters
     ----------
     u, sigma_rad : (n, 3), (n,) float
-        Centroids' directions (sensor) and errors an axis [rad].
+        Centroids' directions (sensor) and errors per axis [rad].
     star_u : (m, 3) float
         Catalogue directions (ICRS).
     centroid, star : (c,) int

@@ -46,7 +46,7 @@ def match_four_base_stars(
     Parameters
     ----------
     u, sigma_rad : (n, 3), (n,) float
-        Centroids, brightest first: directions (sensor) and errors an axis [rad].
+        Centroids, brightest first: directions (sensor) and errors per axis [rad].
     star_u : (m, 3) float
         Catalogue directions (ICRS).
     pairs

@@ -1,8 +1,8 @@
 """Lost in space in a crowd: few stars among hundreds of other centroids.
 
-Few pivots of a crowd are stars. Therefore many are tried, each quickly. Only its near companions
-vote: among these the share of stars is as large as among all, and the sky has fewer pairs with so
-small a separation. For each pivot:
+Few pivots of a crowd are stars. Therefore many are tried, each quickly. Only the near companions of
+a pivot vote: the share of stars among them is that among all, and the sky has fewer pairs with such
+a small separation. For each pivot:
 
 1. Each star that the pivot may be has near neighbours on the sky. A companion with the separation
    of a neighbour votes for the roll that puts it there. `roll_votes` counts coarsely how many votes
@@ -223,8 +223,8 @@ def _vote_with_most_agreeing(n, at_bin, votes):
 
 @borrowing_kernel
 def _farthest_agreeing_vote(n, k, near, votes):
-    """Return which of the first n votes that agree with vote k has the farthest neighbour, and with
-    how many it agrees: it tells the roll best."""
+    """Return which of the first n votes that agree with vote k has the farthest neighbour, and the
+    number of votes that agree with it. This vote determines the roll best."""
     best, agreed = k, 0
     for m in range(n):
         if _agree(k, m, votes) and near.chord[votes.entry[m]] > near.chord[votes.entry[best]]:

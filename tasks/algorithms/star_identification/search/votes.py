@@ -212,7 +212,7 @@ class RefinedVotes(NamedTuple):
 
 @kernel
 def make_refined_votes():
-    """Return room for `MAX_SIFTED` votes (compiled)."""
+    """Return room for `MAX_REFINED` votes (compiled)."""
     return RefinedVotes(
         np.empty(MAX_REFINED, np.int64),
         np.empty(MAX_REFINED, np.int64),
