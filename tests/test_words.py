@@ -127,7 +127,8 @@ def test_names_are_read_word_by_word():
 REFERENCE = re.compile(r"(?<!`)`([A-Za-z_]\w*(?:\.\w+)*)`(?!`)")
 # Names of other packages and formats.
 NOT_OURS = {
-    "log_time", "publish_time", "savefig", "erfa", "foxglove", "epipole", "log_", "ros2msg", "setup",
+    "epipole", "erfa", "foxglove", "log_", "log_time", "publish_time", "ros2msg", "savefig",
+    "setup",
 }  # fmt: skip
 
 

@@ -17,9 +17,6 @@ Indices = npt.NDArray[np.int64]
 STEP_S = 60.0  # longest step of the propagation: right to 5 m in half an hour of a low orbit
 ITERATIONS = 12  # of Gauss and Newton; a fit that needs more fails
 CONVERGED = 1e-3  # decrease of chi-square: the log evidence is then right to half of it
-# Longer steps, over the distance to the geocentre, are shortened: the equations are linear nearby.
-# With half or twice of it bench_orbit_linking finds the same objects.
-MAX_STEP_SHARE = 0.3
 # Neglected accelerations, as a share of gravity: harmonics of the Earth beyond J2 are 1e-6 to 1e-5.
 SHARE_OF_GRAVITY = 1e-5
 MIN_COSINE = (
@@ -287,11 +284,8 @@ def fit_component(tracklets, members, epoch_s, component, state, work):
             evidence = log - 0.5 * (total - gain) + 3.0 * LN_2PI - 0.5 * log_det
             return evidence - len(members) * 2.0 * LN_2PI - 0.5 * log_dets, chi2
         before = total
-        size = np.sqrt(rhs[0] ** 2 + rhs[1] ** 2 + rhs[2] ** 2)
-        limit = MAX_STEP_SHARE * np.sqrt(state[0] ** 2 + state[1] ** 2 + state[2] ** 2)
-        shorter = min(1.0, limit / max(size, 1e-9))
-        for a in range(6):
-            state[a] += shorter * rhs[a]
+        for m in range(6):
+            state[m] += rhs[m]
     return np.nan, np.nan
 
 

@@ -20,7 +20,9 @@ from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-ROUNDS = 4  # solutions, each with the coefficients of the orbit of the one before
+# Solutions, each with the coefficients of the orbit of the one before. With 2, bench_orbit_linking
+# takes twice the time, and finds other objects.
+ROUNDS = 4
 FIRST_RANGE_KM = (
     1000.0  # ranges are unknown at first: the first solution has the sigmas at this one
 )
