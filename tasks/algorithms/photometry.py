@@ -17,9 +17,7 @@ Indices = npt.NDArray[np.int64]
 MIN_VALUES = 20  # minimum number of residuals for an estimate of the variance
 MIN_PER_BIN = 25  # minimum number of residuals per bin of flux
 MAX_BINS = 8
-UNKNOWN_STAR_MAG2 = (
-    0.3**2
-)  # variance of one star if there are too few residuals: colours, variables
+UNKNOWN_STAR_MAG2 = 0.3**2  # variance of a star with too few residuals: colours, variables
 MIN_MAG2 = 1e-8
 CLIP_SIGMA = 3.5  # larger residuals: variable, blended or wrong in the catalogue
 REJECTED_WEIGHT = 1e-6  # factor of the weight beyond `CLIP_SIGMA`

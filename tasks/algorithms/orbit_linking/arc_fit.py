@@ -19,9 +19,7 @@ ITERATIONS = 12  # of Gauss and Newton; a fit that needs more fails
 CONVERGED = 1e-3  # decrease of chi-square: the log evidence is then right to half of it
 # Neglected accelerations, as a share of gravity: harmonics of the Earth beyond J2 are 1e-6 to 1e-5.
 SHARE_OF_GRAVITY = 1e-5
-MIN_COSINE = (
-    0.5  # of the angle between measured and computed direction: beyond 60 degrees a fit fails
-)
+MIN_COSINE = 0.5  # of the angle between measured and computed direction: beyond, a fit fails
 
 
 class Tracklets(NamedTuple):

@@ -21,11 +21,11 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 # Solutions, each with the coefficients of the orbit of the one before. With 2, bench_orbit_linking
-# takes twice the time, and finds other objects.
+# takes up to twice the time, and joins some sets differently.
 ROUNDS = 4
-FIRST_RANGE_KM = (
-    1000.0  # ranges are unknown at first: the first solution has the sigmas at this one
-)
+# Ranges are unknown at first: the first solution has the sigmas at this one. With half or twice of it
+# bench_orbit_linking finds the same objects.
+FIRST_RANGE_KM = 1000.0
 # The path of a satellite is an orbit at range 0 from itself: it fits any two of its tracklets. So
 # other solutions are searched for from circular orbits at these ranges.
 OTHER_RANGES_KM = (150.0, 500.0, 1000.0, 1700.0, 2700.0)
