@@ -23,8 +23,8 @@ Indices = npt.NDArray[np.int64]
 # Solutions, each with the coefficients of the orbit of the one before. With 2, bench_orbit_linking
 # takes up to twice the time, and joins some sets differently.
 ROUNDS = 4
-# Ranges are unknown at first: the first solution has the sigmas at this one. With half or twice of it
-# bench_orbit_linking finds the same objects.
+# Ranges are unknown at first: the first solution has the sigmas at this one. With half or twice of
+# it bench_orbit_linking finds the same objects.
 FIRST_RANGE_KM = 1000.0
 # The path of a satellite is an orbit at range 0 from itself: it fits any two of its tracklets. So
 # other solutions are searched for from circular orbits at these ranges.

@@ -18,8 +18,8 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 MAX_OFFSET_S = 5.0  # largest clock offset that is searched
-# Largest residual of a line and its object at the best offset; twice of it finds the same offsets in
-# the tests, with half of it true ones are lost.
+# Largest residual of a line and its object at the best offset. With twice of it the same offsets
+# are found in the tests; with half of it true ones are lost.
 GATE_SIGMA = 4.0
 QUARTER_TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])
 SAME_SIGMA = 3.0  # offsets agree if they differ by less; with half of it true ones are lost
