@@ -9,45 +9,16 @@ each instant.
 import numpy as np
 
 from epipole.tasks.algorithms.association.views import PLANE, X, Y, direction, residual
-from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, GM_KM3_S2, J2
+from epipole.tasks.algorithms.constants import GM_KM3_S2, LN_2PI
+from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.symmetric_matrices import factor
 
-J2_RE2_KM2 = J2 * EARTH_RADIUS_KM**2  # about the pole of GCRF: accurate enough
-STEP_S = 60.0  # one Runge-Kutta step of a low orbit errs by 0.1 m
-ITERATIONS = 6
-CONVERGED = 1e-4  # sigmas squared
+STEP_S = 60.0  # longest step of the propagation: one of a low orbit errs by 0.1 m
+ITERATIONS = 6  # of Gauss and Newton, at most
+CONVERGED = 1e-4  # decrease of chi-square below which a fit has converged: a hundredth of a sigma
 RADIAL_SHARE = 0.6  # an orbiting object's 1-sigma radial velocity over that of a circular orbit
-LN_2PI = np.log(2 * np.pi)
-SLACK_SIGMA = 3.0
-
-
-@kernel
-def _derivative(y, dy):
-    """Write the time derivative of a state (6) about an oblate Earth."""
-    r2 = y[0] * y[0] + y[1] * y[1] + y[2] * y[2]
-    gravity = GM_KM3_S2 / (r2 * np.sqrt(r2))
-    flat = 1.5 * J2_RE2_KM2 / r2
-    for a in range(3):
-        dy[a] = y[3 + a]
-        dy[3 + a] = gravity * y[a] * (flat * (5.0 * y[2] * y[2] / r2 - 1.0) - 1.0)
-    dy[5] -= 2.0 * gravity * flat * y[2]
-
-
-@kernel
-def _propagate(y, dt_s, k):
-    """Propagate a state by dt_s in place (Runge-Kutta); `k` (5, 6) is work space."""
-    n = int(np.ceil(dt_s / STEP_S))
-    for _ in range(n):
-        h = dt_s / n
-        _derivative(y, k[0])
-        k[4] = y + h / 2 * k[0]
-        _derivative(k[4], k[1])
-        k[4] = y + h / 2 * k[1]
-        _derivative(k[4], k[2])
-        k[4] = y + h * k[2]
-        _derivative(k[4], k[3])
-        y += h / 6 * (k[0] + 2 * k[1] + 2 * k[2] + k[3])
+SLACK_SIGMA = 3.0  # an orbit is hyperbolic if its energy is above zero by this
 
 
 @kernel
@@ -100,7 +71,7 @@ def _normal_equations(views, members, first, state, at, k, N, rhs):
     gravity = GM_KM3_S2 / (r2 * np.sqrt(r2))
     for m in range(first, len(views.time_s)):
         if m > first:
-            _propagate(y, views.time_s[m] - views.time_s[m - 1], k)
+            advance(y, views.time_s[m] - views.time_s[m - 1], STEP_S, k)
         at[m] = y
         t = views.time_s[m] - views.time_s[first]
         for i in members:

@@ -8,7 +8,7 @@ Earth is not in between.
 
 import numpy as np
 
-from epipole.tasks.algorithms.association.arcs import LN_2PI, arc_odds
+from epipole.tasks.algorithms.association.arcs import arc_odds
 from epipole.tasks.algorithms.association.views import (
     HALF,
     PLANE,
@@ -18,7 +18,7 @@ from epipole.tasks.algorithms.association.views import (
     residual,
     residual_chi2,
 )
-from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
+from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM, LN_2PI
 from epipole.tasks.algorithms.kernels import borrowing_kernel, kernel
 from epipole.tasks.algorithms.symmetric_matrices import determinant3
 

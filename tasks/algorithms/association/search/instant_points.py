@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from epipole.tasks.algorithms.association.arcs import CONVERGED, ITERATIONS
 from epipole.tasks.algorithms.association.odds import blocked
 from epipole.tasks.algorithms.association.search.sight_lines import BEYOND, SLACK_SIGMA
 from epipole.tasks.algorithms.association.views import direction, residual
@@ -9,8 +10,6 @@ from epipole.tasks.algorithms.constants import EARTH_RADIUS_KM
 from epipole.tasks.algorithms.kernels import borrowing_kernel
 from epipole.tasks.algorithms.symmetric_matrices import invert_symmetric
 
-ITERATIONS = 6  # of Gauss and Newton, at most
-CONVERGED = 1e-4  # decrease of chi-square below which a point is solved: a hundredth of a sigma
 RHS = 11  # offset of the right-hand side of the normal equations, after the residual
 
 
