@@ -34,7 +34,7 @@ CERTAIN_LOG_ODDS = 8.0  # log-odds from which a group is certain
 # Minimum number of other sensors that detect an object: with several instants, with a single one.
 MIN_OTHERS, MIN_OTHERS_AT_ONCE = 3, 4
 PRIOR_LOOKS = 10.0  # weight of the prior, as a number of detections and misses
-MIN_DETECTION, MAX_DETECTION = 0.05, 0.99
+MIN_DETECTION, MAX_DETECTION = 0.05, 0.99  # bounds of a sensor's estimated probability
 SIGHTS = 200  # lines of sight that sample the fields of a set of sensors
 SAMPLED = 12  # sensors of a set whose fields are sampled
 STEPS = 24  # along a line of sight, in addition to the shells' edges

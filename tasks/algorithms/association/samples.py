@@ -12,7 +12,7 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-FREE = -1
+FREE = -1  # the object of a tracklet that belongs to none
 
 
 class Samples(NamedTuple):
