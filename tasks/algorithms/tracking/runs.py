@@ -10,7 +10,9 @@ each frame, `_follow` does these steps:
 4. Two tracks exchange detections where both together then fit better (`_exchange`).
 5. Detections that are still free may begin tracks (`initiation.new_tracks`).
 
-The free detections of a short sequence are then followed once more, with a lower limit of evidence.
+Where frames are so far apart that co-located objects are confused, objects that move alike are then
+followed again, in a frame of reference that moves with them (`common_motion`). The free detections
+of a short sequence are followed once more, with a lower limit of evidence.
 """
 
 from typing import NamedTuple
@@ -19,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from epipole.tasks.algorithms.kernels import kernel
+from epipole.tasks.algorithms.tracking.common_motion import CommonMotion, common_motion
 from epipole.tasks.algorithms.tracking.initiation import (
     EXTRA_DETECTIONS,
     FAINT_FRAMES,
@@ -56,6 +59,10 @@ SHORT_SEQUENCE = 2  # a sequence is short up to twice the frames in which a trac
 # A track whose motion is known precisely goes on through more misses than `max_missed`: up to this
 # many frames, and while fewer false detections than this are expected in its gates.
 MAX_MISSED_FRAMES, MAX_STRAYS = 24, 3e-3
+# With the common motion removed, objects move by less than this share of its rate, or than this
+# rate [rad/s], 6 arcsec/s. The bounds of acceleration are smaller by the square of the factor: time
+# is counted in units of so many seconds. From simulated geostationary objects at 10 and 30 s.
+COMMON_SHARE, COMMON_RATE, COMMON_FACTOR = 0.3, 3e-5, 2.0
 
 
 class _Tracks(NamedTuple):
@@ -139,22 +146,65 @@ def follow_detections(
         -float(np.log(false_alarm)),
         float(min(max_per_frame, MAX_PAIRS)),
     )
-    track = _follow_by_rule(time_s, offsets, u_icrs, sigma_rad, rule)
+    detections = (time_s, offsets, u_icrs, sigma_rad)
+    track = _follow_by_rule(*detections, rule)
+    motion = common_motion(*detections, track)
+    if motion is not None:
+        moving = _follow_free(*detections, _follow_in_motion(*detections, rule, motion), rule)
+        # Confused tracks break: the better tracks hold more detections in fewer pieces.
+        track = max(track, moving, key=lambda tracks: _held(tracks, rule.min_detections))
     n_frames = int(np.count_nonzero(np.diff(offsets)))
-    free = np.flatnonzero(track == NONE)
-    if n_frames > SHORT_SEQUENCE * (rule.min_detections + EXTRA_DETECTIONS) or not len(free):
+    if n_frames > SHORT_SEQUENCE * (rule.min_detections + EXTRA_DETECTIONS):
         return track
-    per_frame = max(false_alarm, false_alarm_sequence / n_frames)
-    before = np.searchsorted(free, offsets)
-    again = _follow_by_rule(
-        time_s,
-        before,
-        u_icrs[free],
-        sigma_rad[free],
-        rule._replace(min_evidence=-float(np.log(per_frame))),
+    per_frame = max(false_alarm, false_alarm_sequence / n_frames) if n_frames else false_alarm
+    return _follow_free(*detections, track, rule._replace(min_evidence=-float(np.log(per_frame))))
+
+
+def _held(track: npt.NDArray[np.int64], min_detections: int) -> int:
+    """Return how many detections the tracks hold beyond the least that each must have."""
+    return int(np.count_nonzero(track != NONE)) - min_detections * (int(track.max(initial=-1)) + 1)
+
+
+def _follow_in_motion(
+    time_s: Array,
+    offsets: npt.NDArray[np.int64],
+    u_icrs: Array,
+    sigma_rad: Array,
+    rule: TrackRule,
+    motion: CommonMotion,
+) -> npt.NDArray[np.int64]:
+    """Return the track number of every detection that moves as the common motion says."""
+    frame = np.repeat(np.arange(len(time_s)), np.diff(offsets))
+    return _follow_by_rule(
+        time_s / COMMON_FACTOR,
+        offsets,
+        np.einsum("nij,nj->ni", motion.rotation[frame], u_icrs),
+        sigma_rad,
+        rule._replace(
+            max_rate=max(COMMON_SHARE * motion.rate, COMMON_RATE) * COMMON_FACTOR,
+            max_coast=rule.max_coast / COMMON_FACTOR,
+        ),
     )
-    track[free] = np.where(again == NONE, NONE, again + track.max() + 1)
-    return track
+
+
+def _follow_free(
+    time_s: Array,
+    offsets: npt.NDArray[np.int64],
+    u_icrs: Array,
+    sigma_rad: Array,
+    track: npt.NDArray[np.int64],
+    rule: TrackRule,
+) -> npt.NDArray[np.int64]:
+    """Return the tracks with those of the detections that have none; these come last."""
+    free = np.flatnonzero(track == NONE)
+    if not len(free):
+        return track
+    more = _follow_by_rule(
+        time_s, np.searchsorted(free, offsets), u_icrs[free], sigma_rad[free], rule
+    )
+    out = track.copy()
+    out[free] = np.where(more == NONE, NONE, more + track.max() + 1)
+    return out
 
 
 def _follow_by_rule(
