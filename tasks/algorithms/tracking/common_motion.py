@@ -1,7 +1,7 @@
 """Common motion: what all objects of a sensor do that are far away and near each other.
 
 At one frame in many seconds, the next position of a new track is uncertain by more than the
-distance of co-located satellites, because the sensor's own acceleration shifts it. But it shifts
+distance of co-located satellites, because the sensor's acceleration shifts it. But it shifts
 all of them alike. Their second differences, from frame to frame, show this acceleration. Seen from
 a frame that moves with them, they hardly move, and which detection belongs to which is clear.
 """

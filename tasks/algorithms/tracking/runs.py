@@ -60,8 +60,8 @@ SHORT_SEQUENCE = 2  # a sequence is short up to twice the frames in which a trac
 # many frames, and while fewer false detections than this are expected in its gates.
 MAX_MISSED_FRAMES, MAX_STRAYS = 24, 3e-3
 # With the common motion removed, objects move by less than this share of its rate, or than this
-# rate [rad/s], 6 arcsec/s. The bounds of acceleration are smaller by the square of the factor: time
-# is counted in units of so many seconds. From simulated geostationary objects at 10 and 30 s.
+# rate [rad/s], 6 arcsec/s. Time is counted in units of the factor [s], so that the bounds of
+# acceleration are smaller by its square. From simulated geostationary objects at 10 and 30 s.
 COMMON_SHARE, COMMON_RATE, COMMON_FACTOR = 0.3, 3e-5, 2.0
 
 
@@ -152,7 +152,7 @@ def follow_detections(
     if motion is not None:
         moving = _follow_free(*detections, _follow_in_motion(*detections, rule, motion), rule)
         # Confused tracks break: the better tracks hold more detections in fewer pieces.
-        track = max(track, moving, key=lambda tracks: _held(tracks, rule.min_detections))
+        track = max(track, moving, key=lambda tracks: _explained(tracks, rule.min_detections))
     n_frames = int(np.count_nonzero(np.diff(offsets)))
     if n_frames > SHORT_SEQUENCE * (rule.min_detections + EXTRA_DETECTIONS):
         return track
@@ -160,7 +160,7 @@ def follow_detections(
     return _follow_free(*detections, track, rule._replace(min_evidence=-float(np.log(per_frame))))
 
 
-def _held(track: npt.NDArray[np.int64], min_detections: int) -> int:
+def _explained(track: npt.NDArray[np.int64], min_detections: int) -> int:
     """Return how many detections the tracks hold beyond the least that each must have."""
     return int(np.count_nonzero(track != NONE)) - min_detections * (int(track.max(initial=-1)) + 1)
 
