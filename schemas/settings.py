@@ -357,6 +357,13 @@ class LinkingSettings(Group):
         description="Longest time between two tracklets that are compared. Less than half a low "
         "orbit: beyond it, an object may have passed once more.",
     )
+    max_orbit_gap_s: float = Field(
+        10800.0,
+        ge=0,
+        le=43200,
+        description="Longest time between two objects of several tracklets each that are compared, "
+        "by their orbits. 0: none are.",
+    )
     log_odds: float = Field(
         9.0,
         gt=0,

@@ -220,6 +220,7 @@ def link(tracklets: pl.DataFrame, settings: Settings | None = None) -> pl.Series
         found = link_tracklets(
             attributables_of(rows), known_numbers(rows).to_numpy(),
             max_gap_s=linking.max_gap_s, log_odds=linking.log_odds,
+            max_orbit_gap_s=linking.max_orbit_gap_s,
         )  # fmt: skip
     except pl.exceptions.ColumnNotFoundError as error:
         raise ValueError(f"tracklets: has no column {error}") from error

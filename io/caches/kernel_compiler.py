@@ -46,7 +46,7 @@ def compiled_share() -> float:
 
     names = [name.partition(":") for name, _ in read_kernels()]
     kept = sum(_is_kept(module, function) for module, _, function in names)
-    return kept / len(names)
+    return kept / len(names) if names else 1.0
 
 
 def _is_kept(module: str, function: str) -> bool:

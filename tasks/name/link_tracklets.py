@@ -68,7 +68,7 @@ def link_tracklets(tracklets: pa.Table, night: str, settings: LinkingSettings) -
         return NO_LINKS
     found = link_by_orbit(
         attributables_of(rows), rows["known"].to_numpy(), max_gap_s=settings.max_gap_s,
-        log_odds=settings.log_odds,
+        log_odds=settings.log_odds, max_orbit_gap_s=settings.max_orbit_gap_s,
     )  # fmt: skip
     links = _name(rows.with_columns(label=pl.Series(found.label)), night)
     return links._replace(orbits=_orbits(rows, found, links.tracklets))

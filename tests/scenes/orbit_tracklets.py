@@ -57,13 +57,17 @@ def low_orbit(rng, eccentricity=0.002):
 
 def orbit_tracklets(
     seed, n_objects, per_object, gap_s, *, direction_arcsec=4.0, rate_arcsec_s=1.0, noisy=True,
-    range_km=(300, 2000),
+    range_km=(300, 2000), pause_s=0.0,
 ):  # fmt: skip
-    """Return tracklets of objects: the times of each are up to `gap_s` apart."""
+    """Return tracklets of objects: the times of each are up to `gap_s` apart.
+
+    Half of them are `pause_s` later.
+    """
     rng = np.random.default_rng(seed)
     rows = []
     for number in range(n_objects):
         times = np.cumsum(rng.uniform(0.05, 1.0, per_object) * gap_s)
+        times[per_object // 2 :] += pause_s
         for t, state in zip(times, moved(low_orbit(rng), times), strict=True):
             rows.append((t, number, state))
     rows.sort(key=lambda row: row[0])

@@ -8,6 +8,8 @@ two, are the difference of the log evidences.
 2. Short tracklets say little in pairs, and enough by three or more: single tracklets join loosely.
 3. Of loosely joined sets those stay that all others of the set support (`_confirm`).
 4. What was released may join again, by the rule of step 1.
+5. Sets that begin up to hours after another's end are compared with the orbit of that one, and join
+   by the same rule (`_far_edges`).
 """
 
 from typing import NamedTuple
@@ -18,6 +20,7 @@ import numpy.typing as npt
 from epipole.tasks.algorithms.earth_gravity import advance
 from epipole.tasks.algorithms.kernels import kernel
 from epipole.tasks.algorithms.orbit_linking.arc_fit import STEP_S, Tracklets, fit_arc, fit_work
+from epipole.tasks.algorithms.orbit_linking.arc_search import ArcEnds, move, near_orbits
 from epipole.tasks.algorithms.orbit_linking.pair_search import (
     may_be_one,
     packed_tracklets,
@@ -54,6 +57,8 @@ class Edges(NamedTuple):
         Log odds that they are one object.
     epoch_s, state : (e,), (e, 6) float
         Their orbit [km, km/s], GCRF.
+    reach_s : (e,) float
+        Members of both sets this near to the epoch are compared [s].
     offsets, row : (n + 1,), (2 e,) int
         The edges of tracklet k are ``row[offsets[k]:offsets[k + 1]]``, best first.
     """
@@ -62,6 +67,7 @@ class Edges(NamedTuple):
     odds: Array
     epoch_s: Array
     state: Array
+    reach_s: Array
     offsets: Indices
     row: Indices
 
@@ -91,7 +97,12 @@ class Sets(NamedTuple):
 
 
 def link_tracklets(
-    tracklets: Tracklets, known: Indices, *, max_gap_s: float, log_odds: float
+    tracklets: Tracklets,
+    known: Indices,
+    *,
+    max_gap_s: float,
+    log_odds: float,
+    max_orbit_gap_s: float = 0.0,
 ) -> LinkedTracklets:
     """Return which tracklets are one object.
 
@@ -105,10 +116,12 @@ def link_tracklets(
         Longest time between two tracklets that are compared [s].
     log_odds
         Minimum log odds of a join, also against any that contradicts it.
+    max_orbit_gap_s
+        Longest time between two sets of several tracklets that are compared [s].
 
     Notes
     -----
-    Forces: two bodies and J2, over at most `MAX_ARC_S`.
+    Forces: two bodies and J2. What they neglect is noise that grows with time (`arc_fit`).
     """
     n, known = len(known), np.array(known, np.int64)
     alone = log_attributable_density(tracklets.r_km, tracklets.v_km_s, tracklets.u, tracklets.w)
@@ -121,6 +134,9 @@ def link_tracklets(
     _join_all(tracklets, alone, edges, LOOSE_LOG_ODDS, True, sets, is_loose, epoch_s, state)
     _confirm(tracklets, alone, _stays(known), log_odds, sets, is_loose, epoch_s, state)
     _join_all(tracklets, alone, edges, log_odds, False, sets, is_loose, epoch_s, state)
+    if max_orbit_gap_s > 0.0:
+        far = _far_edges(tracklets, alone, sets, epoch_s, state, max_orbit_gap_s)
+        _join_all(tracklets, alone, far, log_odds, False, sets, is_loose, epoch_s, state)
     return LinkedTracklets(sets.root, epoch_s, state)
 
 
@@ -143,6 +159,13 @@ def _edges(tracklets: Tracklets, known: Indices, alone: Array, max_gap_s: float)
     pairs, states = pairs[:count], states[:count]
     odds, epoch_s = np.empty(count), np.empty(count)
     _score(tracklets, alone, pairs, odds, epoch_s, states)
+    return _best_first(n, pairs, odds, epoch_s, states, np.full(count, MAX_ARC_S / 2))
+
+
+def _best_first(
+    n: int, pairs: Indices, odds: Array, epoch_s: Array, states: Array, reach_s: Array
+) -> Edges:
+    """Return the edges of n tracklets, those that cannot become one object left out."""
     kept = np.flatnonzero(odds > KEPT_LOG_ODDS)
     # Best first; ties by time. A pair that was found with several orbits keeps the best.
     order = kept[np.lexsort((pairs[kept, 1], pairs[kept, 0], -odds[kept]))]
@@ -152,7 +175,87 @@ def _edges(tracklets: Tracklets, known: Indices, alone: Array, max_gap_s: float)
     ends, row = pairs.T.ravel(), np.tile(np.arange(len(order)), 2)
     by_end = np.lexsort((row, ends))
     offsets = np.searchsorted(ends[by_end], np.arange(n + 1))
-    return Edges(pairs, odds[order], epoch_s[order], states[order], offsets, row[by_end])
+    return Edges(
+        pairs, odds[order], epoch_s[order], states[order], reach_s[order], offsets, row[by_end]
+    )
+
+
+def _far_edges(
+    tracklets: Tracklets, alone: Array, sets: Sets, epoch_s: Array, state: Array, max_gap_s: float
+) -> Edges:
+    """Return the edges from the last tracklet of sets to the first of later ones."""
+    n = len(sets.root)
+    roots = np.flatnonzero((sets.root == np.arange(n)) & np.isfinite(epoch_s))
+    heads, tails = _no_ends(len(roots)), _no_ends(len(roots))
+    _fit_ends(tracklets, alone, sets, roots, epoch_s, state, heads, tails)
+    heads, tails = _sound(heads), _sound(tails)
+    pairs = near_orbits(tails, heads, max_gap_s)
+    earlier, later = pairs.T
+    middle_s = (tails.time_s[earlier] + heads.time_s[later]) / 2
+    states = tails.state[earlier]
+    move(states, middle_s - tails.epoch_s[earlier])
+    rows = np.stack([tails.row[earlier], heads.row[later]], axis=1)
+    reach_s = middle_s - tails.time_s[earlier] + MAX_ARC_S / 2
+    odds = np.empty(len(rows))
+    _score_sets(tracklets, alone, sets, rows, middle_s, states, reach_s, odds)
+    return _best_first(n, rows, odds, middle_s, states, reach_s)
+
+
+def _no_ends(count: int) -> ArcEnds:
+    return ArcEnds(
+        np.full(count, NONE), np.zeros(count), np.zeros(count), np.full((count, 6), np.nan)
+    )
+
+
+def _sound(ends: ArcEnds) -> ArcEnds:
+    """Return the ends with an orbit."""
+    kept = np.isfinite(ends.state).all(axis=1)
+    return ArcEnds(ends.row[kept], ends.time_s[kept], ends.epoch_s[kept], ends.state[kept])
+
+
+@kernel
+def _fit_ends(tracklets, alone, sets, roots, epoch_s, states, heads, tails):
+    """Write the orbits of sets by their first and by their last members; NaN where none fits."""
+    work, rows = fit_work(), np.empty(MAX_MEMBERS, np.int64)
+    for s in range(len(roots)):
+        root = roots[s]
+        first, last, k = root, root, root
+        while k != NONE:
+            if tracklets.time_s[k] < tracklets.time_s[first]:
+                first = k
+            if tracklets.time_s[k] > tracklets.time_s[last]:
+                last = k
+            k = sets.next[k]
+        for side in range(2):
+            ends, k = (heads, first) if side == 0 else (tails, last)
+            at_s = tracklets.time_s[k]
+            count = _nearest(tracklets, sets, root, at_s, MAX_ARC_S, NONE, rows)
+            if count < 2:
+                continue
+            evidence, _, _, epoch, state = _sum(
+                tracklets, alone, rows[:count], epoch_s[root], states[root], work
+            )
+            if np.isfinite(evidence):
+                ends.row[s], ends.time_s[s], ends.epoch_s[s] = k, at_s, epoch
+                for m in range(6):
+                    ends.state[s, m] = state[m]
+
+
+@kernel
+def _score_sets(tracklets, alone, sets, rows, epoch_s, states, reach_s, odds):
+    """Write the log odds that the sets of two rows are one object; -inf where they cannot be."""
+    work = fit_work()
+    for p in range(len(rows)):
+        a, b = sets.root[rows[p, 0]], sets.root[rows[p, 1]]
+        odds[p] = -np.inf
+        if _compatible(tracklets, sets, a, b):
+            gain, orbit_s, orbit = _odds(
+                tracklets, alone, sets, a, b, epoch_s[p], reach_s[p], epoch_s[p], states[p], work
+            )
+            if np.isfinite(gain):
+                odds[p], epoch_s[p] = gain, orbit_s
+                for m in range(6):
+                    states[p, m] = orbit[m]
 
 
 @kernel
@@ -195,16 +298,16 @@ def _join_known(known, first, sets):
 
 
 @kernel
-def _nearest(tracklets, sets, root, at_s, but, out):
+def _nearest(tracklets, sets, root, at_s, reach_s, but, out):
     """Write at most MAX_MEMBERS members of a set that are nearest in time; return their number.
 
-    They are within MAX_ARC_S / 2; in order of distance in time. Member `but` is left out.
+    They are within reach_s; in order of distance in time. Member `but` is left out.
     """
     count = 0
     k = root
     while k != NONE:
         gap = abs(tracklets.time_s[k] - at_s)
-        if gap <= 0.5 * MAX_ARC_S and k != but:
+        if gap <= reach_s and k != but:
             at = count
             if count == MAX_MEMBERS:
                 at = count - 1
@@ -293,11 +396,11 @@ def _gain(tracklets, alone, a, b, start_s, start, work):
 
 
 @kernel
-def _odds(tracklets, alone, sets, a, b, at_s, start_s, start, work):
+def _odds(tracklets, alone, sets, a, b, at_s, reach_s, start_s, start, work):
     """Return the log odds that two sets are one object, by their members near a time."""
     rows_a, rows_b = np.empty(MAX_MEMBERS, np.int64), np.empty(MAX_MEMBERS, np.int64)
-    n_a = _nearest(tracklets, sets, a, at_s, NONE, rows_a)
-    n_b = _nearest(tracklets, sets, b, at_s, NONE, rows_b)
+    n_a = _nearest(tracklets, sets, a, at_s, reach_s, NONE, rows_a)
+    n_b = _nearest(tracklets, sets, b, at_s, reach_s, NONE, rows_b)
     if n_a == 0 or n_b == 0:
         return -np.inf, start_s, start.copy()
     return _gain(tracklets, alone, rows_a[:n_a], rows_b[:n_b], start_s, start, work)
@@ -327,7 +430,9 @@ def _has_rival(tracklets, alone, edges, sets, edge, end, minimum, orbit_s, orbit
         if not _compatible(tracklets, sets, b, c):
             return True
         at_s = tracklets.time_s[k]
-        odds, _, _ = _odds(tracklets, alone, sets, b, c, at_s, orbit_s, orbit, work)
+        odds, _, _ = _odds(
+            tracklets, alone, sets, b, c, at_s, edges.reach_s[edge], orbit_s, orbit, work
+        )
         if not odds > KEPT_LOG_ODDS:
             return True
     return False
@@ -337,7 +442,7 @@ def _has_rival(tracklets, alone, edges, sets, edge, end, minimum, orbit_s, orbit
 def _support(tracklets, alone, sets, root, k, start_s, start, work):
     """Return the log odds that tracklet k of a set is one object with the others near its time."""
     rows, one = np.empty(MAX_MEMBERS, np.int64), np.full(1, k)
-    count = _nearest(tracklets, sets, root, tracklets.time_s[k], k, rows)
+    count = _nearest(tracklets, sets, root, tracklets.time_s[k], 0.5 * MAX_ARC_S, k, rows)
     if count == 0:
         return -np.inf
     return _gain(tracklets, alone, rows[:count], one, start_s, start, work)[0]
@@ -427,8 +532,10 @@ def _join_all(tracklets, alone, edges, log_odds, loosely, sets, is_loose, epoch_
             tried[edge] = size
             if not _compatible(tracklets, sets, a, b):
                 continue
-            at_s, state = edges.epoch_s[edge], edges.state[edge]
-            gain, orbit_s, orbit = _odds(tracklets, alone, sets, a, b, at_s, at_s, state, work)
+            at_s, state, reach_s = edges.epoch_s[edge], edges.state[edge], edges.reach_s[edge]
+            gain, orbit_s, orbit = _odds(
+                tracklets, alone, sets, a, b, at_s, reach_s, at_s, state, work
+            )
             if not gain >= log_odds:
                 continue
             minimum = edges.odds[edge] - log_odds

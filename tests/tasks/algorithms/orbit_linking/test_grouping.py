@@ -94,6 +94,19 @@ def test_groups_do_not_depend_on_tracklets_elsewhere():
     np.testing.assert_array_equal(kept[linked(part)], label[kept])
 
 
+def test_an_object_is_found_again_after_hours():
+    scene = orbit_tracklets(11, 40, 6, 100.0, pause_s=5400.0)
+    known = np.full(len(scene.object), NONE)
+    given = {"max_gap_s": 900.0, "log_odds": 9.0}
+    apart = link_tracklets(scene.tracklets, known, **given).label
+    joined = link_tracklets(scene.tracklets, known, **given, max_orbit_gap_s=7200.0).label
+    assert len(np.unique(apart)) >= 80
+    assert wrong(joined, scene.object) == 0
+    assert len(np.unique(joined)) <= 42
+    shorter = link_tracklets(scene.tracklets, known, **given, max_orbit_gap_s=3600.0).label
+    np.testing.assert_array_equal(shorter, apart)
+
+
 def test_no_tracklets_no_groups():
     scene = orbit_tracklets(7, 1, 1, 1.0)
     empty = Tracklets(*(column[:0] for column in scene.tracklets))
