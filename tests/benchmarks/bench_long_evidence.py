@@ -155,7 +155,7 @@ def main() -> None:
             epipole("simulate", toml, "--out", log)
             for longest_s in args.longest:
                 settings = work / f"{longest_s:.0f}.toml"
-                settings.write_text(f"[association]\nlongest_span_s = {longest_s}\n")
+                settings.write_text(f"[association]\nmax_window_s = {longest_s}\n")
                 out = work / f"{seed}-{longest_s:.0f}"
                 epipole("run", log, "--out", out, "--settings", settings)
                 report = json.loads(epipole("evaluate", out, "--truth", f"{log}.truth", "--json"))
