@@ -68,7 +68,9 @@ def common_motion(
     triple = np.flatnonzero(next_to[:-1] & next_to[1:])
     middle = two[triple]
     bend = 2 * (w[triple + 1] - w[triple]) / (dt[triple] + dt[triple + 1])[:, None]
-    shown = [np.flatnonzero(frame[middle] == f) for f in range(len(time_s))]
+    by_frame = np.argsort(frame[middle], kind="stable")
+    ends = np.searchsorted(frame[middle][by_frame], np.arange(1, len(time_s)))
+    shown = np.split(by_frame, ends)
     bends = np.full((len(time_s), 3), np.nan)
     for f, at in enumerate(shown):
         if len(at) >= MIN_TRACKS:
