@@ -4,6 +4,7 @@ They come from a TOML file or from flow parameters. They are passed in, never re
 """
 
 import hashlib
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -499,5 +500,17 @@ def _first_fault(error: ValidationError) -> str:
     name = as_line(".".join(str(part) for part in fault["loc"]), LONGEST_VALUE)
     value = as_line(repr(fault["input"]), LONGEST_VALUE)
     if fault["type"] == "extra_forbidden":
-        return f"unknown setting {name}; `epipole settings` lists them all"
+        return f"unknown setting {name}{_meant(name)}; `epipole settings` lists them all"
     return f"{name} = {value}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
+
+
+def _meant(unknown: str) -> str:
+    """Return the group, or the setting of its group, that is most like an unknown name."""
+    group, _, key = unknown.rpartition(".")
+    fields = Settings.model_fields
+    if group in fields and (settings := fields[group].annotation) is not None:
+        names = list(settings.model_fields)
+    else:
+        names, key = list(fields), unknown
+    near = get_close_matches(key, names, n=1)
+    return f" (did you mean {near[0]}?)" if near else ""

@@ -104,7 +104,10 @@ def test_a_missing_log_is_said_before_prefect_starts(epipole, tmp_path):
     ("text", "says"),
     [
         ("[sensors]\nstate_gap_s = -1", r"sensors\.state_gap_s = -1: .*greater than 0"),
-        ("[sensors]\nstate_gap = 1", r"unknown setting sensors\.state_gap; `epipole settings`"),
+        (
+            "[sensors]\nstate_gap = 1",
+            r"unknown setting sensors\.state_gap \(did you mean \w+\?\); `epipole",
+        ),
         ("[sensors", "not TOML"),
     ],
 )
