@@ -81,6 +81,7 @@ def folder_of(module: str) -> Path | None:
     return _folder / f"{module.removeprefix(PACKAGE + '.')}-{digest_of(module)}"
 
 
+@functools.cache  # asked for each kernel of a module
 def digest_of(module: str, root: Path = _ROOT) -> str:
     """Return the digest of a module, of all modules that it imports, and of numba's version."""
     digest = hashlib.sha256(importlib.metadata.version("numba").encode())

@@ -18,8 +18,9 @@ from epipole.tasks.algorithms.orbit_linking.arc_fit import STEP_S
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-BLOCK_S = 600.0
-# Farther apart two orbits are not compared: an orbit of two tracklets, an hour later.
+BLOCK_S = 600.0  # length of a block: the orbits that begin in it are propagated to its middle
+# Farther apart [km, km/s] two orbits are not compared. Estimated: the orbit of two tracklets a
+# minute apart is off by a part of this an hour later, and neighbours in a plane are farther apart.
 NEAR_KM, NEAR_KM_S = 300.0, 0.3
 
 

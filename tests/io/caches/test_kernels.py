@@ -51,8 +51,8 @@ def test_a_module_depends_on_what_it_imports_directly_or_not(code):
 
 def test_a_change_changes_the_digests_of_what_imports_the_module(code):
     def digests():
-        kernels._source.cache_clear()
-        kernels._imports.cache_clear()
+        for known in (kernels._source, kernels._imports, digest_of):
+            known.cache_clear()
         return [digest_of(f"epipole.tasks.{name}", code) for name in "abcd"]
 
     before = digests()
@@ -139,11 +139,11 @@ def test_the_folders_that_were_not_used_for_longest_are_removed(tmp_path):
 def test_a_folder_that_is_used_is_not_old(tmp_path, monkeypatch):
     monkeypatch.setattr(kernel_locator, "_folder_of", lambda _: tmp_path)
     os.utime(tmp_path, (0, 0))
-    located = KernelLocator.from_function(digest_of, __file__)
+    located = KernelLocator.from_function(folder_of, __file__)
     assert located.get_cache_path() == str(tmp_path)
     assert tmp_path.stat().st_mtime > time.time() - 3600
     monkeypatch.setattr(kernel_locator, "_folder_of", lambda _: None)
-    assert KernelLocator.from_function(digest_of, __file__) is None
+    assert KernelLocator.from_function(folder_of, __file__) is None
 
 
 FLAGS = "flags\t\t: fpu abm avx avx2 bmi1 bmi2 f16c fma movbe\n"
