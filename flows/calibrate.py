@@ -22,6 +22,7 @@ from epipole.tasks.calibrate.calibrate_unknown import (
 )
 from epipole.tasks.read.order_frames import (
     OrderedFrames,
+    frame_times,
     frames_between,
     order_logs,
     states_between,
@@ -55,9 +56,9 @@ def calibrate(
     paths = [log for where in logs for log in list_logs(where)[0]]
     with temporary_folder("calibrate") as made:
         folder = ReadFolder(made)
-        read = [read_log_into.fn(folder, k, path) for k, path in enumerate(paths)]
+        read = [read_log_into(folder, k, path) for k, path in enumerate(paths)]
         frames = order_logs(folder, read, settings.sensors)
-        numbers = [k for k, time_ns in enumerate(frames.time_ns) if len(time_ns)]
+        numbers = [k for k, spans in enumerate(frames.spans) if spans]
         if not numbers:
             raise LogError(f"{', '.join(paths)}: no frames in these logs; check the recording")
         return [_of_sensor(frames, number, field_deg, settings) for number in numbers]
@@ -66,7 +67,7 @@ def calibrate(
 def _of_sensor(
     frames: OrderedFrames, number: int, field_deg: float | None, settings: Settings
 ) -> CameraReport:
-    time_ns = frames.time_ns[number]
+    time_ns = frame_times(frames.folder, number)
     rows = evenly_spaced(len(time_ns), MAX_FRAMES)
     parts = [frames_between(frames.folder, number, t, t + 1) for t in time_ns[rows].tolist()]
     exposures: pa.Table = concat(EXPOSURES, parts).combine_chunks()

@@ -6,7 +6,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pyarrow as pa
 from prefect import flow
 
@@ -109,7 +108,7 @@ def nightly(
     with lock_nights(out, [night] if night else []) as run:
         frames = read(given.paths, ReadFolder(run), settings)
 
-        nights = nights_of(np.concatenate([np.empty(0, np.int64), *frames.time_ns]))
+        nights = nights_of(frames.days)
         chosen = choose_nights(given.paths, nights, night, frames.rejects)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
@@ -175,7 +174,7 @@ def make_night(
     work, stated = find_cameras(work, settings)
     work, calibrations = calibrate(work, stated, settings)
     while True:
-        track(work, night, settings)
+        work = track(work, night, settings)
         solved = solve(work, settings)
         work, again, left_out = check(work, solved, settings)
         if not again:

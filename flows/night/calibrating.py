@@ -4,13 +4,13 @@ Each sensor is a task; those whose optics change are identified again.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from epipole.flows.night.progress import results
-from epipole.flows.night.stages import identify_spans
+from epipole.flows.night.progress import flat, results
+from epipole.flows.night.stages import identify_all
 from epipole.flows.night.work import Work
 from epipole.schemas.bridge import concat
 from epipole.schemas.settings import Settings
@@ -18,11 +18,10 @@ from epipole.schemas.spans import Sensor
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CALIBRATIONS
 from epipole.schemas.work_tables import CAMERAS
-from epipole.tasks.calibrate.calibrate_sensors import Calibrated, calibrate_sensor
+from epipole.tasks.calibrate.calibrate_sensors import Calibrated, SensorStars, calibrate_each
 from epipole.tasks.calibrate.find_camera import (
     CameraFinding,
-    contradicts_camera,
-    find_sensor_camera,
+    find_sensor_cameras,
 )
 
 LOGGER = logging.getLogger(__name__)
@@ -45,21 +44,13 @@ def find_cameras(work: Work, settings: Settings) -> tuple[Work, pa.Table]:
     mode = settings.identification.calibrate
     if mode == "off":
         return work, work.cameras
-    spans = {
-        sensor: of_sensor
-        for sensor, of_sensor in work.spans.items()
-        if contradicts_camera(sensor, work.identified[sensor], of_sensor, work.cameras)
-    }
     futures = [
-        find_sensor_camera.submit(
-            work.frames, sensor, work.identified[sensor], of_sensor, work.cameras, settings.sensors,
-            settings.identification,
+        find_sensor_cameras.submit(
+            work.frames, batch, work.cameras, settings.sensors, settings.identification
         )
-        for sensor, of_sensor in spans.items()
-    ]  # fmt: skip
-    findings: list[CameraFinding] = [
-        finding for finding in results(Stage.CALIBRATE, futures) if finding is not None
+        for batch in work.sensor_batches(_stars_of(work, work.spans))
     ]
+    findings: list[CameraFinding] = flat(results(Stage.CALIBRATE, futures))
     for finding in findings:
         used = "" if finding.camera is None else "; used" if mode == "use" else "; not used"
         LOGGER.warning("%s%s", finding, used)
@@ -102,18 +93,20 @@ def _fit_sensors(
     work: Work, stated: pa.Table, excluded: set[str], settings: Settings
 ) -> list[Calibrated]:
     """Fit the optics of each sensor to its stars, except those excluded."""
-    spans = {
-        sensor: spans for sensor, spans in work.spans.items() if sensor.sensor_id not in excluded
-    }
+    sensors = [sensor for sensor in work.spans if sensor.sensor_id not in excluded]
     futures = [
-        calibrate_sensor.submit(
-            sensor, work.identified[sensor], of_sensor, work.cameras, stated,
-            settings.sensors.principal_point_sigma_px,
+        calibrate_each.submit(
+            batch, work.cameras, stated, settings.sensors.principal_point_sigma_px
         )
-        for sensor, of_sensor in spans.items()
-    ]  # fmt: skip
-    fits: list[Calibrated] = results(Stage.CALIBRATE, futures)
+        for batch in work.sensor_batches(_stars_of(work, sensors))
+    ]
+    fits: list[Calibrated] = flat(results(Stage.CALIBRATE, futures))
     return fits
+
+
+def _stars_of(work: Work, sensors: Iterable[Sensor]) -> list[SensorStars]:
+    """Return where the identified stars of these sensors are."""
+    return [SensorStars(sensor, work.spans[sensor], work.identified[sensor]) for sensor in sensors]
 
 
 def _n_solved(work: Work, sensor: Sensor) -> int:
@@ -157,7 +150,7 @@ def _identify_again(
              if sensor.sensor_id in departed}  # fmt: skip
     where = {sensor: work.folder.identified_again(sensor, number) for sensor in spans}
     departed_work = work._replace(cameras=cameras, spans=spans, identified=where)
-    identify_spans(Stage.CALIBRATE, departed_work, settings)
+    identify_all(Stage.CALIBRATE, departed_work, settings)
     return work._replace(cameras=cameras, identified={**work.identified, **where})
 
 

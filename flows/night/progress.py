@@ -8,10 +8,12 @@ import copy
 import itertools
 import logging
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from epipole.schemas.stages import Stage
 from epipole.schemas.text import as_line
+
+T = TypeVar("T")
 
 ROOT = logging.getLogger("epipole")
 STEPS = logging.getLogger("epipole.steps")
@@ -75,6 +77,11 @@ def results(stage: Stage, futures: Sequence[Future], part: tuple[int, int] = (0,
         returned.append(future.result())
         step(stage, len(returned), len(futures), part)
     return returned
+
+
+def flat(lists: Sequence[Sequence[T]]) -> list[T]:
+    """Return the results of a stage's tasks, each a list, as one list."""
+    return list(itertools.chain.from_iterable(lists))
 
 
 def with_safe_text(record: logging.LogRecord) -> logging.LogRecord:

@@ -6,14 +6,14 @@ a task works on depends on the data and the settings, never on the workers.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from epipole.flows.night.progress import results
 from epipole.flows.night.work import Work
-from epipole.io.work.work_layout import SensorParts, SolvedParts, ViewedParts
+from epipole.io.work.work_layout import SolvedParts, ViewedParts
 from epipole.schemas.bridge import array
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
@@ -108,7 +108,7 @@ def _view(night: _Night) -> dict[Span, int]:
     groups = [
         (span, group)
         for span in night.spans
-        for group in _sensor_groups(work, sensors, span, limit)
+        for group in _sensor_groups(work, list(sensors), span, limit)
     ]
     futures = [
         view_sensors.submit(
@@ -125,21 +125,20 @@ def _view(night: _Night) -> dict[Span, int]:
 
 
 def _sensor_groups(
-    work: Work, sensors: Mapping[Sensor, SensorParts], span: Span, limit: int
+    work: Work, sensors: Sequence[Sensor], span: Span, limit: int
 ) -> list[list[Sensor]]:
     """Return the sensors with frames in or near a span, in groups of about `limit` detections."""
     near = set(spans_between(*span.widened(1)))
     groups: list[list[Sensor]] = []
     n_detections = limit
-    for sensor, parts in sensors.items():
+    for sensor in sensors:
         if near.isdisjoint(work.spans[sensor]):
             continue
         if n_detections >= limit:
             groups.append([])
             n_detections = 0
         groups[-1].append(sensor)
-        if parts.tracked.holds(span):
-            n_detections += parts.tracked.read(span, "detections", ["time"]).num_rows
+        n_detections += work.n_detections.get((sensor, span), 0)
     return groups
 
 

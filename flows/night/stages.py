@@ -1,4 +1,4 @@
-"""The stages of a night, each as tasks for one sensor and span.
+"""The stages of a night, each as tasks for some sensors and spans.
 
 Tasks take paths and small tables, and write their results as parts of the work folder. A part that
 exists is not made again: the name of the folder depends on everything that parts depend on. The
@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
-from epipole.flows.night.progress import results, step
+from epipole.flows.night.progress import flat, results, step
 from epipole.flows.night.solving import solve_objects
 from epipole.flows.night.summary import Summary, many, summarise
-from epipole.flows.night.work import Spans, Work, spans_of_night
+from epipole.flows.night.work import Spans, Work, count_frames, spans_of_night
 from epipole.io.catalogues.element_sets import KnownObjects
 from epipole.io.work.parts import IDENTIFIED, Parts, write_part
 from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
@@ -33,7 +33,8 @@ from epipole.tasks.check.check_sensors import (
     check_sensors,
 )
 from epipole.tasks.check.correct_clock import correct_clock
-from epipole.tasks.identify.identify_span import Counts, identify_span
+from epipole.tasks.common.batches import FRAMES_OF_TASK, in_batches
+from epipole.tasks.identify.identify_span import Counts, SpanToIdentify, identify_spans
 from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_night
 from epipole.tasks.name.known_objects import name_known_objects
 from epipole.tasks.name.link_tracklets import OrbitLinks, link_tracklets
@@ -53,10 +54,15 @@ from epipole.tasks.publish.night_objects import write_objects
 from epipole.tasks.publish.night_parts import NightParts, publish_nights
 from epipole.tasks.publish.orbits import OrbitRows, fit_orbits, orbit_shares, write_orbits
 from epipole.tasks.publish.write_tables import SHARES, tracklets_of_night, write_tables
-from epipole.tasks.read.order_frames import OrderedFrames, order_logs
-from epipole.tasks.read.read_logs import read_log_into
-from epipole.tasks.track.join_tracklets import join_tracklets
-from epipole.tasks.track.track_span import track_span
+from epipole.tasks.read.order_frames import (
+    OrderedFrames,
+    order_sensors,
+    ordered_logs,
+    plan_order,
+)
+from epipole.tasks.read.read_logs import LogToRead, read_logs
+from epipole.tasks.track.join_tracklets import SensorToJoin, join_tracklets
+from epipole.tasks.track.track_span import SpanToTrack, track_spans
 
 LOGGER = logging.getLogger(__name__)
 
@@ -65,31 +71,37 @@ MAX_CORRECTIONS = 2
 
 
 def read(logs: Sequence[str], folder: ReadFolder, settings: Settings) -> OrderedFrames:
-    """Read the logs, a task per log, and order their frames and states."""
-    futures = [read_log_into.submit(folder, k, log) for k, log in enumerate(logs)]
-    logs = results(Stage.READ, futures)
-    frames = order_logs(folder, logs, settings.sensors)
-    count = sum(len(time_ns) for time_ns in frames.time_ns)
-    LOGGER.info("read %s of %s", many(count, "frame"), many(len(frames.sources), "log"))
+    """Read the logs, some per task, and order the frames and states of each sensor."""
+    to_read = [LogToRead(number, log) for number, log in enumerate(logs)]
+    batches = in_batches(to_read, [FRAMES_OF_TASK] * len(logs))
+    futures = [read_logs.submit(folder, batch) for batch in batches]
+    plan = plan_order(folder, flat(results(Stage.READ, futures, (0, 2))))
+    futures = [order_sensors.submit(folder, batch, settings.sensors) for batch in plan.batches()]
+    frames = ordered_logs(plan, flat(results(Stage.READ, futures, (1, 2))), settings.sensors)
+    LOGGER.info("read %s of %s", many(frames.n_frames, "frame"), many(len(frames.sources), "log"))
     return frames
 
 
 def identify(frames: OrderedFrames, spans: Spans, folder: WorkFolder, settings: Settings) -> Work:
-    """Interpolate sensor states, identify stars and solve attitudes, a task per sensor and span."""
+    """Interpolate sensor states, identify stars and solve attitudes."""
     where = {sensor: folder.identified(sensor) for sensor in spans}
-    work = Work(frames.folder, folder, spans, frames.cameras, where)
-    identify_spans(Stage.IDENTIFY, work, settings)
+    n_frames = count_frames(frames, spans)
+    work = Work(frames.folder, folder, spans, n_frames, frames.cameras, where)
+    identify_all(Stage.IDENTIFY, work, settings)
     return work
 
 
-def identify_spans(stage: Stage, work: Work, settings: Settings) -> None:
+def identify_all(stage: Stage, work: Work, settings: Settings) -> None:
     """Identify the frames of all spans of `work`; the parts go to `work.identified`."""
+    pieces = [
+        SpanToIdentify(sensor, span, work.identified[sensor]) for sensor, span in work.by_span()
+    ]
     futures = [
-        identify_span.submit(
-            work.frames, sensor, span, work.cameras, settings.sensors, settings.identification,
-            settings.tracklets.max_detections, work.identified[sensor],
+        identify_spans.submit(
+            work.frames, batch, work.cameras, settings.sensors, settings.identification,
+            settings.tracklets.max_detections,
         )
-        for sensor, span in work.by_span()
+        for batch in work.span_batches(pieces)
     ]  # fmt: skip
     counts: list[Counts] = results(stage, futures)
     frames, by_stars, stars = (
@@ -99,25 +111,26 @@ def identify_spans(stage: Stage, work: Work, settings: Settings) -> None:
                 many(stars, "star"))  # fmt: skip
 
 
-def track(work: Work, night: str, settings: Settings) -> None:
-    """Follow detections from frame to frame, a task per sensor and span, and name tracklets."""
+def track(work: Work, night: str, settings: Settings) -> Work:
+    """Follow detections from frame to frame, and name tracklets; return the work with counts."""
     parts = work.sensor_parts()
-    futures = [
-        track_span.submit(
-            sensor, parts[sensor].identified, span, work.cameras, settings.tracklets,
-            settings.alignment.window_s, parts[sensor].tracked,
-        )
+    to_track = [
+        SpanToTrack(sensor, span, parts[sensor].identified, parts[sensor].tracked)
         for sensor, span in work.by_span()
-    ]  # fmt: skip
-    results(Stage.TRACK, futures)
+    ]
     futures = [
-        join_tracklets.submit(
-            sensor, parts[sensor].tracked, spans, night, parts[sensor].names,
-        )
+        track_spans.submit(batch, work.cameras, settings.tracklets, settings.alignment.window_s)
+        for batch in work.span_batches(to_track)
+    ]
+    n_detections = flat(results(Stage.TRACK, futures, (0, 2)))
+    to_join = [
+        SensorToJoin(sensor, spans, parts[sensor].tracked, parts[sensor].names)
         for sensor, spans in work.spans.items()
-    ]  # fmt: skip
-    count = sum(results(Stage.TRACK, futures))
+    ]
+    futures = [join_tracklets.submit(batch, night) for batch in work.sensor_batches(to_join)]
+    count = sum(results(Stage.TRACK, futures, (1, 2)))
     LOGGER.info("followed %s", many(count, "tracklet"))
+    return work._replace(n_detections=dict(zip(work.by_span(), n_detections, strict=True)))
 
 
 def solve(

@@ -1,9 +1,8 @@
 """The work of a night: its sensors, their spans with frames, and where their parts are."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, TypeVar
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -14,10 +13,17 @@ from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import Reason, Trait, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Sensor, Span, day_of
 from epipole.schemas.tables import REJECTS
+from epipole.tasks.calibrate.calibrate_sensors import SensorStars
 from epipole.tasks.check.check_sensors import SensorVerdict
-from epipole.tasks.read.order_frames import OrderedFrames
+from epipole.tasks.common.batches import Batch, in_batches
+from epipole.tasks.identify.identify_span import SpanToIdentify
+from epipole.tasks.read.order_frames import OrderedFrames, SpanFrames
+from epipole.tasks.track.join_tracklets import SensorToJoin
+from epipole.tasks.track.track_span import SpanToTrack
 
 Spans = dict[Sensor, list[Span]]
+OfSpan = TypeVar("OfSpan", SpanToIdentify, SpanToTrack)
+OfSensor = TypeVar("OfSensor", SensorStars, SensorToJoin)
 
 
 class Work(NamedTuple):
@@ -29,10 +35,12 @@ class Work(NamedTuple):
     frames: ReadFolder  # ordered by `order_logs`
     folder: WorkFolder
     spans: Spans  # with frames, of each sensor
+    n_frames: Mapping[tuple[Sensor, Span], int]
     cameras: pa.Table
     identified: dict[Sensor, Parts]  # the newest of each sensor
     round: int = 0
     verdicts: tuple[SensorVerdict, ...] = ()  # of the logs, before any correction
+    n_detections: Mapping[tuple[Sensor, Span], int] = {}  # in this round, from `track` on
 
     def all_spans(self) -> list[Span]:
         """Return the spans in which any sensor has frames, in order."""
@@ -42,6 +50,17 @@ class Work(NamedTuple):
         """Return each sensor and span, in order of time: sensors are worked on together."""
         pairs = [(sensor, span) for sensor, spans in self.spans.items() for span in spans]
         return sorted(pairs, key=lambda pair: (pair[1], pair[0]))
+
+    def span_batches(self, pieces: Sequence[OfSpan]) -> list[Batch[OfSpan]]:
+        """Return pieces of work, each of one sensor and span, in batches of about equal work."""
+        return in_batches(pieces, [self.n_frames.get((p.sensor, p.span), 0) for p in pieces])
+
+    def sensor_batches(self, pieces: Sequence[OfSensor]) -> list[Batch[OfSensor]]:
+        """Return pieces of work, each of one sensor, in batches of about equal work."""
+        counts = dict.fromkeys(self.spans, 0)
+        for (sensor, _), count in self.n_frames.items():
+            counts[sensor] += count
+        return in_batches(pieces, [counts[piece.sensor] for piece in pieces])
 
     def sensor_parts(self) -> dict[Sensor, SensorParts]:
         """Return where the parts of each sensor lie in this round."""
@@ -70,23 +89,39 @@ def plan_spans(frames: OrderedFrames, night: str) -> tuple[Spans, pa.Table]:
     day = day_of(night)
     spans: Spans = {}
     rejects = []
-    for number, sensor_id in enumerate(frames.sensors):
-        time_ns = frames.time_ns[number]
-        wanted = _wanted(np.unique(time_ns // SPAN_NS), day)
+    for number, (sensor_id, found) in enumerate(zip(frames.sensors, frames.spans, strict=True)):
+        wanted = [each.span for each in found if _is_wanted(each.span, day)]
         if wanted and sensor_id in calibrated:
             spans[Sensor(number, sensor_id)] = wanted
-        elif len(of_day := time_ns[time_ns // DAY_NS == day]):
-            rejects.append(
-                reject_rows(
-                    Reason.NO_CALIBRATION, sensor_id=sensor_id, time=of_day[:1], count=[len(of_day)]
-                )
-            )
+        elif of_day := [each for each in found if each.span.start_ns // DAY_NS == day]:
+            rejects.append(_without_calibration(sensor_id, of_day))
     if not spans:
         raise LogError(
             f"{', '.join(log.name for log in frames.sources)}: no sensor has a calibration "
             f"({', '.join(frames.sensors)}) on {night}; {_why_not(frames.rejects)}"
         )
     return spans, concat(REJECTS, rejects)
+
+
+def count_frames(
+    frames: OrderedFrames, spans: Mapping[Sensor, Sequence[Span]]
+) -> dict[tuple[Sensor, Span], int]:
+    """Return the number of frames of each sensor in each of its spans."""
+    return {
+        (sensor, each.span): each.n_frames
+        for sensor, wanted in spans.items()
+        for each in frames.spans[sensor.number]
+        if each.span in set(wanted)
+    }
+
+
+def _without_calibration(sensor_id: str, of_day: Sequence[SpanFrames]) -> pa.Table:
+    return reject_rows(
+        Reason.NO_CALIBRATION,
+        sensor_id=sensor_id,
+        time=[of_day[0].first_ns],
+        count=[sum(each.n_frames for each in of_day)],
+    )
 
 
 def _why_not(rejects: pa.Table) -> str:
@@ -104,7 +139,6 @@ def spans_of_night(spans: Sequence[Span], night: str) -> list[Span]:
     return [span for span in spans if span.start_ns // DAY_NS == day_of(night)]
 
 
-def _wanted(numbers: np.ndarray, day: int) -> list[Span]:
-    """Return the spans of a day, and one before and after: no track is cut at midnight."""
-    near = (numbers[:, None] + [-1, 0, 1]) * SPAN_NS // DAY_NS == day
-    return [Span(k * SPAN_NS, (k + 1) * SPAN_NS) for k in numbers[near.any(axis=1)].tolist()]
+def _is_wanted(span: Span, day: int) -> bool:
+    """Return whether a span is of a day, or the one before or after: no track is cut there."""
+    return day in {(span.start_ns + k * SPAN_NS) // DAY_NS for k in (-1, 0, 1)}

@@ -33,6 +33,7 @@ from epipole.tasks.algorithms.geometry.optics_calibration import (
     calibrate_in_steps,
     calibrate_optics,
 )
+from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.sightings import camera_of, optics_covariance_of
 from epipole.tasks.common.stage_tasks import stage_task
 
@@ -58,28 +59,38 @@ class Calibrated(NamedTuple):
     departed: list[str]
 
 
-@stage_task(Stage.CALIBRATE, "{sensor}")
-def calibrate_sensor(
-    sensor: Sensor,
-    identified: Parts,
-    spans: Sequence[Span],
+class SensorStars(NamedTuple):
+    """A sensor's parts of `identify_spans`, and their spans."""
+
+    sensor: Sensor
+    spans: Sequence[Span]
+    identified: Parts
+
+    def __str__(self) -> str:
+        """Return the sensor's id."""
+        return f"{self.sensor}"
+
+
+@stage_task(Stage.CALIBRATE, "{sensors}")
+def calibrate_each(
+    sensors: Batch[SensorStars],
     cameras: pa.Table,
     nominal: pa.Table,
     principal_point_px: float | None,
-) -> Calibrated:
-    """Fit one sensor's optics to its stars of all spans.
+) -> list[Calibrated]:
+    """Fit the optics of some sensors, each to its stars of all spans; see `calibrate_sensors`."""
+    return [_calibrate(sensor, cameras, nominal, principal_point_px) for sensor in sensors]
 
-    Parameters
-    ----------
-    identified
-        The parts of the sensor, with the stars.
-    cameras, nominal, principal_point_px
-        As in `calibrate_sensors`.
-    """
-    of_sensor = pc.field("sensor_id") == sensor.sensor_id
-    stars = _sampled_stars(identified, spans)
+
+def _calibrate(
+    stars: SensorStars, cameras: pa.Table, nominal: pa.Table, principal_point_px: float | None
+) -> Calibrated:
+    of_sensor = pc.field("sensor_id") == stars.sensor.sensor_id
     return calibrate_sensors(
-        stars, cameras.filter(of_sensor), nominal.filter(of_sensor), principal_point_px
+        _sampled_stars(stars.identified, stars.spans),
+        cameras.filter(of_sensor),
+        nominal.filter(of_sensor),
+        principal_point_px,
     )
 
 

@@ -1,7 +1,7 @@
 """Find the camera of a sensor whose calibration does not fit its stars.
 
 `contradicts_camera` finds these sensors: few frames are identified, or stars lie far from their
-predicted positions, or all stars are in one part of the image. `find_sensor_camera` then searches
+predicted positions, or all stars are in one part of the image. `find_sensor_cameras` then searches
 three frames for focal length, direction of the rows and distortion (`camera_search`); another frame
 has to agree. A `CameraFinding` says what differs from the log's calibration.
 """
@@ -35,7 +35,8 @@ from epipole.tasks.algorithms.star_identification.camera_search import (
 )
 from epipole.tasks.algorithms.star_identification.centroids import brightest_first
 from epipole.tasks.algorithms.star_identification.sensor_model import Skies
-from epipole.tasks.calibrate.calibrate_sensors import with_optics
+from epipole.tasks.calibrate.calibrate_sensors import SensorStars, with_optics
+from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.sightings import camera_of
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.cache_skies import CachedSkies, Catalogue
@@ -116,7 +117,7 @@ class CameraFinding(NamedTuple):
 
 
 def contradicts_camera(
-    sensor: Sensor, identified: Parts, spans: Sequence[Span], cameras: pa.Table
+    sensor: Sensor, spans: Sequence[Span], identified: Parts, cameras: pa.Table
 ) -> bool:
     """Return whether a sensor's stars contradict its camera.
 
@@ -174,21 +175,36 @@ def _solutions(identified: Parts, spans: Sequence[Span]) -> pa.Table:
     return pa.concat_tables([identified.read(span, "solutions", columns) for span in spans])
 
 
-@stage_task(Stage.CALIBRATE, "{sensor}")
-def find_sensor_camera(
+@stage_task(Stage.CALIBRATE, "{stars}")
+def find_sensor_cameras(
+    frames: ReadFolder,
+    stars: Batch[SensorStars],
+    cameras: pa.Table,
+    sensors: SensorSettings,
+    identification: IdentificationSettings,
+) -> list[CameraFinding]:
+    """Return what can be found of the cameras of those sensors whose stars contradict them.
+
+    Left out is a sensor that has several calibrations or too few centroids, or that identifies
+    some frames with its nominal camera if no other camera matches clearly more stars.
+    """
+    findings = [
+        _find_sensor_camera(frames, *each, cameras, sensors, identification)
+        for each in stars
+        if contradicts_camera(*each, cameras)
+    ]
+    return [finding for finding in findings if finding is not None]
+
+
+def _find_sensor_camera(
     frames: ReadFolder,
     sensor: Sensor,
-    identified: Parts,
     spans: Sequence[Span],
+    identified: Parts,
     cameras: pa.Table,
     sensors: SensorSettings,
     identification: IdentificationSettings,
 ) -> CameraFinding | None:
-    """Return what can be found of the camera of a sensor whose frames contradict its calibration.
-
-    None if the sensor has several calibrations or too few centroids, or if it identifies some
-    frames with its nominal camera and no other camera matches clearly more stars.
-    """
     camera = _only_camera(cameras, sensor.sensor_id)
     tried = _solutions(identified, spans).filter(pc.field("n_centroids") >= MIN_CENTROIDS)
     solved = tried.filter(pc.field("attitude_source") == "stars")

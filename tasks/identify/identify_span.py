@@ -1,4 +1,4 @@
-"""Identify a span: one sensor's stars and attitudes, from part to part."""
+"""Identify spans: the stars and attitudes of one sensor each, from part to part."""
 
 import logging
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from epipole.schemas.settings import IdentificationSettings, SensorSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
+from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.identify.frame_inputs import interpolate_sensor_states
 from epipole.tasks.identify.identify_stars import identify_stars
@@ -25,34 +26,59 @@ LOGGER = logging.getLogger(__name__)
 BRIDGED_NS = 300_000_000_000  # states this far outside a span are interpolated to its frames
 
 
+class SpanToIdentify(NamedTuple):
+    """A sensor's frames of a span, and where their part goes: `IDENTIFIED`."""
+
+    sensor: Sensor
+    span: Span
+    parts: Parts
+
+    def __str__(self) -> str:
+        """Return the sensor and the times of day."""
+        return f"{self.sensor} {self.span}"
+
+
 class Counts(NamedTuple):
-    """Counts of a part; `by_stars` are frames with an attitude from stars."""
+    """Counts of some parts; `by_stars` are frames with an attitude from stars."""
 
     frames: int
     by_stars: int
     stars: int
 
 
-@stage_task(Stage.IDENTIFY, "{sensor} {span}")
-def identify_span(
+@stage_task(Stage.IDENTIFY, "{spans}")
+def identify_spans(
     frames: ReadFolder,
-    sensor: Sensor,
-    span: Span,
+    spans: Batch[SpanToIdentify],
     cameras: pa.Table,
     sensors: SensorSettings,
     identification: IdentificationSettings,
     max_detections: int,
-    parts: Parts,
 ) -> Counts:
-    """Identify one sensor's frames of a span, unless the part exists.
+    """Identify the frames of some spans, one sensor each, unless their parts exist.
 
     Parameters
     ----------
     frames
-        Where `order_logs` put the frames.
-    parts
-        Where the part goes: `IDENTIFIED`.
+        Where `order_sensors` put the frames.
     """
+    counts = [
+        _identify_span(frames, *each, cameras, sensors, identification, max_detections)
+        for each in spans
+    ]
+    return Counts(*(sum(count) for count in zip(*counts, strict=True)))
+
+
+def _identify_span(
+    frames: ReadFolder,
+    sensor: Sensor,
+    span: Span,
+    parts: Parts,
+    cameras: pa.Table,
+    sensors: SensorSettings,
+    identification: IdentificationSettings,
+    max_detections: int,
+) -> Counts:
     if not parts.holds(span):
         exposures = frames_between(frames, sensor.number, *span)
         states = states_about(frames, sensor, span, sensors.state_gap_s)

@@ -1,9 +1,11 @@
 """Order frames: those of all logs by sensor and time, each once; states are converted to GCRF.
 
 Frames stay in the parts of their logs; an index per sensor says where. So a night is never in
-memory as a whole, whatever the order of its frames and the number of its logs.
+memory as a whole, whatever the order of its frames and the number of its logs. Each sensor is
+ordered by itself, from the pieces of logs that have something of it.
 """
 
+import itertools
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,6 +23,8 @@ from epipole.schemas.bridge import array, concat, conform, table, unstack_covari
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import SensorSettings
+from epipole.schemas.spans import DAY_NS, SPAN_NS, Span
+from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX, LOG_STATES, LogSource
 from epipole.tasks.algorithms.times import (
@@ -31,6 +35,8 @@ from epipole.tasks.algorithms.times import (
     order_frames,
     order_states,
 )
+from epipole.tasks.common.batches import Batch, in_batches
+from epipole.tasks.common.stage_tasks import stage_task
 from epipole.tasks.read.read_logs import ReadLog
 from epipole.tasks.read.states_to_gcrf import states_to_gcrf
 
@@ -45,52 +51,129 @@ _DUPLICATES = {
 }
 
 
+class SpanFrames(NamedTuple):
+    """The frames of one sensor in a span: how many, and the time of the first and the last [ns]."""
+
+    span: Span
+    n_frames: int
+    first_ns: int
+    last_ns: int
+
+
 class OrderedFrames(NamedTuple):
-    """The frames of a run: where they are, and in memory only their times and small tables."""
+    """The frames of a run: where they are, and in memory only their counts and small tables."""
 
     folder: ReadFolder
     sensors: list[str]  # sorted; a sensor's number is its index here
-    time_ns: list[Indices]  # of each sensor's frames
+    spans: list[list[SpanFrames]]  # of each sensor, in order
     cameras: pa.Table
     sources: list[LogSource]
     rejects: pa.Table
+
+    @property
+    def days(self) -> set[int]:
+        """The days since 1970 that have frames."""
+        return {each.span.start_ns // DAY_NS for of_sensor in self.spans for each in of_sensor}
+
+    @property
+    def n_frames(self) -> int:
+        """The number of frames."""
+        return sum(each.n_frames for of_sensor in self.spans for each in of_sensor)
+
+
+class SensorPieces(NamedTuple):
+    """Where a sensor's frames and states are: pieces of logs, in the order of the logs."""
+
+    number: int
+    sensor_id: str
+    pieces: list[tuple[LogSource, int, int]]  # the log's content, its number, and the piece
+
+    def __str__(self) -> str:
+        """Return the sensor's id."""
+        return self.sensor_id
+
+
+class _OrderedSensor(NamedTuple):
+    """One sensor's frames; `rejects` are strays, each kind of duplicates, and repeated states."""
+
+    spans: list[SpanFrames]
+    rejects: list[pa.Table]
+
+
+class OrderPlan(NamedTuple):
+    """What there is to order: the logs, each content once, and the sensors in them."""
+
+    folder: ReadFolder
+    logs: list[ReadLog]
+    sensors: list[SensorPieces]
+
+    def batches(self) -> list[Batch[SensorPieces]]:
+        """Return the sensors in batches, for `order_sensors`."""
+        n_frames = dict.fromkeys((sensor.sensor_id for sensor in self.sensors), 0)
+        for log in self.logs:
+            for sensor_id, found in log.sensors.items():
+                n_frames[sensor_id] += found.n_frames
+        return in_batches(self.sensors, list(n_frames.values()))
+
+
+def plan_order(folder: ReadFolder, logs: Sequence[ReadLog]) -> OrderPlan:
+    """Return what there is to order. Of two logs with the same content one is used."""
+    logs = _distinct(logs)
+    pieces: dict[str, list[tuple[LogSource, int, int]]] = {}
+    for log in logs:
+        for sensor_id, found in log.sensors.items():
+            of_log = [(log.source, log.number, piece) for piece in found.pieces]
+            pieces.setdefault(sensor_id, []).extend(of_log)
+    sensors = [SensorPieces(k, name, pieces[name]) for k, name in enumerate(sorted(pieces))]
+    return OrderPlan(folder, logs, sensors)
+
+
+@stage_task(Stage.READ, "{sensors}")
+def order_sensors(
+    folder: ReadFolder, sensors: Batch[SensorPieces], settings: SensorSettings
+) -> list[_OrderedSensor]:
+    """Order the frames and states of some sensors; each becomes a part, `READ_SENSOR`.
+
+    A frame that occurs twice counts once; `order_frames` says what a repeat is.
+    """
+    return [_order_sensor(folder, sensor, settings) for sensor in sensors]
+
+
+def ordered_logs(
+    plan: OrderPlan, ordered: Sequence[_OrderedSensor], settings: SensorSettings
+) -> OrderedFrames:
+    """Return the frames of all sensors of the plan, which `order_sensors` has ordered."""
+    parts = [plan.folder.piece(log.number, k) for log in plan.logs for k in range(log.n_pieces)]
+    cameras = with_uncertain_principal_points(
+        _sorted_cameras(_piece_tables(parts, "cameras", CAMERAS)),
+        settings.principal_point_sigma_px or 0.0,
+    )
+    rejects = [_piece_tables(parts, "rejects", REJECTS)]
+    rejects += [rows for of_kind in zip(*(each.rejects for each in ordered), strict=True)
+                for rows in of_kind]  # fmt: skip
+    spans = [each.spans for each in ordered]
+    return OrderedFrames(
+        plan.folder,
+        [sensor.sensor_id for sensor in plan.sensors],
+        spans,
+        cameras,
+        _dated([log.source for log in plan.logs], [each for found in spans for each in found]),
+        concat(REJECTS, rejects),
+    )
 
 
 def order_logs(
     folder: ReadFolder, logs: Sequence[ReadLog], settings: SensorSettings
 ) -> OrderedFrames:
-    """Order the content of logs; the order of the logs does not matter.
+    """Order the content of logs, without tasks; the order of the logs does not matter."""
+    plan = plan_order(folder, logs)
+    ordered = [_order_sensor(folder, sensor, settings) for sensor in plan.sensors]
+    return ordered_logs(plan, ordered, settings)
 
-    A frame that occurs twice counts once; `order_frames` says what a repeat is. Of two logs with
-    the same content one is used.
-    """
-    logs = _distinct(logs)
-    pieces = {(log.number, k): folder.piece(log.number, k) for log in logs
-              for k in range(log.n_pieces)}  # fmt: skip
-    keys, strays = _without_strays(_keys(pieces), logs)
-    sensors = sorted(_names(pieces, "exposures") | _names(pieces, "states"))
-    sensor = _numbers(keys["sensor_id"], sensors)
-    order, verdict = order_frames(sensor, array(keys, "time"), array(keys, "frame_number"))
-    rejects = [_piece_tables(pieces, "rejects", REJECTS), stray_rejects(strays)]
-    rejects += [
-        frames_left_out(keys.take(order[verdict == code]), reason)
-        for code, reason in _DUPLICATES.items()
-    ]
-    kept = order[verdict == KEEP]
-    time_ns = []
-    for number in range(len(sensors)):
-        index = conform(FRAME_INDEX, keys.take(kept[sensor[kept] == number]))
-        states, repeats = _sorted_states(folder, logs, sensors[number], settings)
-        rejects.append(repeats)
-        write_part(folder.sensor(number), READ_SENSOR, {"index": index, "states": states})
-        time_ns.append(array(index, "time"))
-    cameras = with_uncertain_principal_points(
-        _sorted_cameras(_piece_tables(pieces, "cameras", CAMERAS)),
-        settings.principal_point_sigma_px or 0.0,
-    )
-    left_out = concat(REJECTS, rejects)
-    sources = _dated([log.source for log in logs], array(keys, "time"))
-    return OrderedFrames(folder, sensors, time_ns, cameras, sources, left_out)
+
+def frame_times(folder: ReadFolder, sensor: int) -> Indices:
+    """Return the times [ns] of a sensor's frames, in order."""
+    return array(read_part(folder.sensor(sensor), "index"), "time")
 
 
 def frames_between(folder: ReadFolder, sensor: int, start_ns: int, end_ns: int) -> pa.Table:
@@ -130,58 +213,81 @@ def _distinct(logs: Sequence[ReadLog]) -> list[ReadLog]:
     return list(by_content.values())
 
 
-def _keys(pieces: Mapping[tuple[int, int], Path]) -> pa.Table:
-    """Return a row per frame of all pieces: its key, its log, its piece and its row."""
+def _order_sensor(
+    folder: ReadFolder, sensor: SensorPieces, settings: SensorSettings
+) -> _OrderedSensor:
+    keys, strays = _without_strays(_keys(folder, sensor), sensor)
+    time_ns, number = array(keys, "time"), array(keys, "frame_number")
+    order, verdict = order_frames(np.zeros(len(time_ns), np.int64), time_ns, number)
+    index = conform(FRAME_INDEX, keys.take(order[verdict == KEEP]))
+    states, repeats = _sorted_states(folder, sensor, settings)
+    write_part(folder.sensor(sensor.number), READ_SENSOR, {"index": index, "states": states})
+    duplicates = [
+        frames_left_out(keys.take(order[verdict == code]), reason)
+        for code, reason in _DUPLICATES.items()
+    ]
+    return _OrderedSensor(_by_span(array(index, "time")), [stray_rejects(strays), *duplicates,
+                                                           repeats])  # fmt: skip
+
+
+def _by_span(time_ns: Indices) -> list[SpanFrames]:
+    """Return the frames, which are in order of time, by span."""
+    number = time_ns // SPAN_NS
+    bounds = np.flatnonzero(np.diff(number, prepend=-1, append=-1)).tolist()
+    return [
+        SpanFrames(
+            Span(int(number[a]) * SPAN_NS, (int(number[a]) + 1) * SPAN_NS),
+            b - a,
+            int(time_ns[a]),
+            int(time_ns[b - 1]),
+        )
+        for a, b in itertools.pairwise(bounds)
+    ]
+
+
+def _keys(folder: ReadFolder, sensor: SensorPieces) -> pa.Table:
+    """Return a row per frame of a sensor: its key, its log, its piece and its row."""
     names = ["sensor_id", "frame_number", "time", "source"]
     located = ("log", "piece", "row")
     schema = pa.schema(
         [EXPOSURES.field(name) for name in names] + [FRAME_INDEX.field(name) for name in located]
     )
     rows = [schema.empty_table()]
-    for (log, piece), part in pieces.items():
-        keys = read_part(part, "exposures", names)
-        n = keys.num_rows
+    for _, log, piece in sensor.pieces:
+        keys = read_part(folder.piece(log, piece), "exposures", names)
+        row = np.flatnonzero(pc.equal(keys["sensor_id"], sensor.sensor_id).to_numpy())
         located_columns = (
-            pa.array(np.full(n, log, np.int32)),
-            pa.array(np.full(n, piece, np.int32)),
-            pa.array(np.arange(n)),
+            pa.array(np.full(len(row), log, np.int32)),
+            pa.array(np.full(len(row), piece, np.int32)),
+            pa.array(row),
         )
-        rows.append(pa.Table.from_arrays([*keys.columns, *located_columns], schema=schema))
+        columns = [*keys.take(row).columns, *located_columns]
+        rows.append(pa.Table.from_arrays(columns, schema=schema))
     return pa.concat_tables(rows)
 
 
-def _names(pieces: Mapping[tuple[int, int], Path], name: str) -> set[str]:
-    """Return the ids of the sensors in one table of all pieces."""
-    tables = (read_part(part, name, ["sensor_id"]) for part in pieces.values())
-    return {sensor for rows in tables for sensor in pc.unique(rows["sensor_id"]).to_pylist()}
+def _piece_tables(parts: Sequence[Path], name: str, schema: pa.Schema) -> pa.Table:
+    return concat(schema, [read_part(part, name) for part in parts])
 
 
-def _numbers(sensor_id: pa.ChunkedArray, sensors: list[str]) -> Indices:
-    numbers = pc.index_in(sensor_id, pa.array(sensors, pa.string()))
-    return np.asarray(numbers.to_numpy(), np.int64)
-
-
-def _piece_tables(pieces: Mapping[tuple[int, int], Path], name: str, schema: pa.Schema) -> pa.Table:
-    return concat(schema, [read_part(part, name) for part in pieces.values()])
-
-
-def _without_strays(keys: pa.Table, logs: Sequence[ReadLog]) -> tuple[pa.Table, pa.Table]:
+def _without_strays(keys: pa.Table, sensor: SensorPieces) -> tuple[pa.Table, pa.Table]:
     """Return the keys of frames within the time range of their log, and those of strays."""
-    n_logs = max((log.number for log in logs), default=-1) + 1
-    first, last = np.zeros(n_logs, np.int64), np.zeros(n_logs, np.int64)
-    for log in logs:
-        first[log.number] = log.source.first_time_ns or 0
-        last[log.number] = log.source.last_time_ns or 0
-    log_of, time_ns = array(keys, "log"), array(keys, "time")
-    inside = (time_ns >= first[log_of]) & (time_ns <= last[log_of])
+    ranges: Mapping[int, tuple[int, int]] = {
+        log: (source.first_time_ns or 0, source.last_time_ns or 0)
+        for source, log, _ in sensor.pieces
+    }
+    logs, of_log = np.unique(array(keys, "log"), return_inverse=True)
+    limits = np.array([ranges[log] for log in logs.tolist()], np.int64).reshape(-1, 2)[of_log]
+    time_ns = array(keys, "time")
+    inside = (time_ns >= limits[:, 0]) & (time_ns <= limits[:, 1])
     return keys.filter(pa.array(inside)), keys.filter(pa.array(~inside))
 
 
-def _dated(sources: Sequence[LogSource], time_ns: Indices) -> list[LogSource]:
+def _dated(sources: Sequence[LogSource], spans: Sequence[SpanFrames]) -> list[LogSource]:
     """Return the sources; one without any time is part of the whole run."""
-    if not len(time_ns):
+    if not spans:
         return list(sources)
-    first, last = int(time_ns.min()), int(time_ns.max())
+    first, last = min(each.first_ns for each in spans), max(each.last_ns for each in spans)
     return [
         source._replace(first_time_ns=first, last_time_ns=last)
         if source.first_time_ns is None
@@ -191,15 +297,14 @@ def _dated(sources: Sequence[LogSource], time_ns: Indices) -> list[LogSource]:
 
 
 def _sorted_states(
-    folder: ReadFolder, logs: Sequence[ReadLog], sensor_id: str, settings: SensorSettings
+    folder: ReadFolder, sensor: SensorPieces, settings: SensorSettings
 ) -> tuple[pa.Table, pa.Table]:
     """Return one sensor's states in GCRF, sorted, each time once; and the rejects of repeats."""
     states, names = [], []
-    for log in logs:
-        for k in range(log.n_pieces):
-            all_states = read_part(folder.piece(log.number, k), "states")
-            states.append(all_states.filter(pc.field("sensor_id") == sensor_id))
-            names += [log.source.name] * states[-1].num_rows
+    for source, log, piece in sensor.pieces:
+        all_states = read_part(folder.piece(log, piece), "states")
+        states.append(all_states.filter(pc.field("sensor_id") == sensor.sensor_id))
+        names += [source.name] * states[-1].num_rows
     rows = concat(LOG_STATES, states)
     order, repeats = order_states(np.zeros(rows.num_rows, np.int64), array(rows, "time"))
     named = rows.select(["sensor_id", "time"]).append_column("source", pa.array(names, pa.string()))

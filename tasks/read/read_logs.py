@@ -3,25 +3,53 @@
 import logging
 from typing import NamedTuple
 
+import pyarrow as pa
+import pyarrow.compute as pc
+
 from epipole.io.logs.reader import read_log_pieces
 from epipole.io.work.parts import LOG_PIECE, write_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import LogSource
+from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import stage_task
 
 LOGGER = logging.getLogger(__name__)
 
 
+class LogToRead(NamedTuple):
+    """A log of a run: its number there, and its path or URL."""
+
+    number: int
+    path: str
+
+    def __str__(self) -> str:
+        """Return the path."""
+        return self.path
+
+
+class SensorInLog(NamedTuple):
+    """What a log has of a sensor: which pieces have frames or states of it, and its frames."""
+
+    pieces: list[int]
+    n_frames: int
+
+
 class ReadLog(NamedTuple):
-    """A log that was read: its number in the run, and how many pieces it has."""
+    """A log that was read: its number in the run, how many pieces it has, and its sensors."""
 
     number: int
     n_pieces: int
     source: LogSource
+    sensors: dict[str, SensorInLog]
 
 
-@stage_task(Stage.READ, "{path}", retried=True)
+@stage_task(Stage.READ, "{logs}", retried=True)
+def read_logs(folder: ReadFolder, logs: Batch[LogToRead]) -> list[ReadLog]:
+    """Read some logs, each into pieces of bounded size; see `read_log_into`."""
+    return [read_log_into(folder, *log) for log in logs]
+
+
 def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
     """Read one log into pieces of bounded size.
 
@@ -32,7 +60,8 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
     LogError
         If it is not a log; see `read_log_pieces`.
     """
-    n_pieces, n_frames, source = 0, 0, None
+    n_pieces, source = 0, None
+    sensors: dict[str, SensorInLog] = {}
     for piece in read_log_pieces(path):
         write_part(
             folder.piece(number, n_pieces),
@@ -45,9 +74,20 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
             },
             within=folder.root,
         )
+        for sensor_id, n_frames in _frames_of(piece.exposures, piece.states).items():
+            before = sensors.get(sensor_id, SensorInLog([], 0))
+            sensors[sensor_id] = SensorInLog([*before.pieces, n_pieces], before.n_frames + n_frames)
         n_pieces += 1
-        n_frames += piece.exposures.num_rows
         source = piece.source or source
     assert source is not None, "the last piece has it"
+    n_frames = sum(found.n_frames for found in sensors.values())
     LOGGER.info("%s: read %d frames in %d pieces", source.name, n_frames, n_pieces)
-    return ReadLog(number, n_pieces, source)
+    return ReadLog(number, n_pieces, source, sensors)
+
+
+def _frames_of(exposures: pa.Table, states: pa.Table) -> dict[str, int]:
+    """Return the number of frames of each sensor in a piece, also of those with states only."""
+    found = dict.fromkeys(pc.unique(states["sensor_id"]).to_pylist(), 0)
+    for counted in pc.value_counts(exposures["sensor_id"]).to_pylist():
+        found[counted["values"]] = counted["counts"]
+    return found

@@ -6,6 +6,7 @@ detections there are one tracklet.
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import polars as pl
@@ -23,27 +24,31 @@ from epipole.schemas.spans import DAY_NS, Sensor, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import HOT_SUSPECTS, TRACKLET_NAMES, TRACKLET_RUNS
 from epipole.tasks.algorithms.tracking.linking.chains import chain_heads
+from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import stage_task
 
 KEY = ["frame_number", "centroid"]
 
 
-@stage_task(Stage.TRACK, "{sensor} all spans")
-def join_tracklets(
-    sensor: Sensor, tracked: Parts, spans: Sequence[Span], night: str, parts: Parts
-) -> int:
-    """Name one sensor's tracklets for the night, unless the parts exist.
+class SensorToJoin(NamedTuple):
+    """A sensor's tracklets: its parts of `track_spans`, their spans in order, and where parts go.
 
-    Parameters
-    ----------
-    tracked
-        The sensor's parts of `track_span`.
-    spans
-        The spans of these parts, in order.
-    night
-        UTC date.
-    parts
-        Where the parts go: `SPAN_NAMES` of each span, and `NIGHT_TRACKLETS`.
+    These are `SPAN_NAMES` of each span, and `NIGHT_TRACKLETS`.
+    """
+
+    sensor: Sensor
+    spans: Sequence[Span]
+    tracked: Parts
+    parts: Parts
+
+    def __str__(self) -> str:
+        """Return the sensor's id."""
+        return f"{self.sensor}"
+
+
+@stage_task(Stage.TRACK, "{sensors} all spans")
+def join_tracklets(sensors: Batch[SensorToJoin], night: str) -> int:
+    """Name the tracklets of some sensors for a night, a UTC date, unless the parts exist.
 
     Returns
     -------
@@ -57,9 +62,12 @@ def join_tracklets(
     Which tracklet it continues is taken from the span in which it begins. A tracklet that crosses
     midnight is one in each night: its id, times and counts are of its detections in the night.
     """
-    if not is_written(parts.of_night()):
-        _join(sensor, tracked, spans, night, parts)
-    return read_part(parts.of_night(), "tracklets").num_rows
+    count = 0
+    for each in sensors:
+        if not is_written(each.parts.of_night()):
+            _join(each.sensor, each.tracked, each.spans, night, each.parts)
+        count += read_part(each.parts.of_night(), "tracklets").num_rows
+    return count
 
 
 def _join(sensor: Sensor, tracked: Parts, spans: Sequence[Span], night: str, parts: Parts) -> None:

@@ -39,6 +39,7 @@ from epipole.tasks.algorithms.tracking.linking.chains import (
 )
 from epipole.tasks.algorithms.tracking.local_motion import directions_at
 from epipole.tasks.algorithms.tracking.runs import NONE, follow_detections
+from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.sightings import (
     Frames,
     Sightings,
@@ -425,30 +426,40 @@ def track_margin_ns(settings: TrackletSettings) -> int:
     return round((MARGIN_S + (settings.link_gap_s or LINK_MARGIN_S)) * 1e9)
 
 
-@stage_task(Stage.TRACK, "{sensor} {span}")
-def track_span(
-    sensor: Sensor,
-    identified: Parts,
-    span: Span,
-    cameras: pa.Table,
-    settings: TrackletSettings,
-    half_width_s: float,
-    parts: Parts,
-) -> int:
-    """Follow one sensor's detections through a span and its margins, unless the part exists.
+class SpanToTrack(NamedTuple):
+    """A sensor's detections of a span: its parts of `identify_spans`, and where the part goes.
 
-    Parameters
-    ----------
-    identified
-        The sensor's parts of `identify_span`.
-    parts
-        Where the part goes: `TRACKED`, with the tracklets' names in the span.
+    The part is `TRACKED`, with the tracklets' names in the span.
+    """
+
+    sensor: Sensor
+    span: Span
+    identified: Parts
+    parts: Parts
+
+    def __str__(self) -> str:
+        """Return the sensor and the times of day."""
+        return f"{self.sensor} {self.span}"
+
+
+@stage_task(Stage.TRACK, "{spans}")
+def track_spans(
+    spans: Batch[SpanToTrack], cameras: pa.Table, settings: TrackletSettings, half_width_s: float
+) -> list[int]:
+    """Follow detections through some spans and their margins, unless the parts exist.
 
     Returns
     -------
-    int
-        Number of tracklets.
+    list of int
+        The number of detections in each part.
     """
+    return [_track_span(each, cameras, settings, half_width_s) for each in spans]
+
+
+def _track_span(
+    work: SpanToTrack, cameras: pa.Table, settings: TrackletSettings, half_width_s: float
+) -> int:
+    _, span, identified, parts = work
     if not parts.holds(span):
         wide = span.widened(track_margin_ns(settings))
         tracked = build_tracklets(
@@ -460,4 +471,4 @@ def track_span(
             identified.rows_within(wide, STARS, "stars"),
         )
         write_part(parts.of(span), TRACKED, tracked._asdict())
-    return parts.read(span, "tracklets").num_rows
+    return parts.read(span, "detections", ["time"]).num_rows

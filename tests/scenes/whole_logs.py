@@ -33,7 +33,7 @@ def read_whole(
     """Read logs as the flow does, with frames and states of a range of time [ns] only."""
     with tempfile.TemporaryDirectory() as folder:
         where = ReadFolder(Path(folder))
-        read = [read_log_into.fn(where, k, path) for k, path in enumerate(paths)]
+        read = [read_log_into(where, k, path) for k, path in enumerate(paths)]
         frames = order_logs(where, read, settings.sensors)
         numbers = range(len(frames.sensors))
         exposures = [frames_between(where, n, *between) for n in numbers]

@@ -12,9 +12,10 @@ from epipole.io.work.parts import read_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.errors import DatasetError, LogError
 from epipole.schemas.stages import Stage
+from epipole.tasks.common.batches import Batch
 from epipole.tasks.common.stage_tasks import DELAYS_S, RETRIES, stage_task, storage_failed
 from epipole.tasks.read import read_logs as module
-from epipole.tasks.read.read_logs import read_log_into
+from epipole.tasks.read.read_logs import LogToRead, read_logs
 
 
 @pytest.mark.parametrize("stage", Stage)
@@ -102,9 +103,8 @@ def test_a_log_is_read_again_only_after_a_fault_of_the_storage(
 
     @flow
     def reading():
-        return read_log_into.with_options(retry_delay_seconds=0)(
-            ReadFolder(tmp_path), 0, str(night_log)
-        )
+        batch = Batch([LogToRead(0, str(night_log))])
+        return read_logs.with_options(retry_delay_seconds=0)(ReadFolder(tmp_path), batch)[0]
 
     if reads == 1:
         with pytest.raises(LogError):

@@ -22,7 +22,7 @@ def test_a_log_becomes_pieces_with_the_declared_tables(tmp_path, caplog):
             )  # fmt: skip
     folder = ReadFolder(tmp_path)
     with caplog.at_level(logging.INFO):
-        read = read_log_into.fn(folder, 3, str(tmp_path / "a.mcap"))
+        read = read_log_into(folder, 3, str(tmp_path / "a.mcap"))
     assert (read.number, read.source.name) == (3, "a.mcap")
     pieces = [folder.piece(3, k) for k in range(read.n_pieces)]
     rows = {name: sum(read_part(p, name).num_rows for p in pieces) for name in LOG_PIECE}
@@ -34,5 +34,5 @@ def test_a_log_becomes_pieces_with_the_declared_tables(tmp_path, caplog):
 def test_a_file_that_is_no_log_is_an_error_and_leaves_no_part(tmp_path):
     (tmp_path / "a.mcap").write_bytes(b"PNG")
     with pytest.raises(LogError, match=r"a\.mcap"):
-        read_log_into.fn(ReadFolder(tmp_path), 0, str(tmp_path / "a.mcap"))
+        read_log_into(ReadFolder(tmp_path), 0, str(tmp_path / "a.mcap"))
     assert not (tmp_path / "read").exists()
