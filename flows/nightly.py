@@ -108,7 +108,7 @@ def nightly(
     with lock_nights(out, [night] if night else []) as run:
         frames = read(given.paths, ReadFolder(run), settings)
 
-        nights = nights_of(frames.days)
+        nights = nights_of(frames.starts_ns)
         chosen = choose_nights(given.paths, nights, night, frames.rejects)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)

@@ -32,7 +32,7 @@ class Work(NamedTuple):
     A round is one pass from `track` to `check`. After a correction of clocks comes another round.
     """
 
-    frames: ReadFolder  # ordered by `order_logs`
+    frames: ReadFolder  # ordered by `order_sensors`
     folder: WorkFolder
     spans: Spans  # with frames, of each sensor
     n_frames: Mapping[tuple[Sensor, Span], int]

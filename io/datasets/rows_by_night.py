@@ -1,8 +1,8 @@
 """Rows by night: to which UTC date the rows of a table belong, and their order in it."""
 
 import datetime
-from collections.abc import Iterable
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -18,9 +18,9 @@ _WHOLE_NIGHT = {
 }  # fmt: skip
 
 
-def nights_of(days: Iterable[int]) -> list[str]:
-    """Return the UTC dates, ``YYYY-MM-DD``, of days since 1970, each once and in order."""
-    return [_date(day) for day in sorted(set(days))]
+def nights_of(time_ns: np.ndarray) -> list[str]:
+    """Return the UTC dates, ``YYYY-MM-DD``, of these times, each once and in order."""
+    return [_date(day) for day in np.unique(time_ns // DAY_NS)]
 
 
 def rows_of_night(name: str, rows: pa.Table, night: str) -> pa.Table:

@@ -26,7 +26,7 @@ MAX_TASKS = 800  # of a stage, whatever its work: about twelve times this many i
 class Batch(Generic[T]):
     """The pieces of work of one task; as text, the first piece and how many more there are.
 
-    It is no tuple: Prefect looks into tuples for results of other tasks, piece by piece.
+    Not a tuple: Prefect looks into tuples for results of other tasks, piece by piece.
     """
 
     __slots__ = ("pieces",)

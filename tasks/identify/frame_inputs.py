@@ -107,7 +107,7 @@ def interpolate_sensor_states(
 ) -> pa.Table:
     """Return SENSOR_STATES_AT_FRAMES, one row per row of `exposures`; see `interpolate_states`.
 
-    `states` are sorted by sensor and time, each time once, as `order_logs` returns them.
+    `states` are sorted by sensor and time, each time once, as `order_sensors` leaves them.
     """
     sensor, time_ns = array(exposures, "sensor_id"), array(exposures, "time")
     state_sensor, all_states = array(states, "sensor_id"), _states(states, settings)

@@ -23,7 +23,7 @@ from epipole.schemas.bridge import array, concat, conform, table, unstack_covari
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import SensorSettings
-from epipole.schemas.spans import DAY_NS, SPAN_NS, Span
+from epipole.schemas.spans import SPAN_NS, Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import CAMERAS, EXPOSURES, FRAME_INDEX, LOG_STATES, LogSource
@@ -71,9 +71,9 @@ class OrderedFrames(NamedTuple):
     rejects: pa.Table
 
     @property
-    def days(self) -> set[int]:
-        """The days since 1970 that have frames."""
-        return {each.span.start_ns // DAY_NS for of_sensor in self.spans for each in of_sensor}
+    def starts_ns(self) -> Indices:
+        """The starts of all spans with frames."""
+        return np.array([each.span.start_ns for found in self.spans for each in found], np.int64)
 
     @property
     def n_frames(self) -> int:
@@ -226,11 +226,11 @@ def _order_sensor(
         frames_left_out(keys.take(order[verdict == code]), reason)
         for code, reason in _DUPLICATES.items()
     ]
-    return _OrderedSensor(_by_span(array(index, "time")), [stray_rejects(strays), *duplicates,
+    return _OrderedSensor(by_span(array(index, "time")), [stray_rejects(strays), *duplicates,
                                                            repeats])  # fmt: skip
 
 
-def _by_span(time_ns: Indices) -> list[SpanFrames]:
+def by_span(time_ns: Indices) -> list[SpanFrames]:
     """Return the frames, which are in order of time, by span."""
     number = time_ns // SPAN_NS
     bounds = np.flatnonzero(np.diff(number, prepend=-1, append=-1)).tolist()

@@ -1,6 +1,6 @@
 """Track a span: one sensor's tracklets over a span and its margins.
 
-`track_span` reads the parts of a span and its margins and calls `build_tracklets`. For the frames
+`track_spans` reads the parts of a span and its margins and calls `build_tracklets`. For the frames
 with an attitude, and apart from them for the others, that does these steps (`_label`):
 
 1. Hot pixels and planets are labelled and set aside.

@@ -143,8 +143,7 @@ def image_derivatives(camera: Camera, u: Array) -> tuple[Array, Array]:
         moved[:, 0, column], moved[:, 1, column] = f[0] * x * r2**power, f[1] * y * r2**power
     moved[:, 0, 6], moved[:, 1, 6] = f[0] * xy2, f[1] * (r2 + 2 * y * y)
     moved[:, 0, 7], moved[:, 1, 7] = f[0] * (r2 + 2 * x * x), f[1] * xy2
-    J_turn = f[:, None] * np.einsum("nij,njk->nik", stretch, turned)
-    return J_turn, moved
+    return f[:, None] * (stretch @ turned), moved
 
 
 def shared_attitude_covariance(

@@ -29,6 +29,10 @@ CORNER_PX = 20.0  # effect of a term of the distortion at the corners of the ima
 PRINCIPAL_POINT_SHARE = 0.005  # of the image's size
 MIN_PRINCIPAL_POINT_PX = 1e-3  # if the principal point is stated as exact
 MAX_ITERATIONS = 15
+# A fit ends with a step of the optics below this share of their sigmas, and of each frame's turn
+# below this share of a star image's error. Steps fall by ten each (Huber's weights follow), so the
+# rest is a tenth of it, and the rest of chi-square the square of that.
+SETTLED = 0.02
 HUBER = 2.0  # [sigma] larger residuals have less weight
 MIN_FRAMES, MIN_STARS = 3, 60  # minimum numbers for a fit
 # The principal point is free only if its sigma, with all parameters free, is below this share of
@@ -333,31 +337,50 @@ def _fit(
         r, J_turn, J_optics = _linearise(camera, images.xy, u)
         sigma = max(sigma_px, _robust_sigma(r, used))  # far from the optimum all weights are 1
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(np.abs(r), 1e-12)) / sigma**2
-        J_optics = J_optics * scale @ basis
-        A = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_turn), images.starts)
+        J_optics = J_optics @ (scale[:, None] * basis)
+        weighted = weight[..., None] * J_turn
+        A = _sums_by_frame(weighted, J_turn, images.starts)
         # Also with all stars of a frame at one position.
         A += 1e-9 * np.trace(A, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        b = np.add.reduceat(np.einsum("nai,na->ni", J_turn, weight * r), images.starts)
+        b = np.add.reduceat(np.einsum("nai,na->ni", weighted, r), images.starts)
         turn = np.linalg.solve(A, b[..., None])[..., 0]
-        B = np.add.reduceat(np.einsum("nai,na,naj->nij", J_turn, weight, J_optics), images.starts)
-        lever = np.linalg.solve(A, B)  # rotations that compensate a change of the optics
-        C = np.einsum("nai,na,naj->ij", J_optics, weight, J_optics) + np.eye(k)
+        B = _sums_by_frame(weighted, J_optics, images.starts)
+        lever = np.asarray(
+            np.linalg.solve(A, B), np.float64
+        )  # rotations that compensate a change of the optics
+        rows = J_optics.reshape(2 * len(r), k)
+        C = (rows * weight.reshape(-1, 1)).T @ rows + np.eye(k)
         C -= np.einsum("fki,fkj->ij", B, lever)
-        c = np.einsum("nai,na->i", J_optics, weight * r)
+        pull: Array = weight * r
+        c = rows.T @ pull.reshape(-1)
         c -= basis.T @ ((_values(camera) - nominal) / scale)
-        cov = np.linalg.inv(C)
+        cov = np.asarray(np.linalg.inv(C), np.float64)
         step = cov @ (c - np.einsum("fki,fk->i", B, turn))
         turn = turn - lever @ step
-        score = np.einsum("nai,na->ni", J_optics - J_turn @ lever[images.of_frame], weight * r)
         camera = _moved(camera, (basis @ step) * scale)
         u = u + np.cross(turn[images.of_frame], u)
         u = u / np.linalg.norm(u, axis=1, keepdims=True)
-        still = np.abs(step).max(initial=0.0) < 1e-6
-        if still and np.abs(turn).max() < 1e-3 * sigma * camera.pixel_rad:
+        still = np.abs(step / np.sqrt(np.diag(cov))).max(initial=0.0) < SETTLED
+        if still and np.abs(turn).max() < SETTLED * sigma * camera.pixel_rad:
             break
-    r, _, _ = _linearise(camera, images.xy, u)
+    score = _scores(J_turn, J_optics, pull, lever, images.of_frame)
+    r = _residuals(camera, images.xy, u)
     moved = basis.T @ ((_values(camera) - nominal) / scale)
     return _Fit(camera, u, moved, cov, r, sigma_px or _robust_sigma(r, used), score)
+
+
+def _sums_by_frame(a: Array, b: Array, starts: Indices) -> Array:
+    """Return the sums of a' b (f, k, m) over the images of each frame; a (n, 2, k), b (n, 2, m)."""
+    products = a[:, 0, :, None] * b[:, 0, None, :] + a[:, 1, :, None] * b[:, 1, None, :]
+    return np.asarray(np.add.reduceat(products, starts))
+
+
+def _scores(J_turn: Array, J_optics: Array, pull: Array, lever: Array, frame: Indices) -> Array:
+    """Return the gradient (n, k) of each star image by the optics, frames turned along with it."""
+    pulled = np.einsum("nai,na->ni", J_turn, pull)
+    return np.asarray(
+        np.einsum("nai,na->ni", J_optics, pull) - np.einsum("ni,nij->nj", pulled, lever[frame])
+    )
 
 
 def _values(camera: Camera) -> Array:
@@ -386,4 +409,8 @@ def _huber_cost(z: Array) -> float:
 
 def _linearise(camera: Camera, xy: Array, u: Array) -> tuple[Array, Array, Array]:
     """Return residuals (n, 2) [px], and `image_derivatives`."""
-    return xy - np.stack(project(camera, u), axis=1), *image_derivatives(camera, u)
+    return _residuals(camera, xy, u), *image_derivatives(camera, u)
+
+
+def _residuals(camera: Camera, xy: Array, u: Array) -> Array:
+    return xy - np.stack(project(camera, u), axis=1)

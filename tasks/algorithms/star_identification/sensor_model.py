@@ -29,6 +29,9 @@ USELESS_SCATTER_MAG = 1.0  # flux that scatters more about the catalogue is not 
 MIN_SCATTER_MAG = 0.15  # assumed of brightness: a sample may scatter less than all frames
 MAGNITUDE_STEP = 0.25  # in which the faintest star is searched for
 DEEPER_MAG = 2.0  # how far beyond the first guess it is searched for
+# Solved frames in which the faintest star is searched for: a match in the deep sky takes five times
+# as long as in that of the sensor, and neighbouring frames show the same stars.
+LIMIT_FRAMES = 8
 MIN_FLUXES = 8  # matches with a flux from which a zero point is taken
 # Floors that are tried, as factors on the median of the stated errors.
 FLOORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 8.0)
@@ -280,7 +283,10 @@ def _learned_limit(
     """Return the magnitude of the faintest star that the sensor detects, or that settings give."""
     if not model.limit_is_open:
         return model.limit
+    every = np.flatnonzero([s is not None for s in solutions])
+    rows = every[np.linspace(0, len(every) - 1, min(len(every), LIMIT_FRAMES)).astype(np.int64)]
     frames = centroids.frames(model.scale, model.use_flux).each()
+    frames, solutions = [frames[i] for i in rows], [solutions[i] for i in rows]
     sky, deep = skies.sky(model.limit), skies.sky(model.limit + DEEPER_MAG)
     matched = [sky.catalogue.magnitude[s.star[s.star >= 0]] for s in solutions if s is not None]
     start = float(np.floor(4 * np.median(np.concatenate(matched))) / 4)

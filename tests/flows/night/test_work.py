@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from epipole.flows.night.work import Work, plan_spans
+from epipole.flows.night.work import Work, count_frames, plan_spans
 from epipole.io.work.work_layout import ReadFolder, WorkFolder
 from epipole.schemas.bridge import empty
 from epipole.schemas.errors import LogError
@@ -14,7 +14,7 @@ from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
 from epipole.schemas.tables import REJECTS
 from epipole.schemas.work_tables import CAMERAS, LogSource
-from epipole.tasks.read.order_frames import OrderedFrames
+from epipole.tasks.read.order_frames import OrderedFrames, by_span
 
 NIGHT = "2019-04-02"
 MIDNIGHT_NS = int(np.datetime64(NIGHT, "ns").astype(np.int64))
@@ -31,11 +31,10 @@ def cameras(*sensors: str) -> pa.Table:
 def frames(calibrated: list[str], **hours: list[float]) -> OrderedFrames:
     """Frames of sensors, by hours from midnight."""
     time_ns = [MIDNIGHT_NS + (np.array(own) * 3600e9).astype(np.int64) for own in hours.values()]
+    spans = [by_span(each) for each in time_ns]
     sources = [LogSource("log.mcap", 1, "0", 0, 1)]
     folder = ReadFolder(Path("/nowhere"))
-    return OrderedFrames(
-        folder, list(hours), time_ns, cameras(*calibrated), sources, empty(REJECTS)
-    )
+    return OrderedFrames(folder, list(hours), spans, cameras(*calibrated), sources, empty(REJECTS))
 
 
 def test_a_night_has_one_more_span_before_and_after():
@@ -73,7 +72,8 @@ def test_invalid_calibrations_are_named_where_there_are_no_others():
 def test_neighbours_are_worked_on_together():
     found = frames(["a", "b"], a=[1.0, 2.0], b=[1.0, 2.0])
     spans, _ = plan_spans(found, NIGHT)
-    work = Work(found.folder, WorkFolder(Path("/nowhere")), spans, found.cameras, {})
+    n_frames = count_frames(found, spans)
+    work = Work(found.folder, WorkFolder(Path("/nowhere")), spans, n_frames, found.cameras, {})
     order = [(sensor.sensor_id, span.start_ns % DAY_NS) for sensor, span in work.by_span()]
     one, two = 2 * SPAN_NS, 4 * SPAN_NS
     assert order == [("a", one), ("b", one), ("a", two), ("b", two)]
