@@ -24,6 +24,7 @@ from pydantic.fields import FieldInfo
 
 from epipole.flows import api
 from epipole.schemas.log_bounds import BOUNDS, TIME
+from epipole.schemas.log_checks import CheckVerdict, LogCause, LogCheck
 from epipole.schemas.rejects import (
     Found,
     FrameStatus,
@@ -54,6 +55,7 @@ HOMES = ("schemas", "io", "tasks", "flows")
 
 # The published tables, by the stage that makes them.
 MADE_BY = {
+    Stage.READ: ("checks",),
     Stage.IDENTIFY: ("frames", "stars", "detections"),
     Stage.CALIBRATE: ("calibrations",),
     Stage.TRACK: ("tracklets",),
@@ -138,6 +140,23 @@ def bounds() -> str:
 def outcomes() -> str:
     """Return the outcomes of tracklets."""
     return _words("outcome", Outcome)
+
+
+def checks() -> str:
+    """Return what a log is checked for."""
+    return _words("check", LogCheck)
+
+
+def mistakes() -> str:
+    """Return the mistakes that checks of a log name, with what to do."""
+    rows = [(f"`{each}`", _plain(each.evidence), each.cure)
+            for each in LogCause if each.verdict == CheckVerdict.WRONG]  # fmt: skip
+    return _markdown(("cause", "evidence", "what to do"), rows)
+
+
+def _plain(text: str) -> str:
+    """Return a text without the numbers of one finding."""
+    return re.sub(r"\{[^}]*\}", "...", text)
 
 
 def statuses() -> str:
@@ -297,8 +316,9 @@ PARTS: dict[str, dict[str, Callable[[], str]]] = {
         "names": object_names,
         "found": found,
         "verdicts": verdicts,
+        "checks": checks,
     },
-    "docs/input.md": {"bounds": bounds},
+    "docs/input.md": {"bounds": bounds, "mistakes": mistakes},
     "docs/settings.md": {"settings": settings},
     "docs/api.md": {"names": public_names},
     "docs/scenes.md": {"scene": scene},

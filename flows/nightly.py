@@ -1,7 +1,7 @@
 """The nightly flow: logs of star sensors go in, a dataset of space objects comes out."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple
@@ -10,6 +10,7 @@ import pyarrow as pa
 from prefect import flow
 
 from epipole.flows.night.calibrating import calibrate, find_cameras
+from epipole.flows.night.log_checks import check_logs
 from epipole.flows.night.log_choice import Night, find_logs, night_asked, run_name
 from epipole.flows.night.recorded_nights import EarlierNights, unchanged_nights, write_night_row
 from epipole.flows.night.reports import with_reports
@@ -133,7 +134,7 @@ def nightly(
                 earlier_key = earlier.key(date, settings)
                 names = name(made.work, made.solved, date, earlier.last_views(date), settings)
                 elements, unused = choose_elements(catalogue, date, settings)
-                whole = {"sources": sources, "calibrations": made.calibrations,
+                whole = {"sources": sources, **made.tables,
                          "rejects": concat(REJECTS, [rejects, made.rejects, unused])}  # fmt: skip
                 staged[date] = staging / f"night={date}"
                 linked = write_night(
@@ -154,11 +155,11 @@ def nightly(
 
 
 class MadeNight(NamedTuple):
-    """The objects of a night, solved: `rejects` and `calibrations` belong to no span."""
+    """The objects of a night, solved: `tables`, by name, and `rejects` belong to no span."""
 
     work: Work
     solved: SolvedParts
-    calibrations: pa.Table
+    tables: Mapping[str, pa.Table]
     rejects: pa.Table
 
 
@@ -169,6 +170,7 @@ def make_night(
 
     What a night holds does not depend on the other nights of the run.
     """
+    checks = check_logs(frames, night, settings)
     spans, uncalibrated = plan_spans(frames, night)
     work = identify(frames, spans, folder, settings)
     work, stated = find_cameras(work, settings)
@@ -181,7 +183,8 @@ def make_night(
             break  # else: back to `track`, with corrected times
     if left_out:
         solved = solve(work, settings, left_out)
-    return MadeNight(work, solved, calibrations, uncalibrated)
+    tables = {"checks": checks, "calibrations": calibrations}
+    return MadeNight(work, solved, tables, uncalibrated)
 
 
 def choose_nights(

@@ -432,6 +432,28 @@ SENSOR_ERRORS = schema(
     [SENSOR_ID, *SENSOR_ERROR_FIELDS],
 )
 
+CHECKS = schema(
+    "checks",
+    "One row per sensor and check of its logs: units, reference frame, times, cameras, as they "
+    "were written.",
+    [
+        SENSOR_ID,
+        column("check", pa.string(), doc="What was checked: a `LogCheck`."),
+        column("verdict", pa.string(), doc="sound, wrong or unknown."),
+        column(
+            "cause",
+            pa.string(),
+            null=True,
+            doc="The mistake, or why it is unknown: a `LogCause`; null where it is sound.",
+        ),
+        column("value", F64, null=True, doc="What was measured; null where nothing could be."),
+        column("sigma", F64, null=True, doc="Its 1-sigma error; null where it has none."),
+        column("expected", F64, null=True, doc="What it is in a sound log; null where unknown."),
+        column("unit", pa.string(), null=True, doc="Of these three; null for numbers and shares."),
+        column("sentence", pa.string(), doc="The evidence, and what to do."),
+    ],
+)
+
 PAIRS = schema(
     "pairs",
     "One row per pair of detections of one object by two sensors: each with the reference, which "
@@ -553,6 +575,7 @@ TABLES: dict[str, pa.Schema] = {
     "identifications": IDENTIFICATIONS,
     "calibrations": CALIBRATIONS,
     "sensor_errors": SENSOR_ERRORS,
+    "checks": CHECKS,
     "pairs": PAIRS,
     "sources": SOURCES,
     "nights": NIGHTS,

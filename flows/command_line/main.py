@@ -119,6 +119,7 @@ app.command(help=help_text(run.run))(run.run)  # shows by itself what it compile
 for command in (
     nights.nights,
     tools.info,
+    tools.doctor,
     tools.calibrate,
     simulate.simulate,
     tools.evaluate,

@@ -304,3 +304,23 @@ def info(logs: Logs, as_json: AsJson = False) -> None:
         print_json(described)
     else:
         print_lines(line for log in described for line in lines(log))
+
+
+def doctor(logs: Logs, as_json: AsJson = False) -> None:
+    """Check how logs were written, and name ordinary mistakes, each with its cure.
+
+    For each sensor: units and reference frame of its states, velocities against positions,
+    sigmas against scatter, times of frames against states, rounding of times, ids,
+    principal point, image size and fluxes. What the log cannot show is said. Exits with 1
+    where something is wrong. A run makes the same checks: its table checks.
+    """
+    from epipole.flows.doctor import as_dict, lines
+    from epipole.flows.doctor import doctor as examine
+
+    found = examine(logs)
+    if as_json:
+        print_json(as_dict(found))
+    else:
+        print_lines(lines(found))
+    if found.mistakes:
+        sys.exit(1)

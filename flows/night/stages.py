@@ -170,13 +170,12 @@ def check(work: Work, solved: SolvedParts, settings: Settings) -> Checked:
 
 
 def log_verdicts(verdicts: Sequence[SensorVerdict]) -> None:
-    """Log one line for all sound sensors, and a warning for each that is at fault."""
+    """Log one line for sound sensors, and a warning for each that is at fault."""
     sound = [verdict for verdict in verdicts if not verdict.is_faulty]
     if sound:
         within_s = max(max(abs(verdict.offset_s), verdict.sigma_s) for verdict in sound)
-        verb = "is" if len(sound) == 1 else "are"
         LOGGER.info(
-            "clocks of %s %s right within %.2g s", many(len(sound), "sensor"), verb, within_s
+            "clocks of %s agree with each other within %.2g s", many(len(sound), "sensor"), within_s
         )
     for verdict in verdicts:
         if verdict.is_faulty:
@@ -305,7 +304,8 @@ def write_night(
     Parameters
     ----------
     whole
-        Tables of the whole run: `calibrations`, `sources`, and `rejects` that belong to no span.
+        Tables of the whole run: `calibrations`, `checks`, `sources`, and `rejects` that belong to
+        no span.
     """
     spans = work.all_spans()
     sensors = list(work.sensor_parts().values())

@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 
 from epipole.io.datasets.night_tables import Where, count_rows, read_columns
 from epipole.schemas.bridge import array
+from epipole.schemas.log_checks import MISTAKE_COLUMNS, mistakes
 from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome, Reason
 from epipole.schemas.stages import Declared
 from epipole.tasks.report.night_facts import ReportExtract
@@ -51,7 +52,7 @@ class Summary:
 
     `outcomes` are the tracklets by what became of them, `verdicts` the objects. `names` are the
     objects by what is known of their names, `tracklet_names` the tracklets that belong to none;
-    both are empty without a catalogue. `faults` of sensors and
+    both are empty without a catalogue. `mistakes` in logs, `faults` of sensors and
     `residuals` of their known objects are a sentence each. `unchanged` nights were not made again.
     """
 
@@ -72,6 +73,7 @@ class Summary:
     names: dict[str, int]
     tracklet_names: dict[str, int]
     rejects: dict[str, int]
+    mistakes: list[str]
     faults: list[str]
     residuals: list[str]
     unchanged: bool
@@ -98,6 +100,7 @@ class Summary:
             *self._without_object(),
             f"positions   {self.positions:,} at {many(self.epochs, 'epoch')}",
             *self._names(),
+            *[f"mistake     {mistake}" for mistake in self.mistakes],
             *[f"fault       {fault}" for fault in self.faults],
             *self._left_out(),
             f"dataset     {self.dataset}",
@@ -112,6 +115,8 @@ class Summary:
             many(self.positions, "position"),
             f"{self.identified:,} of {many(self.frames, 'frame')} identified",
         ]
+        if self.mistakes:
+            parts.append(f"{many(len(self.mistakes), 'mistake')} in the logs")
         if self.faults:
             parts.append(f"{many(len(self.faults), 'sensor')} at fault")
         if self.rejects:
@@ -207,6 +212,12 @@ def summarise(dataset: str, nights: Mapping[str, Where], unchanged: bool = False
         names=_names(tables["identifications"], pc.is_valid),
         tracklet_names=_names(tables["identifications"], pc.is_null),
         rejects=by_reason(tables["rejects"]),
+        mistakes=_by_night(
+            {
+                night: mistakes(read_columns(folder, "checks", MISTAKE_COLUMNS).to_pylist())
+                for night, folder in nights.items()
+            }
+        ),
         faults=_by_night({night: row["faults"] for night, row in rows.items()}),
         residuals=_by_night({night: row["residuals"] for night, row in rows.items()}),
         unchanged=unchanged,

@@ -124,13 +124,12 @@ def as_markdown(summary: Summary) -> str:
         lines += ["Nothing has changed since it was made, so it was not made again.", ""]
     # No link: browsers open neither files nor buckets from a page.
     lines += ["Tables:", "", *(f"- {as_markdown_text(path)}" for path in _table_paths(summary))]
-    if summary.faults:
-        lines += [
-            "",
-            "Sensors at fault:",
-            "",
-            *(f"- {as_markdown_text(fault)}" for fault in summary.faults),
-        ]
+    for heading, sentences in (
+        ("Mistakes in the logs:", summary.mistakes),
+        ("Sensors at fault:", summary.faults),
+    ):
+        if sentences:
+            lines += ["", heading, "", *(f"- {as_markdown_text(each)}" for each in sentences)]
     if summary.residuals:
         lines += ["", "Known objects, observed minus predicted:", ""]
         lines += [f"- {as_markdown_text(residual)}" for residual in summary.residuals]

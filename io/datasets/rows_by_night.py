@@ -11,10 +11,10 @@ from epipole.schemas.columns import TIME
 from epipole.schemas.spans import DAY_NS, day_of
 
 # The time column that decides to which night a row belongs, where it is not its epoch or `time`.
-# Calibrations and sources belong to a whole night.
+# Calibrations, checks and sources belong to a whole night.
 _NIGHT_COLUMN = {"tracklets": "start_time"}
 _WHOLE_NIGHT = {
-    "calibrations", "identifications", "nights", "objects", "sensor_errors", "sources",
+    "calibrations", "checks", "identifications", "nights", "objects", "sensor_errors", "sources",
 }  # fmt: skip
 
 

@@ -24,7 +24,7 @@ class NightParts(NamedTuple):
 
     `spans` are the night's, in order; `all_spans` also has one before and after it. `names` has,
     for the folder of each span, the names in the night of its objects. `whole` has tables that
-    belong to no span: `calibrations`, `sources`, and some of the `rejects`. `linked` are
+    belong to no span: `calibrations`, `checks`, `sources`, and some of the `rejects`. `linked` are
     LINKED_TRACKLETS.
     """
 

@@ -39,7 +39,7 @@ from epipole.tasks.publish.observed_objects import (
 # These tables may not fit in memory as a whole: they are written in slices of time.
 BY_SENSOR = ("frames", "stars", "detections")
 BY_SPAN = ("epochs", "associations", "positions", "pairs", "states")
-WHOLE = ("tracklets", "calibrations", "sources", "rejects")
+WHOLE = ("tracklets", "calibrations", "checks", "sources", "rejects")
 # The tables of one task each; stars are most of the work.
 SHARES = (("stars",), ("detections",), ("observations",), ("frames",), (*BY_SPAN, *WHOLE))
 SERVED_NS = 60_000_000_000  # longest time between an epoch and the frame that is used for it

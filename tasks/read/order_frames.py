@@ -69,6 +69,7 @@ class OrderedFrames(NamedTuple):
     cameras: pa.Table
     sources: list[LogSource]
     rejects: pa.Table
+    pieces: list[list[Path]]  # of each sensor: parts of logs that have something of it
 
     @property
     def starts_ns(self) -> Indices:
@@ -159,6 +160,7 @@ def ordered_logs(
         cameras,
         _dated([log.source for log in plan.logs], [each for found in spans for each in found]),
         concat(REJECTS, rejects),
+        [[plan.folder.piece(log, k) for _, log, k in sensor.pieces] for sensor in plan.sensors],
     )
 
 

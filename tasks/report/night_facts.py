@@ -11,6 +11,7 @@ import numpy as np
 import polars as pl
 
 from epipole.io.datasets.night_tables import NightReader
+from epipole.schemas.log_checks import MISTAKE_COLUMNS, mistakes
 from epipole.schemas.rejects import Reason, Trait
 from epipole.schemas.stages import Stage
 from epipole.tasks.report.epipolar_views import OPTICS, EpipolarViews, read_epipolar_views
@@ -82,6 +83,7 @@ class NightFacts(NamedTuple):
     counts: dict[str, int]
     series: FrameSeries | None
     left_out: list[LeftOut]
+    mistakes: list[str]
     calibrations: pl.DataFrame
     residuals: StarResiduals | None
     chi2: SolvedChi2
@@ -131,6 +133,7 @@ def read_night_facts(
         counts={name: night.count(name) for name in COUNTED},
         series=series,
         left_out=read_left_out(night),
+        mistakes=mistakes(night.read("checks", MISTAKE_COLUMNS).to_dicts()),
         calibrations=calibrations.sort("sensor_id"),
         residuals=residuals,
         chi2=read_solved_chi2(night),
@@ -157,8 +160,8 @@ MAX_SENTENCES = 12
 
 def needs_look(facts: NightFacts) -> list[str]:
     """Return a sentence for each thing that needs a look, the worst first."""
-    return [*_faults(facts), *_nothing_found(facts), *_sensors(facts), *_sigmas(facts),
-            *_damage(facts), *_changes(facts)]  # fmt: skip
+    return [*facts.mistakes, *_faults(facts), *_nothing_found(facts), *_sensors(facts),
+            *_sigmas(facts), *_damage(facts), *_changes(facts)]  # fmt: skip
 
 
 def _faults(facts: NightFacts) -> Iterator[str]:

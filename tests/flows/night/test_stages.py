@@ -17,7 +17,7 @@ def lines(clocks, caplog):
 
 def test_right_clocks_are_one_line_and_each_wrong_one_a_warning(caplog):
     assert lines([*RIGHT, WRONG], caplog) == [
-        ("INFO", "clocks of 2 sensors are right within 0.029 s"),
+        ("INFO", "clocks of 2 sensors agree with each other within 0.029 s"),
         ("WARNING", "the clock of c is 0.250 s late (sigma 0.010 s)"),
     ]
 

@@ -15,7 +15,7 @@ FOUND = Summary(
     dataset="/data/out", nights=["2019-04-01"], logs=1, sensors=2, frames=1234, identified=1200,
     stars=9000, detections=8, tracklets=1, outcomes={"object": 1}, epochs=6, objects=5, positions=4,
     verdicts={"sound": 5}, rejects={}, tracklet_names={},
-    faults=[], by_sensor=[], names={}, residuals=[], unchanged=False, extracts=(),
+    mistakes=[], faults=[], by_sensor=[], names={}, residuals=[], unchanged=False, extracts=(),
 )  # fmt: skip
 
 
@@ -82,6 +82,8 @@ def test_staged_nights_are_counted_together(tmp_path):
         sources={"sha256": ["s"]},
         stars={"centroid": np.arange(4)},
         nights={"faults": [["the clock of a is late"]]},
+        checks={"sensor_id": ["a", "b"], "check": ["velocity"] * 2, "cause": ["zero"] * 2,
+                "verdict": ["wrong", "unknown"], "sentence": ["0 for unknown", ""]},
     )  # fmt: skip
     reasons = [Reason.NAN, Reason.NO_STATE, Reason.BAD_SIGMA, Reason.NO_STATE]
     second = staged(
@@ -104,6 +106,7 @@ def test_staged_nights_are_counted_together(tmp_path):
     assert summary.verdicts == {"blended": 1, "sound": 2}
     # The most frequent first, then by name.
     assert list(summary.rejects.items()) == [("no_state", 9), ("bad_sigma", 3), ("nan", 3)]
+    assert summary.mistakes == ["2019-04-01: a: 0 for unknown"]
     assert summary.faults == ["2019-04-01: the clock of a is late"]
     rows = [sensor.as_row() for sensor in summary.by_sensor]
     assert rows == [

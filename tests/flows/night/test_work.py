@@ -34,7 +34,9 @@ def frames(calibrated: list[str], **hours: list[float]) -> OrderedFrames:
     spans = [by_span(each) for each in time_ns]
     sources = [LogSource("log.mcap", 1, "0", 0, 1)]
     folder = ReadFolder(Path("/nowhere"))
-    return OrderedFrames(folder, list(hours), spans, cameras(*calibrated), sources, empty(REJECTS))
+    return OrderedFrames(
+        folder, list(hours), spans, cameras(*calibrated), sources, empty(REJECTS), [[]] * len(hours)
+    )
 
 
 def test_a_night_has_one_more_span_before_and_after():

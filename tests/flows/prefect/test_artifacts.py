@@ -21,7 +21,8 @@ FOUND = {
     "dataset": "/data/out", "nights": ["2019-04-01"], "logs": 2, "sensors": 1, "frames": 1234,
     "identified": 1200, "stars": 9, "detections": 8, "tracklets": 7, "outcomes": {"object": 7},
     "epochs": 6, "objects": 5, "verdicts": {"blended": 2, "sound": 3},
-    "positions": 4, "rejects": {"no_state": 34, "bad_sigma": 1}, "faults": [], "by_sensor": [],
+    "positions": 4, "rejects": {"no_state": 34, "bad_sigma": 1}, "mistakes": [], "faults": [],
+    "by_sensor": [],
     "names": {}, "tracklet_names": {}, "residuals": [], "unchanged": False, "extracts": (),
 }  # fmt: skip
 

@@ -34,6 +34,7 @@ WHOLE_NIGHT = (
     "identifications",
     "objects",
     "sensor_errors",
+    "checks",
 )  # tables that are not of an instant
 pytestmark = pytest.mark.long
 

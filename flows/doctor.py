@@ -1,0 +1,118 @@
+"""The doctor of logs: what is written as it says, what is not, and what cannot be known."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import pyarrow as pa
+
+from epipole.flows.night.log_choice import find_logs
+from epipole.flows.night.summary import many
+from epipole.io.caches.private_folders import temporary_folder
+from epipole.io.work.work_layout import ReadFolder
+from epipole.schemas.bridge import concat
+from epipole.schemas.errors import LogError
+from epipole.schemas.log_checks import CheckVerdict, mistakes
+from epipole.schemas.settings import Settings
+from epipole.schemas.tables import REJECTS
+from epipole.tasks.common.batches import Batch
+from epipole.tasks.read.judge_logs import ALL_TIME, judge_logs, judged_sensors
+from epipole.tasks.read.order_frames import OrderedFrames, order_logs, states_between
+from epipole.tasks.read.read_logs import read_log_into
+
+# What states and frames do not show, whatever they are.
+NOT_SHOWN = (
+    "the time scale, if frames and states have the same wrong one",
+    "GCRF, EME2000 or TEME, and axes exchanged or negated in states that do not turn with the "
+    "Earth",
+    "an error of the ephemeris that all its states share",
+    "whether times are those of the start, the middle or the end of an exposure",
+    "whose ephemeris it is",
+)
+
+
+class Diagnosis(NamedTuple):
+    """What the doctor found: CHECKS of all sensors, and counts of what was read."""
+
+    checks: pa.Table
+    logs: int
+    frames: int
+    states: int
+
+    @property
+    def mistakes(self) -> list[str]:
+        """A sentence for each mistake."""
+        return mistakes(self.checks.to_pylist())
+
+
+def doctor(logs: Sequence[str], settings: Settings = Settings()) -> Diagnosis:  # noqa: B008
+    """Return what is wrong in logs, as a run reads them.
+
+    Parameters
+    ----------
+    logs
+        MCAP files, folders, globs or URLs of them.
+
+    Raises
+    ------
+    LogError
+        Where a file is not a log, or the logs have neither frames nor states.
+    """
+    given = find_logs(logs, None)
+    with temporary_folder("doctor") as made:
+        folder = ReadFolder(made)
+        read = [read_log_into(folder, k, path) for k, path in enumerate(given.paths)]
+        frames = order_logs(folder, read, settings.sensors)
+        if not frames.sensors and not frames.rejects.num_rows:
+            raise LogError(
+                f"{', '.join(given.paths)}: neither frames nor states in these logs; "
+                "check the recording"
+            )
+        rejects = concat(REJECTS, [given.rejects, frames.rejects])
+        checks = judge_logs.fn(
+            Batch(judged_sensors(frames)), frames.cameras, rejects, ALL_TIME,
+            settings.sensors.state_gap_s,
+        )  # fmt: skip
+        return Diagnosis(
+            checks,
+            len(given.paths),
+            frames.n_frames,
+            sum(_states(frames, number) for number in range(len(frames.sensors))),
+        )
+
+
+def _states(frames: OrderedFrames, number: int) -> int:
+    return int(states_between(frames.folder, number, *ALL_TIME).num_rows)
+
+
+def as_dict(found: Diagnosis) -> dict[str, Any]:
+    """Return a diagnosis for JSON."""
+    return {
+        "sound": not found.mistakes,
+        "mistakes": found.mistakes,
+        "logs": found.logs,
+        "frames": found.frames,
+        "states": found.states,
+        "checks": found.checks.to_pylist(),
+        "not_shown": list(NOT_SHOWN),
+    }
+
+
+def lines(found: Diagnosis) -> list[str]:
+    """Return a diagnosis as lines for people: what is wrong first."""
+    out = [f"{many(found.frames, 'frame')} and {many(found.states, 'state')} "
+           f"in {many(found.logs, 'log')}"]  # fmt: skip
+    rows = found.checks.to_pylist()
+    for sensor in sorted({row["sensor_id"] for row in rows}):
+        out.append(sensor)
+        of_sensor = [row for row in rows if row["sensor_id"] == sensor]
+        for verdict in (CheckVerdict.WRONG, CheckVerdict.UNKNOWN, CheckVerdict.SOUND):
+            out += [
+                f"  {verdict.value:<8} {row['check']:<16} {row['sentence']}"
+                for row in of_sensor
+                if row["verdict"] == verdict
+            ]
+    out += ["not shown by states and frames:", *(f"  {each}" for each in NOT_SHOWN)]
+    wrong = found.mistakes
+    if not wrong:
+        return [*out, "no mistake found"]
+    return [*out, f"{many(len(wrong), 'mistake')}:", *(f"  {each}" for each in wrong)]

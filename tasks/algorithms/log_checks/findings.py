@@ -1,0 +1,48 @@
+"""Findings: the result of one check of one sensor's log."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+SOUND, WRONG, UNKNOWN = "sound", "wrong", "unknown"
+
+# Checks.
+POSITION_UNIT = "position_unit"
+VELOCITY = "velocity"
+REFERENCE_FRAME = "reference_frame"
+POSITION_SIGMA = "position_sigma"
+SMOOTHNESS = "smoothness"
+ONE_SENSOR = "one_sensor"
+COVERAGE = "coverage"
+FRAME_TIMES = "frame_times"
+PRINCIPAL_POINT = "principal_point"
+IMAGE_SIZE = "image_size"
+FLUX = "flux"
+LEFT_OUT_STATES = "left_out_states"
+
+
+class Finding(NamedTuple):
+    """The result of one check.
+
+    Attributes
+    ----------
+    check
+        What was checked.
+    verdict
+        SOUND, WRONG or UNKNOWN.
+    value, sigma, expected
+        What was measured, its 1-sigma error, and what it is in a sound log; NaN where there is no
+        such number. `unit` is theirs.
+    cause
+        The mistake, or why it is unknown; empty where it is sound.
+    facts
+        Numbers for the sentence, by name.
+    """
+
+    check: str
+    verdict: str
+    value: float = float("nan")
+    sigma: float = float("nan")
+    expected: float = float("nan")
+    unit: str = ""
+    cause: str = ""
+    facts: Mapping[str, float] = {}

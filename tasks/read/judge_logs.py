@@ -1,0 +1,263 @@
+"""Judge logs: units, frames, times and cameras of each sensor, as they were written."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from epipole.io.work.parts import read_part
+from epipole.schemas.bridge import array, concat, flatten, nullable, stack, table
+from epipole.schemas.log_checks import LogCause, LogCheck
+from epipole.schemas.rejects import Reason
+from epipole.schemas.stages import Stage
+from epipole.schemas.tables import CHECKS
+from epipole.schemas.work_tables import EXPOSURES, ITRF, LOG_STATES
+from epipole.tasks.algorithms.constants import SECOND_NS
+from epipole.tasks.algorithms.log_checks.findings import LEFT_OUT_STATES, SOUND, WRONG, Finding
+from epipole.tasks.algorithms.log_checks.frames import (
+    GPS_S,
+    TAI_GPS_S,
+    TAI_S,
+    LogCamera,
+    LogFrames,
+    check_frames,
+)
+from epipole.tasks.algorithms.log_checks.states import LogStates, check_states
+from epipole.tasks.common.batches import Batch
+from epipole.tasks.common.stage_tasks import stage_task
+from epipole.tasks.read.order_frames import OrderedFrames
+
+Integers = npt.NDArray[np.int64]
+
+ALL_TIME = (-(2**63), 2**63 - 1)
+MAX_SAMPLED = 100  # frames of which centroids are looked at
+SAME_TIME_NS = SECOND_NS  # calibrations of one time
+MIN_LEFT_OUT = 0.5  # share of a sensor's states: damage is less, a wrong unit is all of them
+_LEFT_OUT = {
+    Reason.BAD_VELOCITY: LogCause.VELOCITIES_TOO_FAST,
+    Reason.BAD_POSITION: LogCause.POSITIONS_TOO_FAR,
+    Reason.INSIDE_EARTH: LogCause.POSITIONS_TOO_NEAR,
+    Reason.UNKNOWN_FRAME: LogCause.UNKNOWN_FRAME_NAME,
+}
+_SCALES = {
+    GPS_S: "GPS and UTC differ by 18 s",
+    TAI_GPS_S: "TAI and GPS differ by 19 s",
+    TAI_S: "TAI and UTC differ by 37 s",
+}
+
+
+class SensorLog(NamedTuple):
+    """What the logs have of one sensor, in any order.
+
+    `time_ns` and `number` (n,) are those of all frames, `sampled` EXPOSURES some of them. `states`
+    are LOG_STATES, `cameras` CAMERAS. `left_out` counts states that were not read, by reason.
+    """
+
+    time_ns: Integers
+    number: Integers
+    sampled: pa.Table
+    states: pa.Table
+    cameras: pa.Table
+    left_out: Mapping[str, int]
+
+
+class JudgedSensor(NamedTuple):
+    """A sensor, and the parts of logs that have something of it."""
+
+    sensor_id: str
+    pieces: list[Path]
+
+    def __str__(self) -> str:
+        """Return the sensor's id."""
+        return self.sensor_id
+
+
+def judged_sensors(frames: OrderedFrames) -> list[JudgedSensor]:
+    """Return all sensors, those too of which no state or frame could be used."""
+    pieces = dict(zip(frames.sensors, frames.pieces, strict=True))
+    left_out = frames.rejects.filter(pc.is_in(frames.rejects["reason"], pa.array(list(_LEFT_OUT))))
+    names = {*pieces, *left_out["sensor_id"].drop_null().to_pylist()}
+    return [JudgedSensor(name, pieces.get(name, [])) for name in sorted(names)]
+
+
+@stage_task(Stage.READ, "checks of {sensors}")
+def judge_logs(
+    sensors: Batch[JudgedSensor],
+    cameras: pa.Table,
+    rejects: pa.Table,
+    between_ns: tuple[int, int],
+    state_gap_s: float,
+) -> pa.Table:
+    """Return CHECKS of sensors, by what the logs have of them between two times.
+
+    Parameters
+    ----------
+    cameras, rejects
+        CAMERAS and REJECTS of all sensors.
+    state_gap_s
+        Largest time from a frame to the nearest state [s].
+    """
+    found = {}
+    for sensor, pieces in sensors:
+        exposures, states = (
+            [read_part(piece, name) for piece in pieces] for name in ("exposures", "states")
+        )
+        log = sensor_log(sensor, exposures, states, cameras, rejects, between_ns)
+        found[sensor] = judge_sensor(log, state_gap_s)
+    return checks_table(found)
+
+
+def sensor_log(
+    sensor: str,
+    exposures: Sequence[pa.Table],
+    states: Sequence[pa.Table],
+    cameras: pa.Table,
+    rejects: pa.Table,
+    between_ns: tuple[int, int] = ALL_TIME,
+) -> SensorLog:
+    """Return what EXPOSURES, LOG_STATES, CAMERAS and REJECTS have of one sensor."""
+    rows = [_rows_of(of, sensor, between_ns) for of in exposures]
+    of_rows = list(zip(exposures, rows, strict=True))
+    stride = max(sum(map(len, rows)) // MAX_SAMPLED, 1)
+    sampled = [of.take(k[::stride]) for of, k in of_rows]
+    time_ns, number = (
+        np.concatenate([np.zeros(0, np.int64), *(array(of, name)[k] for of, k in of_rows)])
+        for name in ("time", "frame_number")
+    )
+    of_sensor = pc.field("sensor_id") == sensor
+    counts = rejects.filter(of_sensor).group_by("reason").aggregate([("count", "sum")])
+    return SensorLog(
+        time_ns,
+        number,
+        concat(EXPOSURES, sampled),
+        concat(LOG_STATES, [of.take(_rows_of(of, sensor, between_ns)) for of in states]),
+        cameras.filter(of_sensor),
+        {row["reason"]: row["count_sum"] for row in counts.to_pylist()},
+    )
+
+
+def _rows_of(rows: pa.Table, sensor: str, between_ns: tuple[int, int]) -> Integers:
+    of_sensor = np.asarray(pc.equal(rows["sensor_id"], sensor).to_numpy(), bool)
+    time_ns = array(rows, "time")
+    return np.flatnonzero(of_sensor & (time_ns >= between_ns[0]) & (time_ns < between_ns[1]))
+
+
+def judge_sensor(log: SensorLog, state_gap_s: float) -> list[Finding]:
+    """Return the findings of one sensor."""
+    states, frames = _log_states(log.states), _log_frames(log)
+    found = _left_out(log.left_out, log.states.num_rows)
+    found += check_states(states)
+    found += check_frames(frames, states.time_ns, _camera(log.cameras), state_gap_s)
+    # A check that is made of states and of frames: what is wrong counts.
+    by_check: dict[str, Finding] = {}
+    for each in found:
+        known = by_check.setdefault(each.check, each)
+        if each.verdict == WRONG and known.verdict != WRONG:
+            by_check[each.check] = each
+    return list(by_check.values())
+
+
+def _log_states(states: pa.Table) -> LogStates:
+    """Return the states in order of time; of several frames, those in the most frequent one."""
+    frames = pc.value_counts(states["frame"].combine_chunks()).to_pylist()
+    frame = max(frames, key=lambda each: each["counts"])["values"] if frames else ""
+    rows = states.filter(pc.field("frame") == frame)
+    order = np.argsort(array(rows, "time"), kind="stable")
+    return LogStates(
+        array(rows, "time")[order],
+        stack(rows, "{}_km")[order],
+        stack(rows, "v{}_km_s")[order],
+        array(rows, "position_sigma_km")[order],
+        frame == ITRF,
+    )
+
+
+def _log_frames(log: SensorLog) -> LogFrames:
+    """Return the frames in order of time, each once."""
+    keys = np.unique(np.stack([log.time_ns, log.number], axis=1), axis=0)
+    once = np.diff(keys[:, 0], prepend=-1) > 0
+    with_flux = log.sampled.filter(pc.is_valid(log.sampled["flux"]))
+    return LogFrames(
+        keys[once, 0],
+        keys[once, 1],
+        keys[:, 1],
+        flatten(log.sampled, "x_px")[0],
+        flatten(log.sampled, "y_px")[0],
+        flatten(with_flux, "flux")[0],
+    )
+
+
+def _camera(cameras: pa.Table) -> LogCamera | None:
+    if not cameras.num_rows:
+        return None
+    time_ns = array(cameras, "time")
+    names = ("width", "height", "fx_px", "fy_px", "cx_px", "cy_px")
+    values = np.stack([np.asarray(cameras[name].to_numpy(), float) for name in names], axis=1)
+    first = int(np.argmin(time_ns))
+    same = np.abs(time_ns - time_ns[first]) <= SAME_TIME_NS
+    differ = (values != values[first]).any(axis=1)
+    stated = dict(zip(names, values[first].tolist(), strict=True))
+    return LogCamera(**stated, others=int((same & differ).sum()))
+
+
+def _left_out(counts: Mapping[str, int], kept: int) -> list[Finding]:
+    """Return whether the sensor's states are beyond the bounds, all or most of them."""
+    of_states = {reason: counts.get(reason, 0) for reason in _LEFT_OUT}
+    total = kept + sum(of_states.values())
+    if not total:
+        return []
+    reason, count = max(of_states.items(), key=lambda each: each[1])
+    found = Finding(LEFT_OUT_STATES, SOUND, count / total, expected=0.0)
+    if count < MIN_LEFT_OUT * total:
+        return [found]
+    facts = {"count": count, "states": total}
+    return [found._replace(verdict=WRONG, cause=_LEFT_OUT[reason].value, facts=facts)]
+
+
+def checks_table(findings: Mapping[str, Iterable[Finding]]) -> pa.Table:
+    """Return CHECKS of the findings of sensors, in the order of the checks."""
+    order = list(LogCheck)
+    rows = [
+        (sensor, found)
+        for sensor in sorted(findings)
+        for found in sorted(findings[sensor], key=lambda each: order.index(LogCheck(each.check)))
+    ]
+    numbers = {
+        name: nullable(np.array([getattr(found, name) for _, found in rows], float))
+        for name in ("value", "sigma", "expected")
+    }
+    return table(
+        CHECKS,
+        {
+            "sensor_id": [sensor for sensor, _ in rows],
+            "check": [found.check for _, found in rows],
+            "verdict": [found.verdict for _, found in rows],
+            "cause": [found.cause or None for _, found in rows],
+            **numbers,
+            "unit": [found.unit or None for _, found in rows],
+            "sentence": [sentence_of(found) for _, found in rows],
+        },
+    )
+
+
+def sentence_of(found: Finding) -> str:
+    """Return a finding as a sentence: the evidence, and the cure where there is one."""
+    cause = LogCause(found.cause) if found.cause else None
+    numbers = {
+        **found._asdict(),
+        **found.facts,
+        "percent": 100 * found.value,
+        "scale": _scale(found.facts.get("offset_s", 0.0)),
+    }
+    if cause is None:
+        return LogCheck(found.check).sound.format(**numbers)
+    evidence = cause.evidence.format(**numbers)
+    return f"{evidence}; {cause.cure}" if cause.cure else evidence
+
+
+def _scale(offset_s: float) -> str:
+    return _SCALES.get(abs(offset_s), f"clocks that differ by {abs(offset_s) / 3600:.0f} h")

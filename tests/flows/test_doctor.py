@@ -1,0 +1,73 @@
+"""The doctor: sound logs end with 0, mistakes with 1; a run writes the same checks."""
+
+import json
+
+import pytest
+from scenes.log_mistakes import MISTAKES, rewritten
+
+from epipole.flows.command_line.main import app
+from epipole.flows.doctor import NOT_SHOWN, as_dict, doctor, lines
+from epipole.flows.nightly import nightly
+from epipole.io.datasets.dataset import night_reader, read_table
+from epipole.io.logs.reader import read_log
+from epipole.schemas.errors import LogError
+from epipole.schemas.log_checks import CheckVerdict
+from epipole.tasks.report.night_facts import needs_look, read_night_facts
+
+NIGHT = "2019-04-01"
+
+
+@pytest.fixture(scope="module")
+def wrong_log(night_log, tmp_path_factory):
+    """Return the log with velocities of one sensor negated."""
+    log = MISTAKES["velocities negated"][0](read_log(night_log), ["sat2"])
+    return rewritten(log, tmp_path_factory.mktemp("wrong") / "wrong.mcap")
+
+
+def run(*arguments):
+    from typer.testing import CliRunner
+
+    return CliRunner().invoke(app, [str(each) for each in arguments])
+
+
+def test_a_sound_log_ends_with_0_and_says_what_is_not_shown(night_log):
+    result = run("doctor", night_log)
+    assert result.exit_code == 0
+    assert result.output.endswith("no mistake found\n")
+    assert all(each in result.output for each in NOT_SHOWN)
+
+
+def test_a_mistake_ends_with_1_and_has_its_cure(wrong_log):
+    result = run("doctor", wrong_log, "--json")
+    found = json.loads(result.output)
+    assert (result.exit_code, found["sound"]) == (1, False)
+    (mistake,) = found["mistakes"]
+    assert mistake.startswith("sat2: velocities point backwards along the path of positions; ")
+    assert lines(doctor([str(wrong_log)]))[-1] == f"  {mistake}"
+
+
+def test_a_file_that_is_no_log_is_refused(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"x")
+    with pytest.raises(LogError):
+        doctor([str(tmp_path / "a.mcap")])
+
+
+def test_a_run_writes_the_same_checks_and_shows_mistakes(prefect, wrong_log, tmp_path, caplog):
+    summary = nightly([str(wrong_log)], str(tmp_path / "out"))
+    rows = read_table(str(tmp_path / "out"), "checks", NIGHT).to_pylist()
+    key = ("sensor_id", "check")
+    rows = sorted(rows, key=lambda row: [row[name] for name in key])
+    alone = as_dict(doctor([str(wrong_log)]))
+    assert rows == sorted(alone["checks"], key=lambda row: [row[name] for name in key])
+    assert summary.mistakes == alone["mistakes"]
+    assert f"mistake     {summary.mistakes[0]}" in summary.lines()
+    assert "1 mistake in the logs" in summary.sentence()
+    assert summary.mistakes[0] in caplog.messages
+    facts = read_night_facts(night_reader(str(tmp_path / "out"), NIGHT), "out")
+    assert needs_look(facts)[0] == summary.mistakes[0]
+
+
+def test_a_sound_night_has_no_wrong_check(night_dataset):
+    verdicts = set(read_table(str(night_dataset), "checks", NIGHT)["verdict"].to_pylist())
+    assert CheckVerdict.WRONG not in verdicts
+    assert CheckVerdict.SOUND in verdicts

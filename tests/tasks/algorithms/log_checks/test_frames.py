@@ -1,0 +1,130 @@
+"""Frames: cut times, shifted times, two counters, cameras and fluxes."""
+
+import numpy as np
+import pytest
+
+from epipole.tasks.algorithms.log_checks.findings import SOUND, UNKNOWN, WRONG
+from epipole.tasks.algorithms.log_checks.frames import (
+    LogCamera,
+    LogFrames,
+    check_coverage,
+    check_flux,
+    check_frames,
+    check_image_size,
+    check_numbers,
+    check_principal_point,
+    check_times,
+    known_offset,
+)
+
+START_NS = 1_554_091_200_000_000_000
+CAMERA = LogCamera(1024, 800, 1000.0, 1000.0, 511.0, 400.0, 0)
+
+
+def ns(t_s):
+    return START_NS + np.round(np.asarray(t_s) * 1e9).astype(np.int64)
+
+
+def frames(t_s, number=None, **more):
+    """Return frames; of those of one time the first is used."""
+    time_ns = ns(t_s)
+    number = np.arange(len(time_ns)) if number is None else np.asarray(number)
+    used = np.diff(time_ns, prepend=0) > 0
+    empty = {"x_px": np.zeros(0), "y_px": np.zeros(0), "flux": np.zeros(0)}
+    return LogFrames(time_ns[used], number[used], number, **empty | more)
+
+
+def judged(found):
+    return (found.verdict, found.cause)
+
+
+@pytest.mark.parametrize("cadence_s", [0.1, 0.25, 0.7, 1.3, 2.5])
+def test_times_that_are_cut_to_seconds_are_named(cadence_s):
+    t = 0.37 + cadence_s * np.arange(200)
+    assert judged(check_times(frames(np.floor(t)))) == (WRONG, "times_cut")
+    assert check_times(frames(t)).verdict in (SOUND, UNKNOWN)
+
+
+def test_frames_in_step_with_the_second_may_be_cut_or_not():
+    assert judged(check_times(frames(np.arange(60.0)))) == (UNKNOWN, "whole_times")
+    gaps = np.delete(np.arange(60.0), [3, 17, 18, 40])
+    assert judged(check_times(frames(gaps))) == (UNKNOWN, "whole_times")
+    numbered = frames(gaps, number=gaps.astype(int))
+    assert judged(check_times(numbered)) == (UNKNOWN, "whole_times")
+
+
+def test_jitter_of_a_millisecond_is_no_rounding():
+    rng = np.random.default_rng(1)
+    assert check_times(frames(np.arange(60.0) + rng.normal(0, 1e-3, 60))).verdict == SOUND
+
+
+@pytest.mark.parametrize("offset_s", [18.0, -18.0, 19.0, 37.0, -37.0, 3600.0, -7200.0])
+@pytest.mark.parametrize("length_s", [22.0, 60.0, 7200.0])
+def test_a_shift_of_frames_and_states_is_named_by_its_time_scale(offset_s, length_s):
+    frame_ns, state_ns = (
+        ns(np.arange(2.6, length_s, 0.5) + offset_s),
+        ns(np.arange(0, length_s + 3)),
+    )
+    (found,) = check_coverage(frame_ns, state_ns, 10.0)
+    assert judged(found) == (WRONG, "frames_and_states_shifted")
+    assert found.facts["offset_s"] == offset_s
+
+
+@pytest.mark.parametrize("first_s", [-600.0, -30.0, -2.0, 0.0])
+@pytest.mark.parametrize("last_s", [0.0, 2.0, 30.0, 600.0])
+@pytest.mark.parametrize("step_s", [0.1, 1.0, 10.0])
+def test_states_that_last_longer_are_no_mistake(first_s, last_s, step_s):
+    state_ns = ns(np.arange(first_s, 60.0 + last_s + step_s, step_s))
+    (found,) = check_coverage(ns(np.arange(0.3, 60)), state_ns, 10.0)
+    assert found.verdict == SOUND
+
+
+def test_frames_without_a_state_near_are_named_and_few_are_unknown():
+    (found,) = check_coverage(ns(np.arange(0, 60.0)), ns(np.arange(1e6, 1e6 + 60)), 10.0)
+    assert judged(found) == (WRONG, "no_state_near")
+    (found,) = check_coverage(ns(np.arange(0, 60.0)), ns(np.arange(0, 30.0)), 10.0)
+    assert judged(found) == (UNKNOWN, "few_states_near")
+
+
+def test_offsets_of_time_scales():
+    assert [known_offset(t) for t in (0.0, 9.0, 18.2, 18.9, -36.4, 3601.0, 1800.0)] == [
+        0.0, 0.0, 18.0, 19.0, -37.0, 3600.0, 0.0
+    ]  # fmt: skip
+
+
+def test_two_counters_are_two_sensors_and_one_that_starts_again_is_not():
+    two = np.stack([np.arange(40), np.arange(40) + 1000], axis=1).ravel()
+    (found,) = check_numbers(frames(np.arange(80) * 0.5, number=two), CAMERA)
+    assert judged(found) == (WRONG, "numbers_alternate")
+    assert check_numbers(frames(np.arange(80.0), number=np.arange(80) % 16), CAMERA) == []
+    (found,) = check_numbers(frames(np.arange(80.0)), CAMERA._replace(others=1))
+    assert judged(found) == (WRONG, "two_calibrations")
+
+
+def test_a_principal_point_of_zero_is_named():
+    assert check_principal_point(CAMERA).verdict == SOUND
+    zero = CAMERA._replace(cx_px=0.0, cy_px=0.0)
+    assert judged(check_principal_point(zero)) == (WRONG, "principal_point_zero")
+
+
+def test_centroids_tell_the_size_of_the_image():
+    x, y = np.random.default_rng(1).uniform(0, [1023, 799], (500, 2)).T
+    seen = frames(np.arange(5.0), x_px=x, y_px=y)
+    assert check_image_size(seen, CAMERA).verdict == SOUND
+    exchanged = CAMERA._replace(width=800, height=1024)
+    assert judged(check_image_size(seen, exchanged)) == (WRONG, "width_and_height_exchanged")
+    small = CAMERA._replace(width=512, height=400)
+    assert judged(check_image_size(seen, small)) == (WRONG, "image_too_small")
+    large = CAMERA._replace(width=4096, height=4096)
+    assert judged(check_image_size(seen, large)) == (UNKNOWN, "image_not_filled")
+
+
+def test_magnitudes_are_no_fluxes():
+    magnitude = 6.5 - np.random.default_rng(1).exponential(1 / (0.45 * np.log(10)), 400)
+    assert judged(check_flux(magnitude)) == (WRONG, "flux_is_magnitude")
+    for unit in (1.0, 100.0, 1e5):
+        assert check_flux(unit * 10 ** (-0.4 * (magnitude - 6.5))).verdict == SOUND
+
+
+def test_no_frames_have_no_findings():
+    assert check_frames(frames([]), ns(np.arange(5)), CAMERA, 10.0) == []
