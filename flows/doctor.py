@@ -19,7 +19,7 @@ from epipole.tasks.read.judge_logs import ALL_TIME, judge_logs, judged_sensors
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs, states_between
 from epipole.tasks.read.read_logs import read_log_into
 
-# What states and frames do not show, whatever they are.
+# What states and frames do not show, whatever they are. A run shows part of it by lines of sight.
 NOT_SHOWN = (
     "the time scale, if frames and states have the same wrong one",
     "GCRF, EME2000 or TEME, and axes exchanged or negated in states that do not turn with the "
@@ -111,7 +111,10 @@ def lines(found: Diagnosis) -> list[str]:
                 for row in of_sensor
                 if row["verdict"] == verdict
             ]
-    out += ["not shown by states and frames:", *(f"  {each}" for each in NOT_SHOWN)]
+    out += [
+        "not shown by states and frames (a run compares lines of sight too):",
+        *(f"  {each}" for each in NOT_SHOWN),
+    ]
     wrong = found.mistakes
     if not wrong:
         return [*out, "no mistake found"]

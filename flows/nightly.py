@@ -10,7 +10,7 @@ import pyarrow as pa
 from prefect import flow
 
 from epipole.flows.night.calibrating import calibrate, find_cameras
-from epipole.flows.night.log_checks import check_logs
+from epipole.flows.night.log_checks import check_logs, check_readings
 from epipole.flows.night.log_choice import Night, find_logs, night_asked, run_name
 from epipole.flows.night.recorded_nights import EarlierNights, unchanged_nights, write_night_row
 from epipole.flows.night.reports import with_reports
@@ -183,7 +183,7 @@ def make_night(
             break  # else: back to `track`, with corrected times
     if left_out:
         solved = solve(work, settings, left_out)
-    tables = {"checks": checks, "calibrations": calibrations}
+    tables = {"checks": check_readings(work, checks), "calibrations": calibrations}
     return MadeNight(work, solved, tables, uncalibrated)
 
 

@@ -5,6 +5,7 @@ import logging
 import pyarrow as pa
 
 from epipole.flows.night.progress import results
+from epipole.flows.night.work import Work
 from epipole.io.datasets.rows_by_night import rows_of_night
 from epipole.schemas.bridge import concat
 from epipole.schemas.log_checks import mistakes
@@ -12,6 +13,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CHECKS
+from epipole.tasks.check.judge_readings import judge_readings
 from epipole.tasks.common.batches import Batch
 from epipole.tasks.read.judge_logs import judge_logs, judged_sensors
 from epipole.tasks.read.order_frames import OrderedFrames
@@ -38,3 +40,13 @@ def check_logs(frames: OrderedFrames, night: str, settings: Settings) -> pa.Tabl
     for sentence in mistakes(checks.to_pylist()):
         LOGGER.warning("%s", sentence)
     return checks
+
+
+def check_readings(work: Work, checks: pa.Table) -> pa.Table:
+    """Return CHECKS with what the lines of sight of a night say of the sensors' states."""
+    viewed = work.folder.viewed(work.round)
+    judged = judge_readings.submit(viewed, list(work.spans), work.all_spans())
+    (found,) = results(Stage.CHECK, [judged])
+    for sentence in mistakes(found.to_pylist()):
+        LOGGER.warning("%s", sentence)
+    return concat(CHECKS, [checks, found])

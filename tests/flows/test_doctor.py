@@ -55,6 +55,7 @@ def test_a_file_that_is_no_log_is_refused(tmp_path):
 def test_a_run_writes_the_same_checks_and_shows_mistakes(prefect, wrong_log, tmp_path, caplog):
     summary = nightly([str(wrong_log)], str(tmp_path / "out"))
     rows = read_table(str(tmp_path / "out"), "checks", NIGHT).to_pylist()
+    rows = [row for row in rows if row["check"] != "lines_of_sight"]  # only a run compares them
     key = ("sensor_id", "check")
     rows = sorted(rows, key=lambda row: [row[name] for name in key])
     alone = as_dict(doctor([str(wrong_log)]))
@@ -71,3 +72,15 @@ def test_a_sound_night_has_no_wrong_check(night_dataset):
     verdicts = set(read_table(str(night_dataset), "checks", NIGHT)["verdict"].to_pylist())
     assert CheckVerdict.WRONG not in verdicts
     assert CheckVerdict.SOUND in verdicts
+
+
+def test_a_run_names_the_reading_that_makes_lines_of_sight_meet(prefect, night_log, tmp_path):
+    log = read_log(night_log)
+    names = sorted(set(log.states["sensor_id"].to_pylist()))
+    wrong = rewritten(MISTAKES["z negated"][0](log, names), tmp_path / "wrong.mcap")
+    assert doctor([str(wrong)]).mistakes == []  # the states alone are an orbit
+    summary = nightly([str(wrong)], str(tmp_path / "out"))
+    (mistake,) = summary.mistakes
+    assert mistake.startswith(f"{', '.join(names)}: ")
+    assert "with the states' axes exchanged or negated" in mistake
+    assert summary.positions == 0

@@ -18,6 +18,7 @@ PRINCIPAL_POINT = "principal_point"
 IMAGE_SIZE = "image_size"
 FLUX = "flux"
 LEFT_OUT_STATES = "left_out_states"
+LINES_OF_SIGHT = "lines_of_sight"
 
 
 class Finding(NamedTuple):

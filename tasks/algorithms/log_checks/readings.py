@@ -63,8 +63,13 @@ def main_readings(stated_rate: Array) -> list[Reading]:
 
 
 def all_readings(stated_rate: Array) -> list[Reading]:
-    """Return all readings; the stated one is the first."""
-    rates = sorted(RATES, key=lambda rate: rate is not stated_rate)
+    """Return all readings; the stated one is the first.
+
+    Exchanged axes show only where they should turn with the Earth. With another stated frame they
+    would be a second mistake, and thrust may look like one.
+    """
+    rates = [stated_rate, *(w for w in RATES if w is not stated_rate)]
+    rates = rates if stated_rate is EARTH_FIXED else rates[:2]
     return [Reading(scale, rate) for scale in SCALES for rate in rates]
 
 

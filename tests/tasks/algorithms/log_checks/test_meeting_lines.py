@@ -1,0 +1,112 @@
+"""Meeting lines: the mistake that makes lines of sight meet is named, and none where none does."""
+
+import numpy as np
+import pytest
+
+from epipole.tasks.algorithms.log_checks.meeting_lines import (
+    Sights,
+    find_reading,
+    shares_that_meet,
+)
+from epipole.tasks.algorithms.simulation.paths import state_at
+
+ARCSEC = np.pi / 648_000
+N_OBJECTS, N_EPOCHS = 9, 3
+R_TEME = np.array([[1.0, -0.005, 0.0], [0.005, 1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def unit(x):
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def scene(rng, common=True, n_sensors=4, start_s=0.0):
+    """Return the views that low sensors have of objects of a middle orbit."""
+    elements = np.stack([
+        np.array([7000.0 + 40 * k, 0.001, rng.uniform(0.5, 1.7), *rng.uniform(0, 6.28, 3)])
+        for k in range(n_sensors)
+    ])  # fmt: skip
+    middle = 12_000 * unit(rng.normal(size=3))
+    objects = middle + rng.normal(0, 1000, (N_OBJECTS, 3))
+    rows = []
+    for epoch in range(N_EPOCHS):
+        for sensor in range(n_sensors):
+            r, v = state_at(elements[sensor], start_s + 20.0 * epoch)
+            seen = objects if common else middle + rng.normal(0, 1000, (N_OBJECTS, 3))
+            u = unit(unit(seen - r) + rng.normal(0, 10 * ARCSEC, (N_OBJECTS, 3)))
+            rows += [(epoch, sensor, direction, r, v) for direction in u]
+    epoch, sensor, u, r, v = (np.array(each) for each in zip(*rows, strict=True))
+    n = len(epoch)
+    return Sights(epoch, sensor, u, np.full(n, 10 * ARCSEC), r, v, np.full(n, 0.02))
+
+
+def moved(sights, r_km, only=None):
+    """Return the sights with other stated positions, of one sensor only if given."""
+    mine = np.ones(len(r_km), bool) if only is None else sights.sensor == only
+    return sights._replace(r_km=np.where(mine[:, None], r_km, sights.r_km))
+
+
+def later(sights, offset_s):
+    """Return positions at times of frames that are later by an offset, nearly."""
+    return sights.r_km + offset_s * sights.v_km_s
+
+
+MISTAKES = {
+    "other_inertial_frame": lambda sights: sights.r_km @ R_TEME.T,
+    "axes_of_states": lambda sights: sights.r_km[:, [1, 0, 2]],
+    "earth_fixed_times": lambda sights: turned(sights.r_km, 37.0),
+}
+
+
+def turned(r_km, offset_s):
+    angle = 7.292115e-5 * offset_s
+    c, s = np.cos(angle), np.sin(angle)
+    return r_km @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]).T
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_named_where_lines_meet_or_have_nothing_in_common(seed):
+    rng = np.random.default_rng(seed)
+    sights = scene(rng)
+    assert (shares_that_meet(sights) > 0.9).all()
+    assert find_reading(sights, R_TEME) == []
+    assert find_reading(scene(rng, common=False), R_TEME) == []
+
+
+@pytest.mark.parametrize("cause", MISTAKES)
+@pytest.mark.parametrize("only", [None, 2])
+def test_a_mistake_is_named_for_the_sensors_that_have_it(cause, only):
+    named = 0
+    for seed in range(3):
+        sights = scene(np.random.default_rng(seed))
+        found = find_reading(moved(sights, MISTAKES[cause](sights), only), R_TEME)
+        for each in found:
+            assert (each.cause, each.sensor) == (cause, -1 if only is None else only)
+            assert each.share - each.stated_share > 0.2
+        named += len(found)
+    assert named >= 2
+
+
+def test_exchanged_ephemerides_are_named_with_both_sensors():
+    sights = scene(np.random.default_rng(3))
+    r_km = sights.r_km.copy()
+    r_km[sights.sensor == 1], r_km[sights.sensor == 2] = (
+        sights.r_km[sights.sensor == 2], sights.r_km[sights.sensor == 1],
+    )  # fmt: skip
+    (found,) = find_reading(moved(sights, r_km), R_TEME)
+    assert (found.cause, {found.sensor, found.other}) == ("ephemerides_exchanged", {1, 2})
+
+
+@pytest.mark.parametrize("offset_s", [18.0, -37.0])
+def test_times_of_frames_against_those_of_states_are_named_with_their_offset(offset_s):
+    sights = scene(np.random.default_rng(4))
+    (found,) = find_reading(moved(sights, later(sights, offset_s)), R_TEME)
+    assert (found.cause, found.offset_s) == ("frames_and_states_apart", offset_s)
+
+
+def test_few_views_decide_nothing():
+    sights = scene(np.random.default_rng(4))
+    one = Sights(*(each[sights.sensor == 0] for each in sights))
+    assert find_reading(one, R_TEME) == []
+    none = Sights(*(each[:0] for each in sights))
+    assert find_reading(none, R_TEME) == []
+    assert len(shares_that_meet(none)) == 0
