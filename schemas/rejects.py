@@ -228,7 +228,8 @@ class Reason(StrEnum):
     FOLDED_IMAGE = (
         "folded_image",
         Stage.READ,
-        "The calibration's D folds the image: two directions would have one pixel position.",
+        "The calibration's D folds the image, and not only its corners: two directions would have "
+        "one pixel position.",
         Trait.INVALID_CALIBRATION,
     )
     UNKNOWN_DISTORTION_MODEL = (
@@ -461,6 +462,12 @@ class FrameStatus(Declared):
         "The searches of frames near it found nothing, so this one was only followed from others.",
     )
     TIME_LIMIT = "time_limit", "The search was stopped by its time limit."
+    SEARCH_LIMIT = (
+        "search_limit",
+        "It was not searched, or not to the end: the searches of a sensor's frames may cost 50 ms "
+        "of CPU each on average, and those of one frame 0.5 s. Their work is counted, so it is the "
+        "same on every machine.",
+    )
     NO_CALIBRATION = "no_calibration", "No calibration is valid for the frame."
 
 

@@ -61,7 +61,7 @@ FRAMES = schema(
             pa.string(),
             null=True,
             doc="Why there is no attitude from stars: no_centroids, too_few_stars, no_match, "
-            "not_searched, no_calibration, time_limit; null where there is one.",
+            "not_searched, search_limit, no_calibration, time_limit; null where there is one.",
         ),
         *[
             column(

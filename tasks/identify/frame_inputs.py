@@ -63,7 +63,8 @@ def flatten_centroids(
         at = camera_of_frame[frame] == row
         u[at] = unproject(camera, x_px[at], y_px[at])
         pixel_rad[at] = pixel_angle(camera, u[at])
-        in_image[at] = inside(camera, x_px[at], y_px[at])
+        # In the corners of a wide lens's image, a position may have no direction.
+        in_image[at] = inside(camera, x_px[at], y_px[at]) & np.isfinite(u[at, 2])
     flux = _optional(exposures, "flux", len(x_px))
     return FlatCentroids(
         first, frame, x_px, y_px, flux, sigma_px, u, pixel_rad, in_image, camera_of_frame, used

@@ -45,6 +45,7 @@ LOGGER = logging.getLogger(__name__)
 # With more static centroids per frame than this, stars are first searched without them. If at most
 # this share of the frames is then identified, all centroids take part.
 MANY_STATIC, MIN_IDENTIFIED = 40, 0.5
+STATIC_SHARES = (0.7, 0.3)  # of the searches' budget: without static centroids, and with them
 # Speed of a circular orbit 500 km high [km/s], sqrt(GM / r): few sensors move faster. A sensor of
 # unknown velocity may have this speed, in any direction.
 LOW_ORBIT_KM_S = 7.6
@@ -119,10 +120,14 @@ def _identify(
     t_s, priors = (time_ns - time_ns[0]) / 1e9, _priors(frame_states, sensors)
     beta = barycentric_velocity(time_ns, frame_states) / SPEED_OF_LIGHT_KM_S
     best, taken = None, rows
-    for kept in _selections(c):
+    selections = list(_selections(c))
+    for kept, share in zip(
+        selections, STATIC_SHARES if len(selections) > 1 else (1.0,), strict=True
+    ):
         part = rows[kept[rows]]
         raw = _raw_centroids(c, part, kept, beta)
-        found = identify(t_s, raw, priors, skies, rule.magnitude_limit, match_settings(rule))
+        matching = match_settings(rule)._replace(budget_share=share)
+        found = identify(t_s, raw, priors, skies, rule.magnitude_limit, matching)
         if best is None or found.solutions.solved.sum() > best.solutions.solved.sum():
             best, taken = found, part
         if best.solutions.solved.mean() > MIN_IDENTIFIED:

@@ -51,7 +51,7 @@ DAY = 19_723
 STARLESS = 150  # frames of a sensor without stars, between those with stars
 FRAMES_ALONE = 8
 SCATTER_MAG = 0.2
-TRIED = (None, "no_match", "time_limit")
+TRIED = (None, "no_match", "time_limit", "search_limit")
 
 
 class Drawn(NamedTuple):

@@ -29,6 +29,7 @@ TINY = {
     "epipolar": "--scenes 2",
     "example": "--rounds 1 --cached",
     "false_alarms": "followed alone --frames 20 --points 3 9 --every 3",
+    "hostile_logs": "bursts --fields 20 --frames 3 --flux yes",
     "identity": "--gaps 120 --seeds 1",
     "ingest": "--frames 400 --runs 1",
     "known_objects": "--objects 6 --ages 3 --catalogue 60",

@@ -107,23 +107,29 @@ def _optics_fault(
         return CORNER.reason
     if any(k * corner**power not in DISTORTION for k, power in zip(D, POWERS, strict=False)):
         return DISTORTION.reason
-    return Reason.FOLDED_IMAGE if any(D) and _folds(D, corner) else None
+    return Reason.FOLDED_IMAGE if any(D) and _folds(D, corner, max(far)) else None
 
 
-def _folds(D: tuple[float, ...], corner: float) -> bool:
-    """Return whether the distortion folds the image within the distance of its farthest corner.
+def _folds(D: tuple[float, ...], corner: float, side: float) -> bool:
+    """Return whether the distortion folds the image before the end of its longer half axis.
 
     Along a ray from the boresight the distorted distance must grow until it reaches that of the
-    corner, and the derivative of the distorted position must keep its sign, whatever the direction.
+    corner, or has at least reached `side`: a wide lens shows nothing in the corners of its image.
+    The derivative of the distorted position must keep its sign so far, whatever the direction.
     """
     k1, k2, p1, p2, k3 = (*D, 0.0)[:5]
     r = np.linspace(0.0, FARTHEST_UNDISTORTED * corner, FOLD_STEPS)
     r2 = r * r
     distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
     beyond = np.flatnonzero(distorted >= corner)
-    if len(beyond) == 0:
+    falls = np.flatnonzero(np.diff(distorted) <= 0)
+    if len(beyond) and not (len(falls) and falls[0] < beyond[0]):
+        last = beyond[0]
+    elif len(falls) and distorted[falls[0]] >= side:
+        last = np.flatnonzero(distorted >= side)[0]
+    else:
         return True
-    r2 = r2[: beyond[0] + 1, None]
+    r2 = r2[: last + 1, None]
     angle = np.linspace(0.0, 2 * np.pi, FOLD_DIRECTIONS, endpoint=False)
     x, y = np.sqrt(r2) * np.cos(angle), np.sqrt(r2) * np.sin(angle)
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))

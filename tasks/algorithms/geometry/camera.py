@@ -79,6 +79,24 @@ def flip_rows(camera: Camera, y_px: Array) -> tuple[Camera, Array]:
     return camera._replace(fy_px=-camera.fy_px, cy_px=last - camera.cy_px), last - y_px
 
 
+FARTHEST = 4.0  # radius up to which a fold is looked for, normalised coordinates
+FOLD_STEPS = 4000
+
+
+def fold_radius(camera: Camera) -> float:
+    """Return the undistorted radius from which the radial distortion folds back; inf: it does not.
+
+    Beyond it, two directions would have one pixel position. A lens shows nothing there.
+    """
+    if not any((camera.k1, camera.k2, camera.k3)):
+        return float(np.inf)
+    r = np.linspace(0.0, FARTHEST, FOLD_STEPS)
+    r2 = r * r
+    slope = 1 + r2 * (3 * camera.k1 + r2 * (5 * camera.k2 + r2 * 7 * camera.k3))
+    folded = np.flatnonzero(slope <= 0)
+    return float(r[folded[0] - 1]) if len(folded) else float(np.inf)
+
+
 def distort(camera: Camera, x: Array, y: Array) -> tuple[Array, Array]:
     """Return distorted normalised coordinates (OpenCV, camera calibration, eq. plumb_bob)."""
     if not camera.distorts:
@@ -106,13 +124,14 @@ def slopes(camera: Camera, x: Array, y: Array) -> tuple[Array, Array, Array]:
 def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
     """Return the normalised coordinates that `distort` maps to (xd, yd), by Newton's method.
 
-    Far outside the calibrated field, where the distortion folds back, the last iterate is
-    returned. The field of a star sensor does not reach there.
+    NaN where no direction before the fold of the distortion has this position, as in the corners of
+    a wide lens's image.
     """
     x, y = np.array(xd, float), np.array(yd, float)
     if not camera.distorts:
         return x, y
-    for _ in range(8):
+    fold = fold_radius(camera)
+    for _ in range(8 if np.isinf(fold) else 40):
         ex, ey = distort(camera, x, y)
         ex -= xd
         ey -= yd
@@ -126,7 +145,19 @@ def undistort(camera: Camera, xd: Array, yd: Array) -> tuple[Array, Array]:
         )
         if last:
             break
-    return x, y
+        if np.isfinite(fold):
+            x, y = _before(fold, x, y)
+    if np.isinf(fold):
+        return x, y
+    ex, ey = distort(camera, x, y)
+    found = (np.hypot(ex - xd, ey - yd) < 1e-7) & (np.hypot(x, y) <= fold)
+    return np.where(found, x, np.nan), np.where(found, y, np.nan)
+
+
+def _before(fold: float, x: Array, y: Array) -> tuple[Array, Array]:
+    """Return points (n,), those from the fold on moved to just before it."""
+    shrunk = 0.999 * fold / np.maximum(np.hypot(x, y), 0.999 * fold)
+    return x * shrunk, y * shrunk
 
 
 def unproject(camera: Camera, x_px: Array, y_px: Array) -> Array:

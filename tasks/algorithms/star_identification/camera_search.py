@@ -303,7 +303,7 @@ def _near(
 
 def _seen_by(frame: ImageFrame, camera: Camera) -> FrameCentroids:
     u = unproject(camera, frame.x_px, frame.y_px)
-    sigma = _sigma_px(frame, camera) * pixel_angle(camera, u)
+    sigma = _sigma_px(frame, camera) * np.nan_to_num(pixel_angle(camera, u), nan=camera.pixel_rad)
     return FrameCentroids(u, sigma, frame.instrumental_mag, frame.beta, field_of_view(camera))
 
 

@@ -30,7 +30,8 @@ MAX_PREDICTION_SIGMA = 0.02  # [rad] a frame with a wider prediction is searched
 MAX_TURNED = 0.5  # [rad] between two frames of a followed sensor
 # Stars this far around a field are listed once and serve while the sensor turns [rad].
 MARGIN = 0.03
-TOO_FEW, NO_MATCH, NOT_SEARCHED, TIME_LIMIT = 1, 2, 3, 4  # status codes
+# Status codes; 5 is that of a frame without centroids.
+TOO_FEW, NO_MATCH, NOT_SEARCHED, TIME_LIMIT, SEARCH_LIMIT = 1, 2, 3, 4, 6
 
 
 class Memory(NamedTuple):
@@ -276,7 +277,7 @@ def follow(frame_range, frames, priors, stars, rule, memory, solutions, status):
         Frames that are solved already are not changed.
     status : (F,) int8, out
         TOO_FEW centroids, NO_MATCH, NOT_SEARCHED; 0 where solved. Frames with NO_MATCH or
-        TIME_LIMIT are not searched again.
+        TIME_LIMIT are not searched again, those with SEARCH_LIMIT are.
     """
     n = len(stars.u)
     scratch = _FieldScratch(
@@ -297,6 +298,7 @@ def follow(frame_range, frames, priors, stars, rule, memory, solutions, status):
                 if frame_range.searches and memory.counters[2] == 0:
                     return k
                 memory.counters[2] = max(memory.counters[2] - 1, 0)
-                status[k] = NOT_SEARCHED
+                if status[k] != SEARCH_LIMIT:
+                    status[k] = NOT_SEARCHED
         k += frame_range.step
     return k

@@ -1,11 +1,13 @@
 """One frame: its centroids, its solution near a predicted attitude, and its search lost in space.
 
-`identify_predicted` matches the stars of the field that a prediction gives. `identify_lost` first
-searches the whole sky for the attitude: without clusters of centroids, then with the brightest
-ones, and where that fails with all, as a frame of which most centroids are no stars.
+`identify_predicted` matches the stars of the field that a prediction gives. `search_frame` first
+searches the whole sky for the attitude: of a dense frame with its few brightest centroids, then
+without clusters of centroids, then with more of the brightest, and where that fails with all, as a
+frame of which most centroids are no stars.
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +53,16 @@ N_CROWDED, MIN_STARS = 1024, 8.0
 # Centroids without clusters are searched first where they are fewer than this share of all.
 CLUSTERED = 0.75
 CROWDED_TIMES = 10.0  # the time limit of a search of a crowd over that of another one
+# Units of work in a second of CPU time, measured: of a search; of a search of a crowd, where
+# brightness is unknown and where it is known. Only a budget counts with them; a time limit has the
+# nominal rate.
+TRUE_WORK_PER_S, CROWD_WORK_PER_S, BRIGHT_CROWD_WORK_PER_S = 1.3e8, 3.5e7, 4.7e7
+# A dense frame has more centroids than are searched: first this number of its brightest ones is.
+BRIGHTEST_FIRST = (30, 100)
+# What a search of a dense frame's brightest centroids may cost, and one that comes before that of a
+# crowd [s]: where they succeed, they take a few milliseconds. Of another frame, it is a share of
+# the frame's budget.
+BRIGHT_S, BEFORE_CROWD_S, PLAIN_SHARE = 0.012, 0.015, 0.4
 
 
 class FieldOfView(NamedTuple):
@@ -114,6 +126,9 @@ class MatchSettings(NamedTuple):
     scatter_mag : 1-sigma scatter of that
     starlit : prior odds (ln) that a frame has enough stars to be identified, from the sensor's
         other frames; 0 for an unknown sensor
+    budget_s : CPU time of all searches of a frame, see `search_budget`
+    budget_share : of a sensor's budget, what an identification of all its frames may cost
+    crowd_first : of the sensor's frames, the last one was identified as a crowd
     crowded : where a search fails, the frame is searched again as one with few stars among many
         other centroids
     """
@@ -125,6 +140,9 @@ class MatchSettings(NamedTuple):
     scatter_mag: float = TYPICAL_SCATTER_MAG
     crowded: bool = True
     starlit: float = 0.0
+    budget_s: float = math.inf
+    budget_share: float = 1.0
+    crowd_first: bool = False
 
     @property
     def min_evidence_lost(self) -> float:
@@ -139,6 +157,8 @@ class Verdict(NamedTuple):
     R_sensor_from_icrs : (3, 3), of the best hypothesis
     evidence, runner_up : log evidence of the best and of the best different attitude
     exhausted : the search ended because it reached its time limit
+    cost_s : what it cost, CPU time by counted work
+    crowded : it was the search of a crowd
     """
 
     is_clear: bool
@@ -146,6 +166,20 @@ class Verdict(NamedTuple):
     evidence: float
     runner_up: float
     exhausted: bool
+    cost_s: float = 0.0
+    crowded: bool = False
+
+
+class Searched(NamedTuple):
+    """A frame that was searched: its solution, whether a limit or the budget stopped the search,
+    whether it was the budget, what it cost (CPU time by counted work), and whether it was
+    identified as a crowd."""
+
+    solution: Solution | None
+    exhausted: bool
+    over_budget: bool
+    cost_s: float
+    as_crowd: bool = False
 
 
 def rule_of(matching: MatchSettings, sky: Sky) -> MatchRule:
@@ -221,20 +255,33 @@ def search_lost(
     """Search the whole sky for the frame's attitude; see `lost_in_space.search`."""
     # Centroids far outside any image have no direction.
     at = np.flatnonzero(np.isfinite(frame.u[:, 0]))
+    cost_s, verdict = 0.0, NO_VERDICT
+    before_crowd = matching.crowded and len(at) > N_SEARCHED and math.isfinite(matching.budget_s)
+    before_crowd = before_crowd and not matching.crowd_first
+    for part, crowded in _parts(frame, at, matching):
+        left_s = matching.budget_s - cost_s
+        if not crowded:
+            left_s = min(PLAIN_SHARE * left_s, BEFORE_CROWD_S if before_crowd else math.inf)
+        tried = matching._replace(budget_s=left_s)
+        verdict = _search(some_centroids(frame, part), sky, grid, pairs, tried, crowded)
+        cost_s += verdict.cost_s
+        if verdict.is_clear:
+            break
+    return verdict._replace(cost_s=cost_s)
+
+
+def _parts(frame: FrameCentroids, at: Rows, matching: MatchSettings) -> Iterator[tuple[Rows, bool]]:
+    """Yield which centroids are searched, one try after the other, and whether as a crowd."""
+    as_crowd = matching.crowded and len(at) > N_PATTERN
+    if as_crowd and matching.crowd_first:
+        yield at[:N_CROWDED], True
     if len(at) > N_PATTERN:
         unclustered = at[without_clusters(frame.u[at], frame.optics.box)]
         if len(unclustered) < CLUSTERED * len(at):
-            verdict = _search(
-                some_centroids(frame, unclustered[:N_SEARCHED]), sky, grid, pairs, matching, False
-            )
-            if verdict.is_clear:
-                return verdict
-    verdict = _search(
-        some_centroids(frame, at[:N_SEARCHED]), sky, grid, pairs, matching, crowded=False
-    )
-    if verdict.is_clear or not matching.crowded or len(at) <= N_PATTERN:
-        return verdict
-    return _search(some_centroids(frame, at[:N_CROWDED]), sky, grid, pairs, matching, crowded=True)
+            yield unclustered[:N_SEARCHED], False
+    yield at[:N_SEARCHED], False
+    if as_crowd and not matching.crowd_first:
+        yield at[:N_CROWDED], True
 
 
 def some_centroids(frame: FrameCentroids, at: npt.NDArray[np.int64]) -> FrameCentroids:
@@ -253,12 +300,23 @@ def _search(
     crowded: bool,
 ) -> Verdict:
     if len(frame.u) < 3:
-        return Verdict(False, np.eye(3), -np.inf, -np.inf, False)
+        return NO_VERDICT
     R, least = np.zeros((3, 3)), matching.min_evidence_lost
     problem = problem_of(frame, sky, grid, pairs, matching, crowded)
     best, runner_up, work = search_crowded(problem, R) if crowded else search(problem, R)
     is_clear = best > least and best - runner_up > CLEAR_LEAD
-    return Verdict(is_clear, R, best, runner_up, work > problem.limits.budget)
+    rate = _work_per_s(crowded, matching)
+    return Verdict(is_clear, R, best, runner_up, work > problem.limits.budget, work / rate, crowded)
+
+
+def _work_per_s(crowded: bool, matching: MatchSettings) -> float:
+    if not crowded:
+        return TRUE_WORK_PER_S
+    unknown = math.isnan(matching.zero_point_mag)
+    return CROWD_WORK_PER_S if unknown else BRIGHT_CROWD_WORK_PER_S
+
+
+NO_VERDICT = Verdict(False, np.eye(3), -np.inf, -np.inf, False)
 
 
 def problem_of(
@@ -273,11 +331,12 @@ def problem_of(
     n, least, area = len(frame.u), matching.min_evidence_lost, frame.optics.solid_angle_sr
     min_chord = max(0.05 * frame.optics.half_diagonal_rad, 6.0 * _middle(frame.sigma_rad))
     budget = matching.time_limit_s * WORK_PER_S
+    most = matching.budget_s * _work_per_s(crowded, matching)
     if crowded:
         share = min(MIN_STARS / n, STAR_SHARE)
-        limits = SearchLimits(min_chord, n, n, share, CROWDED_TIMES * budget)
+        limits = SearchLimits(min_chord, n, n, share, min(CROWDED_TIMES * budget, most))
     else:
-        limits = SearchLimits(min_chord, N_PATTERN, N_TRIED, STAR_SHARE, budget)
+        limits = SearchLimits(min_chord, N_PATTERN, N_TRIED, STAR_SHARE, min(budget, most))
     return Problem(
         Centroids(*frame[:4]),
         Stars(sky.catalogue.u_icrs, sky.catalogue.magnitude, grid, sky.bands),
@@ -323,8 +382,8 @@ def _search_and_solve(problem, reach, R_found, solution, matches):
 
 def _identify_few(
     frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, matching: MatchSettings
-) -> tuple[Solution | None, bool]:
-    """Return the same as `identify_lost` for a frame that is not crowded."""
+) -> Searched:
+    """Return the same as `search_frame` for a frame that is neither crowded nor dense."""
     problem = problem_of(frame, sky, grid, pairs, matching, crowded=False)
     n = len(frame.u)
     R, P = np.empty((3, 3)), np.empty((3, 3))
@@ -333,27 +392,85 @@ def _identify_few(
     best, runner_up, work, evidence = _search_and_solve(
         problem, reach, np.zeros((3, 3)), Attitude(R, P), Matches(star, chi2)
     )
+    cost_s, exhausted = work / TRUE_WORK_PER_S, bool(work > problem.limits.budget)
     if not (best > matching.min_evidence_lost and best - runner_up > CLEAR_LEAD):
-        return None, work > problem.limits.budget
+        return Searched(None, exhausted, exhausted and cost_s >= matching.budget_s, cost_s)
     if not evidence > _least_of_lost(star, evidence, problem.image.in_view, matching):
-        return None, False
-    return Solution(R, P, star, chi2, evidence), False
+        return Searched(None, False, False, cost_s)
+    return Searched(Solution(R, P, star, chi2, evidence), False, False, cost_s)
+
+
+def _identify_bright(
+    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, matching: MatchSettings
+) -> Searched:
+    """Return the solution of a dense frame by its few brightest centroids, and what it cost.
+
+    Where all its centroids hide these stars, the others are left without one.
+    """
+    cost_s, n = 0.0, len(frame.u)
+    # Each number of centroids is one more chance of a false alarm.
+    pays = matching.threshold + math.log(len(BRIGHTEST_FIRST) + 1)
+    for bright in BRIGHTEST_FIRST:
+        part = some_centroids(frame, np.arange(bright))
+        left_s = PLAIN_SHARE * (matching.budget_s - cost_s)
+        tried = matching._replace(threshold=pays, budget_s=min(BRIGHT_S, left_s))
+        verdict = _search(part, sky, grid, pairs, tried, crowded=False)
+        cost_s += verdict.cost_s
+        if not verdict.is_clear:
+            continue
+        found = _near_verdict(part, sky, verdict, tried)
+        if found is None:
+            continue
+        full = _near_verdict(frame, sky, verdict, matching)
+        if full is None:
+            star, chi2 = np.full(n, -1, np.int64), np.zeros(n)
+            star[:bright], chi2[:bright] = found.star, found.chi2
+            full = found._replace(star=star, chi2=chi2)
+        return Searched(full, False, False, cost_s)
+    return Searched(None, False, False, cost_s)
+
+
+def _near_verdict(
+    frame: FrameCentroids, sky: Sky, verdict: Verdict, matching: MatchSettings
+) -> Solution | None:
+    near = np.eye(3) * (2.0 * _middle(frame.sigma_rad)) ** 2
+    return identify_predicted(frame, sky, verdict.R_sensor_from_icrs, near, matching, lost=True)
+
+
+def search_frame(
+    frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, matching: MatchSettings
+) -> Searched:
+    """Return the solution without a prior, None where no attitude is beyond doubt."""
+    finite = bool(np.isfinite(frame.u).all())
+    if 3 <= len(frame.u) <= N_PATTERN and finite:
+        return _identify_few(frame, sky, grid, pairs, matching)
+    cost_s = 0.0
+    by_flux = len(frame.u) > N_SEARCHED and finite and np.isfinite(frame.instrumental_mag[0])
+    if by_flux and not (matching.crowd_first and matching.crowded):
+        bright = _identify_bright(frame, sky, grid, pairs, matching)
+        if bright.solution is not None:
+            return bright
+        cost_s = bright.cost_s
+        matching = matching._replace(
+            threshold=matching.threshold + math.log(len(BRIGHTEST_FIRST) + 1),
+            budget_s=matching.budget_s - cost_s,
+        )
+    verdict = search_lost(frame, sky, grid, pairs, matching)
+    cost_s += verdict.cost_s
+    if not verdict.is_clear:
+        over = verdict.exhausted and verdict.cost_s >= PLAIN_SHARE * matching.budget_s
+        return Searched(None, verdict.exhausted, over, cost_s)
+    found = _near_verdict(frame, sky, verdict, matching)
+    return Searched(found, False, False, cost_s, verdict.crowded and found is not None)
 
 
 def identify_lost(
     frame: FrameCentroids, sky: Sky, grid: SkyGrid, pairs: PairTable, matching: MatchSettings
 ) -> tuple[Solution | None, bool]:
     """Return the solution without a prior, None where no attitude is beyond doubt, and whether the
-    search reached its time limit."""
-    if 3 <= len(frame.u) <= N_PATTERN and np.isfinite(frame.u).all():
-        return _identify_few(frame, sky, grid, pairs, matching)
-    verdict = search_lost(frame, sky, grid, pairs, matching)
-    if not verdict.is_clear:
-        return None, verdict.exhausted
-    near = np.eye(3) * (2.0 * _middle(frame.sigma_rad)) ** 2
-    return identify_predicted(
-        frame, sky, verdict.R_sensor_from_icrs, near, matching, lost=True
-    ), False
+    search reached a limit."""
+    found = search_frame(frame, sky, grid, pairs, matching)
+    return found.solution, found.exhausted
 
 
 # Clusters of false centroids: a reflection, a bright object's halo, a damaged part of the chip.
@@ -398,7 +515,7 @@ def field_of_view(camera: Camera) -> FieldOfView:
     x, y = undistort(
         camera, (x_px - camera.cx_px) / camera.fx_px, (y_px - camera.cy_px) / camera.fy_px
     )
-    half_diagonal = float(np.arctan(np.max(np.hypot(x, y))))
-    return FieldOfView(
-        half_diagonal, np.array([x.min(), x.max(), y.min(), y.max()]), camera.pixel_rad
-    )
+    # Corners that a wide lens does not reach have no direction.
+    half_diagonal = float(np.arctan(np.nanmax(np.hypot(x, y))))
+    box = np.array([np.nanmin(x), np.nanmax(x), np.nanmin(y), np.nanmax(y)])
+    return FieldOfView(half_diagonal, box, camera.pixel_rad)

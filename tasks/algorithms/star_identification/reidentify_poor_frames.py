@@ -20,9 +20,10 @@ from epipole.tasks.algorithms.star_identification.frame import (
     FrameCentroids,
     MatchSettings,
     Solution,
-    identify_lost,
+    search_frame,
     some_centroids,
 )
+from epipole.tasks.algorithms.star_identification.search_budget import TOO_LITTLE_S, Allowance
 from epipole.tasks.algorithms.star_identification.sensor_model import (
     SensorModel,
     Skies,
@@ -45,6 +46,7 @@ Array = npt.NDArray[np.float64]
 # errors of `by_quality`. Each is one more chance of a false alarm.
 OTHER_TRIALS = 4
 MIN_CENTROIDS = 4  # of a frame that is tried
+SHARE = 0.4  # of what is left of the searches' budget: what each pass here may cost
 
 
 def of_other_brightness(
@@ -61,7 +63,7 @@ def of_other_brightness(
     rows = np.flatnonzero(~solutions.solved & (frames.centroids.counts >= MIN_CENTROIDS))
     if model.use_flux and not np.isnan(model.matching.zero_point_mag) and len(rows):
         found = identify_sample(
-            frames.take(rows), skies, model._replace(matching=matching), hopeless=True
+            frames.take(rows), skies, model._replace(matching=matching), True, SHARE
         )[0]
         solved = np.flatnonzero(found.solved)
         solutions.enter_all(rows[solved], found, solved)
@@ -95,11 +97,15 @@ def poor_frames(solutions: Solutions) -> npt.NDArray[np.int64]:
 
 
 def reidentify_poor_frames(
-    frames: SensorCentroids, solutions: Solutions, where: SensorSky, matching: MatchSettings
+    frames: SensorCentroids,
+    solutions: Solutions,
+    where: SensorSky,
+    matching: MatchSettings,
+    allowance: Allowance | None = None,
 ) -> Array:
     """Enter better solutions of poor frames; return (F,) factors on the errors of each frame.
 
-    `solutions` are changed.
+    `solutions` are changed. `allowance` is what searches may cost.
     """
     factors, failures, skipped = np.ones(len(solutions.solved)), 0, 0
     for k in poor_frames(solutions).tolist():
@@ -110,7 +116,15 @@ def reidentify_poor_frames(
             skipped -= 1
             continue
         if better is None:
-            better = _searched(frame, known, where, matching)
+            searching = matching._replace(crowded=False)
+            if allowance is not None:
+                left_s = allowance.left_s(k, (k + 1) / len(factors))
+                searching = searching._replace(budget_s=left_s)
+            if searching.budget_s < TOO_LITTLE_S:
+                continue
+            better, cost_s = _searched(frame, known, where, searching)
+            if allowance is not None:
+                allowance.spend(k, cost_s)
             failures = 0 if better else failures + 1
             skipped = 2 ** min(max(failures - PATIENCE, 0), MAX_BACKOFF_LOG2) - 1
         if better is not None:
@@ -153,22 +167,22 @@ def _near(
 
 def _searched(
     frame: FrameCentroids, known: Solution, where: SensorSky, matching: MatchSettings
-) -> tuple[Solution, float] | None:
-    """Return the solution of a search of the whole sky, None if it gains too little evidence.
+) -> tuple[tuple[Solution, float] | None, float]:
+    """Return the solution of a search of the whole sky with the factor 1, None if it gains too
+    little evidence; and what the search cost.
 
     Only unmatched centroids are searched: with all of them, the search would end with the known
     solution if that is beyond doubt.
     """
     unmatched = some_centroids(frame, np.flatnonzero(known.star < 0))
-    quick = matching._replace(crowded=False)
-    found = identify_lost(unmatched, where.sky, where.grid, where.pairs(), quick)[0]
-    found = found and _near(frame, found, where.sky, matching, 1.0)
+    searched = search_frame(unmatched, where.sky, where.grid, where.pairs(), matching)
+    found = searched.solution and _near(frame, searched.solution, where.sky, matching, 1.0)
     if found is None:
-        return None
+        return None, searched.cost_s
     same = _near(frame, known, where.sky, matching, 1.0)  # judged as a search would
     if same is not None and found.evidence < same.evidence + MIN_GAIN:
-        return None
-    return found, 1.0
+        return None, searched.cost_s
+    return (found, 1.0), searched.cost_s
 
 
 def _has_more_stars(found: Solution, known: Solution) -> bool:
@@ -207,7 +221,7 @@ def by_quality(
         if abs(np.log(other)) < np.log(MIN_OTHER_ERROR) or not len(rows):
             continue
         tried = frames.take(rows).of_quality(np.full(len(rows), other))
-        found = identify_sample(tried, skies, model._replace(matching=matching), hopeless=True)[0]
+        found = identify_sample(tried, skies, model._replace(matching=matching), True, SHARE)[0]
         solved = np.flatnonzero(found.solved)
         solutions.enter_all(rows[solved], found, solved)
         quality[rows[solved]] = other

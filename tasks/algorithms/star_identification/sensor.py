@@ -31,6 +31,7 @@ from epipole.tasks.algorithms.star_identification.reidentify_poor_frames import 
     of_other_brightness,
     reidentify_poor_frames,
 )
+from epipole.tasks.algorithms.star_identification.search_budget import SearchBudget
 from epipole.tasks.algorithms.star_identification.sensor_model import (
     SensorModel,
     Skies,
@@ -72,6 +73,11 @@ KNOWN_SCALES, UNKNOWN_SCALES_PX = (1.0, 3.0, 0.4), (0.5, 1.5, 0.15)
 # Relative error of the learned centroid error above which all frames are matched again. With half
 # or twice of it the same frames are identified, and squared errors over covariance change by 0.03.
 WRONG_GATE = 0.02
+
+
+# Shares of the searches' budget: of all what the probe may cost, and how many times as much of that
+# a thorough attempt as a quick one; of what is left the pass over all frames, and any other pass.
+PROBE_SHARE, THOROUGH, ALL_SHARE, SHARE = 0.4, 12.0, 0.7, 0.4
 
 
 class IdentifiedSensor(NamedTuple):
@@ -133,20 +139,23 @@ def identify_sensor(
         How frames are judged before anything is known of the sensor.
     """
     centroids, stated = _fill_sigmas(centroids)
-    frames, floor_px = FrameSample(t_s, centroids, priors), 0.0
+    n, floor_px = len(t_s), 0.0
+    budget = SearchBudget(n, matching.budget_share)
+    frames = FrameSample(t_s, centroids, priors, budget=budget, rows=np.arange(n, dtype=np.int64))
     model, probe = _probe(frames, skies, magnitude_limit, matching, stated)
     if not probe.failed:
         if stated:
             frames, model, floor_px = _with_floor(frames, probe, skies, model)
         frames, model = _learn_around(frames, probe, skies, model)
-    solutions, status = identify_sample(frames, skies, model, hopeless=probe.failed)
+    solutions, status = identify_sample(frames, skies, model, probe.failed, ALL_SHARE)
     if probe.failed and solutions.solved.any():
         solutions, status, model = _identify_again(frames, solutions, skies, model)
     solutions, status, model = _with_true_scale(frames, solutions, status, skies, model)
     solutions = of_other_brightness(frames, solutions, skies, model)
     quality = reidentify_poor_frames(
-        frames.scaled(model), solutions, sky_of(frames.centroids, skies, model), model.matching
-    )
+        frames.scaled(model), solutions, sky_of(frames.centroids, skies, model), model.matching,
+        frames.allowance(SHARE),
+    )  # fmt: skip
     solutions, quality = by_quality(frames, solutions, quality, skies, model)
     return IdentifiedSensor(
         solutions, _open_status(status, solutions), skies.sky(model.limit), model.scale * quality,
@@ -209,20 +218,32 @@ def _first_scale(
     """Return the model with a centroid error that identifies frames, and the solutions."""
     attempts = list(_attempts(probe.centroids, skies, model, scales, crowded))
     matching = model.matching
+    # In a crowd only a thorough search finds stars, unless the brightest are stars: with the first
+    # error, and either depth.
+    in_crowd = [crowded and tried.scale == scales[0] and tried.use_flux for tried in attempts]
+    tries = [(tried, False) for tried in attempts]
+    tries += [(tried, True) for tried, also in zip(attempts, in_crowd, strict=True) if also]
     # Each further attempt is one more chance of a false alarm.
-    threshold = matching.threshold + np.log(max(len(attempts) - 1, 1))
+    threshold = matching.threshold + np.log(max(len(tries) - 1, 1))
     quick = matching._replace(
         time_limit_s=matching.time_limit_s / 4, threshold=threshold, crowded=False
     )
     thorough = matching._replace(threshold=threshold)
-    for tried in attempts:
-        # In a crowd only a thorough search finds stars, with the first error and either depth.
-        in_crowd = crowded and tried.scale == scales[0] and tried.use_flux
-        attempt = tried._replace(matching=thorough if in_crowd else quick)
-        found = identify_sample(probe, skies, attempt)[0].each()
+    weight = np.where([is_thorough for _, is_thorough in tries], THOROUGH, 1.0)
+    of_all = _probe_share(len(probe.t_s))
+    for k, (tried, is_thorough) in enumerate(tries):
+        attempt = tried._replace(matching=thorough if is_thorough else quick)
+        share = of_all * weight[k] / (weight.sum() - of_all * weight[:k].sum())
+        tried_all = identify_sample(probe, skies, attempt, share=share, one_will_do=is_thorough)
+        found = tried_all[0].each()
         if any(found):
             return _likeliest_scale(probe.centroids, found, skies, tried, scales)
     return model._replace(scale=scales[0]), [None] * len(probe.t_s)
+
+
+def _probe_share(n_probed: int) -> float:
+    """Return the share of the budget that the probe may cost: of few frames it is nearly all."""
+    return max(PROBE_SHARE, 1.0 - 0.1 * n_probed)
 
 
 def _attempts(
@@ -292,7 +313,7 @@ def _learn_around(
     at = np.searchsorted(probe.usable, probe.rows[solved])
     near = probe.usable[_runs_around(len(probe.usable), at)]
     anchored = frames.anchored(probe.rows, probe.solutions)
-    sampled = identify_sample(anchored.take(near), skies, model)[0].each()
+    sampled = identify_sample(anchored.take(near), skies, model, share=SHARE)[0].each()
     model = learn(frames.take(near).centroids, sampled, skies, model)
     return frames.anchored(near, sampled) if any(sampled) else anchored, model
 
@@ -315,7 +336,7 @@ def _identify_again(
     rows = solved[evenly_spaced(len(solved), SAMPLED)]
     sampled = [solutions.frame(i) for i in rows]
     model = learn(frames.take(rows).centroids, sampled, skies, model)
-    return *identify_sample(frames.anchored(rows, sampled), skies, model), model
+    return *identify_sample(frames.anchored(rows, sampled), skies, model, share=SHARE), model
 
 
 def evenly_spaced(n: int, wanted: int) -> Rows:

@@ -22,6 +22,7 @@ from epipole.tasks.algorithms.star_identification.evidence import MatchRule
 from epipole.tasks.algorithms.star_identification.following import (
     NO_MATCH,
     NOT_SEARCHED,
+    SEARCH_LIMIT,
     TIME_LIMIT,
     TOO_FEW,
     FrameArrays,
@@ -32,11 +33,17 @@ from epipole.tasks.algorithms.star_identification.following import (
 )
 from epipole.tasks.algorithms.star_identification.frame import (
     MatchSettings,
+    Searched,
     Solution,
-    identify_lost,
     rule_of,
+    search_frame,
 )
 from epipole.tasks.algorithms.star_identification.search.match_stars import StarDirections
+from epipole.tasks.algorithms.star_identification.search_budget import (
+    TOO_LITTLE_S,
+    Allowance,
+    SearchBudget,
+)
 from epipole.tasks.algorithms.star_identification.sensor_model import SensorModel, Skies
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
 from epipole.tasks.algorithms.star_identification.star_pairs import PairTable
@@ -57,6 +64,7 @@ STATUS = {
     NO_MATCH: "no_match",
     NOT_SEARCHED: "not_searched",
     TIME_LIMIT: "time_limit",
+    SEARCH_LIMIT: "search_limit",
     NO_CENTROIDS: "no_centroids",
 }
 
@@ -91,17 +99,30 @@ class FrameSample(NamedTuple):
     t_s : (F,) float, times [s], ascending
     centroids, priors : of the F frames
     anchors : some priors are earlier solutions
+    budget, rows : what searches of the sensor may cost, and (F,) int64, which of its frames these
+        are; None: searches have no budget
     """
 
     t_s: Array
     centroids: RawCentroids
     priors: Priors
     anchors: bool = False
+    budget: SearchBudget | None = None
+    rows: npt.NDArray[np.int64] | None = None
 
     def take(self, rows: npt.NDArray[np.int64]) -> "FrameSample":
         """Return the frames of these rows."""
         priors = Priors(self.priors.R_sensor_from_icrs[rows], self.priors.sigma_rad[rows])
-        return FrameSample(self.t_s[rows], self.centroids.take(rows), priors, self.anchors)
+        of_sensor = None if self.rows is None else self.rows[rows]
+        return FrameSample(
+            self.t_s[rows], self.centroids.take(rows), priors, self.anchors, self.budget, of_sensor
+        )
+
+    def allowance(self, share: float, one_will_do: bool = False) -> Allowance | None:
+        """Return what a pass over these frames may cost: a share of what is left."""
+        if self.budget is None or self.rows is None:
+            return None
+        return self.budget.allow(self.rows, share, one_will_do)
 
     def scaled(self, model: SensorModel) -> SensorCentroids:
         """Return the centroids with the errors of the sensor's model."""
@@ -127,17 +148,29 @@ class FrameSample(NamedTuple):
 
 
 def identify_sample(
-    sample: FrameSample, skies: Skies, model: SensorModel, hopeless: bool = False
+    sample: FrameSample,
+    skies: Skies,
+    model: SensorModel,
+    hopeless: bool = False,
+    share: float = 1.0,
+    one_will_do: bool = False,
 ) -> tuple[Solutions, list[str | None]]:
     """Return the frames' solutions and status, identified with a sensor's model.
 
-    `hopeless` : searches of this sensor have failed before, see `identify_sequence`.
+    Parameters
+    ----------
+    hopeless
+        Searches of this sensor have failed before, see `identify_sequence`.
+    share
+        Of what is left of the sensor's budget, what this pass may cost.
+    one_will_do
+        One identified frame is enough: the first ones may cost all of that.
     """
     if not len(sample.t_s):
         return unsolved(sample.centroids.first), []
     return identify_sequence(
         sample.t_s, sample.scaled(model), sample.priors, *sky_of(sample.centroids, skies, model),
-        model.matching, sample.anchors, hopeless,
+        model.matching, sample.anchors, hopeless, sample.allowance(share, one_will_do),
     )  # fmt: skip
 
 
@@ -165,6 +198,7 @@ def identify_sequence(
     matching: MatchSettings,
     anchored: bool = False,
     hopeless: bool = False,
+    allowance: Allowance | None = None,
 ) -> tuple[Solutions, list[str | None]]:
     """Identify frames in order of time; frames that fail are tried again backward in time.
 
@@ -178,13 +212,15 @@ def identify_sequence(
         before any search.
     hopeless
         Searches have failed before: frames are skipped from the first failure on.
+    allowance
+        What the searches may cost; None: they are not limited together.
 
     Returns
     -------
     solutions
         Attitudes and stars.
     status : one per frame
-        None where solved, else no_centroids, too_few_stars, no_match, not_searched or time_limit.
+        None where solved, else a name of `STATUS`.
     """
     n = len(frames.beta)
     solutions, status = unsolved(frames.first), np.zeros(n, np.int8)
@@ -193,15 +229,29 @@ def identify_sequence(
     sequence = _Sequence(frames, arrays, stars, rule, solutions, status)
     forth, back, none = FrameRange(0, n, 1, False), FrameRange(n - 1, -1, -1, False), no_priors(n)
 
-    def search(k: int, failures: int, step: int) -> tuple[Solution | None, bool]:
+    crowd_first = False
+
+    def search(k: int, failures: int, step: int) -> Searched | None:
+        nonlocal crowd_first
         # Crowded frames take long. Where the stars' brightness is unknown, they are tried after 0,
         # 1, 2, 4, 8 ... failures only.
         often = not np.isnan(matching.zero_point_mag)
         tried = matching._replace(
             crowded=matching.crowded and (often or failures.bit_count() <= 1),
             starlit=sequence.starlit(k, step),
+            crowd_first=crowd_first,
         )
-        return identify_lost(frames.frame(k), sky, grid, pairs(), tried)
+        if allowance is not None:
+            done = (k + 1 if step > 0 else n - k) / n
+            tried = tried._replace(budget_s=allowance.left_s(k, done))
+            if tried.budget_s < TOO_LITTLE_S:
+                return None
+        found = search_frame(frames.frame(k), sky, grid, pairs(), tried)
+        if allowance is not None:
+            allowance.spend(k, found.cost_s)
+        if found.solution is not None:
+            crowd_first = found.as_crowd
+        return found
 
     if anchored:
         sequence.follow(forth, priors)
@@ -256,12 +306,13 @@ class _Sequence(NamedTuple):
         self,
         frame_range: FrameRange,
         priors: Priors,
-        search: Callable[[int, int, int], tuple[Solution | None, bool]],
+        search: Callable[[int, int, int], Searched | None],
         failures: int,
     ) -> None:
         """Identify frames from those before them; frames that fail are searched.
 
-        `failures` : number of searches that have failed before
+        `search` returns None where the budget leaves too little. `failures` is the number of
+        searches that have failed before.
         """
         memory, k = new_memory(len(self.stars.u)), frame_range.start
         while True:
@@ -269,13 +320,19 @@ class _Sequence(NamedTuple):
                            self.stars, self.rule, memory, self.solutions, self.status))  # fmt: skip
             if k == frame_range.stop:
                 return
-            solution, cut_short = search(k, failures, frame_range.step)
+            found = search(k, failures, frame_range.step)
+            if found is None:
+                self.status[k] = SEARCH_LIMIT
+                k += frame_range.step
+                continue
+            solution = found.solution
             trusted = bool(memory.counters[1]) and not np.isnan(priors.sigma_rad[k])
             if solution is None:
                 # Where priors were confirmed, most frames fail because they show few stars.
                 failures = max(failures + 1, PATIENCE + 1 if trusted else 0)
                 memory.counters[2] = _skipped(failures, self._refused(k, frame_range.step))
-                self.status[k] = TIME_LIMIT if cut_short else NO_MATCH
+                stopped = SEARCH_LIMIT if found.over_budget else TIME_LIMIT
+                self.status[k] = stopped if found.exhausted else NO_MATCH
             else:
                 failures, memory.counters[1] = 0, 0  # the frame's prior, if any, was wrong
                 self.status[k] = 0
@@ -290,7 +347,8 @@ class _Sequence(NamedTuple):
         """
         before = slice(0, k) if step > 0 else slice(k + 1, None)
         status, solved = self.status[before], self.solutions.solved[before]
-        refused = ((status == NO_MATCH) | (status == TIME_LIMIT)) & ~solved
+        refused = (status == NO_MATCH) | (status == TIME_LIMIT) | (status == SEARCH_LIMIT)
+        refused &= ~solved
         return float(np.log((solved.sum() + 1) / (refused.sum() + 1)))
 
     def _refused(self, k: int, step: int) -> int:

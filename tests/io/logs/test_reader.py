@@ -353,6 +353,7 @@ def test_an_invalid_sigma_is_unknown(tmp_path, sigma):
         ({"p1": 5.0}, "bad_distortion"),
         ({"k1": -5.0}, "folded_image"),  # folds at 0.26 of 0.35
         ({"p2": -0.9}, "folded_image"),
+        ({"fx_px": 426.0, "fy_px": 426.0, "k1": -0.5, "k2": 0.0, "k3": 0.0}, "folded_image"),
     ],
 )
 def test_an_unusable_calibration_is_a_row(tmp_path, changes, reason):
@@ -363,7 +364,15 @@ def test_an_unusable_calibration_is_a_row(tmp_path, changes, reason):
 
 
 @pytest.mark.parametrize(
-    "optics", [{"k1": -0.9, "k2": 0.0, "k3": 0.0}, {"k1": 0.9}, {"k1": -2.0, "k2": 6.0}, {}]
+    "optics",
+    [
+        {"k1": -0.9, "k2": 0.0, "k3": 0.0},
+        {"k1": 0.9},
+        {"k1": -2.0, "k2": 6.0},
+        {},
+        # 62 degrees along the sides: it folds between these and the corners.
+        {"fx_px": 426.0, "fy_px": 426.0, "k1": -0.3, "k2": 0.0, "k3": 0.0},
+    ],
 )
 def test_a_distortion_that_folds_beyond_the_image_is_valid(tmp_path, optics):
     data = protobuf.encode(CALIBRATION, calibration_values("sat1", START_NS, CAMERA | optics))

@@ -25,7 +25,7 @@ Array = npt.NDArray[np.float64]
 # that is so much better in chi-square (odds 20:1), and with neither otherwise.
 CLEARLY_BETTER = 6.0
 N_NUDGED = 12  # brightest centroids onto which a predicted star is moved
-MAX_COMPARED = 100_000_000  # distances that are compared for this, at most: about 0.2 s
+MAX_COMPARED = 100_000_000  # pairs of a centroid and a star for this, at most: about 10 ms
 MAX_MAG_ERROR = 2.5  # a match whose brightness is farther off is a coincidence
 
 
@@ -300,12 +300,19 @@ def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
     u, sigma = centroids.u, centroids.sigma
     n, m = len(u), len(a)
     v, w, trial = np.empty((m, 3)), np.empty((m, 3)), np.empty((3, 3))
+    by_x, nearest, r2 = np.argsort(u[:, 0]), np.empty(n), np.empty(n)
+    x_of = u[:, 0][by_x]
     turn_stars(R0, a, v)
     best, compared = 0.0, 0
     copy_matrix(R0, R)
     for i in range(min(n, N_NUDGED)):
         off2 = u[i, 0] * u[i, 0] + u[i, 1] * u[i, 1]
         reach2 = gate * gate * (s_xy * s_xy + s_z * s_z * off2 + sigma[i] * sigma[i])
+        for k in range(n):
+            ex, ey = u[k, 0] - u[i, 0], u[k, 1] - u[i, 1]
+            lever2 = s_z * s_z * (ex * ex + ey * ey)
+            r2[k] = 6.0 * (sigma[k] * sigma[k] + sigma[i] * sigma[i] + lever2)
+        reach = math.sqrt(np.max(r2))
         for s in range(m):
             dx, dy = v[s, 0] - u[i, 0], v[s, 1] - u[i, 1]
             if dx * dx + dy * dy > reach2 or v[s, 2] <= 0.0:
@@ -316,19 +323,28 @@ def best_nudge(R0, s_xy, s_z, centroids, a, gate, R):
             copy_matrix(R0, trial)
             _nudge(trial, u, i, a, s)
             turn_stars(trial, a, w)
-            hits = 0.0
-            for k in range(n):
-                ex, ey = u[k, 0] - u[i, 0], u[k, 1] - u[i, 1]
-                lever2 = s_z * s_z * (ex * ex + ey * ey)
-                r2 = 6.0 * (sigma[k] * sigma[k] + sigma[i] * sigma[i] + lever2)
-                nearest = r2
-                for t in range(m):
-                    dx, dy = w[t, 0] - u[k, 0], w[t, 1] - u[k, 1]
-                    nearest = min(nearest, dx * dx + dy * dy)
-                hits += 1.0 - nearest / r2
+            hits = _count_hits(u, by_x, x_of, w, reach, r2, nearest)
             if hits > best:
                 best = hits
                 copy_matrix(trial, R)
+
+
+@kernel
+def _count_hits(u, by_x, x_of, w, reach, r2, nearest):
+    """Return how many centroids, given with their order by x, have a star near: each counts as 1
+    less its squared distance over that of its radius, `r2`."""
+    nearest[:] = r2
+    for t in range(len(w)):
+        at = np.searchsorted(x_of, w[t, 0] - reach)
+        while at < len(x_of) and x_of[at] <= w[t, 0] + reach:
+            k = by_x[at]
+            dx, dy = w[t, 0] - u[k, 0], w[t, 1] - u[k, 1]
+            nearest[k] = min(nearest[k], dx * dx + dy * dy)
+            at += 1
+    hits = 0.0
+    for k in range(len(u)):
+        hits += 1.0 - nearest[k] / r2[k]
+    return hits
 
 
 @kernel

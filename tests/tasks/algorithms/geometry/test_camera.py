@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from epipole.tasks.algorithms.geometry.camera import (
     Camera,
     distort,
+    fold_radius,
     inside,
     pixel_angle,
     project,
@@ -80,3 +81,21 @@ def test_the_half_diagonal_reaches_the_farthest_corner():
     plain = Camera(100, 100, 50.0, 50.0, 49.5, 49.5)
     assert plain.half_diagonal_rad == pytest.approx(np.arctan(np.sqrt(2)))
     assert plain.pixel_rad == pytest.approx(1 / 50)
+
+
+# 62 degrees along the sides. The distortion folds at 1.05, between the sides (0.6) and the corners.
+WIDE = Camera(1024, 1024, 852.1, 852.1, 511.5, 511.5, -0.3)
+
+
+def test_before_the_fold_of_a_wide_lens_undistortion_is_the_inverse_and_beyond_it_is_nothing():
+    fold = fold_radius(WIDE)
+    assert fold == pytest.approx(1 / np.sqrt(0.9), abs=2e-3)
+    r, turn = np.meshgrid(np.linspace(0, 0.99 * fold, 60), np.linspace(0, 6, 31))
+    x, y = (r * np.cos(turn)).ravel(), (r * np.sin(turn)).ravel()
+    np.testing.assert_allclose(undistort(WIDE, *distort(WIDE, x, y)), [x, y], atol=1e-6)
+    u = unproject(WIDE, np.array([0.0, 0.0, 1023.0]), np.array([0.0, 511.5, 1023.0]))
+    assert np.isfinite(u[:, 2]).tolist() == [False, True, False]
+
+
+def test_a_camera_that_does_not_fold_has_no_fold():
+    assert fold_radius(WIDE._replace(k1=0.2)) == np.inf

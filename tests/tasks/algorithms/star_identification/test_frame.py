@@ -21,6 +21,7 @@ from epipole.tasks.algorithms.star_identification.frame import (
     aberrate_all,
     identify_lost,
     identify_predicted,
+    search_frame,
     search_lost,
     without_clusters,
 )
@@ -60,6 +61,46 @@ def test_only_the_brightest_centroids_are_searched():
     )
     assert n < N_SEARCHED
     assert search_lost(crowded, sky, grid, pairs, MATCHING).is_clear
+
+
+def dense(seed, sigma_px, n_faint=2900):
+    """Return a frame of stars, 15 hot pixels as bright as they, and points fainter than all."""
+    seen = frame(CATALOGUE, random_attitude(seed), seed, sigma_px, n_false=15)[0]
+    faint = frame(CATALOGUE, random_attitude(seed), 99 + seed, sigma_px, n_faint, missing=1.0)[0]
+    return seen._replace(
+        u=np.concatenate([seen.u, faint.u]),
+        sigma_rad=np.concatenate([seen.sigma_rad, faint.sigma_rad]),
+        instrumental_mag=np.concatenate([seen.instrumental_mag, faint.instrumental_mag + 4.0]),
+    )
+
+
+@pytest.mark.parametrize("sigma_px", [0.3, 2.0])
+def test_a_dense_frame_is_identified_by_its_brightest_centroids(sigma_px):
+    """Two or three thousand are no stars of the catalogue; with 2 px, they hide those that are."""
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.02), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    right = 0
+    for seed in range(6):
+        seen = dense(seed, sigma_px)
+        found = search_frame(seen, sky, grid, pairs, MATCHING._replace(budget_s=0.4))
+        if found.solution is None:
+            continue
+        off = angle_between(found.solution.R_sensor_from_icrs, random_attitude(seed))
+        assert off < 3e-3
+        assert len(found.solution.star) == len(seen.u)
+        right += 1
+    assert right == 6
+
+
+def test_a_dense_frame_without_stars_is_refused():
+    sky = sky_to_limit(CATALOGUE, 99.0)
+    grid, pairs = sky_grid(sky, 0.005), pattern_pairs(CATALOGUE.u_icrs[:2000], 0.4)
+    for seed in range(3):
+        seen = frame(CATALOGUE, random_attitude(seed), seed, 0.3, 3000, missing=1.0)[0]
+        found = search_frame(seen, sky, grid, pairs, MATCHING._replace(budget_s=0.2))
+        assert found.solution is None
+        assert found.over_budget
+        assert found.cost_s < 0.3
 
 
 def test_few_stars_among_many_other_centroids_are_found():

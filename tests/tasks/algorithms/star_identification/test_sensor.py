@@ -18,8 +18,13 @@ from scenes.random_stars import (
 
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, project, unproject
 from epipole.tasks.algorithms.star_catalogue import limit_for_density
-from epipole.tasks.algorithms.star_identification import sensor
-from epipole.tasks.algorithms.star_identification.frame import FrameCentroids
+from epipole.tasks.algorithms.star_identification import sensor, sequence
+from epipole.tasks.algorithms.star_identification.frame import (
+    FrameCentroids,
+    Searched,
+    search_frame,
+)
+from epipole.tasks.algorithms.star_identification.search_budget import AT_ONCE_S
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.algorithms.star_identification.star_grid import (
@@ -74,10 +79,10 @@ def _shot(k, sigma_px, stated_px=np.nan, **how):
     return Shot(seen, np.full(len(seen.u), stated_px), seen.sigma_rad / sigma_px), true
 
 
-def _identify(shots, limit=None):
+def _identify(shots, limit=None, matching=MATCHING):
     n = len(shots)
     centroids = join_centroids(*zip(*shots, strict=True))
-    return identify_sensor(np.arange(n) * 1.0, centroids, no_priors(n), SKIES, limit, MATCHING)
+    return identify_sensor(np.arange(n) * 1.0, centroids, no_priors(n), SKIES, limit, matching)
 
 
 @pytest.mark.parametrize("sigma_px", [0.08, 0.4, 1.2])
@@ -258,3 +263,21 @@ def test_a_lens_that_departs_from_its_calibration_is_lived_with(corner_px, least
     for k in np.flatnonzero(found.solutions.solved):
         R = found.solutions.R_sensor_from_icrs[k]
         assert angle_between(R, random_attitude(k)) < np.radians(0.05)
+
+
+def test_searches_of_a_log_end_at_its_budget_and_say_so(monkeypatch):
+    spent = []
+
+    def spy(*given) -> Searched:
+        spent.append(search_frame(*given))
+        return spent[-1]
+
+    monkeypatch.setattr(sequence, "search_frame", spy)
+    crowds = [_shot(k, 0.3, n_false=400, missing=1.0)[0] for k in range(6)]
+    half = MATCHING._replace(budget_share=0.5)
+    found = _identify(crowds, matching=half)
+    # A search ends at the first pivot beyond its budget.
+    assert 0.1 * AT_ONCE_S < sum(one.cost_s for one in spent) < 0.6 * AT_ONCE_S
+    assert "search_limit" in found.status
+    assert not found.solutions.solved.any()
+    assert _identify(crowds, matching=half).status == found.status
