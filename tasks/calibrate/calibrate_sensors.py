@@ -11,10 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from epipole.io.work.parts import Parts
-from epipole.schemas.bridge import array, concat, empty, rows_of, table, unstack_covariance
+from epipole.schemas.bridge import (
+    array,
+    concat,
+    empty,
+    rows_of,
+    rows_with,
+    table,
+    unstack_covariance,
+)
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
@@ -85,11 +92,11 @@ def calibrate_each(
 def _calibrate(
     stars: SensorStars, cameras: pa.Table, nominal: pa.Table, principal_point_px: float | None
 ) -> Calibrated:
-    of_sensor = pc.field("sensor_id") == stars.sensor.sensor_id
+    name = stars.sensor.sensor_id
     return calibrate_sensors(
         _sampled_stars(stars.identified, stars.spans),
-        cameras.filter(of_sensor),
-        nominal.filter(of_sensor),
+        rows_with(cameras, "sensor_id", name),
+        rows_with(nominal, "sensor_id", name),
         principal_point_px,
     )
 
@@ -130,7 +137,7 @@ def calibrate_sensors(
     rows, changed = [], {}
     logged = _single(nominal)
     for name, optics in _single(cameras).items():
-        images = _images(stars.filter(pc.field("sensor_id") == name), optics.camera)
+        images = _images(rows_with(stars, "sensor_id", name), optics.camera)
         logged_optics = logged.get(name, optics)
         present = _Present(optics.camera, optics.cov != logged_optics.cov)
         fitted = _fit(NominalOptics(logged_optics.camera, principal_point_px), present, images)
@@ -140,7 +147,7 @@ def calibrate_sensors(
         rows.append(_row(name, fit))
         if departs:
             changed[name] = fit.camera._asdict() | _covariance_columns(fit.cov)
-        LOGGER.info("%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px)
+        LOGGER.debug("%s: optics from %d stars, rms %.3f px", name, fit.n_stars, fit.residual_px)
     return Calibrated(
         concat(CALIBRATIONS, rows) if rows else empty(CALIBRATIONS),
         with_optics(cameras, changed),

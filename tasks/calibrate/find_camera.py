@@ -18,7 +18,7 @@ import pyarrow.compute as pc
 from epipole.io.catalogues.star_catalogue import read_star_catalogue
 from epipole.io.work.parts import Parts
 from epipole.io.work.work_layout import ReadFolder
-from epipole.schemas.bridge import array, concat, flatten
+from epipole.schemas.bridge import array, concat, flatten, rows_with
 from epipole.schemas.settings import IdentificationSettings, SensorSettings
 from epipole.schemas.spans import Sensor, Span
 from epipole.schemas.stages import Stage
@@ -84,7 +84,7 @@ class CameraFinding(NamedTuple):
 
     def cameras(self, nominal: pa.Table, camera: Camera) -> pa.Table:
         """Return the sensor's rows of CAMERAS with this camera."""
-        of_sensor = nominal.filter(pc.field("sensor_id") == self.sensor_id)
+        of_sensor = rows_with(nominal, "sensor_id", self.sensor_id)
         return with_optics(of_sensor, {self.sensor_id: camera._asdict()})
 
     def __str__(self) -> str:
@@ -126,7 +126,7 @@ def contradicts_camera(
     """
     rows = _solutions(identified, spans)
     tried = pc.sum(pc.greater_equal(rows["n_centroids"], MIN_CENTROIDS)).as_py() or 0
-    solved = rows.filter(pc.field("attitude_source") == "stars")
+    solved = rows_with(rows, "attitude_source", "stars")
     camera = _only_camera(cameras, sensor.sensor_id)
     if (tried > 0 and solved.num_rows <= MAX_IDENTIFIED * tried) or residuals_are_large(solved):
         return True
@@ -207,7 +207,7 @@ def _find_sensor_camera(
 ) -> CameraFinding | None:
     camera = _only_camera(cameras, sensor.sensor_id)
     tried = _solutions(identified, spans).filter(pc.field("n_centroids") >= MIN_CENTROIDS)
-    solved = tried.filter(pc.field("attitude_source") == "stars")
+    solved = rows_with(tried, "attitude_source", "stars")
     some = solved.num_rows > MAX_IDENTIFIED_TO_WARN * tried.num_rows
     tried = solved if some else tried  # the others may show the Earth
     if camera is None or not tried.num_rows:
@@ -299,6 +299,6 @@ def _frame_with_state(
 
 def _only_camera(cameras: pa.Table, sensor_id: str) -> Camera | None:
     """Return the camera of a sensor, None if it has several or none."""
-    rows = cameras.filter(pc.field("sensor_id") == sensor_id)
+    rows = rows_with(cameras, "sensor_id", sensor_id)
     different = {camera_of(rows, k) for k in range(rows.num_rows)}
     return different.pop() if len(different) == 1 else None

@@ -47,12 +47,14 @@ class Frames(NamedTuple):
 
 def solved_frames(solutions: pa.Table) -> Frames:
     """Return the frames of a `solutions` table that have an attitude, in time order."""
-    return _frames(solutions.filter(pa.compute.field("attitude_source") != "none"))
+    return _frames(solutions.filter(pc.not_equal(solutions["attitude_source"], "none")))
 
 
 def unsolved_frames(solutions: pa.Table) -> Frames:
     """Return the frames of a `solutions` table with a camera but no attitude, in time order."""
-    unsolved = (pa.compute.field("attitude_source") == "none") & (pa.compute.field("camera") >= 0)
+    unsolved = pc.and_(
+        pc.equal(solutions["attitude_source"], "none"), pc.greater_equal(solutions["camera"], 0)
+    )
     frames = _frames(solutions.filter(unsolved))
     n = len(frames.number)
     return frames._replace(

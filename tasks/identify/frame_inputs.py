@@ -130,7 +130,7 @@ def interpolate_sensor_states(
         for column, values in zip(at_frames, _possible(found), strict=True):
             column[frames] = values
     without = np.count_nonzero(np.isnan(at_frames.r_gcrf_km[:, 0]))
-    LOGGER.info(
+    LOGGER.debug(
         "interpolated the states of %d frames; %d have no state near in time", n - without, without
     )
     by_name = {

@@ -91,7 +91,7 @@ def identify_stars(
         detections,
         rejects_table(exposures, centroids, left_out),
     )
-    LOGGER.info(
+    LOGGER.debug(
         "%s: identified %d of %d frames, %d stars, %d other centroids",
         exposures["sensor_id"][0], np.sum(attitudes.source == "stars"), exposures.num_rows,
         result.stars.num_rows, result.detections.num_rows,

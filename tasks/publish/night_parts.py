@@ -52,7 +52,7 @@ def publish_nights(
 # Slices of time: rows of a span from many parts, merged in slices that fit in memory.
 
 MAX_ROWS = 200_000  # in a slice, about
-ROWS_OF_TABLE = 600  # with many tables a slice has more rows: each table is opened for each slice
+ROWS_OF_TABLE = 200  # with many tables a slice has more rows: each table is opened for each slice
 
 
 def in_slices(

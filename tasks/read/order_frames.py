@@ -19,7 +19,7 @@ import pyarrow.compute as pc
 from epipole.io.logs.left_out import frames_left_out, stray_rejects
 from epipole.io.work.parts import READ_SENSOR, read_part, write_part
 from epipole.io.work.work_layout import ReadFolder
-from epipole.schemas.bridge import array, concat, conform, table, unstack_covariance
+from epipole.schemas.bridge import array, concat, conform, rows_with, table, unstack_covariance
 from epipole.schemas.columns import OPTICS_AXES
 from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import SensorSettings
@@ -305,7 +305,7 @@ def _sorted_states(
     states, names = [], []
     for source, log, piece in sensor.pieces:
         all_states = read_part(folder.piece(log, piece), "states")
-        states.append(all_states.filter(pc.field("sensor_id") == sensor.sensor_id))
+        states.append(rows_with(all_states, "sensor_id", sensor.sensor_id))
         names += [source.name] * states[-1].num_rows
     rows = concat(LOG_STATES, states)
     order, repeats = order_states(np.zeros(rows.num_rows, np.int64), array(rows, "time"))

@@ -81,7 +81,7 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
         source = piece.source or source
     assert source is not None, "the last piece has it"
     n_frames = sum(found.n_frames for found in sensors.values())
-    LOGGER.info("%s: read %d frames in %d pieces", source.name, n_frames, n_pieces)
+    LOGGER.debug("%s: read %d frames in %d pieces", source.name, n_frames, n_pieces)
     return ReadLog(number, n_pieces, source, sensors)
 
 

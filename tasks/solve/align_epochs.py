@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 
-from epipole.schemas.bridge import array, concat, table
+from epipole.schemas.bridge import array, concat, rows_with, table
 from epipole.schemas.settings import AlignmentSettings
 from epipole.schemas.tables import EPOCHS
 from epipole.tasks.algorithms.times import (
@@ -45,9 +46,8 @@ def night_grid(time_ns: Sequence[npt.NDArray[np.int64]], settings: AlignmentSett
 
 def usable_frames(solutions: pa.Table) -> pa.Table:
     """Return the frames that have an attitude and a position."""
-    return solutions.filter(
-        (pa.compute.field("attitude_source") != "none") & pa.compute.field("x_km").is_valid()
-    )
+    has_attitude = pc.not_equal(solutions["attitude_source"], "none")
+    return solutions.filter(pc.and_(has_attitude, pc.is_valid(solutions["x_km"])))
 
 
 def align_epochs(
@@ -59,7 +59,7 @@ def align_epochs(
     """
     served = usable_frames(solutions).sort_by("time")
     sensors = sorted(set(served["sensor_id"].to_pylist()))
-    parts = [served.filter(pa.compute.field("sensor_id") == s) for s in sensors]
+    parts = [rows_with(served, "sensor_id", s) for s in sensors]
     times = [array(part, "time") for part in parts]
     if not parts:
         return concat(EPOCHS, [])

@@ -1,5 +1,6 @@
 """Planets: their apparent directions for a sensor, with error bounds."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import erfa
@@ -52,9 +53,9 @@ def planet_directions(
     time_ns = np.asarray(time_ns, np.int64)
     if not len(time_ns):
         return np.zeros((0, len(NUMBERS), 3)), np.zeros((0, len(NUMBERS)))
-    origin = int(time_ns.min())
-    t = (time_ns - origin) / 1e9
-    paths = _paths(origin, int(time_ns.max()))
+    first, last = int(time_ns.min()) // _NODE_NS, -(-int(time_ns.max()) // _NODE_NS)
+    t = (time_ns - first * _NODE_NS) / 1e9
+    paths = _paths(first, last)
     seen, earth_km_s = paths.seen(t), paths.earth_km(t, 1)
     line = seen[..., :3] - r_gcrf_km[:, None]
     reach = np.sqrt(np.einsum("npa,npa->np", line, line))
@@ -74,11 +75,15 @@ class _Paths(NamedTuple):
     earth_km: CubicSpline
 
 
-def _paths(first_ns: int, last_ns: int) -> _Paths:
-    """Return the splines from first to last time, UTC since 1970 [ns]."""
+@lru_cache(maxsize=16)
+def _paths(first: int, last: int) -> _Paths:
+    """Return the splines from the first node to the last, counted from 1970; times from the first.
+
+    Sensors share them: 6 ms.
+    """
     # Light from Neptune takes more than four hours.
-    nodes = np.arange(first_ns - 33 * _NODE_NS, last_ns + 3 * _NODE_NS, _NODE_NS)
-    at = (nodes - first_ns) / 1e9
+    nodes = np.arange(first - 33, last + 3) * _NODE_NS
+    at = (nodes - first * _NODE_NS) / 1e9
     jd = tt_julian_date(nodes)
     from_sun, barycentric = erfa.epv00(*jd)
     earth_km = CubicSpline(at, barycentric["p"] * AU_KM)

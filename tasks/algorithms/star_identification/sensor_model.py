@@ -32,6 +32,7 @@ DEEPER_MAG = 2.0  # how far beyond the first guess it is searched for
 # Solved frames in which the faintest star is searched for: a match in the deep sky takes five times
 # as long as in that of the sensor, and neighbouring frames show the same stars.
 LIMIT_FRAMES = 8
+TURNED_RAD = 0.05  # stars are chosen anew for a frame that is turned by more than this
 MIN_FLUXES = 8  # matches with a flux from which a zero point is taken
 # Floors that are tried, as factors on the median of the stated errors.
 FLOORS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 8.0)
@@ -218,16 +219,21 @@ def faintest_star(
     if len(edges) < 2:
         return start
     in_view, matched, expected_false = np.zeros((3, len(edges) - 1))
+    axis, u, magnitude = np.empty(0), np.empty((0, 3)), np.empty(0)  # the stars around an axis
     for frame, solution in zip(frames, solutions, strict=True):
         if solution is None:
             continue
         R = solution.R_sensor_from_icrs
         x0, x1, y0, y1 = frame.optics.box
-        ahead = deep.catalogue.u_icrs @ R[2] > np.cos(frame.optics.half_diagonal_rad)
-        v = deep.catalogue.u_icrs[ahead] @ R.T
+        if not len(axis) or R[2] @ axis < np.cos(TURNED_RAD):
+            axis, reach = R[2], min(frame.optics.half_diagonal_rad + TURNED_RAD, np.pi)
+            around = np.flatnonzero(deep.catalogue.u_icrs @ axis > np.cos(reach))
+            u, magnitude = deep.catalogue.u_icrs[around], deep.catalogue.magnitude[around]
+        ahead = u @ R[2] > np.cos(frame.optics.half_diagonal_rad)
+        v = u[ahead] @ R.T
         x, y = v[:, 0] / v[:, 2], v[:, 1] / v[:, 2]
         inside = (x > x0) & (x < x1) & (y > y0) & (y < y1)
-        n = np.histogram(deep.catalogue.magnitude[ahead][inside], edges)[0]
+        n = np.histogram(magnitude[ahead][inside], edges)[0]
         star = solution.star[solution.star >= 0]
         in_view += n
         matched += np.histogram(deep.catalogue.magnitude[star], edges)[0]
