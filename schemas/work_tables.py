@@ -17,6 +17,7 @@ from epipole.schemas.columns import (
 )
 from epipole.schemas.observation import FITTED_FIELDS
 from epipole.schemas.tables import (
+    ASSOCIATIONS,
     EPOCH,
     EPOCHS,
     F64,
@@ -429,6 +430,15 @@ OBJECT_VIEWS = schema(
     "object_views",
     "One row per view of an object, at the epochs of `clock_lines`, also where no line was kept.",
     [VIEWS.field(name) for name in ("epoch", "sensor_id", "tracklet_id")],
+)
+
+OBJECT_DETECTIONS = schema(
+    "object_detections",
+    "One row per detection of an object near midnight: two nights name the object alike by them.",
+    [
+        ASSOCIATIONS.field(name)
+        for name in ("object_id", "sensor_id", "frame_number", "centroid", "used")
+    ],
 )
 
 MOVING_OBJECTS = schema(

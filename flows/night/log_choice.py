@@ -7,7 +7,6 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-from prefect.runtime import flow_run
 from pydantic import Field
 
 from epipole.io.logs.listing import list_logs
@@ -150,6 +149,8 @@ def night_asked(night: str | None) -> str | None:
     if night is None:
         return None
     if night == YESTERDAY:
+        from prefect.runtime import flow_run  # not above: an unchanged night needs no Prefect
+
         due: datetime.datetime = flow_run.scheduled_start_time
         return (due.astimezone(datetime.UTC).date() - datetime.timedelta(days=1)).isoformat()
     try:
@@ -160,6 +161,8 @@ def night_asked(night: str | None) -> str | None:
 
 def run_name() -> str:
     """Return the name of a run on Prefect's page, such as ``night 2019-04-01``."""
+    from prefect.runtime import flow_run  # not above, as in `night_asked`
+
     asked: dict[str, Any] = flow_run.parameters
     try:
         night = night_asked(asked.get("night"))

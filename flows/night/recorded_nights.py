@@ -37,7 +37,7 @@ from epipole.schemas.errors import DatasetError
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.tables import NIGHTS, STATES
-from epipole.tasks.name.object_ids import VIEWS
+from epipole.schemas.work_tables import OBJECT_DETECTIONS
 
 # The table `nights`: what a night was made from, with which settings, and what it has.
 
@@ -99,7 +99,7 @@ class EarlierNights:
     _left_out: set[str] = field(default_factory=set)  # that cannot be read
 
     def last_views(self, night: str) -> pa.Table:
-        """Return the `VIEWS` of the last half hour before a night, each detection once.
+        """Return the OBJECT_DETECTIONS of the last half hour before a night, each detection once.
 
         Objects that were followed over midnight keep their ids.
         """
@@ -107,7 +107,7 @@ class EarlierNights:
         start_ns = day_of(night) * DAY_NS
         between_ns = (start_ns - SPAN_NS, start_ns)
         found = self._read(before, lambda where: _views(where, before, between_ns))
-        return found or VIEWS.empty_table()
+        return found or OBJECT_DETECTIONS.empty_table()
 
     def last_states(self, night: str, settings: Settings) -> pa.Table:
         """Return the last STATES of each object before a night.
@@ -155,10 +155,10 @@ class EarlierNights:
 def _views(where: str, night: str, between_ns: tuple[int, int]) -> pa.Table:
     def used(rows: pa.Table) -> pa.Table:
         chosen = to_polars(rows).filter("used").drop_nulls("centroid")
-        return from_polars(VIEWS, chosen.unique(maintain_order=True))
+        return from_polars(OBJECT_DETECTIONS, chosen.unique(maintain_order=True))
 
-    pieces = table_pieces(where, "associations", night, VIEWS.names, between_ns)
-    return _kept(VIEWS, map(used, pieces), f"{where}/night={night}/associations")
+    pieces = table_pieces(where, "associations", night, OBJECT_DETECTIONS.names, between_ns)
+    return _kept(OBJECT_DETECTIONS, map(used, pieces), f"{where}/night={night}/associations")
 
 
 def _states(where: str, night: str, between_ns: tuple[int, int]) -> pa.Table:

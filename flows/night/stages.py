@@ -26,6 +26,7 @@ from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, Span, day_of
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import POSITIONS, REJECTS, STATES
+from epipole.schemas.work_tables import OBJECT_DETECTIONS
 from epipole.tasks.check.check_sensors import (
     REASONS,
     SensorVerdict,
@@ -39,7 +40,6 @@ from epipole.tasks.name.elements_of_night import ElementsOfNight, elements_of_ni
 from epipole.tasks.name.known_objects import name_known_objects
 from epipole.tasks.name.link_tracklets import OrbitLinks, link_tracklets
 from epipole.tasks.name.object_ids import (
-    VIEWS,
     Names,
     followed_objects,
     link_objects,
@@ -242,7 +242,7 @@ def name(
 ) -> Names:
     """Return, for each span, the names of its objects in the night.
 
-    `before` are the `VIEWS` of the night before, as far as it is known.
+    `before` are the OBJECT_DETECTIONS of the night before, as far as it is known.
     """
     step(Stage.NAME, 0, 1)
     spans = [span for span in work.all_spans() if solved.holds(span)]
@@ -263,7 +263,7 @@ def name(
         renamed(rows, linked[span.folder])
         for span in spans
         if span.end_ns <= day_of(night) * DAY_NS
-        for rows in solved.read(span, "associations", VIEWS.names)
+        for rows in solved.read(span, "associations", OBJECT_DETECTIONS.names)
     ]
     followed = followed_objects(views, before)
     names = name_objects(linked, spans_of_night(spans, night), night, followed)

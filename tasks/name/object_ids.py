@@ -15,7 +15,7 @@ from epipole.schemas.columns import POSITION, STATE_AXES, VELOCITY
 from epipole.schemas.settings import StateSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
-from epipole.schemas.tables import ASSOCIATIONS
+from epipole.schemas.work_tables import OBJECT_DETECTIONS
 from epipole.tasks.algorithms.orbits.object_linking import ObservedMotions, chains, link_by_motion
 from epipole.tasks.common.stage_tasks import stage_task
 
@@ -107,7 +107,6 @@ def _seconds(ends: pl.DataFrame, name: str, origin: object) -> Array:
 # detections.
 
 _DETECTION = ["sensor_id", "frame_number", "centroid"]
-VIEWS = pa.schema([ASSOCIATIONS.field(name) for name in ("object_id", *_DETECTION, "used")])
 
 
 def followed_objects(solved: Iterable[pa.Table], published: pa.Table) -> dict[str, str]:
@@ -116,16 +115,16 @@ def followed_objects(solved: Iterable[pa.Table], published: pa.Table) -> dict[st
     Parameters
     ----------
     solved
-        `VIEWS` before midnight, of this night's solution.
+        OBJECT_DETECTIONS before midnight, of this night's solution.
     published
-        `VIEWS` of the night before, as published. Views of other times do no harm.
+        OBJECT_DETECTIONS of the night before, as published. Views of other times do no harm.
 
     Notes
     -----
     The object that shares most detections gets the id, if more than half of its detections that
     have an id have this one. No two objects get one id.
     """
-    ours, theirs = _detections(concat(VIEWS, solved)), _detections(published)
+    ours, theirs = _detections(concat(OBJECT_DETECTIONS, solved)), _detections(published)
     shared = ours.join(theirs.rename({"object_id": "id"}), on=_DETECTION)
     counts = shared.group_by("object_id", "id").len()
     counts = counts.with_columns(share=pl.col("len") / pl.col("len").sum().over("object_id"))

@@ -322,3 +322,12 @@ def test_export_says_what_it_wrote(epipole, night_dataset, tmp_path):
     assert json.loads(as_json)["files"] == sorted(p.name for p in (tmp_path / "b").iterdir())
     code, _, err = epipole(*command, "b")
     assert (code, err.count("\n")) == (1, 1)
+
+
+def test_an_unchanged_night_is_found_without_prefect():
+    # Prefect takes two seconds to import: more than all else that such a run does.
+    code = (
+        "import sys; import epipole.flows.command_line.run_nightly\n"
+        "assert 'prefect' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

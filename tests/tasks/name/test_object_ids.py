@@ -16,9 +16,9 @@ from epipole.schemas.scene import validate_scene
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import SPAN_NS, Span
 from epipole.schemas.tables import ASSOCIATIONS, POSITIONS, STATES
+from epipole.schemas.work_tables import OBJECT_DETECTIONS
 from epipole.tasks.algorithms.orbits.orbit_fit import propagate
 from epipole.tasks.name.object_ids import (
-    VIEWS,
     followed_objects,
     link_objects,
     name_objects,
@@ -145,7 +145,7 @@ def views(*rows):
     """Rows: object, frame number, centroid, used; all of one sensor."""
     columns = ("object_id", "frame_number", "centroid", "used")
     named = [dict(zip(columns, row, strict=True)) | {"sensor_id": "a"} for row in rows]
-    return pa.Table.from_pylist(named, schema=VIEWS)
+    return pa.Table.from_pylist(named, schema=OBJECT_DETECTIONS)
 
 
 BEFORE = views(("x", 1, 0, True), ("x", 2, 0, True), ("y", 1, 1, True), ("z", 1, 2, False))
@@ -168,7 +168,7 @@ def test_views_of_missed_detections_do_not_count():
 
 def test_an_id_goes_to_one_object_only_the_one_that_shares_more():
     own = views(("1", 1, 0, True), ("2", 2, 0, True), ("2", 3, 0, True))
-    before = concat(VIEWS, [BEFORE, views(("x", 3, 0, True))])
+    before = concat(OBJECT_DETECTIONS, [BEFORE, views(("x", 3, 0, True))])
     assert followed_objects([own], before) == {"2": "x"}
 
 
@@ -184,7 +184,7 @@ def test_each_detection_counts_once():
 
 def test_without_a_night_before_all_objects_are_new():
     own = views(("1", 1, 0, True))
-    assert followed_objects([own], VIEWS.empty_table()) == {}
+    assert followed_objects([own], OBJECT_DETECTIONS.empty_table()) == {}
     assert followed_objects([], BEFORE) == {}
 
 
