@@ -412,6 +412,22 @@ class WorkSettings(Group):
         return self.memory_mib * 2**20 // BYTES_PER_VIEW
 
 
+class TableSettings(Group):
+    """What is left out of the largest tables. Nothing else depends on it."""
+
+    stars_every: int = Field(
+        1,
+        ge=0,
+        description="The stars of every N-th frame of a sensor are published: 1: of all frames, "
+        "0: of none. They are nine tenths of a dataset.",
+    )
+    detections: Literal["all", "tracked"] = Field(
+        "all",
+        description="Which detections are published: 'all', or 'tracked': only those of tracklets "
+        "and objects.",
+    )
+
+
 class ReportSettings(Group):
     """The report of a night: a page with pictures. It changes no table."""
 
@@ -435,6 +451,7 @@ class Settings(Group):
     linking: LinkingSettings = LinkingSettings()
     known_objects: KnownObjectSettings = KnownObjectSettings()
     work: WorkSettings = WorkSettings()
+    tables: TableSettings = TableSettings()
     report: ReportSettings = ReportSettings()
 
     @model_validator(mode="after")

@@ -310,7 +310,7 @@ def write_night(
     spans = work.all_spans()
     sensors = list(work.sensor_parts().values())
     of_night = spans_of_night(spans, night)
-    parts = NightParts(night, of_night, spans, sensors, solved, names, whole)
+    parts = NightParts(night, of_night, spans, sensors, solved, names, whole, kept=settings.tables)
     parts, orbits = _link(parts, settings)
     futures = [write_tables.submit(tables, folder, parts) for tables in SHARES]
     results(Stage.PUBLISH, futures)

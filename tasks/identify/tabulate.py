@@ -120,6 +120,11 @@ def _frame_key(exposures: pa.Table, frame: npt.NDArray[np.int64]) -> dict[str, A
     }
 
 
+# Residuals are rounded to 2^-20 pixel: a millionth, where errors of centroids are hundredths. Their
+# last bits are noise that no compression shortens: 3.5 bytes each instead of 6.5.
+RESIDUAL_STEPS = 2.0**20
+
+
 def stars_table(
     exposures: pa.Table,
     frame_states: pa.Table,
@@ -145,8 +150,8 @@ def stars_table(
             "magnitude": m.magnitude,
             "x_px": c.x_px[m.at],
             "y_px": c.y_px[m.at],
-            "dx_px": dx,
-            "dy_px": dy,
+            "dx_px": np.round(dx * RESIDUAL_STEPS) / RESIDUAL_STEPS,
+            "dy_px": np.round(dy * RESIDUAL_STEPS) / RESIDUAL_STEPS,
         },
     )
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 from epipole.io.datasets.dataset import publish_folders
 from epipole.io.work.work_layout import SensorParts, SolvedParts
 from epipole.schemas.bridge import array
+from epipole.schemas.settings import TableSettings
 from epipole.schemas.spans import Span
 from epipole.schemas.stages import Stage
 from epipole.schemas.work_tables import LINKED_TRACKLETS
@@ -25,7 +26,7 @@ class NightParts(NamedTuple):
     `spans` are the night's, in order; `all_spans` also has one before and after it. `names` has,
     for the folder of each span, the names in the night of its objects. `whole` has tables that
     belong to no span: `calibrations`, `checks`, `sources`, and some of the `rejects`. `linked` are
-    LINKED_TRACKLETS.
+    LINKED_TRACKLETS. `kept` says which rows are published.
     """
 
     night: str
@@ -36,6 +37,7 @@ class NightParts(NamedTuple):
     names: Mapping[str, Mapping[str, str]]
     whole: Mapping[str, pa.Table]
     linked: pa.Table = LINKED_TRACKLETS.empty_table()
+    kept: TableSettings = TableSettings()
 
 
 # Publication: the staged tables become the dataset's, all at once.

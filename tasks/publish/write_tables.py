@@ -15,7 +15,7 @@ from epipole.io.datasets.rows_by_night import in_order, rows_of_night
 from epipole.io.work.parts import read_part
 from epipole.schemas.bridge import array, concat, conform, from_polars, table, to_polars
 from epipole.schemas.rejects import Outcome, Reason, Trait, reject_rows
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import Settings, TableSettings
 from epipole.schemas.spans import DAY_NS, Span, spans_between
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import ASSOCIATIONS, REJECTS, SOURCES, TABLES, TRACKLETS
@@ -100,8 +100,20 @@ def _of_sensors(name: str, parts: NightParts) -> Iterator[pa.Table]:
     """Yield the rows of all sensors, sorted by time and then sensor, some time of a span each."""
     slices = _detections(parts) if name == "detections" else _identified(name, parts)
     for rows in slices:
-        together = concat(TABLES[name], rows)
+        together = published_rows(name, concat(TABLES[name], rows), parts.kept)
         yield together.take(np.argsort(array(together, "time"), kind="stable"))
+
+
+def published_rows(name: str, rows: pa.Table, kept: TableSettings) -> pa.Table:
+    """Return the rows of a table that the settings do not leave out."""
+    if name == "stars" and kept.stars_every != 1:
+        number = array(rows, "frame_number")
+        chosen = number % kept.stars_every == 0 if kept.stars_every else np.zeros(len(number), bool)
+        return rows.filter(pa.array(chosen))
+    if name == "detections" and kept.detections == "tracked":
+        is_object = pc.equal(rows["kind"], "object")
+        return rows.filter(pc.or_(is_object, pc.is_valid(rows["tracklet_id"])))
+    return rows
 
 
 def _identified(name: str, parts: NightParts) -> Iterator[list[pa.Table]]:

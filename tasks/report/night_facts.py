@@ -174,7 +174,7 @@ def _faults(facts: NightFacts) -> Iterator[str]:
 def _nothing_found(facts: NightFacts) -> Iterator[str]:
     if facts.series is None:
         yield "The night has no frames."
-    elif not facts.counts["stars"]:
+    elif not facts.series.counts[0].any():
         yield "No star is identified in the whole night."
     elif not facts.objects:
         yield "No object is found."

@@ -247,7 +247,7 @@ def image_residuals(facts: NightFacts) -> Section:
     """Return the section about residuals over the image."""
     title, residuals = "Residuals over the image", facts.residuals
     if residuals is None:
-        return Section("image", title, nothing("No star is identified."))
+        return Section("image", title, nothing("The table `stars` is empty."))
     pictures = [_image_picture(residuals, k) for k in _most_patterned(residuals)]
     how = (
         "Mean star residual in each part of the image. Arrows should point in all directions, and "

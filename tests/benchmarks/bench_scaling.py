@@ -1,12 +1,14 @@
 """CPU and memory of a night of many sensors, by stage, and what a unit of its data costs.
 
-`python tests/benchmarks/bench_scaling.py [--sensors 8 32 128] [--hours 0.17] [--objects 60]`. Each
-row is one `epipole run` of `epipole simulate night`, in its own process and with cached kernels.
+`python tests/benchmarks/bench_scaling.py [--sensors 8 32 128] [--hours 0.17] [--objects 60]`, or
+`[--satellites 24 96 384] [--seconds 30]`. Each row is one `epipole run` of `epipole simulate night`,
+or of `epipole simulate constellation` (two sensors a satellite, a log each), in its own process.
 Needs Linux: the CPU of each stage is read from /proc at the log line that ends it.
 """
 
 import argparse
 import os
+import shutil
 import subprocess
 import tempfile
 from pathlib import Path
@@ -29,10 +31,10 @@ class Night(NamedTuple):
     bytes: int
 
 
-def simulate(log: Path, sensors: int, objects: int, hours: float) -> None:
-    """Write the log of a night."""
-    numbers = ["--sensors", sensors, "--objects", objects, "--hours", hours]
-    command = [*COMMAND, "simulate", "night", *map(str, numbers), "--out", str(log)]
+def simulate(log: Path, scene: str, **numbers: float) -> None:
+    """Write the log of a night, or the logs of a constellation in a folder."""
+    options = [word for name, value in numbers.items() for word in (f"--{name}", str(value))]
+    command = [*COMMAND, "simulate", scene, *options, "--out", str(log)]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
 
 
@@ -77,14 +79,27 @@ def main() -> None:
     arguments.add_argument("--sensors", type=int, nargs="+", default=[8, 32, 128])
     arguments.add_argument("--objects", type=int, default=60)
     arguments.add_argument("--hours", type=float, default=0.17)
+    arguments.add_argument("--satellites", type=int, nargs="+")
+    arguments.add_argument("--seconds", type=float, default=30.0)
     chosen: Any = arguments.parse_args()
+    if chosen.satellites:
+        scenes = {
+            2 * n: ("constellation", {"satellites": n, "seconds": chosen.seconds})
+            for n in chosen.satellites
+        }
+    else:
+        scenes = {
+            n: ("night", {"sensors": n, "objects": chosen.objects, "hours": chosen.hours})
+            for n in chosen.sensors
+        }
     print("| sensors | frames | detections | " + " | ".join(STAGES) + " | CPU s | MiB | disk MiB |")
     with tempfile.TemporaryDirectory() as folder:
-        for sensors in chosen.sensors:
-            log, out = Path(folder) / f"{sensors}.mcap", Path(folder) / f"out{sensors}"
-            simulate(log, sensors, chosen.objects, chosen.hours)
+        for sensors, (scene, numbers) in scenes.items():
+            name = f"{sensors}" if chosen.satellites else f"{sensors}.mcap"
+            log, out = Path(folder) / name, Path(folder) / f"out{sensors}"
+            simulate(log, scene, **numbers)
             night = run(log, out)
-            log.unlink()
+            shutil.rmtree(log) if log.is_dir() else log.unlink()
             stages = " | ".join(f"{night.stages.get(name, 0.0):.1f}" for name in STAGES)
             print(
                 f"| {sensors} | {night.rows['frames']:,} | {night.rows['detections']:,} | {stages} "

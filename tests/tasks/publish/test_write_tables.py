@@ -6,7 +6,7 @@ import pytest
 
 from epipole.schemas.bridge import array, concat, empty
 from epipole.schemas.rejects import Reason, reject_rows
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import Settings, TableSettings
 from epipole.schemas.spans import DAY_NS
 from epipole.schemas.tables import REJECTS, SOURCES, TABLES
 from epipole.schemas.work_tables import LogSource
@@ -17,6 +17,7 @@ from epipole.tasks.publish.write_tables import (
     WHOLE,
     counted,
     into_nights,
+    published_rows,
     source_table,
 )
 
@@ -91,3 +92,24 @@ def test_sources_have_the_code_and_settings_that_made_the_night():
     assert (row["name"], row["size"], row["sha256"]) == ("n.mcap", 5, "ab")
     assert row["settings_key"] == Settings().key()
     assert row["code_version"]
+
+
+@pytest.mark.parametrize(("every", "left"), [(1, [0, 1, 2, 4, 5]), (2, [0, 2, 4]), (0, [])])
+def test_stars_of_some_frames_are_published(every, left):
+    stars = [{f.name: 0 for f in TABLES["stars"]} | {"sensor_id": "a", "frame_number": k}
+             for k in (0, 1, 2, 4, 5)]  # fmt: skip
+    rows = pa.Table.from_pylist(stars, schema=TABLES["stars"])
+    found = published_rows("stars", rows, TableSettings(stars_every=every))
+    assert array(found, "frame_number").tolist() == left
+
+
+def test_tracked_detections_are_those_of_tracklets_and_objects():
+    schema = TABLES["detections"]
+    kinds = [("object", None), ("object", "t"), ("hot_pixel", "t"), ("unclassified", None)]
+    filled = {f.name: "" if f.type == pa.string() else 0 for f in schema}
+    rows = pa.Table.from_pylist(
+        [filled | {"kind": kind, "tracklet_id": name} for kind, name in kinds], schema=schema
+    )
+    assert published_rows("detections", rows, TableSettings()).equals(rows)
+    tracked = published_rows("detections", rows, TableSettings(detections="tracked"))
+    assert tracked.equals(rows.slice(0, 3))

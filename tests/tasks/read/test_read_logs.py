@@ -21,7 +21,7 @@ def test_a_log_becomes_pieces_with_the_declared_tables(tmp_path, caplog):
                 "s", START_NS + k, frame_number=k, exposure_s=0.1, x_px=[1.0], y_px=[2.0]
             )  # fmt: skip
     folder = ReadFolder(tmp_path)
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.DEBUG):
         read = read_log_into(folder, 3, str(tmp_path / "a.mcap"))
     assert (read.number, read.source.name) == (3, "a.mcap")
     pieces = [folder.piece(3, k) for k in range(read.n_pieces)]
