@@ -1,8 +1,8 @@
 """CPU and memory of a night of many sensors, by stage, and what a unit of its data costs.
 
 `python tests/benchmarks/bench_scaling.py [--sensors 8 32 128] [--hours 0.17] [--objects 60]`, or
-`[--satellites 24 96 384] [--seconds 30]`. Each row is one `epipole run` of `epipole simulate night`,
-or of `epipole simulate constellation` (two sensors a satellite, a log each), in its own process.
+`[--satellites 24 96 384] [--seconds 30]`. Each row is one `epipole run`, in its own process: of
+`epipole simulate night`, or of `epipole simulate constellation`, two sensors and a log a satellite.
 Needs Linux: the CPU of each stage is read from /proc at the log line that ends it.
 """
 
