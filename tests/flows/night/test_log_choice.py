@@ -6,13 +6,13 @@ from unittest.mock import patch
 
 import fsspec
 import numpy as np
+import prefect.runtime
 import pytest
 from prefect.exceptions import ParameterTypeError
 from prefect.utilities.callables import parameter_schema
 from prefect.utilities.schema_tools.validation import ValidationError, validate
 
 from epipole.flows.night import log_choice
-from epipole.flows.night import log_choice as parameters
 from epipole.flows.night.log_choice import find_logs, night_asked, run_name
 from epipole.flows.nightly import nightly
 from epipole.io.logs.writer import LogWriter
@@ -197,11 +197,13 @@ def test_the_form_on_the_page_says_what_each_parameter_is():
 
 def test_yesterday_is_the_day_before_the_run_was_scheduled():
     due = datetime.datetime(2019, 4, 2, 6, tzinfo=datetime.UTC)
-    with patch.object(parameters, "flow_run", DueAt(due, {"night": "yesterday"})):
+    with patch.object(prefect.runtime, "flow_run", DueAt(due, {"night": "yesterday"})):
         assert night_asked("yesterday") == "2019-04-01"
         assert run_name() == "night 2019-04-01"
     zone = datetime.timezone(datetime.timedelta(hours=9))
-    with patch.object(parameters, "flow_run", DueAt(due.astimezone(zone), {"logs": "/data/logs"})):
+    with patch.object(
+        prefect.runtime, "flow_run", DueAt(due.astimezone(zone), {"logs": "/data/logs"})
+    ):
         assert night_asked("yesterday") == "2019-04-01"
         assert run_name() == "all nights of logs"
 
@@ -214,7 +216,7 @@ def test_yesterday_is_the_day_before_the_run_was_scheduled():
     ],
 )  # fmt: skip
 def test_a_run_of_no_one_night_is_called_by_its_logs(logs, name):
-    with patch.object(parameters, "flow_run", DueAt(None, {"logs": logs})):
+    with patch.object(prefect.runtime, "flow_run", DueAt(None, {"logs": logs})):
         assert run_name().startswith(f"all nights of {name[:50]}")
         assert len(run_name()) < 90
 
@@ -228,5 +230,5 @@ class DueAt:
 def test_a_day_that_no_month_has_is_an_error_of_the_run():
     with pytest.raises(EpipoleError, match=r"night 2019-02-30: no such date; give one such as"):
         night_asked("2019-02-30")
-    with patch.object(parameters, "flow_run", DueAt(None, {"night": "2019-02-30"})):
+    with patch.object(prefect.runtime, "flow_run", DueAt(None, {"night": "2019-02-30"})):
         assert run_name() == "night 2019-02-30"

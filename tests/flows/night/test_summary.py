@@ -70,7 +70,7 @@ def test_staged_nights_are_counted_together(tmp_path):
         tmp_path / "1",
         frames={
             "sensor_id": ["a", "a", "b"], "attitude_source": ["stars", "prior", "none"],
-            "residual_px": pa.array([0.25, None, None]),
+            "residual_px": pa.array([0.25, None, None]), "n_stars": [4, 0, 0],
         },
         tracklets={
             "sensor_id": ["a", "a", "b"], "track_id": ["t", "t", "u"],
@@ -91,7 +91,7 @@ def test_staged_nights_are_counted_together(tmp_path):
         rejects=reject_rows(reasons, time=[1, 2, 3, 4], count=[3, 8, 3, 1]),
         frames={
             "sensor_id": ["a"], "attitude_source": ["stars"], "residual_px": pa.array([0.75]),
-            "time": [7_000_000_000],
+            "n_stars": [0], "time": [7_000_000_000],
         },
         positions={"object_id": ["o"]},
         objects={"object_id": ["o"], "verdict": ["sound"]},
