@@ -6,6 +6,7 @@ import re
 import resource
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -52,17 +53,18 @@ def whole_run(
         What is measured at these lines, such as the time, by the id of the process.
     """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    summary = tempfile.TemporaryFile("w+")  # more than a pipe holds, with hundreds of sensors
     process = subprocess.Popen(
         [*COMMAND, "run", str(log), "--out", str(out), "--json"],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        stdout=summary, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
     assert process.stderr is not None
     at = {"start": measure(process.pid)}
     for line in process.stderr:
         text = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
         at |= {name: measure(process.pid) for name, word in stages.items() if text.startswith(word)}
-    written = process.stdout.read() if process.stdout else ""
-    assert process.wait() == 0, written
+    assert process.wait() == 0
+    summary.seek(0)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return WholeRun(at, json.loads(written), cpu_s, after.ru_maxrss / 1024)
+    return WholeRun(at, json.load(summary), cpu_s, after.ru_maxrss / 1024)
