@@ -53,18 +53,19 @@ def whole_run(
         What is measured at these lines, such as the time, by the id of the process.
     """
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    summary = tempfile.TemporaryFile("w+")  # more than a pipe holds, with hundreds of sensors
-    process = subprocess.Popen(
-        [*COMMAND, "run", str(log), "--out", str(out), "--json"],
-        stdout=summary, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stderr is not None
-    at = {"start": measure(process.pid)}
-    for line in process.stderr:
-        text = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
-        at |= {name: measure(process.pid) for name, word in stages.items() if text.startswith(word)}
-    assert process.wait() == 0
-    summary.seek(0)
+    command = [*COMMAND, "run", str(log), "--out", str(out), "--json"]
+    # Not a pipe: the summary of hundreds of sensors is more than a pipe holds.
+    with tempfile.TemporaryFile("w+") as written:
+        process = subprocess.Popen(command, stdout=written, stderr=subprocess.PIPE, text=True)
+        assert process.stderr is not None
+        at = {"start": measure(process.pid)}
+        for line in process.stderr:
+            text = re.sub(r"^\d\d:\d\d:\d\d ", "", line)
+            at |= {name: measure(process.pid) for name, word in stages.items()
+                   if text.startswith(word)}  # fmt: skip
+        assert process.wait() == 0
+        written.seek(0)
+        summary = json.load(written)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return WholeRun(at, json.load(summary), cpu_s, after.ru_maxrss / 1024)
+    return WholeRun(at, summary, cpu_s, after.ru_maxrss / 1024)
