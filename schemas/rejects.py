@@ -464,9 +464,8 @@ class FrameStatus(Declared):
     TIME_LIMIT = "time_limit", "The search was stopped by its time limit."
     SEARCH_LIMIT = (
         "search_limit",
-        "It was not searched, or not to the end: the searches of a sensor's frames may cost 50 ms "
-        "of CPU each on average, and those of one frame 0.5 s. Their work is counted, so it is the "
-        "same on every machine.",
+        "It was not searched, or not to the end: searches may cost a frame at most "
+        "`identification.time_limit_s`, and a sensor's frames a tenth of it each on average.",
     )
     NO_CALIBRATION = "no_calibration", "No calibration is valid for the frame."
 

@@ -128,8 +128,9 @@ class IdentificationSettings(Group):
         0.5,
         gt=0,
         le=3600,
-        description="Longest search for one frame, in seconds of a reference machine: work is "
-        "counted.",
+        description="Longest search for one frame, and ten times the longest on average over a "
+        "sensor's frames, in seconds of a reference machine: work is counted. Frames that are not "
+        "searched to the end for it have the status `search_limit`.",
     )
     calibrate: Literal["use", "report", "off"] = Field(
         "use",
@@ -418,6 +419,7 @@ class TableSettings(Group):
     stars_every: int = Field(
         1,
         ge=0,
+        le=1_000_000,
         description="The stars of every N-th frame of a sensor are published: 1: of all frames, "
         "0: of none. They are nine tenths of a dataset.",
     )

@@ -1,7 +1,7 @@
 """Crowded frames: a few stars among hundreds of false points as bright as they.
 
     python tests/benchmarks/bench_crowded_frames.py [--cameras abc] [--false N ...] [--cluster N]
-        [--frames N] [--seed S]
+        [--frames N] [--seed S] [--time-limit S]
 
 Sensors at random attitudes without priors, centroid error 0.3 px stated, a tenth of the stars
 missing; with brightness and without; through `identify_sensor` with the settings of a run. Right
@@ -17,7 +17,7 @@ from bench_star_identification import judge
 from star_frames import KINDS, Kind, expose, hipparcos_at_epoch, seen_stars
 
 from epipole.io.catalogues.hipparcos import read_hipparcos
-from epipole.schemas.settings import Settings
+from epipole.schemas.settings import IdentificationSettings
 from epipole.tasks.algorithms.geometry.camera import pixel_angle, unproject
 from epipole.tasks.algorithms.geometry.directions import canonical, matrix_from_quaternion
 from epipole.tasks.algorithms.star_identification.centroids import RawCentroids
@@ -63,11 +63,18 @@ def centroids(kind: Kind, shots: list[Array], flux: bool) -> RawCentroids:
     )  # fmt: skip
 
 
-def measure(kind: Kind, n_false: int, n_cluster: int, n: int, flux: bool, rng: Rng) -> str:
+def measure(
+    kind: Kind,
+    n_false: int,
+    n_cluster: int,
+    n: int,
+    flux: bool,
+    rng: Rng,
+    rule: IdentificationSettings,
+) -> str:
     """Return a row of the table."""
     catalogue = Catalogue(read_hipparcos())
     skies = CachedSkies(catalogue, DAY, kind.camera.pixel_rad, 2.0)
-    rule = Settings().identification
     matching = MatchSettings(rule.gate_sigma, -np.log(rule.false_alarm), rule.time_limit_s, np.nan)
     seen = seen_stars(hipparcos_at_epoch(kind.magnitude_limit + 1.0), kind)
     R = matrix_from_quaternion(canonical(rng.normal(size=(n, 4))))
@@ -78,7 +85,7 @@ def measure(kind: Kind, n_false: int, n_cluster: int, n: int, flux: bool, rng: R
     ms = 1e3 * (time.process_time() - start) / n
     answers = [s and s.R_sensor_from_icrs for s in found.solutions.each()]
     right, wrong = np.array([judge(a, b) for a, b in zip(answers, R, strict=True)]).T
-    skipped = found.status.count("not_searched")
+    skipped = sum(found.status.count(name) for name in ("not_searched", "search_limit"))
     many = right[np.array(stars) >= MANY_STARS]
     of_many = f"{100 * np.sum(many) / max(len(many), 1):.0f} of {len(many)}"
     return f"{100 * right.mean():.0f} | {of_many} | {wrong.sum()} | {skipped} | {ms:.0f}"
@@ -92,7 +99,10 @@ def main() -> None:
     options.add_argument("--cluster", type=int, default=200, help="points in one; 0: no such row")
     options.add_argument("--frames", type=int, default=48)
     options.add_argument("--seed", type=int, default=1)
+    options.add_argument("--time-limit", type=float, help="`identification.time_limit_s`")
     given = options.parse_args()
+    limit = {} if given.time_limit is None else {"time_limit_s": given.time_limit}
+    rule = IdentificationSettings(**limit)
     crowds = [(n, 0) for n in given.false] + [(3, given.cluster)] * (given.cluster > 0)
     print(
         "| camera | false | cluster | flux | right % | with ten stars | wrong | not searched "
@@ -103,7 +113,7 @@ def main() -> None:
         for crowd in crowds:
             for flux in (True, False):
                 rng = np.random.default_rng([given.seed, *crowd])
-                said = measure(KINDS[name], *crowd, given.frames, flux, rng)
+                said = measure(KINDS[name], *crowd, given.frames, flux, rng, rule)
                 print(f"| {name} | {crowd[0]} | {crowd[1]} | {flux} | {said} |", flush=True)
 
 

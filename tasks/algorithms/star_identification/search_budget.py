@@ -12,9 +12,10 @@ import numpy.typing as npt
 
 Rows = npt.NDArray[np.int64]
 
-# CPU seconds of all searches of one frame, and of a sensor's searches over its frames. Both leave a
-# sixth of 0.5 s and 50 ms to all else.
-AT_ONCE_S, PER_FRAME_S = 0.42, 0.042
+# What all searches of one frame may cost, as part of the setting `identification.time_limit_s`; the
+# rest is left to all else. A sensor's searches may cost a tenth of that per frame: 42 ms with the
+# default of 0.5 s. Frames that are followed cost a hundredth of it; crowds come near it.
+AT_ONCE, PER_FRAME = 0.84, 0.084
 # What is left of a frame's budget, or of a pass's, is too little for a search [s].
 TOO_LITTLE_S = 0.002
 HEAD_START = 0.25  # part of a pass's share with which it begins; all of it where one frame will do
@@ -23,12 +24,14 @@ HEAD_START = 0.25  # part of a pass's share with which it begins; all of it wher
 class SearchBudget:
     """What searches have cost so far, and may cost; changed by each search.
 
+    at_once_s : float, what one frame may cost
     total_s, spent_s : float, of all frames
     frame_s : (F,) float, spent on each
     """
 
-    def __init__(self, n_frames: int, share: float = 1.0) -> None:
-        self.total_s = share * max(AT_ONCE_S, PER_FRAME_S * n_frames)
+    def __init__(self, n_frames: int, time_limit_s: float, share: float = 1.0) -> None:
+        self.at_once_s = AT_ONCE * time_limit_s
+        self.total_s = share * time_limit_s * max(AT_ONCE, PER_FRAME * n_frames)
         self.spent_s = 0.0
         self.frame_s = np.zeros(n_frames)
 
@@ -57,7 +60,7 @@ class Allowance(NamedTuple):
         """Return what a search of frame k of the pass may cost, after this share of its frames."""
         earned = self.size_s * max(share_done, self.head_start)
         of_pass = self.start_s + earned - self.budget.spent_s
-        return float(min(of_pass, AT_ONCE_S - self.budget.frame_s[self.rows[k]]))
+        return float(min(of_pass, self.budget.at_once_s - self.budget.frame_s[self.rows[k]]))
 
     def spend(self, k: int, seconds: float) -> None:
         """Enter what a search of frame k of the pass has cost."""

@@ -140,7 +140,7 @@ def identify_sensor(
     """
     centroids, stated = _fill_sigmas(centroids)
     n, floor_px = len(t_s), 0.0
-    budget = SearchBudget(n, matching.budget_share)
+    budget = SearchBudget(n, matching.time_limit_s, matching.budget_share)
     frames = FrameSample(t_s, centroids, priors, budget=budget, rows=np.arange(n, dtype=np.int64))
     model, probe = _probe(frames, skies, magnitude_limit, matching, stated)
     if not probe.failed:

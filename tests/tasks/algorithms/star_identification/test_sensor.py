@@ -24,7 +24,7 @@ from epipole.tasks.algorithms.star_identification.frame import (
     Searched,
     search_frame,
 )
-from epipole.tasks.algorithms.star_identification.search_budget import AT_ONCE_S
+from epipole.tasks.algorithms.star_identification.search_budget import AT_ONCE
 from epipole.tasks.algorithms.star_identification.sensor import identify_sensor
 from epipole.tasks.algorithms.star_identification.sequence import no_priors
 from epipole.tasks.algorithms.star_identification.star_grid import (
@@ -277,7 +277,8 @@ def test_searches_of_a_log_end_at_its_budget_and_say_so(monkeypatch):
     half = MATCHING._replace(budget_share=0.5)
     found = _identify(crowds, matching=half)
     # A search ends at the first pivot beyond its budget.
-    assert 0.1 * AT_ONCE_S < sum(one.cost_s for one in spent) < 0.6 * AT_ONCE_S
+    at_once_s = AT_ONCE * MATCHING.time_limit_s
+    assert 0.1 * at_once_s < sum(one.cost_s for one in spent) < 0.6 * at_once_s
     assert "search_limit" in found.status
     assert not found.solutions.solved.any()
     assert _identify(crowds, matching=half).status == found.status
