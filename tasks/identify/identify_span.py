@@ -66,7 +66,9 @@ def identify_spans(
         _identify_span(frames, *each, cameras, sensors, identification, max_detections)
         for each in spans
     ]
-    return Counts(*(sum(count) for count in zip(*counts, strict=True)))
+    total = Counts(*(sum(count) for count in zip(*counts, strict=True)))
+    LOGGER.info("%s: identified %d of %d frames", spans, total.by_stars, total.frames)
+    return total
 
 
 def _identify_span(
