@@ -69,6 +69,7 @@ PLAN = {
     "example": Benchmark("example", "--rounds 3", 10),
     "night": Benchmark("night", "--shares 16 1", 10),
     "scaling": Benchmark("scaling", "--sensors 32 128", 12),
+    "constellation": Benchmark("scaling", "--satellites 24 96 384 --seconds 20", 8),
     "ingest": Benchmark("ingest", "--frames 100000 --runs 5"),
     "ingest_json": Benchmark("ingest", "--frames 20000 --runs 5 --encoding json"),
     "queries": Benchmark("queries", "--nights 365 --runs 5", 8),
