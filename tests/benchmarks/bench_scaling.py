@@ -106,7 +106,7 @@ def main() -> None:
                 f"| {night.cpu_s:.1f} | {night.mib:,.0f} | {night.bytes / 2**20:,.0f} |",
                 flush=True,
             )
-            for what, price in prices(night).items():
+            for what, price in ({} if chosen.satellites else prices(night)).items():
                 print(f"{what:>26s}: {price:8.2f} us", flush=True)
 
 

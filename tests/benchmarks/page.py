@@ -68,7 +68,7 @@ PLAN = {
     OF_README: Benchmark("scenes", "", 12),
     "example": Benchmark("example", "--rounds 3", 10),
     "night": Benchmark("night", "--shares 16 1", 10),
-    "scaling": Benchmark("scaling", "--sensors 32 128", 12),
+    "scaling": Benchmark("scaling", "--sensors 128", 8),
     "constellation": Benchmark("scaling", "--satellites 24 96 384 --seconds 20", 8),
     "ingest": Benchmark("ingest", "--frames 100000 --runs 5"),
     "ingest_json": Benchmark("ingest", "--frames 20000 --runs 5 --encoding json"),
