@@ -81,6 +81,7 @@ def main() -> None:
     arguments.add_argument("--hours", type=float, default=0.17)
     arguments.add_argument("--satellites", type=int, nargs="+")
     arguments.add_argument("--seconds", type=float, default=30.0)
+    arguments.add_argument("--prices", action="store_true", help="what a unit of the data costs")
     chosen: Any = arguments.parse_args()
     if chosen.satellites:
         scenes = {
@@ -106,7 +107,7 @@ def main() -> None:
                 f"| {night.cpu_s:.1f} | {night.mib:,.0f} | {night.bytes / 2**20:,.0f} |",
                 flush=True,
             )
-            for what, price in ({} if chosen.satellites else prices(night)).items():
+            for what, price in (prices(night) if chosen.prices else {}).items():
                 print(f"{what:>26s}: {price:8.2f} us", flush=True)
 
 
