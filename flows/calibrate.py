@@ -14,8 +14,9 @@ from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.settings import Settings
+from epipole.schemas.spans import ALL_TIME
 from epipole.schemas.work_tables import EXPOSURES
-from epipole.tasks.algorithms.star_identification.sensor import evenly_spaced
+from epipole.tasks.algorithms.star_identification.sensor_model import evenly_spaced
 from epipole.tasks.calibrate.calibrate_unknown import (
     CameraReport,
     calibrate_unknown,
@@ -30,7 +31,6 @@ from epipole.tasks.read.order_frames import (
 from epipole.tasks.read.read_logs import read_log_into
 
 MAX_FRAMES = 100  # of a sensor, spread over the logs
-ALL_TIME = (-(2**63), 2**63 - 1)
 
 
 def calibrate(

@@ -13,9 +13,10 @@ from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError
 from epipole.schemas.log_checks import CheckVerdict, mistakes
 from epipole.schemas.settings import Settings
+from epipole.schemas.spans import ALL_TIME
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.common.batches import Batch
-from epipole.tasks.read.judge_logs import ALL_TIME, judge_logs, judged_sensors
+from epipole.tasks.read.judge_logs import judge_logs, judged_sensors
 from epipole.tasks.read.order_frames import OrderedFrames, order_logs, states_between
 from epipole.tasks.read.read_logs import read_log_into
 

@@ -61,6 +61,9 @@ class Span(NamedTuple):
         return f"{str(start)[11:]}-{str(end)[11:]}"
 
 
+ALL_TIME = Span(-(2**63), 2**63 - 1)
+
+
 class Sensor(NamedTuple):
     """A sensor: its number in the run, which names its parts, and its id."""
 

@@ -14,13 +14,11 @@ from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CHECKS
 from epipole.tasks.check.judge_readings import judge_readings
-from epipole.tasks.common.batches import Batch
+from epipole.tasks.common.batches import in_batches
 from epipole.tasks.read.judge_logs import judge_logs, judged_sensors
 from epipole.tasks.read.order_frames import OrderedFrames
 
 LOGGER = logging.getLogger(__name__)
-
-SENSORS_OF_TASK = 16
 
 
 def check_logs(frames: OrderedFrames, night: str, settings: Settings) -> pa.Table:
@@ -29,17 +27,15 @@ def check_logs(frames: OrderedFrames, night: str, settings: Settings) -> pa.Tabl
     between_ns = (start_ns - SPAN_NS, start_ns + DAY_NS + SPAN_NS)
     of_night = rows_of_night("rejects", frames.rejects, night)
     sensors = judged_sensors(frames)
+    n_frames = {
+        name: sum(each.n_frames for each in spans)
+        for name, spans in zip(frames.sensors, frames.spans, strict=True)
+    }
     futures = [
-        judge_logs.submit(
-            Batch(sensors[k : k + SENSORS_OF_TASK]), frames.cameras, of_night, between_ns,
-            settings.sensors.state_gap_s,
-        )
-        for k in range(0, len(sensors), SENSORS_OF_TASK)
-    ]  # fmt: skip
-    checks = concat(CHECKS, results(Stage.READ, futures))
-    for sentence in mistakes(checks.to_pylist()):
-        LOGGER.warning("%s", sentence)
-    return checks
+        judge_logs.submit(batch, frames.cameras, of_night, between_ns, settings.sensors.state_gap_s)
+        for batch in in_batches(sensors, [n_frames.get(each.sensor_id, 0) for each in sensors])
+    ]
+    return _with_warnings(concat(CHECKS, results(Stage.READ, futures)))
 
 
 def check_readings(work: Work, checks: pa.Table) -> pa.Table:
@@ -47,6 +43,11 @@ def check_readings(work: Work, checks: pa.Table) -> pa.Table:
     viewed = work.folder.viewed(work.round)
     judged = judge_readings.submit(viewed, list(work.spans), work.all_spans())
     (found,) = results(Stage.CHECK, [judged])
-    for sentence in mistakes(found.to_pylist()):
+    return concat(CHECKS, [checks, _with_warnings(found)])
+
+
+def _with_warnings(checks: pa.Table) -> pa.Table:
+    """Return CHECKS after a warning for each mistake."""
+    for sentence in mistakes(checks.to_pylist()):
         LOGGER.warning("%s", sentence)
-    return concat(CHECKS, [checks, found])
+    return checks

@@ -6,7 +6,7 @@ a task works on depends on the data and the settings, never on the workers.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -105,11 +105,7 @@ def _view(night: _Night) -> dict[Span, int]:
     """View the tracklets of all sensors, a few sensors per task; return the views of each span."""
     work, settings = night.work, night.settings
     sensors, limit = work.sensor_parts(), settings.work.max_views // VIEWS_AT_ONCE
-    groups = [
-        (span, group)
-        for span in night.spans
-        for group in _sensor_groups(work, list(sensors), span, limit)
-    ]
+    groups = [(span, group) for span in night.spans for group in _sensor_groups(work, span, limit)]
     futures = [
         view_sensors.submit(
             [sensors[sensor] for sensor in group], span, night.grid, work.cameras,
@@ -124,15 +120,13 @@ def _view(night: _Night) -> dict[Span, int]:
     return total
 
 
-def _sensor_groups(
-    work: Work, sensors: Sequence[Sensor], span: Span, limit: int
-) -> list[list[Sensor]]:
+def _sensor_groups(work: Work, span: Span, limit: int) -> list[list[Sensor]]:
     """Return the sensors with frames in or near a span, in groups of about `limit` detections."""
     near = set(spans_between(*span.widened(1)))
     groups: list[list[Sensor]] = []
     n_detections = limit
-    for sensor in sensors:
-        if near.isdisjoint(work.spans[sensor]):
+    for sensor, spans in work.spans.items():
+        if near.isdisjoint(spans):
             continue
         if n_detections >= limit:
             groups.append([])

@@ -1,6 +1,6 @@
 """The work of a night: its sensors, their spans with frames, and where their parts are."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 import pyarrow as pa
@@ -57,10 +57,8 @@ class Work(NamedTuple):
 
     def sensor_batches(self, pieces: Sequence[OfSensor]) -> list[Batch[OfSensor]]:
         """Return pieces of work, each of one sensor, in batches of about equal work."""
-        counts = dict.fromkeys(self.spans, 0)
-        for (sensor, _), count in self.n_frames.items():
-            counts[sensor] += count
-        return in_batches(pieces, [counts[piece.sensor] for piece in pieces])
+        counts = [sum(self.n_frames.get((p.sensor, s), 0) for s in p.spans) for p in pieces]
+        return in_batches(pieces, counts)
 
     def sensor_parts(self) -> dict[Sensor, SensorParts]:
         """Return where the parts of each sensor lie in this round."""
@@ -104,14 +102,13 @@ def plan_spans(frames: OrderedFrames, night: str) -> tuple[Spans, pa.Table]:
 
 
 def count_frames(
-    frames: OrderedFrames, spans: Mapping[Sensor, Sequence[Span]]
+    frames: OrderedFrames, sensors: Iterable[Sensor]
 ) -> dict[tuple[Sensor, Span], int]:
-    """Return the number of frames of each sensor in each of its spans."""
+    """Return the number of frames of each of these sensors in each span."""
     return {
         (sensor, each.span): each.n_frames
-        for sensor, wanted in spans.items()
+        for sensor in sensors
         for each in frames.spans[sensor.number]
-        if each.span in set(wanted)
     }
 
 

@@ -10,9 +10,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from epipole.io.work.parts import read_part
-from epipole.schemas.bridge import array, concat, flatten, nullable, stack, table
+from epipole.schemas.bridge import array, concat, flatten, nullable, rows_with, stack, table
 from epipole.schemas.log_checks import LogCause, LogCheck
 from epipole.schemas.rejects import Reason
+from epipole.schemas.spans import ALL_TIME
 from epipole.schemas.stages import Stage
 from epipole.schemas.tables import CHECKS
 from epipole.schemas.work_tables import EXPOSURES, ITRF, LOG_STATES
@@ -33,7 +34,6 @@ from epipole.tasks.read.order_frames import OrderedFrames
 
 Integers = npt.NDArray[np.int64]
 
-ALL_TIME = (-(2**63), 2**63 - 1)
 MAX_SAMPLED = 100  # frames of which centroids are looked at
 SAME_TIME_NS = SECOND_NS  # calibrations of one time
 MIN_LEFT_OUT = 0.5  # share of a sensor's states: damage is less, a wrong unit is all of them
@@ -128,14 +128,14 @@ def sensor_log(
         np.concatenate([np.zeros(0, np.int64), *(array(of, name)[k] for of, k in of_rows)])
         for name in ("time", "frame_number")
     )
-    of_sensor = pc.field("sensor_id") == sensor
-    counts = rejects.filter(of_sensor).group_by("reason").aggregate([("count", "sum")])
+    of_sensor = rows_with(rejects, "sensor_id", sensor)
+    counts = of_sensor.group_by("reason").aggregate([("count", "sum")])
     return SensorLog(
         time_ns,
         number,
         concat(EXPOSURES, sampled),
         concat(LOG_STATES, [of.take(_rows_of(of, sensor, between_ns)) for of in states]),
-        cameras.filter(of_sensor),
+        rows_with(cameras, "sensor_id", sensor),
         {row["reason"]: row["count_sum"] for row in counts.to_pylist()},
     )
 
@@ -165,7 +165,7 @@ def _log_states(states: pa.Table) -> LogStates:
     """Return the states in order of time; of several frames, those in the most frequent one."""
     frames = pc.value_counts(states["frame"].combine_chunks()).to_pylist()
     frame = max(frames, key=lambda each: each["counts"])["values"] if frames else ""
-    rows = states.filter(pc.field("frame") == frame)
+    rows = rows_with(states, "frame", frame)
     order = np.argsort(array(rows, "time"), kind="stable")
     return LogStates(
         array(rows, "time")[order],

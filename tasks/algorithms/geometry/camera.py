@@ -3,6 +3,7 @@
 Pixel (0, 0) is the middle of the top-left pixel; x right, y down, z out along the boresight.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -83,6 +84,7 @@ FARTHEST = 4.0  # radius up to which a fold is looked for, normalised coordinate
 FOLD_STEPS = 4000
 
 
+@lru_cache(maxsize=256)
 def fold_radius(camera: Camera) -> float:
     """Return the undistorted radius from which the radial distortion folds back; inf: it does not.
 

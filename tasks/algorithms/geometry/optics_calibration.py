@@ -345,9 +345,8 @@ def _fit(
         b = np.add.reduceat(np.einsum("nai,na->ni", weighted, r), images.starts)
         turn = np.linalg.solve(A, b[..., None])[..., 0]
         B = _sums_by_frame(weighted, J_optics, images.starts)
-        lever = np.asarray(
-            np.linalg.solve(A, B), np.float64
-        )  # rotations that compensate a change of the optics
+        # Rotations that compensate a change of the optics.
+        lever = np.asarray(np.linalg.solve(A, B), np.float64)
         rows = J_optics.reshape(2 * len(r), k)
         C = (rows * weight.reshape(-1, 1)).T @ rows + np.eye(k)
         C -= np.einsum("fki,fkj->ij", B, lever)

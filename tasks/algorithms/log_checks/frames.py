@@ -159,11 +159,10 @@ def check_coverage(
 def known_offset(shift_s: float) -> float:
     """Return the offset between time scales that a shift is near to; 0 where there is none."""
     size = abs(shift_s)
-    for offset in (GPS_S, TAI_GPS_S, TAI_S):
-        if abs(size - offset) <= NEAR_OFFSET_S:
-            # GPS and TAI minus GPS are a second apart: the shift decides as far as it can.
-            nearest = min((GPS_S, TAI_GPS_S, TAI_S), key=lambda known: abs(size - known))
-            return float(np.copysign(nearest, shift_s))
+    # GPS and TAI minus GPS are a second apart: the shift decides as far as it can.
+    nearest = min((GPS_S, TAI_GPS_S, TAI_S), key=lambda known: abs(size - known))
+    if abs(size - nearest) <= NEAR_OFFSET_S:
+        return float(np.copysign(nearest, shift_s))
     hours = round(size / HOUR_S)
     if 1 <= hours <= 24 and abs(size - hours * HOUR_S) <= NEAR_OFFSET_S:
         return float(np.copysign(hours * HOUR_S, shift_s))

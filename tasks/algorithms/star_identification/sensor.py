@@ -35,6 +35,7 @@ from epipole.tasks.algorithms.star_identification.search_budget import SearchBud
 from epipole.tasks.algorithms.star_identification.sensor_model import (
     SensorModel,
     Skies,
+    evenly_spaced,
     is_significant,
     learn,
     likeliest_floor,
@@ -337,11 +338,6 @@ def _identify_again(
     sampled = [solutions.frame(i) for i in rows]
     model = learn(frames.take(rows).centroids, sampled, skies, model)
     return *identify_sample(frames.anchored(rows, sampled), skies, model, share=SHARE), model
-
-
-def evenly_spaced(n: int, wanted: int) -> Rows:
-    """Return `wanted` of n rows, evenly spaced; all where there are fewer."""
-    return np.unique(np.linspace(0, max(n - 1, 0), wanted).astype(np.int64))[:n]
 
 
 # Pass 5: the true errors.

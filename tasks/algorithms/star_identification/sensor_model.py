@@ -290,7 +290,7 @@ def _learned_limit(
     if not model.limit_is_open:
         return model.limit
     every = np.flatnonzero([s is not None for s in solutions])
-    rows = every[np.linspace(0, len(every) - 1, min(len(every), LIMIT_FRAMES)).astype(np.int64)]
+    rows = every[evenly_spaced(len(every), LIMIT_FRAMES)]
     frames = centroids.frames(model.scale, model.use_flux).each()
     frames, solutions = [frames[i] for i in rows], [solutions[i] for i in rows]
     sky, deep = skies.sky(model.limit), skies.sky(model.limit + DEEPER_MAG)
@@ -298,6 +298,11 @@ def _learned_limit(
     start = float(np.floor(4 * np.median(np.concatenate(matched))) / 4)
     deeper = rematch(frames, solutions, deep, model.matching)
     return faintest_star(frames, deeper, deep, model.matching.gate_sigma, start)
+
+
+def evenly_spaced(n: int, wanted: int) -> npt.NDArray[np.int64]:
+    """Return `wanted` of n rows, evenly spaced; all where there are fewer."""
+    return np.unique(np.linspace(0, max(n - 1, 0), wanted).astype(np.int64))[:n]
 
 
 # Centroid error of each frame.
