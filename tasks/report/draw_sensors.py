@@ -33,6 +33,7 @@ Array = npt.NDArray[np.float64]
 
 IMAGE_IN = 4.1  # height of a picture of an image
 MAX_NAMES = 30
+SAME_PX = 3.0  # a detection so near to an object at the epoch is that object
 CROWD = 60  # objects: more have smaller marks
 MIN_IN_CELL = 10
 SURE_SIGMA = 4.0
@@ -64,7 +65,7 @@ def draw_star_map(figure: Figure, frame: StarMap, size_px: Array) -> None:
         linewidths=0.8,
         label="other detection",
     )
-    for k, (dx, dy, how) in _label_positions(frame, size_px).items():
+    for k, (dx, dy, how) in _label_positions(frame, size_px, scale).items():
         axes.annotate(str(frame.star_id[k]), frame.stars_px[k], (dx, dy), fontsize=6.5,
                       textcoords="offset points", ha=how, va="center", color=BLUE)  # fmt: skip
     as_image(axes, size_px)
@@ -90,22 +91,29 @@ def _vectors(axes: Axes, points: Array, residuals: Array, scale: float, colour: 
                 zorder=4)  # fmt: skip
 
 
-def _label_positions(frame: StarMap, size_px: Array) -> dict[int, tuple[float, float, str]]:
-    """Return offset and side of the names that have room, the brightest stars first."""
-    wide, high = 0.11 * size_px[0], 0.028 * size_px[1]
-    taken = [(x - high / 2, y, x + high / 2) for x, y in (*frame.stars_px, *frame.others_px)]
+def _label_positions(
+    frame: StarMap, size_px: Array, scale: float
+) -> dict[int, tuple[float, float, str]]:
+    """Return offset [pt] and alignment of names where there is room, the brightest stars first."""
+    wide, high = 0.12 * size_px[0], 0.03 * size_px[1]
+    along = np.linspace(0.0, 1.0, 7)[:, None, None] * scale * frame.residuals_px
+    arrows = np.nan_to_num(frame.stars_px + along).reshape(-1, 2)
+    taken = [(x - high / 2, y, x + high / 2) for x, y in (*arrows, *frame.others_px)]
     found: dict[int, tuple[float, float, str]] = {}
     for k in np.argsort(frame.magnitude, kind="stable")[:MAX_NAMES].tolist():
         x, y = frame.stars_px[k]
         sides = (
-            (6.0, "left", x + high, x + high + wide),
-            (-6.0, "right", x - high - wide, x - high),
+            (6.0, 0.0, "left", x + high, y),
+            (-6.0, 0.0, "right", x - high - wide, y),
+            (0.0, 9.0, "center", x - wide / 2, y - 1.7 * high),
+            (0.0, -9.0, "center", x - wide / 2, y + 1.7 * high),
         )
-        for dx, how, low, up in sides:
-            free = all(abs(y - v) > high or up < a or low > b for a, v, b in taken)
-            if free and low > 0 and up < size_px[0]:
-                taken.append((low, y, up))
-                found[k] = (dx, 0.0, how)
+        for dx, dy, how, low, row in sides:
+            up = low + wide
+            free = all(abs(row - v) > high or up < a or low > b for a, v, b in taken)
+            if free and low > 0 and up < size_px[0] and 0 < row < size_px[1]:
+                taken.append((low, row, up))
+                found[k] = (dx, dy, how)
                 break
     return found
 
@@ -142,8 +150,9 @@ def image_pattern(residuals: StarResiduals, k: int) -> tuple[Array, npt.NDArray[
 def draw_epipolar(figure: Figure, views: EpipolarViews) -> None:
     """Draw the lines of one sensor's lines of sight in the image of another."""
     axes = axes_of(figure)
-    if len(views.others_px):
-        x, y = views.others_px.T
+    others = _other_than(views)
+    if len(others):
+        x, y = others.T
         axes.scatter(x, y, s=10, marker="x", color=GREY, linewidths=0.7,
                      label="other detections")  # fmt: skip
     for number, line in enumerate(views.lines):
@@ -155,8 +164,26 @@ def draw_epipolar(figure: Figure, views: EpipolarViews) -> None:
         axes.plot(*line.seen_px, marker="o", markersize=6, markerfacecolor="none", linestyle="",
                   markeredgecolor=colour, markeredgewidth=1.3,
                   label=None if number else names["seen"])  # fmt: skip
+        for at, offset, how in ((line.seen_px, (5, 6), "left"), _line_end(line.line_px)):
+            axes.annotate(f"{number + 1}", (at[0], at[1]), offset, textcoords="offset points",
+                          fontsize=7, ha=how, va="center", color=colour,
+                          annotation_clip=False)  # fmt: skip
     as_image(axes, views.size_px)
     legend_below(figure, axes, columns=2)
+
+
+def _line_end(line_px: Array) -> tuple[Array, tuple[int, int], str]:
+    """Return where the number of a line stands: beyond its right end."""
+    if not len(line_px):
+        return np.full(2, np.nan), (0, 0), "left"
+    return line_px[np.argmax(line_px[:, 0])], (10, 0), "left"
+
+
+def _other_than(views: EpipolarViews) -> Array:
+    """Return the detections that are none of the objects with a line."""
+    seen = np.array([line.seen_px for line in views.lines]).reshape(-1, 2)
+    apart = np.linalg.norm(views.others_px[:, None] - seen, axis=2)
+    return views.others_px[(apart > SAME_PX).all(axis=1)]
 
 
 # Over the night: frames, attitude sigmas, star residuals.

@@ -1,13 +1,13 @@
 """Pictures of the sky and of distributions: tracklets, objects; found against expected."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.special import gammaln
+from scipy.special import gammainc
 
 from epipole.schemas.rejects import NameStatus, Outcome
 from epipole.tasks.report.canvas import (
@@ -100,6 +100,7 @@ def draw_ring(figure: Figure, objects: Sequence[NightObject]) -> None:
         first[jump] = last[jump]
         axes.plot(*np.stack([first, last]).transpose(2, 0, 1), color=colour, linewidth=0.9)
         axes.plot(*last.T, **_mark(marker, colour), label=f"{status} ({len(of_status):,})")
+    axes.locator_params(axis="x", nbins=5)  # more would run into each other
     axes.grid(color="#e3e7ea", linewidth=0.5)
     axes.set_axisbelow(True)
     legend_below(figure, axes, columns=3)
@@ -114,14 +115,21 @@ def draw_elements(figure: Figure, objects: Sequence[NightObject]) -> None:
     """Draw eccentricity and inclination of objects over their semi-major axis."""
     upper, lower = figure.subplots(2, 1, sharex=True)
     for status, (colour, marker) in _STATUSES.items():
-        of_status = [o.elements for o in objects if o.status == status and o.elements is not None]
+        of_status = [o for o in objects if o.status == status and o.elements is not None]
         if not of_status:
             continue
-        a, e, i = np.array(of_status).T
+        a, e, i = np.array([o.elements for o in of_status]).T
+        sigmas = np.array([o.element_sigmas for o in of_status]).T
+        for axes, y, sigma in ((upper, e, sigmas[1]), (lower, i, sigmas[2])):
+            axes.errorbar(a, y, sigma, sigmas[0], fmt="none", ecolor=colour, elinewidth=0.5)
         upper.plot(a, e, **_mark(marker, colour), label=f"{status} ({len(of_status):,})")
         lower.plot(a, i, **_mark(marker, colour))
     upper.set(ylabel="eccentricity")
     lower.set(ylabel="inclination [deg]", xlabel="semi-major axis [thousand km]")
+    a, e, i = np.array([o.elements for o in objects if o.elements is not None]).T
+    for axes, y in ((upper, e), (lower, i)):  # bars may leave the picture, dots may not
+        _around(axes.set_xlim, a)
+        _around(axes.set_ylim, y)
     upper.set_ylim(bottom=0)
     lower.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}")
     lower.locator_params(axis="x", nbins=6)
@@ -129,6 +137,11 @@ def draw_elements(figure: Figure, objects: Sequence[NightObject]) -> None:
         axes.grid(color="#e3e7ea", linewidth=0.5)
         axes.set_axisbelow(True)
     legend_below(figure, upper, columns=3)
+
+
+def _around(set_limits: Callable[[float, float], object], values: Array) -> None:
+    margin = 0.08 * (values.max() - values.min()) + 1e-3 * abs(values.max()) + 1e-6
+    set_limits(values.min() - margin, values.max() + margin)
 
 
 def draw_trend(figure: Figure, nights: Sequence[NightNumbers]) -> None:
@@ -186,25 +199,36 @@ def draw_half_normal(figure: Figure, pairs: Chi2) -> None:
 
 
 def draw_chi2(figure: Figure, found: Chi2, what: str) -> None:
-    """Draw chi-squares, and the sum of the chi-square distributions of their freedoms."""
-    axes = axes_of(figure, f"chi-square of {what}", "density")
+    """Draw chi-squares, and the sum of the chi-square distributions of their freedoms.
+
+    The line is what each bar should be: a density of one degree of freedom has no end at 0. A few
+    values are no bars but dots, each at the share of values below it.
+    """
+    axes = axes_of(figure, f"chi-square of {what}", "share below" if len(found.few) else "density")
+    label = "chi-square distribution"
+    if len(found.few):
+        x = np.linspace(0.0, max(found.edges[-1], 1.05 * found.few[-1]), STEPS)
+        axes.plot(x, _share_below(found, x), label=label, **EXPECTED)
+        share = (np.arange(len(found.few)) + 0.5) / len(found.few)
+        axes.plot(found.few, share, **_mark("o", BLUE), label="found")
+        axes.set_ylim(0, 1.03)
+        _finish(figure, axes, x)
+        return
     _bars(axes, found.edges, found.counts)
-    x = np.linspace(found.edges[0] + 1e-9, found.edges[-1], STEPS)
-    kinds = np.flatnonzero(found.freedom)
-    kinds = kinds[np.argsort(-found.freedom[kinds], kind="stable")][:MAX_FREEDOMS]
-    weights = found.freedom[kinds] / found.freedom[kinds].sum()
-    density = sum(w * _chi2_density(x, int(k)) for w, k in zip(weights, kinds, strict=True))
-    axes.plot(x, density, label="chi-square distribution", **EXPECTED)
-    widths = np.diff(found.edges)
-    highest = (found.counts[1:-1] / (found.counts.sum() * widths[1:-1])).max(initial=0.0)
-    axes.set_ylim(0, 1.25 * max(highest, float(density[STEPS // 12 :].max())))
+    expected = np.diff(_share_below(found, found.edges))
+    expected[-1] += 1 - expected.sum()  # as the last bar has all above it
+    axes.stairs(expected / np.diff(found.edges), found.edges, label=label, **EXPECTED)
     _finish(figure, axes, found.edges)
 
 
-def _chi2_density(x: Array, freedom: int) -> Array:
-    """Return the density of the chi-square distribution; scipy.stats takes a second to import."""
-    half = freedom / 2
-    return np.exp((half - 1) * np.log(x) - x / 2 - half * np.log(2) - gammaln(half))
+def _share_below(found: Chi2, x: Array) -> Array:
+    """Return the share of chi-squares that should be below each x."""
+    kinds = np.flatnonzero(found.freedom)
+    kinds = kinds[np.argsort(-found.freedom[kinds], kind="stable")][:MAX_FREEDOMS]
+    weights = found.freedom[kinds] / found.freedom[kinds].sum()
+    # scipy.stats takes a second to import.
+    share: Array = gammainc(kinds / 2, np.asarray(x)[:, None] / 2) @ weights
+    return share
 
 
 def _bars(axes: Axes, edges: Array, counts: Array) -> None:

@@ -9,6 +9,7 @@ from epipole.schemas.text import as_line
 
 LONGEST_CELL = 250
 LONG_CELL = 36  # has more than one line
+FEW_COLUMNS = 5  # more do not fit on a phone
 # What a data address may have as it is; quotes and ampersands are escaped for the attribute.
 _PLAIN = " !$&()*+,-./:;<=>?@[]^_`{|}~'"
 
@@ -46,8 +47,9 @@ def table(caption: str, heading: Sequence[str], rows: Iterable[Sequence[object]]
     head = "".join(f'<th scope="col">{text(name)}</th>' for name in heading)
     body = "".join(f"<tr>{''.join(map(_cell, row))}</tr>\n" for row in rows)
     label = html.escape(caption, quote=True)
+    wide = " wide" if len(heading) > FEW_COLUMNS else ""
     return (
-        f'<div class="scroll" role="region" tabindex="0" aria-label="{label}">\n'
+        f'<div class="scroll{wide}" role="region" tabindex="0" aria-label="{label}">\n'
         f"<table><caption>{text(caption)}</caption>\n<thead><tr>{head}</tr></thead>\n"
         f"<tbody>\n{body}</tbody></table></div>\n"
     )
@@ -67,6 +69,11 @@ def figure(svg: str, alt: str, says: str) -> str:
         f'<figure><img src="data:image/svg+xml,{address}" alt="{text(alt)}">'
         f"<figcaption>{text(says)}</figcaption></figure>\n"
     )
+
+
+def beside(left: str, right: str) -> str:
+    """Return two parts beside each other where there is room, else one below the other."""
+    return f'<div class="pair"><div>{left}</div><div>{right}</div></div>\n'
 
 
 def figures(pictures: Iterable[str]) -> str:

@@ -2,18 +2,28 @@
 
 from collections.abc import Sequence
 from functools import partial
+from math import floor, log10
 
 from epipole.schemas.rejects import NameStatus, ObjectVerdict, Outcome
 from epipole.tasks.report.canvas import as_svg
 from epipole.tasks.report.draw_sensors import IMAGE_IN, draw_epipolar
 from epipole.tasks.report.draw_sky import draw_elements, draw_ring, draw_sky, draw_trend
 from epipole.tasks.report.frame_series import clock
-from epipole.tasks.report.html import Section, figure, figures, nothing, paragraph, table
+from epipole.tasks.report.html import (
+    Section,
+    beside,
+    figure,
+    figures,
+    nothing,
+    paragraph,
+    table,
+)
 from epipole.tasks.report.night_facts import NightFacts, percent
 from epipole.tasks.report.objects import NightObject
 
 MAX_OBJECTS = 100
 PICTURE_IN = 2.8
+NO_SIGMA = 1e-9  # smaller ones are none
 
 
 def sky(facts: NightFacts) -> Section:
@@ -32,7 +42,7 @@ def sky(facts: NightFacts) -> Section:
     sentences = {outcome.value: outcome.sentence.replace("`", "") for outcome in Outcome}
     rows = [(name, f"{count:,}", sentences[name]) for name, count in tracks.counts.items()]
     heading = ("outcome", "tracklets", "meaning")
-    body = figures([picture]) + table("What became of the tracklets", heading, rows)
+    body = beside(figures([picture]), table("What became of the tracklets", heading, rows))
     return Section("sky", title, body)
 
 
@@ -48,10 +58,15 @@ def epipolar(facts: NightFacts) -> Section:
         f"Image of {views.in_sensor} with {len(views.lines)} lines of sight of "
         f"{views.from_sensor}.",
         f"What {views.from_sensor} sees at {clock(views.epoch_ns)} UTC is a line in the image of "
-        f"{views.in_sensor}. Each ring should lie on the line of its colour; the farthest is "
+        f"{views.in_sensor}. Each ring should lie on the line of its number; the farthest is "
         f"{farthest:.2f} px away. Where all is well it is as far as the pair distances above say.",
     )
-    return Section("epipolar", title, figures([picture]))
+    rows = [
+        (str(number), line.object_id, f"{line.distance_px:.2f}")
+        for number, line in enumerate(views.lines, start=1)
+    ]
+    distances = table("Distance of rings from lines", ("number", "object", "px"), rows)
+    return Section("epipolar", title, beside(figures([picture]), distances))
 
 
 def objects(facts: NightFacts) -> Section:
@@ -73,10 +88,10 @@ def objects(facts: NightFacts) -> Section:
         pictures.append(figure(
             as_svg(partial(draw_elements, objects=others), 3.6),
             f"Semi-major axis, eccentricity and inclination of {len(others)} objects.",
-            "The other objects, by their orbits. From a short arc, axis and eccentricity are "
-            "uncertain: their scatter is not that of orbits.",
+            "The other objects, by their orbits, with bars of one sigma. From a short arc, axis "
+            "and eccentricity are uncertain: their scatter is not that of orbits.",
         ))  # fmt: skip
-    body = paragraph(_names(found)) + _verdicts(found) + figures(pictures) + _table(found)
+    body = beside(figures(pictures), paragraph(_names(found)) + _verdicts(found)) + _table(found)
     return Section("objects", title, body)
 
 
@@ -126,8 +141,15 @@ def _geography(each: NightObject) -> tuple[str, ...]:
     geography = f"{radius:,.0f}", f"{longitude:.2f}", f"{latitude:.2f}"
     if each.elements is None:
         return (*geography, "", "", "")
-    a, e, i = each.elements
-    return *geography, f"{a:,.0f}", f"{e:.4f}", f"{i:.2f}"
+    return *geography, *map(_with_sigma, each.elements, each.element_sigmas)
+
+
+def _with_sigma(value: float, sigma: float) -> str:
+    """Return a value to the second digit of its sigma."""
+    if not NO_SIGMA < sigma < float("inf"):
+        return f"{value:,.5g}"
+    decimals = min(max(1 - floor(log10(sigma)), 0), 9)
+    return f"{value:,.{decimals}f} ± {sigma:,.{decimals}f}"
 
 
 def trend(facts: NightFacts) -> Section:

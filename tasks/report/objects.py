@@ -30,8 +30,10 @@ class NightObject(NamedTuple):
 
     ends : (longitude, latitude [deg], radius [km]) at its first and at its last position; of an
         object without positions twice that at the epoch of its orbit. None: not known.
-    sigma_km : of its positions, or of its orbit; NaN where neither is known
+    sigma_km : of its positions, their median, or of its orbit: the root of the sum of the
+        variances of x, y and z; NaN where neither is known
     elements : semi-major axis [km], eccentricity, inclination [deg] of its orbit; None: no orbit
+    element_sigmas : their sigmas; NaN without an orbit
     """
 
     object_id: str
@@ -45,6 +47,7 @@ class NightObject(NamedTuple):
     sigma_km: float
     ends: tuple[Geography, Geography] | None
     elements: tuple[float, float, float] | None
+    element_sigmas: tuple[float, float, float]
 
     @property
     def near_geostationary(self) -> bool:
@@ -69,9 +72,9 @@ def read_objects(night: NightReader) -> list[NightObject]:
     statuses = night.read("identifications", ["object_id", "status"]).drop_nulls("object_id")
     status = dict(statuses.iter_rows())
     located = {**_of_orbits(night), **_of_positions(night)}
-    elements = night.read("orbits", ["object_id", "a_km", "e", "i_deg"]).rows_by_key(
-        "object_id", unique=True
-    )
+    names = ["a_km", "e", "i_deg"]
+    columns = ["object_id", *names, *(f"sigma_{name}" for name in names)]
+    elements = night.read("orbits", columns).rows_by_key("object_id", unique=True)
     return [
         NightObject(
             row["object_id"],
@@ -84,35 +87,41 @@ def read_objects(night: NightReader) -> list[NightObject]:
             row["n_sensors"],
             sigma_km,
             ends,
-            elements.get(row["object_id"]),
+            orbit[:3] if orbit else None,
+            orbit[3:] if orbit else _NO_SIGMAS,
         )
         for row in found.with_columns(
             first_ns=pl.col("first_time").dt.epoch("ns"), last_ns=pl.col("last_time").dt.epoch("ns")
         ).to_dicts()
         for ends, sigma_km in (located.get(row["object_id"], (None, float("nan"))),)
+        for orbit in (elements.get(row["object_id"]),)
     ]
 
 
 Located = dict[str, tuple[tuple[Geography, Geography], float]]  # ends, sigma [km]
 _VARIANCE = ["cov_xx", "cov_yy", "cov_zz"]
+_SIGMA = pl.sum_horizontal(*_VARIANCE).sqrt().alias("sigma_km")
+_NO_SIGMAS = (float("nan"),) * 3
+MAX_SIGMAS = 2_000_000  # positions that a median is of; of more, every n-th
 
 
 def _of_positions(night: NightReader) -> Located:
     """Return where each object is at its first and its last position."""
-    variance = pl.mean_horizontal(*_VARIANCE)
-    sums = [
-        rows.group_by("object_id", maintain_order=True).agg(
-            count=pl.len(), variance=variance.sum(),
+    columns = ["object_id", "time", *POSITION, *_VARIANCE]
+    step = max(-(-night.count("positions") // MAX_SIGMAS), 1)
+    found, sigmas = [], []
+    for rows in (night.empty("positions", columns), *night.pieces("positions", columns)):
+        found.append(rows.group_by("object_id", maintain_order=True).agg(
             first=pl.struct("time", *POSITION).first(), last=pl.struct("time", *POSITION).last(),
-        )
-        for columns in (["object_id", "time", *POSITION, *_VARIANCE],)
-        for rows in (night.empty("positions", columns), *night.pieces("positions", columns))
-    ]  # fmt: skip
-    rows = pl.concat(sums).group_by("object_id", maintain_order=True).agg(
-        pl.col("count", "variance").sum(), pl.col("first").first(), pl.col("last").last()
-    )  # fmt: skip
+        ))  # fmt: skip
+        some = rows.gather_every(step)
+        sigmas.append(some.select(pl.col("object_id").cast(pl.Categorical), _SIGMA))
+    ends_of = pl.concat(found).group_by("object_id", maintain_order=True)
+    rows = ends_of.agg(pl.col("first").first(), pl.col("last").last())
+    medians = pl.concat(sigmas).group_by("object_id").median()
+    rows = rows.join(medians.cast({"object_id": pl.String}), on="object_id", how="left")
     first, last = (_geography(rows[side].struct.unnest()) for side in ("first", "last"))
-    sigma_km = (rows["variance"] / rows["count"]).sqrt().to_list()
+    sigma_km = rows["sigma_km"].fill_null(float("nan")).to_list()
     ends = zip(first, last, strict=True)
     return dict(zip(rows["object_id"].to_list(), zip(ends, sigma_km, strict=True), strict=True))
 
@@ -121,7 +130,7 @@ def _of_orbits(night: NightReader) -> Located:
     """Return where each object is at the epoch of its orbit."""
     rows = night.read("orbits", ["object_id", "epoch", *POSITION, *_VARIANCE])
     at = _geography(rows.rename({"epoch": "time"}))
-    sigma_km = rows.select(pl.mean_horizontal(*_VARIANCE).sqrt()).to_series().to_list()
+    sigma_km = rows.select(_SIGMA).to_series().to_list()
     ends = zip(at, at, strict=True)
     return dict(zip(rows["object_id"].to_list(), zip(ends, sigma_km, strict=True), strict=True))
 

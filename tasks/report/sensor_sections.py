@@ -23,15 +23,24 @@ from epipole.tasks.report.draw_sensors import (
 )
 from epipole.tasks.report.draw_sky import draw_chi2, draw_half_normal, draw_normal
 from epipole.tasks.report.frame_series import FrameSeries, clock
-from epipole.tasks.report.html import Section, figure, figures, nothing, paragraph, table
+from epipole.tasks.report.html import (
+    Section,
+    beside,
+    figure,
+    figures,
+    nothing,
+    paragraph,
+    table,
+)
 from epipole.tasks.report.night_facts import NightFacts, duration, holds, percent
 from epipole.tasks.report.solved_chi2 import Chi2
-from epipole.tasks.report.stars import StarResiduals
+from epipole.tasks.report.stars import StarMap, StarResiduals
 
 PICTURE_IN = 2.6  # usual height
 SERIES_IN = 2.8
 MAX_IMAGES = 8  # sensors whose image is drawn
 MAX_TABLE_ROWS = 60
+MAX_STARS = 16  # as high as the picture beside it
 
 
 def coverage(facts: NightFacts) -> Section:
@@ -50,8 +59,8 @@ def coverage(facts: NightFacts) -> Section:
         "colour every frame was identified; white is a gap, hatched is a frame without stars."
         + fewer,
     )
-    return Section("coverage", "Coverage", figures([picture]) + _frames_table(series)
-                   + _statuses(series) + _gaps(series))  # fmt: skip
+    tables = _frames_table(series) + _statuses(series) + _gaps(series)
+    return Section("coverage", "Coverage", beside(figures([picture]), tables))
 
 
 def _frames_table(series: FrameSeries) -> str:
@@ -134,11 +143,13 @@ def _sigma_pictures(facts: NightFacts) -> Iterator[str]:
         )
     for what, chi2 in (("positions", positions), ("states", states)):
         if chi2 is not None:
+            marks = "dots" if len(chi2.few) else "bars"
+            last = "" if len(chi2.few) else " The last bar has all above it."
             yield figure(
                 as_svg(partial(draw_chi2, found=chi2, what=what), PICTURE_IN),
-                f"Histogram of the chi-squares of {chi2.number:,} {what} and their distribution.",
-                f"Chi-squares of {what}. The bars should follow the line. Bars farther to the "
-                "right: sigmas too small, or a sensor that is off. The last bar has all above it.",
+                f"The chi-squares of {chi2.number:,} {what} and their distribution.",
+                f"Chi-squares of {what}. The {marks} should follow the line. If they are more to "
+                f"the right: sigmas too small, or a sensor that is off.{last}",
             )
 
 
@@ -240,7 +251,23 @@ def star_map(facts: NightFacts) -> Section:
         f"usual number of stars, which have {names}. Arrows are star residuals, drawn {scale:,.0f} "
         "times longer. They should point in all directions; a pattern is an error of the optics.",
     )
-    return Section("frame", title, figures([picture]))
+    return Section("frame", title, beside(figures([picture]), _stars_table(frame, ids)))
+
+
+def _stars_table(frame: StarMap, ids: str) -> str:
+    order = np.argsort(frame.magnitude, kind="stable")[:MAX_STARS]
+    rows = [
+        (str(frame.star_id[k]), f"{frame.magnitude[k]:.1f}",
+         *(f"{value:.1f}" for value in frame.stars_px[k]),
+         *(f"{value:.3f}" for value in frame.residuals_px[k]))
+        for k in order.tolist()
+    ]  # fmt: skip
+    caption = "Its stars" + (
+        f", the brightest {MAX_STARS}" if len(frame.star_id) > len(rows) else ""
+    )
+    heading = (ids or "star", "magnitude", "column px", "row px", "residual columns",
+               "residual rows")  # fmt: skip
+    return table(caption, heading, rows)
 
 
 def image_residuals(facts: NightFacts) -> Section:

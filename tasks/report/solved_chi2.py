@@ -13,6 +13,7 @@ Indices = npt.NDArray[np.int64]
 PAIR_BINS = np.linspace(0.0, 5.0, 26)  # edges, in sigmas
 MAX_FREEDOM = 4000  # degrees of freedom with a bin each
 MIN_BINS, MAX_BINS = 8, 40
+FEW = 60  # values: fewer make no bars that one could compare with a line
 
 
 class Chi2(NamedTuple):
@@ -22,6 +23,7 @@ class Chi2(NamedTuple):
     freedom : (m,) how many have this many degrees of freedom, by the number
     total, freedoms : sums of the chi-squares and of the degrees of freedom
     independent : how many share no detection with each other
+    few : the values themselves, in order, where they are fewer than `FEW`; else empty
     """
 
     edges: Array
@@ -30,6 +32,7 @@ class Chi2(NamedTuple):
     total: float
     freedoms: int
     independent: int
+    few: Array
 
     @property
     def number(self) -> int:
@@ -63,7 +66,8 @@ def _pairs(night: NightReader) -> Chi2 | None:
         counts += np.histogram(np.minimum(z, PAIR_BINS[-1]), PAIR_BINS)[0]
         total, number = total + float(z @ z), number + len(z)
     freedom = np.array([0, number])
-    return Chi2(PAIR_BINS, counts, freedom, total, number, number) if number else None
+    none = np.empty(0)
+    return Chi2(PAIR_BINS, counts, freedom, total, number, number, none) if number else None
 
 
 def _positions(night: NightReader) -> Chi2 | None:
@@ -79,9 +83,12 @@ def _positions(night: NightReader) -> Chi2 | None:
         return None
     edges = _edges(freedom)
     counts = np.zeros(len(edges) - 1, np.int64)
+    few = [np.empty(0)]
     for rows in night.pieces("positions", ["chi2"]):
-        counts += np.histogram(np.minimum(rows["chi2"].to_numpy(), edges[-1]), edges)[0]
-    return _chi2(edges, counts, freedom, total, independent)
+        chi2 = rows["chi2"].to_numpy()
+        counts += np.histogram(np.minimum(chi2, edges[-1]), edges)[0]
+        few += [chi2] if freedom.sum() < FEW else []
+    return _chi2(edges, counts, freedom, total, independent, np.concatenate(few))
 
 
 def _states(night: NightReader) -> Chi2 | None:
@@ -93,7 +100,8 @@ def _states(night: NightReader) -> Chi2 | None:
     edges = _edges(freedom)
     chi2 = rows["chi2"].to_numpy()
     counts = np.histogram(np.minimum(chi2, edges[-1]), edges)[0]
-    return _chi2(edges, counts, freedom, float(chi2.sum()), len(rows))
+    few = chi2 if len(rows) < FEW else np.empty(0)
+    return _chi2(edges, counts, freedom, float(chi2.sum()), len(rows), few)
 
 
 def _edges(freedom: Indices) -> Array:
@@ -103,6 +111,9 @@ def _edges(freedom: Indices) -> Array:
     return np.linspace(0.0, dof + 4.5 * np.sqrt(2.0 * max(dof, 1)), bins + 1)
 
 
-def _chi2(edges: Array, counts: Indices, freedom: Indices, total: float, independent: int) -> Chi2:
+def _chi2(
+    edges: Array, counts: Indices, freedom: Indices, total: float, independent: int, few: Array
+) -> Chi2:
     freedoms = int(freedom @ np.arange(len(freedom)))
-    return Chi2(edges, counts, np.trim_zeros(freedom, "b"), total, freedoms, independent)
+    by_number = np.trim_zeros(freedom, "b")
+    return Chi2(edges, counts, by_number, total, freedoms, independent, np.sort(few))

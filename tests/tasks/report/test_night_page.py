@@ -5,6 +5,7 @@ from html.parser import HTMLParser
 from urllib.parse import unquote
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 from scenes.made_nights import filled, hostile_night, reader_of, seconds
 
@@ -12,6 +13,7 @@ from epipole.io.datasets.dataset import night_reader
 from epipole.tasks.report.night_facts import read_night_facts
 
 pytest.importorskip("matplotlib")
+from epipole.tasks.report.draw_sensors import _label_positions
 from epipole.tasks.report.page import night_page, report_extract
 
 NIGHT = "2019-04-01"
@@ -71,6 +73,25 @@ def test_a_run_has_every_section_and_its_pictures(page):
                     "epipolar", "objects", "trend", "logs"):  # fmt: skip
         assert f'<section id="{section}">' in page
         assert f'href="#{section}"' in page
+
+
+def test_elements_have_their_sigmas_and_positions_the_sigma_of_the_readme(page):
+    cells = re.findall(r"<td[^>]*>(20190401-00001)</td>(.*?)</tr>", page, re.DOTALL)
+    row = re.findall(r"<td[^>]*>(.*?)</td>", cells[-1][1])
+    assert all(re.fullmatch(r"[\d,.]+ ± [\d,.]+", each) for each in row[-3:])
+
+
+def test_names_of_stars_stay_clear_of_arrows(night_dataset):
+    frame = read_night_facts(night_reader(night_dataset, NIGHT), "out").star_map
+    size = np.array([500.0, 500.0])
+    arrow = np.array([60.0, 0.0])
+    frame = frame._replace(
+        star_id=frame.star_id[:1], magnitude=frame.magnitude[:1], stars_px=size[None] / 2,
+        residuals_px=arrow[None], others_px=np.empty((0, 2)),
+    )  # fmt: skip
+    assert _label_positions(frame, size, 1.0)[0][2] == "right"
+    right = _label_positions(frame._replace(residuals_px=-arrow[None]), size, 1.0)
+    assert right[0][2] == "left"
 
 
 def test_it_needs_no_other_file_and_no_script(page):

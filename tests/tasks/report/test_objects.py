@@ -17,7 +17,7 @@ def test_longitude_is_right_ascension_less_sidereal_time():
     expected = -(12 + 36 / 60 + 16.7 / 3600) * 15 + 0.2459
     assert abs((found.ends[1][0] - expected + 180) % 360 - 180) < 0.01
     assert found.near_geostationary
-    assert found.sigma_km == 2.0
+    assert found.sigma_km == 12.0**0.5
     assert found.elements is None
     assert (found.status, found.name, found.verdict) == ("unknown", "", "no_orbit")
 
@@ -26,15 +26,25 @@ def test_an_object_without_positions_is_where_its_orbit_is():
     made = reader_of({
         "objects": filled("objects", object_id=["o", "p"], n_sensors=[2, 1], name=["SAT 7", None]),
         "identifications": filled("identifications", object_id=["o", None], status=["known"] * 2),
-        "orbits": filled("orbits", object_id=["o"], z_km=[7000.0], cov_xx=[3.0], a_km=[7000.0],
-                         e=[0.1], i_deg=[90.0])})  # fmt: skip
+        "orbits": filled("orbits", object_id=["o"], z_km=[7000.0], cov_xx=[4.0], a_km=[7000.0],
+                         e=[0.1], i_deg=[90.0], sigma_a_km=[8.0])})  # fmt: skip
     found, bare = read_objects(made)
     assert found.ends[0][1:] == found.ends[1][1:] == (90.0, 7000.0)
     assert (found.status, found.name, found.positions) == ("known", "SAT 7", 0)
-    assert (found.sigma_km, found.elements) == (1.0, (7000.0, 0.1, 90.0))
+    assert (found.sigma_km, found.elements) == (2.0, (7000.0, 0.1, 90.0))
+    assert found.element_sigmas == (8.0, 0.0, 0.0)
     assert (found.sensors, found.first_ns) == (2, START_NS)
     assert found.has_orbit
     assert bare.ends is None
     assert np.isnan(bare.sigma_km)
     assert not bare.has_orbit
     assert not bare.near_geostationary
+
+
+def test_the_sigma_of_an_object_is_the_median_of_its_positions():
+    variances = [1.0, 4.0, 9.0, 100.0, 400.0]
+    made = reader_of({
+        "objects": filled("objects", object_id=["o"], n_positions=[5]),
+        "positions": filled("positions", object_id=["o"] * 5, x_km=[7e3] * 5, cov_yy=variances),
+    }, in_group=2)  # fmt: skip
+    assert read_objects(made)[0].sigma_km == 3.0

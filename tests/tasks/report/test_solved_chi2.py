@@ -1,6 +1,7 @@
 """Chi-squares of positions and pairs: right sigmas give 1 per degree of freedom."""
 
 import numpy as np
+import pytest
 from scenes.made_nights import filled, reader_of
 from scipy.stats import chi2
 
@@ -25,3 +26,33 @@ def test_chi_squares_of_right_sigmas_are_one_per_degree_of_freedom():
 
 def test_a_night_without_objects_has_none():
     assert read_solved_chi2(reader_of({})) == (None, None, None)
+
+
+def test_a_few_values_are_kept_and_many_are_not():
+    values = [3.0, 1.0, 2.0]
+    few = filled("states", chi2=values, dof=[2] * 3)
+    many = filled("positions", chi2=np.ones(60), n_sensors=[2] * 60)
+    found = read_solved_chi2(reader_of({"states": few, "positions": many}))
+    assert found.states.few.tolist() == [1.0, 2.0, 3.0]
+    assert len(found.positions.few) == 0
+
+
+def test_the_line_of_chi_squares_is_what_each_bar_should_be():
+    """One degree of freedom has no highest density: the line stays in the picture all the same."""
+    draw_sky = pytest.importorskip("epipole.tasks.report.draw_sky")
+    rng = np.random.default_rng(5)
+    sensors = rng.choice([2, 4], 5000, p=[0.3, 0.7])
+    made = chi2.rvs(2 * sensors - 3, random_state=rng)
+    night = reader_of({"positions": filled("positions", n_sensors=sensors, chi2=made)})
+    figure = draw_sky.Figure()
+    draw_sky.draw_chi2(figure, read_solved_chi2(night).positions, "positions")
+    (axes,) = figure.axes
+    (line,) = [patch for patch in axes.patches if patch.get_label() == "chi-square distribution"]
+    expected, bars = (
+        line.get_data().values,
+        np.array([bar.get_height() for bar in axes.patches[:-1]]),
+    )
+    assert axes.get_ylim()[1] > expected.max()
+    sigma = np.sqrt(expected / (5000 * np.diff(line.get_data().edges)))
+    assert np.abs(bars - expected).max() < 4.5 * sigma.max()
+    assert np.abs((bars - expected) / sigma).mean() < 1.1
