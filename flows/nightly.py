@@ -12,7 +12,13 @@ from prefect import flow
 from epipole.flows.night.calibrating import calibrate, find_cameras
 from epipole.flows.night.log_checks import check_logs, check_readings
 from epipole.flows.night.log_choice import Night, find_logs, night_asked, run_name
-from epipole.flows.night.recorded_nights import EarlierNights, unchanged_nights, write_night_row
+from epipole.flows.night.recorded_nights import (
+    EarlierNights,
+    gave_something,
+    night_logs_key,
+    unchanged_nights,
+    write_night_row,
+)
 from epipole.flows.night.reports import with_reports
 from epipole.flows.night.stages import (
     Destination,
@@ -45,10 +51,11 @@ from epipole.io.datasets.rows_by_night import nights_of
 from epipole.io.paths import known_as
 from epipole.io.settings_file import merged_settings
 from epipole.io.work.folder import work_folder, work_root
-from epipole.io.work.recipe import logs_key, recipe_of
+from epipole.io.work.recipe import recipe_of
 from epipole.io.work.work_layout import ReadFolder, SolvedParts, WorkFolder
 from epipole.schemas.bridge import concat
 from epipole.schemas.errors import LogError, NoFramesError
+from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.tables import REJECTS
 from epipole.tasks.publish.write_tables import into_nights, source_table
@@ -113,20 +120,15 @@ def nightly(
         chosen = choose_nights(given.paths, nights, night, frames.rejects)
         sources = source_table(frames.sources, settings)
         check_sources(out, chosen, sources, replace)
-        rejects = into_nights(concat(REJECTS, [given.rejects, frames.rejects]), nights)
-        recipe = recipe_of(
-            logs_key(
-                [(log.name, log.sha256) for log in frames.sources],
-                given.rejects["source"].to_pylist(),
-            ),
-            settings,
-            known_key,
-        )
+        rejects = concat(REJECTS, [given.rejects, frames.rejects])
         staged: dict[str, Path] = {}
         with lock_nights(out, [] if night else chosen) as staging, ExitStack() as kept:
             for date in chosen:
                 if len(chosen) > 1:
                     LOGGER.info("night %s", date)
+                gave = gave_something(frames.sources, frames.rejects, date)
+                key = night_logs_key(given, date, *gave)
+                recipe = recipe_of(key, settings, known_key)
                 work = work_folder(work_root(out), date, recipe.work_key(date))
                 folder = WorkFolder(kept.enter_context(work))
                 made = make_night(frames, date, folder, settings)
@@ -135,7 +137,8 @@ def nightly(
                 names = name(made.work, made.solved, date, earlier.last_views(date), settings)
                 elements, unused = choose_elements(catalogue, date, settings)
                 whole = {"sources": sources, **made.tables,
-                         "rejects": concat(REJECTS, [rejects, made.rejects, unused])}  # fmt: skip
+                         "rejects": concat(REJECTS, [into_nights(rejects, nights, date),
+                                                     made.rejects, unused])}  # fmt: skip
                 staged[date] = staging / f"night={date}"
                 linked = write_night(
                     made.work, made.solved, date, names, whole, staged[date], settings
@@ -201,7 +204,11 @@ def choose_nights(
 
 
 def _advice(rejects: pa.Table) -> str:
-    left_out = ", ".join(f"{reason} {count}" for reason, count in by_reason(rejects).items())
+    left_out = ", ".join(
+        f"{reason} {count}"
+        for reason, count in by_reason(rejects).items()
+        if reason != Reason.NOTHING_READ
+    )
     if left_out:
         return f"left out: {left_out}; check the recording"
     return "record epipole.CentroidFrame messages (the schema's name decides, not the topic)"

@@ -60,6 +60,12 @@ class Reason(StrEnum):
         "A file that was found in a folder or by a glob is not an MCAP file.",
         Trait.HARMLESS,
     )
+    NOTHING_READ = (
+        "nothing_read",
+        Stage.READ,
+        "A log has no frame, state or calibration that can be used; offset is its size.",
+        Trait.HARMLESS,
+    )
     TRUNCATED = "truncated", Stage.READ, "The log ends too early: cut short, or never closed."
     LOG_BEHIND_LOG = (
         "log_behind_log",

@@ -516,7 +516,11 @@ NIGHTS = schema(
     "One row: what the night was made from and with, and what it holds. Two nights of one date "
     "whose keys are all equal are the same, byte for byte.",
     [
-        column("logs_key", pa.string(), doc="Digest of the logs: their bytes and names."),
+        column(
+            "logs_key",
+            pa.string(),
+            doc="Digest of the logs: their names, and their bytes to the night's end.",
+        ),
         column("settings_key", pa.string(), doc="Digest of the settings."),
         column("star_catalogue_key", pa.string(), doc="Digest of the star catalogue."),
         column("code_version", pa.string(), doc="Version of epipole."),

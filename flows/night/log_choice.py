@@ -2,7 +2,7 @@
 
 import datetime
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -10,7 +10,7 @@ import pyarrow as pa
 from pydantic import Field
 
 from epipole.io.logs.listing import list_logs
-from epipole.io.logs.reader import read_log_times
+from epipole.io.logs.logged_times import read_log_times
 from epipole.schemas.errors import EpipoleError, LogError, NoFramesError
 from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.spans import DAY_NS, SPAN_NS
@@ -27,10 +27,20 @@ MARGIN_NS = SPAN_NS + LOGGED_WITHIN_NS
 
 
 class FoundLogs(NamedTuple):
-    """The logs of a night, and a row of `rejects` for each file that is not a log."""
+    """The logs of a night, and a row of `rejects` for each file that is not a log.
+
+    `logged_ns` is when the first and the last message of a log were logged; it has no logs that
+    may have frames of any night.
+    """
 
     paths: list[str]
     rejects: pa.Table
+    logged_ns: Mapping[str, tuple[int, int]] = {}
+
+    def of(self, night: str) -> list[str]:
+        """Return the logs that may have frames of a night, or of a margin before and after it."""
+        logged = self.logged_ns
+        return [p for p in self.paths if p not in logged or _touches(logged[p], night)]
 
 
 def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
@@ -51,14 +61,15 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
     Notes
     -----
     A log that is named itself is always taken. Logs found in a folder or by a glob are chosen by
-    the times at which their messages were logged. A log that was never closed does not have these
-    times and is taken too. A found file that is not MCAP is left out with a warning, so that one
-    broken recording does not stop every night.
+    the times at which their messages were logged. A log that does not tell them is taken too. A
+    found file that is not MCAP is left out with a warning, so that one broken recording does not
+    stop every night.
     """
     named = [where] if isinstance(where, str) else list(where)
     if not named:
         raise LogError("no logs given; name a log, or a folder of logs")
     chosen: list[str] = []
+    known_ns: dict[str, tuple[int, int]] = {}
     spans: list[tuple[int, int]] = []
     broken: list[str] = []
     for path, is_named in _listed(named).items():
@@ -70,6 +81,8 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
             LOGGER.warning("left out: %s", error)
             broken.append(path)
             continue
+        if not is_named and logged_ns is not None:
+            known_ns[path] = logged_ns
         if is_named or night is None or logged_ns is None or _touches(logged_ns, night):
             chosen.append(path)
         else:
@@ -77,7 +90,7 @@ def find_logs(where: str | Sequence[str], night: str | None) -> FoundLogs:
     if not chosen:
         kind = NoFramesError if spans else LogError
         raise kind(f"{', '.join(named)}: {_none_chosen(night, spans, broken)}")
-    return FoundLogs(chosen, _rejects(broken, night))
+    return FoundLogs(chosen, _rejects(broken), known_ns)
 
 
 def name_of(path: str) -> str:
@@ -109,13 +122,18 @@ def _none_chosen(night: str | None, spans: Sequence[tuple[int, int]], broken: Se
     return f"no frames on {night} in these logs; they have {have}"
 
 
-def _rejects(broken: Sequence[str], night: str | None) -> pa.Table:
+def _rejects(broken: Sequence[str]) -> pa.Table:
     return reject_rows(
         Reason.NO_MCAP,
         source=[name_of(path) for path in broken],
-        time=[_start_ns(night) if night else 0] * len(broken),
+        time=[0] * len(broken),
         count=[1] * len(broken),
     )
+
+
+def end_ns(night: str) -> int:
+    """Return when the messages of a night, and of its margin, have all been logged."""
+    return _start_ns(night) + DAY_NS + MARGIN_NS
 
 
 def _start_ns(night: str) -> int:

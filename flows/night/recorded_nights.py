@@ -7,19 +7,21 @@ skipped.
 """
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import polars as pl
 import pyarrow as pa
 
-from epipole.flows.night.log_choice import FoundLogs, name_of
+from epipole.flows.night.log_choice import FoundLogs, end_ns, name_of
 from epipole.flows.night.summary import count
 from epipole.io.datasets.dataset import (
     missing_tables,
@@ -30,14 +32,15 @@ from epipole.io.datasets.dataset import (
 )
 from epipole.io.datasets.night_tables import write_table
 from epipole.io.datasets.table_pieces import MAX_BYTES, within_bounds
-from epipole.io.logs.mcap.bytes import open_log
+from epipole.io.logs.logged_times import open_mcap, read_digest
 from epipole.io.work.recipe import Recipe, digest_of, logs_key, recipe_of
-from epipole.schemas.bridge import array, concat, from_polars, table, to_polars
-from epipole.schemas.errors import DatasetError
+from epipole.schemas.bridge import array, concat, from_polars, rows_with, table, to_polars
+from epipole.schemas.errors import DatasetError, LogError
+from epipole.schemas.rejects import Reason
 from epipole.schemas.settings import Settings
 from epipole.schemas.spans import DAY_NS, SPAN_NS, day_of
 from epipole.schemas.tables import NIGHTS, STATES
-from epipole.schemas.work_tables import OBJECT_DETECTIONS
+from epipole.schemas.work_tables import OBJECT_DETECTIONS, LogSource
 
 # The table `nights`: what a night was made from, with which settings, and what it has.
 
@@ -241,6 +244,77 @@ def _published(dataset: str, date: str, settings: Settings, known: str | None) -
 HASHED_AT_ONCE = 2  # logs
 
 
+def night_logs_key(
+    given: FoundLogs, night: str, also: Collection[str], but: Collection[tuple[str, int]],
+    whole: Mapping[str, str] = MappingProxyType({}),
+) -> str:  # fmt: skip
+    """Return the `logs_key` of a night: of its logs, as far as the night may depend on their bytes.
+
+    Parameters
+    ----------
+    also, but
+        Names of logs that gave something to the night; names and sizes of those that gave nothing.
+    whole
+        Digests of logs by their names, of those that are known.
+    """
+    until_ns = end_ns(night)
+    paths = _logs_of(given, night, also, but)
+    with ThreadPoolExecutor(HASHED_AT_ONCE, "hash logs") as pool:
+        known = [whole.get(name_of(path)) for path in paths]
+        digests = list(pool.map(read_digest, paths, [until_ns] * len(paths), known))
+    return logs_key(zip(map(name_of, paths), digests, strict=True))
+
+
+class Given(NamedTuple):
+    """What logs gave to a night; arguments of `night_logs_key`."""
+
+    also: set[str]
+    but: set[tuple[str, int]]
+    whole: dict[str, str]
+
+
+def gave_something(sources: Sequence[LogSource], rejects: pa.Table, night: str) -> Given:
+    """Return which logs gave something to a night, and which nothing at all.
+
+    `sources` are those that gave something to any night, `rejects` what reading left out.
+    """
+    day = day_of(night)
+    of_night = {
+        log.name
+        for log in sources
+        if (log.first_time_ns or 0) // DAY_NS <= day <= (log.last_time_ns or 0) // DAY_NS
+    }
+    names = Counter(log.name for log in sources)
+    whole = {log.name: log.sha256 for log in sources if names[log.name] == 1}
+    return Given(of_night, _empty(rejects), whole)
+
+
+def _empty(rejects: pa.Table) -> set[tuple[str, int]]:
+    """Return the names and sizes of logs that gave nothing."""
+    rows = rows_with(rejects, "reason", Reason.NOTHING_READ).to_pylist()
+    return {(row["source"], row["offset"]) for row in rows}
+
+
+def _logs_of(
+    given: FoundLogs, night: str, also: Collection[str], but: Collection[tuple[str, int]]
+) -> list[str]:
+    may = set(given.of(night))
+    return [
+        path
+        for path in given.paths
+        if (path in may or name_of(path) in also) and not _is_among(path, but)
+    ]
+
+
+def _is_among(path: str, logs: Collection[tuple[str, int]]) -> bool:
+    """Return whether a log is one of these, by name and size."""
+    name = name_of(path)
+    if not any(name == other for other, _ in logs):
+        return False
+    with open_mcap(path) as log:
+        return (name, len(log)) in logs
+
+
 def unchanged_nights(
     dataset: str, given: FoundLogs, night: str | None, settings: Settings, known: str | None
 ) -> list[str]:
@@ -258,7 +332,7 @@ def unchanged_nights(
     Notes
     -----
     Logs are the same where their bytes are: they are read once, to be hashed, and only if their
-    names and sizes are those of the published night.
+    names are those of the published night. Logs that give nothing do not count.
     """
     try:
         rows = _rows(dataset, night)
@@ -267,12 +341,13 @@ def unchanged_nights(
             for date, row in rows.items()
             if recipe_in(row) == recipe_of(row["logs_key"], settings, known)
         }
-        same = [date for date in made_so if _same_names(given, _sources(dataset, date))]
-        if not same:
-            return []
-        key = _key_of(given)
-        same = [date for date in same if made_so[date]["logs_key"] == key]
-        if not same or not _all_nights(dataset, same, night):
+        logs = {date: made for date in made_so if (made := _made_from(dataset, date, given))}
+        same = [
+            date
+            for date, (names, empty) in logs.items()
+            if night_logs_key(given, date, names, empty) == made_so[date]["logs_key"]
+        ]
+        if not same or not (night or _all_nights(dataset, given, {d: logs[d] for d in same})):
             return []
         earlier = EarlierNights(dataset, {})
         intact = all(
@@ -280,7 +355,7 @@ def unchanged_nights(
             and not missing_tables(dataset, date)
             for date in same
         )
-    except (DatasetError, OSError):  # making the night again shows what is wrong with it
+    except (DatasetError, LogError, OSError):  # making the night again shows what is wrong with it
         return []
     return same if intact else []
 
@@ -292,40 +367,42 @@ def _rows(dataset: str, night: str | None) -> dict[str, dict[str, Any]]:
     return {date: row for date, row in rows.items() if row is not None}
 
 
-def _sources(dataset: str, night: str) -> pa.Table:
-    return read_table(dataset, "sources", night)
+class MadeFrom(NamedTuple):
+    """The names of logs that gave a night something; names and sizes of those that gave nothing."""
+
+    names: set[str]
+    empty: set[tuple[str, int]]
 
 
-def _same_names(given: FoundLogs, sources: pa.Table) -> bool:
-    """Return whether logs may be those of a night; a second copy of a log is not in the sources."""
-    return {name_of(path) for path in given.paths} >= set(sources["name"].to_pylist())
+def _made_from(dataset: str, night: str, given: FoundLogs) -> MadeFrom | None:
+    """Return which logs a night was made from; None where they are not among those given.
+
+    A second copy of a log is not in the sources.
+    """
+    names = set(read_table(dataset, "sources", night, ["name"])["name"].to_pylist())
+    if not names <= {name_of(path) for path in given.paths}:
+        return None
+    rejects = read_table(dataset, "rejects", night, ["source", "reason", "offset"])
+    return MadeFrom(names, _empty(rejects))
 
 
-def _key_of(given: FoundLogs) -> str:
-    """Return the `logs_key` of logs. Of those with the same bytes the first name counts."""
-    with ThreadPoolExecutor(HASHED_AT_ONCE, "hash logs") as pool:
-        digests = list(pool.map(_sha256, given.paths))
-    by_content: dict[str, str] = {}
-    for name, sha256 in sorted(zip(map(name_of, given.paths), digests, strict=True)):
-        by_content.setdefault(sha256, name)
-    logs = [(name, sha256) for sha256, name in by_content.items()]
-    return logs_key(logs, given.rejects["source"].to_pylist())
-
-
-def _sha256(path: str) -> str:
-    with open_log(path) as log:
-        return log.sha256()
-
-
-def _all_nights(dataset: str, same: Sequence[str], night: str | None) -> bool:
-    """Return whether no other night can have frames of the logs that made these."""
-    if night is not None:
-        return True
-    sources = _sources(dataset, same[0])
-    days = zip(
-        (array(sources, "first_time") // DAY_NS).tolist(),
-        (array(sources, "last_time") // DAY_NS).tolist(),
-        strict=True,
-    )
-    dates = {str(np.datetime64(d, "D")) for first, last in days for d in range(first, last + 1)}
-    return dates <= set(same)
+def _all_nights(dataset: str, given: FoundLogs, same: Mapping[str, MadeFrom]) -> bool:
+    """Return whether no other night can have frames of the logs of these."""
+    known = {
+        path
+        for date, (names, empty) in same.items()
+        for path in given.paths
+        if _is_among(path, empty) or path in _logs_of(given, date, names, empty)
+    }
+    dates: set[str] = set()
+    for date in same:
+        sources = read_table(dataset, "sources", date)
+        days = zip(
+            (array(sources, "first_time") // DAY_NS).tolist(),
+            (array(sources, "last_time") // DAY_NS).tolist(),
+            strict=True,
+        )
+        dates |= {
+            str(np.datetime64(d, "D")) for first, last in days for d in range(first, last + 1)
+        }
+    return known >= set(given.paths) and dates <= set(same)

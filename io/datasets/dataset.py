@@ -73,6 +73,8 @@ def nights_in(dataset: Where) -> list[str]:
 def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, replace: bool) -> None:
     """Raise where a published night was made from a log that is not among these sources.
 
+    A log of the same name that is not smaller is that log: it was still being written, or copied.
+
     Raises
     ------
     DatasetError
@@ -80,10 +82,19 @@ def check_sources(dataset: Where, nights: Sequence[str], sources: pa.Table, repl
     """
     if replace:
         return
-    given = set(sources["sha256"].to_pylist())
+    columns = ["name", "size", "sha256"]
+    rows = sources.select(columns).to_pylist()
+    given = {row["sha256"] for row in rows}
+    sizes: dict[str, int] = {}
+    for row in rows:
+        sizes[row["name"]] = max(row["size"], sizes.get(row["name"], 0))
     for night in nights:
-        recorded = read_table(dataset, "sources", night, ["name", "sha256"])
-        missing = [row["name"] for row in recorded.to_pylist() if row["sha256"] not in given]
+        recorded = read_table(dataset, "sources", night, columns).to_pylist()
+        missing = [
+            row["name"]
+            for row in recorded
+            if row["sha256"] not in given and row["size"] > sizes.get(row["name"], -1)
+        ]
         if missing:
             raise DatasetError(
                 f"{dataset}/night={night}: was also made from {', '.join(missing)}; "

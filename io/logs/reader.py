@@ -16,8 +16,9 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from epipole.io.logs.left_out import RejectList, log_time_range, stray_rejects, without_strays
-from epipole.io.logs.mcap.bytes import LogBytes, open_log
-from epipole.io.logs.mcap.container import MAGIC, Channel, ChannelTable, read_summary
+from epipole.io.logs.logged_times import open_mcap
+from epipole.io.logs.mcap.bytes import LogBytes
+from epipole.io.logs.mcap.container import Channel
 from epipole.io.logs.mcap.records import Block, RecordWalk
 from epipole.io.logs.messages.batches import batches_of
 from epipole.io.logs.messages.cameras import CameraColumns
@@ -26,7 +27,6 @@ from epipole.io.logs.messages.registry import kinds_of_schemas, message_encoding
 from epipole.io.logs.messages.states import StateColumns
 from epipole.io.paths import known_as
 from epipole.schemas.bridge import array
-from epipole.schemas.errors import LogError
 from epipole.schemas.log_messages import CALIBRATION, FRAME, KINDS, STATE
 from epipole.schemas.rejects import Reason
 from epipole.schemas.tables import REJECTS
@@ -87,7 +87,7 @@ def read_log_pieces(
     the rejects and the source, with the log's time range: frames outside it are strays.
     """
     where = known_as(os.fspath(path))
-    with _open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
+    with open_mcap(where) as data, ThreadPoolExecutor(THREADS, "open chunks") as pool:
         reading = _Reading(where, data, pool)
         for block in reading.blocks():
             known = reading.in_known_encodings(block)
@@ -97,29 +97,6 @@ def read_log_pieces(
             if reading.n_bytes >= piece_bytes:
                 yield reading.piece()
         yield reading.last_piece()
-
-
-def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
-    """Return when a log's first and last message were logged, without reading them.
-
-    UTC nanoseconds since 1970, of the recorder's clock: not the times of frames. None where
-    the log has no valid summary, because it was never closed. Only `read_log` finds them then.
-
-    Raises
-    ------
-    LogError
-        Where there is no such file, or it is a folder or not MCAP.
-    """
-    with _open_mcap(os.fspath(path)) as data:
-        return read_summary(data, ChannelTable(frozenset())).logged_ns
-
-
-def _open_mcap(where: str) -> LogBytes:
-    data = open_log(where)
-    if len(data) < len(MAGIC) or data.view(0, len(MAGIC)) != MAGIC:
-        data.close()
-        raise LogError(f"{where}: not an MCAP file; give a log as MCAP (https://mcap.dev)")
-    return data
 
 
 class _Reading:

@@ -37,13 +37,16 @@ def recipe_of(logs: str, settings: Settings, known: str | None = None) -> Recipe
     return Recipe(logs, settings.key(), catalogue, code_key(), known)
 
 
-def logs_key(logs: Iterable[tuple[str, str]], others: Iterable[str] = ()) -> str:
-    """Return a digest of logs, each with its name and its SHA-256, and of files that are no logs.
+def logs_key(logs: Iterable[tuple[str, str]]) -> str:
+    """Return a digest of logs, each with its name and its SHA-256.
 
     Names count: where frames contradict each other, the names of their logs decide which is used.
+    Of those with the same bytes the first name counts.
     """
-    read = sorted(f"{sha256} {name}" for name, sha256 in logs)
-    return digest_of([*read, *(f"no log {name}" for name in sorted(others))])
+    by_content: dict[str, str] = {}
+    for name, sha256 in sorted(logs):
+        by_content.setdefault(sha256, name)
+    return digest_of(sorted(f"{sha256} {name}" for sha256, name in by_content.items()))
 
 
 def star_catalogue_key(which: str) -> str:

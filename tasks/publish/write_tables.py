@@ -235,17 +235,28 @@ def source_table(sources: Sequence[LogSource], settings: Settings) -> pa.Table:
     )
 
 
-def into_nights(rejects: pa.Table, nights: Sequence[str]) -> pa.Table:
-    """Return the rejects; those outside these nights move to the start of the nearest one."""
+def into_nights(rejects: pa.Table, nights: Sequence[str], night: str) -> pa.Table:
+    """Return the rejects of a night, one of `nights`.
+
+    Those outside all nights move to the start of the nearest one. Rows without a time are about
+    logs in which no time can be read: each night has them. Of a log that gave nothing this row is
+    enough.
+    """
+    nothing = pc.equal(rejects["reason"], Reason.NOTHING_READ.value)
+    of_these = pc.is_in(rejects["source"], rejects.filter(nothing)["source"].combine_chunks())
+    of_these = pc.and_(of_these, pc.equal(rejects["time"].cast(pa.int64()), 0))
+    rejects = rejects.filter(pc.or_(nothing, pc.invert(of_these)))
     time_ns = array(rejects, "time")
-    starts = np.array([_start_ns(night) for night in nights])
+    starts = np.array([_start_ns(each) for each in nights])
     day = time_ns // DAY_NS * DAY_NS
     nearest = starts[np.argmin(np.abs(day[:, None] - starts), axis=1)]
     time_ns = np.where(np.isin(day, starts), time_ns, nearest)
+    time_ns = np.where(day == 0, _start_ns(night), time_ns)
     at = rejects.column_names.index("time")
-    return rejects.set_column(
+    moved = rejects.set_column(
         at, REJECTS.field("time"), pa.array(time_ns).cast(REJECTS.field("time").type)
     )
+    return rows_of_night("rejects", moved, night)
 
 
 def _start_ns(night: str) -> int:

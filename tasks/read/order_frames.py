@@ -21,7 +21,7 @@ from epipole.io.work.parts import READ_SENSOR, read_part, write_part
 from epipole.io.work.work_layout import ReadFolder
 from epipole.schemas.bridge import array, concat, conform, rows_with, table, unstack_covariance
 from epipole.schemas.columns import OPTICS_AXES
-from epipole.schemas.rejects import Reason
+from epipole.schemas.rejects import Reason, reject_rows
 from epipole.schemas.settings import SensorSettings
 from epipole.schemas.spans import SPAN_NS, Span
 from epipole.schemas.stages import Stage
@@ -67,7 +67,7 @@ class OrderedFrames(NamedTuple):
     sensors: list[str]  # sorted; a sensor's number is its index here
     spans: list[list[SpanFrames]]  # of each sensor, in order
     cameras: pa.Table
-    sources: list[LogSource]
+    sources: list[LogSource]  # logs that gave something
     rejects: pa.Table
     pieces: list[list[Path]]  # of each sensor: parts of logs that have something of it
 
@@ -152,13 +152,15 @@ def ordered_logs(
     rejects = [_piece_tables(parts, "rejects", REJECTS)]
     rejects += [rows for of_kind in zip(*(each.rejects for each in ordered), strict=True)
                 for rows in of_kind]  # fmt: skip
+    rejects.append(_without_anything(plan.logs))
     spans = [each.spans for each in ordered]
+    sources = [log.source for log in plan.logs if log.is_source]
     return OrderedFrames(
         plan.folder,
         [sensor.sensor_id for sensor in plan.sensors],
         spans,
         cameras,
-        _dated([log.source for log in plan.logs], [each for found in spans for each in found]),
+        _dated(sources, [each for found in spans for each in found]),
         concat(REJECTS, rejects),
         [[plan.folder.piece(log, k) for _, log, k in sensor.pieces] for sensor in plan.sensors],
     )
@@ -285,8 +287,22 @@ def _without_strays(keys: pa.Table, sensor: SensorPieces) -> tuple[pa.Table, pa.
     return keys.filter(pa.array(inside)), keys.filter(pa.array(~inside))
 
 
+def _without_anything(logs: Sequence[ReadLog]) -> pa.Table:
+    """Return a row of `rejects` for each log in which nothing can be used; no time is known."""
+    empty = [log.source for log in logs if not log.is_source]
+    for log in empty:
+        LOGGER.warning("%s: %s", log.name, Reason.NOTHING_READ.sentence)
+    return reject_rows(
+        Reason.NOTHING_READ,
+        source=[log.name for log in empty],
+        offset=[log.size for log in empty],
+        time=[0] * len(empty),
+        count=[1] * len(empty),
+    )
+
+
 def _dated(sources: Sequence[LogSource], spans: Sequence[SpanFrames]) -> list[LogSource]:
-    """Return the sources; one without any time is part of the whole run."""
+    """Return the sources; one that has calibrations alone is part of the whole run."""
     if not spans:
         return list(sources)
     first, last = min(each.first_ns for each in spans), max(each.last_ns for each in spans)

@@ -42,6 +42,12 @@ class ReadLog(NamedTuple):
     n_pieces: int
     source: LogSource
     sensors: dict[str, SensorInLog]
+    n_cameras: int = 0
+
+    @property
+    def is_source(self) -> bool:
+        """Whether anything in it can be used."""
+        return bool(self.sensors or self.n_cameras)
 
 
 @stage_task(Stage.READ, "{logs}", retried=True)
@@ -60,7 +66,7 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
     LogError
         If it is not a log; see `read_log_pieces`.
     """
-    n_pieces, source = 0, None
+    n_pieces, n_cameras, source = 0, 0, None
     sensors: dict[str, SensorInLog] = {}
     for piece in read_log_pieces(path):
         write_part(
@@ -78,11 +84,12 @@ def read_log_into(folder: ReadFolder, number: int, path: str) -> ReadLog:
             before = sensors.get(sensor_id, SensorInLog([], 0))
             sensors[sensor_id] = SensorInLog([*before.pieces, n_pieces], before.n_frames + n_frames)
         n_pieces += 1
+        n_cameras += piece.cameras.num_rows
         source = piece.source or source
     assert source is not None, "the last piece has it"
     n_frames = sum(found.n_frames for found in sensors.values())
     LOGGER.debug("%s: read %d frames in %d pieces", source.name, n_frames, n_pieces)
-    return ReadLog(number, n_pieces, source, sensors)
+    return ReadLog(number, n_pieces, source, sensors, n_cameras)
 
 
 def _frames_of(exposures: pa.Table, states: pa.Table) -> dict[str, int]:

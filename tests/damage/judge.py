@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 from damage.cases import Case, Promise
 from damage.sound_logs import count, keys_of, sound_log
-from epipole.io.logs.reader import read_log, read_log_pieces, read_log_times
+from epipole.io.logs.logged_times import read_log_times
+from epipole.io.logs.reader import read_log, read_log_pieces
 from epipole.schemas.bridge import array, flatten
 from epipole.schemas.errors import LogError
 from epipole.schemas.rejects import Reason

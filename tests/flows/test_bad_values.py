@@ -49,10 +49,10 @@ def test_bad_values_cost_themselves_and_no_night(prefect, folder, tmp_path):
     assert found.nights == ["2019-04-01"]
     assert found.objects == 9
     assert found.identified > 200
-    counts = {"stray_time": 12, "vague_attitude": 234, "bad_velocity": 26, "truncated": 1}
+    counts = {"stray_time": 12, "vague_attitude": 234, "bad_velocity": 26, "nothing_read": 1}
     assert found.rejects.items() >= counts.items()
     sources = pl.read_parquet(out / "night=2019-04-01" / "sources" / "*.parquet")
-    assert sorted(sources["name"]) == ["bad.mcap", "cut.mcap", "states.mcap"]
+    assert sorted(sources["name"]) == ["bad.mcap", "states.mcap"]
 
 
 def test_a_night_without_any_frame_is_an_error_that_says_what_was_left_out(

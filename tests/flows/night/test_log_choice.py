@@ -94,10 +94,17 @@ def test_a_log_that_ends_close_to_midnight_may_have_frames_of_the_night(tmp_path
     assert names(str(tmp_path), "2019-04-02") == ["before05", "before39", "until05", "until39"]
 
 
-def test_a_log_that_was_never_closed_is_taken_for_every_night(folder):
-    whole = (folder / "d1h01.mcap").read_bytes()
-    (folder / "open.mcap").write_bytes(whole[: len(whole) // 2])
-    assert "open" in names(str(folder), "2019-04-03")
+def test_a_log_that_was_never_closed_is_taken_for_its_nights_or_for_every_one(tmp_path):
+    start_ns = instant("2019-04-01T01:00")
+    with LogWriter(tmp_path / "open.mcap", chunk_size=1, compression="none") as log:
+        for k in range(9):
+            log.frame("a", start_ns + k, frame_number=k, exposure_s=0.1, x_px=[1.0], y_px=[2.0])
+    write_log(tmp_path / "other.mcap", *[instant("2019-04-03T12:00")] * 2)
+    whole = (tmp_path / "open.mcap").read_bytes()
+    (tmp_path / "open.mcap").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "begun.mcap").write_bytes(whole[:20])  # it does not tell
+    assert names(str(tmp_path), "2019-04-01") == ["begun", "open"]
+    assert names(str(tmp_path), "2019-04-03") == ["begun", "other"]
 
 
 def test_a_log_that_is_named_itself_is_taken_whenever_it_was_logged(folder):

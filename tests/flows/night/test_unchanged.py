@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from epipole.flows.night.log_choice import FoundLogs, find_logs
+from epipole.flows.night.log_choice import find_logs
 from epipole.flows.night.recorded_nights import unchanged_nights
 from epipole.io.work import recipe
 from epipole.schemas.settings import Settings, validate_settings
@@ -47,15 +47,12 @@ def test_other_logs_are_a_change(night_log, dataset, tmp_path):
     assert found(dataset, night_log, more) == []
 
 
-def test_a_file_that_is_no_log_is_a_change(night_log, night_dataset):
-    given = find_logs([str(night_log)], None)
-    broken = given.rejects.schema.empty_table().to_pylist()
-    assert broken == []
-    from epipole.schemas.rejects import Reason, reject_rows
-
-    rows = reject_rows(Reason.NO_MCAP, source=["x.mcap"], time=[0], count=[1])
-    with_broken = FoundLogs(given.paths, rows)
-    assert unchanged_nights(str(night_dataset), with_broken, None, Settings(), None) == []
+def test_files_that_give_nothing_are_no_change(night_log, night_dataset, tmp_path):
+    (tmp_path / "empty.mcap").touch()
+    shutil.copy(night_log, tmp_path)
+    given = find_logs(str(tmp_path), NIGHT)
+    assert given.rejects["source"].to_pylist() == ["empty.mcap"]
+    assert unchanged_nights(str(night_dataset), given, NIGHT, Settings(), None) == [NIGHT]
 
 
 def test_other_settings_or_catalogues_are_a_change(night_log, night_dataset):

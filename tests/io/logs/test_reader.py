@@ -8,11 +8,12 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from epipole.io.logs.left_out import ROWS_ALIKE
+from epipole.io.logs.logged_times import read_log_times
 from epipole.io.logs.mcap import records as log_records
 from epipole.io.logs.messages import frames as frame_columns
 from epipole.io.logs.messages import json_text, protobuf
 from epipole.io.logs.messages.registry import kinds_of_schemas
-from epipole.io.logs.reader import read_log, read_log_times
+from epipole.io.logs.reader import read_log
 from epipole.io.logs.writer import LogWriter, calibration_values
 from epipole.schemas.bridge import array, flatten, stack
 from epipole.schemas.errors import LogError
@@ -589,7 +590,9 @@ def test_the_times_of_a_log_are_known_without_reading_it(tmp_path, monkeypatch):
     path = write(tmp_path / "a.mcap")
     monkeypatch.setattr(log_records, "open_chunk", None)  # no chunk is opened
     assert read_log_times(path) == (START_NS, START_NS + 7 + (N_FRAMES - 1) * SECOND_NS)
-    path.write_bytes(path.read_bytes()[:-1])
+    path.write_bytes(path.read_bytes()[:-1])  # never closed: its chunks tell
+    assert read_log_times(path) == (START_NS, START_NS + 7 + (N_FRAMES - 1) * SECOND_NS)
+    path.write_bytes(path.read_bytes()[:20])
     assert read_log_times(path) is None
     (tmp_path / "b.mcap").write_bytes(b"no log")
     with pytest.raises(LogError, match="not an MCAP file"):

@@ -26,9 +26,10 @@ def test_names_are_given_after_the_parts_so_the_parts_do_not_depend_on_them():
     assert recipe_of("", Settings()) != recipe_of("", Settings(), "f00")
 
 
-def test_a_file_that_is_no_log_counts_too():
-    assert logs_key([A]) != logs_key([A], ["broken.mcap"])
-    assert logs_key([A], ["x", "y"]) == logs_key([A], ["y", "x"])
+def test_of_logs_with_the_same_bytes_the_first_name_counts():
+    copy = ("z.mcap", A[1])
+    assert logs_key([A]) == logs_key([copy, A])
+    assert logs_key([A]) != logs_key([copy])
 
 
 def test_a_star_catalogue_counts_by_its_bytes(tmp_path):

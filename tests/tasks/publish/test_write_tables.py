@@ -71,18 +71,28 @@ def test_other_reasons_keep_their_rows():
     assert counted([]).equals(empty(REJECTS))
 
 
-def test_a_reject_is_in_one_of_the_nights():
-    hour_ns = 3_600_000_000_000
+def test_a_reject_is_in_one_of_the_nights_and_without_a_time_in_each():
+    hour_ns, other = 3_600_000_000_000, "2019-04-05"
     before, within, gap, after = (
         MIDNIGHT_NS - hour_ns, MIDNIGHT_NS + hour_ns, MIDNIGHT_NS + DAY_NS + hour_ns,
         MIDNIGHT_NS + 9 * DAY_NS,
     )  # fmt: skip
     rows = concat(REJECTS, [view_rejected(t, 1) for t in (0, before, within, gap, after)])
-    moved = into_nights(rows, [NIGHT, "2019-04-05"])
+    first, second = (into_nights(rows, [NIGHT, other], night) for night in (NIGHT, other))
     last = MIDNIGHT_NS + 4 * DAY_NS
-    assert array(moved, "time").tolist() == [MIDNIGHT_NS, MIDNIGHT_NS, within, MIDNIGHT_NS, last]
-    assert moved.schema.equals(rows.schema)
-    assert moved.drop_columns("time").equals(rows.drop_columns("time"))
+    assert array(first, "time").tolist() == [MIDNIGHT_NS, MIDNIGHT_NS, within, MIDNIGHT_NS]
+    assert array(second, "time").tolist() == [last, last]
+    assert first.schema.equals(rows.schema)
+    assert first.drop_columns("time").equals(rows.drop_columns("time").slice(0, 4))
+
+
+def test_a_log_that_gave_nothing_has_one_row():
+    rows = reject_rows([Reason.TRUNCATED, Reason.NOTHING_READ, Reason.TRUNCATED],
+                       source=["a", "a", "b"], time=[0, 0, 0], count=[1] * 3)  # fmt: skip
+    kept = into_nights(rows, [NIGHT], NIGHT)
+    assert kept.select(["source", "reason"]).to_pylist() == [
+        {"source": "a", "reason": "nothing_read"}, {"source": "b", "reason": "truncated"},
+    ]  # fmt: skip
 
 
 def test_sources_have_the_code_and_settings_that_made_the_night():

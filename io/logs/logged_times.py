@@ -1,0 +1,137 @@
+"""When the messages of a log were logged, and its bytes up to a time: found without reading them.
+
+A log that was never closed has no summary: it is still being written, or its recorder was stopped.
+Then the heads of its chunks say it.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from epipole.io.logs.mcap.bytes import LogBytes, open_log
+from epipole.io.logs.mcap.container import (
+    HEAD_BYTES,
+    MAGIC,
+    MAX_RECORD_BYTES,
+    RECORD,
+    ChannelTable,
+    ChunkError,
+    read_head,
+    read_summary,
+)
+from epipole.io.logs.mcap.record_scan import CHUNK, DATA_END, MESSAGE
+from epipole.schemas.errors import LogError
+from epipole.schemas.rejects import Reason
+
+# Records of an unclosed log that are looked at: of a log without chunks each message is one.
+MAX_RECORDS = 50_000
+HASHED_BYTES = 1 << 20  # at once
+
+
+class ChunkTimes(NamedTuple):
+    """Where a chunk begins in the file, and when its messages were logged [ns]."""
+
+    at: int
+    start_ns: int
+    end_ns: int
+
+
+def open_mcap(where: str) -> LogBytes:
+    """Return the bytes of a log.
+
+    Raises
+    ------
+    LogError
+        Where there is no such file, or it is a folder or not MCAP.
+    """
+    data = open_log(where)
+    if len(data) < len(MAGIC) or data.view(0, len(MAGIC)) != MAGIC:
+        data.close()
+        raise LogError(f"{where}: not an MCAP file; give a log as MCAP (https://mcap.dev)")
+    return data
+
+
+def read_log_times(path: str | os.PathLike[str]) -> tuple[int, int] | None:
+    """Return when a log's first and last message were logged, without reading them.
+
+    UTC nanoseconds since 1970, of the recorder's clock: not the times of frames. None where
+    neither its summary nor its chunks tell. Only `read_log` finds them then.
+
+    Raises
+    ------
+    LogError
+        As `open_mcap`.
+    """
+    with open_mcap(os.fspath(path)) as data:
+        summary = read_summary(data, ChannelTable(frozenset()))
+        if summary.data_end is not None:
+            return summary.logged_ns if summary.logged_ns != (0, 0) else None  # no messages
+        try:
+            chunks = list(_walked_chunks(data))
+        except ChunkError:
+            return None
+    times = [t for chunk in chunks for t in chunk[1:] if t]  # a chunk without messages has zeros
+    return (min(times), max(times)) if times else None
+
+
+def read_digest(path: str, until_ns: int, whole: str | None = None) -> str:
+    """Return the SHA-256 of a log; of one that goes on after a time, of its bytes before.
+
+    These end where the first chunk begins whose messages were all logged at that time or after it.
+    So they are the same while the log is still being written.
+
+    Parameters
+    ----------
+    whole
+        The digest of the whole log, if it is known.
+    """
+    with open_mcap(path) as data:
+        try:
+            chunks = list(_chunks(data))
+        except ChunkError:
+            chunks = []
+        after = [chunk.at for chunk in chunks if chunk.start_ns >= until_ns]
+        if not after:
+            return whole or data.sha256()
+        digest = hashlib.sha256()
+        for at in range(0, min(after), HASHED_BYTES):
+            digest.update(data.view(at, min(at + HASHED_BYTES, *after)))
+        return digest.hexdigest()
+
+
+def _chunks(data: LogBytes) -> Iterator[ChunkTimes]:
+    """Yield the chunks of a log, by its summary where it has one."""
+    summary = read_summary(data, ChannelTable(frozenset()))
+    if summary.data_end is None:
+        yield from _walked_chunks(data)
+    for at in summary.chunk_offsets:
+        yield _chunk_at(data, at)
+
+
+def _walked_chunks(data: LogBytes) -> Iterator[ChunkTimes]:
+    """Yield the chunks of a log without a summary; the last one may be incomplete.
+
+    Raises
+    ------
+    ChunkError
+        Where the records between them are damaged, or have messages: then no chunk tells the times.
+    """
+    at = len(MAGIC)
+    for _ in range(MAX_RECORDS):
+        if at + RECORD.size > len(data):
+            return
+        opcode, length = RECORD.unpack(data.view(at, at + RECORD.size))
+        if opcode == CHUNK:
+            if len(data) - at < HEAD_BYTES:  # cut
+                return
+            yield _chunk_at(data, at)
+        elif opcode == MESSAGE or not 0 < opcode <= DATA_END or length > MAX_RECORD_BYTES:
+            break
+        at += RECORD.size + length
+    raise ChunkError(Reason.DAMAGED_RECORD)
+
+
+def _chunk_at(data: LogBytes, at: int) -> ChunkTimes:
+    head = read_head(data.view(at, min(at + HEAD_BYTES, len(data))), at)
+    return ChunkTimes(at, head.start_ns, head.end_ns)

@@ -1,0 +1,74 @@
+"""What an operator meets in the morning: logs that are empty, open or late, and sensors missing."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from epipole.flows.night.log_choice import find_logs
+from epipole.flows.night.recorded_nights import unchanged_nights
+from epipole.flows.nightly import nightly
+from epipole.io.datasets.dataset import read_table
+from epipole.io.logs.writer import LogWriter
+from epipole.schemas.settings import validate_settings
+
+DAYS = ("2019-04-01", "2019-04-02")
+SECOND_NS = 1_000_000_000
+OPTICS = {
+    "width": 512, "height": 512, "fx_px": 14666.0, "fy_px": 14666.0, "cx_px": 255.5,
+    "cy_px": 255.5, "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0, "k3": 0.0,
+}  # fmt: skip
+PLAIN = validate_settings({"report": {"write": False}}, "test")
+
+pytestmark = pytest.mark.usefixtures("prefect")
+
+
+def write_log(path: Path, day: str, n_frames: int = 10) -> Path:
+    """Write a log of a sensor without stars, from four in the morning, a chunk for each frame."""
+    start_ns = int(np.datetime64(f"{day}T04:00", "ns").astype(np.int64))
+    with LogWriter(path, chunk_size=1, compression="none") as log:
+        log.camera("a", start_ns, OPTICS)
+        for k in range(n_frames):
+            t = start_ns + k * SECOND_NS
+            log.frame("a", t, frame_number=k, exposure_s=0.1, x_px=[1.0], y_px=[2.0])
+    return path
+
+
+def unchanged(folder: Path, out: Path, day: str | None) -> list[str]:
+    return unchanged_nights(str(out), find_logs(str(folder), day), day, PLAIN, None)
+
+
+def sources(out: Path, day: str) -> list[str]:
+    return read_table(out, "sources", day, ["name"])["name"].to_pylist()
+
+
+def test_logs_that_give_nothing_are_on_no_night_and_open_ones_on_their_own(tmp_path):
+    folder, out = tmp_path / "logs", tmp_path / "out"
+    folder.mkdir()
+    write_log(folder / "first.mcap", DAYS[0])
+    whole = write_log(tmp_path / "second.mcap", DAYS[1]).read_bytes()
+    (folder / "second.mcap").write_bytes(whole[: len(whole) // 2])  # still written
+    with LogWriter(folder / "nothing.mcap"):
+        pass
+    (folder / "broken.mcap").touch()
+    for day in DAYS:
+        nightly(str(folder), str(out), PLAIN, night=day)
+    assert [sources(out, day) for day in DAYS] == [["first.mcap"], ["second.mcap"]]
+    for day in DAYS:
+        rejects = read_table(out, "rejects", day).to_pylist()
+        found = {row["source"]: row["reason"] for row in rejects if row["stage"] == "read"}
+        assert found.items() >= {"nothing.mcap": "nothing_read", "broken.mcap": "no_mcap"}.items()
+        assert unchanged(folder, out, day) == [day]
+    assert unchanged(folder, out, None) == list(DAYS)
+
+    (folder / "second.mcap").write_bytes(whole)
+    assert [unchanged(folder, out, day) for day in DAYS] == [[DAYS[0]], []]
+    nightly(str(folder), str(out), PLAIN, night=DAYS[1])  # not refused: the log has grown
+    assert read_table(out, "frames", DAYS[1]).num_rows == 10
+
+    for name in ("nothing.mcap", "broken.mcap"):  # moved away
+        (folder / name).unlink()
+    assert unchanged(folder, out, None) == list(DAYS)
+    shutil.copy(folder / "second.mcap", folder / "z.mcap")
+    assert unchanged(folder, out, None) == list(DAYS)  # a copy adds nothing

@@ -1,0 +1,51 @@
+"""When messages were logged, and the bytes of a log up to a time, while the log is written."""
+
+import pytest
+
+from epipole.io.logs.logged_times import read_digest, read_log_times
+from epipole.io.logs.writer import LogWriter
+
+START_NS, SECOND_NS = 1_554_091_200_000_000_000, 1_000_000_000
+N_FRAMES = 40
+
+
+@pytest.fixture
+def closed(tmp_path):
+    """Return a log of many chunks, a frame a second."""
+    with LogWriter(tmp_path / "a.mcap", chunk_size=200, compression="none") as log:
+        for k in range(N_FRAMES):
+            t = START_NS + k * SECOND_NS
+            log.frame("a", t, frame_number=k, exposure_s=0.1, x_px=[1.0], y_px=[2.0])
+    return tmp_path / "a.mcap"
+
+
+def cut(path, share):
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    return path
+
+
+def test_a_log_that_is_still_written_tells_its_times_by_its_chunks(closed):
+    whole = read_log_times(closed)
+    assert whole == (START_NS, START_NS + (N_FRAMES - 1) * SECOND_NS)
+    first, last = read_log_times(cut(closed, 0.5))
+    assert first == START_NS
+    assert START_NS + 5 * SECOND_NS < last < whole[1]
+
+
+def test_damage_between_its_chunks_is_a_log_of_unknown_times(closed):
+    data = bytearray(cut(closed, 0.5).read_bytes())
+    at = 8 + 9 + int.from_bytes(data[9:17], "little")  # the first record behind the header
+    data[at] = 0xEE
+    closed.write_bytes(data)
+    assert read_log_times(closed) is None
+
+
+def test_what_is_logged_after_a_time_does_not_change_the_digest(closed):
+    early, late = (START_NS + k * SECOND_NS for k in (5, N_FRAMES + 1))
+    of_closed = [read_digest(str(closed), until) for until in (early, late)]
+    path = cut(closed, 0.5)
+    of_open = [read_digest(str(path), until) for until in (early, late)]
+    assert of_open[0] == of_closed[0]
+    assert of_open[1] != of_closed[1]
+    assert read_digest(str(path), late, "known") == "known"
