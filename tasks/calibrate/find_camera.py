@@ -7,6 +7,7 @@ has to agree. A `CameraFinding` says what differs from the log's calibration.
 """
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -34,6 +35,7 @@ from epipole.tasks.algorithms.star_identification.camera_search import (
     find_cameras,
 )
 from epipole.tasks.algorithms.star_identification.centroids import brightest_first
+from epipole.tasks.algorithms.star_identification.search_budget import SearchBudget
 from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.calibrate.calibrate_sensors import SensorStars, with_optics
 from epipole.tasks.common.batches import Batch
@@ -212,6 +214,8 @@ def _find_sensor_camera(
     tried = solved if some else tried  # the others may show the Earth
     if camera is None or not tried.num_rows:
         return None
+    # The search may cost as much as all searches of these frames before.
+    budget_s = SearchBudget(tried.num_rows, identification.time_limit_s).total_s
     tried = tried.take(rich_frames(array(tried, "n_centroids")))
     images = [
         image._replace(n_stars=n_stars)
@@ -219,7 +223,7 @@ def _find_sensor_camera(
         for image in image_frames(*_frame_with_state(frames, sensor, int(t), sensors), sensors)
     ]
     skies_of = skies_at(int(array(tried, "time")[0]), identification)
-    found = find_agreed_camera(images, camera, REACH, skies_of, identification)
+    found = find_agreed_camera(images, camera, REACH, skies_of, identification, budget_s)
     if found is None and some:
         return None
     return CameraFinding(sensor.sensor_id, camera, found and found.camera)
@@ -245,11 +249,12 @@ def find_agreed_camera(
     reach: float,
     skies_of: Callable[[float], Skies],
     identification: IdentificationSettings,
+    budget_s: float = math.inf,
 ) -> FoundCamera | None:
     """Return the first camera of a frame that another frame agrees with; or that of the only
-    frame."""
+    frame. `budget_s` as in `find_cameras`."""
     matching = match_settings(identification)
-    for found in find_cameras(frames, nominal, reach, skies_of, matching):
+    for found in find_cameras(frames, nominal, reach, skies_of, matching, budget_s):
         others = [frame for k, frame in enumerate(frames) if k != found.frame]
         if not others or any(
             agreeing_camera(frame, found.camera, skies_of, matching) for frame in others

@@ -11,7 +11,9 @@ For a sensor that identifies nothing with its nominal calibration.
    values of k1 are tried, and the camera that matches most stars is taken.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +29,8 @@ from epipole.tasks.algorithms.star_identification.frame import (
     Solution,
     aberrate_all,
     field_of_view,
-    identify_lost,
     identify_predicted,
+    search_frame,
 )
 from epipole.tasks.algorithms.star_identification.sensor_model import Skies
 from epipole.tasks.algorithms.star_identification.star_grid import Sky, SkyGrid
@@ -88,11 +90,14 @@ class _BlockSky(NamedTuple):
     pairs: PairTable
 
 
-class _Trials(NamedTuple):
-    """What all trials share: a source of skies for the angle of a pixel [rad], and settings."""
+@dataclass
+class _Trials:
+    """What all trials share: a source of skies for the angle of a pixel [rad], settings, and what
+    the searches have cost so far (CPU time by counted work)."""
 
     skies_of: Callable[[float], Skies]
     matching: MatchSettings
+    cost_s: float = 0.0
 
 
 class _Match(NamedTuple):
@@ -117,6 +122,7 @@ def find_cameras(
     reach: float,
     skies_of: Callable[[float], Skies],
     matching: MatchSettings,
+    budget_s: float = math.inf,
 ) -> Iterator[FoundCamera]:
     """Yield the camera that matches most stars of a frame, for each frame with one.
 
@@ -132,8 +138,11 @@ def find_cameras(
         Largest factor on the focal lengths that is tried; the smallest is its inverse.
     skies_of
         Skies for a pixel of this angle [rad].
-    how
+    matching
         Its false alarm probability is that of all frames together.
+    budget_s
+        No further frame is searched once the searches have cost this (CPU time by counted work).
+        The first one is always searched.
     """
     reach = float(np.log(reach))
     n_trials = 2 * (_n_trials(reach) + len(DISTORTIONS) * _n_trials(min(reach, DISTORTED_REACH)))
@@ -142,11 +151,14 @@ def find_cameras(
         time_limit_s=TRIAL_TIME_LIMIT_S,
         crowded=False,
     )
+    trials = _Trials(skies_of, matching)
     for k, frame in enumerate(frames):
         kept = _brightest(frame)
         if len(kept.x_px) < MIN_CENTROIDS:
             continue
-        found = _best_match(kept, nominal, reach, _Trials(skies_of, matching))
+        if trials.cost_s > budget_s:
+            return
+        found = _best_match(kept, nominal, reach, trials)
         if found is not None and found.n_stars >= MORE_STARS * frame.n_stars:
             yield FoundCamera(found.camera, found.n_stars, k)
 
@@ -179,7 +191,7 @@ def _first_match(
         shared = _shared_sky(frame, sides[0], ratios, trials.skies_of)
         for ratio in ratios:
             for side in sides:
-                found = _try(frame, _scaled(side, ratio), shared, trials.matching)
+                found = _try(frame, _scaled(side, ratio), shared, trials)
                 if found is not None:
                     return found
     return None
@@ -209,7 +221,8 @@ def agreeing_camera(
     kept = _brightest(frame)
     if len(kept.x_px) < MIN_CENTROIDS:
         return None
-    found = _try(kept, camera, _shared_sky(kept, camera, [1.0], skies_of), matching)
+    shared = _shared_sky(kept, camera, [1.0], skies_of)
+    found = _try(kept, camera, shared, _Trials(skies_of, matching))
     return None if found is None else FoundCamera(found.camera, found.n_stars, 0)
 
 
@@ -264,11 +277,12 @@ def _sigma_px(frame: ImageFrame, camera: Camera) -> Array:
     return np.hypot(sigma, STEP / np.sqrt(12.0) * r)
 
 
-def _try(
-    frame: ImageFrame, camera: Camera, shared: _BlockSky, matching: MatchSettings
-) -> _Match | None:
+def _try(frame: ImageFrame, camera: Camera, shared: _BlockSky, trials: _Trials) -> _Match | None:
     """Return the camera with a refined focal length, and its match."""
-    solution = identify_lost(_seen_by(frame, camera), *shared, matching)[0]
+    matching = trials.matching
+    searched = search_frame(_seen_by(frame, camera), *shared, matching)
+    trials.cost_s += searched.cost_s
+    solution = searched.solution
     if solution is None:
         return None
     # In dense fields, the middle of the image may fit with a focal length that is steps off.

@@ -107,6 +107,14 @@ def test_the_second_frame_is_searched_where_the_first_shows_nothing(skies_of):
     assert found.frame == 1
 
 
+def test_no_further_frame_is_searched_beyond_the_budget(skies_of):
+    rng = np.random.default_rng(8)
+    noise = frame(TRUE, 8)._replace(x_px=rng.uniform(0, 1023, len(frame(TRUE, 8).x_px)))
+    asked = [noise, frame(TRUE, 6)], TRUE, 1.02, skies_of, MATCHING
+    assert first_camera(*asked, 0.0) is None
+    assert first_camera(*asked).frame == 1
+
+
 def test_another_frame_agrees_with_the_true_camera_alone(skies_of):
     assert agreeing_camera(frame(TRUE, 7), TRUE, skies_of, MATCHING)
     assert agreeing_camera(frame(TRUE, 7), scaled(TRUE, 1.2), skies_of, MATCHING) is None
